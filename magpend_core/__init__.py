@@ -15,14 +15,7 @@ if TYPE_CHECKING:
     from magpend_core.crossing import Crossing
     from magpend_core.lyapunov import LyapunovExponents, lyapunov_exponents
     from magpend_core.meaning import kernel_version
-    from magpend_core.models import (
-        ModelError,
-        load_model,
-        load_preset,
-        model_names,
-        preset_names,
-        preset_provenance,
-    )
+    from magpend_core.models import ModelError, load_model, load_preset, model_names, preset_names, preset_provenance
     from magpend_core.models.model import Model
     from magpend_core.models.parameters import ParameterError, Parameters
     from magpend_core.models.pendulum.mechanics import Torques, accelerations, energy, torques
@@ -66,9 +59,7 @@ _HOMES = {
     "crossing": ("Crossing",),
     "lyapunov": ("LyapunovExponents", "lyapunov_exponents"),
     "meaning": ("kernel_version",),
-    "models": (
-        "ModelError", "load_model", "load_preset", "model_names", "preset_names", "preset_provenance",
-    ),
+    "models": ("ModelError", "load_model", "load_preset", "model_names", "preset_names", "preset_provenance"),
     "models.model": ("Model",),
     "models.parameters": ("ParameterError", "Parameters"),
     "models.pendulum.mechanics": ("Torques", "accelerations", "energy", "torques"),
@@ -77,7 +68,7 @@ _HOMES = {
     "sections": ("Sections", "run_branches", "sections"),
     "status": ("Status",),
     "trajectory": ("trajectory",),
-}  # fmt: skip
+}
 _HOME_OF = {name: f"{__name__}.{module}" for module, names in _HOMES.items() for name in names}
 
 

@@ -54,9 +54,7 @@ class Crossing:
             raise ValueError(f"direction = {self.direction!r} of a section must be 'up' or 'down'.")
         check_array("value of a section", self.value, 0)
         if not check_array("longest of a section", self.longest, 0) > 0.0:
-            raise ValueError(
-                f"longest = {self.longest} of a section is out of bounds: it must be greater than 0."
-            )
+            raise ValueError(f"longest = {self.longest} of a section is out of bounds: it must be greater than 0.")
 
     @property
     def sign(self) -> int:

@@ -70,12 +70,7 @@ def newton_steps(system: System, states: np.ndarray, packed: np.ndarray) -> tupl
 
 
 def find_equilibria(
-    system: System,
-    states: np.ndarray,
-    packed: np.ndarray,
-    *,
-    tolerance: float = 1e-10,
-    max_iterations: int = 30,
+    system: System, states: np.ndarray, packed: np.ndarray, *, tolerance: float = 1e-10, max_iterations: int = 30
 ) -> Equilibria:
     """Find the equilibria near given states.
 

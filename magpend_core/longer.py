@@ -53,10 +53,20 @@ def more_sections(
     # a window of no sections: nothing closes on them
     settings = Settings(0, n_more, 0, 0.0, 1)
     cells = integrate(
-        system, RECORD, settings, parameters=parameters, frequency_hz=frequency_hz,
-        initial_states=last, n_keep=n_more, n_measures=FIRST_TURN + system.n_states, rtol=rtol, atol=atol,
-        max_steps_per_period=max_steps_per_period, step_size=step_size, quantities=quantities,
-    )  # fmt: skip
+        system,
+        RECORD,
+        settings,
+        parameters=parameters,
+        frequency_hz=frequency_hz,
+        initial_states=last,
+        n_keep=n_more,
+        n_measures=FIRST_TURN + system.n_states,
+        rtol=rtol,
+        atol=atol,
+        max_steps_per_period=max_steps_per_period,
+        step_size=step_size,
+        quantities=quantities,
+    )
     angles = [i for i, is_angle in enumerate(system.is_angle) if is_angle]
     return Sections(
         section=cells.section,

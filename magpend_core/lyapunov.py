@@ -128,9 +128,7 @@ def _orthonormalise(state: Any, memory: Any, settings: Any) -> None:
     state[N - 1] = 0.0
 
 
-def _average(
-    section: Any, turns: Any, i_period: int, memory: Any, record: Any, measures: Any, settings: Any
-) -> int:
+def _average(section: Any, turns: Any, i_period: int, memory: Any, record: Any, measures: Any, settings: Any) -> int:
     """Add each period to its block (a row of the record), and its weighted value to the measures."""
     n_vectors = N_TANGENTS // N_BASE
     i = i_period - settings.n_transient
@@ -248,12 +246,19 @@ def lyapunov_exponents(
 
     def averaged(own: slice) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         cells = integrate(
-            extended, _observer(n, n_exponents, has_returns), settings,
-            parameters=packed[own, None], frequency_hz=frequency[own, None],
-            initial_states=_with_vectors(start[own], n_exponents), n_keep=n_blocks,
-            n_measures=n_exponents + 3, rtol=rtol, atol=atol, max_steps_per_period=max_steps_per_period,
+            extended,
+            _observer(n, n_exponents, has_returns),
+            settings,
+            parameters=packed[own, None],
+            frequency_hz=frequency[own, None],
+            initial_states=_with_vectors(start[own], n_exponents),
+            n_keep=n_blocks,
+            n_measures=n_exponents + 3,
+            rtol=rtol,
+            atol=atol,
+            max_steps_per_period=max_steps_per_period,
             n_lanes=n_lanes,
-        )  # fmt: skip
+        )
         return cells.section[:, 0, :, : n_exponents + 2].copy(), cells.measures[:, 0], cells.status[:, 0]
 
     parts = [averaged(own) for own in _parts(len(frequency), extended.n_states * n_blocks, n_lanes)]
@@ -289,9 +294,7 @@ def _parts(n_cells: int, per_cell: int, n_lanes: int) -> list[slice]:
 
 def _settings(n_exponents: int, n_transient: int, n_periods: int, n_blocks: int, system: System) -> _Settings:
     if not 1 <= check_count("n_exponents", n_exponents, 1) <= system.n_states:
-        raise ValueError(
-            f"n_exponents = {n_exponents} is out of bounds: it must be at most {system.n_states}."
-        )
+        raise ValueError(f"n_exponents = {n_exponents} is out of bounds: it must be at most {system.n_states}.")
     n_transient, n_blocks = check_count("n_transient", n_transient, 0), check_count("n_blocks", n_blocks, 2)
     if check_count("n_periods", n_periods, 2) % n_blocks:
         raise ValueError(

@@ -127,10 +127,15 @@ def section_map(
     extended = dataclasses.replace(with_tangents(system, n), n_controlled=None)
     identity = np.broadcast_to(np.eye(n).ravel(), (len(starts), n * n))
     result = run_branches(
-        packed[:, None, :], frequency[:, None],
+        packed[:, None, :],
+        frequency[:, None],
         np.concatenate([np.where(is_finite[:, None], starts, 0.0), identity], axis=1),
-        n_transient=0, n_keep=most, rtol=rtol, atol=rtol, system=extended,
-    )  # fmt: skip
+        n_transient=0,
+        n_keep=most,
+        rtol=rtol,
+        atol=rtol,
+        system=extended,
+    )
     states = np.where(is_finite[:, None, None], result.section[:, 0], np.nan)
     images = states[:, :, :n]
     # tangent vector k, the derivative by state k, is a column
@@ -287,9 +292,7 @@ def polish_orbits(
     )
     for period in np.unique(found.orbit_period):
         rows = np.flatnonzero(found.orbit_period == period)
-        _newton(
-            found, rows, int(period), packed, frequency, tolerance, max_iterations, rtol, least_period, system
-        )
+        _newton(found, rows, int(period), packed, frequency, tolerance, max_iterations, rtol, least_period, system)
     return found
 
 
@@ -307,9 +310,7 @@ def _newton(
 ) -> None:
     """Iterate the orbits of one period in place."""
     for iteration in range(max_iterations + 1):
-        ends = section_map(
-            packed[rows], frequency[rows], found.section[rows], period, rtol=rtol, system=system
-        )
+        ends = section_map(packed[rows], frequency[rows], found.section[rows], period, rtol=rtol, system=system)
         images, derivatives = ends.images, ends.derivatives
         found.residual[rows] = scaled_distance(images[:, -1], found.section[rows], system)
         found.n_iterations[rows] = iteration
@@ -331,9 +332,7 @@ def _newton(
         if not len(rows) or iteration == max_iterations:
             return
         mismatch = wrap_angles(images[:, -1] - found.section[rows], system)
-        found.section[rows] = wrap_angles(
-            found.section[rows] + _newton_steps(derivatives, mismatch, system), system
-        )
+        found.section[rows] = wrap_angles(found.section[rows] + _newton_steps(derivatives, mismatch, system), system)
 
 
 def _newton_steps(derivatives: np.ndarray, mismatch: np.ndarray, system: System) -> np.ndarray:

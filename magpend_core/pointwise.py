@@ -61,9 +61,13 @@ class _Desk(NamedTuple):
 def _desk_for(system: System, n_out: int) -> _Desk:
     n_rows = system.n_constants + system.n_modes
     return _Desk(
-        np.empty(system.n_constants), np.ones(n_rows * WIDTH), np.zeros(WIDTH),
-        np.zeros(system.n_states * WIDTH), np.zeros(n_out * WIDTH), np.zeros((3, max(system.n_edges, 1))),
-    )  # fmt: skip
+        np.empty(system.n_constants),
+        np.ones(n_rows * WIDTH),
+        np.zeros(WIDTH),
+        np.zeros(system.n_states * WIDTH),
+        np.zeros(n_out * WIDTH),
+        np.zeros((3, max(system.n_edges, 1))),
+    )
 
 
 def _evaluate(desk: _Desk, t: Any, states: Any, frequency: float, p: Any, out: Any) -> None:
@@ -143,12 +147,7 @@ def _at(kind: str, n_out: int, t: Any, state: Any, parameters: Parameters, frequ
 
 
 def evaluate_packed(
-    system: System,
-    t: np.ndarray,
-    states: np.ndarray,
-    packed: np.ndarray,
-    frequency_hz: float,
-    out: np.ndarray,
+    system: System, t: np.ndarray, states: np.ndarray, packed: np.ndarray, frequency_hz: float, out: np.ndarray
 ) -> None:
     """Fill `out` with all quantities of a system; the caller has checked the arguments.
 
@@ -203,9 +202,7 @@ def _flow_at(kind: str, n_out: int, system: System, states: np.ndarray, packed: 
     return out
 
 
-def rates_packed(
-    system: System, states: np.ndarray, packed: np.ndarray, frequency_hz: np.ndarray
-) -> np.ndarray:
+def rates_packed(system: System, states: np.ndarray, packed: np.ndarray, frequency_hz: np.ndarray) -> np.ndarray:
     """Return a flow's rates at many states, each with its own, already checked parameters.
 
     Parameters
@@ -307,9 +304,7 @@ def jacobian(t: Any, state: Any, parameters: Parameters, frequency_hz: float) ->
     return whole_jacobian(system, _at("jacobian", n_entries, t, state, parameters, frequency_hz))
 
 
-def evaluate(
-    names: Sequence[str], t: Any, state: Any, parameters: Parameters, frequency_hz: float
-) -> np.ndarray:
+def evaluate(names: Sequence[str], t: Any, state: Any, parameters: Parameters, frequency_hz: float) -> np.ndarray:
     """Return named quantities of the model, for example an energy or a torque.
 
     Parameters

@@ -107,9 +107,12 @@ def recorded_sections(
     initial = check_states(initial_states, 2, system.n_states, "initial_states")
     max_orbit_period = check_count("max_orbit_period", max_orbit_period, 1)
     settings = Settings(
-        n_transient, n_keep, max_orbit_period, check_tolerance("closure_tolerance", closure_tolerance),
+        n_transient,
+        n_keep,
+        max_orbit_period,
+        check_tolerance("closure_tolerance", closure_tolerance),
         max(64, 4 * max_orbit_period),
-    )  # fmt: skip
+    )
     walk = _Walk(own, packed, initial, marks[:total], settings, len(quantities or ()))
     most = n_points or max(1, CHUNK_NUMBERS // max(1, packed.size))
     for first, stop in _chunks(int(marks[n_transient]) + 1, int(marks[total - 1]) + 1, most):
@@ -117,12 +120,21 @@ def recorded_sections(
             break
         points, frequency = _points(own, drive, packed[walk.alive], slice(first, stop))
         cells = integrate(
-            own, RECORD, Settings(0, 1, 1, settings.tolerance, 1), parameters=points,
-            frequency_hz=frequency, initial_states=walk.state[walk.alive], n_keep=1,
-            n_measures=FIRST_TURN + own.n_states, rtol=rtol, atol=atol,
-            max_steps_per_period=max_steps_per_period, step_size=walk.step[walk.alive], n_lanes=n_lanes,
+            own,
+            RECORD,
+            Settings(0, 1, 1, settings.tolerance, 1),
+            parameters=points,
+            frequency_hz=frequency,
+            initial_states=walk.state[walk.alive],
+            n_keep=1,
+            n_measures=FIRST_TURN + own.n_states,
+            rtol=rtol,
+            atol=atol,
+            max_steps_per_period=max_steps_per_period,
+            step_size=walk.step[walk.alive],
+            n_lanes=n_lanes,
             quantities=quantities,
-        )  # fmt: skip
+        )
         walk.take(cells, first)
     return walk.outcome(quantities is not None)
 
@@ -157,9 +169,14 @@ class _Walk:
     """The current states of the branches, and the results so far."""
 
     def __init__(
-        self, system: System, packed: np.ndarray, initial: np.ndarray, marks: np.ndarray, settings: Settings,
+        self,
+        system: System,
+        packed: np.ndarray,
+        initial: np.ndarray,
+        marks: np.ndarray,
+        settings: Settings,
         n_watched: int,
-    ) -> None:  # fmt: skip
+    ) -> None:
         n, total = len(initial), len(marks)
         self.system, self.settings, self.marks = system, settings, marks
         self.alive, self.state, self.step = np.arange(n), initial.copy(), np.zeros(n)
@@ -281,9 +298,15 @@ def recorded_trajectory(
     own = driven_system(model.system, drive)
     state = check_states(initial_state, 1, own.n_states, "initial_state")
     found = sample(
-        own, _padded(parameters.pack(), own)[None], state[None], [times], drives=[drive], rtol=rtol,
-        atol=atol, max_steps_per_interval=max_steps_per_interval,
-    )  # fmt: skip
+        own,
+        _padded(parameters.pack(), own)[None],
+        state[None],
+        [times],
+        drives=[drive],
+        rtol=rtol,
+        atol=atol,
+        max_steps_per_interval=max_steps_per_interval,
+    )
     if found.status[0] != Status.BOUNDED:
         raise ArithmeticError(f"The trajectory ended early: {Status(int(found.status[0])).sentence}.")
     return np.asarray(found.states[0])

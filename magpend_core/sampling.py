@@ -198,18 +198,23 @@ def sample(
     grids = [_check_times(i, t) for i, t in enumerate(times)]
     which = np.arange(len(grids)) if piece is None else np.asarray(piece, np.int64)
     if which.shape != (len(initial),) or (len(which) and not 0 <= which.min() <= which.max() < len(grids)):
-        raise ValueError(
-            f"piece must give one of {len(grids)} pieces for each of {len(initial)} trajectories."
-        )
+        raise ValueError(f"piece must give one of {len(grids)} pieces for each of {len(initial)} trajectories.")
     columns = range(system.n_states) if columns is None else columns
     longest = max((len(t) for t in grids), default=0)
     table = _drive_table(system, grids, drives)
     samples = engine.Samples(
-        packed, initial, which, np.concatenate([*grids, np.zeros(0)]), _offsets(grids), *table,
-        np.array(list(columns), np.int64), slack_of(rtol, atol),
+        packed,
+        initial,
+        which,
+        np.concatenate([*grids, np.zeros(0)]),
+        _offsets(grids),
+        *table,
+        np.array(list(columns), np.int64),
+        slack_of(rtol, atol),
         np.full((len(which), longest, len(columns)), np.nan),
-        np.zeros(len(which), np.int64), np.zeros(len(which), np.int64),
-    )  # fmt: skip
+        np.zeros(len(which), np.int64),
+        np.zeros(len(which), np.int64),
+    )
     if len(which):
         frequency = 1.0 / samples.durations[samples.first_interval[which]]
         check_system(system, packed, frequency, initial)
@@ -267,13 +272,10 @@ def _check_drive(number: int, drive: Drive, names: tuple[str, ...], end_s: float
             f"need one row per interval and the same names {names}."
         )
     if not len(durations) or (durations <= 0.0).any() or not 0.0 <= drive.start_s < durations[0]:
-        raise ValueError(
-            f"drives[{number}]: durations must be above 0, and the start lie in the first interval."
-        )
+        raise ValueError(f"drives[{number}]: durations must be above 0, and the start lie in the first interval.")
     covered = durations.sum() - drive.start_s
     if covered < end_s - engine.COINCIDENT_S:
         raise ValueError(
-            f"drives[{number}] covers {covered:g} s of a piece of {end_s:g} s; give a longer drive or fewer "
-            "times."
+            f"drives[{number}] covers {covered:g} s of a piece of {end_s:g} s; give a longer drive or fewer times."
         )
     return durations

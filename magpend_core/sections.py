@@ -10,25 +10,12 @@ import numpy as np
 
 from magpend_core.crossing import Crossing
 from magpend_core.engine.entry import N_LANES, integrate
-from magpend_core.engine.observers import (
-    FIRST_TURN,
-    ORBIT_PERIOD,
-    RECORD,
-    Settings,
-    window_of,
-)
+from magpend_core.engine.observers import FIRST_TURN, ORBIT_PERIOD, RECORD, Settings, window_of
 from magpend_core.engine.system import System
 from magpend_core.models.parameters import Parameters
 from magpend_core.models.pendulum.systems import PENDULUM_FITTED
 from magpend_core.status import Status
-from magpend_core.validation import (
-    check_array,
-    check_count,
-    check_flag,
-    check_frequency,
-    check_states,
-    check_tolerance,
-)
+from magpend_core.validation import check_array, check_count, check_flag, check_frequency, check_states, check_tolerance
 
 
 @dataclass(frozen=True)
@@ -160,9 +147,13 @@ def run_branches(
     max_orbit_period = check_count("max_orbit_period", max_orbit_period, 1)
     tolerance = check_tolerance("closure_tolerance", closure_tolerance)
     settings = Settings(
-        n_transient, n_keep, max_orbit_period, tolerance, window_of(max_orbit_period),
+        n_transient,
+        n_keep,
+        max_orbit_period,
+        tolerance,
+        window_of(max_orbit_period),
         check_flag("stop_when_closed", stop_when_closed),
-    )  # fmt: skip
+    )
     if method is not None:
         system = replace(system, method=method)
     if section is not None:
@@ -170,12 +161,21 @@ def run_branches(
             raise ValueError("frequency_hz must be None with a section by crossing: its periods are returns.")
         system, parameters, frequency_hz = section.applied(check_array("parameters", parameters, 3), system)
     cells = integrate(
-        system, RECORD, settings,
-        parameters=parameters, frequency_hz=frequency_hz, initial_states=initial_states,
-        n_keep=n_keep, n_measures=FIRST_TURN + system.n_states, rtol=rtol, atol=atol,
-        max_steps_per_period=max_steps_per_period, step_size=step_size, n_lanes=n_lanes,
+        system,
+        RECORD,
+        settings,
+        parameters=parameters,
+        frequency_hz=frequency_hz,
+        initial_states=initial_states,
+        n_keep=n_keep,
+        n_measures=FIRST_TURN + system.n_states,
+        rtol=rtol,
+        atol=atol,
+        max_steps_per_period=max_steps_per_period,
+        step_size=step_size,
+        n_lanes=n_lanes,
         quantities=quantities,
-    )  # fmt: skip
+    )
     angles = [FIRST_TURN + i for i, angle in enumerate(system.is_angle) if angle]
     # where a cell fails between its kept sections, what the observer has noted is no count
     kept = np.isin(cells.status, (Status.PERIODIC, Status.BOUNDED))
@@ -258,8 +258,15 @@ def sections(
     rows = np.stack([one.pack() for one in several])[:, None]
     packed = np.broadcast_to(rows, (n, *rows.shape[1:]))
     result = run_branches(
-        packed, frequency, initial, n_transient=n_transient, n_keep=n_keep,
-        rtol=rtol, atol=atol, system=system, **options,
-    )  # fmt: skip
+        packed,
+        frequency,
+        initial,
+        n_transient=n_transient,
+        n_keep=n_keep,
+        rtol=rtol,
+        atol=atol,
+        system=system,
+        **options,
+    )
     found = {f.name: getattr(result, f.name) for f in fields(result)}
     return replace(result, **{name: value[:, 0] for name, value in found.items() if value is not None})

@@ -58,15 +58,19 @@ def desk_for(system: System) -> Desk:
     """Allocate the arrays of one trajectory."""
     n = system.n_states
     return Desk(
-        np.zeros(rows_of(system).size), np.zeros(max(system.n_constants + system.n_modes, n)), np.zeros(n),
-        np.zeros((3, max(system.n_edges, 1))), np.zeros(n), np.zeros(n), np.zeros(1, np.int64),
-        np.zeros(1, np.int64), np.zeros(n, np.int64),
-    )  # fmt: skip
+        np.zeros(rows_of(system).size),
+        np.zeros(max(system.n_constants + system.n_modes, n)),
+        np.zeros(n),
+        np.zeros((3, max(system.n_edges, 1))),
+        np.zeros(n),
+        np.zeros(n),
+        np.zeros(1, np.int64),
+        np.zeros(1, np.int64),
+        np.zeros(n, np.int64),
+    )
 
 
-def prepare(
-    w: Any, frequency: float, p: Any, state: Any, slack: float, scratch: Any, edge_table: Any
-) -> None:
+def prepare(w: Any, frequency: float, p: Any, state: Any, slack: float, scratch: Any, edge_table: Any) -> None:
     """Fill the rows of one group: the trajectory in lane 0, idle copies in the other lanes."""
     for lane in range(WIDTH):
         load_cell(w, 0, lane, frequency, p, slack, scratch, edge_table)
@@ -76,9 +80,7 @@ def prepare(
         w[ROWS.wish + lane] = FIRST_STEP * w[ROWS.period + lane]
 
 
-def fill(
-    w: Any, y0: Any, k0: Any, t0: float, times: Any, begin: float, turns: Any, done: int, out: Any
-) -> int:
+def fill(w: Any, y0: Any, k0: Any, t0: float, times: Any, begin: float, turns: Any, done: int, out: Any) -> int:
     """Write all states that fall into lane 0's last accepted step; return how many are written."""
     h = w[ROWS.step]
     while done < len(times) and times[done] - begin <= w[ROWS.time]:
@@ -96,9 +98,17 @@ def fill(
 
 
 def follow(
-    desk: Desk, frequency: float, p: Any, state: Any, times: Any, rtol: float, atol: float, slack: float,
-    max_attempts: float, out: Any,
-) -> int:  # fmt: skip
+    desk: Desk,
+    frequency: float,
+    p: Any,
+    state: Any,
+    times: Any,
+    rtol: float,
+    atol: float,
+    slack: float,
+    max_attempts: float,
+    out: Any,
+) -> int:
     """Fill `out` (len(times), N) at rising `times`; return 0, or the status of a failure."""
     w, section, edge_table, turns = desk.rows, desk.section, desk.edge_table, desk.turns
     y0, k0, events, n_watching = desk.y0, desk.k0, desk.events, desk.n_watching

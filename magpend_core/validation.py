@@ -51,9 +51,7 @@ def check_times(values: Any, shape: tuple[int, ...], name: str = "t") -> np.ndar
     try:
         return np.broadcast_to(array, shape)
     except ValueError:
-        raise ValueError(
-            f"{name} has shape {array.shape}; it must be one number, or one per state: {shape}."
-        ) from None
+        raise ValueError(f"{name} has shape {array.shape}; it must be one number, or one per state: {shape}.") from None
 
 
 def check_states(values: Any, ndim: int | tuple[int, ...], n_states: int, name: str = "state") -> np.ndarray:

@@ -63,10 +63,7 @@ n_transient = 60
 n_keep = 12
 """
 
-AT = {
-    "point": ["--at", "frequency_hz=0.159154943", "--at", "amplitude=0.3"],
-    "line": ["--at", "amplitude=0.15"],
-}
+AT = {"point": ["--at", "frequency_hz=0.159154943", "--at", "amplitude=0.3"], "line": ["--at", "amplitude=0.15"]}
 
 ANALYSES = {
     "attractors": ("sweep", []),
@@ -76,10 +73,7 @@ ANALYSES = {
     "chaos": ("sweep", []),
     "dimension": ("sweep", ["--n-max", "2000"]),
     "branches": ("walk", ["--period", "1"]),
-    "curves": (
-        "walk",
-        ["--period", "1", "--second", "amplitude", "--second-from", "0.25", "--second-to", "0.35"],
-    ),
+    "curves": ("walk", ["--period", "1", "--second", "amplitude", "--second-from", "0.25", "--second-to", "0.35"]),
 }
 
 FIGURES_OF = {
@@ -159,8 +153,23 @@ def test_cube__has_the_models_own_names(runs, day):
 
 
 def test_zoom__and_run_it(runs, day):
-    runs("zoom", "sweep", "--x", "0", "1", "--num-x", "3", "--at", "frequency=0.155", "--axis", "v=0:1",
-         "--at", "amplitude=0.15", "--out", "closer.toml")  # fmt: skip
+    runs(
+        "zoom",
+        "sweep",
+        "--x",
+        "0",
+        "1",
+        "--num-x",
+        "3",
+        "--at",
+        "frequency=0.155",
+        "--axis",
+        "v=0:1",
+        "--at",
+        "amplitude=0.15",
+        "--out",
+        "closer.toml",
+    )
     text = (day / "closer.toml").read_text()
     assert "x = { start = 0.0, stop = 1.0, num = 3 }" in text
     assert 'model = "duffing"' in text
@@ -168,8 +177,25 @@ def test_zoom__and_run_it(runs, day):
 
 
 def test_simulate(call, day):
-    call("simulate", "--model", "duffing", "--x", "0.5", "--v", "0.1", "--frequency", "0.16", "--set",
-         "amplitude=0.25", "--periods", "3", "--samples", "20", "--out", "one.csv")  # fmt: skip
+    call(
+        "simulate",
+        "--model",
+        "duffing",
+        "--x",
+        "0.5",
+        "--v",
+        "0.1",
+        "--frequency",
+        "0.16",
+        "--set",
+        "amplitude=0.25",
+        "--periods",
+        "3",
+        "--samples",
+        "20",
+        "--out",
+        "one.csv",
+    )
     with (day / "one.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert float(rows[0]["x_m"]) == 0.5

@@ -80,9 +80,7 @@ def analysed(example, folder):
 @pytest.mark.parametrize("name", NAMES)
 def test_page__tells_of_each_text(name):
     """Its lines, its page with picture and file, and a workflow with a small size."""
-    rows = re.findall(
-        r"^\| \[([\w-]+)\]\(([\w-]+)\.md\) \| (\d+) \|", (PAGES / "README.md").read_text("utf-8"), re.M
-    )
+    rows = re.findall(r"^\| \[([\w-]+)\]\(([\w-]+)\.md\) \| (\d+) \|", (PAGES / "README.md").read_text("utf-8"), re.M)
     (row,) = (row for row in rows if row[0] == name)
     text = (LIBRARY / f"{name}.toml").read_text("utf-8")
     assert int(row[2]) == len(text.splitlines())
@@ -170,9 +168,7 @@ def test_rossler__first_doublings(example, magpend):
     """Located along c, each to seven digits."""
     run = example("rossler")
     rows = json.loads(magpend("analyse", "branches", run, "--period", "4", "--json"))
-    found = {
-        row["period"]: row["c"] for row in rows if row["type"] == "period_doubling" and row["period"] != 3
-    }
+    found = {row["period"]: row["c"] for row in rows if row["type"] == "period_doubling" and row["period"] != 3}
     for known in REFERENCE["rossler"]["doublings"]:
         assert found[known["returns"]] == pytest.approx(known["c"], abs=2e-7)
 
@@ -197,11 +193,13 @@ def _stuck(branches, period):
     """Values at which branches of a period end where the map has no derivative."""
     stuck = branches["last_end"].attrs["flag_meanings"].split().index("stuck")
     mine, n_points = branches["orbit_period"].values == period, branches["n_points"].values
-    return np.array([
-        branches["parameter"].values[k, point[k]]
-        for point, name in ((0 * n_points, "first_end"), (n_points - 1, "last_end"))
-        for k in np.flatnonzero(mine & (branches[name].values == stuck))
-    ])  # fmt: skip
+    return np.array(
+        [
+            branches["parameter"].values[k, point[k]]
+            for point, name in ((0 * n_points, "first_end"), (n_points - 1, "last_end"))
+            for k in np.flatnonzero(mine & (branches[name].values == stuck))
+        ]
+    )
 
 
 @pytest.mark.slow

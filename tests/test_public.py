@@ -40,17 +40,18 @@ def test_magpend__imports_nothing_heavy():
     )
     path = os.pathsep.join([str(ROOT), str(ROOT / "pipeline" / "face"), os.environ.get("PYTHONPATH", "")])
     found = subprocess.run(
-        [sys.executable, "-c", code], env={**os.environ, "PYTHONPATH": path}, capture_output=True, text=True,
-        check=True,
-    )  # fmt: skip
+        [sys.executable, "-c", code], env={**os.environ, "PYTHONPATH": path}, capture_output=True, text=True, check=True
+    )
     assert found.stdout.strip() == "[]"
 
 
 def test_load_model__warns_of_what_nothing_uses():
     table = {
-        "name": "oscillator", "states": {"x": "m", "v": "m/s"}, "parameters": {"c": 0.1, "k": 2.0},
+        "name": "oscillator",
+        "states": {"x": "m", "v": "m/s"},
+        "parameters": {"c": 0.1, "k": 2.0},
         "equations": {"x": "v", "v": "-x - c*v + cos(2*pi*f*t)"},
-    }  # fmt: skip
+    }
     with pytest.warns(UserWarning, match=r"model.parameters.k: nothing uses it; use it"):
         magpend.load_model(table)
 

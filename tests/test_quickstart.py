@@ -30,8 +30,12 @@ def magpend(*arguments, **environment):
     code = "import sys; from pipeline.cli.main import main; sys.argv[0] = 'magpend'; main()"
     return subprocess.run(
         [sys.executable, "-c", code, *map(str, arguments)],
-        capture_output=True, text=True, check=False, timeout=900, env={**os.environ, **environment},
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=900,
+        env={**os.environ, **environment},
+    )
 
 
 @pytest.fixture(scope="module")

@@ -169,5 +169,7 @@ def test_build__finds_what_is_loaded_from_elsewhere(tmp_path):
     )
     (tmp_path / "b.css").write_text("@font-face { src: url('https://e.example/f.woff2') }", "utf-8")
     assert build.loaded_from_elsewhere(tmp_path) == [
-        "a.html: https://b.example/x.js", "a.html: //c.example/y.css", "b.css: https://e.example/f.woff2",
-    ]  # fmt: skip
+        "a.html: https://b.example/x.js",
+        "a.html: //c.example/y.css",
+        "b.css: https://e.example/f.woff2",
+    ]

@@ -48,9 +48,7 @@ class SystemCheckError(ValueError):
 
     def __init__(self, name: str, problems: list[str]) -> None:
         self.problems = problems
-        super().__init__(
-            f"The system {name!r} cannot be integrated:\n" + "\n".join(f"- {p}" for p in problems)
-        )
+        super().__init__(f"The system {name!r} cannot be integrated:\n" + "\n".join(f"- {p}" for p in problems))
 
 
 @dataclass
@@ -70,12 +68,7 @@ _CHECKED: dict[tuple[System, bool], _Checked] = {}
 
 
 def check_system(
-    system: System,
-    parameters: np.ndarray,
-    frequency_hz: np.ndarray,
-    states: np.ndarray,
-    *,
-    jacobian: bool = False,
+    system: System, parameters: np.ndarray, frequency_hz: np.ndarray, states: np.ndarray, *, jacobian: bool = False
 ) -> None:
     """Check a system where it is about to be integrated.
 
@@ -126,9 +119,13 @@ def check_system(
 
 
 def _problems(
-    system: System, linearised: bool, checked: _Checked | None, packed: np.ndarray, frequency: np.ndarray,
+    system: System,
+    linearised: bool,
+    checked: _Checked | None,
+    packed: np.ndarray,
+    frequency: np.ndarray,
     states: np.ndarray,
-) -> list[str]:  # fmt: skip
+) -> list[str]:
     """Look at the declaration, at the cells with extreme parameters, at the motion from a few states."""
     if checked is None:
         problems = list(_declaration(system, linearised))
@@ -326,9 +323,8 @@ class _Motion:
         if self.system.quantities is not None:
             names = self.system.quantity_names
             self.functions.numbers(
-                "quantities", len(names), ", ".join(names), self.times, tuple(self.y), tuple(rates), self.u,
-                self.c,
-            )  # fmt: skip
+                "quantities", len(names), ", ".join(names), self.times, tuple(self.y), tuple(rates), self.u, self.c
+            )
         return found
 
     def _check_forcing(self) -> None:

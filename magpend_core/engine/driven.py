@@ -49,17 +49,20 @@ def with_recorded_drive(system: System) -> System:
     if system.forcing is no_forcing:
         raise ValueError(f"{system.name} has no drive: its forcing cannot be a recording.")
     if system.forcing_is_time or system.timed_layers:
-        raise ValueError(
-            f"{system.name}: time enters by more than one number; a recording cannot take its place."
-        )
+        raise ValueError(f"{system.name}: time enters by more than one number; a recording cannot take its place.")
     n, m, module = system.n_constants, len(system.parameter_names), system.rhs.__module__
     # modes stay behind all constants
     own = f"c[:{n}]" if not system.n_modes else f"c[:{n}] + c[{n + 2}:]"
     bindings = {
-        "_constants": system.constants, "_rhs": system.rhs, "_jacobian": system.jacobian,
-        "_layers": system.layers, "_quantities": system.quantities, "_switches": system.switches,
-        "_impacts": system.impacts, "_reset": system.reset,
-    }  # fmt: skip
+        "_constants": system.constants,
+        "_rhs": system.rhs,
+        "_jacobian": system.jacobian,
+        "_layers": system.layers,
+        "_quantities": system.quantities,
+        "_switches": system.switches,
+        "_impacts": system.impacts,
+        "_reset": system.reset,
+    }
 
     def wrap(head: str, body: str) -> Any:
         return _wrapped(f"def function({head}):\n    {body}\n", module, **bindings)
@@ -80,17 +83,14 @@ def with_recorded_drive(system: System) -> System:
         parameter_names=(*system.parameter_names, LEVEL, SLOPE),
         n_constants=n + 2,
         constants=wrap(
-            "frequency, p, out",
-            f"_constants(frequency, p, out); out[{n}] = p[{m}]; out[{n + 1}] = p[{m + 1}]",
+            "frequency, p, out", f"_constants(frequency, p, out); out[{n}] = p[{m}]; out[{n + 1}] = p[{m + 1}]"
         ),
         forcing=wrap("t, c", f"return c[{n}] + c[{n + 1}] * t"),
         rhs=wrap("y, u, c", f"return _rhs(y, u, {own})"),
         jacobian=None if system.jacobian is None else wrap("y, u, c", f"return _jacobian(y, u, {own})"),
         layers=wrap("y, dy, c", f"return _layers(y, dy, {own})"),
         quantities=(
-            None
-            if system.quantities is None
-            else wrap("t, y, dy, u, c", f"return _quantities(t, y, dy, u, {own})")
+            None if system.quantities is None else wrap("t, y, dy, u, c", f"return _quantities(t, y, dy, u, {own})")
         ),
         n_edges=0,
         edges=no_edges,

@@ -12,13 +12,7 @@ from magpend_core.engine.checks import check_system
 from magpend_core.engine.lanes import Cells, engine_of
 from magpend_core.engine.observers import Observer
 from magpend_core.engine.system import System
-from magpend_core.validation import (
-    check_array,
-    check_count,
-    check_frequency,
-    check_states,
-    check_tolerance,
-)
+from magpend_core.validation import check_array, check_count, check_frequency, check_states, check_tolerance
 
 N_LANES = 64
 """Lanes in flight: four groups, whose numbers just fit the first-level caches."""
@@ -66,8 +60,7 @@ def check_quantities(names: Sequence[str] | None, system: System) -> tuple[int, 
         near = [match for name in unknown for match in get_close_matches(str(name), known, n=2)]
         hint = f"did you mean {', '.join(dict.fromkeys(near))}? " if near else ""
         raise ValueError(
-            f"quantities: {system.name} has no {', '.join(map(repr, unknown))}; {hint}"
-            f"It has {', '.join(known)}."
+            f"quantities: {system.name} has no {', '.join(map(repr, unknown))}; {hint}It has {', '.join(known)}."
         )
     return tuple(known.index(name) for name in names or ())
 

@@ -26,15 +26,14 @@ def declaration(system: System) -> Iterator[str]:
             "has_segments."
         )
     for field, n, of in (
-        ("slides", system.n_switches, "switches"), ("impact_directions", system.n_impacts, "impacts"),
+        ("slides", system.n_switches, "switches"),
+        ("impact_directions", system.n_impacts, "impacts"),
         ("sticks", system.n_impacts, "impacts"),
-    ):  # fmt: skip
+    ):
         if len(getattr(system, field)) != n:
             given = len(getattr(system, field))
             yield f"{field} has {given} entries; it must have one for each of the {n} {of}."
-    for name, needed in (
-        ("switches", system.n_switches), ("impacts", system.n_impacts), ("reset", system.n_impacts),
-    ):  # fmt: skip
+    for name, needed in (("switches", system.n_switches), ("impacts", system.n_impacts), ("reset", system.n_impacts)):
         if needed and getattr(system, name) is None:
             yield f"{name} is missing."
     for direction in system.impact_directions:

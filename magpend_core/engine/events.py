@@ -85,9 +85,11 @@ def _events_of(system: System) -> Callable[..., Any]:
             parts += [f"y[{i}] - level", f"dy[{i}]"]
     lines.append(f"return ({', '.join(parts)},)" if parts else "return ()")
     scope: dict[str, Any] = {
-        "__name__": system.rhs.__module__, "_switches": system.switches, "_impacts": system.impacts,
+        "__name__": system.rhs.__module__,
+        "_switches": system.switches,
+        "_impacts": system.impacts,
         "sincos": sincos,
-    }  # fmt: skip
+    }
     exec("\n    ".join(lines), scope)
     return inline(scope["event_values"])
 

@@ -50,9 +50,12 @@ OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "pipeline_clas
 # a tuple of a dozen arrays to a callee costs a microsecond. Parts have no wrappers for Python and C: those
 # take half of the time to compile.
 _OF_PARTS: dict[str, Any] = {
-    "nogil": True, "error_model": "numpy", "_nrt": False,
-    "no_cfunc_wrapper": True, "no_cpython_wrapper": True,
-}  # fmt: skip
+    "nogil": True,
+    "error_model": "numpy",
+    "_nrt": False,
+    "no_cfunc_wrapper": True,
+    "no_cpython_wrapper": True,
+}
 
 # numba makes a wrapper for C of every function that has none forbidden, though nothing here is called from C.
 WITHOUT_C: dict[str, Any] = {"no_cfunc_wrapper": True}
@@ -135,9 +138,22 @@ _PARTS: dict[Any, tuple[Any, Any]] = {}
 """Parts by what they are made of, each with what must live as long: identities are in its key."""
 
 _SIZES = frozenset(
-    ("N", "N_KNOWN", "N_CONTROLLED", "N_OWN", "NC", "NE", "N_WATCHED", "N_EVENTS", "N_SWITCHES", "N_IMPACTS",
-     "N_ENTRIES", "N_VECTORS", "SECTION_OF")
-)  # fmt: skip
+    (
+        "N",
+        "N_KNOWN",
+        "N_CONTROLLED",
+        "N_OWN",
+        "NC",
+        "NE",
+        "N_WATCHED",
+        "N_EVENTS",
+        "N_SWITCHES",
+        "N_IMPACTS",
+        "N_ENTRIES",
+        "N_VECTORS",
+        "SECTION_OF",
+    )
+)
 """Free names that stand for sizes of a system: a part is compiled once for all values above 0."""
 
 _ARRAYS = frozenset(("IS_ANGLE", "SCALES", "ESCAPE", "DIRECTIONS", "STARTS", "SAME_VALUE"))
@@ -176,9 +192,7 @@ def _part(template: Callable[..., Any], used: Mapping[str, Any], dissolves: bool
         return specialise(template, "part", **used)
     sizes: dict[str, Any] = {}
     # how many rows are loaded at once is a type, so that these templates are compiled for each size
-    general = (
-        used if "load_rows" in names else {k: _without_size(k, v, names, sizes) for k, v in used.items()}
-    )
+    general = used if "load_rows" in names else {k: _without_size(k, v, names, sizes) for k, v in used.items()}
     digest = _template_digest(template, general, dissolves, names)
     function = specialise(template, digest[:16] if digest else "unkept", **general)
     options = {**_OF_PARTS, "forceinline": dissolves}
@@ -236,9 +250,7 @@ def _identity(value: Any, names: set[str]) -> Any:
     if isinstance(value, np.ndarray):
         return value.dtype.str, value.shape, value.tobytes()
     if hasattr(value, "_fields"):
-        return type(value), tuple(
-            (k, _identity(getattr(value, k), names)) for k in value._fields if k in names
-        )
+        return type(value), tuple((k, _identity(getattr(value, k), names)) for k in value._fields if k in names)
     if isinstance(value, tuple):
         return type(value), tuple(_identity(v, names) for v in value)
     if isinstance(value, bool | int | float | str):
@@ -287,9 +299,7 @@ def entry(
     text = f"def {template.__name__}({arguments}):\n    return _part({arguments})\n"
     scope: dict[str, Any] = {"__name__": template.__module__}
     exec(compile(text, code.co_filename, "exec"), scope)
-    return kernel(
-        specialise(scope[template.__name__], name, _part=bound_part(template, bindings, False)), kept
-    )
+    return kernel(specialise(scope[template.__name__], name, _part=bound_part(template, bindings, False)), kept)
 
 
 def kernel(function: F, kept: str | None = "") -> F:
@@ -320,10 +330,7 @@ def specialise(template: Callable[..., Any], name: str, **bindings: Any) -> Call
         Values for global names used in `template`.
     """
     function = pytypes.FunctionType(
-        template.__code__,
-        {**template.__globals__, **bindings},
-        f"{template.__name__}_{name}",
-        template.__defaults__,
+        template.__code__, {**template.__globals__, **bindings}, f"{template.__name__}_{name}", template.__defaults__
     )
     function.__qualname__ = f"{template.__qualname__}_{name}"
     function.__doc__ = template.__doc__

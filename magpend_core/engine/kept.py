@@ -23,12 +23,7 @@ from pathlib import Path
 from typing import Any
 
 import numba
-from numba.core.caching import (
-    CompileResultCacheImpl,
-    FunctionCache,
-    IndexDataCacheFile,
-    UserProvidedCacheLocator,
-)
+from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile, UserProvidedCacheLocator
 
 LOG = logging.getLogger("magpend.cache")
 
@@ -165,9 +160,7 @@ class PartFolder:
         try:
             return None if _made(self._home, self._folder) else _read_sealed(self._path(name))
         except OSError as error:
-            say(
-                f"a compiled kernel is not used: {self._path(name)} ({error.strerror}); it is compiled again."
-            )
+            say(f"a compiled kernel is not used: {self._path(name)} ({error.strerror}); it is compiled again.")
             return None
 
     def write(self, name: str, record: bytes) -> None:

@@ -138,12 +138,19 @@ def rows_of(system: System, n_watched: int = 0) -> Rows:
     """Lay out a group for a system of which `n_watched` quantities are watched."""
     n = system.n_events
     counts = [
-        system.n_states, system.tableau.n_stages * system.n_states, system.n_states, *[1] * 18,
-        system.n_states if n_watched else 0, *[n_watched] * 6, *[2 * n] * 3,
-        2 * n if system.n_switches + system.n_impacts else 0, *[n] * 3, *[1 if n else 0] * 4,
+        system.n_states,
+        system.tableau.n_stages * system.n_states,
+        system.n_states,
+        *[1] * 18,
+        system.n_states if n_watched else 0,
+        *[n_watched] * 6,
+        *[2 * n] * 3,
+        2 * n if system.n_switches + system.n_impacts else 0,
+        *[n] * 3,
+        *[1 if n else 0] * 4,
         (system.tableau.n_stages - 1) * n_entries(system),
         -(-(system.n_constants + system.n_modes) // 4) * 4,
-    ]  # fmt: skip
+    ]
     offsets = np.concatenate([[0], np.cumsum(counts)]) * WIDTH
     return Rows(*(int(x) for x in offsets))
 
@@ -387,9 +394,8 @@ def finish_step(w: Any, base: int, rtol: float, atol: float, max_attempts: float
 
 
 def attempt(
-    w: Any, events: Any, n_watching: Any, n_groups: int, slack: float, rtol: float, atol: float,
-    max_attempts: float,
-) -> None:  # fmt: skip
+    w: Any, events: Any, n_watching: Any, n_groups: int, slack: float, rtol: float, atol: float, max_attempts: float
+) -> None:
     """Advance all groups by one attempted step.
 
     `events` says afterwards which have a lane with an event; `n_watching` holds the number of lanes
@@ -667,9 +673,14 @@ def serve(cells: Cells, work: Work, lane: int, settings: Any, section: Any, scra
             if WATCHES and work.watching[lane] == 1:
                 keep_extremes(w, base, column, cells.watched[at][n_kept(work.memory[lane])])
             status = observe(
-                section, work.turns[lane], work.i_period[lane], work.memory[lane],
-                cells.section[at], cells.measures[at], settings,
-            )  # fmt: skip
+                section,
+                work.turns[lane],
+                work.i_period[lane],
+                work.memory[lane],
+                cells.section[at],
+                cells.measures[at],
+                settings,
+            )
         else:
             status = DIVERGED
         if status == PENDING:
@@ -783,14 +794,39 @@ def copy_lane(work: Work, source: int, target: int) -> None:
 
 
 _INLINE = (
-    "step_ratio", "squared_error", "load_cell", "set_target", "begin_segment", "begin_period",
-    "in_bounds", "take_section", "renew_state", "move_lane", "has_failed",
-    "evaluate_watched", "update_extremes", "keep_extremes", "set_watching", "begin_watch", "keep_time",
-)  # fmt: skip
+    "step_ratio",
+    "squared_error",
+    "load_cell",
+    "set_target",
+    "begin_segment",
+    "begin_period",
+    "in_bounds",
+    "take_section",
+    "renew_state",
+    "move_lane",
+    "has_failed",
+    "evaluate_watched",
+    "update_extremes",
+    "keep_extremes",
+    "set_watching",
+    "begin_watch",
+    "keep_time",
+)
 _CALLED = (
-    "limited_by_layers", "choose_step", "run_stage", "run_stages", "finish_step", "attempt",
-    "forget", "end_cell", "end_branch", "start_point", "start_branch", "serve", "copy_lane",
-)  # fmt: skip
+    "limited_by_layers",
+    "choose_step",
+    "run_stage",
+    "run_stages",
+    "finish_step",
+    "attempt",
+    "forget",
+    "end_cell",
+    "end_branch",
+    "start_point",
+    "start_branch",
+    "serve",
+    "copy_lane",
+)
 
 
 def _name(system: System, observer: Observer, watched: tuple[int, ...]) -> str:

@@ -438,8 +438,22 @@ INLINE = ("lane_pairs", "lane_rates", "gradient_along", "switch_rate", "vector_r
 """Templates here that dissolve into their callers, callees first; they come before those of `CALLED`."""
 
 CALLED = (
-    "seat_switches", "next_mode", "keep_switches", "set_units", "log_volume", "map_vector", "bend",
-    "is_chatter", "hold_on", "hold_contacts", "rest_on", "seat_contacts", "begin_events", "turn_switch",
-    "jump_vectors", "jump", "act_on_events",
-)  # fmt: skip
+    "seat_switches",
+    "next_mode",
+    "keep_switches",
+    "set_units",
+    "log_volume",
+    "map_vector",
+    "bend",
+    "is_chatter",
+    "hold_on",
+    "hold_contacts",
+    "rest_on",
+    "seat_contacts",
+    "begin_events",
+    "turn_switch",
+    "jump_vectors",
+    "jump",
+    "act_on_events",
+)
 """The others."""

@@ -167,9 +167,7 @@ def closed_period(ring: Any, last: int, settings: Settings) -> int:
         steps = (half + p - 1) // p
         hidden = max(older, younger) <= 0.01 * settings.tolerance
         shrinking = younger < older
-        if hidden or (
-            shrinking and younger * (1.0 + steps * younger / (older - younger)) <= settings.tolerance
-        ):
+        if hidden or (shrinking and younger * (1.0 + steps * younger / (older - younger)) <= settings.tolerance):
             return _smallest_divisor(ring, last, half, p, settings)
     return 0
 

@@ -147,10 +147,22 @@ class PartCompiler(EntryCompiler):
     """The same for parts: without the passes that inline, rewrite or annotate what an engine does not use."""
 
     _passes = (
-        TranslateByteCode, FixupArgs, IRProcessing, _NameFields, RewriteSemanticConstants, DeadBranchPrune,
-        GenericRewrites, ReconstructSSA, DeadBranchPrune, NopythonTypeInference, _GivePartLibrary,
-        PreLowerStripPhis, IRLegalization, NativeLowering, NoPythonBackend,
-    )  # fmt: skip
+        TranslateByteCode,
+        FixupArgs,
+        IRProcessing,
+        _NameFields,
+        RewriteSemanticConstants,
+        DeadBranchPrune,
+        GenericRewrites,
+        ReconstructSSA,
+        DeadBranchPrune,
+        NopythonTypeInference,
+        _GivePartLibrary,
+        PreLowerStripPhis,
+        IRLegalization,
+        NativeLowering,
+        NoPythonBackend,
+    )
 
     def define_pipelines(self) -> list[Any]:
         """Return the passes."""
@@ -184,9 +196,13 @@ class PartDispatcher(CPUDispatcher):
     """
 
     def __init__(
-        self, function: Callable[..., Any], options: Mapping[str, Any], sizes: Mapping[str, int],
-        identity: Callable[[], str | None], folder: PartFolder | None,
-    ) -> None:  # fmt: skip
+        self,
+        function: Callable[..., Any],
+        options: Mapping[str, Any],
+        sizes: Mapping[str, int],
+        identity: Callable[[], str | None],
+        folder: PartFolder | None,
+    ) -> None:
         settings = {"nopython": True, "boundscheck": None, **options}
         super().__init__(py_func=function, targetoptions=settings, pipeline_class=PartCompiler)
         self.sizes, self._identify, self._identified = sizes, identity, False
@@ -332,10 +348,16 @@ class PartCache:
         library._final_module = module
         library.finalize()
         return compile_result(
-            typing_context=target_context.typing_context, target_context=target_context,
-            entry_point=_Key(), library=library, signature=signature, objectmode=False, lifted=(),
-            fndesc=fndesc, reload_init=(),
-        )  # fmt: skip
+            typing_context=target_context.typing_context,
+            target_context=target_context,
+            entry_point=_Key(),
+            library=library,
+            signature=signature,
+            objectmode=False,
+            lifted=(),
+            fndesc=fndesc,
+            reload_init=(),
+        )
 
 
 class _Key:

@@ -266,9 +266,7 @@ def seats_for(system: System, samples: Samples, n_lanes: int) -> Seats:
     )
 
 
-def follow_all(
-    samples: Samples, seats: Seats, active: int, rtol: float, atol: float, max_attempts: float
-) -> None:
+def follow_all(samples: Samples, seats: Seats, active: int, rtol: float, atol: float, max_attempts: float) -> None:
     """Integrate all trajectories, `active` at a time, and fill the output arrays of `samples`."""
     n, scratch = len(samples.piece), seats.scratch
     for lane in range(len(seats.trajectory)):

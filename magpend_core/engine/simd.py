@@ -19,12 +19,7 @@ import numpy as np
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
-from numba.extending import (
-    lower_builtin,
-    models,
-    register_model,
-    type_callable,
-)
+from numba.extending import lower_builtin, models, register_model, type_callable
 
 # Two vectors of AVX-512, four of AVX2: enough independent work to hide the latency of a division.
 WIDTH = 16

@@ -239,15 +239,26 @@ class System:
 
         n = self.n_states
         absent = {
-            "is_angle": (False,) * n, "scales": (1.0,) * n, "escape": (math.inf,) * n,
-            "forcing": no_forcing, "edges": no_edges, "layers": no_layers,
-            "slides": (False,) * self.n_switches, "sticks": (0,) * self.n_impacts,
-        }  # fmt: skip
+            "is_angle": (False,) * n,
+            "scales": (1.0,) * n,
+            "escape": (math.inf,) * n,
+            "forcing": no_forcing,
+            "edges": no_edges,
+            "layers": no_layers,
+            "slides": (False,) * self.n_switches,
+            "sticks": (0,) * self.n_impacts,
+        }
         kinds = {
-            "state_names": str, "parameter_names": str, "quantity_names": str,
-            "is_angle": bool, "scales": float, "escape": float, "slides": bool, "impact_directions": int,
+            "state_names": str,
+            "parameter_names": str,
+            "quantity_names": str,
+            "is_angle": bool,
+            "scales": float,
+            "escape": float,
+            "slides": bool,
+            "impact_directions": int,
             "sticks": int,
-        }  # fmt: skip
+        }
         for name, kind in kinds.items():  # lists cannot be hashed, integers among numbers not be looped over
             object.__setattr__(self, name, tuple(kind(value) for value in getattr(self, name)))
         object.__setattr__(self, "has_layers", self.has_layers and self.layers is not None)
@@ -266,14 +277,27 @@ class System:
     def label(self) -> str:
         """Name of the compiled code: `name`, and a digest of the data that goes into the code."""
         data = (
-            self.state_names, self.is_angle, self.scales, self.parameter_names, self.n_constants,
-            self.n_edges, self.has_layers, self.layers_fade, self.escape, self.controlled,
-        )  # fmt: skip
+            self.state_names,
+            self.is_angle,
+            self.scales,
+            self.parameter_names,
+            self.n_constants,
+            self.n_edges,
+            self.has_layers,
+            self.layers_fade,
+            self.escape,
+            self.controlled,
+        )
         if self.n_events or self.n_modes:
             data += (  # type: ignore[assignment]
-                self.n_modes, self.n_switches, self.slides, self.has_segments, self.n_impacts,
-                self.impact_directions, self.section,
-            )  # fmt: skip
+                self.n_modes,
+                self.n_switches,
+                self.slides,
+                self.has_segments,
+                self.n_impacts,
+                self.impact_directions,
+                self.section,
+            )
         if self.n_contacts:
             data += (self.sticks,)  # type: ignore[assignment]
         if self.method != "dopri5":

@@ -51,9 +51,7 @@ def _compile(source: str, name: str, wrapped: Callable[..., Any], bindings: dict
 
 
 @cache
-def with_tangents(
-    system: System, n_vectors: int, divergence: bool = False, written_out: bool | None = None
-) -> System:
+def with_tangents(system: System, n_vectors: int, divergence: bool = False, written_out: bool | None = None) -> System:
     """Return `system` extended by `n_vectors` tangent vectors.
 
     A small system gets a right-hand side with the products of Jacobian and vectors written out. With a large
@@ -129,10 +127,7 @@ def _extended_functions(system: System, n_vectors: int, divergence: bool) -> dic
     behind = [n * (1 + n_vectors) + divergence] if system.timed_layers else []  # where the time is
     rates = ", ".join(f"dy[{i}]" for i in (*range(n), *behind))
     layers = _compile(
-        f"def layers(y, dy, c):\n    return _layers(({_first(n)},), ({rates},), c)\n",
-        "layers",
-        system.layers,
-        bindings,
+        f"def layers(y, dy, c):\n    return _layers(({_first(n)},), ({rates},), c)\n", "layers", system.layers, bindings
     )
     events = {
         name: _compile(
@@ -183,19 +178,19 @@ def with_parameter_tangent(system: System) -> System:
         )
     n, m, nc = system.n_states, len(system.parameter_names), system.n_constants
     bindings = {
-        "_rhs": system.rhs, "_jacobian": system.jacobian, "_layers": system.layers, "_edges": system.edges,
-        "_forcing": system.forcing, "_constants": system.constants,
-    }  # fmt: skip
+        "_rhs": system.rhs,
+        "_jacobian": system.jacobian,
+        "_layers": system.layers,
+        "_edges": system.edges,
+        "_forcing": system.forcing,
+        "_constants": system.constants,
+    }
     home = system.rhs
 
     def compiled(head: str, *lines: str) -> Any:
-        return _compile(
-            f"def function({head}):\n    " + "\n    ".join(lines) + "\n", "function", home, bindings
-        )
+        return _compile(f"def function({head}):\n    " + "\n    ".join(lines) + "\n", "function", home, bindings)
 
-    blocks = [
-        f"_constants(frequency, p[{k * m}:{(k + 1) * m}], out[{k * nc}:{(k + 1) * nc}])" for k in range(3)
-    ]
+    blocks = [f"_constants(frequency, p[{k * m}:{(k + 1) * m}], out[{k * nc}:{(k + 1) * nc}])" for k in range(3)]
     sets = [f"c{k} = c[{k * nc}:{(k + 1) * nc}]" for k in range(3)]
     changes = ", ".join(
         f"{product} + (f1[{i}] - f2[{i}]) * c[{3 * nc}]" for i, product in enumerate(_products(system, 1))
@@ -206,9 +201,7 @@ def with_parameter_tangent(system: System) -> System:
         system,
         name=f"{system.name}_parameter_tangent",
         state_names=(*system.state_names, *(f"d{s}" for s in system.state_names)),
-        parameter_names=(
-            *(f"{name}{end}" for end in ("", PLUS, MINUS) for name in system.parameter_names), PER_STEP,
-        ),
+        parameter_names=(*(f"{name}{end}" for end in ("", PLUS, MINUS) for name in system.parameter_names), PER_STEP),
         n_constants=3 * nc + 1,
         is_angle=(*system.is_angle, *[False] * n),
         scales=(*system.scales, *[1.0] * n),
@@ -218,10 +211,13 @@ def with_parameter_tangent(system: System) -> System:
         # the time itself: each set of parameters has a forcing of its own
         forcing=compiled("t, c", "return 1.0 * t"),
         rhs=compiled(
-            "y, t, c", *sets, f"base = ({_first(n)},)",
+            "y, t, c",
+            *sets,
+            f"base = ({_first(n)},)",
             *(f"u{k} = _forcing(t, c{k})" for k in range(3)),
             *(f"f{k} = _rhs(base, u{k}, c{k})" for k in range(3)),
-            "jacobian = _jacobian(base, u0, c0)", f"return ({own}, {changes})",
+            "jacobian = _jacobian(base, u0, c0)",
+            f"return ({own}, {changes})",
         ),
         layers=compiled("y, dy, c", f"return _layers(y[:{n}], {own_rates}, c[:{nc}])"),
         edges=compiled("frequency, p, at, widths, jumps", f"_edges(frequency, p[:{m}], at, widths, jumps)"),
@@ -229,4 +225,4 @@ def with_parameter_tangent(system: System) -> System:
         quantity_names=(),
         quantities=None,
         tangents_of=system,
-    )  # fmt: skip
+    )

@@ -71,10 +71,12 @@ def load_model(reference: str | Mapping[str, Any] | Model = DEFAULT) -> Model:
     if imported.is_object_path(reference):
         if (known := imported.known_model({imported.KEY: reference})) is not None:
             return known
-        raise ModelError([
-            f"model {reference!r} is a Python object, which is imported where a specification names it, by "
-            f"--import-model {reference}, or by magpend.import_model."
-        ])  # fmt: skip
+        raise ModelError(
+            [
+                f"model {reference!r} is a Python object, which is imported where a specification names it, by "
+                f"--import-model {reference}, or by magpend.import_model."
+            ]
+        )
     if reference in _models():
         return _models()[reference]
     if reference in _texts():

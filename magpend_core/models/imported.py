@@ -71,16 +71,20 @@ def import_model(path: str, folder: str | Path | None = None) -> Model:
         module = importlib.import_module(module_name)
         found = getattr(module, attribute)
     except Exception as error:
-        raise ParameterError([
-            f"{path}: cannot be imported ({type(error).__name__}: {error}); the module must be installed, or "
-            "lie beside the specification or in the current folder."
-        ]) from None  # fmt: skip
+        raise ParameterError(
+            [
+                f"{path}: cannot be imported ({type(error).__name__}: {error}); the module must be installed, or "
+                "lie beside the specification or in the current folder."
+            ]
+        ) from None
     if not isinstance(found, Model):
         kind = type(found).__name__
-        raise ParameterError([
-            f"{path}: is of type {kind}; it must be a Model, which names states and parameters and has the "
-            "System (magpend_core.models.model.Model)."
-        ])  # fmt: skip
+        raise ParameterError(
+            [
+                f"{path}: is of type {kind}; it must be a Model, which names states and parameters and has the "
+                "System (magpend_core.models.model.Model)."
+            ]
+        )
     if found.text is not None:  # written as text: it needs no import
         return found
     if path not in _imported:
@@ -98,8 +102,7 @@ def _description(path: str, model: Model) -> dict[str, Any]:
     for name in ("states", "parameters", "quantities"):
         table[name] = {one.name: _plain(one) for one in getattr(model, name)}
     table["presets"] = {
-        p.name: {"values": dict(p.values), "provenance": dict(p.provenance), "title": p.title}
-        for p in model.presets
+        p.name: {"values": dict(p.values), "provenance": dict(p.provenance), "title": p.title} for p in model.presets
     }
     if model.mirror is not None:
         table["mirror"] = {"signs": list(model.mirror.signs), "half_period": model.mirror.half_period}
@@ -183,16 +186,13 @@ def described_model(table: Mapping[str, Any]) -> Model:
         "presets": _entries(Preset, table, "presets", problems),
         "mirror": _mirror(table, problems),
     }
-    problems += [
-        f"parameters.{p.name}.bound: no bound." for p in given["parameters"] if p.bound not in BOUNDS
-    ]
+    problems += [f"parameters.{p.name}.bound: no bound." for p in given["parameters"] if p.bound not in BOUNDS]
     if problems:
         raise ParameterError(problems)
     texts = {name: table[name] for name in _TEXTS if name in table and name != "digest"}
     return DescribedModel(
-        **texts, **given, system_path="", sources=(), autonomous=table.get("autonomous") is True,
-        text=dict(table),
-    )  # fmt: skip
+        **texts, **given, system_path="", sources=(), autonomous=table.get("autonomous") is True, text=dict(table)
+    )
 
 
 def _outer_problems(table: Mapping[str, Any]) -> list[str]:
@@ -201,9 +201,10 @@ def _outer_problems(table: Mapping[str, Any]) -> list[str]:
     problems = [f"{key}: no part of a model's description." for key in table if key not in known]
     problems += [f"{key}: must be a text." for key in _TEXTS if not isinstance(table.get(key), str)]
     problems += [
-        f"{key}: must be a table." for key in _TABLES
+        f"{key}: must be a table."
+        for key in _TABLES
         if not isinstance(table.get(key), Mapping) or (key in ("states", "presets") and not table[key])
-    ]  # fmt: skip
+    ]
     return problems
 
 

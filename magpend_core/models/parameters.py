@@ -119,9 +119,7 @@ class Parameters(Mapping[str, float]):
         problems = [unknown_name_problem(n, known) for n in values if n not in known]
         problems += [f"{n} has no value; give one." for n in known if n not in values]
         problems += [
-            problem
-            for p in model.parameters
-            if p.name in values and (problem := p.problem(values[p.name])) is not None
+            problem for p in model.parameters if p.name in values and (problem := p.problem(values[p.name])) is not None
         ]
         if not problems:
             self._values = {name: float(values[name]) for name in known}
@@ -186,9 +184,7 @@ class Parameters(Mapping[str, float]):
         return type(self)(self.model, {**self._values, **overrides})
 
 
-def _again(
-    model: str | Mapping[str, Any], values: dict[str, float], crossing: Crossing | None = None
-) -> Parameters:
+def _again(model: str | Mapping[str, Any], values: dict[str, float], crossing: Crossing | None = None) -> Parameters:
     """Unpickle: models are known by name, or by their text, and by the section that they are seen through."""
     from magpend_core.models import load_model
     from magpend_core.models.sectioned import sectioned

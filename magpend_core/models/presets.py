@@ -100,9 +100,7 @@ def _problems(tables: Mapping[str, Any]) -> list[str]:
             hint = near_names(key, (*KEYS, "provenance"), "keys")
             problems.append(f"{key}: is no table of values and no key of a preset; {hint}")
     names = [name for table in own.values() if isinstance(table, dict) for name in table]
-    problems += [
-        f"{name}: has two values; keep one." for name in dict.fromkeys(names) if names.count(name) > 1
-    ]
+    problems += [f"{name}: has two values; keep one." for name in dict.fromkeys(names) if names.count(name) > 1]
     origin = tables.get("provenance", {})
     if not isinstance(origin, dict):
         return [*problems, f"provenance = {origin!r}: must be a table; write [provenance]."]

@@ -94,9 +94,7 @@ def sectioned(model: Model, crossing: Crossing) -> SectionedModel:
         If the model is forced, or has a parameter named like the section's level.
     """
     if not model.autonomous:
-        raise ValueError(
-            f"{model.name} is forced: its sections are at the drive's period; drop the crossing."
-        )
+        raise ValueError(f"{model.name} is forced: its sections are at the drive's period; drop the crossing.")
     if LEVEL in model.parameter_names:
         raise ValueError(f"{model.name} has a parameter named {LEVEL}, which is the level's name; rename it.")
     state = model.state(crossing.of)

@@ -46,9 +46,7 @@ def choose(ds: xr.Dataset, at: Mapping[str, float] | None, keep: tuple[str, ...]
     for name, value in (at or {}).items():
         allowed = [d for d in dims if d not in keep]
         if name not in allowed:
-            raise ValueError(
-                f"unknown axis {name!r}; values can be chosen of: {', '.join(allowed) or 'none'}"
-            )
+            raise ValueError(f"unknown axis {name!r}; values can be chosen of: {', '.join(allowed) or 'none'}")
         ds = ds.isel({name: place(ds[name], float(value))})
     left = [d for d in ds["attractor_id"].dims if d not in keep]
     long = [str(d) for d in left if ds.sizes[d] > 1]
@@ -75,9 +73,7 @@ def place(axis: xr.DataArray, value: float) -> int:
         return index
     low, high = values.min(), values.max()
     if not low < value < high:
-        raise ValueError(
-            f"{axis.name} = {value:.10g} lies off its axis, which runs from {low:.10g} to {high:.10g}"
-        )
+        raise ValueError(f"{axis.name} = {value:.10g} lies off its axis, which runs from {low:.10g} to {high:.10g}")
     below, above = values[values < value].max(), values[values > value].min()
     raise ValueError(
         f"{axis.name} = {value:.10g} is not on its axis; the nearest values are {below:.10g} and {above:.10g}"

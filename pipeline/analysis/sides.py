@@ -57,11 +57,19 @@ def classify(ds: xr.Dataset, *, parameters: Parameters | None = None) -> xr.Data
         inputs.append(ds["turns"])
         cores.append([str(d) for d in ds["turns"].dims if d not in ds["status"].dims])
     label: xr.DataArray = xr.apply_ufunc(
-        _label, *inputs, input_core_dims=cores, dask="parallelized", output_dtypes=[np.int8],
+        _label,
+        *inputs,
+        input_core_dims=cores,
+        dask="parallelized",
+        output_dtypes=[np.int8],
         dask_gufunc_kwargs={"allow_rechunk": True},
-        kwargs={"classifier": model.classifier, "fixed": {name: values[name] for name in names},
-                "swept": swept, "n_angles": len(model.angles)},
-    )  # fmt: skip
+        kwargs={
+            "classifier": model.classifier,
+            "fixed": {name: values[name] for name in names},
+            "swept": swept,
+            "n_angles": len(model.angles),
+        },
+    )
     label = label.transpose(*ds["status"].dims)
     return label.rename("side").assign_attrs(flags_of(model.classifier))
 
@@ -82,9 +90,15 @@ def _frequency(ds: xr.Dataset) -> xr.DataArray:
 
 
 def _label(
-    section: np.ndarray, status: np.ndarray, frequency: np.ndarray, *rest: np.ndarray,
-    classifier: Classifier, fixed: Mapping[str, float], swept: list[str], n_angles: int,
-) -> np.ndarray:  # fmt: skip
+    section: np.ndarray,
+    status: np.ndarray,
+    frequency: np.ndarray,
+    *rest: np.ndarray,
+    classifier: Classifier,
+    fixed: Mapping[str, float],
+    swept: list[str],
+    n_angles: int,
+) -> np.ndarray:
     """Classify the cells of a block; leading dims broadcast, a section's last dims are period and state."""
     values = {**fixed, **dict(zip(swept, rest, strict=False))}
     turns = rest[len(swept)] if len(rest) > len(swept) else np.zeros((1,) * status.ndim + (n_angles,), int)

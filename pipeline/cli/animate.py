@@ -23,19 +23,16 @@ def animate(
         str | None, typer.Argument(metavar="[DIR]", help="Run directory, or s3://BUCKET/PREFIX.")
     ] = None,
     at: Annotated[
-        list[str] | None,
-        typer.Option(metavar="AXIS=VALUE", help="Value of an axis: the parameter point to show."),
+        list[str] | None, typer.Option(metavar="AXIS=VALUE", help="Value of an axis: the parameter point to show.")
     ] = None,
     nearest: Annotated[
         bool, typer.Option("--nearest", help="Use the axes' values nearest to --at, and print them.")
     ] = False,
     attractor: Annotated[
-        list[str] | None,
-        typer.Option(metavar="LETTER", help="Attractor at the point; by default all, side by side."),
+        list[str] | None, typer.Option(metavar="LETTER", help="Attractor at the point; by default all, side by side.")
     ] = None,
     cell: Annotated[
-        list[int] | None,
-        typer.Option(metavar="N", help="Flat index of a cell of the run, to show instead."),
+        list[int] | None, typer.Option(metavar="N", help="Flat index of a cell of the run, to show instead.")
     ] = None,
     model: Annotated[
         str | None,
@@ -45,20 +42,14 @@ def animate(
         ),
     ] = None,
     frequency_hz: Annotated[
-        float | None,
-        typer.Option("--frequency-hz", "--frequency", help="Without a run: frequency [Hz]. Default: 2.2."),
+        float | None, typer.Option("--frequency-hz", "--frequency", help="Without a run: frequency [Hz]. Default: 2.2.")
     ] = None,
-    preset: Annotated[
-        str | None, typer.Option(help="Without a run: parameter preset, or a preset's file.")
-    ] = None,
+    preset: Annotated[str | None, typer.Option(help="Without a run: parameter preset, or a preset's file.")] = None,
     settings: Annotated[
         list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="Without a run: a parameter.")
     ] = None,
     transient: Annotated[int, typer.Option(help="For a start: periods before the film begins.")] = 0,
-    seconds: Annotated[
-        float | None,
-        typer.Option(help="Length of the film [s]; else 8."),
-    ] = None,
+    seconds: Annotated[float | None, typer.Option(help="Length of the film [s]; else 8.")] = None,
     fps: Annotated[float | None, typer.Option(help="Frames per second, GIF at most 50. Default: 25.")] = None,
     speed: Annotated[
         float | None,
@@ -70,15 +61,12 @@ def animate(
     size: Annotated[
         int | None, typer.Option(help="Width of a frame [pixels]; the height follows. Default: 800.")
     ] = None,
-    portrait: Annotated[
-        str | None, typer.Option(metavar="STATE", help="State whose phase portrait is shown.")
-    ] = None,
+    portrait: Annotated[str | None, typer.Option(metavar="STATE", help="State whose phase portrait is shown.")] = None,
     degrees: Annotated[bool, typer.Option("--degrees", help="Use degrees instead of radians.")] = False,
     out: Annotated[
-        Path | None,
-        typer.Option(help="File, .gif, .webp or .mp4; by default in DIR/figures, or animation.gif."),
+        Path | None, typer.Option(help="File, .gif, .webp or .mp4; by default in DIR/figures, or animation.gif.")
     ] = None,
-) -> None:  # fmt: skip
+) -> None:
     """Draw moving motions as GIF, WebP or MP4: the model's drawing, and phase portraits.
 
     With a run, the film shows its attractors at a parameter point (--at) side by side, the cells that you
@@ -119,9 +107,7 @@ def animate(
         problems.append(f"{problem}; give another place: --out FILE.")
     if problems:
         raise SpecError(problems)
-    film = animation(
-        run, options, attractors=attractor or (), cells=cell or (), start=start, echo=console.note
-    )
+    film = animation(run, options, attractors=attractor or (), cells=cell or (), start=start, echo=console.note)
     if target.exists():
         console.note(f"note: {target} was there already, and is replaced")
     make_folder(target.parent)
@@ -131,9 +117,14 @@ def animate(
 
 
 def _start(
-    words: list[str], model: str | None, frequency_hz: float | None, preset: str | None,
-    settings: list[str] | None, transient: int, alone: bool,
-) -> Start | None:  # fmt: skip
+    words: list[str],
+    model: str | None,
+    frequency_hz: float | None,
+    preset: str | None,
+    settings: list[str] | None,
+    transient: int,
+    alone: bool,
+) -> Start | None:
     """Return the given start; None if a run is given and no start."""
     from pipeline.runs.filming import Start
     from pipeline.spec.problems import SpecError
@@ -141,9 +132,7 @@ def _start(
     states = {name: values[0] for name, values in read_named(words, 1).items()}
     given = {"--model": model, "--frequency": frequency_hz, "--preset": preset, "--set": settings}
     if not alone and any(given.values()):
-        raise SpecError(
-            [f"{k}: a run has its own; drop it, or the directory." for k, v in given.items() if v]
-        )
+        raise SpecError([f"{k}: a run has its own; drop it, or the directory." for k, v in given.items() if v])
     if not alone and not states and not transient:
         return None
     overrides = read_pairs("--set", settings or [], "q=1.5")
@@ -152,9 +141,12 @@ def _start(
 
 
 def _contradictions(
-    directory: str | None, at: dict[str, float], attractor: list[str] | None, cell: list[int] | None,
+    directory: str | None,
+    at: dict[str, float],
+    attractor: list[str] | None,
+    cell: list[int] | None,
     start: Start | None,
-) -> list[str]:  # fmt: skip
+) -> list[str]:
     """Return problems with options that exclude each other."""
     of_run: dict[str, Any] = {"--at": at, "--attractor": attractor, "--cell": cell}
     problems = []
@@ -169,9 +161,7 @@ def _contradictions(
     return problems
 
 
-def _place(
-    run: Run | None, at: dict[str, float], attractor: list[str] | None, cell: list[int] | None
-) -> Path:
+def _place(run: Run | None, at: dict[str, float], attractor: list[str] | None, cell: list[int] | None) -> Path:
     """Return the default file of a film: in the run's figures, named by its content."""
     if run is None:
         return Path("animation.gif")

@@ -128,9 +128,7 @@ class Display:
 
     current: Display | None = None
 
-    def __init__(
-        self, name: str, *, terminal: bool | None = None, clock: Callable[[], float] = time.monotonic
-    ) -> None:
+    def __init__(self, name: str, *, terminal: bool | None = None, clock: Callable[[], float] = time.monotonic) -> None:
         self._terminal = sys.stderr.isatty() if terminal is None else terminal
         self._clock, self._started = clock, clock()
         self._work = Work(name, self._started)

@@ -12,9 +12,7 @@ from pipeline.cli.common import Directory
 
 def explore(
     directory: Directory,
-    port: Annotated[
-        int, typer.Option(min=0, max=65535, help="Port on this machine; 0 selects a free one.")
-    ] = 0,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port on this machine; 0 selects a free one.")] = 0,
     no_browser: Annotated[
         bool, typer.Option("--no-browser", help="Print the address of the page; open no browser.")
     ] = False,

@@ -19,16 +19,12 @@ def export(
     folder: Annotated[
         Path | None,
         typer.Option(
-            metavar="OUT",
-            help="Folder for a static web host instead, with the whole cube, loaded on demand.",
+            metavar="OUT", help="Folder for a static web host instead, with the whole cube, loaded on demand."
         ),
     ] = None,
-    force: Annotated[
-        bool, typer.Option("--force", help="Replace the file, or a folder made by export.")
-    ] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace the file, or a folder made by export.")] = False,
     quantity: Annotated[
-        list[str] | None,
-        typer.Option(metavar="NAME", help="Additional quantity of the model for the vertical axis."),
+        list[str] | None, typer.Option(metavar="NAME", help="Additional quantity of the model for the vertical axis.")
     ] = None,
     orbits: Annotated[
         int, typer.Option(min=0, help="Largest number of orbits to integrate and include. Default: 2000.")
@@ -59,12 +55,7 @@ def export(
         else:
             target = page or Path(f"{Path(run.name).resolve().name}.html")
             written = export_page(
-                run,
-                target,
-                force=force,
-                quantities=wanted,
-                most_orbits=orbits,
-                most_bytes=round(megabytes * 1e6),
+                run, target, force=force, quantities=wanted, most_orbits=orbits, most_bytes=round(megabytes * 1e6)
             )
     for sentence in written.sentences:
         console.note(f"note: {sentence}")

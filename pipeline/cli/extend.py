@@ -30,17 +30,14 @@ def extend(
     product: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="NAME[={...}]",
-            help="Additional product, with options as in a specification's [products].",
+            metavar="NAME[={...}]", help="Additional product, with options as in a specification's [products]."
         ),
     ] = None,
     also: Annotated[
-        list[str] | None,
-        typer.Option(metavar="DIR", help="Another run with cells to reuse, such as another half."),
+        list[str] | None, typer.Option(metavar="DIR", help="Another run with cells to reuse, such as another half.")
     ] = None,
     out: Annotated[
-        str | None,
-        typer.Option(help="Directory of the wider run. Default: it replaces DIR when it is complete."),
+        str | None, typer.Option(help="Directory of the wider run. Default: it replaces DIR when it is complete.")
     ] = None,
     workers: Workers = None,
     scheduler: Scheduler = None,
@@ -58,17 +55,28 @@ def extend(
     from pipeline.runs.widen import Widening
 
     changes: dict[str, Any] = {
-        "axes": _axes(axis or []), "starts": starts, "keep": keep, "products": _products(product or []),
-    }  # fmt: skip
+        "axes": _axes(axis or []),
+        "starts": starts,
+        "keep": keep,
+        "products": _products(product or []),
+    }
     if dry_run:
         found = extending.plan_extension((directory, *(also or ())), spec, Widening(**changes))
         for line in extending.describe_extension(found, workers=workers):
             console.result(line)
         return
     state = extending.extend(
-        directory, spec, out, also=also or (), **changes, workers=workers, scheduler=scheduler,
-        cluster=cluster, dashboard=dashboard, echo=console.note,
-    )  # fmt: skip
+        directory,
+        spec,
+        out,
+        also=also or (),
+        **changes,
+        workers=workers,
+        scheduler=scheduler,
+        cluster=cluster,
+        dashboard=dashboard,
+        echo=console.note,
+    )
     console.result(f"cube: {state.files.below('cube.zarr').name}")
 
 
@@ -106,9 +114,7 @@ def _products(texts: list[str]) -> dict[str, dict[str, Any]]:
         if isinstance(value, dict):
             found[name.strip()] = value
         else:
-            problems.append(
-                f"--product {text}: must be NAME or NAME={{...}}, as in 'lyapunov={{n_periods = 800}}'."
-            )
+            problems.append(f"--product {text}: must be NAME or NAME={{...}}, as in 'lyapunov={{n_periods = 800}}'.")
     if problems:
         raise SpecError(problems)
     return found

@@ -14,13 +14,11 @@ def fit_magnet(
     measurement: Annotated[
         str,
         typer.Argument(
-            metavar="MEASUREMENT",
-            help="Header of a table of torque readings (TOML), or discs, an example that ships.",
+            metavar="MEASUREMENT", help="Header of a table of torque readings (TOML), or discs, an example that ships."
         ),
     ],
     out: Annotated[
-        Path | None,
-        typer.Option(metavar="DIR", help="Folder of the results; by default named after the header."),
+        Path | None, typer.Option(metavar="DIR", help="Folder of the results; by default named after the header.")
     ] = None,
     no_figures: Annotated[bool, typer.Option("--no-figures", help="Draw no figures.")] = False,
     json: Json = False,

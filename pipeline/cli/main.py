@@ -70,10 +70,22 @@ def _main(
 
 
 for _command, _settings in (
-    (run, {}), (submit, {}), (status, {}), (verify, {}), (extend, {}), (zoom, EXTRA), (simulate, EXTRA),
-    (explore, {}), (export, {}), (animate, EXTRA), (report, {}), (reproduce, {}),
-    (models, {}), (presets, {}), (fit_magnet, {}),
-):  # fmt: skip
+    (run, {}),
+    (submit, {}),
+    (status, {}),
+    (verify, {}),
+    (extend, {}),
+    (zoom, EXTRA),
+    (simulate, EXTRA),
+    (explore, {}),
+    (export, {}),
+    (animate, EXTRA),
+    (report, {}),
+    (reproduce, {}),
+    (models, {}),
+    (presets, {}),
+    (fit_magnet, {}),
+):
     app.command(epilog=EXIT_HELP, context_settings={**SETTINGS, **_settings})(speaking(_command))
 app.add_typer(analyse_app, name="analyse")
 app.add_typer(plot_app, name="plot")
@@ -90,13 +102,7 @@ def _codes() -> list[tuple[tuple[type[BaseException], ...], Exit]]:
     from pipeline.compute.execute import TaskFailedError
     from pipeline.runs.submit import SubmitError
     from pipeline.spec.problems import SpecError
-    from pipeline.store.errors import (
-        DamagedError,
-        IncompleteError,
-        LockedError,
-        StoreError,
-        UnreadableError,
-    )
+    from pipeline.store.errors import DamagedError, IncompleteError, LockedError, StoreError, UnreadableError
 
     return [
         ((LockedError,), Exit.LOCKED),

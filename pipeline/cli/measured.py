@@ -36,13 +36,11 @@ Recordings = Annotated[
     list[Path], typer.Argument(metavar="RECORDING...", help="Recordings of sweeps of the drive frequency.")
 ]
 Mappings = Annotated[
-    list[Path],
-    typer.Option("--mapping", metavar="MAP", help="Mapping file, one for all recordings or one for each."),
+    list[Path], typer.Option("--mapping", metavar="MAP", help="Mapping file, one for all recordings or one for each.")
 ]
 Transient = Annotated[int, typer.Option(help="Drive periods dropped after each step of the frequency.")]
 Window = Annotated[
-    int | None,
-    typer.Option(help="Drive periods of a window of a slow sweep; by default detected; 0: steps only."),
+    int | None, typer.Option(help="Drive periods of a window of a slow sweep; by default detected; 0: steps only.")
 ]
 WindowS = Annotated[float, typer.Option(help="Width of the polynomials' window about an edge [s].")]
 Hysteresis = Annotated[
@@ -52,9 +50,7 @@ MaxPeriod = Annotated[int, typer.Option(help="Longest orbit period that is detec
 State = Annotated[str, typer.Option(help="State to draw; by default the first measured one.")]
 Degrees = Annotated[bool, typer.Option("--degrees", help="Use degrees instead of radians.")]
 Width = Annotated[float, typer.Option(help="Width of the figure [mm]; 85 is a journal's column.")]
-At = Annotated[
-    list[str] | None, typer.Option("--at", metavar="NAME=VALUE", help="Value of another axis of the run.")
-]
+At = Annotated[list[str] | None, typer.Option("--at", metavar="NAME=VALUE", help="Value of another axis of the run.")]
 Preset = Annotated[str | None, typer.Option(help="Preset of the parameters; by default the model's first.")]
 Set = Annotated[list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="Change a parameter.")]
 
@@ -65,15 +61,11 @@ def _load(paths: list[Path], mappings: list[Path]) -> list[Mapping]:
     from pipeline.spec.problems import SpecError
 
     if len(mappings) not in (1, len(paths)):
-        raise SpecError([
-            f"--mapping: {len(mappings)} for {len(paths)} recordings; give one for all, or one for each."
-        ])  # fmt: skip
+        raise SpecError([f"--mapping: {len(mappings)} for {len(paths)} recordings; give one for all, or one for each."])
     loaded = [load_mapping(m) for m in mappings] * (len(paths) if len(mappings) == 1 else 1)
     models = sorted({m.system for m in loaded}, key=lambda model: model.name)
     if len(models) > 1:
-        raise SpecError(
-            [f"--mapping: of the models {', '.join(m.name for m in models)}; a diagram is one model's."]
-        )
+        raise SpecError([f"--mapping: of the models {', '.join(m.name for m in models)}; a diagram is one model's."])
     return loaded
 
 
@@ -89,9 +81,7 @@ def _read(paths: list[Path], mappings: list[Mapping]) -> list[xr.Dataset]:
     return found
 
 
-def _way(
-    transient: int, window: int | None, window_s: float, hysteresis: float | None, max_period: int
-) -> Way:
+def _way(transient: int, window: int | None, window_s: float, hysteresis: float | None, max_period: int) -> Way:
     from pipeline.rig.measured.measuring import Way
     from pipeline.spec.problems import SpecError
 
@@ -155,9 +145,7 @@ def diagram(
     recordings: Recordings,
     mapping: Mappings,
     out: Annotated[Path, typer.Option(help="Figure, .png, .pdf or .svg.")],
-    run: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Run whose diagram is drawn for comparison.")
-    ] = None,
+    run: Annotated[Path | None, typer.Option(metavar="DIR", help="Run whose diagram is drawn for comparison.")] = None,
     layout: Annotated[str, typer.Option(help="side: beside the computed diagram; over: over it.")] = "side",
     state: State = "",
     degrees: Degrees = False,
@@ -187,9 +175,7 @@ def diagram(
         cube, parameters = cube_and_parameters(AnalysedRun.of(run), mappings[0].system, pairs)
     found = measure(_read(recordings, mappings), way, parameters=parameters)
     with refused(run or out):
-        figure = plot_measured(
-            found, cube, state=state, degrees=degrees, layout=layout, frame=Frame(width)
-        )  # fmt: skip
+        figure = plot_measured(found, cube, state=state, degrees=degrees, layout=layout, frame=Frame(width))
     _save(figure, out)
 
 
@@ -262,9 +248,7 @@ def series(
     out: Annotated[Path, typer.Option(help="Figure, .png, .pdf or .svg; the series goes beside it.")],
     preset: Preset = None,
     settings: Set = None,
-    start_s: Annotated[
-        float | None, typer.Option(help="Start at the first rising edge from this time on [s].")
-    ] = None,
+    start_s: Annotated[float | None, typer.Option(help="Start at the first rising edge from this time on [s].")] = None,
     periods: Annotated[int, typer.Option(help="Number of drive periods.")] = 10,
     degrees: Degrees = False,
     width: Width = 178.0,
@@ -282,9 +266,7 @@ def series(
     mappings = _load([recording], [mapping])
     parameters = _loaded(mappings[0].system, preset, settings)
     (found,) = _read([recording], mappings)
-    ds = series_of(
-        found, parameters, start_s=start_s, n_periods=periods, window_s=window_s, hysteresis=hysteresis
-    )  # fmt: skip
+    ds = series_of(found, parameters, start_s=start_s, n_periods=periods, window_s=window_s, hysteresis=hysteresis)
     with refused(recording):
         figure = plot_series(ds, degrees=degrees, frame=Frame(width))
     for name, value in json.loads(str(ds.attrs["rms"])).items():

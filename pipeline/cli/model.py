@@ -18,8 +18,10 @@ if TYPE_CHECKING:
 
 model_app = typer.Typer(
     help="Your own system as text: begin one, and check how magpend reads it.",
-    no_args_is_help=True, rich_markup_mode=None, context_settings=SETTINGS,
-)  # fmt: skip
+    no_args_is_help=True,
+    rich_markup_mode=None,
+    context_settings=SETTINGS,
+)
 
 
 def _names() -> list[str]:
@@ -44,7 +46,7 @@ def show(
 
     Integration steps are adapted to the detected edges of the drive, steep layers, switches and impacts. The
     checks evaluate the equations at the starts of a specification, or near 0, and compile nothing.
-    """  # fmt: skip
+    """
     from pipeline.cli import console
     from pipeline.cli.exits import Exit
     from pipeline.runs.modelling import examine
@@ -63,8 +65,7 @@ def show(
 
 def new(
     file: Annotated[
-        Path | None,
-        typer.Argument(metavar="[FILE]", help="TOML file to write; by default the standard output."),
+        Path | None, typer.Argument(metavar="[FILE]", help="TOML file to write; by default the standard output.")
     ] = None,
 ) -> None:
     """Write a commented specification with an own model as a template; it runs as it is."""
@@ -92,11 +93,7 @@ def _lines(model: Model, found: Description) -> list[str]:
         lines += ["", "equations"]
         lines += [f"  {name} = {text}" for name, text in found.definitions.items()]
         lines += [f"  d{name}/dt = {text}" for name, text in found.equations.items()]
-    lines += [
-        "",
-        "found",
-        *(f"  {line}" for line in found.found or ["no edges, layers, switches or impacts"]),
-    ]
+    lines += ["", "found", *(f"  {line}" for line in found.found or ["no edges, layers, switches or impacts"])]
     if model.remarks:
         lines += ["", "warnings", *(f"  {line}" for line in model.remarks)]
     if found.problems:

@@ -90,8 +90,7 @@ def all_of(model: Model) -> list[str]:
 def _table(rows: Sequence[tuple[str, ...]]) -> list[str]:
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))] if rows else []
     return [
-        "  " + "  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip()
-        for row in rows
+        "  " + "  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip() for row in rows
     ]
 
 
@@ -99,9 +98,7 @@ def _preset(model: Model, name: str | Preset) -> list[str]:
     """Return lines on the values of a preset and their origins."""
     found = model.preset(name)
     known, origin = model.load(found), found.provenance
-    rows = [
-        (p.name, f"{known[p.name]:g}", p.unit, p.meaning, origin.get(p.name, "")) for p in model.parameters
-    ]
+    rows = [(p.name, f"{known[p.name]:g}", p.unit, p.meaning, origin.get(p.name, "")) for p in model.parameters]
     title = f": {found.title}" if found.title else ""
     return [f"preset {found.name}{title}", *_table(rows)]
 
@@ -113,8 +110,7 @@ def presets(
     model: Annotated[
         str,
         typer.Option(
-            help="Model, by name or file; a preset's file names its own model.",
-            autocompletion=completing(names),
+            help="Model, by name or file; a preset's file names its own model.", autocompletion=completing(names)
         ),
     ] = DEFAULT,
 ) -> None:

@@ -26,8 +26,7 @@ LOGFILE = Annotated[
 IMPORT = Annotated[
     str | None,
     typer.Option(
-        metavar="MODULE:NAME",
-        help="Import this Python object, the model of a run; otherwise nothing is imported.",
+        metavar="MODULE:NAME", help="Import this Python object, the model of a run; otherwise nothing is imported."
     ),
 ]
 _METAVARS = {int: "N", float: "X", str: "TEXT"}
@@ -132,9 +131,7 @@ def _parameter(model: type[Options], name: str) -> inspect.Parameter:
 
     info, flag = model.model_fields[name], flag_of(model, name)
     kind, default = kind_of(info), default_of(model, name)
-    text = help_of(info) + (
-        f" Default: {_shown(default)}." if default not in (None, "", [], {}, False) else ""
-    )
+    text = help_of(info) + (f" Default: {_shown(default)}." if default not in (None, "", [], {}, False) else "")
     declared: dict[str, Any] = {"help": text}
     if get_origin(kind) is Literal:
         choices = [c for c in get_args(kind) if c]
@@ -179,8 +176,6 @@ def _keyword(name: str, annotation: Any, default: Any) -> inspect.Parameter:
 def _signed(run: Command, command: Command, parameters: Sequence[inspect.Parameter]) -> Command:
     signed: Any = run
     signed.__name__, signed.__doc__ = command.__name__, command.__doc__
-    signed.__signature__ = inspect.Signature(
-        [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in parameters]
-    )
+    signed.__signature__ = inspect.Signature([p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in parameters])
     signed.__annotations__ = {p.name: p.annotation for p in parameters}
     return run

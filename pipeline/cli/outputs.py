@@ -91,10 +91,12 @@ def _refuse(path: Path, option: str) -> None:
     from pipeline.spec.problems import SpecError
 
     if not _forced:
-        raise SpecError([
-            f"{option} {path}: is there already, and magpend has not written it; give another name, or "
-            "--force to replace it."
-        ])  # fmt: skip
+        raise SpecError(
+            [
+                f"{option} {path}: is there already, and magpend has not written it; give another name, or "
+                "--force to replace it."
+            ]
+        )
 
 
 def _is_own(path: Path) -> bool:

@@ -36,9 +36,7 @@ def show(
     file: File,
     mapping: Annotated[Path | None, typer.Option(help="Mapping (TOML) from channels to states.")] = None,
     window: Window = None,
-    smooth: Annotated[
-        bool, typer.Option("--smooth", help="Draw smoothed states and the rates from them.")
-    ] = False,
+    smooth: Annotated[bool, typer.Option("--smooth", help="Draw smoothed states and the rates from them.")] = False,
     smoothing_window: Annotated[
         float | None, typer.Option(help="Window of the smoothing [s]; by default the data choose.")
     ] = None,
@@ -59,9 +57,7 @@ def show(
         check_figure_path(out)
     if mapping is None:
         if out is not None or window is not None or smooth:
-            raise SpecError(
-                ["--mapping: missing; what is drawn are states, and a mapping says which they are."]
-            )
+            raise SpecError(["--mapping: missing; what is drawn are states, and a mapping says which they are."])
         tell(describe_file(read_raw(file)), None, as_json)
         return
     ds = _read(file, mapping, window)
@@ -75,9 +71,7 @@ def convert(
     out: Annotated[Path, typer.Option(help="File to write: .tdms, .csv or .nc.")],
     mapping: Annotated[Path, typer.Option(help="Mapping (TOML) from channels to states.")],
     window: Window = None,
-    smooth: Annotated[
-        bool, typer.Option("--smooth", help="Write smoothed states, and the rates from them.")
-    ] = False,
+    smooth: Annotated[bool, typer.Option("--smooth", help="Write smoothed states, and the rates from them.")] = False,
     smoothing_window: Annotated[
         float | None, typer.Option(help="Window of the smoothing [s]; by default the data choose.")
     ] = None,
@@ -126,14 +120,12 @@ def drive(
     file: File,
     mapping: Annotated[Path, typer.Option(help="Mapping (TOML) that names the drive's channel.")],
     kind: Annotated[
-        Literal["edges", "torque"],
-        typer.Option(help="Content: the times at which the drive switches, or its values."),
+        Literal["edges", "torque"], typer.Option(help="Content: the times at which the drive switches, or its values.")
     ] = "edges",
     out: Annotated[Path, typer.Option(help="Drive file, .csv.")] = Path("drive.csv"),
     window: Window = None,
     tolerance: Annotated[
-        float,
-        typer.Option(help="Drop samples of a torque that interpolation meets this closely [N m]."),
+        float, typer.Option(help="Drop samples of a torque that interpolation meets this closely [N m].")
     ] = 0.0,
 ) -> None:
     """Write a recorded drive as a file that ``magpend run`` and ``simulate`` accept.
@@ -152,15 +144,11 @@ def drive(
         console.note(note)
     if made.timing is not None:
         t = made.timing
-        console.result(
-            f"frequency: {t.frequency_hz:.8g} +- {t.frequency_error_hz:.2g} Hz, {t.n_periods} periods"
-        )
+        console.result(f"frequency: {t.frequency_hz:.8g} +- {t.frequency_error_hz:.2g} Hz, {t.n_periods} periods")
         console.result(f"jitter: {t.jitter_s:.3g} s")
         console.result(f"duty cycle: {t.duty_cycle:.6g} +- {t.duty_cycle_error:.2g}")
     if kind == "torque":
-        console.result(
-            f"samples: {made.n_rows} of {made.n_samples} kept; the others lie within {made.error:.3g} N m"
-        )
+        console.result(f"samples: {made.n_rows} of {made.n_samples} kept; the others lie within {made.error:.3g} N m")
     console.result(f"drive: {out}")
 
 

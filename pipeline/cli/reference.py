@@ -149,17 +149,9 @@ def specification() -> str:
     parts = [
         ("[parameters]", tables.ParametersTable, ""),
         ("[axes] NAME = {...}", tables.Range, "NAME is `frequency_hz` or a parameter of the model."),
-        (
-            '[initial_conditions] kind = "grid"',
-            starts.GridStarts,
-            _STATES.format("a number or a range {...}"),
-        ),
+        ('[initial_conditions] kind = "grid"', starts.GridStarts, _STATES.format("a number or a range {...}")),
         ('[initial_conditions] kind = "list"', starts.ListStarts, ""),
-        (
-            '[initial_conditions] kind = "random"',
-            starts.RandomStarts,
-            _STATES.format("a number or [low, high]"),
-        ),
+        ('[initial_conditions] kind = "random"', starts.RandomStarts, _STATES.format("a number or [low, high]")),
         (
             "[section]",
             section.SectionTable,
@@ -192,9 +184,7 @@ def identification() -> str:
     return "\n\n".join(_keys(*part) for part in parts)
 
 
-_STATES = (
-    "Give each state of the model under its own name: {}. For an angle or its rate, `NAME_deg` takes degrees."
-)
+_STATES = "Give each state of the model under its own name: {}. For an angle or its rate, `NAME_deg` takes degrees."
 
 
 def products() -> str:
@@ -202,8 +192,7 @@ def products() -> str:
     from pipeline.products.registry import CELL_PRODUCTS
 
     return "\n\n".join(
-        _keys(f"[products] {name} = {{...}}", product.options, product.help)
-        for name, product in CELL_PRODUCTS.items()
+        _keys(f"[products] {name} = {{...}}", product.options, product.help) for name, product in CELL_PRODUCTS.items()
     )
 
 
@@ -284,9 +273,7 @@ def _keys(head: str, model: Any, more: str, left_out: Sequence[str] = ("kind",))
             continue
         extra: Any = info.json_schema_extra or {}
         unit = f" [{extra['unit']}]" if extra.get("unit") else ""
-        rows.append(
-            (f"`{name}`", _default(info), _bounds(info), f"{(info.description or '').rstrip('.')}{unit}")
-        )
+        rows.append((f"`{name}`", _default(info), _bounds(info), f"{(info.description or '').rstrip('.')}{unit}"))
     text = f"{more}\n\n" if more else ""
     return f"### `{head}`\n\n{text}{table(('key', 'default', 'bounds', 'meaning'), rows)}"
 
@@ -338,9 +325,7 @@ def statuses() -> str:
     """Return the table of a cell's status codes."""
     from magpend_core.status import Status
 
-    return table(
-        ("code", "status", "meaning"), ((str(int(s)), f"`{s.name.lower()}`", s.sentence) for s in Status)
-    )
+    return table(("code", "status", "meaning"), ((str(int(s)), f"`{s.name.lower()}`", s.sentence) for s in Status))
 
 
 def models() -> str:

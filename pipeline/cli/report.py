@@ -9,17 +9,13 @@ import typer
 
 
 def report(
-    directories: Annotated[
-        list[str], typer.Argument(metavar="DIR...", help="Run directories, or s3://BUCKET/PREFIX.")
-    ],
+    directories: Annotated[list[str], typer.Argument(metavar="DIR...", help="Run directories, or s3://BUCKET/PREFIX.")],
     out: Annotated[Path, typer.Option(metavar="FILE", help="File of the page.")] = Path("report.html"),
     title: Annotated[str, typer.Option(help="Title of the page; by default that of the run.")] = "",
     also: Annotated[
         list[str] | None,
         typer.Option(
-            "--with",
-            metavar="ANALYSIS",
-            help="Additional analysis to compute: branches, chaos, ...; may be repeated.",
+            "--with", metavar="ANALYSIS", help="Additional analysis to compute: branches, chaos, ...; may be repeated."
         ),
     ] = None,
     only_stored: Annotated[

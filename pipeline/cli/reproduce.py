@@ -23,28 +23,21 @@ def reproduce(
     study: Annotated[
         str,
         typer.Argument(
-            metavar="STUDY",
-            help="Name of a study that ships, or its TOML file.",
-            autocompletion=completing(studies),
+            metavar="STUDY", help="Name of a study that ships, or its TOML file.", autocompletion=completing(studies)
         ),
     ],
     out: Annotated[
-        Path | None,
-        typer.Option(metavar="DIR", help="Folder of all results; by default reproduce/STUDY."),
+        Path | None, typer.Option(metavar="DIR", help="Folder of all results; by default reproduce/STUDY.")
     ] = None,
     figure: Annotated[
         list[str] | None,
         typer.Option(metavar="N", help="Number of a figure to reproduce; may be repeated. Default: all."),
     ] = None,
     smoke: Annotated[
-        bool,
-        typer.Option(
-            "--smoke", help="Use the small size: it takes minutes and leaves most claims undecided."
-        ),
+        bool, typer.Option("--smoke", help="Use the small size: it takes minutes and leaves most claims undecided.")
     ] = False,
     workers: Annotated[
-        int | None,
-        typer.Option(help="Worker processes, 0: none. By default one per core; with --smoke none.", min=0),
+        int | None, typer.Option(help="Worker processes, 0: none. By default one per core; with --smoke none.", min=0)
     ] = None,
 ) -> None:
     """Compute, draw and judge the figures of a study, and write one HTML page on them.
@@ -65,9 +58,7 @@ def reproduce(
     if done.judgements:
         console.result(headline(done.judgements, smoke))
     for j in decided_first(done.judgements):
-        console.result(
-            f"{j.figure:>8}  {j.verdict.words}: {j.claim.statement} {spelled(j)} {j.reason}".rstrip()
-        )
+        console.result(f"{j.figure:>8}  {j.verdict.words}: {j.claim.statement} {spelled(j)} {j.reason}".rstrip())
     if calibrated := calibrated_on(done.judgements):
         console.result(calibrated)
     console.result(f"report: {done.page} ({done.page.stat().st_size / 1e6:.1f} MB)")

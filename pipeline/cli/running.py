@@ -26,15 +26,15 @@ def workflow_names() -> Iterable[str]:
 Spec = Annotated[
     str,
     typer.Argument(
-        metavar="SPEC", help="A TOML file, or the name of a shipped workflow.",
+        metavar="SPEC",
+        help="A TOML file, or the name of a shipped workflow.",
         autocompletion=completing(workflow_names),
     ),
-]  # fmt: skip
+]
 
 
 Workers = Annotated[
-    int | None,
-    typer.Option(min=0, help="Worker processes; 0 computes in this process. Default: all cores."),
+    int | None, typer.Option(min=0, help="Worker processes; 0 computes in this process. Default: all cores.")
 ]
 Scheduler = Annotated[
     str | None,
@@ -46,9 +46,7 @@ Scheduler = Annotated[
 ]
 ClusterFile = Annotated[
     Path | None,
-    typer.Option(
-        metavar="FILE", help="TOML file whose table [cluster] describes a job. Default: $MAGPEND_CLUSTER."
-    ),
+    typer.Option(metavar="FILE", help="TOML file whose table [cluster] describes a job. Default: $MAGPEND_CLUSTER."),
 ]
 Dashboard = Annotated[
     bool, typer.Option("--dashboard", help="Serve dask's dashboard on this machine, and print its address.")
@@ -58,9 +56,7 @@ DryRun = Annotated[bool, typer.Option("--dry-run", help="Describe the work; crea
 
 def run(
     spec: Spec,
-    out: Annotated[
-        str | None, typer.Option(help="Run directory, or s3://BUCKET/PREFIX; by default runs/NAME.")
-    ] = None,
+    out: Annotated[str | None, typer.Option(help="Run directory, or s3://BUCKET/PREFIX; by default runs/NAME.")] = None,
     workers: Workers = None,
     scheduler: Scheduler = None,
     cluster: ClusterFile = None,
@@ -70,8 +66,7 @@ def run(
         bool, typer.Option("--smoke", help="Run the specification's small size, which takes seconds.")
     ] = False,
     plot: Annotated[
-        bool,
-        typer.Option("--plot", help="Draw the finished run: a diagram, its exponents, or a map."),
+        bool, typer.Option("--plot", help="Draw the finished run: a diagram, its exponents, or a map.")
     ] = False,
 ) -> None:
     """Run a specification, or complete its run.
@@ -90,9 +85,15 @@ def run(
             console.result(line)
         return
     state = runs.run(
-        spec, out, workers=workers, scheduler=scheduler, cluster=cluster, dashboard=dashboard, smoke=smoke,
+        spec,
+        out,
+        workers=workers,
+        scheduler=scheduler,
+        cluster=cluster,
+        dashboard=dashboard,
+        smoke=smoke,
         echo=console.note,
-    )  # fmt: skip
+    )
     done = Run.open(state.files)
     console.result(f"cube: {state.files.below('cube.zarr').name}")
     for line in outcome.summary(done):
@@ -131,10 +132,15 @@ def status(directory: Directory, json: Json = False) -> None:
 
     found = state(directory)
     row = {
-        "directory": found.name, "title": found.title, "complete": found.complete,
-        "cells": found.plan.n_cells, "committed_cells": found.n_committed, "tasks": found.plan.n_tasks,
-        "committed_tasks": len(found.done), "status": dict(found.cells),
-    }  # fmt: skip
+        "directory": found.name,
+        "title": found.title,
+        "complete": found.complete,
+        "cells": found.plan.n_cells,
+        "committed_cells": found.n_committed,
+        "tasks": found.plan.n_tasks,
+        "committed_tasks": len(found.done),
+        "status": dict(found.cells),
+    }
     tell(Table([row], describe_state(found)), None, json)
 
 
@@ -144,8 +150,7 @@ def verify(
         bool,
         typer.Option(
             "--repair",
-            help="Rebuild damaged metadata and coordinates; withdraw damaged tasks, which the next run "
-            "computes again.",
+            help="Rebuild damaged metadata and coordinates; withdraw damaged tasks, which the next run computes again.",
         ),
     ] = False,
 ) -> None:

@@ -40,20 +40,17 @@ def simulate(
         ),
     ] = None,
     drive: Annotated[
-        Path | None,
-        typer.Option(help="Drive file with a recorded drive (see magpend recordings drive)."),
+        Path | None, typer.Option(help="Drive file with a recorded drive (see magpend recordings drive).")
     ] = None,
     preset: Annotated[
-        str | None,
-        typer.Option(help="Parameter preset, or a preset's file, FILE.toml; by default the model's first."),
+        str | None, typer.Option(help="Parameter preset, or a preset's file, FILE.toml; by default the model's first.")
     ] = None,
     settings: Annotated[
         list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="Change a parameter.")
     ] = None,
     transient: Annotated[int, typer.Option(help="Drive periods before the series begins.")] = 0,
     periods: Annotated[
-        int | None,
-        typer.Option(help="Drive periods of the series; by default 10, or all that a drive file has."),
+        int | None, typer.Option(help="Drive periods of the series; by default 10, or all that a drive file has.")
     ] = None,
     samples: Annotated[int, typer.Option(help="Samples per period.")] = 200,
     rtol: Annotated[float, typer.Option(help="Relative tolerance.")] = 1e-8,
@@ -88,10 +85,18 @@ def simulate(
     if frequency is None and drive is None and not chosen.autonomous:
         frequency = DEFAULT_HZ
     ds = simulation.simulate(
-        frequency, simulation.start_of(chosen, _states(context.args)), drive=drive, model=chosen,
-        preset=preset, overrides=overrides, n_transient=transient, n_periods=periods,
-        samples_per_period=samples, rtol=rtol, atol=atol,
-    )  # fmt: skip
+        frequency,
+        simulation.start_of(chosen, _states(context.args)),
+        drive=drive,
+        model=chosen,
+        preset=preset,
+        overrides=overrides,
+        n_transient=transient,
+        n_periods=periods,
+        samples_per_period=samples,
+        rtol=rtol,
+        atol=atol,
+    )
     ds = ds.assign_attrs(versions=json.dumps(versions()), **provenance())
     console.result(f"series: {simulation.write_series(ds, out)}")
     if "closing" in ds.attrs:
@@ -136,9 +141,7 @@ def read_named(words: list[str], n: int) -> dict[str, Any]:
             found[name[2:].replace("-", "_")] = tuple(map(float, own))
         except ValueError:
             numbers = "a number" if n == 1 else f"{n} numbers"
-            problems.append(
-                f"{' '.join([word, *own])}: no option of this command, and no name with {numbers}."
-            )
+            problems.append(f"{' '.join([word, *own])}: no option of this command, and no name with {numbers}.")
     if problems:
         raise SpecError(problems)
     return found

@@ -16,8 +16,7 @@ _NUM = "num_"
 def zoom(
     context: typer.Context,
     source: Annotated[
-        str,
-        typer.Argument(metavar="DIR|SPEC", help="A run directory, a TOML file, or a shipped workflow."),
+        str, typer.Argument(metavar="DIR|SPEC", help="A run directory, a TOML file, or a shipped workflow.")
     ],
     out: Annotated[Path, typer.Option(help="TOML file to write; an existing one is not overwritten.")],
     axis: Annotated[
@@ -25,12 +24,10 @@ def zoom(
         typer.Option(metavar="NAME=LOW:HIGH[:NUM]", help="New range of a parameter or state, by name."),
     ] = None,
     at: Annotated[
-        list[str] | None,
-        typer.Option(metavar="NAME=VALUE", help="One value of a parameter, the frequency or a state."),
+        list[str] | None, typer.Option(metavar="NAME=VALUE", help="One value of a parameter, the frequency or a state.")
     ] = None,
     num: Annotated[
-        int | None,
-        typer.Option(min=2, help="Number of points of every new range; by default as before."),
+        int | None, typer.Option(min=2, help="Number of points of every new range; by default as before.")
     ] = None,
     samples: Annotated[int | None, typer.Option(min=1, help="Number of random initial states.")] = None,
 ) -> None:

@@ -19,9 +19,7 @@ ANSWER_S = 5.0
 
 OPTION = "--scheduler"
 SCHEMES = ("tcp", "tls")
-_ADDRESS = re.compile(
-    r"(?:(?P<scheme>[a-z][a-z0-9+.-]*)://)?(?P<host>\[[^\]]+\]|[^:/\s\[\]]+):(?P<port>\d+)/?", re.I
-)
+_ADDRESS = re.compile(r"(?:(?P<scheme>[a-z][a-z0-9+.-]*)://)?(?P<host>\[[^\]]+\]|[^:/\s\[\]]+):(?P<port>\d+)/?", re.I)
 _TLS_SETTINGS = (
     "DASK_DISTRIBUTED__COMM__TLS__CA_FILE",
     "DASK_DISTRIBUTED__COMM__TLS__CLIENT__CERT",
@@ -74,10 +72,12 @@ def read_address(text: str, source: str) -> Address:
     match = _ADDRESS.fullmatch(text.strip())
     scheme = (match["scheme"] or "tcp").lower() if match else ""
     if match is None or not 0 < int(match["port"]) < 65536:
-        raise SpecError([
-            f"{source}: {text!r} is no address of a scheduler; give tcp://HOST:PORT with a port from 1 to "
-            "65535, tls://HOST:PORT, the scheduler's FILE.json, slurm, pbs, sge, lsf, local or none."
-        ])  # fmt: skip
+        raise SpecError(
+            [
+                f"{source}: {text!r} is no address of a scheduler; give tcp://HOST:PORT with a port from 1 to "
+                "65535, tls://HOST:PORT, the scheduler's FILE.json, slurm, pbs, sge, lsf, local or none."
+            ]
+        )
     if scheme not in SCHEMES:
         hint = " A dashboard's address is another than its scheduler's." if scheme.startswith("http") else ""
         raise SpecError([f"{source}: {text!r}: must begin with tcp:// or tls://.{hint}"])
@@ -89,15 +89,19 @@ def _from_file(path: Path) -> Address:
         content = json.loads(path.read_text("utf-8"))
         address = content["address"]
     except OSError as error:
-        raise SpecError([
-            f"{path}: cannot be read ({error.strerror or error}); dask scheduler --scheduler-file FILE "
-            "writes it when it starts."
-        ]) from None  # fmt: skip
+        raise SpecError(
+            [
+                f"{path}: cannot be read ({error.strerror or error}); dask scheduler --scheduler-file FILE "
+                "writes it when it starts."
+            ]
+        ) from None
     except (ValueError, TypeError, KeyError, RecursionError):
-        raise SpecError([
-            f"{path}: is no scheduler file, which is JSON with an 'address'; dask scheduler --scheduler-file "
-            "FILE writes one."
-        ]) from None  # fmt: skip
+        raise SpecError(
+            [
+                f"{path}: is no scheduler file, which is JSON with an 'address'; dask scheduler --scheduler-file "
+                "FILE writes one."
+            ]
+        ) from None
     if not isinstance(address, str) or address.lower().endswith(".json"):
         raise SpecError([f"{path}: its 'address' must be a text such as tcp://HOST:PORT."])
     return read_address(address, str(path))
@@ -167,8 +171,7 @@ def _knock(address: Address) -> None:
         raise SchedulerError(f"{address.named}: there is no host {address.host!r}; check the name.") from None
     except TimeoutError:
         raise SchedulerError(
-            f"{address.named}: no answer within {ANSWER_S:.0f} s; check the host, and whether a firewall "
-            "lies between."
+            f"{address.named}: no answer within {ANSWER_S:.0f} s; check the host, and whether a firewall lies between."
         ) from None
     except (OSError, UnicodeError) as error:
         why = getattr(error, "strerror", None) or error
@@ -195,9 +198,7 @@ async def _identity(address: Address, security: Any) -> dict[str, Any]:
             comm = await connect(address.url, timeout=ANSWER_S, **keys)  # type: ignore[no-untyped-call]
             await comm.write({"op": "identity", "reply": True})
             answer = await comm.read()
-        return (
-            dict(answer) if isinstance(answer, dict) else {"error": ValueError("its answer is no identity")}
-        )
+        return dict(answer) if isinstance(answer, dict) else {"error": ValueError("its answer is no identity")}
     finally:
         if comm is not None:
             with contextlib.suppress(Exception):

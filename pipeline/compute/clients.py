@@ -65,12 +65,7 @@ class Where:
             If the statement is invalid, or not available here.
         """
         found = self._resolved()
-        if (
-            self.dashboard
-            and found != IN_PROCESS
-            and not isinstance(found, Address)
-            and not find_spec("bokeh")
-        ):
+        if self.dashboard and found != IN_PROCESS and not isinstance(found, Address) and not find_spec("bokeh"):
             raise SpecError(["--dashboard: needs bokeh; install it: pip install 'magpend[dashboard]'."])
         return found
 
@@ -79,10 +74,12 @@ class Where:
         if wanted.lower() in QUEUES or (not wanted and self.cluster_file is not None):
             return self._cluster(wanted.lower())
         if self.cluster_file is not None:
-            raise SpecError([
-                f"--cluster {self.cluster_file}: says what a job of a batch system is, and --scheduler "
-                f"{wanted} asks for none; leave one of them out, or give --scheduler {' or '.join(QUEUES)}."
-            ])  # fmt: skip
+            raise SpecError(
+                [
+                    f"--cluster {self.cluster_file}: says what a job of a batch system is, and --scheduler "
+                    f"{wanted} asks for none; leave one of them out, or give --scheduler {' or '.join(QUEUES)}."
+                ]
+            )
         if wanted.lower() in (LOCAL, IN_PROCESS):
             return wanted.lower()
         if wanted:
@@ -93,16 +90,20 @@ class Where:
     def _cluster(self, kind: str) -> Cluster:
         file = self.cluster_file or os.environ.get(CLUSTER_FILE)
         if not file:
-            raise SpecError([
-                f"--scheduler {kind}: what is a job? Say it in a file with a [cluster] table and give "
-                f"--cluster FILE, or set {CLUSTER_FILE}; docs/clusters.md has an example."
-            ])  # fmt: skip
+            raise SpecError(
+                [
+                    f"--scheduler {kind}: what is a job? Say it in a file with a [cluster] table and give "
+                    f"--cluster FILE, or set {CLUSTER_FILE}; docs/clusters.md has an example."
+                ]
+            )
         cluster = load_cluster(file)
         if kind and cluster.kind != kind:
-            raise SpecError([
-                f"--scheduler {kind}: {file} describes jobs of {cluster.kind}; leave --scheduler out, or "
-                "give another file."
-            ])  # fmt: skip
+            raise SpecError(
+                [
+                    f"--scheduler {kind}: {file} describes jobs of {cluster.kind}; leave --scheduler out, or "
+                    "give another file."
+                ]
+            )
         check_means(cluster)
         return cluster
 

@@ -98,9 +98,10 @@ def closing_of(sections: np.ndarray, system: System) -> Closing | None:
     # prefer a shrinking distance to a small one; multiples of a period have about the same bound
     least = min(found, key=lambda one: (math.isinf(one.to_go), one.distance))
     return next(
-        one for one in found
+        one
+        for one in found
         if one.distance <= 3.0 * least.distance and math.isinf(one.to_go) == math.isinf(least.to_go)
-    )  # fmt: skip
+    )
 
 
 def _lag_distances(sections: np.ndarray, p: int, system: System) -> np.ndarray:

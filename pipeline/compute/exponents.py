@@ -36,10 +36,15 @@ def exponents(job: Job, options: LyapunovOptions) -> dict[str, np.ndarray]:
     cells, inputs, integration = job.cells, job.inputs, job.spec.integration
     branch, point = np.nonzero(np.isin(cells.status, (Status.PERIODIC, Status.BOUNDED)))
     found = lyapunov_exponents(
-        inputs.parameters[branch, point], inputs.frequency_hz[branch, point],
-        cells.section[branch, point, -1], rtol=integration.rtol, atol=integration.atol,
-        max_steps_per_period=integration.max_steps_per_period, system=job.system, **options.model_dump(),
-    )  # fmt: skip
+        inputs.parameters[branch, point],
+        inputs.frequency_hz[branch, point],
+        cells.section[branch, point, -1],
+        rtol=integration.rtol,
+        atol=integration.atol,
+        max_steps_per_period=integration.max_steps_per_period,
+        system=job.system,
+        **options.model_dump(),
+    )
     is_closed = cells.status[branch, point] == Status.PERIODIC
     values = {
         "lyapunov": np.where(is_closed[:, None], _falling(found.weighted), found.exponents),

@@ -36,9 +36,7 @@ def check_means(cluster: Cluster) -> None:
     """
     problems = []
     if not find_spec("dask_jobqueue"):
-        problems.append(
-            f"{cluster.kind}: needs dask-jobqueue, which is not installed: pip install 'magpend[cluster]'."
-        )
+        problems.append(f"{cluster.kind}: needs dask-jobqueue, which is not installed: pip install 'magpend[cluster]'.")
     if not shutil.which(COMMANDS[cluster.kind]):
         problems.append(
             f"{cluster.kind}: there is no command {COMMANDS[cluster.kind]!r} here; give the command on a "
@@ -53,9 +51,7 @@ def jobs_folder(place: str) -> Path:
 
     For a run that is not in a local folder it lies in the working directory.
     """
-    where = (
-        Path(place).absolute() if "://" not in place else Path.cwd() / place.rstrip("/").rpartition("/")[2]
-    )
+    where = Path(place).absolute() if "://" not in place else Path.cwd() / place.rstrip("/").rpartition("/")[2]
     return where.with_name(f"{where.name}.jobs")
 
 
@@ -86,10 +82,8 @@ def settings(cluster: Cluster, folder: Path) -> dict[str, Any]:
         "death_timeout": _MEANWHILE_S,
         "job_script_prologue": [*_THREADS, *cluster.prologue],
         "job_extra_directives": list(cluster.directives),
-        "worker_extra_args": [
-            "--lifetime", f"{cluster.lifetime_s}s", "--lifetime-stagger", f"{cluster.stagger_s}s",
-        ],
-    }  # fmt: skip
+        "worker_extra_args": ["--lifetime", f"{cluster.lifetime_s}s", "--lifetime-stagger", f"{cluster.stagger_s}s"],
+    }
     if cluster.kind == "lsf":
         found["lsf_units"] = "mb"
     return {name: value for name, value in found.items() if value is not None}
@@ -115,9 +109,7 @@ def _keys(folder: Path) -> Any:
             with os.fdopen(os.open(files[name], os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
                 file.write(content)
     roles = {
-        f"tls_{role}_{name}": str(files[name])
-        for role in ("scheduler", "worker", "client")
-        for name in ("cert", "key")
+        f"tls_{role}_{name}": str(files[name]) for role in ("scheduler", "worker", "client") for name in ("cert", "key")
     }
     return Security(  # type: ignore[no-untyped-call]
         require_encryption=True, tls_ca_file=str(files["ca_file"]), **roles
@@ -125,9 +117,7 @@ def _keys(folder: Path) -> Any:
 
 
 @contextlib.contextmanager
-def job_cluster(
-    cluster: Cluster, folder: Path, *, dashboard: bool, echo: Callable[[str], None]
-) -> Iterator[Any]:
+def job_cluster(cluster: Cluster, folder: Path, *, dashboard: bool, echo: Callable[[str], None]) -> Iterator[Any]:
     """Yield a cluster of jobs that ends with the block.
 
     Scheduler and workers identify each other by keys made for this cluster. The keys lie in `folder`,

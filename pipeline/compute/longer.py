@@ -83,11 +83,16 @@ def kept_on(spec: Spec, inputs: Inputs, stored: Mapping[str, np.ndarray], n_old:
     failed = go[more["status"][:, 0] != Status.BOUNDED]
     values = {name: _longer(name, array, more, go, spec.integration.n_keep) for name, array in stored.items()}
     judged = np.flatnonzero(was_kept & is_exact & ~closed)
-    periods = orbit_periods(
-        values["section"][judged, 0, -_judged(spec) :], system=spec.model.system,
-        closure_tolerance=spec.integration.closure_tolerance,
-        max_orbit_period=spec.integration.max_orbit_period,
-    ) if len(judged) else np.zeros(0, np.int16)  # fmt: skip
+    periods = (
+        orbit_periods(
+            values["section"][judged, 0, -_judged(spec) :],
+            system=spec.model.system,
+            closure_tolerance=spec.integration.closure_tolerance,
+            max_orbit_period=spec.integration.max_orbit_period,
+        )
+        if len(judged)
+        else np.zeros(0, np.int16)
+    )
     values["orbit_period"][judged, 0] = periods
     values["status"][judged, 0] = np.where(periods > 0, Status.PERIODIC, Status.BOUNDED)
     is_exact[failed] = False
@@ -101,10 +106,17 @@ def _more(spec: Spec, inputs: Inputs, last: np.ndarray, step_size: np.ndarray, n
         watched |= CELL_PRODUCTS[name].integrate(options)
     integration = spec.integration
     cells = more_sections(
-        inputs.parameters, inputs.frequency_hz, last, step_size, n_more=integration.n_keep - n_old,
-        rtol=integration.rtol, atol=integration.atol, max_steps_per_period=integration.max_steps_per_period,
-        system=replace(spec.model.system, method=integration.method), **watched,
-    )  # fmt: skip
+        inputs.parameters,
+        inputs.frequency_hz,
+        last,
+        step_size,
+        n_more=integration.n_keep - n_old,
+        rtol=integration.rtol,
+        atol=integration.atol,
+        max_steps_per_period=integration.max_steps_per_period,
+        system=replace(spec.model.system, method=integration.method),
+        **watched,
+    )
     names = ("status", "step_size", *SUMS, *PER_SECTION)
     return {name: np.asarray(getattr(cells, name)) for name in names if getattr(cells, name) is not None}
 

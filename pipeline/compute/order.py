@@ -138,9 +138,7 @@ class Order:
         self._second.append(index)
         self._in_a_row += 1
         if self._in_a_row >= MOST_IN_A_ROW or len(self._failed) >= MOST_FAILED:
-            note = (
-                "Given up: so many fail that it is hardly the tasks. What is committed stays, and the same "
-            )
+            note = "Given up: so many fail that it is hardly the tasks. What is committed stays, and the same "
             raise TaskFailedError(self._failed, note=note + "command goes on when the cause is gone.")
 
     def close(self) -> None:

@@ -97,20 +97,12 @@ class Orbits:
     def _on(self, sections: np.ndarray, points: np.ndarray) -> np.ndarray:
         """Return which sections (cell, period, n_states) are these points in some cyclic order."""
         shifts = (np.roll(points, shift, axis=0) for shift in range(len(points)))
-        near = [
-            scaled_distance(sections, p, self.system).max(axis=1, initial=0.0) <= self.tolerance
-            for p in shifts
-        ]
+        near = [scaled_distance(sections, p, self.system).max(axis=1, initial=0.0) <= self.tolerance for p in shifts]
         return np.asarray(np.any(near, axis=0))
 
 
 def infer(
-    shape: tuple[int, ...],
-    stride: int,
-    integrate: Integrate,
-    *,
-    closure_tolerance: float,
-    system: System,
+    shape: tuple[int, ...], stride: int, integrate: Integrate, *, closure_tolerance: float, system: System
 ) -> dict[str, np.ndarray]:
     """Return all variables of a tile, computed where necessary and inferred elsewhere.
 

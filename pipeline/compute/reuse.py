@@ -252,12 +252,18 @@ def _products(spec: Spec, inputs: Inputs, values: Mapping[str, np.ndarray], name
         return {}
     no_turns = np.zeros((*inputs.frequency_hz.shape, 0), np.int32)
     cells = Sections(
-        section=values["section"], turns=values.get("turns", no_turns), status=values["status"],
-        orbit_period=values["orbit_period"], n_periods=values["n_periods"], n_steps=values["n_steps"],
-        n_rejected=values["n_rejected"], final_state=values["section"][:, :, -1],
-        step_size=values["step_size"], return_time=values.get("return_time"),
+        section=values["section"],
+        turns=values.get("turns", no_turns),
+        status=values["status"],
+        orbit_period=values["orbit_period"],
+        n_periods=values["n_periods"],
+        n_steps=values["n_steps"],
+        n_rejected=values["n_rejected"],
+        final_state=values["section"][:, :, -1],
+        step_size=values["step_size"],
+        return_time=values.get("return_time"),
         extremes=values.get("extremes"),
-    )  # fmt: skip
+    )
     found: Values = {}
     for name in names:
         found |= function_of(CELL_PRODUCTS[name].compute)(Job(spec, inputs, cells), spec.products[name])

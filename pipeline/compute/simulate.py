@@ -155,9 +155,7 @@ def _recording(
     return found
 
 
-def _at_frequency(
-    parameters: Parameters, frequency_hz: float, state: np.ndarray, series: Series
-) -> xr.Dataset:
+def _at_frequency(parameters: Parameters, frequency_hz: float, state: np.ndarray, series: Series) -> xr.Dataset:
     """Integrate under the model's own drive."""
     from magpend_core import evaluate, trajectory
 
@@ -184,15 +182,10 @@ def _closing(sections: np.ndarray, parameters: Parameters, series: Series) -> di
     found = closing_of(sections[-LOOKED_AT:], parameters.model.system)
     if found is None:
         return {}
-    return {
-        "orbit_period": found.period if found.is_closed else 0,
-        "closing": found.sentence(series.n_transient),
-    }
+    return {"orbit_period": found.period if found.is_closed else 0, "closing": found.sentence(series.n_transient)}
 
 
-def _under_recording(
-    parameters: Parameters, drive: RecordedDrive, state: np.ndarray, series: Series
-) -> xr.Dataset:
+def _under_recording(parameters: Parameters, drive: RecordedDrive, state: np.ndarray, series: Series) -> xr.Dataset:
     """Integrate under a recorded drive, from its start."""
     from magpend_core.recorded import evaluate_recorded, recorded_trajectory
 
@@ -201,9 +194,7 @@ def _under_recording(
     end = drive.end_s if series.n_periods is None else float(marks[series.n_transient + series.n_periods])
     n = max(1, round((end - begin) * drive.frequency_hz * series.samples_per_period))
     since = np.minimum(np.linspace(begin, end, n + 1) - drive.start_s, drive.end_s - drive.start_s)
-    states = recorded_trajectory(
-        parameters, drive.intervals, state, since, rtol=series.rtol, atol=series.atol
-    )
+    states = recorded_trajectory(parameters, drive.intervals, state, since, rtol=series.rtol, atol=series.atol)
     names = [q.name for q in parameters.model.quantities]
     values = evaluate_recorded(names, since, states, parameters, drive.intervals)
     ds = _labelled(parameters, since + drive.start_s, f"time by the clock of {drive.file}", states, values)

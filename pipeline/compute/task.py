@@ -57,9 +57,7 @@ class Job:
 
 
 @lru_cache(maxsize=4)
-def _prepare(
-    directory: str, digest: str, origin: tuple[str, str] | None
-) -> tuple[RunInfo, Spec, Plan, CellMap]:
+def _prepare(directory: str, digest: str, origin: tuple[str, str] | None) -> tuple[RunInfo, Spec, Plan, CellMap]:
     """Read a run once per worker, and make sure that this installation would compute the same."""
     if origin is not None:
         import_model(*origin)
@@ -198,9 +196,13 @@ def _left(info: RunInfo, plan: Plan, cells: CellMap, index: int) -> dict[str, An
 
 
 def _taking(
-    directory: str, digest: str, sources: tuple[tuple[str, str], ...], cells: CellMap,
-    block: tuple[slice, ...], taken: list[int],
-) -> dict[str, Any]:  # fmt: skip
+    directory: str,
+    digest: str,
+    sources: tuple[tuple[str, str], ...],
+    cells: CellMap,
+    block: tuple[slice, ...],
+    taken: list[int],
+) -> dict[str, Any]:
     """Return the integrator that takes cells from other runs first; empty if there are no other runs."""
     if not sources:
         return {}
@@ -216,14 +218,10 @@ def warm_up(spec: Spec) -> float:
     will do is done here for a single cell over no more than a few periods.
     """
     started = time.perf_counter()
-    short = Inputs(
-        spec.values.pack().reshape(1, 1, -1), np.ones((1, 1)), np.zeros((1, len(spec.model.states)))
-    )
+    short = Inputs(spec.values.pack().reshape(1, 1, -1), np.ones((1, 1)), np.zeros((1, len(spec.model.states))))
     if spec.section is not None:  # products go on from cells that return, so from one that may
         cells = CellMap(spec)
-        short = cells.inputs(
-            tuple(slice(0, 1) if i != cells.path else slice(0, n) for i, n in enumerate(cells.shape))
-        )
+        short = cells.inputs(tuple(slice(0, 1) if i != cells.path else slice(0, n) for i, n in enumerate(cells.shape)))
         short = Inputs(short.parameters[:1, :1], short.frequency_hz[:1, :1], short.initial_states[:1])
     integration = spec.integration.model_copy(update={"n_transient": 0, "n_keep": 1})
     products = {name: CELL_PRODUCTS[name].shortest(options) for name, options in spec.products.items()}

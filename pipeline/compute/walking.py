@@ -49,9 +49,7 @@ def walk(inputs: Inputs, **keywords: Any) -> Sections:
         return run_branches(inputs.parameters, inputs.frequency_hz, inputs.initial_states, **keywords)
     alive = np.isfinite(inputs.step_size)
     some = inputs.take(alive)
-    cells = run_branches(
-        some.parameters, some.frequency_hz, some.initial_states, step_size=some.step_size, **keywords
-    )
+    cells = run_branches(some.parameters, some.frequency_hz, some.initial_states, step_size=some.step_size, **keywords)
     found: dict[str, Any] = {f.name: getattr(cells, f.name) for f in fields(cells)}
     return Sections(**{name: _spread(name, array, alive) for name, array in found.items()})
 

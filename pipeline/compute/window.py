@@ -153,9 +153,7 @@ class Window:
             error = future.exception() if future.status == "error" else asyncio.CancelledError()
             self._news.put(("end", ticket, (None, error)))
         else:  # finished; or lost since, with the worker that had it: then it is computed again
-            fetch = asyncio.run_coroutine_threadsafe(
-                _fetched(self._client, future), self._client.loop.asyncio_loop
-            )
+            fetch = asyncio.run_coroutine_threadsafe(_fetched(self._client, future), self._client.loop.asyncio_loop)
             fetch.add_done_callback(lambda fetched: self._news.put(("end", ticket, fetched.result())))
 
     def _wait(self) -> Iterator[tuple[str, int, Any]]:
@@ -198,9 +196,7 @@ class Window:
             raise SchedulerError(self._lost()) from error
         limit = self._watch.limit_s
         for address in self._watch.look(seen["workers"]):
-            self._echo(
-                f"a worker has not answered for {limit:.0f} s: it is restarted, its tasks go elsewhere"
-            )
+            self._echo(f"a worker has not answered for {limit:.0f} s: it is restarted, its tasks go elsewhere")
             self._restart(address)
         self._say_if_waiting()
 

@@ -33,15 +33,7 @@ from pipeline.analysis.attractors.spirals import Recurrence
 from pipeline.analysis.sets import Geometry
 from pipeline.explorer.series import orbit_series
 from pipeline.explorer.settling import Place
-from pipeline.layout.vocabulary import (
-    ABSENT,
-    APERIODIC,
-    ATTRACTS,
-    EQUILIBRIUM,
-    NOT_SETTLED,
-    PERIODIC_ORBIT,
-    split_dims,
-)
+from pipeline.layout.vocabulary import ABSENT, APERIODIC, ATTRACTS, EQUILIBRIUM, NOT_SETTLED, PERIODIC_ORBIT, split_dims
 from pipeline.products.attractors import IdentifyOptions
 
 MOST_ENTRIES = 64
@@ -184,9 +176,14 @@ class Catalog:
     def _polished(self, points: np.ndarray, period: np.ndarray) -> list[Orbit | None]:
         n = len(points)
         return polish(
-            np.tile(self._packed, (n, 1)), np.full(n, self.place.frequency), points, period,
-            geometry=self._geometry, system=self.model.system, tolerance=self.options.residual,
-        )  # fmt: skip
+            np.tile(self._packed, (n, 1)),
+            np.full(n, self.place.frequency),
+            points,
+            period,
+            geometry=self._geometry,
+            system=self.model.system,
+            tolerance=self.options.residual,
+        )
 
     def _add_orbit(self, orbit: Orbit, entry: Entry) -> None:
         self._orbits.append(orbit)
@@ -277,9 +274,8 @@ class Catalog:
             if number_of(orbit, self._orbits, self._geometry) == len(self._orbits):
                 motion = self._motion_of(orbit)
                 entry = self._new(
-                    PERIODIC_ORBIT, orbit.period, orbit.points, motion,
-                    seconds=orbit.seconds, stability=orbit.stability,
-                )  # fmt: skip
+                    PERIODIC_ORBIT, orbit.period, orbit.points, motion, seconds=orbit.seconds, stability=orbit.stability
+                )
                 self._add_orbit(orbit, entry)
 
     def _in_sets(self, block: Block, numbers: np.ndarray) -> None:
@@ -298,9 +294,15 @@ class Catalog:
         return sum(entry.attractor is None and entry.kind != ABSENT for entry in self.entries)
 
     def _new(
-        self, kind: int, period: int, points: np.ndarray, motion: int = 0, status: int = 0,
-        seconds: float = np.nan, stability: int = 0,
-    ) -> Entry:  # fmt: skip
+        self,
+        kind: int,
+        period: int,
+        points: np.ndarray,
+        motion: int = 0,
+        status: int = 0,
+        seconds: float = np.nan,
+        stability: int = 0,
+    ) -> Entry:
         with self._lock:
             number = max([self.n_ids, *(e.number + 1 for e in self.entries)])
             entry = Entry(number, None, kind, period, motion, status, points, seconds, stability)
@@ -360,10 +362,17 @@ class Catalog:
 
     def _point(self, cells: xr.Dataset) -> _WholePoint:
         return _WholePoint(
-            cells, split_dims(cells["status"])[1], self.place.frequency, self._packed, self.place.parameters,
-            sum(self._geometry.is_angle), cells["status"].size, self.model.system,
-            is_flow=self.model.crossing is not None, can_rest=self.model.autonomous,
-        )  # fmt: skip
+            cells,
+            split_dims(cells["status"])[1],
+            self.place.frequency,
+            self._packed,
+            self.place.parameters,
+            sum(self._geometry.is_angle),
+            cells["status"].size,
+            self.model.system,
+            is_flow=self.model.crossing is not None,
+            can_rest=self.model.autonomous,
+        )
 
 
 class _WholePoint(Point):

@@ -90,34 +90,39 @@ def _schemes(run: ExploredRun) -> Iterator[Scheme]:
     motions = motions_of(cube)
     if motions.told:
         yield Scheme(
-            "motion", "motion",
+            "motion",
+            "motion",
             tuple(Category(c, motions.words[c], rgb(motions.colours[c])) for c in motions.drawn),
-            lambda block: _told(motion_codes(block)), ("section", "turns"),
-        )  # fmt: skip
+            lambda block: _told(motion_codes(block)),
+            ("section", "turns"),
+        )
     if (found := run.kept("attractors")) is not None:
         cast, (codes, others) = palette.cast_of(found), _ends(found)
         yield Scheme(
-            "attractor", "attractor",
+            "attractor",
+            "attractor",
             (*(Category(i, cast.names[i], rgb(cast.colours[i])) for i in sorted(cast.names)), *others),
             lambda block: codes.isel({d: block[f"_{d}"].values for d in codes.dims}),
-        )  # fmt: skip
+        )
     if BRANCH in run.plan.dims:
         present = [d for d in _DIRECTIONS if d in set(cube["direction"].values.tolist())]
         if len(present) > 1:
             yield Scheme(
-                "direction", "direction of the walk",
+                "direction",
+                "direction of the walk",
                 tuple(
                     Category(_DIRECTIONS.index(d), d, c)
                     for d, c in zip(present, (style.BLUE, style.ORANGE), strict=False)
                 ),
                 lambda block: _directions(block["direction"]),
-            )  # fmt: skip
+            )
     yield from _seeds(run)
     yield Scheme(
-        "status", "what became of the cell",
+        "status",
+        "what became of the cell",
         tuple(Category(int(s), s.name.lower().replace("_", " "), c) for s, c in _STATUS.items()),
         lambda block: block["status"],
-    )  # fmt: skip
+    )
 
 
 def _seeds(run: ExploredRun) -> Iterator[Scheme]:

@@ -125,9 +125,7 @@ def _parameter_points(run: ExploredRun) -> tuple[np.ndarray, np.ndarray]:
     return point, grid / np.maximum(np.array(sizes) - 1, 1)
 
 
-def _nearest(
-    groups: np.ndarray, taken: np.ndarray, axis: np.ndarray, same: int
-) -> tuple[np.ndarray, np.ndarray]:
+def _nearest(groups: np.ndarray, taken: np.ndarray, axis: np.ndarray, same: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the orbit for each group of cells: its own, else the nearest, same label preferred."""
     number = np.full(len(groups), NONE, np.uint32)
     means = np.full(len(groups), NEAREST, np.uint8)
@@ -197,9 +195,7 @@ def _bytes_each(copied: Copied, chosen: Chosen, count: np.ndarray, room: Room) -
     return max(1.0, float(np.mean(sizes))) if sizes else 1.0
 
 
-def _orbit(
-    run: ExploredRun, cell: int, count: np.ndarray, room: Room
-) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+def _orbit(run: ExploredRun, cell: int, count: np.ndarray, room: Room) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Integrate the orbit from a cell's last section, at the precision that fits."""
     try:
         arrays, attrs = unpack_arrays(orbit(run, cell, int(count[cell]) - 1))
@@ -209,8 +205,7 @@ def _orbit(
     if room.brief:
         arrays = brief(arrays, closed=attrs["period"] is not None)
     return {
-        name: rounded(values, room.brief) if values.dtype.kind == "f" else values
-        for name, values in arrays.items()
+        name: rounded(values, room.brief) if values.dtype.kind == "f" else values for name, values in arrays.items()
     }, attrs
 
 

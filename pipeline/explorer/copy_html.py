@@ -38,8 +38,7 @@ def static_text(name: str) -> str:
 def inline_html(title: str, generator: str, objects: Mapping[str, bytes]) -> str:
     """Return a page that contains its data and makes no requests."""
     data = "".join(
-        _DATA.format(name=escape(name), content=base64.b64encode(content).decode())
-        for name, content in objects.items()
+        _DATA.format(name=escape(name), content=base64.b64encode(content).decode()) for name, content in objects.items()
     )
     return _page("inline", title, generator, "explorer.js", "'none'", data=data)
 
@@ -61,9 +60,15 @@ def _page(
         f"connect-src {connect}; worker-src blob:; base-uri 'none'; form-action 'none'"
     )
     return _PAGE.format(
-        policy=escape(policy), generator=escape(generator), title=escape(f"{title} - magpend"), style=style,
-        mode=mode, objects=objects, data=data, script=script,
-    )  # fmt: skip
+        policy=escape(policy),
+        generator=escape(generator),
+        title=escape(f"{title} - magpend"),
+        style=style,
+        mode=mode,
+        objects=objects,
+        data=data,
+        script=script,
+    )
 
 
 def _digest(text: str) -> str:

@@ -83,13 +83,22 @@ def diagram(run: Run, x: str, y: str, at: Mapping[str, int]) -> bytes:
     upwards = vertical(explored, y)
     found = points(explored, x, y, at)
     arrays = {
-        "x": found.x, "cell": found.cell, "at": found.at, "first": found.first, "y": found.y,
-        "status": found.status, **{f"colour_{name}": codes for name, codes in found.codes.items()},
-    }  # fmt: skip
+        "x": found.x,
+        "cell": found.cell,
+        "at": found.at,
+        "first": found.first,
+        "y": found.y,
+        "status": found.status,
+        **{f"colour_{name}": codes for name, codes in found.codes.items()},
+    }
     attrs = {
-        "x": x, "y": y, "unit": upwards.unit, "at": explored.place(at, but=x), "kept": found.kept,
+        "x": x,
+        "y": y,
+        "unit": upwards.unit,
+        "at": explored.place(at, but=x),
+        "kept": found.kept,
         "n_keep": explored.n_keep,
-    }  # fmt: skip
+    }
     return pack_arrays(arrays, attrs)
 
 
@@ -114,9 +123,7 @@ def points(run: ExploredRun, x: str, y: str, at: Mapping[str, int]) -> Points:
 def _numbered(run: ExploredRun) -> xr.Dataset:
     """Return the cube with each cell's index along every dim, as ``_DIM``."""
     ds = run.cube()
-    return ds.assign_coords({
-        f"_{d}": (d, np.arange(n)) for d, n in zip(run.plan.dims, run.plan.shape, strict=True)
-    })  # fmt: skip
+    return ds.assign_coords({f"_{d}": (d, np.arange(n)) for d, n in zip(run.plan.dims, run.plan.shape, strict=True)})
 
 
 def _cell_numbers(run: ExploredRun, place: Mapping[str, int]) -> np.ndarray:
@@ -149,9 +156,7 @@ class _Table:
         self.status[where] = status.values
         zero = xr.zeros_like(status, dtype=np.int32)
         for scheme in self.schemes:
-            found = (zero + scheme.codes(block).drop_vars(list(ds.coords), errors="ignore")).transpose(
-                *self.dims
-            )
+            found = (zero + scheme.codes(block).drop_vars(list(ds.coords), errors="ignore")).transpose(*self.dims)
             self.codes[scheme.name][where] = np.where(found.values < 0, NONE, found.values)
 
     def points(self, x: np.ndarray, cells: np.ndarray) -> Points:
@@ -168,7 +173,12 @@ class _Table:
         np.cumsum(there.sum(axis=1), out=first[1:])
         at = np.repeat(np.arange(len(x), dtype=np.uint32), len(values) // len(x))
         return Points(
-            x=np.asarray(x, np.float64), cell=ordered(cells), at=at, first=first,
-            y=values.ravel() if there.all() else values[there], status=ordered(self.status),
-            codes={name: ordered(codes) for name, codes in self.codes.items()}, kept=self.kept,
-        )  # fmt: skip
+            x=np.asarray(x, np.float64),
+            cell=ordered(cells),
+            at=at,
+            first=first,
+            y=values.ravel() if there.all() else values[there],
+            status=ordered(self.status),
+            codes={name: ordered(codes) for name, codes in self.codes.items()},
+            kept=self.kept,
+        )

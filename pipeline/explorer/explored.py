@@ -212,9 +212,7 @@ class ExploredRun(Run):
             If there is no such cell.
         """
         if not 0 <= number < self.plan.n_cells:
-            raise ExplorerError(
-                f"cell = {number} is out of bounds: the cube has cells 0 to {self.plan.n_cells - 1}."
-            )
+            raise ExplorerError(f"cell = {number} is out of bounds: the cube has cells 0 to {self.plan.n_cells - 1}.")
         index = np.unravel_index(number, self.plan.shape)
         return {dim: int(i) for dim, i in zip(self.plan.dims, index, strict=True)}
 

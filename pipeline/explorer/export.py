@@ -105,9 +105,7 @@ def export_page(
     copied.sentences += fitted.sentences()
     html = _html(copied)
     if len(html) > most_bytes:
-        raise RefusedError(
-            f"{source.name}: the page takes {len(html):,} bytes of {most_bytes:,}; use --folder OUT."
-        )
+        raise RefusedError(f"{source.name}: the page takes {len(html):,} bytes of {most_bytes:,}; use --folder OUT.")
     write_atomically(out, html)
     return Exported(out, len(html), orbits, copied.sentences)
 
@@ -165,9 +163,7 @@ def periods(run: ExploredRun) -> np.ndarray:
     return np.asarray(run.cube()["orbit_period"].values).ravel()
 
 
-def add_all_orbits(
-    copied: Copied, columns: Mapping[str, Column], layers: Mapping[str, np.ndarray], room: Room
-) -> int:
+def add_all_orbits(copied: Copied, columns: Mapping[str, Column], layers: Mapping[str, np.ndarray], room: Room) -> int:
     """Integrate the representative orbits and add them; return their number."""
     run = copied.run
     count = columns[next(iter(columns))].count

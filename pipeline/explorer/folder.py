@@ -32,12 +32,7 @@ MOST_BYTES = 500_000_000
 
 
 def export_folder(
-    source: Run,
-    out: Path,
-    *,
-    force: bool = False,
-    quantities: Sequence[str] = (),
-    most_orbits: int = MOST_ORBITS,
+    source: Run, out: Path, *, force: bool = False, quantities: Sequence[str] = (), most_orbits: int = MOST_ORBITS
 ) -> Exported:
     """Write a run as a folder that any static host can serve.
 
@@ -105,9 +100,7 @@ def check_folder(out: Path, force: bool) -> None:
         raise RefusedError(f"{out}: exists already and is not overwritten; give another name, or --force.")
     own = {INDEX, LIST, DATA, LICENCES, CUBE}
     if out.is_symlink() or not out.is_dir() or {p.name for p in out.iterdir()} - own:
-        raise RefusedError(
-            f"{out}: is not a folder that magpend export has made, so --force leaves it; remove it."
-        )
+        raise RefusedError(f"{out}: is not a folder that magpend export has made, so --force leaves it; remove it.")
 
 
 def _write(run: ExploredRun, folder: Path, quantities: Sequence[str], most_orbits: int) -> Exported:

@@ -130,9 +130,16 @@ class Follower:
         number = self._keep(Held(place, held.period, family.state(found.point.u)))
         arrays, attrs = described(self._live, place, family, found.point)
         job.show(
-            "orbit", arrays, **attrs, parameter=request.parameter, value=value, wanted=request.value,
-            lost=found.lost, sentence=found.sentence or None, orbit=number,
-        )  # fmt: skip
+            "orbit",
+            arrays,
+            **attrs,
+            parameter=request.parameter,
+            value=value,
+            wanted=request.value,
+            lost=found.lost,
+            sentence=found.sentence or None,
+            orbit=number,
+        )
 
     def _keep(self, held: Held) -> int:
         with self._lock:
@@ -176,9 +183,13 @@ class Follower:
         if axis is not None and len(axis.values) > 1:
             scale = float(np.ptp(axis.values))
         return Family(
-            system_at(place, self._live.integration.model_copy(update={"method": "dopri5"})), held.period,
-            place.frequency, place.parameters.pack(), (name,), (scale,),
-        )  # fmt: skip
+            system_at(place, self._live.integration.model_copy(update={"method": "dopri5"})),
+            held.period,
+            place.frequency,
+            place.parameters.pack(),
+            (name,),
+            (scale,),
+        )
 
 
 def _value(place: Place, name: str) -> float:
@@ -220,8 +231,7 @@ def cell_orbit(live: LiveRun, cell: int, point: int) -> Held:
     period = int(one["orbit_period"].values) or _period_of_attractor(live, at)
     if not period:
         raise RequestError(
-            f"cell {cell} has no orbit to follow: its sections close on none; take a point of a periodic "
-            "motion."
+            f"cell {cell} has no orbit to follow: its sections close on none; take a point of a periodic motion."
         )
     return Held(place, period, section[point])
 
@@ -252,9 +262,7 @@ def _followed(family: Family, state: np.ndarray, begin: float, target: float, jo
         job.check()
         if time.perf_counter() > until:
             reached = float(here.u[-1] * scale)
-            return Reached(
-                reached, here, f"followed to {reached:.6g} in the time; ask again to go on.", False
-            )
+            return Reached(reached, here, f"followed to {reached:.6g} in the time; ask again to go on.", False)
         left = goal - here.u[-1]
         move = left if abs(left) <= step else np.copysign(step, left)
         there = _step(problem, here, move, normal)
@@ -326,14 +334,23 @@ def described(
     words = model.classifier.words if model.classifier is not None else ()
     known = bool(words and code)
     attrs: dict[str, Any] = {
-        "cell": None, "parameters": {k: v for k, v in place.parameters.items()},
-        "frequency": None if is_flow else place.frequency, "status": Status.PERIODIC.name.lower(),
-        "period": family.period, "seconds": seconds, "motion": words[code] if known else None,
-        "attractor": None, "share": None, "stable": bool(np.abs(multipliers).max() < 1.0),
+        "cell": None,
+        "parameters": {k: v for k, v in place.parameters.items()},
+        "frequency": None if is_flow else place.frequency,
+        "status": Status.PERIODIC.name.lower(),
+        "period": family.period,
+        "seconds": seconds,
+        "motion": words[code] if known else None,
+        "attractor": None,
+        "share": None,
+        "stable": bool(np.abs(multipliers).max() < 1.0),
         "multipliers": [[float(m.real), float(m.imag)] for m in multipliers],
-        "exponents": [float(x) for x in orbit_exponents(multipliers, seconds, is_flow)], "seeds": [],
-        "at": None, "start": None, "fixed": fixed_points(model.flow, place.parameters),
-    }  # fmt: skip
+        "exponents": [float(x) for x in orbit_exponents(multipliers, seconds, is_flow)],
+        "seeds": [],
+        "at": None,
+        "start": None,
+        "fixed": fixed_points(model.flow, place.parameters),
+    }
     return arrays, attrs
 
 

@@ -149,9 +149,7 @@ def place_key(run: ExploredRun, at: Mapping[str, int], x: str = "") -> str:
     return "&".join([*([f"x={x}"] if x else []), *parts])
 
 
-def _answers(
-    copied: Copied, kind: str, asked: Iterable[tuple[str, Callable[[], Any]]], alike: bool = False
-) -> None:
+def _answers(copied: Copied, kind: str, asked: Iterable[tuple[str, Callable[[], Any]]], alike: bool = False) -> None:
     """Put the answers of a kind into objects of about equal size; of too many, none.
 
     If they are all alike, the first stands for all.
@@ -198,11 +196,7 @@ def add_planes(copied: Copied, most_bytes: float) -> None:
         objects[place_key(run, at)] = name
         copied.objects[name] = content
     left = size > most_bytes or len(found) > MOST_PLACES
-    missing = (
-        f"Of the planes of initial states this copy has {len(objects):,} of {_product(run):,}."
-        if left
-        else ""
-    )
+    missing = f"Of the planes of initial states this copy has {len(objects):,} of {_product(run):,}." if left else ""
     if left:
         copied.sentences.append(missing)
     copied.about["planes"] = {"objects": objects, "missing": missing, "none": none or {"source": None}}
@@ -270,6 +264,4 @@ def place_of(run: ExploredRun, vertical: Vertical) -> tuple[str, list[int | None
     )
     first = int(vertical.values(xr.Dataset({vertical.variable: numbers})).isel(period_index=0))
     index = np.unravel_index(first, shape)
-    return vertical.variable, [
-        None if d == "period_index" else int(i) for d, i in zip(own, index, strict=True)
-    ]
+    return vertical.variable, [None if d == "period_index" else int(i) for d, i in zip(own, index, strict=True)]

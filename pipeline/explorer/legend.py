@@ -50,10 +50,14 @@ class Legend:
             new += entry.attractor is None and entry.kind != ABSENT and entry.stability == ATTRACTS
             name = self.name(entry)
             again = sum(line["label"].partition(" #")[0] == name for line in found)
-            found.append({
-                "id": entry.number, "label": f"{name} #{again + 1}" if again else name, "colour": colour,
-                "attractor": entry.attractor,
-            })  # fmt: skip
+            found.append(
+                {
+                    "id": entry.number,
+                    "label": f"{name} #{again + 1}" if again else name,
+                    "colour": colour,
+                    "attractor": entry.attractor,
+                }
+            )
         return found
 
     def line(self, entry: Entry) -> dict[str, Any]:
@@ -96,11 +100,7 @@ class Legend:
             return self._free[new % len(self._free)]
         motion = self.motion(entry.motion)
         # paler than any attractor's: a class of cells is none
-        return (
-            _pale(MOTION_COLOURS[(entry.motion - 1) % len(MOTION_COLOURS)])
-            if motion
-            else rgb(GREYS["not settled"])
-        )
+        return _pale(MOTION_COLOURS[(entry.motion - 1) % len(MOTION_COLOURS)]) if motion else rgb(GREYS["not settled"])
 
 
 def _status_word(status: int) -> str:

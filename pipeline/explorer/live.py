@@ -150,9 +150,7 @@ class LiveRun:
         own = self.spec.frequency_hz
         if given is None:
             if own is None:
-                raise RequestError(
-                    f"frequency: the run sweeps it; give one of {self.model.name}'s drive [Hz]."
-                )
+                raise RequestError(f"frequency: the run sweeps it; give one of {self.model.name}'s drive [Hz].")
             return own
         values = np.array([own]) if axis is None else axis.array()
         low, high = float(values.min()) / FAR, float(values.max()) * FAR
@@ -313,9 +311,7 @@ class Warming:
         live = self._live
         place, start = live.first_start()
         rtol, atol = live.integration.rtol, live.integration.atol
-        orbit_series(
-            place.parameters, place.frequency, start, 1, 0.01 / place.frequency, rtol=rtol, atol=atol
-        )
+        orbit_series(place.parameters, place.frequency, start, 1, 0.01 / place.frequency, rtol=rtol, atol=atol)
 
     def _maps(self) -> None:
         place, start = self._live.first_start()

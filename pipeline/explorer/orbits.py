@@ -15,16 +15,7 @@ from pipeline.analysis.outcomes import share_interval
 from pipeline.explorer.arrays import pack_arrays
 from pipeline.explorer.explored import ExploredRun, ExplorerError
 from pipeline.explorer.series import fixed_points, orbit_series
-from pipeline.layout.vocabulary import (
-    ATTRACTS,
-    BRANCH,
-    EVIDENCE,
-    KINDS,
-    PENDING,
-    STABILITIES,
-    UNSTABLE,
-    grid_dim,
-)
+from pipeline.layout.vocabulary import ATTRACTS, BRANCH, EVIDENCE, KINDS, PENDING, STABILITIES, UNSTABLE, grid_dim
 from pipeline.plots.motions import motion_codes, motions_of
 from pipeline.store.run import Run
 
@@ -131,12 +122,8 @@ def orbit(run: Run, cell: int, point: int, *, linearised: bool = True) -> bytes:
     period = found.period or attractor["period"]
     n_periods = period or N_PERIODS
     seconds = _seconds(run, found, section[point], n_periods)
-    tolerances = {
-        name: min(TOLERANCE, float(getattr(run.spec.integration, name))) for name in ("rtol", "atol")
-    }
-    arrays = orbit_series(
-        found.parameters, found.clock_hz, section[point], n_periods, float(seconds[-1]), **tolerances
-    )
+    tolerances = {name: min(TOLERANCE, float(getattr(run.spec.integration, name))) for name in ("rtol", "atol")}
+    arrays = orbit_series(found.parameters, found.clock_hz, section[point], n_periods, float(seconds[-1]), **tolerances)
     arrays = {**arrays, "section": section[kept], "section_times": np.concatenate([[0.0], seconds])}
     said = _attrs(explored, found, attractor, linearised)
     attrs = {**said, "period": period or None, "point": point, "n_periods": n_periods}
@@ -160,9 +147,16 @@ def _seconds(run: Run, cell: Cell, state: np.ndarray, n_periods: int) -> np.ndar
     own = run.spec.integration
     system = run.model.system
     result = run_branches(
-        cell.parameters.pack()[None, None], np.array([[cell.clock_hz]]), state[None],
-        n_transient=0, n_keep=n_periods, rtol=own.rtol, atol=own.atol, system=system, method=own.method,
-    )  # fmt: skip
+        cell.parameters.pack()[None, None],
+        np.array([[cell.clock_hz]]),
+        state[None],
+        n_transient=0,
+        n_keep=n_periods,
+        rtol=own.rtol,
+        atol=own.atol,
+        system=system,
+        method=own.method,
+    )
     times = np.cumsum(np.asarray(result.return_time)[0, 0])
     reached = times[np.isfinite(times)]
     if not len(reached):
@@ -268,9 +262,8 @@ def linearise(cell: Cell) -> tuple[np.ndarray | None, float | None]:
     if not np.isfinite(guess).all():
         return None, None
     found = polish_orbits(
-        cell.parameters.pack()[None], np.array([cell.clock_hz]), guess[None], np.array([cell.period]),
-        system=system,
-    )  # fmt: skip
+        cell.parameters.pack()[None], np.array([cell.clock_hz]), guess[None], np.array([cell.period]), system=system
+    )
     moved = float(scaled_distance(found.section[0], guess, system))
     if not found.converged[0] or int(found.orbit_period[0]) != cell.period or moved > 1e-2:
         return None, None
@@ -323,10 +316,7 @@ def seeds(run: ExploredRun, cell: Cell) -> list[dict[str, Any]]:
             chosen += [row for row in others if row != own]
     columns = {s.name: _starts_of(run, grid_dim(s.name)) for s in run.model.states}
     return [
-        {
-            **{name: float(values[row]) for name, values in columns.items()},
-            "label": _seed_label(cube, run, row),
-        }
+        {**{name: float(values[row]) for name, values in columns.items()}, "label": _seed_label(cube, run, row)}
         for row in chosen[:MOST_SEEDS]
     ]
 

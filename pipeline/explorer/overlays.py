@@ -85,13 +85,16 @@ def _cube_exponents(run: ExploredRun, x: str, place: Mapping[str, int]) -> Itera
         known = np.isfinite(own).any(axis=1)
         rows = np.where(known[:, None], own, 0.0)
         yield {
-            "name": f"lyapunov{k + 1}", "title": f"Lyapunov exponent {k + 1}, mean over the starts",
-            "unit": "1/s", "group": "exponents", "colour": rgb(EXPONENT_COLOURS[k % len(EXPONENT_COLOURS)]),
+            "name": f"lyapunov{k + 1}",
+            "title": f"Lyapunov exponent {k + 1}, mean over the starts",
+            "unit": "1/s",
+            "group": "exponents",
+            "colour": rgb(EXPONENT_COLOURS[k % len(EXPONENT_COLOURS)]),
             **{
                 key: np.where(known, function(rows, axis=1), np.nan)
                 for key, function in (("y", np.nanmean), ("low", np.nanmin), ("high", np.nanmax))
             },
-        }  # fmt: skip
+        }
 
 
 def _size(array: xr.DataArray, dims: list[Any]) -> int:
@@ -115,9 +118,14 @@ def _attractor_curves(run: ExploredRun, x: str, place: Mapping[str, int]) -> Ite
         exponent = np.atleast_1d(one["lyapunov_max"].values)
         if np.isfinite(exponent).any():
             yield {
-                "name": f"exponent {letter(number)}", "title": f"largest exponent of {name}", "unit": "1/s",
-                "group": "exponents", "colour": colour, "attractor": number, "y": exponent,
-            }  # fmt: skip
+                "name": f"exponent {letter(number)}",
+                "title": f"largest exponent of {name}",
+                "unit": "1/s",
+                "group": "exponents",
+                "colour": colour,
+                "attractor": number,
+                "y": exponent,
+            }
         attracts = np.atleast_1d(one["stability"].values) == ATTRACTS
         if not attracts.any():
             continue
@@ -127,9 +135,14 @@ def _attractor_curves(run: ExploredRun, x: str, place: Mapping[str, int]) -> Ite
             low, high = share_interval(np.atleast_1d(one["n_cells"].values), share)
             shares |= {"low": low, "high": high}
         yield {
-            "name": f"share {letter(number)}", "title": f"share of {name}", "unit": "1", "group": "fractions",
-            "colour": colour, "attractor": number, **shares,
-        }  # fmt: skip
+            "name": f"share {letter(number)}",
+            "title": f"share of {name}",
+            "unit": "1",
+            "group": "fractions",
+            "colour": colour,
+            "attractor": number,
+            **shares,
+        }
 
 
 # ---------------------------------------------------------------- branches over a diagram
@@ -181,10 +194,11 @@ def branches(run: Run, x: str, y: str, at: Mapping[str, int]) -> dict[str, Any]:
             }
             for i in chosen
         ],
-        "points": [_event(found, k, y) for k in range(found.sizes["bifurcation"])
-                   if int(found["of_branch"][k]) in chosen],
+        "points": [
+            _event(found, k, y) for k in range(found.sizes["bifurcation"]) if int(found["of_branch"][k]) in chosen
+        ],
         "note": None if chosen else "no branch was followed at these values of the other axes",
-    }  # fmt: skip
+    }
 
 
 def _is_at(run: ExploredRun, found: xr.Dataset, branch: int, place: Mapping[str, int]) -> bool:

@@ -73,9 +73,12 @@ def plane(run: Run, at: Mapping[str, int]) -> bytes:
     """
     found = plane_of(ExploredRun.of(run), at)
     arrays = {
-        "u": found.u, "v": found.v, "label": found.label, "starts": found.starts,
+        "u": found.u,
+        "v": found.v,
+        "label": found.label,
+        "starts": found.starts,
         "start_label": found.start_label,
-    }  # fmt: skip
+    }
     attrs = {
         "states": list(found.states),
         "fixed": dict(found.fixed),
@@ -115,10 +118,16 @@ def _of_grid(run: ExploredRun, place: Mapping[str, int], scheme: Scheme, dims: l
     columns, rows = np.argsort(u, kind="stable"), np.argsort(v, kind="stable")
     states = (_state_of(run, across), _state_of(run, upwards))
     return Plane(
-        states, u[columns], v[rows], label.values[np.ix_(rows, columns)],
-        _fixed(run, part, states), _categories(scheme, label.values),
-        "basins" if scheme.name == "attractor" else "starts", np.empty((0, 2)), np.empty(0, np.int16),
-    )  # fmt: skip
+        states,
+        u[columns],
+        v[rows],
+        label.values[np.ix_(rows, columns)],
+        _fixed(run, part, states),
+        _categories(scheme, label.values),
+        "basins" if scheme.name == "attractor" else "starts",
+        np.empty((0, 2)),
+        np.empty(0, np.int16),
+    )
 
 
 def _of_starts(run: ExploredRun, place: Mapping[str, int], scheme: Scheme) -> Plane:
@@ -134,18 +143,25 @@ def _of_starts(run: ExploredRun, place: Mapping[str, int], scheme: Scheme) -> Pl
     shown = label.values.ravel()
     source = None
     return Plane(
-        states, np.empty(0), np.empty(0), np.empty((0, 0), np.int16), _fixed(run, part, states),
-        _categories(scheme, shown), source, np.stack(columns, axis=1), shown,
-    )  # fmt: skip
+        states,
+        np.empty(0),
+        np.empty(0),
+        np.empty((0, 0), np.int16),
+        _fixed(run, part, states),
+        _categories(scheme, shown),
+        source,
+        np.stack(columns, axis=1),
+        shown,
+    )
 
 
 def _part(run: ExploredRun, scheme: Scheme, index: Mapping[str, int]) -> xr.Dataset:
     """Load the cells at a parameter point, with their indices in the cube."""
     cube = run.cube()
     names = [n for n in cube.data_vars if n in {"status", *scheme.needs}]
-    numbered = cube[names].assign_coords({
-        f"_{d}": (d, np.arange(n)) for d, n in zip(run.plan.dims, run.plan.shape, strict=True)
-    })  # fmt: skip
+    numbered = cube[names].assign_coords(
+        {f"_{d}": (d, np.arange(n)) for d, n in zip(run.plan.dims, run.plan.shape, strict=True)}
+    )
     # slices of one, so that codes find every dim; dropped afterwards
     kept = numbered.isel({d: slice(i, i + 1) for d, i in index.items()}).load()
     codes = scheme.codes(kept)

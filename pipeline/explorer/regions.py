@@ -62,10 +62,7 @@ def zoomed(run: Run, region: Region) -> tuple[Spec, list[str]]:
 def zoom_toml(run: Run, region: Region) -> str:
     """Return the specification of a region as TOML, with a line on its origin."""
     spec, notes = zoomed(run, region)
-    head = [
-        f"# Zoom into a run, digest {run.info.digest}.",
-        *(f"# note: {_one_line(note)}" for note in notes),
-    ]
+    head = [f"# Zoom into a run, digest {run.info.digest}.", *(f"# note: {_one_line(note)}" for note in notes)]
     return "\n".join([*head, to_toml(spec)])
 
 
@@ -84,9 +81,7 @@ def changes_of(run: Run, region: Region) -> Changes:
             continue
         values = swept[key].values
         if not 0 <= index < len(values):
-            raise RequestError(
-                f"at.{name} = {index}: the axis has {len(values)} values, 0 to {len(values) - 1}."
-            )
+            raise RequestError(f"at.{name} = {index}: the axis has {len(values)} values, 0 to {len(values) - 1}.")
         pins[key] = float(values[index])
     return Changes(ranges, pins)
 
@@ -223,10 +218,14 @@ def _group(words: list[str], folder: Path, said: Any) -> Iterator[subprocess.Pop
     """Run the command line in its own process group, which ends with the block."""
     path = os.pathsep.join([str(_PACKAGES), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep)
     process = subprocess.Popen(
-        [sys.executable, "-m", "pipeline.cli.main", *words], cwd=folder,
-        env={**os.environ, "PYTHONPATH": path}, stdin=subprocess.DEVNULL, stdout=said, stderr=said,
+        [sys.executable, "-m", "pipeline.cli.main", *words],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": path},
+        stdin=subprocess.DEVNULL,
+        stdout=said,
+        stderr=said,
         start_new_session=True,
-    )  # fmt: skip
+    )
     try:
         yield process
     finally:

@@ -84,9 +84,15 @@ def series(
 
 
 def orbit_series(
-    parameters: Parameters, clock_hz: float, state: np.ndarray, n_periods: int, seconds: float,
-    *, rtol: float = 1e-9, atol: float = 1e-9,
-) -> dict[str, np.ndarray]:  # fmt: skip
+    parameters: Parameters,
+    clock_hz: float,
+    state: np.ndarray,
+    n_periods: int,
+    seconds: float,
+    *,
+    rtol: float = 1e-9,
+    atol: float = 1e-9,
+) -> dict[str, np.ndarray]:
     """Return `series` over the periods of an orbit, both ends included; `seconds` is their total time."""
     n = max(1, min(n_periods * SAMPLES, 65_536))
     times = seconds * np.arange(n + 1) / n

@@ -39,9 +39,12 @@ MOST_BODY, MOST_HEADERS = 64 * 1024, 16 * 1024
 """Bytes of a request."""
 
 LIMITS: dict[str, Any] = {
-    "max_body_size": MOST_BODY, "max_header_size": MOST_HEADERS, "max_buffer_size": MOST_BODY + MOST_HEADERS,
-    "idle_connection_timeout": 300.0, "body_timeout": 20.0,
-}  # fmt: skip
+    "max_body_size": MOST_BODY,
+    "max_header_size": MOST_HEADERS,
+    "max_buffer_size": MOST_BODY + MOST_HEADERS,
+    "idle_connection_timeout": 300.0,
+    "body_timeout": 20.0,
+}
 """What a connection may take."""
 
 MOST_ADDRESS = 4096
@@ -66,11 +69,7 @@ STATIC = {
 def static_files() -> dict[str, tuple[bytes, str]]:
     """Return content and type of the page's files, read once."""
     folder = resources.files("pipeline.explorer") / "static"
-    return {
-        name: ((folder / name).read_bytes(), kind)
-        for name, kind in STATIC.items()
-        if (folder / name).is_file()
-    }
+    return {name: ((folder / name).read_bytes(), kind) for name, kind in STATIC.items() if (folder / name).is_file()}
 
 
 class Service:
@@ -259,9 +258,7 @@ class ApiHandler(Handler):
     async def _reply(self, body: bytes) -> None:
         from pipeline.explorer.answers import Query
 
-        query = Query(
-            {k: v[-1].decode("utf-8", "replace") for k, v in self.request.query_arguments.items()}, body
-        )
+        query = Query({k: v[-1].decode("utf-8", "replace") for k, v in self.request.query_arguments.items()}, body)
         service, answer = self.service, self.answer
 
         def work() -> Any:
@@ -313,9 +310,13 @@ def application(service: Service) -> web.Application:
         *_live_routes(service),
     ]
     return web.Application(
-        routes, default_handler_class=NothingHandler, default_handler_args=shared, service=service,
-        compress_response=False, log_function=lambda handler: None,
-    )  # fmt: skip
+        routes,
+        default_handler_class=NothingHandler,
+        default_handler_args=shared,
+        service=service,
+        compress_response=False,
+        log_function=lambda handler: None,
+    )
 
 
 def _live_routes(service: Service) -> list[Any]:
@@ -357,11 +358,7 @@ def listening(port: int) -> socket.socket:
 
 
 def serve(
-    source: str | Path | Run,
-    port: int = 0,
-    *,
-    echo: Callable[[str], None],
-    opened: Callable[[str], None] | None = None,
+    source: str | Path | Run, port: int = 0, *, echo: Callable[[str], None], opened: Callable[[str], None] | None = None
 ) -> None:
     """Serve the page of a run until the process is stopped.
 

@@ -100,9 +100,11 @@ class Flight:
         self._step = np.zeros(len(starts))
         self.status = np.full(len(starts), int(Status.BOUNDED), np.int8)
         self._options: dict[str, Any] = {
-            "rtol": integration.rtol, "atol": integration.atol, "system": self._system,
+            "rtol": integration.rtol,
+            "atol": integration.atol,
+            "system": self._system,
             "max_steps_per_period": min(integration.max_steps_per_period, MOST_STEPS),
-        }  # fmt: skip
+        }
         self._seconds = 0.0
 
     def advance(self, rows: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
@@ -136,9 +138,7 @@ class Flight:
         m = len(rows)
         packed = np.tile(self._packed, (m, 1, 1))
         frequency = np.full((m, 1), self._place.frequency)
-        found = more_sections(
-            packed, frequency, self.state[rows], self._step[rows], n_more=n, **self._options
-        )
+        found = more_sections(packed, frequency, self.state[rows], self._step[rows], n_more=n, **self._options)
         self.status[rows], self.state[rows] = found.status[:, 0], found.final_state[:, 0]
         self._step[rows] = np.nan_to_num(found.step_size[:, 0])
         return found.section[:, 0], found.turns[:, 0]
@@ -146,9 +146,11 @@ class Flight:
     def closed(self, section: np.ndarray, integration: Integration) -> np.ndarray:
         """Return the period on which each row of last sections closes, 0 if on none, by the run's rule."""
         return orbit_periods(
-            section, closure_tolerance=integration.closure_tolerance,
-            max_orbit_period=integration.max_orbit_period, system=self._system,
-        )  # fmt: skip
+            section,
+            closure_tolerance=integration.closure_tolerance,
+            max_orbit_period=integration.max_orbit_period,
+            system=self._system,
+        )
 
     def block(self, rows: np.ndarray, section: np.ndarray, turns: np.ndarray, period: np.ndarray) -> Block:
         """Return cells in the form of the analyses; ended cells have the cube's status."""
@@ -183,8 +185,7 @@ def run_start(flight: Flight, integration: Integration, tell: Tell, periods: int
     n_transient = integration.n_transient if periods is None else periods - n_keep
     if n_keep > MOST_KEPT:
         raise RequestError(
-            f"the run keeps {n_keep} sections of each cell, and a live start at most {MOST_KEPT}; give "
-            "periods."
+            f"the run keeps {n_keep} sections of each cell, and a live start at most {MOST_KEPT}; give periods."
         )
     only, early = np.array([0]), integration.stop_when_closed
     window = window_of(integration.max_orbit_period)
@@ -216,9 +217,8 @@ def taken(block: Block, rows: np.ndarray) -> Block:
     """Return some cells of a block as a block."""
     rest = None if block.rest is None else block.rest[rows]
     return Block(
-        slice(0, len(rows)), block.section[rows], block.status[rows], block.orbit_period[rows],
-        block.turns[rows], rest,
-    )  # fmt: skip
+        slice(0, len(rows)), block.section[rows], block.status[rows], block.orbit_period[rows], block.turns[rows], rest
+    )
 
 
 RUN_ON_LEGS = 32
@@ -229,9 +229,14 @@ RUN_ON_LEG = 64
 
 
 def run_on(
-    place: Place, integration: Integration, ends: Catalog, block: Block, states: np.ndarray, check: Check,
+    place: Place,
+    integration: Integration,
+    ends: Catalog,
+    block: Block,
+    states: np.ndarray,
+    check: Check,
     tell: Tell | None = None,
-) -> np.ndarray:  # fmt: skip
+) -> np.ndarray:
     """Extend the integration until cells reach an orbit; return their entries, -1 if undecided.
 
     As long, and as exactly, as the analysis of attractors runs its spirals on.
@@ -270,9 +275,14 @@ def run_on(
 
 
 def _look(
-    flight: Flight, rows: np.ndarray, last: np.ndarray, integration: Integration, ends: Catalog,
-    *, strictly: bool = False,
-) -> np.ndarray:  # fmt: skip
+    flight: Flight,
+    rows: np.ndarray,
+    last: np.ndarray,
+    integration: Integration,
+    ends: Catalog,
+    *,
+    strictly: bool = False,
+) -> np.ndarray:
     """Return the entries of moving cells, -1 for those not yet on an orbit."""
     no_turns = np.zeros((len(rows), sum(ends.model.is_angle)), np.int64)
     period = np.zeros(len(rows), np.int16)
@@ -284,9 +294,7 @@ def _look(
     return ends.conclude(block, final=False, strictly=strictly)
 
 
-def settle_cells(
-    place: Place, integration: Integration, ends: Catalog, starts: np.ndarray, check: Check
-) -> np.ndarray:
+def settle_cells(place: Place, integration: Integration, ends: Catalog, starts: np.ndarray, check: Check) -> np.ndarray:
     """Return the entry on which each start ends.
 
     A cell is given up as soon as it is on an orbit that is known, or certain to end there; the others go on
@@ -334,9 +342,14 @@ def settle_cells(
 
 
 def conclude(
-    place: Place, integration: Integration, ends: Catalog, block: Block, states: np.ndarray, check: Check,
+    place: Place,
+    integration: Integration,
+    ends: Catalog,
+    block: Block,
+    states: np.ndarray,
+    check: Check,
     tell: Tell | None = None,
-) -> np.ndarray:  # fmt: skip
+) -> np.ndarray:
     """Return each cell's entry at its end, after extending undecided cells that come back near."""
     numbers = ends.conclude(block, final=False)
     unsure = np.flatnonzero(ends.unsure(block, numbers))

@@ -62,9 +62,7 @@ class _Grid:
         What each ends on, rows by the second state; `NOT_YET` before.
     """
 
-    def __init__(
-        self, columns: tuple[int, int], base: np.ndarray, axes: tuple[np.ndarray, np.ndarray]
-    ) -> None:
+    def __init__(self, columns: tuple[int, int], base: np.ndarray, axes: tuple[np.ndarray, np.ndarray]) -> None:
         self._columns, self._base, self.axes = columns, base, axes
         self.n = len(axes[0])
         self.labels = np.full((self.n, self.n), NOT_YET, np.int32)
@@ -85,9 +83,7 @@ class _Grid:
         axes = []
         for name, (low, high) in zip(request.plane, request.ranges, strict=True):
             if not low < high:
-                raise RequestError(
-                    f"ranges: that of {name} is {low:g} to {high:g}; the second must be greater."
-                )
+                raise RequestError(f"ranges: that of {name} is {low:g} to {high:g}; the second must be greater.")
             axes.append(low + (high - low) * ((np.arange(n) + 0.5) / n))
         base = live.state({k: v for k, v in request.fixed.items() if k not in request.plane}, place)
         grid = cls((names.index(request.plane[0]), names.index(request.plane[1])), base, (axes[0], axes[1]))
@@ -173,11 +169,16 @@ class _Slice:
         """Show a grid as it is."""
         step = self._grid.n // n
         own: dict[str, Any] = {
-            "label": self._grid.image(n), "u": self._grid.axes[0][::step].copy(),
+            "label": self._grid.image(n),
+            "u": self._grid.axes[0][::step].copy(),
             "v": self._grid.axes[1][::step].copy(),
-        }  # fmt: skip
+        }
         lines = self._live.legend(self._catalog).lines()
         self._job.show(
-            "slice", own, resolution=n, share_done=float(min(share, 1.0)), labels=lines,
+            "slice",
+            own,
+            resolution=n,
+            share_done=float(min(share, 1.0)),
+            labels=lines,
             states=list(self._job.request.plane),  # type: ignore[union-attr]
-        )  # fmt: skip
+        )

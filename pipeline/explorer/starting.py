@@ -59,10 +59,16 @@ def _end(live: LiveRun, job: Job, place: Place, block: Block, number: int, perio
     # of a start that was run on, the sections kept are those of the way there
     motion = entry.motion if entry.kind != ABSENT else int(catalog.motions(block)[0])
     job.tell(
-        "done", label=line["label"], colour=line["colour"], attractor=entry.attractor, number=number,
-        period=entry.period or int(block.orbit_period[0]), status=Status(int(block.status[0])).name.lower(),
-        motion=legend.motion(motion) or None, periods=periods,
-    )  # fmt: skip
+        "done",
+        label=line["label"],
+        colour=line["colour"],
+        attractor=entry.attractor,
+        number=number,
+        period=entry.period or int(block.orbit_period[0]),
+        status=Status(int(block.status[0])).name.lower(),
+        motion=legend.motion(motion) or None,
+        periods=periods,
+    )
 
 
 class _Path:
@@ -80,10 +86,15 @@ class _Path:
             return 1.0 / place.frequency
         system = system_at(place, self._live.integration)
         found = run_branches(
-            place.parameters.pack()[None, None], np.array([[place.frequency]]), self._state[None],
-            n_transient=0, n_keep=4, rtol=self._live.integration.rtol, atol=self._live.integration.atol,
+            place.parameters.pack()[None, None],
+            np.array([[place.frequency]]),
+            self._state[None],
+            n_transient=0,
+            n_keep=4,
+            rtol=self._live.integration.rtol,
+            atol=self._live.integration.atol,
             system=system,
-        )  # fmt: skip
+        )
         assert found.return_time is not None
         times = found.return_time[np.isfinite(found.return_time)]
         return float(times.mean()) if len(times) else 1.0 / place.frequency
@@ -94,9 +105,14 @@ class _Path:
         times = self._period * np.arange(n_periods * SAMPLES + 1) / SAMPLES
         try:
             found = series(
-                place.parameters, 1.0 / self._period, self._state, times, rtol=live.integration.rtol,
-                atol=live.integration.atol, with_quantities=False,
-            )  # fmt: skip
+                place.parameters,
+                1.0 / self._period,
+                self._state,
+                times,
+                rtol=live.integration.rtol,
+                atol=live.integration.atol,
+                with_quantities=False,
+            )
         except ArithmeticError:
             return
         self._state = found["states"][-1]

@@ -74,12 +74,14 @@ def _diagram(run: ExploredRun, asked: Asked) -> xr.Dataset:
     ends = found.first.astype(np.int64)
     counts = ends[1:] - ends[:-1]
     numbers = np.repeat(np.arange(len(found.cell)), counts)
-    ds = xr.Dataset({
-        "cell": ("row", found.cell.astype(np.int64)[numbers]),
-        x: ("row", found.x[found.at[numbers]], {"units": _unit(run, x)}),
-        y: ("row", found.y, {"units": upwards.unit}),
-        "status": ("row", found.status[numbers]),
-    })  # fmt: skip
+    ds = xr.Dataset(
+        {
+            "cell": ("row", found.cell.astype(np.int64)[numbers]),
+            x: ("row", found.x[found.at[numbers]], {"units": _unit(run, x)}),
+            y: ("row", found.y, {"units": upwards.unit}),
+            "status": ("row", found.status[numbers]),
+        }
+    )
     for scheme in schemes(run):
         if scheme.name not in ("status", "seed"):
             ds[scheme.name] = ("row", _words(scheme)[found.codes[scheme.name][numbers]])
@@ -97,13 +99,20 @@ def _words(scheme: Scheme) -> np.ndarray:
 def _curves(run: ExploredRun, asked: Asked) -> xr.Dataset:
     x = _needed(asked, "x")
     rows = [
-        {"curve": one["title"], "group": one["group"], "unit": one["unit"], x: value, "value": y,
-         "low": low, "high": high}
+        {
+            "curve": one["title"],
+            "group": one["group"],
+            "unit": one["unit"],
+            x: value,
+            "value": y,
+            "low": low,
+            "high": high,
+        }
         for one in curves(run, x, asked["at"])["curves"]
         for value, y, low, high in zip(
             one["x"], one["y"], one.get("low", one["y"]), one.get("high", one["y"]), strict=True
         )
-    ]  # fmt: skip
+    ]
     names = ("curve", "group", "unit", x, "value", "low", "high")
     return _of_rows(rows, names).assign_attrs(_place(run, x, asked["at"]))
 
@@ -112,18 +121,23 @@ def _branches(run: ExploredRun, asked: Asked) -> xr.Dataset:
     x, y = _needed(asked, "x"), _needed(asked, "y")
     found = branches(run, x, y, asked["at"])
     rows = [
-        {"branch": one["id"], "period": one["period"], "what": "stable" if part["stable"] else "unstable",
-         "segment": k, x: value, y: height}
+        {
+            "branch": one["id"],
+            "period": one["period"],
+            "what": "stable" if part["stable"] else "unstable",
+            "segment": k,
+            x: value,
+            y: height,
+        }
         for one in found["branches"]
         for k, part in enumerate(one["segments"])
         for value, height in zip(part["x"], part["y"], strict=True)
-    ]  # fmt: skip
+    ]
     rows += [
-        {"branch": one["branch"], "period": one["period"], "what": one["kind"], "segment": -1, x: one["x"],
-         y: height}
+        {"branch": one["branch"], "period": one["period"], "what": one["kind"], "segment": -1, x: one["x"], y: height}
         for one in found["points"]
         for height in one["y"]
-    ]  # fmt: skip
+    ]
     names = ("branch", "period", "what", "segment", x, y)
     return _of_rows(rows, names).assign_attrs(_place(run, x, asked["at"]))
 
@@ -156,12 +170,14 @@ def _plane(run: ExploredRun, asked: Asked) -> xr.Dataset:
         label = found.label.ravel()
     words = {c.number: c.label for c in found.categories}
     units = {s.name: s.unit for s in run.model.states}
-    ds = xr.Dataset({
-        across: ("row", u, {"units": units[across]}),
-        upwards: ("row", v, {"units": units[upwards]}),
-        "label": ("row", label),
-        "name": ("row", np.array([words.get(int(code), "") for code in label], dtype=str)),
-    })  # fmt: skip
+    ds = xr.Dataset(
+        {
+            across: ("row", u, {"units": units[across]}),
+            upwards: ("row", v, {"units": units[upwards]}),
+            "label": ("row", label),
+            "name": ("row", np.array([words.get(int(code), "") for code in label], dtype=str)),
+        }
+    )
     fixed = {f"fixed_{name}": value for name, value in found.fixed.items()}
     return ds.assign_attrs({**_place(run, "", asked["at"]), **fixed})
 
@@ -174,18 +190,19 @@ def _attractors(run: ExploredRun, asked: Asked) -> xr.Dataset:
     rows = []
     for one in attractors(run, asked["at"])["attractors"]:
         plain = {key: one[key] for key in _OF_SET}
-        rows += [
-            {**plain, "point": k, **dict(zip(states, row, strict=True))}
-            for k, row in enumerate(one["section"])
-        ]
+        rows += [{**plain, "point": k, **dict(zip(states, row, strict=True))} for k, row in enumerate(one["section"])]
     names = (*_OF_SET, "point", *states)
     return _of_rows(rows, names).assign_attrs(_place(run, "", asked["at"]))
 
 
 _TABLES: dict[str, Callable[[ExploredRun, Asked], xr.Dataset]] = {
-    "diagram": _diagram, "curves": _curves, "branches": _branches, "orbit": _orbit, "plane": _plane,
+    "diagram": _diagram,
+    "curves": _curves,
+    "branches": _branches,
+    "orbit": _orbit,
+    "plane": _plane,
     "attractors": _attractors,
-}  # fmt: skip
+}
 
 
 def _needed(asked: Asked, name: str) -> Any:
@@ -261,8 +278,11 @@ def _word(text: str) -> str:
 def _netcdf(run: ExploredRun, ds: xr.Dataset) -> bytes:
     cube = run.cube()
     provenance: dict[str, Any] = {
-        "source": str(cube.attrs.get("source", "magpend")), "run": run.info.title, "digest": run.info.digest,
-        "cube_digest": run.digest, **{k: str(v) for k, v in told_by(cube.attrs).items()},
-    }  # fmt: skip
+        "source": str(cube.attrs.get("source", "magpend")),
+        "run": run.info.title,
+        "digest": run.info.digest,
+        "cube_digest": run.digest,
+        **{k: str(v) for k, v in told_by(cube.attrs).items()},
+    }
     filled = ds.drop_vars([name for name, variable in ds.variables.items() if variable.size == 0])
     return netcdf_bytes(with_provenance(filled, provenance))

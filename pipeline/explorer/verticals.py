@@ -56,10 +56,7 @@ def verticals(run: ExploredRun) -> list[Vertical]:
 def _verticals(run: ExploredRun) -> list[Vertical]:
     model = run.model
     ordered = sorted(model.states, key=lambda s: s.name not in model.section_states)
-    found = [
-        Vertical(s.name, plain(s.symbol, s.name), s.unit, s.on_circle, "section", _state(s.name))
-        for s in ordered
-    ]
+    found = [Vertical(s.name, plain(s.symbol, s.name), s.unit, s.on_circle, "section", _state(s.name)) for s in ordered]
     if run.spec.recorded is None:  # the drive of a recording is another one at each section
         found += [
             Vertical(q.name, plain(q.symbol, q.name), q.unit, False, "section", _quantity(run, q.name))
@@ -71,9 +68,7 @@ def _verticals(run: ExploredRun) -> list[Vertical]:
             one = model.state(name) if name in model.state_names else model.quantity(name)
             label = plain(one.symbol, one.name)
             found += [
-                Vertical(
-                    f"{name}.{kind}", f"{word} {label}", one.unit, False, "extremes", _extreme(name, kind)
-                )
+                Vertical(f"{name}.{kind}", f"{word} {label}", one.unit, False, "extremes", _extreme(name, kind))
                 for kind, word in _WORDS.items()
             ]
     return found
@@ -105,9 +100,7 @@ def _quantity(run: ExploredRun, name: str) -> Callable[[xr.Dataset], xr.DataArra
         rows = section.transpose(*outer, ...)
         found = np.full(rows.shape[:-1], np.nan)
         for index in np.ndindex(*(rows.sizes[d] for d in outer)):
-            packed, hertz = _point(
-                run, {d: float(part[d].values[i]) for d, i in zip(outer, index, strict=True)}
-            )
+            packed, hertz = _point(run, {d: float(part[d].values[i]) for d, i in zip(outer, index, strict=True)})
             states = rows.values[index].reshape(-1, len(model.states))
             finite = np.isfinite(states).all(axis=1)
             out = np.empty((int(finite.sum()), len(model.quantities)))

@@ -118,21 +118,33 @@ def _model(run: ExploredRun) -> dict[str, Any]:
         "forced": not model.autonomous,
         "states": [_state(s) for s in model.states],
         "quantities": [
-            {"name": q.name, "label": plain(q.symbol, q.name), "meaning": q.meaning, "unit": q.unit,
-             "angle": False, "scale": 1.0, "rate": None}
+            {
+                "name": q.name,
+                "label": plain(q.symbol, q.name),
+                "meaning": q.meaning,
+                "unit": q.unit,
+                "angle": False,
+                "scale": 1.0,
+                "rate": None,
+            }
             for q in model.quantities
         ],
         "parameters": [_parameter(run, p) for p in model.parameters],
         "portraits": [list(pair) for pair in model.portraits],
         "drawing": _drawing(run),
-    }  # fmt: skip
+    }
 
 
 def _state(state: Any) -> dict[str, Any]:
     return {
-        "name": state.name, "label": plain(state.symbol, state.name), "meaning": state.meaning,
-        "unit": state.unit, "angle": state.on_circle, "scale": state.scale, "rate": state.rate or None,
-    }  # fmt: skip
+        "name": state.name,
+        "label": plain(state.symbol, state.name),
+        "meaning": state.meaning,
+        "unit": state.unit,
+        "angle": state.on_circle,
+        "scale": state.scale,
+        "rate": state.rate or None,
+    }
 
 
 def _section(model: Model) -> str:
@@ -156,9 +168,14 @@ def _parameter(run: ExploredRun, parameter: Parameter) -> dict[str, Any]:
         low = max(value - reach, _LOWEST.get(parameter.bound, -math.inf))
         high = min(value + reach, 1.0) if parameter.bound == FRACTION else value + reach
     return {
-        "name": parameter.name, "label": plain(parameter.symbol, parameter.name),
-        "meaning": parameter.meaning, "unit": parameter.unit, "value": value, "low": low, "high": high,
-    }  # fmt: skip
+        "name": parameter.name,
+        "label": plain(parameter.symbol, parameter.name),
+        "meaning": parameter.meaning,
+        "unit": parameter.unit,
+        "value": value,
+        "low": low,
+        "high": high,
+    }
 
 
 def _drawing(run: ExploredRun) -> dict[str, Any] | None:
@@ -193,9 +210,14 @@ def _axis(run: ExploredRun, axis: Axis) -> dict[str, Any]:
         meaning = parameter.meaning
     path = run.path == axis.name
     return {
-        "name": axis.name, "parameter": axis.parameter, "label": label, "meaning": meaning, "unit": unit,
-        "values": axis.values.tolist(), "path": path,
-    }  # fmt: skip
+        "name": axis.name,
+        "parameter": axis.parameter,
+        "label": label,
+        "meaning": meaning,
+        "unit": unit,
+        "values": axis.values.tolist(),
+        "path": path,
+    }
 
 
 def planes(run: ExploredRun) -> list[tuple[str, str]]:
@@ -214,8 +236,7 @@ def _has(run: ExploredRun) -> dict[str, bool]:
         "attractors": run.kept("attractors") is not None,
         "branches": run.kept("branches") is not None,
         "basins": run.kept("basins") is not None,
-        "lyapunov": any(str(n).startswith("lyapunov") for n in run.cube().data_vars)
-        or run.kept("chaos") is not None,
+        "lyapunov": any(str(n).startswith("lyapunov") for n in run.cube().data_vars) or run.kept("chaos") is not None,
         "drawing": run.model.drawing is not None,
         "mirror": run.model.mirror is not None,
     }
@@ -224,9 +245,7 @@ def _has(run: ExploredRun) -> dict[str, bool]:
 def commands(run: ExploredRun, directory: str) -> dict[str, str]:
     """Return the command for each missing analysis that the run can have."""
     wanted = [name for name in ("attractors", "branches", "basins") if run.kept(name) is None]
-    return {
-        name: f"magpend analyse {name} {shlex.quote(directory)}" for name in wanted if _can_have(run, name)
-    }
+    return {name: f"magpend analyse {name} {shlex.quote(directory)}" for name in wanted if _can_have(run, name)}
 
 
 def _can_have(run: ExploredRun, name: str) -> bool:

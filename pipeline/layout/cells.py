@@ -144,10 +144,7 @@ def coordinates(spec: Spec) -> tuple[Coordinate, ...]:
     ``direction`` is +1 (up) or -1 (down) here; `open_run` returns it as text.
     """
     model = spec.model
-    found = [
-        Coordinate(a.dim, (a.dim,), a.values, _parameter_attrs(a.parameter, model))
-        for a in parameter_axes(spec)
-    ]
+    found = [Coordinate(a.dim, (a.dim,), a.values, _parameter_attrs(a.parameter, model)) for a in parameter_axes(spec)]
     if FREQUENCY not in spec.axes and spec.section is None:
         attrs = _parameter_attrs(FREQUENCY, model)
         if spec.recorded is not None:
@@ -191,15 +188,14 @@ def _branch_coords(spec: Spec, states: InitialStates) -> list[Coordinate]:
     return [
         Coordinate(BRANCH, dims, np.arange(len(seeds), dtype=np.int32), {"long_name": "branch"}),
         Coordinate(
-            "direction", dims, codes,
+            "direction",
+            dims,
+            codes,
             {"long_name": "direction of the walk", "flag_values": [1, -1], "flag_meanings": "up down"},
         ),
         Coordinate("seed", dims, seeds, {"long_name": "index of the initial condition"}),
-        *(
-            Coordinate(grid_dim(s.name), dims, table[:, i], _start_attrs(s))
-            for i, s in enumerate(spec.model.states)
-        ),
-    ]  # fmt: skip
+        *(Coordinate(grid_dim(s.name), dims, table[:, i], _start_attrs(s)) for i, s in enumerate(spec.model.states)),
+    ]
 
 
 @dataclass(frozen=True)
@@ -224,9 +220,7 @@ class Inputs:
     def take(self, branches: Any) -> Inputs:
         """Return some of the branches."""
         step = None if self.step_size is None else self.step_size[branches]
-        return Inputs(
-            self.parameters[branches], self.frequency_hz[branches], self.initial_states[branches], step
-        )
+        return Inputs(self.parameters[branches], self.frequency_hz[branches], self.initial_states[branches], step)
 
 
 class CellMap:
@@ -265,9 +259,7 @@ class CellMap:
             if name != FREQUENCY:
                 parameters[..., self._names.index(name)] = value
         fixed = np.full(shape, np.nan if self._fixed_hz is None else self._fixed_hz)
-        return Inputs(
-            parameters, values.get(FREQUENCY, fixed), self._states.at(self._start_of(index[:, :, 0]))
-        )
+        return Inputs(parameters, values.get(FREQUENCY, fixed), self._states.at(self._start_of(index[:, :, 0])))
 
     def last_cells(self, block: tuple[slice, ...]) -> tuple[slice, ...]:
         """Return the cells of a block where its branches end. All its branches walk in one direction."""

@@ -112,16 +112,16 @@ def check_space(plan: Plan, folder: Path | None, n_cells: int | None = None) -> 
     free, files = shutil.disk_usage(place).free, _free_files(place)
     lacking = []
     if needed > free:
-        lacking.append(
-            f"up to {in_words(needed)} (its cells before compression), and there are {in_words(free)}"
-        )
+        lacking.append(f"up to {in_words(needed)} (its cells before compression), and there are {in_words(free)}")
     if files is not None and n_files > files:
         lacking.append(f"{n_files} files, and there is room for {files}")
     if lacking:
-        raise SpecError([
-            f"{folder}: the run needs {' and '.join(lacking)}; make room, give another --out, ask for less "
-            f"(cells, integration.n_keep), or set {GO_ON}=0 to go on as far as there is room."
-        ])  # fmt: skip
+        raise SpecError(
+            [
+                f"{folder}: the run needs {' and '.join(lacking)}; make room, give another --out, ask for less "
+                f"(cells, integration.n_keep), or set {GO_ON}=0 to go on as far as there is room."
+            ]
+        )
 
 
 def _nearest(folder: Path) -> Path:

@@ -260,10 +260,7 @@ def apart(old: Spec, new: Spec) -> list[str]:
 def _swept(spec: Spec) -> dict[str, np.ndarray]:
     """Return all values of each parameter and of the frequency."""
     hz = np.nan if spec.frequency_hz is None else spec.frequency_hz
-    values = {
-        FREQUENCY: np.array([hz]),
-        **dict(zip(spec.values.names, spec.values.pack()[:, None], strict=True)),
-    }
+    values = {FREQUENCY: np.array([hz]), **dict(zip(spec.values.names, spec.values.pack()[:, None], strict=True))}
     return values | {axis.parameter: axis.values for axis in parameter_axes(spec)}
 
 

@@ -200,9 +200,7 @@ def make_plan(spec: Spec) -> Plan:
     cells = CellMap(spec)
     seconds = _seconds_per_cell(spec)
     n_points = 1 if cells.path is None else cells.shape[cells.path]
-    wanted = spec.execution.trajectories_per_task or _trajectories(
-        spec, math.prod(cells.shape), n_points, seconds
-    )
+    wanted = spec.execution.trajectories_per_task or _trajectories(spec, math.prod(cells.shape), n_points, seconds)
     directions: tuple[str, ...] = ()
     if spec.continuation is not None:
         directions = spec.continuation.directions
@@ -216,10 +214,18 @@ def make_plan(spec: Spec) -> Plan:
             wanted = max(wanted, min(LEAST_LATTICE * spec.refine ** len(grid), most))
         block = (*(1 for _ in spec.axes), *_tile(grid, spec.refine, wanted))
     return Plan(
-        spec.kind, cells.dims, cells.shape, cells.path, block, variables_of(spec.model, spec.products),
-        sizes_of(spec.model, spec.products, spec.integration.n_keep), seconds, spec.recorded is not None,
-        directions, _seconds_at(spec),
-    )  # fmt: skip
+        spec.kind,
+        cells.dims,
+        cells.shape,
+        cells.path,
+        block,
+        variables_of(spec.model, spec.products),
+        sizes_of(spec.model, spec.products, spec.integration.n_keep),
+        seconds,
+        spec.recorded is not None,
+        directions,
+        _seconds_at(spec),
+    )
 
 
 def seconds_per_period(frequency_hz: np.ndarray, rtol: float) -> np.ndarray:

@@ -29,19 +29,14 @@ def base_variables(model: Model) -> tuple[Variable, ...]:
     wrapped = ", angles wrapped to (-pi, pi]" if model.angles else ""
     units = {"comment": "units of the components: see state_units"}
     section = Variable(
-        "section", ("period_index", "state"), "float64", math.nan, "", f"state at {model.section}{wrapped}",
-        units,
-    )  # fmt: skip
-    turns = Variable(
-        "turns", (model.angle_dim,), "int32", 0, "1", f"full turns over the kept {periods_of(model)}"
+        "section", ("period_index", "state"), "float64", math.nan, "", f"state at {model.section}{wrapped}", units
     )
+    turns = Variable("turns", (model.angle_dim,), "int32", 0, "1", f"full turns over the kept {periods_of(model)}")
     flow = (RETURN_TIME, replace(REST_STATE, attrs=units)) if model.crossing is not None else ()
     return (section, *([turns] if model.angles else []), *_counts(periods_of(model)), *flow)
 
 
-RETURN_TIME = Variable(
-    "return_time", ("period_index",), "float64", math.nan, "s", "time since the crossing before"
-)
+RETURN_TIME = Variable("return_time", ("period_index",), "float64", math.nan, "s", "time since the crossing before")
 REST_STATE = Variable(
     "rest_state", ("state",), "float64", math.nan, "", "state in which a cell that does not return was left"
 )
@@ -58,7 +53,7 @@ def _counts(periods: str) -> tuple[Variable, ...]:
         Variable("n_steps", (), "int32", 0, "1", "accepted integration steps"),
         Variable("n_rejected", (), "int32", 0, "1", "rejected integration steps"),
         Variable("step_size", (), "float64", math.nan, "s", "step that would come next; NaN: it failed"),
-    )  # fmt: skip
+    )
 
 
 def variables_of(model: Model, products: Mapping[str, Options]) -> tuple[Variable, ...]:

@@ -48,9 +48,7 @@ DECISIONS = ("undecided", "closed", "certain", "approaching", "same_set", "exten
 UNDECIDED, CLOSED, CERTAIN, APPROACHING, SAME_SET, EXTENDED, AT_REST, DIVERGES = range(len(DECISIONS))
 """How a cell was decided: values of `decision`."""
 
-(
-    PENDING, PERIODIC, BOUNDED, DIVERGED, STEP_LIMIT, STEP_UNDERFLOW, UNREACHED, INFERRED, NO_RETURN, CHATTER,
-) = Status  # fmt: skip
+(PENDING, PERIODIC, BOUNDED, DIVERGED, STEP_LIMIT, STEP_UNDERFLOW, UNREACHED, INFERRED, NO_RETURN, CHATTER) = Status
 
 FAILED = (STEP_LIMIT, STEP_UNDERFLOW, UNREACHED, NO_RETURN, CHATTER)
 """Status of cells that could not be integrated to the end."""

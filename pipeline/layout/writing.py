@@ -67,8 +67,7 @@ def writing(path: Path | str) -> Iterator[None]:
         raise
     except NoFileError as error:
         raise WritingError(
-            errno.EEXIST,
-            f"{path}: cannot be written (what is there {error}); remove it, then repeat the command.",
+            errno.EEXIST, f"{path}: cannot be written (what is there {error}); remove it, then repeat the command."
         ) from None
     except OSError as error:
         remedy = _REMEDIES.get(error.errno or 0, "look after its disk")

@@ -88,6 +88,13 @@ def say_empty(ax: Axes, survey: Survey, shown: str = "") -> None:
     size = style.look_of(ax).label
     width = 0.8 * style.figure_of(ax).frame.width_in
     ax.text(
-        0.5, 0.5, style.folded(text, width, size), transform=ax.transAxes, ha="center", va="center",
-        fontsize=size, zorder=3, bbox={"facecolor": "white", "edgecolor": "none", "pad": 5.0},
-    )  # fmt: skip
+        0.5,
+        0.5,
+        style.folded(text, width, size),
+        transform=ax.transAxes,
+        ha="center",
+        va="center",
+        fontsize=size,
+        zorder=3,
+        bbox={"facecolor": "white", "edgecolor": "none", "pad": 5.0},
+    )

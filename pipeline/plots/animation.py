@@ -91,9 +91,7 @@ class Animation:
             yield np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
-def plot_animation(
-    ds: xr.Dataset, *, degrees: bool = False, portrait: str = "", size: int = 800
-) -> Animation:
+def plot_animation(ds: xr.Dataset, *, degrees: bool = False, portrait: str = "", size: int = 800) -> Animation:
     """Lay out a film of motions beside one another.
 
     Parameters
@@ -194,12 +192,21 @@ class _Plan:
             height = min(0.56 * width, 6.0) if drawn or n_pairs > 1 else 0.7 * width
             height = max(height, margins + LEAST_HIGH_IN * stacked)
             portrait = (height - margins) / stacked
-            return cls(
-                n, n_pairs, drawn, width, 1, height - above - below, portrait, left, below, above, labelled
-            )
+            return cls(n, n_pairs, drawn, width, 1, height - above - below, portrait, left, below, above, labelled)
         pitch = width / columns
-        return cls(n, n_pairs, drawn, width, columns, 0.95 * pitch if drawn else 0.0,
-                   max(0.55 * (pitch - left), LEAST_HIGH_IN), left, below, above, labelled)  # fmt: skip
+        return cls(
+            n,
+            n_pairs,
+            drawn,
+            width,
+            columns,
+            0.95 * pitch if drawn else 0.0,
+            max(0.55 * (pitch - left), LEAST_HIGH_IN),
+            left,
+            below,
+            above,
+            labelled,
+        )
 
     @property
     def row(self) -> float:

@@ -74,11 +74,13 @@ def plot_basins(
     fig, ax = palette.new_panel(_stored(data, part, cast), _entries(cast, counts, codes.size), frame, 4.7)
     scale = _scale(data, part)
     ax.imshow(
-        _painted(codes, data, part, cast, scale), origin="lower",
+        _painted(codes, data, part, cast, scale),
+        origin="lower",
         extent=_extent(data, attractors, axes, degrees),
         aspect="equal" if _is_square(data, attractors, axes) and not (frame.xlim or frame.ylim) else "auto",
-        interpolation="nearest", gid="basins",
-    )  # fmt: skip
+        interpolation="nearest",
+        gid="basins",
+    )
     style.limits(ax, frame)
     _dress(ax, attractors, axes, degrees)
     if scale is not None:
@@ -94,9 +96,10 @@ def _write_letters(ax: Axes, codes: np.ndarray, cast: palette.Cast) -> None:
     row, column = (
         np.clip(((np.arange(400) + 0.5) / 400 * (b - a) + a - low) / (high - low) * n, 0, n - 1).astype(int)
         for (a, b), low, high, n in (
-            (ax.get_ylim(), bottom, top, codes.shape[0]), (ax.get_xlim(), left, right, codes.shape[1]),
+            (ax.get_ylim(), bottom, top, codes.shape[0]),
+            (ax.get_xlim(), left, right, codes.shape[1]),
         )
-    )  # fmt: skip
+    )
     palette.write_letters(ax, codes[np.ix_(row, column)], cast.main)
 
 
@@ -182,8 +185,7 @@ def _extent(
 ) -> tuple[float, float, float, float]:
     """Return the limits of the image: the outer edges of the outer cells."""
     x, y = (
-        labels.start_measure(attractors, d, degrees).shown(style.edges(data[d].values.astype(np.float64)))
-        for d in axes
+        labels.start_measure(attractors, d, degrees).shown(style.edges(data[d].values.astype(np.float64))) for d in axes
     )
     return float(x[0]), float(x[-1]), float(y[0]), float(y[-1])
 
@@ -219,9 +221,7 @@ def _entries(cast: palette.Cast, counts: Mapping[int, int], total: int) -> list[
 def _draw_scale(fig: style.DataFigure, ax: Axes, scale: LogNorm, periods: str) -> None:
     """Draw the scale below the image: the shade of each convergence time."""
     ramp = LinearSegmentedColormap.from_list("time", [(0.85,) * 3, (0.85 * (1.0 - _DARKEST),) * 3])
-    bar = fig.colorbar(
-        ScalarMappable(scale, ramp), ax=ax, orientation="horizontal", shrink=0.6, aspect=24, pad=0.02
-    )
+    bar = fig.colorbar(ScalarMappable(scale, ramp), ax=ax, orientation="horizontal", shrink=0.6, aspect=24, pad=0.02)
     bar.outline.set_linewidth(style.LINE_PT)
     bar.ax.set_gid("time")
     bar.set_label(f"{periods} to converge", fontsize=fig.look.legend, labelpad=2.0)
@@ -234,9 +234,7 @@ def _draw_scale(fig: style.DataFigure, ax: Axes, scale: LogNorm, periods: str) -
 def _stored(data: xr.Dataset, part: xr.Dataset, cast: palette.Cast) -> xr.Dataset:
     """Return the data kept with the figure: the cells drawn, and the names of the attractors."""
     stored = data.reset_coords(drop=True).assign(share=part["share"].variable)
-    stored = stored.assign_coords(
-        attractor=part["attractor"].variable, name=("attractor", list(cast.names.values()))
-    )
+    stored = stored.assign_coords(attractor=part["attractor"].variable, name=("attractor", list(cast.names.values())))
     scalars = {k: v for k, v in part.coords.items() if v.ndim == 0 and v.dtype.kind == "f"}
     stored = stored.assign_coords(scalars)
     stored.attrs = {"title": "basins of attraction"}

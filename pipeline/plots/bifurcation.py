@@ -106,14 +106,18 @@ class Diagram:
 
     @classmethod
     def of(
-        cls, ds: xr.Dataset, *, state: str = "", quantity: str = "", degrees: bool = False,
-        at: Mapping[str, float] | None = None, frame: style.Frame = style.WIDE,
-    ) -> Diagram:  # fmt: skip
+        cls,
+        ds: xr.Dataset,
+        *,
+        state: str = "",
+        quantity: str = "",
+        degrees: bool = False,
+        at: Mapping[str, float] | None = None,
+        frame: style.Frame = style.WIDE,
+    ) -> Diagram:
         """Survey a cube for its diagram; arguments as for `plot_bifurcation`."""
         if quantity and state:
-            raise ValueError(
-                f"a diagram is drawn of a state or of a quantity; drop {state!r} or {quantity!r}"
-            )
+            raise ValueError(f"a diagram is drawn of a state or of a quantity; drop {state!r} or {quantity!r}")
         part = at_points(ds, at)
         parameter = swept_parameter(part)
         if quantity:
@@ -290,8 +294,9 @@ def _panels(fig: style.DataFigure, diagram: Diagram, layers: Sequence[tuple[int,
             for axes in (ax, lowest):
                 axes.tick_params(labelleft=False)
         if len(layers) > 1:
-            ax.text(0.045, 0.955, diagram.view.layers[column], transform=ax.transAxes, va="top",
-                    fontsize=fig.look.label)  # fmt: skip
+            ax.text(
+                0.045, 0.955, diagram.view.layers[column], transform=ax.transAxes, va="top", fontsize=fig.look.label
+            )
         panels.append(pixels.Panel(ax, shown))
     return panels
 
@@ -301,7 +306,12 @@ def draw(run: Run, options: BifurcationOptions) -> style.DataFigure:
     cube = run.cube()
     at, notes = values_of(run, options)
     figure = plot_bifurcation(
-        cube, state="" if options.quantity else options.state, quantity=options.quantity,
-        degrees=options.degrees, layout=options.layout, at=at, frame=frame_of(options),
-    )  # fmt: skip
+        cube,
+        state="" if options.quantity else options.state,
+        quantity=options.quantity,
+        degrees=options.degrees,
+        layout=options.layout,
+        at=at,
+        frame=frame_of(options),
+    )
     return noted(figure, notes)

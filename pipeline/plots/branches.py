@@ -24,9 +24,11 @@ KINDS = ("fold", "period_doubling", "neimark_sacker", "branch_point")
 MARKERS = {"fold": "^", "period_doubling": "s", "neimark_sacker": "o", "branch_point": "D"}
 SHORT = {"fold": "F", "period_doubling": "PD", "neimark_sacker": "NS", "branch_point": "BP"}
 NAMES = {
-    "fold": "fold", "period_doubling": "period doubling", "neimark_sacker": "Neimark-Sacker",
+    "fold": "fold",
+    "period_doubling": "period doubling",
+    "neimark_sacker": "Neimark-Sacker",
     "branch_point": "branch point",
-}  # fmt: skip
+}
 _STABLE: dict[str, Any] = {"color": "black", "linewidth": 1.3, "linestyle": "-", "zorder": 6.0}
 _UNSTABLE: dict[str, Any] = {"color": "0.3", "linewidth": 0.7, "linestyle": (0, (4, 2)), "zorder": 5.0}
 _NAME_PT = 7.0
@@ -81,9 +83,7 @@ def plot_branches(
     names = _draw_lines(ax, ds, chosen, measure, below is None)
     if below is None:
         _dress(ax, frame, measure)
-    style.label_axes(
-        ax, labels.swept_label(ds.attrs["parameter"], ds.attrs["parameter_units"]), measure.label
-    )
+    style.label_axes(ax, labels.swept_label(ds.attrs["parameter"], ds.attrs["parameter_units"]), measure.label)
     handles = [*(below.handles() if below is not None else []), *_handles(ds, chosen)]
     style.complete(fig, ax, below.caption if below is not None else labels.caption(ds), handles)
     if below is not None:
@@ -93,11 +93,7 @@ def plot_branches(
 
 
 def _below(
-    cube: xr.Dataset | None,
-    measure: Measure,
-    degrees: bool,
-    at: Mapping[str, float] | None,
-    frame: style.Frame,
+    cube: xr.Dataset | None, measure: Measure, degrees: bool, at: Mapping[str, float] | None, frame: style.Frame
 ) -> Diagram | None:
     """Return the diagram under the branches, if a cube is given."""
     if cube is None:
@@ -186,11 +182,18 @@ def _mark(ax: Axes, ds: xr.Dataset, chosen: list[int], measure: Measure, scale: 
         y = measure.shown(ds["bifurcation_section"].sel(state=measure.name).values[k, :period])
         stable = min(int(ds["n_unstable_before"][k]), int(ds["n_unstable_after"][k])) == 0
         ax.plot(
-            np.full(period, x), y, linestyle="none", marker=MARKERS[kind],
-            markersize=size if stable else 0.62 * size, markerfacecolor="white" if stable else "0.75",
-            markeredgecolor="black", markeredgewidth=0.7,
-            zorder=8.0 if stable else 7.0, scalex=scale, scaley=scale,
-        )  # fmt: skip
+            np.full(period, x),
+            y,
+            linestyle="none",
+            marker=MARKERS[kind],
+            markersize=size if stable else 0.62 * size,
+            markerfacecolor="white" if stable else "0.75",
+            markeredgecolor="black",
+            markeredgewidth=0.7,
+            zorder=8.0 if stable else 7.0,
+            scalex=scale,
+            scaley=scale,
+        )
         if stable:
             names.append(_Name(period, x, float(y.min()), float(y.max()), f"{SHORT[kind]}{period}"))
     return sorted(names, key=lambda n: (n.period, n.x, n.low))
@@ -216,10 +219,19 @@ def _name(ax: Axes, names: list[_Name]) -> None:
                 continue
             taken.append(spot)
             ax.annotate(
-                name.text, (name.x, y), tuple(spot - anchor), textcoords="offset points", ha="center",
-                va="center", fontsize=_NAME_PT, fontfamily=style.FONT, zorder=9.0, gid=f"name:{name.text}",
-                arrowprops=_LEADER, path_effects=[withStroke(linewidth=1.5, foreground="white")],
-            )  # fmt: skip
+                name.text,
+                (name.x, y),
+                tuple(spot - anchor),
+                textcoords="offset points",
+                ha="center",
+                va="center",
+                fontsize=_NAME_PT,
+                fontfamily=style.FONT,
+                zorder=9.0,
+                gid=f"name:{name.text}",
+                arrowprops=_LEADER,
+                path_effects=[withStroke(linewidth=1.5, foreground="white")],
+            )
             break
 
 
@@ -232,8 +244,7 @@ def _ink(drawn: Line2D, points: float) -> np.ndarray:
     steps = np.hypot(*np.diff(line, axis=0).T)
     parts = np.minimum(np.ceil(steps / 3.0), 60).astype(int)
     pieces = [
-        a + (b - a) * np.linspace(0.0, 1.0, n + 1)[:, None]
-        for a, b, n in zip(line, line[1:], parts, strict=False)
+        a + (b - a) * np.linspace(0.0, 1.0, n + 1)[:, None] for a, b, n in zip(line, line[1:], parts, strict=False)
     ]
     return np.concatenate(pieces)
 
@@ -245,7 +256,7 @@ def _free(
     ink: np.ndarray,
     taken: list[np.ndarray],
     bounds: np.ndarray,
-) -> np.ndarray | None:  # fmt: skip
+) -> np.ndarray | None:
     """Return the nearest free place for a text of a given size about an anchor [pt], or None."""
     half = 0.5 * np.asarray(size)
     for distance in (9.0, 14.0, 20.0, 28.0, 38.0):
@@ -267,13 +278,20 @@ def _handles(ds: xr.Dataset, chosen: list[int]) -> list[Any]:
         Line2D([], [], label="unstable", **{k: v for k, v in _UNSTABLE.items() if k != "zorder"}),
         *(
             Line2D(
-                [], [], linestyle="none", marker=MARKERS[kind], markersize=4.5, markerfacecolor="white",
-                markeredgecolor="black", markeredgewidth=0.7, label=f"{SHORT[kind]} {NAMES[kind]}",
+                [],
+                [],
+                linestyle="none",
+                marker=MARKERS[kind],
+                markersize=4.5,
+                markerfacecolor="white",
+                markeredgecolor="black",
+                markeredgewidth=0.7,
+                label=f"{SHORT[kind]} {NAMES[kind]}",
             )
             for kind in KINDS
             if kind in present
         ),
-    ]  # fmt: skip
+    ]
 
 
 def draw(run: Run, options: BranchFigureOptions) -> style.DataFigure:
@@ -284,7 +302,12 @@ def draw(run: Run, options: BranchFigureOptions) -> style.DataFigure:
     cube = other.cube()
     below = cube if axis_name(options.parameter) in cube.dims else None
     figure = plot_branches(
-        found, below, state=options.state, max_period=options.shown, degrees=options.degrees, at=at,
+        found,
+        below,
+        state=options.state,
+        max_period=options.shown,
+        degrees=options.degrees,
+        at=at,
         frame=frame_of(options),
-    )  # fmt: skip
+    )
     return noted(figure, notes)

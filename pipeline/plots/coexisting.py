@@ -146,10 +146,7 @@ def _draw_weighted(ax: Axes, one: xr.Dataset, parameter: str, cast: palette.Cast
     x, y, row = _spread(one, parameter, share > 0)
     number = int(one["attractor"])
     size = _diameter(share[row] / np.bincount(row)[row]) ** 2 if row.size else 1.0
-    ax.scatter(
-        x, y, s=size, c=cast.colours[number], linewidths=0.0, rasterized=True,
-        gid=f"points:{letter(number)}",
-    )  # fmt: skip
+    ax.scatter(x, y, s=size, c=cast.colours[number], linewidths=0.0, rasterized=True, gid=f"points:{letter(number)}")
 
 
 def _draw_others(ax: Axes, data: xr.Dataset, parameter: str) -> None:
@@ -160,9 +157,17 @@ def _draw_others(ax: Axes, data: xr.Dataset, parameter: str) -> None:
         if row.size:
             x, y = data[parameter].values[row].astype(np.float64), data["value"].values[chosen]
             ax.plot(
-                x, y, linestyle="none", marker="o", markersize=_UP_PT, markeredgewidth=0.0, color=grey,
-                zorder=1.5, rasterized=True, gid=f"points:{_word(code)}",
-            )  # fmt: skip
+                x,
+                y,
+                linestyle="none",
+                marker="o",
+                markersize=_UP_PT,
+                markeredgewidth=0.0,
+                color=grey,
+                zorder=1.5,
+                rasterized=True,
+                gid=f"points:{_word(code)}",
+            )
 
 
 def _word(stability: int) -> str:
@@ -182,10 +187,17 @@ def _draw_directions(ax: Axes, one: xr.Dataset, parameter: str, cast: palette.Ca
         x, y, _ = _spread(one, parameter, chosen)
         up = word == "up"
         ax.plot(
-            x, y, linestyle="none", marker="o", markersize=_UP_PT if up else _DOWN_PT, markeredgewidth=0.0,
-            color=style.tinted(cast.colours[number], 0.0 if up else _TINT), zorder=2.2 if up else 2.0,
-            rasterized=True, gid=f"points:{word}:{letter(number)}",
-        )  # fmt: skip
+            x,
+            y,
+            linestyle="none",
+            marker="o",
+            markersize=_UP_PT if up else _DOWN_PT,
+            markeredgewidth=0.0,
+            color=style.tinted(cast.colours[number], 0.0 if up else _TINT),
+            zorder=2.2 if up else 2.0,
+            rasterized=True,
+            gid=f"points:{word}:{letter(number)}",
+        )
 
 
 def _entries(data: xr.Dataset, cast: palette.Cast, both: bool, loops: bool) -> list[palette.Entry]:
@@ -211,9 +223,7 @@ def draw(run: Run, options: CoexistingOptions) -> style.DataFigure:
     """Draw the figure ``attractors`` of a run, with its hysteresis if it was continued in both directions."""
     at, notes = values_of(run, options)
     found = attractors_of(run, options)
-    both = "direction" in found.coords and {"up", "down"} == set(
-        found["direction"].values.astype(str).tolist()
-    )
+    both = "direction" in found.coords and {"up", "down"} == set(found["direction"].values.astype(str).tolist())
     loops = run.derive("hysteresis", **options.part(AttractorOptions)) if both else None
     figure = plot_coexisting(
         found, state=options.state, at=at, degrees=options.degrees, hysteresis=loops, frame=frame_of(options)

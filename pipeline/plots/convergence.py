@@ -26,13 +26,17 @@ QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 """Of the bands: the outer two, the inner two, and the median."""
 
 _COLOURS = {
-    Motion.REGULAR: style.BLUE, Motion.UNDECIDED: style.GREY, Motion.CHAOTIC: style.VERMILLION,
+    Motion.REGULAR: style.BLUE,
+    Motion.UNDECIDED: style.GREY,
+    Motion.CHAOTIC: style.VERMILLION,
     Motion.HYPERCHAOTIC: style.PURPLE,
-}  # fmt: skip
+}
 _DASHES: dict[Motion, Any] = {
-    Motion.REGULAR: "-", Motion.UNDECIDED: (0, (1, 1)), Motion.CHAOTIC: "-",
+    Motion.REGULAR: "-",
+    Motion.UNDECIDED: (0, (1, 1)),
+    Motion.CHAOTIC: "-",
     Motion.HYPERCHAOTIC: (0, (5, 1.5)),
-}  # fmt: skip
+}
 
 
 def plot_convergence(
@@ -118,17 +122,13 @@ def _convergence(ds: xr.Dataset, exponent: int, per: str, at: Mapping[str, float
         }
     ).sel(exponent=exponent)
     chosen = chosen.isel(dict.fromkeys(dims, 0)).reset_coords(drop=True)
-    data = (
-        chosen.stack(cell=starts, create_index=False).transpose("cell", "block").rename(block="period").load()
-    )
+    data = chosen.stack(cell=starts, create_index=False).transpose("cell", "block").rename(block="period").load()
     n, length = data.sizes["period"], int(part.attrs.get("lyapunov_n_periods", 0))
     axis = np.arange(1, n + 1) * (length / n if length else 1.0)
     text = periods_of(model) if length else "blocks"
     data = data.assign_coords(period=("period", axis, {"long_name": text}))
     for name in ("running", "in_block", "exponent_value", "exponent_stderr"):
-        data[name].attrs.update(
-            units="1/s" if per == "s" else "1", per="unit time" if per == "s" else period_of(model)
-        )
+        data[name].attrs.update(units="1/s" if per == "s" else "1", per="unit time" if per == "s" else period_of(model))
     return data.drop_vars([c for c in data.coords if c != "period"]).assign_attrs(
         title="convergence of a Lyapunov exponent", place=place, exponent=exponent
     )
@@ -152,9 +152,7 @@ def _draw_running(ax: Axes, final: Axes, data: xr.Dataset) -> list[Any]:
         name = kind.name.lower()
         mean, stderr, _ = (float(v) for v in pooled_mean(value[own], error[own], np.ones(own.size, bool)))
         for axes in (ax, final):
-            axes.axhspan(
-                mean - stderr, mean + stderr, color=colour, alpha=0.25, linewidth=0, gid=f"band:{name}"
-            )
+            axes.axhspan(mean - stderr, mean + stderr, color=colour, alpha=0.25, linewidth=0, gid=f"band:{name}")
         _draw_cells(ax, data, "running", kind, colour)
         _draw_final(final, data, own, rank, colour)
         label = f"{name}: {own.size} cell{'s' * (own.size != 1)}"
@@ -162,9 +160,15 @@ def _draw_running(ax: Axes, final: Axes, data: xr.Dataset) -> list[Any]:
     final.set_xlim(-1.0, value.size)
     final.set_xticks([])
     final.text(
-        0.5, 0.02, "cells", transform=final.transAxes, ha="center", va="bottom",
-        fontsize=style.look_of(final).legend, bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.5},
-    )  # fmt: skip
+        0.5,
+        0.02,
+        "cells",
+        transform=final.transAxes,
+        ha="center",
+        va="bottom",
+        fontsize=style.look_of(final).legend,
+        bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.5},
+    )
     final.tick_params(labelleft=False)
     ax.tick_params(labelbottom=False)
     return handles
@@ -177,12 +181,30 @@ def _draw_final(final: Axes, data: xr.Dataset, own: np.ndarray, rank: np.ndarray
     many = data.sizes["cell"] > 4 * MOST_LINES
     for which, face in ((own[~flagged], colour), (own[flagged], "none")):
         if many:
-            final.plot(rank[which], value[which], linestyle="none", marker="o", markersize=1.4, color=colour,
-                       markerfacecolor=face, markeredgewidth=0.4, rasterized=True)  # fmt: skip
+            final.plot(
+                rank[which],
+                value[which],
+                linestyle="none",
+                marker="o",
+                markersize=1.4,
+                color=colour,
+                markerfacecolor=face,
+                markeredgewidth=0.4,
+                rasterized=True,
+            )
         else:
-            final.errorbar(rank[which], value[which], error[which], linestyle="none", marker="o",
-                           markersize=2.5, color=colour, markerfacecolor=face, markeredgewidth=0.6,
-                           elinewidth=0.7)  # fmt: skip
+            final.errorbar(
+                rank[which],
+                value[which],
+                error[which],
+                linestyle="none",
+                marker="o",
+                markersize=2.5,
+                color=colour,
+                markerfacecolor=face,
+                markeredgewidth=0.6,
+                elinewidth=0.7,
+            )
 
 
 def _draw_cells(ax: Axes, data: xr.Dataset, variable: str, kind: Motion, colour: str) -> None:
@@ -210,7 +232,5 @@ def draw(run: Run, options: ConvergenceOptions) -> style.DataFigure:
     """Draw the figure ``convergence`` of a run."""
     cube = run.cube()
     at, notes = values_of(run, options)
-    figure = plot_convergence(
-        cube, exponent=options.exponent, per=options.per, at=at, frame=frame_of(options)
-    )
+    figure = plot_convergence(cube, exponent=options.exponent, per=options.per, at=at, frame=frame_of(options))
     return noted(figure, notes)

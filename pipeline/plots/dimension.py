@@ -49,18 +49,28 @@ def plot_dimension(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.
         style.style_axes(ax, minor=False)
     radius = data["radius"].values
     top.loglog(
-        radius, data["correlation_sum"].values, linestyle="none", marker="o", markersize=3, color="black",
+        radius,
+        data["correlation_sum"].values,
+        linestyle="none",
+        marker="o",
+        markersize=3,
+        color="black",
         gid="correlation_sum",
-    )  # fmt: skip
+    )
     bottom.semilogx(
-        radius, data["local_slope"].values, "o-", markersize=3, linewidth=0.7, color="black",
-        gid="local_slope",
-    )  # fmt: skip
+        radius, data["local_slope"].values, "o-", markersize=3, linewidth=0.7, color="black", gid="local_slope"
+    )
     _draw_fit(top, bottom, data)
     value, error = (float(data[f"correlation_dimension{end}"]) for end in ("", "_stderr"))
     text = f"$D_2$ = {value:.2f} ± {error:.2f}" if np.isfinite(value) else "no range to fit"
-    top.text(0.03, 0.94, f"{text}\n{int(data['n_points'])} points", transform=top.transAxes, va="top",
-             fontsize=fig.look.label)  # fmt: skip
+    top.text(
+        0.03,
+        0.94,
+        f"{text}\n{int(data['n_points'])} points",
+        transform=top.transAxes,
+        va="top",
+        fontsize=fig.look.label,
+    )
     style.caption(top, data.attrs["place"])
     top.tick_params(labelbottom=False)
     style.label_axes(top, y="correlation sum C(r)")
@@ -80,9 +90,7 @@ def _of_one_attractor(ds: xr.Dataset) -> xr.Dataset:
     others = [d for d in ds["n_points"].dims if d != "attractor"]
     cells = ds["n_cells"].where(ds["n_points"] > 0, 0).sum(others)
     if not int(cells.max() if cells.size else 0):
-        raise ValueError(
-            "there is no correlation sum to draw: no attractor at this point is without a period"
-        )
+        raise ValueError("there is no correlation sum to draw: no attractor at this point is without a period")
     return ds.isel(attractor=int(cells.values.argmax()))
 
 
@@ -90,9 +98,7 @@ def _scales(ds: xr.Dataset) -> str:
     """Return the unit lengths as text, for example ``1 for 1 rad, 10 rad/s``."""
     model = model_of(ds)
     units = {s.unit: s.scale for s in model.states}
-    return "1 for " + ", ".join(
-        f"{scale:g}" + (f" {unit}" if unit != "1" else "") for unit, scale in units.items()
-    )
+    return "1 for " + ", ".join(f"{scale:g}" + (f" {unit}" if unit != "1" else "") for unit, scale in units.items())
 
 
 def _draw_fit(top: Axes, bottom: Axes, data: xr.Dataset) -> None:
@@ -102,8 +108,14 @@ def _draw_fit(top: Axes, bottom: Axes, data: xr.Dataset) -> None:
         return
     value, error = (float(data[f"correlation_dimension{end}"]) for end in ("", "_stderr"))
     radius, share = data["radius"].values, data["correlation_sum"].values
-    bottom.text(np.sqrt(fit[0] * fit[1]), 0.06, "fit", transform=bottom.get_xaxis_transform(), ha="center",
-                fontsize=style.look_of(bottom).legend)  # fmt: skip
+    bottom.text(
+        np.sqrt(fit[0] * fit[1]),
+        0.06,
+        "fit",
+        transform=bottom.get_xaxis_transform(),
+        ha="center",
+        fontsize=style.look_of(bottom).legend,
+    )
     inside = (radius >= fit[0] * (1 - 1e-9)) & (radius <= fit[1] * (1 + 1e-9)) & (share > 0)
     height = np.exp(np.log(share[inside]).mean() + value * (np.log(radius) - np.log(radius[inside]).mean()))
     near = (radius > fit[0] / 3) & (radius < fit[1] * 3)

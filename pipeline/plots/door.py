@@ -87,9 +87,13 @@ def run_provenance(run: Run) -> dict[str, Any]:
     """Return the provenance of a run's numbers."""
     info, attrs = run.info, run.cube().attrs
     found: dict[str, Any] = {
-        "source": str(attrs.get("source", "magpend")), "run": info.title, "digest": info.digest,
-        "cube_digest": run.digest, "versions": info.versions, **getattr(info, "provenance", {}),
-    }  # fmt: skip
+        "source": str(attrs.get("source", "magpend")),
+        "run": info.title,
+        "digest": info.digest,
+        "cube_digest": run.digest,
+        "versions": info.versions,
+        **getattr(info, "provenance", {}),
+    }
     return found | {key: str(value) for key, value in told_by(attrs).items()}
 
 

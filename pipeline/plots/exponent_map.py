@@ -23,11 +23,7 @@ _SHOWN = 0.98
 
 
 def plot_lyapunov_map(
-    ds: xr.Dataset,
-    *,
-    per: str = "s",
-    at: Mapping[str, float] | None = None,
-    frame: style.Frame = style.WIDE,
+    ds: xr.Dataset, *, per: str = "s", at: Mapping[str, float] | None = None, frame: style.Frame = style.WIDE
 ) -> style.DataFigure:
     """Draw the largest exponent over two parameters.
 
@@ -95,9 +91,7 @@ def _draw_map(fig: style.DataFigure, ax: Axes, data: xr.Dataset, part: xr.Datase
     style.label_axes(ax, *(labels.parameter_label(part[d]) for d in swept))
     if not np.isfinite(grid).all():
         style.legend_above(fig, [Patch(facecolor=_NO_EXPONENT, label="no cell has an exponent")])
-    bar = fig.colorbar(
-        ScalarMappable(norm, "PuOr_r"), ax=ax, extend=extend, pad=0.015, aspect=32, ticks=MaxNLocator(7)
-    )
+    bar = fig.colorbar(ScalarMappable(norm, "PuOr_r"), ax=ax, extend=extend, pad=0.015, aspect=32, ticks=MaxNLocator(7))
     text = f"largest exponent [{rate_unit(data)}]\nmaximum over the cells of each point"
     style.style_bar(fig, bar, text)
 
@@ -112,5 +106,8 @@ def _scale(grid: np.ndarray) -> tuple[Normalize, str]:
         half = most or 1.0
     ends = (bool((known < -half).any()), bool((known > half).any()))
     return Normalize(-half, half), {
-        (False, False): "neither", (True, False): "min", (False, True): "max", (True, True): "both"
-    }[ends]  # fmt: skip
+        (False, False): "neither",
+        (True, False): "min",
+        (False, True): "max",
+        (True, True): "both",
+    }[ends]

@@ -50,8 +50,7 @@ def save_figure(fig: Figure, path: str | Path) -> Path:
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         raise ValueError(
-            f"cannot write a figure as {str(path)!r}: "
-            f"the suffix {path.suffix!r} is not one of {', '.join(SUFFIXES)}"
+            f"cannot write a figure as {str(path)!r}: the suffix {path.suffix!r} is not one of {', '.join(SUFFIXES)}"
         )
     buffer = io.BytesIO()
     options: dict[str, Any] = {

@@ -30,15 +30,11 @@ def film_problems(path: Path, fps: float) -> list[str]:
     if path.is_dir():
         problems.append(f"{path}: is a folder; name a file in it.")
     if suffix == ".gif" and fps > MOST_GIF_FPS:
-        problems.append(
-            f"--fps {fps:g}: a GIF has at most {MOST_GIF_FPS:g} frames a second; lower it, or write .webp."
-        )
+        problems.append(f"--fps {fps:g}: a GIF has at most {MOST_GIF_FPS:g} frames a second; lower it, or write .webp.")
     if suffix == ".webp" and not features.check("webp"):
         problems.append(f"{path}: this Pillow was built without WebP; write .gif, or install another Pillow.")
     if suffix == ".mp4" and shutil.which("ffmpeg") is None:
-        problems.append(
-            f"{path}: MP4 takes the program ffmpeg, and there is none; install it, or write .gif."
-        )
+        problems.append(f"{path}: MP4 takes the program ffmpeg, and there is none; install it, or write .gif.")
     return problems
 
 
@@ -96,14 +92,18 @@ def durations(n: int, fps: float, grain_ms: int) -> list[int]:
 
 def _gif(film: Animation, path: Path) -> None:
     palette = _palette(film)
-    images = (
-        Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in film.frames()
-    )
+    images = (Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in film.frames())
     first = next(images)
     first.save(
-        path, save_all=True, append_images=images, loop=0, duration=durations(film.n_frames, film.fps, 10),
-        optimize=False, disposal=1, comment=_about(film).encode("utf-8")[:250],
-    )  # fmt: skip
+        path,
+        save_all=True,
+        append_images=images,
+        loop=0,
+        duration=durations(film.n_frames, film.fps, 10),
+        optimize=False,
+        disposal=1,
+        comment=_about(film).encode("utf-8")[:250],
+    )
 
 
 def _palette(film: Animation) -> Image.Image:
@@ -132,9 +132,15 @@ def _webp(film: Animation, path: Path) -> None:
     images = (Image.fromarray(frame) for frame in film.frames())
     first = next(images)
     first.save(
-        path, save_all=True, append_images=images, loop=0, duration=durations(film.n_frames, film.fps, 1),
-        quality=75, method=4, xmp=_about(film).encode("utf-8"),
-    )  # fmt: skip
+        path,
+        save_all=True,
+        append_images=images,
+        loop=0,
+        duration=durations(film.n_frames, film.fps, 1),
+        quality=75,
+        method=4,
+        xmp=_about(film).encode("utf-8"),
+    )
 
 
 def _mp4(film: Animation, path: Path) -> None:
@@ -142,11 +148,33 @@ def _mp4(film: Animation, path: Path) -> None:
     first = next(frames)
     height, width = first.shape[:2]
     command = [
-        "ffmpeg", "-y", "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24", "-s",
-        f"{width}x{height}", "-r", f"{film.fps:.10g}", "-i", "-", "-an", "-c:v", "libx264",
-        "-pix_fmt", "yuv420p", "-crf", "20",
-        "-movflags", "+faststart", "-metadata", f"comment={_about(film)}", str(path),
-    ]  # fmt: skip
+        "ffmpeg",
+        "-y",
+        "-loglevel",
+        "error",
+        "-f",
+        "rawvideo",
+        "-pix_fmt",
+        "rgb24",
+        "-s",
+        f"{width}x{height}",
+        "-r",
+        f"{film.fps:.10g}",
+        "-i",
+        "-",
+        "-an",
+        "-c:v",
+        "libx264",
+        "-pix_fmt",
+        "yuv420p",
+        "-crf",
+        "20",
+        "-movflags",
+        "+faststart",
+        "-metadata",
+        f"comment={_about(film)}",
+        str(path),
+    ]
     process: Any = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE)
     try:
         process.stdin.write(first.tobytes())

@@ -118,17 +118,9 @@ def _fractions(part: xr.Dataset, parameter: str, cast: palette.Cast) -> xr.Datas
                 variable: ((parameter, "outcome"), values, {"units": "1", "long_name": text})
                 for variable, (values, text) in shares.items()
             },
-            "n_cells": (
-                (parameter,),
-                np.full(n, ids.shape[1], np.int32),
-                {"units": "1", "long_name": "cells"},
-            ),
+            "n_cells": ((parameter,), np.full(n, ids.shape[1], np.int32), {"units": "1", "long_name": "cells"}),
         },
-        coords={
-            parameter: part[parameter],
-            "outcome": labels,
-            "name": ("outcome", names),
-        },
+        coords={parameter: part[parameter], "outcome": labels, "name": ("outcome", names)},
         attrs={"title": f"shares of the {of}" if branches else "basin fractions"},
     )
 
@@ -209,11 +201,7 @@ def _draw_intervals(ax: Axes, data: xr.Dataset, parameter: str, bands: Sequence[
 
 
 def _raster(
-    edges: np.ndarray,
-    codes: np.ndarray,
-    heights: np.ndarray,
-    xlim: tuple[float, float],
-    ylim: tuple[float, float],
+    edges: np.ndarray, codes: np.ndarray, heights: np.ndarray, xlim: tuple[float, float], ylim: tuple[float, float]
 ) -> np.ndarray:
     """Return the band's code at each raster point, 300 x 300 from below; -1 for none."""
     place = (np.arange(300) + 0.5) / 300

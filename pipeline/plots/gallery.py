@@ -142,9 +142,7 @@ class _Layout:
 
 def _described(attractors: xr.Dataset, portraits: xr.Dataset) -> xr.Dataset:
     """Select the attractors at the portraits' parameter point."""
-    at = {
-        d: float(portraits[d]) for d in attractors["kind"].dims if d in portraits.coords and d != "attractor"
-    }
+    at = {d: float(portraits[d]) for d in attractors["kind"].dims if d in portraits.coords and d != "attractor"}
     return attractors.sel(at)
 
 
@@ -157,20 +155,16 @@ def _title(one: xr.Dataset, cast: palette.Cast, layout: _Layout) -> str:
 
 
 def _draw_one(
-    fig: style.DataFigure,
-    layout: _Layout,
-    k: int,
-    one: xr.Dataset,
-    named: tuple[str, palette.Cast],
-    degrees: bool,
+    fig: style.DataFigure, layout: _Layout, k: int, one: xr.Dataset, named: tuple[str, palette.Cast], degrees: bool
 ) -> set[str]:
     model, number = model_of(one), int(one["attractor"])
     title, cast = named
     motion = Motion(
         {name: one["orbit"].sel(state=name).values for name in model.state_names},
         {name: one["attractor_points"].sel(state=name).values for name in model.state_names},
-        palette.GREY_OF.get(int(one["stability"]), cast.colours[number]), letter(number),
-    )  # fmt: skip
+        palette.GREY_OF.get(int(one["stability"]), cast.colours[number]),
+        letter(number),
+    )
     axes = [layout.axes(fig, k, column) for column in range(layout.each)]
     axes[0].text(0.0, 1.04, title, transform=axes[0].transAxes, fontsize=fig.look.legend, va="bottom")
     for ax, pair in zip(axes, model.portraits, strict=False):
@@ -207,11 +201,18 @@ def _write_head(fig: style.DataFigure, text: str, data: xr.Dataset, shown: set[s
     fig.text(0.08 / width, 1.0 - 0.06 / height, text, fontsize=size, va="top", linespacing=1.1)
     handles: list[Any] = [style.dot(once(model_of(data)), "black", 3.0), *_fixed_handles(data, shown)]
     fig.legend(
-        handles=handles, loc="upper left", frameon=False,
+        handles=handles,
+        loc="upper left",
+        frameon=False,
         bbox_to_anchor=(0.04 / width, 1.0 - (0.06 + _LINE_IN * (text.count("\n") + 1)) / height),
-        ncols=len(handles), fontsize=size, borderpad=0.0, borderaxespad=0.0, handletextpad=0.2,
-        columnspacing=1.0, handlelength=1.2,
-    )  # fmt: skip
+        ncols=len(handles),
+        fontsize=size,
+        borderpad=0.0,
+        borderaxespad=0.0,
+        handletextpad=0.2,
+        columnspacing=1.0,
+        handlelength=1.2,
+    )
 
 
 def _fixed_handles(data: xr.Dataset, shown: set[str]) -> list[Any]:

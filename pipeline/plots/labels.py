@@ -124,9 +124,12 @@ def start_measure(ds: xr.Dataset, dim: str, degrees: bool = False) -> Measure:
     model = model_of(ds)
     one = model.state(dim.removesuffix("_0"))
     return _measure(
-        dim, f"{one.symbol}(0)" if one.symbol else f"{one.name}(0)", one.unit,
-        degrees and one.unit.startswith("rad"), one.on_circle,
-    )  # fmt: skip
+        dim,
+        f"{one.symbol}(0)" if one.symbol else f"{one.name}(0)",
+        one.unit,
+        degrees and one.unit.startswith("rad"),
+        one.on_circle,
+    )
 
 
 def some_angle(model: Model, degrees: bool, what: str) -> None:

@@ -79,9 +79,7 @@ def plot_lyapunov(
     lost = _lost(diagram, data)
     with_strip = any(counts.any() for counts in lost.absent.values())
     fig = style.new_figure(5.6, data, frame)
-    grid = fig.add_gridspec(
-        3 if with_strip else 2, 1, height_ratios=[1.25, 1.0, 0.08][: 3 if with_strip else 2]
-    )
+    grid = fig.add_gridspec(3 if with_strip else 2, 1, height_ratios=[1.25, 1.0, 0.08][: 3 if with_strip else 2])
     top = fig.add_subplot(grid[0])
     diagram.dress(top)
     bottom = lowest = fig.add_subplot(grid[1], sharex=top)
@@ -166,9 +164,7 @@ def rate_unit(data: xr.Dataset) -> str:
     return "1/s" if per == "unit time" else f"1/{per.split()[-1]}"
 
 
-def _draw_exponents(
-    ax: Axes, data: xr.Dataset, parameter: str, spectrum: bool, colours: tuple[str, ...]
-) -> list[Any]:
+def _draw_exponents(ax: Axes, data: xr.Dataset, parameter: str, spectrum: bool, colours: tuple[str, ...]) -> list[Any]:
     style.style_axes(ax)
     x = data[parameter].values.astype(np.float64)
     order = (parameter, "cell", "exponent")
@@ -215,10 +211,17 @@ def _draw_class(
         row, column = np.nonzero(chosen)
         if row.size:
             (line,) = ax.plot(
-                x[row], value[row, column], linestyle="none", marker="o", markersize=size,
-                markerfacecolor=face, markeredgecolor=colour, markeredgewidth=0.4 if face == "none" else 0.0,
-                rasterized=True, zorder=2.0,
-            )  # fmt: skip
+                x[row],
+                value[row, column],
+                linestyle="none",
+                marker="o",
+                markersize=size,
+                markerfacecolor=face,
+                markeredgecolor=colour,
+                markeredgewidth=0.4 if face == "none" else 0.0,
+                rasterized=True,
+                zorder=2.0,
+            )
             line.set_gid(gid if face != "none" else f"flagged:{gid}")
 
 
@@ -242,7 +245,12 @@ def draw(run: Run, options: LyapunovFigureOptions) -> style.DataFigure:
     if options.as_map:
         return noted(plot_lyapunov_map(cube, per=options.per, at=at, frame=frame_of(options)), notes)
     figure = plot_lyapunov(
-        cube, spectrum=options.spectrum, per=options.per, state=options.state, degrees=options.degrees, at=at,
+        cube,
+        spectrum=options.spectrum,
+        per=options.per,
+        state=options.state,
+        degrees=options.degrees,
+        at=at,
         frame=frame_of(options),
-    )  # fmt: skip
+    )
     return noted(figure, notes)

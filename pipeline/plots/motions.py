@@ -11,16 +11,7 @@ from pipeline.analysis.sides import classify
 from pipeline.layout.vocabulary import model_of
 from pipeline.plots import style
 
-COLOURS = (
-    style.BLUE,
-    style.VERMILLION,
-    style.GREEN,
-    style.PURPLE,
-    style.ORANGE,
-    style.SKY,
-    "#5B3A1E",
-    "#332288",
-)
+COLOURS = (style.BLUE, style.VERMILLION, style.GREEN, style.PURPLE, style.ORANGE, style.SKY, "#5B3A1E", "#332288")
 """Of the words of a classifier, in their order; a ninth begins again."""
 
 PLAIN = "#1A3A5C"

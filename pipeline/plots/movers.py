@@ -96,9 +96,7 @@ class Point:
         return segments, np.asarray(steps.max(axis=1, initial=0.0) < self.jumps)
 
 
-def _point(
-    ax: Axes, path: Floats, colour: str, trail: Trail, *, jumps: float, size: float, thick: float
-) -> Point:
+def _point(ax: Axes, path: Floats, colour: str, trail: Trail, *, jumps: float, size: float, thick: float) -> Point:
     """Make the artists of a moving point."""
     colours = np.empty((max(trail.length, 1), 4))
     colours[:, :3], colours[:, 3] = to_rgb(colour), np.linspace(0.0, 1.0, len(colours)) ** 1.5
@@ -108,9 +106,17 @@ def _point(
     if not trail.closed:
         (way,) = ax.plot([], [], color=colour, linewidth=0.6, alpha=0.55, animated=True)
     (dot,) = ax.plot(
-        [], [], linestyle="none", marker="o", markersize=size, color=colour, markeredgecolor="white",
-        markeredgewidth=0.8, animated=True, zorder=5,
-    )  # fmt: skip
+        [],
+        [],
+        linestyle="none",
+        marker="o",
+        markersize=size,
+        color=colour,
+        markeredgecolor="white",
+        markeredgewidth=0.8,
+        animated=True,
+        zorder=5,
+    )
     return Point(path, jumps, trail, comet, colours, way, dot)
 
 
@@ -213,22 +219,27 @@ def moving_machine(ax: Axes, scene: Scene, one: xr.Dataset, trail: Trail, *, nam
     everywhere = {**moved, **{name: np.tile(p, (n, 1)) for name, p in still.items()}}
     path = moved[drawing.trace]
     if trail.closed:
-        ax.plot(
-            *path[: trail.closed + 1].T, color=colour, linewidth=0.9, alpha=0.4, gid=f"path:{drawing.trace}"
-        )
+        ax.plot(*path[: trail.closed + 1].T, color=colour, linewidth=0.9, alpha=0.4, gid=f"path:{drawing.trace}")
     _fix(ax, still, scene, named)
     if named:
         _scale_bar(ax, width, drawing.unit)
     corners = tuple(np.stack([everywhere[name] for name in names], axis=1) for names in drawing.lines)
     lines = tuple(
-        ax.plot([], [], color="0.25", linewidth=4.0, solid_capstyle="round", solid_joinstyle="round",
-                animated=True)[0] for _ in drawing.lines
-    )  # fmt: skip
+        ax.plot([], [], color="0.25", linewidth=4.0, solid_capstyle="round", solid_joinstyle="round", animated=True)[0]
+        for _ in drawing.lines
+    )
     places = np.stack([p for name, p in moved.items() if name != drawing.trace] or [path], axis=1)
     (joints,) = ax.plot(
-        [], [], linestyle="none", marker="o", markersize=5.5, color="white", markeredgecolor="0.25",
-        markeredgewidth=1.4, animated=True,
-    )  # fmt: skip
+        [],
+        [],
+        linestyle="none",
+        marker="o",
+        markersize=5.5,
+        color="white",
+        markeredgecolor="0.25",
+        markeredgewidth=1.4,
+        animated=True,
+    )
     traced = _point(ax, path, colour, trail, jumps=math.inf, size=9.0, thick=2.2)
     return Machine(lines, corners, joints, places, traced)
 
@@ -239,15 +250,25 @@ def _fix(ax: Axes, still: dict[str, Floats], scene: Scene, named: bool) -> None:
     for name, place in still.items():
         held = name in ends
         ax.plot(
-            *place[:, None], linestyle="none", marker="^" if held else "s", markersize=8.0 if held else 6.0,
-            color="0.6" if held else "0.15", markeredgewidth=0.0, zorder=1.5, gid=f"fixed:{name}",
-        )  # fmt: skip
+            *place[:, None],
+            linestyle="none",
+            marker="^" if held else "s",
+            markersize=8.0 if held else 6.0,
+            color="0.6" if held else "0.15",
+            markeredgewidth=0.0,
+            zorder=1.5,
+            gid=f"fixed:{name}",
+        )
         if not named:
             continue
         ax.annotate(
-            name, (place[0], place[1]), (9.0, 4.0 if held else -6.0), textcoords="offset points",
-            fontsize=style.look_of(ax).tick - 1.0, color="0.35",
-        )  # fmt: skip
+            name,
+            (place[0], place[1]),
+            (9.0, 4.0 if held else -6.0),
+            textcoords="offset points",
+            fontsize=style.look_of(ax).tick - 1.0,
+            color="0.35",
+        )
 
 
 def _scale_bar(ax: Axes, width: float, unit: str) -> None:
@@ -256,8 +277,15 @@ def _scale_bar(ax: Axes, width: float, unit: str) -> None:
     length = max(f * power for f in (1.0, 2.0, 5.0) if f * power <= 0.25 * width)
     share = length / width
     ax.plot([0.03, 0.03 + share], [0.035] * 2, color="0.35", linewidth=1.4, transform=ax.transAxes)
-    ax.text(0.03, 0.05, f"{length:g} {unit}", transform=ax.transAxes, color="0.35",
-            fontsize=style.look_of(ax).tick - 1.0, va="bottom")  # fmt: skip
+    ax.text(
+        0.03,
+        0.05,
+        f"{length:g} {unit}",
+        transform=ax.transAxes,
+        color="0.35",
+        fontsize=style.look_of(ax).tick - 1.0,
+        va="bottom",
+    )
 
 
 @dataclass(frozen=True)

@@ -20,16 +20,12 @@ MOST = 2.0
 """Multipliers beyond this modulus are left out."""
 
 _COLOURS = {
-    "fold": style.BLUE, "period_doubling": style.VERMILLION, "neimark_sacker": style.GREEN,
+    "fold": style.BLUE,
+    "period_doubling": style.VERMILLION,
+    "neimark_sacker": style.GREEN,
     "branch_point": style.PURPLE,
-}  # fmt: skip
-_DASHES: tuple[Any, ...] = (
-    "-",
-    (0, (6, 2)),
-    (0, (1, 1.2)),
-    (0, (5, 1.5, 1, 1.5)),
-    (0, (8, 1.5, 1, 1.5, 1, 1.5)),
-)
+}
+_DASHES: tuple[Any, ...] = ("-", (0, (6, 2)), (0, (1, 1.2)), (0, (5, 1.5, 1, 1.5)), (0, (8, 1.5, 1, 1.5, 1, 1.5)))
 
 
 def plot_multipliers(ds: xr.Dataset, branch: int = 0, *, frame: style.Frame = style.WIDE) -> style.DataFigure:
@@ -56,9 +52,7 @@ def plot_multipliers(ds: xr.Dataset, branch: int = 0, *, frame: style.Frame = st
         If there is no such branch.
     """
     if not 0 <= branch < ds.sizes["branch"]:
-        raise ValueError(
-            f"branch = {branch} is out of bounds: there are branches 0 to {ds.sizes['branch'] - 1}."
-        )
+        raise ValueError(f"branch = {branch} is out of bounds: there are branches 0 to {ds.sizes['branch'] - 1}.")
     n = int(ds["n_points"][branch])
     z = (ds["multiplier_real"] + 1j * ds["multiplier_imag"]).values[branch, :n]
     x = np.repeat(ds["parameter"].values[branch, :n, None], z.shape[1], axis=1)
@@ -67,9 +61,7 @@ def plot_multipliers(ds: xr.Dataset, branch: int = 0, *, frame: style.Frame = st
     style.style_axes(ax)
     ax.add_patch(Circle((0.0, 0.0), 1.0, fill=False, edgecolor="0.5", linewidth=0.8))
     shown = np.abs(z) <= MOST
-    points = ax.scatter(
-        z.real[shown], z.imag[shown], c=x[shown], s=6.0, cmap="cividis", linewidths=0.0, zorder=3
-    )
+    points = ax.scatter(z.real[shown], z.imag[shown], c=x[shown], s=6.0, cmap="cividis", linewidths=0.0, zorder=3)
     here = np.flatnonzero(ds["of_branch"].values == branch)
     handles = _crossings(ax, ds, here)
     for axis in (ax.axhline, ax.axvline):
@@ -87,8 +79,14 @@ def plot_multipliers(ds: xr.Dataset, branch: int = 0, *, frame: style.Frame = st
     if frame.compact:
         style.legend_below(fig, handles)
     elif handles:
-        fig.legend(handles=handles, loc="outside right upper", frameon=False, fontsize=fig.look.tick,
-                   handletextpad=0.2, borderpad=0.2)  # fmt: skip
+        fig.legend(
+            handles=handles,
+            loc="outside right upper",
+            frameon=False,
+            fontsize=fig.look.tick,
+            handletextpad=0.2,
+            borderpad=0.2,
+        )
     style.finish(fig)
     return fig
 
@@ -101,18 +99,19 @@ def _multipliers(ds: xr.Dataset, branch: int, z: np.ndarray, x: np.ndarray) -> x
             "imaginary": (("point", "multiplier"), z.imag.copy(), {"units": "1"}),
             "parameter": ("point", x, {"units": units, "long_name": str(ds.attrs["parameter"])}),
         },
-        attrs={
-            "title": "Floquet multipliers", "branch": branch, "orbit_period": int(ds["orbit_period"][branch])
-        },
-    )  # fmt: skip
+        attrs={"title": "Floquet multipliers", "branch": branch, "orbit_period": int(ds["orbit_period"][branch])},
+    )
 
 
 def _crossings(ax: Axes, ds: xr.Dataset, here: np.ndarray) -> list[Line2D]:
     """Mark the critical multipliers; return handles that list the bifurcations, tori with their angle."""
     critical = (ds["critical_real"] + 1j * ds["critical_imag"]).values[here]
     look: dict[str, Any] = {
-        "markerfacecolor": "none", "markeredgecolor": style.VERMILLION, "linestyle": "none", "zorder": 4
-    }  # fmt: skip
+        "markerfacecolor": "none",
+        "markeredgecolor": style.VERMILLION,
+        "linestyle": "none",
+        "zorder": 4,
+    }
     handles = []
     for i in np.argsort(ds["value"].values[here], kind="stable"):
         kind, mu = KINDS[int(ds["kind"][here[i]])], critical[i]
@@ -149,10 +148,13 @@ def plot_curves(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.Dat
     for i in range(ds.sizes["curve"]):
         n, period, kind = int(ds["n_points"][i]), int(ds["orbit_period"][i]), KINDS[int(ds["kind"][i])]
         (line,) = ax.plot(
-            ds["first"].values[i, :n], ds["second"].values[i, :n], color=_COLOURS[kind],
-            linestyle=_DASHES[periods.index(period) % len(_DASHES)], linewidth=1.2,
+            ds["first"].values[i, :n],
+            ds["second"].values[i, :n],
+            color=_COLOURS[kind],
+            linestyle=_DASHES[periods.index(period) % len(_DASHES)],
+            linewidth=1.2,
             label=f"{NAMES[kind]}, period {period}",
-        )  # fmt: skip
+        )
         seen.setdefault((period, kind), line)
     style.label_axes(
         ax,

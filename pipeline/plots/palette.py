@@ -41,25 +41,43 @@ from pipeline.layout.words import period_of
 from pipeline.plots import style
 
 COLOURS = (
-    style.BLUE, style.VERMILLION, style.GREEN, style.ORANGE, "#56B4E9", style.PURPLE,
-    "#5B3A1E", "#F0E442", "#332288", "#882255", "#BBDDFF", "#B08D57",
-)  # fmt: skip
+    style.BLUE,
+    style.VERMILLION,
+    style.GREEN,
+    style.ORANGE,
+    "#56B4E9",
+    style.PURPLE,
+    "#5B3A1E",
+    "#F0E442",
+    "#332288",
+    "#882255",
+    "#BBDDFF",
+    "#B08D57",
+)
 OTHERS = "#C8E6C0"
 
 GREYS = {
-    "not settled": "0.7", "on a transient set": "0.82", "on an unstable orbit or equilibrium": "#6b5d4f",
-    "on a neutral set": "#acbfd2", "diverged": "0.0", "failed": "0.45", "no return": "0.17",
-    "chatter": "#320836", "pending": "0.95",
-}  # fmt: skip
+    "not settled": "0.7",
+    "on a transient set": "0.82",
+    "on an unstable orbit or equilibrium": "#6b5d4f",
+    "on a neutral set": "#acbfd2",
+    "diverged": "0.0",
+    "failed": "0.45",
+    "no return": "0.17",
+    "chatter": "#320836",
+    "pending": "0.95",
+}
 """Cells that do not end on an attractor, with their greys; see `pipeline.analysis.outcomes`.
 
 Two are tinted: between twelve colours there are not eight greys that can be told apart.
 """
 
 SETS = {
-    "not settled": NOT_SETTLED, "on a transient set": TRANSIENT,
-    "on an unstable orbit or equilibrium": UNSTABLE, "on a neutral set": NEUTRAL,
-}  # fmt: skip
+    "not settled": NOT_SETTLED,
+    "on a transient set": TRANSIENT,
+    "on an unstable orbit or equilibrium": UNSTABLE,
+    "on a neutral set": NEUTRAL,
+}
 """Stability of the sets that such cells are on."""
 
 GREY_OF = {code: GREYS[name] for name, code in SETS.items()}
@@ -241,9 +259,17 @@ def new_panel(
         style.legend_below(fig, handles)
     elif handles:
         fig.legend(
-            handles=handles, loc="outside right upper", frameon=False, fontsize=look.legend, borderpad=0.0,
-            borderaxespad=0.2, handlelength=1.1, handleheight=0.9, handletextpad=0.5, labelspacing=0.42,
-        )  # fmt: skip
+            handles=handles,
+            loc="outside right upper",
+            frameon=False,
+            fontsize=look.legend,
+            borderpad=0.0,
+            borderaxespad=0.2,
+            handlelength=1.1,
+            handleheight=0.9,
+            handletextpad=0.5,
+            labelspacing=0.42,
+        )
     return fig, ax
 
 
@@ -284,7 +310,13 @@ def write_letters(ax: Axes, codes: np.ndarray, attractors: Iterable[int]) -> Non
         row, column = np.unravel_index(int(depth.argmax()), depth.shape)
         if depth[row, column] >= 0.011 * size:
             ax.text(
-                (column + 0.5) / codes.shape[1], (row + 0.5) / codes.shape[0], letter(number),
-                transform=ax.transAxes, ha="center", va="center", fontsize=size, fontfamily=style.FONT,
+                (column + 0.5) / codes.shape[1],
+                (row + 0.5) / codes.shape[0],
+                letter(number),
+                transform=ax.transAxes,
+                ha="center",
+                va="center",
+                fontsize=size,
+                fontfamily=style.FONT,
                 path_effects=[withStroke(linewidth=2.0, foreground="white")],
-            )  # fmt: skip
+            )

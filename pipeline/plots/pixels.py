@@ -107,10 +107,18 @@ def _draw_markers(panel: Panel, points: Points, view: View, diameter: float, x: 
                 continue
             where, height = distinct(points.x[chosen], points.y[chosen], x, y)
             (line,) = panel.ax.plot(
-                where, height, linestyle="none", marker="o", markersize=look.diameter, markeredgewidth=0.0,
-                color=style.tinted(view.motions.colours[code], look.tint), rasterized=True,
-                zorder=2.0 - 0.1 * i, scalex=False, scaley=False,
-            )  # fmt: skip
+                where,
+                height,
+                linestyle="none",
+                marker="o",
+                markersize=look.diameter,
+                markeredgewidth=0.0,
+                color=style.tinted(view.motions.colours[code], look.tint),
+                rasterized=True,
+                zorder=2.0 - 0.1 * i,
+                scalex=False,
+                scaley=False,
+            )
             line.set_gid("points:" + ":".join(n for n in (view.layers[i], view.motions.words[code]) if n))
 
 
@@ -120,8 +128,7 @@ def distinct(x: np.ndarray, y: np.ndarray, xlim: Range, ylim: Range) -> tuple[np
     Many markers on one spot would darken their smoothed rims, and dots would become squares.
     """
     column, row = (
-        np.round((v - low) * (10_000 / (high - low))).astype(np.int64)
-        for v, (low, high) in ((x, xlim), (y, ylim))
+        np.round((v - low) * (10_000 / (high - low))).astype(np.int64) for v, (low, high) in ((x, xlim), (y, ylim))
     )
     _, first = np.unique(column * 20_000 + row, return_index=True)
     return x[first], y[first]
@@ -138,9 +145,7 @@ def _table(x: np.ndarray, y: np.ndarray, motion: np.ndarray, layer: np.ndarray, 
         }
         ds["motion"] = ("point", motion.astype(np.int8), attrs)
     if view.layers != ("",):
-        attrs = {
-            "flag_values": np.arange(len(view.layers), dtype=np.int8), "flag_meanings": " ".join(view.layers)
-        }  # fmt: skip
+        attrs = {"flag_values": np.arange(len(view.layers), dtype=np.int8), "flag_meanings": " ".join(view.layers)}
         ds["direction"] = ("point", layer.astype(np.int8), attrs)
     return ds
 
@@ -188,9 +193,13 @@ def _draw_images(
         for i, look in reversed(looks(diameter, panel.layers).items()):
             paint(picture, spread[i], look, motions.colours, reference)
         image = panel.ax.imshow(
-            (255.0 * picture + 0.5).astype(np.uint8), extent=(*x, *y), origin="lower", aspect="auto",
-            interpolation="antialiased", zorder=1.0,
-        )  # fmt: skip
+            (255.0 * picture + 0.5).astype(np.uint8),
+            extent=(*x, *y),
+            origin="lower",
+            aspect="auto",
+            interpolation="antialiased",
+            zorder=1.0,
+        )
         image.set_gid("points")
 
 
@@ -207,11 +216,7 @@ def _spread(counts: Counts, looks: Mapping[int, Look]) -> dict[int, dict[int, np
 
 
 def paint(
-    picture: np.ndarray,
-    spread: Mapping[int, np.ndarray],
-    look: Look,
-    colours: Sequence[str],
-    reference: float,
+    picture: np.ndarray, spread: Mapping[int, np.ndarray], look: Look, colours: Sequence[str], reference: float
 ) -> None:
     """Paint the points of one layer over the picture, each pixel by the motion with most points.
 
@@ -281,8 +286,7 @@ def _pixel_table(counts: Counts, x: Range, y: Range, view: View) -> xr.Dataset:
     column, row, motion, layer, count = (np.concatenate(p) for p in zip(*parts, strict=True))
     height, width = next(iter(counts.values())).shape if counts else (1, 1)
     ds = _table(
-        x[0] + (column + 0.5) * (x[1] - x[0]) / width, y[0] + (row + 0.5) * (y[1] - y[0]) / height,
-        motion, layer, view,
-    )  # fmt: skip
+        x[0] + (column + 0.5) * (x[1] - x[0]) / width, y[0] + (row + 0.5) * (y[1] - y[0]) / height, motion, layer, view
+    )
     ds["count"] = ("point", count.astype(np.int32), {"units": "1", "long_name": "points on the pixel"})
     return ds

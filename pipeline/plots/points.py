@@ -184,16 +184,18 @@ def survey(view: View, *, along: str = "", xlim: Range | None = None, ylim: Rang
     """
     size = view.ds.sizes[along] if along else 1
     shape = (len(view.layers), size)
-    found = Survey(
-        cells=np.zeros(shape, np.int64), absent={name: np.zeros(shape, np.int64) for name in ABSENT}
-    )
+    found = Survey(cells=np.zeros(shape, np.int64), absent={name: np.zeros(shape, np.int64) for name in ABSENT})
     marked = view
     if along:
         position = xr.DataArray(np.arange(size), dims=along)
         marked = View(
-            view.ds.assign_coords(_position=position), view.names, view.coordinates, view.n_points,
-            view.layers, view.motions,
-        )  # fmt: skip
+            view.ds.assign_coords(_position=position),
+            view.names,
+            view.coordinates,
+            view.n_points,
+            view.layers,
+            view.motions,
+        )
     for block in marked.blocks():
         found.add(marked.points(block).inside(xlim, ylim), len(view.motions.words))
         _count_absent(marked, block, found)

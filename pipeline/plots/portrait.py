@@ -39,9 +39,7 @@ class Motion:
     gid: str = ""
 
 
-def draw_portrait(
-    ax: Axes, ds: xr.Dataset, pair: tuple[str, str], motion: Motion, *, degrees: bool = False
-) -> None:
+def draw_portrait(ax: Axes, ds: xr.Dataset, pair: tuple[str, str], motion: Motion, *, degrees: bool = False) -> None:
     """Draw a phase portrait: the motion as a line, its section as dots; on the circle where an angle turns.
 
     Parameters
@@ -76,10 +74,16 @@ def draw_portrait(
     ax.plot(x, y, color=motion.colour, linewidth=0.7, gid=f"orbit:{gid}")
     if dots[0].size:
         ax.plot(
-            *(m.shown(values) for m, values in zip(measures, dots, strict=True)), linestyle="none",
-            marker="o", markersize=2.8, color="black", markeredgecolor="white", markeredgewidth=0.4, zorder=3,
+            *(m.shown(values) for m, values in zip(measures, dots, strict=True)),
+            linestyle="none",
+            marker="o",
+            markersize=2.8,
+            color="black",
+            markeredgecolor="white",
+            markeredgewidth=0.4,
+            zorder=3,
             gid=f"section:{gid}",
-        )  # fmt: skip
+        )
     _dress(ax, measures, turning)
 
 
@@ -128,9 +132,15 @@ def draw_path(ax: Axes, drawing: Drawing, parameters: Mapping[str, float], motio
     shown = _near(fixed, place)
     for name in shown:
         ax.plot(
-            *fixed[name][:, None], linestyle="none", marker=_marker(fixed, name), markersize=4.0, color="0.2",
-            markeredgewidth=0.0, gid=f"fixed:{name}", zorder=2.5,
-        )  # fmt: skip
+            *fixed[name][:, None],
+            linestyle="none",
+            marker=_marker(fixed, name),
+            markersize=4.0,
+            color="0.2",
+            markeredgewidth=0.0,
+            gid=f"fixed:{name}",
+            zorder=2.5,
+        )
     style.few_ticks(ax)
     style.label_axes(ax, f"$x$ [{drawing.unit}]", f"$y$ [{drawing.unit}]")
     return shown

@@ -29,8 +29,12 @@ SHARE_LIMIT = 0.05
 
 _NEITHER = "not periodic"
 _CROSS: dict[str, Any] = {
-    "marker": "x", "markersize": 3.0, "markeredgewidth": 0.6, "color": "black", "linestyle": "none",
-}  # fmt: skip
+    "marker": "x",
+    "markersize": 3.0,
+    "markeredgewidth": 0.6,
+    "color": "black",
+    "linestyle": "none",
+}
 
 
 def plot_regimes(
@@ -95,9 +99,14 @@ def _draw_one(data: xr.Dataset, x: str, y: str, show: str, text: str, frame: sty
     fig, ax = palette.new_panel(data, entries, frame)
     edges = [style.edges(data[d].values.astype(np.float64)) for d in (x, y)]
     ax.pcolormesh(
-        *edges, data["regime"].values, cmap=ListedColormap(colours), vmin=-0.5, vmax=len(colours) - 0.5,
-        rasterized=True, gid="regimes",
-    )  # fmt: skip
+        *edges,
+        data["regime"].values,
+        cmap=ListedColormap(colours),
+        vmin=-0.5,
+        vmax=len(colours) - 0.5,
+        rasterized=True,
+        gid="regimes",
+    )
     _dress(ax, data, x, y, frame)
     style.label_axes(ax, labels.parameter_label(data[x]), labels.parameter_label(data[y]))
     style.caption(ax, text)
@@ -138,9 +147,7 @@ def _draw_multiples(
     met = palette.percent(float(1.0 - total[chosen].sum() / total.sum())) if rest else ""
     more = f"{rest} more, met by {met} of the cells, are not shown" if rest else ""
     note = style.join([text, "depth of colour: share of the cells", more])
-    fig.suptitle(
-        style.folded(note, frame.width_in - 0.3, fig.look.legend), fontsize=fig.look.legend, x=0.01, ha="left"
-    )
+    fig.suptitle(style.folded(note, frame.width_in - 0.3, fig.look.legend), fontsize=fig.look.legend, x=0.01, ha="left")
     style.finish(fig)
     return fig
 
@@ -174,12 +181,11 @@ def _axes(attractors: xr.Dataset, at: Mapping[str, float] | None) -> tuple[str, 
     if len(chosen) != 2:
         left_of = f"{len(chosen)} are left of {', '.join(dims)}" if dims else "this run sweeps none"
         raise ValueError(
-            f"a map of regimes has two swept parameters, and {left_of}; "
-            "sweep two, and choose values of any others"
+            f"a map of regimes has two swept parameters, and {left_of}; sweep two, and choose values of any others"
         )
-    return ("frequency", next(d for d in chosen if d != "frequency")) if "frequency" in chosen else (
-        chosen[0], chosen[1],
-    )  # fmt: skip
+    return (
+        ("frequency", next(d for d in chosen if d != "frequency")) if "frequency" in chosen else (chosen[0], chosen[1])
+    )
 
 
 def _regimes(part: xr.Dataset, x: str, y: str, show: str) -> xr.Dataset:
@@ -206,15 +212,11 @@ def _regimes(part: xr.Dataset, x: str, y: str, show: str) -> xr.Dataset:
         },
         coords={x: part[x], y: part[y], "label": ("label", names)},
         attrs={"title": "regimes", "show": show},
-    )  # fmt: skip
-    return (
-        data if show == "number" else data.merge(_members(present, periods, data["share"].values, x, y, show))
     )
+    return data if show == "number" else data.merge(_members(present, periods, data["share"].values, x, y, show))
 
 
-def _members(
-    present: np.ndarray, periods: np.ndarray, share: np.ndarray, x: str, y: str, show: str
-) -> xr.Dataset:
+def _members(present: np.ndarray, periods: np.ndarray, share: np.ndarray, x: str, y: str, show: str) -> xr.Dataset:
     """Return the share of cells on each attractor, or on all attractors of each period."""
     if show == "attractors":
         kinds = np.broadcast_to(np.arange(present.shape[-1]), present.shape)

@@ -147,9 +147,7 @@ def _range(found: tuple[float, float], measure: labels.Measure) -> tuple[float, 
 
 def _handles(view: View, found: set[int]) -> list[Any]:
     motions = view.motions
-    return [
-        style.dot(motions.words[c], motions.colours[c]) for c in motions.drawn if c in found and motions.told
-    ]
+    return [style.dot(motions.words[c], motions.colours[c]) for c in motions.drawn if c in found and motions.told]
 
 
 def _by_attractor(view: View, part: xr.Dataset, attractors: xr.Dataset) -> View:
@@ -160,9 +158,10 @@ def _by_attractor(view: View, part: xr.Dataset, attractors: xr.Dataset) -> View:
     cast = palette.cast_of(attractors, chosen)
     ids, greys = sorted(cast.names), list(palette.GREYS)
     motions = Motions(
-        (*greys, *(cast.names[i] for i in ids)), (*palette.GREYS.values(), *(cast.colours[i] for i in ids)),
+        (*greys, *(cast.names[i] for i in ids)),
+        (*palette.GREYS.values(), *(cast.colours[i] for i in ids)),
         (*(i + len(greys) for i in ids), *range(len(greys))),
-    )  # fmt: skip
+    )
     codes = outcomes(chosen).transpose(*split_dims(chosen["status"])[1]).astype(np.int32) + len(greys)
     for name, which in palette.other_cells(chosen).items():
         codes = codes.where(~which, greys.index(name))
@@ -177,7 +176,5 @@ def draw(run: Run, options: SectionOptions) -> style.DataFigure:
     found = attractors_of(run, options) if options.colour == "attractor" else None
     model = model_of(cube)
     first, second = options.state, options.against or section_pair(model, options.state)[1]
-    figure = plot_section(
-        cube, found, states=(first, second), at=at, degrees=options.degrees, frame=frame_of(options)
-    )
+    figure = plot_section(cube, found, states=(first, second), at=at, degrees=options.degrees, frame=frame_of(options))
     return noted(figure, notes)

@@ -126,8 +126,10 @@ def new_figure(
     share = 1.0 if exact else min(frame.width / WIDE_MM, 1.0)
     figure = DataFigure(
         figsize=(frame.width_in, height * (share + 0.3 * (1.0 - share))),
-        dpi=DPI, facecolor="white", layout="constrained" if arranged else None,
-    )  # fmt: skip
+        dpi=DPI,
+        facecolor="white",
+        layout="constrained" if arranged else None,
+    )
     figure.data, figure.frame, figure.look, figure.notes = data, frame, _LOOKS[frame.compact], []
     engine: Any = figure.get_layout_engine()
     if arranged:
@@ -179,9 +181,14 @@ def style_axes(ax: Axes, *, inside: bool = True, minor: bool = True) -> None:
     """
     look = look_of(ax)
     ax.tick_params(
-        which="both", direction="in" if inside else "out", top=inside, right=inside, width=LINE_PT,
-        labelsize=look.tick, labelfontfamily=FONT,
-    )  # fmt: skip
+        which="both",
+        direction="in" if inside else "out",
+        top=inside,
+        right=inside,
+        width=LINE_PT,
+        labelsize=look.tick,
+        labelfontfamily=FONT,
+    )
     ax.tick_params(which="major", length=4.0 if look.tick > 8.0 else 3.0)
     ax.tick_params(which="minor", length=2.2 if look.tick > 8.0 else 1.7)
     for spine in ax.spines.values():
@@ -245,10 +252,17 @@ def legend_above(figure: DataFigure, handles: Sequence[Any], *, size: float | No
     size = figure.look.legend if size is None else size
     texts = [str(h.get_label()) for h in handles]
     figure.legend(
-        handles=list(handles), loc="outside upper right", ncols=columns(figure.frame, texts, size),
-        frameon=False, fontsize=size, handletextpad=0.35, columnspacing=1.1, borderpad=0.1, handlelength=1.4,
+        handles=list(handles),
+        loc="outside upper right",
+        ncols=columns(figure.frame, texts, size),
+        frameon=False,
+        fontsize=size,
+        handletextpad=0.35,
+        columnspacing=1.1,
+        borderpad=0.1,
+        handlelength=1.4,
         borderaxespad=0.1,
-    )  # fmt: skip
+    )
 
 
 def complete(figure: DataFigure, ax: Axes, text: str, handles: Sequence[Any] = ()) -> None:
@@ -264,10 +278,17 @@ def legend_below(figure: DataFigure, handles: Sequence[Any]) -> None:
         size = figure.look.legend
         texts = [str(h.get_label()) for h in handles]
         figure.legend(
-            handles=list(handles), loc="outside lower left", ncols=columns(figure.frame, texts, size),
-            frameon=False, fontsize=size, handletextpad=0.4, columnspacing=1.1, borderpad=0.1,
-            handlelength=1.2, borderaxespad=0.1,
-        )  # fmt: skip
+            handles=list(handles),
+            loc="outside lower left",
+            ncols=columns(figure.frame, texts, size),
+            frameon=False,
+            fontsize=size,
+            handletextpad=0.4,
+            columnspacing=1.1,
+            borderpad=0.1,
+            handlelength=1.2,
+            borderaxespad=0.1,
+        )
 
 
 def columns(frame: Frame, texts: Sequence[str], size: float) -> int:
@@ -284,9 +305,16 @@ def columns(frame: Frame, texts: Sequence[str], size: float) -> int:
 def dot(label: str, colour: Any, size: float = 5.0, *, face: Any = None, marker: str = "o") -> Line2D:
     """Return a legend handle for points."""
     return Line2D(
-        [], [], linestyle="none", marker=marker, markersize=size, markeredgewidth=0.6 if face else 0.0,
-        color=colour, markerfacecolor=colour if face is None else face, label=label,
-    )  # fmt: skip
+        [],
+        [],
+        linestyle="none",
+        marker=marker,
+        markersize=size,
+        markeredgewidth=0.6 if face else 0.0,
+        color=colour,
+        markerfacecolor=colour if face is None else face,
+        label=label,
+    )
 
 
 def tinted(colour: str, tint: float) -> tuple[float, float, float]:
@@ -310,9 +338,7 @@ def check_choice(what: str, value: str, allowed: Sequence[str]) -> None:
     raise ValueError(f"unknown {what} {value!r}. {hint}Allowed: {', '.join(allowed)}.")
 
 
-def limits(
-    ax: Axes, frame: Frame, x: tuple[float, float] | None = None, y: tuple[float, float] | None = None
-) -> None:
+def limits(ax: Axes, frame: Frame, x: tuple[float, float] | None = None, y: tuple[float, float] | None = None) -> None:
     """Set axis ranges: from the frame, else the given ones, else unchanged.
 
     Raises

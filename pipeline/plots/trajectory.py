@@ -24,9 +24,7 @@ COLOURS = (style.BLUE, style.VERMILLION, style.GREEN, style.PURPLE, style.ORANGE
 """Of the pairs of states that portraits show; a seventh begins again."""
 
 
-def plot_trajectory(
-    ds: xr.Dataset, *, degrees: bool = False, frame: style.Frame = style.WIDE
-) -> style.DataFigure:
+def plot_trajectory(ds: xr.Dataset, *, degrees: bool = False, frame: style.Frame = style.WIDE) -> style.DataFigure:
     """Draw the time series of a trajectory, a phase portrait of each pair of states, and a path.
 
     Parameters
@@ -127,9 +125,7 @@ def _check(ds: xr.Dataset, model: Model) -> None:
     if missing:
         raise ValueError(f"a trajectory needs {', '.join(needed)}; missing: {', '.join(missing)}")
     if ds.sizes["time"] < 2:
-        raise ValueError(
-            f"a trajectory needs at least two points of time, and this one has {ds.sizes['time']}"
-        )
+        raise ValueError(f"a trajectory needs at least two points of time, and this one has {ds.sizes['time']}")
 
 
 def _values(ds: xr.Dataset, name: str, on_circle: bool) -> np.ndarray:
@@ -194,9 +190,13 @@ def _colours(model: Model) -> dict[str, str]:
 
 
 def _draw_series(
-    axes: Sequence[Axes], ds: xr.Dataset, time: np.ndarray, series: dict[str, np.ndarray],
-    rows: Sequence[tuple[str, ...]], degrees: bool,
-) -> None:  # fmt: skip
+    axes: Sequence[Axes],
+    ds: xr.Dataset,
+    time: np.ndarray,
+    series: dict[str, np.ndarray],
+    rows: Sequence[tuple[str, ...]],
+    degrees: bool,
+) -> None:
     model = model_of(ds)
     colours = _colours(model)
     for ax, names in zip(axes, rows, strict=True):
@@ -212,8 +212,9 @@ def _draw_series(
         turn = degrees and model.state(names[0]).unit.startswith("rad")
         measures = [labels.state_measure(ds, name, turn) for name in names]
         for m in measures:
-            ax.plot(time, m.shown(series[m.name]), color=colours.get(m.name, "0.2"), linewidth=0.8,
-                    gid=f"series:{m.name}")  # fmt: skip
+            ax.plot(
+                time, m.shown(series[m.name]), color=colours.get(m.name, "0.2"), linewidth=0.8, gid=f"series:{m.name}"
+            )
         style.label_axes(ax, y=labels.with_unit(", ".join(m.symbol for m in measures), measures[0].unit))
         labels.angle_ticks(ax, measures[0], most=5.0)
     style.label_axes(axes[-1], x="time [s]")
@@ -231,9 +232,17 @@ def _draw_others(ax: Axes, ds: xr.Dataset, time: np.ndarray, names: Sequence[str
     if len(names) > 1:
         low, high = ax.get_ylim()
         ax.set_ylim(low, high + 0.22 * (high - low))  # room for the legend
-        ax.legend(loc="upper right", ncols=len(names), fontsize=style.look_of(ax).tick - 1.0, borderpad=0.2,
-                  handlelength=1.0, framealpha=0.8, edgecolor="none", columnspacing=0.8,
-                  handletextpad=0.3)  # fmt: skip
+        ax.legend(
+            loc="upper right",
+            ncols=len(names),
+            fontsize=style.look_of(ax).tick - 1.0,
+            borderpad=0.2,
+            handlelength=1.0,
+            framealpha=0.8,
+            edgecolor="none",
+            columnspacing=0.8,
+            handletextpad=0.3,
+        )
 
 
 def _handles(ds: xr.Dataset, model: Model, with_section: bool) -> list[Any]:

@@ -21,10 +21,7 @@ class IdentifyOptions(Options):
     polish: bool = option(True, "Refine orbits by Newton's method, which integrates a point per orbit.")
     residual: float = option(1e-10, "Scaled residual at which Newton's method has converged.", gt=0.0)
     max_orbit_period: int = option(
-        32,
-        "Longest orbit period that is sought in cells that are not closed.",
-        unit="drive periods or returns",
-        ge=1,
+        32, "Longest orbit period that is sought in cells that are not closed.", unit="drive periods or returns", ge=1
     )
     n_points: int = option(64, "Section points stored per attractor.", ge=1)
     mirror_threshold: float = option(0.3, "Largest distance of a mirror partner from the image.", gt=0.0)
@@ -32,9 +29,7 @@ class IdentifyOptions(Options):
         True, "Extend the integration of sample cells that are on no known orbit, to find their sets."
     )
     budget: float = option(
-        1.0,
-        "Longest extension at a parameter point, in units of the run's own integration there.",
-        ge=0.0,
+        1.0, "Longest extension at a parameter point, in units of the run's own integration there.", ge=0.0
     )
     n_sample: int = option(32, "Number of cells in the first sample that is extended.", ge=1)
     lifetime_confidence: float = option(0.95, "Level of the intervals of lifetimes.", gt=0.0, lt=1.0)
@@ -58,8 +53,7 @@ class AttractorOptions(IdentifyOptions):
     threshold: float = option(0.3, "Matching: largest distance between sets with one id.", gt=0.0)
     look_back: int = option(3, "Matching: steps over which an id is remembered.", ge=1)
     connect: bool = option(
-        True,
-        "Matching: follow closed orbits along the axes by integration; otherwise match by distance.",
+        True, "Matching: follow closed orbits along the axes by integration; otherwise match by distance."
     )
 
 

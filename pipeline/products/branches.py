@@ -10,10 +10,7 @@ _ROOM = "pipeline.analysis.branches.product"
 class BranchOptions(Options):
     """Options for following branches of periodic orbits."""
 
-    parameter: str = option(
-        "",
-        "Continuation parameter: a parameter, or frequency_hz; by default the swept one.",
-    )
+    parameter: str = option("", "Continuation parameter: a parameter, or frequency_hz; by default the swept one.")
     low: float | None = option(None, "Least value; by default the run's.", unit="SI", flag="--from")
     high: float | None = option(None, "Largest value; by default the run's.", unit="SI", flag="--to")
     max_period: int = option(

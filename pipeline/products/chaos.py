@@ -16,20 +16,14 @@ class ChaosOptions(AttractorOptions):
     n_frequencies: int = option(100, "0-1 test: number of frequencies.", ge=10)
     stride: int = option(1, "0-1 test: step between the sections that are used.", ge=1)
     seed: int = option(0, "0-1 test: seed of the frequencies.", ge=0)
-    n_max: int = option(
-        2000,
-        "Most section points for the correlation dimension; 0 computes none.",
-        ge=0,
-    )
+    n_max: int = option(2000, "Most section points for the correlation dimension; 0 computes none.", ge=0)
 
 
 class DimensionOptions(AttractorOptions):
     """Options for fitting a correlation dimension."""
 
     at: dict[str, float] = option({}, "Value of a swept parameter; by default all values.")
-    theiler: int = option(
-        1, "Theiler window: pairs of sections at most so far apart in time are left out.", ge=0
-    )
+    theiler: int = option(1, "Theiler window: pairs of sections at most so far apart in time are left out.", ge=0)
     n_max: int = option(10_000, "Most section points of an attractor.", ge=100)
     floor: float = option(1e-6, "Smallest resolved distance, in units of the states' scales.", gt=0.0)
 

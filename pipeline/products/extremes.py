@@ -60,7 +60,14 @@ def _engine(options: ExtremesOptions) -> dict[str, Any]:
 
 
 EXTREMES = CellProduct(
-    "extremes", "Least and largest value and mean of named quantities over each kept drive period.",
-    ExtremesOptions, _variables, _sizes, _cost, "pipeline.compute.extremes:extremes",
-    settle=_settled, coordinates=_names, integrate=_engine,
-)  # fmt: skip
+    "extremes",
+    "Least and largest value and mean of named quantities over each kept drive period.",
+    ExtremesOptions,
+    _variables,
+    _sizes,
+    _cost,
+    "pipeline.compute.extremes:extremes",
+    settle=_settled,
+    coordinates=_names,
+    integrate=_engine,
+)

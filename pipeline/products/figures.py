@@ -35,9 +35,7 @@ class BifurcationOptions(StateOptions):
 class SectionOptions(AttractorOptions, StateOptions):
     """Options of a figure of section points at one parameter point."""
 
-    against: str = option(
-        "", "State on the vertical axis; by default the other state's rate, or the next state."
-    )
+    against: str = option("", "State on the vertical axis; by default the other state's rate, or the next state.")
     colour: Literal["motion", "attractor"] = option(
         "motion", "Colour by class of motion, or by attractor; attractors are computed first."
     )
@@ -67,9 +65,7 @@ class LyapunovFigureOptions(StateOptions):
     """Options of a figure of exponents over a parameter, or as a map."""
 
     spectrum: bool = option(False, "Draw all stored exponents, not only the largest.")
-    as_map: bool = option(
-        False, "Draw a map over two parameters instead of a diagram over one.", flag="--map"
-    )
+    as_map: bool = option(False, "Draw a map over two parameters instead of a diagram over one.", flag="--map")
     per: Per = option("s", "Exponents per second, or per drive period or return.")
 
     def label(self) -> str:
@@ -99,12 +95,8 @@ class _AlongOptions(BranchOptions, FigureOptions):
 class BranchFigureOptions(_AlongOptions, StateOptions):
     """Options of a figure of branches over a diagram."""
 
-    over: str = option(
-        "", "Run whose diagram is drawn below; it must sweep the same parameter. By default DIR."
-    )
-    shown: int | None = option(
-        None, "Longest orbit period that is drawn.", unit="drive periods or returns", ge=1
-    )
+    over: str = option("", "Run whose diagram is drawn below; it must sweep the same parameter. By default DIR.")
+    shown: int | None = option(None, "Longest orbit period that is drawn.", unit="drive periods or returns", ge=1)
 
 
 class MultiplierOptions(_AlongOptions):

@@ -25,9 +25,8 @@ class LyapunovOptions(Options):
         None, "Number of exponents, from the largest on; by default one for each state.", ge=1
     )
     n_transient: int = option(
-        200, "Time in which the tangent vectors align.", unit="drive periods or returns",
-        ge=0, le=1_000_000,
-    )  # fmt: skip
+        200, "Time in which the tangent vectors align.", unit="drive periods or returns", ge=0, le=1_000_000
+    )
     n_periods: int = option(
         400, "Time over which growth is averaged.", unit="drive periods or returns", ge=2, le=100_000_000
     )
@@ -38,8 +37,7 @@ class LyapunovOptions(Options):
         if self.n_periods % self.n_blocks:
             nearest = -(-self.n_periods // self.n_blocks) * self.n_blocks
             raise ValueError(
-                f"n_periods = {self.n_periods} must be a multiple of n_blocks = {self.n_blocks}, "
-                f"such as {nearest}."
+                f"n_periods = {self.n_periods} must be a multiple of n_blocks = {self.n_blocks}, such as {nearest}."
             )
         return self
 
@@ -70,22 +68,31 @@ _FLAG_SENTENCES = {
 
 LYAPUNOV_VARIABLES = (
     Variable(
-        "lyapunov", ("exponent",), "float64", math.nan, "1/s",
+        "lyapunov",
+        ("exponent",),
+        "float64",
+        math.nan,
+        "1/s",
         "Lyapunov exponents per unit time, in falling order",
-        {"comment": "divided by the frequency: per drive period. Plain averages; weighted Birkhoff averages "
-         "where the orbit is closed"},
+        {
+            "comment": "divided by the frequency: per drive period. Plain averages; weighted Birkhoff averages "
+            "where the orbit is closed"
+        },
     ),
     Variable("lyapunov_stderr", ("exponent",), "float64", math.nan, "1/s", "standard error over the blocks"),
     Variable(
-        "lyapunov_blocks", ("block", "exponent"), "float64", math.nan, "1/s",
+        "lyapunov_blocks",
+        ("block", "exponent"),
+        "float64",
+        math.nan,
+        "1/s",
         "mean growth rate in each block of drive periods",
     ),
     Variable("divergence", (), "float64", math.nan, "1/s", "time average of the flow's divergence"),
     Variable(
-        "lyapunov_flag", (), "int8", int(LyapunovFlag.ABSENT), "1", "trust in the exponents",
-        flag_attrs(LyapunovFlag),
+        "lyapunov_flag", (), "int8", int(LyapunovFlag.ABSENT), "1", "trust in the exponents", flag_attrs(LyapunovFlag)
     ),
-)  # fmt: skip
+)
 """Variables of ``[products] lyapunov``."""
 
 
@@ -125,7 +132,14 @@ def _shortest(options: LyapunovOptions) -> LyapunovOptions:
 
 
 LYAPUNOV = CellProduct(
-    "lyapunov", "Lyapunov exponents along each cell's attractor, with errors, convergence and an audit.",
-    LyapunovOptions, _variables, _sizes, _cost, "pipeline.compute.exponents:exponents",
-    settle=_settled, coordinates=_numbers, shortest=_shortest,
-)  # fmt: skip
+    "lyapunov",
+    "Lyapunov exponents along each cell's attractor, with errors, convergence and an audit.",
+    LyapunovOptions,
+    _variables,
+    _sizes,
+    _cost,
+    "pipeline.compute.exponents:exponents",
+    settle=_settled,
+    coordinates=_numbers,
+    shortest=_shortest,
+)

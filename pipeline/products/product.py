@@ -188,14 +188,9 @@ class FigureOptions(Options):
     """Options that every figure has."""
 
     at: dict[str, float] = option({}, "Value of an axis that the figure does not show.")
-    nearest: bool = option(
-        False,
-        "Use the axes' values nearest to --at, and print them; otherwise --at must match.",
-    )
+    nearest: bool = option(False, "Use the axes' values nearest to --at, and print them; otherwise --at must match.")
     degrees: bool = option(False, "Use degrees instead of radians.")
-    width: float = option(
-        178.0, "Width of the figure; 85 is a journal's column", unit="mm", ge=40.0, le=1000.0
-    )
+    width: float = option(178.0, "Width of the figure; 85 is a journal's column", unit="mm", ge=40.0, le=1000.0)
     xlim: tuple[float, float] | None = option(None, "Range of the horizontal axis, in its unit.")
     ylim: tuple[float, float] | None = option(None, "Range of the vertical axis, in its unit.")
     out: str = option("", "Figure file; by default in DIR/figures, named by its options.")

@@ -37,11 +37,7 @@ class Registry(Mapping[str, P], Generic[P]):
 
 
 CELL_PRODUCTS: Registry[CellProduct] = Registry(
-    "product",
-    {
-        "lyapunov": "pipeline.products.lyapunov:LYAPUNOV",
-        "extremes": "pipeline.products.extremes:EXTREMES",
-    },
+    "product", {"lyapunov": "pipeline.products.lyapunov:LYAPUNOV", "extremes": "pipeline.products.extremes:EXTREMES"}
 )
 
 ANALYSES: Registry[Analysis] = Registry(
@@ -67,8 +63,19 @@ FIGURES: Registry[Figure] = Registry(
     {
         name: f"pipeline.products.figures:{name.upper()}"
         for name in (
-            "bifurcation", "section", "attractors", "gallery", "basins", "fractions", "regimes", "lyapunov",
-            "convergence", "dimension", "branches", "multipliers", "curves",
+            "bifurcation",
+            "section",
+            "attractors",
+            "gallery",
+            "basins",
+            "fractions",
+            "regimes",
+            "lyapunov",
+            "convergence",
+            "dimension",
+            "branches",
+            "multipliers",
+            "curves",
         )
     },
-)  # fmt: skip
+)

@@ -116,9 +116,7 @@ def _matches(ds: xr.Dataset, options: Options) -> np.ndarray:
         found &= np.isin(periods, np.atleast_1d(wanted))
     if "motion" in options:
         if "motion" not in ds:
-            raise SpecError(
-                [f"motion = {options['motion']!r}: the model of this run has no words for motions."]
-            )
+            raise SpecError([f"motion = {options['motion']!r}: the model of this run has no words for motions."])
         words = str(ds["motion"].attrs["flag_meanings"]).split()
         if options["motion"] not in words:
             raise SpecError([f"motion = {options['motion']!r}: must be one of {', '.join(words)}."])
@@ -174,9 +172,7 @@ def _asked(options: Options) -> str:
     return f"between {options.get('low', -math.inf):g} and {options.get('high', math.inf):g}"
 
 
-def window(
-    results: Results, of: Sequence[str], options: Options
-) -> tuple[Estimate, int, int, xr.Dataset, str]:
+def window(results: Results, of: Sequence[str], options: Options) -> tuple[Estimate, int, int, xr.Dataset, str]:
     """Return the width of the interval about a value in which all cells have a period, with its places."""
     ds, axis = _cells(results, of[0])
     here = _within(ds, axis, {k: v for k, v in options.items() if k in ("low", "high")})
@@ -287,17 +283,13 @@ def rarest_motion(results: Results, of: Sequence[str], options: Options) -> Esti
     Options: ``at``, ``motions``, ``period``.
     """
     shares = [
-        least_share(
-            results, of, {**{k: options[k] for k in ("at", "period") if k in options}, "motion": word}
-        )
+        least_share(results, of, {**{k: options[k] for k in ("at", "period") if k in options}, "motion": word})
         for word in options["motions"]
     ]
     if any(share.missing for share in shares):
         return shares[0]
     rarest = min(shares, key=lambda share: share.value)
-    words = "; ".join(
-        f"{w}: {s.text.partition(' at ')[0]}" for w, s in zip(options["motions"], shares, strict=True)
-    )
+    words = "; ".join(f"{w}: {s.text.partition(' at ')[0]}" for w, s in zip(options["motions"], shares, strict=True))
     return Estimate(rarest.value, rarest.low, rarest.high, words, rarest.step, rarest.n)
 
 
@@ -365,11 +357,7 @@ def share_above(results: Results, of: Sequence[str], options: Options) -> Estima
     signs = values(grid) > 0.0
     changes = np.flatnonzero(signs[1:] != signs[:-1])
     if not signs[0] or changes.size != 1:
-        text = (
-            "is not positive from the begin of the period on"
-            if not signs[0]
-            else "changes sign more than once"
-        )
+        text = "is not positive from the begin of the period on" if not signs[0] else "changes sign more than once"
         return Estimate(0.0, 0.0, 0.0, f"{options['quantity']} {text}")
     low, high = grid[changes[0]], grid[changes[0] + 1]
     while high - low > 1e-12:
@@ -386,9 +374,7 @@ def recorded_duty_cycle(results: Results, of: Sequence[str], options: Options) -
     timing = edges_of(results.recording(of[0])).frequency()
     half = 1.96 * timing.duty_cycle_error
     text = f"{timing.n_periods} periods at {timing.frequency_hz:.6g} Hz"
-    return Estimate(
-        timing.duty_cycle, timing.duty_cycle - half, timing.duty_cycle + half, text, n=timing.n_periods
-    )
+    return Estimate(timing.duty_cycle, timing.duty_cycle - half, timing.duty_cycle + half, text, n=timing.n_periods)
 
 
 def _of_torques(name: str) -> Measure:

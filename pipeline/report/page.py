@@ -195,9 +195,7 @@ class Page:
 def render(page: Page) -> str:
     """Return a page as HTML; equal pages give equal bytes."""
     style = (_TEMPLATES / "page.css").read_text("utf-8")
-    return (
-        _environment().get_template("page.html.j2").render(page=page, style=style, parts=anchored(page.parts))
-    )
+    return _environment().get_template("page.html.j2").render(page=page, style=style, parts=anchored(page.parts))
 
 
 def write(page: Page, path: Path) -> None:
@@ -220,9 +218,13 @@ def _environment() -> Environment:
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
     return Environment(
-        loader=FileSystemLoader(_TEMPLATES), autoescape=True, undefined=StrictUndefined,
-        trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True,
-    )  # fmt: skip
+        loader=FileSystemLoader(_TEMPLATES),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
 
 
 def picture_of(figure: Figure, alt: str, caption: str = "", command: str = "") -> Picture:
@@ -236,9 +238,7 @@ def picture_of(figure: Figure, alt: str, caption: str = "", command: str = "") -
     return Picture(buffer.getvalue(), width, height, plain(alt), caption, command)
 
 
-def grid_of(
-    rows: Sequence[Mapping[str, Any]], caption: str = "", command: str = "", most: int = MOST_ROWS
-) -> Grid:
+def grid_of(rows: Sequence[Mapping[str, Any]], caption: str = "", command: str = "", most: int = MOST_ROWS) -> Grid:
     """Return rows of numbers and texts as a table block; empty columns are left out."""
     names = list(dict.fromkeys(name for row in rows for name in row))
     cells = [[text_of(row.get(name)) for name in names] for row in rows[:most]]

@@ -46,9 +46,7 @@ def _recording(results: Results, table: PictureTable) -> DataFigure:
     from pipeline.rig.recordings.figure import plot_recording
 
     low, high = table.options.get("xlim", (None, None))
-    return plot_recording(
-        results.recording(table.of), frame=Frame(xlim=(low, high) if low is not None else None)
-    )
+    return plot_recording(results.recording(table.of), frame=Frame(xlim=(low, high) if low is not None else None))
 
 
 def _series(results: Results, table: PictureTable) -> DataFigure:
@@ -63,13 +61,7 @@ def _torques(results: Results, table: PictureTable) -> DataFigure:
     return drawn(results.torques(table.of), table.figure)
 
 
-_DRAW = {
-    "plot": _plot,
-    "quantities": _quantities,
-    "recording": _recording,
-    "series": _series,
-    "torques": _torques,
-}
+_DRAW = {"plot": _plot, "quantities": _quantities, "recording": _recording, "series": _series, "torques": _torques}
 
 
 def _command(results: Results, table: PictureTable) -> str:
@@ -106,10 +98,7 @@ def draw_quantities(parameters: Parameters, names: tuple[str, ...], frequency_hz
     values = np.asarray(evaluate(list(names), share / frequency_hz, rest, parameters, frequency_hz))
     about = [model.quantity(name) for name in names]
     data = xr.Dataset(
-        {
-            q.name: ("share", values[:, k], {"units": q.unit, "long_name": q.meaning})
-            for k, q in enumerate(about)
-        },
+        {q.name: ("share", values[:, k], {"units": q.unit, "long_name": q.meaning}) for k, q in enumerate(about)},
         coords={"share": ("share", share, {"units": "1", "long_name": "share of the drive's period"})},
         attrs={"title": "quantities over a drive period", "frequency_hz": frequency_hz},
     )

@@ -62,14 +62,7 @@ def made_by() -> str:
 def _summary(runs: Sequence[AnalysedRun]) -> Grid:
     """Return the table of runs for a page with several runs."""
     rows = [
-        (
-            run.info.title or run.name,
-            run.name,
-            run.model.name,
-            run.spec.kind,
-            str(run.plan.n_cells),
-            run.digest[:12],
-        )
+        (run.info.title or run.name, run.name, run.model.name, run.spec.kind, str(run.plan.n_cells), run.digest[:12])
         for run in runs
     ]
     return Grid(("run", "directory", "model", "kind", "cells", "digest of the cube"), rows)

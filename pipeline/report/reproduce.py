@@ -202,9 +202,13 @@ def _command(results: Results, figure: FigureTable) -> str:
 def _outcome(judgement: Judgement) -> Outcome:
     claim = judgement.claim
     return Outcome(
-        claim.statement, claim.source, f"Came out: {spelled(judgement)}", judgement.verdict, judgement.reason,
+        claim.statement,
+        claim.source,
+        f"Came out: {spelled(judgement)}",
+        judgement.verdict,
+        judgement.reason,
         claim.required,
-    )  # fmt: skip
+    )
 
 
 def spelled(judgement: Judgement) -> str:
@@ -241,12 +245,16 @@ def _summary(results: Results, judgements: Sequence[Judgement]) -> list[Block]:
     lead = [Text(headline(judgements, results.smoke))] if judgements else []
     blocks: list[Block] = [*lead, Note(table.source), *(Text(text) for text in table.about)]
     size = "smoke size: it shows that everything works, and decides little" if results.smoke else "full size"
-    blocks.append(Facts({
-        "size": size,
-        "claims": ", ".join(f"{n} {verdict.words}" for verdict, n in counts.items() if n) or "none",
-        "required claims contradicted": str(failed),
-        "versions": ", ".join(f"{name} {version}" for name, version in versions().items()),
-    }))  # fmt: skip
+    blocks.append(
+        Facts(
+            {
+                "size": size,
+                "claims": ", ".join(f"{n} {verdict.words}" for verdict, n in counts.items() if n) or "none",
+                "required claims contradicted": str(failed),
+                "versions": ", ".join(f"{name} {version}" for name, version in versions().items()),
+            }
+        )
+    )
     rows = [
         (j.figure, j.claim.statement, spelled(j).partition(";")[0].rstrip("."), j.verdict.words)
         for j in decided_first(judgements)
@@ -262,9 +270,7 @@ def _summary(results: Results, judgements: Sequence[Judgement]) -> list[Block]:
 def headline(judgements: Sequence[Judgement], smoke: bool) -> str:
     """Return a sentence on how many claims are met, not met or undecided."""
     tests = decided_first(judgements)
-    met, failed, left = (
-        sum(j.verdict is v for j in tests) for v in (Verdict.MET, Verdict.NOT_MET, Verdict.UNDECIDED)
-    )
+    met, failed, left = (sum(j.verdict is v for j in tests) for v in (Verdict.MET, Verdict.NOT_MET, Verdict.UNDECIDED))
     text = f"Of {len(tests)} claims that are tests, {met} are met, {failed} not met, {left} undecided."
     remedy = " The smoke size shows that every step works; the full size (without --smoke) decides more."
     return text + (remedy if smoke else "")
@@ -283,9 +289,10 @@ def calibrated_on(judgements: Sequence[Judgement]) -> str:
         return ""
     text = f"{len(own)} of {len(judgements)} claims are no test: parameters were calibrated on them."
     heads = {
-        Verdict.MET: "Came out", Verdict.NOT_MET: "Did not come out",
+        Verdict.MET: "Came out",
+        Verdict.NOT_MET: "Did not come out",
         Verdict.UNDECIDED: "Undecided whether they came out",
-    }  # fmt: skip
+    }
     for verdict, head in heads.items():
         named = [f"figure {j.figure}: {j.claim.statement.rstrip('.')}" for j in own if j.plain is verdict]
         text += f" {head}: {'; '.join(named)}." if named else ""
@@ -311,15 +318,25 @@ def _rows(judgements: Sequence[Judgement]) -> str:
     """Return all judgements as JSON."""
     rows = [
         {
-            "figure": j.figure, "statement": j.claim.statement, "source": j.claim.source,
-            "measure": j.claim.measure, "of": list(j.claim.of), "least": _plain(j.claim.least),
-            "most": _plain(j.claim.most), "unit": j.claim.unit, "value": _plain(j.estimate.value),
-            "low": _plain(j.estimate.low), "high": _plain(j.estimate.high),
-            "text": j.estimate.text or j.estimate.missing, "verdict": j.verdict.words, "reason": j.reason,
-            "required": j.claim.required, "fails": j.fails,
+            "figure": j.figure,
+            "statement": j.claim.statement,
+            "source": j.claim.source,
+            "measure": j.claim.measure,
+            "of": list(j.claim.of),
+            "least": _plain(j.claim.least),
+            "most": _plain(j.claim.most),
+            "unit": j.claim.unit,
+            "value": _plain(j.estimate.value),
+            "low": _plain(j.estimate.low),
+            "high": _plain(j.estimate.high),
+            "text": j.estimate.text or j.estimate.missing,
+            "verdict": j.verdict.words,
+            "reason": j.reason,
+            "required": j.claim.required,
+            "fails": j.fails,
         }
         for j in judgements
-    ]  # fmt: skip
+    ]
     return json.dumps(rows, indent=1, ensure_ascii=False) + "\n"
 
 

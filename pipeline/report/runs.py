@@ -84,9 +84,7 @@ class Shown:
         return known or ([{}] if name in self.computed else [])
 
 
-def part_of(
-    source: str | AnalysedRun, echo: Callable[[str], None], computed: tuple[str, ...] = CHEAP
-) -> Part:
+def part_of(source: str | AnalysedRun, echo: Callable[[str], None], computed: tuple[str, ...] = CHEAP) -> Part:
     """Return the section of a report on one run.
 
     Parameters
@@ -121,14 +119,16 @@ def _state(shown: Shown) -> Iterator[Block]:
     run, found = shown.run, state(shown.run)
     swept = ", ".join(f"{name} {_span(shown.cube, name)}" for name in shown.axes) or "nothing"
     model = run.model
-    yield Facts({
-        "model": f"{model.name}: {model.title}",
-        "kind": f"{run.spec.kind}; swept: {swept}",
-        "cells": f"{found.n_committed} of {found.plan.n_cells} computed"
-        + "".join(f", {n} {name.replace('_', ' ')}" for name, n in found.cells.items() if n),
-        "sections": f"{run.spec.integration.n_keep} kept after {run.spec.integration.n_transient}, "
-        f"at {model.section}",
-    })  # fmt: skip
+    yield Facts(
+        {
+            "model": f"{model.name}: {model.title}",
+            "kind": f"{run.spec.kind}; swept: {swept}",
+            "cells": f"{found.n_committed} of {found.plan.n_cells} computed"
+            + "".join(f", {n} {name.replace('_', ' ')}" for name, n in found.cells.items() if n),
+            "sections": f"{run.spec.integration.n_keep} kept after {run.spec.integration.n_transient}, "
+            f"at {model.section}",
+        }
+    )
     if not run.complete:
         yield Note(
             "This run is not complete: what is not computed is left out everywhere below.",
@@ -151,9 +151,7 @@ def _parameters(shown: Shown) -> Iterator[Block]:
     over, swept = run.spec.parameters.overrides, {parameter_name(name): name for name in shown.axes}
     rows = []
     if run.spec.frequency_hz and parameter_name(FREQUENCY) not in swept and run.spec.section is None:
-        rows.append(
-            ("drive's frequency", f"{run.spec.frequency_hz:g}", "Hz", "of the forcing", "the specification")
-        )
+        rows.append(("drive's frequency", f"{run.spec.frequency_hz:g}", "Hz", "of the forcing", "the specification"))
     for p in run.model.parameters:
         source = chosen.provenance.get(p.name, f"preset {chosen.name}")
         value = f"{run.parameters[p.name]:g}"
@@ -163,9 +161,7 @@ def _parameters(shown: Shown) -> Iterator[Block]:
             source = "the specification"
         rows.append((p.name, value, "" if p.unit == "1" else p.unit, p.meaning, source))
     yield Grid(
-        ("parameter", "value", "unit", "meaning", "from"),
-        rows,
-        f"Preset {chosen.name}: {chosen.title}".rstrip(": "),
+        ("parameter", "value", "unit", "meaning", "from"), rows, f"Preset {chosen.name}: {chosen.title}".rstrip(": ")
     )
 
 
@@ -173,9 +169,7 @@ def _diagram(shown: Shown) -> Iterator[Block]:
     """Yield the bifurcation diagram, or the section points if nothing is swept."""
     if len(shown.axes) > 1:
         at = _first_of_others(shown)
-        yield from _drawn(
-            shown, "bifurcation", "Bifurcation diagram at the first values of the other axes", at=at
-        )
+        yield from _drawn(shown, "bifurcation", "Bifurcation diagram at the first values of the other axes", at=at)
     elif shown.axes and shown.cube.sizes[shown.axes[0]] > 1:
         yield from _drawn(shown, "bifurcation", "Bifurcation diagram")
     else:
@@ -185,9 +179,7 @@ def _diagram(shown: Shown) -> Iterator[Block]:
 def _first_of_others(shown: Shown) -> dict[str, float]:
     """Return the first values of the axes that a diagram does not show."""
     continuation = shown.run.spec.continuation
-    path = next(
-        (d for d in shown.axes if continuation and parameter_name(d) == continuation.path), shown.axes[0]
-    )
+    path = next((d for d in shown.axes if continuation and parameter_name(d) == continuation.path), shown.axes[0])
     return {d: float(shown.cube[d].values[0]) for d in shown.axes if d != path}
 
 
@@ -212,9 +204,7 @@ def _attractors(shown: Shown) -> Iterator[Block]:
     if len(shown.axes) == 1 and shown.cube.sizes[shown.axes[0]] > 1:
         yield from _drawn(shown, "attractors", "All coexisting attractors", **options)
         if "fraction" in (rows or [{}])[0]:
-            yield from _drawn(
-                shown, "fractions", "Shares of the initial states that end on each attractor", **options
-            )
+            yield from _drawn(shown, "fractions", "Shares of the initial states that end on each attractor", **options)
     elif len(shown.axes) == 2:
         yield from _drawn(shown, "regimes", "Which periods coexist", **options)
         yield from _drawn(shown, "regimes", "How many attractors coexist", **options, show="number")
@@ -274,9 +264,7 @@ def _share(rows: list[dict[str, Any]], axes: tuple[str, ...]) -> str:
     if not np.isfinite(best["fraction"]):  # it attracts nowhere
         return "-"
     where = ", ".join(f"{name} {best[name]:g}" for name in axes)
-    share = (
-        f"{number(best['fraction'], '.3f')} ({number(best['low'], '.3f')} to {number(best['high'], '.3f')})"
-    )
+    share = f"{number(best['fraction'], '.3f')} ({number(best['low'], '.3f')} to {number(best['high'], '.3f')})"
     return f"{share} at {where}" if where and len(rows) > 1 else share
 
 
@@ -353,8 +341,9 @@ def _exponents(shown: Shown) -> Iterator[Block]:
     if "lyapunov" not in shown.run.spec.products:
         yield Note(
             "Lyapunov exponents were not computed in this run: add the table to the specification and run it "
-            "into another directory.", "[products]\nlyapunov = {}",
-        )  # fmt: skip
+            "into another directory.",
+            "[products]\nlyapunov = {}",
+        )
     elif len(shown.axes) == 2:
         yield from _drawn(shown, "lyapunov", "Largest Lyapunov exponent", as_map=True)
     elif shown.axes and shown.cube.sizes[shown.axes[0]] > 1:

@@ -21,9 +21,7 @@ STUDY = "study.toml"
 class RunTable(Table):
     """A table ``[runs.NAME]``: a run of the study."""
 
-    spec: str = Field(
-        description="Specification: a file, relative to the study, or the name of one that ships."
-    )
+    spec: str = Field(description="Specification: a file, relative to the study, or the name of one that ships.")
 
 
 class RecordingTable(Table):
@@ -48,9 +46,7 @@ class PictureTable(Table):
     )
     of: str = Field(description="Name of the run, the recording or the torque readings.")
     figure: str = Field("", description="Name of the figure of a run or of torque readings.")
-    quantities: Annotated[tuple[str, ...], Field(strict=False)] = Field(
-        (), description="Names of the quantities."
-    )
+    quantities: Annotated[tuple[str, ...], Field(strict=False)] = Field((), description="Names of the quantities.")
     frequency_hz: Annotated[float, Field(gt=0)] | None = Field(None, description="Drive frequency [Hz].")
     caption: str = Field(description="Sentence below the picture.")
     options: dict[str, Any] = Field({}, description="Options of the figure, as its command has them.")
@@ -91,9 +87,7 @@ class FigureTable(Table):
     pictures: Annotated[tuple[PictureTable, ...], Field(strict=False)] = Field(
         (), description="Pictures of the figure."
     )
-    claims: Annotated[tuple[ClaimTable, ...], Field(strict=False)] = Field(
-        (), description="Claims about the figure."
-    )
+    claims: Annotated[tuple[ClaimTable, ...], Field(strict=False)] = Field((), description="Claims about the figure.")
 
     @property
     def numbers(self) -> list[str]:
@@ -184,8 +178,7 @@ def _problems(table: StudyTable) -> list[str]:
     problems = [f"{name}: names two things of the study; give one another name." for name in sorted(twice)]
     for i, figure in enumerate(table.figures):
         problems += [
-            f"figures[{i}]: {unknown_name('input', name, known)}"
-            for name in sorted(figure.needs - set(known))
+            f"figures[{i}]: {unknown_name('input', name, known)}" for name in sorted(figure.needs - set(known))
         ]
         for k, picture in enumerate(figure.pictures):
             if picture.kind == "plot":

@@ -114,11 +114,13 @@ def _edges(recording: xr.Dataset) -> DriveFile:
     between = np.searchsorted(edges.falling, rising[1:]) - after
     if (between != 1).any():
         wrong = int(np.flatnonzero(between != 1)[0])
-        raise SpecError([
-            f"drive: {int(between[wrong])} falling edges between the rising ones at {rising[wrong]:.6g} s "
-            f"and {rising[wrong + 1]:.6g} s, and a period has one; choose a window without this, or look at "
-            "it with: magpend recordings show."
-        ])  # fmt: skip
+        raise SpecError(
+            [
+                f"drive: {int(between[wrong])} falling edges between the rising ones at {rising[wrong]:.6g} s "
+                f"and {rising[wrong + 1]:.6g} s, and a period has one; choose a window without this, or look at "
+                "it with: magpend recordings show."
+            ]
+        )
     falling = edges.falling[after]
     rows = [f"{a!r},{b!r}" for a, b in zip(rising[:-1].tolist(), falling.tolist(), strict=True)]
     lines = [*_head(recording, "Edges", EDGES), *rows, f"{float(rising[-1])!r},"]

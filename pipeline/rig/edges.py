@@ -100,19 +100,19 @@ class Edges:
         """
         rising = self.rising
         if rising.size < 3:
-            raise SpecError(
-                [f"drive: {rising.size} rising edges; a frequency needs 3: choose a longer window."]
-            )
+            raise SpecError([f"drive: {rising.size} rising edges; a frequency needs 3: choose a longer window."])
         number = _numbers(rising)
         start, period = _line(number, rising)
         fitted = start + period * number
         residual = rising - fitted
         jitter = math.sqrt(float(residual @ residual) / (rising.size - 2))
         if jitter > _MOST_JITTER * period:
-            raise SpecError([
-                f"drive: its rising edges scatter by {jitter:.3g} s about a period of {period:.3g} s, so it "
-                "is not periodic here: choose a window of one frequency, or a larger hysteresis."
-            ])  # fmt: skip
+            raise SpecError(
+                [
+                    f"drive: its rising edges scatter by {jitter:.3g} s about a period of {period:.3g} s, so it "
+                    "is not periodic here: choose a window of one frequency, or a larger hysteresis."
+                ]
+            )
         spread = number - number.mean()
         error = self._error(fitted, spread / (spread @ spread), jitter)
         duty, duty_error = self._duty_cycle(fitted, period, jitter)
@@ -213,10 +213,12 @@ def edges_of(recording: xr.Dataset, *, hysteresis: float | None = None) -> Edges
     """
     if DRIVE not in recording:
         name = recording.attrs.get("file", "the recording")
-        raise SpecError([
-            f"{name}: no drive channel, so neither its frequency nor its sections are known: add [drive] to "
-            'the mapping, as in drive = { channel = "rig/motor", kind = "signal" }.'
-        ])  # fmt: skip
+        raise SpecError(
+            [
+                f"{name}: no drive channel, so neither its frequency nor its sections are known: add [drive] to "
+                'the mapping, as in drive = { channel = "rig/motor", kind = "signal" }.'
+            ]
+        )
     time, drive = recording["time"].values, recording[DRIVE].values
     piece = recording["piece"].values if "piece" in recording.coords else np.zeros(time.size, np.int64)
     parts = [_checked(time[piece == k], drive[piece == k]) for k in np.unique(piece)]
@@ -239,15 +241,17 @@ def _switch(x: Floats, hysteresis: float | None) -> _Switch:
     low, high, noise = _levels(x)
     span = high - low
     if span <= _LEAST_CONTRAST * noise or span <= 0:
-        raise SpecError([
-            f"drive: no edges; its levels {low:.4g} and {high:.4g} are within noise, {noise:.2g}: "
-            'map the channel that switches, choose a window in which it runs, or say drive = "none".'
-        ])  # fmt: skip
+        raise SpecError(
+            [
+                f"drive: no edges; its levels {low:.4g} and {high:.4g} are within noise, {noise:.2g}: "
+                'map the channel that switches, choose a window in which it runs, or say drive = "none".'
+            ]
+        )
     band = 0.5 * span if hysteresis is None else hysteresis
     if not 0 < band < span:
-        raise SpecError([
-            f"hysteresis = {band:g}: must be greater than 0 and less than the levels' distance, {span:g}."
-        ])  # fmt: skip
+        raise SpecError(
+            [f"hysteresis = {band:g}: must be greater than 0 and less than the levels' distance, {span:g}."]
+        )
     return _Switch(0.5 * (low + high), span, band, noise)
 
 

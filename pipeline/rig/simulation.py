@@ -27,14 +27,10 @@ from pipeline.spec.tables import Table
 class SensorTable(Table):
     """A table ``[sensors.STATE]``: a sensor of one state."""
 
-    kind: Literal["potentiometer", "encoder"] = Field(
-        description="Potentiometer (wraps, 0 to 5 V) or encoder."
-    )
+    kind: Literal["potentiometer", "encoder"] = Field(description="Potentiometer (wraps, 0 to 5 V) or encoder.")
     noise: float = Field(default=0.0, ge=0.0, description="Standard deviation [the state's unit].")
     bits: Annotated[int, Field(ge=1, le=32)] | None = Field(default=None, description="Resolution.")
-    dead_band: float = Field(
-        default=0.0, ge=0.0, lt=math.pi, description="Part of a turn that is not measured [rad]."
-    )
+    dead_band: float = Field(default=0.0, ge=0.0, lt=math.pi, description="Part of a turn that is not measured [rad].")
 
 
 class SweepTable(Table):
@@ -52,8 +48,7 @@ class DriveTable(Table):
     kind: Literal["torque", "signal"] = Field(default="signal", description="Recorded quantity.")
     noise: float = Field(default=0.0, ge=0.0, description="Standard deviation [N m, or V].")
     steps: Annotated[tuple[dict[str, float], ...], Field(strict=False, min_length=1)] | None = Field(
-        default=None,
-        description="Steps, one table each: frequency_hz, n_periods, and parameters that differ.",
+        default=None, description="Steps, one table each: frequency_hz, n_periods, and parameters that differ."
     )
     sweep: SweepTable | None = Field(default=None, description="Evenly spaced steps, instead of steps.")
 
@@ -75,9 +70,7 @@ class DriveTable(Table):
 class RigTable(Table):
     """The keys at the top of the file."""
 
-    model: str | dict[str, Any] = Field(
-        description="Model, as in a specification: a name, a file or a table."
-    )
+    model: str | dict[str, Any] = Field(description="Model, as in a specification: a name, a file or a table.")
     preset: str | None = Field(default=None, description="Preset of the model; by default the first.")
     parameters: dict[str, float] = Field(default={}, description="Values that differ from the preset [SI].")
     initial_state: dict[str, float] = Field(
@@ -189,9 +182,7 @@ def simulated(rig: Rig, *, is_csv: bool = False) -> tuple[Raw, Mapping]:
     ArithmeticError
         If the trajectory diverges or meets the step limit.
     """
-    raw, mapping = readings(
-        rig.parameters, rig.drive, rig.initial_state, rig.times, sensors=rig.sensors, seed=rig.seed
-    )
+    raw, mapping = readings(rig.parameters, rig.drive, rig.initial_state, rig.times, sensors=rig.sensors, seed=rig.seed)
     if is_csv:
         mapping = mapping.model_copy(update={"time": TimeMap(channel="time")})
     return replace(raw, path=Path("simulated")), mapping

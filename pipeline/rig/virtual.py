@@ -220,8 +220,9 @@ def _check(parameters: Parameters, drive: Sequence[Step] | None, times: np.ndarr
     for i, step in enumerate(drive or ()):
         problems += [
             f"drive.steps[{i}]: {unknown_name('parameter', name, model.parameter_names)}"
-            for name in step.values if name not in model.parameter_names
-        ]  # fmt: skip
+            for name in step.values
+            if name not in model.parameter_names
+        ]
         if not (step.frequency_hz > 0.0 and step.n_periods >= 1):
             problems.append(f"drive.steps[{i}]: frequency_hz must be above 0, and n_periods 1 or more.")
     if drive is not None and not problems:
@@ -252,9 +253,7 @@ def _sensor_problems(path: str, sensor: Sensor, is_angle: bool) -> list[str]:
     return problems
 
 
-def _states(
-    parameters: Parameters, drive: Sequence[Step] | None, start: np.ndarray, times: np.ndarray
-) -> np.ndarray:
+def _states(parameters: Parameters, drive: Sequence[Step] | None, start: np.ndarray, times: np.ndarray) -> np.ndarray:
     """Integrate the model; return states, (n, n_states), angles not wrapped."""
     from magpend_core.sampling import sample
     from magpend_core.status import Status
@@ -262,9 +261,14 @@ def _states(
     drives = None if drive is None else [_intervals(parameters, drive, times[-1])]
     # tighter than any fit to the recording, so that its errors are the sensors' alone
     found = sample(
-        parameters.model.system, parameters.pack()[None], start[None], [times], drives=drives, rtol=TOLERANCE,
+        parameters.model.system,
+        parameters.pack()[None],
+        start[None],
+        [times],
+        drives=drives,
+        rtol=TOLERANCE,
         atol=TOLERANCE,
-    )  # fmt: skip
+    )
     status = Status(int(found.status[0]))
     if not np.isfinite(found.states[0]).all():
         raise ArithmeticError(f"The trajectory ended early: {status.sentence}.")
@@ -299,9 +303,14 @@ def _potentiometer(
         grain = SUPPLY_V / (2**sensor.bits - 1)
         noisy = grain * np.round(noisy / grain)
     entry = ChannelMap(
-        channel=channel, unit="V", scale=1.0 / per_rad, zero=middle, range=(0.0, SUPPLY_V), wraps=True,
+        channel=channel,
+        unit="V",
+        scale=1.0 / per_rad,
+        zero=middle,
+        range=(0.0, SUPPLY_V),
+        wraps=True,
         dead_band=(0.0, DEAD_V) if sensor.dead_band else None,
-    )  # fmt: skip
+    )
     return noisy, entry, "V"
 
 

@@ -45,9 +45,7 @@ WORDS = {
     "slurm": Words(("sbatch", "--parsable"), ("squeue", "-h", "-o", "%T", "-j"), "squeue -j", "scancel"),
     "pbs": Words(("qsub",), ("qstat",), "qstat", "qdel", number=r"(?P<job>\d+[\w.\[\]-]*)"),
     "sge": Words(("qsub", "-terse"), ("qstat", "-j"), "qstat -j", "qdel"),
-    "lsf": Words(
-        ("bsub",), ("bjobs", "-noheader", "-o", "stat"), "bjobs", "bkill", r"DONE|EXIT", r"<(?P<job>\d+)>"
-    ),
+    "lsf": Words(("bsub",), ("bjobs", "-noheader", "-o", "stat"), "bjobs", "bkill", r"DONE|EXIT", r"<(?P<job>\d+)>"),
 }
 
 

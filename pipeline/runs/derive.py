@@ -85,11 +85,7 @@ class AnalysedRun(Run):
 
 
 def derive(
-    source: Source,
-    name: str,
-    options: Mapping[str, Any] | Options | None = None,
-    *,
-    echo: Echo | None = None,
+    source: Source, name: str, options: Mapping[str, Any] | Options | None = None, *, echo: Echo | None = None
 ) -> xr.Dataset:
     """Return the result of an analysis of a run, stored or computed.
 
@@ -205,12 +201,14 @@ def _options_of(attrs: Mapping[str, Any]) -> dict[str, Any]:
 def _refuse_recorded(run: Run, name: str) -> None:
     """Refuse a run with a recorded drive: analyses integrate cells further, but the recording ends."""
     if run.spec.recorded is not None:
-        raise SpecError([
-            f"{run.name}: its drive is the recording {run.spec.recorded.file}, and {name} goes on where "
-            "it ends. For attractors and what rests on them make a run at its mean frequency (frequency_hz = "
-            f"{run.spec.frequency_hz:.6g} instead of [drive]); this one's sections can be drawn: magpend "
-            "plot bifurcation, or section."
-        ])  # fmt: skip
+        raise SpecError(
+            [
+                f"{run.name}: its drive is the recording {run.spec.recorded.file}, and {name} goes on where "
+                "it ends. For attractors and what rests on them make a run at its mean frequency (frequency_hz = "
+                f"{run.spec.frequency_hz:.6g} instead of [drive]); this one's sections can be drawn: magpend "
+                "plot bifurcation, or section."
+            ]
+        )
 
 
 def prepared(run: AnalysedRun, product: Any, options: Options) -> Options:
@@ -286,9 +284,7 @@ def refused(directory: str | Path) -> Iterator[None]:
         raise
     except ValueError as error:
         if "checksum" in str(error).lower():
-            raise DamagedError(
-                f"{directory}: a chunk is damaged; look with: magpend verify {directory}"
-            ) from None
+            raise DamagedError(f"{directory}: a chunk is damaged; look with: magpend verify {directory}") from None
         if hasattr(error, "problems"):  # parameters out of bounds say enough themselves
             raise
         raise SpecError([f"{directory}: {error}"]) from None

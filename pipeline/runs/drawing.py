@@ -55,9 +55,7 @@ def figure(
     return drawn(run, name, wanted)
 
 
-def ready(
-    source: Source, name: str, options: FigureOptions, echo: Echo | None
-) -> tuple[AnalysedRun, FigureOptions]:
+def ready(source: Source, name: str, options: FigureOptions, echo: Echo | None) -> tuple[AnalysedRun, FigureOptions]:
     """Open a run, and return it with the options in its own names."""
     run = AnalysedRun.of(source, echo)
     settled: Any = prepared(run, FIGURES[name], options)

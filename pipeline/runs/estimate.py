@@ -231,9 +231,7 @@ def _periods_until_closed(spec: Spec, plan: Plan, most: float, ratio: float) -> 
         inputs = _sample(spec, plan, rng, n_branches, pairs=True)
         a_period = ratio * float(seconds_per_period(inputs.frequency_hz, spec.integration.rtol).mean())
         if not len(found):
-            cap = int(
-                min(most, max(CLOSING_S / (a_period * inputs.frequency_hz.size), n_keep + LEAST_PERIODS))
-            )
+            cap = int(min(most, max(CLOSING_S / (a_period * inputs.frequency_hz.size), n_keep + LEAST_PERIODS)))
             integration = spec.integration.model_copy(update={"n_transient": cap - n_keep})
         started = time.process_time()
         values = integrate(replace(spec, integration=integration), inputs)

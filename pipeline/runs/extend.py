@@ -133,9 +133,9 @@ def plan_extension(
 def _wide(run: Run, spec: str | Path | None, widening: Widening) -> tuple[Spec, str]:
     """Return the wider specification and its text."""
     if spec is None and not widening:
-        raise SpecError([
-            "extend: nothing to change; give a wider SPEC, or an option such as --axis NAME=LOW:HIGH:NUM."
-        ])  # fmt: skip
+        raise SpecError(
+            ["extend: nothing to change; give a wider SPEC, or an option such as --axis NAME=LOW:HIGH:NUM."]
+        )
     if spec is not None:
         path = find_spec(spec)
         parsed = load_spec(path)
@@ -305,8 +305,7 @@ def _record(extension: Extension, files: Files) -> None:
     runs = zip(extension.runs, extension.counts, strict=True)
     content = {
         "sources": [
-            {"directory": run.info.files.place, "digest": run.info.digest, "cells": count}
-            for run, count in runs
+            {"directory": run.info.files.place, "digest": run.info.digest, "cells": count} for run, count in runs
         ],
         "cells": extension.plan.n_cells,
         "reused": sum(taken.values()),

@@ -118,9 +118,8 @@ def _silent(_: str) -> None:
 
 
 def _of_run(
-    run: AnalysedRun, options: AnimationOptions, attractors: Sequence[str], cells: Sequence[int],
-    start: Start | None,
-) -> tuple[list[instants.Moving], list[str]]:  # fmt: skip
+    run: AnalysedRun, options: AnimationOptions, attractors: Sequence[str], cells: Sequence[int], start: Start | None
+) -> tuple[list[instants.Moving], list[str]]:
     from pipeline.compute.simulate import start_of
 
     if cells:

@@ -190,11 +190,14 @@ def filmed(moving: Sequence[Moving], plan: Schedule) -> xr.Dataset:
     from magpend_core.trajectory import trajectory
 
     model, times = moving[0].parameters.model, plan.times
-    orbits = np.stack([
-        np.tile(m.start, (times.size, 1)) if m.period_s == 0.0
-        else trajectory(of_flow(m.parameters), m.frequency_hz, m.start, times, rtol=RTOL, atol=RTOL)
-        for m in moving
-    ])  # fmt: skip
+    orbits = np.stack(
+        [
+            np.tile(m.start, (times.size, 1))
+            if m.period_s == 0.0
+            else trajectory(of_flow(m.parameters), m.frequency_hz, m.start, times, rtol=RTOL, atol=RTOL)
+            for m in moving
+        ]
+    )
     longest = max(len(m.section) for m in moving)
     section = np.full((len(moving), longest, len(model.states)), np.nan)
     for row, m in zip(section, moving, strict=True):
@@ -209,13 +212,19 @@ def filmed(moving: Sequence[Moving], plan: Schedule) -> xr.Dataset:
             "period": ("motion", [m.period_s for m in moving], {"units": "s", "long_name": "period"}),
             "drive_frequency": ("motion", [m.frequency_hz for m in moving], {"units": "Hz"}),
         },
-        coords={"time": ("sample", times, {"units": "s", "long_name": "time since a section"}),
-                "state": list(model.state_names)},
-        attrs={
-            "title": f"animation of the {model.title}", "n_frames": plan.n_frames, "substeps": plan.substeps,
-            "speed": plan.speed, "repeats": int(plan.repeats), **_told(moving),
+        coords={
+            "time": ("sample", times, {"units": "s", "long_name": "time since a section"}),
+            "state": list(model.state_names),
         },
-    )  # fmt: skip
+        attrs={
+            "title": f"animation of the {model.title}",
+            "n_frames": plan.n_frames,
+            "substeps": plan.substeps,
+            "speed": plan.speed,
+            "repeats": int(plan.repeats),
+            **_told(moving),
+        },
+    )
     return _drawn(ds, moving, orbits)
 
 
@@ -224,9 +233,11 @@ def _told(moving: Sequence[Moving]) -> dict[str, Any]:
     first = moving[0].parameters
     lines = [f"{name} = {value!r}" for name, value in first.as_dict().items()]
     told = {
-        "model": model_attribute(first.model), "parameters": "\n".join(lines),
-        "state_units": ", ".join(first.model.state_units), **section_attributes(first.model.crossing),
-    }  # fmt: skip
+        "model": model_attribute(first.model),
+        "parameters": "\n".join(lines),
+        "state_units": ", ".join(first.model.state_units),
+        **section_attributes(first.model.crossing),
+    }
     differing = [n for n in first if any(m.parameters[n] != first[n] for m in moving)]
     return told | {f"{name}_by_motion": [m.parameters[name] for m in moving] for name in differing}
 

@@ -14,14 +14,7 @@ import numpy as np
 
 from magpend_core.models.sectioned import of_flow
 from pipeline.layout.letters import letter
-from pipeline.layout.vocabulary import (
-    ATTRACTS,
-    EQUILIBRIUM,
-    PERIODIC_ORBIT,
-    frequency_of,
-    parameters_of,
-    start_dims,
-)
+from pipeline.layout.vocabulary import ATTRACTS, EQUILIBRIUM, PERIODIC_ORBIT, frequency_of, parameters_of, start_dims
 from pipeline.products.animation import AnimationOptions
 from pipeline.runs.derive import AnalysedRun, refused
 from pipeline.runs.instants import RTOL, Moving
@@ -74,11 +67,15 @@ def of_attractors(
         points = one["attractor_points"].transpose("point", "state").values
         moving.append(
             Moving(
-                cast.names[number], palette.GREY_OF.get(int(one["stability"]), cast.colours[number]),
-                parameters, frequency, points[0],
-                points[np.isfinite(points).all(axis=1)], _period(one, parameters, frequency),
+                cast.names[number],
+                palette.GREY_OF.get(int(one["stability"]), cast.colours[number]),
+                parameters,
+                frequency,
+                points[0],
+                points[np.isfinite(points).all(axis=1)],
+                _period(one, parameters, frequency),
             )
-        )  # fmt: skip
+        )
     return moving, [*notes, *more]
 
 
@@ -86,20 +83,14 @@ def _chosen(name: str, here: xr.Dataset, letters: Sequence[str]) -> tuple[list[i
     """Return the ids of the attractors that are shown, and notes on the others."""
     there = [int(i) for i in here["attractor"].values]
     if not there:
-        raise SpecError(
-            [f"{name}: no attractor was found at this point; look with magpend analyse attractors."]
-        )
+        raise SpecError([f"{name}: no attractor was found at this point; look with magpend analyse attractors."])
     by_letter = {letter(i): i for i in there}
     if wrong := [text for text in letters if text.upper() not in by_letter]:
-        raise SpecError([
-            f"--attractor {text}: is not at this point; there: {', '.join(by_letter)}." for text in wrong
-        ])  # fmt: skip
+        raise SpecError([f"--attractor {text}: is not at this point; there: {', '.join(by_letter)}." for text in wrong])
     if letters:
         chosen = list(dict.fromkeys(by_letter[text.upper()] for text in letters))
         if len(chosen) > MOST_MOTIONS:
-            raise SpecError(
-                [f"--attractor: {len(chosen)} are asked for; at most {MOST_MOTIONS} fit a frame."]
-            )
+            raise SpecError([f"--attractor: {len(chosen)} are asked for; at most {MOST_MOTIONS} fit a frame."])
         return chosen, []
     attract = here["stability"].values == ATTRACTS
     wanted = attract if attract.any() else ~attract
@@ -180,9 +171,7 @@ def of_cells(run: AnalysedRun, numbers: Sequence[int]) -> list[Moving]:
         seen_by_drive = not parameters.model.autonomous and period > 0.0
         name = f"cell {number}: {_where(one)}"
         moving.append(
-            Moving(
-                name, colour, parameters, frequency, points[0], points, period if seen_by_drive else math.nan
-            )
+            Moving(name, colour, parameters, frequency, points[0], points, period if seen_by_drive else math.nan)
         )
     if problems:
         raise SpecError(problems)
@@ -205,15 +194,15 @@ def _where(one: xr.Dataset) -> str:
 
 def _refuse_recorded(run: AnalysedRun) -> None:
     if run.spec.recorded is not None:
-        raise SpecError([
-            f"{run.name}: its drive is the recording {run.spec.recorded.file}; an animation takes a run at a "
-            "frequency. Draw this one's sections: magpend plot section."
-        ])  # fmt: skip
+        raise SpecError(
+            [
+                f"{run.name}: its drive is the recording {run.spec.recorded.file}; an animation takes a run at a "
+                "frequency. Draw this one's sections: magpend plot section."
+            ]
+        )
 
 
-def of_start(
-    parameters: Parameters, frequency_hz: float, state: Sequence[float], n_transient: int = 0
-) -> Moving:
+def of_start(parameters: Parameters, frequency_hz: float, state: Sequence[float], n_transient: int = 0) -> Moving:
     """Return the motion from a start, after some periods if wanted.
 
     Parameters

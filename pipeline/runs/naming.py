@@ -69,18 +69,22 @@ def _swept(run: Run) -> str:
     cube = run.cube()
     swept = [name for name in run.spec.axes if cube.sizes.get(axis_name(name), 1) > 1]
     if len(swept) > 1:
-        raise SpecError([
-            f"{run.name} sweeps {', '.join(swept)}; say which of them to follow: "
-            + " or ".join(f"--parameter {name}" for name in swept)
-            + "."
-        ])  # fmt: skip
+        raise SpecError(
+            [
+                f"{run.name} sweeps {', '.join(swept)}; say which of them to follow: "
+                + " or ".join(f"--parameter {name}" for name in swept)
+                + "."
+            ]
+        )
     if swept or run.model.crossing is None:
         return swept[0] if swept else FREQUENCY
     known = ", ".join(run.model.parameter_names)
-    raise SpecError([
-        f"{run.name} sweeps no parameter, and {run.model.name} has no drive's frequency to follow; give "
-        f"--parameter: {known}."
-    ])  # fmt: skip
+    raise SpecError(
+        [
+            f"{run.name} sweeps no parameter, and {run.model.name} has no drive's frequency to follow; give "
+            f"--parameter: {known}."
+        ]
+    )
 
 
 def _unknown(what: str, given: str, name: str, known: Iterable[str]) -> list[str]:

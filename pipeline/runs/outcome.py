@@ -110,8 +110,7 @@ def warning(run: Run) -> str:
     if n_lost <= WORTH_A_WARNING * computed:
         return ""
     told = "; ".join(
-        f"{o.n_cells} {o.word}" + (f" at {o.place}" if o.where else "") + f": {o.status.sentence}"
-        for o in lost
+        f"{o.n_cells} {o.word}" + (f" at {o.place}" if o.where else "") + f": {o.status.sentence}" for o in lost
     )
     return (
         f"warning: {n_lost} of {computed} cells ({100 * n_lost / computed:.1f} %) diverged or failed; "

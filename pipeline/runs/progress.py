@@ -99,11 +99,7 @@ class Progress:
     def line(self) -> str:
         """Return a line of plain text on the progress."""
         rate = self.rate()
-        left = (
-            f", {duration((self._total - self._done) / rate)} left"
-            if rate > 0 and self._done < self._total
-            else ""
-        )
+        left = f", {duration((self._total - self._done) / rate)} left" if rate > 0 and self._done < self._total else ""
         share = 100 * self._done / self._total
         return f"{self._done}/{self._total} cells ({share:.0f} %), {rate:.0f} cells/s{left}"
 
@@ -113,8 +109,13 @@ def _bar(total: int, done: int) -> Any:
     from rich.progress import Progress as RichProgress
 
     bar = RichProgress(
-        TextColumn("computing"), BarColumn(), MofNCompleteColumn(), TextColumn("cells"),
-        TextColumn("{task.fields[rate]}"), TimeRemainingColumn(), TextColumn("left"),
-    )  # fmt: skip
+        TextColumn("computing"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("cells"),
+        TextColumn("{task.fields[rate]}"),
+        TimeRemainingColumn(),
+        TextColumn("left"),
+    )
     bar.add_task("cells", total=total, completed=done, rate="")
     return bar

@@ -107,14 +107,7 @@ def run(
 
 
 def carry_out(
-    spec: Spec,
-    text: str,
-    files: Files,
-    *,
-    workers: int | None,
-    where: Where,
-    echo: Echo,
-    sources: Sources = (),
+    spec: Spec, text: str, files: Files, *, workers: int | None, where: Where, echo: Echo, sources: Sources = ()
 ) -> None:
     """Run a specification in a run directory, or complete its run.
 
@@ -184,9 +177,7 @@ def _complete(
         return
     before = plan.n_cells - sum(plan.cells_in(i) for i in missing)
     check_space(plan, info.files.local, plan.n_cells - before)
-    echo(
-        f"{plan.n_cells} cells in {plan.n_tasks} tasks" + (f", {before} cells done before" if before else "")
-    )
+    echo(f"{plan.n_cells} cells in {plan.n_tasks} tasks" + (f", {before} cells done before" if before else ""))
     clients.reach(where)
     report("compiling the kernel", 0, 0)
     seconds = task.warm_up(spec)

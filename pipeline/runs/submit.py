@@ -101,18 +101,22 @@ def prepare(
     parsed = load_spec(path, smoke=smoke)
     file = cluster_file or os.environ.get(CLUSTER_FILE)
     if not file:
-        raise SpecError([
-            f"what is a job? Say it in a file with a [cluster] table and give --cluster FILE, or set "
-            f"{CLUSTER_FILE}; docs/clusters.md has an example."
-        ])  # fmt: skip
+        raise SpecError(
+            [
+                f"what is a job? Say it in a file with a [cluster] table and give --cluster FILE, or set "
+                f"{CLUSTER_FILE}; docs/clusters.md has an example."
+            ]
+        )
     cluster = load_cluster(file)
     files = open_files(out if out is not None else default_directory(path, smoke))
     folder = jobs_folder(files.place)
     if _AWKWARD.search(str(folder)):
-        raise SpecError([
-            f"{folder}: batch systems do not take this path for what a job says; give an --out of letters, "
-            "digits, and . _ - + , : = @ alone."
-        ])  # fmt: skip
+        raise SpecError(
+            [
+                f"{folder}: batch systems do not take this path for what a job says; give an --out of letters, "
+                "digits, and . _ - + , : = @ alone."
+            ]
+        )
     check_starts(parsed)
     plan = make_plan(parsed)
     info = check(files, identity_here(parsed, plan))
@@ -130,9 +134,16 @@ def _command(cluster: Cluster, file: Path, spec: Path, place: str, smoke: bool) 
         where = ["--scheduler", cluster.kind, "--cluster", str(file.absolute())]
     python = cluster.python or sys.executable
     return [
-        python, "-m", "pipeline.cli.main", "run", str(spec.absolute()), "--out", place,
-        *where, *(["--smoke"] if smoke else []),
-    ]  # fmt: skip
+        python,
+        "-m",
+        "pipeline.cli.main",
+        "run",
+        str(spec.absolute()),
+        "--out",
+        place,
+        *where,
+        *(["--smoke"] if smoke else []),
+    ]
 
 
 def send(submission: Submission) -> Submission:
@@ -150,10 +161,12 @@ def send(submission: Submission) -> Submission:
     kind = submission.cluster.kind
     words = WORDS[kind]
     if not shutil.which(words.send[0]):
-        raise SpecError([
-            f"{kind}: there is no command {words.send[0]!r} here; give the command on a machine that sends "
-            "jobs, such as the login node, or --dry-run to see the script."
-        ])  # fmt: skip
+        raise SpecError(
+            [
+                f"{kind}: there is no command {words.send[0]!r} here; give the command on a machine that sends "
+                "jobs, such as the login node, or --dry-run to see the script."
+            ]
+        )
     _refuse_second(submission)
     submission.folder.mkdir(parents=True, exist_ok=True)
     script = submission.folder / SCRIPT
@@ -166,12 +179,7 @@ def send(submission: Submission) -> Submission:
         raise SubmitError(f"{words.send[0]} did not take the job: {said}. The script is {script}.")
     write_atomically(submission.folder / SENT, json.dumps({"kind": kind, "job": job}) + "\n")
     return Submission(
-        submission.name,
-        submission.folder,
-        submission.cluster,
-        submission.script,
-        submission.complete,
-        job,
+        submission.name, submission.folder, submission.cluster, submission.script, submission.complete, job
     )
 
 
@@ -197,8 +205,6 @@ def _refuse_second(submission: Submission) -> None:
 
 def _ask(command: Sequence[str], text: str | None = None) -> subprocess.CompletedProcess[str]:
     try:
-        return subprocess.run(
-            list(command), input=text, capture_output=True, text=True, timeout=_ANSWER_S, check=False
-        )
+        return subprocess.run(list(command), input=text, capture_output=True, text=True, timeout=_ANSWER_S, check=False)
     except subprocess.TimeoutExpired:
         raise SubmitError(f"{command[0]}: no answer within {_ANSWER_S:.0f} s; try again.") from None

@@ -59,8 +59,7 @@ def describe(found: Verification, directory: str | Path, *, repaired: bool) -> l
     lines = [f"{directory}: {found.n_committed} of {found.n_tasks} tasks committed and intact"]
     odd = [f"{key}: {ODD}" for key in found.odd]
     lines += [
-        f"  damaged: {text}"
-        for text in (*odd, *found.damaged.values(), *found.skeleton, *found.derived.values())
+        f"  damaged: {text}" for text in (*odd, *found.damaged.values(), *found.skeleton, *found.derived.values())
     ]
     lines += [f"  rebuilt: {text}" for text in found.rebuilt]
     if found.leftovers:
@@ -74,13 +73,9 @@ def describe(found: Verification, directory: str | Path, *, repaired: bool) -> l
     elif found.skeleton:
         lines.append("Metadata and coordinates follow from the specification: rebuild them with --repair.")
     if found.damaged and repaired:
-        lines.append(
-            f"{len(found.damaged)} records withdrawn: run the specification again to compute these tasks."
-        )
+        lines.append(f"{len(found.damaged)} records withdrawn: run the specification again to compute these tasks.")
     if found.odd:
-        lines.append(
-            f"{len(found.odd)} moved into {directory}/{ASIDE}." if repaired else "--repair moves these aside."
-        )
+        lines.append(f"{len(found.odd)} moved into {directory}/{ASIDE}." if repaired else "--repair moves these aside.")
     if found.derived and repaired:
         lines.append(f"{len(found.derived)} products removed: they are computed again when asked for.")
     elif found.derived:

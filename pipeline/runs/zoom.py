@@ -153,9 +153,7 @@ def _check(spec: Spec, changes: Changes) -> list[str]:
     """Return problems with the changes themselves."""
     keys = [*changes.ranges, *changes.pins]
     if not keys:
-        return [
-            "zoom: nothing to change; give a range such as --axis NAME=LOW:HIGH, or --at frequency_hz=2.2."
-        ]
+        return ["zoom: nothing to change; give a range such as --axis NAME=LOW:HIGH, or --at frequency_hz=2.2."]
     names = [_state(spec, key) or key for key in keys]
     known = (FREQUENCY, *state_keys(spec.model), *spec.model.parameter_names)
     unknown = [f"zoom: {unknown_name('axis', key, known)}" for key in keys if key not in known]
@@ -183,9 +181,7 @@ def _check(spec: Spec, changes: Changes) -> list[str]:
         if name not in ranged:
             problems.append(f"points of {name}: no range is given for it; give one or drop it.")
         elif sampled and name in spec.model.state_names:
-            problems.append(
-                f"number of points of {name}: samples have none; --samples says how many are drawn."
-            )
+            problems.append(f"number of points of {name}: samples have none; --samples says how many are drawn.")
     for key in changes.ranges:
         if not (sampled and _state(spec, key)) and _points(spec, key, changes) < 2:
             problems.append(f"{key}: a range has 2 points or more; say how many, such as --num 101.")

@@ -61,8 +61,7 @@ class Cluster(Table):
     memory: str = Field(description="Memory of a job, such as '16 GB'.")
     walltime: str = Field(description="Time after which the batch system ends a job, such as '04:00:00'.")
     lifetime: str | None = Field(
-        None,
-        description="Time after which workers leave; by default shortly before the walltime.",
+        None, description="Time after which workers leave; by default shortly before the walltime."
     )
     lifetime_stagger: str | None = Field(
         None, description="Spread of the times at which workers leave, so that they do not leave at once."
@@ -76,17 +75,11 @@ class Cluster(Table):
         None, description="Time of the coordinator's job; by default the walltime of the others."
     )
     wait: str = Field("24:00:00", description="Longest time to wait for the first worker.")
-    prologue: Lines = Field(
-        (), description="Shell lines before the workers start, such as 'module load python'."
-    )
-    directives: Lines = Field(
-        (), description="More lines for the batch system, such as '--constraint=avx512'."
-    )
+    prologue: Lines = Field((), description="Shell lines before the workers start, such as 'module load python'.")
+    directives: Lines = Field((), description="More lines for the batch system, such as '--constraint=avx512'.")
     interface: str | None = Field(None, description="Network interface, such as 'ib0'.")
     scratch: str | None = Field(None, description="Folder on a node's local disk, such as '$TMPDIR'.")
-    python: str | None = Field(
-        None, description="Python on the nodes; by default the Python that runs this command."
-    )
+    python: str | None = Field(None, description="Python on the nodes; by default the Python that runs this command.")
 
     @field_validator("walltime", "lifetime", "lifetime_stagger", "coordinator_walltime", "wait")
     @classmethod

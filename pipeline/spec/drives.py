@@ -129,14 +129,16 @@ def read_drive(path: str | Path) -> tuple[str, str]:
     try:
         content = Path(path).read_bytes()
     except OSError as error:
-        raise SpecError([
-            f"{path}: cannot be read ({error.strerror or error}); make one with: magpend recordings drive."
-        ]) from None  # fmt: skip
+        raise SpecError(
+            [f"{path}: cannot be read ({error.strerror or error}); make one with: magpend recordings drive."]
+        ) from None
     if len(content) > MOST_BYTES:
-        raise SpecError([
-            f"{path}: has {len(content)} bytes; a drive file has at most {MOST_BYTES}: choose a part of the "
-            "recording, or thin it (magpend recordings drive --window, --tolerance)."
-        ])  # fmt: skip
+        raise SpecError(
+            [
+                f"{path}: has {len(content)} bytes; a drive file has at most {MOST_BYTES}: choose a part of the "
+                "recording, or thin it (magpend recordings drive --window, --tolerance)."
+            ]
+        )
     try:
         return content.decode("utf-8"), hashlib.sha256(content).hexdigest()
     except UnicodeDecodeError:
@@ -230,9 +232,7 @@ def _rows(text: str, file: str) -> tuple[str, list[tuple[int, list[str]]]]:
         if header == names:
             return kind, [(i, [field.strip() for field in line.split(",")]) for i, line in lines[1:]]
     wanted = " or ".join(repr(",".join(names)) for names in HEADERS.values())
-    raise SpecError([
-        f"{file}: its columns are {','.join(header)[:80]!r}; a drive file begins with the line {wanted}."
-    ])  # fmt: skip
+    raise SpecError([f"{file}: its columns are {','.join(header)[:80]!r}; a drive file begins with the line {wanted}."])
 
 
 def _columns(kind: str, rows: list[tuple[int, list[str]]], file: str) -> tuple[np.ndarray, np.ndarray]:
@@ -249,8 +249,7 @@ def _columns(kind: str, rows: list[tuple[int, list[str]]], file: str) -> tuple[n
             continue
         if not (math.isfinite(first[k]) and math.isfinite(second[k])):
             problems.append(
-                f"{file}, line {line}: {','.join(fields)[:60]!r} is not finite; leave the line out, or "
-                "record anew."
+                f"{file}, line {line}: {','.join(fields)[:60]!r} is not finite; leave the line out, or record anew."
             )
     if problems:
         raise SpecError(_few(problems, file))
@@ -267,8 +266,7 @@ def _edge_problems(rising: np.ndarray, falling: np.ndarray, file: str) -> list[s
     if len(rising) < 2:
         return [f"{file}: has {len(rising)} rising edges; two make a period: record longer."]
     problems = [
-        f"{file}: rising_s = {rising[i + 1]:.9g} s follows {rising[i]:.9g} s; rising edges must rise: sort "
-        "them."
+        f"{file}: rising_s = {rising[i + 1]:.9g} s follows {rising[i]:.9g} s; rising edges must rise: sort them."
         for i in np.flatnonzero(np.diff(rising) <= 0)
     ]
     between = (rising[:-1] < falling[:-1]) & (falling[:-1] < rising[1:])

@@ -44,10 +44,12 @@ def toml_tables(content: bytes, name: str) -> dict[str, Any]:
     """
     try:
         if len(content) > MOST_BYTES:
-            raise SpecError([
-                f"{name}: has more than {MOST_BYTES // 1_000_000} MB, the most that a specification has; "
-                "give ranges, or random starts with a seed, instead of lists."
-            ])  # fmt: skip
+            raise SpecError(
+                [
+                    f"{name}: has more than {MOST_BYTES // 1_000_000} MB, the most that a specification has; "
+                    "give ranges, or random starts with a seed, instead of lists."
+                ]
+            )
         data = tomllib.loads(content.decode("utf-8"))
     except (ValueError, RecursionError) as error:
         if isinstance(error, SpecError):
@@ -68,9 +70,7 @@ def _unreadable(error: Exception) -> str:
     if isinstance(error, tomllib.TOMLDecodeError):
         return f"is not valid TOML: {error}."
     if isinstance(error, RecursionError):
-        return (
-            f"is nested too deep; a specification has at most {MOST_DEPTH} tables and lists within another."
-        )
+        return f"is nested too deep; a specification has at most {MOST_DEPTH} tables and lists within another."
     # Python's own bound on the digits of a whole number; or a path with a null character
     return f"is not valid TOML: {str(error).partition(';')[0].partition(':')[0]}."
 
@@ -84,9 +84,7 @@ def odd_data(data: Any) -> list[str]:
     while todo:
         place, value, depth = todo.pop()
         if depth > MOST_DEPTH:
-            return [
-                f"{place[:MOST_KEY]}: is nested too deep: more than {MOST_DEPTH} tables or lists in another."
-            ]
+            return [f"{place[:MOST_KEY]}: is nested too deep: more than {MOST_DEPTH} tables or lists in another."]
         if isinstance(value, Mapping):
             for key, inner in value.items():
                 if not isinstance(key, str):
@@ -103,9 +101,7 @@ def odd_data(data: Any) -> list[str]:
             todo += [(place, v, depth + 1) for v in value if not isinstance(v, (float, str, bool))]
         elif isinstance(value, int) and value not in WHOLE_NUMBERS:
             bits = value.bit_length()
-            return [
-                f"{place}: a whole number of {bits} bits is none in TOML, whose have 64; write it as 1e300."
-            ]
+            return [f"{place}: a whole number of {bits} bits is none in TOML, whose have 64; write it as 1e300."]
     return []
 
 

@@ -9,9 +9,7 @@ from pipeline.products.registry import CELL_PRODUCTS
 from pipeline.spec.tables import Integration
 
 
-def method_problems(
-    integration: Integration | None, products: Mapping[str, Options], is_recorded: bool
-) -> list[str]:
+def method_problems(integration: Integration | None, products: Mapping[str, Options], is_recorded: bool) -> list[str]:
     """Return problems with `integration.method`: only the method of order 5 can interpolate in a step."""
     if integration is None or integration.method == "dopri5":
         return []

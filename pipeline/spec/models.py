@@ -50,11 +50,13 @@ def find_model(reference: Any, folder: str | Path | None = ".", at: str = "model
         if isinstance(reference, Mapping | Model):
             return load_model(reference)
         if not isinstance(reference, str):
-            raise SpecError([
-                f"{at} = {shown(reference)}: must be a name in quotes, such as {model_names()[0]!r}, a file "
-                '"FILE.toml", a Python object "package.module:NAME", or a table [model] with states, '
-                "parameters and equations."
-            ])  # fmt: skip
+            raise SpecError(
+                [
+                    f"{at} = {shown(reference)}: must be a name in quotes, such as {model_names()[0]!r}, a file "
+                    '"FILE.toml", a Python object "package.module:NAME", or a table [model] with states, '
+                    "parameters and equations."
+                ]
+            )
         if folder is not None and is_object_path(reference):
             return import_model(reference, folder)
         if is_model_file(reference):
@@ -72,9 +74,7 @@ def _placed(problem: str, at: str, reference: Any) -> str:
     return f"{at}.{problem.removeprefix(head)}" if problem.startswith(head) else f"{at}: {problem}"
 
 
-def add_model(
-    reference: Any, folder: str | Path | None, problems: list[str], at: str = "model"
-) -> Model | None:
+def add_model(reference: Any, folder: str | Path | None, problems: list[str], at: str = "model") -> Model | None:
     """Return the model as `find_model` does; on a problem, add it to `problems` and return None."""
     try:
         return find_model(reference, folder, at)

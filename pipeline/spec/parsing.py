@@ -32,15 +32,7 @@ from pipeline.spec.ranges import corner_problems, size_problems
 from pipeline.spec.recorded import DriveTable, recorded, run_problems, with_drive
 from pipeline.spec.section import SectionTable, section_of, seen_through
 from pipeline.spec.starts import STARTS, GridStarts, Starts, refine_problems, starts_model
-from pipeline.spec.tables import (
-    FREQUENCY,
-    Continuation,
-    Execution,
-    Integration,
-    ParametersTable,
-    Range,
-    Table,
-)
+from pipeline.spec.tables import FREQUENCY, Continuation, Execution, Integration, ParametersTable, Range, Table
 
 KINDS = ("sweep", "continuation")
 IDENTIFICATION = "identification"
@@ -104,9 +96,7 @@ class Spec:
                 tables[name] = table.model_dump(mode="json", exclude_none=True)
         tables["initial_conditions"] = self.initial_conditions.model_dump(mode="json", exclude_none=True)
         tables["products"] = {name: options.plain() for name, options in self.products.items()}
-        tables["axes"] = {
-            name: axis.model_dump(mode="json", exclude_none=True) for name, axis in self.axes.items()
-        }
+        tables["axes"] = {name: axis.model_dump(mode="json", exclude_none=True) for name, axis in self.axes.items()}
         return tables
 
 
@@ -120,9 +110,19 @@ _TABLES: dict[str, type[Table]] = {
 }
 _OPTIONAL = ("drive", "section")
 _KEYS = (
-    "kind", "title", "model", "parameters", "axes", "initial_conditions", "continuation", "integration",
-    "products", "execution", "drive", "section",
-)  # fmt: skip
+    "kind",
+    "title",
+    "model",
+    "parameters",
+    "axes",
+    "initial_conditions",
+    "continuation",
+    "integration",
+    "products",
+    "execution",
+    "drive",
+    "section",
+)
 
 
 def load_spec(path: str | Path, *, smoke: bool = False) -> Spec:
@@ -243,14 +243,22 @@ def parse_spec(data: Mapping[str, Any], folder: str | Path | None = ".") -> Spec
         raise SpecError(problems)
     assert starts is not None
     return Spec(
-        kind, title, model.reference, tables["parameters"], axes, starts, walk, tables["integration"],
-        products, tables["execution"], tables["drive"], section,
-    )  # fmt: skip
+        kind,
+        title,
+        model.reference,
+        tables["parameters"],
+        axes,
+        starts,
+        walk,
+        tables["integration"],
+        products,
+        tables["execution"],
+        tables["drive"],
+        section,
+    )
 
 
-def _with_preset(
-    data: Mapping[str, Any], folder: str | Path | None, problems: list[str]
-) -> Mapping[str, Any]:
+def _with_preset(data: Mapping[str, Any], folder: str | Path | None, problems: list[str]) -> Mapping[str, Any]:
     """Replace the name of a preset's file by its content; drop the name if the file cannot be read."""
     table = data.get("parameters")
     name = table.get("preset") if isinstance(table, dict) else None
@@ -391,8 +399,7 @@ def _walk(
     if walk is not None and walk.path not in declared:
         known = ", ".join(declared) or "none yet"
         problems.append(
-            f"continuation.path = {walk.path!r}: must be an axis (axes: {known}); "
-            "add it to [axes] or set the path."
+            f"continuation.path = {walk.path!r}: must be an axis (axes: {known}); add it to [axes] or set the path."
         )
     return walk
 

@@ -25,8 +25,7 @@ def size_problems(axes: dict[str, Range], starts: Starts | None) -> list[str]:
     if math.prod(sizes.values()) <= MAX_CELLS:
         return []
     return [
-        f"{' x '.join(sizes)}: {math.prod(sizes.values()):.3g} cells; {MAX_CELLS:.0e} are the most: take "
-        "fewer values."
+        f"{' x '.join(sizes)}: {math.prod(sizes.values()):.3g} cells; {MAX_CELLS:.0e} are the most: take fewer values."
     ]
 
 

@@ -22,8 +22,7 @@ class DriveTable(Table):
 
     file: str = Field(min_length=1, description="Drive file (CSV), relative to the specification.")
     section_hz: Annotated[float, Field(gt=0)] | None = Field(
-        None,
-        description="Sections per second of a torque; by default sections lie at its rising edges.",
+        None, description="Sections per second of a torque; by default sections lie at its rising edges."
     )
     sha256: str | None = Field(None, description="Digest of the file; filled in when the file is read.")
     text: str | None = Field(None, description="The file's text; filled in when the file is read.")
@@ -107,9 +106,7 @@ def run_problems(
     for table in ("axes", "parameters.overrides", "parameters"):
         problems += _replaced_problems(drive, table, data)
     if not drive.n_periods:
-        problems.append(
-            f"drive: {drive.file} has no rising edge after its start, so no section; set drive.section_hz."
-        )
+        problems.append(f"drive: {drive.file} has no rising edge after its start, so no section; set drive.section_hz.")
     elif integration is not None and integration.n_transient + integration.n_keep > drive.n_periods:
         problems.append(
             f"integration: n_transient = {integration.n_transient} and n_keep = {integration.n_keep} are "
@@ -150,13 +147,7 @@ def _replaced_problems(drive: RecordedDrive, table: str, data: Mapping[str, Any]
     found: Any = data
     for key in table.split("."):
         found = found.get(key, {}) if isinstance(found, Mapping) else {}
-    names = (
-        (DUTY,)
-        if table.endswith("overrides")
-        else (FREQUENCY,)
-        if table == "parameters"
-        else (FREQUENCY, DUTY)
-    )
+    names = (DUTY,) if table.endswith("overrides") else (FREQUENCY,) if table == "parameters" else (FREQUENCY, DUTY)
     return [
         f"{table}.{name}: the drive is the recording {drive.file}, which has its own; drop it, or [drive]."
         for name in names

@@ -23,9 +23,7 @@ class SectionTable(Table):
     value: float = Field(0.0, description="Level in the state's unit; for an angle, modulo 2 pi.")
     direction: Literal["up", "down"] = Field("up", description="Whether the state rises or falls there.")
     longest: float = Field(
-        100.0,
-        gt=0,
-        description="Longest time between crossings [s]; a cell that takes longer does not return.",
+        100.0, gt=0, description="Longest time between crossings [s]; a cell that takes longer does not return."
     )
 
     @property
@@ -74,9 +72,7 @@ def section_of(
     if FREQUENCY in _keys(data, "axes"):
         problems.append(f"axes.{FREQUENCY}: {clash}.")
     if "drive" in data:
-        problems.append(
-            f"drive: {model.name} has no drive that a recording could take the place of; drop it."
-        )
+        problems.append(f"drive: {model.name} has no drive that a recording could take the place of; drop it.")
     return found
 
 

@@ -9,15 +9,7 @@ from __future__ import annotations
 from functools import lru_cache
 from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import (
-    AfterValidator,
-    BaseModel,
-    Discriminator,
-    Field,
-    Tag,
-    create_model,
-    model_validator,
-)
+from pydantic import AfterValidator, BaseModel, Discriminator, Field, Tag, create_model, model_validator
 
 from magpend_core.models.model import Model
 from pipeline.spec.tables import MAX_POINTS, Integration, Range, Table
@@ -47,13 +39,10 @@ Extent = Annotated[
     Annotated[float, Tag("(number)")] | Annotated[Range, Tag("(range)")], Discriminator(_number_or_range)
 ]
 Interval = Annotated[
-    Annotated[float, Tag("(number)")]
-    | Annotated[tuple[float, float], Field(strict=False), Tag("(interval)")],
+    Annotated[float, Tag("(number)")] | Annotated[tuple[float, float], Field(strict=False), Tag("(interval)")],
     Discriminator(_number_or_interval),
 ]
-Rows = Annotated[
-    tuple[Annotated[tuple[float, ...], Field(strict=False)], ...], Field(strict=False, min_length=1)
-]
+Rows = Annotated[tuple[Annotated[tuple[float, ...], Field(strict=False)], ...], Field(strict=False, min_length=1)]
 
 
 def degrees_key(state: str) -> str:
@@ -64,9 +53,7 @@ def degrees_key(state: str) -> str:
 def state_keys(model: Model) -> tuple[str, ...]:
     """Return all keys that set a state: names, and names in degrees for angles and their rates."""
     return tuple(
-        key
-        for s in model.states
-        for key in ((s.name, degrees_key(s.name)) if s.unit in IN_DEGREES else (s.name,))
+        key for s in model.states for key in ((s.name, degrees_key(s.name)) if s.unit in IN_DEGREES else (s.name,))
     )
 
 
@@ -138,9 +125,7 @@ class ListStarts(Table):
         if self.points_deg is not None and not degrees:
             raise ValueError(f"points_deg: not all of {', '.join(names)} are angles; give points.")
         if (self.points is None) == (self.points_deg is None):
-            both = (
-                "points (rad, rad/s) or points_deg (degrees, degrees/s), one of them" if degrees else "points"
-            )
+            both = "points (rad, rad/s) or points_deg (degrees, degrees/s), one of them" if degrees else "points"
             raise ValueError(f"give {both}.")
         lengths = sorted({len(positions(self.system)), len(names)})
         for i, row in enumerate(self.points or self.points_deg or ()):
@@ -199,9 +184,7 @@ def starts_model(kind: str, model: Model) -> type[Starts]:
     return made
 
 
-def refine_problems(
-    kind: str, starts: Starts | None, integration: Integration | None, model: Model
-) -> list[str]:
+def refine_problems(kind: str, starts: Starts | None, integration: Integration | None, model: Model) -> list[str]:
     """Return problems with a grid's `refine`: with its ranges, the kind of run, or the kept sections."""
     if not isinstance(starts, GridStarts) or starts.refine is None:
         return []
@@ -213,9 +196,7 @@ def refine_problems(
         return [f"{key}: there is no range to refine; give a state a range, or drop the key."]
     shortest = min(lengths, key=lengths.__getitem__)
     if lengths[shortest] < stride:
-        return [
-            f"{key}: must be at most {lengths[shortest]}, the points of {shortest}; lower it, or add points."
-        ]
+        return [f"{key}: must be at most {lengths[shortest]}, the points of {shortest}; lower it, or add points."]
     if integration is not None:
         n_bytes = stride ** len(lengths) * integration.n_keep * len(model.states) * 8
         if n_bytes > MAX_TILE_BYTES:

@@ -46,9 +46,7 @@ class Range(Table):
         forms = [{"start", "stop", "num"}, {"start", "stop", "step"}, {"values"}]
         if given not in forms:
             have = ", ".join(sorted(given)) or "nothing"
-            raise ValueError(
-                f"give start, stop and num, or start, stop and step, or values alone (given: {have})."
-            )
+            raise ValueError(f"give start, stop and num, or start, stop and step, or values alone (given: {have}).")
         if self.values is not None:
             if any(b <= a for a, b in itertools.pairwise(self.values)):
                 raise ValueError("values must rise strictly; sort them and drop repeated ones.")
@@ -112,10 +110,7 @@ class ParametersTable(Table):
 
     nested_model: ClassVar[type[BaseModel] | None] = PresetTable
     preset: (
-        Annotated[
-            Annotated[str, Tag("(name)")] | Annotated[PresetTable, Tag("(table)")],
-            Discriminator(_name_or_table),
-        ]
+        Annotated[Annotated[str, Tag("(name)")] | Annotated[PresetTable, Tag("(table)")], Discriminator(_name_or_table)]
         | None
     ) = Field(
         None,
@@ -137,9 +132,7 @@ class Continuation(Table):
     """The table ``[continuation]``: the axis that branches follow, and the direction."""
 
     path: str = Field(FREQUENCY, description="Axis that the branches follow: the continuation parameter.")
-    direction: Literal["up", "down", "both"] = Field(
-        "up", description="Direction in which the branches follow it."
-    )
+    direction: Literal["up", "down", "both"] = Field("up", description="Direction in which the branches follow it.")
 
     @property
     def directions(self) -> tuple[str, ...]:
@@ -153,8 +146,7 @@ class Integration(Table):
     rtol: float = Field(1e-8, ge=1e-13, lt=1, description="Relative tolerance of a step.")
     atol: float = Field(1e-8, gt=0, lt=1, description="Absolute tolerance of a step, in the states' units.")
     method: Literal["dopri5", "dop853"] = Field(
-        "dopri5",
-        description="Runge-Kutta method: dopri5 of order 5, or dop853 of order 8 for smooth equations.",
+        "dopri5", description="Runge-Kutta method: dopri5 of order 5, or dop853 of order 8 for smooth equations."
     )
     n_transient: int = Field(
         300, ge=0, le=100_000_000, description="Drive periods or returns before sections are kept."
@@ -181,6 +173,5 @@ class Execution(Table):
         None, description="Cells or branches of a task; by default chosen by chunk size and time."
     )
     points_per_task: Annotated[int, Field(ge=1, le=MAX_POINTS)] | None = Field(
-        None,
-        description="Points of the continuation that a task covers; by default chosen by time.",
+        None, description="Points of the continuation that a task covers; by default chosen by time."
     )

@@ -15,9 +15,15 @@ numcodecs.blosc.use_threads = False
 
 
 def create_array(
-    group: zarr.Group, name: str, dims: tuple[str, ...], shape: tuple[int, ...], chunks: tuple[int, ...],
-    dtype: str, fill: float | int | str, attrs: Mapping[str, Any],
-) -> Any:  # fmt: skip
+    group: zarr.Group,
+    name: str,
+    dims: tuple[str, ...],
+    shape: tuple[int, ...],
+    chunks: tuple[int, ...],
+    dtype: str,
+    fill: float | int | str,
+    attrs: Mapping[str, Any],
+) -> Any:
     """Create an array whose chunks carry checksums; the `dtype` ``string`` holds texts of any length."""
     serializer: Any = "auto"
     if dtype != "string":

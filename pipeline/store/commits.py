@@ -80,12 +80,7 @@ def write_task(
     objects = [key for v in plan.variables for key in write_block(cube, plan, index, v.name, values[v.name])]
     cube.sync(objects)  # the chunks are durable before their record exists
     # no time and no host: the record's bytes are the same whoever computes the task
-    record = {
-        "digest": info.digest,
-        "task": index,
-        "status": dict(counts),
-        "objects": entries_of(cube, objects),
-    }
+    record = {"digest": info.digest, "task": index, "status": dict(counts), "objects": entries_of(cube, objects)}
     # not asked in an object store: it has no folder to remove, and each question is a request
     if info.files.local is not None and not info.files.is_there(RUN_FILE):
         cube.remove(objects)
@@ -125,9 +120,7 @@ def write_block(cube: Files, plan: Plan, index: int, name: str, values: np.ndarr
     region = (*block, *(slice(0, n) for n in own))
     expected = tuple(s.stop - s.start for s in region)
     if values.shape != expected or values.dtype != array.dtype:
-        raise ValueError(
-            f"{name}: {values.dtype} {values.shape} where the store has {array.dtype} {expected}."
-        )
+        raise ValueError(f"{name}: {values.dtype} {values.shape} where the store has {array.dtype} {expected}.")
     keys = chunk_keys(name, region, array.chunks, array.shape)
     cube.refuse_links(*keys)
     with writing(f"{cube.name}/{name}"):
@@ -358,8 +351,5 @@ def sweep(info: RunInfo, plan: Plan, commits: Records, echo: Echo | None = None)
     info.files.remove(leftovers)
     if leftovers and echo:
         more = f" and {len(leftovers) - 3} more" if len(leftovers) > 3 else ""
-        echo(
-            f"removed {len(leftovers)} files that no commit record vouches for: "
-            f"{', '.join(leftovers[:3])}{more}"
-        )
+        echo(f"removed {len(leftovers)} files that no commit record vouches for: {', '.join(leftovers[:3])}{more}")
     return len(leftovers)

@@ -158,9 +158,14 @@ def _write_group(run: Run, store: LocalStore, columns: _Columns, layers: Layers)
 
 
 def _create(
-    group: zarr.Group, name: str, dims: Iterable[Any], like: Any, chunks: tuple[int, ...], fill: Any,
+    group: zarr.Group,
+    name: str,
+    dims: Iterable[Any],
+    like: Any,
+    chunks: tuple[int, ...],
+    fill: Any,
     attrs: Mapping[Any, Any],
-) -> Any:  # fmt: skip
+) -> Any:
     """Create an array with codecs that browsers can decode; checksums stand at the ends of chunks."""
     dtype: np.dtype[Any] = like.dtype
     texts = dtype.kind == "U"

@@ -44,11 +44,7 @@ class Declared:
     def __init__(self, plan: Plan) -> None:
         self._sizes: Mapping[str, int] = {**dict(zip(plan.dims, plan.shape, strict=True)), **plan.sizes}
         self._variables = {
-            v.name: (
-                (*plan.shape, *(plan.sizes[d] for d in v.own_dims)),
-                plan.chunks(v),
-                str(np.dtype(v.dtype)),
-            )
+            v.name: ((*plan.shape, *(plan.sizes[d] for d in v.own_dims)), plan.chunks(v), str(np.dtype(v.dtype)))
             for v in plan.variables
         }
         self._texts: set[str] = set()
@@ -94,9 +90,7 @@ class Declared:
         if codecs == CODECS[1]:
             self._texts.add(name)
         if name in self._variables:
-            return (
-                None if (shape, chunk, dtype) == self._variables[name] else "has another shape than the plan"
-            )
+            return None if (shape, chunk, dtype) == self._variables[name] else "has another shape than the plan"
         if shape != tuple(self._sizes.get(dim) for dim in dims) or chunk != tuple(max(n, 1) for n in shape):
             return "has another shape than its dims"
         return None

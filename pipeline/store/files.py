@@ -200,9 +200,7 @@ def local_path(path: str | Path) -> Path:
     text = str(path)
     if _URL.match(text):
         if is_url(text):
-            raise RefusedError(
-                f"{text}: must be a folder of this machine; runs alone are kept in object stores."
-            )
+            raise RefusedError(f"{text}: must be a folder of this machine; runs alone are kept in object stores.")
         raise RefusedError(f"{text}: is no folder and no object store; give a path, or s3://BUCKET/PREFIX.")
     return Path(path)
 

@@ -7,9 +7,7 @@ import itertools
 from pipeline.layout.plan import Plan
 
 
-def chunk_keys(
-    name: str, region: tuple[slice, ...], chunks: tuple[int, ...], shape: tuple[int, ...]
-) -> list[str]:
+def chunk_keys(name: str, region: tuple[slice, ...], chunks: tuple[int, ...], shape: tuple[int, ...]) -> list[str]:
     """Return the keys of the chunks in a region.
 
     A region that cuts a chunk is refused with a `ValueError`: writing it would lose a neighbour's cells.

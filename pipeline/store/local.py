@@ -346,8 +346,7 @@ def writer_lock(directory: Path) -> Iterator[bool]:
         with contextlib.suppress(OSError), open_plain(directory / HOLDER, "rb") as file:
             said = file.read()
         raise LockedError(
-            f"{directory}: another magpend run is writing here{in_words(said)}. Wait for it or stop it, then "
-            "run again."
+            f"{directory}: another magpend run is writing here{in_words(said)}. Wait for it or stop it, then run again."
         ) from None
     except (NotImplementedError, OSError) as error:
         warnings.warn(f"{directory}: no file lock here ({error}); start one run at a time.", stacklevel=3)

@@ -26,9 +26,13 @@ from pipeline.store.errors import DamagedError, RefusedError, UnreadableError
 T = TypeVar("T")
 
 CREDENTIALS = (
-    "AWS_ACCESS_KEY_ID", "AWS_SKIP_SIGNATURE", "AWS_WEB_IDENTITY_TOKEN_FILE", "AWS_METADATA_ENDPOINT",
-    "AWS_CONTAINER_CREDENTIALS_RELATIVE_URI", "AWS_CONTAINER_CREDENTIALS_FULL_URI",
-)  # fmt: skip
+    "AWS_ACCESS_KEY_ID",
+    "AWS_SKIP_SIGNATURE",
+    "AWS_WEB_IDENTITY_TOKEN_FILE",
+    "AWS_METADATA_ENDPOINT",
+    "AWS_CONTAINER_CREDENTIALS_RELATIVE_URI",
+    "AWS_CONTAINER_CREDENTIALS_FULL_URI",
+)
 """Environment variables, any one of them enough to tell who may use the store."""
 
 AT_ONCE = 16
@@ -297,9 +301,7 @@ class RunStore(ObjectStore[Any]):
         """Return the same store, read-only or not, as zarr asks for."""
         return RunStore(self._files, read_only=read_only)
 
-    async def get(
-        self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None
-    ) -> Buffer | None:
+    async def get(self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None) -> Buffer | None:
         """Return the content of a key, as zarr asks for; None if there is none."""
         kept = self._files.metadata
         if key in kept and not self.read_only:

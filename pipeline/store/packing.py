@@ -12,16 +12,7 @@ from collections.abc import Iterable, Mapping
 from pipeline.layout.plan import Plan
 from pipeline.store.commits import scan
 from pipeline.store.files import COMMITS
-from pipeline.store.records import (
-    BLOCK,
-    Commit,
-    Records,
-    block_of_pack,
-    marker_key,
-    pack_key,
-    pack_text,
-    salvage,
-)
+from pipeline.store.records import BLOCK, Commit, Records, block_of_pack, marker_key, pack_key, pack_text, salvage
 from pipeline.store.runfile import RunInfo
 
 

@@ -54,9 +54,8 @@ def _git(*arguments: str) -> str | None:
     """Return the output of a git command at magpend's sources; None if it fails."""
     try:
         done = subprocess.run(
-            ["git", "-C", str(_ROOT), *arguments],
-            capture_output=True, text=True, check=True, timeout=_GIT_SECONDS,
-        )  # fmt: skip
+            ["git", "-C", str(_ROOT), *arguments], capture_output=True, text=True, check=True, timeout=_GIT_SECONDS
+        )
     except (OSError, subprocess.SubprocessError):
         return None
     return done.stdout.strip()

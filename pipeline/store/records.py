@@ -184,11 +184,7 @@ class Records(Mapping[int, Commit]):
     """
 
     def __init__(
-        self,
-        files: Files,
-        digest: str,
-        singles: Mapping[int, Commit],
-        packs: Mapping[int, Pack] | None = None,
+        self, files: Files, digest: str, singles: Mapping[int, Commit], packs: Mapping[int, Pack] | None = None
     ) -> None:
         self._files = files
         self._digest = digest
@@ -242,9 +238,7 @@ class Records(Mapping[int, Commit]):
         except FileNotFoundError:
             content = b""
         if read_pack(content, self._digest, block) != pack:
-            raise DamagedError(
-                f"{self._files.name}/{key}: has changed since the run was opened; open it again."
-            )
+            raise DamagedError(f"{self._files.name}/{key}: has changed since the run was opened; open it again.")
         lines = content.split(b"\n")
         return {index: line + b"\n" for index, line in zip(pack.tasks, lines, strict=False)}
 

@@ -92,9 +92,7 @@ def read_run(place: str | Path | Files) -> RunInfo:
         _refuse_format(path, data, content)
         whole = fits(content) and data.pop(CHECKSUM) is not None
         info = RunInfo(files=files, **data) if whole else None
-        whole = (
-            info is not None and digest_of(info.identity) == info.digest and is_whole(info.spec.get("drive"))
-        )
+        whole = info is not None and digest_of(info.identity) == info.digest and is_whole(info.spec.get("drive"))
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
         raise DamagedError(f"{path}: damaged ({error}); {_remedy(directory)}") from None
     if info is None or not whole:
@@ -121,11 +119,7 @@ def _remedy(directory: str) -> str:
 
 
 def write_run(
-    files: Files,
-    spec: Spec,
-    identity: Mapping[str, Any],
-    spec_text: str,
-    skeleton: Mapping[str, Mapping[str, Any]],
+    files: Files, spec: Spec, identity: Mapping[str, Any], spec_text: str, skeleton: Mapping[str, Mapping[str, Any]]
 ) -> RunInfo:
     """Write ``run.json`` and return its content."""
     content = {

@@ -12,17 +12,7 @@ from pipeline.layout.plan import Plan
 from pipeline.spec.parsing import Spec
 from pipeline.store.checking import ODD, odd_keys, verify
 from pipeline.store.errors import DamagedError, RefusedError
-from pipeline.store.files import (
-    COMMITS,
-    CUBE,
-    HOLDER,
-    OWN_NAMES,
-    RUN_FILE,
-    TIMINGS,
-    Files,
-    is_temporary,
-    open_files,
-)
+from pipeline.store.files import COMMITS, CUBE, HOLDER, OWN_NAMES, RUN_FILE, TIMINGS, Files, is_temporary, open_files
 from pipeline.store.lease import is_note
 from pipeline.store.local import run_around
 from pipeline.store.packing import withdraw
@@ -72,8 +62,7 @@ def check(place: str | Path | Files, identity: Mapping[str, Any]) -> RunInfo | N
     lines = differences(info.identity, identity)
     if lines:
         raise RefusedError(
-            f"{files.name}: holds another run. Give another --out, or remove it. What differs:\n  "
-            + "\n  ".join(lines)
+            f"{files.name}: holds another run. Give another --out, or remove it. What differs:\n  " + "\n  ".join(lines)
         )
     return info
 
@@ -153,9 +142,7 @@ def _holds_something(files: Files, name: str) -> bool:
 
 def _digests(files: Files) -> set[str]:
     """Return the digests of runs that the group's metadata and the commit records name."""
-    records = [
-        f"{COMMITS}/{key}" for key in files.below(COMMITS).everything() if key.endswith((".json", ".jsonl"))
-    ]
+    records = [f"{COMMITS}/{key}" for key in files.below(COMMITS).everything() if key.endswith((".json", ".jsonl"))]
     # a pack names the digest in its first record
     found = {_text_in(content, "digest") for _, content in files.read_each(records)}
     for _, content in files.read_each([f"{CUBE}/{GROUP_KEY}"]):
@@ -176,9 +163,7 @@ def _text_in(content: bytes | FileNotFoundError, *keys: str) -> str | None:
     return data if isinstance(data, str) else None
 
 
-def create(
-    place: str | Path | Files, spec: Spec, plan: Plan, identity: Mapping[str, Any], spec_text: str
-) -> RunInfo:
+def create(place: str | Path | Files, spec: Spec, plan: Plan, identity: Mapping[str, Any], spec_text: str) -> RunInfo:
     """Make a run directory. ``run.json`` is written last: without it, no run has begun.
 
     Call `check` first: files with the same names are replaced.

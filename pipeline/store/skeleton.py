@@ -28,9 +28,7 @@ from pipeline.store.runfile import RunInfo
 GROUP_KEY = "zarr.json"
 
 
-def skeleton_files(
-    spec: Spec, plan: Plan, identity: Mapping[str, Any], spec_text: str, title: str
-) -> dict[str, bytes]:
+def skeleton_files(spec: Spec, plan: Plan, identity: Mapping[str, Any], spec_text: str, title: str) -> dict[str, bytes]:
     """Return the contents of all files of an empty cube by key; the group's metadata come first."""
     attrs = {
         "kind": plan.kind,
@@ -47,10 +45,15 @@ def skeleton_files(
     group = zarr.create_group(store, zarr_format=3, attributes={**attrs, "coordinates": names})
     for variable in plan.variables:
         create_array(
-            group, variable.name, (*plan.dims, *variable.own_dims),
+            group,
+            variable.name,
+            (*plan.dims, *variable.own_dims),
             (*plan.shape, *plan.chunks(variable)[len(plan.shape) :]),
-            plan.chunks(variable), variable.dtype, variable.fill, variable.attributes(),
-        )  # fmt: skip
+            plan.chunks(variable),
+            variable.dtype,
+            variable.fill,
+            variable.attributes(),
+        )
     for coordinate in found:
         write_whole(group, coordinate.name, coordinate.dims, np.asarray(coordinate.values), coordinate.attrs)
     with warnings.catch_warnings():
@@ -72,9 +75,7 @@ def _labels(spec: Spec) -> list[Coordinate]:
     model = spec.model
     found = [
         Coordinate("state", ("state",), _values(model.state_names), {"long_name": "component of the state"}),
-        Coordinate(
-            "state_units", ("state",), _values(model.state_units), {"long_name": "unit of the component"}
-        ),
+        Coordinate("state_units", ("state",), _values(model.state_units), {"long_name": "unit of the component"}),
     ]
     if model.angles:
         dim = model.angle_dim

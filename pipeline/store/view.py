@@ -88,9 +88,7 @@ class CommittedStore(WrapperStore[Store]):
     def _with_store(self, store: Store) -> CommittedStore:
         return type(self)(store, self._files, self._shown, self._checks)
 
-    async def get(
-        self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None
-    ) -> Buffer | None:
+    async def get(self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None) -> Buffer | None:
         """Return the content of a key, as zarr asks for; None if it is not committed.
 
         Raises
@@ -140,9 +138,7 @@ class CommittedStore(WrapperStore[Store]):
     def _compare(self, key: str, entry: Mapping[str, Any], content: bytes | None) -> bytes:
         if content is None:
             raise self._damaged(key, "is missing")
-        if self._checks and (
-            len(content) != entry["size"] or hashlib.sha256(content).hexdigest() != entry["sha256"]
-        ):
+        if self._checks and (len(content) != entry["size"] or hashlib.sha256(content).hexdigest() != entry["sha256"]):
             raise self._damaged(key, "is not what was written: its content has changed")
         if problem := self._shown.declared.problem(key, content):
             raise self._damaged(key, f"is not what was written: {problem}")

@@ -37,10 +37,7 @@ TOLERANCE = 1e-8
 SAME = 1e-6
 """Largest difference between the first section points of orbits that count as one [rad, rad/s]."""
 
-OWN_DIMS = {
-    "section": ("period_index", "state"), "turns": ("link",), "status": (), "orbit_period": (),
-    "n_periods": (),
-}  # fmt: skip
+OWN_DIMS = {"section": ("period_index", "state"), "turns": ("link",), "status": (), "orbit_period": (), "n_periods": ()}
 
 
 @dataclass
@@ -159,14 +156,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     each = scipy_seconds(parameters, starts.reshape(-1, 4)[np.sort(pick)], options.scipy_periods)
     work = options.size**2 * periods[fixed.name]
     print(f"scipy solve_ivp RK45: {1e6 * each:.0f} us per period and trajectory")
-    print(
-        f"the fixed way with it: {each * work / 3600:.1f} h, {each * work / fixed.wall_s:.0f} times as long"
-    )
+    print(f"the fixed way with it: {each * work / 3600:.1f} h, {each * work / fixed.wall_s:.0f} times as long")
 
 
-def _report(
-    fixed: Way, early: Way, found: dict[str, xr.Dataset], periods: dict[str, float], n_cells: int
-) -> None:
+def _report(fixed: Way, early: Way, found: dict[str, xr.Dataset], periods: dict[str, float], n_cells: int) -> None:
     print(f"{n_cells} cells at {FREQUENCY_HZ} Hz")
     print(f"{'':16s} {'periods':>9s} {'wall s':>8s} {'cpu s':>8s} {'identify s':>10s} {'cells/s':>8s}")
     for way in (fixed, early):
@@ -174,15 +167,19 @@ def _report(
         numbers = f"{way.wall_s:8.1f} {way.cpu_s:8.1f} {way.identify_s:10.1f} {rate:8.1f}"
         print(f"{way.name:16s} {periods[way.name]:9.1f} {numbers}")
     whole = (early.wall_s + early.identify_s) / (fixed.wall_s + fixed.identify_s)
-    print(f"ratio: periods {periods[early.name] / periods[fixed.name]:.3f}, "
-          f"integration wall {early.wall_s / fixed.wall_s:.3f}, cpu {early.cpu_s / fixed.cpu_s:.3f}, "
-          f"with identification {whole:.3f}")  # fmt: skip
+    print(
+        f"ratio: periods {periods[early.name] / periods[fixed.name]:.3f}, "
+        f"integration wall {early.wall_s / fixed.wall_s:.3f}, cpu {early.cpu_s / fixed.cpu_s:.3f}, "
+        f"with identification {whole:.3f}"
+    )
     same = same_labels(found[fixed.name], found[early.name])
     kind, _, _ = _labels(found[fixed.name])
     on_orbit = same[kind == PERIODIC_ORBIT]
     share = f"{100 * on_orbit.mean():.3f} %" if len(on_orbit) else "none"
-    print(f"same labels: {100 * same.mean():.3f} % of all cells, "
-          f"{share} of the {len(on_orbit)} that the fixed way sees on an orbit")  # fmt: skip
+    print(
+        f"same labels: {100 * same.mean():.3f} % of all cells, "
+        f"{share} of the {len(on_orbit)} that the fixed way sees on an orbit"
+    )
     for way in (fixed, early):
         one = found[way.name]
         counts = zip(one["orbit_period"].values, one["n_cells"].values, strict=True)

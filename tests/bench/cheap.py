@@ -104,18 +104,20 @@ def scalar(starts: np.ndarray, n_periods: int, tolerance: float) -> Outcome:
 
 
 def lanes(
-    starts: np.ndarray,
-    n_periods: int,
-    tolerance: float,
-    n_keep: int = 1,
-    quantities: Sequence[str] | None = None,
+    starts: np.ndarray, n_periods: int, tolerance: float, n_keep: int = 1, quantities: Sequence[str] | None = None
 ) -> Outcome:
     n = len(starts)
     found = run_branches(
-        np.broadcast_to(PARAMETERS, (n, 1, len(PARAMETERS))), np.full((n, 1), FREQUENCY), starts,
-        n_transient=n_periods - n_keep, n_keep=n_keep, rtol=tolerance, atol=tolerance,
-        system=DUFFING, quantities=quantities,
-    )  # fmt: skip
+        np.broadcast_to(PARAMETERS, (n, 1, len(PARAMETERS))),
+        np.full((n, 1), FREQUENCY),
+        starts,
+        n_transient=n_periods - n_keep,
+        n_keep=n_keep,
+        rtol=tolerance,
+        atol=tolerance,
+        system=DUFFING,
+        quantities=quantities,
+    )
     return Outcome(found.section[:, 0, -1], int(found.n_steps.sum() + found.n_rejected.sum()))
 
 

@@ -46,11 +46,7 @@ def attempts(result: Sections) -> float:
 
 
 def runner(
-    parameters: Parameters,
-    frequency: float | None,
-    section: Crossing | None,
-    rtol: float,
-    args: argparse.Namespace,
+    parameters: Parameters, frequency: float | None, section: Crossing | None, rtol: float, args: argparse.Namespace
 ) -> Callable[[], Sections]:
     """Return a function that integrates random starts over `args.periods` periods or returns."""
     system, n = parameters.model.system, args.trajectories
@@ -60,9 +56,16 @@ def runner(
 
     def run() -> Sections:
         return run_branches(
-            packed, hertz, starts, n_transient=args.periods // 2, n_keep=args.periods // 2, rtol=rtol,
-            atol=rtol, system=system, section=section,
-        )  # fmt: skip
+            packed,
+            hertz,
+            starts,
+            n_transient=args.periods // 2,
+            n_keep=args.periods // 2,
+            rtol=rtol,
+            atol=rtol,
+            system=system,
+            section=section,
+        )
 
     return run
 
@@ -81,9 +84,7 @@ def print_crossings(args: argparse.Namespace) -> None:
             assert first.return_time is not None
             times = first.return_time
             mean = float(np.nanmean(times)) if np.isfinite(times).any() else duration
-            (a, plain), (b, found) = timed(
-                [runner(parameters, 1.0 / mean, None, rtol, args), crossed], args.rounds
-            )
+            (a, plain), (b, found) = timed([runner(parameters, 1.0 / mean, None, rtol, args), crossed], args.rounds)
             n = 2 * (args.periods // 2)
             per_attempt = (b / attempts(found)) / (a / attempts(plain))
             off = np.nanmax(np.abs(found.section[..., column] - section.value))

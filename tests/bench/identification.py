@@ -73,9 +73,15 @@ def by_scipy(problem: Problem) -> np.ndarray:
     for piece in problem.pieces:
         end = float(piece.time[-1])
         found = solve_ivp(
-            right_hand_side, (0.0, end), piece.start, "RK45", piece.time, args=(p,), rtol=problem.rtol,
+            right_hand_side,
+            (0.0, end),
+            piece.start,
+            "RK45",
+            piece.time,
+            args=(p,),
+            rtol=problem.rtol,
             atol=problem.rtol,
-        )  # fmt: skip
+        )
         rows.append((piece.measured - found.y[: len(problem.channels)].T) / problem.noise)
     return np.concatenate(rows).ravel()
 
@@ -114,9 +120,7 @@ def shipped_problem(n_pieces: int) -> Problem:
 
 def main(arguments: list[str] | None = None) -> None:
     """Print times and ratios."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--pieces", type=int, default=26)
     options = parser.parse_args(arguments)
@@ -127,9 +131,7 @@ def main(arguments: list[str] | None = None) -> None:
     print(f"residuals of {len(problem.pieces)} pieces, largest difference {same:.1e} rad")
     print(f"  lanes      {1e3 * lanes:9.2f} ms")
     print(f"  solve_ivp  {1e3 * scipy:9.2f} ms   {scipy / lanes:.0f} times (target {TARGET:.0f})")
-    differences, tangents = least_time(
-        options.rounds, lambda: with_slopes(problem), lambda: with_slopes(variational)
-    )
+    differences, tangents = least_time(options.rounds, lambda: with_slopes(problem), lambda: with_slopes(variational))
     apart = np.abs(with_slopes(problem) - with_slopes(variational)).max()
     print(f"residuals with slopes by {len(problem.free)} unknowns and the starts")
     print(f"  differences between lanes  {1e3 * differences:9.2f} ms")

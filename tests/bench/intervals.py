@@ -51,9 +51,7 @@ def problem_of(seed: int) -> Problem:
         pieces += pieces_of(MODEL, CHANNELS, (ds, smooth(ds)), table, k)
     lower = {name: -3 * TRUTH[name] if name in ("c1", "c2") else 0.0 for name in UNKNOWN}
     free = tuple(Free(name, 1.1 * TRUTH[name], lower[name], 5 * TRUTH[name]) for name in UNKNOWN)
-    return Problem(
-        model=MODEL, fixed=TRUTH, free=free, channels=CHANNELS, pieces=tuple(pieces), noise=np.full(2, 2e-3)
-    )
+    return Problem(model=MODEL, fixed=TRUTH, free=free, channels=CHANNELS, pieces=tuple(pieces), noise=np.full(2, 2e-3))
 
 
 def outcome(seed: int) -> Outcome:
@@ -70,9 +68,7 @@ def outcome(seed: int) -> Outcome:
         raise ArithmeticError(f"seed {seed}: {fit.message}")
     covariance = covariance_of(linearise(problem, fit), np.array([TRUTH[name] for name in UNKNOWN]))
     missing = sum(int(np.isnan(p.measured).sum()) for p in problem.pieces)
-    return Outcome(
-        fit.theta, covariance.errors, covariance.critical * covariance.errors, covariance.estimator, missing
-    )
+    return Outcome(fit.theta, covariance.errors, covariance.critical * covariance.errors, covariance.estimator, missing)
 
 
 def coverage(n_seeds: int) -> tuple[np.ndarray, list[Outcome]]:

@@ -130,9 +130,7 @@ def lanes_without_limiter(case: Case) -> Outcome:
 
 
 def twin(case: Case, control: str = LIMITED) -> Outcome:
-    section, steps = run_twin(
-        control, case.parameters, case.frequency_hz, case.initial, case.n_periods, case.tolerance
-    )
+    section, steps = run_twin(control, case.parameters, case.frequency_hz, case.initial, case.n_periods, case.tolerance)
     accepted, rejected = steps.sum(axis=0)
     return Outcome(section, int(accepted), int(rejected))
 
@@ -161,9 +159,7 @@ def check_agreement(case: Case) -> float:
     short = replace(case, n_periods=AGREEMENT_PERIODS, tolerance=AGREEMENT_TOLERANCE)
     largest = float(np.max(scaled_error(lanes(short, n_keep=AGREEMENT_PERIODS).section, twin(short).section)))
     if not largest <= AGREEMENT:
-        raise AssertionError(
-            f"lanes and scalar twin differ by {largest:.2g}; expected {AGREEMENT:g} at most."
-        )
+        raise AssertionError(f"lanes and scalar twin differ by {largest:.2g}; expected {AGREEMENT:g} at most.")
     return largest
 
 
@@ -251,17 +247,11 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--periods", type=int, default=40)
     parser.add_argument("--frequency", type=float, default=2.8, help="of the drive [Hz]")
     parser.add_argument("--tolerance", type=float, default=1e-6, help="rtol and atol")
-    parser.add_argument(
-        "--eps-drive", type=float, help="steepness of the drive's edges; the preset's if not given"
-    )
+    parser.add_argument("--eps-drive", type=float, help="steepness of the drive's edges; the preset's if not given")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--rounds", type=int, default=7)
     parser.add_argument(
-        "--tolerances",
-        type=float,
-        nargs="*",
-        default=[10.0**-k for k in range(4, 11)],
-        help="of the second table",
+        "--tolerances", type=float, nargs="*", default=[10.0**-k for k in range(4, 11)], help="of the second table"
     )
     parser.add_argument(
         "--part", choices=["all", "speed", "compile"], default="all", help="what to print; children use it"
@@ -302,9 +292,7 @@ def print_speed(case: Case, variants: dict[str, Variant], rounds: int, reference
 
 def print_all(case: Case, arguments: argparse.Namespace) -> None:
     """Print what this process can measure: the variants and the tolerances."""
-    print(
-        f"numba {numba.__version__}, kernel {source_digest()}; ratio: time per period over the first row's;"
-    )
+    print(f"numba {numba.__version__}, kernel {source_digest()}; ratio: time per period over the first row's;")
     print(f"error: median over the trajectories after {ERROR_PERIODS} periods, rates in units of 10 rad/s")
     reference = reference_states(case)
     print_speed(case, VARIANTS, arguments.rounds, reference)

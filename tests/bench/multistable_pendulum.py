@@ -51,12 +51,7 @@ from pipeline.analysis.basins.numbers import basin_fractions
 
 GOAL = 12.0  # s, on two cores
 
-PUBLISHED = {
-    "Julia, 24 threads, integration only": 12.4,
-    "pyBasin": 63.0,
-    "pynamicalsys": 116.0,
-    "bSTAB": 309.0,
-}
+PUBLISHED = {"Julia, 24 threads, integration only": 12.4, "pyBasin": 63.0, "pynamicalsys": 116.0, "bSTAB": 309.0}
 """Seconds that others report for the same starts, on laptops with 24 cores."""
 
 UNDECIDED, REST, ROTATION = -1, 0, 1
@@ -141,9 +136,15 @@ def draw_starts(n: int, seed: int) -> np.ndarray:
 
 
 def integrate(
-    starts: np.ndarray, torque: np.ndarray | float, *, n_sections: int, section_time: float, n_keep: int,
-    threads: int, step_size: np.ndarray | None = None,
-) -> Sections:  # fmt: skip
+    starts: np.ndarray,
+    torque: np.ndarray | float,
+    *,
+    n_sections: int,
+    section_time: float,
+    n_keep: int,
+    threads: int,
+    step_size: np.ndarray | None = None,
+) -> Sections:
     """Sections of all starts, dims (start, 1, ...), by as many threads as asked for."""
     n = len(starts)
     packed = np.empty((n, 1, 2))
@@ -153,10 +154,18 @@ def integrate(
     def run(first: int) -> Sections:
         rows = slice(first, first + CHUNK)
         return run_branches(
-            packed[rows], frequency[rows], starts[rows], n_transient=n_sections - n_keep, n_keep=n_keep,
-            rtol=RTOL, atol=ATOL, closure_tolerance=CLOSURE, max_orbit_period=1, system=PENDULUM,
+            packed[rows],
+            frequency[rows],
+            starts[rows],
+            n_transient=n_sections - n_keep,
+            n_keep=n_keep,
+            rtol=RTOL,
+            atol=ATOL,
+            closure_tolerance=CLOSURE,
+            max_orbit_period=1,
+            system=PENDULUM,
             step_size=None if step_size is None else step_size[rows],
-        )  # fmt: skip
+        )
 
     with ThreadPoolExecutor(threads) as pool:
         parts = list(pool.map(run, range(0, n, CHUNK)))
@@ -209,9 +218,15 @@ class Regions:
 
         comes_round.terminal = turns_back.terminal = True  # type: ignore[attr-defined]
         found = solve_ivp(
-            rates, (0.0, 1e3), start, method="DOP853", rtol=1e-12, atol=1e-12, max_step=0.02,
+            rates,
+            (0.0, 1e3),
+            start,
+            method="DOP853",
+            rtol=1e-12,
+            atol=1e-12,
+            max_step=0.02,
             events=(comes_round, turns_back),
-        )  # fmt: skip
+        )
         round_it = len(found.t_events[0]) and found.y[1, -1] > MARGIN
         return cls(saddle, torque, CubicSpline(found.y[0], found.y[1]) if round_it else None)
 
@@ -230,9 +245,7 @@ class Regions:
 def run_to_the_end(starts: np.ndarray, duration: float, threads: int) -> tuple[np.ndarray, int]:
     """Labels of all starts after `duration`, and attempted steps."""
     n_sections = round(duration / SECTION_TIME)
-    found = integrate(
-        starts, TORQUE, n_sections=n_sections, section_time=SECTION_TIME, n_keep=2, threads=threads
-    )
+    found = integrate(starts, TORQUE, n_sections=n_sections, section_time=SECTION_TIME, n_keep=2, threads=threads)
     return classify(found), int(found.n_steps.sum() + found.n_rejected.sum())
 
 

@@ -95,9 +95,11 @@ def table(n_tasks: int, latency_s: float, folder: Path) -> list[str]:
 
     server = Server()
     os.environ |= {
-        "AWS_ENDPOINT_URL": server.url, "AWS_ACCESS_KEY_ID": KEY_ID, "AWS_SECRET_ACCESS_KEY": SECRET,
+        "AWS_ENDPOINT_URL": server.url,
+        "AWS_ACCESS_KEY_ID": KEY_ID,
+        "AWS_SECRET_ACCESS_KEY": SECRET,
         "AWS_REGION": "us-east-1",
-    }  # fmt: skip
+    }
     text = SPEC.format(n=n_tasks)
     try:
         measure(str(folder / "warm"), SPEC.format(n=2), lambda: 0)  # imports

@@ -62,8 +62,7 @@ def measure(seconds: float, folder: Path) -> dict[str, float]:
         "kernel in the worker": inside + first["kernel_s"],
         "per cent, writing": 100 * writing / inside,
         "per cent, dask": 100 * (whole - inside - writing) / inside,
-        "per cent, both, over the kernel here": 100
-        * (whole / (kernel * (plan.n_tasks - 1) / plan.n_tasks) - 1),
+        "per cent, both, over the kernel here": 100 * (whole / (kernel * (plan.n_tasks - 1) / plan.n_tasks) - 1),
     }
 
 

@@ -291,8 +291,14 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--periods", type=int, default=40, help="drive periods that are timed (40)")
     p.add_argument("--error-period", type=int, default=5, help="section at which errors are taken (5)")
     p.add_argument("--frequency", type=float, default=2.8, help="of the drive [Hz] (2.8)")
-    p.add_argument("--eps-drive", type=drive_steepness, nargs="+", default=[None, 1000.0], metavar="EPS",
-                   help="steepness of the drive's edges, or `preset` (both: preset 1000)")  # fmt: skip
+    p.add_argument(
+        "--eps-drive",
+        type=drive_steepness,
+        nargs="+",
+        default=[None, 1000.0],
+        metavar="EPS",
+        help="steepness of the drive's edges, or `preset` (both: preset 1000)",
+    )
     p.add_argument("--seed", type=int, default=1, help="of the initial states (1)")
     p.add_argument("--rounds", type=int, default=8, help="timed rounds, of which the best counts (8)")
     p.add_argument("--peers", nargs="+", choices=list(ENTRIES), default=list(ENTRIES))

@@ -27,9 +27,11 @@ from pipeline.analysis.attractors.extending import LEAST_STAY
 from pipeline.analysis.sets import Geometry
 
 UEDA = {
-    "name": "ueda", "states": {"x": {}, "v": {}}, "parameters": {"k": 0.05, "B": 7.5},
+    "name": "ueda",
+    "states": {"x": {}, "v": {}},
+    "parameters": {"k": 0.05, "B": 7.5},
     "equations": {"x": "v", "v": "-k*v - x**3 + B*cos(2*pi*f*t)"},
-}  # fmt: skip
+}
 """Ueda, J. Stat. Phys. 20, 181 (1979)."""
 
 KEPT = (20, 60, 300, LEAST_STAY)
@@ -71,9 +73,7 @@ def cells_of(case: Case, n: int) -> tuple[np.ndarray, Geometry]:
     model = load_model(case.model)
     parameters = model.load(**case.changes)
     starts = 0.1 + case.spread * np.random.default_rng(1).uniform(-1.0, 1.0, (n, len(model.states)))
-    found = sections(
-        parameters, case.frequency_hz, starts, n_transient=500, n_keep=LEAST_STAY, section=case.section
-    )
+    found = sections(parameters, case.frequency_hz, starts, n_transient=500, n_keep=LEAST_STAY, section=case.section)
     return found.section[found.status == 2], Geometry(model.is_angle, model.scales)
 
 
@@ -89,9 +89,7 @@ def rates_of(cells: np.ndarray, geometry: Geometry) -> Iterator[Rates]:
         same = [mixing(own[a], own[b], geometry) for a, b in pairs]
         two = [mixing(own[a], own[b] + shift, geometry) for a, b in pairs]
         groups = int(group(list(own), geometry)[0].max()) + 1
-        yield Rates(
-            float(np.mean(np.less(same, OTHER))), float(np.mean(np.greater_equal(two, OTHER))), groups
-        )
+        yield Rates(float(np.mean(np.less(same, OTHER))), float(np.mean(np.greater_equal(two, OTHER))), groups)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -37,9 +37,7 @@ def _numbalsoda_loop(parameters: magpend_core.Parameters, method: str) -> Any:
     def run(initial: Any, times: Any, omega: Any, tolerance: float) -> Any:
         section = np.full((len(initial), times.shape[1] - 1, 4), np.nan)
         for i in range(len(initial)):
-            solution, success = solve(
-                address, initial[i], times[i], omega[i], tolerance, tolerance, MAX_STEPS
-            )
+            solution, success = solve(address, initial[i], times[i], omega[i], tolerance, tolerance, MAX_STEPS)
             if success:
                 section[i] = solution[1:]
         return section

@@ -339,9 +339,18 @@ def sections_of(control: str) -> Any:
 
     @njit(**WITHOUT_DOORS)
     def run_segment(
-        start: float, end: float, wish: float, y: Any, k: Any, new: Any, m: Any,
-        rtol: float, atol: float, edge_ratio: float, steps: Any,
-    ) -> float:  # fmt: skip
+        start: float,
+        end: float,
+        wish: float,
+        y: Any,
+        k: Any,
+        new: Any,
+        m: Any,
+        rtol: float,
+        atol: float,
+        edge_ratio: float,
+        steps: Any,
+    ) -> float:
         t, rejected = start, False
         slack = SLACK * (rtol + atol)
         while t < end:

@@ -32,13 +32,7 @@ def variants(
 
     def plain() -> object:
         return run_branches(
-            packed[:, None],
-            frequency[:, None],
-            states,
-            n_transient=n_periods - 1,
-            n_keep=1,
-            rtol=1e-8,
-            atol=1e-8,
+            packed[:, None], frequency[:, None], states, n_transient=n_periods - 1, n_keep=1, rtol=1e-8, atol=1e-8
         )
 
     def exponents(n: int) -> Callable[[], object]:
@@ -82,9 +76,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         for name, function in cases.items():
             times[name].append(cpu_seconds(function))
     least = {name: min(values) for name, values in times.items()}
-    print(
-        f"{n} trajectories, {options.periods} periods at {options.frequency} Hz, tolerance 1e-8, one thread"
-    )
+    print(f"{n} trajectories, {options.periods} periods at {options.frequency} Hz, tolerance 1e-8, one thread")
     print(f"{'':14s}{'us per period':>15s}{'ratio':>9s}")
     for name, seconds in least.items():
         per_period = 1e6 * seconds / (n * options.periods)

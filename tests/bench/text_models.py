@@ -136,17 +136,22 @@ class Contestant:
     periods: int
 
 
-def lanes(
-    system: System, packed: np.ndarray, frequency: float, tolerance: float, on_steps: Any = None
-) -> Runner:
+def lanes(system: System, packed: np.ndarray, frequency: float, tolerance: float, on_steps: Any = None) -> Runner:
     """Runner of the engine."""
 
     def runner(initial: np.ndarray, n_periods: int) -> np.ndarray:
         n = len(initial)
         found = run_branches(
-            np.tile(packed, (n, 1, 1)), np.full((n, 1), frequency), initial, n_transient=n_periods - 1,
-            n_keep=1, rtol=tolerance, atol=tolerance, system=system, max_steps_per_period=1_000_000,
-        )  # fmt: skip
+            np.tile(packed, (n, 1, 1)),
+            np.full((n, 1), frequency),
+            initial,
+            n_transient=n_periods - 1,
+            n_keep=1,
+            rtol=tolerance,
+            atol=tolerance,
+            system=system,
+            max_steps_per_period=1_000_000,
+        )
         if on_steps is not None:
             on_steps(found)
         return found.section[:, 0, 0]
@@ -210,9 +215,8 @@ def race(
 
 
 def engine_entry(
-    name: str, system: System, packed: np.ndarray, case: Case, setting: Setting,
-    methods: Sequence[str] = ("dopri5",),
-) -> Contestant:  # fmt: skip
+    name: str, system: System, packed: np.ndarray, case: Case, setting: Setting, methods: Sequence[str] = ("dopri5",)
+) -> Contestant:
     """Enter the engine, swept over rtol = atol = 1e-3 ... 1e-11 by each method."""
     sweep = {
         f"{method} {t:.0e}": lanes(dataclasses.replace(system, method=method), packed, 1.0 / case.period, t)
@@ -324,9 +328,7 @@ def compare_layers(names: Sequence[str], setting: Setting, all_points: bool) -> 
             engine_entry("without", without, parameters.pack(), case, setting),
         ]
         curves = race(entries, case, solved(model, case, over), system, setting.rounds)
-        print(
-            f"\n{name}; layers found: {system.has_layers}\n{HEAD}\n" + "\n".join(ratios(curves)), flush=True
-        )
+        print(f"\n{name}; layers found: {system.has_layers}\n{HEAD}\n" + "\n".join(ratios(curves)), flush=True)
         if all_points:
             print("\n".join(points(curves)), flush=True)
 
@@ -404,11 +406,7 @@ def compare_compiling(names: Sequence[str]) -> None:
             rows = []
             for _ in range(2):
                 done = subprocess.run(
-                    [sys.executable, "-c", script],
-                    env=environment,
-                    capture_output=True,
-                    text=True,
-                    check=True,
+                    [sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=True
                 )
                 rows.append([float(v) for v in done.stdout.split()])
         print(f"  {name:<18}{rows[0][0]:>15.2f}{rows[0][1]:>12.2f}{rows[1][1]:>15.2f}", flush=True)

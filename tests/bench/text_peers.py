@@ -67,11 +67,7 @@ def scalar_rhs(model: TextModel, values: Mapping[str, float], frequency: float) 
     """Compiled ``rhs(t, *states)`` -> rates as a tuple."""
     definition = model.definition
     states = [s.name for s in model.states]
-    known = {
-        **{name: repr(float(v)) for name, v in values.items()},
-        "pi": repr(math.pi),
-        "f": repr(frequency),
-    }
+    known = {**{name: repr(float(v)) for name, v in values.items()}, "pi": repr(math.pi), "f": repr(frequency)}
     lines = [f"def rhs(t, {', '.join(states)}):"]
     for name in definition.used(definition.equations.values()):
         if name == "phase":
@@ -177,9 +173,7 @@ def scipy_states(rhs: Any, initial: np.ndarray, end: float, tolerance: float) ->
         return np.array(rhs(t, *_fixed(y, n)))
 
     _fixed = _tuple_of(n)
-    rows = [
-        solve_ivp(function, (0.0, end), y, "DOP853", rtol=tolerance, atol=tolerance).y[:, -1] for y in initial
-    ]
+    rows = [solve_ivp(function, (0.0, end), y, "DOP853", rtol=tolerance, atol=tolerance).y[:, -1] for y in initial]
     return np.array(rows)
 
 
@@ -259,10 +253,7 @@ def _heyoka(tree: Tree, names: Mapping[str, Any]) -> Any:
     if tree.kind == "product":
         value = _heyoka(tree.args[0], names)
         for part in tree.args[1:]:
-            if part.kind == "inverse":
-                value = value / _heyoka(part.args[0], names)
-            else:
-                value = value * _heyoka(part, names)
+            value = value / _heyoka(part.args[0], names) if part.kind == "inverse" else value * _heyoka(part, names)
         return value
     args = [_heyoka(arg, names) for arg in tree.args]
     if tree.kind == "call":
@@ -280,9 +271,7 @@ def _heyoka(tree: Tree, names: Mapping[str, Any]) -> Any:
     return getattr(hy, joined[tree.kind])(args)
 
 
-def heyoka_equations(
-    model: TextModel, values: Mapping[str, float], frequency: float
-) -> tuple[list[Any], list[Any]]:
+def heyoka_equations(model: TextModel, values: Mapping[str, float], frequency: float) -> tuple[list[Any], list[Any]]:
     """State variables and the expressions of their rates, parameters folded in as numbers."""
     import heyoka as hy
 
@@ -307,8 +296,11 @@ def heyoka_batch(
     integrator = hy.taylor_adaptive_batch(
         list(zip(variables, right, strict=True)),
         np.zeros((len(variables), batch)),
-        tol=tolerance, compact_mode=False, fast_math=True, force_avx512=True,
-    )  # fmt: skip
+        tol=tolerance,
+        compact_mode=False,
+        fast_math=True,
+        force_avx512=True,
+    )
 
     def runner(initial: np.ndarray, n_periods: int) -> np.ndarray:
         out = np.empty_like(initial)

@@ -66,23 +66,24 @@ def problem_of(seed: int, shorten: int = 1) -> Problem:
     times = np.arange(int(LENGTH_S * RATE_HZ) // shorten) / RATE_HZ
     off = TRUTH.replace(q=0.0)
     made = [
-        record(off, None, start, times, sensors=SENSORS, seed=100 * seed + k)
-        for k, start in enumerate(FREE_SWINGS)
+        record(off, None, start, times, sensors=SENSORS, seed=100 * seed + k) for k, start in enumerate(FREE_SWINGS)
     ]
     made += [
         record(
-            TRUTH, [Step(frequency, math.ceil(LENGTH_S * frequency) + 1, {})], start, times, sensors=SENSORS,
+            TRUTH,
+            [Step(frequency, math.ceil(LENGTH_S * frequency) + 1, {})],
+            start,
+            times,
+            sensors=SENSORS,
             seed=100 * seed + 10 + k,
         )
         for k, (frequency, start) in enumerate(FORCED)
-    ]  # fmt: skip
+    ]
     pieces, smoothed = [], [smooth(ds) for ds in made]
     for k, ds in enumerate(made):
         drive = "none" if k < len(FREE_SWINGS) else "recorded"
         table = RecordingTable.model_validate({"file": "", "mapping": "", "drive": drive, "piece_s": PIECE_S})
-        pieces += [
-            replace(p, follows=-1) for p in pieces_of(MODEL, MODEL.angles, (ds, smoothed[k]), table, k)
-        ]
+        pieces += [replace(p, follows=-1) for p in pieces_of(MODEL, MODEL.angles, (ds, smoothed[k]), table, k)]
     rng = np.random.default_rng(seed)
     free = []
     for name in UNKNOWN:
@@ -91,14 +92,7 @@ def problem_of(seed: int, shorten: int = 1) -> Problem:
         free.append(Free(name, value, 0.2 * value, 5.0 * value, prior_mean=mean, prior_sd=sd))
     noise = noise_of(MODEL, MODEL.angles, smoothed, {})
     return Problem(
-        MODEL,
-        TRUTH,
-        tuple(free),
-        MODEL.angles,
-        tuple(apply_settings(pieces, {})),
-        noise,
-        rtol=1e-9,
-        recorded=True,
+        MODEL, TRUTH, tuple(free), MODEL.angles, tuple(apply_settings(pieces, {})), noise, rtol=1e-9, recorded=True
     )
 
 
@@ -126,24 +120,19 @@ def from_afar(seed: int) -> Outcome:
     problem = problem_of(seed)
     signs = np.random.default_rng(seed).choice([-1, 1], len(UNKNOWN))
     guess = [
-        f.prior_mean if f.has_prior else f.start * (1 + 0.1 * sign)
-        for f, sign in zip(problem.free, signs, strict=True)
+        f.prior_mean if f.has_prior else f.start * (1 + 0.1 * sign) for f, sign in zip(problem.free, signs, strict=True)
     ]
     return judged(problem, refine(problem, np.array(guess)))
 
 
 def main(arguments: list[str] | None = None) -> None:
     """Print truth, estimate and interval of a seed, and the coverage over many."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=200)
     options = parser.parse_args(arguments)
     first = from_afar(0)
     print(f"one rig: {first.fit.n_evaluations} evaluations, rms {np.round(1e3 * first.fit.rms, 3)} mrad")
-    for name, value, theta, half, hit in zip(
-        UNKNOWN, truth(), first.fit.theta, first.half, first.hits, strict=True
-    ):
+    for name, value, theta, half, hit in zip(UNKNOWN, truth(), first.fit.theta, first.half, first.hits, strict=True):
         print(f"  {name:4s} {value:12.6g} {theta:12.6g} +- {half:9.3g} {'' if hit else 'outside'}")
     found = [o for o in map(outcome, range(1, options.seeds + 1)) if o is not None]
     if found:
@@ -151,10 +140,7 @@ def main(arguments: list[str] | None = None) -> None:
         z = np.array([(o.fit.theta - truth()) / o.errors for o in found])
         print(f"coverage over {len(found)} of {options.seeds} seeds: {100 * hits.mean():.1f} %")
         for k, name in enumerate(UNKNOWN):
-            print(
-                f"  {name:4s} {100 * hits[:, k].mean():6.1f} %   "
-                f"z {z[:, k].mean():+.2f} +- {z[:, k].std():.2f}"
-            )
+            print(f"  {name:4s} {100 * hits[:, k].mean():6.1f} %   z {z[:, k].mean():+.2f} +- {z[:, k].std():.2f}")
 
 
 if __name__ == "__main__":

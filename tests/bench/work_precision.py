@@ -76,9 +76,7 @@ def draw(results: list[tuple[Problem, list[Curve]]], path: Path) -> None:
     """Write the figure."""
     with plt.rc_context(STYLE):
         n = len(results)
-        figure, row = plt.subplots(
-            1, n, figsize=(3.6 * n + 0.2, 3.9), sharey=True, squeeze=False, layout="constrained"
-        )
+        figure, row = plt.subplots(1, n, figsize=(3.6 * n + 0.2, 3.9), sharey=True, squeeze=False, layout="constrained")
         for axes, (problem, curves), letter in zip(row[0], results, "abcdefgh", strict=False):
             draw_panel(axes, problem, curves, letter)
         row[0][0].set_ylabel("CPU time per period and trajectory [\N{MICRO SIGN}s]")

@@ -155,8 +155,13 @@ def run_python(tmp_path):
         settings = {"MAGPEND_CACHE_DIR": str(tmp_path / "cache"), **env, "PYTHONPATH": str(package)}
         done = subprocess.run(
             [sys.executable, "-W", "error", "-c", script],
-            env=keep | settings, cwd=tmp_path, capture_output=True, text=True, timeout=300, check=False,
-        )  # fmt: skip
+            env=keep | settings,
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+            timeout=300,
+            check=False,
+        )
         assert done.returncode == 0, done.stderr
         return done.stdout
 

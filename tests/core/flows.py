@@ -9,10 +9,11 @@ _PLANE = {"x": {}, "y": {}}
 
 _NORMAL_FORM = {
     # one name and one text: the two differ in values alone, and compile once
-    "name": "normal_form", "states": _PLANE,
+    "name": "normal_form",
+    "states": _PLANE,
     "define": {"s": "x**2 + y**2", "g": "mu + cubic*s + quintic*s**2"},
     "equations": {"x": "g*x - omega*y", "y": "omega*x + g*y"},
-}  # fmt: skip
+}
 
 HOPF = {**_NORMAL_FORM, "parameters": {"mu": 0.25, "omega": 2.0, "cubic": -1.0, "quintic": 0.0}}
 """Normal form of Hopf's bifurcation: radius sqrt(mu), period 2 pi/omega, multiplier exp(-4 pi mu/omega)."""
@@ -21,21 +22,26 @@ BAUTIN = {**_NORMAL_FORM, "parameters": {"mu": 0.1, "omega": 2.0, "cubic": 1.0, 
 """Subcritical: with s the squared radius, mu + s - s**2 = 0; a fold of cycles at mu = -1/4, s = 1/2."""
 
 PAIR = {
-    "name": "pair", "states": {"x": {}, "y": {}, "u": {}, "w": {}},
+    "name": "pair",
+    "states": {"x": {}, "y": {}, "u": {}, "w": {}},
     "parameters": {"mu": -0.1, "fast": 2.0, "slow": 0.7},
     "define": {"s": "x**2 + y**2", "r": "u**2 + w**2"},
     "equations": {
-        "x": "x*(1 - s) - fast*y", "y": "y*(1 - s) + fast*x",
-        "u": "u*(mu - r) - slow*w", "w": "w*(mu - r) + slow*u",
+        "x": "x*(1 - s) - fast*y",
+        "y": "y*(1 - s) + fast*x",
+        "u": "u*(mu - r) - slow*w",
+        "w": "w*(mu - r) + slow*u",
     },
-}  # fmt: skip
+}
 """Two oscillators: multipliers exp((mu +- i slow) 2 pi/fast) of the first; a torus from mu = 0."""
 
 VAN_DER_POL = {
     # as in the library, and compiled once with it
-    "name": "van_der_pol", "states": {"x": {}, "v": {}}, "parameters": {"mu": 1.0},
+    "name": "van_der_pol",
+    "states": {"x": {}, "v": {}},
+    "parameters": {"mu": 1.0},
     "equations": {"x": "v", "v": "mu*(1 - x**2)*v - x"},
-}  # fmt: skip
+}
 
 ROSSLER, LORENZ = "rossler", "lorenz"
 """Those of the library."""
@@ -49,9 +55,8 @@ def flow(table: dict[str, object] | str) -> Model:
 def lorenz96(n: int, forcing: float = 8.0) -> dict[str, object]:
     """Lorenz-96 with `n` states in a ring: every one with the same four neighbours in its equation."""
     return {
-        "name": "lorenz96", "states": {f"x{i}": {} for i in range(n)}, "parameters": {"F": forcing},
-        "equations": {
-            f"x{i}": f"(x{(i + 1) % n} - x{(i - 2) % n})*x{(i - 1) % n} - x{i} + F"
-            for i in range(n)
-        },
-    }  # fmt: skip
+        "name": "lorenz96",
+        "states": {f"x{i}": {} for i in range(n)},
+        "parameters": {"F": forcing},
+        "equations": {f"x{i}": f"(x{(i + 1) % n} - x{(i - 2) % n})*x{(i - 1) % n} - x{i} + F" for i in range(n)},
+    }

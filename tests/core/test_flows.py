@@ -85,9 +85,8 @@ def test_section_map__differences():
     for k in (1, 2):
         shift = step * np.eye(3)[k]
         ends = section_map(
-            np.tile(packed, (2, 1)), np.tile(rate, 2), np.array([point + shift, point - shift]), 2,
-            system=system,
-        )  # fmt: skip
+            np.tile(packed, (2, 1)), np.tile(rate, 2), np.array([point + shift, point - shift]), 2, system=system
+        )
         slope = (ends.images[0, -1] - ends.images[1, -1]) / (2.0 * step)
         np.testing.assert_allclose(found.derivatives[0, :, k], slope, atol=2e-7)
     assert (found.derivatives[0, 0] == 0.0).all()
@@ -127,13 +126,25 @@ def exponents(parameters, starts, n_periods, tolerance=1e-8):
     packed = np.tile(parameters.pack(), (n, 1))
     longest = np.full(n, parameters.model.crossing.frequency_hz)
     settled = run_branches(
-        packed[:, None], longest[:, None], np.asarray(starts), n_transient=100, n_keep=1, rtol=tolerance,
-        atol=tolerance, system=system,
-    )  # fmt: skip
+        packed[:, None],
+        longest[:, None],
+        np.asarray(starts),
+        n_transient=100,
+        n_keep=1,
+        rtol=tolerance,
+        atol=tolerance,
+        system=system,
+    )
     return lyapunov_exponents(
-        packed, longest, settled.section[:, 0, -1], n_transient=50, n_periods=n_periods, rtol=tolerance,
-        atol=tolerance, system=system,
-    )  # fmt: skip
+        packed,
+        longest,
+        settled.section[:, 0, -1],
+        n_transient=50,
+        n_periods=n_periods,
+        rtol=tolerance,
+        atol=tolerance,
+        system=system,
+    )
 
 
 def test_lyapunov_exponents__limit_cycle():

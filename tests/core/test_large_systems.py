@@ -140,9 +140,13 @@ def test_lyapunov__standard_case_of_forty_states():
     # unit, and a dimension of 27.1; the tolerances are those of published values, not of the 16 trajectories
     n, rng = 40, np.random.default_rng(1)
     found = lyapunov_exponents(
-        np.full((16, 1), 8.0), np.ones(16), 8.0 + rng.normal(size=(16, n)),
-        system=flow(lorenz96(n)).system, n_transient=100, n_periods=400,
-    )  # fmt: skip
+        np.full((16, 1), 8.0),
+        np.ones(16),
+        8.0 + rng.normal(size=(16, n)),
+        system=flow(lorenz96(n)).system,
+        n_transient=100,
+        n_periods=400,
+    )
     mean = found.exponents.mean(axis=0)
     assert mean[0] == pytest.approx(1.69, abs=0.03)
     assert kaplan_yorke(mean) == pytest.approx(27.1, abs=0.3)
@@ -182,9 +186,15 @@ def _chain_jacobian(y, u, c):
 
 
 CHAIN = System(
-    name="chain", state_names=("a", "b"), parameter_names=(), n_constants=1, constants=_no_constants,
-    rhs=_chain_rhs, jacobian=_chain_jacobian, jacobian_entries=(1, 2),
-)  # fmt: skip
+    name="chain",
+    state_names=("a", "b"),
+    parameter_names=(),
+    n_constants=1,
+    constants=_no_constants,
+    rhs=_chain_rhs,
+    jacobian=_chain_jacobian,
+    jacobian_entries=(1, 2),
+)
 
 
 @pytest.mark.parametrize(

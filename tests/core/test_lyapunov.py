@@ -19,9 +19,12 @@ def packed(parameters, n):
 def of_duffing(parameters, n_cells=32, **options):
     rng = np.random.default_rng(4)
     return lyapunov_exponents(
-        np.tile(np.array(parameters), (n_cells, 1)), np.full(n_cells, UNIT_FREQUENCY),
-        rng.uniform(-1.0, 1.0, (n_cells, 2)), system=DUFFING, **options,
-    )  # fmt: skip
+        np.tile(np.array(parameters), (n_cells, 1)),
+        np.full(n_cells, UNIT_FREQUENCY),
+        rng.uniform(-1.0, 1.0, (n_cells, 2)),
+        system=DUFFING,
+        **options,
+    )
 
 
 def test_duffing__published_exponents():
@@ -60,9 +63,7 @@ def test_lyapunov__reference_spectra(preset, reference, case):
     states = run.section[:, -1]
     if case == 1:  # the left attractor, on which the reference is
         states = states[np.abs(states[:, 0] + 0.0557) < 0.01]
-    found = lyapunov_exponents(
-        packed(preset, len(states)), np.full(len(states), frequency), states, n_periods=800
-    )
+    found = lyapunov_exponents(packed(preset, len(states)), np.full(len(states), frequency), states, n_periods=800)
     errors = np.hypot(found.stderr.mean(axis=0) / np.sqrt(len(states)), expected["stderr"])
     assert len(states) >= 2
     assert (np.abs(found.exponents.mean(axis=0) - expected["lyapunov_per_s"]) < 3.0 * errors).all()
@@ -142,9 +143,13 @@ def test_lyapunov__blocks_average_to_the_exponents(mixed):
 def test_lyapunov__a_trajectory_that_fails_has_no_exponents():
     # negative cubic stiffness: one of the two escapes
     found = lyapunov_exponents(
-        np.tile([0.1, 1.0, -1.0, 0.1], (2, 1)), np.full(2, UNIT_FREQUENCY),
-        np.array([[0.0, 0.0], [3.0, 1.0]]), n_exponents=2, n_periods=16, system=DUFFING,
-    )  # fmt: skip
+        np.tile([0.1, 1.0, -1.0, 0.1], (2, 1)),
+        np.full(2, UNIT_FREQUENCY),
+        np.array([[0.0, 0.0], [3.0, 1.0]]),
+        n_exponents=2,
+        n_periods=16,
+        system=DUFFING,
+    )
     assert found.status.tolist() == [Status.BOUNDED, Status.DIVERGED]
     assert np.isfinite(found.exponents[0]).all()
     for name in ("exponents", "stderr", "weighted", "blocks", "divergence", "loss"):

@@ -62,16 +62,12 @@ def test_polish_orbits__period_2(packed):
 
 
 def test_polish_orbits__far_from_any(packed):
-    found = polish_orbits(
-        packed[:1], np.array([2.03]), [[2.0, -2.0, 15.0, -20.0]], np.array([1]), max_iterations=3
-    )
+    found = polish_orbits(packed[:1], np.array([2.03]), [[2.0, -2.0, 15.0, -20.0]], np.array([1]), max_iterations=3)
     assert not found.converged[0]
     assert np.isnan(found.multipliers).all()
 
 
-@pytest.mark.parametrize(
-    ("periods", "message"), [([0], "1 or more"), ([1.5], "whole numbers"), ([1, 1], "must agree")]
-)
+@pytest.mark.parametrize(("periods", "message"), [([0], "1 or more"), ([1.5], "whole numbers"), ([1, 1], "must agree")])
 def test_polish_orbits__bad_input(packed, periods, message):
     with pytest.raises(ValueError, match=message):
         polish_orbits(packed[:1], np.array([2.2]), np.zeros((1, 4)), np.array(periods))
@@ -84,9 +80,14 @@ def test_stroboscopic_map__derivatives(packed, reference):
     step = 1e-6 * np.array([1.0, 1.0, 10.0, 10.0])
     shifted = np.concatenate([points[0] + np.diag(step), points[0] - np.diag(step)])
     plain = run_branches(
-        np.tile(packed[0], (8, 1, 1)), np.full((8, 1), frequency[0]), shifted,
-        n_transient=0, n_keep=1, rtol=1e-12, atol=1e-12,
-    ).section[:, 0, 0]  # fmt: skip
+        np.tile(packed[0], (8, 1, 1)),
+        np.full((8, 1), frequency[0]),
+        shifted,
+        n_transient=0,
+        n_keep=1,
+        rtol=1e-12,
+        atol=1e-12,
+    ).section[:, 0, 0]
     differences = (plain[:4] - plain[4:]).T / (2.0 * step)
     # integration error over the step, and the step's square
     assert np.abs(derivatives[0] - differences).max() < 1e-4 * np.abs(differences).max()
@@ -128,6 +129,4 @@ def test_stroboscopic_map__derivative_at_rest(period):
         np.array([[c, k, 0.0, 0.0]]), np.array([1.0 / period]), np.zeros((1, 2)), 1, system=DUFFING
     )
     assert (image == 0.0).all()
-    assert derivative[0] == pytest.approx(
-        scipy.linalg.expm(np.array([[0.0, 1.0], [-k, -c]]) * period), abs=1e-8
-    )
+    assert derivative[0] == pytest.approx(scipy.linalg.expm(np.array([[0.0, 1.0], [-k, -c]]) * period), abs=1e-8)

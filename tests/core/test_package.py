@@ -111,9 +111,7 @@ def version_after(run_python, copied, name, old, new):
     text = path.read_text("utf-8")
     assert text.count(old) == 1
     path.write_text(text.replace(old, new), "utf-8")
-    return run_python(
-        "from magpend_core import kernel_version; print(kernel_version())", package=copied
-    ).strip()
+    return run_python("from magpend_core import kernel_version; print(kernel_version())", package=copied).strip()
 
 
 def test_kernel_version__follows_the_engines_meaning(run_python, copied):
@@ -127,6 +125,4 @@ def test_kernel_version__follows_the_engines_meaning(run_python, copied):
 
 def test_kernel_version__leaves_models_to_their_own_digests(run_python, copied):
     name = "models/parameters.py"
-    assert (
-        version_after(run_python, copied, name, 'FRACTION = "between', 'FRACTION = "in') == kernel_version()
-    )
+    assert version_after(run_python, copied, name, 'FRACTION = "between', 'FRACTION = "in') == kernel_version()

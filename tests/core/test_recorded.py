@@ -89,28 +89,23 @@ def test_recorded_sections__same_bits_in_any_chunks(torque):
     drive, ends = Drive.from_edges(rising, falling), None
     if torque:
         times = np.linspace(0, 4, 41)
-        drive, ends = (
-            Drive.from_torque(times, np.sin(13 * times)),
-            np.array([3, 7, 12, 15, 21, 28, 30, 35, 39]),
-        )
+        drive, ends = (Drive.from_torque(times, np.sin(13 * times)), np.array([3, 7, 12, 15, 21, 28, 30, 35, 39]))
     found = [
         recorded_sections(
-            packed(5), drive, states(5, rate=30.0), ends=ends, n_transient=4, n_keep=5, system=SYSTEM,
-            n_points=n, n_lanes=lanes,
+            packed(5),
+            drive,
+            states(5, rate=30.0),
+            ends=ends,
+            n_transient=4,
+            n_keep=5,
+            system=SYSTEM,
+            n_points=n,
+            n_lanes=lanes,
         )
         for n, lanes in ((None, 64), (1, 3), (4, 8))
-    ]  # fmt: skip
+    ]
     for other in found[1:]:
-        for name in (
-            "section",
-            "turns",
-            "status",
-            "n_steps",
-            "n_rejected",
-            "n_periods",
-            "final_state",
-            "step_size",
-        ):
+        for name in ("section", "turns", "status", "n_steps", "n_rejected", "n_periods", "final_state", "step_size"):
             np.testing.assert_array_equal(getattr(other, name), getattr(found[0], name), err_msg=name)
 
 
@@ -129,13 +124,17 @@ def test_recorded_sections__of_uneven_periods_against_another_integrator(pendulu
         return p["q"] * 2 / np.pi * np.arctan(p["eps_drive"] * wave)
 
     found = recorded_sections(
-        values.pack()[None], Drive.from_edges(rising, falling), [start], n_transient=2, n_keep=4,
-        system=model.system, **TIGHT,
-    )  # fmt: skip
+        values.pack()[None],
+        Drive.from_edges(rising, falling),
+        [start],
+        n_transient=2,
+        n_keep=4,
+        system=model.system,
+        **TIGHT,
+    )
     other = solve_ivp(
-        pendulum_rhs(p, torque), (0, rising[-1]), start, "DOP853", rising[3:], rtol=1e-10, atol=1e-10,
-        max_step=2e-3,
-    )  # fmt: skip
+        pendulum_rhs(p, torque), (0, rising[-1]), start, "DOP853", rising[3:], rtol=1e-10, atol=1e-10, max_step=2e-3
+    )
     np.testing.assert_allclose(found.section[0, 0], other.y.T, atol=2e-6)
     assert found.n_periods[0, 0] == 6
 
@@ -146,9 +145,15 @@ def test_recorded_sections__of_a_torque_are_the_exact_response():
     torque = np.random.default_rng(2).normal(size=241).cumsum() * 0.1
     ends = np.array([9, 40, 41, 100, 180, 239])
     found = recorded_sections(
-        LINEAR.pack()[None], Drive.from_torque(times, torque), [[0.1, 0.0]], ends=ends, n_transient=1,
-        n_keep=5, system=DUFFING.system, **TIGHT,
-    )  # fmt: skip
+        LINEAR.pack()[None],
+        Drive.from_torque(times, torque),
+        [[0.1, 0.0]],
+        ends=ends,
+        n_transient=1,
+        n_keep=5,
+        system=DUFFING.system,
+        **TIGHT,
+    )
     exact = lsim(([[0, 1], [-4.0, -0.3]], [[0], [1]], np.eye(2), [[0], [0]]), torque, times, [0.1, 0.0])[1]
     np.testing.assert_allclose(found.section[0, 0], exact[ends[1:] + 1], atol=1e-9)
 
@@ -175,9 +180,14 @@ def test_recorded_sections__says_who_diverged():
     runaway = DUFFING.load(damping=0.0, linear=-1.0, cubic=-1.0, amplitude=0.0).pack()
     drive = Drive.from_torque(np.linspace(0, 20, 81), np.zeros(81))
     found = recorded_sections(
-        np.array([runaway, LINEAR.pack()]), drive, [[2.0, 1.0], [0.1, 0.0]], n_transient=3, n_keep=60,
-        system=DUFFING.system, n_points=7,
-    )  # fmt: skip
+        np.array([runaway, LINEAR.pack()]),
+        drive,
+        [[2.0, 1.0], [0.1, 0.0]],
+        n_transient=3,
+        n_keep=60,
+        system=DUFFING.system,
+        n_points=7,
+    )
     assert found.status[:, 0].tolist() == [Status.DIVERGED, Status.BOUNDED]
     assert np.isnan(found.section[0]).all()
     assert np.isfinite(found.section[1]).all()
@@ -231,17 +241,11 @@ def test_evaluate_recorded__of_a_torque_is_the_torque():
 
 @pytest.mark.parametrize(
     ("model", "wanted"),
-    [
-        ("pendulum", {"duty_cycle", "q", "eps_drive"}),
-        ("duffing", {"amplitude"}),
-        ("double-pendulum", {"q"}),
-    ],
+    [("pendulum", {"duty_cycle", "q", "eps_drive"}), ("duffing", {"amplitude"}), ("double-pendulum", {"q"})],
 )
 def test_drive_parameters__are_those_of_the_forcing(model, wanted):
     from magpend_core.engine.driven import drive_parameters
 
     found = load_model(model)
     values = found.load(q=1.0) if "q" in found.parameter_names else found.load()
-    assert (
-        wanted <= set(drive_parameters(found.system, values.pack())) <= {*wanted, "duty_cycle", "eps_drive"}
-    )
+    assert wanted <= set(drive_parameters(found.system, values.pack())) <= {*wanted, "duty_cycle", "eps_drive"}

@@ -25,18 +25,14 @@ def some_states(n, seed=0):
 def test_sample__of_a_linear_oscillator_is_the_closed_form():
     frequency, times = 0.4, np.sort(np.random.default_rng(1).uniform(0, 9, 200))
     drive = Drive(np.full(5, 1 / frequency))
-    found = sample(
-        DUFFING.system, LINEAR.pack()[None], [[0.5, -0.2]], [times], drives=[drive], rtol=1e-11, atol=1e-11
-    )
+    found = sample(DUFFING.system, LINEAR.pack()[None], [[0.5, -0.2]], [times], drives=[drive], rtol=1e-11, atol=1e-11)
     omega, d = TWO_PI * frequency, 0.3
     a = 0.7 / complex(4.0 - omega**2, d * omega)  # amplitude of x = Re(a exp(i omega t))
     root = np.sqrt(4.0 - d**2 / 4)
     c1 = 0.5 - a.real
     c2 = (-0.2 - (1j * omega * a).real + d / 2 * c1) / root
     decay = np.exp(-d / 2 * times)
-    x = (a * np.exp(1j * omega * times)).real + decay * (
-        c1 * np.cos(root * times) + c2 * np.sin(root * times)
-    )
+    x = (a * np.exp(1j * omega * times)).real + decay * (c1 * np.cos(root * times) + c2 * np.sin(root * times))
     np.testing.assert_allclose(found.states[0, :, 0], x, atol=2e-9)
     assert found.status[0] == Status.BOUNDED
 
@@ -73,12 +69,8 @@ def test_sample__follows_measured_edges(pendulum_rhs):
         return p["q"] * 2 / np.pi * np.arctan(p["eps_drive"] * wave)
 
     times, start = np.linspace(0, 1.5, 61), [0.4, -0.3, 1.0, -2.0]
-    found = sample(
-        PENDULUM.system, values.pack()[None], [start], [times], drives=[drive], rtol=1e-11, atol=1e-11
-    )
-    other = solve_ivp(
-        pendulum_rhs(p, torque), (0, 1.5), start, "DOP853", times, rtol=1e-10, atol=1e-10, max_step=2e-3
-    )
+    found = sample(PENDULUM.system, values.pack()[None], [start], [times], drives=[drive], rtol=1e-11, atol=1e-11)
+    other = solve_ivp(pendulum_rhs(p, torque), (0, 1.5), start, "DOP853", times, rtol=1e-10, atol=1e-10, max_step=2e-3)
     np.testing.assert_allclose(found.states[0], other.y.T, atol=2e-6)
 
 
@@ -113,9 +105,7 @@ def test_sample__says_who_diverged():
     """What a trajectory did not reach stays NaN; its neighbour goes on."""
     runaway = DUFFING.load(damping=0.0, linear=-1.0, cubic=-1.0, amplitude=0.0).pack()
     packed = np.array([runaway, LINEAR.pack()])
-    found = sample(
-        DUFFING.system, packed, [[2.0, 1.0], [0.1, 0.0]], [np.linspace(0, 5, 51)], piece=np.zeros(2, int)
-    )
+    found = sample(DUFFING.system, packed, [[2.0, 1.0], [0.1, 0.0]], [np.linspace(0, 5, 51)], piece=np.zeros(2, int))
     assert found.status[0] in (Status.DIVERGED, Status.STEP_UNDERFLOW)
     assert found.status[1] == Status.BOUNDED
     assert np.isfinite(found.states[0, 0]).all()
@@ -128,10 +118,7 @@ def test_sample__says_who_diverged():
     [
         ({"times": [np.array([0.0, 2.0, 1.0])]}, "times.0. must start at 0 or later and rise"),
         ({"drives": [Drive(np.array([0.5]))]}, "covers 0.5 s of a piece of 1 s"),
-        (
-            {"drives": [Drive(np.array([2.0]), ("dampin",), np.zeros((1, 1)))]},
-            "'dampin', which is no parameter",
-        ),
+        ({"drives": [Drive(np.array([2.0]), ("dampin",), np.zeros((1, 1)))]}, "'dampin', which is no parameter"),
         ({"drives": [Drive(np.array([2.0, 0.0]))]}, "durations must be above 0"),
         ({"drives": []}, "0 drives for 1 pieces"),
         ({"piece": np.array([1])}, "piece must give one of 1 pieces"),
@@ -172,9 +159,15 @@ def test_with_parameter_tangent__of_a_linear_oscillator_is_the_closed_form():
     per_step[0] = 1 / 2e-4
     start = [[0.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]]
     found = sample(
-        with_parameter_tangent(DUFFING.system), np.hstack([packed, per_step]), start, [times],
-        piece=np.zeros(2, int), drives=[Drive(np.full(8, 1.1))], rtol=1e-10, atol=1e-10,
-    )  # fmt: skip
+        with_parameter_tangent(DUFFING.system),
+        np.hstack([packed, per_step]),
+        start,
+        [times],
+        piece=np.zeros(2, int),
+        drives=[Drive(np.full(8, 1.1))],
+        rtol=1e-10,
+        atol=1e-10,
+    )
     np.testing.assert_allclose(found.states[0, :, 2:], found.states[0, :, :2] / 0.7, atol=1e-8)
     root = np.sqrt(4.0 - 0.15**2)
     free = np.exp(-0.15 * times) * (np.cos(root * times) + 0.15 / root * np.sin(root * times))
@@ -197,9 +190,15 @@ def test_with_parameter_tangent__is_that_of_differences(name):
         with_parameter_tangent(PENDULUM.system), given[None], [[*start, 0, 0, 0, 0]], [times], drives=drive
     ).states[0, :, 4:]
     sides = sample(
-        PENDULUM.system, np.array([p + step, p - step]), np.array([start, start]), [times],
-        piece=np.zeros(2, int), drives=drive, rtol=1e-12, atol=1e-12,
-    ).states  # fmt: skip
+        PENDULUM.system,
+        np.array([p + step, p - step]),
+        np.array([start, start]),
+        [times],
+        piece=np.zeros(2, int),
+        drives=drive,
+        rtol=1e-12,
+        atol=1e-12,
+    ).states
     difference = (sides[0] - sides[1]) / (2 * h)
     np.testing.assert_allclose(tangent, difference, atol=1e-4 * np.abs(difference).max())
 

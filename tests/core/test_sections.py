@@ -64,9 +64,16 @@ def test_sections__stop_when_closed_is_within_the_tolerance_of_the_orbit(preset,
     points = np.array([orbit["section"] for orbit in orbits])
     frequencies = [orbit["frequency_hz"] for orbit in orbits]
     found = sections(
-        preset, frequencies, points + 0.01, n_transient=2000, n_keep=3, rtol=1e-10, atol=1e-10,
-        stop_when_closed=True, closure_tolerance=tolerance,
-    )  # fmt: skip
+        preset,
+        frequencies,
+        points + 0.01,
+        n_transient=2000,
+        n_keep=3,
+        rtol=1e-10,
+        atol=1e-10,
+        stop_when_closed=True,
+        closure_tolerance=tolerance,
+    )
     # slow spirals, of moduli 0.93 to 0.96
     assert (distance(found.section, points[:, None]) <= tolerance).all()
     assert (found.orbit_period == 1).all()
@@ -74,9 +81,7 @@ def test_sections__stop_when_closed_is_within_the_tolerance_of_the_orbit(preset,
     assert (found.n_periods < 600).all()
     # it is the early part of the straight run, taken sooner
     n = int(found.n_periods[0])
-    straight = sections(
-        preset, frequencies[:1], points[:1] + 0.01, n_transient=n - 3, n_keep=3, rtol=1e-10, atol=1e-10
-    )
+    straight = sections(preset, frequencies[:1], points[:1] + 0.01, n_transient=n - 3, n_keep=3, rtol=1e-10, atol=1e-10)
     assert straight.section.tobytes() == found.section[:1].tobytes()
 
 
@@ -184,9 +189,7 @@ def test_sections__name_the_bad_argument(preset, change, message):
 )
 def test_run_branches__names_the_bad_array(parameters, frequency, message):
     with pytest.raises(ValueError, match=message):
-        run_branches(
-            parameters, frequency, [[0.1, 0.1, 0.0, 0.0]], n_transient=0, n_keep=1, rtol=1e-8, atol=1e-8
-        )
+        run_branches(parameters, frequency, [[0.1, 0.1, 0.0, 0.0]], n_transient=0, n_keep=1, rtol=1e-8, atol=1e-8)
 
 
 def test_run_branches__read_only_memory_compiles_nothing_more(preset):

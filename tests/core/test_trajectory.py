@@ -25,9 +25,7 @@ def by_scipy(parameters, frequency, start, times):
     states, y = np.empty((len(times), 4)), np.array(start, dtype=float)
     for begin, end in itertools.pairwise(edges):
         inside = (times >= begin) & (times <= end)
-        piece = solve_ivp(
-            rhs, (begin, end), y, "DOP853", t_eval=np.append(times[inside], end), rtol=1e-10, atol=1e-10
-        )
+        piece = solve_ivp(rhs, (begin, end), y, "DOP853", t_eval=np.append(times[inside], end), rtol=1e-10, atol=1e-10)
         states[inside], y = piece.y.T[:-1], piece.y[:, -1]
     return states
 

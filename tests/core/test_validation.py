@@ -3,17 +3,7 @@
 import numpy as np
 import pytest
 
-from magpend_core import (
-    accelerations,
-    energy,
-    evaluate,
-    jacobian,
-    load_model,
-    rates,
-    sections,
-    torques,
-    trajectory,
-)
+from magpend_core import accelerations, energy, evaluate, jacobian, load_model, rates, sections, torques, trajectory
 from magpend_core.pointwise import drive_level
 from magpend_core.status import Status
 
@@ -72,8 +62,12 @@ def test_sections__masked_entries_are_refused():
 def test_sections__absurd_frequencies_end(frequency):
     found = sections(DUFFING, frequency, [[0.1, 0.0], [0.0, 0.0]], n_transient=1, n_keep=1)
     assert set(found.status) <= {
-        Status.PERIODIC, Status.BOUNDED, Status.DIVERGED, Status.STEP_LIMIT, Status.STEP_UNDERFLOW
-    }  # fmt: skip
+        Status.PERIODIC,
+        Status.BOUNDED,
+        Status.DIVERGED,
+        Status.STEP_LIMIT,
+        Status.STEP_UNDERFLOW,
+    }
 
 
 @pytest.mark.parametrize("start", [1e308, -1e308, 1e200, 1e20])

@@ -144,9 +144,14 @@ def magpend(tmp_path, environment):
     def call(*arguments, **options):
         return subprocess.run(
             [sys.executable, "-m", "pipeline.cli.main", *map(str, arguments)],
-            cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=240, check=False,
+            cwd=tmp_path,
+            env=environment,
+            capture_output=True,
+            text=True,
+            timeout=240,
+            check=False,
             **options,
-        )  # fmt: skip
+        )
 
     return call
 
@@ -163,9 +168,13 @@ def start(tmp_path, environment):
     def begin(*arguments):
         process = subprocess.Popen(
             [sys.executable, "-m", "pipeline.cli.main", *map(str, arguments)],
-            cwd=tmp_path, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+            cwd=tmp_path,
+            env=environment,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
             start_new_session=True,
-        )  # fmt: skip
+        )
         running.append(process)
         return process
 

@@ -114,6 +114,10 @@ def from_data(name: str, data: Mapping[str, Any]) -> Answer:
         for one in data.get("set", [])
     )
     return Answer(
-        name, data["source"], sets, tuple(data.get("also", ())), bool(data.get("quick", False)),
+        name,
+        data["source"],
+        sets,
+        tuple(data.get("also", ())),
+        bool(data.get("quick", False)),
         float(data.get("share_error", 0.03)),
-    )  # fmt: skip
+    )

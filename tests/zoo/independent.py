@@ -366,9 +366,13 @@ def cloud(field: Field, known: Mapping[str, Any], n: int = 4000) -> np.ndarray:
 
 
 def shares(
-    spec: Mapping[str, Any], field: Field, sets: list[dict[str, Any]],
-    n: int = 1000, n_periods: int = 400, n_steps: int = 100,
-) -> tuple[np.ndarray, float]:  # fmt: skip
+    spec: Mapping[str, Any],
+    field: Field,
+    sets: list[dict[str, Any]],
+    n: int = 1000,
+    n_periods: int = 400,
+    n_steps: int = 100,
+) -> tuple[np.ndarray, float]:
     """Fractions of random starts that end nearest to each set, and the distance that 99 % keep within."""
     from scipy.spatial import cKDTree
 
@@ -389,9 +393,15 @@ def shares(
 
 
 def lifetime(
-    field: Field, spec: Mapping[str, Any], sets: list[dict[str, Any]],
-    n: int = 400, n_periods: int = 2000, n_steps: int = 100, near: float = 0.05, after: int = 100,
-) -> tuple[float, float]:  # fmt: skip
+    field: Field,
+    spec: Mapping[str, Any],
+    sets: list[dict[str, Any]],
+    n: int = 400,
+    n_periods: int = 2000,
+    n_steps: int = 100,
+    near: float = 0.05,
+    after: int = 100,
+) -> tuple[float, float]:
     """Mean lifetime of the transients before some attractors [periods, or s], and its standard error.
 
     A trajectory has left when it stays nearer than `near` to a set. Of those that have not after `after`
@@ -412,9 +422,7 @@ def lifetime(
     alive = left > after
     gone = alive & (left < n_periods)
     mean = (left[alive] - after).sum() / gone.sum()
-    return float(mean * period if not np.isfinite(field.period) else mean), float(
-        mean / math.sqrt(gone.sum())
-    )
+    return float(mean * period if not np.isfinite(field.period) else mean), float(mean / math.sqrt(gone.sum()))
 
 
 def _line(what: str, said: Any, found: Any, error: float) -> None:
@@ -443,12 +451,8 @@ def recompute(name: str) -> None:
         for known in sets:
             found = numbers(field, known, section)
             print(f"  {known['kind']} at {np.round(found.get('at', known['at']), 8).tolist()}")
-            for key in (
-                {"multiplier", "seconds", "period", "lyapunov", "eigenvalue"} & known.keys() & found.keys()
-            ):
-                error = (
-                    known["lyapunov_error"] if key == "lyapunov" else 1e-6 + 1e-6 * np.max(np.abs(found[key]))
-                )
+            for key in {"multiplier", "seconds", "period", "lyapunov", "eigenvalue"} & known.keys() & found.keys():
+                error = known["lyapunov_error"] if key == "lyapunov" else 1e-6 + 1e-6 * np.max(np.abs(found[key]))
                 _line(key, known[key], found[key], error)
         sets = [s for s in sets if s.get("stability", "attracts") == "attracts"]
         if any("share" in s for s in sets):

@@ -69,9 +69,14 @@ class Verdict:
 
 
 def judge_point(
-    answer: Answer, where: Mapping[str, float], rows: Sequence[Row], *,
-    n_cells: int, n_left: int = 0, geometry: Any = None,
-) -> Verdict:  # fmt: skip
+    answer: Answer,
+    where: Mapping[str, float],
+    rows: Sequence[Row],
+    *,
+    n_cells: int,
+    n_left: int = 0,
+    geometry: Any = None,
+) -> Verdict:
     """Judge the rows of one parameter point.
 
     Parameters
@@ -108,9 +113,7 @@ def judge_point(
 def _assigned(known: Sequence[Known], rows: Sequence[Row], verdict: Verdict, geometry: Any) -> dict[int, Row]:
     """Give each attracting row an attractor of its own; returns the rows by the attractor's place."""
     reasons = [[mismatch(k, r, geometry) for r in rows] for k in known]
-    cost = np.array([[bool(reason) for reason in line] for line in reasons], float).reshape(
-        len(known), len(rows)
-    )
+    cost = np.array([[bool(reason) for reason in line] for line in reasons], float).reshape(len(known), len(rows))
     pairs = [(k, r) for k, r in zip(*linear_sum_assignment(cost), strict=True) if not reasons[k][r]]
     taken = {r for _, r in pairs}
     for k, r in pairs:
@@ -215,9 +218,7 @@ def _judge_other(row: Row, known: Sequence[Known], answer: Answer, verdict: Verd
         verdict.n_right += 1
     elif any(k.stability == "semistable" for k in known):
         verdict.n_undecided += 1
-    elif stability in answer.also or (
-        stability == "unstable" and row["kind"] in ("periodic_orbit", "equilibrium")
-    ):
+    elif stability in answer.also or (stability == "unstable" and row["kind"] in ("periodic_orbit", "equilibrium")):
         # every chaotic set has unstable orbits; the numbers have been looked at
         pass
     elif any(k.attracts for k in same):
@@ -238,9 +239,13 @@ def _judge_lifetime(row: Row, same: Sequence[Known], verdict: Verdict) -> None:
 
 
 def _judge_completeness(
-    known: Sequence[Known], given: Mapping[int, Row], rows: Sequence[Row], n_cells: int, answer: Answer,
+    known: Sequence[Known],
+    given: Mapping[int, Row],
+    rows: Sequence[Row],
+    n_cells: int,
+    answer: Answer,
     verdict: Verdict,
-) -> None:  # fmt: skip
+) -> None:
     """Judge whether attractors are missing, and the shares of those listed; nothing is left open."""
     attractors = [k for k in known if k.attracts]
     others = [r for r in rows if r["stability"] == "neutral"]
@@ -255,12 +260,7 @@ def _judge_completeness(
 
 
 def _judge_share(
-    one: Known,
-    attractors: Sequence[Known],
-    given: Mapping[int, Row],
-    i: int,
-    answer: Answer,
-    verdict: Verdict,
+    one: Known, attractors: Sequence[Known], given: Mapping[int, Row], i: int, answer: Answer, verdict: Verdict
 ) -> None:
     """Judge one basin fraction; attractors that only their points tell apart may have swapped theirs."""
     row = given[i]
@@ -278,11 +278,7 @@ def words(row: Row) -> str:
     """Describe a row in a few words."""
     parts = [row["stability"].replace("_", " "), row["kind"].replace("_", " ")]
     parts += [f"period {row['orbit_period']}"] if row.get("orbit_period") else []
-    for key, name in (
-        ("multiplier_modulus", "|m|"),
-        ("eigenvalue_real", "eigenvalue"),
-        ("lyapunov_max", "exponent"),
-    ):
+    for key, name in (("multiplier_modulus", "|m|"), ("eigenvalue_real", "eigenvalue"), ("lyapunov_max", "exponent")):
         value = row.get(key)
         parts += [f"{name} {value:.4g}"] if value is not None and math.isfinite(value) else []
     return " ".join([*parts, f"({row.get('n_cells', 0)} cells)"])

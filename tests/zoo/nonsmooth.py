@@ -32,9 +32,7 @@ def _linear(t0: float, x0: float, v0: float, w: float, amplitude: float, zeta: f
     def motion(t: float | np.ndarray) -> tuple:
         e, co, si = np.exp(-zeta * (t - t0)), np.cos(q * (t - t0)), np.sin(q * (t - t0))
         x = e * (a * co + b * si) + c * np.cos(w * t) + s * np.sin(w * t)
-        v = e * ((b * q - zeta * a) * co - (a * q + zeta * b) * si) - w * (
-            c * np.sin(w * t) - s * np.cos(w * t)
-        )
+        v = e * ((b * q - zeta * a) * co - (a * q + zeta * b) * si) - w * (c * np.sin(w * t) - s * np.cos(w * t))
         return x, v
 
     return motion
@@ -107,9 +105,7 @@ def coulomb_map(state, w: float, amplitude: float, mu: float) -> tuple[np.ndarra
             if not len(first):
                 return np.array([x, 0.0]), stops
             i = first[0]
-            t = brentq(
-                lambda s, x=x: abs(amplitude * math.cos(w * s) - x) - mu, grid[i], grid[i + 1], xtol=1e-15
-            )
+            t = brentq(lambda s, x=x: abs(amplitude * math.cos(w * s) - x) - mu, grid[i], grid[i + 1], xtol=1e-15)
             t, v = t + 1e-12, 0.0
             push = amplitude * math.cos(w * t) - x
         sign = math.copysign(1.0, v if abs(v) >= 1e-13 else push)
@@ -160,9 +156,7 @@ def belt_motion(x: float, v: float, seconds: float) -> tuple[np.ndarray, list[fl
         meets.terminal, meets.direction = True, -1.0
         rises = lambda _, y: y[1]  # noqa: E731
         rises.direction = 1.0
-        run = solve_ivp(
-            rates, (t, seconds), [x, v], events=[meets, rises], rtol=1e-10, atol=1e-12, method="DOP853"
-        )
+        run = solve_ivp(rates, (t, seconds), [x, v], events=[meets, rises], rtol=1e-10, atol=1e-12, method="DOP853")
         ups += list(run.t_events[1])
         t = run.t[-1]
         x, v = run.y[:, -1]
@@ -199,9 +193,7 @@ def report() -> None:
         print(name, _census(lambda s, p=p: impact_map(s, **p)[0], [-2.0, -2.0], [p["gap"] - 0.05, 2.0], n))
     print("impact-one in closed form: phase, velocity, product", impact_one(2.5, 1.0, 0.1, 0.0, 0.6))
     for w in (0.7, 1.6):
-        print(
-            "coulomb", w, _census(lambda s, w=w: coulomb_map(s, w, 1.0, 0.2)[0], [-2.0, -2.0], [2.0, 2.0], 20)
-        )
+        print("coulomb", w, _census(lambda s, w=w: coulomb_map(s, w, 1.0, 0.2)[0], [-2.0, -2.0], [2.0, 2.0], 20))
     rng = np.random.default_rng(1)
     ends = [belt_motion(*s, 150.0) for s in rng.uniform([-1.0, -2.0], [3.0, 2.0], (200, 2))]
     rest = _friction(BELT["belt"])

@@ -65,9 +65,7 @@ def test_variants__change_one_thing_at_a_time_and_are_valid(tmp_path):
 
 def row(kind, stability="attracts", **more):
     """Make a row of the table."""
-    empty = dict.fromkeys(
-        ("multiplier_modulus", "eigenvalue_real", "eigenvalue_imag", "lyapunov_max"), np.nan
-    )
+    empty = dict.fromkeys(("multiplier_modulus", "eigenvalue_real", "eigenvalue_imag", "lyapunov_max"), np.nan)
     return {"kind": kind, "stability": stability, "orbit_period": 0, "n_cells": 20, **empty, **more}
 
 
@@ -88,9 +86,7 @@ def orbit(**more):
 
 
 def chaos(**more):
-    return row(
-        "chaotic_set", **{"lyapunov_max": 0.161, "lyapunov_low": 0.158, "lyapunov_high": 0.164, **more}
-    )
+    return row("chaotic_set", **{"lyapunov_max": 0.161, "lyapunov_low": 0.158, "lyapunov_high": 0.164, **more})
 
 
 def at(x):
@@ -131,9 +127,7 @@ def test_judge__open():
         pytest.param([ORBIT], [orbit(), row("chaotic_set", "transient")], id="a transient that is none"),
         pytest.param([ORBIT, {**ORBIT, "multiplier": 0.3, "share": 0.4}], [orbit()], id="one is missing"),
         pytest.param([CHAOS], [row("torus")], id="chaos as a torus"),
-        pytest.param(
-            [CHAOS], [chaos(lyapunov_max=0.3, lyapunov_low=0.29, lyapunov_high=0.31)], id="exponent"
-        ),
+        pytest.param([CHAOS], [chaos(lyapunov_max=0.3, lyapunov_low=0.29, lyapunov_high=0.31)], id="exponent"),
         pytest.param([{"kind": "any", "stability": "neutral"}], [orbit()], id="an attractor without damping"),
         pytest.param([{**ORBIT, "stability": "semistable"}], [orbit()], id="half stable as attractor"),
         pytest.param(
@@ -149,10 +143,7 @@ def test_judge__wrong(sets, rows):
 
 def test_judge__share_that_its_interval_excludes():
     sets = [{**ORBIT, "share": 0.5}, {**ORBIT, "multiplier": 0.3, "share": 0.5}]
-    rows = [
-        orbit(fraction=f, low=f - 0.05, high=f + 0.05, multiplier_modulus=m)
-        for f, m in ((0.9, 0.5), (0.1, 0.3))
-    ]
+    rows = [orbit(fraction=f, low=f - 0.05, high=f + 0.05, multiplier_modulus=m) for f, m in ((0.9, 0.5), (0.1, 0.3))]
     assert judge(sets, rows).word == "WRONG"
     assert judge(sets, [*rows, row("bounded_set", "not_settled")]).word == "not settled"
 

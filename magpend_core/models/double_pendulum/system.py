@@ -14,11 +14,33 @@ from magpend_core.models.double_pendulum.models import PARAMETERS, QUANTITIES, S
 AT = positions(tuple(p.name for p in PARAMETERS))
 C = positions(
     (
-        "B1", "B2", "N12", "M1", "M2", "c1", "c2", "T1", "T2", "drop", "floor", "c0", "eps", "per_eps",
-        "per_reversal1", "per_reversal2", "l1", "drag1", "near", "middle", "far", "outer", "inner", "q",
+        "B1",
+        "B2",
+        "N12",
+        "M1",
+        "M2",
+        "c1",
+        "c2",
+        "T1",
+        "T2",
+        "drop",
+        "floor",
+        "c0",
+        "eps",
+        "per_eps",
+        "per_reversal1",
+        "per_reversal2",
+        "l1",
+        "drag1",
+        "near",
+        "middle",
+        "far",
+        "outer",
+        "inner",
+        "q",
         "omega",
     )
-)  # fmt: skip
+)
 
 TWO_OVER_PI = 2.0 / math.pi
 GAUSS = math.sqrt(0.15)
@@ -123,10 +145,7 @@ def _rhs(y: Any, u: Any, c: Any) -> Any:
 @inline
 def _solved(d1: Any, d2: Any, cross: Any, per_det: Any, c: Any) -> Any:
     """Changes of the accelerations for changes of the torques on their left-hand sides."""
-    return (
-        multiply_add(c[C.B2], d1, -(cross * d2)) * per_det,
-        multiply_add(c[C.B1], d2, -(cross * d1)) * per_det,
-    )
+    return (multiply_add(c[C.B2], d1, -(cross * d2)) * per_det, multiply_add(c[C.B1], d2, -(cross * d1)) * per_det)
 
 
 @inline
@@ -156,11 +175,23 @@ def _jacobian(y: Any, u: Any, c: Any) -> Any:
     zero = 0.0 * w1
     one = zero + 1.0
     return (
-        zero, zero, one, zero,
-        zero, zero, zero, one,
-        psi1[0], psi2[0], rate1[0], rate2[0],
-        psi1[1], psi2[1], rate1[1], rate2[1],
-    )  # fmt: skip
+        zero,
+        zero,
+        one,
+        zero,
+        zero,
+        zero,
+        zero,
+        one,
+        psi1[0],
+        psi2[0],
+        rate1[0],
+        rate2[0],
+        psi1[1],
+        psi2[1],
+        rate1[1],
+        rate2[1],
+    )
 
 
 @inline
@@ -168,9 +199,7 @@ def _quantities(t: Any, y: Any, dy: Any, u: Any, c: Any) -> Any:
     w1, w2 = y[2], y[3]
     c12 = sincos(y[0] - y[1])[1]
     half1, half2 = sin(0.5 * y[0]), sin(0.5 * y[1])
-    kinetic = multiply_add(
-        0.5 * c[C.B1] * w1, w1, multiply_add(0.5 * c[C.B2] * w2, w2, c[C.N12] * c12 * w1 * w2)
-    )
+    kinetic = multiply_add(0.5 * c[C.B1] * w1, w1, multiply_add(0.5 * c[C.B2] * w2, w2, c[C.N12] * c12 * w1 * w2))
     height = 2.0 * multiply_add(c[C.M1] * half1, half1, c[C.M2] * half2 * half2)
     friction1, friction2, drag1, drag2 = _torques(y, c)
     lost = multiply_add(friction1, w1, friction2 * (w2 - w1)) + multiply_add(drag1, w1, drag2 * w2)

@@ -34,10 +34,7 @@ QUANTITIES = (
 
 _DOUBLE_WELL = {"damping": 0.2, "linear": -1.0, "cubic": 1.0, "amplitude": 0.3}
 _SOURCES = {
-    "twin-well": (
-        _DOUBLE_WELL,
-        "chaotic at 1/(2 pi) Hz: ChaosTools.jl, issue 301",
-    ),
+    "twin-well": (_DOUBLE_WELL, "chaotic at 1/(2 pi) Hz: ChaosTools.jl, issue 301"),
     "twin-well-periodic": (
         {**_DOUBLE_WELL, "damping": 0.15, "amplitude": 0.2},
         "two coexisting orbits of period 1 at 1/(2 pi) Hz: DynamicalSystemsBase.jl, issue 139",
@@ -53,9 +50,7 @@ DUFFING = Model(
     title="forced Duffing oscillator",
     states=STATES,
     parameters=PARAMETERS,
-    presets=tuple(
-        Preset(name, values, dict.fromkeys(values, source)) for name, (values, source) in _SOURCES.items()
-    ),
+    presets=tuple(Preset(name, values, dict.fromkeys(values, source)) for name, (values, source) in _SOURCES.items()),
     system_path=f"{__package__}.system:DUFFING",
     sources=(Path(__file__), Path(__file__).with_name("system.py")),
     section="the drive's maximum",

@@ -123,13 +123,37 @@ def link_constants(frequency: Any, p: Any) -> Any:
     jump1 = 2.0 * (T1 + mu * g * (m1 + m2)) * B2 * per_det
     jump2 = 2.0 * (T2 + mu * g * m2) * (B1 + N12) * per_det
     return LinkConstants(
-        B1, B2, N12, m1 * g * e1 + m2 * g * l1, m2 * g * e2, B1 * B2,
-        m1 * g, m2 * g, m1 * e1, m2 * e2, m2 * l1, m1 * e1 + m2 * l1,
-        T1, T2, 2.0 * c, c, mu, TWO_OVER_PI * mu0, TWO_OVER_PI * (1.0 - mu0),
-        LOG2_E * p[AT.c0], eps, 1.0 / eps,
-        TWO_PI * frequency, phase, offset, amplitude, eps_drive,
-        B2 * per_det, eps / max(jump1, 1e-30), eps / max(jump2, 1e-30),
-    )  # fmt: skip
+        B1,
+        B2,
+        N12,
+        m1 * g * e1 + m2 * g * l1,
+        m2 * g * e2,
+        B1 * B2,
+        m1 * g,
+        m2 * g,
+        m1 * e1,
+        m2 * e2,
+        m2 * l1,
+        m1 * e1 + m2 * l1,
+        T1,
+        T2,
+        2.0 * c,
+        c,
+        mu,
+        TWO_OVER_PI * mu0,
+        TWO_OVER_PI * (1.0 - mu0),
+        LOG2_E * p[AT.c0],
+        eps,
+        1.0 / eps,
+        TWO_PI * frequency,
+        phase,
+        offset,
+        amplitude,
+        eps_drive,
+        B2 * per_det,
+        eps / max(jump1, 1e-30),
+        eps / max(jump2, 1e-30),
+    )
 
 
 def square_wave_constants(p: Any) -> Any:
@@ -255,10 +279,7 @@ def _newton_change(r1: Any, r2: Any, loads_there: Any, effect: Any, f: Any, k: A
     turned2 = multiply_add(k.m2_l1, r1, cosine)
     change1 = multiply_add(across1, turned1, -(along1 * sine)) / maximum(load1, 1e-290)
     change2 = multiply_add(across2, turned2, -(along2 * sine)) / maximum(load2, 1e-290)
-    return (
-        r1 + multiply_add(p11, change1, p12 * change2),
-        r2 + multiply_add(p21, change1, p22 * change2),
-    )
+    return (r1 + multiply_add(p11, change1, p12 * change2), r2 + multiply_add(p21, change1, p22 * change2))
 
 
 @inline

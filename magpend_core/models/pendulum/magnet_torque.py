@@ -27,10 +27,7 @@ SIDES = ("right", "left")
 HEIGHT, POSITION, WIDTH = "A", "b", "c"
 """What a bump has (Eq. 17)."""
 
-FITTED = (
-    "alpha1", "alpha2", "beta1", "beta2", "gamma1", "gamma2", "p1", "p2", "r1", "r2", "c1", "c2",
-    "eps_mag",
-)  # fmt: skip
+FITTED = ("alpha1", "alpha2", "beta1", "beta2", "gamma1", "gamma2", "p1", "p2", "r1", "r2", "c1", "c2", "eps_mag")
 """Parameters of the fitted torque (Eq. 18-19) that curves determine, in the order of `moment_slopes`."""
 
 MODEL, DIPOLES = "pendulum", "pendulum-dipole"

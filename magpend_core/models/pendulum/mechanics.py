@@ -37,14 +37,18 @@ class Torques(NamedTuple):
 
 
 _TORQUES = (
-    "load1", "load2", "friction1", "friction2", "drive_torque", "magnet_moment", "magnet_torque1",
+    "load1",
+    "load2",
+    "friction1",
+    "friction2",
+    "drive_torque",
+    "magnet_moment",
+    "magnet_torque1",
     "magnet_torque2",
-)  # fmt: skip
+)
 
 
-def accelerations(
-    t: float | np.ndarray, state: np.ndarray, parameters: Parameters, frequency_hz: float
-) -> np.ndarray:
+def accelerations(t: float | np.ndarray, state: np.ndarray, parameters: Parameters, frequency_hz: float) -> np.ndarray:
     """Angular accelerations of both links from the full, implicit model.
 
     Parameters

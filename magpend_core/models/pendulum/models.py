@@ -35,15 +35,11 @@ MAGNET_QUANTITIES = (
 )
 """After those of the links, where there are magnets."""
 
-SIDES = Classifier(
-    sides.WORDS, sides.NEUTRAL, "side of the fixed magnet on which the motion stays", sides.classify
-)
+SIDES = Classifier(sides.WORDS, sides.NEUTRAL, "side of the fixed magnet on which the motion stays", sides.classify)
 
 _ROOM = Path(__file__).parent
 _PRESETS = tuple(Preset.read(path) for path in sorted((_ROOM / "presets").glob("*.toml")))
-_SOURCES = tuple(
-    _ROOM / f"{name}.py" for name in ("equations", "jacobian", "models", "quantities", "systems")
-)
+_SOURCES = tuple(_ROOM / f"{name}.py" for name in ("equations", "jacobian", "models", "quantities", "systems"))
 _DRIVES: dict[str, tuple[Any, str]] = {
     "": (groups.SQUARE_WAVE, "the drive's rising edge"),
     "-sine": (groups.SINE, "the drive's rising zero"),

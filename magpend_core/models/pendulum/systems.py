@@ -40,11 +40,31 @@ def _fitted_magnet(p: Any, values: Any, out: Any) -> None:
     per_magnet_jump = eps_mag / max(jump, 1e-30)
     root = math.sqrt(LOG2_E)
     magnet = FittedConstants(
-        0.5 * alpha1, 0.5 * alpha2, p[AT.beta1], p[AT.beta2], root / p[AT.gamma1], root / p[AT.gamma2],
-        p1, p2, r1, r2, root / p[AT.c1], root / p[AT.c2], -0.5 * (p1 + p2), -0.5 * (r1 + r2),
-        eps_mag, 1.0 / eps_mag, l1, l2, h, 1.0 / h, l1 / h, l2 / h, p[AT.delta] * p[AT.delta],
+        0.5 * alpha1,
+        0.5 * alpha2,
+        p[AT.beta1],
+        p[AT.beta2],
+        root / p[AT.gamma1],
+        root / p[AT.gamma2],
+        p1,
+        p2,
+        r1,
+        r2,
+        root / p[AT.c1],
+        root / p[AT.c2],
+        -0.5 * (p1 + p2),
+        -0.5 * (r1 + r2),
+        eps_mag,
+        1.0 / eps_mag,
+        l1,
+        l2,
+        h,
+        1.0 / h,
+        l1 / h,
+        l2 / h,
+        p[AT.delta] * p[AT.delta],
         per_magnet_jump,
-    )  # fmt: skip
+    )
     for i in range(N_FITTED):
         out[N_LINK + i] = magnet[i]
 
@@ -79,10 +99,7 @@ def _no_magnet_torques(y: Any, s1: Any, c1: Any, s2: Any, c2: Any, c: Any) -> An
 @inline
 def _friction_layers(y: Any, dy: Any, k: Any) -> Any:
     """Velocity reversals in the joints: atan(eps v) has its poles at v = +-i/eps."""
-    return (
-        (y[2], dy[2], k.per_eps, k.per_reversal1),
-        (y[3] - y[2], dy[3] - dy[2], k.per_eps, k.per_reversal2),
-    )
+    return ((y[2], dy[2], k.per_eps, k.per_reversal1), (y[3] - y[2], dy[3] - dy[2], k.per_eps, k.per_reversal2))
 
 
 @inline

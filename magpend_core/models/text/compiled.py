@@ -86,7 +86,22 @@ def _compiled(source: str) -> dict[str, Any]:
 def vecmath_names() -> tuple[str, ...]:
     """Functions of `engine.vecmath` that expressions can need."""
     wanted = (
-        "sincos", "sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sinh", "cosh", "tanh", "exp", "log",
-        "power", "sign", "square_wave", "inverse_sqrt",
-    )  # fmt: skip
+        "sincos",
+        "sin",
+        "cos",
+        "tan",
+        "asin",
+        "acos",
+        "atan",
+        "atan2",
+        "sinh",
+        "cosh",
+        "tanh",
+        "exp",
+        "log",
+        "power",
+        "sign",
+        "square_wave",
+        "inverse_sqrt",
+    )
     return tuple(name for name in wanted if hasattr(vecmath, name))

@@ -74,9 +74,7 @@ def with_contacts(
     GraphError
         If an impact that sticks does not change how fast its own value changes.
     """
-    found = {
-        k: _contact(graph, free, jumps[k], f"impacts[{k}].stick") for k, stick in enumerate(sticks) if stick
-    }
+    found = {k: _contact(graph, free, jumps[k], f"impacts[{k}].stick") for k, stick in enumerate(sticks) if stick}
     rates, changed = list(free), list(jumps)
     for k, contact in found.items():
         mode = graph.leaf("mode_contact", k)
@@ -93,10 +91,7 @@ def with_contacts(
             at_rest=_resting(graph, free, jump, contact),
         )
     alone = any(
-        not _change(graph, found[j].slopes, found[k].direction).is_number(0.0)
-        for j in found
-        for k in found
-        if j != k
+        not _change(graph, found[j].slopes, found[k].direction).is_number(0.0) for j in found for k in found if j != k
     )
     return tuple(rates), changed, tuple((2 if alone else 1) if stick else 0 for stick in sticks)
 
@@ -111,9 +106,7 @@ def _contact(graph: Graph, free: tuple[Node, ...], jump: Jump, place: str) -> _C
     speed = _of_motion(graph, jump.rate, free)
     slopes = _slopes(graph, speed, len(free))
     direction = _pushed(graph, jump.states, slopes)
-    if direction is None or not _change(graph, _slopes(graph, jump.value, len(free)), direction).is_number(
-        0.0
-    ):
+    if direction is None or not _change(graph, _slopes(graph, jump.value, len(free)), direction).is_number(0.0):
         raise GraphError(
             f"{place}: a state can rest on a surface whose speed the impact changes, and not its place: `of` "
             "must need a coordinate, and `set` the velocity of that coordinate"

@@ -119,9 +119,7 @@ class Definition:
         """Return a sentence for each parameter and definition that no expression uses."""
         trees = [*self.dynamics, *self.quantities.values()]
         if self.drawing is not None:
-            trees += [
-                t for pair in (*self.drawing.points.values(), *self.drawing.fixed.values()) for t in pair
-            ]
+            trees += [t for pair in (*self.drawing.points.values(), *self.drawing.fixed.values()) for t in pair]
         if self.classifier is not None:
             trees += self.classifier.words.values()
         used = set(self.used(trees))

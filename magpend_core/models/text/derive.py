@@ -135,13 +135,20 @@ def derive(definition: Definition) -> Derived:
     late = [s.form for s in steep if s.value.kind != TIMED and not _is_layer(s)]
     preferred = None if drive is None else sliding.lowered(sides.rewritten([drive], more=False))[0]
     return Derived(
-        graph, rates, jacobian, tuple(sliding.lowered(own)), forcing_of(graph, (*rates, *jacobian),
-        preferred),
-        tuple(layers), tuple(w for w in waves if w.count), tuple(sides.instants), tuple(sides.switches),
+        graph,
+        rates,
+        jacobian,
+        tuple(sliding.lowered(own)),
+        forcing_of(graph, (*rates, *jacobian), preferred),
+        tuple(layers),
+        tuple(w for w in waves if w.count),
+        tuple(sides.instants),
+        tuple(sides.switches),
         sliding,
-        tuple(jumps), sticks,
+        tuple(jumps),
+        sticks,
         (*(f"{form} beside a jump in time" for form in late), *(["square"] * len(sides.left))),
-    )  # fmt: skip
+    )
 
 
 def _breaks(graph: Graph, rates: tuple[Node, ...], presets: Sequence[Mapping[int, float]]) -> bool:
@@ -254,12 +261,7 @@ class Builder:
         self.definition = definition
         self.graph = graph = Graph()
         time, frequency = graph.leaf("time"), graph.leaf("frequency")
-        self.names = {
-            "t": time,
-            "f": frequency,
-            "pi": graph.number(math.pi),
-            "phase": graph.mul(time, frequency),
-        }
+        self.names = {"t": time, "f": frequency, "pi": graph.number(math.pi), "phase": graph.mul(time, frequency)}
         for i, state in enumerate(definition.states):
             self.names[state.name] = graph.leaf("state", i)
         for i, parameter in enumerate(definition.parameters):

@@ -144,9 +144,7 @@ def _start_faults(definition: Definition, values: Mapping[str, Any]) -> list[Fau
     return found
 
 
-def _look(
-    tree: Tree, place: str, known: Mapping[str, Any], rows: np.ndarray, found: list[Fault]
-) -> np.ndarray:
+def _look(tree: Tree, place: str, known: Mapping[str, Any], rows: np.ndarray, found: list[Fault]) -> np.ndarray:
     """Add the faults of a part, the innermost first; returns where it has no finite value."""
     if tree.kind == "inverse":  # told with its product
         return _look(tree.args[0], place, known, rows, found)

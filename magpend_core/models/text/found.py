@@ -58,9 +58,8 @@ def found_in(
 
 
 def _numbers(
-    nodes: Sequence[Node], own: Definition, parameters: Mapping[str, float], frequency_hz: float,
-    state: Sequence[float],
-) -> list[float]:  # fmt: skip
+    nodes: Sequence[Node], own: Definition, parameters: Mapping[str, float], frequency_hz: float, state: Sequence[float]
+) -> list[float]:
     """Values of nodes at one point; 1 stands for what a side or a mode may be."""
     given = {"parameter": [parameters[p.name] for p in own.parameters], "state": list(state)}
     leaves: dict[int, Any] = {}
@@ -91,8 +90,7 @@ def _text(node: Node, own: Definition, depth: int = 0) -> str:
     parts = [_text(arg, own, depth + 1) for arg in node.args]
     if node.op == "add":
         parts.sort(key=lambda part: part.startswith("-"))  # what is subtracted comes last
-        text = "".join(p if i == 0 else f" - {p[1:]}" if p.startswith("-") else f" + {p}"
-                       for i, p in enumerate(parts))  # fmt: skip
+        text = "".join(p if i == 0 else f" - {p[1:]}" if p.startswith("-") else f" + {p}" for i, p in enumerate(parts))
         return f"({text})" if depth else text
     if node.op in ("mul", "div"):
         return f"{parts[0]}{'*' if node.op == 'mul' else '/'}{parts[1]}"

@@ -204,16 +204,7 @@ def source_of(derived: Derived) -> Source:
     switches = [node for pair in derived.sliding.pairs for node in pair]
     impacts = [node for jump in derived.impacts for node in (jump.value, jump.rate)]
     resets = [node for jump in derived.impacts for node in (*jump.states, *jump.at_rest)]
-    roots = (
-        *derived.rates,
-        *derived.jacobian,
-        *derived.quantities,
-        *forcing,
-        *layers,
-        *switches,
-        *impacts,
-        *resets,
-    )
+    roots = (*derived.rates, *derived.jacobian, *derived.quantities, *forcing, *layers, *switches, *impacts, *resets)
     constants = constants_of(roots)
     n_contacts = len(derived.sticks) if any(derived.sticks) else 0
     n_constants = max(1, len(constants))
@@ -362,9 +353,7 @@ def _forcing(forcing: Node | None, leaves: Mapping[int, str]) -> str:
     return _function("forcing", "t, c", [*writer.lines, f"return {value}"])
 
 
-def _tuple(
-    name: str, arguments: str, roots: Iterable[Node], leaves: Mapping[int, str], group: int = 0
-) -> str:
+def _tuple(name: str, arguments: str, roots: Iterable[Node], leaves: Mapping[int, str], group: int = 0) -> str:
     """A function that returns a tuple of numbers per lane, or of groups of them."""
     roots = list(roots)
     writer = Writer(leaves)

@@ -28,22 +28,40 @@ MANY = 8
 
 FUNCTIONS: dict[str, tuple[int, int]] = {
     **dict.fromkeys(
-        ("sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "exp", "log", "sqrt", "abs",
-         "sign"),
+        ("sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "exp", "log", "sqrt", "abs", "sign"),
         (1, 1),
     ),
-    "atan2": (2, 2), "min": (2, MANY), "max": (2, MANY), "where": (3, 3), "square": (2, 2),
-}  # fmt: skip
+    "atan2": (2, 2),
+    "min": (2, MANY),
+    "max": (2, MANY),
+    "where": (3, 3),
+    "square": (2, 2),
+}
 """Least and greatest number of arguments by name."""
 
 BUILT_IN = ("t", "f", "phase", "pi")
 """Time since the section [s], drive frequency [Hz], t f in [0, 1), and pi."""
 
 ELSEWHERE = {
-    "ln": "log", "arctan": "atan", "arcsin": "asin", "arccos": "acos", "arctan2": "atan2", "fabs": "abs",
-    "pow": "**", "sgn": "sign", "heaviside": "where", "if": "where", "Piecewise": "where", "Abs": "abs",
-    "power": "**", "minimum": "min", "maximum": "max", "time": "t", "frequency": "f", "frequency_hz": "f",
-}  # fmt: skip
+    "ln": "log",
+    "arctan": "atan",
+    "arcsin": "asin",
+    "arccos": "acos",
+    "arctan2": "atan2",
+    "fabs": "abs",
+    "pow": "**",
+    "sgn": "sign",
+    "heaviside": "where",
+    "if": "where",
+    "Piecewise": "where",
+    "Abs": "abs",
+    "power": "**",
+    "minimum": "min",
+    "maximum": "max",
+    "time": "t",
+    "frequency": "f",
+    "frequency_hz": "f",
+}
 """What other languages call it."""
 
 _TOKEN = re.compile(
@@ -54,9 +72,16 @@ _SPACE = re.compile(r"[ \t\r\n]*")
 _COMPARISONS = ("<", "<=", ">", ">=")
 _OR, _AND, _NOT, _COMPARE, _SUM, _PRODUCT, _SIGN, _POWER = range(1, 9)
 _BINDING = {
-    "or": _OR, "and": _AND, **dict.fromkeys(_COMPARISONS, _COMPARE), "+": _SUM, "-": _SUM, "*": _PRODUCT,
-    "/": _PRODUCT, "**": _POWER, "^": _POWER,
-}  # fmt: skip
+    "or": _OR,
+    "and": _AND,
+    **dict.fromkeys(_COMPARISONS, _COMPARE),
+    "+": _SUM,
+    "-": _SUM,
+    "*": _PRODUCT,
+    "/": _PRODUCT,
+    "**": _POWER,
+    "^": _POWER,
+}
 
 
 class GrammarError(ValueError):
@@ -262,9 +287,11 @@ class _Parser:
     def unexpected(self, token: _Token) -> GrammarError:
         """What is wrong with a token that cannot follow, with a remedy where one is known."""
         hints = {
-            "==": "; compare with < or >", "!=": "; compare with < or >",
-            "=": "; an expression assigns nothing", ")": ": there is no ( for it",
-        }  # fmt: skip
+            "==": "; compare with < or >",
+            "!=": "; compare with < or >",
+            "=": "; an expression assigns nothing",
+            ")": ": there is no ( for it",
+        }
         if token.kind == "end":
             return GrammarError("ends where something must follow")
         before = self.tokens[self.next - 1] if self.next else None
@@ -274,9 +301,7 @@ class _Parser:
                 f"{token.text!r} at character {token.at} follows {before.text!r} without a sign; for a "
                 f"product write {before.text}*{token.text}"
             )
-        return GrammarError(
-            f"{token.text!r} at character {token.at} cannot stand here{hints.get(token.text, '')}"
-        )
+        return GrammarError(f"{token.text!r} at character {token.at} cannot stand here{hints.get(token.text, '')}")
 
     def expression(self, least: int) -> Tree:
         """Read as far as signs bind at least as strongly as `least`."""
@@ -396,9 +421,7 @@ class _Parser:
         least, most = FUNCTIONS.get(name.text, (0, len(args)))
         if not least <= len(args) <= most:
             wanted = f"{least}" if least == most else f"{least} to {most}"
-            self.problems.append(
-                f"{name.text} at character {name.at} has {len(args)} arguments; it takes {wanted}"
-            )
+            self.problems.append(f"{name.text} at character {name.at} has {len(args)} arguments; it takes {wanted}")
         elif name.text == "where":
             if not args[0].is_condition:
                 self.problems.append(
@@ -411,8 +434,7 @@ class _Parser:
     def numbers(self, parts: tuple[Tree, ...], token: _Token) -> tuple[Tree, ...]:
         """Return parts, after noting those that are conditions."""
         self.problems += [
-            f"a condition stands at character {part.at} where {token.text!r} needs a number; "
-            "use where(condition, a, b)"
+            f"a condition stands at character {part.at} where {token.text!r} needs a number; use where(condition, a, b)"
             for part in parts
             if part.is_condition
         ]

@@ -53,17 +53,35 @@ class Node:
 
 
 _LEAVES = {
-    "number": CONSTANT, "parameter": CONSTANT, "frequency": CONSTANT, "rank": CONSTANT, "time": TIMED,
-    "segment": TIMED, "clock": TIMED, "mode_clock": TIMED, "state": STATED, "rate": STATED,
-    "side": STATED, "mode_side": STATED, "mode_contact": STATED,
-}  # fmt: skip
+    "number": CONSTANT,
+    "parameter": CONSTANT,
+    "frequency": CONSTANT,
+    "rank": CONSTANT,
+    "time": TIMED,
+    "segment": TIMED,
+    "clock": TIMED,
+    "mode_clock": TIMED,
+    "state": STATED,
+    "rate": STATED,
+    "side": STATED,
+    "mode_side": STATED,
+    "mode_contact": STATED,
+}
 
 _FOLDED: dict[str, Callable[..., float]] = {"sqrt": math.sqrt, "absolute": abs, "floor": math.floor}
 # exact at 0, whatever the function's last bit elsewhere
 _AT_ZERO = {
-    "sin": 0.0, "cos": 1.0, "tan": 0.0, "atan": 0.0, "tanh": 0.0, "sinh": 0.0, "cosh": 1.0, "exp": 1.0,
-    "asin": 0.0, "sign": 0.0,
-}  # fmt: skip
+    "sin": 0.0,
+    "cos": 1.0,
+    "tan": 0.0,
+    "atan": 0.0,
+    "tanh": 0.0,
+    "sinh": 0.0,
+    "cosh": 1.0,
+    "exp": 1.0,
+    "asin": 0.0,
+    "sign": 0.0,
+}
 
 
 def _finite(function: Callable[[float, float], float], a: float, b: float) -> float:
@@ -73,9 +91,7 @@ def _finite(function: Callable[[float, float], float], a: float, b: float) -> fl
     except OverflowError:
         value = math.inf
     if not math.isfinite(value):
-        raise GraphError(
-            f"the equations, or their derivatives, have a number too large to compute with ({a:g}, {b:g})"
-        )
+        raise GraphError(f"the equations, or their derivatives, have a number too large to compute with ({a:g}, {b:g})")
     return value
 
 

@@ -10,16 +10,56 @@ from magpend_core.models.text.grammar import Tree
 
 _OR, _AND, _COMPARE, _SUM, _PRODUCT, _POWER, _ATOM = range(7)
 _GREEK = (
-    "alpha", "beta", "gamma", "delta", "epsilon", "zeta", "eta", "theta", "iota", "kappa", "lambda", "mu",
-    "nu", "xi", "pi", "rho", "sigma", "tau", "phi", "chi", "psi", "omega", "Gamma", "Delta", "Theta",
-    "Lambda", "Xi", "Pi", "Sigma", "Phi", "Psi", "Omega",
-)  # fmt: skip
+    "alpha",
+    "beta",
+    "gamma",
+    "delta",
+    "epsilon",
+    "zeta",
+    "eta",
+    "theta",
+    "iota",
+    "kappa",
+    "lambda",
+    "mu",
+    "nu",
+    "xi",
+    "pi",
+    "rho",
+    "sigma",
+    "tau",
+    "phi",
+    "chi",
+    "psi",
+    "omega",
+    "Gamma",
+    "Delta",
+    "Theta",
+    "Lambda",
+    "Xi",
+    "Pi",
+    "Sigma",
+    "Phi",
+    "Psi",
+    "Omega",
+)
 _NAMED = {
-    "asin": r"\arcsin", "acos": r"\arccos", "atan": r"\arctan", "sinh": r"\sinh", "cosh": r"\cosh",
-    "tanh": r"\tanh", "sin": r"\sin", "cos": r"\cos", "tan": r"\tan", "log": r"\ln", "min": r"\min",
-    "max": r"\max", "sign": r"\operatorname{sign}", "atan2": r"\operatorname{atan2}",
+    "asin": r"\arcsin",
+    "acos": r"\arccos",
+    "atan": r"\arctan",
+    "sinh": r"\sinh",
+    "cosh": r"\cosh",
+    "tanh": r"\tanh",
+    "sin": r"\sin",
+    "cos": r"\cos",
+    "tan": r"\tan",
+    "log": r"\ln",
+    "min": r"\min",
+    "max": r"\max",
+    "sign": r"\operatorname{sign}",
+    "atan2": r"\operatorname{atan2}",
     "square": r"\operatorname{square}",
-}  # fmt: skip
+}
 _SIGNS = {"<": "<", "<=": r"\le", ">": ">", ">=": r"\ge"}
 
 
@@ -151,7 +191,5 @@ def _call(tree: Tree, symbols: Mapping[str, str]) -> str:
         return rf"\mathrm{{e}}^{{{args[0]}}}"
     if tree.value == "where":
         condition, first, second = args
-        return (
-            rf"\begin{{cases}} {first} & \text{{if }} {condition} \\ {second} & \text{{else}} \end{{cases}}"
-        )
+        return rf"\begin{{cases}} {first} & \text{{if }} {condition} \\ {second} & \text{{else}} \end{{cases}}"
     return rf"{_NAMED[str(tree.value)]}\left({', '.join(args)}\right)"

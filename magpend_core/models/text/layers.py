@@ -183,9 +183,7 @@ def _above_zero(graph: Graph, node: Node) -> bool:
         return all(_above_zero(graph, a) for a in node.args)
     if node.op == "add":
         parts = [_above_zero(graph, a) for a in node.args]
-        return any(parts) and all(
-            p or _not_below_zero(graph, a) for p, a in zip(parts, node.args, strict=True)
-        )
+        return any(parts) and all(p or _not_below_zero(graph, a) for p, a in zip(parts, node.args, strict=True))
     return False
 
 

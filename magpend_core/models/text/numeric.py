@@ -32,21 +32,44 @@ def _fold(function: Callable[[Any, Any], Any]) -> Callable[..., Any]:
 
 
 CALLS: dict[str, Callable[..., Any]] = {
-    "sin": np.sin, "cos": np.cos, "tan": np.tan, "asin": np.arcsin, "acos": np.arccos, "atan": np.arctan,
-    "atan2": np.arctan2, "sinh": np.sinh, "cosh": np.cosh, "tanh": np.tanh, "exp": np.exp, "log": np.log,
-    "sqrt": np.sqrt, "abs": np.abs, "sign": np.sign, "min": _fold(np.minimum), "max": _fold(np.maximum),
-    "where": np.where, "square": _square,
-}  # fmt: skip
+    "sin": np.sin,
+    "cos": np.cos,
+    "tan": np.tan,
+    "asin": np.arcsin,
+    "acos": np.arccos,
+    "atan": np.arctan,
+    "atan2": np.arctan2,
+    "sinh": np.sinh,
+    "cosh": np.cosh,
+    "tanh": np.tanh,
+    "exp": np.exp,
+    "log": np.log,
+    "sqrt": np.sqrt,
+    "abs": np.abs,
+    "sign": np.sign,
+    "min": _fold(np.minimum),
+    "max": _fold(np.maximum),
+    "where": np.where,
+    "square": _square,
+}
 """numpy's function for each of `grammar.FUNCTIONS`."""
 
 _COMPARE: dict[str, Callable[[Any, Any], Any]] = {
-    "<": np.less, "<=": np.less_equal, ">": np.greater, ">=": np.greater_equal,
-}  # fmt: skip
+    "<": np.less,
+    "<=": np.less_equal,
+    ">": np.greater,
+    ">=": np.greater_equal,
+}
 
 _JOIN: dict[str, Callable[..., Any]] = {
-    "sum": _fold(np.add), "product": _fold(np.multiply), "and": _fold(np.logical_and),
-    "or": _fold(np.logical_or), "negative": np.negative, "not": np.logical_not, "power": _power,
-}  # fmt: skip
+    "sum": _fold(np.add),
+    "product": _fold(np.multiply),
+    "and": _fold(np.logical_and),
+    "or": _fold(np.logical_or),
+    "negative": np.negative,
+    "not": np.logical_not,
+    "power": _power,
+}
 
 
 def value_of(tree: Tree, names: Mapping[str, Any]) -> Any:
@@ -95,11 +118,20 @@ def _product(tree: Tree, names: Mapping[str, Any]) -> Any:
 
 
 _NODES: dict[str, Callable[..., Any]] = {
-    **CALLS, "add": _fold(np.add), "mul": np.multiply, "div": np.divide, "neg": np.negative, "power": _power,
-    "absolute": np.abs, "minimum": np.minimum, "maximum": np.maximum, "floor": np.floor, "held": lambda x: x,
+    **CALLS,
+    "add": _fold(np.add),
+    "mul": np.multiply,
+    "div": np.divide,
+    "neg": np.negative,
+    "power": _power,
+    "absolute": np.abs,
+    "minimum": np.minimum,
+    "maximum": np.maximum,
+    "floor": np.floor,
+    "held": lambda x: x,
     "less": lambda a, b, yes, no: np.where(a < b, yes, no),
     "choice": lambda side, yes, no: np.where(side > 0.0, yes, no),
-}  # fmt: skip
+}
 
 
 def node_values(roots: Sequence[Node], leaves: Mapping[int, Any]) -> list[Any]:

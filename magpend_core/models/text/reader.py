@@ -7,15 +7,7 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from magpend_core.models.parameters import near_names
-from magpend_core.models.text.grammar import (
-    GrammarError,
-    Tree,
-    name_problem,
-    names,
-    parse,
-    parse_condition,
-    unknown,
-)
+from magpend_core.models.text.grammar import GrammarError, Tree, name_problem, names, parse, parse_condition, unknown
 
 MAX_TEXT = 2000
 """Characters of a title, a unit, a phrase."""
@@ -50,9 +42,7 @@ class Reader:
     def table(self, value: Any, place: str, most: int, what: str = "entries") -> dict[str, Any]:
         """Return a table; {} if it is none, without keys that are no text."""
         if not isinstance(value, Mapping):
-            self.report(
-                place, f"{shown(value)} must be a table; write {place.rpartition('.')[2]} = {{ ... }}."
-            )
+            self.report(place, f"{shown(value)} must be a table; write {place.rpartition('.')[2]} = {{ ... }}.")
             return {}
         if len(value) > most:
             self.report(place, f"has {len(value)} {what}; {most} are the most.")
@@ -67,9 +57,7 @@ class Reader:
         known = tuple(known)
         for key in table:
             if key not in known:
-                self.report(
-                    f"{place}.{key[:SHOWN]}", f"is no key here; {near_names(key[:SHOWN], known, 'keys')}"
-                )
+                self.report(f"{place}.{key[:SHOWN]}", f"is no key here; {near_names(key[:SHOWN], known, 'keys')}")
 
     def text(self, table: Mapping[str, Any], key: str, place: str, default: str = "") -> str:
         """Return a phrase."""
@@ -127,9 +115,7 @@ class Reader:
         """Return a condition of known names, or None."""
         return self._tree(value, place, known, parse_condition)
 
-    def _tree(
-        self, value: Any, place: str, known: Mapping[str, str], read: Callable[[Any], Tree]
-    ) -> Tree | None:
+    def _tree(self, value: Any, place: str, known: Mapping[str, str], read: Callable[[Any], Tree]) -> Tree | None:
         tree: Tree | None = None
         found: tuple[tuple[str, int], ...] = ()
         wrong: list[tuple[str, str]] = []

@@ -22,17 +22,39 @@ ESCAPE = 1e9
 """Bound beyond which a trajectory has diverged, if the text gives none."""
 BOUNDS = {"finite": FINITE, "positive": POSITIVE, "non-negative": NON_NEGATIVE, "fraction": FRACTION}
 KEYS = (
-    "name", "title", "source", "section", "states", "parameters", "define", "equations", "quantities",
-    "impacts", "drawing", "mirror", "presets", "classifier",
-)  # fmt: skip
+    "name",
+    "title",
+    "source",
+    "section",
+    "states",
+    "parameters",
+    "define",
+    "equations",
+    "quantities",
+    "impacts",
+    "drawing",
+    "mirror",
+    "presets",
+    "classifier",
+)
 _STATE_KEYS = ("unit", "meaning", "symbol", "on_circle", "scale", "escape")
 _PARAMETER_KEYS = ("value", "unit", "meaning", "symbol", "bound")
 _QUANTITY_KEYS = ("value", "unit", "meaning", "symbol")
 # dims, coordinates and keys of runs: a state, a parameter or a quantity of the name would be taken for them
 _OF_RUNS = (
-    "frequency", "frequency_hz", "state", "quantity", "branch", "cell", "angle", "period_index", "kind",
-    "preset", "drive_period", "time",
-)  # fmt: skip
+    "frequency",
+    "frequency_hz",
+    "state",
+    "quantity",
+    "branch",
+    "cell",
+    "angle",
+    "period_index",
+    "kind",
+    "preset",
+    "drive_period",
+    "time",
+)
 
 
 def read_definition(table: Any, place: str = "model") -> tuple[Definition | None, list[str]]:
@@ -73,9 +95,7 @@ class _Reading(ViewsReader):
         self.keys(table, self.place, KEYS)
         for key in ("name", "states", "equations"):
             if key not in table:
-                self.report(
-                    f"{self.place}.{key}", "missing; a model has name, states and equations at least."
-                )
+                self.report(f"{self.place}.{key}", "missing; a model has name, states and equations at least.")
         head = {key: self.text(table, key, self.place) for key in ("name", "title", "source", "section")}
         self._model_name(head["name"], "name" in table)
         states = self._states(table.get("states", {}))
@@ -94,23 +114,29 @@ class _Reading(ViewsReader):
         if self.problems:
             return None
         return Definition(
-            **head, states=states, parameters=parameters, define=define, equations=equations,
-            quantities=quantities, described=described, impacts=impacts, drawing=drawing, mirror=mirror,
-            presets=presets, classifier=classifier, table=_plain(table),
-        )  # fmt: skip
+            **head,
+            states=states,
+            parameters=parameters,
+            define=define,
+            equations=equations,
+            quantities=quantities,
+            described=described,
+            impacts=impacts,
+            drawing=drawing,
+            mirror=mirror,
+            presets=presets,
+            classifier=classifier,
+            table=_plain(table),
+        )
 
     def _model_name(self, name: str, given: bool) -> None:
         plain = name.replace("-", "").replace("_", "")
         if given and not (plain.isascii() and plain.isalnum() and len(name) <= 60 and name[0].isalpha()):
-            self.report(
-                self.at("name"), f"{shown(name)} must be a letter, then letters, digits, - and _, 60 at most."
-            )
+            self.report(self.at("name"), f"{shown(name)} must be a letter, then letters, digits, - and _, 60 at most.")
 
     def _new_name(self, name: str, place: str, kind: str) -> bool:
         if name in _OF_RUNS:
-            self.report(
-                place, f"{name!r} names something else in runs; choose another name, such as {name}_."
-            )
+            self.report(place, f"{name!r} names something else in runs; choose another name, such as {name}_.")
             return False
         if not self.name(name, place, self.known):
             return False
@@ -167,11 +193,7 @@ class _Reading(ViewsReader):
 
     def _defined(self, given: Any) -> dict[str, Tree]:
         table = self.table(given, self.at("define"), MAX_DEFINED, "definitions")
-        table = {
-            name: v
-            for name, v in table.items()
-            if self._new_name(name, self.at("define", name), "definition")
-        }
+        table = {name: v for name, v in table.items() if self._new_name(name, self.at("define", name), "definition")}
         trees = {name: self.expression(v, self.at("define", name), self.known) for name, v in table.items()}
         found = {name: tree for name, tree in trees.items() if tree is not None}
         circle = _circle(found)

@@ -68,10 +68,7 @@ def drawing_of(definition: Definition) -> Drawing | None:
 
 
 def _places(
-    definition: Definition,
-    places: Mapping[str, tuple[Tree, Tree]],
-    given: Mapping[str, Any],
-    shape: tuple[int, ...],
+    definition: Definition, places: Mapping[str, tuple[Tree, Tree]], given: Mapping[str, Any], shape: tuple[int, ...]
 ) -> dict[str, np.ndarray]:
     found = {}
     for name, pair in places.items():
@@ -97,8 +94,7 @@ def classifier_of(definition: Definition) -> Classifier | None:
         given = by_name(definition, section, own)
         shape = section.shape[:-1]
         holds = [
-            np.broadcast_to(value, shape).all(axis=-1)
-            for value in values_of(definition, text.words.values(), given)
+            np.broadcast_to(value, shape).all(axis=-1) for value in values_of(definition, text.words.values(), given)
         ]
         codes = [np.int8(code) for code in range(1, len(words) - 1)]
         return np.select(holds, codes, np.int8(len(words) - 1)).astype(np.int8)

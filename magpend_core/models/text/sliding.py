@@ -184,8 +184,6 @@ def _joint(
     )
     alone = graph.neg(_quotient(graph, graph.add(rest_k, graph.mul(kj, modes[j])), kk))
     both = _quotient(
-        graph,
-        graph.sub(graph.mul(kj, rest_j), graph.mul(jj, rest_k)),
-        graph.sub(graph.mul(kk, jj), graph.mul(kj, jk)),
+        graph, graph.sub(graph.mul(kj, rest_j), graph.mul(jj, rest_k)), graph.sub(graph.mul(kk, jj), graph.mul(kj, jk))
     )
     return _while_sliding(graph, modes[j], both, alone)

@@ -28,9 +28,7 @@ class ViewsReader(Reader):
         """A place below the model's."""
         return ".".join((self.place, *(k[:60] for k in keys)))
 
-    def _timeless(
-        self, tree: Tree | None, place: str, define: dict[str, Tree], only: set[str] | None = None
-    ) -> bool:
+    def _timeless(self, tree: Tree | None, place: str, define: dict[str, Tree], only: set[str] | None = None) -> bool:
         """Whether an expression needs no time, and of the states none but `only`; reports what it does."""
         if tree is None:
             return False
@@ -78,14 +76,11 @@ class ViewsReader(Reader):
             self.report(f"{place}.lines", 'must be a list of lists of points, such as [["pivot", "bob"]].')
             lines = []
         for name in dict.fromkeys(n for line in lines for n in line if n not in known):
-            self.report(
-                f"{place}.lines", f"{shown(name)} is no point; {near_names(name[:60], known, 'points')}"
-            )
+            self.report(f"{place}.lines", f"{shown(name)} is no point; {near_names(name[:60], known, 'points')}")
         trace = self.text(table, "trace", place, next(iter(points), ""))
         if trace not in points:
             self.report(
-                f"{place}.trace",
-                f"{shown(trace)} is no moving point; {near_names(trace[:60], points, 'points')}",
+                f"{place}.trace", f"{shown(trace)} is no moving point; {near_names(trace[:60], points, 'points')}"
             )
         unit = self.text(table, "unit", place, "m")
         return DrawingText(points, fixed, tuple(tuple(line) for line in lines), trace, unit)
@@ -100,8 +95,7 @@ class ViewsReader(Reader):
         for name, sign in signs.items():
             if name not in states:
                 self.report(
-                    f"{place}.signs.{name[:60]}",
-                    f"there is no such state; {near_names(name, states, 'states')}",
+                    f"{place}.signs.{name[:60]}", f"there is no such state; {near_names(name, states, 'states')}"
                 )
             elif isinstance(sign, bool) or sign not in (1, -1):
                 self.report(f"{place}.signs.{name}", f"{shown(sign)} must be 1 or -1.")
@@ -148,7 +142,5 @@ class ViewsReader(Reader):
                 found.append(Preset(name, {**values, **numbers}, provenance))
         names_given = [p.name for p in found]
         if len(set(names_given)) < len(names_given):
-            self.report(
-                self.at("presets", DEFAULT_PRESET), "is that of the table of parameters; choose another name."
-            )
+            self.report(self.at("presets", DEFAULT_PRESET), "is that of the table of parameters; choose another name.")
         return tuple(found)

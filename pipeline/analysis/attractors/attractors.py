@@ -185,18 +185,20 @@ def identify(
     tolerance = options.tolerance or max(1e-4, 10.0 * float(ds.attrs.get("closure_tolerance", 1e-5)))
     dynamics = Dynamics.of(ds, parameters, system, needed=options.polish)
     settings = Settings.of(
-        ds, dynamics.system, dynamics.geometry,
-        closure=CLOSURE, longest=options.max_orbit_period, residual=options.residual,
-    )  # fmt: skip
+        ds,
+        dynamics.system,
+        dynamics.geometry,
+        closure=CLOSURE,
+        longest=options.max_orbit_period,
+        residual=options.residual,
+    )
     search = Search(options, tolerance, dynamics, settings)
     found: dict[tuple[int, ...], Found] = {}
     for points in slabs(ds, dynamics, block_bytes):
         if dynamics.can_rest:
             tell_rest(points.values(), tolerance, dynamics.geometry)
         if dynamics.can_rest and not dynamics.is_flow and options.polish:
-            tell_cycles(
-                points.values(), tolerance, options.max_orbit_period, options.residual, dynamics.geometry
-            )
+            tell_cycles(points.values(), tolerance, options.max_orbit_period, options.residual, dynamics.geometry)
         works = {index: analyse(point, search) for index, point in points.items()}
         found |= answer_all(works, points, settings, "finding attractors")
     return _with_exponents(_dataset(ds, found, search), ds)
@@ -217,8 +219,10 @@ def _dataset(ds: xr.Dataset, found: Mapping[tuple[int, ...], Found], search: Sea
     table = _filled(ds, dims, shape, found, search)
     result = xr.Dataset(table.variables())
     result["ran_out"] = (
-        dims, np.zeros(shape, np.int8), {"units": "1", "long_name": "whether the extension's budget ended"}
-    )  # fmt: skip
+        dims,
+        np.zeros(shape, np.int8),
+        {"units": "1", "long_name": "whether the extension's budget ended"},
+    )
     cell_dims = (*dims, *start_dims)
     cell_shape = (*shape, *(ds.sizes[d] for d in start_dims))
     ids, decisions = np.empty(cell_shape, np.int32), np.empty(cell_shape, np.int8)
@@ -241,15 +245,23 @@ def _dataset(ds: xr.Dataset, found: Mapping[tuple[int, ...], Found], search: Sea
 
 
 def _filled(
-    ds: xr.Dataset, dims: tuple[str, ...], shape: tuple[int, ...],
-    found: Mapping[tuple[int, ...], Found], search: Search,
-) -> _Table:  # fmt: skip
+    ds: xr.Dataset,
+    dims: tuple[str, ...],
+    shape: tuple[int, ...],
+    found: Mapping[tuple[int, ...], Found],
+    search: Search,
+) -> _Table:
     """Fill the table of the attractors of all parameter points."""
     n = max((len(f.features) for f in found.values()), default=0)
     longest = max((len(x.points) for f in found.values() for x in f.features), default=0)
     n_states = ds.sizes["state"]
-    sizes = {"point": max(search.options.n_points, longest), "state": n_states, "multiplier": n_states,
-             "angle": search.dynamics.n_angles, "destination": n}  # fmt: skip
+    sizes = {
+        "point": max(search.options.n_points, longest),
+        "state": n_states,
+        "multiplier": n_states,
+        "angle": search.dynamics.n_angles,
+        "destination": n,
+    }
     table = _Table(dims, shape, n, sizes, search.dynamics)
     starts = [d for d in ds["status"].dims if d not in dims]
     table.n_diverged = (ds["status"] == DIVERGED).sum(starts).transpose(*dims).values
@@ -320,14 +332,20 @@ _TABLE: dict[str, tuple[tuple[str, ...], str, float, str, str]] = {
     "lifetime_low": ((), "float64", np.nan, "1", "lower end of the interval, drive periods"),
     "lifetime_high": ((), "float64", np.nan, "1", "upper end of the interval, drive periods"),
     "closes_above": ((), "int32", 0, "1", "period of cells that seem to close above the longest looked for"),
-}  # fmt: skip
+}
 """Own dims, dtype, fill, units and long name of the variables per attractor."""
 
 
 _ELSEWHERE = (
-    "n_cells", "share", "attractor_points", "multiplier_real", "multiplier_imag", "eigenvalue_real",
-    "eigenvalue_imag", "n_to",
-)  # fmt: skip
+    "n_cells",
+    "share",
+    "attractor_points",
+    "multiplier_real",
+    "multiplier_imag",
+    "eigenvalue_real",
+    "eigenvalue_imag",
+    "n_to",
+)
 """Variables that are not copied from an attribute of `Features`."""
 
 
@@ -349,9 +367,8 @@ class _Table:
     """Arrays of the variables per attractor."""
 
     def __init__(
-        self, dims: tuple[str, ...], shape: tuple[int, ...], n: int, sizes: Mapping[str, int],
-        dynamics: Dynamics,
-    ) -> None:  # fmt: skip
+        self, dims: tuple[str, ...], shape: tuple[int, ...], n: int, sizes: Mapping[str, int], dynamics: Dynamics
+    ) -> None:
         self._dims, self.n, self._dynamics = (*dims, "attractor"), n, dynamics
         self.n_diverged = np.zeros(shape, np.int64)
         self.angle_dim = dynamics.model.angle_dim if dynamics.model is not None else "angle"
@@ -387,9 +404,10 @@ class _Table:
     def variables(self) -> dict[str, Any]:
         """Return the arrays as (dims, values, attributes) for xarray."""
         more: dict[str, dict[str, Any]] = {
-            "kind": _flags(" ".join(KINDS)), "stability": _flags(" ".join(STABILITIES)),
+            "kind": _flags(" ".join(KINDS)),
+            "stability": _flags(" ".join(STABILITIES)),
             "evidence": _flags(" ".join(EVIDENCE)),
-        }  # fmt: skip
+        }
         model = self._dynamics.model
         if "side" in self.arrays and model is not None and model.classifier is not None:
             more["side"] = flags_of(model.classifier)
@@ -400,7 +418,5 @@ class _Table:
         for name, values in self.arrays.items():
             own = tuple(self.angle_dim if d == "angle" else d for d in _TABLE[name][0])
             units, text = _TABLE[name][3:]
-            found[name] = (
-                (*self._dims, *own), values, {"units": units, "long_name": text, **more.get(name, {})}
-            )  # fmt: skip
+            found[name] = ((*self._dims, *own), values, {"units": units, "long_name": text, **more.get(name, {})})
         return found

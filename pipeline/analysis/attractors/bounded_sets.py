@@ -100,21 +100,39 @@ def describe(
             break
     verdict, evidence = _verdict(own, left, growth, has_stayed, settings)
     return BoundedSet(
-        np.array([c.cell for c in own], np.int64), Cloud.of(paths, settings.geometry, settings.closure),
-        pooled, kind, verdict, evidence, growth, len(own) + len(left), len(left), 0,
-        float(sum(c.length for c in own) + sum(c.periods for c in left)), ends_of(left),
+        np.array([c.cell for c in own], np.int64),
+        Cloud.of(paths, settings.geometry, settings.closure),
+        pooled,
+        kind,
+        verdict,
+        evidence,
+        growth,
+        len(own) + len(left),
+        len(left),
+        0,
+        float(sum(c.length for c in own) + sum(c.periods for c in left)),
+        ends_of(left),
         _closes_above(own, growth, settings),
-    )  # fmt: skip
+    )
 
 
 def left_behind(left: Sequence[Course], settings: Settings) -> BoundedSet:
     """Return the transient set that cells were on before they left, when no sampled cell stayed."""
     paths = [course.stayed for course in left]
     return BoundedSet(
-        np.zeros(0, np.int64), Cloud.of(paths, settings.geometry, settings.closure), np.concatenate(paths),
-        BOUNDED_SET, TRANSIENT, stability.BY_LEAVING, None, len(left), len(left), 0,
-        float(sum(course.periods for course in left)), ends_of(left),
-    )  # fmt: skip
+        np.zeros(0, np.int64),
+        Cloud.of(paths, settings.geometry, settings.closure),
+        np.concatenate(paths),
+        BOUNDED_SET,
+        TRANSIENT,
+        stability.BY_LEAVING,
+        None,
+        len(left),
+        len(left),
+        0,
+        float(sum(course.periods for course in left)),
+        ends_of(left),
+    )
 
 
 def ends_of(left: Iterable[Course]) -> dict[int, int]:

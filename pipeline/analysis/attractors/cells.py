@@ -40,9 +40,7 @@ class Block:
 
     def take(self, rows: np.ndarray) -> Block:
         """Return the cells of some rows; `cells` no longer gives their places."""
-        return Block(
-            self.cells, self.section[rows], self.status[rows], self.orbit_period[rows], self.turns[rows]
-        )
+        return Block(self.cells, self.section[rows], self.status[rows], self.orbit_period[rows], self.turns[rows])
 
     @property
     def is_closed(self) -> np.ndarray:
@@ -153,9 +151,12 @@ class ClosedCells:
             last = section[:, -1]
             back = section[:, -1 - int(p)] if section.shape[1] > p else last
             found = Guesses(
-                keys[:, -1], self.geometry.distance(last, back), hashes(section.reshape(len(cells), -1)),
-                last, np.full(len(cells), int(p), np.int64),
-            )  # fmt: skip
+                keys[:, -1],
+                self.geometry.distance(last, back),
+                hashes(section.reshape(len(cells), -1)),
+                last,
+                np.full(len(cells), int(p), np.int64),
+            )
             self.guesses = self.guesses.joined(found)
 
     def _keep(self, rows: np.ndarray, keys: np.ndarray) -> None:

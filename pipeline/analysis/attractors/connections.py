@@ -101,11 +101,7 @@ def connections(
     axes: list[int] = []
     for axis, dim in enumerate(dims):
         values = attractors[dim].values.astype(float)
-        if (
-            dim not in (FREQUENCY, *system.parameter_names)
-            or len(values) < 2
-            or not (np.diff(values) > 0).all()
-        ):
+        if dim not in (FREQUENCY, *system.parameter_names) or len(values) < 2 or not (np.diff(values) > 0).all():
             continue
         own: dict[tuple[int, ...], list[Found]] = {}
         for n, points in orbits.items():
@@ -136,9 +132,8 @@ def _orbit(attractors: xr.Dataset, place: Place) -> np.ndarray:
 
 
 def _family(
-    system: System, period: int, packed: np.ndarray, frequency: float, at: Mapping[str, float],
-    free: str, scale: float,
-) -> Family:  # fmt: skip
+    system: System, period: int, packed: np.ndarray, frequency: float, at: Mapping[str, float], free: str, scale: float
+) -> Family:
     own = packed.copy()
     for name, value in at.items():
         if name in system.parameter_names:

@@ -75,14 +75,18 @@ class _Crossings:
         """Return successive crossings, shape (cell, RETURNS, state), padded with NaN."""
         n = len(states)
         found = run_branches(
-            np.tile(np.append(self._packed, level), (n, 1, 1)), np.full((n, 1), self._rate), states,
-            n_transient=0, n_keep=RETURNS, rtol=RTOL, atol=RTOL, system=self._system,
-        )  # fmt: skip
+            np.tile(np.append(self._packed, level), (n, 1, 1)),
+            np.full((n, 1), self._rate),
+            states,
+            n_transient=0,
+            n_keep=RETURNS,
+            rtol=RTOL,
+            atol=RTOL,
+            system=self._system,
+        )
         return np.asarray(found.section[:, 0])
 
-    def cycle_of(
-        self, start: np.ndarray, geometry: Geometry, residual: float
-    ) -> tuple[Cycle, np.ndarray] | None:
+    def cycle_of(self, start: np.ndarray, geometry: Geometry, residual: float) -> tuple[Cycle, np.ndarray] | None:
         """Return the stable cycle that a state is on and the cycle's crossings of the level, or None."""
         level = float(start[self.state])
         path = self.of(start[None], level)[0]
@@ -91,9 +95,7 @@ class _Crossings:
         if not len(near):
             return None
         packed, rate = np.append(self._packed, level)[None], np.array([self._rate])
-        found = polish_orbits(
-            packed, rate, path[-1:], np.array([near[0] + 1]), tolerance=residual, system=self._system
-        )
+        found = polish_orbits(packed, rate, path[-1:], np.array([near[0] + 1]), tolerance=residual, system=self._system)
         if not found.converged[0] or not found.is_stable[0]:
             return None
         own = found.multipliers[0][:-1]  # the last one is 0: the direction of the flow
@@ -101,9 +103,7 @@ class _Crossings:
         return cycle, self.of(found.section, level)[0, : int(found.orbit_period[0])]
 
 
-def tell_cycles(
-    points: Iterable[Point], tolerance: float, longest: int, residual: float, geometry: Geometry
-) -> None:
+def tell_cycles(points: Iterable[Point], tolerance: float, longest: int, residual: float, geometry: Geometry) -> None:
     """Find the limit cycles that cells of some parameter points are on, in place.
 
     Parameters

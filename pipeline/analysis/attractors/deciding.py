@@ -117,17 +117,13 @@ def _nearest(
         yield cells[near == i], int(owner[i]), int(phase[i])
 
 
-def _on_orbit(
-    section: np.ndarray, orbit: Orbit, phase: int, tolerance: float, geometry: Geometry
-) -> np.ndarray:
+def _on_orbit(section: np.ndarray, orbit: Orbit, phase: int, tolerance: float, geometry: Geometry) -> np.ndarray:
     q = min(orbit.period, section.shape[1])
     points = orbit.points[(phase - np.arange(q)[::-1]) % orbit.period]
     return np.asarray(geometry.distance(section[:, -q:], points).max(axis=1) <= tolerance)
 
 
-def _approach(
-    section: np.ndarray, orbit: Orbit, phase: int, tolerance: float, geometry: Geometry
-) -> np.ndarray:
+def _approach(section: np.ndarray, orbit: Orbit, phase: int, tolerance: float, geometry: Geometry) -> np.ndarray:
     """Return ``CERTAIN``, ``APPROACHING`` or ``UNDECIDED`` for cells whose last section has this phase."""
     code = np.zeros(len(section), np.int8)
     last = section.shape[1] - 1 - phase

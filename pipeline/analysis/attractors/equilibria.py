@@ -77,9 +77,7 @@ class Equilibrium:
     def eigenvalue_error(self) -> float:
         """Error of the largest real part of the eigenvalues [1/s]."""
         # the error of the state is its residual, or more if degenerate, and carries over to the Jacobian
-        size = max(RATE_ERROR, 1e-4 * float(np.sqrt(self.residual))) * float(
-            np.abs(self.jacobian).max(initial=1.0)
-        )
+        size = max(RATE_ERROR, 1e-4 * float(np.sqrt(self.residual))) * float(np.abs(self.jacobian).max(initial=1.0))
         return largest_error(self.jacobian, size, real=True)
 
     @cached_property
@@ -104,9 +102,7 @@ class Equilibrium:
         except np.linalg.LinAlgError:
             return None
 
-    def is_approached(
-        self, section: np.ndarray, seconds: np.ndarray, noise: float, geometry: Geometry
-    ) -> np.ndarray:
+    def is_approached(self, section: np.ndarray, seconds: np.ndarray, noise: float, geometry: Geometry) -> np.ndarray:
         """Return which trajectories follow the linear flow towards it, shape (n,).
 
         With A the Jacobian, t the time between two sections and r = exp(-rate t) the bound on the linear
@@ -192,9 +188,15 @@ def _waited(point: Point, states: np.ndarray) -> np.ndarray:
         if not len(far):
             break
         result = run_branches(
-            np.tile(point.packed, (len(far), 1, 1)), np.full((len(far), 1), point.frequency), states[far],
-            n_transient=0, n_keep=1, rtol=RTOL, atol=RTOL, system=system,
-        )  # fmt: skip
+            np.tile(point.packed, (len(far), 1, 1)),
+            np.full((len(far), 1), point.frequency),
+            states[far],
+            n_transient=0,
+            n_keep=1,
+            rtol=RTOL,
+            atol=RTOL,
+            system=system,
+        )
         waits = result.status[:, 0] == Status.NO_RETURN
         states[far] = np.where(waits[:, None], result.final_state[:, 0], np.nan)
         far = far[waits]
@@ -223,9 +225,7 @@ def equilibria_near(point: Point, states: np.ndarray, geometry: Geometry) -> lis
     for i in np.flatnonzero(found.converged):
         if all(geometry.distance(found.states[i], other.state) > SAME for other in kept):
             jacobian = found.jacobians[i] * scales / scales[:, None]
-            kept.append(
-                Equilibrium(found.states[i], found.eigenvalues[i], float(found.residual[i]), jacobian)
-            )
+            kept.append(Equilibrium(found.states[i], found.eigenvalues[i], float(found.residual[i]), jacobian))
         if len(kept) == MOST:
             break
     if not kept:

@@ -166,9 +166,7 @@ class _Extension:
 
     def told(self, loose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the loose cells on sets whose verdict is final, and the sets' numbers."""
-        final = [
-            i for i, one in enumerate(self.sets) if one.stability in (ATTRACTS, NEUTRAL) or not self.budget
-        ]
+        final = [i for i, one in enumerate(self.sets) if one.stability in (ATTRACTS, NEUTRAL) or not self.budget]
         clouds = [one for i in final if (one := self.sets[i].cloud) is not None]
         is_loose = np.zeros(self.point.n_cells, bool)
         is_loose[loose] = True
@@ -237,9 +235,7 @@ class _Extension:
     def _take(self, going: Sequence[Course], leg: Extended) -> Work[None]:
         """Record the results of a leg, and end the cells that reached an orbit or an equilibrium."""
         computed = np.isin(leg.status, (Status.PERIODIC, Status.BOUNDED))
-        for course, state, step, section, ok in zip(
-            going, leg.state, leg.step, leg.section, computed, strict=True
-        ):
+        for course, state, step, section, ok in zip(going, leg.state, leg.step, leg.section, computed, strict=True):
             course.state, course.step = state, float(step)
             if ok:
                 course.legs.append(section)
@@ -248,9 +244,7 @@ class _Extension:
         rows = np.flatnonzero(computed)
         if not len(rows):
             return
-        block = Block(
-            slice(0, 0), leg.section[rows], leg.status[rows], leg.orbit_period[rows], leg.turns[rows]
-        )
+        block = Block(slice(0, 0), leg.section[rows], leg.status[rows], leg.orbit_period[rows], leg.turns[rows])
         own = [going[i] for i in rows.tolist()]
         n = len(own[0].legs)
         if n.bit_count() == 1 or n % SEARCH_EACH == 0:
@@ -276,9 +270,7 @@ class _Extension:
         """Find orbits by Newton's method, from cells that close or nearly close."""
         label, _ = decide(block, self.orbits, 10.0 * self.settings.closure, self.geometry)
         rest = np.flatnonzero(label < 0).tolist()
-        closed = ClosedCells(
-            self.geometry, 10.0 * self.settings.closure, Guesses.none(block.section.shape[2])
-        )
+        closed = ClosedCells(self.geometry, 10.0 * self.settings.closure, Guesses.none(block.section.shape[2]))
         closed.add(block.take(np.array(rest, np.int64)))
         found = closed.guesses
         depths = [min(LOOK_BACK, len(own[i].legs)) for i in rest]
@@ -345,8 +337,7 @@ class _Extension:
         has_stayed = bool(going[0].legs) and self._has_stayed(going, LEAST_STAY)
         numbers, is_sure = group([c.stayed for c in going], self.geometry, self.settings.closure)
         groups = [
-            [course for course, n in zip(going, numbers, strict=True) if n == k]
-            for k in range(int(numbers.max()) + 1)
+            [course for course, n in zip(going, numbers, strict=True) if n == k] for k in range(int(numbers.max()) + 1)
         ]
         gone = [] if has_stayed else [course for course in self.courses if course.has_left]
         self.sets, in_doubt = [], not is_sure

@@ -161,9 +161,7 @@ def mean_rotation(section: np.ndarray, turns: np.ndarray, geometry: Geometry) ->
     return np.asarray((change / TWO_PI + turns) / n)
 
 
-def sides_of(
-    section: np.ndarray, turns: np.ndarray, frequency: float, parameters: Parameters | None
-) -> np.ndarray:
+def sides_of(section: np.ndarray, turns: np.ndarray, frequency: float, parameters: Parameters | None) -> np.ndarray:
     """Classify rows of sections by the model's classifier; unknown without a classifier or with a NaN."""
     classifier = parameters.model.classifier if parameters is not None else None
     if classifier is None or parameters is None:
@@ -203,10 +201,19 @@ def fill_cycle(found: Features, cycle: Cycle) -> None:
 def of_equilibrium(found: Equilibrium, parameters: Parameters | None, n_angles: int) -> Features:
     """Return the features of an equilibrium; its largest exponent is an eigenvalue's real part."""
     x = Features(
-        found.state[None], EQUILIBRIUM, 0, np.zeros(n_angles), UNKNOWN, found.state, found.state,
-        residual=found.residual, is_polished=True, stability=found.stability,
-        evidence=BY_APPROACH if found.approached_within else BY_EIGENVALUES, eigenvalues=found.eigenvalues,
-    )  # fmt: skip
+        found.state[None],
+        EQUILIBRIUM,
+        0,
+        np.zeros(n_angles),
+        UNKNOWN,
+        found.state,
+        found.state,
+        residual=found.residual,
+        is_polished=True,
+        stability=found.stability,
+        evidence=BY_APPROACH if found.approached_within else BY_EIGENVALUES,
+        eigenvalues=found.eigenvalues,
+    )
     x.lyapunov_max = x.lyapunov_low = x.lyapunov_high = float(found.eigenvalues.real[0])
     if parameters is None:
         return x
@@ -224,9 +231,7 @@ def follow_points(found: Features, parameters: Parameters, frequency: float) -> 
     ends = found.points
     if mirror.half_period:
         times = np.array([0.5 / frequency])
-        ends = np.array(
-            [trajectory(parameters, frequency, x, times, rtol=RTOL, atol=RTOL)[0] for x in found.points]
-        )
+        ends = np.array([trajectory(parameters, frequency, x, times, rtol=RTOL, atol=RTOL)[0] for x in found.points])
     found.image = ends * np.array(mirror.signs)
 
 

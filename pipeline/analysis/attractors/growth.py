@@ -124,9 +124,15 @@ def growth_of(derivatives: np.ndarray, n_known: int, volumes: np.ndarray) -> Gro
     whole = _weighted(first)
     halves = np.stack([_weighted(first[:, : n // 2]), _weighted(first[:, n // 2 :])])
     return Growth(
-        rate, rate - N_SIGMA * error, rate + N_SIGMA * error, float(whole[np.abs(whole).argmax()]),
-        float(np.abs(halves[0] - halves[1]).max()), volume, volume_error, n,
-    )  # fmt: skip
+        rate,
+        rate - N_SIGMA * error,
+        rate + N_SIGMA * error,
+        float(whole[np.abs(whole).argmax()]),
+        float(np.abs(halves[0] - halves[1]).max()),
+        volume,
+        volume_error,
+        n,
+    )
 
 
 def _mean(values: np.ndarray) -> tuple[float, float]:

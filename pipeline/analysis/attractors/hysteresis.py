@@ -65,16 +65,8 @@ def hysteresis(ds: xr.Dataset, ids: xr.Dataset) -> xr.Dataset:
     differs = (present[..., 0, :] != present[..., 1, :]).any(axis=-1) & present.any(axis=-1).all(axis=-1)
     result = xr.Dataset(
         {
-            "present": (
-                (*order, "direction", "attractor"),
-                present,
-                {"units": "1", "long_name": "met by a branch"},
-            ),
-            "differs": (
-                tuple(order),
-                differs,
-                {"units": "1", "long_name": "up and down meet other attractors"},
-            ),
+            "present": ((*order, "direction", "attractor"), present, {"units": "1", "long_name": "met by a branch"}),
+            "differs": (tuple(order), differs, {"units": "1", "long_name": "up and down meet other attractors"}),
         },
         coords={
             **{d: ids[d] for d in order if d in ids.coords},
@@ -130,11 +122,7 @@ def _loops(
             np.array([along[e - 1] for _, _, e in rows]),
             {**units, "long_name": "last value of the path"},
         ),
-        "loop_points": (
-            "loop",
-            np.array([e - s for _, s, e in rows], np.int64),
-            {"units": "1", "long_name": "points"},
-        ),
+        "loop_points": ("loop", np.array([e - s for _, s, e in rows], np.int64), {"units": "1", "long_name": "points"}),
         "only_up": (
             ("loop", "attractor"),
             counts(up, down),

@@ -7,11 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import xarray as xr
 
-from pipeline.analysis.tabular import (
-    Row,
-    aligned,
-    unit_of,
-)
+from pipeline.analysis.tabular import Row, aligned, unit_of
 from pipeline.products.product import Table
 
 
@@ -40,10 +36,15 @@ def hysteresis_lines(ds: xr.Dataset, rows: Sequence[Row]) -> list[str]:
     lines += aligned([_loop_words(ds.isel(loop=i), unit) for i in range(n)])
     lines.append(f"jumps of the branches: {sum(row['count'] for row in rows) or 'none'}")
     words = [
-        {"direction": r["direction"], f"from {unit}": f"{r['from']:g}", "to": f"{r['to']:g}",
-         "ids": f"{r['from_id']} -> {r['to_id']}", "branches": str(r["count"])}
+        {
+            "direction": r["direction"],
+            f"from {unit}": f"{r['from']:g}",
+            "to": f"{r['to']:g}",
+            "ids": f"{r['from_id']} -> {r['to_id']}",
+            "branches": str(r["count"]),
+        }
         for r in rows
-    ]  # fmt: skip
+    ]
     return lines + aligned(words)
 
 

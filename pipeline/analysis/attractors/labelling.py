@@ -158,9 +158,7 @@ def _label_orbits(point: Point, state: State, labels: _Labels, search: Search) -
     groups = np.full(point.n_cells, -1, np.int64)
     for block in point.blocks():
         own = block.cells
-        labels.label[own], labels.decision[own] = decide(
-            block, state.orbits, search.tolerance, search.geometry
-        )
+        labels.label[own], labels.decision[own] = decide(block, state.orbits, search.tolerance, search.geometry)
         if search.is_loose:
             _label_ends(block, state.ends, labels.label, labels.decision)
             continue
@@ -211,9 +209,7 @@ def _label_courses(point: Point, found: Outcome, labels: _Labels, groups: np.nda
                 point.at_rest[cell] = number
 
 
-def _label_raw(
-    point: Point, state: State, groups: np.ndarray, labels: _Labels, search: Search
-) -> list[Orbit]:
+def _label_raw(point: Point, state: State, groups: np.ndarray, labels: _Labels, search: Search) -> list[Orbit]:
     """Label the closed cells without a polished orbit, one raw orbit per group."""
     left = np.where((labels.label < 0) & (labels.decision != DIVERGES) & ~_is_elsewhere(point), groups, -1)
     best: dict[int, tuple[float, int, np.ndarray]] = {}
@@ -304,9 +300,7 @@ def _describe(
 
 def _label_elsewhere(point: Point, first: int, labels: _Labels) -> None:
     """Label the cells at equilibria, then those on limit cycles of a flow sampled at equal times."""
-    for told, known, code in (
-        (point.at_rest, point.equilibria, AT_REST), (point.on_cycle, point.cycles, CLOSED),
-    ):  # fmt: skip
+    for told, known, code in ((point.at_rest, point.equilibria, AT_REST), (point.on_cycle, point.cycles, CLOSED)):
         if told is not None:
             own = told >= 0
             labels.put(own, first + told[own], code)
@@ -334,12 +328,7 @@ def _number_ends(
 
 
 def _features_of(
-    number: int,
-    cells: Cells,
-    orbits: Sequence[Orbit],
-    sets: Sequence[BoundedSet],
-    point: Point,
-    search: Search,
+    number: int, cells: Cells, orbits: Sequence[Orbit], sets: Sequence[BoundedSet], point: Point, search: Search
 ) -> Features:
     """Return the features of the set with a provisional number, from its cells."""
     resting = len(orbits) + len(sets)
@@ -388,9 +377,15 @@ def _of_set(cells: Cells, one: BoundedSet, point: Point, search: Search) -> Feat
 
 def _of_orbit(cells: Cells, orbit: Orbit, point: Point, search: Search) -> Features:
     found = Features(
-        orbit.points, PERIODIC_ORBIT, orbit.period, cells.mean_rotation, UNKNOWN, cells.low, cells.high,
+        orbit.points,
+        PERIODIC_ORBIT,
+        orbit.period,
+        cells.mean_rotation,
+        UNKNOWN,
+        cells.low,
+        cells.high,
         stability=orbit.stability,
-    )  # fmt: skip
+    )
     frequency, is_flow = point.frequency, search.dynamics.is_flow
     if point.parameters is not None:
         found.side = cells.side(point.parameters, frequency)

@@ -148,9 +148,12 @@ def match(
         here = [_seen(attractors, n, places[n]) for n in numbers.get(index, [])]
         seen[index] = ids.at(here, _known(seen, index, look_back))
     attrs = {
-        **attractors.attrs, "matched": 1, "match_threshold": threshold, "match_look_back": look_back,
+        **attractors.attrs,
+        "matched": 1,
+        "match_threshold": threshold,
+        "match_look_back": look_back,
         "match_connect": int(connect),
-    }  # fmt: skip
+    }
     flags = {"flag_values": np.arange(len(BASES), dtype=np.int8), "flag_meanings": " ".join(BASES)}
     about = {"units": "1", "long_name": "what the id rests on", **flags}
     rows = attractors.assign(match_basis=((*dims, _PER_ATTRACTOR), ids.basis, about))
@@ -158,9 +161,12 @@ def match(
 
 
 def _connections(
-    attractors: xr.Dataset, places: Sequence[Place], dims: Sequence[str],
-    parameters: Parameters | np.ndarray | None, system: System | None,
-) -> Connections:  # fmt: skip
+    attractors: xr.Dataset,
+    places: Sequence[Place],
+    dims: Sequence[str],
+    parameters: Parameters | np.ndarray | None,
+    system: System | None,
+) -> Connections:
     """Follow the closed orbits along the axes, if at least two can be followed."""
     if not dims or sum(followable(attractors, place) for place in places) < 2:
         return Connections.none(len(places))
@@ -307,8 +313,7 @@ def _renumbered(attractors: xr.Dataset, ids: np.ndarray, n_ids: int, dims: tuple
         ordered = variable.transpose(*dims, _PER_ATTRACTOR, ...)
         values = ordered.values
         moved = np.full(
-            (*values.shape[: len(dims)], n_ids, *values.shape[len(dims) + 1 :]),
-            _fill(str(name), values.dtype),
+            (*values.shape[: len(dims)], n_ids, *values.shape[len(dims) + 1 :]), _fill(str(name), values.dtype)
         )
         moved = moved.astype(values.dtype)
         if name == "n_to":

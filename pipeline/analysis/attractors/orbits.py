@@ -148,9 +148,16 @@ def polish(
     if not len(points):
         return []
     near = polish_orbits(
-        packed, frequency, points, period,
-        tolerance=NEAR, max_iterations=NEAR_STEPS, rtol=NEAR_RTOL, least_period=False, system=system,
-    )  # fmt: skip
+        packed,
+        frequency,
+        points,
+        period,
+        tolerance=NEAR,
+        max_iterations=NEAR_STEPS,
+        rtol=NEAR_RTOL,
+        least_period=False,
+        system=system,
+    )
     first, own = near.section.copy(), np.flatnonzero(near.converged)
     images, _ = _images(packed[own], frequency[own], first[own], near.orbit_period[own], NEAR_RTOL, system)
     for row, image in zip(own, images, strict=True):
@@ -163,9 +170,14 @@ def polish(
     rows = good[once]
     # start from the rounded point, so that an orbit does not depend on which guess came first
     orbits = _polished(
-        packed[rows], frequency[rows], rounded[once] * np.asarray(geometry.scales), near.orbit_period[rows],
-        geometry, system, tolerance,
-    )  # fmt: skip
+        packed[rows],
+        frequency[rows],
+        rounded[once] * np.asarray(geometry.scales),
+        near.orbit_period[rows],
+        geometry,
+        system,
+        tolerance,
+    )
     found: list[Orbit | None] = [None] * len(points)
     for i, k in zip(good, place.ravel(), strict=True):
         found[i] = orbits[k]
@@ -173,9 +185,15 @@ def polish(
 
 
 def _polished(
-    packed: np.ndarray, frequency: np.ndarray, points: np.ndarray, period: np.ndarray, geometry: Geometry,
-    system: System, tolerance: float, turned: bool = False,
-) -> list[Orbit | None]:  # fmt: skip
+    packed: np.ndarray,
+    frequency: np.ndarray,
+    points: np.ndarray,
+    period: np.ndarray,
+    geometry: Geometry,
+    system: System,
+    tolerance: float,
+    turned: bool = False,
+) -> list[Orbit | None]:
     """Polish guesses to a residual; polish an orbit again from its least point if it started elsewhere."""
     found = polish_orbits(packed, frequency, points, period, tolerance=tolerance, system=system)
     orbits: list[Orbit | None] = [None] * len(points)
@@ -191,9 +209,15 @@ def _polished(
         if not turned and (first != in_time[0]).any():
             one = slice(row, row + 1)
             (orbits[row],) = _polished(
-                packed[one], frequency[one], first[None], found.orbit_period[one], geometry, system,
-                tolerance, turned=True,
-            )  # fmt: skip
+                packed[one],
+                frequency[one],
+                first[None],
+                found.orbit_period[one],
+                geometry,
+                system,
+                tolerance,
+                turned=True,
+            )
     return orbits
 
 
@@ -212,17 +236,24 @@ def run_on(
     if not len(points):
         return points, np.zeros(0, np.int64)
     result = run_branches(
-        packed[:, None], frequency[:, None], points, n_transient=RUN_ON_PERIODS, n_keep=1,
-        rtol=RUN_ON_RTOL, atol=RUN_ON_RTOL, stop_when_closed=True, closure_tolerance=RUN_ON_TOLERANCE,
-        max_orbit_period=max_orbit_period, system=system,
-    )  # fmt: skip
+        packed[:, None],
+        frequency[:, None],
+        points,
+        n_transient=RUN_ON_PERIODS,
+        n_keep=1,
+        rtol=RUN_ON_RTOL,
+        atol=RUN_ON_RTOL,
+        stop_when_closed=True,
+        closure_tolerance=RUN_ON_TOLERANCE,
+        max_orbit_period=max_orbit_period,
+        system=system,
+    )
     return result.section[:, 0, -1], result.orbit_period[:, 0].astype(np.int64)
 
 
 def _images(
-    packed: np.ndarray, frequency: np.ndarray, points: np.ndarray, period: np.ndarray, rtol: float,
-    system: System,
-) -> tuple[list[np.ndarray], np.ndarray]:  # fmt: skip
+    packed: np.ndarray, frequency: np.ndarray, points: np.ndarray, period: np.ndarray, rtol: float, system: System
+) -> tuple[list[np.ndarray], np.ndarray]:
     """Return per row the section points after 1, ..., period drive periods and the last one's derivative."""
     images: list[np.ndarray] = [points[:0]] * len(points)
     derivatives = np.full((len(points), system.n_states, system.n_states), np.nan)

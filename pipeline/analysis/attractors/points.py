@@ -25,9 +25,7 @@ if TYPE_CHECKING:
     from pipeline.analysis.attractors.cycles import Cycle
     from pipeline.analysis.attractors.equilibria import Equilibrium
 
-_READ = (
-    "section", "status", "orbit_period", "turns", "rest_state", "return_time", "n_periods", "step_size",
-)  # fmt: skip
+_READ = ("section", "status", "orbit_period", "turns", "rest_state", "return_time", "n_periods", "step_size")
 """Variables that are read from a cube."""
 
 BUDGET = 256 * 2**20
@@ -58,9 +56,13 @@ class Dynamics:
 
     @classmethod
     def of(
-        cls, ds: xr.Dataset, parameters: Parameters | np.ndarray | None = None, system: System | None = None,
-        *, needed: bool = True,
-    ) -> Dynamics:  # fmt: skip
+        cls,
+        ds: xr.Dataset,
+        parameters: Parameters | np.ndarray | None = None,
+        system: System | None = None,
+        *,
+        needed: bool = True,
+    ) -> Dynamics:
         """Collect the parameters and the system that are given, or else those of the run.
 
         Raises
@@ -234,26 +236,32 @@ def _fixed(ds: xr.Dataset) -> dict[str, float]:
 
 
 def _point(
-    one: xr.Dataset, start_dims: tuple[str, ...], values: Mapping[str, float], dynamics: Dynamics,
-    block_cells: int,
-) -> Point:  # fmt: skip
+    one: xr.Dataset, start_dims: tuple[str, ...], values: Mapping[str, float], dynamics: Dynamics, block_cells: int
+) -> Point:
     frequency, base = frequency_of(dynamics.model, values), dynamics.parameters
     own: dict[str, Any] = {
-        "is_flow": dynamics.is_flow, "can_rest": dynamics.can_rest,
-        "n_periods": int(one["n_periods"].sum()) if "n_periods" in one
+        "is_flow": dynamics.is_flow,
+        "can_rest": dynamics.can_rest,
+        "n_periods": int(one["n_periods"].sum())
+        if "n_periods" in one
         else one["status"].size * one.sizes["period_index"],
-    }  # fmt: skip
+    }
     if isinstance(base, Parameters):
         parameters = base.replace(**{name: value for name, value in values.items() if name in base})
         return Point(
-            one, start_dims, frequency, parameters.pack(), parameters, dynamics.n_angles, block_cells,
-            dynamics.system, **own,
-        )  # fmt: skip
+            one,
+            start_dims,
+            frequency,
+            parameters.pack(),
+            parameters,
+            dynamics.n_angles,
+            block_cells,
+            dynamics.system,
+            **own,
+        )
     names = dynamics.system.parameter_names if dynamics.system is not None else ()
     packed = np.zeros(len(names)) if base is None else np.array(base, np.float64)
     for name, value in values.items():
         if name in names:
             packed[names.index(name)] = value
-    return Point(
-        one, start_dims, frequency, packed, None, dynamics.n_angles, block_cells, dynamics.system, **own
-    )
+    return Point(one, start_dims, frequency, packed, None, dynamics.n_angles, block_cells, dynamics.system, **own)

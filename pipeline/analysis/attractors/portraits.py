@@ -13,14 +13,7 @@ from magpend_core.models.sectioned import of_flow
 from magpend_core.sections import run_branches
 from magpend_core.trajectory import trajectory
 from pipeline.analysis.selection import choose, start_dims
-from pipeline.layout.vocabulary import (
-    APERIODIC,
-    EQUILIBRIUM,
-    PERIODIC_ORBIT,
-    frequency_of,
-    parameters_of,
-    told_by,
-)
+from pipeline.layout.vocabulary import APERIODIC, EQUILIBRIUM, PERIODIC_ORBIT, frequency_of, parameters_of, told_by
 
 RTOL = 1e-9
 
@@ -75,10 +68,7 @@ def portraits(
     base = parameters_of(attractors) if parameters is None else parameters
     base = base.replace(**{k: v for k, v in values.items() if k in base})
     step = _step(here, base, frequency_of(base.model, values), n_samples)
-    orbits = [
-        _orbit(here.isel(attractor=i), base, step, n_samples, n_periods)
-        for i in range(here.sizes["attractor"])
-    ]
+    orbits = [_orbit(here.isel(attractor=i), base, step, n_samples, n_periods) for i in range(here.sizes["attractor"])]
     return _dataset(here, orbits, base, step)
 
 
@@ -105,17 +95,21 @@ def _step(here: xr.Dataset, parameters: Parameters, frequency: float, n_samples:
 def _mean_return(starts: np.ndarray, parameters: Parameters, frequency: float) -> float:
     """Integrate 16 crossings and return the mean time between them [s]."""
     result = run_branches(
-        parameters.pack()[None, None], np.full((1, 1), frequency), starts, n_transient=0, n_keep=16,
-        rtol=RTOL, atol=RTOL, system=parameters.model.system,
-    )  # fmt: skip
+        parameters.pack()[None, None],
+        np.full((1, 1), frequency),
+        starts,
+        n_transient=0,
+        n_keep=16,
+        rtol=RTOL,
+        atol=RTOL,
+        system=parameters.model.system,
+    )
     assert result.return_time is not None
     found = float(result.return_time.mean())
     return found if np.isfinite(found) else 0.1 / frequency
 
 
-def _orbit(
-    one: xr.Dataset, parameters: Parameters, step: float, n_samples: int, n_periods: int
-) -> np.ndarray:
+def _orbit(one: xr.Dataset, parameters: Parameters, step: float, n_samples: int, n_periods: int) -> np.ndarray:
     start = one["attractor_points"].transpose("point", "state").values[0]
     kind, periods = int(one["kind"]), int(one["orbit_period"])
     n = n_samples * (periods if kind == PERIODIC_ORBIT else n_periods)
@@ -134,15 +128,15 @@ def _dataset(here: xr.Dataset, orbits: list[np.ndarray], parameters: Parameters,
         row[: len(orbit)] = orbit
     keep = ["attractor_points", "share", "n_cells", "orbit_period", "kind", "stability", "side"]
     result = here[[name for name in keep if name in here]].assign(
-        orbit=(("attractor", "sample", "state"), table,
-               {"units": "see state_units", "long_name": "motion on the attractor"}),
-    )  # fmt: skip
+        orbit=(
+            ("attractor", "sample", "state"),
+            table,
+            {"units": "see state_units", "long_name": "motion on the attractor"},
+        )
+    )
     time = np.arange(length) * step
     result = result.assign_coords(time=("sample", time, {"units": "s", "long_name": "time"}))
-    result.attrs = {
-        **told_by(here.attrs),
-        "title": "portraits of attractors",
-    }
+    result.attrs = {**told_by(here.attrs), "title": "portraits of attractors"}
     return _drawn(result, table, parameters)
 
 

@@ -136,16 +136,20 @@ class Settings:
         method = str(given.get("method", system.method if system is not None else ""))
         seen = int(given.get("n_transient", 0)) + int(given.get("n_keep", ds.sizes["period_index"]))
         return cls(
-            float(given.get("rtol", 1e-8)), float(given.get("atol", 1e-8)),
-            int(given.get("max_steps_per_period", 20_000)), seen=seen, system=system, method=method,
-            geometry=geometry, **asked,
-        )  # fmt: skip
+            float(given.get("rtol", 1e-8)),
+            float(given.get("atol", 1e-8)),
+            int(given.get("max_steps_per_period", 20_000)),
+            seen=seen,
+            system=system,
+            method=method,
+            geometry=geometry,
+            **asked,
+        )
 
 
 def answer_all(
-    works: Mapping[tuple[int, ...], Work[T]], points: Mapping[tuple[int, ...], Point], settings: Settings,
-    what: str,
-) -> dict[tuple[int, ...], T]:  # fmt: skip
+    works: Mapping[tuple[int, ...], Work[T]], points: Mapping[tuple[int, ...], Point], settings: Settings, what: str
+) -> dict[tuple[int, ...], T]:
     """Carry out the work on all points in step, and return the result of each point."""
     answers: dict[tuple[int, ...], Any] = dict.fromkeys(works)
     results: dict[tuple[int, ...], T] = {}
@@ -183,22 +187,34 @@ def _legs(
     sizes = [len(leg.state) for leg in asked.values()]
     packed, frequency, ends = _gathered(sizes, asked, points)
     found = run_branches(
-        packed[:, None], frequency[:, None], np.concatenate([leg.state for leg in asked.values()]),
-        n_transient=0, n_keep=LEG, rtol=settings.rtol, atol=settings.atol,
-        max_steps_per_period=settings.max_steps, closure_tolerance=settings.closure,
-        max_orbit_period=settings.longest, system=replace(settings.system, method=settings.method),
+        packed[:, None],
+        frequency[:, None],
+        np.concatenate([leg.state for leg in asked.values()]),
+        n_transient=0,
+        n_keep=LEG,
+        rtol=settings.rtol,
+        atol=settings.atol,
+        max_steps_per_period=settings.max_steps,
+        closure_tolerance=settings.closure,
+        max_orbit_period=settings.longest,
+        system=replace(settings.system, method=settings.method),
         step_size=np.concatenate([leg.step for leg in asked.values()]),
-    )  # fmt: skip
+    )
     seconds = np.broadcast_to(1.0 / frequency[:, None], (len(frequency), LEG))
     if found.return_time is not None:
         seconds = found.return_time[:, 0]
     return {
         index: Extended(
-            found.section[own, 0], found.status[own, 0], found.orbit_period[own, 0], found.turns[own, 0],
-            found.final_state[own, 0], np.nan_to_num(found.step_size[own, 0]), seconds[own],
+            found.section[own, 0],
+            found.status[own, 0],
+            found.orbit_period[own, 0],
+            found.turns[own, 0],
+            found.final_state[own, 0],
+            np.nan_to_num(found.step_size[own, 0]),
+            seconds[own],
         )
         for index, own in _slices(asked, sizes, ends)
-    }  # fmt: skip
+    }
 
 
 def _slices(
@@ -221,21 +237,23 @@ def _polished(
     start[unknown], period[unknown] = run_on(
         packed[unknown], frequency[unknown], start[unknown], settings.longest, settings.system
     )
-    rows, place = _each_once(
-        np.repeat(np.arange(len(sizes)), sizes), start, period, mark, unknown, settings.geometry
-    )
+    rows, place = _each_once(np.repeat(np.arange(len(sizes)), sizes), start, period, mark, unknown, settings.geometry)
     polished = polish(
-        packed[rows], frequency[rows], start[rows], period[rows],
-        geometry=settings.geometry, system=settings.system, tolerance=settings.residual,
-    )  # fmt: skip
+        packed[rows],
+        frequency[rows],
+        start[rows],
+        period[rows],
+        geometry=settings.geometry,
+        system=settings.system,
+        tolerance=settings.residual,
+    )
     found = [polished[i] if i >= 0 else None for i in place]
     return {index: found[own] for index, own in _slices(asked, sizes, ends)}
 
 
 def _each_once(
-    search: np.ndarray, start: np.ndarray, period: np.ndarray, mark: np.ndarray, ended: np.ndarray,
-    geometry: Geometry,
-) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    search: np.ndarray, start: np.ndarray, period: np.ndarray, mark: np.ndarray, ended: np.ndarray, geometry: Geometry
+) -> tuple[np.ndarray, np.ndarray]:
     """Choose the rows to polish; return them, and for each row the index of its representative (-1: none).
 
     Rows that were integrated further and ended in one box are on one orbit; the row of least hash represents

@@ -130,9 +130,7 @@ def moving(orbits: Sequence[Orbit | None], point: Point, geometry: Geometry) -> 
     """Replace orbits that are equilibria by None, and add these equilibria to the point, in place."""
     if not point.can_rest:
         return list(orbits)
-    return [
-        None if o is None or rest_of_orbit(point, o.points[0], geometry) is not None else o for o in orbits
-    ]
+    return [None if o is None or rest_of_orbit(point, o.points[0], geometry) is not None else o for o in orbits]
 
 
 def _closed_undecided(point: Point, orbits: Sequence[Orbit], search: Search) -> Guesses:

@@ -9,10 +9,25 @@ import xarray as xr
 from pipeline.products.attractors import AttractorOptions
 
 VARIABLES = (
-    "kind", "stability", "evidence", "n_cells", "n_sampled", "n_left", "n_leaving", "n_to", "time_at_risk",
-    "mean_lifetime", "lifetime_low", "lifetime_high", "lyapunov_max", "lyapunov_low", "lyapunov_high",
-    "closes_above", "orbit_period", "ran_out",
-)  # fmt: skip
+    "kind",
+    "stability",
+    "evidence",
+    "n_cells",
+    "n_sampled",
+    "n_left",
+    "n_leaving",
+    "n_to",
+    "time_at_risk",
+    "mean_lifetime",
+    "lifetime_low",
+    "lifetime_high",
+    "lyapunov_max",
+    "lyapunov_low",
+    "lyapunov_high",
+    "closes_above",
+    "orbit_period",
+    "ran_out",
+)
 """Variables of the attractors that the settling table shows."""
 
 

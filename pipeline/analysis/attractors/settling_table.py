@@ -7,14 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import xarray as xr
 
-from pipeline.analysis.tabular import (
-    Row,
-    aligned,
-    number,
-    unit_of,
-    where_of,
-    words_of,
-)
+from pipeline.analysis.tabular import Row, aligned, number, unit_of, where_of, words_of
 from pipeline.layout.vocabulary import APERIODIC, model_of
 from pipeline.layout.words import periods_of
 from pipeline.products.product import Table
@@ -58,9 +51,7 @@ def settling_lines(ds: xr.Dataset, rows: Sequence[Row]) -> list[str]:
         lifetime = f"{number(row['mean_lifetime'], '.0f')} ({low} to {high})"
         if not row["n_left"]:
             lifetime = f"above {low}" if low != "-" else low
-        counts = {
-            "cells": "n_cells", "extended": "n_sampled", "near an orbit": "n_leaving", "left later": "n_left",
-        }  # fmt: skip
+        counts = {"cells": "n_cells", "extended": "n_sampled", "near an orbit": "n_leaving", "left later": "n_left"}
         counts = {text: str(row[name]) for text, name in counts.items()}
         told = {name: row[name].replace("_", " ") for name in ("kind", "stability")}
         told = {"id": str(row["attractor_id"])} | told

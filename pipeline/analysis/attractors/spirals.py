@@ -131,9 +131,7 @@ def near_closed(section: np.ndarray, max_period: int, geometry: Geometry) -> Gue
     )
     # rank means after recurring sections, since a mean is not a section
     away = geometry.distance(found.centre[contracting], section[contracting, -1]) + NEAR
-    means = _guesses(
-        found.centred[contracting], away, marks[contracting], found.centre[contracting], geometry
-    )
+    means = _guesses(found.centred[contracting], away, marks[contracting], found.centre[contracting], geometry)
     return spirals.joined(means)
 
 
@@ -150,9 +148,7 @@ def closes_in(section: np.ndarray, max_period: int, geometry: Geometry) -> np.nd
     return np.asarray(closes)
 
 
-def _guesses(
-    period: np.ndarray, score: np.ndarray, mark: np.ndarray, point: np.ndarray, geometry: Geometry
-) -> Guesses:
+def _guesses(period: np.ndarray, score: np.ndarray, mark: np.ndarray, point: np.ndarray, geometry: Geometry) -> Guesses:
     # separate decades of the score: a cell may guess well nearby after failing from far
     decade = np.floor(np.log10(np.maximum(score, 1e-12))).astype(np.int64)
     rows = np.concatenate([period[:, None], decade[:, None], geometry.boxes(point, NEAR)], axis=1)
@@ -174,9 +170,7 @@ def beside(orbits: Sequence[Orbit], max_period: int, geometry: Geometry) -> Gues
             continue
         direction = vectors[:, k].real / np.abs(vectors[:, k].real).max()
         for size in BESIDE:
-            points += [
-                orbit.points[0] + sign * size * direction * np.asarray(geometry.scales) for sign in (1, -1)
-            ]
+            points += [orbit.points[0] + sign * size * direction * np.asarray(geometry.scales) for sign in (1, -1)]
             periods += [period, period]
     if not points:
         return Guesses.none(len(geometry.scales))

@@ -28,9 +28,7 @@ from pipeline.layout.letters import letter
 from pipeline.layout.vocabulary import ATTRACTS, STABILITIES, split_dims
 from pipeline.products.product import Table
 
-_NUMBERS = (
-    "lyapunov_max", "lyapunov_low", "lyapunov_high", "mean_lifetime", "lifetime_low", "lifetime_high",
-)  # fmt: skip
+_NUMBERS = ("lyapunov_max", "lyapunov_low", "lyapunov_high", "mean_lifetime", "lifetime_low", "lifetime_high")
 
 
 def attractors_table(ds: xr.Dataset) -> Table:
@@ -50,9 +48,8 @@ def attractor_rows(ds: xr.Dataset, *, interval: Interval = "wilson", confidence:
     fractions = None
     if start_dims and start_dims != ("branch",):
         fractions = basin_fractions(
-            outcomes(ds), dims=start_dims, ids=ds["attractor"].values.tolist(),
-            confidence=confidence, method=interval,
-        )  # fmt: skip
+            outcomes(ds), dims=start_dims, ids=ds["attractor"].values.tolist(), confidence=confidence, method=interval
+        )
     rows = []
     for index in np.ndindex(*(ds.sizes[d] for d in dims)):
         at = dict(zip(dims, index, strict=True))
@@ -185,9 +182,12 @@ def _attractor_words(row: Row, n_points: int) -> dict[str, str]:
 
 
 _SHOWN_BY = {
-    "none": "-", "eigenvalues": "eigenvalues", "multipliers": "multipliers",
-    "approach": "both sides come nearer", "volume": "volume preserved",
-}  # fmt: skip
+    "none": "-",
+    "eigenvalues": "eigenvalues",
+    "multipliers": "multipliers",
+    "approach": "both sides come nearer",
+    "volume": "volume preserved",
+}
 
 
 def _shown_by(row: Row) -> str:

@@ -20,9 +20,7 @@ from pipeline.layout.vocabulary import ATTRACTS, split_dims
 from pipeline.products.basins import BasinOptions
 
 
-def basins(
-    ds: xr.Dataset, ids: xr.Dataset, options: BasinOptions | None = None, **changes: Any
-) -> xr.Dataset:
+def basins(ds: xr.Dataset, ids: xr.Dataset, options: BasinOptions | None = None, **changes: Any) -> xr.Dataset:
     """Compute the basins of attraction at each parameter point of a sweep, with fractions and boundaries.
 
     Parameters
@@ -69,9 +67,13 @@ def basins(
     result["outcome"] = labels.assign_attrs(units="1", long_name="attractor that the cell ends on")
     attract = np.flatnonzero((ids["stability"] == ATTRACTS).any(dims).values)
     fractions = basin_fractions(
-        labels, dims=start_dims, ids=ids["attractor"].values[attract].tolist(),
-        inferred=ids["status"] == vocabulary.INFERRED, confidence=options.confidence, method=options.interval,
-    )  # fmt: skip
+        labels,
+        dims=start_dims,
+        ids=ids["attractor"].values[attract].tolist(),
+        inferred=ids["status"] == vocabulary.INFERRED,
+        confidence=options.confidence,
+        method=options.interval,
+    )
     result = result.assign(fractions.data_vars).assign(_unfinished(ids, dims))
     result = result.assign_coords(label=fractions["label"])
     reason = _no_grid(ds, start_dims)
@@ -87,9 +89,7 @@ def basins(
     return result.assign_attrs({**ids.attrs, **about, "not_computed": reasons})
 
 
-_OWN = (
-    "interval", "confidence", "box", "block", "scaling", "radius", "metric", "resamples", "seed",
-)  # fmt: skip
+_OWN = ("interval", "confidence", "box", "block", "scaling", "radius", "metric", "resamples", "seed")
 """Options of basins alone, without those of the attractors."""
 
 
@@ -118,7 +118,7 @@ def _unfinished(ids: xr.Dataset, dims: tuple[str, ...]) -> dict[str, xr.DataArra
             ("step limit", "step underflow", "unreached", "no return", "chatter"),
             "cells that could not be integrated",
         ),
-    }  # fmt: skip
+    }
     found = {}
     for name, (words, text) in kinds.items():
         which = np.zeros(shape, bool)
@@ -155,10 +155,17 @@ _LONG_NAMES = {
 _FLAGS = ("above_ln2_surely", "wada")
 _ERRORS = ("stderr", "low", "high")
 _SCALARS = (
-    *(f"{name}{end}" for name in ("basin_entropy", "boundary_basin_entropy", "uncertainty_exponent",
-      "wada_beyond") for end in ("", *(f"_{e}" for e in _ERRORS))),
-    "above_ln2_surely", "boundary_dimension", "exponent_r_squared", "wada_distance", "wada",
-)  # fmt: skip
+    *(
+        f"{name}{end}"
+        for name in ("basin_entropy", "boundary_basin_entropy", "uncertainty_exponent", "wada_beyond")
+        for end in ("", *(f"_{e}" for e in _ERRORS))
+    ),
+    "above_ln2_surely",
+    "boundary_dimension",
+    "exponent_r_squared",
+    "wada_distance",
+    "wada",
+)
 
 
 class _Points:
@@ -168,8 +175,7 @@ class _Points:
         self.dims, self.shape = dims, shape
         self.missing: set[str] = set()
         self._scalars = {
-            name: np.full(shape, -1, np.int8) if name in _FLAGS else np.full(shape, np.nan)
-            for name in _SCALARS
+            name: np.full(shape, -1, np.int8) if name in _FLAGS else np.full(shape, np.nan) for name in _SCALARS
         }
         self._epsilon = np.empty(0, np.int64)
         self._uncertain: dict[tuple[int, ...], np.ndarray] = {}

@@ -174,9 +174,7 @@ def tipping_probabilities(
     n_cells, n_unfinished = table.sum(axis=1), table[:, 0]
     ds = xr.Dataset(coords={"before": before.ids, "after": after.ids})
     ds = ds.assign(
-        _with_intervals(
-            table[:, 1:], n_cells, n_unfinished, ("before", "after"), confidence, method, "probability"
-        )
+        _with_intervals(table[:, 1:], n_cells, n_unfinished, ("before", "after"), confidence, method, "probability")
     )
     ds = ds.assign(
         n_cells=("before", n_cells),
@@ -205,9 +203,7 @@ def _kept_dims(
     return tuple(dim for dim in have if dim not in dims), tuple(dims)
 
 
-def _count_rows(
-    grid: LabelGrid, shape: tuple[int, ...]
-) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+def _count_rows(grid: LabelGrid, shape: tuple[int, ...]) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
     """Count the cells per label and the unfinished cells, for each element of the leading axes `shape`."""
     n_rows, width = int(np.prod(shape)), grid.ids.size + 1
     codes = grid.codes.reshape(n_rows, -1).astype(np.int64) + 1
@@ -256,9 +252,7 @@ def _with_intervals(
     }
 
 
-def _upper_bound(
-    count: npt.NDArray[np.int64], n: npt.NDArray[np.int64], confidence: float
-) -> npt.NDArray[np.float64]:
+def _upper_bound(count: npt.NDArray[np.int64], n: npt.NDArray[np.int64], confidence: float) -> npt.NDArray[np.float64]:
     """Compute the one-sided upper Clopper-Pearson bound; 1 if all `n` trials are hits, or `n` is 0."""
     bound = special.betaincinv(count + 1.0, np.maximum(n - count, 1), confidence)
     return np.where(count >= n, 1.0, bound)
@@ -268,8 +262,7 @@ def _same_cells(before: xr.DataArray, after: xr.DataArray) -> xr.DataArray:
     """Check that both arrays lie on the same cells, and transpose `after` to the dims of `before`."""
     if set(before.dims) != set(after.dims):
         raise ValueError(
-            f"labels before have the dims {before.dims}, after {after.dims}: select one parameter value "
-            "from each"
+            f"labels before have the dims {before.dims}, after {after.dims}: select one parameter value from each"
         )
     for dim in before.dims:
         one, other = before.indexes.get(dim), after.indexes.get(dim)

@@ -51,10 +51,7 @@ def basin_lines(ds: xr.Dataset, rows: Sequence[Row]) -> list[str]:
     n_points = int(np.prod([ds.sizes[d] for d in dims]))
     seen = [row for row in rows if row["n_cells"]]
     confidence = f"{100 * ds.attrs['basin_confidence']:g} %"
-    lines = [
-        f"fractions of the cells that end on attractors or diverge, {ds.attrs['basin_interval']}, "
-        f"{confidence}"
-    ]
+    lines = [f"fractions of the cells that end on attractors or diverge, {ds.attrs['basin_interval']}, {confidence}"]
     if n_points > FEW_POINTS:
         lines += summary(ds, seen, dims, _label_summary)
         lines += [_range_line(ds, name, text) for name, text in _BOUNDARY.items() if name in ds]

@@ -146,9 +146,7 @@ def _boundary_cells(codes: Codes, code: int) -> Ints:
     return np.flatnonzero(edge)
 
 
-def _distances(
-    shape: tuple[int, ...], boundaries: list[Ints], radii: Ints, metric: Metric
-) -> tuple[Floats, Floats]:
+def _distances(shape: tuple[int, ...], boundaries: list[Ints], radii: Ints, metric: Metric) -> tuple[Floats, Floats]:
     """Compute each boundary's largest distance from every other, and count cells beyond each radius per tile.
 
     There is one distance transform per label, which is read at the boundary cells of each pair.

@@ -67,11 +67,7 @@ class Trace:
 
 
 def correct(
-    problem: Problem,
-    guess: np.ndarray,
-    normal: np.ndarray,
-    settings: Settings,
-    along: np.ndarray | None = None,
+    problem: Problem, guess: np.ndarray, normal: np.ndarray, settings: Settings, along: np.ndarray | None = None
 ) -> Steps[Point | None]:
     """Find the solution in the plane through `guess` with this normal; None if Newton's method fails.
 
@@ -139,11 +135,7 @@ def trace(problem: Problem, start: Point, settings: Settings, stop: Stop, betwee
         here = found.points[-1]
         guess = _ahead(found.points, step)
         there = yield from correct(problem, guess, here.tangent, settings)
-        if (
-            there is None
-            or not _is_near(here, there, step, settings)
-            or not (yield from between(here, there))
-        ):
+        if there is None or not _is_near(here, there, step, settings) or not (yield from between(here, there)):
             step *= 0.5
             if step < settings.shortest_step:
                 found.end = "stuck"

@@ -140,9 +140,7 @@ def _explains(kinds: list[str], change: int) -> bool:
     return change in reachable
 
 
-def locate(
-    problem: OrbitProblem, a: Point, b: Point, kind: str, settings: Settings
-) -> Steps[Bifurcation | None]:
+def locate(problem: OrbitProblem, a: Point, b: Point, kind: str, settings: Settings) -> Steps[Bifurcation | None]:
     """Find where a test function vanishes between two points; None if an orbit between is not found."""
     test = TESTS[kind]
     chord = b.u - a.u

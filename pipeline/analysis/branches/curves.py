@@ -80,9 +80,7 @@ CurveStart = tuple[int, Family, str, np.ndarray]
 
 
 def continue_curves(
-    starts: Sequence[CurveStart],
-    bounds: tuple[tuple[float, float], tuple[float, float]],
-    settings: Settings = CURVE,
+    starts: Sequence[CurveStart], bounds: tuple[tuple[float, float], tuple[float, float]], settings: Settings = CURVE
 ) -> list[Curve]:
     """Follow each start both ways until a bound, its own start, or a resonance; see `curves_from`."""
     problems = [BifurcationProblem(family, kind) for _, family, kind, _ in starts]
@@ -91,8 +89,7 @@ def continue_curves(
     )
     found = [(s, p, f) for s, p, f in zip(starts, problems, firsts, strict=True) if f is not None]
     traces = run_together(
-        [_follow(p, way, bounds, settings) for _, p, f in found for way in (opposite(f), f)],
-        "following curves",
+        [_follow(p, way, bounds, settings) for _, p, f in found for way in (opposite(f), f)], "following curves"
     )
     curves: list[Curve] = []
     for i, ((number, family, kind, _), _, first) in enumerate(found):
@@ -121,14 +118,7 @@ def _starts(
             continue
         own = parameters.replace(**{n: float(ds[n][branch]) for n in parameters.names if n in ds})
         frequency = float(ds[FREQUENCY][branch]) if FREQUENCY in ds else frequency_of(parameters.model, {})
-        family = Family(
-            parameters.model.system,
-            period,
-            frequency,
-            own.pack(),
-            (first, second),
-            (scales[0], scales[1]),
-        )
+        family = Family(parameters.model.system, period, frequency, own.pack(), (first, second), (scales[0], scales[1]))
         here = frequency if second == FREQUENCY else own[second]
         state = np.asarray(ds["bifurcation_section"].values[k, 0])
         found.append((k, family, kind, family.unknowns(state, [float(ds["value"][k]), here])))
@@ -197,9 +187,7 @@ def _passes(curve: Curve, kind: str, family: Family, start: Point) -> bool:
     return False
 
 
-def curves_dataset(
-    curves: Sequence[Curve], first: str, second: str, model: Model | None = None
-) -> xr.Dataset:
+def curves_dataset(curves: Sequence[Curve], first: str, second: str, model: Model | None = None) -> xr.Dataset:
     """Return curves as a dataset: dims ``curve``, ``point`` (NaN beyond a curve's own) and ``state``.
 
     Parameters
@@ -246,4 +234,4 @@ def curves_dataset(
         },
         coords={"state": list(names)},
         attrs={"first_parameter": first, "second_parameter": second},
-    )  # fmt: skip
+    )

@@ -22,10 +22,7 @@ CRITICALITIES = ("", "supercritical", "subcritical")
 
 
 def dataset_of(
-    branches: Sequence[Branch],
-    parameter: str,
-    parameters: Parameters | None = None,
-    left_out: Sequence[str] = (),
+    branches: Sequence[Branch], parameter: str, parameters: Parameters | None = None, left_out: Sequence[str] = ()
 ) -> xr.Dataset:
     """Return branches as a dataset; see `pipeline.analysis.branches` for its variables.
 
@@ -58,9 +55,7 @@ def dataset_of(
     events = [(i, b) for i, branch in enumerate(branches) for b in branch.bifurcations]
     states = state_units(model)
     variables = arrays.variables(parameter_units(parameter, model), states)
-    variables |= _per_branch(branches, events, n_angles, model) | _per_event(
-        branches, events, longest, names, states
-    )
+    variables |= _per_branch(branches, events, n_angles, model) | _per_event(branches, events, longest, names, states)
     variables |= _fixed(branches, parameter, parameters)
     if words:
         variables |= _side_variables(arrays.side, events, words)
@@ -247,10 +242,7 @@ def _per_event(
     found: dict[str, Any] = {name: ("bifurcation", *column) for name, column in columns.items()}
     dims = ("bifurcation", "multiplier")
     found["bifurcation_multiplier_real"] = (dims, *_column(multipliers.real, "float64", "multipliers, real"))
-    found["bifurcation_multiplier_imag"] = (
-        dims,
-        *_column(multipliers.imag, "float64", "multipliers, imaginary"),
-    )
+    found["bifurcation_multiplier_imag"] = (dims, *_column(multipliers.imag, "float64", "multipliers, imaginary"))
     found["bifurcation_section"] = (
         ("bifurcation", "phase", "state"),
         *_column(section, "float64", "section points of the orbit there", units=units),

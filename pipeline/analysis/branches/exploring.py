@@ -99,10 +99,7 @@ def _follow_starts(starts: Sequence[Start], branches: list[Branch], scope: Scope
 
 def _both_ways(starts: Sequence[Start], scope: Scope, what: str) -> list[Branch | None]:
     firsts = run_together(
-        [
-            first_point(OrbitProblem(s.family), s.family.unknowns(s.state, [s.value]), scope.settings)
-            for s in starts
-        ]
+        [first_point(OrbitProblem(s.family), s.family.unknowns(s.state, [s.value]), scope.settings) for s in starts]
     )
     pairs = [(s.family, p) for s, p in zip(starts, firsts, strict=True) if p is not None]
     halves = run_together(
@@ -150,11 +147,7 @@ def _near(start: Start, branch: Branch) -> Iterator[np.ndarray]:
         guess[-1] = start.value / family.scales[0]
         orbits = [p.value.images for p in (a, b)]
         if (
-            min(
-                np.abs(family.mismatch(family.unknowns(start.state, [0.0]), x)).max()
-                for o in orbits
-                for x in o
-            )
+            min(np.abs(family.mismatch(family.unknowns(start.state, [0.0]), x)).max() for o in orbits for x in o)
             < GUESS
         ):
             yield guess
@@ -250,12 +243,7 @@ def _switch(branches: list[Branch], scope: Scope, what: str) -> None:
     halves = run_together(
         [
             half_branch(
-                replace(b.family, period=2 * b.family.period),
-                start,
-                scope.low,
-                scope.high,
-                scope.settings,
-                True,
+                replace(b.family, period=2 * b.family.period), start, scope.low, scope.high, scope.settings, True
             )
             for b, _, start in ready
         ],
@@ -282,9 +270,7 @@ def _cross(points: Sequence[tuple[Branch, Bifurcation]], branches: list[Branch],
             continue
         halves = run_together(
             [
-                crossing_half(
-                    parent.family, one, _direction(parent, one), way, scope.low, scope.high, scope.settings
-                )
+                crossing_half(parent.family, one, _direction(parent, one), way, scope.low, scope.high, scope.settings)
                 for way in (-1.0, 1.0)
             ],
             FOLLOWING,
@@ -306,10 +292,7 @@ def _is_crossing(parent: Branch, one: Bifurcation, branches: Sequence[Branch]) -
     """Return whether the other branch is known: it has a branch point at the same orbit."""
     for branch in branches:
         for other in branch.bifurcations if branch.family.period == parent.family.period else ():
-            same = (
-                _gap(branch.family, one.point, other) < 1e-4
-                and abs(one.point.u[-1] - other.point.u[-1]) < 1e-4
-            )
+            same = _gap(branch.family, one.point, other) < 1e-4 and abs(one.point.u[-1] - other.point.u[-1]) < 1e-4
             if other is not one and other.kind == BRANCHING and same:
                 one.child = other.child = branch
                 return True

@@ -166,8 +166,7 @@ def half_branch(
 def _is_known(one: Bifurcation, found: list[Bifurcation]) -> bool:
     """Return whether the same bifurcation was located on an earlier step."""
     return any(
-        b.kind == one.kind and b.after < one.after and abs(b.point.u[-1] - one.point.u[-1]) < 1e-6
-        for b in found
+        b.kind == one.kind and b.after < one.after and abs(b.point.u[-1] - one.point.u[-1]) < 1e-6 for b in found
     )
 
 
@@ -196,18 +195,20 @@ def joined(family: Family, backward: Half, forward: Half) -> Branch:
     n = len(back) - 1
     turned = [
         Bifurcation(
-            b.kind, Point(b.point.u, -b.point.tangent, b.point.value, b.point.n_iterations), b.bracket,
-            b.n_unstable_after, b.n_unstable_before, b.rises_before != (b.kind != FOLD), n - 1 - b.after,
+            b.kind,
+            Point(b.point.u, -b.point.tangent, b.point.value, b.point.n_iterations),
+            b.bracket,
+            b.n_unstable_after,
+            b.n_unstable_before,
+            b.rises_before != (b.kind != FOLD),
+            n - 1 - b.after,
         )
         for b in reversed(backward.bifurcations)
-    ]  # fmt: skip
+    ]
     for one in forward.bifurcations:
         one.after += n
     return Branch(
-        family,
-        back + forward.trace.points[1:],
-        turned + forward.bifurcations,
-        (backward.trace.end, forward.trace.end),
+        family, back + forward.trace.points[1:], turned + forward.bifurcations, (backward.trace.end, forward.trace.end)
     )
 
 

@@ -62,11 +62,7 @@ def run_together(computations: Sequence[Steps[T]], what: str = "") -> list[T]:
 
 
 def _report(
-    what: str,
-    queries: Mapping[int, Query],
-    waiting: Iterable[int],
-    seen: dict[int, tuple[float, float]],
-    n: int,
+    what: str, queries: Mapping[int, Query], waiting: Iterable[int], seen: dict[int, tuple[float, float]], n: int
 ) -> None:
     """Report progress; `seen` has the range of the last unknown of each computation, updated in place."""
     for i, query in queries.items():

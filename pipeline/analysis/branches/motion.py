@@ -75,8 +75,13 @@ def rotation_of(branch: Branch) -> np.ndarray:
     # use the system with tangents, whose code is compiled already
     extended = dataclasses.replace(with_tangents(family.system, n), n_controlled=None)
     result = run_branches(
-        rows.parameters[:, None], rows.frequency_hz[:, None],
+        rows.parameters[:, None],
+        rows.frequency_hz[:, None],
         np.append(on_section(rows.states[0], rows.parameters[0], family.system), np.eye(n))[None],
-        n_transient=0, n_keep=family.period + 1, rtol=RTOL, atol=RTOL, system=extended,
-    )  # fmt: skip
+        n_transient=0,
+        n_keep=family.period + 1,
+        rtol=RTOL,
+        atol=RTOL,
+        system=extended,
+    )
     return np.asarray(result.turns[0, 0] / family.period, np.float64)

@@ -270,14 +270,13 @@ class BifurcationProblem:
         tests = np.array([test(m) if np.isfinite(m).all() else np.nan for m in ends.monodromy])
         mismatch = np.array([self.family.mismatch(u, image) for image in ends.images[:, -1]])
         up, down = slice(1 + n, 1 + size), slice(1 + size + n, None)
-        slopes = np.array(
-            [_wrapped(a - b, self.family) for a, b in zip(mismatch[up], mismatch[down], strict=True)]
-        )
-        matrix = np.column_stack(
-            [self.family.scaled(ends.monodromy[0]) - np.eye(n), slopes.T / (2.0 * PARAMETER_STEP)]
-        )
+        slopes = np.array([_wrapped(a - b, self.family) for a, b in zip(mismatch[up], mismatch[down], strict=True)])
+        matrix = np.column_stack([self.family.scaled(ends.monodromy[0]) - np.eye(n), slopes.T / (2.0 * PARAMETER_STEP)])
         gradient = (tests[1 : 1 + size] - tests[1 + size :]) / (2.0 * self._steps)
         return Value(
-            np.append(mismatch[0], tests[0]), np.vstack([matrix, gradient]), ends.images[0],
-            ends.monodromy[0], float(ends.times[0].sum()),
-        )  # fmt: skip
+            np.append(mismatch[0], tests[0]),
+            np.vstack([matrix, gradient]),
+            ends.images[0],
+            ends.monodromy[0],
+            float(ends.times[0].sum()),
+        )

@@ -112,10 +112,7 @@ def _interval(run: Run, parameter: str, low: float | None, high: float | None) -
     chosen = (ends[0] if low is None else float(low), ends[1] if high is None else float(high))
     if not chosen[0] < chosen[1]:
         raise SpecError(
-            [
-                f"the interval {chosen[0]} to {chosen[1]} of {parameter} is empty; "
-                "--from must be less than --to."
-            ]
+            [f"the interval {chosen[0]} to {chosen[1]} of {parameter} is empty; --from must be less than --to."]
         )
     if is_frequency and chosen[0] <= 0.0:
         raise SpecError([f"--from {chosen[0]}: a drive frequency must be greater than 0."])

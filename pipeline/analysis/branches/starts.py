@@ -58,17 +58,11 @@ def listed(attractors: xr.Dataset, parameters: Parameters, parameter: str, scale
                 family = family_of(parameters.model.system, period, frequency, packed, parameter, scale)
                 state = np.asarray(one["attractor_points"].values[0])
                 start = Start(family, state, value_of(family, frequency, packed))
-            yield Listed(
-                int(i), where, period, start, kind == EQUILIBRIUM, kind == PERIODIC_ORBIT and not period
-            )
+            yield Listed(int(i), where, period, start, kind == EQUILIBRIUM, kind == PERIODIC_ORBIT and not period)
 
 
 def attracting(
-    attractors: xr.Dataset,
-    parameters: Parameters,
-    parameter: str,
-    interval: tuple[float, float],
-    max_period: int = 0,
+    attractors: xr.Dataset, parameters: Parameters, parameter: str, interval: tuple[float, float], max_period: int = 0
 ) -> tuple[list[Start], list[str]]:
     """Return the polished closed orbits among the attractors of a run, and the attractors left out.
 
@@ -168,9 +162,7 @@ def _parameters_at(point: xr.Dataset, base: Parameters) -> tuple[float, np.ndarr
     return frequency_of(base.model, {str(k): v for k, v in point.coords.items()}), base.replace(**axes).pack()
 
 
-def recurrent(
-    cube: xr.Dataset, parameters: Parameters, parameter: str, scale: float, max_period: int
-) -> list[Start]:
+def recurrent(cube: xr.Dataset, parameters: Parameters, parameter: str, scale: float, max_period: int) -> list[Start]:
     """Find the orbits, mostly unstable, that bounded trajectories of a cube come near.
 
     Where two sections of a trajectory are close, p periods apart, Newton's method from the first often

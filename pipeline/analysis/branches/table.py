@@ -106,12 +106,16 @@ def _lines(ds: xr.Dataset, rows: Sequence[Row]) -> list[str]:
         to = f" -> {row['to_branch']}" if row["to_branch"] >= 0 else ""
         z = complex(row["multiplier_real"], row["multiplier_imag"])
         known = {
-            _with_unit(ds): f"{row[parameter]:.7f}", "type": row["type"], "criticality": row["criticality"],
-            "period": str(row["period"]), "seconds": f"{row['period_s']:.6g}", "side": row.get("side", ""),
+            _with_unit(ds): f"{row[parameter]:.7f}",
+            "type": row["type"],
+            "criticality": row["criticality"],
+            "period": str(row["period"]),
+            "seconds": f"{row['period_s']:.6g}",
+            "side": row.get("side", ""),
             "multiplier": _number(z),
             "unstable below, above": f"{row['unstable_below']}, {row['unstable_above']}",
             "branch": f"{row['branch']}{to}{_at(ds, row['branch'])}",
-        }  # fmt: skip
+        }
         if model_of(ds).crossing is None:  # the period in drive periods says the same
             known.pop("seconds")
         table.append(known if "side" in row else {n: v for n, v in known.items() if n != "side"})
@@ -120,9 +124,7 @@ def _lines(ds: xr.Dataset, rows: Sequence[Row]) -> list[str]:
 
 def _with_unit(ds: xr.Dataset) -> str:
     units = str(ds.attrs["parameter_units"])
-    return (
-        f"{ds.attrs['parameter']} {units}".rstrip() if units not in ("", "1") else str(ds.attrs["parameter"])
-    )
+    return f"{ds.attrs['parameter']} {units}".rstrip() if units not in ("", "1") else str(ds.attrs["parameter"])
 
 
 def _aligned(rows: Sequence[Mapping[str, str]]) -> list[str]:

@@ -21,9 +21,7 @@ from pipeline.analysis.chaos.zero_one import SHORTEST, zero_one_test
 from pipeline.products.chaos import ChaosOptions
 
 
-def chaos(
-    ds: xr.Dataset, attractors: xr.Dataset, options: ChaosOptions | None = None, **changes: Any
-) -> xr.Dataset:
+def chaos(ds: xr.Dataset, attractors: xr.Dataset, options: ChaosOptions | None = None, **changes: Any) -> xr.Dataset:
     """Compute the indicators of chaos of each cell and of each attractor.
 
     Parameters
@@ -95,9 +93,7 @@ def chaotic_cells(ds: xr.Dataset, options: ChaosOptions | None = None, **changes
     missing = reasons(ds, options.stride)
     cells = _of_exponents(ds, options) if "lyapunov" in ds else _without_exponents(ds)
     if not any(reason.startswith("0-1") for reason in missing):
-        found = zero_one_test(
-            ds, n_frequencies=options.n_frequencies, stride=options.stride, seed=options.seed
-        )
+        found = zero_one_test(ds, n_frequencies=options.n_frequencies, stride=options.stride, seed=options.seed)
         cells = cells.assign(found.data_vars)
     cells = cells.assign(status=ds["status"]).drop_attrs(deep=False).load()
     coords = {name: c for name, c in ds.coords.items() if set(c.dims) <= set(cells["motion"].dims)}

@@ -206,9 +206,12 @@ def correlation_dimension(
         known = values[np.isfinite(values).all(axis=(1, 2))]
         found[index] = _dimension_of(_sample(known, n_max), theiler, floor, geometry)
     return _curves(ds, kept, shape, found).assign_attrs(
-        pool=" ".join(map(str, pool)), theiler=theiler, floor=floor, n_max=n_max,
+        pool=" ".join(map(str, pool)),
+        theiler=theiler,
+        floor=floor,
+        n_max=n_max,
         references="Grassberger and Procaccia, Physica D 9, 189 (1983); Theiler, Phys. Rev. A 34 (1986)",
-    )  # fmt: skip
+    )
 
 
 @dataclass(frozen=True)
@@ -352,7 +355,7 @@ _CURVE = {
     "largest_resolved": ("largest_resolved", "largest dimension that so many points can show"),
     "log_radius": ("log_radius", "natural logarithm of the scaled radius"),
     "log_correlation_sum": ("log_sum", "natural logarithm of the correlation sum"),
-}  # fmt: skip
+}
 
 
 def _curves(

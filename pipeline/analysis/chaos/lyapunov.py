@@ -138,18 +138,18 @@ def _motion(ds: xr.Dataset, n_sigma: float, least: float) -> dict[str, xr.DataAr
     about = {"units": "1", "long_name": "closed, and yet with a positive exponent"}
     return {
         "motion": motion.assign_attrs(motion_attrs()),
-        "contradicts": contradicts.assign_attrs(about, flag_values=np.arange(2, dtype=np.int8),
-                                                flag_meanings="no yes"),
-    }  # fmt: skip
+        "contradicts": contradicts.assign_attrs(about, flag_values=np.arange(2, dtype=np.int8), flag_meanings="no yes"),
+    }
 
 
 def motion_attrs() -> dict[str, Any]:
     """Return the attributes of an array of codes of `Motion`."""
     return {
-        "units": "1", "long_name": "kind of motion by its exponents",
+        "units": "1",
+        "long_name": "kind of motion by its exponents",
         "flag_values": np.array(list(Motion), np.int8),
         "flag_meanings": " ".join(m.name.lower() for m in Motion),
-    }  # fmt: skip
+    }
 
 
 def transients(ds: xr.Dataset, *, n_sigma: float, least: float) -> xr.DataArray:
@@ -165,9 +165,11 @@ def transients(ds: xr.Dataset, *, n_sigma: float, least: float) -> xr.DataArray:
     """
     known = (ds["lyapunov_flag"] >= GOOD) & (ds["lyapunov_flag"] != FAILED)
     attrs = {
-        "units": "1", "long_name": "the chaos ended within the blocks",
-        "flag_values": np.arange(-1, 2, dtype=np.int8), "flag_meanings": "unknown no yes",
-    }  # fmt: skip
+        "units": "1",
+        "long_name": "the chaos ended within the blocks",
+        "flag_values": np.arange(-1, 2, dtype=np.int8),
+        "flag_meanings": "unknown no yes",
+    }
     if ds.sizes.get("block", 0) < FEWEST_BLOCKS:
         return xr.full_like(known, -1, dtype=np.int8).assign_attrs(attrs)
     first, quarter = ds["lyapunov_blocks"].isel(exponent=0, drop=True), ds.sizes["block"] // 4
@@ -272,9 +274,7 @@ class JacobianSpectrum:
     blocks: Floats
 
 
-def spectrum_of_jacobians(
-    jacobians: npt.ArrayLike, *, n_blocks: int = 16, n_transient: int = 0
-) -> JacobianSpectrum:
+def spectrum_of_jacobians(jacobians: npt.ArrayLike, *, n_blocks: int = 16, n_transient: int = 0) -> JacobianSpectrum:
     """Compute the Lyapunov spectrum of a map from its Jacobians along trajectories.
 
     A basis is carried along by the Jacobians and made orthonormal at each by QR; an exponent is the mean
@@ -323,9 +323,7 @@ def spectrum_of_jacobians(
         basis, r = np.linalg.qr(given[..., i, :, :] @ basis)
         if i >= n_transient:
             factor = np.abs(np.diagonal(r, axis1=-2, axis2=-1))
-            growth[..., i - n_transient, :] = np.log(
-                factor, out=np.full(factor.shape, -np.inf), where=factor > 0.0
-            )
+            growth[..., i - n_transient, :] = np.log(factor, out=np.full(factor.shape, -np.inf), where=factor > 0.0)
     blocks = growth.reshape(*growth.shape[:-2], n_blocks, n // n_blocks, size).mean(axis=-2)
     order = np.argsort(-blocks.mean(axis=-2), axis=-1, kind="stable")
     blocks = np.take_along_axis(blocks, order[..., None, :], axis=-1)

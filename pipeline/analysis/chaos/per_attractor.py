@@ -130,9 +130,7 @@ class _Cells:
         return self.values.get(name)
 
 
-def chaos_per_attractor(
-    ds: xr.Dataset, cells: xr.Dataset, attractors: xr.Dataset, options: ChaosOptions
-) -> xr.Dataset:
+def chaos_per_attractor(ds: xr.Dataset, cells: xr.Dataset, attractors: xr.Dataset, options: ChaosOptions) -> xr.Dataset:
     """Add the variables per attractor to those of the cells; see the text of this module.
 
     Parameters
@@ -148,9 +146,19 @@ def chaos_per_attractor(
     """
     dims, starts = split_dims(cells["motion"])
     copied = [
-        "kind", "stability", "evidence", "orbit_period", "n_cells", "share", "multiplier_real",
-        "multiplier_imag", "period_s", "lyapunov_max", "lyapunov_low", "lyapunov_high",
-    ]  # fmt: skip
+        "kind",
+        "stability",
+        "evidence",
+        "orbit_period",
+        "n_cells",
+        "share",
+        "multiplier_real",
+        "multiplier_imag",
+        "period_s",
+        "lyapunov_max",
+        "lyapunov_low",
+        "lyapunov_high",
+    ]
     copied += [name for name in ("eigenvalue_real", "eigenvalue_imag") if name in attractors]
     own = attractors[copied].transpose(*dims, "attractor", ...)
     shape, n_states = own["kind"].shape, ds.sizes["state"]
@@ -170,10 +178,9 @@ def chaos_per_attractor(
             for name in arrays.keys() & found.keys():
                 arrays[name][(*index, i)] = found[name]
     variables = {
-        name: ((*dims, "attractor", *(("rank",) if rank else ())), arrays[name],
-               {"units": units, "long_name": text})
+        name: ((*dims, "attractor", *(("rank",) if rank else ())), arrays[name], {"units": units, "long_name": text})
         for name, (rank, _, _, units, text) in _TABLE.items()
-    }  # fmt: skip
+    }
     result = cells.assign(own.data_vars).assign(variables)
     natures = " ".join(n.name.lower() for n in Nature)
     result["nature"].attrs |= {"flag_values": np.arange(len(Nature), dtype=np.int8), "flag_meanings": natures}
@@ -189,9 +196,7 @@ def _flags(words: Sequence[str]) -> dict[str, Any]:
     return {"flag_values": np.arange(len(words), dtype=np.int8), "flag_meanings": " ".join(words)}
 
 
-def _of_attractor(
-    one: xr.Dataset, cells: _Cells, number: int, n_states: int, options: ChaosOptions
-) -> dict[str, Any]:
+def _of_attractor(one: xr.Dataset, cells: _Cells, number: int, n_states: int, options: ChaosOptions) -> dict[str, Any]:
     """Compute the counts, exponents, 0-1 test and nature of one attractor."""
     is_own = cells.values["attractor_id"] == number
     found: dict[str, Any] = {"kind_is_bounded": int(one["kind"]) in APERIODIC}
@@ -200,11 +205,7 @@ def _of_attractor(
     k = cells.get("zero_one")
     if k is not None and np.isfinite(k[is_own]).any():
         known = k[is_own][np.isfinite(k[is_own])]
-        found |= {
-            "median_zero_one": np.median(known),
-            "least_zero_one": known.min(),
-            "largest_zero_one": known.max(),
-        }
+        found |= {"median_zero_one": np.median(known), "least_zero_one": known.min(), "largest_zero_one": known.max()}
     found["nature"] = int(_nature(one, found, options))
     return found
 
@@ -225,23 +226,25 @@ def _counts(cells: _Cells, is_own: npt.NDArray[np.bool_], options: ChaosOptions)
     return found
 
 
-def _exponents(
-    one: xr.Dataset, cells: _Cells, is_own: npt.NDArray[np.bool_], n_states: int
-) -> dict[str, Any]:
+def _exponents(one: xr.Dataset, cells: _Cells, is_own: npt.NDArray[np.bool_], n_states: int) -> dict[str, Any]:
     real, imaginary = one["multiplier_real"].values, one["multiplier_imag"].values
     if int(one["kind"]) == PERIODIC_ORBIT and np.isfinite(real).all():
         rate = orbit_exponents(real + 1j * imaginary, float(one["period_s"]), cells.is_flow)
         zero = np.zeros(n_states)
         return {
-            "exponents_from": 1, "attractor_lyapunov": rate, "attractor_lyapunov_stderr": zero,
+            "exponents_from": 1,
+            "attractor_lyapunov": rate,
+            "attractor_lyapunov_stderr": zero,
             "attractor_lyapunov_between": zero,
-        }  # fmt: skip
+        }
     if int(one["kind"]) == EQUILIBRIUM:
         zero = np.zeros(n_states)
         return {
-            "exponents_from": 3, "attractor_lyapunov": one["eigenvalue_real"].values,
-            "attractor_lyapunov_stderr": zero, "attractor_lyapunov_between": zero,
-        }  # fmt: skip
+            "exponents_from": 3,
+            "attractor_lyapunov": one["eigenvalue_real"].values,
+            "attractor_lyapunov_stderr": zero,
+            "attractor_lyapunov_between": zero,
+        }
     rates, flag = cells.get("lyapunov"), cells.get("lyapunov_flag")
     if rates is None or flag is None:
         return {}
@@ -347,15 +350,23 @@ _TABLE: dict[str, tuple[bool, str, float, str, str]] = {
     "attractor_lyapunov": (True, "float64", np.nan, "1/s", "Lyapunov exponents per unit time"),
     "attractor_lyapunov_stderr": (True, "float64", np.nan, "1/s", "their standard errors"),
     "attractor_lyapunov_between": (
-        True, "float64", np.nan, "1/s", "standard deviation between cells beyond their errors",
+        True,
+        "float64",
+        np.nan,
+        "1/s",
+        "standard deviation between cells beyond their errors",
     ),
     "attractor_correlation": (False, "float64", np.nan, "1", "correlation dimension of the section"),
     "attractor_correlation_stderr": (False, "float64", np.nan, "1", "its sampling error"),
     "attractor_correlation_spread": (
-        False, "float64", np.nan, "1", "slope of the lower half of the range minus the upper",
+        False,
+        "float64",
+        np.nan,
+        "1",
+        "slope of the lower half of the range minus the upper",
     ),
     "median_zero_one": (False, "float64", np.nan, "1", "0-1 test, median over the cells"),
     "least_zero_one": (False, "float64", np.nan, "1", "0-1 test, least over the cells"),
     "largest_zero_one": (False, "float64", np.nan, "1", "0-1 test, largest over the cells"),
-}  # fmt: skip
+}
 """Whether on `rank`, dtype, fill, units and long name of the variables per attractor."""

@@ -69,9 +69,13 @@ def section_dimension(
         own = (ids[index[:-1]] == number).ravel() & stays
         point = section.isel(dict(zip(dims, index[:-1], strict=True)))
         curve = correlation_dimension(
-            pooled(point, starts, own), pool=["cell"], theiler=options.theiler, n_max=options.n_max,
-            floor=options.floor, geometry=geometry_of(ds),
-        )  # fmt: skip
+            pooled(point, starts, own),
+            pool=["cell"],
+            theiler=options.theiler,
+            n_max=options.n_max,
+            floor=options.floor,
+            geometry=geometry_of(ds),
+        )
         curves.append(curve)
         reason[index] = _reason(int(kind[index]), stays, float(curve["correlation_dimension"]))
     return _dataset(found, curves, reason, dims).assign_attrs(
@@ -87,22 +91,18 @@ def _reason(kind: int, stays: bool, dimension: float) -> int:
     return HAS_DIMENSION if np.isfinite(dimension) else TOO_FEW
 
 
-def _dataset(
-    found: xr.Dataset, curves: list[xr.Dataset], reason: np.ndarray, dims: tuple[str, ...]
-) -> xr.Dataset:
+def _dataset(found: xr.Dataset, curves: list[xr.Dataset], reason: np.ndarray, dims: tuple[str, ...]) -> xr.Dataset:
     own = (*dims, "attractor")
     variables: dict[str, Any] = {}
     for name in curves[0].data_vars if curves else ():
         values = np.stack([one[name].values for one in curves])
         tail = tuple(map(str, curves[0][name].dims))
-        variables[str(name)] = (
-            (*own, *tail),
-            values.reshape(*reason.shape, *values.shape[1:]),
-            curves[0][name].attrs,
-        )
+        variables[str(name)] = ((*own, *tail), values.reshape(*reason.shape, *values.shape[1:]), curves[0][name].attrs)
     about = {
-        "units": "1", "long_name": "why there is no dimension",
-        "flag_values": np.arange(len(REASONS), dtype=np.int8), "flag_meanings": " ".join(REASONS),
-    }  # fmt: skip
+        "units": "1",
+        "long_name": "why there is no dimension",
+        "flag_values": np.arange(len(REASONS), dtype=np.int8),
+        "flag_meanings": " ".join(REASONS),
+    }
     copied = ["n_cells", "share", "kind", "stability", "n_sampled", "n_left", "lifetime_low"]
     return found[copied].transpose(*own).assign(variables).assign(reason=(own, reason, about))

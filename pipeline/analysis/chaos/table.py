@@ -23,17 +23,16 @@ from pipeline.analysis.tabular import (
 from pipeline.layout.vocabulary import APERIODIC, KINDS, split_dims
 from pipeline.products.product import Table
 
-_COUNTS = (
-    "n_transient", "n_contradicting", "n_drifting", "n_audit_failed", "n_unresolved", "n_failed",
-)  # fmt: skip
+_COUNTS = ("n_transient", "n_contradicting", "n_drifting", "n_audit_failed", "n_unresolved", "n_failed")
 _FLAGS = {
-    "n_transient": "transient", "n_contradicting": "closed with a positive exponent",
-    "n_drifting": "drifting", "n_audit_failed": "audit failed", "n_unresolved": "unresolved",
+    "n_transient": "transient",
+    "n_contradicting": "closed with a positive exponent",
+    "n_drifting": "drifting",
+    "n_audit_failed": "audit failed",
+    "n_unresolved": "unresolved",
     "n_failed": "failed",
-}  # fmt: skip
-_NUMBERS = (
-    "kaplan_yorke", "kaplan_yorke_stderr", "correlation", "correlation_stderr", "correlation_spread",
-)  # fmt: skip
+}
+_NUMBERS = ("kaplan_yorke", "kaplan_yorke_stderr", "correlation", "correlation_stderr", "correlation_spread")
 _TEST = ("median_zero_one", "least_zero_one", "largest_zero_one")
 
 
@@ -63,13 +62,16 @@ def _rows(ds: xr.Dataset) -> list[Row]:
         at = dict(zip(dims, index, strict=True))
         one = ds.isel(at).isel(attractor=i)
         row: Row = {
-            **where_of(ds, at), "attractor_id": int(one["attractor"]),
+            **where_of(ds, at),
+            "attractor_id": int(one["attractor"]),
             "kind": words_of(one["kind"])[int(one["kind"])],
             "stability": words_of(one["stability"])[int(one["stability"])],
-            "nature": natures[int(one["nature"])], "orbit_period": int(one["orbit_period"]),
-            "n_cells": int(one["n_cells"]), "share": float(one["share"]),
+            "nature": natures[int(one["nature"])],
+            "orbit_period": int(one["orbit_period"]),
+            "n_cells": int(one["n_cells"]),
+            "share": float(one["share"]),
             "exponents_from": sources[int(one["exponents_from"])],
-        }  # fmt: skip
+        }
         row |= {name: int(one[name]) for name in _COUNTS}
         row |= _spectrum(one)
         row |= {name: float(one[f"attractor_{name}"]) for name in _NUMBERS}
@@ -144,9 +146,7 @@ def _summary(ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str]) -> list[s
                 "cells": str(sum(r["n_cells"] for r in own)),
                 "points": str(len(places)),
             }
-            table.append(
-                words | {f"{d}{unit_of(ds, d)}": axis_ranges(ds, d, own, len(dims) == 1) for d in dims}
-            )
+            table.append(words | {f"{d}{unit_of(ds, d)}": axis_ranges(ds, d, own, len(dims) == 1) for d in dims})
     counts = [(text, sum(row[name] for row in rows)) for name, text in _FLAGS.items()]
     flags = ", ".join(f"{n} {text}" for text, n in counts if n)
     return aligned(table) + _extremes(ds, rows, dims) + [f"  cells flagged: {flags or 'none'}"]
@@ -169,13 +169,18 @@ def _extremes(ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str]) -> list[
 # ---- correlation dimension ---------------------------------------------------------------------
 
 _CURVE = (
-    "correlation_dimension", "correlation_dimension_stderr", "correlation_dimension_spread", "fit_low",
-    "fit_high", "largest_resolved",
-)  # fmt: skip
+    "correlation_dimension",
+    "correlation_dimension_stderr",
+    "correlation_dimension_spread",
+    "fit_low",
+    "fit_high",
+    "largest_resolved",
+)
 _WHY = {
-    "closed": "none: it closes", "does_not_attract": "none: not shown to attract",
+    "closed": "none: it closes",
+    "does_not_attract": "none: not shown to attract",
     "too_few_points": "none: too few points for a range to fit",
-}  # fmt: skip
+}
 
 
 _OPEN = tuple(KINDS[code] for code in APERIODIC)

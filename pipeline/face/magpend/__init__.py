@@ -50,14 +50,12 @@ _HOMES = {
     "pipeline.runs.filming": ("animation",),
     "pipeline.plots.films": ("save_animation",),
     "pipeline.rig.identify.identification": ("identify",),
-    "pipeline.rig.recordings": (
-        "findings_of", "load_mapping", "read_recording", "smooth", "window", "write_recording",
-    ),
+    "pipeline.rig.recordings": ("findings_of", "load_mapping", "read_recording", "smooth", "window", "write_recording"),
     "pipeline.rig.recordings.figure": ("plot_recording",),
     "pipeline.analysis.chaos.dimensions": ("correlation_dimension", "kaplan_yorke_dimension"),
     "pipeline.analysis.chaos.zero_one": ("zero_one_test",),
     "pipeline.analysis.chaos.lyapunov": ("spectrum_of_jacobians",),
-}  # fmt: skip
+}
 _HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
 
 
@@ -72,9 +70,7 @@ def _analysis(name: str) -> Callable[..., Any]:
 
     analysis = ANALYSES[name]
     model = analysis.options
-    lines = [
-        f"    {k} = {default_of(model, k)!r}: {info.description}" for k, info in model.model_fields.items()
-    ]
+    lines = [f"    {k} = {default_of(model, k)!r}: {info.description}" for k, info in model.model_fields.items()]
     found.__name__ = found.__qualname__ = name
     found.__doc__ = "\n".join([analysis.help, "", "Options:", *lines])
     return found

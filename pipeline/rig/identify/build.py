@@ -115,13 +115,19 @@ def build(spec: IdentificationSpec, recordings: Sequence[xr.Dataset]) -> Built:
     both = apply_settings([*kept, *held], {i: t.parameters for i, t in enumerate(spec.recordings)})
     kept, held = both[: len(kept)], both[len(kept) :]
     problem = Problem(
-        model=spec.model, fixed=spec.values, free=free_of(spec, channels, len(recordings)), channels=channels,
-        pieces=tuple(kept), tied=spec.tied, loss=spec.fit.loss,
+        model=spec.model,
+        fixed=spec.values,
+        free=free_of(spec, channels, len(recordings)),
+        channels=channels,
+        pieces=tuple(kept),
+        tied=spec.tied,
+        loss=spec.fit.loss,
         noise=noise_of(spec.model, channels, smoothed, spec.fit.noise),
-        continuity=None if spec.fit.continuity == "free" else float(spec.fit.continuity), rtol=spec.fit.rtol,
+        continuity=None if spec.fit.continuity == "free" else float(spec.fit.continuity),
+        rtol=spec.fit.rtol,
         slopes=spec.fit.slopes,
         recorded=any(t.drive == "recorded" for t in spec.recordings),
-    )  # fmt: skip
+    )
     simulated = any(bool(ds.attrs.get("simulated")) for ds in recordings)
     said = tuple(tuple(summary(f for f in findings_of(ds) if f.severity != "note")) for ds in recordings)
     return Built(problem, tuple(replace(p, follows=-1) for p in held), simulated, said)
@@ -163,9 +169,7 @@ def drive_problems(
     for i, (table, ds) in enumerate(zip(tables, recordings, strict=True)):
         path = f"{where}[{i}].drive = {table.drive!r}"
         if table.drive != "none" and DRIVE not in ds:
-            problems.append(
-                f'{path}: the mapping names no drive channel; add [drive] there, or set drive = "none".'
-            )
+            problems.append(f'{path}: the mapping names no drive channel; add [drive] there, or set drive = "none".')
         elif table.drive == "recorded" and ds[DRIVE].attrs.get("kind") == "signal":
             problems.append(
                 f'{path}: the mapping calls the drive a signal, not a torque; use "edges", or map a torque '
@@ -185,9 +189,7 @@ def drive_problems(
             if table.drive == "none" and not table.parameters
         ]
     if "edges" in kinds and DUTY not in model.parameter_names:
-        problems.append(
-            f'{where}: drive = "edges" asks for a model with a parameter {DUTY}; {model.name} has none.'
-        )
+        problems.append(f'{where}: drive = "edges" asks for a model with a parameter {DUTY}; {model.name} has none.')
     return problems
 
 
@@ -238,9 +240,13 @@ def noise_of(
 
 
 def pieces_of(
-    model: Model, channels: Sequence[str], both: tuple[xr.Dataset, xr.Dataset], table: RecordingTable,
-    recording: int, decimate: int = 1,
-) -> list[Piece]:  # fmt: skip
+    model: Model,
+    channels: Sequence[str],
+    both: tuple[xr.Dataset, xr.Dataset],
+    table: RecordingTable,
+    recording: int,
+    decimate: int = 1,
+) -> list[Piece]:
     """Cut a recording into pieces.
 
     Parameters
@@ -283,10 +289,15 @@ def pieces_of(
         whole = samples.start == stretch.samples.start
         found.append(
             Piece(
-                recording, stretch.number, time - time[0], measured, start, pieces_drive,
+                recording,
+                stretch.number,
+                time - time[0],
+                measured,
+                start,
+                pieces_drive,
                 len(found) - 1 if stretch.continues and found and whole else -1,
             )
-        )  # fmt: skip
+        )
     if problems:
         raise SpecError(problems)
     return found
@@ -374,10 +385,12 @@ def _drive_of(table: RecordingTable, ds: xr.Dataset) -> _Driven | None:
     rising = edges.rising
     falling = np.array([edges.falling[edges.falling > r][:1] for r in rising[:-1]], dtype=object)
     if len(rising) < 2 or any(len(f) != 1 or f[0] >= r for f, r in zip(falling, rising[1:], strict=True)):
-        raise SpecError([
-            "its drive has no two rising edges with a falling one between each two; look at it with "
-            "magpend recordings show, and choose a window in which it switches."
-        ])  # fmt: skip
+        raise SpecError(
+            [
+                "its drive has no two rising edges with a falling one between each two; look at it with "
+                "magpend recordings show, and choose a window in which it switches."
+            ]
+        )
     flat = np.array([float(f[0]) for f in falling])
     return _Driven(Drive.from_edges(rising, flat, name=DUTY), float(rising[0]), float(rising[-1]))
 

@@ -66,9 +66,7 @@ def check(directory: str | Path, recording: str | Path, *, like: int = 0) -> dic
     model = load_model(result["model"])
     channels = tuple(result["channels"])
     missing = [name for name in channels if name not in ds]
-    problems = [
-        f"{recording}: has no channel {name!r}; it must have those that were fitted." for name in missing
-    ]
+    problems = [f"{recording}: has no channel {name!r}; it must have those that were fitted." for name in missing]
     problems += drive_problems(model, [table], [ds], str(recording))
     if problems:
         raise SpecError(problems)
@@ -77,10 +75,15 @@ def check(directory: str | Path, recording: str | Path, *, like: int = 0) -> dic
     zeros = result["zeros"]
     free = tuple(Free(name, value) for name, value in zeros.items())
     problem = Problem(
-        model=model, fixed=Parameters(model, result["values"]), free=free,
-        channels=channels, pieces=tuple(pieces), noise=np.array([result["noise"][c] for c in channels]),
-        rtol=_rtol(info), recorded=table.drive == "recorded",
-    )  # fmt: skip
+        model=model,
+        fixed=Parameters(model, result["values"]),
+        free=free,
+        channels=channels,
+        pieces=tuple(pieces),
+        noise=np.array([result["noise"][c] for c in channels]),
+        rtol=_rtol(info),
+        recorded=table.drive == "recorded",
+    )
     judgement, fit = judge(problem, result["values"], zeros, pieces)
     require_starts(fit, f"pieces of {recording}")
     return {

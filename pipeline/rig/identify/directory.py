@@ -49,13 +49,15 @@ T = TypeVar("T")
 
 FORMAT = 1
 IDENTIFICATION, RESULT, RESIDUALS, PRESET, OUTCOMES = (
-    "identification.json", "result.json", "residuals.nc", "preset.toml", "outcomes",
-)  # fmt: skip
+    "identification.json",
+    "result.json",
+    "residuals.nc",
+    "preset.toml",
+    "outcomes",
+)
 _OWN = frozenset({IDENTIFICATION, RESULT, RESIDUALS, PRESET, OUTCOMES, FIGURES, LOCK, HOLDER})
 _ROOM = Path(__file__).parent
-_NOT_NUMBERS = (
-    "check.py", "comparison.py", "directory.py", "figures.py", "reports.py", "residuals.py",
-)  # fmt: skip
+_NOT_NUMBERS = ("check.py", "comparison.py", "directory.py", "figures.py", "reports.py", "residuals.py")
 """Modules that do not affect the numbers."""
 
 
@@ -155,10 +157,7 @@ def identity_of(spec: IdentificationSpec, sources: Sequence[Source]) -> dict[str
         "spec": tables,
         "kernel_version": kernel_version(),
         "model_digest": spec.model.digest,
-        "code": {
-            "identify": meaning_digest(own),
-            "recordings": meaning_digest([_ROOM.parent / "recordings"]),
-        },
+        "code": {"identify": meaning_digest(own), "recordings": meaning_digest([_ROOM.parent / "recordings"])},
     }
 
 
@@ -189,17 +188,14 @@ def read_info(directory: str | Path) -> Info:
         found = data["identity"]["format"]
         if found != FORMAT:
             raise RefusedError(
-                f"{path}: format {found}, and this magpend reads {FORMAT}; identify again into another "
-                "directory."
+                f"{path}: format {found}, and this magpend reads {FORMAT}; identify again into another directory."
             )
         info = Info(directory=directory, **data)
         fits = digest_of(info.identity) == info.digest
     except (ValueError, TypeError, KeyError) as error:
         raise DamagedError(f"{path}: damaged ({error}); remove {directory} and identify again.") from None
     if not fits:
-        raise DamagedError(
-            f"{path}: damaged (its digest does not fit); remove {directory} and identify again."
-        )
+        raise DamagedError(f"{path}: damaged (its digest does not fit); remove {directory} and identify again.")
     return info
 
 
@@ -228,8 +224,7 @@ def check(directory: Path, identity: Mapping[str, Any]) -> Info | None:
             names = sorted(name for name in found if name not in locks and not is_temporary(name))
         if names:
             raise RefusedError(
-                f"{directory}: is not empty and holds no identification ({', '.join(names[:5])}); give "
-                "another --out."
+                f"{directory}: is not empty and holds no identification ({', '.join(names[:5])}); give another --out."
             )
         return None
     info = read_info(directory)
@@ -254,10 +249,15 @@ def establish(directory: Path, spec: IdentificationSpec, sources: Sequence[Sourc
     if check(directory, identity) is None:
         directory.mkdir(parents=True, exist_ok=True)
         content = {
-            "digest": digest_of(identity), "identity": identity, "title": spec.title, "spec_text": spec_text,
-            "files": [s.file for s in sources], "mappings": [s.mapping for s in sources],
-            "versions": versions(), "provenance": provenance(),
-        }  # fmt: skip
+            "digest": digest_of(identity),
+            "identity": identity,
+            "title": spec.title,
+            "spec_text": spec_text,
+            "files": [s.file for s in sources],
+            "mappings": [s.mapping for s in sources],
+            "versions": versions(),
+            "provenance": provenance(),
+        }
         write_atomically(directory / IDENTIFICATION, canonical(content))
         sync_folder(directory.parent)
     (directory / OUTCOMES).mkdir(exist_ok=True)
@@ -316,9 +316,7 @@ def read_result(directory: str | Path) -> dict[str, Any]:
     path = local_path(directory) / RESULT
     read_info(directory)
     if not is_there(path):
-        raise RefusedError(
-            f"{directory}: the identification is not finished; give its command again: it goes on."
-        )
+        raise RefusedError(f"{directory}: the identification is not finished; give its command again: it goes on.")
     try:
         with unreadable(path):
             found: dict[str, Any] = json.loads(path.read_bytes())

@@ -154,8 +154,9 @@ def _draw_piece(above: Axes, below: Axes, own: xr.Dataset, channel: str) -> None
     time = own["time"].values
     measured, left = own[f"{channel}_measured"].values, own[f"{channel}_residual"].values
     step = max(1, len(time) // 300)
-    above.plot(time[::step], measured[::step], linestyle="none", marker="o", markersize=1.6, color="0.65",
-               markeredgewidth=0.0)  # fmt: skip
+    above.plot(
+        time[::step], measured[::step], linestyle="none", marker="o", markersize=1.6, color="0.65", markeredgewidth=0.0
+    )
     above.plot(time, measured - left, color=FITTED, linewidth=0.8)
     below.axhline(0.0, color="0.7", linewidth=0.5)
     below.plot(time, _milli(own, channel)[1] * left, color="0.15", linewidth=0.5)
@@ -255,11 +256,25 @@ def _draw_pieces(ax: Axes, ds: xr.Dataset, channel: str, factor: float) -> None:
 def _draw_against_rate(ax: Axes, ds: xr.Dataset, views: xr.Dataset, channel: str, factor: float) -> None:
     rate, left = rate_of(ds, channel)
     step = max(1, len(rate) // MOST_DOTS)
-    ax.plot(rate[::step], factor * left[::step], linestyle="none", marker=".", markersize=1.5, color="0.72",
-            markeredgewidth=0.0, rasterized=True)  # fmt: skip
+    ax.plot(
+        rate[::step],
+        factor * left[::step],
+        linestyle="none",
+        marker=".",
+        markersize=1.5,
+        color="0.72",
+        markeredgewidth=0.0,
+        rasterized=True,
+    )
     ax.axhline(0.0, color="0.5", linewidth=0.5)
-    ax.plot(views[f"{channel}_rate"], factor * views[f"{channel}_mean"], color=style.ORANGE, marker="o",
-            markersize=2.2, linewidth=1.0)  # fmt: skip
+    ax.plot(
+        views[f"{channel}_rate"],
+        factor * views[f"{channel}_mean"],
+        color=style.ORANGE,
+        marker="o",
+        markersize=2.2,
+        linewidth=1.0,
+    )
     reach = 3.5 * factor * float(np.nanstd(left))
     ax.set_ylim(-reach, reach)
 
@@ -270,8 +285,13 @@ def _draw_histogram(ax: Axes, views: xr.Dataset, channel: str, factor: float) ->
     ax.stairs(density, edges, color=FITTED, fill=True, alpha=0.55)
     width = factor * float(views[f"{channel}_density"].attrs["width"])
     x = np.linspace(edges[0], edges[-1], 200)
-    ax.plot(x, np.exp(-0.5 * (x / width) ** 2) / (math.sqrt(2 * math.pi) * width), color="black",
-            linestyle="--", linewidth=0.9)  # fmt: skip
+    ax.plot(
+        x,
+        np.exp(-0.5 * (x / width) ** 2) / (math.sqrt(2 * math.pi) * width),
+        color="black",
+        linestyle="--",
+        linewidth=0.9,
+    )
     ax.set_xlim(edges[0], edges[-1])
     ax.set_ylim(0.0, None)
 
@@ -326,9 +346,7 @@ def plot_profiles(
     return fig
 
 
-def _draw_profile(
-    ax: Axes, data: xr.Dataset, name: str, estimate: Mapping[str, Any], critical: float
-) -> None:
+def _draw_profile(ax: Axes, data: xr.Dataset, name: str, estimate: Mapping[str, Any], critical: float) -> None:
     x, growth = data[f"{name}_values"].values, data[f"{name}_growth"].values
     centre = float(estimate["value"])
     scale, exponent = _engineering(float(np.nanmax(np.abs(x))))
@@ -383,8 +401,9 @@ def plot_correlations(
     matrix = np.array([[_nan(result["correlations"][a][b]) for b in names] for a in names], np.float64)
     data = xr.Dataset(
         {"correlation": (("row", "column"), matrix, {"units": "1"})},
-        coords={"row": names, "column": names}, attrs={**attrs, "title": _title(attrs, "correlations")},
-    )  # fmt: skip
+        coords={"row": names, "column": names},
+        attrs={**attrs, "title": _title(attrs, "correlations")},
+    )
     n = len(names)
     fig = style.new_figure(min(1.4 + 0.42 * n, 7.2), data, frame)
     ax = fig.add_subplot()
@@ -399,8 +418,9 @@ def plot_correlations(
             shown = f"{value:.2f}".replace("-", "\N{MINUS SIGN}")
             text = "" if np.isnan(value) else shown if i != j else "1"
             strong = abs(value) > 0.7
-            ax.text(j, i, text, ha="center", va="center", fontsize=fig.look.tick - 1.5,
-                    color="white" if strong else "black")  # fmt: skip
+            ax.text(
+                j, i, text, ha="center", va="center", fontsize=fig.look.tick - 1.5, color="white" if strong else "black"
+            )
     ax.set_title(" ", fontsize=fig.look.legend)
     style.style_bar(fig, fig.colorbar(image, ax=ax, pad=0.02, aspect=28), "correlation of the estimates")
     _finish(fig)

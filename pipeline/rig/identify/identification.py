@@ -106,9 +106,14 @@ def directory_of(spec: str | Path, out: str | Path | None) -> Path:
 
 
 def _write(
-    folder: Path, spec: IdentificationSpec, built: Built, found: reports.Finding, sources: list[Source],
-    digest: str, figures: bool,
-) -> dict[str, Any]:  # fmt: skip
+    folder: Path,
+    spec: IdentificationSpec,
+    built: Built,
+    found: reports.Finding,
+    sources: list[Source],
+    digest: str,
+    figures: bool,
+) -> dict[str, Any]:
     reports.write_values(folder / store.PRESET, spec, found, sources)
     residuals = reports.residuals_of(spec, found)
     if built.simulated:
@@ -137,25 +142,31 @@ def refuse_invisible(problem: Problem) -> None:
     """
     first = evaluate(problem, problem.start[None], problem.starts[None], slopes=True)[0]
     if _is_driven(problem):
-        raise SpecError([
-            'recordings: drive = "none", but the model is driven with these parameters; set the amplitude of '
-            "its drive to 0 under [parameters]."
-        ])  # fmt: skip
+        raise SpecError(
+            [
+                'recordings: drive = "none", but the model is driven with these parameters; set the amplitude of '
+                "its drive to 0 under [parameters]."
+            ]
+        )
     if first.failed:
-        raise SpecError([
-            f"identify: at the start, the trajectories of {first.failed} of {len(problem.pieces)} pieces "
-            "diverge; give starts that are nearer."
-        ])  # fmt: skip
+        raise SpecError(
+            [
+                f"identify: at the start, the trajectories of {first.failed} of {len(problem.pieces)} pieces "
+                "diverge; give starts that are nearer."
+            ]
+        )
     columns = first.jacobian[:, : len(problem.free)]
     n_priors = sum(f.has_prior for f in problem.free)
     data = columns[: len(columns) - n_priors]
     names = identifiability.invisible(data.T @ data, problem.names)
     if names:
-        raise SpecError([
-            f"identify.{name}: the recordings do not depend on it at all, at the start; fix it under "
-            "[parameters], give others values with which it matters, or add a recording in which it does."
-            for name in names
-        ])  # fmt: skip
+        raise SpecError(
+            [
+                f"identify.{name}: the recordings do not depend on it at all, at the start; fix it under "
+                "[parameters], give others values with which it matters, or add a recording in which it does."
+                for name in names
+            ]
+        )
 
 
 def _is_driven(problem: Problem) -> bool:
@@ -185,9 +196,15 @@ def find(spec: IdentificationSpec, built: Built, outcomes: Outcomes, echo: Echo)
     problem, table = built.problem, spec.search
     keep = Kept(outcomes)
     fits = search(
-        problem, n_starts=table.n_starts, seed=table.seed, spread=table.spread, method=table.method,
-        n_samples=table.n_samples, keep=keep, tell=echo,
-    )  # fmt: skip
+        problem,
+        n_starts=table.n_starts,
+        seed=table.seed,
+        spread=table.spread,
+        method=table.method,
+        n_samples=table.n_samples,
+        keep=keep,
+        tell=echo,
+    )
     best = fits[0]
     if not best.converged:
         raise NotConvergedError(
@@ -199,20 +216,23 @@ def find(spec: IdentificationSpec, built: Built, outcomes: Outcomes, echo: Echo)
     linear = linearise(problem, best)
     scale = _sizes(problem, best)
     covariance = covariance_of(linear, scale)
-    directions = identifiability.directions_of(
-        linear.information - np.diag(linear.prior), scale, covariance.inflation
-    )
+    directions = identifiability.directions_of(linear.information - np.diag(linear.prior), scale, covariance.inflation)
     held = None
     if built.held_out:
-        held, fit = judge(
-            problem, problem.values(best.theta), reports.zeros_of(problem, best), built.held_out
-        )
+        held, fit = judge(problem, problem.values(best.theta), reports.zeros_of(problem, best), built.held_out)
         require_starts(fit, "held-out pieces")
     at_bound = _at_bound(problem, best, scale)
     found = reports.Finding(
-        problem, keep.fits, best, covariance, directions, judge_fit(problem, best), held,
-        dict(zip(problem.channels, n_effective(linear.residuals), strict=True)), at_bound,
-    )  # fmt: skip
+        problem,
+        keep.fits,
+        best,
+        covariance,
+        directions,
+        judge_fit(problem, best),
+        held,
+        dict(zip(problem.channels, n_effective(linear.residuals), strict=True)),
+        at_bound,
+    )
     profiles = _profiles(found, linear, scale, outcomes) if table.profiles else {}
     return replace(found, profiles=profiles, warnings=_warnings(found, profiles))
 
@@ -257,9 +277,7 @@ def _warnings(found: reports.Finding, profiles: Mapping[str, Profile]) -> list[s
     return lines
 
 
-def _profiles(
-    found: reports.Finding, linear: Linearised, scale: np.ndarray, outcomes: Outcomes
-) -> dict[str, Profile]:
+def _profiles(found: reports.Finding, linear: Linearised, scale: np.ndarray, outcomes: Outcomes) -> dict[str, Profile]:
     problem, best = found.problem, found.best
     if problem.loss != "linear":
         problem = replace(problem, loss_scale=loss_scale_of(problem, best))
@@ -277,9 +295,7 @@ def _profiles(
             about = Curvature(error, float(plain[i]), covariance.critical, size, moves, starts)
             kept = profile(problem, best, name, about, fit_local)
             interval = np.array(kept.interval)
-            outcomes.store(
-                f"profile-{name}", {"values": kept.values, "growth": kept.growth, "interval": interval}
-            )
+            outcomes.store(f"profile-{name}", {"values": kept.values, "growth": kept.growth, "interval": interval})
         profiles[name] = kept
     return profiles
 
@@ -329,17 +345,30 @@ def pack_fit(fit: Fit) -> dict[str, np.ndarray]:
     """Return a fit as arrays."""
     lengths = np.array([len(r) for r in fit.residuals], np.int64)
     return {
-        "theta": fit.theta, "starts": fit.starts, "rows": fit.rows, "jacobian": fit.jacobian,
-        "residuals": np.concatenate(fit.residuals), "lengths": lengths,
-        "cost": np.array(fit.cost), "converged": np.array(fit.converged), "message": np.array(fit.message),
+        "theta": fit.theta,
+        "starts": fit.starts,
+        "rows": fit.rows,
+        "jacobian": fit.jacobian,
+        "residuals": np.concatenate(fit.residuals),
+        "lengths": lengths,
+        "cost": np.array(fit.cost),
+        "converged": np.array(fit.converged),
+        "message": np.array(fit.message),
         "n_evaluations": np.array(fit.n_evaluations),
-    }  # fmt: skip
+    }
 
 
 def unpack_fit(data: Mapping[str, np.ndarray]) -> Fit:
     """Return the fit that `pack_fit` turned into arrays."""
     residuals = np.split(data["residuals"], np.cumsum(data["lengths"])[:-1])
     return Fit(
-        data["theta"], data["starts"], float(data["cost"]), bool(data["converged"]), str(data["message"]),
-        int(data["n_evaluations"]), tuple(residuals), data["rows"], data["jacobian"],
-    )  # fmt: skip
+        data["theta"],
+        data["starts"],
+        float(data["cost"]),
+        bool(data["converged"]),
+        str(data["message"]),
+        int(data["n_evaluations"]),
+        tuple(residuals),
+        data["rows"],
+        data["jacobian"],
+    )

@@ -109,9 +109,14 @@ def known_problem(
     """
     free = tuple(f for f in problem.free if f.name in zeros)
     known = replace(
-        problem, fixed=problem.fixed.replace(**values), free=free, tied={}, pieces=tuple(pieces),
-        loss="linear", continuity=None,
-    )  # fmt: skip
+        problem,
+        fixed=problem.fixed.replace(**values),
+        free=free,
+        tied={},
+        pieces=tuple(pieces),
+        loss="linear",
+        continuity=None,
+    )
     return known.without(zeros)
 
 

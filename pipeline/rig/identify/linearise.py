@@ -36,24 +36,33 @@ def linearise(problem: Problem, fit: Fit) -> Linearised:
     for k, own in enumerate(full):
         flat = own.reshape(-1, own.shape[-1])
         # free starts are eliminated piece by piece here: the fit's one-sided differences are less exact
-        moves = (
-            eliminate_starts(flat, n_free)[1] if follow is None else follow[k * n_states : (k + 1) * n_states]
-        )
+        moves = eliminate_starts(flat, n_free)[1] if follow is None else follow[k * n_states : (k + 1) * n_states]
         slopes.append(own[..., :n_free] - own[..., n_free:] @ moves)
         following.append(-moves)
     prior = np.array([f.prior_sd**-2 if f.has_prior else 0.0 for f in problem.free])
     residuals = tuple(r / problem.noise for r in fit.residuals)
     information = _information(problem, fit, slopes, residuals, prior, scale)
     return Linearised(
-        information, prior, residuals, tuple(slopes), groups_of(problem), fit.starts.size, problem.loss,
-        scale, np.array(following),
-    )  # fmt: skip
+        information,
+        prior,
+        residuals,
+        tuple(slopes),
+        groups_of(problem),
+        fit.starts.size,
+        problem.loss,
+        scale,
+        np.array(following),
+    )
 
 
 def _information(
-    problem: Problem, fit: Fit, slopes: list[np.ndarray], residuals: tuple[np.ndarray, ...],
-    prior: np.ndarray, scale: float,
-) -> np.ndarray:  # fmt: skip
+    problem: Problem,
+    fit: Fit,
+    slopes: list[np.ndarray],
+    residuals: tuple[np.ndarray, ...],
+    prior: np.ndarray,
+    scale: float,
+) -> np.ndarray:
     """Return the information matrix: that of the samples, or with continuity that of the fit."""
     if problem.continuity is not None:
         return eliminate_starts(fit.jacobian, len(problem.free))[0]

@@ -207,12 +207,18 @@ def _least_squares(walk: _Search, x: Array, ending: _Ending) -> tuple[Array, boo
     lower[: walk.n_free], upper[: walk.n_free] = problem.lower, problem.upper
     sparse = len(sizes) > DENSE_COLUMNS
     found = least_squares(
-        lambda x: walk.at(x).rows, x,
+        lambda x: walk.at(x).rows,
+        x,
         jac=lambda x: csr_array(walk.at(x).jacobian) if sparse else walk.at(x).jacobian,
-        bounds=(lower / sizes, upper / sizes), method="trf", x_scale="jac", xtol=ending.tolerance,
-        ftol=0.1 * ending.tolerance, gtol=None, tr_solver="lsmr" if sparse else "exact",
+        bounds=(lower / sizes, upper / sizes),
+        method="trf",
+        x_scale="jac",
+        xtol=ending.tolerance,
+        ftol=0.1 * ending.tolerance,
+        gtol=None,
+        tr_solver="lsmr" if sparse else "exact",
         max_nfev=ending.max_evaluations,
-    )  # fmt: skip
+    )
     return found.x, bool(found.status > 0), found.message
 
 
@@ -233,29 +239,33 @@ def _outcome(point: _Point, count: int, ended: bool, message: str) -> Fit:
     if failed:
         message = f"the trajectories of {failed} of {len(point.starts)} pieces diverge"
     return Fit(
-        point.theta, point.starts, evaluation.cost, ended and not failed, message, count,
-        evaluation.residuals, evaluation.rows, evaluation.jacobian,
-    )  # fmt: skip
+        point.theta,
+        point.starts,
+        evaluation.cost,
+        ended and not failed,
+        message,
+        count,
+        evaluation.residuals,
+        evaluation.rows,
+        evaluation.jacobian,
+    )
 
 
 def _fit_others(
-    problem: Problem, theta0: Array, starts: Array | None, fixed: Mapping[str, float],
-    ending: _Ending,
-) -> Fit:  # fmt: skip
+    problem: Problem, theta0: Array, starts: Array | None, fixed: Mapping[str, float], ending: _Ending
+) -> Fit:
     """Fit with some unknowns held; the outcome holds all unknowns."""
     held = np.array([name in fixed for name in problem.names], bool)
     part = fit_local(
-        problem.without(fixed), np.asarray(theta0)[~held], starts=starts,
-        max_evaluations=ending.max_evaluations, tolerance=ending.tolerance,
-    )  # fmt: skip
+        problem.without(fixed),
+        np.asarray(theta0)[~held],
+        starts=starts,
+        max_evaluations=ending.max_evaluations,
+        tolerance=ending.tolerance,
+    )
     theta = np.array([fixed.get(name, 0.0) for name in problem.names])
     theta[~held] = part.theta
     whole = evaluate(problem, theta[None], part.starts[None], slopes=True)[0]
     return replace(
-        part,
-        theta=theta,
-        cost=whole.cost,
-        residuals=whole.residuals,
-        rows=whole.rows,
-        jacobian=whole.jacobian,
+        part, theta=theta, cost=whole.cost, residuals=whole.residuals, rows=whole.rows, jacobian=whole.jacobian
     )

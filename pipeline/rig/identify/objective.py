@@ -135,9 +135,7 @@ def _by_differences(problem: Problem, thetas: Array, starts: Array) -> _Motions:
     moves = STEP * np.diag(problem.model.scales)
     packed = problem.pack(thetas)[:, None]
     n_moving = len(problem.moving)
-    parameters = np.concatenate(
-        [packed, _changed(problem, thetas, steps), np.repeat(packed, n, axis=1)], axis=1
-    )
+    parameters = np.concatenate([packed, _changed(problem, thetas, steps), np.repeat(packed, n, axis=1)], axis=1)
     start = np.repeat(starts[:, None], 1 + n_moving + n, axis=1)
     start[:, 1 + n_moving :] += moves[:, None, :]
     tolerance = min(problem.rtol, SLOPES_RTOL)
@@ -179,11 +177,14 @@ def _integrate(
     found = sample(
         problem.system if system is None else system,
         np.repeat(parameters.reshape(-1, parameters.shape[-1]), n_pieces, axis=0),
-        starts.reshape(-1, starts.shape[-1]), [_grid(problem, k) for k in range(n_pieces)],
+        starts.reshape(-1, starts.shape[-1]),
+        [_grid(problem, k) for k in range(n_pieces)],
         piece=np.tile(np.arange(n_pieces), shape[0] * shape[1]),
         drives=drives if any(d is not None for d in drives) else None,
-        columns=columns, rtol=tolerance, atol=tolerance,
-    )  # fmt: skip
+        columns=columns,
+        rtol=tolerance,
+        atol=tolerance,
+    )
     states = found.states.reshape(*shape, *found.states.shape[1:])
     return states, (found.status != int(Status.BOUNDED)).reshape(shape)
 
@@ -211,9 +212,7 @@ def _read(problem: Problem, k: int, states: Array) -> Array:
     return np.asarray(read[..., :n, :])
 
 
-def _block(
-    problem: Problem, k: int, theta: Array, member: _Motions, slopes: bool
-) -> tuple[int, Array, Array]:
+def _block(problem: Problem, k: int, theta: Array, member: _Motions, slopes: bool) -> tuple[int, Array, Array]:
     """Return a piece's number, compressed rows, and slopes by the unknowns and its own start."""
     piece, n_free = problem.pieces[k], len(problem.free)
     n_own = n_free + len(problem.model.states)

@@ -227,7 +227,5 @@ class Problem:
         offset = np.array([fixed.get(f.name, 0.0) for f in self.free]) * [
             f.name not in held and f.name in fixed for f in self.free
         ]
-        pieces = tuple(
-            replace(p, measured=p.measured - self.zeros[p.recording] @ offset) for p in self.pieces
-        )
+        pieces = tuple(replace(p, measured=p.measured - self.zeros[p.recording] @ offset) for p in self.pieces)
         return replace(self, fixed=self.fixed.replace(**held), free=kept, pieces=pieces)

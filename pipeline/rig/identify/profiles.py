@@ -82,9 +82,7 @@ class Curvature:
     starts: np.ndarray
 
 
-def profile(
-    problem: Problem, best: Fit, name: str, about: Curvature, fit_local: Callable[..., Fit]
-) -> Profile:
+def profile(problem: Problem, best: Fit, name: str, about: Curvature, fit_local: Callable[..., Fit]) -> Profile:
     """Compute the profile of one parameter; all others and all starts are fitted again at each value.
 
     Parameters
@@ -135,9 +133,7 @@ def following(information: np.ndarray, index: int) -> np.ndarray:
     return moves
 
 
-def interval_of(
-    values: np.ndarray, growth: np.ndarray, estimate: float, critical: float
-) -> tuple[float, float]:
+def interval_of(values: np.ndarray, growth: np.ndarray, estimate: float, critical: float) -> tuple[float, float]:
     """Return where the root of a profile's growth crosses the critical value, interpolated linearly.
 
     Parameters

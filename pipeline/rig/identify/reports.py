@@ -88,9 +88,8 @@ def zeros_of(problem: Problem, fit: Fit) -> dict[str, float]:
 
 
 def result_of(
-    spec: IdentificationSpec, found: Finding, sources: Sequence[Source], digest: str,
-    findings: Sequence[Sequence[str]],
-) -> dict[str, Any]:  # fmt: skip
+    spec: IdentificationSpec, found: Finding, sources: Sequence[Source], digest: str, findings: Sequence[Sequence[str]]
+) -> dict[str, Any]:
     """Return ``result.json`` as plain data. It does not depend on time or speed."""
     names = found.problem.names
     return {
@@ -166,9 +165,11 @@ def _sureness(found: Finding) -> dict[str, Any]:
 def _errors(sources: Sequence[Source], findings: Sequence[Sequence[str]]) -> list[str]:
     """Return the findings that make results from a recording wrong."""
     return [
-        f"{s.file} has an {line}" for s, said in zip(sources, findings, strict=True) for line in said
+        f"{s.file} has an {line}"
+        for s, said in zip(sources, findings, strict=True)
+        for line in said
         if line.startswith("error")
-    ]  # fmt: skip
+    ]
 
 
 def _estimate(found: Finding, i: int) -> dict[str, Any]:
@@ -240,9 +241,7 @@ def residuals_of(spec: IdentificationSpec, found: Finding) -> xr.Dataset:
     for judgement, is_held in parts:
         for piece, residuals in zip(judgement.pieces, judgement.residuals, strict=True):
             n = len(piece.time)
-            for name, number in (
-                ("recording", piece.recording), ("piece", piece.number), ("held_out", is_held)
-            ):  # fmt: skip
+            for name, number in (("recording", piece.recording), ("piece", piece.number), ("held_out", is_held)):
                 add(name, np.full(n, number, np.int32))
             add("time", piece.time)
             for c, channel in enumerate(judgement.channels):
@@ -255,11 +254,7 @@ def residuals_of(spec: IdentificationSpec, found: Finding) -> xr.Dataset:
         ds[f"{channel}_residual"].attrs = {"units": unit, "long_name": f"{channel}, measured less computed"}
     ds["time"].attrs = {"units": "s", "long_name": "time since the piece's start"}
     ds["held_out"].attrs = {"long_name": "1 in pieces that were not fitted"}
-    attrs = {
-        "model": model_attribute(spec.model),
-        "title": spec.title,
-        "channels": " ".join(found.problem.channels),
-    }
+    attrs = {"model": model_attribute(spec.model), "title": spec.title, "channels": " ".join(found.problem.channels)}
     return ds.set_coords(["recording", "piece", "held_out", "time"]).assign_attrs(attrs)
 
 
@@ -290,7 +285,6 @@ def judgement_lines(judged: Mapping[str, Any], units: Mapping[str, str]) -> list
         shown = "-" if rms is None else f"{rms:.4g} {units[name]}"
         correlation = judged["correlation"][name]
         lines.append(
-            f"{name}: root mean square {shown}, correlation "
-            + ("-" if correlation is None else f"{correlation:.6f}")
+            f"{name}: root mean square {shown}, correlation " + ("-" if correlation is None else f"{correlation:.6f}")
         )
     return lines

@@ -94,17 +94,19 @@ def search(
 
 
 def _kept(
-    problem: Problem, stages: Sequence[Problem], k: int, theta: Array, total: int, keep: Keep | None,
+    problem: Problem,
+    stages: Sequence[Problem],
+    k: int,
+    theta: Array,
+    total: int,
+    keep: Keep | None,
     tell: Callable[[str], None],
-) -> Fit:  # fmt: skip
+) -> Fit:
     """Return the outcome of a start: the stored one, or that of a new fit."""
     fit = keep.recall(k) if keep is not None else None
     if fit is None:
         fit = refine(
-            problem,
-            theta,
-            stages=stages,
-            echo=lambda _, cost: report(f"start {k + 1}, cost {cost:.6g}", k, total),
+            problem, theta, stages=stages, echo=lambda _, cost: report(f"start {k + 1}, cost {cost:.6g}", k, total)
         )
         if keep is not None:
             keep.store(k, fit)
@@ -120,10 +122,7 @@ def guess(
     if n_starts == 1:
         return [problem.start]
     if method == "cma":
-        return [
-            problem.start,
-            *(_evolve(shortest, problem.start, seed + k, spread) for k in range(n_starts - 1)),
-        ]
+        return [problem.start, *(_evolve(shortest, problem.start, seed + k, spread) for k in range(n_starts - 1))]
     points = sobol(problem, max(n_samples, n_starts) - 1, seed, spread)
     if len(points) > n_starts - 1:
         order = np.argsort(costs(shortest, points), kind="stable")
@@ -160,9 +159,14 @@ def _evolve(problem: Problem, start: Array, seed: int, spread: float) -> Array:
     sizes = np.array([f.size for f in problem.free])
     lower, upper = problem.lower / sizes, problem.upper / sizes
     options = {
-        "bounds": [list(lower), list(upper)], "seed": seed + 1, "verbose": -9, "popsize": POPULATION,
-        "maxiter": 200, "tolfun": 1e-3, "tolx": 1e-5,
-    }  # fmt: skip
+        "bounds": [list(lower), list(upper)],
+        "seed": seed + 1,
+        "verbose": -9,
+        "popsize": POPULATION,
+        "maxiter": 200,
+        "tolfun": 1e-3,
+        "tolx": 1e-5,
+    }
     evolution = cma.CMAEvolutionStrategy(np.clip(start / sizes, lower, upper), max(spread, 0.05), options)
     while not evolution.stop():
         members = np.array(evolution.ask())
@@ -172,9 +176,7 @@ def _evolve(problem: Problem, start: Array, seed: int, spread: float) -> Array:
     return np.asarray(evolution.result.xbest * sizes)
 
 
-def refine(
-    problem: Problem, theta: Array, *, stages: Sequence[Problem] | None = None, echo: Echo | None = None
-) -> Fit:
+def refine(problem: Problem, theta: Array, *, stages: Sequence[Problem] | None = None, echo: Echo | None = None) -> Fit:
     """Fit from one first guess: over short stretches, longer ones, then whole pieces, with free starts.
 
     Noise may lead short stretches to a wrong optimum from which longer ones do not return. The last fit
@@ -244,9 +246,7 @@ def _stretches(problem: Problem, piece: Piece, length_s: float) -> list[Piece]:
             begin = drive.start_s + piece.time[a]
             drive = drive.window(begin, drive.start_s + piece.time[b - 1])
         time = piece.time[a:b:step] - piece.time[a]
-        found.append(
-            replace(piece, time=time, measured=piece.measured[a:b:step], start=start, drive=drive, follows=-1)
-        )
+        found.append(replace(piece, time=time, measured=piece.measured[a:b:step], start=start, drive=drive, follows=-1))
     return found
 
 

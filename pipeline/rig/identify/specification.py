@@ -13,10 +13,7 @@ from pydantic import Field
 
 from magpend_core.models import model_names
 from magpend_core.models.model import Model
-from magpend_core.models.parameters import (
-    Parameters,
-    near_names,
-)
+from magpend_core.models.parameters import Parameters, near_names
 from magpend_core.models.presets import is_file
 from pipeline.rig.identify.settings import setting_problems
 from pipeline.rig.identify.unknowns import Pair, ParameterTables, Unknown, table_at, validate
@@ -52,9 +49,7 @@ class RecordingTable(Table):
     piece_s: Annotated[float, Field(gt=0)] | None = Field(
         None, description="Cut pieces into equal stretches of about this length [s], each with a free start"
     )
-    window_s: Pair | None = Field(
-        None, description="Start and end of the part that is used [s since the first sample]"
-    )
+    window_s: Pair | None = Field(None, description="Start and end of the part that is used [s since the first sample]")
     hold_out: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(strict=False)] = Field(
         (), description="Indices of pieces (with `piece_s`, of stretches) that are judged but not fitted"
     )
@@ -64,9 +59,10 @@ class FitTable(Table):
     """The table ``[fit]``: the criterion of the fit."""
 
     channels: Annotated[tuple[str, ...], Field(strict=False)] = Field(
-        (), description="States that are compared; by default those that all recordings measure, without "
+        (),
+        description="States that are compared; by default those that all recordings measure, without "
         "rates of measured angles",
-    )  # fmt: skip
+    )
     loss: Literal["linear", "soft_l1", "huber", "cauchy"] = Field(
         "linear", description="Loss of residuals in units of their scale; `linear` is least squares"
     )
@@ -92,8 +88,7 @@ class SearchTable(Table):
     """The table ``[search]``: the global search, and the profiles after it."""
 
     n_starts: Annotated[int, Field(ge=1, le=10_000)] = Field(
-        8,
-        description="Number of first guesses that are refined; the first is the specification's",
+        8, description="Number of first guesses that are refined; the first is the specification's"
     )
     seed: Annotated[int, Field(ge=0)] = Field(1, description="Seed of the guesses")
     spread: Annotated[float, Field(ge=0, lt=1)] = Field(
@@ -188,10 +183,7 @@ def _plain(bound: float) -> float | str:
     return bound if math.isfinite(bound) else str(bound)
 
 
-_KEYS = (
-    "kind", "title", "model", "preset", "parameters", "identify", "tied", "sensors", "recordings", "fit",
-    "search",
-)  # fmt: skip
+_KEYS = ("kind", "title", "model", "preset", "parameters", "identify", "tied", "sensors", "recordings", "fit", "search")
 
 
 def load_identification(path: str | Path) -> IdentificationSpec:
@@ -237,9 +229,19 @@ def parse_identification(data: Mapping[str, Any], folder: Path) -> Identificatio
         raise SpecError(problems)
     assert own.values is not None
     return IdentificationSpec(
-        title or "", model, preset, own.fixed, own.values, own.unknowns, own.tied, sensors, recordings, fit,
-        search, folder,
-    )  # fmt: skip
+        title or "",
+        model,
+        preset,
+        own.fixed,
+        own.values,
+        own.unknowns,
+        own.tied,
+        sensors,
+        recordings,
+        fit,
+        search,
+        folder,
+    )
 
 
 def _text(data: Mapping[str, Any], key: str, problems: list[str]) -> str | None:

@@ -92,9 +92,7 @@ _TIE = re.compile(r"\s*(?:([+-]?\s*[0-9.]+(?:[eE][+-]?[0-9]+)?)\s*\*\s*|(-)\s*)?
 class ParameterTables:
     """The fixed values, unknowns and ties of a specification, checked together."""
 
-    def __init__(
-        self, data: Mapping[str, Any], model: Model, preset: str | Path | None, problems: list[str]
-    ) -> None:
+    def __init__(self, data: Mapping[str, Any], model: Model, preset: str | Path | None, problems: list[str]) -> None:
         self._model, self._problems = model, problems
         identified = table_at(data, "identify", problems)
         tied = table_at(data, "tied", problems)
@@ -127,9 +125,7 @@ class ParameterTables:
 
     def _unknown(self, name: str, table: Any) -> Unknown | None:
         if name not in self._model.parameter_names:
-            self._problems.append(
-                f"identify.{name}: {unknown_name_problem(name, self._model.parameter_names)}"
-            )
+            self._problems.append(f"identify.{name}: {unknown_name_problem(name, self._model.parameter_names)}")
             return None
         one = validate(Identified, table, f"identify.{name}", self._problems)
         if one is None or (self.values is None and one.start is None):

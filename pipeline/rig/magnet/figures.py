@@ -41,10 +41,7 @@ _ANGLE, _LOCKED = (f"${laws.SYMBOLS[name]}$ [deg]" for name in (laws.ANGLE, laws
 _TORQUE = f"${laws.SYMBOLS['torque']}$ [N m]"
 _FIT, _BUMP = "fit (Eq. 19)", "bump (Eq. 17)"
 _NAMES = {"fit": _FIT, "dipoles": "point dipoles (Eq. 16)"}
-_MODELS: dict[str, tuple[str, Any, str]] = {
-    "fit": ("black", "-", "o"),
-    "dipoles": (style.VERMILLION, (0, (4, 2)), "x"),
-}
+_MODELS: dict[str, tuple[str, Any, str]] = {"fit": ("black", "-", "o"), "dipoles": (style.VERMILLION, (0, (4, 2)), "x")}
 """Colour, dash and marker by model."""
 
 
@@ -70,9 +67,7 @@ def draw_curves(outcome: Outcome, frame: style.Frame = style.WIDE) -> style.Data
         place = _place(shown, fit.curve.locked) or 0
         ax.plot(np.degrees(at), bump, color=COLOURS[place], linewidth=1.0)
         _points(ax, m.angle[fit.curve.rows], m.torque[fit.curve.rows], place, fit.curve.side)
-    handles: list[Any] = [
-        style.dot(_degrees(v), COLOURS[i], 4.0, marker=MARKERS[i]) for i, v in enumerate(shown)
-    ]
+    handles: list[Any] = [style.dot(_degrees(v), COLOURS[i], 4.0, marker=MARKERS[i]) for i, v in enumerate(shown)]
     handles[0].set_label(f"${laws.SYMBOLS[laws.LOCKED]}$ = {handles[0].get_label()}")
     handles += [
         style.dot("right", "0.3", 4.0),
@@ -92,9 +87,10 @@ def draw_numbers(outcome: Outcome, frame: style.Frame = style.WIDE) -> style.Dat
     figure = style.new_figure(3.1, _numbers(outcome, fine), frame)
     grid = figure.subplots(1, 3)
     looks = (
-        (laws.HEIGHT, "$|A|$ [N m]", 1.0), (laws.POSITION, "$b$ [deg]", 180.0 / np.pi),
+        (laws.HEIGHT, "$|A|$ [N m]", 1.0),
+        (laws.POSITION, "$b$ [deg]", 180.0 / np.pi),
         (laws.WIDTH, "$c$ [deg]", 180.0 / np.pi),
-    )  # fmt: skip
+    )
     for ax, (name, label, factor) in zip(grid, looks, strict=True):
         style.style_axes(ax)
         style.label_axes(ax, _LOCKED, label)
@@ -102,10 +98,16 @@ def draw_numbers(outcome: Outcome, frame: style.Frame = style.WIDE) -> style.Dat
             own = figure.data.sel(curve=figure.data["curve_side"] == side)
             sign = -1.0 if name == laws.HEIGHT and side else 1.0
             ax.errorbar(
-                own["curve_locked"], sign * factor * own[name], factor * own[f"{name}_error"],
-                fmt=MARKERS[side], color=colour, markersize=3.2, linewidth=0.7, markeredgewidth=0.7,
+                own["curve_locked"],
+                sign * factor * own[name],
+                factor * own[f"{name}_error"],
+                fmt=MARKERS[side],
+                color=colour,
+                markersize=3.2,
+                linewidth=0.7,
+                markeredgewidth=0.7,
                 markerfacecolor=colour if side == 0 else "white",
-            )  # fmt: skip
+            )
             for kind, dash in (("law", "-"), ("joint", (0, (4, 2)))):
                 values = sign * factor * figure.data[f"{name}_{kind}"][side]
                 ax.plot(figure.data["fine_locked"], values, color=colour, linewidth=0.9, linestyle=dash)
@@ -143,9 +145,7 @@ def draw_map(outcome: Outcome, frame: style.Frame = style.WIDE) -> style.DataFig
     ax.set_ylim(*np.degrees(locked[[0, -1]]))
     bar = figure.colorbar(image, ax=ax, pad=0.02)
     style.style_bar(figure, bar, f"{_TORQUE}, {_FIT}")
-    handles = [
-        Line2D([], [], color="black", linewidth=1.1, label="transition"), style.dot("readings", "0.25", 2.5),
-    ]  # fmt: skip
+    handles = [Line2D([], [], color="black", linewidth=1.1, label="transition"), style.dot("readings", "0.25", 2.5)]
     return _done(figure, ax, outcome, handles)
 
 
@@ -159,16 +159,17 @@ def draw_comparison(outcome: Outcome, frame: style.Frame = style.WIDE) -> style.
         upper, lower = grid[:, column]
         own = data.isel(reading=np.abs(data["locked"].values - np.degrees(locked)) < np.degrees(SAME_ANGLE))
         for name, (colour, dash, marker) in _MODELS.items():
-            upper.plot(
-                data["fine_angle"][column], data[name][column], color=colour, linewidth=1.0, linestyle=dash
-            )
+            upper.plot(data["fine_angle"][column], data[name][column], color=colour, linewidth=1.0, linestyle=dash)
             lower.plot(
-                own["angle"], own[f"left_by_{name}"], linestyle="none", marker=marker, markersize=2.6,
-                color=colour, markeredgewidth=0.7,
-            )  # fmt: skip
-        upper.plot(
-            own["angle"], own["torque"], linestyle="none", marker="o", markersize=2.8, color=style.BLUE
-        )
+                own["angle"],
+                own[f"left_by_{name}"],
+                linestyle="none",
+                marker=marker,
+                markersize=2.6,
+                color=colour,
+                markeredgewidth=0.7,
+            )
+        upper.plot(own["angle"], own["torque"], linestyle="none", marker="o", markersize=2.8, color=style.BLUE)
         text = f"${laws.SYMBOLS[laws.LOCKED]}$ = {_degrees(locked)}"
         upper.set_title(text, fontsize=figure.look.legend)
         for ax in (upper, lower):
@@ -182,16 +183,17 @@ def draw_comparison(outcome: Outcome, frame: style.Frame = style.WIDE) -> style.
     for name, (colour, dash, marker) in _MODELS.items():
         label = f"{_NAMES[name]}, $R^2$ = {r2[name]}"
         handles.append(
-            Line2D(
-                [], [], color=colour, linewidth=1.0, linestyle=dash, marker=marker, markersize=3, label=label
-            )
+            Line2D([], [], color=colour, linewidth=1.0, linestyle=dash, marker=marker, markersize=3, label=label)
         )
     return _done(figure, grid[0, 0], outcome, handles, short=True)
 
 
 FIGURES: dict[str, Callable[..., style.DataFigure]] = {
-    "fig6": draw_curves, "fig7": draw_numbers, "fig8": draw_map, "fig9": draw_comparison,
-}  # fmt: skip
+    "fig6": draw_curves,
+    "fig7": draw_numbers,
+    "fig8": draw_map,
+    "fig9": draw_comparison,
+}
 """Functions that draw, by the name of the file."""
 
 
@@ -240,7 +242,7 @@ def _readings(outcome: Outcome, rows: np.ndarray) -> xr.Dataset:
         "torque": (m.torque, "N m", "torque of the magnets, corrected"),
         "left_by_fit": (outcome.joint.residuals, "N m", "torque less the joint fit's"),
         "left_by_dipoles": (outcome.dipoles.residuals, "N m", "torque less the point dipoles'"),
-    }  # fmt: skip
+    }
     return xr.Dataset(
         {
             name: ("reading", values[rows], {"units": unit, "long_name": text})
@@ -301,9 +303,15 @@ def _axes(figure: style.DataFigure, x: str, y: str, *, inside: bool = True) -> A
 
 def _points(ax: Axes, angle: np.ndarray, torque: np.ndarray, place: int, side: int) -> None:
     ax.plot(
-        np.degrees(angle), torque, linestyle="none", marker=MARKERS[place], markersize=3.2,
-        color=COLOURS[place], markerfacecolor=COLOURS[place] if side == 0 else "white", markeredgewidth=0.7,
-    )  # fmt: skip
+        np.degrees(angle),
+        torque,
+        linestyle="none",
+        marker=MARKERS[place],
+        markersize=3.2,
+        color=COLOURS[place],
+        markerfacecolor=COLOURS[place] if side == 0 else "white",
+        markeredgewidth=0.7,
+    )
 
 
 def _done(
@@ -313,9 +321,11 @@ def _done(
     text = outcome.measured.label
     if short:
         figure.suptitle(
-            style.folded(text, figure.frame.width_in - 0.6, figure.look.legend), fontsize=figure.look.legend,
-            x=0.01, ha="left",
-        )  # fmt: skip
+            style.folded(text, figure.frame.width_in - 0.6, figure.look.legend),
+            fontsize=figure.look.legend,
+            x=0.01,
+            ha="left",
+        )
         style.legend_below(figure, handles)
         style.finish(figure)
     else:

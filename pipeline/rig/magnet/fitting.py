@@ -143,9 +143,7 @@ def fit_curve(angle: np.ndarray, torque: np.ndarray, curve: Curve) -> CurveFit:
     area = float(np.trapezoid(torque[order], angle[order]))
     width = abs(area) / (math.sqrt(math.pi) * max(abs(torque[peak]), 1e-300)) or np.ptp(angle)
     start = (torque[peak], -angle[peak], min(width, float(np.ptp(angle))))
-    found = solve(
-        lambda x: torque - laws.bump(angle, *x), lambda x: -laws.bump_slopes(angle, *x), start, what
-    )
+    found = solve(lambda x: torque - laws.bump(angle, *x), lambda x: -laws.bump_slopes(angle, *x), start, what)
     height, position, width = found.x[0], found.x[1], abs(found.x[2])
     within = angle.min() <= -position <= angle.max()
     if not within or (height > 0.0) != (curve.side == 0):
@@ -226,9 +224,8 @@ def _gaussian(x: np.ndarray, y: np.ndarray, weight: np.ndarray, what: str) -> La
     top = int(np.abs(y).argmax())
     start = (y[top], -x[top], max(np.ptp(x), 1e-3))
     found = solve(
-        lambda v: weight * (y - laws.bump(x, *v)), lambda v: -weight[:, None] * laws.bump_slopes(x, *v),
-        start, what,
-    )  # fmt: skip
+        lambda v: weight * (y - laws.bump(x, *v)), lambda v: -weight[:, None] * laws.bump_slopes(x, *v), start, what
+    )
     return found, laws.bump(x, *found.x)
 
 
@@ -250,9 +247,7 @@ def _constant(x: np.ndarray, y: np.ndarray, weight: np.ndarray, what: str) -> La
 # ---- all at once ---------------------------------------------------------------------------------
 
 
-def fit_jointly(
-    measured: Measurement, start: Mapping[str, float], hold: Mapping[str, float] | None = None
-) -> JointFit:
+def fit_jointly(measured: Measurement, start: Mapping[str, float], hold: Mapping[str, float] | None = None) -> JointFit:
     """Fit Eq. 18-19 to all readings at once.
 
     Parameters
@@ -310,9 +305,7 @@ def _upright(values: dict[str, float]) -> dict[str, float]:
     return {n: abs(v) if n.startswith(("gamma", "c")) else v for n, v in values.items()}
 
 
-def _judged(
-    measured: Measurement, found: Solution, free: tuple[str, ...], values: dict[str, float]
-) -> JointFit:
+def _judged(measured: Measurement, found: Solution, free: tuple[str, ...], values: dict[str, float]) -> JointFit:
     errors = dict(zip(free, map(float, found.errors), strict=True))
     correlation = found.correlation
     clusters = [curve.rows for curve in measured.curves]
@@ -320,10 +313,16 @@ def _judged(
     doubtful = [n for n in free if np.fmax(errors[n], by_curve[n]) > LARGE_ERROR * _scale(n, values)]
     off = np.abs(correlation) * [name not in doubtful for name in free]
     return JointFit(
-        free, values, errors, by_curve, correlation, Quality.of(measured.torque, found.residuals),
-        found.residuals, _neighbours(measured, found.residuals),
+        free,
+        values,
+        errors,
+        by_curve,
+        correlation,
+        Quality.of(measured.torque, found.residuals),
+        found.residuals,
+        _neighbours(measured, found.residuals),
         {n: free[int(off[free.index(n)].argmax())] for n in doubtful},
-    )  # fmt: skip
+    )
 
 
 def _scale(name: str, values: Mapping[str, float]) -> float:
@@ -373,9 +372,8 @@ def fit_dipoles(measured: Measurement, *, place: bool = False) -> DipoleFit:
         best = int(np.argmin([(r := at(float(g))[1]) @ r for g in grid]))
         low, high = grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)]
         found = minimize_scalar(
-            lambda g: (r := at(g)[1]) @ r, bounds=(low, high), method="bounded",
-            options={"xatol": 1e-9 * reach},
-        )  # fmt: skip
+            lambda g: (r := at(g)[1]) @ r, bounds=(low, high), method="bounded", options={"xatol": 1e-9 * reach}
+        )
         h = float(found.x)
     strength, residuals = at(h)
     if not (np.isfinite(residuals).all() and strength > 0.0):

@@ -105,9 +105,7 @@ class Correction(Table):
     @model_validator(mode="after")
     def _once(self) -> Correction:
         if self.without is not None and (self.weights or self.tie is not None):
-            raise ValueError(
-                "readings without the magnets have the weights already; set weights = false and drop tie."
-            )
+            raise ValueError("readings without the magnets have the weights already; set weights = false and drop tie.")
         return self
 
 
@@ -129,13 +127,9 @@ class Header(Table):
     delimiter: Literal[",", ";", "\t"] = Field(",", description="Separator of the table's fields.")
     decimal: Literal[".", ","] = Field(".", description="Decimal sign of the table.")
     model: str = Field(laws.MODEL, description="Model whose torque is fitted.")
-    preset: str | None = Field(
-        None, description="Preset, or a preset's file, with the parameters that are not fitted."
-    )
+    preset: str | None = Field(None, description="Preset, or a preset's file, with the parameters that are not fitted.")
     columns: Columns = Field(description="Columns of the table.")
-    parameters: dict[str, float] = Field(
-        {}, description="Known parameters of the rig; they replace the preset's."
-    )
+    parameters: dict[str, float] = Field({}, description="Known parameters of the rig; they replace the preset's.")
     provenance: dict[str, str] = Field({}, description="Origin of each value in [parameters].")
     correction: Correction = Field(description="Torques in the readings besides the magnets' torque.")
     hold: Annotated[tuple[str, ...], Field(strict=False)] = Field(
@@ -226,9 +220,7 @@ def curves_of(locked: np.ndarray, side: np.ndarray) -> tuple[Curve, ...]:
         rows = np.flatnonzero(side == code)
         rows = rows[np.argsort(locked[rows], kind="stable")]
         breaks = np.flatnonzero(np.diff(locked[rows]) > SAME_ANGLE) + 1
-        found += [
-            Curve(code, float(np.median(locked[r])), np.sort(r)) for r in np.split(rows, breaks) if len(r)
-        ]
+        found += [Curve(code, float(np.median(locked[r])), np.sort(r)) for r in np.split(rows, breaks) if len(r)]
     return tuple(found)
 
 
@@ -283,11 +275,7 @@ def read_measurement(path: str | Path) -> Measurement:
 
 
 def _besides(
-    correction: Correction,
-    p: Parameters,
-    angle: np.ndarray,
-    locked: np.ndarray,
-    columns: Mapping[str, np.ndarray],
+    correction: Correction, p: Parameters, angle: np.ndarray, locked: np.ndarray, columns: Mapping[str, np.ndarray]
 ) -> np.ndarray:
     """Return the torque in the readings that does not come from the magnets [N m]."""
     if correction.without is not None:
@@ -337,12 +325,7 @@ def _table(path: Path, header: Header) -> tuple[dict[str, list[str]], bytes, lis
         return {}, b"", [f"file = {header.file!r}: is not text in UTF-8; write the table as CSV."], []
     rows = list(csv.reader((line for line in lines if not line.startswith("#")), delimiter=header.delimiter))
     if len(rows) < 2:
-        return (
-            {},
-            content,
-            [f"file = {header.file!r}: has no readings; names in the first row, then numbers."],
-            [],
-        )
+        return ({}, content, [f"file = {header.file!r}: has no readings; names in the first row, then numbers."], [])
     names = [name.strip() for name in rows[0]]
     wanted, warnings = _but_for_units(_wanted(header), names, header)
     problems = [
@@ -367,9 +350,7 @@ def _wanted(header: Header) -> dict[str, str]:
     return found
 
 
-def _but_for_units(
-    wanted: dict[str, str], names: list[str], header: Header
-) -> tuple[dict[str, str], list[str]]:
+def _but_for_units(wanted: dict[str, str], names: list[str], header: Header) -> tuple[dict[str, str], list[str]]:
     """Accept columns whose names have a unit in brackets besides, for the header gives it; warn of them."""
     found, warnings = dict(wanted), []
     for key, name in wanted.items():

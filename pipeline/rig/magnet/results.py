@@ -41,21 +41,27 @@ def report_of(outcome: Outcome) -> dict[str, Any]:
         for fit in outcome.curves
     ]
     return {
-        "title": m.header.title, "synthetic": m.header.synthetic, "model": m.header.model,
-        "header": m.path.name, "file": m.header.file, "sha256": m.digest, "n_readings": len(m.torque),
+        "title": m.header.title,
+        "synthetic": m.header.synthetic,
+        "model": m.header.model,
+        "header": m.path.name,
+        "file": m.header.file,
+        "sha256": m.digest,
+        "n_readings": len(m.torque),
         "correction": m.header.correction.model_dump(mode="json"),
         "parameters": {name: m.parameters[name] for name in sorted(m.header.parameters)},
         "curves": curves,
         "over_locked_angle": {
-            "values": outcome.laws.values, "standard_errors": outcome.laws.errors, "r2": outcome.laws.r2,
+            "values": outcome.laws.values,
+            "standard_errors": outcome.laws.errors,
+            "r2": outcome.laws.r2,
         },
         "joint": _joint(outcome.joint),
         "joint_with_nothing_held": _joint(outcome.unheld) if outcome.unheld else None,
-        "point_dipoles": {
-            "at_the_magnet": _dipoles(outcome.dipoles), "best_place": _dipoles(outcome.placed_dipoles),
-        },
-        "versions": versions(), **provenance(),
-    }  # fmt: skip
+        "point_dipoles": {"at_the_magnet": _dipoles(outcome.dipoles), "best_place": _dipoles(outcome.placed_dipoles)},
+        "versions": versions(),
+        **provenance(),
+    }
 
 
 def _joint(fit: JointFit) -> dict[str, Any]:
@@ -68,9 +74,11 @@ def _joint(fit: JointFit) -> dict[str, Any]:
         "standard_errors_by_curve": by_curve,
         "correlation": {"names": list(fit.free), "matrix": fit.correlation.tolist()},
         "transition": {"slope": line.slope, "offset_rad": line.offset},
-        "r2": fit.quality.r2, "rms_Nm": fit.quality.rms, "neighbours_correlate": fit.neighbours,
+        "r2": fit.quality.r2,
+        "rms_Nm": fit.quality.rms,
+        "neighbours_correlate": fit.neighbours,
         "undetermined": fit.undetermined,
-    }  # fmt: skip
+    }
 
 
 def _dipoles(fit: DipoleFit) -> dict[str, Any]:
@@ -95,17 +103,20 @@ def write_presets(outcome: Outcome, folder: Path) -> list[Path]:
     fitted = {name: joint.values[name] for name in joint.free}
     sources = {name: f"joint fit of {origin}, {_error(joint, name, m)}" for name in fitted}
     first = write_preset(
-        folder / PRESET, m.header.model, stated | fitted, known | sources, m.label,
-        base=_base(m, m.header.model),
-    )  # fmt: skip
+        folder / PRESET, m.header.model, stated | fitted, known | sources, m.label, base=_base(m, m.header.model)
+    )
     poles = {name: value for name, value in outcome.dipoles.values.items() if name != "h"}
     phrase = f"point dipoles fitted to {origin}, R2 = {outcome.dipoles.quality.r2:.3f}"
     names = load_model(laws.DIPOLES).parameter_names
     shared = {name: value for name, value in stated.items() if name in names}
     second = write_preset(
-        folder / DIPOLE_PRESET, laws.DIPOLES, shared | poles, known | dict.fromkeys(poles, phrase),
-        f"point dipoles for {m.label}", base=_base(m, laws.DIPOLES),
-    )  # fmt: skip
+        folder / DIPOLE_PRESET,
+        laws.DIPOLES,
+        shared | poles,
+        known | dict.fromkeys(poles, phrase),
+        f"point dipoles for {m.label}",
+        base=_base(m, laws.DIPOLES),
+    )
     return [first, second]
 
 

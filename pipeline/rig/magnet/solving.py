@@ -89,9 +89,16 @@ def solve(
     """
     with np.errstate(all="ignore"):
         found = least_squares(
-            residuals, start, slopes, method="lm", x_scale="jac", ftol=4 * _EPS, xtol=4 * _EPS, gtol=4 * _EPS,
+            residuals,
+            start,
+            slopes,
+            method="lm",
+            x_scale="jac",
+            ftol=4 * _EPS,
+            xtol=4 * _EPS,
+            gtol=4 * _EPS,
             max_nfev=MAX_EVALUATIONS,
-        )  # fmt: skip
+        )
         finite = bool(np.isfinite(found.x).all() and np.isfinite(found.fun).all())
         if found.status < 1 or not finite:
             raise ArithmeticError(f"{what}: the fit did not converge ({found.message}); it is no result.")

@@ -64,10 +64,12 @@ def compare_with(measured: xr.Dataset, computed: Computed, *, seed: int = 0) -> 
     f = measured["frequency"].values
     if not any(computed.place(float(x)) >= 0 for x in f):
         own = computed.frequencies
-        raise SpecError([
-            f"frequency: measured from {f.min():.4g} to {f.max():.4g} Hz, computed from {own.min():.4g} to "
-            f"{own.max():.4g} Hz; the ranges do not overlap: run the model over the measured range."
-        ])  # fmt: skip
+        raise SpecError(
+            [
+                f"frequency: measured from {f.min():.4g} to {f.max():.4g} Hz, computed from {own.min():.4g} to "
+                f"{own.max():.4g} Hz; the ranges do not overlap: run the model over the measured range."
+            ]
+        )
     ids = computed.attractors["attractor"].values
     distances = np.full((f.size, ids.size), np.nan)
     rows = [_step(measured, i, computed, distances[i], seed) for i in range(f.size)]
@@ -82,10 +84,12 @@ def compare_with(measured: xr.Dataset, computed: Computed, *, seed: int = 0) -> 
         "same_period": ("1", "whether the periods agree"),
         "same_side": ("1", "whether the sides agree"),
     }
-    found = measured.assign({
-        n: ("step", np.array([row[n] for row in rows]), {"units": u, "long_name": text})
-        for n, (u, text) in names.items()
-    })  # fmt: skip
+    found = measured.assign(
+        {
+            n: ("step", np.array([row[n] for row in rows]), {"units": u, "long_name": text})
+            for n, (u, text) in names.items()
+        }
+    )
     found = found.assign(distances=(("step", "attractor"), distances, {"units": "1"}))
     found = found.assign_coords(attractor=ids)
     classifier = computed.model.classifier
@@ -97,9 +101,7 @@ def compare_with(measured: xr.Dataset, computed: Computed, *, seed: int = 0) -> 
     )
 
 
-def _step(
-    measured: xr.Dataset, step: int, computed: Computed, distances: np.ndarray, seed: int
-) -> dict[str, float]:
+def _step(measured: xr.Dataset, step: int, computed: Computed, distances: np.ndarray, seed: int) -> dict[str, float]:
     """Return the comparison of one step; fill its row of `distances`."""
     states = [str(s) for s in measured["state"].values]
     geometry = geometry_of(states, computed.model.state_names, Geometry.of(computed.model))
@@ -136,14 +138,7 @@ def _agreement(measured: xr.Dataset, step: int, winner: Candidate) -> dict[str, 
 
 def _with_edges(found: xr.Dataset, edges: list[WindowEdge]) -> xr.Dataset:
     plain = [asdict(e) | {"shift_hz": e.shift_hz, "shift_error_hz": e.shift_error_hz} for e in edges]
-    hz = (
-        "measured_hz",
-        "measured_error_hz",
-        "computed_hz",
-        "computed_error_hz",
-        "shift_hz",
-        "shift_error_hz",
-    )
+    hz = ("measured_hz", "measured_error_hz", "computed_hz", "computed_error_hz", "shift_hz", "shift_error_hz")
     columns: dict[str, tuple[str, np.ndarray]] = {
         f"edge_{n}": ("edge", np.array([p[n] for p in plain], np.float64)) for n in hz
     }

@@ -14,14 +14,7 @@ from magpend_core.models.model import Model
 from magpend_core.models.parameters import Parameters
 from pipeline.analysis.selection import choose, select_points, start_dims
 from pipeline.analysis.sets import Geometry
-from pipeline.layout.vocabulary import (
-    ABSENT,
-    APERIODIC,
-    FREQUENCY_DIM,
-    PERIODIC_ORBIT,
-    UNSTABLE,
-    split_dims,
-)
+from pipeline.layout.vocabulary import ABSENT, APERIODIC, FREQUENCY_DIM, PERIODIC_ORBIT, UNSTABLE, split_dims
 from pipeline.rig.measured.distances import Candidate
 from pipeline.runs.derive import AnalysedRun, refused
 from pipeline.spec.problems import SpecError
@@ -42,16 +35,20 @@ def cube_and_parameters(
     where = run.name
     model = load_model(model)
     if run.model is not model:
-        raise SpecError([
-            f"{where}: a run of the model {run.model.name}, while the recordings' mapping says {model.name}: "
-            "give a run of that model, or correct model in the mapping."
-        ])  # fmt: skip
+        raise SpecError(
+            [
+                f"{where}: a run of the model {run.model.name}, while the recordings' mapping says {model.name}: "
+                "give a run of that model, or correct model in the mapping."
+            ]
+        )
     cube = run.cube()
     if FREQUENCY_DIM not in cube["status"].dims:
-        raise SpecError([
-            f"{where}: sweeps no drive frequency, so there is nothing to hold a measured sweep against: run "
-            "a specification with axes.frequency_hz."
-        ])  # fmt: skip
+        raise SpecError(
+            [
+                f"{where}: sweeps no drive frequency, so there is nothing to hold a measured sweep against: run "
+                "a specification with axes.frequency_hz."
+            ]
+        )
     with refused(where):
         part = select_points(cube, at)
         long = [d for d in split_dims(part["status"])[0] if d != FREQUENCY_DIM and part.sizes[d] > 1]
@@ -167,12 +164,7 @@ class Computed:
         frequency = self.frequencies[place]
         dims = start_dims(self.attractors)
         ids = self.attractors["attractor_id"].isel({FREQUENCY_DIM: place}).transpose(*dims).values
-        cells = (
-            self.cube["section"]
-            .sel({FREQUENCY_DIM: frequency})
-            .transpose(*dims, "period_index", "state")
-            .values
-        )
+        cells = self.cube["section"].sel({FREQUENCY_DIM: frequency}).transpose(*dims, "period_index", "state").values
         points = cells[ids == attractor].reshape(-1, cells.shape[-1])
         points = points[np.isfinite(points).all(axis=1)]
         return points if len(points) else self._points(place, attractor)

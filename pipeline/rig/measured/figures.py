@@ -85,8 +85,16 @@ def plot_measured(
         axes[1].set_ylabel("")
         axes[1].tick_params(labelleft=False)
         for ax, text in zip(axes, (_rig(measured), "computed"), strict=True):
-            ax.text(0.045, 0.955, text, transform=ax.transAxes, va="top", fontsize=fig.look.label, zorder=5.0,
-                    bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.85, "pad": 1.5})  # fmt: skip
+            ax.text(
+                0.045,
+                0.955,
+                text,
+                transform=ax.transAxes,
+                va="top",
+                fontsize=fig.look.label,
+                zorder=5.0,
+                bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.85, "pad": 1.5},
+            )
     over = diagram is not None and layout == "over"
     _draw_steps(axes[0], measured, values, over)
     motions = motions_of(measured)
@@ -118,9 +126,7 @@ def _ranges(
 def _data(measured: xr.Dataset, values: np.ndarray, measure: labels.Measure) -> xr.Dataset:
     about = {"units": measure.unit, "long_name": f"{measure.name} at the rising edge"}
     kept = ["orbit_period", "confidence", "side", "frequency_error_hz"]
-    data = measured[[n for n in kept if n in measured]].assign(
-        value=(("step", "period_index"), values, about)
-    )
+    data = measured[[n for n in kept if n in measured]].assign(value=(("step", "period_index"), values, about))
     return data.drop_vars(["state", "state_units"], errors="ignore").assign_attrs(title="measured diagram")
 
 
@@ -144,17 +150,24 @@ def _draw_steps(ax: Axes, measured: xr.Dataset, values: np.ndarray, over: bool) 
             shown = np.isfinite(values[chosen])
             size, tint = _LOOKS[way]
             colour = style.tinted(motions.colours[int(code)], tint)
-            look: dict[str, Any] = {
-                "marker": "o",
-                "markersize": size,
-                "markeredgewidth": 0.0,
-                "color": colour,
-            }
+            look: dict[str, Any] = {"marker": "o", "markersize": size, "markeredgewidth": 0.0, "color": colour}
             if over:
-                look = {"marker": _MARKERS[way], "markersize": 3.4, "markeredgewidth": 0.5,
-                        "markeredgecolor": "black", "markerfacecolor": "none"}  # fmt: skip
-            ax.plot(x[shown], values[chosen][shown], linestyle="none", rasterized=True, zorder=3.0,
-                    gid=f"measured:{way}:{motions.words[int(code)]}", **look)  # fmt: skip
+                look = {
+                    "marker": _MARKERS[way],
+                    "markersize": 3.4,
+                    "markeredgewidth": 0.5,
+                    "markeredgecolor": "black",
+                    "markerfacecolor": "none",
+                }
+            ax.plot(
+                x[shown],
+                values[chosen][shown],
+                linestyle="none",
+                rasterized=True,
+                zorder=3.0,
+                gid=f"measured:{way}:{motions.words[int(code)]}",
+                **look,
+            )
 
 
 def _handles(measured: xr.Dataset, motions: Motions, diagram: Diagram | None, over: bool) -> list[Any]:
@@ -164,9 +177,7 @@ def _handles(measured: xr.Dataset, motions: Motions, diagram: Diagram | None, ov
         present = set(measured["side"].values.tolist())
         handles = [style.dot(motions.words[c], motions.colours[c]) for c in motions.drawn if c in present]
     if over:
-        handles += [
-            style.dot(f"{_rig(measured)}, {w}", "black", 4.0, face="none", marker=_MARKERS[w]) for w in ways
-        ]
+        handles += [style.dot(f"{_rig(measured)}, {w}", "black", 4.0, face="none", marker=_MARKERS[w]) for w in ways]
     elif diagram is None or len(diagram.layers) < 2:
         handles += [style.dot(w, style.tinted("black", _LOOKS[w][1]), _LOOKS[w][0] + 1.5) for w in ways]
         if diagram is None and int(measured.attrs.get("simulated", 0)):
@@ -175,9 +186,8 @@ def _handles(measured: xr.Dataset, motions: Motions, diagram: Diagram | None, ov
 
 
 def plot_comparison(
-    compared: xr.Dataset, computed: Computed, *, state: str = "", degrees: bool = False,
-    frame: style.Frame = style.WIDE,
-) -> style.DataFigure:  # fmt: skip
+    compared: xr.Dataset, computed: Computed, *, state: str = "", degrees: bool = False, frame: style.Frame = style.WIDE
+) -> style.DataFigure:
     """Draw measured points over the attractors, their distances in units of noise, and both regimes.
 
     Parameters
@@ -271,9 +281,18 @@ def _draw_attractors(ax: Axes, computed: Computed, measure: labels.Measure, met:
         kept = np.isfinite(values[:, i])
         if kept.any():
             own = number in met.colours
-            ax.plot(x[kept], values[:, i][kept], linestyle="none", marker="o", markersize=1.6 if own else 1.2,
-                    zorder=2.0 if own else 1.8, markeredgewidth=0.0, color=met.colours.get(number, UNMET),
-                    rasterized=True, gid=f"points:{letter(number)}")  # fmt: skip
+            ax.plot(
+                x[kept],
+                values[:, i][kept],
+                linestyle="none",
+                marker="o",
+                markersize=1.6 if own else 1.2,
+                zorder=2.0 if own else 1.8,
+                markeredgewidth=0.0,
+                color=met.colours.get(number, UNMET),
+                rasterized=True,
+                gid=f"points:{letter(number)}",
+            )
 
 
 def _draw_distances(ax: Axes, compared: xr.Dataset, met: _Met) -> None:
@@ -285,9 +304,18 @@ def _draw_distances(ax: Axes, compared: xr.Dataset, met: _Met) -> None:
         for number in np.unique(winners[winners >= 0]):
             chosen = (ways == way) & (winners == number)
             face = met.colours[int(number)] if way != "down" else "white"
-            ax.plot(f[chosen], d[chosen], linestyle="none", marker=_MARKERS[way], markersize=4.0, zorder=2.0,
-                    markeredgewidth=0.8, markeredgecolor=met.colours[int(number)], markerfacecolor=face,
-                    gid=f"distance:{way}:{letter(int(number))}")  # fmt: skip
+            ax.plot(
+                f[chosen],
+                d[chosen],
+                linestyle="none",
+                marker=_MARKERS[way],
+                markersize=4.0,
+                zorder=2.0,
+                markeredgewidth=0.8,
+                markeredgecolor=met.colours[int(number)],
+                markerfacecolor=face,
+                gid=f"distance:{way}:{letter(int(number))}",
+            )
     known = d[np.isfinite(d)]
     if known.size:
         ax.set_ylim(min(0.5, 0.7 * float(known.min())), max(10.0, 1.6 * float(known.max())))
@@ -299,23 +327,19 @@ def _draw_regimes(ax: Axes, compared: xr.Dataset, motions: Motions, ways: Sequen
     for way in ways:
         chosen = np.flatnonzero(compared["direction"].values == way)
         chosen = chosen[np.argsort(compared["frequency"].values[chosen], kind="stable")]
-        for who, period, side in (
-            ("rig", "orbit_period", "side"),
-            ("model", "computed_period", "computed_side"),
-        ):
+        for who, period, side in (("rig", "orbit_period", "side"), ("model", "computed_period", "computed_side")):
             place = -len(rows)
             rows.append(f"{who}, {way}" if way != "none" else who)
             sides = compared[side].values[chosen] if side in compared else np.zeros(chosen.size, int)
-            _draw_strip(ax, compared["frequency"].values[chosen], compared[period].values[chosen], sides,
-                        place, motions)  # fmt: skip
+            _draw_strip(
+                ax, compared["frequency"].values[chosen], compared[period].values[chosen], sides, place, motions
+            )
     ax.set_yticks(-np.arange(len(rows)), rows)
     ax.tick_params(axis="y", which="both", length=0.0)
     ax.set_ylim(-len(rows) + 0.4, 0.6)
 
 
-def _draw_strip(
-    ax: Axes, f: np.ndarray, periods: np.ndarray, sides: np.ndarray, place: int, motions: Motions
-) -> None:
+def _draw_strip(ax: Axes, f: np.ndarray, periods: np.ndarray, sides: np.ndarray, place: int, motions: Motions) -> None:
     edges = style.edges(f)
     size = style.look_of(ax).tick - 1.5
     whole = float(edges[-1] - edges[0])
@@ -326,22 +350,29 @@ def _draw_strip(
         members = list(run)
         low, high = edges[members[0]], edges[members[-1] + 1]
         colour = style.tinted(motions.colours[side] if side else "0.5", 0.0 if period == 0 else 0.45)
-        ax.add_patch(Rectangle((low, place - 0.42), high - low, 0.84, facecolor=colour, edgecolor="white",
-                               linewidth=0.4, gid=f"regime:{period}:{side}"))  # fmt: skip
+        ax.add_patch(
+            Rectangle(
+                (low, place - 0.42),
+                high - low,
+                0.84,
+                facecolor=colour,
+                edgecolor="white",
+                linewidth=0.4,
+                gid=f"regime:{period}:{side}",
+            )
+        )
         if high - low > 0.012 * whole:
             text, ink = (str(period), "black") if period else ("×", "white")
-            ax.text(
-                0.5 * (low + high), place - 0.03, text, ha="center", va="center", fontsize=size, color=ink
-            )
+            ax.text(0.5 * (low + high), place - 0.03, text, ha="center", va="center", fontsize=size, color=ink)
 
 
 def _comparison_handles(compared: xr.Dataset, met: _Met, motions: Motions, ways: Sequence[str]) -> list[Any]:
     handles: list[Any] = [style.dot(name, met.colours[i]) for i, name in met.names.items()]
     handles += [style.dot("not met by the rig", UNMET)] if met.others else []
     handles += [
-        style.dot(f"{_rig(compared)}{', ' + w if w != 'none' else ''}", "black", 4.0, face="none",
-                  marker=_MARKERS[w]) for w in ways
-    ]  # fmt: skip
+        style.dot(f"{_rig(compared)}{', ' + w if w != 'none' else ''}", "black", 4.0, face="none", marker=_MARKERS[w])
+        for w in ways
+    ]
     codes = {*compared["computed_side"].values.tolist()}
     codes |= set(compared["side"].values.tolist()) if "side" in compared else set()
     handles += [

@@ -101,10 +101,12 @@ def measure(
     way = way or Way()
     models = sorted({model_of(r) for r in recordings}, key=lambda model: model.name)
     if len(models) != 1:
-        raise SpecError([
-            f"recordings: of the models {', '.join(m.name for m in models) or 'none'}; a diagram is drawn of "
-            "one: give recordings whose mappings name the same model."
-        ])  # fmt: skip
+        raise SpecError(
+            [
+                f"recordings: of the models {', '.join(m.name for m in models) or 'none'}; a diagram is drawn of "
+                "one: give recordings whose mappings name the same model."
+            ]
+        )
     (model,) = models
     known = model.load() if parameters is None else parameters
     steps = [step for i, r in enumerate(recordings) for step in _steps(r, i, way, known)]
@@ -166,12 +168,7 @@ def _with_instants(
 
 
 def _shaken(
-    points: np.ndarray,
-    noise: np.ndarray,
-    kink: np.ndarray,
-    names: tuple[str, ...],
-    model: Model,
-    shake_s: float,
+    points: np.ndarray, noise: np.ndarray, kink: np.ndarray, names: tuple[str, ...], model: Model, shake_s: float
 ) -> np.ndarray:
     """Return the expected scatter of a closed motion whose drive itself jitters.
 
@@ -192,15 +189,17 @@ def _check(steps: Sequence[_Step], recordings: Sequence[xr.Dataset]) -> None:
     """Refuse recordings without sections, or with different states."""
     if not steps:
         names = ", ".join(name_of(r) for r in recordings)
-        raise SpecError([
-            f"{names}: no stretch of one frequency holds {LEAST} sections; choose longer recordings, a "
-            "smaller transient, or a window of a slow sweep."
-        ])  # fmt: skip
+        raise SpecError(
+            [
+                f"{names}: no stretch of one frequency holds {LEAST} sections; choose longer recordings, a "
+                "smaller transient, or a window of a slow sweep."
+            ]
+        )
     states = sorted({", ".join(s.state) for s in steps})
     if len(states) > 1:
-        raise SpecError([
-            f"recordings: they hold different states ({'; '.join(states)}); map the same channels of all."
-        ])  # fmt: skip
+        raise SpecError(
+            [f"recordings: they hold different states ({'; '.join(states)}); map the same channels of all."]
+        )
 
 
 def _dataset(steps: Sequence[_Step], model: Model, recordings: Sequence[xr.Dataset]) -> xr.Dataset:
@@ -213,11 +212,7 @@ def _dataset(steps: Sequence[_Step], model: Model, recordings: Sequence[xr.Datas
     about = {"units": "see state_units", "long_name": "state at the rising edge"}
     timing, regime = [s.stretch.timing for s in steps], [s.regime for s in steps]
     rows = {
-        "frequency_error_hz": (
-            [t.frequency_error_hz for t in timing],
-            "Hz",
-            "standard error of the frequency",
-        ),
+        "frequency_error_hz": ([t.frequency_error_hz for t in timing], "Hz", "standard error of the frequency"),
         "jitter_s": ([t.jitter_s for t in timing], "s", "scatter of the rising edges"),
         "duty_cycle": ([t.duty_cycle for t in timing], "1", "share of the period in the high state"),
         "duty_cycle_error": ([t.duty_cycle_error for t in timing], "1", "standard error of the duty cycle"),
@@ -247,13 +242,12 @@ def _dataset(steps: Sequence[_Step], model: Model, recordings: Sequence[xr.Datas
             "state": list(steps[0].state),
             "state_units": ("state", [model.state(n).unit for n in steps[0].state]),
         },
-    )  # fmt: skip
+    )
     files = [{"file": name_of(r), "sha256": str(r.attrs.get("sha256", ""))} for r in recordings]
     simulated = any(int(r.attrs.get("simulated", 0)) for r in recordings)
     return found.assign_attrs(
-        title="measured diagram", model=model_attribute(model), simulated=int(simulated),
-        recordings=json.dumps(files),
-    )  # fmt: skip
+        title="measured diagram", model=model_attribute(model), simulated=int(simulated), recordings=json.dumps(files)
+    )
 
 
 def _about(units: str, text: str) -> dict[str, str]:

@@ -18,9 +18,7 @@ RIG, MODEL = "0.15", style.VERMILLION
 SUFFIX = "_computed"
 
 
-def plot_series(
-    ds: xr.Dataset, *, degrees: bool = False, frame: style.Frame = style.WIDE
-) -> style.DataFigure:
+def plot_series(ds: xr.Dataset, *, degrees: bool = False, frame: style.Frame = style.WIDE) -> style.DataFigure:
     """Draw the series of `pipeline.rig.measured.series.series_of` over each other, and phase portraits.
 
     Parameters
@@ -49,9 +47,7 @@ def plot_series(
     fig = style.new_figure(max(1.25 * n, 2.4 * m) + 0.7, ds, frame)
     outer = fig.add_gridspec(1, 2, width_ratios=[1.55, 1.0])
     left, right = outer[0].subgridspec(n, 1), outer[1].subgridspec(m, 1)
-    measures = {
-        s.name: labels.state_measure(ds, s.name, degrees and s.unit.startswith("rad")) for s in model.states
-    }
+    measures = {s.name: labels.state_measure(ds, s.name, degrees and s.unit.startswith("rad")) for s in model.states}
     axes = [fig.add_subplot(left[i]) for i in range(n)]
     _draw_series(axes, ds, model, measures)
     for k, pair in enumerate(model.portraits):
@@ -85,8 +81,15 @@ def _draw_series(axes: list[Axes], ds: xr.Dataset, model: Model, measures: dict[
         ax.set_xlim(float(time[0]), float(time[-1]))
         low, high = ax.get_ylim()
         ax.set_ylim(low, high + 0.25 * (high - low))  # room for the words
-        ax.text(0.99, 0.93, f"rms {rms[s.name] * m.factor:.3g} {m.unit}", transform=ax.transAxes, ha="right",
-                va="top", fontsize=style.look_of(ax).tick - 1.0)  # fmt: skip
+        ax.text(
+            0.99,
+            0.93,
+            f"rms {rms[s.name] * m.factor:.3g} {m.unit}",
+            transform=ax.transAxes,
+            ha="right",
+            va="top",
+            fontsize=style.look_of(ax).tick - 1.0,
+        )
         style.label_axes(ax, y=m.label)
         labels.angle_ticks(ax, m, most=5.0)
     style.label_axes(axes[-1], x="time [s]")

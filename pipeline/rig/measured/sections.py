@@ -69,10 +69,12 @@ def channels_of(recording: xr.Dataset, model: Model) -> list[Channel]:
 
     found = [channel(i, s) for i, s in enumerate(model.states) if s.name in recording]
     if not found:
-        raise SpecError([
-            f"{name_of(recording)}: none of the states of {model.name} ({', '.join(names)}) is measured: "
-            "name at least one under [channels] of the mapping."
-        ])  # fmt: skip
+        raise SpecError(
+            [
+                f"{name_of(recording)}: none of the states of {model.name} ({', '.join(names)}) is measured: "
+                "name at least one under [channels] of the mapping."
+            ]
+        )
     return found
 
 
@@ -81,9 +83,7 @@ def name_of(recording: xr.Dataset) -> str:
     return str(recording.attrs.get("file") or "the recording")
 
 
-def find_sections(
-    recording: xr.Dataset, edges: Edges, *, window_s: float = WINDOW_S, order: int = ORDER
-) -> xr.Dataset:
+def find_sections(recording: xr.Dataset, edges: Edges, *, window_s: float = WINDOW_S, order: int = ORDER) -> xr.Dataset:
     """Return states at the rising edges, by local polynomials with a kink at the edge.
 
     Parameters
@@ -117,10 +117,12 @@ def find_sections(
     known = sorted({c.place for c in channels} | {c.slope for c in channels} - {-1})
     fits = _fits(recording, edges, channels, window_s, order)
     if not fits:
-        raise SpecError([
-            f"{name_of(recording)}: no rising edge of the drive has samples on either side; choose a longer "
-            "stretch of the recording, or a shorter window_s."
-        ])  # fmt: skip
+        raise SpecError(
+            [
+                f"{name_of(recording)}: no rising edge of the drive has samples on either side; choose a longer "
+                "stretch of the recording, or a shorter window_s."
+            ]
+        )
     kept, values, spread, variance, jumps = (np.array(part) for part in zip(*fits, strict=True))
     noise = np.sqrt(np.median(variance, axis=0))
     section, blur, kink = (np.full((len(kept), len(model.states)), np.nan) for _ in range(3))
@@ -146,10 +148,13 @@ def find_sections(
             "state_units": ("state", units),
         },
         attrs={
-            "model": model_attribute(model), "file": name_of(recording), "window_s": window_s, "order": order,
+            "model": model_attribute(model),
+            "file": name_of(recording),
+            "window_s": window_s,
+            "order": order,
             "noise": json.dumps({c.name: float(s) for c, s in zip(channels, noise, strict=True)}),
         },
-    )  # fmt: skip
+    )
 
 
 def _check(recording: xr.Dataset, window_s: float, order: int) -> None:
@@ -159,10 +164,12 @@ def _check(recording: xr.Dataset, window_s: float, order: int) -> None:
     step = float(np.median(np.diff(recording["time"].values)))
     least = 2 * (order + _LEAST_SPARE) * step
     if not window_s >= least:
-        raise SpecError([
-            f"window_s = {window_s:g}: must be at least {least:.3g} at {1 / step:g} samples per second and "
-            f"order {order}."
-        ])  # fmt: skip
+        raise SpecError(
+            [
+                f"window_s = {window_s:g}: must be at least {least:.3g} at {1 / step:g} samples per second and "
+                f"order {order}."
+            ]
+        )
 
 
 def _fits(

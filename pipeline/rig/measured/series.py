@@ -68,10 +68,12 @@ def series_of(
     """
     model = parameters.model
     if model_of(recording) is not model:
-        raise SpecError([
-            f"{name_of(recording)}: mapped to the model {model_of(recording).name}, while {model.name} is to "
-            "be computed: choose one of them."
-        ])  # fmt: skip
+        raise SpecError(
+            [
+                f"{name_of(recording)}: mapped to the model {model_of(recording).name}, while {model.name} is to "
+                "be computed: choose one of them."
+            ]
+        )
     if n_periods < 1:
         raise SpecError([f"periods = {n_periods}: must be at least 1."])
     edges = edges_of(recording, hysteresis=hysteresis)
@@ -81,10 +83,12 @@ def series_of(
     sections = find_sections(recording, at, window_s=window_s, order=order)
     missing = [n for n in model.state_names if n not in sections["state"].values]
     if missing:
-        raise SpecError([
-            f"{name_of(recording)}: {', '.join(missing)} at the start is not known: map its channel, or that "
-            "of the angle whose rate it is."
-        ])  # fmt: skip
+        raise SpecError(
+            [
+                f"{name_of(recording)}: {', '.join(missing)} at the start is not known: map its channel, or that "
+                "of the angle whose rate it is."
+            ]
+        )
     first, last = _part(recording, edges, sections, start_s, n_periods)
     own = _fitted(edges, first, last)
     period = (own[-1] - own[0]) / (own.size - 1)
@@ -106,11 +110,13 @@ def _part(
             # the drive changes its frequency within stretches of a few periods
             if a <= first < b and b - a >= _LEAST:
                 return first, min(b, first + n_periods)
-    raise SpecError([
-        f"start_s = {begin:g}: {name_of(recording)} has no rising edge with samples around it and {_LEAST} "
-        f"periods of one frequency after it; edges lie from {edges.rising[0]:.3f} to "
-        f"{edges.rising[-1]:.3f} s."
-    ])  # fmt: skip
+    raise SpecError(
+        [
+            f"start_s = {begin:g}: {name_of(recording)} has no rising edge with samples around it and {_LEAST} "
+            f"periods of one frequency after it; edges lie from {edges.rising[0]:.3f} to "
+            f"{edges.rising[-1]:.3f} s."
+        ]
+    )
 
 
 def _first_timing(edges: Edges) -> float:
@@ -131,19 +137,20 @@ def _fitted(edges: Edges, first: int, last: int) -> np.ndarray:
 
 
 def _dataset(
-    recording: xr.Dataset, parameters: Parameters, edges: Edges, start: np.ndarray, begin: float,
-    frequency_hz: float, n_periods: int,
-) -> xr.Dataset:  # fmt: skip
+    recording: xr.Dataset,
+    parameters: Parameters,
+    edges: Edges,
+    start: np.ndarray,
+    begin: float,
+    frequency_hz: float,
+    n_periods: int,
+) -> xr.Dataset:
     from magpend_core import trajectory
     from pipeline.rig.recordings import smooth
 
     model = parameters.model
-    chosen = (recording["time"].values >= begin) & (
-        recording["time"].values <= begin + n_periods / frequency_hz
-    )
-    margin = (recording["time"].values > begin - 1) & (
-        recording["time"].values < begin + n_periods / frequency_hz + 1
-    )
+    chosen = (recording["time"].values >= begin) & (recording["time"].values <= begin + n_periods / frequency_hz)
+    margin = (recording["time"].values > begin - 1) & (recording["time"].values < begin + n_periods / frequency_hz + 1)
     around = np.concatenate([edges.rising, edges.falling])
     smoothed = smooth(recording.isel(sample=np.flatnonzero(margin)), edges_s=np.sort(around))
     inner = chosen[margin]
@@ -158,19 +165,19 @@ def _dataset(
         off = off - 2 * np.pi * np.round(off / (2 * np.pi)) if s.on_circle else off
         about = {"units": s.unit, "long_name": s.meaning}
         variables[s.name] = ("time", source - shift, about)
-        variables[f"{s.name}_computed"] = (
-            "time",
-            states[:, i],
-            {**about, "long_name": f"{s.meaning}, computed"},
-        )
+        variables[f"{s.name}_computed"] = ("time", states[:, i], {**about, "long_name": f"{s.meaning}, computed"})
         rms[s.name] = float(np.sqrt(np.nanmean(off**2)))
     if DRIVE in recording:
         variables[DRIVE] = ("time", recording[DRIVE].values[chosen], dict(recording[DRIVE].attrs))
     axis = ("time", time, {"units": "s", "long_name": f"time since {model.section}"})
     return xr.Dataset(variables, coords={"time": axis}).assign_attrs(
-        title="recording and model from the same state", model=model_attribute(model),
+        title="recording and model from the same state",
+        model=model_attribute(model),
         frequency_hz=frequency_hz,
-        start_s=begin, start=json.dumps(dict(zip(model.state_names, start.tolist(), strict=True))),
-        rms=json.dumps(rms), simulated=int(recording.attrs.get("simulated", 0)), file=name_of(recording),
+        start_s=begin,
+        start=json.dumps(dict(zip(model.state_names, start.tolist(), strict=True))),
+        rms=json.dumps(rms),
+        simulated=int(recording.attrs.get("simulated", 0)),
+        file=name_of(recording),
         parameters="\n".join(f"{n} = {v!r}" for n, v in parameters.as_dict().items()),
-    )  # fmt: skip
+    )

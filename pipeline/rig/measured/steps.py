@@ -95,10 +95,12 @@ def cut(edges: Edges, *, transient: int = TRANSIENT, window: int | None = None) 
     if problems:
         raise SpecError(problems)
     if edges.rising.size <= LEAST:
-        raise SpecError([
-            f"drive: {edges.rising.size} rising edges; a stretch needs more than {LEAST}: choose a longer "
-            "recording, or look at the drive's channel."
-        ])  # fmt: skip
+        raise SpecError(
+            [
+                f"drive: {edges.rising.size} rising edges; a stretch needs more than {LEAST}: choose a longer "
+                "recording, or look at the drive's channel."
+            ]
+        )
     if window:
         return _directed(_windows(edges, window))
     spans = constant_spans(edges)
@@ -107,11 +109,13 @@ def cut(edges: Edges, *, transient: int = TRANSIENT, window: int | None = None) 
         return _directed(_windows(edges, WINDOW))
     if not kept:
         longest = max(b - a for a, b in spans)
-        raise SpecError([
-            f"drive: the longest stretch of one frequency has {longest} periods, and {transient} of "
-            f"transient and {LEAST} of sections are wanted: lower transient, or give window for a drive that "
-            "is swept slowly."
-        ])  # fmt: skip
+        raise SpecError(
+            [
+                f"drive: the longest stretch of one frequency has {longest} periods, and {transient} of "
+                f"transient and {LEAST} of sections are wanted: lower transient, or give window for a drive that "
+                "is swept slowly."
+            ]
+        )
     return _directed([_constant(edges, a, b, transient) for a, b in kept])
 
 
@@ -215,10 +219,12 @@ def _windows(edges: Edges, window: int) -> list[Stretch]:
         curve = np.asarray((float(bend[2]) if bend.size > 2 else 0.0) * n**2)
         found.append(_stretch(own, curve, 0))
     if not found:
-        raise SpecError([
-            f"window = {window}: the recording has {edges.rising.size - 1} periods without a gap at most; "
-            "choose a shorter window."
-        ])  # fmt: skip
+        raise SpecError(
+            [
+                f"window = {window}: the recording has {edges.rising.size - 1} periods without a gap at most; "
+                "choose a shorter window."
+            ]
+        )
     return found
 
 

@@ -83,9 +83,7 @@ def words_for(regime: Regime, words: tuple[str, ...]) -> str:
 
 def windows_of(measured: xr.Dataset, *, confident: float = CONFIDENT) -> list[Window]:
     """Return the windows of all recordings; steps with an uncertain period are skipped."""
-    keys = list(
-        zip(measured["recording"].values.tolist(), measured["direction"].values.tolist(), strict=True)
-    )
+    keys = list(zip(measured["recording"].values.tolist(), measured["direction"].values.tolist(), strict=True))
     sure = [i for i in range(len(keys)) if measured["confidence"].values[i] >= confident]
     labelled = itertools.groupby(sure, key=lambda i: (keys[i], regime_of(measured, i)))
     return [Window(regime, tuple(steps), *key) for (key, regime), steps in labelled]
@@ -119,10 +117,16 @@ def window_edges(
             note = "an unclosed motion may be a transient, which ends by chance"
         found.append(
             WindowEdge(
-                one.direction, one.regime, two.regime, 0.5 * (last + first), 0.5 * abs(first - last),
-                computed_hz, error, note,
+                one.direction,
+                one.regime,
+                two.regime,
+                0.5 * (last + first),
+                0.5 * abs(first - last),
+                computed_hz,
+                error,
+                note,
             )
-        )  # fmt: skip
+        )
     return found
 
 
@@ -147,9 +151,7 @@ def _computed_end(
     return _walk(place, sign, computed, lambda i: _is(computed.regime(i, number), window.regime, with_side))
 
 
-def _walk(
-    place: int, sign: int, computed: Computed, holds: Callable[[int], bool]
-) -> tuple[float, float, str]:
+def _walk(place: int, sign: int, computed: Computed, holds: Callable[[int], bool]) -> tuple[float, float, str]:
     """Follow the run's axis while a condition holds; return where it ends, half a step, and a note."""
     f = computed.frequencies
     while 0 <= place + sign < f.size:

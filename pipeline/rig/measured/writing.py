@@ -19,9 +19,14 @@ from pipeline.store.local import make_folder
 
 
 def write_comparison(
-    compared: xr.Dataset, computed: Computed, folder: Path, *, state: str = "", degrees: bool = False,
+    compared: xr.Dataset,
+    computed: Computed,
+    folder: Path,
+    *,
+    state: str = "",
+    degrees: bool = False,
     frame: Frame = WIDE,
-) -> list[Path]:  # fmt: skip
+) -> list[Path]:
     """Write the figures, the tables and the numbers of a comparison.
 
     Parameters
@@ -44,9 +49,7 @@ def write_comparison(
     figures = {
         "comparison": plot_comparison(compared, computed, state=state, degrees=degrees, frame=frame),
         "beside": plot_measured(compared, computed.cube, state=state, degrees=degrees, frame=frame),
-        "over": plot_measured(
-            compared, computed.cube, state=state, degrees=degrees, layout="over", frame=frame
-        ),
+        "over": plot_measured(compared, computed.cube, state=state, degrees=degrees, layout="over", frame=frame),
     }
     make_folder(folder)
     written = []

@@ -7,6 +7,17 @@ from pipeline.rig.recordings.smoothing import smooth
 from pipeline.rig.recordings.writing import mapping_for, write_raw, write_recording
 
 __all__ = [
-    "Finding", "Mapping", "findings_of", "load_mapping", "mapping_for", "parse_mapping", "read_recording",
-    "recording_of", "smooth", "summary", "window", "write_raw", "write_recording",
-]  # fmt: skip
+    "Finding",
+    "Mapping",
+    "findings_of",
+    "load_mapping",
+    "mapping_for",
+    "parse_mapping",
+    "read_recording",
+    "recording_of",
+    "smooth",
+    "summary",
+    "window",
+    "write_raw",
+    "write_recording",
+]

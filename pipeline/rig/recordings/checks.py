@@ -63,11 +63,7 @@ def constant(signal: Signal, severity: str = "warning") -> list[Finding]:
     if known.size and np.ptp(known) > 0.0:
         return []
     level = f"is {known[0]:.6g} throughout" if known.size else "has no number"
-    return [
-        signal.found(
-            "constant", 0, len(signal.raw), severity, f"{level}; is the sensor connected, and mapped?"
-        )
-    ]
+    return [signal.found("constant", 0, len(signal.raw), severity, f"{level}; is the sensor connected, and mapped?")]
 
 
 def saturated(signal: Signal, entry: ChannelMap) -> list[Finding]:
@@ -85,11 +81,14 @@ def saturated(signal: Signal, entry: ChannelMap) -> list[Finding]:
         at_end &= ~_beside_wraps(signal, 0.5 * (high - low))
     return [
         signal.found(
-            "saturated", i, k, "warning",
+            "saturated",
+            i,
+            k,
+            "warning",
             f"{k - i} samples at the end of the range from {low:g} to {high:g}: the true value lies beyond.",
         )
         for i, k in runs(at_end, signal.piece)
-    ]  # fmt: skip
+    ]
 
 
 def _beside_wraps(signal: Signal, least: float) -> np.ndarray:
@@ -121,11 +120,16 @@ def _cut_off(signal: Signal) -> list[Finding]:
                 continue
             slope = abs(raw[i - 1] - raw[i - lead]) / (lead - 1)
             if slope * length / 2.0 > CLIPPED_RISE * grain:
-                findings.append(signal.found(
-                    "saturated", i, k, "warning",
-                    f"{length} samples stay at {level:.6g}, the extreme: the top looks cut off. State the "
-                    "sensor's range in the mapping.",
-                ))  # fmt: skip
+                findings.append(
+                    signal.found(
+                        "saturated",
+                        i,
+                        k,
+                        "warning",
+                        f"{length} samples stay at {level:.6g}, the extreme: the top looks cut off. State the "
+                        "sensor's range in the mapping.",
+                    )
+                )
     return findings
 
 
@@ -142,11 +146,14 @@ def in_dead_band(signal: Signal, entry: ChannelMap) -> tuple[np.ndarray, list[Fi
     low, high = entry.dead_band
     return mask, [
         signal.found(
-            "dead-band", i, k, "warning",
+            "dead-band",
+            i,
+            k,
+            "warning",
             f"{k - i} samples in the dead band from {low:g} to {high:g} are not measured; they are NaN.",
         )
         for i, k in runs(mask, signal.piece)
-    ]  # fmt: skip
+    ]
 
 
 def unwrapped(signal: Signal, angle: np.ndarray, wraps: bool) -> tuple[np.ndarray, list[Finding]]:
@@ -215,9 +222,12 @@ def leaps(signal: Signal, angle: np.ndarray) -> list[Finding]:
     is_leap = (off > LEAP_TURNS) & (off <= JUMP_TURNS)
     return [
         signal.found(
-            "leap", i, k + 1, "error",
+            "leap",
+            i,
+            k + 1,
+            "error",
             f"leaps by {off[i:k].max():.2g} turns within a sample; if the sensor wraps here, state its dead "
             "band, so that what it reads there is left out.",
         )
         for i, k in runs(is_leap)
-    ]  # fmt: skip
+    ]

@@ -116,9 +116,7 @@ def clock_of(
 
 
 def _changes(
-    numbers: np.ndarray,
-    stretches: Sequence[Mapping[str, Channel]],
-    taken: Sequence[Mapping[str, tuple[int, int]]],
+    numbers: np.ndarray, stretches: Sequence[Mapping[str, Channel]], taken: Sequence[Mapping[str, tuple[int, int]]]
 ) -> np.ndarray:
     """Return the samples at which the file's piece number changes."""
     parts, first = [], 0
@@ -204,9 +202,7 @@ def _aligned(
     channels: Mapping[str, Channel], step: float, source: str
 ) -> tuple[dict[str, tuple[int, int]], list[Finding]]:
     """Align the channels of a stretch: from the latest start to the earliest end."""
-    starts = {
-        n: float(c.time[0]) if c.time is not None and len(c) else c.start_s for n, c in channels.items()
-    }
+    starts = {n: float(c.time[0]) if c.time is not None and len(c) else c.start_s for n, c in channels.items()}
     known = [s for s in starts.values() if math.isfinite(s)]
     first = max(known, default=0.0)
     late = {n: (first - s) / step if math.isfinite(s) else 0.0 for n, s in starts.items()}
@@ -225,22 +221,35 @@ def _start_findings(late: Mapping[str, float], step: float, all_known: bool) -> 
     for name, distance in late.items():
         whole, rest = round(distance), distance - round(distance)
         if whole:
-            findings.append(Finding(
-                "start", name, 0.0, 0.0, "warning",
-                f"begins {whole * step:.6g} s before the last channel to begin; its first {whole} "
-                "samples are left out.",
-            ))  # fmt: skip
+            findings.append(
+                Finding(
+                    "start",
+                    name,
+                    0.0,
+                    0.0,
+                    "warning",
+                    f"begins {whole * step:.6g} s before the last channel to begin; its first {whole} "
+                    "samples are left out.",
+                )
+            )
         if abs(rest) > EVEN:
-            findings.append(Finding(
-                "start", name, 0.0, 0.0, "warning",
-                f"is sampled {abs(rest) * step:.3g} s {'after' if rest < 0.0 else 'before'} the others; "
-                "it is laid on their instants as it is.",
-            ))  # fmt: skip
+            findings.append(
+                Finding(
+                    "start",
+                    name,
+                    0.0,
+                    0.0,
+                    "warning",
+                    f"is sampled {abs(rest) * step:.3g} s {'after' if rest < 0.0 else 'before'} the others; "
+                    "it is laid on their instants as it is.",
+                )
+            )
     if not all_known and any(late.values()):
-        findings.append(Finding(
-            "start", "", 0.0, 0.0, "warning",
-            "some channels do not say when they begin; with the last is assumed.",
-        ))  # fmt: skip
+        findings.append(
+            Finding(
+                "start", "", 0.0, 0.0, "warning", "some channels do not say when they begin; with the last is assumed."
+            )
+        )
     return findings
 
 
@@ -248,12 +257,16 @@ def _length_findings(lengths: Mapping[str, int], n_common: int, step: float) -> 
     short = [n for n, length in lengths.items() if length == n_common]
     return [
         Finding(
-            "length", name, n_common * step, length * step, "warning",
-            f"has {length} samples, {', '.join(short)} only {n_common}; the last {length - n_common} are "
-            "left out.",
+            "length",
+            name,
+            n_common * step,
+            length * step,
+            "warning",
+            f"has {length} samples, {', '.join(short)} only {n_common}; the last {length - n_common} are left out.",
         )
-        for name, length in lengths.items() if length > n_common
-    ]  # fmt: skip
+        for name, length in lengths.items()
+        if length > n_common
+    ]
 
 
 def _checked_stamps(stamps: list[np.ndarray], step: float, source: str) -> list[np.ndarray]:
@@ -263,9 +276,7 @@ def _checked_stamps(stamps: list[np.ndarray], step: float, source: str) -> list[
     for s in stamps:
         bad = np.flatnonzero(~np.isfinite(s))
         if bad.size:
-            raise SpecError(
-                [f"{source}: time stamp {bad[0]} is no number; give sampling_rate_hz instead of time."]
-            )
+            raise SpecError([f"{source}: time stamp {bad[0]} is no number; give sampling_rate_hz instead of time."])
     _refuse_backwards(stamps, source)
     return stamps
 
@@ -279,11 +290,15 @@ def _cut(
     even, own_step, residual = _even(time, piece, step, stated)
     findings = [
         Finding(
-            "gap", "", float(time[i - 1]), float(time[i]), "warning",
+            "gap",
+            "",
+            float(time[i - 1]),
+            float(time[i]),
+            "warning",
             f"{round((even[i] - even[i - 1]) / own_step) - 1} samples are missing; a new piece begins.",
         )
         for i in np.flatnonzero(is_gap)
-    ]  # fmt: skip
+    ]
     return even, piece, own_step, findings + _jitter_findings(even, residual, own_step)
 
 
@@ -342,9 +357,7 @@ def _refuse_backwards(stamps: list[np.ndarray], source: str) -> None:
             )
 
 
-def _one_after_another(
-    stamps: list[np.ndarray], step: float, findings: list[Finding]
-) -> tuple[list[np.ndarray], bool]:
+def _one_after_another(stamps: list[np.ndarray], step: float, findings: list[Finding]) -> tuple[list[np.ndarray], bool]:
     """Shift stretches whose clock restarts behind the stretch before; return whether any was shifted."""
     placed = [stamps[0]]
     moved = 0
@@ -354,11 +367,17 @@ def _one_after_another(
         placed.append(s - s[0] + last + step if anew else s)
         moved += anew
     if moved:
-        findings.append(Finding(
-            "pieces", "", math.nan, math.nan, "note",
-            f"the clock begins anew in {moved} of {len(stamps)} stretches; they are laid one after another, "
-            "a sampling interval apart. How far apart they were is not known.",
-        ))  # fmt: skip
+        findings.append(
+            Finding(
+                "pieces",
+                "",
+                math.nan,
+                math.nan,
+                "note",
+                f"the clock begins anew in {moved} of {len(stamps)} stretches; they are laid one after another, "
+                "a sampling interval apart. How far apart they were is not known.",
+            )
+        )
     return placed, moved > 0
 
 
@@ -394,14 +413,15 @@ def _jitter_findings(time: np.ndarray, residual: np.ndarray, step: float) -> lis
         f"{worst:.3g} s at most"
     )
     if worst < UNEVEN * step:
-        return [
-            Finding("jitter", "", float(time[0]), float(time[-1]), "note", f"{text}; even steps are used.")
-        ]
+        return [Finding("jitter", "", float(time[0]), float(time[-1]), "note", f"{text}; even steps are used.")]
     far = runs(np.abs(residual) >= UNEVEN * step)
     return [
         Finding(
-            "jitter", "", float(time[far[0, 0]]), float(time[far[-1, 1] - 1]), "warning",
-            f"{text}; even steps are used. If the sampling itself was uneven, resample the file before it "
-            "is read.",
+            "jitter",
+            "",
+            float(time[far[0, 0]]),
+            float(time[far[-1, 1] - 1]),
+            "warning",
+            f"{text}; even steps are used. If the sampling itself was uneven, resample the file before it is read.",
         )
-    ]  # fmt: skip
+    ]

@@ -80,10 +80,16 @@ def read_csv(path: Path, stated: CsvMap) -> Raw:
     last = split(body[-1], form.delimiter)
     if len(body) > 1 and len(last) < len(split(body[-2], form.delimiter)):
         body = body[:-1]
-        findings.append(Finding(
-            "truncated", "", math.nan, math.nan, "warning",
-            f"the last row has {len(last)} of {form.n_columns} fields; it is left out.",
-        ))  # fmt: skip
+        findings.append(
+            Finding(
+                "truncated",
+                "",
+                math.nan,
+                math.nan,
+                "warning",
+                f"the last row has {len(last)} of {form.n_columns} fields; it is left out.",
+            )
+        )
     found = {}
     for j, values in _columns(body, form).items():
         if np.isfinite(values).any():

@@ -22,9 +22,14 @@ MOST_DOTS = 6000
 
 LINES = (style.BLUE, style.VERMILLION, style.GREEN, style.PURPLE)
 MARKS = {
-    "gap": "0.7", "dead-band": style.ORANGE, "saturated": style.VERMILLION, "missing": style.PURPLE,
-    "wrap": "0.25", "start": style.GREEN, "leap": style.BLUE,
-}  # fmt: skip
+    "gap": "0.7",
+    "dead-band": style.ORANGE,
+    "saturated": style.VERMILLION,
+    "missing": style.PURPLE,
+    "wrap": "0.25",
+    "start": style.GREEN,
+    "leap": style.BLUE,
+}
 """Colour by kind of finding; other kinds concern a whole recording and stand in the caption."""
 
 INSTANTS = ("wrap", "start", "leap")
@@ -120,15 +125,10 @@ def _envelope(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndar
     pair = np.sort(np.column_stack([low, high]), axis=1) + n * rows[:, None]
     picked = values[pair]
     picked[~known] = np.nan
-    return (
-        np.append(time[pair].ravel(), time[whole:]),
-        np.append(picked.ravel(), values[whole:]),
-    )
+    return (np.append(time[pair].ravel(), time[whole:]), np.append(picked.ravel(), values[whole:]))
 
 
-def _mark(
-    axes: Sequence[Axes], rows: Sequence[Sequence[str]], ds: xr.Dataset, span: tuple[float, float]
-) -> list[str]:
+def _mark(axes: Sequence[Axes], rows: Sequence[Sequence[str]], ds: xr.Dataset, span: tuple[float, float]) -> list[str]:
     """Shade the findings and draw the ends of pieces; return the kinds that are marked."""
     least = LEAST_MARK * (span[1] - span[0])
     kinds: dict[str, None] = {}
@@ -160,8 +160,10 @@ def _line_handles(ds: xr.Dataset, rows: Sequence[Sequence[str]]) -> list[Any]:
     """Return the legend of panels with more than one line; colours are the same in all panels."""
     return [
         Line2D([], [], color=colour, linewidth=1.2, label=_symbol(ds, name))
-        for names in rows if len(names) > 1 for colour, name in zip(LINES, names, strict=False)
-    ]  # fmt: skip
+        for names in rows
+        if len(names) > 1
+        for colour, name in zip(LINES, names, strict=False)
+    ]
 
 
 def _caption(ds: xr.Dataset) -> str:

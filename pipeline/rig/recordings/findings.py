@@ -66,17 +66,13 @@ def findings_of(ds: xr.Dataset) -> list[Finding]:
     """Return the findings of a recording, from its attribute ``findings``."""
     rows = json.loads(ds.attrs.get("findings", "[]"))
     return [
-        Finding(**{**row, **{k: math.nan if row[k] is None else row[k] for k in ("start_s", "end_s")}})
-        for row in rows
+        Finding(**{**row, **{k: math.nan if row[k] is None else row[k] for k in ("start_s", "end_s")}}) for row in rows
     ]
 
 
 def to_json(findings: Iterable[Finding]) -> str:
     """Return findings as a JSON list; unknown times are null."""
-    rows = [
-        {k: None if isinstance(v, float) and math.isnan(v) else v for k, v in asdict(f).items()}
-        for f in findings
-    ]
+    rows = [{k: None if isinstance(v, float) and math.isnan(v) else v for k, v in asdict(f).items()} for f in findings]
     return json.dumps(rows)
 
 

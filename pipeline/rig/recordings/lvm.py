@@ -194,14 +194,26 @@ def _truncations(segment: _Segment, channels: dict[str, Channel], style: _Style)
     for j, channel in zip(_columns(segment), channels.values(), strict=True):
         stated = _number(segment, "Samples", j, style)
         if math.isfinite(stated) and len(channel) < stated:
-            findings.append(Finding(
-                "truncated", channel.name, math.nan, math.nan, "warning",
-                f"the segment from line {segment.first_line} has {len(channel)} of the {stated:.0f} samples "
-                "that its header states.",
-            ))  # fmt: skip
+            findings.append(
+                Finding(
+                    "truncated",
+                    channel.name,
+                    math.nan,
+                    math.nan,
+                    "warning",
+                    f"the segment from line {segment.first_line} has {len(channel)} of the {stated:.0f} samples "
+                    "that its header states.",
+                )
+            )
     if "_cut" in segment.keys:
-        findings.append(Finding(
-            "truncated", "", math.nan, math.nan, "warning",
-            f"the file ends within the header that begins in line {segment.keys['_cut'][0]}.",
-        ))  # fmt: skip
+        findings.append(
+            Finding(
+                "truncated",
+                "",
+                math.nan,
+                math.nan,
+                "warning",
+                f"the file ends within the header that begins in line {segment.keys['_cut'][0]}.",
+            )
+        )
     return findings

@@ -140,9 +140,7 @@ class Mapping(Table):
     def toml(self) -> str:
         """Return the text of a file that `load_mapping` reads as this mapping."""
         plain = self.model_dump(mode="json", exclude_none=True, exclude_defaults=True)
-        tables = {
-            key: plain.pop(key) for key in ("csv", "channels", "drive") if isinstance(plain.get(key), dict)
-        }
+        tables = {key: plain.pop(key) for key in ("csv", "channels", "drive") if isinstance(plain.get(key), dict)}
         model = model_toml(plain.pop("model")).rstrip("\n")
         is_line = not model.startswith("[")
         lines = [model] if is_line else []
@@ -170,9 +168,7 @@ def load_mapping(path: str | Path) -> Mapping:
     return parse_mapping(read_toml(path), str(path), Path(path).parent)
 
 
-def parse_mapping(
-    data: AnyMapping[str, Any] | str, source: str = "", folder: str | Path | None = KEPT
-) -> Mapping:
+def parse_mapping(data: AnyMapping[str, Any] | str, source: str = "", folder: str | Path | None = KEPT) -> Mapping:
     """Validate a mapping given as plain data, or as the text of a TOML file.
 
     Parameters
@@ -235,9 +231,7 @@ def _rest(rest: dict[str, Any], problems: list[str]) -> dict[str, Any]:
 
 def _model(tables: AnyMapping[str, Any], folder: str | Path | None, problems: list[str]) -> Model | None:
     if "model" not in tables:
-        problems.append(
-            "model: missing; name the model whose states are measured, as magpend models lists them."
-        )
+        problems.append("model: missing; name the model whose states are measured, as magpend models lists them.")
         return None
     return add_model(tables["model"], folder, problems)
 
@@ -245,9 +239,7 @@ def _model(tables: AnyMapping[str, Any], folder: str | Path | None, problems: li
 def _entries(tables: AnyMapping[str, Any], problems: list[str]) -> dict[str, ChannelMap]:
     channels = tables.get("channels", {})
     if not isinstance(channels, dict) or not channels:
-        problems.append(
-            "channels: missing; add a table [channels.STATE] for each measured state of the model."
-        )
+        problems.append("channels: missing; add a table [channels.STATE] for each measured state of the model.")
         return {}
     found = {}
     for name, entry in channels.items():
@@ -291,17 +283,11 @@ def _unit_problems(path: str, entry: Scaled, wanted: str) -> list[str]:
         return [f"{path}.scale = 0: must not be 0; give {wanted} per {entry.unit or 'unit of the file'}."]
     if known is None and kind is not None and kind != "s":
         choices = ", ".join(units.UNITS.get(wanted, {wanted: 1.0}))
-        return [
-            f"{path}.unit = {entry.unit!r}: is not one of {wanted}; give one of {choices}, or another "
-            "channel."
-        ]
+        return [f"{path}.unit = {entry.unit!r}: is not one of {wanted}; give one of {choices}, or another channel."]
     if known is None and entry.scale is None:
         return [f"{path}.scale: missing; the unit {entry.unit!r} needs one, in {wanted} per {entry.unit}."]
     if known not in (None, 1.0) and entry.scale is not None and abs(entry.scale / known - 1.0) < 0.02:
-        return [
-            f"{path}.scale = {entry.scale!r}: the unit {entry.unit!r} is converted already; drop "
-            "scale, or unit."
-        ]
+        return [f"{path}.scale = {entry.scale!r}: the unit {entry.unit!r} is converted already; drop scale, or unit."]
     return []
 
 
@@ -312,8 +298,9 @@ def _angle_problems(
     if known[name] != "rad":
         problems += [
             f"{path}.{key}: only an angle has one, and {name} is in {known[name]}; drop the key."
-            for key, given in (("wraps", entry.wraps), ("dead_band", entry.dead_band is not None)) if given
-        ]  # fmt: skip
+            for key, given in (("wraps", entry.wraps), ("dead_band", entry.dead_band is not None))
+            if given
+        ]
     other = entry.relative_to
     if other is not None and (other not in channels or other == name):
         problems.append(f"{path}.relative_to = {other!r}: must be another channel of this mapping.")

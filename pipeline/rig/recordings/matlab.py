@@ -38,9 +38,7 @@ def read_matlab(path: Path) -> Raw:
     try:
         found = loadmat(path, squeeze_me=False, struct_as_record=True)
     except Exception as error:  # scipy raises what its parser meets: zlib.error, OSError, ValueError, ...
-        raise SpecError(
-            [f"{path}: is not a MATLAB file that can be read ({error}); save it with -v7."]
-        ) from None
+        raise SpecError([f"{path}: is not a MATLAB file that can be read ({error}); save it with -v7."]) from None
     leaves: dict[str, list[np.ndarray]] = {}
     for name, value in found.items():
         if not name.startswith(_PRIVATE):
@@ -107,15 +105,11 @@ def _step(leaves: dict[str, list[np.ndarray]]) -> float:
     return math.nan
 
 
-def _stretches(
-    path: Path, leaves: dict[str, list[np.ndarray]], step: float
-) -> tuple[dict[str, Channel], ...]:
+def _stretches(path: Path, leaves: dict[str, list[np.ndarray]], step: float) -> tuple[dict[str, Channel], ...]:
     counts = {name: len(arrays) for name, arrays in leaves.items() if len(arrays) > 1}
     if len(set(counts.values())) > 1:
         told = ", ".join(f"{name} has {n}" for name, n in counts.items())
-        raise SpecError(
-            [f"{path}: cells are the pieces of one recording, but {told}; save equally many of each."]
-        )
+        raise SpecError([f"{path}: cells are the pieces of one recording, but {told}; save equally many of each."])
     n = max(counts.values(), default=1)
     return tuple(
         {

@@ -34,12 +34,17 @@ def describe_file(raw: Raw) -> Table:
         ("channel", "samples", "rate [Hz]", "start [s]", "unit", "least", "greatest"),
         [
             (
-                row["channel"], _counted(row), _number(row["sampling_rate_hz"]), _number(row["start_s"]),
-                row["unit"] or "-", _number(row["least"]), _number(row["greatest"]),
+                row["channel"],
+                _counted(row),
+                _number(row["sampling_rate_hz"]),
+                _number(row["start_s"]),
+                row["unit"] or "-",
+                _number(row["least"]),
+                _number(row["greatest"]),
             )
             for row in rows
         ],
-    )  # fmt: skip
+    )
     lines += [f"{f.severity}: {f.channel}{': ' if f.channel else ''}{f.text}" for f in raw.findings]
     return Table(rows, lines)
 
@@ -51,12 +56,16 @@ def _channel_row(raw: Raw, name: str) -> dict[str, Any]:
     step = step_of(own[0])
     start = float(own[0].time[0]) if own[0].time is not None and len(own[0]) else own[0].start_s
     return {
-        "channel": name, "stretches": len(own), "samples": len(values),
-        "sampling_rate_hz": 1.0 / step if step > 0.0 else math.nan, "start_s": start, "unit": own[0].unit,
+        "channel": name,
+        "stretches": len(own),
+        "samples": len(values),
+        "sampling_rate_hz": 1.0 / step if step > 0.0 else math.nan,
+        "start_s": start,
+        "unit": own[0].unit,
         "least": float(known.min()) if known.size else math.nan,
         "greatest": float(known.max()) if known.size else math.nan,
         "no_numbers": len(values) - int(known.size),
-    }  # fmt: skip
+    }
 
 
 def _counted(row: dict[str, Any]) -> str:
@@ -93,12 +102,17 @@ def describe_recording(ds: xr.Dataset) -> tuple[Table, Table]:
         ("quantity", "unit", "least", "greatest", "not measured", "noise", "window [s]"),
         [
             (
-                row["quantity"], row["unit"], _number(row["least"]), _number(row["greatest"]),
-                str(row["not_measured"]), _number(row["noise"]), _number(row["window_s"]),
+                row["quantity"],
+                row["unit"],
+                _number(row["least"]),
+                _number(row["greatest"]),
+                str(row["not_measured"]),
+                _number(row["noise"]),
+                _number(row["window_s"]),
             )
             for row in rows
         ],
-    )  # fmt: skip
+    )
     return Table(rows, lines), _findings_table(findings_of(ds))
 
 
@@ -107,22 +121,28 @@ def _quantity_row(ds: xr.Dataset, smoothed: xr.Dataset, name: str) -> dict[str, 
     known = values[np.isfinite(values)]
     attrs = smoothed[name].attrs if name != DRIVE else {}
     return {
-        "quantity": name, "unit": str(ds[name].attrs["units"]),
+        "quantity": name,
+        "unit": str(ds[name].attrs["units"]),
         "least": float(known.min()) if known.size else math.nan,
         "greatest": float(known.max()) if known.size else math.nan,
         "not_measured": len(values) - int(known.size),
-        "noise": float(attrs.get("noise", math.nan)), "window_s": float(attrs.get("window_s", math.nan)),
-    }  # fmt: skip
+        "noise": float(attrs.get("noise", math.nan)),
+        "window_s": float(attrs.get("window_s", math.nan)),
+    }
 
 
 def _findings_table(findings: Sequence[Finding]) -> Table:
     rows = [
         {
-            "kind": f.kind, "channel": f.channel, "start_s": f.start_s, "end_s": f.end_s,
-            "severity": f.severity, "text": f.text,
+            "kind": f.kind,
+            "channel": f.channel,
+            "start_s": f.start_s,
+            "end_s": f.end_s,
+            "severity": f.severity,
+            "text": f.text,
         }
         for f in findings
-    ]  # fmt: skip
+    ]
     lines = summary(findings)
     return Table(rows, lines or ["findings: none"])
 

@@ -174,9 +174,7 @@ def _name_but_for_unit(entry: Scaled | TimeMap | PieceMap, names: Sequence[str])
         return None
     name, stated = near[0]
     # the unit of time stamps has a default, so it must agree with the file's
-    if isinstance(entry, TimeMap) and units.factor(units.spelled(stated), "s") != units.factor(
-        entry.unit, "s"
-    ):
+    if isinstance(entry, TimeMap) and units.factor(units.spelled(stated), "s") != units.factor(entry.unit, "s"):
         return None
     return name
 
@@ -201,12 +199,16 @@ def _name_findings(mapping: Mapping, columns: dict[str, str]) -> list[Finding]:
         given["time"] = mapping.time.channel
     return [
         Finding(
-            "name", name, math.nan, math.nan, "warning",
+            "name",
+            name,
+            math.nan,
+            math.nan,
+            "warning",
             f"the file's channel is {columns[name]!r}, the mapping's {channel!r}; it is taken for the same.",
         )
         for name, channel in given.items()
         if isinstance(channel, str) and channel.strip() != columns[name].strip()
-    ]  # fmt: skip
+    ]
 
 
 def _timed(
@@ -221,9 +223,7 @@ def _timed(
     for name, values in axes.items():
         for own, channel in chosen.items():
             if len(channel) > len(values):
-                text = (
-                    f"has {len(channel)} samples, the channel of {name} {len(values)}; the last are left out."
-                )
+                text = f"has {len(channel)} samples, the channel of {name} {len(values)}; the last are left out."
                 findings.append(Finding("length", own, math.nan, math.nan, "warning", text))
                 chosen[own] = replace(channel, values=channel.values[: len(values)])
         longest = max(map(len, chosen.values()))
@@ -277,10 +277,16 @@ def _unit_findings(raw: Raw, mapping: Mapping, columns: dict[str, str]) -> list[
         stated = units.spelled(raw.stretches[0][columns[name]].unit)
         own = units.spelled(entry.unit or mapping.unit_of(name))
         if stated and not units.same(stated, own):
-            findings.append(Finding(
-                "unit", name, math.nan, math.nan, "warning",
-                f"the file says {stated!r}, the mapping {own!r}; the mapping's is used.",
-            ))  # fmt: skip
+            findings.append(
+                Finding(
+                    "unit",
+                    name,
+                    math.nan,
+                    math.nan,
+                    "warning",
+                    f"the file says {stated!r}, the mapping {own!r}; the mapping's is used.",
+                )
+            )
     return findings
 
 
@@ -295,20 +301,22 @@ def _labelled(
         attrs = {"units": mapping.unit_of(name), "long_name": meanings.get(name, "drive")}
         if name == DRIVE and mapping.drive_map is not None:
             kind = mapping.drive_map.kind
-            attrs |= {
-                "kind": kind,
-                "long_name": "driving torque" if kind == "torque" else "signal of the drive",
-            }
+            attrs |= {"kind": kind, "long_name": "driving torque" if kind == "torque" else "signal of the drive"}
         data[name] = (DIM, values, attrs)
     coords = {
         "time": (DIM, clock.time, {"units": "s", "long_name": "time since the recording's first sample"}),
         "piece": (DIM, clock.piece, {"units": "1", "long_name": "stretch without a gap"}),
     }
     about: dict[str, Any] = {
-        "sampling_rate_hz": 1.0 / clock.step_s, "file": str(raw.path), "sha256": raw.sha256,
-        "format": raw.format, "mapping": mapping.toml(), "model": model_attribute(mapping.system),
-        "findings": to_json(findings), "magpend_version": metadata.version("magpend"),
-    }  # fmt: skip
+        "sampling_rate_hz": 1.0 / clock.step_s,
+        "file": str(raw.path),
+        "sha256": raw.sha256,
+        "format": raw.format,
+        "mapping": mapping.toml(),
+        "model": model_attribute(mapping.system),
+        "findings": to_json(findings),
+        "magpend_version": metadata.version("magpend"),
+    }
     if raw.simulated:
         about["simulated"] = 1
     return xr.Dataset(data, coords=coords, attrs=about)

@@ -262,9 +262,7 @@ def _order_of(own: int, width: int, order: int) -> int:
     return max(order - sum(own < share * width for share in SHORT), 1)
 
 
-def _fit_ends(
-    values: np.ndarray, parts: np.ndarray, width: int, order: int, out: tuple[np.ndarray, ...]
-) -> None:
+def _fit_ends(values: np.ndarray, parts: np.ndarray, width: int, order: int, out: tuple[np.ndarray, ...]) -> None:
     """Fill in the first and the last half of each stretch from the window at its end."""
     basis, half = _basis(width, order), width // 2
     for begins, rows in ((parts[:, 0], slice(0, half + 1)), (parts[:, 1] - width, slice(half, width))):
@@ -277,9 +275,7 @@ def _fit_ends(
         out[2][places] = basis.leverage[rows]
 
 
-def _fit_middles(
-    values: np.ndarray, parts: np.ndarray, width: int, order: int, out: tuple[np.ndarray, ...]
-) -> None:
+def _fit_middles(values: np.ndarray, parts: np.ndarray, width: int, order: int, out: tuple[np.ndarray, ...]) -> None:
     """Fill in samples with half a window on either side, by convolution."""
     half = width // 2
     long = parts[np.diff(parts, axis=1).ravel() > width + 1]

@@ -46,10 +46,7 @@ def read_tdms(path: Path) -> Raw:
             file = TdmsFile.read(str(path), raw_timestamps=True)
         except Exception as error:  # npTDMS raises what its parser meets: struct.error, KeyError, ...
             raise SpecError(
-                [
-                    f"{path}: is not a TDMS file that can be read ({error}); write it anew, or "
-                    "export it as CSV."
-                ]
+                [f"{path}: is not a TDMS file that can be read ({error}); write it anew, or export it as CSV."]
             ) from None
     found = {}
     zero = _earliest(file)
@@ -102,13 +99,16 @@ def _truncations(path: Path, file: Any, warnings: list[str]) -> list[Finding]:
     if status.channel_statuses:
         return [
             Finding(
-                "truncated", name.replace("'", "").strip("/"), math.nan, math.nan, "warning",
-                f"the last segment holds {s.read_length} of the {s.expected_length} samples that it "
-                f"states; {remedy}.",
+                "truncated",
+                name.replace("'", "").strip("/"),
+                math.nan,
+                math.nan,
+                "warning",
+                f"the last segment holds {s.read_length} of the {s.expected_length} samples that it states; {remedy}.",
             )
             for name, s in status.channel_statuses.items()
             if s.read_length < s.expected_length
-        ] or [_truncated(f"the last segment was not closed; {remedy}.")]  # fmt: skip
+        ] or [_truncated(f"the last segment was not closed; {remedy}.")]
     if warnings:
         return [_truncated(f"{text[:1].lower()}{text[1:]}; {remedy}.") for text in warnings]
     rest = _bytes_after_last_segment(path)

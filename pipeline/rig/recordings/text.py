@@ -83,9 +83,13 @@ def table(lines: Sequence[str], columns: Sequence[int], delimiter: str, decimal:
         text = text.replace(",", ".")
     try:
         found = np.loadtxt(
-            io.StringIO(text), delimiter=None if delimiter == " " else delimiter, usecols=columns,
-            ndmin=2, comments=None, quotechar='"',
-        )  # fmt: skip
+            io.StringIO(text),
+            delimiter=None if delimiter == " " else delimiter,
+            usecols=columns,
+            ndmin=2,
+            comments=None,
+            quotechar='"',
+        )
         if found.shape == (len(lines), len(columns)):
             return found
     except (ValueError, IndexError):

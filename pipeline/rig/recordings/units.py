@@ -13,22 +13,42 @@ _DEGREE, _TURN = math.pi / 180.0, 2.0 * math.pi
 
 UNITS: dict[str, dict[str, float]] = {
     "rad": {
-        "rad": 1.0, "mrad": 1e-3, "deg": _DEGREE, "degree": _DEGREE, "degrees": _DEGREE, "°": _DEGREE,
-        "turn": _TURN, "turns": _TURN, "rev": _TURN,
+        "rad": 1.0,
+        "mrad": 1e-3,
+        "deg": _DEGREE,
+        "degree": _DEGREE,
+        "degrees": _DEGREE,
+        "°": _DEGREE,
+        "turn": _TURN,
+        "turns": _TURN,
+        "rev": _TURN,
     },
     "rad/s": {
-        "rad/s": 1.0, "mrad/s": 1e-3, "deg/s": _DEGREE, "°/s": _DEGREE, "turns/s": _TURN, "rev/s": _TURN,
+        "rad/s": 1.0,
+        "mrad/s": 1e-3,
+        "deg/s": _DEGREE,
+        "°/s": _DEGREE,
+        "turns/s": _TURN,
+        "rev/s": _TURN,
         "rpm": _TURN / 60.0,
     },
     "N m": {"N m": 1.0, "Nm": 1.0, "N*m": 1.0, "mN m": 1e-3, "mNm": 1e-3, "N cm": 1e-2, "Ncm": 1e-2},
     "s": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0},
-}  # fmt: skip
+}
 """Factors to an SI unit, by that unit and by the unit in a file."""
 
 _SPELLINGS = {
-    "volt": "V", "volts": "V", "ampere": "A", "amperes": "A", "radian": "rad", "radians": "rad",
-    "second": "s", "seconds": "s", "newtons": "N", "newton": "N",
-}  # fmt: skip
+    "volt": "V",
+    "volts": "V",
+    "ampere": "A",
+    "amperes": "A",
+    "radian": "rad",
+    "radians": "rad",
+    "second": "s",
+    "seconds": "s",
+    "newtons": "N",
+    "newton": "N",
+}
 
 
 def spelled(unit: str) -> str:

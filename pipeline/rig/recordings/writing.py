@@ -76,9 +76,7 @@ def mapping_for(ds: xr.Dataset, path: str | Path) -> Mapping:
 
 def _is_one_waveform(ds: xr.Dataset) -> bool:
     """Return whether start and sampling interval describe all times."""
-    return ds["piece"].size == 0 or (
-        int(ds["piece"][0]) == int(ds["piece"][-1]) and float(ds["time"][0]) == 0.0
-    )
+    return ds["piece"].size == 0 or (int(ds["piece"][0]) == int(ds["piece"][-1]) and float(ds["time"][0]) == 0.0)
 
 
 def write_raw(raw: Raw, path: str | Path) -> Path:
@@ -140,9 +138,7 @@ def _write_csv(channels: Sequence[Channel], path: Path, is_simulated: bool) -> N
     if not any(name == "time" for name, _ in columns) and math.isfinite(step):
         columns.insert(0, ("time", step * np.arange(len(channels[0]))))
     n = max(len(values) for _, values in columns)
-    texts = [
-        [repr(float(v)) if v == v else "" for v in values] + [""] * (n - len(values)) for _, values in columns
-    ]
+    texts = [[repr(float(v)) if v == v else "" for v in values] + [""] * (n - len(values)) for _, values in columns]
     lines = [SIMULATED_LINE] if is_simulated else []
     lines.append(",".join(name for name, _ in columns))
     lines += map(",".join, zip(*texts, strict=True))

@@ -8,14 +8,7 @@ import re
 import numpy as np
 import pytest
 
-from magpend_core import (
-    accelerations,
-    load_preset,
-    lyapunov_exponents,
-    polish_orbits,
-    run_branches,
-    trajectory,
-)
+from magpend_core import accelerations, load_preset, lyapunov_exponents, polish_orbits, run_branches, trajectory
 from magpend_core.engine import checks, entry
 from magpend_core.engine import vecmath as elementary
 from magpend_core.engine.checks import SystemCheckError, check_system
@@ -230,11 +223,7 @@ def _edges_by_parameters(frequency, p, times, half_widths, jumps):
 @pytest.mark.parametrize(
     ("edges", "parameters", "words"),
     [
-        (
-            _nothing_filled,
-            DUFFING,
-            "edges: time 0 is nan s at frequency_hz = 0.16; it must be in [0, 6.25) s",
-        ),
+        (_nothing_filled, DUFFING, "edges: time 0 is nan s at frequency_hz = 0.16; it must be in [0, 6.25) s"),
         (_edges_by_parameters, [0.0, 1.0, 1.0, 1.0], "edges: time 1 is 6.25 s"),
         (_edges_by_parameters, [-0.1, 0.5, 1.0, 1.0], "edges: time 0 is -0.625 s"),
         (_edges_by_parameters, [0.5, 0.2, 1.0, 1.0], "edges: the times [3.125, 1.25] s"),
@@ -315,14 +304,23 @@ def test_check_system__quantities(broken):
 
 def test_check_system__names_all_problems_of_the_fields_at_once(broken):
     system = broken(
-        is_angle=(True,), scales=(0.0, math.inf, 1.0), escape=(1.0,), n_controlled=3,
-        parameter_names=("a", "a", "b", "c"), n_edges=-1,
-    )  # fmt: skip
+        is_angle=(True,),
+        scales=(0.0, math.inf, 1.0),
+        escape=(1.0,),
+        n_controlled=3,
+        parameter_names=("a", "a", "b", "c"),
+        n_edges=-1,
+    )
     starts = (
-        "is_angle has 1 entries; it must have one for each of the 2 states (x, v)", "scales has 3 entries",
-        "escape has 1 entries", "scales: 0.0 for x is out of bounds", "scales: inf for v",
-        "parameter_names has 'a' twice", "n_edges = -1", "n_controlled = 3",
-    )  # fmt: skip
+        "is_angle has 1 entries; it must have one for each of the 2 states (x, v)",
+        "scales has 3 entries",
+        "escape has 1 entries",
+        "scales: 0.0 for x is out of bounds",
+        "scales: inf for v",
+        "parameter_names has 'a' twice",
+        "n_edges = -1",
+        "n_controlled = 3",
+    )
     problems = found(system)
     assert len(problems) == len(starts)
     assert all(problem.startswith(start) for problem, start in zip(problems, starts, strict=True))
@@ -332,9 +330,15 @@ def test_check_system__comes_before_compiling(broken, monkeypatch):
     monkeypatch.setattr(entry, "engine_of", None)
     with pytest.raises(SystemCheckError, match="cannot be integrated:\n- rhs returns 3"):
         run_branches(
-            np.array([[DUFFING]]), np.array([[FREQUENCY]]), np.zeros((1, 2)), system=broken(rhs=_three_rates),
-            n_transient=0, n_keep=1, rtol=1e-6, atol=1e-6,
-        )  # fmt: skip
+            np.array([[DUFFING]]),
+            np.array([[FREQUENCY]]),
+            np.zeros((1, 2)),
+            system=broken(rhs=_three_rates),
+            n_transient=0,
+            n_keep=1,
+            rtol=1e-6,
+            atol=1e-6,
+        )
 
 
 def test_check_system__is_asked_by_trajectory(monkeypatch):
@@ -357,9 +361,14 @@ def test_check_system__compiles_nothing_and_runs_once():
         out[0] = p[0]
 
     system = System(
-        name="counted", state_names=("a", "v"), is_angle=(True, False), parameter_names=("damping",),
-        n_constants=1, constants=constants, rhs=inline(rhs),
-    )  # fmt: skip
+        name="counted",
+        state_names=("a", "v"),
+        is_angle=(True, False),
+        parameter_names=("damping",),
+        n_constants=1,
+        constants=constants,
+        rhs=inline(rhs),
+    )
     before = list(getattr(_pendulum_rhs, "signatures", []))
     assert found(system, [0.1]) == []
     n = len(calls)

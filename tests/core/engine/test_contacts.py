@@ -25,16 +25,17 @@ BALL = {
     "parameters": {"g": {"value": EARTH}, "r": {"value": 0.5, "bound": "non-negative"}, "G": {"value": 2.0}},
     "define": {"w": "2*pi*f", "amp": "G*g/w**2", "table": "amp*sin(w*t)", "vtable": "amp*w*cos(w*t)"},
     "equations": {"h": "v", "v": "-g"},
-    "impacts": [
-        {"of": "h - table", "direction": "down", "set": {"v": "vtable - r*(v - vtable)"}, "stick": True}
-    ],
+    "impacts": [{"of": "h - table", "direction": "down", "set": {"v": "vtable - r*(v - vtable)"}, "stick": True}],
 }
 
 LOAD = {
     "name": "load-on-a-spring",
     "states": {name: {} for name in ("x", "vx", "y", "vy")},
     "parameters": {
-        "m": {"value": 1.0}, "M": {"value": 2.0}, "k": {"value": 50.0}, "g": {"value": EARTH},
+        "m": {"value": 1.0},
+        "M": {"value": 2.0},
+        "k": {"value": 50.0},
+        "g": {"value": EARTH},
         "r": {"value": 0.5, "bound": "non-negative"},
     },
     # x lies on y, which a spring carries; both masses push one another
@@ -42,11 +43,13 @@ LOAD = {
     "equations": {"x": "vx", "vx": "-g", "y": "vy", "vy": "-g - k*y/M"},
     "impacts": [
         {
-            "of": "x - y", "direction": "down",
-            "set": {"vx": "mean - r*gap*M/(m + M)", "vy": "mean + r*gap*m/(m + M)"}, "stick": True,
+            "of": "x - y",
+            "direction": "down",
+            "set": {"vx": "mean - r*gap*M/(m + M)", "vy": "mean + r*gap*m/(m + M)"},
+            "stick": True,
         }
     ],
-}  # fmt: skip
+}
 
 
 def without_stick(table):
@@ -133,9 +136,8 @@ class ExactBall:
 def test_stick__is_that_of_closed_forms(ball, ratio, start):
     exact = ExactBall(ratio, 0.5).run(*start, 12)
     found = sections(
-        ball.load("default", G=ratio), FREQUENCY, np.array([start]), n_transient=0, n_keep=12,
-        rtol=1e-12, atol=1e-14,
-    )  # fmt: skip
+        ball.load("default", G=ratio), FREQUENCY, np.array([start]), n_transient=0, n_keep=12, rtol=1e-12, atol=1e-14
+    )
     assert found.section[0] == pytest.approx(exact, rel=0, abs=1e-9)
 
 
@@ -151,9 +153,7 @@ def test_chatter__is_named_where_nothing_sticks(table):
 
 
 def test_elastic_impacts__are_no_chatter(ball):
-    found = sections(
-        ball.load("default", r=1.0, G=0.01), FREQUENCY, np.array([[1e-6, 0.0]]), n_transient=0, n_keep=3
-    )
+    found = sections(ball.load("default", r=1.0, G=0.01), FREQUENCY, np.array([[1e-6, 0.0]]), n_transient=0, n_keep=3)
     assert found.status[0] != Status.CHATTER
 
 
@@ -171,9 +171,14 @@ def test_ball__one_impact_in_n_periods_begins_and_doubles_where_published(ball, 
         assert speed - table == pytest.approx(r * (speed + table))
         h = amplitude * math.sin(OMEGA * t) - speed * t - 0.5 * EARTH * t * t
         found = sections(
-            ball.load("default", G=ratio), FREQUENCY, np.array([[h + 1e-7, -(-speed - EARTH * t)]]) * [1, 1],
-            n_transient=6000, n_keep=64, rtol=1e-10, atol=1e-12,
-        )  # fmt: skip
+            ball.load("default", G=ratio),
+            FREQUENCY,
+            np.array([[h + 1e-7, -(-speed - EARTH * t)]]) * [1, 1],
+            n_transient=6000,
+            n_keep=64,
+            rtol=1e-10,
+            atol=1e-12,
+        )
         assert found.orbit_period.tolist() == [period]
 
 
@@ -217,10 +222,11 @@ def test_derivatives__of_a_chattering_load_are_those_of_differences():
     slopes = section_map(packed, f, start, 1, rtol=1e-12, system=model.system).derivatives[0]
     steps = 1e-6 * np.eye(4)
     ends = [
-        section_map(np.repeat(packed, 4, axis=0), np.repeat(f, 4), start + sign * steps, 1, rtol=1e-12,
-                    system=model.system).images[:, -1]
+        section_map(
+            np.repeat(packed, 4, axis=0), np.repeat(f, 4), start + sign * steps, 1, rtol=1e-12, system=model.system
+        ).images[:, -1]
         for sign in (1.0, -1.0)
-    ]  # fmt: skip
+    ]
     assert slopes == pytest.approx(((ends[0] - ends[1]).T / 2e-6), abs=2e-4)
 
 
@@ -237,18 +243,15 @@ def test_rest__goes_on_from_a_section_as_if_it_had_not_stopped(ball):
 def test_force_that_jumps__lifts_at_its_edge():
     """A force that is on for half a period lifts a ball at rest at once; it flies on parabolas."""
     lifted = {
-        "name": "lifted", "states": {"h": {}, "v": {}},
+        "name": "lifted",
+        "states": {"h": {}, "v": {}},
         "parameters": {"g": {"value": 10.0}, "F": {"value": 30.0}},
         "equations": {"h": "v", "v": "-g + where(square(t*f - 0.25, 0.5) > 0, F, 0)"},
         "impacts": [{"of": "h", "direction": "down", "set": {"v": "-0.1*v"}, "stick": True}],
-    }  # fmt: skip
+    }
     model = read_model(lifted)
-    found = trajectory(
-        model.load("default"), 0.25, np.array([0.0, 0.0]), np.array([0.9, 1.5, 3.0, 3.5]), rtol=1e-10
-    )
-    assert found[:3] == pytest.approx(
-        np.array([[0.0, 0.0], [0.5 * 20 * 0.25, 20 * 0.5], [40.0, 40.0]]), abs=1e-9
-    )
+    found = trajectory(model.load("default"), 0.25, np.array([0.0, 0.0]), np.array([0.9, 1.5, 3.0, 3.5]), rtol=1e-10)
+    assert found[:3] == pytest.approx(np.array([[0.0, 0.0], [0.5 * 20 * 0.25, 20 * 0.5], [40.0, 40.0]]), abs=1e-9)
     assert found[3] == pytest.approx([40.0 + 40.0 * 0.5 - 5.0 * 0.25, 35.0], abs=1e-9)
 
 
@@ -262,8 +265,11 @@ def test_force_that_jumps__lifts_at_its_edge():
 )
 def test_stick__refused(impact, message):
     table = {
-        "name": "refused", "states": {"h": {}, "v": {}}, "parameters": {"g": 9.81},
-        "equations": {"h": "v", "v": "-g"}, "impacts": [{"direction": "down", "stick": True, **impact}],
-    }  # fmt: skip
+        "name": "refused",
+        "states": {"h": {}, "v": {}},
+        "parameters": {"g": 9.81},
+        "equations": {"h": "v", "v": "-g"},
+        "impacts": [{"direction": "down", "stick": True, **impact}],
+    }
     with pytest.raises(ModelError, match=message.replace("[", r"\[")):
         _ = read_model(table).system

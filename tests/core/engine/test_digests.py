@@ -75,10 +75,7 @@ def test_functions_digest__changes_with_all_that_is_reached(old, new):
 
 @pytest.mark.parametrize(
     ("old", "new"),
-    [
-        ("    return 3.0 * x", "    # a reason\n    return 3.0 * x"),
-        ("FACTOR = 2.0", "FACTOR = 2.0\nUNUSED = 5"),
-    ],
+    [("    return 3.0 * x", "    # a reason\n    return 3.0 * x"), ("FACTOR = 2.0", "FACTOR = 2.0\nUNUSED = 5")],
 )
 def test_functions_digest__does_not_change_with_the_rest(old, new):
     assert digest_of(SOURCE.replace(old, new)) == digest_of(SOURCE)

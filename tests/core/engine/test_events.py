@@ -31,9 +31,14 @@ def copy_parameters(frequency, p, out):
 def flow(name, states, parameters, rhs, **fields):
     """An autonomous system whose constants are its parameters."""
     return System(
-        name=name, state_names=states, parameter_names=parameters, n_constants=len(parameters),
-        constants=copy_parameters, rhs=rhs, **fields,
-    )  # fmt: skip
+        name=name,
+        state_names=states,
+        parameter_names=parameters,
+        n_constants=len(parameters),
+        constants=copy_parameters,
+        rhs=rhs,
+        **fields,
+    )
 
 
 @inline
@@ -53,9 +58,17 @@ def returns(system, parameters, starts, section, *, n_transient=0, n_keep=1, rto
     starts = np.atleast_2d(np.asarray(starts, float))
     packed = np.broadcast_to(np.asarray(parameters, float), (len(starts), 1, len(system.parameter_names)))
     return run_branches(
-        packed, None, starts, n_transient=n_transient, n_keep=n_keep, rtol=rtol, atol=rtol, system=system,
-        section=section, **options,
-    )  # fmt: skip
+        packed,
+        None,
+        starts,
+        n_transient=n_transient,
+        n_keep=n_keep,
+        rtol=rtol,
+        atol=rtol,
+        system=system,
+        section=section,
+        **options,
+    )
 
 
 def crossings_of(rhs, start, level, of, direction, time):
@@ -76,9 +89,15 @@ VAN_DER_POL_PERIOD = 6.6632868593231301
 @pytest.mark.parametrize("direction", ["up", "down"])
 def test_section__of_van_der_pol_has_the_published_period(direction):
     found = returns(
-        VAN_DER_POL, [1.0], [[0.5, 0.1], [2.0, 3.0]], Crossing("v", 0.0, direction, 20.0),
-        n_transient=8, n_keep=6, rtol=1e-12, **(RISING if direction == "up" else {}),
-    )  # fmt: skip
+        VAN_DER_POL,
+        [1.0],
+        [[0.5, 0.1], [2.0, 3.0]],
+        Crossing("v", 0.0, direction, 20.0),
+        n_transient=8,
+        n_keep=6,
+        rtol=1e-12,
+        **(RISING if direction == "up" else {}),
+    )
     assert found.status.tolist() == [[Status.PERIODIC]] * 2
     assert found.orbit_period.tolist() == [[1]] * 2
     assert abs(found.return_time - VAN_DER_POL_PERIOD).max() < 2e-11
@@ -149,9 +168,16 @@ def test_section__no_return_ends_the_cell_and_the_walk_goes_on():
     # mu < 0: to rest; then mu = 1 at the second point
     packed = np.array([[[-1.0], [1.0]]])
     found = run_branches(
-        packed, None, [[-1.0, -0.3]], n_transient=0, n_keep=2, rtol=1e-9, atol=1e-9, system=VAN_DER_POL,
+        packed,
+        None,
+        [[-1.0, -0.3]],
+        n_transient=0,
+        n_keep=2,
+        rtol=1e-9,
+        atol=1e-9,
+        system=VAN_DER_POL,
         section=Crossing("v", -0.5, "down", 60.0),
-    )  # fmt: skip
+    )
     assert found.status[0].tolist() == [Status.NO_RETURN, Status.BOUNDED]
     assert np.isnan(found.section[0, 0]).all()
     assert np.isnan(found.return_time[0, 0]).all()
@@ -195,9 +221,8 @@ def test_section__continues_from_its_final_state():
     whole = returns(VAN_DER_POL, [1.0], [[0.5, 0.1]], section, n_keep=6, rtol=1e-8)
     first = returns(VAN_DER_POL, [1.0], [[0.5, 0.1]], section, n_keep=2, rtol=1e-8)
     second = returns(
-        VAN_DER_POL, [1.0], first.final_state[:, 0], section, n_keep=4, rtol=1e-8,
-        step_size=first.step_size[:, 0],
-    )  # fmt: skip
+        VAN_DER_POL, [1.0], first.final_state[:, 0], section, n_keep=4, rtol=1e-8, step_size=first.step_size[:, 0]
+    )
     together = np.concatenate([first.section, second.section], axis=2)
     assert together.tobytes() == whole.section.tobytes()
 
@@ -205,8 +230,8 @@ def test_section__continues_from_its_final_state():
 def test_section__watched_quantities_are_means_over_the_return():
     # over a turn of the circle v is 0 in the mean, its extremes are 1
     found = returns(
-        VAN_DER_POL, CIRCLE, [[-0.8, 0.6]], Crossing("v", 0.6), n_transient=1, n_keep=2, rtol=1e-10, **RISING,
-    )  # fmt: skip
+        VAN_DER_POL, CIRCLE, [[-0.8, 0.6]], Crossing("v", 0.6), n_transient=1, n_keep=2, rtol=1e-10, **RISING
+    )
     assert found.extremes[0, 0, :, 0] == pytest.approx(np.tile([-1.0, 1.0, 0.0], (2, 1)), abs=1e-5)
 
 
@@ -239,9 +264,16 @@ def test_with_section__refuses(duffing):
         with_section(with_section(VAN_DER_POL, "x", 1), "v", 1)
     with pytest.raises(ValueError, match="frequency_hz must be None"):
         run_branches(
-            np.ones((1, 1, 1)), [[1.0]], [[1.0, 0.0]], n_transient=0, n_keep=1, rtol=1e-8, atol=1e-8,
-            system=VAN_DER_POL, section=Crossing("v"),
-        )  # fmt: skip
+            np.ones((1, 1, 1)),
+            [[1.0]],
+            [[1.0, 0.0]],
+            n_transient=0,
+            n_keep=1,
+            rtol=1e-8,
+            atol=1e-8,
+            system=VAN_DER_POL,
+            section=Crossing("v"),
+        )
 
 
 def test_cubic__root_and_dip_are_those_of_numpy():
@@ -321,10 +353,22 @@ def _two_edges(frequency, p, times, half_widths, jumps):
 
 # one system for dry friction, a push between two edges, and a relay: each engine is compiled once
 STICK = System(
-    name="stick", state_names=("x", "v"), parameter_names=("force", "push", "k", "mu", "of_x"), n_constants=6,
-    constants=_stick_constants, forcing=_stick_forcing, rhs=_stick_rhs, jacobian=_stick_jacobian, n_modes=2,
-    n_switches=1, switches=_stick_switches, slides=(True,), has_segments=True, n_edges=2, edges=_two_edges,
-)  # fmt: skip
+    name="stick",
+    state_names=("x", "v"),
+    parameter_names=("force", "push", "k", "mu", "of_x"),
+    n_constants=6,
+    constants=_stick_constants,
+    forcing=_stick_forcing,
+    rhs=_stick_rhs,
+    jacobian=_stick_jacobian,
+    n_modes=2,
+    n_switches=1,
+    switches=_stick_switches,
+    slides=(True,),
+    has_segments=True,
+    n_edges=2,
+    edges=_two_edges,
+)
 RELAY = [0.0, 0.0, 0.0, 1.0, 1.0]
 """Parameters of x'' = -sign(x)."""
 
@@ -343,9 +387,16 @@ def run_cells(system, parameters, frequency, starts, *, n_transient=0, n_keep=1,
     starts = np.atleast_2d(np.asarray(starts, float))
     packed = np.broadcast_to(np.asarray(parameters, float), (len(starts), 1, len(system.parameter_names)))
     return run_branches(
-        packed, np.full((len(starts), 1), frequency), starts, n_transient=n_transient, n_keep=n_keep,
-        rtol=rtol, atol=rtol, system=system, **options,
-    )  # fmt: skip
+        packed,
+        np.full((len(starts), 1), frequency),
+        starts,
+        n_transient=n_transient,
+        n_keep=n_keep,
+        rtol=rtol,
+        atol=rtol,
+        system=system,
+        **options,
+    )
 
 
 def relay_exactly(amplitude, time):
@@ -498,9 +549,19 @@ def _bounce(k, t, y, c):
 
 # x'' = -g - k sign(x - level); at the floor it is thrown back, or put down below
 TOSS = flow(
-    "toss", ("x", "v"), ("g", "k", "level", "floor", "r", "down"), _toss, jacobian=_toss_jacobian, n_modes=1,
-    n_switches=1, switches=_of_level, n_impacts=1, impacts=_of_floor, impact_directions=(-1,), reset=_bounce,
-)  # fmt: skip
+    "toss",
+    ("x", "v"),
+    ("g", "k", "level", "floor", "r", "down"),
+    _toss,
+    jacobian=_toss_jacobian,
+    n_modes=1,
+    n_switches=1,
+    switches=_of_level,
+    n_impacts=1,
+    impacts=_of_floor,
+    impact_directions=(-1,),
+    reset=_bounce,
+)
 
 
 def ball(g, r, down=0.0):
@@ -654,13 +715,9 @@ def test_impact__multipliers_of_an_orbit_are_those_of_the_exact_map():
     packed = np.array([[zeta, force, gap, r]])
     settled = run_cells(STRUCK, packed, frequency, [[-0.7, 0.5]], n_transient=60, rtol=1e-10)
     assert settled.orbit_period[0, 0] in (0, 1)
-    orbit = polish_orbits(
-        packed, np.array([frequency]), settled.section[0, :, 0], np.array([1]), system=STRUCK
-    )
+    orbit = polish_orbits(packed, np.array([frequency]), settled.section[0, :, 0], np.array([1]), system=STRUCK)
     assert orbit.converged[0]
-    image, matrix, count = ImpactOscillator(zeta, force, gap, r, frequency).after(
-        orbit.section[0], 1 / frequency
-    )
+    image, matrix, count = ImpactOscillator(zeta, force, gap, r, frequency).after(orbit.section[0], 1 / frequency)
     assert count >= 1
     assert image == pytest.approx(orbit.section[0], abs=1e-9)
     exact = np.linalg.eigvals(matrix)
@@ -700,9 +757,15 @@ def test_lyapunov__exponents_through_impacts_add_up_to_the_loss_of_area():
     zeta, force, gap, r, frequency = 0.05, 1.0, 0.4, 0.8, 0.13
     packed = np.tile([zeta, force, gap, r], (2, 1))
     found = lyapunov_exponents(
-        packed, np.full(2, frequency), np.array([[-0.7, 0.5], [0.2, 0.1]]), n_transient=40, n_periods=64,
-        system=STRUCK, rtol=1e-9, atol=1e-9,
-    )  # fmt: skip
+        packed,
+        np.full(2, frequency),
+        np.array([[-0.7, 0.5], [0.2, 0.1]]),
+        n_transient=40,
+        n_periods=64,
+        system=STRUCK,
+        rtol=1e-9,
+        atol=1e-9,
+    )
     assert found.exponents.sum(axis=1) == pytest.approx(found.divergence, abs=1e-6)
     # volumes shrink by exp(-2 zeta T) in the flow, by r^2 at each impact
     settled = run_cells(STRUCK, packed[:1], frequency, [[-0.7, 0.5]], n_transient=40, rtol=1e-10)
@@ -718,16 +781,26 @@ def test_lyapunov__through_sticking_has_a_largest_exponent():
     force, mu, frequency = 1.0, 0.6, 0.05
     packed = np.array([dry(force, mu)])
     found = lyapunov_exponents(
-        packed, np.array([frequency]), np.array([[0.3, 0.2]]), n_exponents=2, n_transient=8,
-        n_periods=32, system=STICK, rtol=1e-9, atol=1e-9,
-    )  # fmt: skip
+        packed,
+        np.array([frequency]),
+        np.array([[0.3, 0.2]]),
+        n_exponents=2,
+        n_transient=8,
+        n_periods=32,
+        system=STICK,
+        rtol=1e-9,
+        atol=1e-9,
+    )
     assert found.status[0] == Status.BOUNDED
     assert found.loss[0] > 1e14
     assert found.exponents[0, 1] < -1.0
     _, derivative = stroboscopic_map(
-        packed, np.array([frequency]),
-        run_cells(STICK, packed[0], frequency, [[0.3, 0.2]], n_transient=8).section[0, 0], 1, system=STICK,
-    )  # fmt: skip
+        packed,
+        np.array([frequency]),
+        run_cells(STICK, packed[0], frequency, [[0.3, 0.2]], n_transient=8).section[0, 0],
+        1,
+        system=STICK,
+    )
     largest = abs(np.linalg.eigvals(derivative[0])).max()
     expected = math.log(largest) * frequency if largest > 1e-9 else -1.0
     assert found.exponents[0, 0] == pytest.approx(expected, abs=1e-6) or found.exponents[0, 0] < expected

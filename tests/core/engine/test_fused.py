@@ -40,7 +40,7 @@ from magpend_core.engine.vecmath import (
     tan,
     tanh,
     wrapped,
-)  # fmt: skip
+)
 
 C_FMA = ctypes.CDLL(None).fma
 C_FMA.restype, C_FMA.argtypes = ctypes.c_double, [ctypes.c_double] * 3
@@ -110,9 +110,21 @@ def at_the_door(function):
 
 
 PRIMITIVES = [
-    "sqrt", "inverse_sqrt_rough", "floor", "upper", "absolute", "copysign", "where_less", "minimum",
-    "maximum", "times_power_of_two", "where_odd", "binary_exponent", "mantissa", "negate_if_bit",
-]  # fmt: skip
+    "sqrt",
+    "inverse_sqrt_rough",
+    "floor",
+    "upper",
+    "absolute",
+    "copysign",
+    "where_less",
+    "minimum",
+    "maximum",
+    "times_power_of_two",
+    "where_odd",
+    "binary_exponent",
+    "mantissa",
+    "negate_if_bit",
+]
 KNOWN = {getattr(simd, name): at_the_door(getattr(simd, name)) for name in PRIMITIVES}
 KNOWN[simd.multiply_add] = lambda a, b, c: Number(C_FMA(a, b, c))
 
@@ -125,9 +137,7 @@ def interpreted(value, known=None):
         return Number(value)
     if isinstance(source, FunctionType) and value not in known:
         scope = dict(source.__globals__)
-        function = FunctionType(
-            source.__code__, scope, source.__name__, source.__defaults__, source.__closure__
-        )
+        function = FunctionType(source.__code__, scope, source.__name__, source.__defaults__, source.__closure__)
         known[value] = at_the_door(function)
         for name in source.__code__.co_names:
             if name in scope:
@@ -169,9 +179,7 @@ def assert_follows_the_rule(function, columns):
     among = among.transpose(0, 2, 1).reshape(expected.shape)
     for found in among, alone:
         wrong = ~same_bits(found, expected)
-        assert not wrong.any(), (
-            f"results {np.unique(np.nonzero(wrong)[1])} in {wrong.any(axis=1).sum()} columns"
-        )
+        assert not wrong.any(), f"results {np.unique(np.nonzero(wrong)[1])} in {wrong.any(axis=1).sum()} columns"
 
 
 @inline
@@ -185,12 +193,30 @@ def _sums(v):
     named = a * b
     twice = c * d
     return (
-        a * b + c, c + a * b, a * b - c, c - a * b, a * b + c * d, a * b - c * d, (a + b) * (c - d) + a * b,
-        -(a * b) + c, c - -(a * b), named + c, twice + twice, named * c + twice, twice * twice - named,
-        _product(a, b) + c, c - _product(a, b) * d, multiply_add(a, b, c) + c * d, (a * b) / c + d,
-        where_less(a, b, a * b, c) + d, maximum(a, b) * c + d, a * b * c * d + a, a + b * c + d * a,
-        2.0 * a + b, 3.0 * (a - b) * c - 2.5 * d,
-    )  # fmt: skip
+        a * b + c,
+        c + a * b,
+        a * b - c,
+        c - a * b,
+        a * b + c * d,
+        a * b - c * d,
+        (a + b) * (c - d) + a * b,
+        -(a * b) + c,
+        c - -(a * b),
+        named + c,
+        twice + twice,
+        named * c + twice,
+        twice * twice - named,
+        _product(a, b) + c,
+        c - _product(a, b) * d,
+        multiply_add(a, b, c) + c * d,
+        (a * b) / c + d,
+        where_less(a, b, a * b, c) + d,
+        maximum(a, b) * c + d,
+        a * b * c * d + a,
+        a + b * c + d * a,
+        2.0 * a + b,
+        3.0 * (a - b) * c - 2.5 * d,
+    )
 
 
 @inline
@@ -198,11 +224,33 @@ def _elementary(v):
     (x,) = v
     sine, cosine = sincos(x)
     return (
-        exp(x), sine, cosine, sin(x), cos(x), atan(x), log2_rough(absolute(x)), exp2_rough(x), wrapped(x),
-        log(x), exp2_falling(x), hypot_rough(x, 1.5), tan(x), tanh(x), sinh(x), cosh(x), asin(x), acos(x),
-        expm1(x), sign(x), square_wave(x, 0.3), power(x, 1.7), power(x, -17.3), atan2(0.7, x), atan2(x, -0.4),
+        exp(x),
+        sine,
+        cosine,
+        sin(x),
+        cos(x),
+        atan(x),
+        log2_rough(absolute(x)),
+        exp2_rough(x),
+        wrapped(x),
+        log(x),
+        exp2_falling(x),
+        hypot_rough(x, 1.5),
+        tan(x),
+        tanh(x),
+        sinh(x),
+        cosh(x),
+        asin(x),
+        acos(x),
+        expm1(x),
+        sign(x),
+        square_wave(x, 0.3),
+        power(x, 1.7),
+        power(x, -17.3),
+        atan2(0.7, x),
+        atan2(x, -0.4),
         inverse_sqrt(x),
-    )  # fmt: skip
+    )
 
 
 def test_rule__sums_and_differences():
@@ -241,20 +289,11 @@ def test_rule__ends_at_branches_and_loops():
 
 def test_rule__elementary_functions():
     rng = np.random.default_rng(6)
-    x = np.concatenate(
-        [rng.uniform(-1.0, 1.0, 300), rng.normal(0.0, 30.0, 300), 10.0 ** rng.uniform(-300, 2, 100)]
-    )
+    x = np.concatenate([rng.uniform(-1.0, 1.0, 300), rng.normal(0.0, 30.0, 300), 10.0 ** rng.uniform(-300, 2, 100)])
     assert_follows_the_rule(_elementary, x[:, None])
 
 
-MODELS = [
-    "pendulum",
-    "pendulum-dipole-sine",
-    "double-pendulum",
-    "duffing",
-    "pendulum-text",
-    "impact",
-]
+MODELS = ["pendulum", "pendulum-dipole-sine", "double-pendulum", "duffing", "pendulum-text", "impact"]
 
 
 def rates_of(system):

@@ -50,12 +50,7 @@ def test_kernel__sees_an_edit_of_a_callee_in_a_folder_named_by_the_digest(run_py
     again = run_python(SCRIPT, package=copied).split()
     assert first[:2] == again[:2]
     assert (first[2:], again[2:]) == (["0", "1"], ["1", "0"])
-    edit(
-        copied,
-        "models/duffing/system.py",
-        "return v, u - c[C.damping] * v",
-        "return v, u - 1.01 * c[C.damping] * v",
-    )
+    edit(copied, "models/duffing/system.py", "return v, u - c[C.damping] * v", "return v, u - 1.01 * c[C.damping] * v")
     edited = run_python(SCRIPT, package=copied).split()
     assert edited[0] != first[0]
     assert edited[1] != first[1]
@@ -145,9 +140,11 @@ def test_bound_part__is_shared_where_all_that_it_uses_agrees():
     first = bound_part(_shifted, {"OFFSET": 7, "ROWS": _Rows(1, 2), "other": 1}, True)
     assert bound_part(_shifted, {"OFFSET": 7, "ROWS": _Rows(1, 3), "other": 2}, True) is first
     for differs in (
-        {"OFFSET": 7.0, "ROWS": _Rows(1, 2)}, {"OFFSET": True, "ROWS": _Rows(1, 2)},
-        {"OFFSET": 7, "ROWS": _Rows(0, 2)}, {"OFFSET": np.array([7]), "ROWS": _Rows(1, 2)},
-    ):  # fmt: skip
+        {"OFFSET": 7.0, "ROWS": _Rows(1, 2)},
+        {"OFFSET": True, "ROWS": _Rows(1, 2)},
+        {"OFFSET": 7, "ROWS": _Rows(0, 2)},
+        {"OFFSET": np.array([7]), "ROWS": _Rows(1, 2)},
+    ):
         assert bound_part(_shifted, differs, True) is not first
     assert bound_part(_shifted, {"OFFSET": 7, "ROWS": _Rows(1, 2)}, False) is not first
     zero, minus = ({"OFFSET": x, "ROWS": _Rows(1, 2)} for x in (0.0, -0.0))

@@ -31,11 +31,17 @@ def order_conditions(weights, order):
         3: [(b @ c**2, 3), (b @ a @ c, 6)],
         4: [(b @ c**3, 4), (b @ (c * (a @ c)), 8), (b @ a @ c**2, 12), (b @ a @ a @ c, 24)],
         5: [
-            (b @ c**4, 5), (b @ (c**2 * (a @ c)), 10), (b @ (c * (a @ c**2)), 15),
-            (b @ (c * (a @ a @ c)), 30), (b @ (a @ c) ** 2, 20), (b @ a @ c**3, 20),
-            (b @ a @ (c * (a @ c)), 40), (b @ a @ a @ c**2, 60), (b @ a @ a @ a @ c, 120),
+            (b @ c**4, 5),
+            (b @ (c**2 * (a @ c)), 10),
+            (b @ (c * (a @ c**2)), 15),
+            (b @ (c * (a @ a @ c)), 30),
+            (b @ (a @ c) ** 2, 20),
+            (b @ a @ c**3, 20),
+            (b @ a @ (c * (a @ c)), 40),
+            (b @ a @ a @ c**2, 60),
+            (b @ a @ a @ a @ c, 120),
         ],
-    }  # fmt: skip
+    }
     return [value - 1.0 / size for value, size in trees[order]]
 
 
@@ -65,9 +71,15 @@ def test_dense__ends_at_the_step_and_has_order_4():
     assert pytest.approx([0.0] * 6 + [1.0], abs=1e-13) == DENSE @ [1.0, 2.0, 3.0, 4.0]
     a, c = MATRIX, NODES
     for tree, size, order in [
-        (np.ones(N_STAGES), 1, 1), (c, 2, 2), (c**2, 3, 3), (a @ c, 6, 3),
-        (c**3, 4, 4), (c * (a @ c), 8, 4), (a @ c**2, 12, 4), (a @ a @ c, 24, 4),
-    ]:  # fmt: skip
+        (np.ones(N_STAGES), 1, 1),
+        (c, 2, 2),
+        (c**2, 3, 3),
+        (a @ c, 6, 3),
+        (c**3, 4, 4),
+        (c * (a @ c), 8, 4),
+        (a @ c**2, 12, 4),
+        (a @ a @ c, 24, 4),
+    ]:
         assert tree @ b == pytest.approx(x**order / size, abs=1e-13)
 
 
@@ -148,9 +160,7 @@ def test_engine__error_follows_the_tolerance(preset, reference):
     exact = np.array(orbit["sections"][1])
     errors = []
     for rtol in (1e-5, 1e-7, 1e-9, 1e-11):
-        found = sections(
-            preset, orbit["frequency_hz"], [orbit["y0"]], n_transient=1, n_keep=1, rtol=rtol, atol=rtol
-        )
+        found = sections(preset, orbit["frequency_hz"], [orbit["y0"]], n_transient=1, n_keep=1, rtol=rtol, atol=rtol)
         errors.append(np.max(abs(found.section[0, 0] - exact)))
         assert errors[-1] < 300.0 * rtol
     assert errors == sorted(errors, reverse=True)
@@ -218,11 +228,19 @@ def test_choose_step__keeps_the_distance_from_layers_and_edges(oscillator, fades
         wish = 10.0 ** rng.uniform(-4.0, 0.0, WIDTH)
         fresh = rng.integers(0, 8, WIDTH) == 0
         for name, values in {
-            "state": x, "slopes": rate, "time": 1.0 + passed, "start": 1.0, "wish": wish,
-            "target": 1.0 + passed + remaining, "start_width": widths[0], "target_width": widths[1],
-            "start_ratio": ratios[0], "target_ratio": ratios[1],
-            "target_share": ratios[1] / (1.0 + ratios[1]), "fresh": fresh,
-        }.items():  # fmt: skip
+            "state": x,
+            "slopes": rate,
+            "time": 1.0 + passed,
+            "start": 1.0,
+            "wish": wish,
+            "target": 1.0 + passed + remaining,
+            "start_width": widths[0],
+            "target_width": widths[1],
+            "start_ratio": ratios[0],
+            "target_ratio": ratios[1],
+            "target_share": ratios[1] / (1.0 + ratios[1]),
+            "fresh": fresh,
+        }.items():
             step_of(rows, w, name)[:] = values
         choose_step(w, 0, slack)
         bounds, ending = limits(slack, x, rate, passed, remaining, widths, ratios, fades)

@@ -25,9 +25,17 @@ def run(name, method, tolerance, n_periods, starts, values=None, **options):
     n = len(starts)
     packed = np.broadcast_to(model.load(**values or {}).pack(), (n, 1, len(model.parameters)))
     return run_branches(
-        packed, np.full((n, 1), options.pop("frequency", 0.2)), starts, n_transient=n_periods - 1, n_keep=1,
-        rtol=tolerance, atol=tolerance, system=model.system, method=method, **options,
-    )  # fmt: skip
+        packed,
+        np.full((n, 1), options.pop("frequency", 0.2)),
+        starts,
+        n_transient=n_periods - 1,
+        n_keep=1,
+        rtol=tolerance,
+        atol=tolerance,
+        system=model.system,
+        method=method,
+        **options,
+    )
 
 
 def some_starts(n):

@@ -31,9 +31,16 @@ def run_many(packed, frequency, starts, **options):
 
 
 FIELDS = (
-    "section", "turns", "status", "orbit_period", "n_periods", "n_steps", "n_rejected", "final_state",
+    "section",
+    "turns",
+    "status",
+    "orbit_period",
+    "n_periods",
+    "n_steps",
+    "n_rejected",
+    "final_state",
     "step_size",
-)  # fmt: skip
+)
 
 
 def assert_same_bits(a, b, rows=slice(None)):

@@ -55,8 +55,7 @@ def test_linear_oscillator__transient_is_exact(oscillator):
 
 
 @pytest.mark.parametrize(
-    ("start", "point"),
-    [((-0.8, 0.0), (-0.7790549287, 0.0274168155)), ((1.2, 0.0), (1.2100908241, 0.0552949542))],
+    ("start", "point"), [((-0.8, 0.0), (-0.7790549287, 0.0274168155)), ((1.2, 0.0), (1.2100908241, 0.0552949542))]
 )
 def test_duffing__two_attractors_at_their_published_points(oscillator, start, point):
     # x'' = .2 cos t + x - x^3 - .15 x'; points recomputed independently, also in issue 139 of
@@ -167,9 +166,15 @@ def test_one_state__section_multiplier_and_exponent_are_the_closed_forms():
     packed, frequency = np.array([[rate]] * 2), np.full(2, UNIT_FREQUENCY)
     starts = np.array([[0.3], [-2.0]])
     result = run_branches(
-        packed[:, None], frequency[:, None], starts, system=BOUNDED_RELAXATION, n_transient=10, n_keep=1,
-        rtol=1e-11, atol=1e-11,
-    )  # fmt: skip
+        packed[:, None],
+        frequency[:, None],
+        starts,
+        system=BOUNDED_RELAXATION,
+        n_transient=10,
+        n_keep=1,
+        rtol=1e-11,
+        atol=1e-11,
+    )
     orbit = rate / (rate**2 + omega**2)
     decayed = (starts[:, 0] - orbit) * np.exp(-rate * 11 * PERIOD)
     assert result.section[:, 0, 0, 0] == pytest.approx(orbit + decayed, abs=1e-10)
@@ -193,18 +198,23 @@ def _growth_rhs(y, u, c):
 
 
 GROWTH = System(
-    name="growth", state_names=("x",), parameter_names=(), n_constants=0, constants=_no_constants,
-    rhs=_growth_rhs,
-)  # fmt: skip
+    name="growth", state_names=("x",), parameter_names=(), n_constants=0, constants=_no_constants, rhs=_growth_rhs
+)
 """x' = x (1 - x), the least of all: neither forcing nor parameters"""
 
 
 def test_one_state__that_is_left_unbounded_fails_by_a_status():
     # x' = cos t + 0.5 x leaves any bound
     result = run_branches(
-        np.array([[[-0.5]]]), np.array([[UNIT_FREQUENCY]]), np.array([[1.0]]), system=BOUNDED_RELAXATION,
-        n_transient=50, n_keep=1, rtol=1e-6, atol=1e-6,
-    )  # fmt: skip
+        np.array([[[-0.5]]]),
+        np.array([[UNIT_FREQUENCY]]),
+        np.array([[1.0]]),
+        system=BOUNDED_RELAXATION,
+        n_transient=50,
+        n_keep=1,
+        rtol=1e-6,
+        atol=1e-6,
+    )
     assert result.status.item() == Status.DIVERGED
 
 
@@ -233,10 +243,18 @@ def test_observer__of_ones_own_on_one_state_without_forcing_or_parameters(n_keep
     observer = Observer("count_above", _count_above, _no_memory, codes)
     starts = np.array([0.0, 0.1, 0.9])
     cells = integrate(
-        GROWTH, observer, _Count(7), parameters=np.empty((3, 1, 0)), frequency_hz=np.full((3, 1), 2.0),
-        initial_states=starts[:, None], n_keep=n_keep, n_measures=1, rtol=1e-11, atol=1e-11,
+        GROWTH,
+        observer,
+        _Count(7),
+        parameters=np.empty((3, 1, 0)),
+        frequency_hz=np.full((3, 1), 2.0),
+        initial_states=starts[:, None],
+        n_keep=n_keep,
+        n_measures=1,
+        rtol=1e-11,
+        atol=1e-11,
         max_steps_per_period=20_000,
-    )  # fmt: skip
+    )
     # logistic growth: x(t) = 1/(1 + (1/x0 - 1) exp(-t)), 1/2 at t = ln 9 from the second start
     assert cells.measures.ravel().tolist() == [0.0, 3.0, 7.0]
     assert cells.n_periods.ravel().tolist() == [7, 7, 7]

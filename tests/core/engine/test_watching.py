@@ -24,9 +24,7 @@ def linear_oscillator(n=3, **options):
     start = [response.real, (1j * omega * response).real]
     packed = np.tile([DAMPING, STIFFNESS, 0.0, AMPLITUDE], (n, 1, 1))
     settings = {"n_transient": 1, "n_keep": 2, "rtol": 1e-9, "atol": 1e-9, **options}
-    found = run_branches(
-        packed, np.full((n, 1), FREQUENCY), np.tile(start, (n, 1)), system=DUFFING, **settings
-    )
+    found = run_branches(packed, np.full((n, 1), FREQUENCY), np.tile(start, (n, 1)), system=DUFFING, **settings)
     return found, abs(response), omega
 
 
@@ -135,9 +133,16 @@ def test_extremes__of_failed_cells_are_nan():
     packed, frequency, starts = many(3)
     starts[1] = [0.0, 0.0, 9e3, -9e3]
     found = run_branches(
-        packed, frequency, starts, n_transient=0, n_keep=2, rtol=1e-6, atol=1e-6,
-        max_steps_per_period=2000, quantities=OF_THE_PENDULUM,
-    )  # fmt: skip
+        packed,
+        frequency,
+        starts,
+        n_transient=0,
+        n_keep=2,
+        rtol=1e-6,
+        atol=1e-6,
+        max_steps_per_period=2000,
+        quantities=OF_THE_PENDULUM,
+    )
     assert (found.status[1] > found.status[0]).all()
     assert np.isnan(found.extremes[1]).all()
     assert np.isfinite(found.extremes[[0, 2]]).all()
@@ -146,10 +151,7 @@ def test_extremes__of_failed_cells_are_nan():
 @pytest.mark.parametrize(
     ("names", "message"),
     [
-        (
-            ("enrgy", "speed"),
-            r"duffing has no 'enrgy', 'speed'; did you mean energy\? It has x, v, energy, power_in",
-        ),
+        (("enrgy", "speed"), r"duffing has no 'enrgy', 'speed'; did you mean energy\? It has x, v, energy, power_in"),
         ("energy", r"one string; give a sequence of names: \['energy'\]"),
     ],
 )

@@ -13,9 +13,7 @@ from magpend_core.pointwise import jacobian, rates
 from magpend_core.sampling import sample
 
 MODEL = load_model("double-pendulum")
-VALUES = MODEL.load(
-    T1=1e-3, T2=8e-4, c1=3e-4, c2=1e-4, mu0=0.7, c0=2.0, eps=30.0, k1=0.05, k2=0.03, l2=0.28, q=0.02
-)
+VALUES = MODEL.load(T1=1e-3, T2=8e-4, c1=3e-4, c2=1e-4, mu0=0.7, c0=2.0, eps=30.0, k1=0.05, k2=0.03, l2=0.28, q=0.02)
 
 
 def some_states(n=12, seed=4):
@@ -83,9 +81,7 @@ def test_jacobian__is_that_of_differences():
     found = jacobian(0.1, states, VALUES, 1.0)
     for j in range(4):
         step = h * np.eye(4)[j]
-        difference = (rates(0.1, states + step, VALUES, 1.0) - rates(0.1, states - step, VALUES, 1.0)) / (
-            2 * h
-        )
+        difference = (rates(0.1, states + step, VALUES, 1.0) - rates(0.1, states - step, VALUES, 1.0)) / (2 * h)
         np.testing.assert_allclose(found[..., j], difference, rtol=1e-6, atol=1e-5)
 
 

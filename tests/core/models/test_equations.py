@@ -93,15 +93,16 @@ def lagrangian_accelerations():
     y2 = -l1 * sympy.cos(q[0]) - e2 * sympy.cos(q[1])
     rates = [x.diff(t) for x in q]
     kinetic = (
-        m1 * (x1.diff(t) ** 2 + y1.diff(t) ** 2) + m2 * (x2.diff(t) ** 2 + y2.diff(t) ** 2)
-        + j1 * rates[0] ** 2 + j2 * rates[1] ** 2
-    ) / 2  # fmt: skip
+        m1 * (x1.diff(t) ** 2 + y1.diff(t) ** 2)
+        + m2 * (x2.diff(t) ** 2 + y2.diff(t) ** 2)
+        + j1 * rates[0] ** 2
+        + j2 * rates[1] ** 2
+    ) / 2
     potential = g * (m1 * (y1 + e1) + m2 * (y2 + l1 + e2))
     state = sympy.symbols("p1 p2 w1 w2")
     plain = dict(zip([*rates, *q], [*state[2:], *state[:2]], strict=True))
     equations = [
-        ((kinetic - potential).diff(w).diff(t) - (kinetic - potential).diff(x))
-        for x, w in zip(q, rates, strict=True)
+        ((kinetic - potential).diff(w).diff(t) - (kinetic - potential).diff(x)) for x, w in zip(q, rates, strict=True)
     ]
     second = [x.diff(t, 2) for x in q]
     mass, rest = sympy.linear_eq_to_matrix(equations, second)
@@ -177,9 +178,7 @@ def test_dipole_torques__equal_the_force_between_poles(dipoles):
     # F = mu0 p1 p2/(4 pi r^2) away from the fixed magnet at (0, -h), times the lever of each angle
     m, l1 = dipoles, dipoles["l1"]
     for y in np.concatenate([random_states(50, 8), near_magnet(50, 9)]):
-        at = np.array(
-            [l1 * np.sin(y[0]) + m["l2"] * np.sin(y[1]), -l1 * np.cos(y[0]) - m["l2"] * np.cos(y[1])]
-        )
+        at = np.array([l1 * np.sin(y[0]) + m["l2"] * np.sin(y[1]), -l1 * np.cos(y[0]) - m["l2"] * np.cos(y[1])])
         line = at - [0.0, -m["h"]]
         r = np.hypot(*line)
         force = VACUUM_PERMEABILITY * m["pole1"] * m["pole2"] / (4.0 * np.pi * r**2) * line / r

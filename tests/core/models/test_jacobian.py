@@ -62,8 +62,7 @@ def test_jacobian__equals_differences_inside_the_friction_layers(parameters):
 
 
 @pytest.mark.parametrize(
-    "overrides",
-    [{"mu": 2e-3, "T1": 0.0, "T2": 0.0}, {"mu": 0.0, "c": 0.5}, {"delta": 0.05, "beta1": 0.2, "r2": 0.1}],
+    "overrides", [{"mu": 2e-3, "T1": 0.0, "T2": 0.0}, {"mu": 0.0, "c": 0.5}, {"delta": 0.05, "beta1": 0.2, "r2": 0.1}]
 )
 def test_jacobian__equals_differences_with_other_weights_of_the_terms(overrides):
     # in the first the loads are all of the friction, and four times what they are in the preset

@@ -146,18 +146,22 @@ def _run(model, states, n_transient, n_keep, tolerance=1e-9, preset=None, freque
     n = len(states)
     packed = np.broadcast_to(model.load(preset, **values).pack(), (n, 1, len(model.parameters)))
     return run_branches(
-        np.ascontiguousarray(packed), np.full((n, 1), frequency_hz), np.asarray(states, float),
-        n_transient=n_transient, n_keep=n_keep, rtol=tolerance, atol=tolerance, system=model.system,
-    )  # fmt: skip
+        np.ascontiguousarray(packed),
+        np.full((n, 1), frequency_hz),
+        np.asarray(states, float),
+        n_transient=n_transient,
+        n_keep=n_keep,
+        rtol=tolerance,
+        atol=tolerance,
+        system=model.system,
+    )
 
 
 def test_driven_pendulum__constant_torque_of_menck_et_al():
     """Rest .152 +- .004 (bSTAB, case 1) of the states around the rest; all else rotates."""
     model = load_model("driven-pendulum")
     middle = math.asin(0.5)
-    th, w = np.meshgrid(
-        np.linspace(middle - np.pi, middle + np.pi, 60, endpoint=False), np.linspace(-10.0, 10.0, 61)
-    )
+    th, w = np.meshgrid(np.linspace(middle - np.pi, middle + np.pi, 60, endpoint=False), np.linspace(-10.0, 10.0, 61))
     states = np.stack([th.ravel(), w.ravel()], -1)
     found = _run(model, states, 40, 1, 1e-7, preset="constant-torque").section[:, 0, 0]
     assert np.mean(np.abs(found[:, 1]) < 0.1) == pytest.approx(0.152, abs=0.01)
@@ -176,9 +180,8 @@ def _cycles(name, crossing, points, periods, **values):
     model = sectioned(load_model(name), crossing)
     packed = np.stack([model.load(**values).pack()] * len(points))
     return polish_orbits(
-        packed, np.full(len(points), 1.0 / crossing.longest), np.array(points), np.array(periods),
-        system=model.system,
-    )  # fmt: skip
+        packed, np.full(len(points), 1.0 / crossing.longest), np.array(points), np.array(periods), system=model.system
+    )
 
 
 def test_van_der_pol__period_amplitude_and_multiplier(library):
@@ -205,9 +208,8 @@ def _half_a_turn(point):
 
     rises.terminal, rises.direction = True, 1.0
     found = solve_ivp(
-        _rossler, (0.0, 30.0), point, "DOP853", events=rises, args=(EQUATIONS["rossler"][1],), rtol=1e-12,
-        atol=1e-12,
-    )  # fmt: skip
+        _rossler, (0.0, 30.0), point, "DOP853", events=rises, args=(EQUATIONS["rossler"][1],), rtol=1e-12, atol=1e-12
+    )
     return found.y_events[0][0]
 
 
@@ -268,9 +270,7 @@ def test_pendulum_text__accelerations_and_quantities(pendulums):
     rng = np.random.default_rng(8)
     states = rng.uniform([-3.0, -3.0, -10.0, -20.0], [3.0, 3.0, 10.0, 20.0], (300, 4))
     times = rng.uniform(0.0, 0.5, 300)
-    assert rates(times, states, text, 2.2) == pytest.approx(
-        rates(times, states, built_in, 2.2), rel=1e-9, abs=1e-9
-    )
+    assert rates(times, states, text, 2.2) == pytest.approx(rates(times, states, built_in, 2.2), rel=1e-9, abs=1e-9)
     names = [q.name for q in text.model.quantities]
     shared = [name for name in names if name in {q.name for q in built_in.model.quantities}]
     assert {"energy", "drive_torque", "load1", "load2"} <= set(shared)
@@ -305,9 +305,7 @@ def test_impact__the_stop_is_first_touched_at_the_grazing_amplitude(library):
     grazing = library["impact"]["grazing"]
     assert grazing == pytest.approx(math.hypot(1.0 - 0.81, 0.18), abs=1e-12)
     for size, closes in ((0.999, True), (1.003, False)):
-        found = _run(
-            load_model("impact"), [[0.1, 0.0]], 400, 2, frequency_hz=0.9 * HZ, A=size * grazing
-        ).section[0, 0]
+        found = _run(load_model("impact"), [[0.1, 0.0]], 400, 2, frequency_hz=0.9 * HZ, A=size * grazing).section[0, 0]
         assert (np.abs(found[1] - found[0]).max() < 1e-6) == closes
 
 

@@ -12,15 +12,7 @@ STATES = np.stack([PSI1, PSI1 + PSI_REL, 0 * PSI1, 0 * PSI1], axis=-1)
 
 
 def uneven():
-    changes = {
-        "alpha2": -1.3,
-        "beta1": 0.05,
-        "beta2": -0.02,
-        "gamma2": 0.4,
-        "p2": 0.55,
-        "c2": 0.06,
-        "r2": 0.05,
-    }
+    changes = {"alpha2": -1.3, "beta1": 0.05, "beta2": -0.02, "gamma2": 0.4, "p2": 0.55, "c2": 0.06, "r2": 0.05}
     return load_model("pendulum").load(**changes)
 
 
@@ -37,9 +29,7 @@ def test_moment_slopes__are_those_of_the_law():
     assert slopes.shape == (200, len(laws.FITTED))
     for i, name in enumerate(laws.FITTED):
         step = 1e-5 * max(abs(p[name]), 0.01)
-        up, down = (
-            laws.magnet_moment(PSI1, PSI_REL, p.replace(**{name: p[name] + s})) for s in (step, -step)
-        )
+        up, down = (laws.magnet_moment(PSI1, PSI_REL, p.replace(**{name: p[name] + s})) for s in (step, -step))
         # second order of the differences, about 1e-10 of the third derivative's size
         np.testing.assert_allclose(slopes[:, i], (up - down) / (2 * step), rtol=1e-6, atol=1e-7, err_msg=name)
 

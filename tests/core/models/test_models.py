@@ -7,17 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
-from magpend_core import (
-    ParameterError,
-    energy,
-    evaluate,
-    jacobian,
-    load_model,
-    model_names,
-    rates,
-    sections,
-    torques,
-)
+from magpend_core import ParameterError, energy, evaluate, jacobian, load_model, model_names, rates, sections, torques
 from magpend_core.models import LIBRARY
 from magpend_core.models.pendulum.sides import Side, classify, slowest_hz
 
@@ -134,9 +124,7 @@ def test_evaluate__duffing_energy_changes_by_the_powers():
     parameters = load_model("duffing").load("twin-well")
     h, y = 1e-5, states_of(parameters.model)
     rate = rates(0.1, y, parameters, FREQUENCY)
-    ahead, behind = (
-        evaluate(["energy"], 0.1, y + s * h * rate, parameters, FREQUENCY)[:, 0] for s in (1, -1)
-    )
+    ahead, behind = (evaluate(["energy"], 0.1, y + s * h * rate, parameters, FREQUENCY)[:, 0] for s in (1, -1))
     power_in, lost = evaluate(["power_in", "power_dissipated"], 0.1, y, parameters, FREQUENCY).T
     np.testing.assert_allclose((ahead - behind) / (2 * h), power_in - lost, rtol=1e-7, atol=1e-7)
 

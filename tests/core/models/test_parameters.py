@@ -8,15 +8,43 @@ from magpend_core import ParameterError, load_model, load_preset, preset_names, 
 from magpend_core.models.pendulum.systems import PENDULUM_DIPOLE, PENDULUM_FITTED
 
 TABLE_1 = {
-    "g": 9.812, "l1": 0.174, "m1": 4.275, "m2": 1.365, "e1": 64.175e-3, "e2": 88.292e-3,
-    "J1": 45.381e-3, "J2": 14.308e-3, "T1": 86.004e-3, "T2": 18.824e-3, "c": 0.759e-3,
-    "mu": 0.461e-3, "mu0": 0.631, "c0": 13.447, "eps": 1000.0, "duty_cycle": 0.4927,
-}  # fmt: skip
+    "g": 9.812,
+    "l1": 0.174,
+    "m1": 4.275,
+    "m2": 1.365,
+    "e1": 64.175e-3,
+    "e2": 88.292e-3,
+    "J1": 45.381e-3,
+    "J2": 14.308e-3,
+    "T1": 86.004e-3,
+    "T2": 18.824e-3,
+    "c": 0.759e-3,
+    "mu": 0.461e-3,
+    "mu0": 0.631,
+    "c0": 13.447,
+    "eps": 1000.0,
+    "duty_cycle": 0.4927,
+}
 CALIBRATED = {
-    "q": 1.543, "eps_drive": 54.84, "alpha1": 1.1306, "alpha2": -1.1306, "beta1": 0.0, "beta2": 0.0,
-    "gamma1": 0.3143, "gamma2": 0.3143, "p1": 0.5870, "p2": 0.5870, "r1": -0.05745, "r2": 0.05745,
-    "c1": 0.05338, "c2": 0.05338, "eps_mag": 96.85, "l2": 0.1788, "h": 0.3742, "delta": 3.265e-3,
-}  # fmt: skip
+    "q": 1.543,
+    "eps_drive": 54.84,
+    "alpha1": 1.1306,
+    "alpha2": -1.1306,
+    "beta1": 0.0,
+    "beta2": 0.0,
+    "gamma1": 0.3143,
+    "gamma2": 0.3143,
+    "p1": 0.5870,
+    "p2": 0.5870,
+    "r1": -0.05745,
+    "r2": 0.05745,
+    "c1": 0.05338,
+    "c2": 0.05338,
+    "eps_mag": 96.85,
+    "l2": 0.1788,
+    "h": 0.3742,
+    "delta": 3.265e-3,
+}
 
 
 def problems_of(**overrides):

@@ -58,9 +58,12 @@ def test_load__takes_what_preset_returned(written):
 
 def test_write_preset__takes_over_the_values_and_sources_of_a_base_from_a_file(written, tmp_path):
     second = write_preset(
-        tmp_path / "second.toml", "pendulum", {"q": 1.5, "c1": 0.07}, {"q": "scale", "c1": "ruler"},
+        tmp_path / "second.toml",
+        "pendulum",
+        {"q": 1.5, "c1": 0.07},
+        {"q": "scale", "c1": "ruler"},
         base=Preset.read(written),
-    )  # fmt: skip
+    )
     written.unlink()
     model = load_model("pendulum")
     assert model.load(second) == model.load("wojna2018", **FIT | {"q": 1.5, "c1": 0.07})
@@ -121,13 +124,13 @@ def test_load__says_what_is_wrong_with_a_file(tmp_path, text, words):
 
 def test_load__says_all_that_is_wrong_with_a_file_at_once(tmp_path):
     path = tmp_path / "bad.toml"
-    path.write_text(
-        "model = 'pendulum'\nbase = 'zzz'\n[values]\nalpa1 = 1\nc1 = -1\n[provenance]\nvalues = 'fit'"
-    )
+    path.write_text("model = 'pendulum'\nbase = 'zzz'\n[values]\nalpa1 = 1\nc1 = -1\n[provenance]\nvalues = 'fit'")
     problems = problems_of(path)
     assert [("zzz" in p, "alpa1" in p, "c1 = -1" in p) for p in problems] == [
-        (True, False, False), (False, True, False), (False, False, True),
-    ]  # fmt: skip
+        (True, False, False),
+        (False, True, False),
+        (False, False, True),
+    ]
 
 
 def test_load__says_that_a_file_is_not_there(tmp_path):

@@ -152,9 +152,7 @@ def test_identify__order_and_blocks_of_cells_do_not_matter(cube, found):
 def test_identify__grid_of_starts(cube, found):
     grid = cube.drop_vars("state").rename(initial_condition="cell").assign_coords(state=STATES)
     shape = {"psi1_0": 8, "psi2_0": 8}
-    data = {
-        n: ((*shape, *v.dims[1:]), v.values.reshape(8, 8, *v.shape[1:])) for n, v in grid.data_vars.items()
-    }
+    data = {n: ((*shape, *v.dims[1:]), v.values.reshape(8, 8, *v.shape[1:])) for n, v in grid.data_vars.items()}
     grid = xr.Dataset(data, coords={"state": STATES, "frequency": FREQUENCY})
     result = identify(grid, parameters=load_preset(), block_bytes=40_000)
     assert result["attractor_id"].dims == ("psi1_0", "psi2_0")
@@ -202,9 +200,15 @@ def test_identify__rotating_orbits_close():
     parameters = model.load(d=0.5, A=1.4)
     starts = np.random.default_rng(1).uniform(-2, 2, (n, 2))
     result = run_branches(
-        np.tile(parameters.pack(), (n, 1, 1)), np.full((n, 1), frequency), starts,
-        n_transient=100, n_keep=24, rtol=1e-9, atol=1e-9, system=model.system,
-    )  # fmt: skip
+        np.tile(parameters.pack(), (n, 1, 1)),
+        np.full((n, 1), frequency),
+        starts,
+        n_transient=100,
+        n_keep=24,
+        rtol=1e-9,
+        atol=1e-9,
+        system=model.system,
+    )
     ds = xr.Dataset(
         {
             "section": (("initial_condition", "period_index", "state"), result.section[:, 0]),

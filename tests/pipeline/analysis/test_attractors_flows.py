@@ -26,9 +26,15 @@ def cube(table, states, *, crossing=None, frequency_hz=1.0, n_transient=200, n_k
     parameters, n = model.load(**values), len(states)
     rate = frequency_hz if crossing is None else crossing.frequency_hz
     found = run_branches(
-        np.tile(parameters.pack(), (n, 1, 1)), np.full((n, 1), rate), np.array(states),
-        n_transient=n_transient, n_keep=n_keep, rtol=1e-9, atol=1e-9, system=model.system,
-    )  # fmt: skip
+        np.tile(parameters.pack(), (n, 1, 1)),
+        np.full((n, 1), rate),
+        np.array(states),
+        n_transient=n_transient,
+        n_keep=n_keep,
+        rtol=1e-9,
+        atol=1e-9,
+        system=model.system,
+    )
     cells = "initial_condition"
     variables = {
         "section": ((cells, "period_index", "state"), found.section[:, 0]),
@@ -41,9 +47,11 @@ def cube(table, states, *, crossing=None, frequency_hz=1.0, n_transient=200, n_k
     else:
         variables["rest_state"] = ((cells, "state"), rest_states(found)[:, 0])
     attrs = {
-        "model": json.dumps(model.reference), "closure_tolerance": 1e-6, **section_attributes(model.crossing),
+        "model": json.dumps(model.reference),
+        "closure_tolerance": 1e-6,
+        **section_attributes(model.crossing),
         "parameters": "\n".join(f"{k} = {v!r}" for k, v in parameters.as_dict().items()),
-    }  # fmt: skip
+    }
     return xr.Dataset(variables, coords=coords, attrs=attrs)
 
 
@@ -67,9 +75,7 @@ def test_identify__cycle_beside_equilibrium(value):
     assert float(found["period_s"][orbit]) == pytest.approx(np.pi, rel=1e-9)
     assert np.isnan(found["period_s"][rest])
     radius = np.sqrt(0.5 * (1.0 + np.sqrt(0.6)))
-    assert float(found["state_max"].sel(state="y")[orbit]) == pytest.approx(
-        radius, rel=1e-3
-    )  # of 256 samples
+    assert float(found["state_max"].sel(state="y")[orbit]) == pytest.approx(radius, rel=1e-3)  # of 256 samples
     np.testing.assert_allclose(found["attractor_points"].values[rest, 0], 0.0, atol=1e-10)
     np.testing.assert_allclose(found["eigenvalue_real"].values[rest], -0.1, atol=1e-10)
     np.testing.assert_allclose(np.sort(found["eigenvalue_imag"].values[rest]), [-2.0, 2.0], atol=1e-10)

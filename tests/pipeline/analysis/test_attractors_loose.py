@@ -23,9 +23,14 @@ def run(frequency, closure_tolerance, n=8, n_transient=3000):
     starts = np.zeros((n * n, 4))
     starts[:, :2] = np.stack(np.meshgrid(line, line, indexing="ij"), axis=-1).reshape(-1, 2)
     result = sections(
-        load_preset(), frequency, starts, n_transient=n_transient, n_keep=16,
-        stop_when_closed=True, closure_tolerance=closure_tolerance,
-    )  # fmt: skip
+        load_preset(),
+        frequency,
+        starts,
+        n_transient=n_transient,
+        n_keep=16,
+        stop_when_closed=True,
+        closure_tolerance=closure_tolerance,
+    )
     own = {"section": ("period_index", "state"), "turns": ("link",), "status": (), "orbit_period": ()}
     data = {name: (("initial_condition", *dims), getattr(result, name)) for name, dims in own.items()}
     data["n_periods"] = ("initial_condition", result.n_periods)
@@ -41,9 +46,7 @@ def orbit_of_cells(found):
     rows = found["attractor_id"].values
     on_orbit = (rows >= 0) & (found["kind"].values[rows] == PERIODIC_ORBIT)
     assert (~on_orbit).sum() <= 1
-    return found["attractor_points"].values[rows, 0], np.where(
-        on_orbit, found["orbit_period"].values[rows], 0
-    )
+    return found["attractor_points"].values[rows, 0], np.where(on_orbit, found["orbit_period"].values[rows], 0)
 
 
 @pytest.mark.parametrize(

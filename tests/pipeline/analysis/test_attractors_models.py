@@ -24,9 +24,7 @@ def cube(preset, n, n_transient, n_keep, **overrides):
     parameters = DUFFING.load(preset, **overrides)
     axis = np.linspace(-2.0, 2.0, n)
     starts = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)
-    found = sections(
-        parameters, FREQUENCY, starts, n_transient=n_transient, n_keep=n_keep, rtol=1e-9, atol=1e-9
-    )
+    found = sections(parameters, FREQUENCY, starts, n_transient=n_transient, n_keep=n_keep, rtol=1e-9, atol=1e-9)
     dims = ("x_0", "v_0")
     flags = {"flag_values": np.arange(3, dtype=np.int8), "flag_meanings": "pending periodic bounded"}
     return xr.Dataset(
@@ -37,14 +35,19 @@ def cube(preset, n, n_transient, n_keep, **overrides):
             "n_periods": (dims, found.n_periods.reshape(n, n)),
         },
         coords={
-            "x_0": axis, "v_0": axis, "frequency": FREQUENCY, "state": ["x", "v"],
+            "x_0": axis,
+            "v_0": axis,
+            "frequency": FREQUENCY,
+            "state": ["x", "v"],
             "state_units": ("state", ["m", "m/s"]),
         },
         attrs={
-            "model": "duffing", "rtol": 1e-9, "atol": 1e-9,
+            "model": "duffing",
+            "rtol": 1e-9,
+            "atol": 1e-9,
             "parameters": "\n".join(f"{k} = {v!r}" for k, v in parameters.items()),
         },
-    )  # fmt: skip
+    )
 
 
 @pytest.fixture(scope="module")
@@ -80,9 +83,7 @@ def test_identify__two_published_orbits(two):
     found = identify(two)
     assert found["orbit_period"].values.tolist() == [1, 1]
     points = found["attractor_points"].values[:, 0]
-    assert points == pytest.approx(
-        np.array([[-0.7790549287, 0.0274168155], [1.2100908241, 0.0552949542]]), abs=1e-9
-    )
+    assert points == pytest.approx(np.array([[-0.7790549287, 0.0274168155], [1.2100908241, 0.0552949542]]), abs=1e-9)
     multipliers = found["multiplier_real"].values + 1j * np.abs(found["multiplier_imag"].values)
     assert multipliers == pytest.approx(np.full((2, 2), -0.226806 + 0.581567j), abs=1e-6)
     assert found["mirror_partner"].values.tolist() == [1, 0]
@@ -118,8 +119,7 @@ def test_portraits__of_a_model_without_a_drawing(strange):
 
 
 def test_datasets__are_fit_for_netcdf(chaotic, strange, tmp_path):
-    for name, ds in (("found", strange), ("ids", match(strange)),
-                     ("chaos", chaos(chaotic, strange))):  # fmt: skip
+    for name, ds in (("found", strange), ("ids", match(strange)), ("chaos", chaos(chaotic, strange))):
         ds.to_netcdf(tmp_path / f"{name}.nc", engine="scipy")
         with xr.open_dataset(tmp_path / f"{name}.nc", engine="scipy") as stored:
             assert set(stored.data_vars) == set(ds.data_vars)

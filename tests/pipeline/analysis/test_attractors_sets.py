@@ -97,9 +97,7 @@ def stable_orbit():
 
 def decision_of(*sections, status=2, period=0, orbit=None):
     n = len(sections)
-    block = Block(
-        slice(0, n), np.stack(sections), np.full(n, status), np.full(n, period), np.zeros((n, 1), int)
-    )
+    block = Block(slice(0, n), np.stack(sections), np.full(n, status), np.full(n, period), np.zeros((n, 1), int))
     label, decision = decide(block, [orbit or stable_orbit()], 1e-4, PLANE)
     assert ((label >= 0) == (decision != UNDECIDED)).all()
     return decision.tolist()

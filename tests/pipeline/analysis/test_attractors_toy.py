@@ -217,9 +217,7 @@ def test_match__does_not_depend_on_the_order_of_the_cells():
     order = np.random.default_rng(8).permutation(30)
     plain, shuffled = (match(identify(sweep(order=o)[0], polish=False)) for o in (None, order))
     assert np.array_equal(shuffled["attractor_id"].values, plain["attractor_id"].values[:, order])
-    assert np.array_equal(
-        shuffled["attractor_points"].values, plain["attractor_points"].values, equal_nan=True
-    )
+    assert np.array_equal(shuffled["attractor_points"].values, plain["attractor_points"].values, equal_nan=True)
 
 
 def rows(*points, rotation=None):
@@ -316,10 +314,7 @@ def test_hysteresis__loop_and_jumps():
     assert table["present"].sel(direction="up").values.tolist() == [[1, 0]] * 5 + [[0, 1]]
     jumps = set(
         zip(
-            *(
-                table[f"jump_{n}"].values.tolist()
-                for n in ("direction", "from", "to", "from_id", "to_id", "count")
-            ),
+            *(table[f"jump_{n}"].values.tolist() for n in ("direction", "from", "to", "from_id", "to_id", "count")),
             strict=True,
         )
     )
@@ -342,10 +337,7 @@ def test_identify__largest_exponent_of_bounded_sets_is_that_of_their_good_cells(
             "turns": (("initial_condition", "link"), np.zeros((6, 2), np.int32)),
             "status": ("initial_condition", np.full(6, 2, np.int8)),
             "orbit_period": ("initial_condition", np.zeros(6, np.int16)),
-            "lyapunov": (
-                ("initial_condition", "exponent"),
-                np.array([[0.1], [0.3], [9.0], [0.5], [0.6], [0.7]]),
-            ),
+            "lyapunov": (("initial_condition", "exponent"), np.array([[0.1], [0.3], [9.0], [0.5], [0.6], [0.7]])),
             "lyapunov_stderr": (("initial_condition", "exponent"), np.full((6, 1), 0.01)),
             "lyapunov_flag": ("initial_condition", np.array([1, 1, 2, 1, 1, 1], np.int8)),
         },
@@ -379,10 +371,7 @@ def test_match__unlike_things_have_different_ids_however_near(periods, width, sa
         {
             "attractor_points": (("frequency", "attractor", "point", "state"), points),
             "rotation": (("frequency", "attractor", "link"), np.zeros((2, 1, 2))),
-            "kind": (
-                ("frequency", "attractor"),
-                [[PERIODIC_ORBIT if p else BOUNDED_SET] for p in periods],
-            ),
+            "kind": (("frequency", "attractor"), [[PERIODIC_ORBIT if p else BOUNDED_SET] for p in periods]),
             "orbit_period": (("frequency", "attractor"), np.array(periods)[:, None]),
             "attractor_id": (("frequency", "initial_condition"), np.zeros((2, 1), np.int32)),
         },

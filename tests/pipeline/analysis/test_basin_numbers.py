@@ -126,9 +126,7 @@ def test_basin_fractions__simulated_coverage(method):
     rng = np.random.default_rng(7)
     starts = rng.uniform(-1.04, 2.0, (2000, 150))
     truth = np.array([2.0, 1.0, 0.04]) / 3.04
-    ds = basin_fractions(
-        xr.DataArray(cubic_map(starts), dims=("run", "start")), dims=["start"], method=method
-    )
+    ds = basin_fractions(xr.DataArray(cubic_map(starts), dims=("run", "start")), dims=["start"], method=method)
     assert ds["fraction"].dims == ("run", "label")
     assert ds["fraction"].mean("run").values == pytest.approx(truth, abs=0.003)
     rate = ((ds["low"] <= truth) & (truth <= ds["high"])).mean("run").values
@@ -144,9 +142,7 @@ def test_basin_fractions__unfinished_cells_that_are_not_like_the_rest():
     rng = np.random.default_rng(8)
     labels = cubic_map(rng.uniform(-1.5, 1.5, (1000, 150)))
     labels[labels == 2] = -1  # one basin is slow: none of its cells finished
-    ds = basin_fractions(
-        xr.DataArray(labels, dims=("run", "start")), dims="start", ids=[2], method="clopper-pearson"
-    )
+    ds = basin_fractions(xr.DataArray(labels, dims=("run", "start")), dims="start", ids=[2], method="clopper-pearson")
     truth = np.array([4, 1, 1]) / 6
     naive = ((ds["low"] <= truth) & (truth <= ds["high"])).mean("run").values
     honest = ((ds["low_if_none"] <= truth) & (truth <= ds["high_if_all"])).mean("run").values
@@ -315,9 +311,7 @@ def test_basin_entropy__no_boundary():
     assert not ds["above_ln2"].item()
 
 
-@pytest.mark.parametrize(
-    ("patch", "block", "low", "high"), [(1, 1, 0.8, 1.25), (4, 4, 0.8, 1.25), (4, 1, 0.1, 0.45)]
-)
+@pytest.mark.parametrize(("patch", "block", "low", "high"), [(1, 1, 0.8, 1.25), (4, 4, 0.8, 1.25), (4, 1, 0.1, 0.45)])
 def test_basin_entropy__bootstrap_tells_the_scatter(patch, block, low, high):
     # patches of boxes are mixed or not by a coin: the scatter over many such grids is the true error
     rng = np.random.default_rng(5)
@@ -336,14 +330,7 @@ def test_boundaries__names_of_labels_do_not_matter():
     renamed = np.array([40, -7, 3])[labels]
     for function in (basin_entropy, uncertainty_exponent, wada_merge_test):
         one, other = function(labels), function(renamed)
-        for name in (
-            "entropy",
-            "entropy_stderr",
-            "exponent",
-            "exponent_stderr",
-            "hausdorff_distance",
-            "beyond_stderr",
-        ):
+        for name in ("entropy", "entropy_stderr", "exponent", "exponent_stderr", "hausdorff_distance", "beyond_stderr"):
             if name in one:
                 np.testing.assert_allclose(one[name], other[name], rtol=1e-12)
 
@@ -406,9 +393,7 @@ def test_uncertainty_exponent__plane_boundary_is_exact(dims):
 
 def test_uncertainty_exponent__entropy_of_a_straight_boundary():
     i = np.arange(400)
-    ds = uncertainty_exponent(
-        (i[:, None] + i < 400).astype(int), method="entropy", epsilons=[8, 10, 20, 40, 50]
-    )
+    ds = uncertainty_exponent((i[:, None] + i < 400).astype(int), method="entropy", epsilons=[8, 10, 20, 40, 50])
     # only the boxes on the diagonal are mixed, each about half and half
     assert ds["exponent"].item() == pytest.approx(1.0, abs=0.03)
     np.testing.assert_allclose(ds["uncertain"] * 400 / ds["epsilon"], np.log(2), rtol=0.02)

@@ -16,30 +16,14 @@ from magpend_core.models import load_model
 from magpend_core.models.pendulum.sides import Side
 from magpend_core.models.pendulum.systems import PENDULUM_FITTED
 from magpend_core.orbits import scaled_distance, stroboscopic_map
-from pipeline.analysis.branches import (
-    Scope,
-    Start,
-    attracting,
-    dataset_of,
-    explore,
-    orbits_near,
-    table_of,
-    windows_of,
-)
+from pipeline.analysis.branches import Scope, Start, attracting, dataset_of, explore, orbits_near, table_of, windows_of
 from pipeline.analysis.branches.arclength import Point, Settings
 from pipeline.analysis.branches.bifurcations import Bifurcation, multipliers_of, n_unstable, tell_apart
 from pipeline.analysis.branches.curves import continue_curves
 from pipeline.analysis.branches.exploring import _cross
 from pipeline.analysis.branches.following import first_point
 from pipeline.analysis.branches.lockstep import run_alone, run_together
-from pipeline.analysis.branches.problems import (
-    Family,
-    OrbitProblem,
-    Value,
-    doubling_test,
-    fold_test,
-    torus_test,
-)
+from pipeline.analysis.branches.problems import Family, OrbitProblem, Value, doubling_test, fold_test, torus_test
 from pipeline.analysis.branches.table import branches_table
 from pipeline.layout.vocabulary import BOUNDED_SET, PERIODIC_ORBIT
 
@@ -278,10 +262,7 @@ def test_attracting__all_periods_or_a_line_for_what_is_left_out():
     assert "--recurrences" in line
     starts, left_out = attracting(found, parameters, "frequency", (0.1, 0.17), 5)
     assert sorted(s.family.period for s in starts) == [1, 5]
-    assert (
-        "attractor 2 at frequency 0.15 to 0.2 (2 points): its period is 7; take it with --period 7"
-        in left_out
-    )
+    assert "attractor 2 at frequency 0.15 to 0.2 (2 points): its period is 7; take it with --period 7" in left_out
     outside = "attractor 0 at frequency 0.2: outside of frequency 0.1 to 0.17"
     assert any(line.startswith(outside) for line in left_out)
 
@@ -292,8 +273,7 @@ def cascade():
     parameters = [0.3, 0, -1.0, 1.0, 0.2]
     orbits = family(1.2 / (2.0 * np.pi), parameters, "amplitude", 0.1)
     return orbits, explore(
-        [Start(orbits, settled([1.2, 0.0], orbits.frequency_hz, parameters), 0.2)],
-        Scope(0.2, 0.3, max_period=4),
+        [Start(orbits, settled([1.2, 0.0], orbits.frequency_hz, parameters), 0.2)], Scope(0.2, 0.3, max_period=4)
     )
 
 
@@ -301,9 +281,7 @@ def test_explore__period_doublings(cascade):
     orbits, branches = cascade
     assert [b.family.period for b in branches] == [1, 2, 4]
     first, second = (only(b, "period_doubling")[0] for b in branches[:2])
-    there = recomputed(
-        first, orbits, doubling_test, lambda a: (orbits.frequency_hz, [*orbits.parameters[:4], a])
-    )
+    there = recomputed(first, orbits, doubling_test, lambda a: (orbits.frequency_hz, [*orbits.parameters[:4], a]))
     assert orbits.values(first.point.u)[0] == pytest.approx(there, abs=1e-8)
     assert (first.n_unstable_before, first.n_unstable_after) == (0, 1)
     assert first.criticality == second.criticality == "supercritical"
@@ -313,9 +291,7 @@ def test_explore__period_doublings(cascade):
     point = branches[1].points[5]
     assert n_unstable(point) == 0
     image, _ = flow(
-        branches[1].family.state(point.u),
-        orbits.frequency_hz,
-        [*orbits.parameters[:4], branches[1].values[5]],
+        branches[1].family.state(point.u), orbits.frequency_hz, [*orbits.parameters[:4], branches[1].values[5]]
     )
     assert np.abs(image - branches[1].family.state(point.u)).max() > 1e-3
 
@@ -359,8 +335,7 @@ def test_explore__symmetry_breaking():
     parameters = [0.1, 0, 0.0, 1.0, 0.3]
     orbits = family(1.0 / (2.0 * np.pi), parameters, "amplitude", 1.0)
     branches = explore(
-        [Start(orbits, settled([0.0, 0.0], orbits.frequency_hz, parameters), 0.3)],
-        Scope(0.1, 2.5, max_period=1),
+        [Start(orbits, settled([0.0, 0.0], orbits.frequency_hz, parameters), 0.3)], Scope(0.1, 2.5, max_period=1)
     )
     pitchfork = only(branches[0], "branch_point")[0]
     broken = pitchfork.child
@@ -549,10 +524,16 @@ def test_explore__brute_force_agrees(right_family):
     orbits = [ds["section"].values[i, j, : branches[i].family.period] for i, j in chosen]
     n = len(chosen)
     result = run_branches(
-        np.tile(parameters.pack(), (n, 1, 1)), np.array([[branches[i].values[j]] for i, j in chosen]),
+        np.tile(parameters.pack(), (n, 1, 1)),
+        np.array([[branches[i].values[j]] for i, j in chosen]),
         np.array([orbit[0] for orbit in orbits]) + [1e-3, -1e-3, 1e-2, 1e-2],
-        n_transient=1500, n_keep=4, rtol=1e-9, atol=1e-9, stop_when_closed=True, closure_tolerance=1e-7,
-    )  # fmt: skip
+        n_transient=1500,
+        n_keep=4,
+        rtol=1e-9,
+        atol=1e-9,
+        stop_when_closed=True,
+        closure_tolerance=1e-7,
+    )
     assert result.orbit_period[:, 0].tolist() == [branches[i].family.period for i, _ in chosen]
     for orbit, sections in zip(orbits, result.section[:, 0], strict=True):
         for section in sections:
@@ -571,9 +552,7 @@ def test_locate__at_a_velocity_reversal(right_family):
     for offset in (-2e-4, -1e-4, 1e-4, 2e-4):
         u = halving.point.u + offset / halving.point.tangent[-1] * halving.point.tangent
         u[-1] = at + offset
-        tests.append(
-            doubling_test(run_alone(first_point(OrbitProblem(orbits), u, Settings())).value.monodromy)
-        )
+        tests.append(doubling_test(run_alone(first_point(OrbitProblem(orbits), u, Settings())).value.monodromy))
     left, right = tests[1] - tests[0], tests[3] - tests[2]
     # the slope changes by its own derivative only: with a corner, the two would differ at any offset
     assert left == pytest.approx(right, rel=1e-2)

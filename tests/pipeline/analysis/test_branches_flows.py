@@ -27,9 +27,7 @@ def followed(table, of, state, parameter, low, high, *, max_period=1, **values):
     """Branches from a limit cycle near a state."""
     parameters = sectioned(flow(table), Crossing(of, longest=50.0)).load(**values)
     model = parameters.model
-    family = family_of(
-        model.system, 1, model.crossing.frequency_hz, parameters.pack(), parameter, high - low
-    )  # fmt: skip
+    family = family_of(model.system, 1, model.crossing.frequency_hz, parameters.pack(), parameter, high - low)
     start = Start(family, np.array(state, float), parameters[parameter])
     return dataset_of(explore([start], Scope(low, high, max_period, 2)), parameter, parameters)
 
@@ -75,9 +73,7 @@ def shot(c, guess):
     def rates(t, w, c=c):
         x, y, z = w[:3]
         jacobian = np.array([[0.0, -1.0, -1.0], [1.0, 0.2, 0.0], [z, 0.0, x - c]])
-        return np.concatenate(
-            [[-y - z, x + 0.2 * y, 0.2 + z * (x - c)], (jacobian @ w[3:].reshape(3, 3)).ravel()]
-        )
+        return np.concatenate([[-y - z, x + 0.2 * y, 0.2 + z * (x - c)], (jacobian @ w[3:].reshape(3, 3)).ravel()])
 
     def end(y, z, time):
         start = np.concatenate([[0.0, y, z], np.eye(3).ravel()])

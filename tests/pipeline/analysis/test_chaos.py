@@ -221,9 +221,7 @@ def test_chaos__without_exponents():
 
 def test_chaos__correlation_dimension_of_enough_points():
     cube = on_a_plane()
-    found = chaos(cube, attractors_of(cube, [0] * 8 + [1, 1], [BOUNDED_SET] * 2), n_max=4000).isel(
-        frequency=0
-    )
+    found = chaos(cube, attractors_of(cube, [0] * 8 + [1, 1], [BOUNDED_SET] * 2), n_max=4000).isel(frequency=0)
     assert found.attractor_correlation.values[0] == pytest.approx(2.0, abs=0.15)
     assert np.isnan(found.attractor_correlation.values[1])
     without = chaos(cube, one_set(cube), n_max=0)
@@ -241,9 +239,7 @@ def test_chaos_table__a_summary_if_there_are_many_points():
     rates = np.full((8, 2), -0.2)
     rates[[0, 1, 4], 0] = [0.3, 0.38, 0.33]
     cube = made_up(rates, frequency)
-    table = chaos_table(
-        chaos(cube, attractors_of(cube, np.tile([0, 1], (8, 1)), np.full((8, 2), BOUNDED_SET)))
-    )
+    table = chaos_table(chaos(cube, attractors_of(cube, np.tile([0, 1], (8, 1)), np.full((8, 2), BOUNDED_SET))))
     assert table.lines[0] == "16 cells at 8 parameter points"
     assert re.search(r"^  regular +0, 1 +13 +8 +1 to 4\.5$", table.lines[2])
     assert re.search(r"^  chaotic +0 +3 +3 +1 to 1\.5, 3$", table.lines[3])
@@ -358,10 +354,7 @@ def test_section_dimension__of_each_set_that_stays():
     found = section_dimension(
         cube,
         attractors_of(
-            cube,
-            [0] * 8 + [1, 2],
-            [BOUNDED_SET, BOUNDED_SET, PERIODIC_ORBIT],
-            verdicts=[ATTRACTS, TRANSIENT, ATTRACTS],
+            cube, [0] * 8 + [1, 2], [BOUNDED_SET, BOUNDED_SET, PERIODIC_ORBIT], verdicts=[ATTRACTS, TRANSIENT, ATTRACTS]
         ),
         at={"frequency": 2.0},
     ).isel(frequency=0)

@@ -27,9 +27,15 @@ HARDENING = DUFFING.load("hardening")
 
 def settled(parameters, frequency, state, n=300):
     result = run_branches(
-        parameters.pack()[None, None], np.array([[frequency]]), np.array([state]),
-        n_transient=n, n_keep=1, rtol=1e-9, atol=1e-9, system=DUFFING.system,
-    )  # fmt: skip
+        parameters.pack()[None, None],
+        np.array([[frequency]]),
+        np.array([state]),
+        n_transient=n,
+        n_keep=1,
+        rtol=1e-9,
+        atol=1e-9,
+        system=DUFFING.system,
+    )
     return result.section[0, 0, -1]
 
 
@@ -41,9 +47,8 @@ def closed(parameters, frequency, state, period):
     assert found.converged[0]
     assert found.orbit_period[0] == period
     images = run_branches(
-        packed[:, None], f[:, None], found.section, n_transient=0, n_keep=period, rtol=1e-12, atol=1e-12,
-        system=system,
-    ).section[0, 0]  # fmt: skip
+        packed[:, None], f[:, None], found.section, n_transient=0, n_keep=period, rtol=1e-12, atol=1e-12, system=system
+    ).section[0, 0]
     return np.roll(images, 1, axis=0)
 
 
@@ -170,10 +175,7 @@ def appearances(axis, values, *points, model="duffing", parameters=TWIN_WELL, si
             "orbit_period": (dims, period),
             "attractor_points": ((*dims, "point", "state"), section),
             "rotation": ((*dims, "angle"), np.zeros((*period.shape, n_angles))),
-            "attractor_id": (
-                (axis, "initial_condition"),
-                np.where(present, np.arange(rows), -1).astype(np.int32),
-            ),
+            "attractor_id": ((axis, "initial_condition"), np.where(present, np.arange(rows), -1).astype(np.int32)),
         },
         coords={axis: list(values)},
         attrs={"model": model, "parameters": text},
@@ -186,26 +188,19 @@ def appearances(axis, values, *points, model="duffing", parameters=TWIN_WELL, si
 def told(ds):
     """Id and basis of the attractors at each value."""
     ids = ds["attractor"].values
-    return [
-        [(int(i), BASES[b]) for i, b in zip(ids, basis, strict=True) if b]
-        for basis in ds["match_basis"].values
-    ]
+    return [[(int(i), BASES[b]) for i, b in zip(ids, basis, strict=True) if b] for basis in ds["match_basis"].values]
 
 
 def test_match__ids_rest_on_followed_branches(wells):
     """However far apart: the unstable part of a branch and a doubling connect, distance never did."""
-    ds = appearances(
-        "amplitude", [0.2, 0.28, 0.3], [wells(1, 0.2)], [wells(2, 0.28)], [wells(1, 0.3)]
-    )  # fmt: skip
+    ds = appearances("amplitude", [0.2, 0.28, 0.3], [wells(1, 0.2)], [wells(2, 0.28)], [wells(1, 0.3)])
     assert told(match(ds, threshold=1e-9)) == [[(0, "first_appearance")], [(0, "doubling")], [(0, "branch")]]
     assert match(ds, threshold=1e-9, connect=False).sizes["attractor"] == 3
 
 
 def test_match__coexisting_attractors_have_different_ids(wells):
     """The single orbit is listed beside the doubled one: the doubled one is another attractor then."""
-    ds = appearances(
-        "amplitude", [0.26, 0.28], [wells(1, 0.26)], [wells(1, 0.28), wells(2, 0.28)]
-    )  # fmt: skip
+    ds = appearances("amplitude", [0.26, 0.28], [wells(1, 0.26)], [wells(1, 0.28), wells(2, 0.28)])
     named = match(ds)
     assert told(named) == [[(0, "first_appearance")], [(0, "branch"), (1, "first_appearance")]]
     assert named["orbit_period"].values.tolist() == [[1, 0], [1, 2]]
@@ -236,9 +231,8 @@ def test_match__one_sided_motions_through_the_chaotic_band():
     parameters = load_model("pendulum").load()
     points = [[RIGHT[f], LEFT[f]] if f in LEFT else [RIGHT[f]] for f in RIGHT]
     ds = appearances(
-        "frequency", list(RIGHT), *points, model="pendulum", parameters=parameters,
-        sides=[[2, 1], [2, 0], [2, 1]],
-    )  # fmt: skip
+        "frequency", list(RIGHT), *points, model="pendulum", parameters=parameters, sides=[[2, 1], [2, 0], [2, 1]]
+    )
     named = match(ds, threshold=1e-9)
     periods, sides = named["orbit_period"].values, named["side"].values
     assert sorted(zip(sides[0].tolist(), periods.T.tolist(), strict=True)) == [(1, [1, 0, 1]), (2, [1, 2, 1])]

@@ -12,15 +12,7 @@ from pipeline.analysis.attractors.growth import growth_of, on_closed_curves
 from pipeline.analysis.attractors.orbits import Orbit
 from pipeline.analysis.attractors.requests import LEG, Extended, Leg, Polish, Settings, Slopes
 from pipeline.analysis.sets import Geometry
-from pipeline.layout.vocabulary import (
-    ATTRACTS,
-    BOUNDED_SET,
-    CHAOTIC_SET,
-    NEUTRAL,
-    NOT_SETTLED,
-    TORUS,
-    TRANSIENT,
-)
+from pipeline.layout.vocabulary import ATTRACTS, BOUNDED_SET, CHAOTIC_SET, NEUTRAL, NOT_SETTLED, TORUS, TRANSIENT
 
 N_KEEP = 20
 TENT_SLOPE = 2.05
@@ -68,13 +60,7 @@ def settle(point, orbits=(), *, budget=1e6, seen=N_KEEP, scale=1.0) -> Outcome:
             n = len(state)
             status = np.where(np.isfinite(state).all(axis=1), Status.BOUNDED, Status.DIVERGED)
             answer = Extended(
-                section,
-                status,
-                np.zeros(n, int),
-                np.zeros((n, 0), int),
-                state,
-                np.zeros(n),
-                np.ones((n, LEG)),
+                section, status, np.zeros(n, int), np.zeros((n, 0), int), state, np.zeros(n), np.ones((n, LEG))
             )
         elif isinstance(asked, Slopes):
             answer = point.step(asked.point), point.slope(asked.point)
@@ -155,10 +141,7 @@ def rotation(alpha, contraction):
         turned = angle + 2 * np.pi * alpha
         new_radial = np.stack([np.cos(turned), np.sin(turned)], axis=1)
         new_tangent = np.stack([-np.sin(turned), np.cos(turned)], axis=1)
-        return (
-            contraction * new_radial[:, :, None] * radial[:, None]
-            + new_tangent[:, :, None] * tangent[:, None]
-        )
+        return contraction * new_radial[:, :, None] * radial[:, None] + new_tangent[:, :, None] * tangent[:, None]
 
     return step, derivative
 

@@ -349,12 +349,8 @@ def test_correlation_dimension__error_is_the_scatter():
 def test_correlation_dimension__scales_of_the_states_do_not_matter():
     section = henon(1, 1500)
     plain = correlation_dimension(cube(section), geometry=PLANE)
-    scaled = correlation_dimension(
-        cube(section * [1.0, 10.0]), geometry=Geometry((False, False), (1.0, 10.0))
-    )
-    assert scaled["correlation_dimension"].item() == pytest.approx(
-        plain["correlation_dimension"].item(), abs=1e-6
-    )
+    scaled = correlation_dimension(cube(section * [1.0, 10.0]), geometry=Geometry((False, False), (1.0, 10.0)))
+    assert scaled["correlation_dimension"].item() == pytest.approx(plain["correlation_dimension"].item(), abs=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -34,12 +34,7 @@ def make_cube(rates, *, stderr=0.02, n_exponents=4, blocks=8, **dims):
             "divergence": (names, spectrum.sum(-1) + 0.001),
             "lyapunov_flag": (names, np.ones(shape, np.int8)),
         },
-        coords={
-            **dims,
-            "state": STATES,
-            "exponent": np.arange(1, n_exponents + 1),
-            "frequency": dims["frequency"],
-        },
+        coords={**dims, "state": STATES, "exponent": np.arange(1, n_exponents + 1), "frequency": dims["frequency"]},
         attrs={"model": "pendulum", "parameters": PARAMETERS},
     )
 
@@ -161,9 +156,7 @@ def test_spectrum_of_jacobians__is_the_spectrum_of_the_engine():
         jacobians.append(derivative[0])
         point = image[:, -1]
     expected = spectrum_of_jacobians(jacobians, n_blocks=4, n_transient=10)
-    found = lyapunov_exponents(
-        one, frequency, start, n_transient=10, n_periods=16, rtol=1e-11, atol=1e-11, n_blocks=4
-    )
+    found = lyapunov_exponents(one, frequency, start, n_transient=10, n_periods=16, rtol=1e-11, atol=1e-11, n_blocks=4)
     assert found.exponents[0] == pytest.approx(expected.exponents * 2.4, abs=1e-4)
     assert found.blocks[0] == pytest.approx(expected.blocks * 2.4, abs=1e-4)
     assert found.stderr[0] == pytest.approx(expected.stderr * 2.4, abs=1e-4)
@@ -177,9 +170,7 @@ def test_plot_lyapunov__points_are_the_largest_exponents(cube):
     fig = plot_lyapunov(cube)
     (line,) = artists(fig, "exponent:2")  # right: psi1 = psi2 = 0.3
     drawn = sorted(zip(line.get_xdata(), line.get_ydata(), strict=True))
-    expected = sorted(
-        (f, v) for f, row in zip(FREQUENCY, cube.lyapunov.values[..., 0], strict=True) for v in row
-    )
+    expected = sorted((f, v) for f, row in zip(FREQUENCY, cube.lyapunov.values[..., 0], strict=True) for v in row)
     assert np.array(drawn) == pytest.approx(np.array(expected))
     top, bottom = fig.axes
     assert bottom.get_shared_x_axes().joined(top, bottom)

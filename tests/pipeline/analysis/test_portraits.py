@@ -59,9 +59,7 @@ def test_portraits__closed_orbits_close(attractors):
 
 
 def test_portraits__velocities_are_those_of_the_angles(attractors):
-    found = portraits(
-        attractors, at={"frequency": 2.2}, parameters=load_preset(), n_samples=2000, n_periods=1
-    )
+    found = portraits(attractors, at={"frequency": 2.2}, parameters=load_preset(), n_samples=2000, n_periods=1)
     orbit, time = found["orbit"].values[0, :2001], found["time"].values[:2001]
     rate = np.gradient(orbit[:, :2], time, axis=0)[1:-1]
     assert np.abs(rate - orbit[1:-1, 2:]).max() < 2e-2

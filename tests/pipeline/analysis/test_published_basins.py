@@ -62,9 +62,17 @@ def two_wells(duffing):
     """The starts integrated until their orbits close, as a cube."""
     n = len(STARTS)
     result = run_branches(
-        np.broadcast_to(TWO_WELLS, (n, 1, 2)), np.full((n, 1), UNIT_FREQUENCY), STARTS, system=duffing,
-        n_transient=400, n_keep=16, rtol=1e-8, atol=1e-8, stop_when_closed=True, max_orbit_period=4,
-    )  # fmt: skip
+        np.broadcast_to(TWO_WELLS, (n, 1, 2)),
+        np.full((n, 1), UNIT_FREQUENCY),
+        STARTS,
+        system=duffing,
+        n_transient=400,
+        n_keep=16,
+        rtol=1e-8,
+        atol=1e-8,
+        stop_when_closed=True,
+        max_orbit_period=4,
+    )
     return cube_of(result, duffing, UNIT_FREQUENCY)
 
 
@@ -161,9 +169,17 @@ def rest_fraction(bench, torques, n):
     packed[:, 0, 1] = np.repeat(torques, len(starts))
     # without forcing any time between sections will do; ten time units have a rotation's phase drift
     result = run_branches(
-        packed, np.full((cells, 1), 0.1), np.tile(starts, (len(torques), 1)), system=bench.PENDULUM,
-        n_transient=40, n_keep=30, rtol=1e-8, atol=1e-8, closure_tolerance=1e-4, max_orbit_period=1,
-    )  # fmt: skip
+        packed,
+        np.full((cells, 1), 0.1),
+        np.tile(starts, (len(torques), 1)),
+        system=bench.PENDULUM,
+        n_transient=40,
+        n_keep=30,
+        rtol=1e-8,
+        atol=1e-8,
+        closure_tolerance=1e-4,
+        max_orbit_period=1,
+    )
     ds = cube_of(result, bench.PENDULUM, 0.1, torque=torques)
     # not polished: at rest, steps that the trajectory alone controls grow too long for its tangents
     found = identify(ds, system=bench.PENDULUM, parameters=np.array([0.1, 0.0]), polish=False, tolerance=1e-3)
@@ -199,8 +215,12 @@ def test_regions__rotation_begins_at_the_unstable_manifold(bench, torque):
     angles = saddle + np.linspace(0.1, TWO_PI, 50)
     speed = solve_ivp(
         lambda angle, w: (torque - 0.1 * w - np.sin(angle)) / w,
-        (saddle + 1e-5, angles[-1]), [slope * 1e-5], t_eval=angles, rtol=1e-9, atol=1e-12,
-    ).y[0]  # fmt: skip
+        (saddle + 1e-5, angles[-1]),
+        [slope * 1e-5],
+        t_eval=angles,
+        rtol=1e-9,
+        atol=1e-12,
+    ).y[0]
     regions = bench.Regions.of(torque)
     for shift in (1e-4, -1e-4):
         label = regions.certain(np.stack([angles, speed + shift], axis=-1))
@@ -217,8 +237,11 @@ def test_regions__certain_states_go_there(bench):
     for start, code in zip(starts[rows], label[rows], strict=True):
         end = solve_ivp(
             lambda t, y: (y[1], bench.TORQUE - bench.DAMPING * y[1] - np.sin(y[0])),
-            (0.0, 150.0), start, rtol=1e-8, atol=1e-8,
-        ).y[:, -1]  # fmt: skip
+            (0.0, 150.0),
+            start,
+            rtol=1e-8,
+            atol=1e-8,
+        ).y[:, -1]
         assert (end[1] > 1.0) == (code == bench.ROTATION)
     # no rotation where none lasts
     assert bench.Regions.of(0.11).manifold is None

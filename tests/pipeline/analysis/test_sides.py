@@ -70,11 +70,7 @@ def test_classify__nothing_to_judge(status):
 
 def test_classify__inferred_cell_is_judged_like_the_one_it_stands_for():
     for section in ([0.1, 0.1], [-0.1, -0.1]):
-        assert (
-            classify(cells([[section]], status=7)).item()
-            == classify(cells([[section]])).item()
-            != Side.UNKNOWN
-        )
+        assert classify(cells([[section]], status=7)).item() == classify(cells([[section]])).item() != Side.UNKNOWN
 
 
 def test_classify__nan_section_is_unknown():

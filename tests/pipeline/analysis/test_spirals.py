@@ -30,9 +30,7 @@ SLOW = [
 
 def cell(frequency, state):
     """One cell that did not close, as the quickstart keeps it."""
-    found = sections(
-        load_preset(), frequency, np.array([state]), n_transient=0, n_keep=60, rtol=1e-7, atol=1e-7
-    )
+    found = sections(load_preset(), frequency, np.array([state]), n_transient=0, n_keep=60, rtol=1e-7, atol=1e-7)
     return xr.Dataset(
         {
             "section": (("initial_condition", "period_index", "state"), found.section),

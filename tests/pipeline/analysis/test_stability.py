@@ -75,9 +75,11 @@ def test_attractors__a_repeller_on_the_grid_is_none(pitchfork):
     told = {(row["r"], row["stability"], row["n_cells"], round(row["multiplier_modulus"], 4)) for row in rows}
     assert told == {
         (0.0, "attracts", 5, 1.0),
-        (0.001, "attracts", 2, 0.998), (0.001, "unstable", 1, 1.001),
-        (3.0, "attracts", 2, 0.3679), (3.0, "unstable", 1, 20.0855),
-    }  # fmt: skip
+        (0.001, "attracts", 2, 0.998),
+        (0.001, "unstable", 1, 1.001),
+        (3.0, "attracts", 2, 0.3679),
+        (3.0, "unstable", 1, 20.0855),
+    }
     assert [row["evidence"] for row in rows if row["r"] == 0.0] == ["approach"]
     fractions = [row["fraction"] for row in rows if row["r"] > 0.0 and row["stability"] == "attracts"]
     assert fractions == [0.5] * 4

@@ -31,9 +31,7 @@ def test_help__is_light(environment):
         "    heavy = ('numba', 'numpy', 'dask', 'zarr', 'xarray', 'matplotlib', 'pydantic', 'scipy')\n"
         "    print([m for m in heavy if m in sys.modules])\n"
     )
-    found = subprocess.run(
-        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
-    )
+    found = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
     assert found.stdout.splitlines()[-1] == "[]"
     for command in ("run", "status", "verify", "analyse", "plot", "simulate", "models", "presets"):
         assert command in found.stdout
@@ -233,9 +231,7 @@ def test_run__failed_task_has_its_own_code(main, write_spec, sweep_text, monkeyp
     from pipeline.compute import task
 
     write_spec(sweep_text)
-    monkeypatch.setattr(
-        task, "compute", lambda *_: (_ for _ in ()).throw(OSError(28, "No space left on device"))
-    )
+    monkeypatch.setattr(task, "compute", lambda *_: (_ for _ in ()).throw(OSError(28, "No space left on device")))
     code, _, err = main("run", "spec.toml", "--workers", "0")
     assert code == Exit.FAILED
     assert "No space left on device" in err

@@ -14,21 +14,18 @@ from pipeline.analysis.basins.basins import basins as basins_of
 from pipeline.analysis.basins.table import basins_table
 from pipeline.analysis.tabular import FEW_POINTS
 from pipeline.cli.exits import Exit
-from pipeline.layout.vocabulary import (
-    APERIODIC,
-    ATTRACTS,
-    EVIDENCE,
-    KINDS,
-    NOT_SETTLED,
-    PERIODIC_ORBIT,
-    STABILITIES,
-)
+from pipeline.layout.vocabulary import APERIODIC, ATTRACTS, EVIDENCE, KINDS, NOT_SETTLED, PERIODIC_ORBIT, STABILITIES
 from pipeline.runs.derive import derive
 
 NUMBERS = (
-    "multiplier_error", "lyapunov_max", "lyapunov_low", "lyapunov_high", "mean_lifetime", "lifetime_low",
+    "multiplier_error",
+    "lyapunov_max",
+    "lyapunov_low",
+    "lyapunov_high",
+    "mean_lifetime",
+    "lifetime_low",
     "lifetime_high",
-)  # fmt: skip
+)
 COUNTS = ("n_sampled", "n_left", "closes_above")
 
 SPIRALS = """
@@ -81,9 +78,7 @@ def test_attractors__table_per_point(main, spirals, tmp_path):
         i, at = int(row["attractor_id"]), {"frequency": float(row["frequency"])}
         one = ds.sel(at).isel(attractor=i)
         assert int(row["n_cells"]) == int(one["n_cells"])
-        assert (row["kind"], row["stability"], row["evidence"]) == (
-            "periodic_orbit", "attracts", "multipliers"
-        )  # fmt: skip
+        assert (row["kind"], row["stability"], row["evidence"]) == ("periodic_orbit", "attracts", "multipliers")
         assert float(row["low"]) < float(row["fraction"]) < float(row["high"])
         decided = sum(int(count) for name, count in row.items() if name.startswith("by_"))
         assert decided == int(row["n_cells"])
@@ -239,7 +234,7 @@ def test_analyse__incomplete_run_and_prune(main, made):
         (["attractors", "--csv", "no/where.csv"], "--csv no/where.csv: must be a file in a folder"),
     ],
     ids=lambda x: " ".join(x) if isinstance(x, list) else "",
-)  # fmt: skip
+)
 def test_analyse__refused_before_computing(main, made, arguments, message):
     made.commit(0)
     code, out, err = main("analyse", arguments[0], made.info.directory, *arguments[1:])
@@ -263,19 +258,11 @@ def test_report__a_line_per_attractor_if_there_are_many_points():
     ds = xr.Dataset(
         {
             "attractor_id": (cells_of, cells),
-            "decision": (
-                cells_of,
-                np.ones_like(cells, np.int8),
-                {"flag_meanings": "undecided closed extended"},
-            ),
+            "decision": (cells_of, np.ones_like(cells, np.int8), {"flag_meanings": "undecided closed extended"}),
             "status": (cells_of, np.ones_like(cells, np.int8), flags),
             "ran_out": ("frequency", np.zeros(n, np.int8)),
-            "kind": (
-                ("frequency", "attractor"), PERIODIC_ORBIT * kind, {"flag_meanings": " ".join(KINDS)},
-            ),
-            "stability": (
-                ("frequency", "attractor"), ATTRACTS * kind, {"flag_meanings": " ".join(STABILITIES)},
-            ),
+            "kind": (("frequency", "attractor"), PERIODIC_ORBIT * kind, {"flag_meanings": " ".join(KINDS)}),
+            "stability": (("frequency", "attractor"), ATTRACTS * kind, {"flag_meanings": " ".join(STABILITIES)}),
             "evidence": (("frequency", "attractor"), 0 * kind, {"flag_meanings": " ".join(EVIDENCE)}),
             "orbit_period": (("frequency", "attractor"), kind * np.array([1, 2])),
             "period_s": (("frequency", "attractor"), kind * np.array([1, 2]) / frequency[:, None]),
@@ -290,14 +277,12 @@ def test_report__a_line_per_attractor_if_there_are_many_points():
             "mirror_distance": (("frequency", "attractor"), nan),
         },
         coords={"frequency": ("frequency", frequency, {"units": "Hz"}), "attractor": [0, 1]},
-    )  # fmt: skip
+    )
     lines = attractors_table(ds).lines
     assert lines[0] == f"2 attractors at {n} parameter points"
     assert lines[1].split()[:4] == ["id", "kind", "stability", "periods"]
     assert re.search(r"^  0 +periodic orbit +attracts +1 +unknown +2 to 5 +7 +56 .*1\.0000 at 2 Hz", lines[2])
-    assert re.search(
-        r"^  1 +periodic orbit +attracts +2 +unknown +4 to 5 +3 +14 .*0\.8000 at 4\.5 Hz", lines[3]
-    )
+    assert re.search(r"^  1 +periodic orbit +attracts +2 +unknown +4 to 5 +3 +14 .*0\.8000 at 4\.5 Hz", lines[3])
     assert lines[4] == "all 70 cells end on attractors"
     other = ds.copy(deep=True)
     other["stability"][5, 1] = NOT_SETTLED

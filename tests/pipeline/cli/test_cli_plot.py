@@ -32,14 +32,19 @@ def test_plot__every_figure_of_a_sweep(main, write_spec, tmp_path):
     assert main("run", "spec.toml", "--out", "run", "--workers", "0")[0] == 0
     one, both = ["--at", "q=1.5"], ["--at", "q=1.5", "--at", "frequency=2.6"]
     figures = {
-        "basins": [*both, "--degrees", "--shade"], "fractions": one, "gallery": both,
-        "attractors": [*one, "--state", "psi2"], "regimes": ["--show", "number"],
-    }  # fmt: skip
+        "basins": [*both, "--degrees", "--shade"],
+        "fractions": one,
+        "gallery": both,
+        "attractors": [*one, "--state", "psi2"],
+        "regimes": ["--show", "number"],
+    }
     names = {
-        "basins": "basins_q_1.5_frequency_2.6_degrees_shade", "fractions": "fractions_q_1.5",
-        "gallery": "gallery_q_1.5_frequency_2.6", "attractors": "attractors_psi2_q_1.5",
+        "basins": "basins_q_1.5_frequency_2.6_degrees_shade",
+        "fractions": "fractions_q_1.5",
+        "gallery": "gallery_q_1.5_frequency_2.6",
+        "attractors": "attractors_psi2_q_1.5",
         "regimes": "regimes_number",
-    }  # fmt: skip
+    }
     for verb, options in figures.items():
         code, out, err = main("plot", verb, "run", *options)
         assert code == 0, err

@@ -35,8 +35,9 @@ def test_tell__lines_for_people_and_rows_for_programs(capsys, tmp_path):
     assert capsys.readouterr().out == "two lines\nfor people\n"
     tell(TABLE, "-", False)
     assert list(csv.DictReader(io.StringIO(capsys.readouterr().out))) == [
-        {"x": "1.5", "name": "a"}, {"x": "", "name": "b"},
-    ]  # fmt: skip
+        {"x": "1.5", "name": "a"},
+        {"x": "", "name": "b"},
+    ]
     tell(TABLE, None, True)
     assert json.loads(capsys.readouterr().out) == [{"x": 1.5, "name": "a"}, {"x": None, "name": "b"}]
     tell(TABLE, str(tmp_path / "a.csv"), False)
@@ -112,15 +113,21 @@ def test_head__ends_with_0(magpend, made, environment):
     command = f"{sys.executable} -m pipeline.cli.main status {made.info.directory} | head -c 1"
     found = subprocess.run(
         ["bash", "-c", f"{command}; echo rc ${{PIPESTATUS[0]}}"],
-        env=environment, capture_output=True, text=True, check=True,
-    )  # fmt: skip
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
     assert found.stdout.endswith("rc 0\n")
     assert found.stderr == ""
     code = "import sys; from pipeline.cli import console\nfor i in range(100000): console.result('line')"
     found = subprocess.run(
-        ["bash", "-c", f"{sys.executable} -c \"{code}\" 2>&1 | head -1"],
-        env=environment, capture_output=True, text=True, check=True,
-    )  # fmt: skip
+        ["bash", "-c", f'{sys.executable} -c "{code}" 2>&1 | head -1'],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
     assert "EnoughError" in found.stdout or found.stdout == "line\n"
 
 
@@ -173,17 +180,9 @@ def test_completion__is_offered(main):
 )
 def test_completion__completes_names(environment, line, word):
     code = "import sys; sys.argv[0] = 'magpend'; from pipeline.cli.main import main; main()"
-    asked = {
-        "COMP_WORDS": line,
-        "COMP_CWORD": str(len(line.split()) - 1),
-        "_MAGPEND_COMPLETE": "complete_bash",
-    }
+    asked = {"COMP_WORDS": line, "COMP_CWORD": str(len(line.split()) - 1), "_MAGPEND_COMPLETE": "complete_bash"}
     found = subprocess.run(
-        [sys.executable, "-c", code],
-        env={**environment, **asked},
-        capture_output=True,
-        text=True,
-        check=False,
+        [sys.executable, "-c", code], env={**environment, **asked}, capture_output=True, text=True, check=False
     )
     assert found.stdout.split() == [word]
 

@@ -56,12 +56,7 @@ def test_show__text_of_a_specification(main, tmp_path, own):
     (tmp_path / "spec.toml").write_text(own.spec(own.text))
     code, out, said = main("model", "show", "spec.toml")
     assert code == 0, said
-    for line in (
-        "  drive = A*cos(2*pi*f*t)",
-        "  dx/dt = v",
-        "  dv/dt = drive - d*v - x**3",
-        "  A  N  amplitude",
-    ):
+    for line in ("  drive = A*cos(2*pi*f*t)", "  dx/dt = v", "  dv/dt = drive - d*v - x**3", "  A  N  amplitude"):
         assert line in out.splitlines()
     assert "checks: passed" in out
     found = json.loads(main("model", "show", "spec.toml", "--json")[1])
@@ -107,9 +102,7 @@ def test_show__definitions_of_impacts_and_names_without_use(main, tmp_path):
 
 
 def test_run__warns_of_names_without_use(main, tmp_path, own):
-    (tmp_path / "spec.toml").write_text(
-        own.spec(own.text.replace("parameters = {", "parameters = { k = 1.0,"))
-    )
+    (tmp_path / "spec.toml").write_text(own.spec(own.text.replace("parameters = {", "parameters = { k = 1.0,")))
     code, out, said = main("run", "spec.toml", "--dry-run")
     assert code == 0, said
     assert "warning: model.parameters.k: nothing uses it; " in out
@@ -167,9 +160,21 @@ def test_run__start_without_a_value_is_refused_before_anything_is_made(main, tmp
 def test_simulate__text_of_a_file(main, tmp_path, own):
     (tmp_path / "shared.toml").write_text(own.text)
     code, _, said = main(
-        "simulate", "--model", "shared.toml", "--x", "0.5", "--set", "A=0.3", "--frequency", "0.16",
-        "--periods", "2", "--out", "series.csv", "--no-figure",
-    )  # fmt: skip
+        "simulate",
+        "--model",
+        "shared.toml",
+        "--x",
+        "0.5",
+        "--set",
+        "A=0.3",
+        "--frequency",
+        "0.16",
+        "--periods",
+        "2",
+        "--out",
+        "series.csv",
+        "--no-figure",
+    )
     assert code == 0, said
     head, first = (tmp_path / "series.csv").read_text().splitlines()[:2]
     assert head == "time_s,x_m,v_m_per_s"
@@ -183,14 +188,8 @@ def test_simulate__text_of_a_file(main, tmp_path, own):
     ("force", "words"),
     [
         ("-0.3*tanh(v/0.01)", r"layer: tanh where v passes 0; half-width 0\.0157, jump 0\.6"),
-        (
-            "-0.3*atan(100*(v - 0.2))*2/pi",
-            r"layer: atan where v - 0\.2 passes 0; half-width 0\.01, jump 0\.6",
-        ),
-        (
-            "-0.3*sign(v - 0.2)",
-            r"switch: a jump where v - 0\.2 passes 0; a step ends there, and motion may slide",
-        ),
+        ("-0.3*atan(100*(v - 0.2))*2/pi", r"layer: atan where v - 0\.2 passes 0; half-width 0\.01, jump 0\.6"),
+        ("-0.3*sign(v - 0.2)", r"switch: a jump where v - 0\.2 passes 0; a step ends there, and motion may slide"),
         ("-abs(x)", r"switch: a corner where x passes 0; a step ends there$"),
     ],
 )
@@ -212,9 +211,7 @@ def test_show__impacts_and_no_drive(main, tmp_path, own):
 
 
 def test_show__flow_seen_at_crossings_is_shown_as_it_is_written(main, tmp_path, own):
-    text = own.spec(own.text.replace("drive - d*v", "-d*v"), '[section]\nof = "v"').replace(
-        "frequency_hz =", "# "
-    )
+    text = own.spec(own.text.replace("drive - d*v", "-d*v"), '[section]\nof = "v"').replace("frequency_hz =", "# ")
     (tmp_path / "spec.toml").write_text(text)
     code, out, said = main("model", "show", "spec.toml")
     assert code == 0, said

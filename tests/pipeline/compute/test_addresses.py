@@ -59,9 +59,12 @@ def cluster():
     from distributed import LocalCluster
 
     with LocalCluster(
-        n_workers=1, processes=False, host="127.0.0.1", protocol="tcp",
+        n_workers=1,
+        processes=False,
+        host="127.0.0.1",
+        protocol="tcp",
         scheduler_kwargs={"dashboard": False, "dashboard_address": "127.0.0.1:0"},
-    ) as found:  # fmt: skip
+    ) as found:
         yield found
 
 
@@ -125,9 +128,14 @@ def test_ask__plain_where_tls_is_spoken(tmp_path, monkeypatch):
 
     security = Security.temporary()
     with LocalCluster(
-        n_workers=0, processes=False, host="127.0.0.1", protocol="tls", security=security,
-        scheduler_kwargs={"dashboard": False, "dashboard_address": "127.0.0.1:0"}, silence_logs=60,
-    ) as cluster:  # fmt: skip
+        n_workers=0,
+        processes=False,
+        host="127.0.0.1",
+        protocol="tls",
+        security=security,
+        scheduler_kwargs={"dashboard": False, "dashboard_address": "127.0.0.1:0"},
+        silence_logs=60,
+    ) as cluster:
         for name, key in (("CA_FILE", "ca_file"), ("CLIENT__CERT", "cert"), ("CLIENT__KEY", "key")):
             file = tmp_path / key
             file.write_text(security.get_tls_config_for_role("client")[key])
@@ -144,10 +152,18 @@ def test_ask__plain_where_tls_is_spoken(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     "address",
     [
-        "tcp://", "tcp://host", "host", "tcp://host:port", "tcp://host:0", "tcp://host:70000", "tcp://a:1:2",
-        "tcp://ho st:1", "slurmm", "tcp:/host:1",
+        "tcp://",
+        "tcp://host",
+        "host",
+        "tcp://host:port",
+        "tcp://host:0",
+        "tcp://host:70000",
+        "tcp://a:1:2",
+        "tcp://ho st:1",
+        "slurmm",
+        "tcp:/host:1",
     ],
-)  # fmt: skip
+)
 def test_read_address__malformed(address):
     assert f"{address!r} is no address of a scheduler; give tcp://HOST:PORT" in refusal(address)
 
@@ -245,9 +261,7 @@ def test_run__wrong_address(main, tmp_path, write_spec, sweep_text):
     assert "is no address" in errors
     assert not (tmp_path / "out").exists()
     with closed_port() as port:
-        code, _, errors = main(
-            "run", path, "--out", tmp_path / "out", "--scheduler", f"tcp://127.0.0.1:{port}"
-        )
+        code, _, errors = main("run", path, "--out", tmp_path / "out", "--scheduler", f"tcp://127.0.0.1:{port}")
     assert code == 4
     assert "nothing listens there" in errors
     assert "Traceback" not in errors

@@ -58,8 +58,12 @@ def processes(tmp_path, environment):
         log = (tmp_path / f"process-{len(started)}.log").open("wb")
         process = subprocess.Popen(
             [*before, sys.executable, "-m", *map(str, words)],
-            cwd=tmp_path, env={**environment, **variables}, stdout=log, stderr=log, start_new_session=True,
-        )  # fmt: skip
+            cwd=tmp_path,
+            env={**environment, **variables},
+            stdout=log,
+            stderr=log,
+            start_new_session=True,
+        )
         log.close()
         started.append(process)
         return process
@@ -79,9 +83,17 @@ def end(process):
 def scheduler_file(tmp_path, processes):
     path = tmp_path / "scheduler.json"
     processes(
-        "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard",
-        "--dashboard-address", "127.0.0.1:0", "--scheduler-file", path,
-    )  # fmt: skip
+        "distributed.cli.dask_scheduler",
+        "--host",
+        "127.0.0.1",
+        "--port",
+        "0",
+        "--no-dashboard",
+        "--dashboard-address",
+        "127.0.0.1:0",
+        "--scheduler-file",
+        path,
+    )
     until(lambda: path.exists() and "address" in json.loads(path.read_text() or "{}"))
     return path
 
@@ -90,10 +102,20 @@ def scheduler_file(tmp_path, processes):
 def worker(processes, scheduler_file, tmp_path):
     def begin(**options):
         return processes(
-            "distributed.cli.dask_worker", "--scheduler-file", scheduler_file, "--host", "127.0.0.1",
-            "--nthreads", "1", "--no-dashboard", "--dashboard-address", "127.0.0.1:0",
-            "--local-directory", tmp_path / "scratch", **options,
-        )  # fmt: skip
+            "distributed.cli.dask_worker",
+            "--scheduler-file",
+            scheduler_file,
+            "--host",
+            "127.0.0.1",
+            "--nthreads",
+            "1",
+            "--no-dashboard",
+            "--dashboard-address",
+            "127.0.0.1:0",
+            "--local-directory",
+            tmp_path / "scratch",
+            **options,
+        )
 
     return begin
 
@@ -255,13 +277,24 @@ scratch = "$TMPDIR"
 python = "/opt/python"
 """
 HEADS = {
-    "slurm": ("#SBATCH -p short", "#SBATCH -A p-42", "#SBATCH --cpus-per-task=4", "#SBATCH --mem=8G",
-              "#SBATCH -t 04:00:00", "#SBATCH -pe smp 4"),
-    "pbs": ("#PBS -q short", "#PBS -A p-42", "#PBS -l select=1:ncpus=4:mem=7630MB",
-            "#PBS -l walltime=04:00:00", "#PBS -pe smp 4"),
+    "slurm": (
+        "#SBATCH -p short",
+        "#SBATCH -A p-42",
+        "#SBATCH --cpus-per-task=4",
+        "#SBATCH --mem=8G",
+        "#SBATCH -t 04:00:00",
+        "#SBATCH -pe smp 4",
+    ),
+    "pbs": (
+        "#PBS -q short",
+        "#PBS -A p-42",
+        "#PBS -l select=1:ncpus=4:mem=7630MB",
+        "#PBS -l walltime=04:00:00",
+        "#PBS -pe smp 4",
+    ),
     "sge": ("#$ -q short", "#$ -P p-42", "#$ -l h_rt=04:00:00", "#$ -pe smp 4"),
     "lsf": ("#BSUB -q short", '#BSUB -P "p-42"', "#BSUB -n 4", "#BSUB -M 8000", "#BSUB -W 04:00"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("kind", HEADS)
@@ -275,10 +308,15 @@ def test_worker_script(tmp_path, kind):
     command = next(line for line in script.splitlines() if line.startswith("/opt/python"))
     # one process for each core, which leave before the job ends
     for words in (
-        "-m distributed.cli.dask_worker tls://SCHEDULER:PORT", "--nthreads 1", "--nworkers 4",
-        "--memory-limit 1.86GiB", "--local-directory $TMPDIR", "--interface ib0", "--lifetime 13200s",
+        "-m distributed.cli.dask_worker tls://SCHEDULER:PORT",
+        "--nthreads 1",
+        "--nworkers 4",
+        "--memory-limit 1.86GiB",
+        "--local-directory $TMPDIR",
+        "--interface ib0",
+        "--lifetime 13200s",
         "--lifetime-stagger 300s",
-    ):  # fmt: skip
+    ):
         assert words in command
     assert script.index("export NUMBA_NUM_THREADS=1") < script.index("module load python/3.12")
     assert script.index("module load python/3.12") < script.index("/opt/python")

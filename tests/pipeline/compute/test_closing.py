@@ -80,9 +80,7 @@ def test_simulate__says_that_the_left_orbit_is_closed():
 
 def test_simulate__says_that_300_periods_are_too_few_and_that_1000_will_do():
     start = (0.0, math.radians(20.0), 0.0, 0.0)
-    early, late = (
-        simulate(2.48, start, n_transient=n, n_periods=4, samples_per_period=20) for n in (300, 1000)
-    )
+    early, late = (simulate(2.48, start, n_transient=n, n_periods=4, samples_per_period=20) for n in (300, 1000))
     assert early.attrs["orbit_period"] == 0
     assert early.attrs["closing"].startswith("not closed")
     assert late.attrs["orbit_period"] == 2

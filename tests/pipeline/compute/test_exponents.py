@@ -47,10 +47,14 @@ def test_lyapunov__is_what_the_core_gives_from_the_last_section(cube):
         one = cube.sel(frequency=frequency)
         rows = np.flatnonzero(one.status == Status.BOUNDED)
         found = lyapunov_exponents(
-            np.tile(packed, (len(rows), 1)), np.full(len(rows), frequency),
+            np.tile(packed, (len(rows), 1)),
+            np.full(len(rows), frequency),
             one.section.isel(period_index=-1).values[rows],
-            n_transient=100, n_periods=160, n_blocks=4, max_steps_per_period=400,
-        )  # fmt: skip
+            n_transient=100,
+            n_periods=160,
+            n_blocks=4,
+            max_steps_per_period=400,
+        )
         assert (one.lyapunov.values[rows] == found.exponents).all()
         assert (one.lyapunov_stderr.values[rows] == found.stderr).all()
         assert (one.lyapunov_blocks.values[rows] == found.blocks).all()
@@ -63,10 +67,7 @@ def test_lyapunov__of_a_closed_orbit_is_that_of_its_multipliers(cube):
     closed = cube.sel(frequency=2.2).isel(initial_condition=0)
     assert closed.status == Status.PERIODIC
     orbit = polish_orbits(
-        load_preset().pack()[None],
-        np.array([2.2]),
-        closed.section.values[-1:],
-        closed.orbit_period.values[None],
+        load_preset().pack()[None], np.array([2.2]), closed.section.values[-1:], closed.orbit_period.values[None]
     )
     expected = np.log(np.abs(orbit.multipliers[0])) * 2.2
     # 160 periods: the weighted average is at 1e-4 with the default of 400
@@ -120,11 +121,15 @@ def test_lyapunov__without_the_product_there_is_no_variable(tmp_path):
 
 def made_up(**changes):
     values = {
-        "exponents": np.tile([0.5, 0.0, -0.2, -1.0], (2, 1)), "stderr": np.zeros((2, 4)),
-        "weighted": np.zeros((2, 4)), "blocks": np.zeros((2, 4, 4)), "divergence": np.full(2, -0.7),
-        "loss": np.full(2, 1e3), "status": np.full(2, Status.BOUNDED, np.int8),
+        "exponents": np.tile([0.5, 0.0, -0.2, -1.0], (2, 1)),
+        "stderr": np.zeros((2, 4)),
+        "weighted": np.zeros((2, 4)),
+        "blocks": np.zeros((2, 4, 4)),
+        "divergence": np.full(2, -0.7),
+        "loss": np.full(2, 1e3),
+        "status": np.full(2, Status.BOUNDED, np.int8),
         "is_whole": True,
-    }  # fmt: skip
+    }
     return LyapunovExponents(**{**values, **changes})
 
 
@@ -156,11 +161,7 @@ def test_flags__audit_a_whole_spectrum_of_any_length():
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        (
-            "n_periods = 160",
-            "n_periods = 161",
-            r"products.lyapunov: n_periods = 161 .* multiple of n_blocks = 4.* 164",
-        ),
+        ("n_periods = 160", "n_periods = 161", r"products.lyapunov: n_periods = 161 .* multiple of n_blocks = 4.* 164"),
         ("n_blocks = 4", "n_blocks = 1", r"products.lyapunov.n_blocks = 1: must be at least 2"),
         ("n_transient = 100,", "n_exponents = 5,", r"products.lyapunov.n_exponents = 5: must be at most 4"),
         ("n_transient = 100,", "n_transients = 20,", r"n_transients: unknown key; did you mean n_transient"),

@@ -159,11 +159,16 @@ def test_orbits__cyclic_sets_on_the_circle_with_turns():
     a, b = [3.1, 0.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0]
     wrapped = [-3.1, 0.0, 0.0, 0.0]  # 0.083 from `a` on the circle
     rows = [
-        ([b, a, b], 2, [0, 0], 1), ([a, b, a], 2, [0, 0], 1), ([b, wrapped, b], 2, [0, 0], 1),
-        ([b, a, b], 2, [1, 0], 1), ([b, b, b], 1, [0, 0], 1), ([b, a, b], 2, [0, 0], 2),
-        ([b, a, b], 4, [0, 0], 1), ([a, a, [1.0, 0.0, 0.9, 0.0]], 1, [0, 0], 1),
+        ([b, a, b], 2, [0, 0], 1),
+        ([a, b, a], 2, [0, 0], 1),
+        ([b, wrapped, b], 2, [0, 0], 1),
+        ([b, a, b], 2, [1, 0], 1),
+        ([b, b, b], 1, [0, 0], 1),
+        ([b, a, b], 2, [0, 0], 2),
+        ([b, a, b], 4, [0, 0], 1),
+        ([a, a, [1.0, 0.0, 0.9, 0.0]], 1, [0, 0], 1),
         ([b, b, [1.0, 0.0, 1.1, 0.0]], 1, [0, 0], 1),
-    ]  # fmt: skip
+    ]
     cells = {
         "section": np.array([r[0] for r in rows]),
         "orbit_period": np.array([r[1] for r in rows], np.int16),
@@ -190,10 +195,18 @@ def two_wells(n, system):
 
     def integrate(cells):
         result = run_branches(
-            np.broadcast_to([0.25, 0.08], (len(cells), 1, 2)), np.full((len(cells), 1), 0.2), starts[cells],
-            n_transient=200, n_keep=4, rtol=1e-6, atol=1e-6, stop_when_closed=True,
-            closure_tolerance=TOLERANCE, max_orbit_period=4, system=system,
-        )  # fmt: skip
+            np.broadcast_to([0.25, 0.08], (len(cells), 1, 2)),
+            np.full((len(cells), 1), 0.2),
+            starts[cells],
+            n_transient=200,
+            n_keep=4,
+            rtol=1e-6,
+            atol=1e-6,
+            stop_when_closed=True,
+            closure_tolerance=TOLERANCE,
+            max_orbit_period=4,
+            system=system,
+        )
         return {v.name: getattr(result, v.name)[:, 0] for v in VARIABLES}
 
     return integrate
@@ -228,11 +241,15 @@ def test_infer__carries_all_but_the_work():
     def integrate(cells):
         n = len(cells)
         return {
-            "section": np.full((n, 1, 4), 0.5), "status": np.full(n, Status.PERIODIC, np.int8),
-            "orbit_period": np.ones(n, np.int16), "turns": np.full((n, 2), 3, np.int32),
-            "n_periods": cells + 1, "n_steps": cells + 1, "n_rejected": cells + 1,
+            "section": np.full((n, 1, 4), 0.5),
+            "status": np.full(n, Status.PERIODIC, np.int8),
+            "orbit_period": np.ones(n, np.int16),
+            "turns": np.full((n, 2), 3, np.int32),
+            "n_periods": cells + 1,
+            "n_steps": cells + 1,
+            "n_rejected": cells + 1,
             "lyapunov": np.stack([cells, -cells - 1.0], axis=1),
-        }  # fmt: skip
+        }
 
     found = infer((9, 5), 4, integrate, closure_tolerance=1e-4, system=PENDULUM_FITTED)
     inferred = found["status"] == Status.INFERRED
@@ -310,9 +327,7 @@ def test_compute__one_and_four_grid_dims(lengths):
 
 def refined_text(shape, stride, extra=""):
     names = ("psi1", "psi2", "psi1_dot", "psi2_dot")
-    ranges = "\n".join(
-        f"{s} = {{ start = 0.0, stop = 1.0, num = {n} }}" for s, n in zip(names, shape, strict=False)
-    )
+    ranges = "\n".join(f"{s} = {{ start = 0.0, stop = 1.0, num = {n} }}" for s, n in zip(names, shape, strict=False))
     return (
         'kind = "sweep"\n[axes]\nfrequency_hz = { values = [2.0, 2.5] }\n'
         f'[initial_conditions]\nkind = "grid"\nrefine = {stride}\n{ranges}\n'
@@ -370,13 +385,14 @@ def test_identity__refinement_counts():
         (("n_keep = 8", "n_keep = 200000"), "initial_conditions.refine = 8", "lower refine or integration"),
         (
             ('kind = "sweep"', 'kind = "continuation"'),
-            "initial_conditions.refine = 8", "branches are not refined; drop the key",
+            "initial_conditions.refine = 8",
+            "branches are not refined; drop the key",
         ),
         (('kind = "grid"', 'kind = "list"\npoints = [[0, 0]]'), "initial_conditions.refine:", "only a grid"),
         (('kind = "grid"', 'kind = "random"\nn = 3'), "initial_conditions.refine", "only a grid"),
         (('kind = "grid"', 'kind = "grid" # fixed'), "initial_conditions.refine = 8", "there is no range"),
     ],
-)  # fmt: skip
+)
 def test_parse_spec__refine_problems(change, path, remedy):
     text = refined_text((32, 40), 8)
     assert change[0] in text
@@ -392,9 +408,5 @@ def test_parse_spec__refine_problems(change, path, remedy):
 
 def test_orbits__model_without_angles_has_no_turns(duffing):
     section = np.array([[[0.1, 0.2]], [[0.1, 0.2]], [[0.9, 0.0]]])
-    cells = {
-        "section": section,
-        "status": np.full(3, Status.PERIODIC, np.int8),
-        "orbit_period": np.ones(3, np.int16),
-    }
+    cells = {"section": section, "status": np.full(3, Status.PERIODIC, np.int8), "orbit_period": np.ones(3, np.int16)}
     assert Orbits(1e-6, duffing).classes(cells).tolist() == [0, 0, 1]

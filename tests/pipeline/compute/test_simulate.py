@@ -44,9 +44,15 @@ def test_write_series__csv_and_netcdf_read_back(series, tmp_path):
 def test_simulate__all_problems_at_once():
     with pytest.raises(SpecError) as caught:
         simulate(
-            float("nan"), (float("inf"), 0, 0, 0), overrides={"qq": 1}, n_transient=-1, n_periods=0,
-            samples_per_period=0, rtol=float("nan"), atol=-1,
-        )  # fmt: skip
+            float("nan"),
+            (float("inf"), 0, 0, 0),
+            overrides={"qq": 1},
+            n_transient=-1,
+            n_periods=0,
+            samples_per_period=0,
+            rtol=float("nan"),
+            atol=-1,
+        )
     starts = ("frequency_hz", "rtol", "atol", "psi1", "n_transient", "n_periods", "samples", "'qq'")
     assert len(caught.value.problems) == len(starts)
     for start in starts:

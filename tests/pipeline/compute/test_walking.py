@@ -74,9 +74,8 @@ FREQUENCIES = "frequency_hz = { start = 0.06, stop = 0.26, num = 7 }"
 def duffing(axes=FREQUENCIES, path="frequency_hz", direction="both", integration="", products="", cut=None):
     execution = "" if cut is None else f"points_per_task = {cut}"
     return DUFFING.format(
-        axes=axes, path=path, direction=direction, integration=integration, products=products,
-        execution=execution,
-    )  # fmt: skip
+        axes=axes, path=path, direction=direction, integration=integration, products=products, execution=execution
+    )
 
 
 @pytest.fixture(autouse=True)

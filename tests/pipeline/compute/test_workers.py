@@ -89,9 +89,7 @@ def test_workers__one_that_dies_with_a_result_that_was_not_fetched_yet(faulty, t
     assert states != ["finished"]
 
 
-def test_workers__one_that_takes_all_memory_is_ended_before_the_machine_suffers(
-    faulty, tmp_path, monkeypatch
-):
+def test_workers__one_that_takes_all_memory_is_ended_before_the_machine_suffers(faulty, tmp_path, monkeypatch):
     monkeypatch.setattr(clients, "ALLOWED_FAILURES", 0)  # each death is a worker to be started
     monkeypatch.setattr(local, "memory_per_worker", lambda n_workers: 900_000_000)
     task = partial(faulty.greedy, str(tmp_path), poison=(1,))
@@ -135,8 +133,10 @@ def dask_command(name, folder, *words):
     words = ["--host", "127.0.0.1", "--scheduler-file", folder / "scheduler.json", *words]
     with subprocess.Popen(
         [sys.executable, "-m", f"distributed.cli.dask_{name}", *words],
-        cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-    ) as process:  # fmt: skip
+        cwd=folder,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    ) as process:
         try:
             yield process
         finally:

@@ -8,9 +8,7 @@ from pipeline.explorer.arrays import DTYPES, pack_arrays, unpack_arrays
 
 def test_arrays__come_back_as_they_were():
     given = {name: np.arange(-3, 4).astype(name)[:, None] * np.ones(2, name) for name in DTYPES}
-    arrays, attrs = unpack_arrays(
-        pack_arrays({**given, "none": np.empty((0, 3))}, {"title": "ψ <b>", "at": None})
-    )
+    arrays, attrs = unpack_arrays(pack_arrays({**given, "none": np.empty((0, 3))}, {"title": "ψ <b>", "at": None}))
     assert attrs == {"title": "ψ <b>", "at": None}
     assert arrays.pop("none").shape == (0, 3)
     for name, values in given.items():

@@ -41,8 +41,7 @@ def _data(content: bytes):
 def _objects(path):
     """Objects of data by name in a page."""
     found = re.findall(
-        r'<script type="application/octet-stream;base64" id="data-([^"]+)">([^<]*)</script>',
-        path.read_text("utf-8"),
+        r'<script type="application/octet-stream;base64" id="data-([^"]+)">([^<]*)</script>', path.read_text("utf-8")
     )
     return {name: base64.b64decode(content) for name, content in found}
 
@@ -152,9 +151,7 @@ def test_fit__gives_numbers_that_are_those_of_what_it_keeps():
         arrays, _ = _data(found.objects["a"])
         assert found.kept == len(arrays["y"]) == int(arrays["count"].sum())
         assert found.closed == int(((count > 0) & (period > 0)).sum())
-        assert (
-            found.kept == found.total or f"{found.kept:,} of {found.total:,} points" in found.sentences()[-1]
-        )
+        assert found.kept == found.total or f"{found.kept:,} of {found.total:,} points" in found.sentences()[-1]
         first, here = np.cumsum(count) - count, np.cumsum(arrays["count"]) - arrays["count"]
         last = count > 0
         np.testing.assert_array_equal(
@@ -323,9 +320,7 @@ def test_export__a_quantity_on_the_vertical_axis(run, tmp_path):
     explored = ExploredRun.of(run)
     wanted, _ = column(explored, "frequency", name)
     written = export_page(run, tmp_path / "copy.html", most_orbits=0, quantities=[name])
-    assert any(
-        f"{len(run.model.quantities) - 1} quantities of the model are not" in s for s in written.sentences
-    )
+    assert any(f"{len(run.model.quantities) - 1} quantities of the model are not" in s for s in written.sentences)
     objects = _objects(tmp_path / "copy.html")
     view, about = _about(objects)
     assert [v["name"] for v in view["verticals"]] == [*run.model.state_names, name]

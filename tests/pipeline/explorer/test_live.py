@@ -190,9 +190,7 @@ def test_start__has_the_bits_and_the_attractor_of_the_cell(directories, watch, n
     watcher, seen = watch(opened), set()
     ids = attractors["attractor_id"].transpose("A", "x_0", "v_0").values
     # cells of every attractor at each value, and of none
-    cells = [
-        (a, *i) for a in (0, 1) for k in np.unique(ids[a]) for i in np.argwhere(ids[a] == k)[:3].tolist()
-    ]
+    cells = [(a, *i) for a in (0, 1) for k in np.unique(ids[a]) for i in np.argwhere(ids[a] == k)[:3].tolist()]
     for a, x, v in cells:
         one, start = start_of(cube, {"A": a, "x_0": x, "v_0": v})
         number = watcher.send(do="start", parameters={"A": float(one["A"])}, state=start)
@@ -296,8 +294,12 @@ def test_legend__names_end_with_what_is_known_of_the_stability():
     catalog = SimpleNamespace(model=load_model("duffing"), entries=entries)
     lines = Legend(catalog, None).lines()
     assert [line["label"] for line in lines] == [
-        "period 2", "period 3, unstable", "at rest, neutral", "not periodic, not settled", "diverged"
-    ]  # fmt: skip
+        "period 2",
+        "period 3, unstable",
+        "at rest, neutral",
+        "not periodic, not settled",
+        "diverged",
+    ]
     greys = ("on an unstable orbit or equilibrium", "on a neutral set", "not settled", "diverged")
     assert [line["colour"] for line in lines[1:]] == [rgb(palette.GREYS[name]) for name in greys]
     assert lines[0]["colour"] in palette.COLOURS
@@ -320,9 +322,8 @@ def test_slice__is_that_of_the_cube_and_computes_no_start_twice(directories, wat
     watcher = watch(opened)
     # its 16 columns are the run's own: centres of cells of 0.125; four of its rows are
     number = watcher.send(
-        do="slice", parameters={"A": 0.2}, plane=["x", "v"], ranges=[[-1.0, 1.0], [-0.515625, 0.484375]],
-        resolution=32,
-    )  # fmt: skip
+        do="slice", parameters={"A": 0.2}, plane=["x", "v"], ranges=[[-1.0, 1.0], [-0.515625, 0.484375]], resolution=32
+    )
     end = watcher.wait(number)
     assert end["kind"] == "done", end
     images = [a for a in watcher.of(number) if a["kind"] == "slice"]
@@ -339,9 +340,7 @@ def test_slice__is_that_of_the_cube_and_computes_no_start_twice(directories, wat
     # a start of the plane ends where a live start, and so a cell, ends
     rng = np.random.default_rng(1)
     for row, column in rng.integers(0, 32, (8, 2)):
-        one = watcher.ask(
-            do="start", parameters={"A": 0.2}, state={"x": float(u[column]), "v": float(v[row])}
-        )
+        one = watcher.ask(do="start", parameters={"A": 0.2}, state={"x": float(u[column]), "v": float(v[row])})
         assert one["number"] == fine[row, column]
     assert cube.sizes["x_0"] == 16
 
@@ -350,9 +349,8 @@ def test_slice__at_the_cubes_own_starts(directories, watch):
     attractors = derive(directories["whole"], "attractors").isel(A=1)
     watcher = watch(directories["whole"])
     number = watcher.send(
-        do="slice", parameters={"A": 0.25}, plane=["x", "v"], ranges=[[-1.0, 1.0], [-0.625, 3.375]],
-        resolution=16,
-    )  # fmt: skip
+        do="slice", parameters={"A": 0.25}, plane=["x", "v"], ranges=[[-1.0, 1.0], [-0.625, 3.375]], resolution=16
+    )
     end = watcher.wait(number)
     assert end["kind"] == "done", end
     image = [a for a in watcher.of(number) if a["kind"] == "slice"][-1]["arrays"]
@@ -366,9 +364,8 @@ def test_slice__at_the_cubes_own_starts(directories, watch):
 def test_slice__without_an_analysis_tells_orbits_apart(directories, watch):
     watcher = watch(directories["whole"])
     number = watcher.send(
-        do="slice", parameters={"A": 0.2, "d": 0.081}, plane=["x", "v"], ranges=[[-1, 1], [-0.5, 1]],
-        resolution=16,
-    )  # fmt: skip
+        do="slice", parameters={"A": 0.2, "d": 0.081}, plane=["x", "v"], ranges=[[-1, 1], [-0.5, 1]], resolution=16
+    )
     end = watcher.wait(number)
     orbits = [line for line in end["labels"] if "period" in line["label"]]
     assert len(orbits) >= 5
@@ -410,17 +407,19 @@ def test_follow__is_the_orbit_at_the_value(directories, watch):
     live = LiveRun(Run.open(directories["whole"]))
     watcher = watch(live)
     orbit = watcher.ask(
-        "orbit", "error", do="follow", **{"from": {"cell": closed_cell(live), "point": 2}},
-        parameter="A", value=0.23,
-    )  # fmt: skip
+        "orbit", "error", do="follow", **{"from": {"cell": closed_cell(live), "point": 2}}, parameter="A", value=0.23
+    )
     assert orbit["kind"] == "orbit", orbit
     assert (orbit["lost"], orbit["value"], orbit["parameters"]["A"]) == (False, 0.23, 0.23)
     place = live.place({"A": 0.23}, None)
     section = orbit["arrays"]["section"]
     again = polish_orbits(
-        place.parameters.pack()[None], np.array([HZ]), section[-1:], np.array([orbit["period"]]),
+        place.parameters.pack()[None],
+        np.array([HZ]),
+        section[-1:],
+        np.array([orbit["period"]]),
         system=live.model.system,
-    )  # fmt: skip
+    )
     assert again.converged[0]
     np.testing.assert_allclose(again.section[0], section[-1], atol=1e-7)
     found = np.array([complex(*m) for m in orbit["multipliers"]])
@@ -473,18 +472,20 @@ def test_follow__of_a_flow(directories, watch):
     period = live.cube["orbit_period"].isel(mu=1).transpose("x_0", "y_0").values
     x, y = map(int, np.argwhere(period == 1)[0])
     orbit = watcher.ask(
-        "orbit", "error", do="follow", **{"from": {"cell": cell_of(live, mu=1, x_0=x, y_0=y)}},
-        parameter="mu", value=-0.2,
-    )  # fmt: skip
+        "orbit",
+        "error",
+        do="follow",
+        **{"from": {"cell": cell_of(live, mu=1, x_0=x, y_0=y)}},
+        parameter="mu",
+        value=-0.2,
+    )
     assert orbit["kind"] == "orbit", orbit
     radius = np.hypot(*orbit["arrays"]["states"].T)
     np.testing.assert_allclose(radius**2, 0.5 * (1.0 + np.sqrt(1.0 - 0.8)), atol=1e-7)
     assert orbit["frequency"] is None
     np.testing.assert_allclose(orbit["seconds"], np.pi, rtol=1e-8)
     # at mu = -1/4 the two cycles meet
-    gone = watcher.ask(
-        "orbit", do="follow", **{"from": {"orbit": orbit["orbit"]}}, parameter="mu", value=-0.3
-    )
+    gone = watcher.ask("orbit", do="follow", **{"from": {"orbit": orbit["orbit"]}}, parameter="mu", value=-0.3)
     assert gone["lost"]
     assert abs(gone["value"] + 0.25) < 1e-3
     assert "fold" in gone["sentence"]

@@ -73,9 +73,14 @@ class Client:
         async def fetch():
             client = SimpleAsyncHTTPClient(force_instance=True)
             request = HTTPRequest(
-                f"http://127.0.0.1:{self.port}{path}", method=method, headers={**sent, **(headers or {})},
-                body=body, follow_redirects=False, allow_nonstandard_methods=True, request_timeout=60,
-            )  # fmt: skip
+                f"http://127.0.0.1:{self.port}{path}",
+                method=method,
+                headers={**sent, **(headers or {})},
+                body=body,
+                follow_redirects=False,
+                allow_nonstandard_methods=True,
+                request_timeout=60,
+            )
             try:
                 return await client.fetch(request, raise_error=False)
             finally:
@@ -195,9 +200,15 @@ def test_api__every_answer_has_the_policy(client):
 
 @pytest.mark.parametrize(
     "path",
-    ["/api/view", "/api/diagram?x=frequency&y=psi1&at.q=0", "/api/orbit?cell=0&point=0", "/api/table", "/",
-     "/api/zoom"],
-)  # fmt: skip
+    [
+        "/api/view",
+        "/api/diagram?x=frequency&y=psi1&at.q=0",
+        "/api/orbit?cell=0&point=0",
+        "/api/table",
+        "/",
+        "/api/zoom",
+    ],
+)
 @pytest.mark.parametrize("given", ["", "wrong", "token wrong"])
 def test_api__is_refused_without_the_token(client, path, given):
     headers = {"Authorization": given} if given else {}
@@ -265,10 +276,18 @@ def test_api__refuses_in_a_sentence(client, path, code, said):
 
 @pytest.mark.parametrize(
     "path",
-    ["/static/../server.py", "/static/%2e%2e/server.py", "/static/..%2fserver.py", "/static//etc/passwd",
-     "/static/explorer.css.map", "/static/", "/static/LICENSES.txt%00.js",
-     "/run.json", "/cube.zarr/zarr.json"],
-)  # fmt: skip
+    [
+        "/static/../server.py",
+        "/static/%2e%2e/server.py",
+        "/static/..%2fserver.py",
+        "/static//etc/passwd",
+        "/static/explorer.css.map",
+        "/static/",
+        "/static/LICENSES.txt%00.js",
+        "/run.json",
+        "/cube.zarr/zarr.json",
+    ],
+)
 def test_static__serves_its_own_files_alone(client, path):
     text = f"GET {path} HTTP/1.1\r\nHost: 127.0.0.1:{client.port}\r\nConnection: close\r\n\r\n"
     answer = client.raw(text.encode())

@@ -58,9 +58,13 @@ class Pages:
         """Status with which a connection is refused."""
         reader, writer = await asyncio.open_connection("127.0.0.1", self._port)
         own = {
-            "Host": f"127.0.0.1:{self._port}", "Upgrade": "websocket", "Connection": "Upgrade",
-            "Sec-WebSocket-Key": "dGhlIHNhbXBsZSBub25jZQ==", "Sec-WebSocket-Version": "13", **headers,
-        }  # fmt: skip
+            "Host": f"127.0.0.1:{self._port}",
+            "Upgrade": "websocket",
+            "Connection": "Upgrade",
+            "Sec-WebSocket-Key": "dGhlIHNhbXBsZSBub25jZQ==",
+            "Sec-WebSocket-Version": "13",
+            **headers,
+        }
         lines = [f"GET /ws{query} HTTP/1.1", *(f"{k}: {v}" for k, v in own.items()), "", ""]
         writer.write("\r\n".join(lines).encode())
         status = await reader.readline()

@@ -157,9 +157,7 @@ def test_describe_view__says_what_stands_in_a_run(sweep):
     assert str(sweep.parent) not in json.dumps(found)
     assert found["digest"] == explored.digest
     assert (found["complete"], found["live"], found["n_keep"]) == (True, True, 12)
-    assert found["cells"] == {
-        "total": cube.status.size, "pending": 0, "failed": int((cube.status == DIVERGED).sum())
-    }  # fmt: skip
+    assert found["cells"] == {"total": cube.status.size, "pending": 0, "failed": int((cube.status == DIVERGED).sum())}
     assert [a["name"] for a in found["axes"]] == ["frequency", "amplitude"]
     assert found["axes"][1]["values"] == cube["amplitude"].values.tolist()
     assert found["starts"] == {"dims": ["x_0", "v_0"], "count": 24}
@@ -181,9 +179,7 @@ def test_describe_view__names_commands_that_the_run_can_have(sweep, walk, made_r
     # of what a run of two parameters is to be followed along, a person has to say
     assert describe_view(ExploredRun.of(sweep), False)["commands"] == {}
     assert "basins" not in describe_view(ExploredRun.of(walk), False)["commands"]  # a walk has no basins
-    assert {"attractors", "basins"} <= describe_view(ExploredRun.of(made_run.directory), False)[
-        "commands"
-    ].keys()
+    assert {"attractors", "basins"} <= describe_view(ExploredRun.of(made_run.directory), False)["commands"].keys()
 
 
 def test_describe_view__reads_what_is_computed_later(walk):
@@ -233,9 +229,7 @@ def test_diagram__has_every_point_of_the_cube(sweep, x, y):
         assert float(one[x]) == arrays["x"][arrays["at"][k]]
         assert float(one[other]) == float(cube[other][1])
         own = arrays["y"][arrays["first"][k] : arrays["first"][k + 1]]
-        kept = (
-            one["section"].sel(state=y) if y == "v" else one["extremes"].sel(quantity="energy", extreme="max")
-        )
+        kept = one["section"].sel(state=y) if y == "v" else one["extremes"].sel(quantity="energy", extreme="max")
         is_drawn = int(one["status"]) != DIVERGED
         np.testing.assert_array_equal(own, kept.values if is_drawn else [])
         assert arrays["status"][k] == int(one["status"])
@@ -259,11 +253,7 @@ def test_diagram__shows_quantities_at_the_sections(sweep):
 def test_diagram__colours_are_those_of_the_analyses(sweep):
     explored = ExploredRun.of(sweep)
     arrays, _ = unpack_arrays(diagram(explored, "amplitude", "x", {"frequency": 0}))
-    ids = (
-        derive(sweep, "attractors")["attractor_id"]
-        .transpose("frequency", "amplitude", "x_0", "v_0")
-        .values.ravel()
-    )
+    ids = derive(sweep, "attractors")["attractor_id"].transpose("frequency", "amplitude", "x_0", "v_0").values.ravel()
     expected = ids[arrays["cell"]]
     assert len(set(expected.tolist())) > 1
     np.testing.assert_array_equal(arrays["colour_attractor"], np.where(expected < 0, NONE, expected))
@@ -459,8 +449,9 @@ def test_view__what_does_not_attract_is_no_attractor(sweep):
     assert {told[number][key] for key in ("stability", "evidence")} == {"transient", "left"}
     assert told[number]["name"].endswith(", transient")
     assert told[number]["low"] is None
-    assert number not in {c["attractor"] for c in curves(explored, "amplitude", {"frequency": 1})["curves"]
-                          if c["group"] == "fractions"}  # fmt: skip
+    assert number not in {
+        c["attractor"] for c in curves(explored, "amplitude", {"frequency": 1})["curves"] if c["group"] == "fractions"
+    }
     _, attrs = unpack_arrays(orbit(explored, int(cell_on(explored, known, at, number)), 0))
     assert (attrs["attractor"], attrs["stability"], attrs["stable"]) == (number, "transient", None)
 
@@ -583,9 +574,7 @@ def test_branches__lie_on_the_diagram(walk):
         for j in np.flatnonzero(cube["status"].values[i] == PERIODIC):
             value = float(cube["section"].sel(state="x").values[i, j, -1])
             heights = [
-                np.interp(
-                    float(cube["amplitude"][i]), *(np.array(s[k])[np.argsort(s["x"])] for k in ("x", "y"))
-                )
+                np.interp(float(cube["amplitude"][i]), *(np.array(s[k])[np.argsort(s["x"])] for k in ("x", "y")))
                 for s in stable
                 if min(s["x"]) <= float(cube["amplitude"][i]) <= max(s["x"])
             ]
@@ -668,13 +657,20 @@ def test_table__has_the_same_rows_in_both_formats(sweep, kind, tmp_path):
 def test_table__a_word_is_no_formula(monkeypatch):
     """Names come from models and titles; a spreadsheet would run one that begins like a formula."""
     monkeypatch.setattr(tables, "_ROWS_AT_ONCE", 2)
-    ds = xr.Dataset({
-        "name": ("row", np.array(["=1+1", "+x", "@y", "B: left", ""])),
-        "value": ("row", np.array([-1.0, np.nan, 0.1, 2.0, 1e-300])),
-    })  # fmt: skip
+    ds = xr.Dataset(
+        {
+            "name": ("row", np.array(["=1+1", "+x", "@y", "B: left", ""])),
+            "value": ("row", np.array([-1.0, np.nan, 0.1, 2.0, 1e-300])),
+        }
+    )
     assert tables._csv(ds).decode().splitlines() == [
-        "name,value", "'=1+1,-1.0", "'+x,", "'@y,0.1", "B: left,2.0", ",1e-300"
-    ]  # fmt: skip
+        "name,value",
+        "'=1+1,-1.0",
+        "'+x,",
+        "'@y,0.1",
+        "B: left,2.0",
+        ",1e-300",
+    ]
 
 
 def test_table__of_branches_and_its_refusals(walk):
@@ -699,9 +695,7 @@ def test_query__takes_whole_numbers_alone(text):
 
 
 def test_zoom__is_a_specification_of_the_region(sweep, tmp_path):
-    body = json.dumps(
-        {"x": [0.21, 0.24], "axes": ["amplitude", "x"], "y": [0, 1], "at": {"frequency": 0}}
-    ).encode()
+    body = json.dumps({"x": [0.21, 0.24], "axes": ["amplitude", "x"], "y": [0, 1], "at": {"frequency": 0}}).encode()
     reply = ANSWERS["zoom"].give(ExploredRun.of(sweep), Query({}, body), None)
     path = tmp_path / "zoom.toml"
     path.write_bytes(reply.content)

@@ -71,9 +71,7 @@ def test_outputs__every_cell_gets_its_own_numbers(walk_text, extra, first):
 
 def test_initial_states__samples_do_not_depend_on_what_is_fixed(walk_text):
     free = parse_spec(tomllib.loads(walk_text)).initial_conditions
-    fixed = parse_spec(
-        tomllib.loads(walk_text.replace("psi1_deg = [-40, 40]", "psi1_deg = 3"))
-    ).initial_conditions
+    fixed = parse_spec(tomllib.loads(walk_text.replace("psi1_deg = [-40, 40]", "psi1_deg = 3"))).initial_conditions
     rows = np.arange(5)
     assert (initial_states(free).at(rows)[:, 1] == initial_states(fixed).at(rows)[:, 1]).all()
     assert (np.abs(initial_states(free).at(rows)[:, :2]) <= np.deg2rad(40)).all()

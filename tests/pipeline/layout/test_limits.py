@@ -122,10 +122,8 @@ def test_check_plan__branches_whose_starts_fill_the_memory():
         "kind": "continuation",
         "model": "duffing",
         "axes": {"frequency_hz": {"values": [0.1, 0.2]}},
-        "initial_conditions": {
-            "kind": "grid", **{s: {"start": 0.0, "stop": 1.0, "num": 100_000} for s in ("x", "v")}
-        },
-    }  # fmt: skip
+        "initial_conditions": {"kind": "grid", **{s: {"start": 0.0, "stop": 1.0, "num": 100_000} for s in ("x", "v")}},
+    }
     assert "10000000 are the most" in refused(lambda: check_plan(make_plan(parse_spec(data))))
 
 

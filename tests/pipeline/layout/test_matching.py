@@ -37,10 +37,13 @@ def starts(draw):
 def specs(draw, kind):
     hz = [f for f in (0.1, 0.2, 0.3, 0.4) if draw(st.booleans())] or [0.2]
     data = {
-        "kind": kind, "model": "duffing", "axes": {"frequency_hz": {"values": hz}},
-        "initial_conditions": draw(starts()), "parameters": {"overrides": {}},
+        "kind": kind,
+        "model": "duffing",
+        "axes": {"frequency_hz": {"values": hz}},
+        "initial_conditions": draw(starts()),
+        "parameters": {"overrides": {}},
         "execution": {"trajectories_per_task": draw(st.integers(1, 4))},
-    }  # fmt: skip
+    }
     if draw(st.booleans()):
         data["axes"]["amplitude"] = {"values": rising(draw(values))}
     else:

@@ -63,9 +63,7 @@ def test_chunks__tasks_own_whole_chunks(n_points, n_branches, n_keep):
         assert size <= planning.CHUNK_BYTES or chunks[0] == 1
 
 
-@pytest.mark.parametrize(
-    ("n_points", "n_branches", "n_keep"), [(266, 16, 290), (400, 70, 300), (7, 3, 60_000)]
-)
+@pytest.mark.parametrize(("n_points", "n_branches", "n_keep"), [(266, 16, 290), (400, 70, 300), (7, 3, 60_000)])
 def test_chunks__ceil_of_a_ceil_stays_within_the_bound(n_points, n_branches, n_keep):
     shape = (n_points, n_branches)
     block = planning._block(shape, 0, 16)
@@ -88,9 +86,7 @@ def test_make_plan__multiples_of_lanes_and_sizes():
     plan = make_plan(parse_spec(tomllib.loads(text)))
     assert plan.n_cells == 101 * 400 * 400
     cells = plan.cells_in(0)
-    assert (
-        1e6 < cells * sum(v.itemsize({"period_index": 60, "state": 4, "link": 2}) for v in VARIABLES) <= 8.1e6
-    )
+    assert 1e6 < cells * sum(v.itemsize({"period_index": 60, "state": 4, "link": 2}) for v in VARIABLES) <= 8.1e6
     assert plan.n_tasks < 20_000
 
 
@@ -121,8 +117,7 @@ def test_task__out_of_range(sweep_text):
 
 
 @pytest.mark.parametrize(
-    "module",
-    ["pipeline.layout.plan", "pipeline.layout.schema", "pipeline.spec.parsing", "pipeline.layout.identity"],
+    "module", ["pipeline.layout.plan", "pipeline.layout.schema", "pipeline.spec.parsing", "pipeline.layout.identity"]
 )
 def test_import__pure(module):
     heavy = "('dask', 'zarr', 'xarray', 'matplotlib')"
@@ -140,12 +135,7 @@ def test_identity__what_counts(sweep_text):
     assert digest(sweep_text.replace("small sweep", "another title")) == same
     assert digest(sweep_text.replace("stop = 30", "stop = 30.0")) == same
     assert digest(sweep_text + "\n", "other kernel") != same
-    for old, new in [
-        ("n_keep = 3", "n_keep = 4"),
-        ("1.6]", "1.7]"),
-        ("= 24", "= 12"),
-        ("rtol = 1e-6", "rtol = 1e-7"),
-    ]:
+    for old, new in [("n_keep = 3", "n_keep = 4"), ("1.6]", "1.7]"), ("= 24", "= 12"), ("rtol = 1e-6", "rtol = 1e-7")]:
         assert digest(sweep_text.replace(old, new)) != same
 
 

@@ -52,10 +52,7 @@ def make_attractors(ids, dims, coords):
             "orbit_period": (per, (counts > 0) * np.arange(1, n + 1, dtype=np.int32)),
             "n_cells": (per, counts),
             "share": (per, counts / flat.shape[-1]),
-            "attractor_points": (
-                (*per, "point", "state"),
-                np.broadcast_to(points, (*counts.shape, 2, 2)).copy(),
-            ),
+            "attractor_points": ((*per, "point", "state"), np.broadcast_to(points, (*counts.shape, 2, 2)).copy()),
         },
         coords={"state": ["x", "v"], "attractor": np.arange(n, dtype=np.int32), **coords},
         attrs=ATTRS,
@@ -63,9 +60,7 @@ def make_attractors(ids, dims, coords):
 
 
 def test_attractor_figures__without_angles_and_classifier():
-    sweep = make_attractors(
-        [[0, 0, 1], [0, 1, 1]], ("frequency", "initial_condition"), {"frequency": [0.1, 0.2]}
-    )
+    sweep = make_attractors([[0, 0, 1], [0, 1, 1]], ("frequency", "initial_condition"), {"frequency": [0.1, 0.2]})
     for figure in (plot_fractions(sweep), plot_coexisting(sweep)):
         texts = [t.get_text() for t in figure.legends[0].get_texts()]
         assert {"A: period 1", "B: period 2"} <= set(texts)
@@ -121,9 +116,7 @@ def test_plot_trajectory__panel_per_unit_and_no_path_without_a_drawing():
     ds = make_series("duffing", ["x", "v"], parameters=DUFFING)
     ds["energy"] = ("time", np.ones(301), {"units": "J/kg"})
     figure = plot_trajectory(ds)
-    assert [ax.get_ylabel() for ax in figure.axes] == [
-        "$x$ [m]", r"$\dot{x}$ [m/s]", "$E$ [J/kg]", r"$\dot{x}$ [m/s]"
-    ]  # fmt: skip
+    assert [ax.get_ylabel() for ax in figure.axes] == ["$x$ [m]", r"$\dot{x}$ [m/s]", "$E$ [J/kg]", r"$\dot{x}$ [m/s]"]
     assert "path" not in figure.data
 
 
@@ -173,11 +166,7 @@ def make_diagram(levels):
             "section": (("branch", "frequency", "period_index", "state"), section),
             "status": (("branch", "frequency"), np.full((2, 20), 2, np.int8)),
         },
-        coords={
-            "frequency": np.linspace(0.1, 0.3, 20),
-            "state": ["x", "v"],
-            "direction": ("branch", ["up", "down"]),
-        },
+        coords={"frequency": np.linspace(0.1, 0.3, 20), "state": ["x", "v"], "direction": ("branch", ["up", "down"])},
         attrs=ATTRS,
     )
 
@@ -198,9 +187,13 @@ def test_plot_branches__names_cover_no_line():
     section = np.zeros((2, n, 1, 2))
     section[:, :, 0, 0] = psi, psi + 0.1
     events = {
-        "kind": [0, 0], "value": [0.3, 0.3], "of_branch": [0, 1], "after": [20, 20],
-        "n_unstable_before": [0, 0], "n_unstable_after": [1, 1],
-    }  # fmt: skip
+        "kind": [0, 0],
+        "value": [0.3, 0.3],
+        "of_branch": [0, 1],
+        "after": [20, 20],
+        "n_unstable_before": [0, 0],
+        "n_unstable_after": [1, 1],
+    }
     at = np.zeros((2, 1, 2))
     at[1, 0, 0] = 0.1
     ds = xr.Dataset(

@@ -23,15 +23,19 @@ def made_up():
     n = len(psi)
     section = np.zeros((1, n, 1, 4))
     section[0, :, 0, 0] = psi
-    multipliers = np.stack([1.0 - psi, 0.5 + 0 * psi, 0.2 + 0.1j + 0 * psi, 0.2 - 0.1j + 0 * psi], axis=1)[
-        None
-    ]
+    multipliers = np.stack([1.0 - psi, 0.5 + 0 * psi, 0.2 + 0.1j + 0 * psi, 0.2 - 0.1j + 0 * psi], axis=1)[None]
     after = int(np.flatnonzero(psi > 0)[-1])
     event = {
-        "kind": 0, "value": 3.0, "of_branch": 0, "after": after,
-        "n_unstable_before": 0, "n_unstable_after": 1, "critical_real": 1.0,
-        "critical_imag": 0.0, "bifurcation_side": 2,
-    }  # fmt: skip
+        "kind": 0,
+        "value": 3.0,
+        "of_branch": 0,
+        "after": after,
+        "n_unstable_before": 0,
+        "n_unstable_after": 1,
+        "critical_real": 1.0,
+        "critical_imag": 0.0,
+        "bifurcation_side": 2,
+    }
     return xr.Dataset(
         {
             "parameter": (("branch", "point"), frequency[None]),
@@ -151,13 +155,9 @@ def test_branches__command(main, tmp_path):
     assert drawn.returncode == 0, drawn.stderr
     assert "taken from" in drawn.stderr
     assert figure_of(drawn, tmp_path).stat().st_size > 10_000
-    curved = magpend(
-        "plot", "curves", "run", *options, "--second", "q", "--second-from", 1.5, "--second-to", 1.6
-    )
+    curved = magpend("plot", "curves", "run", *options, "--second", "q", "--second-from", 1.5, "--second-to", 1.6)
     assert curved.returncode == 0, curved.stderr
     assert figure_of(curved, tmp_path).stat().st_size > 10_000
-    refused = magpend(
-        "plot", "curves", "run", *options, "--second", "q", "--second-from", 2, "--second-to", 1
-    )
+    refused = magpend("plot", "curves", "run", *options, "--second", "q", "--second-from", 2, "--second-to", 1)
     assert refused.returncode == 2
     assert "is empty" in refused.stderr

@@ -45,9 +45,11 @@ class FakeRun:
 
     digest = "c" * 64
     info = SimpleNamespace(
-        title="a run", digest="d" * 64, versions={"numpy": "9.9"},
+        title="a run",
+        digest="d" * 64,
+        versions={"numpy": "9.9"},
         provenance={"host": "node7", "created": "2026-01-02T03:04:05+00:00", "git_commit": "f" * 40},
-    )  # fmt: skip
+    )
 
     def __init__(self):
         self.said, self.derived = [], []
@@ -69,12 +71,25 @@ def other_value(model, name):
     """A valid value of an option that is not its default."""
     default = default_of(model, name)
     special = {
-        "at": {"frequency": 2.05}, "xlim": (2.0, 2.1), "ylim": (0.0, 1.0), "layout": "side", "per": "period",
-        "show": "number", "colour": "attractor", "width": 85.0, "state": "psi2", "quantity": "energy.max",
+        "at": {"frequency": 2.05},
+        "xlim": (2.0, 2.1),
+        "ylim": (0.0, 1.0),
+        "layout": "side",
+        "per": "period",
+        "show": "number",
+        "colour": "attractor",
+        "width": 85.0,
+        "state": "psi2",
+        "quantity": "energy.max",
         "against": "psi2",
-        "second_low": 0.5, "second_high": 0.7, "over": "other/run", "parameter": "q", "low": 2.0,
-        "high": 2.5, "shown": 2,
-    }  # fmt: skip
+        "second_low": 0.5,
+        "second_high": 0.7,
+        "over": "other/run",
+        "parameter": "q",
+        "low": 2.0,
+        "high": 2.5,
+        "shown": 2,
+    }
     if name in special:
         return special[name]
     if isinstance(default, bool):
@@ -85,9 +100,7 @@ def other_value(model, name):
 @pytest.mark.parametrize("name", list(FIGURES))
 def test_label__every_option_that_changes_the_picture_changes_the_name(name):
     model = FIGURES[name].options
-    required = {
-        key: {"second": "q"}.get(key, 1.0) for key, field in model.model_fields.items() if field.is_required()
-    }
+    required = {key: {"second": "q"}.get(key, 1.0) for key, field in model.model_fields.items() if field.is_required()}
     base = model.model_construct(**required)
     seen = {base.label(): "nothing"}
     for key in model.model_fields:
@@ -128,9 +141,13 @@ def test_place__value_between_names_its_neighbours():
 def test_draw_figure__value_between_is_refused_before_anything_is_computed(name):
     run = FakeRun()
     with pytest.raises(ValueError, match=r"nearest values are 2\.05 and 2\.1"):
-        draw_figure(run, name, options_of(name, state="psi1", at={"frequency": 2.053})
-                    if "state" in FIGURES[name].options.model_fields
-                    else options_of(name, at={"frequency": 2.053}))  # fmt: skip
+        draw_figure(
+            run,
+            name,
+            options_of(name, state="psi1", at={"frequency": 2.053})
+            if "state" in FIGURES[name].options.model_fields
+            else options_of(name, at={"frequency": 2.053}),
+        )
     assert run.derived == []
 
 

@@ -32,11 +32,13 @@ def make_cube(n_cells=3, dims=(), sizes=(), exponents=(0.3, -0.4)):
             "divergence": (names, np.full(shape, -0.1)),
         },
         coords={
-            "state": ["x", "v"], "exponent": [1, 2], "frequency": ((), FREQUENCY, {"units": "Hz"}),
+            "state": ["x", "v"],
+            "exponent": [1, 2],
+            "frequency": ((), FREQUENCY, {"units": "Hz"}),
             **{d: (d, np.arange(n, dtype=float), {"units": "1"}) for d, n in zip(dims, sizes, strict=True)},
         },
         attrs={"model": "duffing", "parameters": "", "lyapunov_n_periods": 64},
-    )  # fmt: skip
+    )
 
 
 @pytest.mark.parametrize("per", ["s", "period"])
@@ -62,9 +64,7 @@ def test_plot_convergence__many_cells_are_bands():
     median = next(line for line in many.axes[0].get_lines() if line.get_gid() == "running:chaotic")
     np.testing.assert_allclose(median.get_ydata(), np.median(running, axis=0))
     # every stored exponent still has its point
-    assert (
-        sum(len(line.get_xdata()) for line in many.axes[2].get_lines() if len(line.get_xdata()) > 2) == 10_000
-    )
+    assert sum(len(line.get_xdata()) for line in many.axes[2].get_lines() if len(line.get_xdata()) > 2) == 10_000
 
 
 def test_plot_lyapunov_map__says_that_it_shows_the_maximum_over_cells():
@@ -124,9 +124,7 @@ def test_plot_lyapunov__shows_where_cells_were_lost_and_why():
     ds["lyapunov"][0, 0] = np.nan
     figure = plot_lyapunov(ds)
     labels = [text.get_text() for legend in figure.legends for text in legend.get_texts()]
-    assert labels[-3:] == [
-        "diverged: 2 of 12 cells", "failed: 1 of 12 cells", "without exponent: 1 of 12 cells"
-    ]  # fmt: skip
+    assert labels[-3:] == ["diverged: 2 of 12 cells", "failed: 1 of 12 cells", "without exponent: 1 of 12 cells"]
     top, bottom, strip = figure.axes
     assert boxes(strip, "absent:diverged") == (3.5, 4.5)
     assert boxes(strip, "absent:without exponent") == (-0.5, 0.5)

@@ -11,12 +11,7 @@ import xarray as xr
 from matplotlib.colors import to_rgb
 
 from magpend_core.models import load_model
-from pipeline.plots import (
-    pixels,
-    plot_bifurcation,
-    points,
-    style,
-)
+from pipeline.plots import pixels, plot_bifurcation, points, style
 
 SYMBOLS = {s.name: f"${s.symbol}$" for s in load_model("pendulum").states}
 STATES = ["psi1", "psi2", "psi1_dot", "psi2_dot"]
@@ -221,10 +216,7 @@ def test_plot_bifurcation__two_parameters_are_refused():
     [
         ({"state": "psi"}, r"unknown state 'psi'\. Did you mean 'psi2'\? Allowed: psi1, psi2, psi1_dot"),
         ({"state": "energy"}, r"unknown state 'energy'\. Allowed: psi1"),
-        (
-            {"layout": "overlap"},
-            r"unknown layout 'overlap'\. Did you mean 'overlay'\? Allowed: overlay, side",
-        ),
+        ({"layout": "overlap"}, r"unknown layout 'overlap'\. Did you mean 'overlay'\? Allowed: overlay, side"),
     ],
 )
 def test_plot_bifurcation__unknown_names(options, message):

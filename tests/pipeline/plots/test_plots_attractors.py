@@ -120,17 +120,16 @@ def test_plot_basins__each_cell_has_the_colour_of_its_legend(grid):
     fig = plot_basins(grid)
     picture, legend = colours_of(fig), legend_colours(fig)
     assert list(legend) == [
-        "A: period 1, left, 50.0 %", "B: period 1, left, 25.0 %", "not settled, 6.2 %", "diverged, 6.2 %",
-        "failed, 6.2 %", "pending, 6.2 %",
-    ]  # fmt: skip
+        "A: period 1, left, 50.0 %",
+        "B: period 1, left, 25.0 %",
+        "not settled, 6.2 %",
+        "diverged, 6.2 %",
+        "failed, 6.2 %",
+        "pending, 6.2 %",
+    ]
     expected = np.empty((4, 4, 3))
     expected[:], expected[2:, 2:] = legend["A: period 1, left, 50.0 %"], legend["B: period 1, left, 25.0 %"]
-    for cell, name in {
-        (3, 0): "diverged",
-        (3, 1): "pending",
-        (2, 0): "failed",
-        (2, 1): "not settled",
-    }.items():
+    for cell, name in {(3, 0): "diverged", (3, 1): "pending", (2, 0): "failed", (2, 1): "not settled"}.items():
         expected[cell] = legend[f"{name}, 6.2 %"]
     assert np.abs(picture - expected).max() < 0.003
 
@@ -217,9 +216,7 @@ def test_plot_basins__selection(grid):
     with pytest.raises(ValueError, match=r"frequency = 3 lies off its axis, which runs from 2\.2 to 2\.4"):
         plot_basins(more, at={"frequency": 3.0})
     fig = plot_basins(more, at={"frequency": 2.4})
-    np.testing.assert_array_equal(
-        fig.data["attractor_id"].transpose(*GRID), more["attractor_id"].isel(frequency=1)
-    )
+    np.testing.assert_array_equal(fig.data["attractor_id"].transpose(*GRID), more["attractor_id"].isel(frequency=1))
     assert caption_of(fig) == "$f$ = 2.4 Hz"
 
 
@@ -284,15 +281,7 @@ def test_cast_of__most_cells_have_own_colours_and_selection_changes_none():
     part["kind"][5:] = part["stability"][5:] = 0
     assert palette.cast_of(ds, part).colours == cast.colours
     assert palette.cast_of(ds, part).names[20] == "U: absent"
-    assert [letter(i) for i in (0, 25, 26, 51, 52, 701, 702)] == [
-        "A",
-        "Z",
-        "AA",
-        "AZ",
-        "BA",
-        "ZZ",
-        "AAA",
-    ]
+    assert [letter(i) for i in (0, 25, 26, 51, 52, 701, 702)] == ["A", "Z", "AA", "AZ", "BA", "ZZ", "AAA"]
 
 
 def test_describe__periods_sides_turns():
@@ -320,16 +309,10 @@ def test_describe__periods_sides_turns():
 # Machado, Oliveira & Fernandes, IEEE TVCG 15 (2009) 1291, severity 1; rows act on linear RGB
 VISION = {
     "normal": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
-    "protanopia": [
-        [0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998],
-    ],
-    "deuteranopia": [
-        [0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.011820, 0.042940, 0.968881],
-    ],
-    "tritanopia": [
-        [1.255528, -0.076749, -0.178779], [-0.078411, 0.930809, 0.147602], [0.004733, 0.691367, 0.303900],
-    ],
-}  # fmt: skip
+    "protanopia": [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]],
+    "deuteranopia": [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.011820, 0.042940, 0.968881]],
+    "tritanopia": [[1.255528, -0.076749, -0.178779], [-0.078411, 0.930809, 0.147602], [0.004733, 0.691367, 0.303900]],
+}
 
 
 def lab(colour, vision):
@@ -429,9 +412,7 @@ def test_plot_coexisting__points_and_weights(sweep):
     sweep["attractor_points"][0, 0, 1] = 0.3
     halves = offsets(plot_coexisting(sweep), "points:A")[1]
     least, growth = 1.1**2, 5.0**2
-    np.testing.assert_allclose(
-        halves**2, [least + growth * 0.25, least + growth * 0.25, least + growth * 0.4]
-    )
+    np.testing.assert_allclose(halves**2, [least + growth * 0.25, least + growth * 0.25, least + growth * 0.4])
 
 
 def test_plot_coexisting__angles_on_the_circle_and_unknown_state(sweep):
@@ -452,12 +433,16 @@ def test_plot_coexisting__sets_that_do_not_attract_are_small_and_grey(sweep):
     np.testing.assert_allclose(offsets(fig, "points:B")[0], [[2.0, 0.2]])
     lines = {line.get_gid(): line for line in fig.axes[0].get_lines()}
     assert {gid: line.get_xdata().tolist() for gid, line in lines.items()} == {
-        "points:not settled": [2.1], "points:unstable": [2.2],
-    }  # fmt: skip
+        "points:not settled": [2.1],
+        "points:unstable": [2.2],
+    }
     assert lines["points:unstable"].get_color() == palette.GREY_OF[vocabulary.UNSTABLE]
     assert legend_texts(fig)[:4] == [
-        "A: period 1, left", "B: period 1, left, unstable or not settled in parts", "not settled", "unstable"
-    ]  # fmt: skip
+        "A: period 1, left",
+        "B: period 1, left, unstable or not settled in parts",
+        "not settled",
+        "unstable",
+    ]
 
 
 @pytest.fixture
@@ -475,9 +460,11 @@ def test_plot_coexisting__directions_and_loops(walk):
     fig = plot_coexisting(walk, hysteresis=hysteresis(walk, walk))
     lines = {line.get_gid(): line for line in fig.axes[0].get_lines()}
     assert {gid: np.round(line.get_xdata(), 9).tolist() for gid, line in lines.items()} == {
-        "points:up:A": [2.0, 2.1, 2.2], "points:down:A": [2.0, 2.1], "points:up:B": [2.3, 2.4],
+        "points:up:A": [2.0, 2.1, 2.2],
+        "points:down:A": [2.0, 2.1],
+        "points:up:B": [2.3, 2.4],
         "points:down:B": [2.2, 2.3, 2.4],
-    }  # fmt: skip
+    }
     up, down = lines["points:up:A"], lines["points:down:A"]
     assert up.get_markersize() < down.get_markersize()
     assert up.get_zorder() > down.get_zorder()
@@ -492,9 +479,7 @@ def test_plot_coexisting__directions_and_loops(walk):
 @pytest.fixture
 def map_of_two():
     """2 frequencies x 3 amplitudes, 4 cells: A alone, A + B, B with a cell not settled, ..."""
-    ids = np.array(
-        [[[0] * 4, [0, 0, 1, 1], [1, 1, 1, -1]], [[0] * 4, [0] * 4, [-1] * 4]], np.int32
-    )  # fmt: skip
+    ids = np.array([[[0] * 4, [0, 0, 1, 1], [1, 1, 1, -1]], [[0] * 4, [0] * 4, [-1] * 4]], np.int32)
     coords = {
         "frequency": ("frequency", [2.0, 2.2], {"units": "Hz"}),
         "q": ("q", [1.0, 1.5, 2.0], {"units": "N m", "long_name": "amplitude"}),
@@ -713,9 +698,12 @@ def test_legends__fit_into_the_figure_beside_the_axes():
 
 def test_save_data__every_figure(sweep, walk, map_of_two, tmp_path):
     figures = [
-        plot_fractions(sweep), plot_coexisting(sweep), plot_coexisting(walk), plot_regimes(map_of_two),
+        plot_fractions(sweep),
+        plot_coexisting(sweep),
+        plot_coexisting(walk),
+        plot_regimes(map_of_two),
         plot_gallery(sweep, make_portraits(2).assign_coords(frequency=2.1)),
-    ]  # fmt: skip
+    ]
     for fig in figures:
         with xr.open_dataset(save_data(fig, tmp_path / "a.svg"), engine="scipy") as stored:
             assert set(stored.data_vars) == set(fig.data.data_vars)
@@ -733,16 +721,18 @@ def test_greys__every_cell_without_an_attractor_has_one():
     status = np.array([*Status, PERIODIC, PERIODIC, BOUNDED, BOUNDED], np.int8)
     ids = np.array([*np.full(len(Status), -1), 0, 1, 2, 3], np.int32)
     ds = make_attractors(ids, ("initial_condition",), {}, status=status)
-    ds["stability"][:] = [
-        vocabulary.NOT_SETTLED, vocabulary.TRANSIENT, vocabulary.UNSTABLE, vocabulary.NEUTRAL
-    ]  # fmt: skip
+    ds["stability"][:] = [vocabulary.NOT_SETTLED, vocabulary.TRANSIENT, vocabulary.UNSTABLE, vocabulary.NEUTRAL]
     found = palette.other_cells(ds)
     assert found.keys() == palette.GREYS.keys()
     assert np.sum(list(found.values()), axis=0).tolist() == [1] * len(ids)
     for code, name in {
-        Status.DIVERGED: "diverged", Status.PENDING: "pending", Status.NO_RETURN: "no return",
-        Status.STEP_UNDERFLOW: "failed", Status.UNREACHED: "failed", Status.BOUNDED: "not settled",
-    }.items():  # fmt: skip
+        Status.DIVERGED: "diverged",
+        Status.PENDING: "pending",
+        Status.NO_RETURN: "no return",
+        Status.STEP_UNDERFLOW: "failed",
+        Status.UNREACHED: "failed",
+        Status.BOUNDED: "not settled",
+    }.items():
         assert found[name][list(Status).index(code)], name
     on_sets = ["not settled", "on a transient set", "on an unstable orbit or equilibrium", "on a neutral set"]
     assert [bool(found[name][len(Status) + k]) for k, name in enumerate(on_sets)] == [True] * 4

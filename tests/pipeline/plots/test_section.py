@@ -44,9 +44,7 @@ def test_plot_section__all_points_with_labels_and_fixed_values(tmp_path):
     ax = figure.axes[0]
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("$x$ [m]", r"$\dot{x}$ [m/s]")
     assert ax.get_title(loc="left") == "$f$ = 0.2\N{NO-BREAK SPACE}Hz"
-    np.testing.assert_array_equal(
-        np.sort(points_of(figure)[0]), np.sort(ds["section"][..., 0].values.ravel())
-    )
+    np.testing.assert_array_equal(np.sort(points_of(figure)[0]), np.sort(ds["section"][..., 0].values.ravel()))
     (line,) = ax.get_lines()
     assert len(line.get_xdata()) == 200
     with xr.open_dataset(save_data(figure, tmp_path / "a.png"), engine="scipy") as stored:
@@ -78,9 +76,7 @@ def test_plot_section__ten_million_points_within_seconds():
 
 def test_plot_section__one_parameter_point():
     ds = xr.concat([make_sections(), make_sections(seed=4)], "frequency").assign_coords(frequency=[0.1, 0.2])
-    with pytest.raises(
-        ValueError, match=r"one parameter point, .*frequency \(2 values\).*--at frequency=0\.2"
-    ):
+    with pytest.raises(ValueError, match=r"one parameter point, .*frequency \(2 values\).*--at frequency=0\.2"):
         plot_section(ds)
     np.testing.assert_array_equal(
         np.sort(points_of(plot_section(ds, at={"frequency": 0.1}))[0]),
@@ -91,9 +87,7 @@ def test_plot_section__one_parameter_point():
 def test_plot_section__states_and_degrees():
     ds = make_sections()
     figure = plot_section(ds, states=("v", "x"))
-    np.testing.assert_array_equal(
-        np.sort(points_of(figure)[1]), np.sort(ds["section"][..., 0].values.ravel())
-    )
+    np.testing.assert_array_equal(np.sort(points_of(figure)[1]), np.sort(ds["section"][..., 0].values.ravel()))
     with pytest.raises(ValueError, match="neither x nor v is an angle"):
         plot_section(ds, degrees=True)
     with pytest.raises(ValueError, match=r"unknown state 'w'\. Allowed: x, v"):
@@ -118,9 +112,7 @@ def test_plot_section__colours_of_attractors():
     figure = plot_section(ds, ids)
     lines = {line.get_gid(): line for line in figure.axes[0].get_lines()}
     assert set(lines) == {"points:A: chaotic", "points:B: chaotic", "points:not settled"}
-    np.testing.assert_array_equal(
-        np.sort(lines["points:A: chaotic"].get_xdata()), np.sort(ds["section"][0, :, 0])
-    )
+    np.testing.assert_array_equal(np.sort(lines["points:A: chaotic"].get_xdata()), np.sort(ds["section"][0, :, 0]))
     colours = [to_rgb(line.get_color()) for line in lines.values()]
     assert len(set(colours)) == 3
     # what does not attract has no colour of its own
@@ -142,16 +134,16 @@ def make_extremes():
             "extremes": (dims, values),
         },
         coords={
-            "frequency": ("frequency", frequency, {"units": "Hz"}), "state": ["x", "v"],
-            "quantity": ["energy", "v"], "extreme": ["min", "max", "mean"],
+            "frequency": ("frequency", frequency, {"units": "Hz"}),
+            "state": ["x", "v"],
+            "quantity": ["energy", "v"],
+            "extreme": ["min", "max", "mean"],
         },
         attrs=ATTRS,
-    )  # fmt: skip
+    )
 
 
-@pytest.mark.parametrize(
-    ("kind", "word", "column"), [("min", "least", 0), ("max", "largest", 1), ("mean", "mean", 2)]
-)
+@pytest.mark.parametrize(("kind", "word", "column"), [("min", "least", 0), ("max", "largest", 1), ("mean", "mean", 2)])
 def test_plot_bifurcation__extremes_of_a_quantity(kind, word, column):
     ds = make_extremes()
     figure = plot_bifurcation(ds, quantity=f"energy.{kind}")
@@ -170,7 +162,5 @@ def test_plot_bifurcation__extremes_refused():
         plot_bifurcation(ds, quantity="energy")
     with pytest.raises(ValueError, match=r"unknown quantity 'enrgy'\. Did you mean 'energy'"):
         plot_bifurcation(ds, quantity="enrgy.max")
-    with pytest.raises(
-        ValueError, match=r'run it with \[products\] extremes = \{ quantities = \["energy"\] \}'
-    ):
+    with pytest.raises(ValueError, match=r'run it with \[products\] extremes = \{ quantities = \["energy"\] \}'):
         plot_bifurcation(ds.drop_vars("extremes"), quantity="energy.max")

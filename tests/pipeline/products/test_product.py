@@ -69,11 +69,15 @@ def test_label__tells_figures_apart():
     labels = {
         options.label()
         for options in (
-            StateOptions(state="x"), StateOptions(state="v"), StateOptions(state="x", degrees=True),
-            StateOptions(state="x", at={"q": 1.5}), StateOptions(state="x", at={"q": 1.6}),
-            StateOptions(state="x", width=85.0), StateOptions(state="x", xlim=(1.0, 2.0)),
+            StateOptions(state="x"),
+            StateOptions(state="v"),
+            StateOptions(state="x", degrees=True),
+            StateOptions(state="x", at={"q": 1.5}),
+            StateOptions(state="x", at={"q": 1.6}),
+            StateOptions(state="x", width=85.0),
+            StateOptions(state="x", xlim=(1.0, 2.0)),
         )
-    }  # fmt: skip
+    }
     assert len(labels) == 7
     assert StateOptions(state="x", at={"q": 1.5}).label() == "_x_q_1.5"
     assert all("/" not in label for label in labels)

@@ -30,9 +30,7 @@ def opened(tmp_path_factory):
             told = []
             seen.on("console", lambda message: told.append(message.text))
             seen.on("pageerror", lambda error: told.append(str(error)))
-            seen.on(
-                "request", lambda r: told.append(r.url) if not r.url.startswith(("data:", "file:")) else None
-            )
+            seen.on("request", lambda r: told.append(r.url) if not r.url.startswith(("data:", "file:")) else None)
             seen.goto(path.as_uri())
             return seen, told
 

@@ -144,9 +144,16 @@ def test_matches__words_of_the_model(known):
 
 def claim(**given):
     table = {
-        "statement": "band", "source": "here", "measure": "window_width", "of": ["run"],
-        "options": {"period": 1, "contains": 2.2}, "least": 0.2, "most": 0.3, "unit": "Hz", "step": 0.02,
-    }  # fmt: skip
+        "statement": "band",
+        "source": "here",
+        "measure": "window_width",
+        "of": ["run"],
+        "options": {"period": 1, "contains": 2.2},
+        "least": 0.2,
+        "most": 0.3,
+        "unit": "Hz",
+        "step": 0.02,
+    }
     return ClaimTable.model_validate({**table, **given})
 
 
@@ -182,6 +189,4 @@ def test_judge__never_met_by_a_coarse_grid():
 
 
 def test_spelled__digits_follow_the_interval(known):
-    assert spelled(judge(known, "1", claim())).startswith(
-        "0.260 Hz (0.250 to 0.270); all of 20 cells from 2.1 to 2.35"
-    )
+    assert spelled(judge(known, "1", claim())).startswith("0.260 Hz (0.250 to 0.270); all of 20 cells from 2.1 to 2.35")

@@ -16,9 +16,13 @@ HOSTILE = "</title><script>alert('x')</script><img src=http://e.org/x onerror=al
 def page_of(text: str) -> Page:
     outcome = Outcome(text, text, text, Verdict.MET, text, True, text)
     blocks = [
-        Picture(b"\x89PNG", 3, 2, text, text, text), Grid([text], [[text]], text, text, 4), Note(text, text),
-        Facts({text: text}), Source(text, text), outcome,
-    ]  # fmt: skip
+        Picture(b"\x89PNG", 3, 2, text, text, text),
+        Grid([text], [[text]], text, text, 4),
+        Note(text, text),
+        Facts({text: text}),
+        Source(text, text),
+        outcome,
+    ]
     return Page(text, blocks, [Part(text, blocks, [Part(text, blocks)]), Part("two", [])], text)
 
 

@@ -171,8 +171,12 @@ def test_report__jumps_of_walks_have_their_place(folder, command):
     assert found.sizes["jump"]
     head = re.search(r"<tr><th scope=\"col\">direction</th>(.*?)</tr>", html)[1]
     assert re.findall(r"<th scope=\"col\">(.*?)</th>", head) == [
-        "from frequency [Hz]", "to frequency [Hz]", "from attractor", "to attractor", "count",
-    ]  # fmt: skip
+        "from frequency [Hz]",
+        "to frequency [Hz]",
+        "from attractor",
+        "to attractor",
+        "count",
+    ]
     rows = re.findall(r"<tr><td>(up|down)</td><td>(.*?)</td><td>(.*?)</td><td>([A-Z])</td>", html)
     names = [("up" if d > 0 else "down") for d in found["jump_direction"].values]
     ends = ([f"{v:.6g}" for v in found[f"jump_{end}"].values] for end in ("from", "to"))

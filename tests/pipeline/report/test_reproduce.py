@@ -136,20 +136,20 @@ def test_reproduce__a_required_claim_is_contradicted(study, main, tmp_path, cali
 @pytest.mark.parametrize("smoke", [False, True])
 def test_headline__decided_claims_come_first_and_calibrated_ones_are_a_paragraph(smoke):
     judgements = [
-        _judgement("1", "A.", Verdict.UNDECIDED), _judgement("2", "B", Verdict.MET),
-        _judgement("3", "C.", Verdict.CALIBRATED, Verdict.MET), _judgement("4", "D", Verdict.NOT_MET),
+        _judgement("1", "A.", Verdict.UNDECIDED),
+        _judgement("2", "B", Verdict.MET),
+        _judgement("3", "C.", Verdict.CALIBRATED, Verdict.MET),
+        _judgement("4", "D", Verdict.NOT_MET),
         _judgement("5", "E", Verdict.CALIBRATED, Verdict.UNDECIDED),
         _judgement("6", "F", Verdict.CALIBRATED, Verdict.MET),
-    ]  # fmt: skip
+    ]
     assert [j.figure for j in decided_first(judgements)] == ["2", "4", "1"]
     assert calibrated_on(judgements) == (
         "3 of 6 claims are no test: parameters were calibrated on them. Came out: figure 3: C; figure 6: F. "
         "Undecided whether they came out: figure 5: E."
     )
     assert calibrated_on(judgements[:2]) == ""
-    assert headline(judgements, smoke).startswith(
-        "Of 3 claims that are tests, 1 are met, 1 not met, 1 undecided."
-    )
+    assert headline(judgements, smoke).startswith("Of 3 claims that are tests, 1 are met, 1 not met, 1 undecided.")
     assert ("without --smoke" in headline(judgements, smoke)) == smoke
 
 
@@ -202,9 +202,7 @@ def test_load_study__all_that_is_wrong(study):
 
 def test_reproduce__all_is_read_before_anything_is_computed(study, main, tmp_path):
     more = '[torques.t]\nheader = "disks"\n[recordings.r]\nrig = "none.toml"\n[runs.other]\nspec = "fig31"\n'
-    text = STUDY.replace("[[figures]]", f"{more}[[figures]]", 1) + FALSE.replace(
-        '["sweep"]', '["other", "r", "t"]'
-    )
+    text = STUDY.replace("[[figures]]", f"{more}[[figures]]", 1) + FALSE.replace('["sweep"]', '["other", "r", "t"]')
     study(text)
     code, _, err = main("reproduce", "mine.toml", "--out", "done", "--workers", "0")
     assert code == Exit.REFUSED

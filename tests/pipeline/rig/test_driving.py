@@ -133,9 +133,7 @@ def test_cli__from_a_recording_to_a_simulation_and_a_run(main, tmp_path):
     off = found["psi1_rad"][early] - np.interp(found["time_s"][early], ds.time, ds.psi1)
     assert np.sqrt(np.mean(off**2)) < 5e-3
     spec = 'kind = "sweep"\n[drive]\nfile = "edges.csv"\n[initial_conditions]\nkind = "random"\nn = 4\n'
-    (tmp_path / "spec.toml").write_text(
-        spec + "psi1 = [-1.0, 1.0]\n[integration]\nn_transient = 2\nn_keep = 3\n"
-    )
+    (tmp_path / "spec.toml").write_text(spec + "psi1 = [-1.0, 1.0]\n[integration]\nn_transient = 2\nn_keep = 3\n")
     assert main("run", "spec.toml", "--out", "run", "--workers", "0")[0] == 0
     assert load_drive(tmp_path / "edges.csv").n_periods >= 5
 

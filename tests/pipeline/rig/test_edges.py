@@ -19,9 +19,7 @@ def square(time, frequency_hz=2.2, duty=DUTY, start_s=0.1):
 
 def drive_of(edges_up, edges_down, time):
     """A signal that rises and falls at given instants."""
-    return (
-        np.searchsorted(edges_up, time, side="right") - np.searchsorted(edges_down, time, side="right") - 0.5
-    )
+    return np.searchsorted(edges_up, time, side="right") - np.searchsorted(edges_down, time, side="right") - 0.5
 
 
 def test_find_edges__a_hard_square_wave_is_found_within_half_a_sample():
@@ -170,8 +168,7 @@ def test_frequency__too_few_edges_or_no_period_are_refused():
 def test_edges_of__pieces_are_not_joined():
     time = np.concatenate([np.arange(5000) / 1000, 7.31 + np.arange(5000) / 1000])
     ds = xr.Dataset(
-        {"drive": ("sample", square(time))},
-        {"time": ("sample", time), "piece": ("sample", np.repeat([0, 1], 5000))},
+        {"drive": ("sample", square(time))}, {"time": ("sample", time), "piece": ("sample", np.repeat([0, 1], 5000))}
     )
     edges = edges_of(ds)
     assert not ((edges.rising > 4.999) & (edges.rising < 7.31)).any()

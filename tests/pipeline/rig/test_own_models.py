@@ -119,9 +119,7 @@ def test_load_rig__text_of_a_file(bench):
 
 @pytest.mark.slow
 def test_identify__text_of_a_file_and_without_it_afterwards(bench):
-    result = identification.identify(
-        bench / "spec.toml", bench / "out", figures=False, echo=lambda line: None
-    )
+    result = identification.identify(bench / "spec.toml", bench / "out", figures=False, echo=lambda line: None)
     for name, value in TRUTH.items():
         low, high = result["estimates"][name]["interval"]
         assert low - 0.5 * (high - low) < value < high + 0.5 * (high - low), name

@@ -29,9 +29,13 @@ def ideal(*names):
 
 def test_record__ideal_sensors_see_the_engines_states(parameters):
     ds = record(
-        parameters, [Step(2.2, 14)], START, TIMES,
-        sensors={**ideal("psi1", "psi2", "psi1_dot"), "drive": DriveSensor("torque")}, seed=0,
-    )  # fmt: skip
+        parameters,
+        [Step(2.2, 14)],
+        START,
+        TIMES,
+        sensors={**ideal("psi1", "psi2", "psi1_dot"), "drive": DriveSensor("torque")},
+        seed=0,
+    )
     states = trajectory(parameters, 2.2, np.array(START), TIMES, rtol=TOLERANCE, atol=TOLERANCE)
     for i, name in ((0, "psi1"), (1, "psi2"), (2, "psi1_dot")):
         # both walk the drive's periods with the same steps; what differs is rounding, which chaos lets grow
@@ -66,13 +70,7 @@ def test_record__steps_of_the_drive_carry_the_state_on(parameters):
 
             local = np.maximum(times[inside] - begin, 0.0)
             found = solve_ivp(
-                slope,
-                (0.0, end - begin),
-                state,
-                t_eval=[*local, end - begin],
-                rtol=1e-9,
-                atol=1e-9,
-                max_step=2e-3,
+                slope, (0.0, end - begin), state, t_eval=[*local, end - begin], rtol=1e-9, atol=1e-9, max_step=2e-3
             )
             np.testing.assert_allclose(ds["psi1"].values[inside], found.y[0, :-1], atol=1e-5)
             np.testing.assert_allclose(ds["psi2"].values[inside], found.y[1, :-1], atol=1e-5)
@@ -105,9 +103,13 @@ def test_record__free_swing_of_another_model():
 def test_record__noise_and_quantisation_are_those_of_the_sensor(parameters):
     ideal_ds = record(parameters, [Step(2.2, 14)], START, TIMES, sensors=ideal("psi1", "psi2"), seed=0)
     ds = record(
-        parameters, [Step(2.2, 14)], START, TIMES,
-        sensors={"psi1": Sensor("encoder", 2e-3), "psi2": Sensor("encoder", 0.0, 12)}, seed=0,
-    )  # fmt: skip
+        parameters,
+        [Step(2.2, 14)],
+        START,
+        TIMES,
+        sensors={"psi1": Sensor("encoder", 2e-3), "psi2": Sensor("encoder", 0.0, 12)},
+        seed=0,
+    )
     error = ds - ideal_ds
     assert float(error["psi1"].std()) == pytest.approx(2e-3, rel=0.05)
     grain = 2.0 * math.pi / 2**12
@@ -159,9 +161,13 @@ def test_readings__through_a_file_are_the_recording(tmp_path, parameters, suffix
 def test_record__refuses_all_at_once(parameters):
     with pytest.raises(SpecError) as caught:
         record(
-            parameters, [Step(2.2, 2, {"duty": 0.5}), Step(0.0, 1)], START, TIMES, seed=0,
+            parameters,
+            [Step(2.2, 2, {"duty": 0.5}), Step(0.0, 1)],
+            START,
+            TIMES,
+            seed=0,
             sensors={"psi_1": Sensor(), "psi1_dot": Sensor("potentiometer"), "psi2": Sensor(noise=-1.0)},
-        )  # fmt: skip
+        )
     text = "\n".join(caught.value.problems)
     assert "unknown state 'psi_1'; did you mean psi1" in text
     assert "measures angles alone" in text
@@ -205,9 +211,11 @@ def test_load_rig__reads_a_specification(tmp_path):
 
 def test_parse_rig__sweep_is_its_steps():
     data = {
-        "model": "pendulum", "sampling_rate_hz": 100.0, "sensors": {"psi1": {"kind": "encoder"}},
+        "model": "pendulum",
+        "sampling_rate_hz": 100.0,
+        "sensors": {"psi1": {"kind": "encoder"}},
         "drive": {"sweep": {"start_hz": 3.0, "stop_hz": 2.0, "num": 5, "n_periods": 6}},
-    }  # fmt: skip
+    }
     rig = parse_rig(data)
     assert [s.frequency_hz for s in rig.drive] == [3.0, 2.75, 2.5, 2.25, 2.0]
     assert {s.n_periods for s in rig.drive} == {6}
@@ -226,19 +234,27 @@ def test_record__offset_is_what_the_mapping_does_not_know(parameters):
 
 def test_parse_rig__names_all_problems_at_once():
     with pytest.raises(SpecError) as caught:
-        parse_rig({
-            "model": "pendulum", "sampling_rate": 10.0, "sampling_rate_hz": -1.0, "preset": "wojna2018",
-            "initial_state": {"psi": 1.0, "psi1": math.inf},
-            "drive": {"steps": [{"frequency_hz": 2.0}, {"frequency_hz": 2.0, "n_periods": 1, "Q": 1.0}]},
-            "sensors": {"psi1": {"kind": "camera"}},
-        })  # fmt: skip
+        parse_rig(
+            {
+                "model": "pendulum",
+                "sampling_rate": 10.0,
+                "sampling_rate_hz": -1.0,
+                "preset": "wojna2018",
+                "initial_state": {"psi": 1.0, "psi1": math.inf},
+                "drive": {"steps": [{"frequency_hz": 2.0}, {"frequency_hz": 2.0, "n_periods": 1, "Q": 1.0}]},
+                "sensors": {"psi1": {"kind": "camera"}},
+            }
+        )
     text = "\n".join(caught.value.problems)
     for sentence in (
-        "sampling_rate: unknown key; did you mean sampling_rate_hz", "sampling_rate_hz = -1.0",
-        "initial_state.psi: unknown state", "initial_state.psi1 = inf: must be a finite number",
-        "drive.steps[0].n_periods: must be there", "drive.steps[1]: 'Q' is not a parameter",
+        "sampling_rate: unknown key; did you mean sampling_rate_hz",
+        "sampling_rate_hz = -1.0",
+        "initial_state.psi: unknown state",
+        "initial_state.psi1 = inf: must be a finite number",
+        "drive.steps[0].n_periods: must be there",
+        "drive.steps[1]: 'Q' is not a parameter",
         "sensors.psi1.kind = 'camera'",
-    ):  # fmt: skip
+    ):
         assert sentence in text
 
 
@@ -261,9 +277,7 @@ def test_parse_rig__refuses(data, sentence):
 def test_load_rig__finds_a_presets_file_beside_it(tmp_path, monkeypatch):
     """Wherever the command is given from."""
     values = load_preset(T1=0.095)
-    write_preset(
-        tmp_path / "own.toml", "pendulum", values.as_dict(), dict.fromkeys(values.names, "a test"), "own"
-    )
+    write_preset(tmp_path / "own.toml", "pendulum", values.as_dict(), dict.fromkeys(values.names, "a test"), "own")
     rig = 'model = "pendulum"\npreset = "own.toml"\nsampling_rate_hz = 100.0\nduration_s = 1.0\n'
     (tmp_path / "rig.toml").write_text(rig + '[sensors.psi1]\nkind = "encoder"\n')
     (tmp_path / "elsewhere").mkdir()

@@ -82,9 +82,16 @@ def running(folder: Path) -> Iterator[dict[str, str]]:
     variables = {"SLURM_CONF": str(conf), "PATH": f"{os.environ.get('PATH', '')}:{SBIN}"}
     environment = {**os.environ, **variables}
     try:
-        _call(environment, "munged", "--force", f"--key-file={key}", f"--socket={folder}/munge.socket",
-              f"--pid-file={folder}/munged.pid", f"--log-file={folder}/munged.log",
-              f"--seed-file={folder}/munged.seed")  # fmt: skip
+        _call(
+            environment,
+            "munged",
+            "--force",
+            f"--key-file={key}",
+            f"--socket={folder}/munge.socket",
+            f"--pid-file={folder}/munged.pid",
+            f"--log-file={folder}/munged.log",
+            f"--seed-file={folder}/munged.seed",
+        )
         _call(environment, "slurmctld", "-f", str(conf))
         _call(environment, "slurmd", "-f", str(conf))
         _wait_for_node(environment, folder)
@@ -105,12 +112,7 @@ def _wait_for_node(environment: dict[str, str], folder: Path, seconds: float = 2
     deadline = time.monotonic() + seconds
     while True:
         state = subprocess.run(
-            ["sinfo", "-h", "-o", "%T"],
-            env=environment,
-            check=False,
-            capture_output=True,
-            text=True,
-            timeout=30,
+            ["sinfo", "-h", "-o", "%T"], env=environment, check=False, capture_output=True, text=True, timeout=30
         ).stdout.strip()
         if state == "idle":
             return

@@ -235,9 +235,7 @@ def _write_often(directory, barrier, n):
 def test_derive__writers_at_once(whole, compute):
     context = multiprocessing.get_context("spawn")
     barrier = context.Barrier(2)
-    writers = [
-        context.Process(target=_write_often, args=(whole.info.directory, barrier, 5)) for _ in range(2)
-    ]
+    writers = [context.Process(target=_write_often, args=(whole.info.directory, barrier, 5)) for _ in range(2)]
     for writer in writers:
         writer.start()
     for writer in writers:

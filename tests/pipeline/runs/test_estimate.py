@@ -155,9 +155,7 @@ def test_describe_plan__complete_run_takes_nothing(write_spec, sweep_text, tmp_p
     from pipeline.runs.run import run
 
     run(write_spec(sweep_text), tmp_path / "run", workers=0, echo=lambda line: None)
-    assert list(describe_plan(tmp_path / "spec.toml", tmp_path / "run"))[-1] == (
-        "time: nothing is left to compute"
-    )
+    assert list(describe_plan(tmp_path / "spec.toml", tmp_path / "run"))[-1] == ("time: nothing is left to compute")
 
 
 @pytest.mark.parametrize("stops", [True, False])

@@ -112,9 +112,7 @@ WIDER = {
     "a longer axis": (BASE, BASE.replace("stop = 0.14, num = 5", "stop = 0.16, num = 7"), 10),
     "a finer and longer grid": (
         BASE,
-        BASE.replace(
-            "x = { start = -1.0, stop = 1.0, num = 5 }", "x = { start = -1.0, stop = 1.5, num = 11 }"
-        ),
+        BASE.replace("x = { start = -1.0, stop = 1.0, num = 5 }", "x = { start = -1.0, stop = 1.5, num = 11 }"),
         30,
     ),
     "a grid of another state": (BASE, BASE.replace("v = 0.1", "v = { values = [0.0, 0.1] }"), 25),
@@ -181,9 +179,7 @@ def test_walk__new_products(grown, count):
 
 KEPT = BASE.replace("n_transient = 3\nn_keep = 4", "n_transient = 40\nn_keep = 30")
 KEPT_MORE = KEPT.replace("n_keep = 30", "n_keep = 70")
-WATCHED = (
-    "[products]\nextremes = { quantities = ['energy', 'v'] }\nlyapunov = { n_periods = 4, n_blocks = 2 }\n[ex"
-)
+WATCHED = "[products]\nextremes = { quantities = ['energy', 'v'] }\nlyapunov = { n_periods = 4, n_blocks = 2 }\n[ex"
 STOPS = "stop_when_closed = true\nclosure_tolerance = 1e-6\n[execution]"
 CLOSING = (
     KEPT.replace("[execution]", STOPS)
@@ -206,12 +202,7 @@ LONGER_CELLS = {
         None,
         None,
     ),
-    "where some have closed": (
-        CLOSING,
-        CLOSING.replace("n_keep = 30", "n_keep = 70"),
-        None,
-        None,
-    ),
+    "where some have closed": (CLOSING, CLOSING.replace("n_keep = 30", "n_keep = 70"), None, None),
 }
 
 
@@ -263,9 +254,7 @@ def test_extend__damaged_cells_are_integrated(grown, tmp_path, write_spec, bytes
 def test_extend__two_halves(tmp_path, write_spec, bytes_of, count):
     """What merging is for: two halves that were computed apart."""
     low = write_spec(BASE.replace("stop = 0.14, num = 5", "stop = 0.12, num = 3"), "low.toml")
-    high = write_spec(
-        BASE.replace("start = 0.10, stop = 0.14, num = 5", "values = [0.12, 0.13, 0.14]"), "high.toml"
-    )
+    high = write_spec(BASE.replace("start = 0.10, stop = 0.14, num = 5", "values = [0.12, 0.13, 0.14]"), "high.toml")
     run(low, tmp_path / "low", workers=0, echo=silent)
     run(high, tmp_path / "high", workers=0, echo=silent)
     whole = write_spec(BASE, "whole.toml")
@@ -450,11 +439,7 @@ REFINED = FULL.replace("num = 9 }\n[int", "num = 9 }\nrefine = 4\n[int")
 
 @pytest.mark.parametrize(("old", "new"), [("full", "refined"), ("refined", "full"), ("refined", "wider")])
 def test_refined__integrated_cells_alone_are_taken(grown, tmp_path, old, new):
-    texts = {
-        "full": FULL,
-        "refined": REFINED,
-        "wider": REFINED.replace("stop = 1.5, num = 9", "stop = 2.0, num = 13"),
-    }
+    texts = {"full": FULL, "refined": REFINED, "wider": REFINED.replace("stop = 1.5, num = 9", "stop = 2.0, num = 13")}
     cells = grown(texts[old], texts[new])
     found = open_run(tmp_path / ("new" if new != "full" else "old")).status.values
     n_inferred = int((found == Status.INFERRED).sum())

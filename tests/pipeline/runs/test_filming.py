@@ -72,9 +72,7 @@ def test_animation__frames_are_where_another_integration_says(swinging):
     at_frames = data.time.values[:: data.attrs["substeps"]]
     assert np.diff(at_frames) == pytest.approx(data.attrs["speed"] / 6.0)
     assert data.attrs["speed"] == 5.0  # a period of 9.1 s takes about two
-    there = solve_ivp(
-        pendulum, (0.0, at_frames[-1]), [0.4, -0.2], "DOP853", at_frames, rtol=1e-11, atol=1e-11
-    )
+    there = solve_ivp(pendulum, (0.0, at_frames[-1]), [0.4, -0.2], "DOP853", at_frames, rtol=1e-11, atol=1e-11)
     found = data.orbit.isel(motion=0, sample=slice(None, None, data.attrs["substeps"])).values
     np.testing.assert_allclose(found, there.y.T, atol=1e-6)
     machine = swinging.movers[0]
@@ -134,9 +132,15 @@ def test_animation__attractors_side_by_side_repeat(run):
         orbit = data.orbit.isel(motion=k).values
         np.testing.assert_allclose(orbit[-1], orbit[0], atol=1e-6)
         there = solve_ivp(
-            duffing, (0.0, data.time.values[-1]), orbit[0], "DOP853", data.time.values,
-            args=(hz,), rtol=1e-10, atol=1e-10,
-        )  # fmt: skip
+            duffing,
+            (0.0, data.time.values[-1]),
+            orbit[0],
+            "DOP853",
+            data.time.values,
+            args=(hz,),
+            rtol=1e-10,
+            atol=1e-10,
+        )
         np.testing.assert_allclose(orbit, there.y.T, atol=1e-6)
     cube = magpend.open_run(run).sel(frequency=hz)
     kept = cube.section.isel(period_index=-1).values
@@ -232,10 +236,7 @@ def test_animate__mp4_without_ffmpeg_is_refused(main, tmp_path, monkeypatch):
     monkeypatch.setattr(shutil, "which", lambda _: None)
     code, _, err = main("animate", "--model", "duffing", "--out", "film.mp4")
     assert code == Exit.REFUSED
-    assert (
-        err
-        == "magpend: film.mp4: MP4 takes the program ffmpeg, and there is none; install it, or write .gif.\n"
-    )
+    assert err == "magpend: film.mp4: MP4 takes the program ffmpeg, and there is none; install it, or write .gif.\n"
     assert not list(tmp_path.iterdir())
 
 
@@ -262,7 +263,7 @@ def test_animate__mp4_without_ffmpeg_is_refused(main, tmp_path, monkeypatch):
         (["--transient", "-1"], "--transient -1: must be at least 0."),
         (["--size", "10"], "size = 10: must be at least 200"),
     ],
-)  # fmt: skip
+)
 def test_animate__refuses_in_one_sentence(main, run, tmp_path, words, said):
     before = sorted(run.rglob("*"))
     code, _, err = main("animate", *[str(run) if word == "RUN" else word for word in words])

@@ -41,8 +41,13 @@ def process(environment):
     def call(folder: Path, *arguments):
         return subprocess.run(
             [sys.executable, "-m", "pipeline.cli.main", *map(str, arguments)],
-            cwd=folder, env=environment, capture_output=True, text=True, timeout=300, check=False,
-        )  # fmt: skip
+            cwd=folder,
+            env=environment,
+            capture_output=True,
+            text=True,
+            timeout=300,
+            check=False,
+        )
 
     return call
 
@@ -72,8 +77,13 @@ def in_turn(tmp_path, environment):
         words = json.dumps([[str(word) for word in command] for command in commands])
         done = subprocess.run(
             [sys.executable, "-c", IN_TURN, words],
-            cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300, check=False,
-        )  # fmt: skip
+            cwd=tmp_path,
+            env=environment,
+            capture_output=True,
+            text=True,
+            timeout=300,
+            check=False,
+        )
         assert done.returncode == 0, done.stderr
         return [SimpleNamespace(**one) for one in json.loads(done.stdout)]
 
@@ -200,12 +210,18 @@ def test_open_run__stranger_s_object_is_never_imported(own, text_spec, tmp_path,
     run(text_spec, tmp_path / "run", workers=0, echo=lambda line: None)
     table = read_run(tmp_path / "run").spec["model"]
     described = {
-        "python": "trap:MINE", "digest": "0123456789abcdef", "name": "mine", "title": "", "section": "",
-        "angle_dim": "angle", "autonomous": False,
+        "python": "trap:MINE",
+        "digest": "0123456789abcdef",
+        "name": "mine",
+        "title": "",
+        "section": "",
+        "angle_dim": "angle",
+        "autonomous": False,
         "states": {n: {"unit": "m", "meaning": n} for n in table["states"]},
         "parameters": {"d": {"unit": "1", "meaning": "d"}, "A": {"unit": "1", "meaning": "A"}},
-        "quantities": {}, "presets": {"default": {"values": {"d": 0.08, "A": 0.2}}},
-    }  # fmt: skip
+        "quantities": {},
+        "presets": {"default": {"values": {"d": 0.08, "A": 0.2}}},
+    }
 
     def change(spec):
         spec["model"] = described
@@ -241,9 +257,14 @@ def test_run__object_reaches_workers_and_is_held_to_its_digest(own, tmp_path, pr
     ds = open_run(elsewhere / "run")
     cell, f = ds.isel(x_0=1, v_0=2), float(ds.frequency)
     found = solve_ivp(
-        lambda t, y: [y[1], np.cos(2 * np.pi * f * t) - 0.1 * y[1] - y[0]], (0, 24 / f),
-        [float(cell.x_0), float(cell.v_0)], "DOP853", (21 + np.arange(4)) / f, rtol=1e-12, atol=1e-12,
-    ).y.T  # fmt: skip
+        lambda t, y: [y[1], np.cos(2 * np.pi * f * t) - 0.1 * y[1] - y[0]],
+        (0, 24 / f),
+        [float(cell.x_0), float(cell.v_0)],
+        "DOP853",
+        (21 + np.arange(4)) / f,
+        rtol=1e-12,
+        atol=1e-12,
+    ).y.T
     assert cell.section.values == pytest.approx(found, abs=2e-5)
     named = "--import-model", "mine:MINE"
     trace.unlink()

@@ -69,9 +69,7 @@ def test_run__of_a_text_goes_on_where_it_was(tmp_path, monkeypatch):
 
 def test_run__of_a_text_refuses_with_all_problems(tmp_path):
     with pytest.raises(SpecError, match=r"axes\.B") as caught:
-        run_quietly(
-            TEXT.replace("A = { values", "B = { values").replace("n_keep = 4", "n_keep = 0"), tmp_path / "r"
-        )
+        run_quietly(TEXT.replace("A = { values", "B = { values").replace("n_keep = 4", "n_keep = 0"), tmp_path / "r")
     assert "n_keep" in str(caught.value)
     assert not (tmp_path / "r").exists()
 
@@ -118,8 +116,6 @@ def test_sections__of_one_set_or_of_many():
         alone = magpend.sections(one, 0.2, starts[:1], n_transient=5, n_keep=2)
         assert np.array_equal(both.section[i], alone.section[0])
     with pytest.raises(ValueError, match="of one model"):
-        magpend.sections(
-            [sets[0], magpend.load_model("duffing").load()], 0.2, starts, n_transient=0, n_keep=1
-        )
+        magpend.sections([sets[0], magpend.load_model("duffing").load()], 0.2, starts, n_transient=0, n_keep=1)
     with pytest.raises(ValueError, match="3 sets for 2 cells"):
         magpend.sections([*sets, sets[0]], 0.2, starts, n_transient=0, n_keep=1)

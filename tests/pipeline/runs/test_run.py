@@ -135,11 +135,7 @@ def test_run__failed_task_then_only_the_rest(write_spec, sweep_text, tmp_path, m
     assert len(tried) == n_tasks + 1
     assert tried[2] == tried[-1]
     assert state(tmp_path / "run").done == set(range(n_tasks)) - {2}
-    for leftover in (
-        "cube.zarr/section/c.2.0.0.0.0.abc.partial",
-        "cube.zarr/status/c.2.0.0.0",
-        "commits/.2.tmp",
-    ):
+    for leftover in ("cube.zarr/section/c.2.0.0.0.0.abc.partial", "cube.zarr/status/c.2.0.0.0", "commits/.2.tmp"):
         (tmp_path / "run" / leftover).write_bytes(b"left by a crash")
     calls = counted(monkeypatch)
     run(path, tmp_path / "run", workers=0, echo=silent)
@@ -285,9 +281,13 @@ def test_scheduler__existing_one(write_spec, sweep_text, tmp_path, bytes_of, mon
     path = write_spec(sweep_text)
     run(path, tmp_path / "alone", scheduler="none", echo=silent)
     with LocalCluster(
-        n_workers=1, threads_per_worker=2, processes=False, host="127.0.0.1", protocol="tcp",
+        n_workers=1,
+        threads_per_worker=2,
+        processes=False,
+        host="127.0.0.1",
+        protocol="tcp",
         scheduler_kwargs={"dashboard": False, "dashboard_address": "127.0.0.1:0"},
-    ) as cluster:  # fmt: skip
+    ) as cluster:
         run(path, tmp_path / "address", scheduler=cluster.scheduler_address, echo=silent)
         monkeypatch.setenv("DASK_SCHEDULER_ADDRESS", cluster.scheduler_address)
         run(path, tmp_path / "environment", echo=silent)
@@ -301,9 +301,6 @@ def test_local_cluster__listens_on_loopback_only():
         assert len(client.nthreads()) == 1
         processes = [psutil.Process(), *psutil.Process().children(recursive=True)]
         listening = {
-            c.laddr.ip
-            for p in processes
-            for c in p.net_connections(kind="inet")
-            if c.status == psutil.CONN_LISTEN
+            c.laddr.ip for p in processes for c in p.net_connections(kind="inet") if c.status == psutil.CONN_LISTEN
         }
     assert listening == {"127.0.0.1"}

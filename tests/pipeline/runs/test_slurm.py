@@ -135,9 +135,7 @@ def test_submit__follow_cancel_and_go_on(tmp_path, shell, magpend, bytes_of):
     assert "workers come in slurm jobs" in told
     assert 1 <= len(list(logs.glob("magpend-worker-*.out"))) <= 2
     assert bytes_of(out) == bytes_of(tmp_path / "laptop")
-    assert "complete; nothing to send" in magpend(
-        "submit", "spec.toml", "--cluster", "one.toml", "--out", "out"
-    )
+    assert "complete; nothing to send" in magpend("submit", "spec.toml", "--cluster", "one.toml", "--out", "out")
 
     # nothing is left: no job, no keys
     wait(lambda: not shell("squeue", "-h"), logs)

@@ -47,10 +47,14 @@ def begin(tmp_path):
     def begin():
         process = subprocess.Popen(
             [sys.executable, "-m", "pipeline.cli.main", "run", "spec.toml", "--out", "run", "--workers", "2"],
-            cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
+            cwd=tmp_path,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
             preexec_fn=heed_signals,
             env=dict(os.environ, TMPDIR=str(tmp_path / "temporary")),
-        )  # fmt: skip
+        )
         begun.append(process)
         return process
 

@@ -138,9 +138,7 @@ def test_script__coordinator_of_other_jobs(cluster, kind, lines):
 
 @pytest.mark.parametrize("kind", WHOLE)
 def test_script__is_bash(cluster, kind):
-    done = subprocess.run(
-        ["bash", "-n"], input=script(cluster(kind)), text=True, capture_output=True, check=False
-    )
+    done = subprocess.run(["bash", "-n"], input=script(cluster(kind)), text=True, capture_output=True, check=False)
     assert done.returncode == 0, done.stderr
 
 
@@ -170,9 +168,19 @@ def test_submit__dry_run(main, tmp_path, write_spec, sweep_text, cluster):
     assert code == 0
     words = shlex.split(out.splitlines()[-1])
     assert words == [
-        "exec", sys.executable, "-m", "pipeline.cli.main", "run", str(path), "--out", str(tmp_path / "out"),
-        "--scheduler", "local", "--workers", "4",
-    ]  # fmt: skip
+        "exec",
+        sys.executable,
+        "-m",
+        "pipeline.cli.main",
+        "run",
+        str(path),
+        "--out",
+        str(tmp_path / "out"),
+        "--scheduler",
+        "local",
+        "--workers",
+        "4",
+    ]
     several = cluster("pbs", "max_jobs = 3\n")
     code, out, _ = main("submit", path, "--cluster", several, "--out", "out", "--dry-run")
     assert shlex.split(out.splitlines()[-1])[-4:] == ["--scheduler", "pbs", "--cluster", str(several)]

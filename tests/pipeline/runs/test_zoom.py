@@ -90,10 +90,15 @@ def test_zoom__beyond_the_old_range_is_noted(sweep):
     old = sweep.initial_conditions
     assert old.psi1_deg.stop == 30
     for key, pair, noted in [
-        ("psi1_deg", (-30, 30), False), ("psi1_deg", (-31, 0), True), ("psi1_deg", (0, 30.1), True),
-        ("psi1", (-np.pi / 6, np.pi / 6), False), ("psi1", (0, 0.53), True),
-        ("frequency_hz", (2.0, 3.0), False), ("frequency_hz", (1.9, 2.0), True), ("q", (1.5, 1.7), True),
-    ]:  # fmt: skip
+        ("psi1_deg", (-30, 30), False),
+        ("psi1_deg", (-31, 0), True),
+        ("psi1_deg", (0, 30.1), True),
+        ("psi1", (-np.pi / 6, np.pi / 6), False),
+        ("psi1", (0, 0.53), True),
+        ("frequency_hz", (2.0, 3.0), False),
+        ("frequency_hz", (1.9, 2.0), True),
+        ("q", (1.5, 1.7), True),
+    ]:
         _, notes = zoom(sweep, Changes({key: pair}))
         assert len(notes) == noted, (key, pair)
         assert all(note.startswith(f"{key}: ") and "beyond the old" in note for note in notes)

@@ -60,7 +60,9 @@ def test_cluster__given_lifetime(load):
 
 
 def test_cluster__all_problems_at_once(load):
-    found = problems(load, """
+    found = problems(
+        load,
+        """
         title = "mine"
         [cluster]
         kind = "slurmm"
@@ -71,15 +73,22 @@ def test_cluster__all_problems_at_once(load):
         partition = "short"
         prologue = ["two\\nlines"]
         queue = "a; rm -rf b"
-        """)  # fmt: skip
+        """,
+    )
     text = "\n".join(found)
     assert len(found) == 9
     for words in (
-        "title: unknown key", "cluster.kind = 'slurmm': must be", "Did you mean 'slurm'?",
-        "cluster.cores = 0: must be at least 1", "cluster.memory: 'much': must be a number",
-        "cluster.walltime: '4h': must be hours", "cluster.max_jobs = 0", "cluster.partition: unknown key",
-        "cluster.prologue: 'two\\nlines': must be one line", "cluster.queue: 'a; rm -rf b': must be one word",
-    ):  # fmt: skip
+        "title: unknown key",
+        "cluster.kind = 'slurmm': must be",
+        "Did you mean 'slurm'?",
+        "cluster.cores = 0: must be at least 1",
+        "cluster.memory: 'much': must be a number",
+        "cluster.walltime: '4h': must be hours",
+        "cluster.max_jobs = 0",
+        "cluster.partition: unknown key",
+        "cluster.prologue: 'two\\nlines': must be one line",
+        "cluster.queue: 'a; rm -rf b': must be one word",
+    ):
         assert words in text
 
 
@@ -98,11 +107,7 @@ def test_cluster__grid_engine_wants_a_parallel_environment(load):
 
 @pytest.mark.parametrize(
     ("text", "words"),
-    [
-        ("", "has no table [cluster]"),
-        ("cluster = 3", "has no table [cluster]"),
-        ("[cluster", "is not valid TOML"),
-    ],
+    [("", "has no table [cluster]"), ("cluster = 3", "has no table [cluster]"), ("[cluster", "is not valid TOML")],
 )
 def test_cluster__no_table(load, text, words):
     assert words in problems(load, text)[0]

@@ -183,10 +183,14 @@ def test_parse_spec__all_that_makes_no_sense_at_once(tmp_path):
     with pytest.raises(SpecError) as caught:
         parsed(tmp_path, text.replace("start = 0, stop = 1,", "start = 0.0, stop = 1.0,"))
     wanted = (
-        "drive: a continuation", "axes.frequency_hz: the drive is the recording drive.csv",
-        "axes.duty_cycle: the drive is", "n_transient = 300 and n_keep = 60 are 360 drive periods",
-        "integration.stop_when_closed", "initial_conditions.refine", "products.lyapunov",
-    )  # fmt: skip
+        "drive: a continuation",
+        "axes.frequency_hz: the drive is the recording drive.csv",
+        "axes.duty_cycle: the drive is",
+        "n_transient = 300 and n_keep = 60 are 360 drive periods",
+        "integration.stop_when_closed",
+        "initial_conditions.refine",
+        "products.lyapunov",
+    )
     for words in wanted:
         assert any(words in p for p in caught.value.problems), words
     assert "drive.csv has 3" in str(caught.value)
@@ -215,9 +219,7 @@ def test_parse_spec__refuses_extremes_and_no_section_of_a_torque(tmp_path):
     spec = SPEC + '[products]\nextremes = { quantities = ["psi1"] }\n'
     with pytest.raises(SpecError, match=r"products\.extremes: are taken over the intervals"):
         parsed(tmp_path, spec, TORQUE)
-    with pytest.raises(
-        SpecError, match=r"no rising edge after its start, so no section; set drive\.section_hz"
-    ):
+    with pytest.raises(SpecError, match=r"no rising edge after its start, so no section; set drive\.section_hz"):
         parsed(tmp_path, SPEC, "time_s,drive\n0,1\n5,1\n")
 
 

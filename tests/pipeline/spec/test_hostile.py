@@ -157,27 +157,53 @@ def test_run__a_refusal_is_short(main, tmp_path, text):
 # ---- mutations --------------------------------------------------------------------------------------
 
 VALUES = st.one_of(
-    st.none(), st.booleans(), st.integers(), st.sampled_from([2**63, -(2**70), 10**400, 0, -1]),
-    st.floats(), st.sampled_from([1e308, 1e-308, 5e-324, -0.0, 1e180]),
+    st.none(),
+    st.booleans(),
+    st.integers(),
+    st.sampled_from([2**63, -(2**70), 10**400, 0, -1]),
+    st.floats(),
+    st.sampled_from([1e308, 1e-308, 5e-324, -0.0, 1e180]),
     st.text(max_size=8),
     st.sampled_from(["sweep", "grid", "list", "random", "up", "both", "nan", "duffing", "x"]),
-    st.lists(
-        st.one_of(st.integers(), st.floats(), st.text(max_size=3), st.lists(st.floats(), max_size=2)),
-        max_size=3,
-    ),
+    st.lists(st.one_of(st.integers(), st.floats(), st.text(max_size=3), st.lists(st.floats(), max_size=2)), max_size=3),
     st.dictionaries(
         st.sampled_from(["start", "stop", "num", "step", "values", "kind", "a.b", "", "\x1b"]),
-        st.one_of(st.integers(), st.floats(), st.lists(st.floats(), max_size=3)), max_size=4,
+        st.one_of(st.integers(), st.floats(), st.lists(st.floats(), max_size=3)),
+        max_size=4,
     ),
-)  # fmt: skip
+)
 KEYS = st.one_of(
-    st.sampled_from([
-        "kind", "title", "model", "axes", "smoke", "drive", "section", "products", "continuation", "step",
-        "refine", "n", "seed", "points", "x", "x_deg", "frequency_hz", "preset", "stop_when_closed",
-        "lyapunov", "extremes", "path", "file", "of", "values",
-    ]),
+    st.sampled_from(
+        [
+            "kind",
+            "title",
+            "model",
+            "axes",
+            "smoke",
+            "drive",
+            "section",
+            "products",
+            "continuation",
+            "step",
+            "refine",
+            "n",
+            "seed",
+            "points",
+            "x",
+            "x_deg",
+            "frequency_hz",
+            "preset",
+            "stop_when_closed",
+            "lyapunov",
+            "extremes",
+            "path",
+            "file",
+            "of",
+            "values",
+        ]
+    ),
     st.text(max_size=6),
-)  # fmt: skip
+)
 
 
 def places(table, at=()):
@@ -235,8 +261,7 @@ def outcome(path, smoke):
 
 
 FUZZ = settings(
-    max_examples=1000 if LONG else 25,
-    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
+    max_examples=1000 if LONG else 25, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
 )
 
 
@@ -303,9 +328,7 @@ def test_range__ten_million_points_take_seconds():
         assert seconds_of(Range(**axis).array) < 60
 
 
-@given(
-    st.floats(-1e6, 1e6), st.floats(1e-6, 1e6), st.integers(2, 40), st.booleans(), st.integers(0, 12)
-)  # fmt: skip
+@given(st.floats(-1e6, 1e6), st.floats(1e-6, 1e6), st.integers(2, 40), st.booleans(), st.integers(0, 12))
 def test_range__values_are_the_nearest_floats(start, span, num, by_step, digits):
     from fractions import Fraction
 
@@ -343,11 +366,10 @@ def test_parse_spec__corners_of_related_parameters_are_looked_at():
         "kind": "sweep",
         "model": "pendulum-dipole",
         "parameters": {"frequency_hz": 2.0},
-        "axes": {
-            name: {"values": [p[name], p[name] + 0.6 * room]} for name in ("l1", "l2")
-        } | {"q": {"values": [1.0, 2.0]}},
+        "axes": {name: {"values": [p[name], p[name] + 0.6 * room]} for name in ("l1", "l2")}
+        | {"q": {"values": [1.0, 2.0]}},
         "initial_conditions": {"kind": "list", "points": [[0.0, 0.0]]},
-    }  # fmt: skip
+    }
     with pytest.raises(SpecError, match="magnets can meet"):
         parse_spec(data)
     del data["axes"]["l2"]

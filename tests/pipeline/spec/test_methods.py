@@ -12,12 +12,14 @@ from pipeline.spec.problems import SpecError
 def spec_of(method, **more):
     return parse_spec(
         {
-            "kind": "sweep", "model": "duffing", "parameters": {"preset": "hardening", "frequency_hz": 0.2},
+            "kind": "sweep",
+            "model": "duffing",
+            "parameters": {"preset": "hardening", "frequency_hz": 0.2},
             "initial_conditions": {"kind": "list", "points": [[0.3, 0.1], [-0.2, 0.5]]},
             "integration": {"method": method, "n_transient": 20, "n_keep": 4, "rtol": 1e-10, "atol": 1e-10},
             **more,
         }
-    )  # fmt: skip
+    )
 
 
 def cells_of(spec):

@@ -174,9 +174,13 @@ def test_import_model__digest_is_that_of_the_module(own, tmp_path, module):
         path.write_text(path.read_text().replace(*change) if change[0] else path.read_text())
         code = f"from magpend_core.models import import_model as i; print(i('{name}:MINE', '.').digest)"
         found = subprocess.run(
-            [sys.executable, "-c", code], cwd=folder, capture_output=True, text=True, check=True,
+            [sys.executable, "-c", code],
+            cwd=folder,
+            capture_output=True,
+            text=True,
+            check=True,
             env={**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)},
-        )  # fmt: skip
+        )
         digests.append(found.stdout.strip())
     assert digests[0] == digests[1] != digests[2]
 

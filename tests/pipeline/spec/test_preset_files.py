@@ -93,14 +93,8 @@ def test_run__explains_itself_when_the_file_is_gone(tmp_path):
     [
         (None, "cannot be read"),
         ("model = 'duffing'", "is of model 'duffing'"),
-        (
-            "model = 'pendulum'\nbase = 'wojna2018'\n[values]\nc1 = 'x'\n[provenance]\nc1 = 'y'",
-            "must be a number",
-        ),
-        (
-            "model = 'pendulum'\nbase = 'wojna2018'\n[values]\nc1 = -1\n[provenance]\nc1 = 'y'",
-            "greater than 0",
-        ),
+        ("model = 'pendulum'\nbase = 'wojna2018'\n[values]\nc1 = 'x'\n[provenance]\nc1 = 'y'", "must be a number"),
+        ("model = 'pendulum'\nbase = 'wojna2018'\n[values]\nc1 = -1\n[provenance]\nc1 = 'y'", "greater than 0"),
     ],
 )
 def test_load_spec__says_what_is_wrong_with_the_file_beside_all_else(tmp_path, content, words):

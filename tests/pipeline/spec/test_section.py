@@ -16,11 +16,12 @@ from pipeline.spec.problems import SpecError
 from tests.core.flows import VAN_DER_POL
 
 SPEC = {
-    "kind": "sweep", "model": VAN_DER_POL,
+    "kind": "sweep",
+    "model": VAN_DER_POL,
     "section": {"of": "v", "value": 0.5, "direction": "down", "longest": 50.0},
     "axes": {"mu": {"values": [0.5, 1.0]}},
     "initial_conditions": {"kind": "list", "points": [[1.0, 0.0], [2.0, 0.0]]},
-}  # fmt: skip
+}
 
 
 def problems(**changes):
@@ -61,9 +62,7 @@ def test_cells__no_frequency():
 
 
 @pytest.mark.parametrize(
-    "change",
-    [{"of": "x"}, {"value": 0.4}, {"direction": "up"}, {"longest": 40.0}],
-    ids=lambda c: next(iter(c)),
+    "change", [{"of": "x"}, {"value": 0.4}, {"direction": "up"}, {"longest": 40.0}], ids=lambda c: next(iter(c))
 )
 def test_identity__every_key_of_the_section(change):
     spec = parse_spec(SPEC)
@@ -94,10 +93,7 @@ def test_parse_spec__strobed_flow():
     ("changes", "text"),
     [
         ({"section": {"of": "w"}}, "section.of = 'w': is not a state of van_der_pol; known states: x, v."),
-        (
-            {"section": {"of": "x", "direction": "left"}},
-            "section.direction = 'left': must be 'up' or 'down'.",
-        ),
+        ({"section": {"of": "x", "direction": "left"}}, "section.direction = 'left': must be 'up' or 'down'."),
         ({"section": {"of": "x", "longest": 0.0}}, "section.longest = 0.0: must be greater than 0.0."),
         ({"section": {"value": 0.0}}, "section.of: missing"),
         ({"section": 3}, "section = 3: must be a table; write [section]."),

@@ -88,11 +88,7 @@ def test_parse_spec__all_errors_at_once():
         (("[axes]", "[parameters]\noverrides = { q = 1.0 }\n[axes]"), "axes.q", "keep one"),
         (("[axes]", "[continuation]\n[axes]"), "continuation", "a sweep has none"),
         (("start = 2.0, stop = 3.0", "start = 0.0, stop = 3.0"), "axes.frequency_hz", "greater than 0 Hz"),
-        (
-            ("start = 2.0, stop = 3.0", "start = 3.0, stop = 2.0"),
-            "axes.frequency_hz",
-            "must be greater than start",
-        ),
+        (("start = 2.0, stop = 3.0", "start = 3.0, stop = 2.0"), "axes.frequency_hz", "must be greater than start"),
         (("[1.5, 1.6]", "[1.6, 1.5]"), "axes.q", "rise strictly"),
         (("[1.5, 1.6]", "[]"), "axes.q.values", "at least 1"),
         (('kind = "grid"', 'kind = "gird"'), "initial_conditions.kind", "Did you mean 'grid'"),
@@ -131,10 +127,7 @@ def test_parse_spec__bad_rows(rows):
 
 
 def test_load_spec__unreadable(tmp_path, write_spec):
-    for path, words in [
-        (tmp_path / "absent.toml", "cannot be read"),
-        (write_spec("kind = \n"), "not valid TOML"),
-    ]:
+    for path, words in [(tmp_path / "absent.toml", "cannot be read"), (write_spec("kind = \n"), "not valid TOML")]:
         with pytest.raises(SpecError) as caught:
             load_spec(path)
         assert len(caught.value.problems) == 1

@@ -115,9 +115,14 @@ class Steps:
             return scandir(path)
 
         patched = {
-            "fsync": fsync, "replace": move("replace"), "rename": move("rename"), "open": low_opening,
-            "mkdir": simple("mkdir", MKDIR), "unlink": simple("unlink", UNLINK), "scandir": listing,
-        }  # fmt: skip
+            "fsync": fsync,
+            "replace": move("replace"),
+            "rename": move("rename"),
+            "open": low_opening,
+            "mkdir": simple("mkdir", MKDIR),
+            "unlink": simple("unlink", UNLINK),
+            "scandir": listing,
+        }
         original |= {"open": low_open, "scandir": scandir}
         try:
             _put(patched, opening)

@@ -118,9 +118,7 @@ WAYS = {f.__name__: f for f in (flip, truncate, extend, zero, delete, garble)}
 
 def chunks(directory):
     """Chunks of cells, which the records vouch for."""
-    keys = [
-        key for f in sorted(directory.glob("commits/*.json")) for key in unseal(f.read_bytes())["objects"]
-    ]
+    keys = [key for f in sorted(directory.glob("commits/*.json")) for key in unseal(f.read_bytes())["objects"]]
     return [directory / "cube.zarr" / key for key in keys]
 
 
@@ -247,8 +245,14 @@ def link_chunk(directory, rng):
 
 def foreign_file(directory, rng):
     """What nobody of this run has written, or what an earlier one has left."""
-    names = ["cube.zarr/status/c.9.9", "cube.zarr/notes.txt", "cube.zarr/more/zarr.json", "commits/.3.tmp",
-             "commits/000077.json", "commits/notes.txt"]  # fmt: skip
+    names = [
+        "cube.zarr/status/c.9.9",
+        "cube.zarr/notes.txt",
+        "cube.zarr/more/zarr.json",
+        "commits/.3.tmp",
+        "commits/000077.json",
+        "commits/notes.txt",
+    ]
     path = directory / names[int(rng.integers(len(names)))]
     path.parent.mkdir(exist_ok=True)
     path.write_bytes(rng.bytes(30))
@@ -277,9 +281,19 @@ def in_one(target, way):
 
 KINDS = {f"{way} {target}": in_one(target, way) for target in TARGETS for way in WAYS} | {
     f.__name__.replace("_", " "): f
-    for f in (swap_chunks, swap_coordinates, swap_records, edit_record, edit_run, edit_metadata, link_chunk,
-              foreign_file, record_of_another_run, drop_folder)
-}  # fmt: skip
+    for f in (
+        swap_chunks,
+        swap_coordinates,
+        swap_records,
+        edit_record,
+        edit_run,
+        edit_metadata,
+        link_chunk,
+        foreign_file,
+        record_of_another_run,
+        drop_folder,
+    )
+}
 
 
 # ---- what must hold ----------------------------------------------------------------------------

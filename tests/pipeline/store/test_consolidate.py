@@ -45,9 +45,7 @@ def test_write_cube__lists_the_digest_of_every_file(made, tmp_path):
     made.commit(0)
     entries = consolidate.write_cube(Run.open(made.info.directory), tmp_path / "out", "q", {})
     files = {
-        p.relative_to(tmp_path / "out").as_posix(): p.read_bytes()
-        for p in (tmp_path / "out").rglob("*")
-        if p.is_file()
+        p.relative_to(tmp_path / "out").as_posix(): p.read_bytes() for p in (tmp_path / "out").rglob("*") if p.is_file()
     }
     assert {k: v["sha256"] for k, v in entries.items()} == {
         k: hashlib.sha256(content).hexdigest() for k, content in files.items()
@@ -56,12 +54,8 @@ def test_write_cube__lists_the_digest_of_every_file(made, tmp_path):
     assert "section" in group["consolidated_metadata"]["metadata"]
 
 
-@pytest.mark.parametrize(
-    ("along", "chunk"), [("frequency", (3, 1, 3, 4)), ("q", (1, 2, 3, 4)), (None, (1, 2, 3, 4))]
-)
-def test_write_cube__a_chunk_is_a_state_of_all_starts_at_some_values(
-    made, tmp_path, monkeypatch, along, chunk
-):
+@pytest.mark.parametrize(("along", "chunk"), [("frequency", (3, 1, 3, 4)), ("q", (1, 2, 3, 4)), (None, (1, 2, 3, 4))])
+def test_write_cube__a_chunk_is_a_state_of_all_starts_at_some_values(made, tmp_path, monkeypatch, along, chunk):
     """12 starts x 3 sections x 8 bytes a column; room for three of them."""
     monkeypatch.setattr(consolidate, "CHUNK_BYTES", 3 * 12 * 3 * 8)
     monkeypatch.setattr(consolidate, "SLAB_BYTES", 1)

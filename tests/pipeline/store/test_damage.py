@@ -288,9 +288,7 @@ def test_rebuild__run_json(whole, change):
     assert info.skeleton == whole.info.skeleton
     assert len(read_commits(info, whole.plan)) == whole.plan.n_tasks
     after = everything(directory)
-    assert {k: v for k, v in after.items() if k != "run.json"} == {
-        k: v for k, v in before.items() if k != "run.json"
-    }
+    assert {k: v for k, v in after.items() if k != "run.json"} == {k: v for k, v in before.items() if k != "run.json"}
 
 
 def test_rebuild__keeps_only_what_fits_its_record(whole):

@@ -273,9 +273,7 @@ def small_disk(tmp_path):
 
     def mount(options):
         found = subprocess.run(
-            ["mount", "-t", "tmpfs", "-o", options, "test", str(top)],
-            capture_output=True,
-            check=False,
+            ["mount", "-t", "tmpfs", "-o", options, "test", str(top)], capture_output=True, check=False
         )
         if found.returncode:
             pytest.skip("this needs the right to mount a file system")

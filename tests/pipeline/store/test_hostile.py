@@ -267,23 +267,19 @@ def test_commands__execute_nothing_of_a_run_directory(hostile, tmp_path):
     (hostile / "commits" / "passwd.json").symlink_to("/etc/passwd")
     # the compiled code of the analyses comes from the cache, whose pickles are the user's own
     place = str(hostile)
-    commands = [
-        ["status", place],
-        ["verify", place],
-        ["plot", "bifurcation", place],
-        ["status", place, "--json"],
-    ]
+    commands = [["status", place], ["verify", place], ["plot", "bifurcation", place], ["status", place, "--json"]]
     script = tmp_path / "watched.py"
     script.write_text(WATCHED.format(place=place, commands=commands))
-    environment = {
-        **os.environ,
-        "PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'pipeline' / 'face'}",
-        "MPLBACKEND": "Agg",
-    }
+    environment = {**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'pipeline' / 'face'}", "MPLBACKEND": "Agg"}
     done = subprocess.run(
-        [sys.executable, str(script)], cwd=hostile, env=environment, capture_output=True, text=True,
-        timeout=250, check=False,
-    )  # fmt: skip
+        [sys.executable, str(script)],
+        cwd=hostile,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=250,
+        check=False,
+    )
     assert "SEEN []" in done.stdout, done.stdout + done.stderr
     assert "raised" not in done.stderr
     assert not (hostile / "BOOM").exists()

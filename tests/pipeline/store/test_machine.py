@@ -255,7 +255,5 @@ class Life(RuleBasedStateMachine):
                 assert np.array_equal(cube[variable.name].values[block], expected, equal_nan=True)
 
 
-Life.TestCase.settings = settings(
-    max_examples=200 if LONG else 5, stateful_step_count=30 if LONG else 8, deadline=None
-)
+Life.TestCase.settings = settings(max_examples=200 if LONG else 5, stateful_step_count=30 if LONG else 8, deadline=None)
 test_life = Life.TestCase

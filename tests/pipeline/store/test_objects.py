@@ -211,9 +211,7 @@ def test_run__an_outage_is_one_line_and_the_same_command_goes_on(s3, write_spec,
         return "503" if down else None
 
     s3.harm = harm
-    with pytest.raises(
-        Exception, match=r"127\.0\.0\.1:\d+ answers 503 Harm; what is committed stays"
-    ) as caught:
+    with pytest.raises(Exception, match=r"127\.0\.0\.1:\d+ answers 503 Harm; what is committed stays") as caught:
         run(spec, PLACE, workers=0, echo=silent)
     assert KEY_ID not in str(caught.value)
     s3.reset()
@@ -344,10 +342,7 @@ def held_by(remote, **changes):
 def test_lease__names_its_holder_and_ends_with_it(remote):
     files = remote.info.files
     with files.lock():
-        with (
-            pytest.raises(LockedError, match=rf"process {os.getpid()} on {platform.node()} since 20"),
-            files.lock(),
-        ):
+        with pytest.raises(LockedError, match=rf"process {os.getpid()} on {platform.node()} since 20"), files.lock():
             pass
         assert files.is_there("lock")
     assert not files.is_there("lock")
@@ -363,10 +358,7 @@ def test_lease__of_a_process_that_was_killed_is_free_at_once(remote):
 
 def test_lease__lapses_when_it_is_not_renewed(remote, monkeypatch):
     held_by(remote, host="elsewhere")
-    with (
-        pytest.raises(LockedError, match=r"on elsewhere since .*lapses 150 s after"),
-        remote.info.files.lock(),
-    ):
+    with pytest.raises(LockedError, match=r"on elsewhere since .*lapses 150 s after"), remote.info.files.lock():
         pass
     monkeypatch.setattr(lease, "LEASE_S", -1.0)
     with remote.info.files.lock():

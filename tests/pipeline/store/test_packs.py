@@ -158,9 +158,7 @@ def test_damaged_pack__loses_only_the_damaged_record(packed, bytes_of):
         assert bytes_of(packed.info.directory) == packed.before
 
 
-@pytest.mark.parametrize(
-    "change", [lambda p: p.unlink(), lambda p: p.write_bytes(b""), lambda p: p.write_bytes(b"x")]
-)
+@pytest.mark.parametrize("change", [lambda p: p.unlink(), lambda p: p.write_bytes(b""), lambda p: p.write_bytes(b"x")])
 def test_damaged_pack__lost_altogether(packed, bytes_of, change):
     change(packed.info.directory / pack_key(1))
     assert set(read_commits(packed.info, packed.plan)) == {0, 1, 4}
@@ -226,13 +224,7 @@ def test_sweep__keeps_packs_and_removes_what_they_replace(packed):
 
 def test_names__of_packs():
     assert block_of_pack("000002-000003.jsonl") == 1
-    for name in (
-        "000001-000002.jsonl",
-        "000002.json",
-        "2-3.jsonl",
-        "x-y.jsonl",
-        ".000002-000003.jsonl.a.tmp",
-    ):
+    for name in ("000001-000002.jsonl", "000002.json", "2-3.jsonl", "x-y.jsonl", ".000002-000003.jsonl.a.tmp"):
         assert block_of_pack(name) is None
 
 
@@ -252,9 +244,7 @@ def test_run__packs_as_it_goes_and_mends_one_task(write_spec, tmp_path, bytes_of
     grid = '[initial_conditions]\nkind = "grid"\nx = 0.5\nv = 0.1'
     short = "rtol = 1e-6\natol = 1e-6\nn_transient = 2\nn_keep = 3"
     one = "[execution]\ntrajectories_per_task = 1"
-    spec = write_spec(
-        f'kind = "sweep"\nmodel = "duffing"\n[axes]\n{axis}\n{grid}\n[integration]\n{short}\n{one}'
-    )
+    spec = write_spec(f'kind = "sweep"\nmodel = "duffing"\n[axes]\n{axis}\n{grid}\n[integration]\n{short}\n{one}')
     directory, said = tmp_path / "run", []
     assert run(spec, directory, workers=0, echo=silent).complete
     assert sorted(f.name for f in (directory / "commits").iterdir()) == PACKED

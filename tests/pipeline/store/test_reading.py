@@ -26,9 +26,7 @@ def test_open_run__explains_itself(made):
     assert ds.psi1_dot_0.item() == 0.1
     assert np.allclose(np.rad2deg(ds.psi1_0), [-30, 0, 30])
     assert ds.state.values.tolist() == ["psi1", "psi2", "psi1_dot", "psi2_dot"]
-    meanings = dict(
-        zip(ds.status.attrs["flag_values"], ds.status.attrs["flag_meanings"].split(), strict=True)
-    )
+    meanings = dict(zip(ds.status.attrs["flag_values"], ds.status.attrs["flag_meanings"].split(), strict=True))
     assert meanings == {int(s): s.name.lower() for s in Status}
     assert ds.attrs["spec"] == made.info.spec_text
     assert ds.attrs["title"] == "small sweep"

@@ -183,8 +183,9 @@ def test_write_task__order_of_syncs(made, monkeypatch):
     assert order == ["file", "folder", "marker", "commits"]
     assert kinds.count("file") == CUBE_WRITES
     assert {p for p, k in zip(log, kinds, strict=True) if k == "folder"} == {
-        "cube.zarr", *(f"cube.zarr/{v.name}" for v in VARIABLES)
-    }  # fmt: skip
+        "cube.zarr",
+        *(f"cube.zarr/{v.name}" for v in VARIABLES),
+    }
 
 
 def test_read__leftover_chunk_is_not_data(made):

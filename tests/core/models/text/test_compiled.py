@@ -10,14 +10,7 @@ from magpend_core.pointwise import rates
 
 def oscillator(force):
     states, parameters = {"x": {}, "v": {}}, {"k": 1e3, "e": 0.01}
-    return read_model(
-        {
-            "name": "one",
-            "states": states,
-            "parameters": parameters,
-            "equations": {"x": "v", "v": force},
-        }
-    )
+    return read_model({"name": "one", "states": states, "parameters": parameters, "equations": {"x": "v", "v": force}})
 
 
 @pytest.mark.parametrize(

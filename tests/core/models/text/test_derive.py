@@ -24,9 +24,7 @@ FREQUENCY = 0.7
 
 def model_of(equations, parameters=None, **more):
     states = {name: "1" for name in equations}
-    return read_model(
-        {"name": "a", "states": states, "parameters": parameters or {}, "equations": equations, **more}
-    )
+    return read_model({"name": "a", "states": states, "parameters": parameters or {}, "equations": equations, **more})
 
 
 def model_with_value(text):
@@ -92,9 +90,9 @@ def joined(inner):
         st.tuples(inner, st.sampled_from(["2", "3", "5", "-1", "0.5", "-2", "1.5"])).map(
             lambda p: f"({p[0]})**({p[1]})"
         ),
-        st.tuples(
-            st.sampled_from(["sin", "cos", "atan", "tanh", "exp", "sqrt", "log", "sinh", "cosh"]), inner
-        ).map(lambda p: f"{p[0]}({p[1]})"),
+        st.tuples(st.sampled_from(["sin", "cos", "atan", "tanh", "exp", "sqrt", "log", "sinh", "cosh"]), inner).map(
+            lambda p: f"{p[0]}({p[1]})"
+        ),
         inner.map(lambda text: f"(-{text})"),
     )
 
@@ -143,20 +141,40 @@ def test_rates__are_what_the_text_says_on_each_side_of_its_corners(text, x, v):
 @pytest.mark.parametrize(
     "text",
     [
-        "abs(x)", "sign(x)", "abs(-2*x) + v*sign(-x)", "max(x, v)", "min(x, v)", "max(x, v, a)",
-        "min(x, v, b, 0.1)", "sign(x - sign(v))*x", "where(square(t*f, 0.3) > 0, x, v)",
+        "abs(x)",
+        "sign(x)",
+        "abs(-2*x) + v*sign(-x)",
+        "max(x, v)",
+        "min(x, v)",
+        "max(x, v, a)",
+        "min(x, v, b, 0.1)",
+        "sign(x - sign(v))*x",
+        "where(square(t*f, 0.3) > 0, x, v)",
         "abs(x - abs(v)) + sign(-v)",
-        "where(t*f + 0.1*square(t*f, 0.5) < 0.33, x, v)", "sign(max(x, v) - min(a, v) - 0.01)",
-        "where(x < v, 1, 2)", "where(x <= v, x, v)", "where(x > v, 1, 2)", "where(x >= v, x, v)",
-        "where(not x < v, 1, 2)", "where(x < 0 and v < 0, 1, 2)", "where(x < 0 or v < 0, 1, 2)",
-        "where(x > 0, sqrt(x), v)", "abs(x)*sign(x - v)", "square(t*f + a, 0.3)", "where(phase < 0.2, x, v)",
-        "where(t < 0.2, x, v)", "square(2*t*f + where(x < x, a, x), 0.3)", "where(x >= x, x, v)",
+        "where(t*f + 0.1*square(t*f, 0.5) < 0.33, x, v)",
+        "sign(max(x, v) - min(a, v) - 0.01)",
+        "where(x < v, 1, 2)",
+        "where(x <= v, x, v)",
+        "where(x > v, 1, 2)",
+        "where(x >= v, x, v)",
+        "where(not x < v, 1, 2)",
+        "where(x < 0 and v < 0, 1, 2)",
+        "where(x < 0 or v < 0, 1, 2)",
+        "where(x > 0, sqrt(x), v)",
+        "abs(x)*sign(x - v)",
+        "square(t*f + a, 0.3)",
+        "where(phase < 0.2, x, v)",
+        "where(t < 0.2, x, v)",
+        "square(2*t*f + where(x < x, a, x), 0.3)",
+        "where(x >= x, x, v)",
         "sign(sign(x) - sign(v))*x",
-        "where(sign(v) < square(2*t*f + x, 0.3), x, v)", "where(sign(x) <= sign(v), 1, 2)",
+        "where(sign(v) < square(2*t*f + x, 0.3), x, v)",
+        "where(sign(x) <= sign(v), 1, 2)",
         "abs(sign(x) - sign(v))",
-        "sign(sin(2*pi*f*t) - 0.2)", "abs(cos(6*pi*f*t))*x",
+        "sign(sin(2*pi*f*t) - 0.2)",
+        "abs(cos(6*pi*f*t))*x",
     ],
-)  # fmt: skip
+)
 def test_rates__on_either_side_of_a_corner(text):
     model = model_of({"x": "v", "v": text}, PARAMETERS)
     for x, v, t in itertools.product((-0.9, -0.2, 0.3, 1.1), (-1.0, -0.15, 0.25, 0.8), (0.05, 0.3, 0.9)):
@@ -171,17 +189,14 @@ def test_jacobian__is_sympys_derivative(text):
     model = model_of({"x": text, "v": "x*v"}, PARAMETERS)
     symbols = sympy.symbols("x v")
     scope = {
-        name: getattr(sympy, name)
-        for name in ("sin", "cos", "atan", "tanh", "exp", "sqrt", "log", "sinh", "cosh")
+        name: getattr(sympy, name) for name in ("sin", "cos", "atan", "tanh", "exp", "sqrt", "log", "sinh", "cosh")
     }
     known = {"t": 0.3, "f": FREQUENCY, "phase": 0.3 * FREQUENCY, **PARAMETERS}
     expression = sympy.sympify(text, locals={**scope, "x": symbols[0], "v": symbols[1], **known})
     wanted = []
     for symbol in symbols:
         slope = sympy.diff(expression, symbol).subs(dict(zip(symbols, (x, v), strict=True)))
-        number = (
-            complex(slope.evalf(30)) if slope.is_number and not slope.has(sympy.zoo, sympy.nan) else math.nan
-        )
+        number = complex(slope.evalf(30)) if slope.is_number and not slope.has(sympy.zoo, sympy.nan) else math.nan
         wanted.append(number)
     try:
         found = plain_jacobian(model, (x, v))
@@ -199,10 +214,12 @@ def test_duffing__is_the_hand_written_one():
         {"x": "v", "v": "amplitude*cos(2*pi*f*t) - damping*v - linear*x - cubic*x**3"},
         dict(hand.load("hardening")),
         quantities={
-            "energy": "0.5*v**2 + 0.5*linear*x**2 + 0.25*cubic*x**4", "power_in": "amplitude*cos(2*pi*f*t)*v",
-            "power_dissipated": "damping*v**2", "drive": "amplitude*cos(2*pi*phase)",
+            "energy": "0.5*v**2 + 0.5*linear*x**2 + 0.25*cubic*x**4",
+            "power_in": "amplitude*cos(2*pi*f*t)*v",
+            "power_dissipated": "damping*v**2",
+            "drive": "amplitude*cos(2*pi*phase)",
         },
-    )  # fmt: skip
+    )
     y = np.random.default_rng(3).normal(size=(50, 2)) * 3.0
     t = np.linspace(0.0, 1.0 / FREQUENCY, 50)
     names = [q.name for q in hand.quantities]
@@ -218,9 +235,7 @@ def test_pendulum__is_the_hand_written_one():
     own = hand.load(**{n: v for n, v in text.load().items() if n in hand.parameter_names})
     y = np.random.default_rng(4).uniform(-1.0, 1.0, (60, 4)) * [3.0, 3.0, 15.0, 15.0]
     wanted = rates(0.2, y, own, 1.7)
-    np.testing.assert_allclose(
-        rates(0.2, y, text.load(), 1.7), wanted, rtol=1e-9, atol=1e-9 * np.abs(wanted).max()
-    )
+    np.testing.assert_allclose(rates(0.2, y, text.load(), 1.7), wanted, rtol=1e-9, atol=1e-9 * np.abs(wanted).max())
     wanted = jacobian(0.2, y, own, 1.7)
     scale = np.abs(wanted).max(axis=0)
     # the hand-written one leaves out what the friction of the loads changes at second order
@@ -239,11 +254,17 @@ def functions():
         if name not in ("where", "square")
     }
     texts |= {
-        "where1": "where(x < a, x, v)", "where2": "where(x > a or v > 1, x, v)",
-        "where3": "where(x >= a, 1, 2)", "square1": "square(v, 0.3)", "power1": "x**a", "power2": "x**7",
+        "where1": "where(x < a, x, v)",
+        "where2": "where(x > a or v > 1, x, v)",
+        "where3": "where(x >= a, 1, 2)",
+        "square1": "square(v, 0.3)",
+        "power1": "x**a",
+        "power2": "x**7",
         "power3": "x**-3",
-        "power4": "x**2.5", "power5": "x**-0.5", "power6": "x**0.3",
-    }  # fmt: skip
+        "power4": "x**2.5",
+        "power5": "x**-0.5",
+        "power6": "x**0.3",
+    }
     return model_of({"x": "v", "v": "-x"}, {"a": 0.4}, quantities=texts)
 
 
@@ -257,10 +278,13 @@ def exact(name, x, v, a):
         yes, no = (1, 2) if name == "where3" else (x, v)
         return yes if holds else no
     own = {
-        "square1": lambda: 1 if v - math.floor(v) < 0.3 else -1, "f_abs": lambda: abs(x),
-        "f_min": lambda: min(x, a), "f_max": lambda: max(x, a), "f_sign": lambda: (x > 0) - (x < 0),
+        "square1": lambda: 1 if v - math.floor(v) < 0.3 else -1,
+        "f_abs": lambda: abs(x),
+        "f_min": lambda: min(x, a),
+        "f_max": lambda: max(x, a),
+        "f_sign": lambda: (x > 0) - (x < 0),
         "f_atan2": lambda: m.atan2(x, a),
-    }  # fmt: skip
+    }
     return own[name]() if name in own else getattr(m, name.removeprefix("f_"))(x)
 
 

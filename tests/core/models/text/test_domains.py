@@ -13,9 +13,12 @@ from magpend_core.models.text.numeric import value_of
 
 def faults(rate, define=None, **values):
     table = {
-        "name": "probe", "states": {"x": "1", "v": "1"}, "parameters": {"k": 1.0, "g": 2.0, "z": 0.0},
-        "define": define or {}, "equations": {"x": "v", "v": rate},
-    }  # fmt: skip
+        "name": "probe",
+        "states": {"x": "1", "v": "1"},
+        "parameters": {"k": 1.0, "g": 2.0, "z": 0.0},
+        "define": define or {},
+        "equations": {"x": "v", "v": rate},
+    }
     given = {"x": 0.0, "v": 0.0, "k": 1.0, "g": 2.0, "z": 0.0, "t": 0.0, "f": 1.0, "phase": 0.0, **values}
     n = max(np.size(v) for v in given.values())
     columns = {name: np.broadcast_to(np.asarray(v, float), n) for name, v in given.items()}
@@ -65,24 +68,28 @@ def test_domain_faults__constant_parts_count_in_every_branch(rate, part, why):
     assert fault.values == ({"z": 0.0} if "z" in part else {})
 
 
-@pytest.mark.parametrize(
-    "rate", ["where(z > 0, v/z, v)", "where(z > 0, log(z), 1)*v", "where(not z < 1, 1/z, x)"]
-)
+@pytest.mark.parametrize("rate", ["where(z > 0, v/z, v)", "where(z > 0, log(z), 1)*v", "where(not z < 1, 1/z, x)"])
 def test_domain_faults__none_behind_a_guard_without_a_state(rate):
     assert faults(rate) == []
 
 
 def test_domain_faults__impacts_and_quantities():
     table = {
-        "name": "probe", "states": {"x": "1", "v": "1"}, "parameters": {"d": 0.0}, "define": {"g": "1/d"},
-        "equations": {"x": "v", "v": "-x"}, "quantities": {"q": "x*sqrt(-1)"},
+        "name": "probe",
+        "states": {"x": "1", "v": "1"},
+        "parameters": {"d": 0.0},
+        "define": {"g": "1/d"},
+        "equations": {"x": "v", "v": "-x"},
+        "quantities": {"q": "x*sqrt(-1)"},
         "impacts": [{"of": "x - log(d)", "direction": "up", "set": {"v": "-v*g"}}],
-    }  # fmt: skip
+    }
     zeros = dict.fromkeys(("x", "v", "d", "t", "f", "phase"), np.zeros(1))
     found = domain_faults(load_model(table).definition, zeros)
     assert [(f.place, f.part) for f in found] == [
-        ("define.g", "1/d"), ("impacts[0].of", "log(d)"), ("quantities.q", "sqrt(-1)"),
-    ]  # fmt: skip
+        ("define.g", "1/d"),
+        ("impacts[0].of", "log(d)"),
+        ("quantities.q", "sqrt(-1)"),
+    ]
 
 
 @pytest.mark.parametrize("rate", ["k + x", "where(x > 0, 1/x, 0)", "where(x > 0, log(x), -x)", "atan2(v, x)"])
@@ -113,11 +120,30 @@ def test_domain_faults__all_at_once():
 
 @pytest.mark.parametrize(
     "text",
-    ["a + b - c", "a - (b - c)", "a*(b + c)/d", "a/(b*c)", "a/b/c", "-a*b", "(-x)**2", "-x**2", "2**(-x)",
-     "a - (-b)", "where(x > 0 and not (y <= 1 or x < 2), -x, 1/y)", "(a + b)**(c*d)", "min(a, b + 1)*3",
-     "0.001*log(x)/v",
-     "-a*b*c", "a - (-b*c)", "a*(-b)*c", "(-a*b)**2", "-(a + b)*c", "a*(b/c)", "(a < b) and (b < c)"],
-)  # fmt: skip
+    [
+        "a + b - c",
+        "a - (b - c)",
+        "a*(b + c)/d",
+        "a/(b*c)",
+        "a/b/c",
+        "-a*b",
+        "(-x)**2",
+        "-x**2",
+        "2**(-x)",
+        "a - (-b)",
+        "where(x > 0 and not (y <= 1 or x < 2), -x, 1/y)",
+        "(a + b)**(c*d)",
+        "min(a, b + 1)*3",
+        "0.001*log(x)/v",
+        "-a*b*c",
+        "a - (-b*c)",
+        "a*(-b)*c",
+        "(-a*b)**2",
+        "-(a + b)*c",
+        "a*(b/c)",
+        "(a < b) and (b < c)",
+    ],
+)
 def test_readable__means_the_same(text):
     numbers = {"a": 1.3, "b": -0.7, "c": 2.1, "d": 0.4, "x": 0.9, "y": -1.7, "v": 3.0}
     tree = parse_condition(text) if " and " in text and "where" not in text else parse(text)

@@ -105,9 +105,16 @@ def test_parse__says_what_is_wrong_and_where(text, words):
 
 @pytest.mark.parametrize(
     ("text", "same"),
-    [("x^2", "x**2"), ("-x^2", "-(x**2)"), ("x^-y", "x**(-y)"), ("(x^y)^2", "(x**y)**2"),
-     ("x^(y^2)", "x**(y**2)"), ("2*x^2*y^3", "2*(x**2)*(y**3)"), ("sin(x^2)^2", "sin(x**2)**2")],
-)  # fmt: skip
+    [
+        ("x^2", "x**2"),
+        ("-x^2", "-(x**2)"),
+        ("x^-y", "x**(-y)"),
+        ("(x^y)^2", "(x**y)**2"),
+        ("x^(y^2)", "x**(y**2)"),
+        ("2*x^2*y^3", "2*(x**2)*(y**3)"),
+        ("sin(x^2)^2", "sin(x**2)**2"),
+    ],
+)
 def test_parse__reads_a_caret_as_a_power(text, same):
     assert written(parse(text)) == written(parse(same))
     assert value(text) == value(same)
@@ -117,8 +124,13 @@ def test_parse__says_all_that_is_wrong():
     with pytest.raises(GrammarError) as error:
         parse("sine(x) + ln(y, 2) + (x < 1) + sin(x, y) + w + q*1e999)")
     assert [problem.split(" at ")[0] for problem in error.value.problems] == [
-        "unknown function 'sine'", "unknown function 'ln'", "a condition stands", "sin", "the number", "')'",
-    ]  # fmt: skip
+        "unknown function 'sine'",
+        "unknown function 'ln'",
+        "a condition stands",
+        "sin",
+        "the number",
+        "')'",
+    ]
     assert dict(error.value.names).keys() == {"x", "y", "w", "q"}
     with pytest.raises(GrammarError) as error:
         parse("x@y + $z + y@x")
@@ -129,8 +141,11 @@ def test_parse__reads_on_after_a_missing_sign():
     with pytest.raises(GrammarError) as error:
         parse("2x + sine(y) - (x)3 + sin(x, y)")
     assert [problem.split(" at ")[0] for problem in error.value.problems] == [
-        "'x'", "unknown function 'sine'", "'3'", "sin",
-    ]  # fmt: skip
+        "'x'",
+        "unknown function 'sine'",
+        "'3'",
+        "sin",
+    ]
 
 
 @pytest.mark.parametrize("text", ["x + * y - sine(x)", "x) - sine(x)", "x @ y - sine(x)", "x == sine(x)"])
@@ -201,9 +216,15 @@ def test_value_of__is_what_python_computes(text):
         return yes if condition else no
 
     scope = {
-        **VALUES, "where": where, "sin": np.sin, "atan": np.arctan, "tanh": np.tanh, "abs": np.abs,
-        "sign": np.sign, "cos": np.cos,
-    }  # fmt: skip
+        **VALUES,
+        "where": where,
+        "sin": np.sin,
+        "atan": np.arctan,
+        "tanh": np.tanh,
+        "abs": np.abs,
+        "sign": np.sign,
+        "cos": np.cos,
+    }
     numbers = {name: np.float64(v) if isinstance(v, float) else v for name, v in scope.items()}
     with np.errstate(all="ignore"):
         try:
@@ -223,14 +244,52 @@ def test_parse__ends_in_a_tree_or_in_one_error(text):
 
 SOURCE = "drive - d*w - where(abs(x) < gap, 0, k*(x - gap*sign(x)))**3/max(1, exp(-0.5*t)) + square(t, 0.25)"
 HOSTILE = [
-    "__import__('os').system('touch /tmp/executed')", "().__class__.__bases__[0].__subclasses__()",
-    "eval('1')", "exec('import os')", "open('/etc/passwd')", "x.__class__", "[x for x in (1,)]", "f'{x}'",
-    "(lambda: 0)()", "x := 1", "9**9**9**9", "1" * 5000, "((" * 500, "\x00", "\ud800", "ſin(x)", "x\u2028y",
-    "where(" * 50, "0x10", "1_000", "1j", "'a'*9", "print(x)", "globals()", "%", "@", "~x", "x//y",
-    "x%y", "x|y", "x<<9", "not", "and", "x and", "or x", "None", "True", "import os", "*x", "**x", ",",
+    "__import__('os').system('touch /tmp/executed')",
+    "().__class__.__bases__[0].__subclasses__()",
+    "eval('1')",
+    "exec('import os')",
+    "open('/etc/passwd')",
+    "x.__class__",
+    "[x for x in (1,)]",
+    "f'{x}'",
+    "(lambda: 0)()",
+    "x := 1",
+    "9**9**9**9",
+    "1" * 5000,
+    "((" * 500,
+    "\x00",
+    "\ud800",
+    "ſin(x)",
+    "x\u2028y",
+    "where(" * 50,
+    "0x10",
+    "1_000",
+    "1j",
+    "'a'*9",
+    "print(x)",
+    "globals()",
+    "%",
+    "@",
+    "~x",
+    "x//y",
+    "x%y",
+    "x|y",
+    "x<<9",
+    "not",
+    "and",
+    "x and",
+    "or x",
+    "None",
+    "True",
+    "import os",
+    "*x",
+    "**x",
+    ",",
     "sin()",
-    "sin(,)", "sin(x,)", "max(" + ",".join("x" * 60) + ")",
-]  # fmt: skip
+    "sin(,)",
+    "sin(x,)",
+    "max(" + ",".join("x" * 60) + ")",
+]
 
 
 @pytest.mark.parametrize("text", HOSTILE, ids=range(len(HOSTILE)))
@@ -253,11 +312,15 @@ def test_parse__stands_a_thousand_mutations():
         text = SOURCE
         for _ in range(chance.randint(1, 6)):
             i, j = sorted(chance.randrange(len(text) + 1) for _ in range(2))
-            text = chance.choice([
-                text[:i] + chance.choice(alphabet) + text[i + 1 :], text[:i] + text[j:], text[:j] + text[i:],
-                text[:i] + chance.choice(HOSTILE)[:40] + text[i:],
-                text[:i] + chance.choice(list(FUNCTIONS)) + text[i:],
-            ])  # fmt: skip
+            text = chance.choice(
+                [
+                    text[:i] + chance.choice(alphabet) + text[i + 1 :],
+                    text[:i] + text[j:],
+                    text[:j] + text[i:],
+                    text[:i] + chance.choice(HOSTILE)[:40] + text[i:],
+                    text[:i] + chance.choice(list(FUNCTIONS)) + text[i:],
+                ]
+            )
         begin = time.process_time()
         try:
             parse(text)

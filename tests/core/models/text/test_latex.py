@@ -31,28 +31,40 @@ from magpend_core.models.text.latex import equations_of, latex_of, symbol_of
         ("abs(x)*x", r"\left|x\right| \, x"),
         ("sin(2*pi*f*t)", r"\sin\left(2 \, \pi \, f \, t\right)"),
         ("atan2(y, x)", r"\operatorname{atan2}\left(y, x\right)"),
-        ("where(x > 0 and y <= 1, a, b)",
-         r"\begin{cases} a & \text{if } x > 0 \land y \le 1 \\ b & \text{else} \end{cases}"),
+        (
+            "where(x > 0 and y <= 1, a, b)",
+            r"\begin{cases} a & \text{if } x > 0 \land y \le 1 \\ b & \text{else} \end{cases}",
+        ),
     ],
-)  # fmt: skip
+)
 def test_latex_of__as_it_was_written(text, latex):
     assert latex_of(parse(text), {}) == latex
 
 
 @pytest.mark.parametrize(
     ("name", "latex"),
-    [("x", "x"), ("theta", r"\theta"), ("drive", r"\mathrm{drive}"), ("x1", "x_{1}"),
-     ("k_max", r"k_{\mathrm{max}}"), ("omega_0", r"\omega_{0}"), ("th", r"\mathrm{th}")],
-)  # fmt: skip
+    [
+        ("x", "x"),
+        ("theta", r"\theta"),
+        ("drive", r"\mathrm{drive}"),
+        ("x1", "x_{1}"),
+        ("k_max", r"k_{\mathrm{max}}"),
+        ("omega_0", r"\omega_{0}"),
+        ("th", r"\mathrm{th}"),
+    ],
+)
 def test_symbol_of__letters_words_and_indices(name, latex):
     assert symbol_of(name, {}) == latex
 
 
 def test_equations_of__definitions_in_the_order_of_their_need_and_own_symbols():
     table = {
-        "name": "probe", "states": {"th": {"unit": "rad", "symbol": r"\vartheta"}}, "parameters": {"k": 1.0},
-        "define": {"b": "a + 1", "a": "k*th", "idle": "2"}, "equations": {"th": "-b"},
-    }  # fmt: skip
+        "name": "probe",
+        "states": {"th": {"unit": "rad", "symbol": r"\vartheta"}},
+        "parameters": {"k": 1.0},
+        "define": {"b": "a + 1", "a": "k*th", "idle": "2"},
+        "equations": {"th": "-b"},
+    }
     assert equations_of(load_model(table).definition) == [
         r"a &= k \, \vartheta",
         r"b &= a + 1",

@@ -20,9 +20,7 @@ KEPT = {"n_transient": 0, "n_keep": 1, "rtol": 1e-10, "atol": 1e-10}
 
 def model_of(equations, parameters=None, **more):
     states = {name: "1" for name in equations}
-    return read_model(
-        {"name": "a", "states": states, "parameters": parameters or {}, "equations": equations, **more}
-    )
+    return read_model({"name": "a", "states": states, "parameters": parameters or {}, "equations": equations, **more})
 
 
 def declared(model, y, frequency=1.7, **values):
@@ -124,9 +122,7 @@ def test_layers__that_move_with_time_carry_tangents(shaken):
     h = 1e-5
     for k, direction in enumerate(np.eye(2)):
         ends = [
-            run_branches(
-                packed, frequency, start + s * h * direction, **keywords, system=shaken.system
-            ).section
+            run_branches(packed, frequency, start + s * h * direction, **keywords, system=shaken.system).section
             for s in (1.0, -1.0)
         ]
         slope = (ends[0] - ends[1])[0, 0, 0] / (2.0 * h)
@@ -149,9 +145,7 @@ def test_layers__make_a_steep_friction_cheaper():
     y0 = np.random.default_rng(2).normal(size=(8, 2))
     packed = np.tile(model.load(zeta=0.0, amplitude=0.5, eps=3e3).pack(), (8, 1, 1))
     found = [
-        run_branches(
-            packed, np.full((8, 1), 0.2), y0, n_transient=6, n_keep=1, rtol=1e-7, atol=1e-7, system=s
-        )
+        run_branches(packed, np.full((8, 1), 0.2), y0, n_transient=6, n_keep=1, rtol=1e-7, atol=1e-7, system=s)
         for s in (system, dataclasses.replace(system, name=f"{system.name}_without", has_layers=False))
     ]
     with_layer, without = (int(f.n_rejected.sum()) for f in found)
@@ -202,9 +196,7 @@ def test_square__is_followed_exactly(duty, jumping):
     assert found.n_rejected[0] <= 2
 
 
-@pytest.mark.parametrize(
-    ("d", "e", "s"), [(0.3, 0.6, 0.37), (0.7, 0.2, -0.9), (0.5, 0.5, 2.6), (0.1, 0.95, 0.0)]
-)
+@pytest.mark.parametrize(("d", "e", "s"), [(0.3, 0.6, 0.37), (0.7, 0.2, -0.9), (0.5, 0.5, 2.6), (0.1, 0.95, 0.0)])
 def test_jumps_in_time__are_followed_in_whatever_order_the_parameters_put_them(d, e, s, jumping):
     alone = model_of({"x": f"{JUMPS} - k*x"}, {"d": 0.3, "e": 0.6, "s": 0.37, "k": 1.0})
     assert alone.derived.n_edges == 12
@@ -218,9 +210,7 @@ def test_jumps_in_time__are_followed_in_whatever_order_the_parameters_put_them(d
         return 2 * square(3 * share + s, d) - 2 * square(share - s, e) + third
 
     turns = np.arange(-4, 8)
-    breaks = np.concatenate([
-        (turns - s) / 3, (turns + d - s) / 3, turns + s, turns + e + s, [0.0, 1.0, d, e, 0.1]
-    ])  # fmt: skip
+    breaks = np.concatenate([(turns - s) / 3, (turns + d - s) / 3, turns + s, turns + e + s, [0.0, 1.0, d, e, 0.1]])
     breaks = np.unique(breaks[(breaks >= 0.0) & (breaks <= 1.0)])
     levels = [((b - a) / frequency, level(0.5 * (a + b))) for a, b in itertools.pairwise(breaks)]
     found = sections(jumping.load(d=d, e=e, s=s, jumps=1.0), [frequency], [[0.2]], **KEPT)
@@ -264,12 +254,14 @@ def by_scipy(function, y0, end):
 
 
 CORNERS = {
-    "abs(x)": abs, "max(x, 0.2)": lambda x: max(x, 0.2), "min(x, 0.2, -0.1)": lambda x: min(x, -0.1),
+    "abs(x)": abs,
+    "max(x, 0.2)": lambda x: max(x, 0.2),
+    "min(x, 0.2, -0.1)": lambda x: min(x, -0.1),
     "where(x > 0.3, 3*(x - 0.3), 0)": lambda x: max(3 * (x - 0.3), 0.0),
     "where(x > 0.3, x**1.5, 0.3**1.5)": lambda x: max(x, 0.3) ** 1.5,
     "where(x < -0.1 or x > 0.5, 1 + x, -2)": lambda x: 1 + x if x < -0.1 or x > 0.5 else -2.0,
     "sign(x)*x**2": lambda x: abs(x) * x,
-}  # fmt: skip
+}
 
 
 @pytest.fixture(scope="module")
@@ -283,9 +275,7 @@ def cornered():
     layer = "rub*(tanh(20*v) + atan(3*v)*exp(-x**2)/(1 + log(2 + v**2)))"
     oscillator = {"x": "v", "v": f"cos(2*pi*f*t) - 0.1*v - {layer} - x - ({' + '.join(terms)})"}
     impacts = [{"of": "h", "direction": "down", "set": {"w": "-r*w", "n": "n + 1"}}]
-    return model_of(
-        {**oscillator, "h": "w", "w": "-g", "n": "0"}, {**weights, "g": 0.0, "r": 0.5}, impacts=impacts
-    )
+    return model_of({**oscillator, "h": "w", "w": "-g", "n": "0"}, {**weights, "g": 0.0, "r": 0.5}, impacts=impacts)
 
 
 @pytest.mark.slow

@@ -68,13 +68,8 @@ def problems_of(table):
 
 def test_read_model__fills_in_what_a_short_text_leaves_out():
     model = read_model(DUFFING)
-    assert model.states == (
-        State("x", "m", "x", escape=1e9, rate="v"), State("v", "m/s", "v", escape=1e9),
-    )  # fmt: skip
-    assert [(p.name, p.unit, p.meaning) for p in model.parameters] == [
-        ("d", "1", "d"),
-        ("A", "N", "amplitude"),
-    ]
+    assert model.states == (State("x", "m", "x", escape=1e9, rate="v"), State("v", "m/s", "v", escape=1e9))
+    assert [(p.name, p.unit, p.meaning) for p in model.parameters] == [("d", "1", "d"), ("A", "N", "amplitude")]
     assert dict(model.load()) == {"d": 0.08, "A": 0.2}
     assert model.preset_names == ("default",)
     assert model.preset().provenance["d"]
@@ -90,9 +85,7 @@ def test_read_model__keeps_all_that_a_long_text_says():
     assert model.states[1].escape == 1e4
     assert model.parameter("l").bound == POSITIVE
     assert model.mirror == Mirror((-1, -1), True)
-    assert [(q.name, q.unit, q.meaning) for q in model.quantities] == [
-        ("E", "1/s2", "energy"), ("push", "1", "push"),
-    ]  # fmt: skip
+    assert [(q.name, q.unit, q.meaning) for q in model.quantities] == [("E", "1/s2", "energy"), ("push", "1", "push")]
     assert model.load("strong")["A"] == 3.0
     assert model.load("strong")["d"] == 0.1
     assert model.preset("strong").provenance == {"l": "a textbook", "d": "a textbook", "A": "a guess"}
@@ -165,7 +158,7 @@ def test_classifier__calls_what_stays_by_its_word():
         (("define", "A"), "2", "model.define.A: is the name of a parameter already"),
         (("define", "a1"), "a1 + 1", "model.define.a1: goes round in a circle: a1 needs a1."),
         (("parameters",), {1: 2.0}, "model.parameters: the key 1 must be a text."),
-        (("name",), "five wells", "model.name: \"five wells\" must be a letter"),
+        (("name",), "five wells", 'model.name: "five wells" must be a letter'),
         (("quantities", "x"), "v", "model.quantities.x: is the name of a state already"),
         (("quantities", "E"), {"unit": "J"}, "model.quantities.E"),
         (("impacts",), {"of": "x"}, "model.impacts: must be a list of tables"),
@@ -185,7 +178,7 @@ def test_classifier__calls_what_stays_by_its_word():
         (("classifier",), {"words": {"left": "x"}}, "must be a condition"),
         (("equatoins",), {}, "model.equatoins: is no key here; did you mean equations or quantities?"),
     ],
-)  # fmt: skip
+)
 def test_read_model__says_what_is_wrong_and_where(path, value, words):
     found = problems_of(changed(DUFFING, *path, value=value))
     assert any(words in p for p in found), found
@@ -199,9 +192,7 @@ def test_read_model__tells_all_problems_at_once():
 
 def test_read_model__follows_a_circle_of_definitions():
     table = changed(DUFFING, "define", value={"drive": "b1*2", "b1": "sin(b2)", "b2": "drive + 1"})
-    assert problems_of(table) == [
-        "model.define.drive: goes round in a circle: drive needs b1 needs b2 needs drive."
-    ]
+    assert problems_of(table) == ["model.define.drive: goes round in a circle: drive needs b1 needs b2 needs drive."]
 
 
 def test_autonomous__is_what_knows_no_time():
@@ -260,9 +251,7 @@ def test_digest__stays_where_the_meaning_does():
     assert digest(changed(DUFFING, "parameters", "A", "meaning", value="force")) == same
     assert digest(changed(DUFFING, "parameters", "d", value=0.1)) == same  # a run has the values that it uses
     two = changed(DUFFING, "define", value={"drive": "A*shape", "shape": "cos(2*pi*f*t)"})
-    assert digest(two) == digest(
-        changed(DUFFING, "define", value={"shape": "cos(2*pi*f*t)", "drive": "A*shape"})
-    )
+    assert digest(two) == digest(changed(DUFFING, "define", value={"shape": "cos(2*pi*f*t)", "drive": "A*shape"}))
 
 
 @pytest.mark.parametrize(
@@ -309,11 +298,39 @@ def test_source__is_the_same_whatever_was_read_before(run_python):
 def mutated(chance: random.Random, value: Any, depth: int = 0) -> Any:
     """A value with something exchanged for what does not belong there."""
     strange = [
-        None, True, 3, -1.5, float("nan"), float("inf"), 10**400, "", "x", "import os", "__class__", [], {},
-        [[]], {"x": {}}, {"": ""}, ["x"] * 3, "x" * 9000, {str(i): "x" for i in range(300)}, b"x", {1: 2},
-        "((((", "1e999", {"value": "x"}, "9**9**9**9", object(), "sin", "\ud800", {"unit": "\x00"}, "x.y",
-        "(lambda: 0)()", ("x", "x"),
-    ]  # fmt: skip
+        None,
+        True,
+        3,
+        -1.5,
+        float("nan"),
+        float("inf"),
+        10**400,
+        "",
+        "x",
+        "import os",
+        "__class__",
+        [],
+        {},
+        [[]],
+        {"x": {}},
+        {"": ""},
+        ["x"] * 3,
+        "x" * 9000,
+        {str(i): "x" for i in range(300)},
+        b"x",
+        {1: 2},
+        "((((",
+        "1e999",
+        {"value": "x"},
+        "9**9**9**9",
+        object(),
+        "sin",
+        "\ud800",
+        {"unit": "\x00"},
+        "x.y",
+        "(lambda: 0)()",
+        ("x", "x"),
+    ]
     if depth > 5 or chance.random() < 0.12:
         return chance.choice(strange)
     if isinstance(value, dict) and value:
@@ -322,19 +339,13 @@ def mutated(chance: random.Random, value: Any, depth: int = 0) -> Any:
         if action == 0:
             del made[key]
         elif action == 1:
-            made[
-                chance.choice(["x", "drive", "sin", "import", "a" * 99, "", "x y", "\n", "v", "__init__"])
-            ] = made[key]
+            made[chance.choice(["x", "drive", "sin", "import", "a" * 99, "", "x y", "\n", "v", "__init__"])] = made[key]
         else:
             made[key] = mutated(chance, value[key], depth + 1)
         return made
     if isinstance(value, str) and value:
         i = chance.randrange(len(value))
-        return (
-            value[:i]
-            + chance.choice(list("()*+-/.,<>=_'\"\\\n\x00 19xé{}[]:;@"))
-            + value[i + chance.randrange(2) :]
-        )
+        return value[:i] + chance.choice(list("()*+-/.,<>=_'\"\\\n\x00 19xé{}[]:;@")) + value[i + chance.randrange(2) :]
     if isinstance(value, list) and value:
         return [mutated(chance, value[0], depth + 1), *value[1:]]
     return chance.choice(strange)
@@ -364,9 +375,7 @@ def test_read_model__stands_a_thousand_mutations():
     assert slowest < 10.0
 
 
-@pytest.mark.parametrize(
-    "table", [None, 3, "x", [], {}, {"name": "a"}, {"states": 1, "name": 2, "equations": 3}]
-)
+@pytest.mark.parametrize("table", [None, 3, "x", [], {}, {"name": "a"}, {"states": 1, "name": 2, "equations": 3}])
 def test_read_model__refuses_what_is_no_table_of_a_model(table):
     assert problems_of(table)
 
@@ -388,9 +397,10 @@ def test_read_model__reports_all_that_is_wrong_in_an_expression():
     problems = problems_of(changed(DUFFING, "equations", "v", value="driv - e*v - sine(x) + q1 + q2*q3 +"))
     said = [problem.removeprefix("model.equations.v: ").partition(": ")[2] for problem in problems]
     assert [s.split(" at ")[0] for s in said] == [
-        "unknown function 'sine'", "ends where something must follow.",
+        "unknown function 'sine'",
+        "ends where something must follow.",
         *(f"unknown name {name!r}" for name in ("driv", "e", "q1", "q2", "q3")),
-    ]  # fmt: skip
+    ]
     problems = problems_of(changed(DUFFING, "equations", "v", value="+".join(f"q{i}" for i in range(20))))
     assert len(problems) == 9
     assert problems[-1].endswith("12 more problems.")

@@ -89,9 +89,7 @@ class Opened:
 
         self.page.on("console", console)
         self.page.on("pageerror", lambda error: self.complaints.append(f"script: {error}"))
-        self.page.on(
-            "requestfailed", lambda asked: self.complaints.append(f"request: {asked.url} {asked.failure}")
-        )
+        self.page.on("requestfailed", lambda asked: self.complaints.append(f"request: {asked.url} {asked.failure}"))
         self.page.on("request", request)
 
 

@@ -74,9 +74,7 @@ def points_of(cube: xr.Dataset, state: str = "psi1") -> tuple[np.ndarray, np.nda
     """Frequency and value of every cell's sections, cells in C order."""
     dims = cube["status"].dims
     values = cube["section"].sel(state=state).transpose(*dims, "period_index").values
-    frequency = np.broadcast_to(
-        cube["frequency"].values[:, None], (values.shape[0], int(np.prod(values.shape[1:-1])))
-    )
+    frequency = np.broadcast_to(cube["frequency"].values[:, None], (values.shape[0], int(np.prod(values.shape[1:-1]))))
     assert dims[0] == "frequency"
     return frequency.ravel(), values.reshape(-1, values.shape[-1])
 
@@ -138,9 +136,7 @@ def test_diagram__bitmap_has_the_cubes_points_and_nothing_else(page: Any, cube: 
     drawn_at.ravel()[pixels["alpha"]] = True
     assert drawn_at[row, np.broadcast_to(column, row.shape)].all()
     near = np.zeros_like(drawn_at)
-    for r, c in set(
-        zip(row.ravel().tolist(), np.broadcast_to(column, row.shape).ravel().tolist(), strict=True)
-    ):
+    for r, c in set(zip(row.ravel().tolist(), np.broadcast_to(column, row.shape).ravel().tolist(), strict=True)):
         near[max(0, r - 4) : r + 5, max(0, c - 4) : c + 5] = True
     assert not (drawn_at & ~near).any()
 
@@ -178,9 +174,7 @@ def test_diagram__address_restores_the_view(
 ) -> None:
     one = own.page
     one.select_option("select[name=y]", "psi2_dot")
-    until(
-        one, "magpend.diagram.vertical.name === 'psi2_dot' && !document.querySelector('.diagram[aria-busy]')"
-    )
+    until(one, "magpend.diagram.vertical.name === 'psi2_dot' && !document.querySelector('.diagram[aria-busy]')")
     one.select_option("select[name=colour]", "attractor")
     one.locator(".legend-entry").first.click()
     one.locator(".legend-entry").first.click()
@@ -211,9 +205,7 @@ def test_diagram__address_restores_the_view(
 def test_diagram__an_address_that_says_nothing_of_use_shows_the_beginning(
     visit: Callable[..., Any], explorer: str
 ) -> None:
-    opened = drawn(
-        visit(f"{explorer}#x=no&y=%3Cimg%3E&window=1,0,a&point=-3,x&at.q=9&hide.motion=z&plane=a,b")
-    )
+    opened = drawn(visit(f"{explorer}#x=no&y=%3Cimg%3E&window=1,0,a&point=-3,x&at.q=9&hide.motion=z&plane=a,b"))
     begun = state_of(opened.page)
     assert begun["y"] == "psi1"
     assert begun["window"] is None
@@ -303,9 +295,7 @@ def test_diagram__pictures_to_keep(page: Any, cube: xr.Dataset) -> None:
     root = svg_root(one)
     svg = "{http://www.w3.org/2000/svg}"
     circles = [
-        path
-        for path in root.iter(f"{svg}path")
-        if path.get("fill", "none") != "none" and "A" in path.get("d", "")
+        path for path in root.iter(f"{svg}path") if path.get("fill", "none") != "none" and "A" in path.get("d", "")
     ]
     assert len(circles) == cube["status"].size * cube.sizes["period_index"] <= 20_000
     assert any("drive frequency [Hz]" in (text.text or "") for text in root.iter(f"{svg}text"))
@@ -501,9 +491,7 @@ def test_diagram__ten_million_points(visit: Callable[..., Any], tmp_path: Path) 
         assert opened.outside == []
 
 
-def test_diagram__zoom_here_gives_the_window_as_a_specification_and_runs_it(
-    page: Any, looked_at: Path
-) -> None:
+def test_diagram__zoom_here_gives_the_window_as_a_specification_and_runs_it(page: Any, looked_at: Path) -> None:
     one = page.page
     one.evaluate("magpend.diagram.moveTo([2.22, 2.28, ...magpend.diagram.window.slice(2)])")
     settled(one)
@@ -531,11 +519,7 @@ def test_diagram__of_a_run_that_is_not_complete_says_so_and_other_axes_are_chose
     total = made.plan.n_cells
     with served(made.info.directory) as address:
         opened = drawn(visit(address))
-        page, note, inside = (
-            opened.page,
-            opened.page.locator(".note-line"),
-            opened.page.locator(".diagram-note"),
-        )
+        page, note, inside = (opened.page, opened.page.locator(".note-line"), opened.page.locator(".diagram-note"))
         assert f"{total} of {total} cells are pending" in note.inner_text()
         assert "No cell of this run is computed yet" in inside.inner_text()
         made.commit(0)
@@ -557,9 +541,7 @@ def _choose_other_axes(page: Any, cube: xr.Dataset) -> None:
     (other,) = at
     page.select_option(f"select[name='at.{other}']", "1")
     drawn_of = "[...magpend.diagram.data.cell].join()"
-    part = cube.assign(
-        number=(cube["status"].dims, np.arange(cube["status"].size).reshape(cube["status"].shape))
-    )
+    part = cube.assign(number=(cube["status"].dims, np.arange(cube["status"].size).reshape(cube["status"].shape)))
     cells = part["number"].isel({other: 1}).transpose(shown, ...).values.ravel()
     until(page, f"{drawn_of} === '{','.join(map(str, cells))}'")
     page.select_option("select[name=x]", other)

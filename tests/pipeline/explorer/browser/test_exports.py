@@ -84,9 +84,7 @@ def _compare(page, run):
             found = _asked(page, "diagram", query)
             assert set(found["arrays"]) == set(arrays)
             for name, values in arrays.items():
-                np.testing.assert_array_equal(
-                    np.array(found["arrays"][name]), values, err_msg=f"{query} {name}"
-                )
+                np.testing.assert_array_equal(np.array(found["arrays"][name]), values, err_msg=f"{query} {name}")
             assert {k: found["attrs"][k] for k in ("x", "y", "unit", "at")} == {
                 k: attrs[k] for k in ("x", "y", "unit", "at")
             }
@@ -117,9 +115,7 @@ def _compare_tables(page, run, queries):
         for row, row_too in zip(rows, rows_too, strict=True):
             for value, value_too in zip(row, row_too, strict=True):
                 # an orbit has the digits that a copy keeps
-                assert value == value_too or float(value) == pytest.approx(
-                    float(value_too), rel=1e-4, abs=1e-3
-                )
+                assert value == value_too or float(value) == pytest.approx(float(value_too), rel=1e-4, abs=1e-3)
 
 
 @pytest.mark.parametrize("form", ["file", "folder"])
@@ -153,9 +149,7 @@ def test_copy__shows_the_diagram_and_an_orbit(visit, copies, hosted, looked_at, 
     last = {"at": {"frequency": 4}}
     stored = {"cell": orbit["attrs"]["stored"], "point": section.shape[0] - 1}
     _compare_tables(
-        page,
-        run,
-        {"attractors": last, "plane": last, "curves": {"x": "frequency", "at": {}}, "orbit": stored},
+        page, run, {"attractors": last, "plane": last, "curves": {"x": "frequency", "at": {}}, "orbit": stored}
     )
     assert opened.complaints == []
     assert opened.outside == []

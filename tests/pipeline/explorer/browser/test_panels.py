@@ -72,9 +72,7 @@ def choose(opened: Any, cell: int, point: int = 0) -> None:
 def fact(opened: Any, name: str) -> str:
     """What stands beside a name in the card of facts."""
     return str(
-        opened.page.locator(".panel-facts dt", has_text=name)
-        .locator("xpath=following-sibling::dd[1]")
-        .text_content()
+        opened.page.locator(".panel-facts dt", has_text=name).locator("xpath=following-sibling::dd[1]").text_content()
     )
 
 

@@ -63,9 +63,13 @@ def fit(times, measured, *, noise=1.0, prior=None) -> Fitted:
         reduced.append((own[:, :2] - own[:, 2:] @ following)[:, None, :])
         row += len(r)
     linear = Linearised(
-        information, 1 / sd**2, tuple(r[:, None] for r in residuals), tuple(reduced),
-        tuple(range(len(times))), starts.size,
-    )  # fmt: skip
+        information,
+        1 / sd**2,
+        tuple(r[:, None] for r in residuals),
+        tuple(reduced),
+        tuple(range(len(times))),
+        starts.size,
+    )
     return Fitted(theta, starts, residuals, jacobian, linear)
 
 
@@ -127,6 +131,4 @@ def record(rng, *, n_pieces=10, n=120, noise=0.01, memory=0.0, bits=None, dead_b
 
 @pytest.fixture(scope="session")
 def ringdown():
-    return SimpleNamespace(
-        TRUTH=TRUTH, motion=motion, slopes=slopes, fit=fit, linearise=linearise, record=record
-    )
+    return SimpleNamespace(TRUTH=TRUTH, motion=motion, slopes=slopes, fit=fit, linearise=linearise, record=record)

@@ -26,9 +26,14 @@ def table(**values):
 
 def problem_of(parameters, channels, pieces, *, recorded=False) -> Problem:
     return Problem(
-        model=parameters.model, fixed=parameters, free=(), channels=channels, pieces=tuple(pieces),
-        noise=np.full(len(channels), NOISE), recorded=recorded,
-    )  # fmt: skip
+        model=parameters.model,
+        fixed=parameters,
+        free=(),
+        channels=channels,
+        pieces=tuple(pieces),
+        noise=np.full(len(channels), NOISE),
+        recorded=recorded,
+    )
 
 
 @pytest.fixture(scope="module")
@@ -36,9 +41,13 @@ def forced():
     """An oscillator under a sine that was measured."""
     parameters = load_model("duffing").load("hardening", amplitude=0.4)
     ds = record(
-        parameters, [Step(0.2, 6)], [0.5, 0.0], 0.02 * np.arange(1400),
-        sensors={"x": Sensor(noise=NOISE), "drive": DriveSensor("torque", 1e-3)}, seed=3,
-    )  # fmt: skip
+        parameters,
+        [Step(0.2, 6)],
+        [0.5, 0.0],
+        0.02 * np.arange(1400),
+        sensors={"x": Sensor(noise=NOISE), "drive": DriveSensor("torque", 1e-3)},
+        seed=3,
+    )
     return parameters, ds
 
 
@@ -70,11 +79,7 @@ def test_pieces_of__a_recorded_torque_drives_the_model(forced):
         # one frequency: edges between samples of 2 ms are known by the line through all of them
         ([Step(1.3, 12, {"duty_cycle": 0.45})], DriveSensor("signal", 0.02), 500.0),
         # two frequencies and duty cycles: samples lie on the torque's flanks
-        (
-            [Step(1.3, 5, {"duty_cycle": 0.45}), Step(1.5, 8, {"duty_cycle": 0.52})],
-            DriveSensor("torque"),
-            2000.0,
-        ),
+        ([Step(1.3, 5, {"duty_cycle": 0.45}), Step(1.5, 8, {"duty_cycle": 0.52})], DriveSensor("torque"), 2000.0),
     ],
 )
 def test_pieces_of__measured_edges_drive_the_model(steps, sensor, rate_hz):

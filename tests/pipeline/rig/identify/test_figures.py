@@ -20,16 +20,15 @@ def ds():
         left = 0.002 * rate * (1 + held) + 1e-4 * rng.normal(size=400)
         parts.append(
             xr.Dataset(
-                {
-                    "x_measured": ("sample", x + left, {"units": "m"}),
-                    "x_residual": ("sample", left, {"units": "m"}),
-                },
+                {"x_measured": ("sample", x + left, {"units": "m"}), "x_residual": ("sample", left, {"units": "m"})},
                 coords={
-                    "time": ("sample", t), "recording": ("sample", np.zeros(400, np.int32)),
-                    "piece": ("sample", np.full(400, number)), "held_out": ("sample", np.full(400, held)),
+                    "time": ("sample", t),
+                    "recording": ("sample", np.zeros(400, np.int32)),
+                    "piece": ("sample", np.full(400, number)),
+                    "held_out": ("sample", np.full(400, held)),
                 },
             )
-        )  # fmt: skip
+        )
     return xr.concat(parts, "sample").assign_attrs(model="duffing", title="made up", channels="x")
 
 
@@ -45,14 +44,16 @@ RESULT = {
     },
     "covariance": {"critical": 2.0},
     "correlations": {"a": {"a": 1.0, "zero.x": None}, "zero.x": {"a": None, "zero.x": None}},
-}  # fmt: skip
+}
 
 
 def test_pieces_in__and_their_root_mean_squares(ds):
     found = residuals.pieces_in(ds)
     assert [(s.number, s.held_out, s.samples) for s in found] == [
-        (0, False, (0, 400)), (2, False, (400, 800)), (1, True, (800, 1200)),
-    ]  # fmt: skip
+        (0, False, (0, 400)),
+        (2, False, (400, 800)),
+        (1, True, (800, 1200)),
+    ]
     rms = residuals.per_piece(ds, "x")
     assert rms["piece"].values.tolist() == [0, 1, 2]
     assert rms["held_out"].values.tolist() == [0, 1, 0]
@@ -73,9 +74,7 @@ def test_residual_views__mean_goes_with_the_rate(ds):
 def test_draw_all__writes_figures_and_their_data(ds, tmp_path):
     files = figures.draw_all(tmp_path, ds, RESULT)
     assert sorted(files) == sorted(
-        f"{name}.{suffix}"
-        for name in ("fit", "residuals", "profiles", "correlations")
-        for suffix in ("png", "nc")
+        f"{name}.{suffix}" for name in ("fit", "residuals", "profiles", "correlations") for suffix in ("png", "nc")
     )
     with xr.open_dataset(tmp_path / "fit.nc", engine="scipy") as drawn:
         assert drawn.sizes["sample"] == 1200

@@ -88,19 +88,14 @@ def test_evaluate__has_the_cost_and_the_normal_equations_of_all_samples(slopes):
     problem = make_problem(slopes=slopes)
     theta = truth_of(problem) * 1.02
     found = evaluate(problem, theta[None], problem.starts[None], slopes=True)[0]
-    rows, jacobian = (
-        brute_rows(problem, theta, problem.starts),
-        brute_jacobian(problem, theta, problem.starts),
-    )
+    rows, jacobian = (brute_rows(problem, theta, problem.starts), brute_jacobian(problem, theta, problem.starts))
     assert len(found.rows) < len(rows) / 10
     assert found.cost == pytest.approx(0.5 * rows @ rows, rel=1e-5)
     size = np.linalg.norm(jacobian, axis=0)
     normal = (jacobian.T @ jacobian) / np.outer(size, size)
     np.testing.assert_allclose(found.jacobian.T @ found.jacobian / np.outer(size, size), normal, atol=2e-4)
     gradient = jacobian.T @ rows / size / np.linalg.norm(rows)
-    np.testing.assert_allclose(
-        found.jacobian.T @ found.rows / size / np.linalg.norm(rows), gradient, atol=2e-4
-    )
+    np.testing.assert_allclose(found.jacobian.T @ found.rows / size / np.linalg.norm(rows), gradient, atol=2e-4)
 
 
 def test_evaluate__of_a_population_is_that_of_each_alone():
@@ -118,9 +113,7 @@ def test_evaluate__counts_a_robust_loss_as_scipy_does(loss):
     problem = make_problem(loss=loss, loss_scale=3.0)
     theta = truth_of(problem) * 1.001
     z = brute_rows(problem, theta, problem.starts)
-    asked = least_squares(
-        lambda x: z + 0 * x, [0.0], jac=lambda x: np.zeros((len(z), 1)), loss=loss, f_scale=3.0
-    )
+    asked = least_squares(lambda x: z + 0 * x, [0.0], jac=lambda x: np.zeros((len(z), 1)), loss=loss, f_scale=3.0)
     for slopes in (False, True):
         found = evaluate(problem, theta[None], problem.starts[None], slopes=slopes)[0]
         assert found.cost == pytest.approx(asked.cost, rel=1e-5)
@@ -129,8 +122,7 @@ def test_evaluate__counts_a_robust_loss_as_scipy_does(loss):
 def test_evaluate__ignores_what_was_not_measured():
     problem = make_problem()
     holes = [
-        replace(p, measured=np.where(np.arange(161)[:, None] % 3 == 0, np.nan, p.measured))
-        for p in problem.pieces
+        replace(p, measured=np.where(np.arange(161)[:, None] % 3 == 0, np.nan, p.measured)) for p in problem.pieces
     ]
     theta = truth_of(problem) * 1.01
     found = evaluate(replace(problem, pieces=tuple(holes)), theta[None], problem.starts[None], slopes=True)[0]
@@ -154,9 +146,11 @@ def test_fit_local__is_the_optimum_of_brute_force():
     whole = np.append(fit.theta, fit.starts.ravel())
     n = len(fit.theta)
     other = least_squares(
-        lambda w: brute_rows(problem, w[:n], w[n:].reshape(-1, 2)), whole * 1.001,
-        jac=lambda w: brute_jacobian(problem, w[:n], w[n:].reshape(-1, 2)), x_scale="jac",
-    )  # fmt: skip
+        lambda w: brute_rows(problem, w[:n], w[n:].reshape(-1, 2)),
+        whole * 1.001,
+        jac=lambda w: brute_jacobian(problem, w[:n], w[n:].reshape(-1, 2)),
+        x_scale="jac",
+    )
     deviation = np.sqrt(np.diag(np.linalg.inv(other.jac.T @ other.jac)))
     assert np.max(np.abs(whole - other.x) / deviation) < 1e-2
     assert fit.rms[0] == pytest.approx(NOISE, rel=0.1)
@@ -182,17 +176,13 @@ def test_fit_starts__finds_each_start_by_itself():
     assert settled.all()
     np.testing.assert_allclose(found, STARTS, atol=1e-5)
     alone = replace(problem, pieces=problem.pieces[1:2])
-    np.testing.assert_allclose(
-        fit_starts(alone, truth_of(problem), guess[1:2]).starts[0], found[1], atol=1e-9
-    )
+    np.testing.assert_allclose(fit_starts(alone, truth_of(problem), guess[1:2]).starts[0], found[1], atol=1e-9)
 
 
 def test_fit_local__withstands_outliers_with_a_robust_loss():
     problem = make_problem(NOISE)
     rng = np.random.default_rng(3)
-    spoilt = tuple(
-        replace(p, measured=p.measured + 0.3 * (rng.random((161, 1)) < 0.05)) for p in problem.pieces
-    )
+    spoilt = tuple(replace(p, measured=p.measured + 0.3 * (rng.random((161, 1)) < 0.05)) for p in problem.pieces)
     errors = {}
     for loss in ("linear", "soft_l1"):
         fit = fit_local(replace(problem, pieces=spoilt, loss=loss), problem.start)
@@ -239,14 +229,7 @@ def long_problem(weight):
         pieces.append(Piece(0, 0, time[a:b] - time[a], x[a:b], np.array(start), drive, k - 1))
     unknowns = tuple(Free(n, 1.05 * TRUTH[n], 0.0, 10.0) for n in TRUTH)
     return Problem(
-        MODEL,
-        MODEL.load(**TRUTH),
-        unknowns,
-        ("x",),
-        tuple(pieces),
-        np.array([NOISE]),
-        continuity=weight,
-        rtol=1e-9,
+        MODEL, MODEL.load(**TRUTH), unknowns, ("x",), tuple(pieces), np.array([NOISE]), continuity=weight, rtol=1e-9
     )
 
 
@@ -257,12 +240,7 @@ def test_fit_local__closes_the_gaps_as_their_weight_grows():
         fit = fit_local(problem, problem.start)
         assert fit.converged
         ends = [
-            motion(
-                dict(zip(TRUTH, fit.theta, strict=True)),
-                fit.starts[k],
-                np.append(p.time, p.time[-1] + 0.05),
-                t,
-            )[-1]
+            motion(dict(zip(TRUTH, fit.theta, strict=True)), fit.starts[k], np.append(p.time, p.time[-1] + 0.05), t)[-1]
             for k, (p, t) in enumerate(zip(problem.pieces, (0.0, 5.0, 10.5), strict=True))
         ]
         gaps.append(max(np.abs(ends[k] - fit.starts[k + 1]).max() for k in range(2)))

@@ -64,9 +64,14 @@ def write_ringdowns(path, seed, n_pieces=4, n=150):
     for _ in range(n_pieces):
         t = 0.1 * np.arange(n)
         found = solve_ivp(
-            oscillator, (0.0, t[-1]), [rng.uniform(1.0, 2.0), rng.uniform(-1.0, 1.0)],
-            method="DOP853", t_eval=t, rtol=1e-10, atol=1e-10,
-        )  # fmt: skip
+            oscillator,
+            (0.0, t[-1]),
+            [rng.uniform(1.0, 2.0), rng.uniform(-1.0, 1.0)],
+            method="DOP853",
+            t_eval=t,
+            rtol=1e-10,
+            atol=1e-10,
+        )
         x = found.y[0] + ZERO + NOISE * rng.normal(size=n)
         rows += [f"{begin + a:.3f},{b:.8f}" for a, b in zip(t, x, strict=True)]
         begin += t[-1] + 1.1
@@ -113,10 +118,7 @@ def test_identify__profiles_agree_with_standard_errors(bench):
     _, result, _ = bench
     for name, e in result["estimates"].items():
         np.testing.assert_allclose(
-            e["profile_interval"],
-            e["interval"],
-            atol=0.1 * (e["interval"][1] - e["interval"][0]),
-            err_msg=name,
+            e["profile_interval"], e["interval"], atol=0.1 * (e["interval"][1] - e["interval"][0]), err_msg=name
         )
 
 
@@ -177,9 +179,7 @@ def test_identify__killed_goes_on_to_the_same_bytes(bench, tmp_path, start):
     identification.identify(folder / "spec.toml", out, echo=lambda _: None)
     whole, found = files_of(folder / "out"), files_of(out)
     begun = {d.IDENTIFICATION}  # says when and where
-    assert {k: v for k, v in found.items() if k not in begun} == {
-        k: v for k, v in whole.items() if k not in begun
-    }
+    assert {k: v for k, v in found.items() if k not in begun} == {k: v for k, v in whole.items() if k not in begun}
 
 
 def test_identify__another_specification_is_refused(bench):
@@ -311,9 +311,7 @@ def test_refuse_invisible__names_what_the_data_cannot_see(bench):
     still = tuple(replace(p, start=np.zeros(2)) for p in problem.pieces)
     with pytest.raises(SpecError) as caught:
         identification.refuse_invisible(replace(problem, pieces=still))
-    assert [p.split(":")[0] for p in caught.value.problems] == [
-        "identify.damping", "identify.linear", "identify.cubic",
-    ]  # fmt: skip
+    assert [p.split(":")[0] for p in caught.value.problems] == ["identify.damping", "identify.linear", "identify.cubic"]
 
 
 @pytest.fixture(scope="module")
@@ -455,9 +453,7 @@ def test_identify__stretches_with_a_price_on_their_gaps(bench, tmp_path):
     width = {}
     for name, price in (("free", '"free"'), ("joined", "1000.0")):
         (folder / f"{name}.toml").write_text(f"{text}[fit]\ncontinuity = {price}\n")
-        result = identification.identify(
-            folder / f"{name}.toml", tmp_path / name, figures=False, echo=lambda _: None
-        )
+        result = identification.identify(folder / f"{name}.toml", tmp_path / name, figures=False, echo=lambda _: None)
         assert len(result["pieces"]) == 16
         low, high = result["estimates"]["linear"]["interval"]
         assert low - 0.5 * (high - low) < TRUTH["linear"] < high + 0.5 * (high - low)

@@ -26,10 +26,7 @@ def local(cost):
         a = fixed["a"]
         found = minimize_scalar(lambda b: cost(np.array([a, b])), bracket=(theta0[1], theta0[1] + 0.1))
         return SimpleNamespace(
-            theta=np.array([a, found.x]),
-            starts=starts,
-            cost=found.fun,
-            converged=bool(np.isfinite(found.fun)),
+            theta=np.array([a, found.x]), starts=starts, cost=found.fun, converged=bool(np.isfinite(found.fun))
         )
 
     return fit_local

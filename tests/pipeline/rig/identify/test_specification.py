@@ -76,10 +76,12 @@ def test_parse_identification__plain_data_are_json(parse):
 @pytest.mark.parametrize(
     ("text", "tie"),
     [
-        ("linear", (1.0, "linear")), ("-linear", (-1.0, "linear")), ("2e-1 * linear", (0.2, "linear")),
+        ("linear", (1.0, "linear")),
+        ("-linear", (-1.0, "linear")),
+        ("2e-1 * linear", (0.2, "linear")),
         ("+3*linear", (3.0, "linear")),
     ],
-)  # fmt: skip
+)
 def test_tied__is_a_number_times_a_name(parse, text, tie):
     assert parse(GOOD.replace("-0.5*linear", text)).tied["cubic"] == tie
 
@@ -107,7 +109,7 @@ def test_tied__is_a_number_times_a_name(parse, text, tie):
         ("amplitude = 0.0", "amplitude = 0.0\ndamping = 0.1", ("parameters.damping", "also in identify")),
         ('kind = "identification"', 'kind = "identfication"', ("kind", "Did you mean 'identification'")),
     ],
-)  # fmt: skip
+)
 def test_parse_identification__names_the_problem(parse, old, new, words):
     found = problems_of(parse, (old, new))
     assert len(found) == 1

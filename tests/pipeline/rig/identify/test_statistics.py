@@ -86,12 +86,7 @@ def test_covariance_of__what_is_not_determined_is_infinite():
     slope = rng.normal(size=(100, 2))
     slopes = np.stack([slope[:, 0], slope[:, 0], slope[:, 1]], axis=1)[:, None, :]
     fit = st.Linearised(
-        np.einsum("tcp,tcq->pq", slopes, slopes),
-        np.zeros(3),
-        (rng.normal(size=(100, 1)),),
-        (slopes,),
-        (0,),
-        0,
+        np.einsum("tcp,tcq->pq", slopes, slopes), np.zeros(3), (rng.normal(size=(100, 1)),), (slopes,), (0,), 0
     )
     covariance = st.covariance_of(fit, np.ones(3))
     assert np.isinf(covariance.errors[:2]).all()
@@ -138,8 +133,10 @@ def test_pooled_autocorrelation__leaves_out_what_was_not_measured(rng):
     holes = r.copy()
     holes[rng.choice(400, 100, replace=False)] = np.nan
     np.testing.assert_allclose(
-        st.pooled_autocorrelation([holes], 10), np.cos(np.arange(11.0)), atol=0.03  # 300 of 400 samples
-    )  # fmt: skip
+        st.pooled_autocorrelation([holes], 10),
+        np.cos(np.arange(11.0)),
+        atol=0.03,  # 300 of 400 samples
+    )
 
 
 def coverage(ringdown, seeds: int, *estimators, **rig) -> tuple[np.ndarray, list[set[str]]]:

@@ -33,9 +33,20 @@ tie = { mass_kg = 0.05, lever_m = 0.12 }
 """
 
 TRUE = {
-    "alpha1": 1.2, "alpha2": -1.3, "beta1": 0.03, "beta2": -0.02, "gamma1": 0.5, "gamma2": 0.55, "p1": 0.58,
-    "p2": 0.56, "r1": -0.06, "r2": 0.058, "c1": 0.055, "c2": 0.06, "eps_mag": 80.0,
-}  # fmt: skip
+    "alpha1": 1.2,
+    "alpha2": -1.3,
+    "beta1": 0.03,
+    "beta2": -0.02,
+    "gamma1": 0.5,
+    "gamma2": 0.55,
+    "p1": 0.58,
+    "p2": 0.56,
+    "r1": -0.06,
+    "r2": 0.058,
+    "c1": 0.055,
+    "c2": 0.06,
+    "eps_mag": 80.0,
+}
 
 
 def grid(n_locked=9, n=21):
@@ -66,9 +77,8 @@ def write_rig(folder):
     header = folder / "rig.toml"
     header.write_text(HEADER)
     return SimpleNamespace(
-        path=header, table=folder / "readings.csv", angle=angle, locked=locked, side=side, magnets=magnets,
-        parameters=p,
-    )  # fmt: skip
+        path=header, table=folder / "readings.csv", angle=angle, locked=locked, side=side, magnets=magnets, parameters=p
+    )
 
 
 @pytest.fixture

@@ -98,9 +98,11 @@ def test_loads__bent_are_those_of_magpylib(make_discs):
         z = -p["l1"] * np.cos(psi1[i]) - p["l2"] * np.cos(psi2[i])
         # turning a link by psi in the plane of x and z is a turn by -psi about y
         moving = magpylib.magnet.Cylinder(
-            dimension=size, polarization=(0, 0, -DISC["remanence_T"]), position=(x, 0, z),
+            dimension=size,
+            polarization=(0, 0, -DISC["remanence_T"]),
+            position=(x, 0, z),
             orientation=Rotation.from_euler("y", -psi2[i]),
-        )  # fmt: skip
+        )
         f, t = magpylib.getFT(fixed, moving, pivot=(0, 0, 0), meshing=4000)
         # 4000 cells: some 0.2 %
         np.testing.assert_allclose(force[i], f[[0, 2]], rtol=5e-3, atol=5e-3)

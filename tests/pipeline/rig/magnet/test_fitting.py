@@ -9,14 +9,7 @@ import pytest
 from scipy.optimize import curve_fit
 
 from magpend_core.models.pendulum import magnet_torque as laws
-from pipeline.rig.magnet.fitting import (
-    fit_curve,
-    fit_curves,
-    fit_dipoles,
-    fit_jointly,
-    fit_laws,
-    fit_measurement,
-)
+from pipeline.rig.magnet.fitting import fit_curve, fit_curves, fit_dipoles, fit_jointly, fit_laws, fit_measurement
 from pipeline.rig.magnet.measurement import Curve, read_measurement
 from pipeline.rig.magnet.solving import errors_by_cluster, solve
 
@@ -168,9 +161,7 @@ def test_errors_by_cluster__are_the_jackknife_of_a_line():
     design, y = np.stack([np.ones(24), x], axis=-1), 1.0 + 2.0 * x + rng.normal(0, 0.3, 24)
     clusters = np.split(np.arange(24), 6)
     all_of_it = solve(lambda v: y - design @ v, lambda v: -design, (0.0, 0.0), "line")
-    without = np.array(
-        [np.linalg.lstsq(np.delete(design, c, 0), np.delete(y, c), rcond=None)[0] for c in clusters]
-    )
+    without = np.array([np.linalg.lstsq(np.delete(design, c, 0), np.delete(y, c), rcond=None)[0] for c in clusters])
     expected = np.sqrt(((without - all_of_it.x) ** 2).sum(axis=0) * 5 / 6)
     np.testing.assert_allclose(errors_by_cluster(all_of_it, clusters), expected, rtol=1e-9)
     one_decides = [np.arange(23), np.array([23])]

@@ -39,9 +39,10 @@ def test_read_measurement__correction_is_that_of_statics_written_by_forces(rig):
     joint = p["l1"] * np.sin(found.angle)
     second = joint + p["e2"] * np.sin(found.angle + found.locked)
     forces = [
-        (p["m1"] * p["g"], p["e1"] * np.sin(found.angle)), (p["m2"] * p["g"], second),
+        (p["m1"] * p["g"], p["e1"] * np.sin(found.angle)),
+        (p["m2"] * p["g"], second),
         (0.05 * p["g"], 0.12 * np.sin(found.angle)),
-    ]  # fmt: skip
+    ]
     expected = found.reading + sum(force * x for force, x in forces)
     np.testing.assert_allclose(found.torque, expected, rtol=0, atol=1e-14)
 
@@ -60,10 +61,7 @@ def test_read_measurement__takes_off_readings_without_the_magnets(rig):
     raw = read_measurement(rig.path).reading
     lines = rig.table.read_text().splitlines()
     blank = raw - rig.magnets
-    more = [
-        lines[0] + ",blank",
-        *(f"{line},{b!r}" for line, b in zip(lines[1:], blank.tolist(), strict=True)),
-    ]
+    more = [lines[0] + ",blank", *(f"{line},{b!r}" for line, b in zip(lines[1:], blank.tolist(), strict=True))]
     rig.table.write_text("\n".join(more))
     tie = "tie = { mass_kg = 0.05, lever_m = 0.12 }"
     change(rig.path, ("weights = true", 'weights = false\nwithout = "blank"'), (tie, ""))
@@ -118,9 +116,10 @@ def test_read_measurement__angles_in_radians_and_words_for_sides(rig):
     rows = [[repr(float(np.radians(float(a)))), b, w, t] for a, b, w, t in lines[1:]]
     rig.table.write_text("# a remark\n\n" + "\n".join(map(",".join, [lines[0], *rows])))
     change(
-        rig.path, ('psi1 = { column = "angle", unit = "deg" }', 'psi1 = { column = "angle", unit = "rad" }'),
+        rig.path,
+        ('psi1 = { column = "angle", unit = "deg" }', 'psi1 = { column = "angle", unit = "rad" }'),
         ('side = { column = "where" }', 'side = { column = "where", right = "R", left = "L" }'),
-    )  # fmt: skip
+    )
     np.testing.assert_allclose(read_measurement(rig.path).torque, rig.magnets, rtol=0, atol=1e-13)
 
 
@@ -147,21 +146,13 @@ def test_read_measurement__says_all_that_is_wrong_with_the_readings_at_once(rig)
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        (
-            '"angle"',
-            '"angel"',
-            "columns.psi1 = 'angel': readings.csv has no such column; it has: angle",
-        ),
+        ('"angle"', '"angel"', "columns.psi1 = 'angel': readings.csv has no such column; it has: angle"),
         ("readings.csv", "absent.csv", "file = 'absent.csv': cannot be read"),
         ('unit = "N m"', 'unit = "Nm"', "columns.torque.unit = 'Nm': must be 'N m' or"),
         ('unit = "N m"', 'unit = "N"', "arm_m goes with"),
         ("l2 = 0.18\n", "l2 = -0.18\n", "l2 = -0.18 is out of bounds"),
         ('l2 = "ruler"', "", "parameters.l2: has no provenance"),
-        (
-            "l2 = 0.18\n",
-            "l2 = 0.18\nalpha1 = 1.0\n",
-            "parameters.alpha1: is fitted; drop it, or name it in hold",
-        ),
+        ("l2 = 0.18\n", "l2 = 0.18\nalpha1 = 1.0\n", "parameters.alpha1: is fitted; drop it, or name it in hold"),
         ("[columns]", 'hold = ["eps"]\n[columns]', "hold = 'eps': must be"),
         ("[columns]", 'model = "duffing"\n[columns]', "model = 'duffing': has no alpha1"),
         ("[columns]", 'model = "pendulim"\n[columns]', "did you mean pendulum"),

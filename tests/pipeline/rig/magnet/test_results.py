@@ -41,9 +41,7 @@ def test_write_results__every_value_has_its_origin(rig, tmp_path):
     found = load_model("pendulum").preset(tmp_path / "preset.toml")
     assert found.title == "SYNTHETIC: a known torque"
     for name in TRUE:
-        assert found.provenance[name].startswith(
-            "joint fit of 18 torque curves (SYNTHETIC readings, readings.csv"
-        )
+        assert found.provenance[name].startswith("joint fit of 18 torque curves (SYNTHETIC readings, readings.csv")
     assert found.provenance["h"] == "ruler"
     assert found.provenance["delta"] == "calibrated"
     dipoles = load_model("pendulum-dipole").preset(tmp_path / "preset-dipoles.toml")
@@ -54,9 +52,11 @@ def test_write_results__every_value_has_its_origin(rig, tmp_path):
 def test_write_results__the_preset_may_rest_on_a_preset_from_a_file(rig, tmp_path):
     write_results(fit_measurement(read_measurement(rig.path)), tmp_path)
     text = rig.path.read_text().replace('"wojna2018"', '"preset.toml"')
-    rig.path.write_text(text.replace("[parameters]", "[parameters]\ndelta = 0.002").replace(
-        "[provenance]", '[provenance]\ndelta = "guess"'
-    ))  # fmt: skip
+    rig.path.write_text(
+        text.replace("[parameters]", "[parameters]\ndelta = 0.002").replace(
+            "[provenance]", '[provenance]\ndelta = "guess"'
+        )
+    )
     second = tmp_path / "second"
     second.mkdir()
     write_results(fit_measurement(read_measurement(rig.path)), second)
@@ -117,9 +117,7 @@ def test_fit_magnet__writes_all_and_says_where(main, rig, tmp_path):
 
 
 def test_fit_magnet__json_is_the_report(main, rig, tmp_path):
-    code, result, _ = main(
-        "fit-magnet", str(rig.path), "--out", str(tmp_path / "x"), "--json", "--no-figures"
-    )
+    code, result, _ = main("fit-magnet", str(rig.path), "--out", str(tmp_path / "x"), "--json", "--no-figures")
     assert code == 0
     assert json.loads(result)["joint"] == json.loads((tmp_path / "x" / "fit.json").read_text())["joint"]
     assert not list((tmp_path / "x").glob("fig*"))
@@ -155,9 +153,7 @@ def test_fit_magnet__refuses_a_bad_measurement_and_writes_nothing(main, rig, tmp
 
 
 def test_fit_magnet__a_fit_that_does_not_converge_is_no_result(main, rig, tmp_path):
-    rig.table.write_text(
-        rig.table.read_text().replace("right", "R").replace("left", "right").replace("R", "left")
-    )
+    rig.table.write_text(rig.table.read_text().replace("right", "R").replace("left", "right").replace("R", "left"))
     code, _, notes = main("fit-magnet", str(rig.path), "--out", str(tmp_path / "fit"))
     assert code == 4
     assert "no peak of the expected sign" in notes

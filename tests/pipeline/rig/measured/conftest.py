@@ -61,10 +61,7 @@ def stepped(parameters, steps, start, *, noise=1e-3, bits=12, seed=1, drive_nois
     step = 2 * np.pi / 2**bits
     names = model.state_names
     sensed = {
-        names[i]: (
-            "sample",
-            np.round((x[:, i] + rng.normal(0, noise, time.size)) / step) * step if noise else x[:, i],
-        )
+        names[i]: ("sample", np.round((x[:, i] + rng.normal(0, noise, time.size)) / step) * step if noise else x[:, i])
         for i in angles
     }
     sensed["drive"] = ("sample", signal + rng.normal(0, drive_noise, time.size))

@@ -27,8 +27,9 @@ def files(tmp_path_factory, pendulum):
     raw, mapping = readings(pendulum, steps, RIGHT, times, sensors=sensors, seed=4)
     write_raw(raw, folder / "up.tdms")
     (folder / "rig.toml").write_text(mapping.toml(), "utf-8")
-    (folder / "no_drive.toml").write_text(mapping.toml().split("[drive]")[0].replace(
-        "[channels.psi1]", 'drive = "none"\n[channels.psi1]', 1), "utf-8")  # fmt: skip
+    (folder / "no_drive.toml").write_text(
+        mapping.toml().split("[drive]")[0].replace("[channels.psi1]", 'drive = "none"\n[channels.psi1]', 1), "utf-8"
+    )
     return folder
 
 
@@ -36,9 +37,7 @@ def test_measured_steps__prints_a_table_and_json(main, files):
     code, out, err = main("measured", "steps", files / "up.tdms", "--mapping", files / "rig.toml", *FEW)
     assert code == 0, err
     assert out.splitlines()[0] == "4 steps"
-    code, out, _ = main(
-        "measured", "steps", files / "up.tdms", "--mapping", files / "rig.toml", *FEW, "--json"
-    )
+    code, out, _ = main("measured", "steps", files / "up.tdms", "--mapping", files / "rig.toml", *FEW, "--json")
     rows = json.loads(out)
     assert code == 0
     assert [r["orbit_period"] for r in rows] == [2, 2, 1, 1]
@@ -54,8 +53,9 @@ def test_measured_compare__writes_figures_tables_and_numbers(main, files, run_di
     assert "1 window edge" in out
     names = {p.name for p in (tmp_path / "out").iterdir()}
     assert names == {f"{n}.{s}" for n in ("comparison", "beside", "over") for s in ("png", "nc")} | {
-        "steps.csv", "edges.csv",
-    }  # fmt: skip
+        "steps.csv",
+        "edges.csv",
+    }
     with (tmp_path / "out" / "steps.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [r["computed_side"] for r in rows] == ["right"] * 4
@@ -78,9 +78,18 @@ def test_measured_diagram__alone_and_with_a_run(main, files, run_directory, tmp_
 
 def test_measured_series__prints_how_far_off_it_is(main, files, tmp_path):
     code, out, err = main(
-        "measured", "series", files / "up.tdms", "--mapping", files / "rig.toml", "--out", tmp_path / "s.png",
-        "--start-s", 100, "--periods", 4,
-    )  # fmt: skip
+        "measured",
+        "series",
+        files / "up.tdms",
+        "--mapping",
+        files / "rig.toml",
+        "--out",
+        tmp_path / "s.png",
+        "--start-s",
+        100,
+        "--periods",
+        4,
+    )
     assert code == 0, err
     assert out.startswith("rms of psi1: 0.0")
     assert (tmp_path / "s.png").exists()
@@ -100,18 +109,20 @@ def test_measured_series__prints_how_far_off_it_is(main, files, tmp_path):
 )
 def test_measured_steps__bad_input_exits_with_2(main, files, change, says):
     code, _, err = main(
-        "measured", "steps", files / change.get("recording", "up.tdms"),
-        "--mapping", files / change.get("mapping", "rig.toml"), *change.get("more", ()),
-    )  # fmt: skip
+        "measured",
+        "steps",
+        files / change.get("recording", "up.tdms"),
+        "--mapping",
+        files / change.get("mapping", "rig.toml"),
+        *change.get("more", ()),
+    )
     assert code == 2
     assert says in err
     assert "Traceback" not in err
 
 
 def test_measured__two_mappings_for_three_recordings_are_refused(main, files):
-    code, _, err = main(
-        "measured", "steps", *[files / "up.tdms"] * 3, *["--mapping", files / "rig.toml"] * 2
-    )  # fmt: skip
+    code, _, err = main("measured", "steps", *[files / "up.tdms"] * 3, *["--mapping", files / "rig.toml"] * 2)
     assert code == 2
     assert "2 for 3 recordings" in err
 
@@ -134,13 +145,20 @@ def test_measured_compare__a_run_that_does_not_fit_is_refused_before_anything_is
     assert code == 2
     assert "a run of the model pendulum, while the recordings' mapping says pendulum-sine" in err
     code, _, err = main(
-        "measured", "compare", run_directory, files / "gone.tdms", "--mapping", files / "rig.toml", *more,
-        "--at", "q=1.5",
-    )  # fmt: skip
+        "measured",
+        "compare",
+        run_directory,
+        files / "gone.tdms",
+        "--mapping",
+        files / "rig.toml",
+        *more,
+        "--at",
+        "q=1.5",
+    )
     assert code == 2
     assert "unknown axis 'q'" in err
     code, _, err = main(
         "measured", "steps", *[files / "up.tdms"] * 2, "--mapping", sine, "--mapping", files / "rig.toml"
-    )  # fmt: skip
+    )
     assert code == 2
     assert "of the models pendulum, pendulum-sine" in err

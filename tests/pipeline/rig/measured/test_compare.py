@@ -36,9 +36,17 @@ def truth(pendulum, start, frequencies):
     """Periods along a sweep without noise, from other code: the engine's closure test on stepped walks."""
     packed = np.broadcast_to(pendulum.pack(), (1, len(frequencies), len(pendulum.names)))
     found = run_branches(
-        packed, np.array(frequencies)[None], np.array([start]), n_transient=600, n_keep=16, rtol=1e-8,
-        atol=1e-8, stop_when_closed=True, closure_tolerance=1e-5, system=pendulum.model.system,
-    )  # fmt: skip
+        packed,
+        np.array(frequencies)[None],
+        np.array([start]),
+        n_transient=600,
+        n_keep=16,
+        rtol=1e-8,
+        atol=1e-8,
+        stop_when_closed=True,
+        closure_tolerance=1e-5,
+        system=pendulum.model.system,
+    )
     return found.orbit_period[0]
 
 
@@ -55,9 +63,7 @@ def test_measure__a_sweep_is_recovered(measured, swept, pendulum):
     for i, (_, true) in enumerate(zip(f, [*swept[0][1], *swept[1][1]], strict=True)):
         n = int(measured["n_sections"][i])
         # the last edge of a recording has no samples after it
-        true = min(
-            (true[-n:], true[-n - 1 : -1]), key=lambda t: abs(t - measured["section"].values[i, :n]).sum()
-        )
+        true = min((true[-n:], true[-n - 1 : -1]), key=lambda t: abs(t - measured["section"].values[i, :n]).sum())
         off = measured["section"].values[i, :n] - true
         noise = measured["section_noise"].values[i, :n].copy()
         # at 2.5 Hz all edges fall on the same place in a sample: half a millisecond may be hidden
@@ -97,9 +103,7 @@ def test_compare__the_true_model_is_a_noise_floor_away(compared):
 def test_compare__window_edges_lie_within_the_step(compared, swept, pendulum):
     """Period 2 ends, going up, where it ends without noise: within a step of the rig's own sweep."""
     assert compared.sizes["edge"] == 2
-    for edge, (start, way, sign) in enumerate(
-        ((swept[0][1][0][0], "up", 1), (swept[1][1][0][0], "down", -1))
-    ):
+    for edge, (start, way, sign) in enumerate(((swept[0][1][0][0], "up", 1), (swept[1][1][0][0], "down", -1))):
         fine = np.arange(2.46, 2.5401, 0.005)[::sign]
         periods = truth(pendulum, start, fine)
         first = 2 if sign > 0 else 1
@@ -112,9 +116,7 @@ def test_compare__window_edges_lie_within_the_step(compared, swept, pendulum):
         assert abs(shift) <= error + 1e-5
 
 
-def test_compare__a_model_that_is_off_is_far_and_its_windows_shift(
-    measured, compared, run_directory, tmp_path
-):
+def test_compare__a_model_that_is_off_is_far_and_its_windows_shift(measured, compared, run_directory, tmp_path):
     """With 10 % more inertia of a link the doublings lie 30 mHz lower, and distances far above the noise."""
     from pipeline.runs.run import run
 
@@ -157,9 +159,15 @@ def test_candidates__orbits_are_interpolated_between_frequencies(run_directory, 
     start = np.array([right.points[0]])
     packed = np.broadcast_to(pendulum.pack(), (1, 1, len(pendulum.names)))
     exact = run_branches(
-        packed, np.array([[2.545]]), start, n_transient=2000, n_keep=1, rtol=1e-9, atol=1e-9,
+        packed,
+        np.array([[2.545]]),
+        start,
+        n_transient=2000,
+        n_keep=1,
+        rtol=1e-9,
+        atol=1e-9,
         system=pendulum.model.system,
-    ).section[0, 0]  # fmt: skip
+    ).section[0, 0]
     nearest = computed.candidates(2.54, pendulum.model.state_names)
     off = np.abs(right.points - exact).max()
     assert off < 2e-4
@@ -178,10 +186,7 @@ def test_compare__steps_off_the_runs_axis_have_no_winner(measured, run_directory
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        (
-            {"frequency": 0.5},
-            r"measured from 2\.96 to 3\.04 Hz, computed from 2\.44 to 2\.56 Hz.*do not overlap",
-        ),
+        ({"frequency": 0.5}, r"measured from 2\.96 to 3\.04 Hz, computed from 2\.44 to 2\.56 Hz.*do not overlap"),
         ({"model": "duffing"}, "a run of the model pendulum, while the recordings' mapping says duffing"),
     ],
 )

@@ -33,9 +33,7 @@ def test_find_period__cycles_among_noise(period, seed):
     assert found.closure == pytest.approx(1.0, abs=0.35)
 
 
-@pytest.mark.parametrize(
-    ("r", "period"), [(2.9, 1), (3.2, 2), (3.5, 4), (3.83, 3), (3.74, 5), (3.9, 0), (3.6, 0)]
-)
+@pytest.mark.parametrize(("r", "period"), [(2.9, 1), (3.2, 2), (3.5, 4), (3.83, 3), (3.74, 5), (3.9, 0), (3.6, 0)])
 def test_find_period__the_logistic_map_as_on_paper(r, period):
     found = find_period(*noisy(logistic(r, 64), 1e-3))
     assert found.orbit_period == period

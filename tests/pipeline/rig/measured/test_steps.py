@@ -106,10 +106,7 @@ def test_cut__stretches_too_short_for_the_transient_say_so():
 
 @pytest.mark.parametrize(
     ("options", "says"),
-    [
-        ({"transient": -1}, "transient = -1: must be at least 0"),
-        ({"window": 3}, "window = 3: must be 0 or at least 8"),
-    ],
+    [({"transient": -1}, "transient = -1: must be at least 0"), ({"window": 3}, "window = 3: must be 0 or at least 8")],
 )
 def test_cut__numbers_out_of_bounds_are_refused(options, says):
     with pytest.raises(SpecError, match=says):

@@ -47,9 +47,7 @@ def test_measure__a_drive_that_truly_jitters_hides_no_period(pendulum, record_st
     for f in (2.46, 2.48, 2.54, 2.56):
         edges = np.arange(151) / f + rng.normal(0, 5e-4, 151)
         steps += [(1 / d, 1) for d in np.diff(edges)]
-    found = measure(
-        [record_steps(pendulum, steps, RIGHT)[0]], Way(transient=80, window=0), parameters=pendulum
-    )
+    found = measure([record_steps(pendulum, steps, RIGHT)[0]], Way(transient=80, window=0), parameters=pendulum)
     np.testing.assert_allclose(found["frequency"].values, [2.46, 2.48, 2.54, 2.56], atol=3e-4)
     # the edges' own scatter and that of sampling
     np.testing.assert_allclose(found["jitter_s"].values, np.hypot(5e-4, 1e-3 / np.sqrt(12)), rtol=0.2)
@@ -59,8 +57,7 @@ def test_measure__a_drive_that_truly_jitters_hides_no_period(pendulum, record_st
 
 
 @pytest.mark.parametrize(
-    ("model", "phase"),
-    [("pendulum", 0.0), ("pendulum-sine", 0.0), ("duffing", 0.25), ("double-pendulum", 0.0)],
+    ("model", "phase"), [("pendulum", 0.0), ("pendulum-sine", 0.0), ("duffing", 0.25), ("double-pendulum", 0.0)]
 )
 def test_section_phase__is_what_the_model_says(model, phase):
     """The rising edge, the rising zero, the maximum; and a drive that does nothing."""
@@ -81,9 +78,15 @@ def test_measure__sections_of_another_model_are_where_it_takes_them():
     f = np.array([0.16, 0.18, 0.2])
     packed = np.broadcast_to(parameters.pack(), (1, 3, len(parameters.names)))
     exact = run_branches(
-        packed, f[None], np.array([[0.1, 0.0]]), n_transient=65, n_keep=1, rtol=1e-9, atol=1e-9,
+        packed,
+        f[None],
+        np.array([[0.1, 0.0]]),
+        n_transient=65,
+        n_keep=1,
+        rtol=1e-9,
+        atol=1e-9,
         system=parameters.model.system,
-    ).section[0, :, 0]  # fmt: skip
+    ).section[0, :, 0]
     mean = np.nanmean(found["section"].values, axis=1)
     # a mean of 20 sections, and what is left of the transient
     np.testing.assert_allclose(mean, exact, atol=6e-3)

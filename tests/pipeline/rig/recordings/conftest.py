@@ -35,10 +35,9 @@ def raw_of(*stretches, apart=False):
 
 def mapping_of(**more):
     """A mapping of the channels a and b, with further keys of the first."""
-    return parse_mapping({
-        "model": "pendulum",
-        "channels": {"psi1": {"channel": "a", **more}, "psi2": {"channel": "b"}},
-    })  # fmt: skip
+    return parse_mapping(
+        {"model": "pendulum", "channels": {"psi1": {"channel": "a", **more}, "psi2": {"channel": "b"}}}
+    )
 
 
 def recorded(a=None, b=None, **more):
@@ -53,6 +52,13 @@ def recorded(a=None, b=None, **more):
 def make():
     """What tests make recordings of."""
     return SimpleNamespace(
-        swing=swing, channels=channels_of, raw=raw_of, mapping=mapping_of, recorded=recorded,
-        time=np.arange(N) / RATE_HZ, rate_hz=RATE_HZ, step_s=1.0 / RATE_HZ, n=N,
-    )  # fmt: skip
+        swing=swing,
+        channels=channels_of,
+        raw=raw_of,
+        mapping=mapping_of,
+        recorded=recorded,
+        time=np.arange(N) / RATE_HZ,
+        rate_hz=RATE_HZ,
+        step_s=1.0 / RATE_HZ,
+        n=N,
+    )

@@ -164,19 +164,18 @@ def test_relative_to__is_added(make):
     from pipeline.rig.recordings.reading import recording_of
 
     a, b = make.swing()
-    mapping = parse_mapping({
-        "model": "pendulum",
-        "channels": {"psi1": {"channel": "a"}, "psi2": {"channel": "b", "relative_to": "psi1", "sign": -1}},
-    })  # fmt: skip
+    mapping = parse_mapping(
+        {
+            "model": "pendulum",
+            "channels": {"psi1": {"channel": "a"}, "psi2": {"channel": "b", "relative_to": "psi1", "sign": -1}},
+        }
+    )
     ds = recording_of(make.raw(make.channels({"a": a, "b": b})), mapping)
     np.testing.assert_allclose(ds["psi2"], a - b)
 
 
 def test_findings__pass_through_json():
-    found = [
-        Finding("gap", "", 1.0, 2.0, "warning", "x"),
-        Finding("unit", "a", math.nan, math.nan, "note", "y"),
-    ]
+    found = [Finding("gap", "", 1.0, 2.0, "warning", "x"), Finding("unit", "a", math.nan, math.nan, "note", "y")]
     import xarray as xr
 
     back = findings_of(xr.Dataset(attrs={"findings": to_json(found)}))

@@ -19,10 +19,13 @@ def stamped(make, stamps, **more):
     """Recording with a channel of time stamps."""
     n = len(stamps)
     a, b = make.swing(n)
-    mapping = parse_mapping({
-        "model": "pendulum", "time": {"channel": "t", **more},
-        "channels": {"psi1": {"channel": "a"}, "psi2": {"channel": "b"}},
-    })  # fmt: skip
+    mapping = parse_mapping(
+        {
+            "model": "pendulum",
+            "time": {"channel": "t", **more},
+            "channels": {"psi1": {"channel": "a"}, "psi2": {"channel": "b"}},
+        }
+    )
     return recording_of(make.raw(make.channels({"t": stamps, "a": a, "b": b}, step_s=np.nan)), mapping)
 
 
@@ -36,9 +39,7 @@ def test_clock__even_stamps_give_a_round_rate(make):
 
 def test_clock__a_rate_that_is_not_round_stays_as_it_is(make):
     step = 1.0 / 997.3137
-    assert stamped(make, step * np.arange(4000)).attrs["sampling_rate_hz"] == pytest.approx(
-        997.3137, rel=1e-9
-    )
+    assert stamped(make, step * np.arange(4000)).attrs["sampling_rate_hz"] == pytest.approx(997.3137, rel=1e-9)
 
 
 def test_clock__unit_of_the_stamps(make):
@@ -111,9 +112,7 @@ def test_clock__time_that_goes_backwards_is_refused(make):
 def test_clock__mixed_rates_are_refused(make):
     a, b = make.swing()
     channels = {"a": Channel("a", a, step_s=0.001), "b": Channel("b", b[::2], step_s=0.002)}
-    with pytest.raises(
-        SpecError, match=r"different sampling rates \(psi1 1000 Hz, psi2 500 Hz\); map channels"
-    ):
+    with pytest.raises(SpecError, match=r"different sampling rates \(psi1 1000 Hz, psi2 500 Hz\); map channels"):
         recording_of(make.raw(channels), make.mapping())
 
 
@@ -204,10 +203,13 @@ def test_clock__piece_channel_begins_new_pieces(make):
     a, b = make.swing()
     number = (np.arange(make.n) >= 1200).astype(float)
     raw = make.raw(make.channels({"a": a, "b": b, "k": number}))
-    mapping = parse_mapping({
-        "model": "pendulum", "piece": {"channel": "k"},
-        "channels": {"psi1": {"channel": "a"}, "psi2": {"channel": "b"}},
-    })  # fmt: skip
+    mapping = parse_mapping(
+        {
+            "model": "pendulum",
+            "piece": {"channel": "k"},
+            "channels": {"psi1": {"channel": "a"}, "psi2": {"channel": "b"}},
+        }
+    )
     ds = recording_of(raw, mapping)
     np.testing.assert_array_equal(ds["piece"], number)
 
@@ -217,10 +219,9 @@ def test_clock__piece_channel_begins_new_pieces(make):
 def test_timed__stamps_or_numbers_of_another_length_are_a_finding(make, axis, key, n):
     a, b = make.swing()
     values = np.arange(n) * make.step_s if axis == "t" else (np.arange(n) > 700).astype(float)
-    mapping = parse_mapping({
-        "model": "pendulum", key: {"channel": axis},
-        "channels": {"psi1": {"channel": "a"}, "psi2": {"channel": "b"}},
-    })  # fmt: skip
+    mapping = parse_mapping(
+        {"model": "pendulum", key: {"channel": axis}, "channels": {"psi1": {"channel": "a"}, "psi2": {"channel": "b"}}}
+    )
     ds = recording_of(make.raw(make.channels({axis: values, "a": a, "b": b})), mapping)
     assert ds.sizes["sample"] == min(n, make.n)
     told = {(f.kind, f.channel) for f in findings_of(ds)}
@@ -230,10 +231,9 @@ def test_timed__stamps_or_numbers_of_another_length_are_a_finding(make, axis, ke
 
 def test_resolved__missing_channels_are_named_with_the_nearest(make):
     raw = make.raw(make.channels({"rig/angle 1": make.swing()[0], "rig/motor": make.swing()[1]}))
-    mapping = parse_mapping({
-        "model": "pendulum",
-        "channels": {"psi1": {"channel": "rig/angle1"}, "psi2": {"channel": 7}},
-    })  # fmt: skip
+    mapping = parse_mapping(
+        {"model": "pendulum", "channels": {"psi1": {"channel": "rig/angle1"}, "psi2": {"channel": 7}}}
+    )
     with pytest.raises(SpecError) as caught:
         recording_of(raw, mapping)
     assert len(caught.value.problems) == 2
@@ -251,8 +251,9 @@ def test_resolved__a_unit_in_the_name_may_be_missing_where_the_mapping_gives_it(
     ds = recording_of(read_raw(path), parse_mapping(tables))
     np.testing.assert_allclose(ds["psi1"], [a * math.pi / 180 for _, a in rows], rtol=1e-12)
     assert [(f.kind, f.channel, f.severity) for f in findings_of(ds)] == [
-        ("name", "psi1", "warning"), ("name", "time", "warning"),
-    ]  # fmt: skip
+        ("name", "psi1", "warning"),
+        ("name", "time", "warning"),
+    ]
     assert "'Winkel oben [deg]', the mapping's 'Winkel oben'" in findings_of(ds)[0].text
     whole = {**tables, "time": {"channel": "Zeit [s]"}, "channels": {"psi1": {**channel, "channel": 2}}}
     assert findings_of(recording_of(read_raw(path), parse_mapping(whole))) == []

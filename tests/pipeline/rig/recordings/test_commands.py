@@ -44,8 +44,10 @@ def test_recordings_show__lists_the_channels_of_a_file(main, swing):
     assert code == 0
     assert "3 channels, simulated" in out
     assert [line.split()[:3] for line in out.splitlines()[2:]] == [
-        ["rig/psi1", "1000", "500"], ["rig/psi2", "1000", "500"], ["rig/drive", "1000", "500"],
-    ]  # fmt: skip
+        ["rig/psi1", "1000", "500"],
+        ["rig/psi2", "1000", "500"],
+        ["rig/drive", "1000", "500"],
+    ]
     code, out, _ = main("recordings", "show", swing.name, "--json")
     assert [row["channel"] for row in json.loads(out)] == ["rig/psi1", "rig/psi2", "rig/drive"]
 
@@ -75,9 +77,7 @@ def test_recordings_convert__is_read_with_its_mapping(main, swing):
         code, out, _ = main("recordings", "show", name, "--mapping", f"{name[0]}.toml")
         assert "501 samples at 500 Hz" in out
         assert "simulated" in out
-    code, out, _ = main(
-        "recordings", "convert", swing.name, "--mapping", "swing.toml", "--out", "x.nc", "--smooth"
-    )
+    code, out, _ = main("recordings", "convert", swing.name, "--mapping", "swing.toml", "--out", "x.nc", "--smooth")
     assert out == "recording: x.nc\n"
 
 

@@ -27,10 +27,14 @@ def broken(make):
     a, b = make.swing()
     a[100:120] = np.nan
     stamps = make.time + 0.5 * (make.time > 2.0)
-    mapping = parse_mapping({
-        "model": "pendulum", "time": {"channel": "t"}, "drive": {"channel": "m", "kind": "torque"},
-        "channels": {"psi1": {"channel": "a"}, "psi2": {"channel": "b"}},
-    })  # fmt: skip
+    mapping = parse_mapping(
+        {
+            "model": "pendulum",
+            "time": {"channel": "t"},
+            "drive": {"channel": "m", "kind": "torque"},
+            "channels": {"psi1": {"channel": "a"}, "psi2": {"channel": "b"}},
+        }
+    )
     columns = {"t": stamps, "a": a, "b": b, "m": np.cos(3.0 * make.time)}
     return recording_of(make.raw(make.channels(columns, step_s=np.nan)), mapping)
 

@@ -15,10 +15,7 @@ from pipeline.spec.problems import SpecError
 
 nptdms = pytest.importorskip("nptdms")
 
-RIG = {
-    "channels": {"psi1": {"channel": "rig/angle 1"}, "psi2": {"channel": "rig/angle 2"}},
-    "model": "pendulum",
-}
+RIG = {"channels": {"psi1": {"channel": "rig/angle 1"}, "psi2": {"channel": "rig/angle 2"}}, "model": "pendulum"}
 
 
 def write_tdms(path, columns, *, segments=1, **properties):
@@ -37,11 +34,7 @@ def write_tdms(path, columns, *, segments=1, **properties):
 def test_read_tdms__waveforms(tmp_path, make):
     a, b = make.swing()
     path = tmp_path / "swing.tdms"
-    wave = {
-        "wf_increment": 0.002,
-        "unit_string": "rad",
-        "wf_start_time": np.datetime64("2026-03-01T12:00:00.25"),
-    }
+    wave = {"wf_increment": 0.002, "unit_string": "rad", "wf_start_time": np.datetime64("2026-03-01T12:00:00.25")}
     write_tdms(path, {"angle 1": a, "angle 2": b}, segments=7, **{"angle 1": wave, "angle 2": wave})
     ds = read_recording(path, parse_mapping(RIG))
     assert findings_of(ds) == []
@@ -123,13 +116,15 @@ def test_read_tdms__other_unit_is_a_finding(tmp_path, make):
     path = tmp_path / "deg.tdms"
     waves = [{"wf_increment": 0.002, "unit_string": u} for u in ("Volts", "deg")]
     write_tdms(path, {"angle 1": a, "angle 2": b}, **{"angle 1": waves[0], "angle 2": waves[1]})
-    mapping = parse_mapping({
-        "model": "pendulum",
-        "channels": {
-            "psi1": {"channel": "rig/angle 1", "unit": "V", "scale": 2.0},
-            "psi2": {"channel": "rig/angle 2"},
-        },
-    })  # fmt: skip
+    mapping = parse_mapping(
+        {
+            "model": "pendulum",
+            "channels": {
+                "psi1": {"channel": "rig/angle 1", "unit": "V", "scale": 2.0},
+                "psi2": {"channel": "rig/angle 2"},
+            },
+        }
+    )
     (found,) = findings_of(read_recording(path, mapping))
     assert (found.kind, found.channel) == ("unit", "psi2")
     assert "the file says 'deg', the mapping 'rad'" in found.text
@@ -152,9 +147,7 @@ def test_read_matlab__vectors_rows_structures_and_cells(tmp_path, make):
     a, b = make.swing()
     cells = np.empty(2, object)
     cells[:] = [np.stack([a[:900], b[:900]]), np.stack([a[900:], b[900:]])]
-    savemat(
-        tmp_path / "x.mat", {"y": np.stack([a, b]), "column": a[:, None], "rig": {"angle": b}, "dt": 0.002}
-    )
+    savemat(tmp_path / "x.mat", {"y": np.stack([a, b]), "column": a[:, None], "rig": {"angle": b}, "dt": 0.002})
     savemat(tmp_path / "cells.mat", {"y": cells, "dt": 0.002, "name": "text is no channel"})
     whole = read_raw(tmp_path / "x.mat")
     assert whole.names == ("y[0]", "y[1]", "column", "rig.angle")
@@ -233,11 +226,16 @@ def lvm_segment(a, b, *, columns, time, x0=0.0, step=0.002, samples=None, commen
     n = len(a) if samples is None else samples
     gap = "\t\t" if columns == "Multi" else "\t"
     lines = [
-        "Channels\t2\t", f"Samples\t{n}{gap}{n}\t", f"Date\t2026/03/01{gap}2026/03/01\t",
-        f"Time\t{time}{gap}{time}\t", f"Y_Unit_Label\tVolts{gap}Volts\t", f"X_Dimension\tTime{gap}Time\t",
-        f"X0\t{x0:.16E}{gap}{x0:.16E}\t", f"Delta_X\t{step:.6f}{gap}{step:.6f}\t",
+        "Channels\t2\t",
+        f"Samples\t{n}{gap}{n}\t",
+        f"Date\t2026/03/01{gap}2026/03/01\t",
+        f"Time\t{time}{gap}{time}\t",
+        f"Y_Unit_Label\tVolts{gap}Volts\t",
+        f"X_Dimension\tTime{gap}Time\t",
+        f"X0\t{x0:.16E}{gap}{x0:.16E}\t",
+        f"Delta_X\t{step:.6f}{gap}{step:.6f}\t",
         "***End_of_Header***\t\t\t",
-    ]  # fmt: skip
+    ]
     x = [f"{x0 + step * i:.6f}" for i in range(len(a))]
     head = (
         "X_Value\tVoltage_0\tX_Value\tVoltage_1\tComment"
@@ -322,9 +320,7 @@ def test_read_lvm__fewer_samples_than_stated_is_a_finding(tmp_path, make):
     a, b = (v[:90] for v in make.swing())
     segment = lvm_segment(a, b, columns="One", time="12:00:00", samples=100)
     ds = read_recording(written_lvm(tmp_path / "x.lvm", [segment]), parse_mapping(LVM_MAPPING))
-    assert [(f.kind, f.channel) for f in findings_of(ds)] == [
-        ("truncated", "Voltage_0"), ("truncated", "Voltage_1")
-    ]  # fmt: skip
+    assert [(f.kind, f.channel) for f in findings_of(ds)] == [("truncated", "Voltage_0"), ("truncated", "Voltage_1")]
     assert "90 of the 100 samples" in findings_of(ds)[0].text
 
 
@@ -362,10 +358,7 @@ def test_read_csv__form_is_found_out(tmp_path, make, delimiter, decimal, header)
     if delimiter == decimal:
         return
     a, b = (v[:200] for v in make.swing())
-    rows = [
-        delimiter.join(f"{x:.9f}" for x in row).replace(".", decimal)
-        for row in zip(a, b, make.time, strict=False)
-    ]
+    rows = [delimiter.join(f"{x:.9f}" for x in row).replace(".", decimal) for row in zip(a, b, make.time, strict=False)]
     head = [delimiter.join(["left", "right", "t"])] if header else []
     path = tmp_path / "x.csv"
     path.write_text("\n".join(head + rows) + "\n")
@@ -385,18 +378,16 @@ def test_read_csv__names_with_units_in_brackets_or_below(tmp_path):
     np.testing.assert_array_equal(b.stretches[0]["Channel A"].values, [1.5, 2.5])
 
 
-@pytest.mark.parametrize(
-    "stamp", ["2026-03-01 12:00:{:06.3f}", "2026/03/01T12:00:{:06.3f}", "12:00:{:06.3f}"]
-)
+@pytest.mark.parametrize("stamp", ["2026-03-01 12:00:{:06.3f}", "2026/03/01T12:00:{:06.3f}", "12:00:{:06.3f}"])
 def test_read_csv__dates_are_seconds_and_other_texts_are_left_out(tmp_path, make, stamp):
     a, _ = make.swing()
     rows = [f"{stamp.format(0.002 * i)};ok;{a[i]:.9f}".replace(".", ",") for i in range(500)]
     path = tmp_path / "x.csv"
     path.write_text("when;state;angle\n" + "\n".join(rows))
     assert read_raw(path).names == ("when", "angle")
-    mapping = parse_mapping({
-        "model": "pendulum", "time": {"channel": "when"}, "channels": {"psi1": {"channel": "angle"}},
-    })  # fmt: skip
+    mapping = parse_mapping(
+        {"model": "pendulum", "time": {"channel": "when"}, "channels": {"psi1": {"channel": "angle"}}}
+    )
     ds = read_recording(path, mapping)
     assert ds.attrs["sampling_rate_hz"] == 500.0
     assert findings_of(ds) == []
@@ -447,14 +438,16 @@ def test_read_csv__what_is_no_table_is_refused(tmp_path, text):
 def test_read_csv__time_column_in_a_recording(tmp_path, make):
     a, b = make.swing()
     rows = [
-        f"{t!r};{x!r};{y!r}".replace(".", ",")
-        for t, x, y in zip(*(v.tolist() for v in (make.time, a, b)), strict=True)
+        f"{t!r};{x!r};{y!r}".replace(".", ",") for t, x, y in zip(*(v.tolist() for v in (make.time, a, b)), strict=True)
     ]
     (tmp_path / "x.csv").write_text("t;a;b\n" + "\n".join(rows))
-    mapping = parse_mapping({
-        "model": "pendulum", "time": {"channel": "t"},
-        "channels": {"psi1": {"channel": "a", "unit": "deg"}, "psi2": {"channel": 3}},
-    })  # fmt: skip
+    mapping = parse_mapping(
+        {
+            "model": "pendulum",
+            "time": {"channel": "t"},
+            "channels": {"psi1": {"channel": "a", "unit": "deg"}, "psi2": {"channel": 3}},
+        }
+    )
     ds = read_recording(tmp_path / "x.csv", mapping)
     assert findings_of(ds) == []
     np.testing.assert_allclose(ds["psi1"], a * math.pi / 180, rtol=1e-14)

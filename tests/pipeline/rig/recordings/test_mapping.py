@@ -59,17 +59,19 @@ def test_mapping__its_text_is_read_back_as_itself():
 
 
 def test_parse_mapping__names_all_problems_at_once():
-    found = problems_of({
-        "model": "pendulum",
-        "fromat": "tdms",
-        "sampling_rate_hz": -1.0,
-        "channels": {
-            "psi_1": {"channel": "a"},
-            "psi2": {"channel": "b", "unit": "V"},
-            "psi2_dot": {"channel": "c", "wraps": True},
-        },
-        "drive": {"channel": "d"},
-    })  # fmt: skip
+    found = problems_of(
+        {
+            "model": "pendulum",
+            "fromat": "tdms",
+            "sampling_rate_hz": -1.0,
+            "channels": {
+                "psi_1": {"channel": "a"},
+                "psi2": {"channel": "b", "unit": "V"},
+                "psi2_dot": {"channel": "c", "wraps": True},
+            },
+            "drive": {"channel": "d"},
+        }
+    )
     text = "\n".join(found)
     assert "fromat: unknown key; did you mean format?" in text
     assert "sampling_rate_hz = -1.0: must be greater than 0" in text
@@ -118,11 +120,7 @@ def test_parse_mapping__refuses(entry, sentence):
             "the second number must be the greater one",
         ),
         (
-            {
-                "model": "pendulum",
-                "channels": {"psi1": {"channel": "a"}},
-                "time": {"channel": "t", "unit": "V"},
-            },
+            {"model": "pendulum", "channels": {"psi1": {"channel": "a"}}, "time": {"channel": "t", "unit": "V"}},
             "time.unit",
         ),
     ],

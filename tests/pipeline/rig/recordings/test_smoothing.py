@@ -58,8 +58,9 @@ def test_smooth__noise_counts_the_degrees_of_freedom(make):
     rng = np.random.default_rng(3)
     found = [
         smooth(make.recorded(rng.standard_normal(60), rng.standard_normal(60)), window_s=0.01)[name].attrs
-        for _ in range(100) for name in ("psi1", "psi2")
-    ]  # fmt: skip
+        for _ in range(100)
+        for name in ("psi1", "psi2")
+    ]
     mean_square = np.mean([attrs["noise"] ** 2 for attrs in found])
     assert mean_square == pytest.approx(1.0, abs=0.06)  # 200 times some 30 degrees of freedom: 2 per cent
 
@@ -76,9 +77,7 @@ def test_smooth__what_is_left_of_the_noise_is_what_it_says(make):
 def test_smooth__chosen_window_is_near_the_best(make):
     """The error of angles at the chosen window is at most a fifth above that at the best of all windows."""
     ds, angles, _ = noisy(make, 1e-3, n=6000)
-    error = {
-        w: (smooth(ds, window_s=w)["psi1"].values - angles[0]).std() for w in np.arange(0.011, 0.2, 0.004)
-    }
+    error = {w: (smooth(ds, window_s=w)["psi1"].values - angles[0]).std() for w in np.arange(0.011, 0.2, 0.004)}
     chosen = (smooth(ds)["psi1"].values - angles[0]).std()
     assert chosen < 1.2 * min(error.values())
 
@@ -106,10 +105,13 @@ def test_smooth__keeps_a_kink_at_an_edge(make):
 def driven(make, level):
     """Recording with a drive."""
     a, b = make.swing(len(level))
-    mapping = parse_mapping({
-        "model": "pendulum", "drive": {"channel": "m", "kind": "signal"},
-        "channels": {"psi1": {"channel": "a"}, "psi2": {"channel": "b"}},
-    })  # fmt: skip
+    mapping = parse_mapping(
+        {
+            "model": "pendulum",
+            "drive": {"channel": "m", "kind": "signal"},
+            "channels": {"psi1": {"channel": "a"}, "psi2": {"channel": "b"}},
+        }
+    )
     return recording_of(make.raw(make.channels({"a": a, "b": b, "m": level})), mapping)
 
 
@@ -191,10 +193,7 @@ def test_smooth__short_stretches_have_lower_order(make):
 
 def test_smooth__measured_rates_are_kept(make):
     a, b = make.swing()
-    mapping = parse_mapping({
-        "model": "pendulum",
-        "channels": {"psi1": {"channel": "a"}, "psi1_dot": {"channel": "b"}},
-    })  # fmt: skip
+    mapping = parse_mapping({"model": "pendulum", "channels": {"psi1": {"channel": "a"}, "psi1_dot": {"channel": "b"}}})
     ds = recording_of(make.raw(make.channels({"a": a, "b": b})), mapping)
     found = smooth(ds, window_s=0.02)
     assert set(found.data_vars) == {"psi1", "psi1_dot"}

@@ -27,13 +27,15 @@ def pieces(make):
     a[5:9] = np.nan
     stamps = make.time + 0.3 * (make.time > 2.0)
     drive = np.where(np.mod(make.time, 0.4) < 0.2, 1.5, -1.5)
-    mapping = parse_mapping({
-        "model": "pendulum", "time": {"channel": "t"}, "drive": {"channel": "m", "kind": "torque"},
-        "channels": {"psi1": {"channel": "a"}, "psi2": {"channel": "b"}},
-    })  # fmt: skip
-    return recording_of(
-        make.raw(make.channels({"t": stamps, "a": a, "b": b, "m": drive}, step_s=np.nan)), mapping
+    mapping = parse_mapping(
+        {
+            "model": "pendulum",
+            "time": {"channel": "t"},
+            "drive": {"channel": "m", "kind": "torque"},
+            "channels": {"psi1": {"channel": "a"}, "psi2": {"channel": "b"}},
+        }
     )
+    return recording_of(make.raw(make.channels({"t": stamps, "a": a, "b": b, "m": drive}, step_s=np.nan)), mapping)
 
 
 def same(found, wanted):
@@ -93,8 +95,11 @@ def test_write_recording__refuses_a_path_that_cannot_be_written(tmp_path, make):
 def test_write_raw__csv_has_a_column_of_time(tmp_path, make):
     a, b = make.swing()
     path = write_raw(make.raw(make.channels({"a": a, "b": b})), tmp_path / "x.csv")
-    mapping = parse_mapping({
-        "model": "pendulum", "time": {"channel": "time"},
-        "channels": {"psi1": {"channel": "a"}, "psi2": {"channel": "b"}},
-    })  # fmt: skip
+    mapping = parse_mapping(
+        {
+            "model": "pendulum",
+            "time": {"channel": "time"},
+            "channels": {"psi1": {"channel": "a"}, "psi2": {"channel": "b"}},
+        }
+    )
     np.testing.assert_array_equal(read_recording(path, mapping)["psi2"], b)
