@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from magpend_core.crossing import Crossing
     from magpend_core.lyapunov import LyapunovExponents, lyapunov_exponents
-    from magpend_core.meaning import kernel_version
     from magpend_core.models import ModelError, load_model, load_preset, model_names, preset_names, preset_provenance
     from magpend_core.models.model import Model
     from magpend_core.models.parameters import ParameterError, Parameters
@@ -22,6 +21,7 @@ if TYPE_CHECKING:
     from magpend_core.orbits import PeriodicOrbits, polish_orbits
     from magpend_core.pointwise import evaluate, jacobian, rates
     from magpend_core.sections import Sections, run_branches, sections
+    from magpend_core.source_digests import kernel_version
     from magpend_core.status import Status
     from magpend_core.trajectory import trajectory
 
@@ -58,7 +58,7 @@ __all__ = [
 _HOMES = {
     "crossing": ("Crossing",),
     "lyapunov": ("LyapunovExponents", "lyapunov_exponents"),
-    "meaning": ("kernel_version",),
+    "source_digests": ("kernel_version",),
     "models": ("ModelError", "load_model", "load_preset", "model_names", "preset_names", "preset_provenance"),
     "models.model": ("Model",),
     "models.parameters": ("ParameterError", "Parameters"),

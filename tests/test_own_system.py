@@ -12,7 +12,7 @@ import pytest
 
 from magpend_core.models.text.grammar import FUNCTIONS
 from magpend_core.models.text.reading import KEYS
-from pipeline.spec.parsing import parse_spec
+from pipeline.specification.parsing import parse_spec
 
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs" / "own-system.md").read_text("utf-8")

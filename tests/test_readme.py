@@ -15,7 +15,7 @@ from pipeline.cli import reference
 from pipeline.cli.main import app
 from pipeline.layout.vocabulary import FREQUENCY_DIM
 from pipeline.runs.workflows import shipped_workflows
-from pipeline.spec.parsing import parse_spec
+from pipeline.specification.parsing import parse_spec
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text("utf-8")

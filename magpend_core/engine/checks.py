@@ -15,7 +15,7 @@ import numpy as np
 
 from magpend_core.engine import event_checks
 from magpend_core.engine.jacobians import declaration_problems, places_of, whole_jacobian
-from magpend_core.engine.plain import plain
+from magpend_core.engine.plain_python import plain
 from magpend_core.engine.system import System
 
 N_SAMPLES = 16

@@ -6,7 +6,7 @@ import dataclasses
 from functools import cache
 
 from magpend_core.crossing import LEVEL
-from magpend_core.engine.absent import no_forcing
+from magpend_core.engine.placeholders import no_forcing
 from magpend_core.engine.system import System
 
 

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from magpend_core.engine.absent import no_edges, no_forcing
 from magpend_core.engine.jit import inline
-from magpend_core.engine.plain import plain
+from magpend_core.engine.placeholders import no_edges, no_forcing
+from magpend_core.engine.plain_python import plain
 from magpend_core.engine.system import System
 
 LEVEL, SLOPE = "recorded_drive", "recorded_drive_slope"

@@ -14,7 +14,7 @@ Environment variables, read once at import:
     ``0`` compiles in every process and writes nothing.
 ``MAGPEND_CACHE_DIR``
     The folder that holds the caches; unset or empty, ``magpend`` in the user's cache folder. What is in it is
-    executed: it must be the user's own, see `kept`.
+    executed: it must be the user's own, see `code_cache`.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ import numpy as np
 from numba import njit
 from numba.core import event
 
+from magpend_core.engine.code_cache import PartFolder, keep
 from magpend_core.engine.digests import PACKAGE, code_digest, functions_digest
-from magpend_core.engine.kept import PartFolder, keep
 from magpend_core.engine.linking import placeholder, placeholder_of_array
-from magpend_core.engine.parts import EntryCompiler, PartDispatcher
+from magpend_core.engine.precompiled import EntryCompiler, PartDispatcher
 
-# No fast math: which products are fused is said by `fused`, and wider flags would turn isnan(nan) into
+# No fast math: which products are fused is said by `fusing`, and wider flags would turn isnan(nan) into
 # False. The default error model would add a branch to every division.
 F = TypeVar("F", bound=Callable[..., Any])
 

@@ -18,7 +18,7 @@ import numpy as np
 from llvmlite import ir
 from numba.core import cgutils
 
-from magpend_core.engine.fused import FusedLibrary, fuse_products
+from magpend_core.engine.fusing import FusedLibrary, fuse_products
 
 _PLACEHOLDER = 0x6D61_6770_0000_0000
 """Placeholders are integers from here on; no template contains numbers of this size."""

@@ -173,7 +173,7 @@ def absolute(x: Any) -> Any:
 def multiply_add(a: Any, b: Any, c: Any) -> Any:
     """``a * b + c``, rounded once.
 
-    Within a function sums of products are fused by themselves (see `fused`); of two products that is the
+    Within a function sums of products are fused by themselves (see `fusing`); of two products that is the
     one on the left, and this can say another.
     """
     return a * b + c

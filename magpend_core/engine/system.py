@@ -235,7 +235,7 @@ class System:
     recorded_for: System | None = field(default=None, compare=False, repr=False)
 
     def __post_init__(self) -> None:
-        from magpend_core.engine.absent import no_edges, no_forcing, no_layers  # brings the compiler
+        from magpend_core.engine.placeholders import no_edges, no_forcing, no_layers  # brings the compiler
 
         n = self.n_states
         absent = {

@@ -27,7 +27,7 @@ def order_of(row: dict[int, int]) -> list[int]:
     """Return the columns of a row of the Jacobian in the order in which their products are summed.
 
     The first product is rounded by itself, the others are fused with the sum. Where neither of the first two
-    columns is 0, the second comes first, as in a written-out sum (see `fused`). So leaving out the zeros of a
+    columns is 0, the second comes first, as in a written-out sum (see `fusing`). So leaving out the zeros of a
     row changes no bit of the sum.
     """
     columns = sorted(row)

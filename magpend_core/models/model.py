@@ -278,7 +278,7 @@ class Model:
     @cached_property
     def digest(self) -> str:
         """Return the digest of the model's own sources, without comments and docstrings."""
-        from magpend_core.meaning import meaning_digest
+        from magpend_core.source_digests import meaning_digest
 
         return meaning_digest(self.sources)
 

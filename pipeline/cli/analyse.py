@@ -26,7 +26,7 @@ def _make(name: str) -> Any:
         from pipeline.cli import console
         from pipeline.products.product import function_of
         from pipeline.runs.derive import derive
-        from pipeline.spec.problems import SpecError
+        from pipeline.specification.problems import SpecError
 
         check_csv(csv)
         ds = derive(directory, name, options, echo=console.note)

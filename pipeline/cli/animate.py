@@ -79,7 +79,7 @@ def animate(
     from pipeline.plots.files import save_data
     from pipeline.plots.films import film_problems, save_animation
     from pipeline.runs.filming import animation
-    from pipeline.spec.problems import SpecError
+    from pipeline.specification.problems import SpecError
     from pipeline.store.files import FIGURES
     from pipeline.store.local import make_folder, refuse_links, unwritable
     from pipeline.store.run import Run
@@ -127,7 +127,7 @@ def _start(
 ) -> Start | None:
     """Return the given start; None if a run is given and no start."""
     from pipeline.runs.filming import Start
-    from pipeline.spec.problems import SpecError
+    from pipeline.specification.problems import SpecError
 
     states = {name: values[0] for name, values in read_named(words, 1).items()}
     given = {"--model": model, "--frequency": frequency_hz, "--preset": preset, "--set": settings}

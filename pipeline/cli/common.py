@@ -35,7 +35,7 @@ Json = Annotated[bool, typer.Option("--json", help="Write the table as JSON to t
 
 def read_pairs(option: str, texts: list[str], example: str) -> dict[str, float]:
     """Read ``NAME=VALUE`` pairs with numbers; raise `SpecError` with all that are wrong."""
-    from pipeline.spec.problems import SpecError
+    from pipeline.specification.problems import SpecError
 
     found, problems = {}, []
     for text in texts:
@@ -52,7 +52,7 @@ def read_pairs(option: str, texts: list[str], example: str) -> dict[str, float]:
 def check_csv(path: str | None) -> None:
     """Refuse a table that cannot be written, before anything is computed."""
     from pipeline.cli.outputs import check_file
-    from pipeline.spec.problems import SpecError
+    from pipeline.specification.problems import SpecError
 
     if path not in (None, "-") and (Path(str(path)).is_dir() or not Path(str(path)).parent.is_dir()):
         raise SpecError([f"--csv {path}: must be a file in a folder that exists."])

@@ -95,7 +95,7 @@ def configure(quiet: bool, verbose: bool, log: Path | None) -> None:
         try:
             file = logging.FileHandler(log, encoding="utf-8")
         except OSError as error:
-            from pipeline.spec.problems import SpecError
+            from pipeline.specification.problems import SpecError
 
             raise SpecError([f"--log {log}: cannot be written to ({error.strerror})."]) from None
         file.setFormatter(_Visible("%(asctime)s %(levelname)s %(message)s"))

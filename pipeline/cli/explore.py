@@ -24,8 +24,8 @@ def explore(
     the port: ssh -L PORT:127.0.0.1:PORT
     """
     from pipeline.cli import console
-    from pipeline.explorer.browser import browser
-    from pipeline.explorer.server import serve
+    from pipeline.explorer.serving.browser import browser
+    from pipeline.explorer.serving.server import serve
 
     def serving(address: str) -> None:
         console.at_rest()

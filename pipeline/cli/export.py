@@ -39,9 +39,9 @@ def export(
     do not fit into one file are left out, and the page names them.
     """
     from pipeline.cli import console
-    from pipeline.explorer.export import export_page
-    from pipeline.explorer.folder import export_folder
-    from pipeline.spec.problems import SpecError
+    from pipeline.explorer.copies.export import export_page
+    from pipeline.explorer.copies.folder import export_folder
+    from pipeline.specification.problems import SpecError
     from pipeline.store.run import Run
 
     if page is not None and folder is not None:

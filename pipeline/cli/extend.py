@@ -83,7 +83,7 @@ def extend(
 def _axes(texts: list[str]) -> dict[str, dict[str, Any]]:
     """Read ``NAME=LOW:HIGH:NUM``."""
     from pipeline.layout.vocabulary import parameter_name
-    from pipeline.spec.problems import SpecError
+    from pipeline.specification.problems import SpecError
 
     found, problems = {}, []
     for text in texts:
@@ -102,7 +102,7 @@ def _products(texts: list[str]) -> dict[str, dict[str, Any]]:
     """Read ``NAME`` and ``NAME={key = value, ...}``."""
     import tomllib
 
-    from pipeline.spec.problems import SpecError
+    from pipeline.specification.problems import SpecError
 
     found, problems = {}, []
     for text in texts:

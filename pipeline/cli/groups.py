@@ -50,7 +50,7 @@ class RegistryGroup(TyperGroup):
             if later:
                 rest = [a for a in args if a != later[0]]
                 raise UsageError(f"the directory comes last: magpend {self.verb} {later[0]} {' '.join(rest)}")
-            from pipeline.spec.problems import unknown_name
+            from pipeline.specification.problems import unknown_name
 
             raise UsageError(unknown_name(f"magpend {self.verb}", args[0], self.list_commands(ctx)))
         return super().resolve_command(ctx, args)
@@ -65,7 +65,7 @@ class TopGroup(TyperGroup):
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """Find a command; if there is none, name the nearest or the moved one."""
         if args and args[0] not in self.list_commands(ctx) and not args[0].startswith("-"):
-            from pipeline.spec.problems import unknown_name
+            from pipeline.specification.problems import unknown_name
 
             if args[0] in _MOVED:
                 raise UsageError(f"no command {args[0]!r}; it is: {_MOVED[args[0]]}")

@@ -60,7 +60,7 @@ def fit_magnet(
 def _folder(path: Path) -> Path:
     """Refuse a folder that cannot be written to, before anything is computed."""
     from pipeline.cli.outputs import check_place
-    from pipeline.spec.problems import SpecError
+    from pipeline.specification.problems import SpecError
 
     if path.exists() and not path.is_dir():
         raise SpecError([f"--out {path}: is a file; give a folder."])

@@ -101,7 +101,7 @@ def _codes() -> list[tuple[tuple[type[BaseException], ...], Exit]]:
     from pipeline.compute.addresses import SchedulerError
     from pipeline.compute.execute import TaskFailedError
     from pipeline.runs.submit import SubmitError
-    from pipeline.spec.problems import SpecError
+    from pipeline.specification.problems import SpecError
     from pipeline.store.errors import DamagedError, IncompleteError, LockedError, StoreError, UnreadableError
 
     return [

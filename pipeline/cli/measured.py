@@ -58,7 +58,7 @@ Set = Annotated[list[str] | None, typer.Option("--set", metavar="NAME=VALUE", he
 def _load(paths: list[Path], mappings: list[Path]) -> list[Mapping]:
     """Return a mapping for each recording; all must have the same model."""
     from pipeline.rig.recordings import load_mapping
-    from pipeline.spec.problems import SpecError
+    from pipeline.specification.problems import SpecError
 
     if len(mappings) not in (1, len(paths)):
         raise SpecError([f"--mapping: {len(mappings)} for {len(paths)} recordings; give one for all, or one for each."])
@@ -83,7 +83,7 @@ def _read(paths: list[Path], mappings: list[Mapping]) -> list[xr.Dataset]:
 
 def _way(transient: int, window: int | None, window_s: float, hysteresis: float | None, max_period: int) -> Way:
     from pipeline.rig.measured.measuring import Way
-    from pipeline.spec.problems import SpecError
+    from pipeline.specification.problems import SpecError
 
     if max_period < 1:
         raise SpecError([f"--max-period {max_period}: must be at least 1."])

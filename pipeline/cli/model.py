@@ -14,7 +14,7 @@ from pipeline.cli.options import completing, speaking
 
 if TYPE_CHECKING:
     from magpend_core.models.model import Model
-    from magpend_core.models.showing import Description
+    from magpend_core.models.summary import Description
 
 model_app = typer.Typer(
     help="Your own system as text: begin one, and check how magpend reads it.",
@@ -85,7 +85,7 @@ for _command in (show, new):
 
 
 def _lines(model: Model, found: Description) -> list[str]:
-    from magpend_core.models.showing import checks_of
+    from magpend_core.models.summary import checks_of
     from pipeline.cli.models import all_of
 
     lines = all_of(model)
@@ -105,7 +105,7 @@ def _lines(model: Model, found: Description) -> list[str]:
 
 def _latex(model: Model, found: Description) -> None:
     from pipeline.cli import console
-    from pipeline.spec.problems import SpecError
+    from pipeline.specification.problems import SpecError
 
     if not found.latex:
         raise SpecError([f"--latex: {model.name} is no text, and has no equations to be written; drop it."])

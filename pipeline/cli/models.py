@@ -40,7 +40,7 @@ def models(
     from magpend_core.models import load_model, model_names
     from pipeline.cli.common import tell
     from pipeline.products.product import Table
-    from pipeline.spec.models import find_model
+    from pipeline.specification.models import find_model
 
     chosen = [find_model(name, at="model")] if name else [load_model(n) for n in model_names()]
     rows = [described(model) for model in chosen]
@@ -117,7 +117,7 @@ def presets(
     """List the presets of a model: values, units, and the origin of each value."""
     from magpend_core.models.presets import find_preset
     from pipeline.cli import console
-    from pipeline.spec.models import find_model
+    from pipeline.specification.models import find_model
 
     found = find_preset(name) if name else None
     chosen = find_model(model if model != DEFAULT else getattr(found, "model", "") or model, at="--model")

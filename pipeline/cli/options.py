@@ -64,7 +64,7 @@ def taking(model: type[Options], command: Command) -> Command:
     """
 
     def run(*args: Any, **given: Any) -> None:
-        from pipeline.spec.problems import SpecError, validated
+        from pipeline.specification.problems import SpecError, validated
 
         wanted, problems = {}, []
         for name in model.model_fields:

@@ -88,7 +88,7 @@ def check_log(path: Path) -> None:
 
 
 def _refuse(path: Path, option: str) -> None:
-    from pipeline.spec.problems import SpecError
+    from pipeline.specification.problems import SpecError
 
     if not _forced:
         raise SpecError(

@@ -84,7 +84,7 @@ def _in_run(files: Files, name: str, options: FigureOptions) -> Path:
 def check_figure_path(path: Path, within: str = "") -> None:
     """Refuse a figure file that cannot be written, before anything is computed; see `check_place`."""
     from pipeline.cli.outputs import check_file
-    from pipeline.spec.problems import SpecError
+    from pipeline.specification.problems import SpecError
 
     suffixes = [f".{name}" for name in FORMATS]
     if path.suffix.lower() not in suffixes:

@@ -51,7 +51,7 @@ def show(
     """
     from pipeline.rig.recordings.formats import read_raw
     from pipeline.rig.recordings.overview import describe_file
-    from pipeline.spec.problems import SpecError
+    from pipeline.specification.problems import SpecError
 
     if out is not None:
         check_figure_path(out)
@@ -102,7 +102,7 @@ def simulate(
     from pipeline.cli import console
     from pipeline.rig.recordings.writing import SUFFIXES, check_target, write_raw
     from pipeline.rig.simulation import load_rig, simulated
-    from pipeline.spec.problems import SpecError
+    from pipeline.specification.problems import SpecError
 
     check_target(out, SUFFIXES[:2])
     _check_recording(out)
@@ -154,7 +154,7 @@ def drive(
 
 def _keep(file: Path, out: Path) -> None:
     """Refuse to overwrite the recording that is read."""
-    from pipeline.spec.problems import SpecError
+    from pipeline.specification.problems import SpecError
 
     if out.exists() and file.exists() and out.samefile(file):
         raise SpecError([f"--out {out}: is the file that is read; give another name."])
@@ -169,7 +169,7 @@ def _check_recording(out: Path) -> None:
 
 def _beside(out: Path, text: str) -> Path:
     """Return the place of a recording's mapping; refuse to replace another file."""
-    from pipeline.spec.problems import SpecError
+    from pipeline.specification.problems import SpecError
 
     path = out.with_suffix(".toml")
     if path.exists() and path.read_bytes() != text.encode():

@@ -144,7 +144,7 @@ def workflows() -> str:
 
 def specification() -> str:
     """Return the keys of a specification, table by table."""
-    from pipeline.spec import recorded, section, starts, tables
+    from pipeline.specification import recorded_drive, section, starts, tables
 
     parts = [
         ("[parameters]", tables.ParametersTable, ""),
@@ -160,7 +160,7 @@ def specification() -> str:
         ("[continuation]", tables.Continuation, 'For `kind = "continuation"` alone.'),
         (
             "[drive]",
-            recorded.DriveTable,
+            recorded_drive.DriveTable,
             'For `kind = "sweep"` alone: see [Recorded drives](../rig.md#recorded-drives).',
         ),
         ("[integration]", tables.Integration, ""),

@@ -41,7 +41,7 @@ def report(
 def check_page(path: Path) -> None:
     """Refuse a page that cannot be written, before anything is computed."""
     from pipeline.cli.outputs import check_file
-    from pipeline.spec.problems import SpecError
+    from pipeline.specification.problems import SpecError
     from pipeline.store.errors import RefusedError
     from pipeline.store.local import unwritable
 

@@ -73,7 +73,7 @@ def reproduce(
 def _check_folder(folder: Path) -> None:
     """Refuse a folder that cannot be written to, before anything is computed."""
     from pipeline.cli.outputs import check_place
-    from pipeline.spec.problems import SpecError
+    from pipeline.specification.problems import SpecError
     from pipeline.store.errors import RefusedError
     from pipeline.store.local import unwritable
 

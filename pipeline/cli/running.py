@@ -110,7 +110,7 @@ def _plot(run: Run) -> None:
     from pipeline.cli.plot import draw
     from pipeline.products.registry import FIGURES
     from pipeline.runs.preview import figure_command, shown
-    from pipeline.spec.problems import SpecError
+    from pipeline.specification.problems import SpecError
     from pipeline.store.errors import RefusedError
 
     name, options, left_out = shown(run)

@@ -71,7 +71,7 @@ def simulate(
     from pipeline.cli import console
     from pipeline.cli.outputs import check_file
     from pipeline.compute import simulate as simulation
-    from pipeline.spec.models import find_model
+    from pipeline.specification.models import find_model
     from pipeline.store.provenance import provenance, versions
 
     chosen = find_model(model, at="--model")
@@ -123,7 +123,7 @@ def _states(words: list[str]) -> dict[str, float]:
 
 def read_named(words: list[str], n: int) -> dict[str, Any]:
     """Read ``--NAME VALUE ...`` with `n` numbers each, by name; raise `SpecError` with all mistakes."""
-    from pipeline.spec.problems import SpecError
+    from pipeline.specification.problems import SpecError
 
     found: dict[str, Any] = {}
     problems, left = [], list(words)

@@ -58,7 +58,7 @@ def zoom(
 
 def _named(words: list[str]) -> tuple[dict[str, Any], dict[str, int]]:
     """Read ``--NAME LOW HIGH`` and ``--num-NAME N``."""
-    from pipeline.spec.problems import SpecError
+    from pipeline.specification.problems import SpecError
 
     numbered: list[str] = []
     ranged: list[str] = []
@@ -79,7 +79,7 @@ def _named(words: list[str]) -> tuple[dict[str, Any], dict[str, int]]:
 
 def _axes(texts: list[str]) -> tuple[dict[str, tuple[float, float]], dict[str, int]]:
     """Read ``NAME=LOW:HIGH`` and ``NAME=LOW:HIGH:NUM``."""
-    from pipeline.spec.problems import SpecError
+    from pipeline.specification.problems import SpecError
 
     ranges, points, problems = {}, {}, []
     for text in texts:

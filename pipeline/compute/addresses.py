@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pipeline.spec.problems import SpecError
+from pipeline.specification.problems import SpecError
 
 ANSWER_S = 5.0
 """Longest time for a scheduler to accept a connection, and again to identify itself [s]."""

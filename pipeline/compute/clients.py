@@ -15,8 +15,8 @@ from pipeline.compute.addresses import OPTION, Address, SchedulerError, ask, rea
 from pipeline.compute.jobqueue import check_means, job_cluster, jobs_folder
 from pipeline.compute.local import local_cluster
 from pipeline.compute.probe import check_directory, check_versions
-from pipeline.spec.clusters import QUEUES, Cluster, clock, load_cluster, seconds_of
-from pipeline.spec.problems import SpecError
+from pipeline.specification.clusters import QUEUES, Cluster, clock, load_cluster, seconds_of
+from pipeline.specification.problems import SpecError
 
 Echo = Callable[[str], None]
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from magpend_core.engine.system import System
-from pipeline.spec.tables import Integration
+from pipeline.specification.tables import Integration
 
 LOOKED_AT = 129
 """Number of last sections of a trajectory that are compared."""

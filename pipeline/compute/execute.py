@@ -70,8 +70,8 @@ def run_tasks(
     if where.resolved() == IN_PROCESS or workers == 0:
         yield from _in_process(task, order)
         return
+    from pipeline.compute.dispatch import Window
     from pipeline.compute.probe import Fitting
-    from pipeline.compute.window import Window
 
     n_workers = min(workers or default_workers(), len(indices))
     with connected(where, n_workers, echo) as client:

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.compute.addresses import SchedulerError
-from pipeline.spec.clusters import Cluster, hours_and_minutes
-from pipeline.spec.problems import SpecError
+from pipeline.specification.clusters import Cluster, hours_and_minutes
+from pipeline.specification.problems import SpecError
 
 JOB_NAME = "magpend-worker"
 _CLASSES = {"slurm": "SLURMCluster", "pbs": "PBSCluster", "sge": "SGECluster", "lsf": "LSFCluster"}

@@ -19,7 +19,7 @@ from pipeline.store.errors import StoreError
 from pipeline.store.files import COMMITS, open_files
 
 PACKAGES = ("numpy", "numba", "zarr", "numcodecs", "dask", "distributed")
-_ROOMS = ("spec", "layout", "products", "compute", "store")
+_ROOMS = ("specification", "layout", "products", "compute", "store")
 _SHOWN = 3
 _LATE_S, _AGAIN_S = 5.0, 0.2
 """Longest wait for a new file on a network's file system, and time between two looks [s]."""
@@ -28,7 +28,7 @@ _LATE_S, _AGAIN_S = 5.0, 0.2
 @cache
 def installation() -> dict[str, str]:
     """Return the versions of the programs here, and digests of magpend's own code."""
-    from magpend_core.meaning import kernel_version, meaning_digest
+    from magpend_core.source_digests import kernel_version, meaning_digest
 
     pipeline = Path(__file__).parents[1]
     found = {"Python": ".".join(platform.python_version_tuple()[:2])}

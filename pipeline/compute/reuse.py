@@ -15,20 +15,20 @@ from typing import Any
 import numpy as np
 
 from magpend_core import Sections, Status
-from pipeline.compute.longer import kept_on, obstacle
+from pipeline.compute.continuation import WALKED, going_on
+from pipeline.compute.extension import kept_on, obstacle
 from pipeline.compute.task import Integrate, Job, integrate
-from pipeline.compute.walking import WALKED, going_on
 from pipeline.layout.cells import CellMap, Inputs
 from pipeline.layout.identity import code_version
 from pipeline.layout.matching import NOWHERE, Finder, Way, unlike, way_of
 from pipeline.layout.schema import base_variables
 from pipeline.products.product import function_of
 from pipeline.products.registry import CELL_PRODUCTS
-from pipeline.spec.parsing import Spec, kept_spec
-from pipeline.store.cells import read_block
+from pipeline.specification.parsing import Spec, kept_spec
 from pipeline.store.errors import DamagedError, RefusedError
 from pipeline.store.run import Run
 from pipeline.store.runfile import read_run
+from pipeline.store.task_cells import read_block
 
 Origin = tuple[str, str]
 """Directory and digest of a run that cells are taken from."""

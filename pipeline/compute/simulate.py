@@ -19,10 +19,10 @@ from pipeline.compute.closing import LOOKED_AT, closing_of
 from pipeline.layout.domains import check_states
 from pipeline.layout.vocabulary import model_attribute
 from pipeline.layout.writing import write_atomically, write_netcdf
-from pipeline.spec.drives import RecordedDrive, load_drive
-from pipeline.spec.problems import SpecError, unknown_name, validated
-from pipeline.spec.recorded import model_problems
-from pipeline.spec.tables import FREQUENCY, Integration
+from pipeline.specification.drive_files import RecordedDrive, load_drive
+from pipeline.specification.problems import SpecError, unknown_name, validated
+from pipeline.specification.recorded_drive import model_problems
+from pipeline.specification.tables import FREQUENCY, Integration
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -71,7 +71,7 @@ def simulate(
     initial_state
         The model's states at time 0, or where the recorded drive begins, in their units.
     drive
-        A drive file (see `pipeline.spec.drives`): the drive is a recording.
+        A drive file (see `pipeline.specification.drive_files`): the drive is a recording.
     model
         A model, or what `magpend_core.load_model` takes for one.
     preset, overrides
@@ -187,7 +187,7 @@ def _closing(sections: np.ndarray, parameters: Parameters, series: Series) -> di
 
 def _under_recording(parameters: Parameters, drive: RecordedDrive, state: np.ndarray, series: Series) -> xr.Dataset:
     """Integrate under a recorded drive, from its start."""
-    from magpend_core.recorded import evaluate_recorded, recorded_trajectory
+    from magpend_core.recorded_drive import evaluate_recorded, recorded_trajectory
 
     marks = np.append(drive.start_s, drive.sections_s)
     begin = float(marks[series.n_transient])

@@ -17,20 +17,20 @@ import numpy as np
 from magpend_core import Sections, Status, kernel_version
 from magpend_core.engine.system import System
 from magpend_core.models import import_model
-from pipeline.compute.recorded import under_recording
+from pipeline.compute.continuation import WALKED, going_on, walk
+from pipeline.compute.recorded_drive import under_recording
 from pipeline.compute.refinement import infer
-from pipeline.compute.walking import WALKED, going_on, walk
 from pipeline.layout.cells import CellMap, Inputs
 from pipeline.layout.identity import differences, digest_of, identity_of
 from pipeline.layout.plan import Plan, make_plan
 from pipeline.layout.schema import REST_STATE, base_variables
 from pipeline.products.product import function_of
 from pipeline.products.registry import CELL_PRODUCTS
-from pipeline.spec.parsing import Spec, kept_spec
-from pipeline.store.cells import read_cells
+from pipeline.specification.parsing import Spec, kept_spec
 from pipeline.store.commits import write_task
 from pipeline.store.errors import RefusedError
 from pipeline.store.runfile import RunInfo, read_run
+from pipeline.store.task_cells import read_cells
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,5 @@
 """Show a run on an interactive page, served on loopback or exported as files.
 
-Python describes the run (`view`, `diagram`, `orbits`), computes live requests (`live`) and serves both
-(`server`). `page/` has the page's sources, `static/` the files built from them.
+`data` reads the run, `live` computes while the user watches, `serving` answers the page's requests, and `copies`
+exports pages that need no server. `page/` has the page's sources, `static/` the files built from them.
 """

@@ -11,9 +11,9 @@ import numpy as np
 
 from magpend_core.models.model import Model, State
 from pipeline.layout.vocabulary import BRANCH, FREQUENCY_DIM, START, grid_dim
-from pipeline.spec.parsing import Spec
-from pipeline.spec.starts import GridStarts, ListStarts, RandomStarts, Starts, degrees_key
-from pipeline.spec.tables import FREQUENCY, Range
+from pipeline.specification.parsing import Spec
+from pipeline.specification.starts import GridStarts, ListStarts, RandomStarts, Starts, degrees_key
+from pipeline.specification.tables import FREQUENCY, Range
 
 DIRECTION_CODES = {"up": 1, "down": -1}
 

@@ -11,9 +11,9 @@ import numpy as np
 from magpend_core.models import load_model
 from magpend_core.models.text.model import TextModel
 from pipeline.layout.cells import initial_states, parameter_axes
-from pipeline.spec.parsing import Spec
-from pipeline.spec.problems import SpecError
-from pipeline.spec.tables import FREQUENCY
+from pipeline.specification.parsing import Spec
+from pipeline.specification.problems import SpecError
+from pipeline.specification.tables import FREQUENCY
 
 if TYPE_CHECKING:
     from magpend_core.models.model import Model

@@ -12,19 +12,16 @@ from typing import Any
 
 import numpy as np
 
-from magpend_core.meaning import meaning_digest
+from magpend_core.source_digests import meaning_digest
 from pipeline.layout.cells import coordinates
 from pipeline.layout.plan import Plan
 from pipeline.layout.schema import FORMAT, REFINEMENT
 from pipeline.products.registry import CELL_PRODUCTS
-from pipeline.spec.parsing import Spec
+from pipeline.specification.parsing import Spec
 
 _PIPELINE = Path(__file__).parents[1]
 CODE = ("layout.cells", "compute.task")
 """Modules of the pipeline that decide the numbers of every task.
-
-Modules for refined grids and for products are added where they are used. The numerical core and the model
-have their own versions.
 
 Modules for refined grids and for products are added where they are used. The numerical core and the model
 have their own versions.
@@ -68,14 +65,14 @@ def code_of(spec: Spec) -> list[str]:
     """Return the modules of the pipeline that decide the numbers of a run's tasks."""
     products = [CELL_PRODUCTS[name].compute.partition(":")[0] for name in spec.products]
     refined = ["compute.refinement"] if spec.refine is not None else []
-    walked = ["compute.walking"] if spec.continuation is not None else []
-    driven = ["compute.recorded", "spec.drives"] if spec.drive is not None else []
+    walked = ["compute.continuation"] if spec.continuation is not None else []
+    driven = ["compute.recorded_drive", "specification.drive_files"] if spec.drive is not None else []
     return [*CODE, *refined, *walked, *driven, *(module.removeprefix("pipeline.") for module in products)]
 
 
 @lru_cache
 def code_version(module: str) -> str:
-    """Return a digest of a module's meaning; see `magpend_core.meaning`."""
+    """Return a digest of a module's meaning; see `magpend_core.source_digests`."""
     return meaning_digest([_PIPELINE / f"{module.replace('.', '/')}.py"])
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.spec.problems import SpecError
+from pipeline.specification.problems import SpecError
 
 if TYPE_CHECKING:
     from pipeline.layout.plan import Plan

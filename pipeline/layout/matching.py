@@ -15,13 +15,13 @@ import numpy as np
 
 from pipeline.layout.cells import InitialStates, Inputs, initial_states, parameter_axes
 from pipeline.layout.identity import CODE, differences
-from pipeline.spec.parsing import Spec
-from pipeline.spec.tables import FREQUENCY
+from pipeline.specification.parsing import Spec
+from pipeline.specification.tables import FREQUENCY
 
 NOWHERE = -1
 """Index that stands for a cell that the run does not have."""
 
-_CODE = (*CODE, "compute.walking", "compute.recorded", "spec.drives")
+_CODE = (*CODE, "compute.continuation", "compute.recorded_drive", "specification.drive_files")
 
 
 def deciding(identity: Mapping[str, Any]) -> dict[str, Any]:

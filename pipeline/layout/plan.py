@@ -22,9 +22,9 @@ from pipeline.layout.schema import sizes_of, variables_of
 from pipeline.layout.vocabulary import FREQUENCY_DIM
 from pipeline.products.registry import CELL_PRODUCTS
 from pipeline.products.variable import Variable
-from pipeline.spec.drives import TORQUE
-from pipeline.spec.parsing import Spec
-from pipeline.spec.tables import FREQUENCY
+from pipeline.specification.drive_files import TORQUE
+from pipeline.specification.parsing import Spec
+from pipeline.specification.tables import FREQUENCY
 
 MICROSECONDS_PER_PERIOD, MICROSECONDS_PER_SECOND = 9.0, 21.5
 """Rule of thumb for one trajectory on one core at rtol 1e-8: a period of length T takes

@@ -17,7 +17,7 @@ from magpend_core.models.model import Model
 from magpend_core.models.parameters import Parameters
 from magpend_core.models.sectioned import sectioned
 from magpend_core.status import Status
-from pipeline.spec.tables import FREQUENCY
+from pipeline.specification.tables import FREQUENCY
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -39,7 +39,7 @@ APERIODIC = (TORUS, CHAOTIC_SET, BOUNDED_SET)
 
 STABILITIES = ("absent", "attracts", "unstable", "transient", "not_settled", "neutral")
 _, ATTRACTS, UNSTABLE, TRANSIENT, NOT_SETTLED, NEUTRAL = range(len(STABILITIES))
-"""Values of `stability`; see `pipeline.analysis.attractors.stability`."""
+"""Values of `stability`; see `pipeline.analysis.attractors.finding.stability`."""
 
 EVIDENCE = ("none", "eigenvalues", "multipliers", "approach", "stayed", "left", "volume")
 """Values of `evidence`: the grounds for the stability of a set."""

@@ -11,8 +11,8 @@ from pipeline.plots.branches import plot_branches
 from pipeline.plots.coexisting import plot_coexisting
 from pipeline.plots.convergence import plot_convergence
 from pipeline.plots.dimension import plot_dimension
-from pipeline.plots.door import draw_figure
 from pipeline.plots.exponent_map import plot_lyapunov_map
+from pipeline.plots.figure import draw_figure
 from pipeline.plots.files import save_data, save_figure
 from pipeline.plots.fractions import plot_fractions
 from pipeline.plots.gallery import plot_gallery

@@ -13,10 +13,10 @@ from matplotlib.ticker import LogLocator, NullLocator, ScalarFormatter
 
 from pipeline.analysis.outcomes import outcomes
 from pipeline.analysis.selection import choose, start_dims
+from pipeline.layout.period_names import periods_of
 from pipeline.layout.vocabulary import INFERRED, PERIODIC_ORBIT, grid_dim, model_of
-from pipeline.layout.words import periods_of
 from pipeline.plots import labels, palette, style
-from pipeline.plots.door import Run, attractors_of, frame_of, noted, values_of
+from pipeline.plots.figure import Run, attractors_of, frame_of, noted, values_of
 from pipeline.products.figures import BasinFigureOptions
 
 _DARKEST = 0.62

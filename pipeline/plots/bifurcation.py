@@ -16,9 +16,9 @@ from matplotlib.axes import Axes
 
 from pipeline.layout.vocabulary import split_dims
 from pipeline.plots import labels, pixels, style
-from pipeline.plots.absent import absent_handles, draw_absent, say_empty
-from pipeline.plots.door import Run, frame_of, noted, values_of
+from pipeline.plots.figure import Run, frame_of, noted, values_of
 from pipeline.plots.labels import Measure
+from pipeline.plots.missing_cells import absent_handles, draw_absent, say_empty
 from pipeline.plots.points import Survey, View, make_view, survey
 from pipeline.plots.selection import at_points
 from pipeline.products.figures import BifurcationOptions

@@ -15,7 +15,7 @@ from matplotlib.patheffects import withStroke
 from pipeline.layout.vocabulary import axis_name
 from pipeline.plots import labels, pixels, style
 from pipeline.plots.bifurcation import Diagram, with_diagram
-from pipeline.plots.door import Run, frame_of, noted, values_of
+from pipeline.plots.figure import Run, frame_of, noted, values_of
 from pipeline.plots.labels import Measure
 from pipeline.products.branches import BranchOptions
 from pipeline.products.figures import BranchFigureOptions

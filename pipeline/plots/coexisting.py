@@ -12,10 +12,10 @@ from matplotlib.patches import Patch
 
 from pipeline.analysis.outcomes import left_out
 from pipeline.analysis.selection import choose, start_dims
-from pipeline.layout.letters import letter
+from pipeline.layout.attractor_letters import letter
 from pipeline.layout.vocabulary import ATTRACTS, STABILITIES
 from pipeline.plots import labels, palette, style
-from pipeline.plots.door import Run, attractors_of, frame_of, noted, values_of
+from pipeline.plots.figure import Run, attractors_of, frame_of, noted, values_of
 from pipeline.plots.fractions import swept_parameter
 from pipeline.products.attractors import AttractorOptions
 from pipeline.products.figures import CoexistingOptions
@@ -47,7 +47,7 @@ def plot_coexisting(
     degrees
         Degrees instead of radians.
     hysteresis
-        Result of `pipeline.analysis.attractors.hysteresis.hysteresis`; its loops are shaded.
+        Result of `pipeline.analysis.attractors.matching.hysteresis.hysteresis`; its loops are shaded.
     frame
         Width of the figure and ranges of its axes.
 

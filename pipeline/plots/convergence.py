@@ -12,10 +12,10 @@ from matplotlib.lines import Line2D
 
 from pipeline.analysis.chaos.lyapunov import GOOD, Motion, period_seconds, pooled_mean, summarise
 from pipeline.analysis.selection import select_points
+from pipeline.layout.period_names import period_of, periods_of
 from pipeline.layout.vocabulary import model_of, split_dims
-from pipeline.layout.words import period_of, periods_of
 from pipeline.plots import labels, style
-from pipeline.plots.door import Run, frame_of, noted, values_of
+from pipeline.plots.figure import Run, frame_of, noted, values_of
 from pipeline.plots.lyapunov import UNITS, left_out
 from pipeline.products.figures import ConvergenceOptions
 

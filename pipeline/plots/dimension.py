@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from pipeline.analysis.selection import select_points
 from pipeline.layout.vocabulary import model_of
 from pipeline.plots import labels, style
-from pipeline.plots.door import Run, frame_of, noted, values_of
+from pipeline.plots.figure import Run, frame_of, noted, values_of
 from pipeline.products.chaos import DimensionOptions
 from pipeline.products.figures import DimensionFigureOptions
 
@@ -21,7 +21,7 @@ def plot_dimension(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.
     ----------
     ds
         Result of `pipeline.analysis.chaos.dimensions.correlation_dimension` for one set of points, or of
-        `pipeline.analysis.chaos.staying.section_dimension` for one parameter point. In the latter
+        `pipeline.analysis.chaos.correlation.section_dimension` for one parameter point. In the latter
         case the attractor with the most cells is drawn, among those with a dimension.
     frame
         Width of the figure; ranges of the radius and the correlation sum.

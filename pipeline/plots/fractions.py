@@ -14,9 +14,9 @@ from matplotlib.lines import Line2D
 from pipeline.analysis.intervals import binomial_interval
 from pipeline.analysis.outcomes import outcomes
 from pipeline.analysis.selection import choose, parameter_dims, start_dims
-from pipeline.layout.letters import letter
+from pipeline.layout.attractor_letters import letter
 from pipeline.plots import labels, palette, style
-from pipeline.plots.door import Run, attractors_of, frame_of, noted, values_of
+from pipeline.plots.figure import Run, attractors_of, frame_of, noted, values_of
 from pipeline.products.figures import AttractorFigureOptions
 
 MOST_BARS = 60

@@ -11,11 +11,11 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
 from pipeline.analysis.outcomes import left_out
-from pipeline.layout.letters import letter
+from pipeline.layout.attractor_letters import letter
+from pipeline.layout.period_names import once
 from pipeline.layout.vocabulary import ATTRACTS, model_of, parameters_of, told_by
-from pipeline.layout.words import once
 from pipeline.plots import labels, palette, style
-from pipeline.plots.door import Run, attractors_of, frame_of, noted, values_of
+from pipeline.plots.figure import Run, attractors_of, frame_of, noted, values_of
 from pipeline.plots.portrait import Motion, draw_path, draw_portrait, equalise, fixed_handles
 from pipeline.products.figures import AttractorFigureOptions
 
@@ -38,7 +38,7 @@ def plot_gallery(
     attractors
         Result of `pipeline.analysis.attractors.attractors.match`; gives colours and names.
     portraits
-        Result of `pipeline.analysis.attractors.portraits.portraits` for one of its parameter points.
+        Result of `pipeline.analysis.attractors.describing.portraits.portraits` for one of its parameter points.
     degrees
         Degrees instead of radians.
     frame
@@ -222,7 +222,7 @@ def _fixed_handles(data: xr.Dataset, shown: set[str]) -> list[Any]:
 
 def draw(run: Run, options: AttractorFigureOptions) -> style.DataFigure:
     """Draw the figure ``gallery`` of a run; integrates the portraits."""
-    from pipeline.analysis.attractors.portraits import portraits
+    from pipeline.analysis.attractors.describing.portraits import portraits
 
     at, notes = values_of(run, options)
     found = attractors_of(run, options)

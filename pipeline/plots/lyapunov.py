@@ -12,12 +12,12 @@ from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 
 from pipeline.analysis.chaos.lyapunov import GOOD, period_seconds
+from pipeline.layout.period_names import period_of
 from pipeline.layout.vocabulary import model_of
-from pipeline.layout.words import period_of
 from pipeline.plots import labels, pixels, style
-from pipeline.plots.absent import absent_handles, draw_absent, shade_blank
 from pipeline.plots.bifurcation import Diagram, with_diagram
-from pipeline.plots.door import Run, frame_of, noted, values_of
+from pipeline.plots.figure import Run, frame_of, noted, values_of
+from pipeline.plots.missing_cells import absent_handles, draw_absent, shade_blank
 from pipeline.plots.motions import motion_codes, motions_of
 from pipeline.plots.points import ABSENT, DRAWN, Survey
 from pipeline.products.figures import LyapunovFigureOptions

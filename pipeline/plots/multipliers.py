@@ -12,7 +12,7 @@ from matplotlib.patches import Circle
 
 from pipeline.plots import labels, style
 from pipeline.plots.branches import KINDS, MARKERS, NAMES, SHORT
-from pipeline.plots.door import Run, frame_of
+from pipeline.plots.figure import Run, frame_of
 from pipeline.products.branches import BranchOptions, CurveOptions
 from pipeline.products.figures import CurveFigureOptions, MultiplierOptions
 

@@ -21,7 +21,8 @@ from matplotlib.patheffects import withStroke
 from scipy.ndimage import distance_transform_edt
 
 from pipeline.analysis import outcomes
-from pipeline.layout.letters import letter
+from pipeline.layout.attractor_letters import letter
+from pipeline.layout.period_names import period_of
 from pipeline.layout.vocabulary import (
     ABSENT,
     ATTRACTS,
@@ -37,7 +38,6 @@ from pipeline.layout.vocabulary import (
     UNSTABLE,
     model_of,
 )
-from pipeline.layout.words import period_of
 from pipeline.plots import style
 
 COLOURS = (

@@ -17,10 +17,10 @@ from matplotlib.lines import Line2D
 from pipeline.analysis.basins.numbers import basin_fractions
 from pipeline.analysis.outcomes import left_out, outcomes, share_interval
 from pipeline.analysis.selection import choose, parameter_dims, start_dims
-from pipeline.layout.letters import letter
+from pipeline.layout.attractor_letters import letter
 from pipeline.layout.vocabulary import ATTRACTS
 from pipeline.plots import labels, palette, style
-from pipeline.plots.door import Run, attractors_of, frame_of, noted, values_of
+from pipeline.plots.figure import Run, attractors_of, frame_of, noted, values_of
 from pipeline.products.figures import RegimeOptions
 
 KINDS = ("periods", "attractors", "number")

@@ -11,12 +11,12 @@ import xarray as xr
 
 from magpend_core.models.model import Model
 from pipeline.analysis.outcomes import outcomes
+from pipeline.layout.period_names import section_name
 from pipeline.layout.vocabulary import model_of, split_dims
-from pipeline.layout.words import section_name
 from pipeline.plots import labels, palette, pixels, style
-from pipeline.plots.absent import absent_handles, say_empty
 from pipeline.plots.bifurcation import fixed_of
-from pipeline.plots.door import Run, attractors_of, frame_of, noted, values_of
+from pipeline.plots.figure import Run, attractors_of, frame_of, noted, values_of
+from pipeline.plots.missing_cells import absent_handles, say_empty
 from pipeline.plots.motions import Motions
 from pipeline.plots.points import View, make_view, survey
 from pipeline.plots.selection import at_points

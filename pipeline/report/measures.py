@@ -20,7 +20,7 @@ from pipeline.analysis.intervals import binomial_interval
 from pipeline.analysis.selection import place
 from pipeline.analysis.sides import classify
 from pipeline.layout.vocabulary import split_dims
-from pipeline.spec.problems import SpecError
+from pipeline.specification.problems import SpecError
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -13,7 +13,7 @@ from pipeline.report.results import Results
 from pipeline.report.runs import command_of
 from pipeline.report.study import PictureTable
 from pipeline.runs.drawing import figure
-from pipeline.spec.problems import SpecError
+from pipeline.specification.problems import SpecError
 
 if TYPE_CHECKING:
     from magpend_core.models.parameters import Parameters

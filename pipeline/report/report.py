@@ -8,7 +8,7 @@ from importlib import metadata
 from pipeline.report.page import Grid, Page
 from pipeline.report.runs import CHEAP, SHOWN, part_of
 from pipeline.runs.derive import AnalysedRun
-from pipeline.spec.problems import SpecError, unknown_name
+from pipeline.specification.problems import SpecError, unknown_name
 
 Echo = Callable[[str], None]
 

@@ -20,7 +20,7 @@ from pipeline.report.runs import provenance_of
 from pipeline.report.study import ClaimTable, FigureTable, Study
 from pipeline.report.verdicts import Verdict, judged
 from pipeline.runs.stopping import stoppable
-from pipeline.spec.problems import SpecError, unknown_name
+from pipeline.specification.problems import SpecError, unknown_name
 from pipeline.store.provenance import versions
 
 PAGE, CLAIMS = "report.html", "claims.json"

@@ -11,8 +11,8 @@ from pipeline.report.study import Study
 from pipeline.runs.derive import AnalysedRun
 from pipeline.runs.run import run
 from pipeline.runs.workflows import find_spec
-from pipeline.spec.parsing import load_spec
-from pipeline.spec.problems import SpecError
+from pipeline.specification.parsing import load_spec
+from pipeline.specification.problems import SpecError
 
 if TYPE_CHECKING:
     import xarray as xr

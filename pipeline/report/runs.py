@@ -15,7 +15,7 @@ import numpy as np
 
 from pipeline.analysis.outcomes import sentence
 from pipeline.analysis.tabular import axis_ranges, distinct, number
-from pipeline.layout.letters import letter
+from pipeline.layout.attractor_letters import letter
 from pipeline.layout.vocabulary import is_grid_dim, parameter_name, split_dims
 from pipeline.products.product import function_of
 from pipeline.products.registry import ANALYSES, FIGURES
@@ -24,8 +24,8 @@ from pipeline.report.stored import settled_options, stored_options
 from pipeline.runs.derive import AnalysedRun
 from pipeline.runs.drawing import figure
 from pipeline.runs.status import state
-from pipeline.spec.problems import SpecError
-from pipeline.spec.tables import FREQUENCY
+from pipeline.specification.problems import SpecError
+from pipeline.specification.tables import FREQUENCY
 
 if TYPE_CHECKING:
     import xarray as xr

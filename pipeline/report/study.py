@@ -10,9 +10,9 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, ValidationError
 
 from pipeline.products.registry import FIGURES
-from pipeline.spec.files import read_toml
-from pipeline.spec.problems import SpecError, problems_of, unknown_name, validated
-from pipeline.spec.tables import Table
+from pipeline.specification.files import read_toml
+from pipeline.specification.problems import SpecError, problems_of, unknown_name, validated
+from pipeline.specification.tables import Table
 
 STUDY = "study.toml"
 """File name of a study that ships; its folder has the study's name."""

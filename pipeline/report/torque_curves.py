@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.report.measures import Estimate
-from pipeline.spec.problems import SpecError, unknown_name
+from pipeline.specification.problems import SpecError, unknown_name
 
 if TYPE_CHECKING:
     from pipeline.plots.style import DataFigure

@@ -1,4 +1,4 @@
-"""Make a drive file from a recording, in the format that `pipeline.spec.drives` reads."""
+"""Make a drive file from a recording, in the format that `pipeline.specification.drive_files` reads."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import numpy.typing as npt
 import xarray as xr
 
 from pipeline.rig.edges import DRIVE, Timing, edges_of
-from pipeline.spec.drives import EDGES, HEADERS, TORQUE, parse_drive
-from pipeline.spec.problems import SpecError
+from pipeline.specification.drive_files import EDGES, HEADERS, TORQUE, parse_drive
+from pipeline.specification.problems import SpecError
 
 Floats = npt.NDArray[np.float64]
 

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
-from pipeline.spec.problems import SpecError
+from pipeline.specification.problems import SpecError
 
 Floats = npt.NDArray[np.float64]
 

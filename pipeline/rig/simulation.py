@@ -17,11 +17,11 @@ from magpend_core.models.presets import find_preset
 from pipeline.rig.recordings.mapping import DRIVE, Mapping, TimeMap
 from pipeline.rig.recordings.raw import Raw
 from pipeline.rig.virtual import DriveSensor, Sensor, Step, readings
-from pipeline.spec.files import read_toml
-from pipeline.spec.models import add_model
-from pipeline.spec.problems import SpecError, problems_of, unknown_key, unknown_name
-from pipeline.spec.starts import degrees_key, state_keys, state_of_key
-from pipeline.spec.tables import Table
+from pipeline.specification.files import read_toml
+from pipeline.specification.models import add_model
+from pipeline.specification.problems import SpecError, problems_of, unknown_key, unknown_name
+from pipeline.specification.starts import degrees_key, state_keys, state_of_key
+from pipeline.specification.tables import Table
 
 
 class SensorTable(Table):

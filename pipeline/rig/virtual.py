@@ -18,8 +18,8 @@ import numpy as np
 from pipeline.rig.recordings.mapping import DRIVE, ChannelMap, DriveMap, Mapping
 from pipeline.rig.recordings.raw import Channel, Raw
 from pipeline.rig.recordings.reading import recording_of
-from pipeline.spec.models import kept_reference
-from pipeline.spec.problems import SpecError, unknown_name
+from pipeline.specification.models import kept_reference
+from pipeline.specification.problems import SpecError, unknown_name
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -7,7 +7,7 @@ import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from pipeline.spec.clusters import Cluster, bytes_of, clock, hours_and_minutes, seconds_of
+from pipeline.specification.clusters import Cluster, bytes_of, clock, hours_and_minutes, seconds_of
 
 
 @dataclass(frozen=True)

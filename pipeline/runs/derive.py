@@ -32,7 +32,7 @@ from pipeline.products.product import Analysis, Options, function_of
 from pipeline.products.registry import ANALYSES
 from pipeline.runs.naming import named
 from pipeline.runs.versions import code_version
-from pipeline.spec.problems import SpecError, unknown_name, validated
+from pipeline.specification.problems import SpecError, unknown_name, validated
 from pipeline.store.errors import DamagedError
 from pipeline.store.files import DERIVED, Files
 from pipeline.store.local import unwritable

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from pipeline.products.product import FigureOptions
 from pipeline.products.registry import FIGURES
 from pipeline.runs.derive import AnalysedRun, Echo, Source, prepared, refused
-from pipeline.spec.problems import SpecError, unknown_name, validated
+from pipeline.specification.problems import SpecError, unknown_name, validated
 
 if TYPE_CHECKING:
     from pipeline.plots.style import DataFigure

@@ -19,7 +19,7 @@ import numpy as np
 from pipeline.layout.cells import CellMap, Inputs
 from pipeline.layout.plan import Plan, mean_seconds_per_period, periods_per_cell, seconds_per_period
 from pipeline.products.registry import CELL_PRODUCTS
-from pipeline.spec.parsing import Spec
+from pipeline.specification.parsing import Spec
 
 BRANCHES, MOST_BRANCHES, POINTS = 32, 256, 8
 """Size of a sample: branches (two groups of lanes or more), most branches, points of each branch."""

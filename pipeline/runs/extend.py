@@ -27,8 +27,8 @@ from pipeline.runs.status import State, state
 from pipeline.runs.widen import Widening, widened
 from pipeline.runs.workflows import find_spec
 from pipeline.runs.zoom import to_toml
-from pipeline.spec.parsing import Spec, load_spec
-from pipeline.spec.problems import SpecError
+from pipeline.specification.parsing import Spec, load_spec
+from pipeline.specification.problems import SpecError
 from pipeline.store.errors import RefusedError
 from pipeline.store.files import EXTENDED, TIMINGS, Files, open_files
 from pipeline.store.run import Run

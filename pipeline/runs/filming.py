@@ -14,7 +14,7 @@ from pipeline.products.animation import AnimationOptions
 from pipeline.runs import instants, moving
 from pipeline.runs.derive import AnalysedRun, Echo, Source
 from pipeline.runs.naming import named
-from pipeline.spec.problems import SpecError, validated
+from pipeline.specification.problems import SpecError, validated
 
 if TYPE_CHECKING:
     from pipeline.plots.animation import Animation
@@ -86,7 +86,7 @@ def animation(
         If a trajectory diverges.
     """
     from pipeline.plots.animation import plot_animation, portraits_of
-    from pipeline.plots.door import run_provenance
+    from pipeline.plots.figure import run_provenance
     from pipeline.plots.files import with_provenance
 
     if isinstance(options, AnimationOptions):
@@ -137,7 +137,7 @@ def _alone(start: Start) -> instants.Moving:
 
     from pipeline.compute.simulate import start_of
     from pipeline.layout.domains import check_states
-    from pipeline.spec.tables import FREQUENCY
+    from pipeline.specification.tables import FREQUENCY
 
     model = load_model(start.model)
     frequency = start.frequency_hz

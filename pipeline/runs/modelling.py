@@ -12,17 +12,17 @@ from magpend_core.models.parameters import Parameters
 from pipeline.layout.cells import CellMap
 from pipeline.layout.domains import check_starts, check_states
 from pipeline.runs.workflows import find_spec
-from pipeline.spec.files import read_toml
-from pipeline.spec.models import find_model, is_model_file
-from pipeline.spec.parsing import KINDS, Spec, load_spec
-from pipeline.spec.problems import SpecError
-from pipeline.spec.tables import FREQUENCY
+from pipeline.specification.files import read_toml
+from pipeline.specification.models import find_model, is_model_file
+from pipeline.specification.parsing import KINDS, Spec, load_spec
+from pipeline.specification.problems import SpecError
+from pipeline.specification.tables import FREQUENCY
 from pipeline.store.local import refuse_place
 
 if TYPE_CHECKING:
-    from magpend_core.models.showing import Description
+    from magpend_core.models.summary import Description
 
-TEMPLATE = Path(__file__).parents[1] / "spec" / "template.toml"
+TEMPLATE = Path(__file__).parents[1] / "specification" / "template.toml"
 NEAR_ZERO = (0.0, 0.1, -0.2, 0.3)
 """Initial states in units of the states' scales, if no specification gives any."""
 
@@ -41,7 +41,7 @@ def examine(name: str) -> tuple[Model, Description]:
     SpecError
         If there is no such model, or it is not valid, or its equations have no value at the starts.
     """
-    from magpend_core.models.showing import describe
+    from magpend_core.models.summary import describe
 
     spec = _specification(name)
     if spec is None:

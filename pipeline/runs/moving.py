@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from magpend_core.models.sectioned import of_flow
-from pipeline.layout.letters import letter
+from pipeline.layout.attractor_letters import letter
 from pipeline.layout.vocabulary import ATTRACTS, EQUILIBRIUM, PERIODIC_ORBIT, frequency_of, parameters_of, start_dims
 from pipeline.products.animation import AnimationOptions
 from pipeline.runs.derive import AnalysedRun, refused
 from pipeline.runs.instants import RTOL, Moving
-from pipeline.spec.problems import SpecError
+from pipeline.specification.problems import SpecError
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -51,7 +51,7 @@ def of_attractors(
     from pipeline.analysis.selection import choose
     from pipeline.analysis.selection import start_dims as dims_of_starts
     from pipeline.plots import palette
-    from pipeline.plots.door import attractors_of, values_of
+    from pipeline.plots.figure import attractors_of, values_of
 
     with refused(run.name):
         at, notes = values_of(run, options)
@@ -245,7 +245,7 @@ def point_of_run(run: AnalysedRun, options: AnimationOptions) -> tuple[Parameter
         If several points are left, or the run does not have the point.
     """
     from pipeline.analysis.selection import select_points
-    from pipeline.plots.door import values_of
+    from pipeline.plots.figure import values_of
 
     _refuse_recorded(run)
     cube = run.cube()

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.layout.vocabulary import axis_name, grid_dim, is_grid_dim, parameter_name
 from pipeline.products.product import Options
-from pipeline.spec.problems import SpecError, unknown_name
-from pipeline.spec.tables import FREQUENCY
+from pipeline.specification.problems import SpecError, unknown_name
+from pipeline.specification.tables import FREQUENCY
 
 if TYPE_CHECKING:
     import xarray as xr

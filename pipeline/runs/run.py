@@ -20,7 +20,7 @@ from pipeline.runs.progress import Progress, duration
 from pipeline.runs.status import State, state
 from pipeline.runs.stopping import InterruptedRunError, stoppable
 from pipeline.runs.workflows import read_given
-from pipeline.spec.parsing import Spec
+from pipeline.specification.parsing import Spec
 from pipeline.store.checking import damaged_records, name_of
 from pipeline.store.commits import log_timing, sweep
 from pipeline.store.errors import IncompleteError

@@ -20,9 +20,9 @@ from pipeline.layout.writing import write_atomically
 from pipeline.runs.batch import WORDS, coordinator_script, is_whole
 from pipeline.runs.run import identity_here
 from pipeline.runs.workflows import default_directory, find_spec
-from pipeline.spec.clusters import Cluster, load_cluster
-from pipeline.spec.parsing import load_spec
-from pipeline.spec.problems import SpecError
+from pipeline.specification.clusters import Cluster, load_cluster
+from pipeline.specification.parsing import load_spec
+from pipeline.specification.problems import SpecError
 from pipeline.store.commits import read_commits
 from pipeline.store.errors import LockedError
 from pipeline.store.files import open_files

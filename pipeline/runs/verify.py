@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from pipeline.layout.plan import make_plan
-from pipeline.spec.parsing import kept_spec
+from pipeline.specification.parsing import kept_spec
 from pipeline.store.checking import ODD, Verification, verify
 from pipeline.store.files import ASIDE, DERIVED
 from pipeline.store.packing import withdraw

@@ -7,7 +7,7 @@ import hashlib
 from functools import cache
 from pathlib import Path
 
-from magpend_core.meaning import meaning_digest
+from magpend_core.source_digests import meaning_digest
 from pipeline.products.registry import ANALYSES
 
 _ROOT = Path(__file__).parents[2]

@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from pipeline.runs.zoom import put_value
-from pipeline.spec.parsing import Spec, kept_spec
-from pipeline.spec.problems import SpecError, unknown_name
-from pipeline.spec.starts import GridStarts, RandomStarts, state_keys, state_of_key
-from pipeline.spec.tables import FREQUENCY
+from pipeline.specification.parsing import Spec, kept_spec
+from pipeline.specification.problems import SpecError, unknown_name
+from pipeline.specification.starts import GridStarts, RandomStarts, state_keys, state_of_key
+from pipeline.specification.tables import FREQUENCY
 
 
 @dataclass(frozen=True)

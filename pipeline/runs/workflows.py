@@ -9,10 +9,10 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from pipeline.spec.files import toml_tables
-from pipeline.spec.given import is_toml_text, toml_of
-from pipeline.spec.parsing import IDENTIFICATION, Spec, load_spec, spec_of_tables
-from pipeline.spec.problems import SpecError, unknown_name
+from pipeline.specification.files import toml_tables
+from pipeline.specification.inputs import is_toml_text, toml_of
+from pipeline.specification.parsing import IDENTIFICATION, Spec, load_spec, spec_of_tables
+from pipeline.specification.problems import SpecError, unknown_name
 
 
 def find_spec(name: str | Path) -> Path:

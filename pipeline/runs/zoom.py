@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import Any
 
 from magpend_core.models.imported import KEY
-from pipeline.spec.models import model_toml
-from pipeline.spec.parsing import Spec, kept_spec, load_spec
-from pipeline.spec.problems import SpecError, unknown_name
-from pipeline.spec.starts import GridStarts, RandomStarts, degrees_key, state_keys, state_of_key
-from pipeline.spec.tables import FREQUENCY, Range
-from pipeline.spec.toml import toml_key, toml_value
+from pipeline.specification.models import model_toml
+from pipeline.specification.parsing import Spec, kept_spec, load_spec
+from pipeline.specification.problems import SpecError, unknown_name
+from pipeline.specification.starts import GridStarts, RandomStarts, degrees_key, state_keys, state_of_key
+from pipeline.specification.tables import FREQUENCY, Range
+from pipeline.specification.toml import toml_key, toml_value
 from pipeline.store.local import refuse_place
 
 MARK = "(zoom)"

@@ -10,7 +10,7 @@ import numpy as np
 from pipeline.layout.attributes import netcdf_safe
 from pipeline.layout.cells import DIRECTION_CODES
 from pipeline.layout.vocabulary import model_attribute, section_attributes
-from pipeline.store.quick import quick_reading
+from pipeline.store.parallel_reads import quick_reading
 from pipeline.store.run import Run
 from pipeline.store.view import committed_view
 

@@ -19,9 +19,9 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from pipeline.store.checksums import fits, seal, unseal
 from pipeline.store.errors import DamagedError
 from pipeline.store.files import COMMITS, Files
-from pipeline.store.seal import fits, seal, unseal
 
 BLOCK = 1000
 """Tasks whose records make a pack; this number is part of the directory's format."""

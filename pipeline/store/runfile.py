@@ -10,12 +10,12 @@ from typing import Any
 
 from pipeline.layout.identity import digest_of
 from pipeline.layout.schema import FORMAT
-from pipeline.spec.parsing import Spec
-from pipeline.spec.recorded import is_whole
+from pipeline.specification.parsing import Spec
+from pipeline.specification.recorded_drive import is_whole
+from pipeline.store.checksums import CHECKSUM, fits, has_seal, seal
 from pipeline.store.errors import DamagedError, RefusedError
 from pipeline.store.files import RUN_FILE, Files, open_files
 from pipeline.store.provenance import provenance, versions
-from pipeline.store.seal import CHECKSUM, fits, has_seal, seal
 
 
 @dataclass(frozen=True)

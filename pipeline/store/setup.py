@@ -9,7 +9,7 @@ from typing import Any
 
 from pipeline.layout.identity import differences, digest_of
 from pipeline.layout.plan import Plan
-from pipeline.spec.parsing import Spec
+from pipeline.specification.parsing import Spec
 from pipeline.store.checking import ODD, odd_keys, verify
 from pipeline.store.errors import DamagedError, RefusedError
 from pipeline.store.files import COMMITS, CUBE, HOLDER, OWN_NAMES, RUN_FILE, TIMINGS, Files, is_temporary, open_files

@@ -19,7 +19,7 @@ from pipeline.layout.identity import digest_of
 from pipeline.layout.plan import Plan
 from pipeline.layout.vocabulary import model_attribute
 from pipeline.products.registry import CELL_PRODUCTS
-from pipeline.spec.parsing import Spec
+from pipeline.specification.parsing import Spec
 from pipeline.store.arrays import create_array, write_whole
 from pipeline.store.errors import DamagedError
 from pipeline.store.files import CUBE, Files, entry_of, problems_of

@@ -30,7 +30,7 @@ VERIFY = "MAGPEND_VERIFY"
 """Environment variable; ``0`` reads chunks without comparing them with their records."""
 
 SMALL = 200_000
-"""Largest size in bytes of a chunk that `pipeline.store.quick` reads; zarr reads larger ones."""
+"""Largest size in bytes of a chunk that `pipeline.store.parallel_reads` reads; zarr reads larger ones."""
 
 
 def checks_chunks() -> bool:

@@ -47,7 +47,7 @@ def make(directory: Path, n_tasks: int, *, packed: bool = True, chunks: bool = T
     from magpend_core import kernel_version
     from pipeline.layout.identity import identity_of
     from pipeline.layout.plan import make_plan
-    from pipeline.spec.parsing import load_spec
+    from pipeline.specification.parsing import load_spec
     from pipeline.store.files import entry_of
     from pipeline.store.keys import keys_of
     from pipeline.store.records import BLOCK, Commit, line_of, marker_key, pack_key, pack_text

@@ -53,7 +53,7 @@ def measure(place: str, text: str, n_requests: Callable[[], int]) -> list[tuple[
     from pipeline.layout.plan import make_plan
     from pipeline.runs.status import state
     from pipeline.runs.verify import verify_run
-    from pipeline.spec.parsing import parse_spec
+    from pipeline.specification.parsing import parse_spec
     from pipeline.store.commits import write_task
     from pipeline.store.setup import create
 

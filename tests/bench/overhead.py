@@ -24,7 +24,7 @@ from pipeline.compute import task
 from pipeline.layout.cells import CellMap
 from pipeline.layout.plan import make_plan
 from pipeline.runs import run as runs
-from pipeline.spec.parsing import load_spec
+from pipeline.specification.parsing import load_spec
 
 SPEC = """
 kind = "sweep"

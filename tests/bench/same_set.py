@@ -22,8 +22,8 @@ from typing import Any
 import numpy as np
 
 from magpend_core import Crossing, load_model, sections
-from pipeline.analysis.attractors.clouds import OTHER, group, mixing
-from pipeline.analysis.attractors.extending import LEAST_STAY
+from pipeline.analysis.attractors.extension.clouds import OTHER, group, mixing
+from pipeline.analysis.attractors.extension.extending import LEAST_STAY
 from pipeline.analysis.sets import Geometry
 
 UEDA = {

@@ -30,9 +30,9 @@ from typing import Any
 
 from distributed import Client, LocalCluster, Worker
 
+from pipeline.compute.dispatch import Window
 from pipeline.compute.limits import Limits
 from pipeline.compute.order import Order
-from pipeline.compute.window import Window
 from pipeline.runs import run as runs
 
 SPEC = """

@@ -3,7 +3,7 @@
 import pytest
 
 import magpend_core
-from magpend_core.meaning import kernel_version, meaning_digest
+from magpend_core.source_digests import kernel_version, meaning_digest
 
 
 def test_import__leaves_the_compiler_out(run_python):

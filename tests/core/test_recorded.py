@@ -10,7 +10,7 @@ from scipy.signal import lsim
 from magpend_core import evaluate, load_preset, run_branches
 from magpend_core.models import load_model
 from magpend_core.pointwise import drive_level
-from magpend_core.recorded import evaluate_recorded, recorded_sections, recorded_trajectory
+from magpend_core.recorded_drive import evaluate_recorded, recorded_sections, recorded_trajectory
 from magpend_core.sampling import Drive
 from magpend_core.status import Status
 from tests.core.watched import OF_THE_DRIVE, OF_THE_PENDULUM

@@ -138,7 +138,7 @@ def test_drive__refuses_edges_out_of_order():
 def test_with_recorded_drive__refuses_a_system_without_a_drive():
     import dataclasses
 
-    from magpend_core.engine.absent import no_forcing
+    from magpend_core.engine.placeholders import no_forcing
 
     alone = dataclasses.replace(DUFFING.system, name="alone", forcing=no_forcing)
     with pytest.raises(ValueError, match="has no drive"):

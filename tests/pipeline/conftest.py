@@ -100,7 +100,7 @@ def made(tmp_path, write_spec, sweep_text):
     """A run directory set up from the small sweep, with made-up numbers to commit."""
     from pipeline.layout.identity import identity_of
     from pipeline.layout.plan import make_plan
-    from pipeline.spec.parsing import load_spec
+    from pipeline.specification.parsing import load_spec
     from pipeline.store.commits import write_task
     from pipeline.store.setup import create
 

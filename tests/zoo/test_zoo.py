@@ -48,7 +48,7 @@ def test_zoo__has_a_source_for_each_of_at_least_44_systems():
 
 
 def test_variants__change_one_thing_at_a_time_and_are_valid(tmp_path):
-    from pipeline.spec.parsing import load_spec
+    from pipeline.specification.parsing import load_spec
 
     for name in answers.names():
         own = variants.load(name)

@@ -84,7 +84,7 @@ class TextModel(Model):
     @cached_property
     def digest(self) -> str:
         """Digest of what the text means, and of what makes a system of it."""
-        from magpend_core.meaning import meaning_digest
+        from magpend_core.source_digests import meaning_digest
 
         # the source, too: what is found at the default parameters, edges say, is in it
         parts = meaning_digest(self.sources), self.definition.meaning(), self.source.text

@@ -12,8 +12,8 @@ from magpend_core.models.model import Quantity, State
 from magpend_core.models.parameters import FINITE, FRACTION, NON_NEGATIVE, POSITIVE, Parameter, near_names
 from magpend_core.models.text.definition import Definition, Impact
 from magpend_core.models.text.grammar import Tree, names
-from magpend_core.models.text.reader import shown
 from magpend_core.models.text.scene import mirror_problem
+from magpend_core.models.text.tables import shown
 from magpend_core.models.text.views import MAX_OTHERS, MAX_PARAMETERS, ViewsReader
 from magpend_core.sizes import MAX_STATES
 

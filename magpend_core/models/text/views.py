@@ -8,7 +8,7 @@ from magpend_core.models.model import Mirror, Preset
 from magpend_core.models.parameters import Parameter, near_names
 from magpend_core.models.text.definition import ClassifierText, DrawingText, needed
 from magpend_core.models.text.grammar import BUILT_IN, Tree
-from magpend_core.models.text.reader import Reader, shown
+from magpend_core.models.text.tables import Reader, shown
 from magpend_core.sizes import MAX_STATES
 
 MAX_PARAMETERS, MAX_OTHERS = 120, 60

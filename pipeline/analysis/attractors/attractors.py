@@ -4,7 +4,7 @@
     found = identify(ds)                 # integrates: Newton's method, and samples of what has not settled
     named = match(found, threshold=0.3)  # follows orbits along the axes; repeat it with other options
 
-The modules work on a parameter point in this order: `equilibria` and `cycles` find the equilibria and the
+The modules work on a parameter point in this order: `equilibria` and `limit_cycles` find the equilibria and the
 limit cycles of flows, `searching` finds orbits, `extending` integrates the remaining cells further, and
 `labelling` labels cells and describes sets. `hysteresis.hysteresis` finds where a continuation meets
 different attractors going up and going down.
@@ -84,7 +84,7 @@ dims, attractor): the evidence for the id there. `matching` defines an id.
 Each row lists a *set* that cells are on. Only a set with the stability ``attracts`` is an attractor; see
 `stability` for the criteria. `decision` is 0 undecided (no id), 1 closed on the orbit, 2 certain to end on
 the orbit, 3 approaching the orbit, 4 one of the set, 5 ended there when it was extended, 6 at rest (see
-`equilibria`), 7 diverged when it was extended (no id); `deciding.decide` has the criteria. A cell that is
+`equilibria`), 7 diverged when it was extended (no id); `assigning.decide` has the criteria. A cell that is
 not bounded (diverged, step limit, pending, unreached, or without a return and yet not at rest) has the id -1
 and its own `status`. A bounded cell that belongs to no set has the id -1 and `decision` 0: it is not settled.
 
@@ -92,7 +92,7 @@ A run with a loose `closure_tolerance` (above 1e-4, which makes the default `tol
 1e-3) is short, and closure proves little: sections also recur
 within a few per cent near unstable orbits, and with half the period near a period doubling. In this case a
 cell is assigned to an orbit only if the orbit is polished and attracts, and the cell is near enough or
-spirals in. All other cells are integrated further (`orbits.run_on`) until they close within 1e-5, or stay
+spirals in. All other cells are integrated further (`closed_orbits.run_on`) until they close within 1e-5, or stay
 undecided. A loose closure alone never makes an attractor, and periods are those of polished orbits.
 """
 
@@ -106,14 +106,14 @@ import xarray as xr
 
 from magpend_core.engine.system import System
 from magpend_core.models.parameters import Parameters
-from pipeline.analysis.attractors.cycles import tell_cycles
-from pipeline.analysis.attractors.equilibria import tell_rest
-from pipeline.analysis.attractors.features import ENERGY, Features
-from pipeline.analysis.attractors.labelling import Found, analyse
-from pipeline.analysis.attractors.matching import match
-from pipeline.analysis.attractors.points import BUDGET, Dynamics, slabs
-from pipeline.analysis.attractors.requests import Settings, answer_all
-from pipeline.analysis.attractors.searching import Search
+from pipeline.analysis.attractors.describing.features import ENERGY, Features
+from pipeline.analysis.attractors.describing.labelling import Found, analyse
+from pipeline.analysis.attractors.finding.equilibria import tell_rest
+from pipeline.analysis.attractors.finding.limit_cycles import tell_cycles
+from pipeline.analysis.attractors.finding.points import BUDGET, Dynamics, slabs
+from pipeline.analysis.attractors.finding.requests import Settings, answer_all
+from pipeline.analysis.attractors.finding.searching import Search
+from pipeline.analysis.attractors.matching.matching import match
 from pipeline.analysis.chaos.lyapunov import on_attractor, pooled_mean
 from pipeline.analysis.sides import flags_of
 from pipeline.layout.vocabulary import (

@@ -14,13 +14,13 @@ if TYPE_CHECKING:
 
 def needs_directions(run: Run, options: AttractorOptions) -> None:
     """Raise ValueError unless the run is a continuation in both directions."""
-    from pipeline.analysis.attractors.hysteresis import check_directions
+    from pipeline.analysis.attractors.matching.hysteresis import check_directions
 
     check_directions(run.cube())
 
 
 def hysteresis(run: Any, options: AttractorOptions) -> xr.Dataset:
     """Compute the hysteresis loops of a run and the jumps between its attractors."""
-    from pipeline.analysis.attractors.hysteresis import hysteresis as compute
+    from pipeline.analysis.attractors.matching.hysteresis import hysteresis as compute
 
     return compute(run.cube(), run.derive("attractors", **options.plain()))

@@ -8,8 +8,8 @@ import numpy as np
 import xarray as xr
 
 from pipeline.analysis.tabular import Row, aligned, number, unit_of, where_of, words_of
+from pipeline.layout.period_names import periods_of
 from pipeline.layout.vocabulary import APERIODIC, model_of
-from pipeline.layout.words import periods_of
 from pipeline.products.product import Table
 
 

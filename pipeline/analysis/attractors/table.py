@@ -24,7 +24,7 @@ from pipeline.analysis.tabular import (
     with_interval,
     words_of,
 )
-from pipeline.layout.letters import letter
+from pipeline.layout.attractor_letters import letter
 from pipeline.layout.vocabulary import ATTRACTS, STABILITIES, split_dims
 from pipeline.products.product import Table
 

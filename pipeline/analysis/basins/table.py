@@ -19,7 +19,7 @@ from pipeline.analysis.tabular import (
     where_of,
     with_interval,
 )
-from pipeline.layout.letters import letter
+from pipeline.layout.attractor_letters import letter
 from pipeline.layout.vocabulary import split_dims
 from pipeline.products.product import Table
 

@@ -97,7 +97,7 @@ variable                          dims                     meaning
 from pipeline.analysis.branches.curves import curves_dataset, curves_from
 from pipeline.analysis.branches.dataset import dataset_of
 from pipeline.analysis.branches.exploring import Scope, Start, explore
-from pipeline.analysis.branches.starts import attracting, orbits_near, recurrent
+from pipeline.analysis.branches.starting_orbits import attracting, orbits_near, recurrent
 from pipeline.analysis.branches.table import table_of, windows_of
 
 __all__ = [

@@ -15,8 +15,8 @@ from pipeline.analysis.branches.following import ENDS, Branch
 from pipeline.analysis.branches.motion import rotation_of, sides_of
 from pipeline.analysis.branches.problems import FREQUENCY
 from pipeline.analysis.branches.units import parameter_units, state_units
+from pipeline.layout.period_names import period_of, periods_of
 from pipeline.layout.vocabulary import model_attribute, section_attributes
-from pipeline.layout.words import period_of, periods_of
 
 CRITICALITIES = ("", "supercritical", "subcritical")
 

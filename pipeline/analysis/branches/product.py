@@ -26,7 +26,7 @@ def settle_branches(run: Run, options: BranchOptions) -> BranchOptions:
 
 def _refuse_frequency_of_flow(run: Run, parameter: str) -> None:
     """Raise SpecError if the parameter is the frequency and the model has no drive."""
-    from pipeline.spec.problems import SpecError
+    from pipeline.specification.problems import SpecError
 
     if axis_name(parameter) == FREQUENCY_DIM and run.model.crossing is not None:
         swept = [name for name in run.spec.axes if _axis(run, name) is not None]
@@ -62,7 +62,7 @@ def _ends(options: BranchOptions) -> tuple[float, float]:
 
 def settle_curves(run: Run, options: CurveOptions) -> CurveOptions:
     """Complete the branches' interval; raise SpecError unless two different parameters span a plane."""
-    from pipeline.spec.problems import SpecError
+    from pipeline.specification.problems import SpecError
 
     settled = options.model_copy(update=settle_branches(run, options).part(BranchOptions))
     second = options.second
@@ -96,7 +96,7 @@ def _axis(run: Run, parameter: str) -> xr.DataArray | None:
 
 def _interval(run: Run, parameter: str, low: float | None, high: float | None) -> tuple[float, float]:
     """Check the parameter and complete its interval from the run's axis."""
-    from pipeline.spec.problems import SpecError, unknown_name
+    from pipeline.specification.problems import SpecError, unknown_name
 
     base = parameters_of(run.cube())
     is_frequency = axis_name(parameter) == FREQUENCY_DIM

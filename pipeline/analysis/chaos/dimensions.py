@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
-from pipeline.analysis.chaos.sections import FLOOR, Floats, at_least, computed, geometry_of, with_coords
+from pipeline.analysis.chaos.section_samples import FLOOR, Floats, at_least, computed, geometry_of, with_coords
 from pipeline.analysis.sets import Geometry
 from pipeline.products.lyapunov import LyapunovFlag
 from pipeline.products.reporting import track

@@ -50,7 +50,7 @@ import xarray as xr
 from magpend_core.multipliers import orbit_exponents
 from pipeline.analysis.chaos.dimensions import correlation_dimension, kaplan_yorke_dimension
 from pipeline.analysis.chaos.lyapunov import GOOD, UNRESOLVED, pooled_mean
-from pipeline.analysis.chaos.sections import Floats, geometry_of
+from pipeline.analysis.chaos.section_samples import Floats, geometry_of
 from pipeline.layout.vocabulary import (
     APERIODIC,
     CHAOTIC_SET,

@@ -44,6 +44,6 @@ def settle_dimension(run: Run, options: DimensionOptions) -> DimensionOptions:
 
 def dimension(run: Any, options: DimensionOptions) -> xr.Dataset:
     """Compute the correlation dimension of each attractor that does not close."""
-    from pipeline.analysis.chaos.staying import section_dimension
+    from pipeline.analysis.chaos.correlation import section_dimension
 
     return section_dimension(run.cube(), run.derive("attractors", **options.part(AttractorOptions)), options)

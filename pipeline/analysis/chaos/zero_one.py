@@ -7,7 +7,7 @@ import numpy.typing as npt
 import xarray as xr
 from scipy import fft
 
-from pipeline.analysis.chaos.sections import FLOOR, Floats, at_least, computed, geometry_of, with_coords
+from pipeline.analysis.chaos.section_samples import FLOOR, Floats, at_least, computed, geometry_of, with_coords
 from pipeline.analysis.sets import Geometry
 from pipeline.products.reporting import report
 

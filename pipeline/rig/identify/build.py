@@ -17,7 +17,7 @@ from pipeline.rig.identify.problem import ZERO, Free, Piece, Problem
 from pipeline.rig.identify.settings import apply_settings
 from pipeline.rig.identify.specification import IdentificationSpec, RecordingTable
 from pipeline.rig.recordings import findings_of, load_mapping, read_recording, smooth, summary
-from pipeline.spec.problems import SpecError
+from pipeline.specification.problems import SpecError
 
 FEWEST_SAMPLES = 12
 """Fewest samples of a piece; a free start takes most of the information in a shorter one."""

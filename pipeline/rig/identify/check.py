@@ -17,7 +17,7 @@ from pipeline.rig.identify.problem import Free, Problem
 from pipeline.rig.identify.settings import apply_settings
 from pipeline.rig.identify.specification import RecordingTable
 from pipeline.rig.recordings import parse_mapping, read_recording, smooth
-from pipeline.spec.problems import SpecError
+from pipeline.specification.problems import SpecError
 
 
 def check(directory: str | Path, recording: str | Path, *, like: int = 0) -> dict[str, Any]:

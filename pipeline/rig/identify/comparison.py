@@ -9,7 +9,7 @@ from typing import Any
 
 from pipeline.products.product import Table
 from pipeline.rig.identify.directory import read_info, read_result
-from pipeline.spec.problems import SpecError
+from pipeline.specification.problems import SpecError
 
 
 def compare(directories: Sequence[str | Path]) -> Table:

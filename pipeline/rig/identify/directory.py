@@ -23,13 +23,13 @@ from zipfile import BadZipFile
 import numpy as np
 
 from magpend_core import kernel_version
-from magpend_core.meaning import meaning_digest
 from magpend_core.models.imported import is_object_path
+from magpend_core.source_digests import meaning_digest
 from pipeline.layout.identity import canonical, differences, digest_of
 from pipeline.layout.writing import sync_folder, write_atomically
 from pipeline.rig.identify.specification import IdentificationSpec
 from pipeline.rig.recordings import load_mapping
-from pipeline.spec.models import is_model_file
+from pipeline.specification.models import is_model_file
 from pipeline.store.errors import DamagedError, RefusedError
 from pipeline.store.files import (
     FIGURES,
@@ -120,7 +120,7 @@ def sources_of(spec: IdentificationSpec) -> list[Source]:
     SpecError
         If a file cannot be read.
     """
-    from pipeline.spec.problems import SpecError
+    from pipeline.specification.problems import SpecError
 
     found, problems = [], []
     for i, table in enumerate(spec.recordings):

@@ -29,7 +29,7 @@ from pipeline.rig.identify.specification import IdentificationSpec, load_identif
 from pipeline.rig.identify.statistics import Covariance, Linearised, covariance_of, n_effective
 from pipeline.runs.stopping import stoppable
 from pipeline.runs.workflows import default_directory, find_spec
-from pipeline.spec.problems import SpecError
+from pipeline.specification.problems import SpecError
 from pipeline.store.files import FIGURES, local_path
 from pipeline.store.local import make_folder, refuse_links, writer_lock
 

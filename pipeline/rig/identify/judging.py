@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.rig.identify.first_guesses import fit_starts
 from pipeline.rig.identify.local import Fit, fit_local
 from pipeline.rig.identify.problem import Piece, Problem
 from pipeline.rig.identify.search import slowest_period
-from pipeline.rig.identify.starts import fit_starts
 
 FIRST_PERIODS = 0.7
 """Length, in periods of the slowest oscillation, over which starts are fitted first.

@@ -9,9 +9,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.rig.identify.first_guesses import carry_starts, fit_starts, project_starts_out
 from pipeline.rig.identify.objective import Evaluation, evaluate
 from pipeline.rig.identify.problem import Problem
-from pipeline.rig.identify.starts import carry_starts, fit_starts, project_starts_out
 
 Array = NDArray[np.float64]
 

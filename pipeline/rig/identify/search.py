@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.products.reporting import report
+from pipeline.rig.identify.first_guesses import fit_starts
 from pipeline.rig.identify.local import Echo, Fit, fit_local
 from pipeline.rig.identify.objective import evaluate
 from pipeline.rig.identify.problem import Piece, Problem
-from pipeline.rig.identify.starts import fit_starts
 
 Array = NDArray[np.float64]
 

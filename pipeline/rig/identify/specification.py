@@ -17,11 +17,11 @@ from magpend_core.models.parameters import Parameters, near_names
 from magpend_core.models.presets import is_file
 from pipeline.rig.identify.settings import setting_problems
 from pipeline.rig.identify.unknowns import Pair, ParameterTables, Unknown, table_at, validate
-from pipeline.spec.files import read_toml
-from pipeline.spec.models import add_model
-from pipeline.spec.parsing import IDENTIFICATION
-from pipeline.spec.problems import SpecError, unknown_choice, unknown_key
-from pipeline.spec.tables import Table
+from pipeline.specification.files import read_toml
+from pipeline.specification.models import add_model
+from pipeline.specification.parsing import IDENTIFICATION
+from pipeline.specification.problems import SpecError, unknown_choice, unknown_key
+from pipeline.specification.tables import Table
 
 
 class SensorsTable(Table):

@@ -20,8 +20,8 @@ from magpend_core.models.parameters import (
     Parameters,
     unknown_name_problem,
 )
-from pipeline.spec.problems import problems_of
-from pipeline.spec.tables import Table
+from pipeline.specification.problems import problems_of
+from pipeline.specification.tables import Table
 
 _LEAST = 1e-9
 """Smallest value of a positive parameter, relative to its start."""

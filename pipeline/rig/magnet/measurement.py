@@ -24,9 +24,9 @@ from magpend_core.models.parameters import ParameterError, Parameters
 from magpend_core.models.pendulum import magnet_torque as laws
 from magpend_core.models.presets import find_preset
 from pipeline.rig.recordings import units
-from pipeline.spec.files import read_toml
-from pipeline.spec.problems import SpecError, unknown_choice, unknown_name, validated
-from pipeline.spec.tables import Table
+from pipeline.specification.files import read_toml
+from pipeline.specification.problems import SpecError, unknown_choice, unknown_name, validated
+from pipeline.specification.tables import Table
 
 MIN_READINGS = 5
 """Fewest readings of a curve. A bump has three parameters; further readings show how well it fits."""

@@ -16,7 +16,7 @@ from pipeline.rig.measured.distances import Candidate, cloud_of, distance_to, fl
 from pipeline.rig.measured.measuring import with_sides
 from pipeline.rig.measured.windows import WindowEdge, window_edges
 from pipeline.runs.derive import AnalysedRun
-from pipeline.spec.problems import SpecError
+from pipeline.specification.problems import SpecError
 
 NOBODY = -1
 

@@ -17,7 +17,7 @@ from pipeline.analysis.sets import Geometry
 from pipeline.layout.vocabulary import ABSENT, APERIODIC, FREQUENCY_DIM, PERIODIC_ORBIT, UNSTABLE, split_dims
 from pipeline.rig.measured.distances import Candidate
 from pipeline.runs.derive import AnalysedRun, refused
-from pipeline.spec.problems import SpecError
+from pipeline.specification.problems import SpecError
 
 Floats = npt.NDArray[np.float64]
 

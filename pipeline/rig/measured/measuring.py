@@ -15,10 +15,10 @@ from pipeline.analysis.sides import UNKNOWN, flags_of
 from pipeline.layout.vocabulary import model_attribute, model_of
 from pipeline.rig.edges import Edges, edges_of
 from pipeline.rig.measured.phase import section_phase
+from pipeline.rig.measured.recorded_sections import ORDER, WINDOW_S, find_sections, name_of
 from pipeline.rig.measured.regimes import LIMIT, MAX_PERIOD, Regime, find_period
-from pipeline.rig.measured.sections import ORDER, WINDOW_S, find_sections, name_of
 from pipeline.rig.measured.steps import LEAST, TRANSIENT, Stretch, cut
-from pipeline.spec.problems import SpecError
+from pipeline.specification.problems import SpecError
 
 _MEMORY = 3.0
 """Scatter of a jittered motion relative to the effect of one edge: each period has two, and effects last."""
@@ -37,7 +37,7 @@ class Way:
     window : int, optional
         Drive periods of a window of a slow sweep; see `pipeline.rig.measured.steps.cut`.
     window_s, order
-        Window and order of the local polynomials; see `pipeline.rig.measured.sections.find_sections`.
+        Window and order of the local polynomials; see `pipeline.rig.measured.recorded_sections.find_sections`.
     hysteresis : float, optional
         Band that the drive's edges must cross; see `pipeline.rig.edges.find_edges`.
     limit, max_period

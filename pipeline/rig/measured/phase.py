@@ -6,7 +6,7 @@ import numpy as np
 
 from magpend_core.models.parameters import Parameters
 from pipeline.rig.edges import find_edges
-from pipeline.spec.problems import SpecError
+from pipeline.specification.problems import SpecError
 
 _SAMPLES = 4096
 _SNAP = 2e-3

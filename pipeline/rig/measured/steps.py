@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from pipeline.rig.edges import Edges, Timing
-from pipeline.spec.problems import SpecError
+from pipeline.specification.problems import SpecError
 
 Floats = npt.NDArray[np.float64]
 

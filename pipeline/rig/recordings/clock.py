@@ -10,7 +10,7 @@ import numpy as np
 
 from pipeline.rig.recordings.findings import Finding, runs
 from pipeline.rig.recordings.raw import Channel
-from pipeline.spec.problems import SpecError
+from pipeline.specification.problems import SpecError
 
 MIXED = 1e-3
 """Relative difference of sampling intervals above which channels have different rates."""

@@ -14,7 +14,7 @@ from pipeline.rig.recordings.findings import Finding
 from pipeline.rig.recordings.mapping import CsvMap
 from pipeline.rig.recordings.raw import Channel, Raw, digest
 from pipeline.rig.recordings.text import instants, number, read_text, split, table, unique, without_end
-from pipeline.spec.problems import SpecError
+from pipeline.specification.problems import SpecError
 
 SIMULATED = "# simulated"
 """First line of a file with simulated readings."""

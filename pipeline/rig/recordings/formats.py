@@ -6,7 +6,7 @@ from pathlib import Path
 
 from pipeline.rig.recordings.mapping import CsvMap
 from pipeline.rig.recordings.raw import Raw
-from pipeline.spec.problems import SpecError
+from pipeline.specification.problems import SpecError
 
 SUFFIXES = {
     ".tdms": "tdms",

@@ -16,7 +16,7 @@ import numpy as np
 from pipeline.rig.recordings.findings import Finding
 from pipeline.rig.recordings.raw import Channel, Raw, digest
 from pipeline.rig.recordings.text import number, read_text, split, table, unique, without_end
-from pipeline.spec.problems import SpecError
+from pipeline.specification.problems import SpecError
 
 MAGIC = "LabVIEW Measurement"
 END = "***End_of_Header***"

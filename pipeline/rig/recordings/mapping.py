@@ -12,11 +12,11 @@ from pydantic import BaseModel, Field, ValidationError, model_validator
 from magpend_core.models import load_model
 from magpend_core.models.model import Model
 from pipeline.rig.recordings import units
-from pipeline.spec.files import read_toml
-from pipeline.spec.models import KEPT, add_model, kept_reference, model_toml
-from pipeline.spec.problems import SpecError, problems_of, unknown_key
-from pipeline.spec.tables import Table
-from pipeline.spec.toml import toml_key, toml_value
+from pipeline.specification.files import read_toml
+from pipeline.specification.models import KEPT, add_model, kept_reference, model_toml
+from pipeline.specification.problems import SpecError, problems_of, unknown_key
+from pipeline.specification.tables import Table
+from pipeline.specification.toml import toml_key, toml_value
 
 FORMATS = ("tdms", "lvm", "csv", "matlab")
 DRIVE = "drive"

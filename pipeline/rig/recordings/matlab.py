@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.rig.recordings.raw import Channel, Raw, digest
-from pipeline.spec.problems import SpecError
+from pipeline.specification.problems import SpecError
 
 STEP = "dt"
 """Name of the variable with the sampling interval [s]."""

@@ -28,7 +28,7 @@ from pipeline.rig.recordings.mapping import (
     load_mapping,
 )
 from pipeline.rig.recordings.raw import Channel, Raw
-from pipeline.spec.problems import SpecError, unknown_name
+from pipeline.specification.problems import SpecError, unknown_name
 
 DIM = "sample"
 

@@ -20,7 +20,7 @@ import xarray as xr
 from pipeline.layout.vocabulary import model_of
 from pipeline.rig.recordings.findings import runs
 from pipeline.rig.recordings.mapping import DRIVE
-from pipeline.spec.problems import SpecError
+from pipeline.specification.problems import SpecError
 
 LEAP, LEAP_SAMPLES = 0.4, 5
 """Change of the drive, relative to its range, that counts as a switch, and its most samples."""

@@ -13,7 +13,7 @@ import numpy as np
 
 from pipeline.rig.recordings.findings import Finding
 from pipeline.rig.recordings.raw import Channel, Raw, digest
-from pipeline.spec.problems import SpecError
+from pipeline.specification.problems import SpecError
 
 SIMULATED = "simulated"
 """Property of a file with simulated readings."""

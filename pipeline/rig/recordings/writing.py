@@ -17,8 +17,8 @@ from pipeline.rig.recordings.delimited import SIMULATED as SIMULATED_LINE
 from pipeline.rig.recordings.mapping import DRIVE, ChannelMap, DriveMap, Mapping, PieceMap, TimeMap
 from pipeline.rig.recordings.raw import Channel, Raw
 from pipeline.rig.recordings.tdms import SIMULATED
-from pipeline.spec.models import kept_reference
-from pipeline.spec.problems import SpecError
+from pipeline.specification.models import kept_reference
+from pipeline.specification.problems import SpecError
 
 SUFFIXES = (".tdms", ".csv", ".nc")
 GROUP = "recording"

@@ -13,7 +13,7 @@ from magpend_core.engine import checks, entry
 from magpend_core.engine import vecmath as elementary
 from magpend_core.engine.checks import SystemCheckError, check_system
 from magpend_core.engine.jit import inline
-from magpend_core.engine.plain import plain
+from magpend_core.engine.plain_python import plain
 from magpend_core.engine.system import System
 from magpend_core.engine.variational import with_tangents
 from magpend_core.engine.vecmath import TWO_PI, sincos

@@ -9,7 +9,7 @@ from numba import njit
 
 from magpend_core.engine import vecmath
 from magpend_core.engine.jit import OPTIONS
-from magpend_core.engine.plain import plain
+from magpend_core.engine.plain_python import plain
 from magpend_core.engine.simd import WIDTH, load, store_rows
 
 NAMES = (

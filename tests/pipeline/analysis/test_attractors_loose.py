@@ -8,9 +8,9 @@ import xarray as xr
 
 from magpend_core import load_preset, sections
 from pipeline.analysis.attractors.attractors import identify
-from pipeline.analysis.attractors.cells import Block
-from pipeline.analysis.attractors.deciding import decide
-from pipeline.analysis.attractors.orbits import Orbit
+from pipeline.analysis.attractors.finding.assigning import decide
+from pipeline.analysis.attractors.finding.cell_blocks import Block
+from pipeline.analysis.attractors.finding.closed_orbits import Orbit
 from pipeline.analysis.sets import Geometry
 from pipeline.layout.vocabulary import ATTRACTS, CLOSED, EXTENDED, PERIODIC_ORBIT, UNDECIDED
 

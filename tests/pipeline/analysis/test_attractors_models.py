@@ -8,7 +8,7 @@ import xarray as xr
 
 from magpend_core import load_model, sections
 from pipeline.analysis.attractors.attractors import identify, match
-from pipeline.analysis.attractors.portraits import portraits
+from pipeline.analysis.attractors.describing.portraits import portraits
 from pipeline.analysis.attractors.settling_table import settling_table
 from pipeline.analysis.attractors.table import attractors_table
 from pipeline.analysis.basins.basins import basins

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.analysis.attractors.cells import Block
-from pipeline.analysis.attractors.deciding import decide
-from pipeline.analysis.attractors.orbits import Orbit, raw_orbit
-from pipeline.analysis.attractors.spirals import near_closed
+from pipeline.analysis.attractors.finding.assigning import decide
+from pipeline.analysis.attractors.finding.cell_blocks import Block
+from pipeline.analysis.attractors.finding.closed_orbits import Orbit, raw_orbit
+from pipeline.analysis.attractors.finding.spirals import near_closed
 from pipeline.analysis.sets import Geometry, groups, hashes, mean_distance, nearest_distances
 from pipeline.layout.vocabulary import APPROACHING, CERTAIN, CLOSED, UNDECIDED
 

@@ -7,7 +7,7 @@ import pytest
 import xarray as xr
 
 from pipeline.analysis.attractors.attractors import identify, match
-from pipeline.analysis.attractors.hysteresis import hysteresis
+from pipeline.analysis.attractors.matching.hysteresis import hysteresis
 from pipeline.layout.vocabulary import ATTRACTS, BOUNDED_SET, NOT_SETTLED, PERIODIC_ORBIT
 
 STATES = ["psi1", "psi2", "psi1_dot", "psi2_dot"]

@@ -10,7 +10,7 @@ from magpend_core.status import Status
 from pipeline.analysis.basins.basins import basins
 from pipeline.layout.vocabulary import ATTRACTS, PERIODIC_ORBIT
 from pipeline.runs.derive import derive
-from pipeline.spec.problems import SpecError
+from pipeline.specification.problems import SpecError
 
 LN_2 = np.log(2.0)
 DIMS = ("frequency", "psi1_0", "psi2_0")

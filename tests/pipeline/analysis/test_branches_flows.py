@@ -19,7 +19,7 @@ from pipeline.analysis.branches import (
     table_of,
     windows_of,
 )
-from pipeline.analysis.branches.starts import family_of
+from pipeline.analysis.branches.starting_orbits import family_of
 from tests.core.flows import BAUTIN, PAIR, ROSSLER, flow
 
 

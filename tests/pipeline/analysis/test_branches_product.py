@@ -14,7 +14,7 @@ from pipeline.products.registry import ANALYSES, FIGURES
 from pipeline.products.reporting import reporting
 from pipeline.runs.derive import AnalysedRun, derive, prepared
 from pipeline.runs.run import run
-from pipeline.spec.problems import SpecError
+from pipeline.specification.problems import SpecError
 
 SPEC = """
 kind = "sweep"

@@ -13,9 +13,9 @@ from magpend_core import Status
 from pipeline import open_run
 from pipeline.analysis.attractors.attractors import identify
 from pipeline.analysis.chaos.chaos import chaos, chaotic_cells
+from pipeline.analysis.chaos.correlation import section_dimension
 from pipeline.analysis.chaos.lyapunov import Motion, pooled_mean
 from pipeline.analysis.chaos.per_attractor import Nature
-from pipeline.analysis.chaos.staying import section_dimension
 from pipeline.analysis.chaos.table import chaos_table, dimension_table
 from pipeline.cli.exits import Exit
 from pipeline.layout.vocabulary import (

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.analysis.attractors.clouds import OTHER, SAME, Cloud, group, is_stationary, members, mixing
+from pipeline.analysis.attractors.extension.clouds import OTHER, SAME, Cloud, group, is_stationary, members, mixing
 from pipeline.analysis.sets import Geometry
 
 PLANE = Geometry((False, False), (1.0, 1.0))

@@ -10,7 +10,7 @@ from magpend_core import trajectory
 from magpend_core.models import load_model
 from magpend_core.orbits import polish_orbits
 from magpend_core.sections import run_branches
-from pipeline.analysis.attractors.matching import BASES, match
+from pipeline.analysis.attractors.matching.matching import BASES, match
 from pipeline.analysis.branches import connecting, lockstep
 from pipeline.analysis.branches.arclength import Settings
 from pipeline.analysis.branches.connecting import Found, Link, connect, grouped

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from magpend_core.status import Status
-from pipeline.analysis.attractors.cells import Block
-from pipeline.analysis.attractors.extending import Outcome, extend
-from pipeline.analysis.attractors.growth import growth_of, on_closed_curves
-from pipeline.analysis.attractors.orbits import Orbit
-from pipeline.analysis.attractors.requests import LEG, Extended, Leg, Polish, Settings, Slopes
+from pipeline.analysis.attractors.extension.extending import Outcome, extend
+from pipeline.analysis.attractors.extension.growth import growth_of, on_closed_curves
+from pipeline.analysis.attractors.finding.cell_blocks import Block
+from pipeline.analysis.attractors.finding.closed_orbits import Orbit
+from pipeline.analysis.attractors.finding.requests import LEG, Extended, Leg, Polish, Settings, Slopes
 from pipeline.analysis.sets import Geometry
 from pipeline.layout.vocabulary import ATTRACTS, BOUNDED_SET, CHAOTIC_SET, NEUTRAL, NOT_SETTLED, TORUS, TRANSIENT
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.analysis.attractors.lifetimes import lifetime_interval
+from pipeline.analysis.attractors.extension.lifetimes import lifetime_interval
 
 # ---- intervals ---------------------------------------------------------------------------------
 

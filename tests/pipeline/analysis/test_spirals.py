@@ -8,9 +8,9 @@ import xarray as xr
 
 from magpend_core import load_preset, sections
 from pipeline.analysis.attractors.attractors import identify
-from pipeline.analysis.attractors.orbits import Orbit
-from pipeline.analysis.attractors.requests import LEG
-from pipeline.analysis.attractors.spirals import Recurrence, leap, near_closed
+from pipeline.analysis.attractors.finding.closed_orbits import Orbit
+from pipeline.analysis.attractors.finding.requests import LEG
+from pipeline.analysis.attractors.finding.spirals import Recurrence, leap, near_closed
 from pipeline.analysis.sets import Geometry
 from pipeline.layout.vocabulary import ATTRACTS, BOUNDED_SET, NOT_SETTLED, PERIODIC_ORBIT
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.analysis.attractors.orbits import Orbit
-from pipeline.analysis.attractors.stability import by_margin, largest_error
+from pipeline.analysis.attractors.finding.closed_orbits import Orbit
+from pipeline.analysis.attractors.finding.stability import by_margin, largest_error
 from pipeline.analysis.attractors.table import attractors_table
 from pipeline.analysis.outcomes import other_cells, outcomes, sentence
 from pipeline.layout.vocabulary import ATTRACTS, NEUTRAL, UNSTABLE

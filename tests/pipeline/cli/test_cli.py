@@ -16,7 +16,7 @@ from pipeline.cli.exits import Exit
 from pipeline.layout.plan import make_plan
 from pipeline.runs import preview, workflows
 from pipeline.runs.preview import figure_command, first_figure
-from pipeline.spec.parsing import parse_spec
+from pipeline.specification.parsing import parse_spec
 
 BAD = 'kind = "sweep"\n[axes]\nq = { start = 1, stop = 2, nun = 3 }\n[integration]\nrtol = -1'
 

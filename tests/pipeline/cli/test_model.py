@@ -9,7 +9,7 @@ import tomllib
 import pytest
 
 from pipeline.runs.modelling import TEMPLATE
-from pipeline.spec.parsing import load_spec
+from pipeline.specification.parsing import load_spec
 
 
 def test_new__runs_as_it_is(main, tmp_path):

@@ -14,7 +14,7 @@ import pytest
 from pipeline.compute import addresses, clients
 from pipeline.compute.addresses import Address, SchedulerError, ask, read_address
 from pipeline.compute.clients import Where
-from pipeline.spec.problems import SpecError
+from pipeline.specification.problems import SpecError
 
 SECONDS = 60.0
 """Within which each is refused: 5 s of silence, and a machine that is busy."""

@@ -20,7 +20,7 @@ from pipeline.compute.clients import Where, connected
 from pipeline.compute.jobqueue import settings, worker_script
 from pipeline.runs.progress import Progress
 from pipeline.runs.run import run
-from pipeline.spec.clusters import load_cluster
+from pipeline.specification.clusters import load_cluster
 
 SPEC = """
 kind = "sweep"

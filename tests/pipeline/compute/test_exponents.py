@@ -9,8 +9,8 @@ from pipeline.compute.exponents import flags
 from pipeline.layout.plan import make_plan
 from pipeline.products.lyapunov import LYAPUNOV_VARIABLES, LyapunovFlag
 from pipeline.runs.run import run
-from pipeline.spec.parsing import load_spec
-from pipeline.spec.problems import SpecError
+from pipeline.specification.parsing import load_spec
+from pipeline.specification.problems import SpecError
 
 SPEC = """
 kind = "sweep"

@@ -25,8 +25,8 @@ from pipeline.layout.plan import make_plan
 from pipeline.layout.schema import REFINEMENT, base_variables
 from pipeline.runs.run import run
 from pipeline.runs.status import state
-from pipeline.spec.parsing import parse_spec
-from pipeline.spec.problems import SpecError
+from pipeline.specification.parsing import parse_spec
+from pipeline.specification.problems import SpecError
 
 VARIABLES = base_variables(load_model())
 

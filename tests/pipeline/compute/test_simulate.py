@@ -8,7 +8,7 @@ import xarray as xr
 
 from magpend_core import load_preset, trajectory
 from pipeline.compute.simulate import simulate, write_series
-from pipeline.spec.problems import SpecError
+from pipeline.specification.problems import SpecError
 
 START = (0.2, 0.1, 0.0, 0.0)
 
@@ -71,7 +71,7 @@ def test_write_series__bad_paths(series, tmp_path):
 def test_simulate__has_the_bounds_of_specifications(name, value):
     from pydantic import ValidationError
 
-    from pipeline.spec.tables import Integration
+    from pipeline.specification.tables import Integration
 
     with pytest.raises(ValidationError):
         Integration(**{name: value})

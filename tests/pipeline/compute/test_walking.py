@@ -13,7 +13,7 @@ from pipeline import open_run
 from pipeline.layout.plan import make_plan
 from pipeline.runs.run import run
 from pipeline.runs.status import state
-from pipeline.spec.parsing import parse_spec
+from pipeline.specification.parsing import parse_spec
 from pipeline.store.commits import marker_key
 
 DUFFING = """

@@ -13,13 +13,13 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.compute import clients, limits, local, window
+from pipeline.compute import clients, dispatch, limits, local
 from pipeline.compute.addresses import SchedulerError
+from pipeline.compute.dispatch import Watch, Window
 from pipeline.compute.execute import run_tasks
 from pipeline.compute.limits import Limits
 from pipeline.compute.local import local_cluster
 from pipeline.compute.order import Order, TaskFailedError
-from pipeline.compute.window import Watch, Window
 
 
 @pytest.fixture
@@ -102,7 +102,7 @@ def test_workers__one_that_takes_all_memory_is_ended_before_the_machine_suffers(
 
 def test_workers__one_that_is_stopped(faulty, tmp_path, monkeypatch):
     """SIGSTOP: it falls silent, is restarted, and its task is done by another."""
-    monkeypatch.setattr(window, "SILENT_S", 6.0)  # a busy machine keeps a worker silent for seconds
+    monkeypatch.setattr(dispatch, "SILENT_S", 6.0)  # a busy machine keeps a worker silent for seconds
     task = partial(faulty.hanging, str(tmp_path), number=signal.SIGSTOP, unlucky=(2,))
     lines = []
     results = run_tasks(task, range(6), seconds=one_second, workers=2, echo=lines.append)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.explorer.arrays import DTYPES, pack_arrays, unpack_arrays
+from pipeline.explorer.data.arrays import DTYPES, pack_arrays, unpack_arrays
 
 
 def test_arrays__come_back_as_they_were():

@@ -12,17 +12,17 @@ import re
 import numpy as np
 import pytest
 
-from pipeline.explorer import copied_orbits
-from pipeline.explorer import folder as folder_module
-from pipeline.explorer.arrays import unpack_arrays
-from pipeline.explorer.columns import fit, levels, thinned
-from pipeline.explorer.copied_orbits import ALIKE, NEAREST, NONE, SAME_ATTRACTOR, choose
-from pipeline.explorer.explored import ExploredRun
-from pipeline.explorer.export import RESERVE, export_page
-from pipeline.explorer.folder import export_folder
-from pipeline.explorer.gather import Column, column
-from pipeline.explorer.packing import packed
-from pipeline.spec.problems import SpecError
+from pipeline.explorer.copies import folder as folder_module
+from pipeline.explorer.copies import orbits as copied_orbits
+from pipeline.explorer.copies.columns import fit, levels, thinned
+from pipeline.explorer.copies.content import Column, column
+from pipeline.explorer.copies.export import RESERVE, export_page
+from pipeline.explorer.copies.folder import export_folder
+from pipeline.explorer.copies.orbits import ALIKE, NEAREST, NONE, SAME_ATTRACTOR, choose
+from pipeline.explorer.copies.packing import packed
+from pipeline.explorer.data.arrays import unpack_arrays
+from pipeline.explorer.data.explored import ExploredRun
+from pipeline.specification.problems import SpecError
 from pipeline.store.errors import DamagedError, RefusedError
 from pipeline.store.run import Run
 

@@ -14,15 +14,15 @@ import pytest
 
 from magpend_core.models import load_model
 from magpend_core.orbits import polish_orbits
-from pipeline.explorer import slices
-from pipeline.explorer.arrays import unpack_arrays
-from pipeline.explorer.catalog import Entry
-from pipeline.explorer.colours import rgb
-from pipeline.explorer.legend import Legend
-from pipeline.explorer.live import LiveRun, LiveSession, live_problem
-from pipeline.explorer.messages import MOST_BYTES, Region, RequestError, read_request
-from pipeline.explorer.regions import zoom_toml, zoomed
-from pipeline.explorer.settling import settle_cells
+from pipeline.explorer.data.arrays import unpack_arrays
+from pipeline.explorer.data.colours import rgb
+from pipeline.explorer.live import slices
+from pipeline.explorer.live.catalog import Entry
+from pipeline.explorer.live.legend import Legend
+from pipeline.explorer.live.live import LiveRun, LiveSession, live_problem
+from pipeline.explorer.live.messages import MOST_BYTES, Region, RequestError, read_request
+from pipeline.explorer.live.regions import zoom_toml, zoomed
+from pipeline.explorer.live.settling import settle_cells
 from pipeline.layout.identity import identity_of
 from pipeline.layout.plan import make_plan
 from pipeline.layout.vocabulary import (
@@ -39,8 +39,8 @@ from pipeline.plots import palette
 from pipeline.runs.derive import derive
 from pipeline.runs.run import run
 from pipeline.runs.status import state
-from pipeline.spec.parsing import load_spec
-from pipeline.spec.problems import SpecError
+from pipeline.specification.parsing import load_spec
+from pipeline.specification.problems import SpecError
 from pipeline.store.run import Run
 from pipeline.store.setup import create
 
@@ -577,7 +577,7 @@ def own_children():
 
 
 def test_run__of_too_much_is_refused(directories, watch, monkeypatch):
-    monkeypatch.setattr("pipeline.explorer.regions.MOST_CELLS", 50)
+    monkeypatch.setattr("pipeline.explorer.live.regions.MOST_CELLS", 50)
     end = watch(directories["whole"]).ask(do="run", **REGION)
     assert "112 cells" in end["error"]
 

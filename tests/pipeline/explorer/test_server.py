@@ -21,15 +21,15 @@ from tornado.httpserver import HTTPServer
 from tornado.simple_httpclient import SimpleAsyncHTTPClient
 from tornado.websocket import websocket_connect
 
-from pipeline.explorer import browser, page_html, server
-from pipeline.explorer.answers import ANSWERS
-from pipeline.explorer.arrays import unpack_arrays
-from pipeline.explorer.security import Guard, Rate, content_policy, new_token
-from pipeline.explorer.server import Service, application, listening
+from pipeline.explorer.data.arrays import unpack_arrays
+from pipeline.explorer.serving import browser, page_html, server
+from pipeline.explorer.serving.answers import ANSWERS
+from pipeline.explorer.serving.security import Guard, Rate, content_policy, new_token
+from pipeline.explorer.serving.server import Service, application, listening
 from pipeline.layout.identity import identity_of
 from pipeline.layout.plan import make_plan
-from pipeline.spec.parsing import load_spec
-from pipeline.spec.problems import SpecError
+from pipeline.specification.parsing import load_spec
+from pipeline.specification.problems import SpecError
 from pipeline.store.commits import write_task
 from pipeline.store.run import Run
 from pipeline.store.setup import create
@@ -371,7 +371,7 @@ def test_zoom__unknown_axes_are_refused(client):
 
 
 def test_first_answers__what_fails_is_logged(client, monkeypatch, caplog):
-    from pipeline.explorer import answers
+    from pipeline.explorer.serving import answers
 
     def fail(*arguments):
         raise ValueError("no picture today")

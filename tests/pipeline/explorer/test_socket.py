@@ -11,10 +11,10 @@ from tornado.netutil import bind_sockets
 from tornado.web import Application
 from tornado.websocket import websocket_connect
 
-from pipeline.explorer import socket as sockets
-from pipeline.explorer.arrays import unpack_arrays
-from pipeline.explorer.live import LiveRun
-from pipeline.explorer.messages import MOST_BYTES
+from pipeline.explorer.data.arrays import unpack_arrays
+from pipeline.explorer.live.live import LiveRun
+from pipeline.explorer.live.messages import MOST_BYTES
+from pipeline.explorer.serving import socket as sockets
 from pipeline.runs.run import run
 from pipeline.store.run import Run
 

@@ -13,27 +13,27 @@ from scipy.integrate import solve_ivp
 
 from magpend_core import rates
 from magpend_core.models import load_model, model_names
-from pipeline.explorer import diagram as diagrams
-from pipeline.explorer import tables
-from pipeline.explorer.answers import ANSWERS, Query
-from pipeline.explorer.arrays import unpack_arrays
-from pipeline.explorer.colours import NONE, rgb, schemes
-from pipeline.explorer.diagram import diagram
-from pipeline.explorer.explored import ExploredRun, ExplorerError
-from pipeline.explorer.orbits import cell_of, linearise, orbit
-from pipeline.explorer.overlays import attractors, branches, curves
-from pipeline.explorer.plain import plain
-from pipeline.explorer.planes import plane
-from pipeline.explorer.series import SAMPLES
-from pipeline.explorer.tables import table
-from pipeline.explorer.view import describe_view
+from pipeline.explorer.data import diagram as diagrams
+from pipeline.explorer.data import tables
+from pipeline.explorer.data.arrays import unpack_arrays
+from pipeline.explorer.data.clicked_orbit import cell_of, linearise, orbit
+from pipeline.explorer.data.colours import NONE, rgb, schemes
+from pipeline.explorer.data.diagram import diagram
+from pipeline.explorer.data.explored import ExploredRun, ExplorerError
+from pipeline.explorer.data.overlays import attractors, branches, curves
+from pipeline.explorer.data.plain_text import plain
+from pipeline.explorer.data.planes import plane
+from pipeline.explorer.data.series import SAMPLES
+from pipeline.explorer.data.tables import table
+from pipeline.explorer.data.view import describe_view
+from pipeline.explorer.serving.answers import ANSWERS, Query
 from pipeline.layout.identity import identity_of
 from pipeline.layout.plan import make_plan
 from pipeline.layout.vocabulary import ATTRACTS, DIVERGED, EVIDENCE, PERIODIC, TRANSIENT
 from pipeline.plots import palette
 from pipeline.runs.derive import derive
 from pipeline.runs.run import run
-from pipeline.spec.parsing import load_spec
+from pipeline.specification.parsing import load_spec
 from pipeline.store.errors import DamagedError
 from pipeline.store.run import Run
 from pipeline.store.setup import create

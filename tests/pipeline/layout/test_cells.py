@@ -11,7 +11,7 @@ import pytest
 from magpend_core import load_preset
 from pipeline.layout.cells import CellMap, coordinates, initial_states
 from pipeline.layout.plan import make_plan
-from pipeline.spec.parsing import parse_spec
+from pipeline.specification.parsing import parse_spec
 
 NAMES = load_preset().names
 

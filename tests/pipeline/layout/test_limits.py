@@ -13,8 +13,8 @@ from pipeline.layout.limits import MOST_CHUNK_BYTES, MOST_TASKS, check_plan, che
 from pipeline.layout.plan import make_plan
 from pipeline.runs.preview import describe_plan
 from pipeline.runs.run import run
-from pipeline.spec.parsing import parse_spec
-from pipeline.spec.problems import SpecError
+from pipeline.specification.parsing import parse_spec
+from pipeline.specification.problems import SpecError
 from pipeline.store.commits import read_commits
 from pipeline.store.runfile import read_run
 

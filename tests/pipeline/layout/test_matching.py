@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from pipeline.layout.cells import CellMap
 from pipeline.layout.matching import NOWHERE, Finder, apart, way_of
 from pipeline.layout.plan import make_plan
-from pipeline.spec.parsing import Spec, parse_spec
+from pipeline.specification.parsing import Spec, parse_spec
 
 values = st.lists(st.sampled_from([-1.0, -0.5, -0.0, 0.0, 0.1, 1 / 3, 0.5, 1.0]), min_size=1, max_size=4)
 

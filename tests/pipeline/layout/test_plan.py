@@ -20,7 +20,7 @@ from pipeline.layout import plan as planning
 from pipeline.layout.identity import differences, digest_of, identity_of
 from pipeline.layout.plan import Plan, make_plan
 from pipeline.layout.schema import base_variables, sizes_of
-from pipeline.spec.parsing import parse_spec
+from pipeline.specification.parsing import parse_spec
 
 VARIABLES = base_variables(load_model())
 
@@ -117,7 +117,8 @@ def test_task__out_of_range(sweep_text):
 
 
 @pytest.mark.parametrize(
-    "module", ["pipeline.layout.plan", "pipeline.layout.schema", "pipeline.spec.parsing", "pipeline.layout.identity"]
+    "module",
+    ["pipeline.layout.plan", "pipeline.layout.schema", "pipeline.specification.parsing", "pipeline.layout.identity"],
 )
 def test_import__pure(module):
     heavy = "('dask', 'zarr', 'xarray', 'matplotlib')"

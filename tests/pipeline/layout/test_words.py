@@ -7,8 +7,8 @@ import xarray as xr
 from magpend_core import load_model
 from magpend_core.crossing import Crossing
 from magpend_core.models.sectioned import sectioned
+from pipeline.layout.period_names import once, period_of, section_name
 from pipeline.layout.vocabulary import frequency_of, model_attribute, model_of, section_attributes, told_by
-from pipeline.layout.words import once, period_of, section_name
 from pipeline.plots.section import section_pair
 from tests.core.flows import ROSSLER, VAN_DER_POL, flow
 

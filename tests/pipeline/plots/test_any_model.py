@@ -12,7 +12,7 @@ from matplotlib.text import Text
 
 import pipeline.plots
 from magpend_core.models import load_model
-from pipeline.layout.letters import letter
+from pipeline.layout.attractor_letters import letter
 from pipeline.layout.vocabulary import ATTRACTS, PERIODIC_ORBIT
 from pipeline.plots import (
     Frame,

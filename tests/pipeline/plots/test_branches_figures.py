@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 from magpend_core.models.parameters import ParameterError
 from pipeline.plots import plot_branches, plot_curves, plot_multipliers
 from pipeline.runs.derive import derive
-from pipeline.spec.problems import SpecError
+from pipeline.specification.problems import SpecError
 
 
 @pytest.fixture

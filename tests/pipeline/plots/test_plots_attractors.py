@@ -16,9 +16,9 @@ from matplotlib.colors import to_rgb
 from magpend_core.models import load_model
 from magpend_core.models.pendulum.sides import Side
 from magpend_core.status import Status
-from pipeline.analysis.attractors.hysteresis import hysteresis
+from pipeline.analysis.attractors.matching.hysteresis import hysteresis
 from pipeline.layout import vocabulary
-from pipeline.layout.letters import letter
+from pipeline.layout.attractor_letters import letter
 from pipeline.layout.vocabulary import ATTRACTS, PERIODIC_ORBIT
 from pipeline.plots import (
     palette,

@@ -10,7 +10,7 @@ import pytest
 
 from pipeline.products.product import FigureOptions, StateOptions, default_of, function_of
 from pipeline.products.registry import ANALYSES, CELL_PRODUCTS, COMMANDS, FIGURES
-from pipeline.spec.problems import SpecError, validated
+from pipeline.specification.problems import SpecError, validated
 
 ALL = [*CELL_PRODUCTS.values(), *ANALYSES.values(), *FIGURES.values()]
 NAMES = [f"{type(p).__name__}-{p.name}" for p in ALL]

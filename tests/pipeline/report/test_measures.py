@@ -14,7 +14,7 @@ from pipeline.report.measures import MEASURES
 from pipeline.report.reproduce import judge, spelled
 from pipeline.report.study import ClaimTable
 from pipeline.report.verdicts import Verdict
-from pipeline.spec.problems import SpecError
+from pipeline.specification.problems import SpecError
 
 N = 20
 FREQUENCY = np.round(np.arange(2.0, 3.0001, 0.01), 9)

@@ -16,7 +16,7 @@ from pipeline.report.report import report
 from pipeline.report.stored import stored_options
 from pipeline.runs.derive import derive
 from pipeline.runs.run import run as run_spec
-from pipeline.spec.problems import SpecError
+from pipeline.specification.problems import SpecError
 from pipeline.store.run import Run
 
 HOSTILE = "<script>alert(1)</script> & friends"

@@ -17,7 +17,7 @@ from pipeline.report.measures import Estimate
 from pipeline.report.reproduce import Judgement, calibrated_on, decided_first, headline
 from pipeline.report.study import ClaimTable, load_study, shipped_studies
 from pipeline.report.verdicts import Verdict
-from pipeline.spec.problems import SpecError
+from pipeline.specification.problems import SpecError
 
 SPEC = """
 kind = "sweep"

@@ -7,7 +7,7 @@ import pytest
 import xarray as xr
 
 from pipeline.rig.edges import Edges, edges_of, find_edges
-from pipeline.spec.problems import SpecError
+from pipeline.specification.problems import SpecError
 
 DUTY = 0.4927
 

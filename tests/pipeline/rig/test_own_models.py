@@ -16,7 +16,7 @@ from pipeline.rig.identify.check import check
 from pipeline.rig.recordings import load_mapping, mapping_for, parse_mapping, read_recording, write_recording
 from pipeline.rig.recordings.reading import recording_of
 from pipeline.rig.simulation import load_rig, simulated
-from pipeline.spec.problems import SpecError
+from pipeline.specification.problems import SpecError
 
 MODEL = """
 name = "spring"

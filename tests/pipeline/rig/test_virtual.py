@@ -12,7 +12,7 @@ from magpend_core.models.presets import write_preset
 from pipeline.rig.recordings import findings_of, parse_mapping, read_recording, write_raw
 from pipeline.rig.simulation import load_rig, parse_rig, simulated
 from pipeline.rig.virtual import TOLERANCE, DriveSensor, Sensor, Step, readings, record
-from pipeline.spec.problems import SpecError
+from pipeline.specification.problems import SpecError
 
 TIMES = np.arange(3000) / 500.0
 START = (0.6, -0.2, 0.0, 0.0)

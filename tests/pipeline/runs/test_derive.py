@@ -16,7 +16,7 @@ from pipeline.products.registry import ANALYSES
 from pipeline.runs import derive as deriving
 from pipeline.runs import versions
 from pipeline.runs.derive import AnalysedRun, derive
-from pipeline.spec.problems import SpecError
+from pipeline.specification.problems import SpecError
 from pipeline.store.errors import DamagedError
 from pipeline.store.packing import withdraw
 from pipeline.store.run import Run

@@ -18,7 +18,7 @@ from pipeline.runs import estimate as estimates
 from pipeline.runs import preview
 from pipeline.runs.estimate import _points, _sample, estimate, mean_with_tail, writing_seconds
 from pipeline.runs.preview import describe_plan
-from pipeline.spec.parsing import parse_spec
+from pipeline.specification.parsing import parse_spec
 from pipeline.store import commits
 
 CLOSING = """
@@ -160,16 +160,16 @@ def test_describe_plan__complete_run_takes_nothing(write_spec, sweep_text, tmp_p
 
 @pytest.mark.parametrize("stops", [True, False])
 def test_estimate__compiles_no_kernel_that_the_run_does_not_need(monkeypatch, stops):
-    from pipeline.compute import walking
+    from pipeline.compute import continuation
 
     asked = []
-    original = walking.run_branches
+    original = continuation.run_branches
 
     def run_branches(*arguments, **options):
         asked.append((options["stop_when_closed"], options.get("quantities")))
         return original(*arguments, **options)
 
-    monkeypatch.setattr(walking, "run_branches", run_branches)
+    monkeypatch.setattr(continuation, "run_branches", run_branches)
     text = CLOSING if stops else CLOSING.replace("= true", "= false")
     estimate(*read(text))
     assert set(asked) == {(stops, None)}

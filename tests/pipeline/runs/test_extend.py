@@ -12,12 +12,12 @@ import pytest
 
 from magpend_core import Status
 from pipeline import open_run
-from pipeline.compute import exponents, longer, task, walking
+from pipeline.compute import continuation, exponents, extension, task
 from pipeline.compute.execute import TaskFailedError
 from pipeline.runs import extend as extending
 from pipeline.runs.extend import extend
 from pipeline.runs.run import run
-from pipeline.spec.problems import SpecError
+from pipeline.specification.problems import SpecError
 from pipeline.store.errors import RefusedError
 from pipeline.store.run import Run
 
@@ -61,7 +61,7 @@ class Count:
 
     def __init__(self, monkeypatch):
         self.cells, self.tangents, self.more = 0, 0, 0
-        branches, tangents = walking.run_branches, exponents.lyapunov_exponents
+        branches, tangents = continuation.run_branches, exponents.lyapunov_exponents
 
         def run_branches(parameters, frequency, states, **options):
             self.cells += parameters.shape[0] * parameters.shape[1]
@@ -71,14 +71,14 @@ class Count:
             self.tangents += len(parameters)
             return tangents(parameters, *words, **options)
 
-        more_sections = longer.more_sections
+        more_sections = extension.more_sections
 
         def go_on(parameters, *words, **options):
             self.more += len(parameters)
             return more_sections(parameters, *words, **options)
 
-        monkeypatch.setattr(longer, "more_sections", go_on)
-        monkeypatch.setattr(walking, "run_branches", run_branches)
+        monkeypatch.setattr(extension, "more_sections", go_on)
+        monkeypatch.setattr(continuation, "run_branches", run_branches)
         monkeypatch.setattr(exponents, "lyapunov_exponents", lyapunov_exponents)
         monkeypatch.setattr(task, "warm_up", lambda spec: 0.0)
 

@@ -20,7 +20,7 @@ from pipeline.runs import instants
 from pipeline.runs.derive import AnalysedRun
 from pipeline.runs.filming import Start, animation
 from pipeline.runs.moving import of_attractors
-from pipeline.spec.problems import SpecError
+from pipeline.specification.problems import SpecError
 
 HZ = 0.11
 
@@ -104,7 +104,7 @@ def test_of_attractors__what_does_not_attract_is_shown_when_asked_for(run, monke
     """Else it is said to be there; where nothing attracts, all sets are shown."""
     opened, options = AnalysedRun.of(run), AnimationOptions(at={"frequency": 0.16})
     found = opened.derive("attractors").copy(deep=True)
-    monkeypatch.setattr("pipeline.plots.door.attractors_of", lambda run, options: found)
+    monkeypatch.setattr("pipeline.plots.figure.attractors_of", lambda run, options: found)
     found["stability"][:, 1] = TRANSIENT
     found["share"][:, 1] = 0.0
     shown, notes = of_attractors(opened, options)

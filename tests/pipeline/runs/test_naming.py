@@ -9,7 +9,7 @@ import pytest
 from pipeline.products.branches import BranchOptions
 from pipeline.products.product import FigureOptions, StateOptions
 from pipeline.runs.naming import named, place
-from pipeline.spec.problems import SpecError
+from pipeline.specification.problems import SpecError
 from pipeline.store.run import Run
 
 

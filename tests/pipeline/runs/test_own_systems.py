@@ -21,8 +21,8 @@ from pipeline import open_run
 from pipeline.layout.identity import digest_of
 from pipeline.layout.vocabulary import model_of
 from pipeline.runs.run import run
+from pipeline.store.checksums import seal, unseal
 from pipeline.store.runfile import read_run
-from pipeline.store.seal import seal, unseal
 
 MANY = '[smoke]\n"initial_conditions.x.num" = 80\n"integration.n_transient" = 400\n'
 

@@ -8,7 +8,7 @@ import pytest
 from magpend_core import Status
 from pipeline import open_run
 from pipeline.runs.run import run
-from pipeline.spec.problems import SpecError
+from pipeline.specification.problems import SpecError
 
 SPEC = """
 kind = "sweep"

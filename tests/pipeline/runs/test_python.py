@@ -8,7 +8,7 @@ import pytest
 import magpend
 from magpend_core.models import ModelError
 from pipeline.runs.run import run as run_quietly
-from pipeline.spec.problems import SpecError
+from pipeline.specification.problems import SpecError
 
 OSCILLATOR = {
     "name": "oscillator",

@@ -20,8 +20,8 @@ from pipeline.runs.preview import describe_plan
 from pipeline.runs.run import run
 from pipeline.runs.status import state
 from pipeline.runs.zoom import Changes, read_source, to_toml, zoom
-from pipeline.spec.parsing import parse_spec
-from pipeline.spec.problems import SpecError
+from pipeline.specification.parsing import parse_spec
+from pipeline.specification.problems import SpecError
 from pipeline.store.errors import DamagedError, RefusedError
 from pipeline.store.runfile import read_run
 

@@ -20,7 +20,7 @@ from pipeline.compute.local import local_cluster
 from pipeline.runs.preview import describe_plan
 from pipeline.runs.run import InterruptedRunError, run
 from pipeline.runs.status import state
-from pipeline.spec.parsing import parse_spec
+from pipeline.specification.parsing import parse_spec
 from pipeline.store.errors import LockedError, RefusedError
 from pipeline.store.runfile import read_run
 

@@ -13,8 +13,8 @@ from pipeline.runs.batch import WORDS, coordinator_script
 from pipeline.runs.run import run
 from pipeline.runs.submit import prepare
 from pipeline.runs.workflows import find_spec
-from pipeline.spec.clusters import load_cluster
-from pipeline.spec.problems import SpecError
+from pipeline.specification.clusters import load_cluster
+from pipeline.specification.problems import SpecError
 
 CLUSTER = """
 [cluster]

@@ -16,8 +16,8 @@ from pipeline.runs.preview import describe_plan
 from pipeline.runs.run import run
 from pipeline.runs.workflows import shipped_workflows
 from pipeline.runs.zoom import Changes, read_source, to_toml, write_zoom, zoom
-from pipeline.spec.parsing import load_spec, parse_spec
-from pipeline.spec.problems import SpecError
+from pipeline.specification.parsing import load_spec, parse_spec
+from pipeline.specification.problems import SpecError
 from pipeline.store.runfile import read_run
 
 

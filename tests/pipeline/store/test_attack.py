@@ -21,9 +21,9 @@ from pipeline.compute import task
 from pipeline.runs.run import run
 from pipeline.runs.status import state
 from pipeline.runs.verify import verify_run
+from pipeline.store.checksums import seal, unseal
 from pipeline.store.errors import DamagedError, RefusedError, StoreError
 from pipeline.store.products import write_product
-from pipeline.store.seal import seal, unseal
 
 LONG = os.environ.get("MAGPEND_LONG") == "1"
 PLACES = 20 if LONG else 6

@@ -22,13 +22,13 @@ from pipeline.runs.status import state
 from pipeline.runs.verify import describe, verify_run
 from pipeline.runs.zoom import read_source
 from pipeline.store import local
+from pipeline.store.checksums import seal, unseal
 from pipeline.store.commits import marker_key, read_commits, sweep
 from pipeline.store.errors import DamagedError, IncompleteError, RefusedError, UnreadableError
 from pipeline.store.files import local_path
 from pipeline.store.local import LocalFiles
 from pipeline.store.records import Records
 from pipeline.store.run import Run
-from pipeline.store.seal import seal, unseal
 from pipeline.store.setup import check, create, establish
 from pipeline.store.skeleton import skeleton_files
 

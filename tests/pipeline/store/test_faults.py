@@ -23,10 +23,10 @@ import pytest
 from pipeline import open_run
 from pipeline.layout.plan import make_plan
 from pipeline.runs.run import run
-from pipeline.spec.parsing import load_spec
+from pipeline.specification.parsing import load_spec
 from pipeline.store import commits, packing, records
+from pipeline.store.checksums import fits, unseal
 from pipeline.store.errors import StoreError
-from pipeline.store.seal import fits, unseal
 
 sys.path.insert(0, str(Path(__file__).parent))
 import faults

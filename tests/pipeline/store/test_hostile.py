@@ -15,7 +15,7 @@ import pytest
 from pipeline.layout.plan import make_plan
 from pipeline.runs.derive import derive
 from pipeline.runs.run import run
-from pipeline.spec.parsing import kept_spec
+from pipeline.specification.parsing import kept_spec
 from pipeline.store.declared import Declared, declared_bytes
 from pipeline.store.errors import DamagedError, StoreError
 from pipeline.store.reading import open_run

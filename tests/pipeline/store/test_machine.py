@@ -28,7 +28,7 @@ from pipeline.runs.mending import sound_commits
 from pipeline.runs.run import run
 from pipeline.runs.status import state
 from pipeline.runs.verify import verify_run
-from pipeline.spec.parsing import load_spec
+from pipeline.specification.parsing import load_spec
 from pipeline.store import commits, packing, records
 from pipeline.store.commits import read_commits, write_task
 from pipeline.store.errors import DamagedError, RefusedError, StoreError

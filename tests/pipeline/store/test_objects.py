@@ -447,9 +447,9 @@ def test_run__credentials_are_nowhere(s3, write_spec, magpend, environment, tmp_
 
 
 def test_explorer__reads_a_run_there_as_in_a_folder(whole, made):
-    from pipeline.explorer.diagram import diagram
-    from pipeline.explorer.explored import ExploredRun
-    from pipeline.explorer.view import describe_view
+    from pipeline.explorer.data.diagram import diagram
+    from pipeline.explorer.data.explored import ExploredRun
+    from pipeline.explorer.data.view import describe_view
 
     for task in range(made.plan.n_tasks):
         made.commit(task)

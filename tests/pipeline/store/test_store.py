@@ -370,7 +370,7 @@ def test_create__axes_keep_the_order_of_the_file(tmp_path, write_spec):
     """The order of the axes is that of the cube's dims: what reads run.json must see it."""
     from pipeline.layout.identity import digest_of, identity_of
     from pipeline.layout.plan import make_plan
-    from pipeline.spec.parsing import load_spec, parse_spec
+    from pipeline.specification.parsing import load_spec, parse_spec
     from pipeline.store.runfile import read_run
     from pipeline.store.setup import create
 

@@ -16,7 +16,7 @@ import { onDark, themeSwitch } from "./switch.js";
 import { tabs } from "./tabs.js";
 import { Toolbar } from "./toolbar.js";
 
-/** Format of the answers that this page understands; see pipeline/explorer/view.py. */
+/** Format of the answers that this page understands; see pipeline/explorer/data/view.py. */
 const FORMAT = 1;
 
 /**

@@ -1,4 +1,4 @@
-// Arrays as the server packs them (pipeline/explorer/arrays.py): one buffer, read without copying.
+// Arrays as the server packs them (pipeline/explorer/data/arrays.py): one buffer, read without copying.
 
 const TYPES = {
   float64: Float64Array, float32: Float32Array, int32: Int32Array, uint32: Uint32Array,

@@ -1,4 +1,4 @@
-// Tables of a view's data that the browser writes itself: CSV, in the columns of pipeline/explorer/tables.py.
+// Tables of a view's data that the browser writes itself: CSV, in the columns of pipeline/explorer/data/tables.py.
 // NetCDF needs magpend.
 
 /** A field: what has commas, quotes or line ends is quoted; nothing stands for what has no value. */

@@ -6,7 +6,7 @@ import { tableOf } from "./formats.js";
 import { SourceError } from "./source.js";
 
 const NONE = 0xffffffff;
-/** What an orbit is to a cell, as pipeline/explorer/copied_orbits.py says it. */
+/** What an orbit is to a cell, as pipeline/explorer/copies/orbits.py says it. */
 const SAME_ATTRACTOR = 1, ALIKE = 2;
 
 /** A source over objects by name; the kinds of copies say where these are, and where the columns. */

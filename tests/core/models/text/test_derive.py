@@ -13,7 +13,7 @@ from hypothesis import given, reject
 from hypothesis import strategies as st
 
 from magpend_core import evaluate, jacobian, load_model, rates, sections
-from magpend_core.engine.plain import plain
+from magpend_core.engine.plain_python import plain
 from magpend_core.models import ModelError
 from magpend_core.models.text import graph, read_model
 from magpend_core.models.text.grammar import FUNCTIONS, parse

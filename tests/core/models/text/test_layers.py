@@ -10,7 +10,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from magpend_core import jacobian, load_model, rates, sections
-from magpend_core.engine.plain import plain
+from magpend_core.engine.plain_python import plain
 from magpend_core.engine.variational import with_tangents
 from magpend_core.models.text import read_model
 from magpend_core.sections import run_branches

@@ -12,11 +12,11 @@ import threading
 import numpy as np
 import pytest
 
-from pipeline.explorer.arrays import unpack_arrays
-from pipeline.explorer.diagram import diagram
-from pipeline.explorer.export import export_page
-from pipeline.explorer.folder import export_folder
-from pipeline.explorer.tables import table
+from pipeline.explorer.copies.export import export_page
+from pipeline.explorer.copies.folder import export_folder
+from pipeline.explorer.data.arrays import unpack_arrays
+from pipeline.explorer.data.diagram import diagram
+from pipeline.explorer.data.tables import table
 from pipeline.store.run import Run
 
 pytestmark = pytest.mark.slow

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from pipeline.layout.letters import letter
+from pipeline.layout.attractor_letters import letter
 from pipeline.runs.derive import stored
 from pipeline.store.reading import open_run
 from pipeline.store.run import Run

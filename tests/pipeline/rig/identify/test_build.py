@@ -15,7 +15,7 @@ from pipeline.rig.identify.problem import Problem
 from pipeline.rig.identify.specification import RecordingTable
 from pipeline.rig.recordings import smooth
 from pipeline.rig.virtual import DriveSensor, Sensor, Step, record
-from pipeline.spec.problems import SpecError
+from pipeline.specification.problems import SpecError
 
 NOISE = 1e-3
 

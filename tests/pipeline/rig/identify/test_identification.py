@@ -17,7 +17,7 @@ from magpend_core.models import load_model
 from pipeline.rig.identify import check as checking
 from pipeline.rig.identify import directory as d
 from pipeline.rig.identify import identification
-from pipeline.spec.problems import SpecError
+from pipeline.specification.problems import SpecError
 from pipeline.store.errors import RefusedError
 
 TRUTH = {"damping": 0.15, "linear": 1.1, "cubic": 0.4}

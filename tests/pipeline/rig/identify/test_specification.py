@@ -8,7 +8,7 @@ import tomllib
 import pytest
 
 from pipeline.rig.identify.specification import load_identification, parse_identification
-from pipeline.spec.problems import SpecError
+from pipeline.specification.problems import SpecError
 
 GOOD = """
 kind = "identification"

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.rig.magnet.measurement import read_measurement
-from pipeline.spec.problems import SpecError
+from pipeline.specification.problems import SpecError
 
 from .conftest import write_table
 

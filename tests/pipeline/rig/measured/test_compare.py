@@ -14,7 +14,7 @@ from pipeline.rig.measured.figures import plot_comparison, plot_measured
 from pipeline.rig.measured.measuring import Way, measure
 from pipeline.rig.measured.tables import edges_table, steps_table, summary_lines
 from pipeline.runs.derive import AnalysedRun
-from pipeline.spec.problems import SpecError
+from pipeline.specification.problems import SpecError
 
 SWEPT = np.array([2.46, 2.48, 2.5, 2.52, 2.54])
 LEFT, RIGHT = 1, 2

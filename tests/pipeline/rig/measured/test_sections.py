@@ -7,8 +7,8 @@ import pytest
 import xarray as xr
 
 from pipeline.rig.edges import Edges, edges_of
-from pipeline.rig.measured.sections import find_sections
-from pipeline.spec.problems import SpecError
+from pipeline.rig.measured.recorded_sections import find_sections
+from pipeline.specification.problems import SpecError
 
 STATES = ("psi1", "psi2", "psi1_dot", "psi2_dot")
 

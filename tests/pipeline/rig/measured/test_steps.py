@@ -7,7 +7,7 @@ import pytest
 
 from pipeline.rig.edges import Edges
 from pipeline.rig.measured.steps import constant_spans, cut
-from pipeline.spec.problems import SpecError
+from pipeline.specification.problems import SpecError
 
 DUTY = 0.4927
 

@@ -14,7 +14,7 @@ from pipeline.rig.measured.overlays import plot_series
 from pipeline.rig.measured.phase import section_phase
 from pipeline.rig.measured.series import series_of
 from pipeline.rig.virtual import DriveSensor, Sensor, Step, record
-from pipeline.spec.problems import SpecError
+from pipeline.specification.problems import SpecError
 
 RIGHT = [0.05208, 0.13572, -3.01085, 3.20903]
 

@@ -10,7 +10,7 @@ import pytest
 from pipeline.rig.recordings import parse_mapping, recording_of
 from pipeline.rig.recordings.formats import read_raw
 from pipeline.rig.recordings.writing import write_raw
-from pipeline.spec.problems import SpecError
+from pipeline.specification.problems import SpecError
 
 LVM = """LabVIEW Measurement\t
 Separator\tTab

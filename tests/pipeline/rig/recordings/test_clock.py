@@ -12,7 +12,7 @@ from pipeline.rig.recordings.clock import clock_of
 from pipeline.rig.recordings.formats import read_raw
 from pipeline.rig.recordings.mapping import parse_mapping
 from pipeline.rig.recordings.raw import Channel
-from pipeline.spec.problems import SpecError
+from pipeline.specification.problems import SpecError
 
 
 def stamped(make, stamps, **more):

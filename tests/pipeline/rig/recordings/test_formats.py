@@ -11,7 +11,7 @@ import pytest
 from pipeline.rig.recordings import findings_of, parse_mapping, read_recording
 from pipeline.rig.recordings.formats import read_raw
 from pipeline.rig.recordings.mapping import CsvMap
-from pipeline.spec.problems import SpecError
+from pipeline.specification.problems import SpecError
 
 nptdms = pytest.importorskip("nptdms")
 

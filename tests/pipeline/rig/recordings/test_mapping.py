@@ -7,7 +7,7 @@ import math
 import pytest
 
 from pipeline.rig.recordings.mapping import load_mapping, parse_mapping
-from pipeline.spec.problems import SpecError
+from pipeline.specification.problems import SpecError
 
 FULL = """
 model = "pendulum"

@@ -10,7 +10,7 @@ import pytest
 from pipeline.rig.recordings import recording_of, smooth
 from pipeline.rig.recordings.mapping import parse_mapping
 from pipeline.rig.recordings.smoothing import _first_samples, _smoothed, _switches
-from pipeline.spec.problems import SpecError
+from pipeline.specification.problems import SpecError
 
 
 def noisy(make, sigma, seed=0, n=20_000, rate_hz=1000.0):

@@ -17,7 +17,7 @@ from pipeline.rig.recordings import (
     write_raw,
     write_recording,
 )
-from pipeline.spec.problems import SpecError
+from pipeline.specification.problems import SpecError
 
 
 @pytest.fixture

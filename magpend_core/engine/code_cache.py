@@ -1,0 +1,238 @@
+"""Machine code on disk: used only if it is whole, for what it says, and written by nobody else.
+
+numba unpickles what it finds in its cache and jumps into the machine code in there. So an entry here is one
+file that begins with the sha256 of the rest, and the rest begins with what it was compiled from: one that is
+empty, cut, changed or another's is compiled again and written anew. A checksum is no signature: who can write
+to the folder decides what is executed. Folders are made for their owner alone, and one that others can write
+to or own is not used.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+import logging
+import multiprocessing
+import os
+import pickle
+import stat
+import threading
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numba
+from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile, UserProvidedCacheLocator
+
+LOG = logging.getLogger("magpend.cache")
+
+_DIGEST = hashlib.sha256
+_LENGTH = _DIGEST().digest_size
+
+_PICKING = threading.Lock()
+"""One thread at a time changes numba's settings: another would be given the folder of neither."""
+
+
+@cache
+def say(line: str) -> None:
+    """Tell people, once and from the main process alone: workers meet the same folder."""
+    if multiprocessing.parent_process() is None:
+        LOG.warning(line)
+
+
+def keep(dispatcher: Any, home: Path, folder: Path) -> Any:
+    """Let a compiled function keep its machine code.
+
+    Parameters
+    ----------
+    dispatcher
+        What numba's decorator returned.
+    home, folder
+        The folder of all caches, and the one in there for this function.
+
+    Returns
+    -------
+    dispatcher
+        The same one; without a cache where the folder cannot be used, which is said.
+    """
+    if not hasattr(dispatcher, "py_func"):  # NUMBA_DISABLE_JIT
+        return dispatcher
+    function = dispatcher.py_func
+    file = inspect.getfile(function)
+    own = folder / UserProvidedCacheLocator.get_suitable_cache_subpath(file)  # type: ignore[no-untyped-call]
+    problem = _made(home, own)
+    if not problem:
+        try:
+            dispatcher._cache = KeptCode(function, folder)
+        except RuntimeError as error:  # the folder has gone since it was looked at
+            problem = f"{error};"
+    if problem:
+        say(
+            f"magpend's compile cache is not used, every process compiles anew: {problem} set "
+            "MAGPEND_CACHE_DIR to a folder of your own."
+        )
+    return dispatcher
+
+
+@cache
+def _made(home: Path, folder: Path) -> str:
+    """Make a folder for its owner alone, and those above it up to `home`; return why it cannot be used."""
+    try:
+        home.parent.mkdir(parents=True, exist_ok=True)
+        for path in (home, *_below(home, folder)):
+            path.mkdir(mode=0o700, exist_ok=True)
+            found = path.stat()
+            if problem := _exposed(found):
+                mended = f"chmod go-w {path}, or " if found.st_uid == os.geteuid() else ""
+                return f"{path} {problem}, and what is in it is executed; {mended}"
+        if not os.access(folder, os.W_OK | os.X_OK):
+            return f"{folder} cannot be written to;"
+    except OSError as error:
+        return f"{error.filename or home} cannot be used ({error.strerror or error});"
+    return ""
+
+
+def _below(home: Path, folder: Path) -> list[Path]:
+    parts = folder.relative_to(home).parts
+    return [home.joinpath(*parts[: i + 1]) for i in range(len(parts))]
+
+
+def _exposed(found: os.stat_result) -> str:
+    """Say who else can write to a file or folder; empty if nobody can, or the system knows no owners."""
+    if not hasattr(os, "geteuid"):
+        return ""
+    mode = f"mode {stat.S_IMODE(found.st_mode):04o}"
+    if found.st_uid != os.geteuid():
+        return f"belongs to user {found.st_uid} ({mode}), not to you ({os.geteuid()})"
+    return f"can be written by others (owner {found.st_uid}, {mode})" if found.st_mode & 0o022 else ""
+
+
+class _InItsFolder(CompileResultCacheImpl):
+    """What numba would keep beside the sources, where its folder cannot be used, is not kept."""
+
+    _locator_classes = [UserProvidedCacheLocator]  # noqa: RUF012 # as declared there
+
+
+class KeptCode(FunctionCache):
+    """The cache of one function; what goes wrong with it costs a compilation, never the computation."""
+
+    _impl_class = _InItsFolder
+
+    def __init__(self, function: Callable[..., Any], folder: Path) -> None:
+        # numba picks its folder from settings, which are put back for other users of numba
+        settings: Any = numba.config
+        with _PICKING:
+            before = settings.CACHE_DIR, settings.CACHE_LOCATOR_CLASSES
+            settings.CACHE_DIR, settings.CACHE_LOCATOR_CLASSES = str(folder), ""
+            try:
+                super().__init__(function)  # type: ignore[no-untyped-call]
+            finally:
+                settings.CACHE_DIR, settings.CACHE_LOCATOR_CLASSES = before
+        stamp = self._impl.locator.get_source_stamp()
+        self._cache_file = _Entries(self._cache_path, self._impl.filename_base, stamp)  # type: ignore[no-untyped-call]
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """Return the machine code for a signature, None if there is none that can be used."""
+        try:
+            return super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
+        except Exception as error:
+            # what is whole and cannot be read was written by another Python or numpy than it says
+            say(f"a compiled kernel in {self._cache_path} cannot be used ({error!r}); it is compiled again.")
+            return None
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        """Keep the machine code of a signature, if that is possible."""
+        try:
+            super().save_overload(sig, data)  # type: ignore[no-untyped-call]
+        except OSError as error:
+            _say_not_kept(self._cache_path, error)
+
+
+class PartFolder:
+    """Records of an engine's parts, each a sealed file; see `precompiled`."""
+
+    def __init__(self, folder: Path) -> None:
+        self._home, self._folder = folder.parent, folder / "parts"
+
+    def read(self, name: str) -> bytes | None:
+        """Return a record, None if there is none that can be used."""
+        try:
+            return None if _made(self._home, self._folder) else _read_sealed(self._path(name))
+        except OSError as error:
+            say(f"a compiled kernel is not used: {self._path(name)} ({error.strerror}); it is compiled again.")
+            return None
+
+    def write(self, name: str, record: bytes) -> None:
+        """Keep a record, if that is possible."""
+        if _made(self._home, self._folder):
+            return
+        path = self._path(name)
+        own = f"{path}.{os.getpid()}.{threading.get_ident()}"
+        try:
+            with open(own, "wb", opener=_for_the_owner) as file:
+                file.write(_DIGEST(record).digest())
+                file.write(record)
+            os.replace(own, path)
+        except OSError as error:
+            _say_not_kept(str(self._folder), error)
+
+    def _path(self, name: str) -> str:
+        return os.path.join(self._folder, f"{name}.part")
+
+
+def _for_the_owner(path: str, flags: int) -> int:
+    return os.open(path, flags, 0o600)
+
+
+def _read_sealed(path: str) -> bytes | None:
+    """Return the content of a file that is whole and nobody else's; None, and say why, if it is not."""
+    try:
+        with open(path, "rb") as file:
+            problem = _exposed(os.fstat(file.fileno()))
+            sealed = b"" if problem else file.read()
+    except FileNotFoundError:
+        return None
+    content = sealed[_LENGTH:]
+    # the digest of nothing does not begin an empty file
+    if not problem and _DIGEST(content).digest() == sealed[:_LENGTH]:
+        return content
+    say(f"a compiled kernel is not used: {path} {problem or 'is damaged'}; it is compiled again.")
+    return None
+
+
+def _say_not_kept(folder: str, error: OSError) -> None:
+    say(
+        f"compiled kernels cannot be kept in {folder} ({error.strerror or error}); make room there, or set "
+        "MAGPEND_CACHE_DIR to another folder."
+    )
+
+
+class _Entries(IndexDataCacheFile):
+    """A file for each signature, without numba's index, in which two processes could mix them up."""
+
+    def load(self, key: Any) -> Any:
+        path = self._path(key)
+        content = _read_sealed(path)
+        if content is None:
+            return None
+        name, stamp, kept = pickle.loads(content)
+        if (name, stamp) == (key, self._source_stamp):
+            return kept
+        say(f"a compiled kernel is not used: {path} is damaged; it is compiled again.")
+        return None
+
+    def save(self, key: Any, data: Any) -> None:
+        content = self._dump((key, self._source_stamp, data))  # type: ignore[no-untyped-call]
+        with self._open_for_write(self._path(key)) as file:
+            os.chmod(file.name, 0o600)
+            file.write(_DIGEST(content).digest())
+            file.write(content)
+
+    def flush(self) -> None:
+        for path in Path(self._cache_path).glob(self._data_name_pattern.format(number=0)[:-5] + "*.nbc"):
+            path.unlink(missing_ok=True)
+
+    def _path(self, key: Any) -> str:
+        name = _DIGEST(repr(key).encode()).hexdigest()[:16]
+        return os.path.join(self._cache_path, f"{self._index_name.removesuffix('.nbi')}.{name}.nbc")

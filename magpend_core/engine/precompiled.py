@@ -1,0 +1,364 @@
+"""Compile the parts of an engine, and keep their code for other engines and other processes.
+
+numba types and lowers every function before LLVM sees it; this is nine tenths of the time that an engine
+takes to compile. Most functions of an engine know no equations. Here such a function, a *part*, is compiled
+once, to LLVM code in which nothing of a system is left:
+
+- Another part that it calls is a declaration. Which function that is, is decided when an engine is linked.
+- A size of the system, such as the number of its states, has a name and no value (see `linking`).
+
+So a new system compiles its own equations alone, and links them to parts from the cache.
+
+Read in this order: `PartDispatcher` (a function that only compiled functions call), `linking.PartLibrary`
+(its LLVM code), `PartCache` (its code on disk), `linking.EntryLibrary` (an engine's machine code).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import pickle
+from collections.abc import Callable, Mapping
+from itertools import count
+from typing import Any
+from weakref import WeakKeyDictionary
+
+import llvmlite.binding as llvm
+import numba
+from numba.core import ir as numba_ir
+from numba.core.compiler import CompilerBase, DefaultPassBuilder, compile_result
+from numba.core.compiler_lock import global_compiler_lock
+from numba.core.compiler_machinery import FunctionPass, PassManager, register_pass
+from numba.core.ir_utils import build_definitions
+from numba.core.registry import CPUDispatcher
+from numba.core.typed_passes import (
+    IRLegalization,
+    NativeLowering,
+    NoPythonBackend,
+    NopythonTypeInference,
+    PreLowerStripPhis,
+)
+from numba.core.untyped_passes import (
+    DeadBranchPrune,
+    FixupArgs,
+    GenericRewrites,
+    IRProcessing,
+    ReconstructSSA,
+    RewriteSemanticConstants,
+    TranslateByteCode,
+)
+
+from magpend_core.engine.code_cache import PartFolder, say
+from magpend_core.engine.digests import lookups, reached
+from magpend_core.engine.linking import EntryLibrary, PartLibrary
+
+
+@register_pass(mutates_CFG=False, analysis_only=False)
+class _NameFields(FunctionPass):
+    """Replaces a field of a named tuple of integers by that integer.
+
+    numba would make a constant of the whole tuple at each place where one of its fields is read.
+    """
+
+    _name = "magpend_name_fields"
+
+    def __init__(self) -> None:
+        FunctionPass.__init__(self)
+
+    def run_pass(self, state: Any) -> bool:
+        """Look for fields of global named tuples."""
+        found = [block for block in state.func_ir.blocks.values() if _name_fields(block)]
+        if found:
+            # where they are defined has changed
+            state.func_ir._definitions = build_definitions(state.func_ir.blocks)
+        return bool(found)
+
+
+def _name_fields(block: Any) -> bool:
+    tuples: dict[str, Any] = {}
+    body = []
+    for statement in block.body:
+        value = getattr(statement, "value", None)
+        if isinstance(value, numba_ir.Global | numba_ir.FreeVar) and _has_integers(value.value):
+            tuples[statement.target.name] = statement
+            continue
+        if isinstance(value, numba_ir.Expr) and value.op == "getattr" and value.value.name in tuples:
+            whole = tuples[value.value.name].value
+            number = getattr(whole.value, value.attr)
+            statement.value = numba_ir.Global(f"{whole.name}.{value.attr}", number, value.loc)
+        else:
+            # used in another way: as it was
+            names = {v.name for v in statement.list_vars()}
+            body += [tuples.pop(name) for name in names & set(tuples)]
+        body.append(statement)
+    changed = len(body) != len(block.body)
+    block.body = body
+    return changed
+
+
+def _has_integers(value: Any) -> bool:
+    return isinstance(value, tuple) and hasattr(value, "_fields") and all(type(x) is int for x in value)
+
+
+@register_pass(mutates_CFG=False, analysis_only=False)
+class _GiveEntryLibrary(FunctionPass):
+    _name = "magpend_entry_library"
+
+    def __init__(self) -> None:
+        FunctionPass.__init__(self)
+
+    def run_pass(self, state: Any) -> bool:
+        """Give a function its library before numba does, and let its machine code be kept."""
+        state.library = EntryLibrary(state.targetctx.codegen(), state.func_id.func_qualname)
+        state.library.enable_object_caching()
+        return True
+
+
+@register_pass(mutates_CFG=False, analysis_only=False)
+class _GivePartLibrary(FunctionPass):
+    _name = "magpend_part_library"
+
+    def __init__(self) -> None:
+        FunctionPass.__init__(self)
+
+    def run_pass(self, state: Any) -> bool:
+        """Give a part its library, and a number by which its name is the same in all processes."""
+        dispatcher = _COMPILED_NOW[-1]
+        state.library = PartLibrary(state.targetctx.codegen(), state.func_id.func_qualname)
+        state.library.dispatcher = dispatcher
+        state.func_id.unique_id = dispatcher.number
+        return True
+
+
+class EntryCompiler(CompilerBase):
+    """numba's compiler of functions, with products fused by our rule (see `fusing`)."""
+
+    _gives: type[FunctionPass] = _GiveEntryLibrary
+
+    def define_pipelines(self) -> list[Any]:
+        """Return numba's own passes with two more."""
+        passes = DefaultPassBuilder.define_nopython_pipeline(self.state)
+        passes.add_pass_after(_NameFields, IRProcessing)
+        passes.add_pass_after(self._gives, NopythonTypeInference)
+        passes.finalize()
+        return [passes]
+
+
+class PartCompiler(EntryCompiler):
+    """The same for parts: without the passes that inline, rewrite or annotate what an engine does not use."""
+
+    _passes = (
+        TranslateByteCode,
+        FixupArgs,
+        IRProcessing,
+        _NameFields,
+        RewriteSemanticConstants,
+        DeadBranchPrune,
+        GenericRewrites,
+        ReconstructSSA,
+        DeadBranchPrune,
+        NopythonTypeInference,
+        _GivePartLibrary,
+        PreLowerStripPhis,
+        IRLegalization,
+        NativeLowering,
+        NoPythonBackend,
+    )
+
+    def define_pipelines(self) -> list[Any]:
+        """Return the passes."""
+        passes = PassManager("magpend_part")
+        for step in self._passes:
+            passes.add_pass(step, step.__name__)
+        passes.finalize()
+        return [passes]
+
+
+_COMPILED_NOW: list[Any] = []
+"""Parts that are being compiled, under numba's lock; the last is in progress."""
+
+
+class PartDispatcher(CPUDispatcher):
+    """A function that compiled functions call. A call from Python compiles a copy of it first.
+
+    Parameters
+    ----------
+    function
+        A plain function.
+    options
+        numba's.
+    sizes
+        Values of the placeholders that it was bound to.
+    identity
+        Returns a digest of all that its code depends on but the functions that it calls and the sizes; None
+        if that cannot be found out. Its code is then not kept.
+    folder
+        Where code is kept; None to keep it in this process alone.
+    """
+
+    def __init__(
+        self,
+        function: Callable[..., Any],
+        options: Mapping[str, Any],
+        sizes: Mapping[str, int],
+        identity: Callable[[], str | None],
+        folder: PartFolder | None,
+    ) -> None:
+        settings = {"nopython": True, "boundscheck": None, **options}
+        super().__init__(py_func=function, targetoptions=settings, pipeline_class=PartCompiler)
+        self.sizes, self._identify, self._identified = sizes, identity, False
+        self._key: str | None = None
+        self._options = options
+        self._copy: Any = None
+        self._cache = PartCache(self, folder)
+
+    @property
+    def key(self) -> str | None:
+        """What the code is kept under; None if it is not."""
+        if not self._identified:
+            self._key, self._identified = self._identify(), True
+        return self._key
+
+    @property
+    def number(self) -> int:
+        """A number that no other part's symbol has."""
+        return int(self.key[:14], 16) if self.key else next(_UNKEPT)
+
+    def compile(self, sig: Any) -> Any:
+        """Compile for a signature, or take the code from the cache."""
+        with global_compiler_lock:
+            _COMPILED_NOW.append(self)
+            try:
+                return super().compile(sig)
+            finally:
+                _COMPILED_NOW.pop()
+
+    def add_overload(self, cres: Any) -> None:
+        """Take note of what was compiled, which Python cannot call."""
+        self.overloads[tuple(cres.signature.args)] = cres
+        cres.library.symbol = cres.fndesc.mangled_name
+        _OWNERS[cres.library] = tuple(cres.signature.args)
+
+    def _compile_for_args(self, *args: Any, **kws: Any) -> Any:
+        if self._copy is None:
+            options = {name: value for name, value in self._options.items() if name != "no_cpython_wrapper"}
+            self._copy = numba.njit(pipeline_class=EntryCompiler, **options)(self.py_func)
+        return self._copy
+
+
+_UNKEPT = count(1)
+_OWNERS: WeakKeyDictionary[Any, tuple[Any, ...]] = WeakKeyDictionary()
+"""Of each part's library the argument types."""
+
+
+# ---- code that is kept ---------------------------------------------------------------------------------
+
+_MEMORY: dict[str, bytes] = {}
+"""Records of this process."""
+
+
+class PartCache:
+    """Records of one part: its LLVM code, and which functions it calls with which types."""
+
+    def __init__(self, dispatcher: PartDispatcher, folder: PartFolder | None) -> None:
+        self._dispatcher, self._folder = dispatcher, folder
+        self.cache_path = None
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """Return what was compiled for a signature, None if nothing fits."""
+        name = self._name(sig)
+        if name is None:
+            return None
+        record = _MEMORY.get(name)
+        if record is None and self._folder is not None:
+            record = self._folder.read(name)
+        if record is None:
+            return None
+        try:
+            whose, *content = pickle.loads(record)
+        except Exception as error:
+            # what is whole and cannot be read was written by another Python than it says
+            say(f"a compiled part of a kernel, {name}, cannot be used ({error!r}); it is compiled again.")
+            return None
+        found = self._rebuilt(content, target_context) if whose == name else None
+        if found is not None:
+            _MEMORY[name] = record
+        return found
+
+    def save_overload(self, sig: Any, cres: Any) -> None:
+        """Keep what was compiled, if it can be found again."""
+        name = self._name(sig)
+        callees = self._callees(cres.library)
+        if name is None or callees is None:
+            return
+        fndesc = cres.fndesc
+        fndesc.typemap = fndesc.calltypes = None
+        code = cres.library._final_module.as_bitcode()
+        try:
+            record = pickle.dumps((name, code, fndesc, cres.signature, callees))
+        except Exception:  # a type that cannot be pickled
+            return
+        _MEMORY[name] = record
+        if self._folder is not None:
+            self._folder.write(name, record)
+
+    def _name(self, sig: Any) -> str | None:
+        if self._dispatcher.key is None:
+            return None
+        text = f"{self._dispatcher.key} {tuple(getattr(sig, 'args', sig))!r}"
+        return f"{self._dispatcher.py_func.__name__[:40]}-{hashlib.sha256(text.encode()).hexdigest()[:24]}"
+
+    def _callees(self, library: PartLibrary) -> list[Any] | None:
+        """Return where the function finds each part that it calls; None if it calls something else."""
+        source = self._dispatcher.py_func
+        paths = {id(reached(source, path)): path for path in lookups(source.__code__)}
+        declared = {function.name for function in library._final_module.functions}
+        rows = []
+        for callee in dict.fromkeys(library._linking_libraries):
+            if callee not in _OWNERS or id(callee.dispatcher) not in paths:
+                return None
+            if callee.symbol not in declared:  # LLVM has seen that the call is never reached
+                continue
+            args = _OWNERS[callee]
+            returns = callee.dispatcher.overloads[args].signature.return_type
+            rows.append((paths[id(callee.dispatcher)], args, callee.symbol, returns))
+        # two functions of one content have one symbol; those of another system need not
+        return rows if len({row[2] for row in rows}) == len(rows) else None
+
+    def _rebuilt(self, record: Any, target_context: Any) -> Any:
+        code, fndesc, signature, callees = record
+        library = PartLibrary(target_context.codegen(), fndesc.qualname)
+        library.dispatcher = self._dispatcher
+        module = llvm.parse_bitcode(code)
+        declared = []
+        for path, args, symbol, returns in callees:
+            callee = reached(self._dispatcher.py_func, path)
+            callee.compile(args)
+            compiled = callee.overloads[args]
+            if compiled.signature.return_type != returns:
+                return None
+            library.add_linking_library(compiled.library)
+            declared.append((module.get_function(symbol), compiled.library.symbol))
+        if len({symbol for _, symbol in declared}) < len(declared):
+            return None
+        # all lose their names before one takes another's
+        for function, _ in declared:
+            function.name = ""
+        for function, symbol in declared:
+            function.name = symbol
+        library._final_module = module
+        library.finalize()
+        return compile_result(
+            typing_context=target_context.typing_context,
+            target_context=target_context,
+            entry_point=_Key(),
+            library=library,
+            signature=signature,
+            objectmode=False,
+            lifted=(),
+            fndesc=fndesc,
+            reload_init=(),
+        )
+
+
+class _Key:
+    """Stands for a function that Python cannot call; numba finds compiled code by it."""

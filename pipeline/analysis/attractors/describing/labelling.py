@@ -1,0 +1,414 @@
+"""Label the cells of one parameter point, and describe its sets with their evidence."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from magpend_core.multipliers import orbit_exponents
+from pipeline.analysis.attractors.describing import features as feature
+from pipeline.analysis.attractors.describing.features import Cells, Features
+from pipeline.analysis.attractors.extension.bounded_sets import BoundedSet
+from pipeline.analysis.attractors.extension.clouds import members
+from pipeline.analysis.attractors.extension.courses import DIVERGED, rest_number
+from pipeline.analysis.attractors.extension.extending import Outcome, extend
+from pipeline.analysis.attractors.extension.lifetimes import lifetime_interval
+from pipeline.analysis.attractors.finding import stability
+from pipeline.analysis.attractors.finding.assigning import decide
+from pipeline.analysis.attractors.finding.cell_blocks import Block, marks_of
+from pipeline.analysis.attractors.finding.closed_orbits import Orbit, raw_orbit
+from pipeline.analysis.attractors.finding.equilibria import put_at_rest
+from pipeline.analysis.attractors.finding.points import Point
+from pipeline.analysis.attractors.finding.probing import is_approaching, probe_equilibrium, probe_orbit
+from pipeline.analysis.attractors.finding.requests import Slopes, Work
+from pipeline.analysis.attractors.finding.searching import Search, State, search_orbits
+from pipeline.analysis.attractors.finding.spirals import keys_of
+from pipeline.analysis.sets import Geometry, order_by_points
+from pipeline.analysis.sides import UNKNOWN
+from pipeline.layout.vocabulary import (
+    APPROACHING,
+    AT_REST,
+    BOUNDED_SET,
+    CLOSED,
+    DIVERGES,
+    EXTENDED,
+    NEUTRAL,
+    PERIODIC_ORBIT,
+    SAME_SET,
+    UNDECIDED,
+)
+
+PRESERVED, VOLUME_RTOL = 1e-7, 1e-11
+"""Largest log change of a volume over a period that counts as 0, and the tolerance of its integration."""
+
+MOST_PROBES = 8
+"""Most degenerate orbits, and most degenerate equilibria, of a point that are probed by trajectories."""
+
+
+@dataclass
+class Found:
+    """Sets of one parameter point, and the set of each cell.
+
+    Attributes
+    ----------
+    label : ndarray of int32, (cell,)
+        Index into `features`, -1 for none.
+    decision : ndarray of int8, (cell,)
+        Codes of `vocabulary.DECISIONS`.
+    features : list of Features
+        Features of each set.
+    counts : list of int
+        Number of cells on each set.
+    ran_out : bool
+        Whether the budget of the extension ended before all cells were decided.
+    """
+
+    label: np.ndarray
+    decision: np.ndarray
+    features: list[Features]
+    counts: list[int]
+    ran_out: bool = False
+
+
+@dataclass
+class _Labels:
+    """Provisional labels of the cells, numbered in the order orbits, raw orbits, sets, equilibria, cycles."""
+
+    label: np.ndarray
+    decision: np.ndarray
+
+    @classmethod
+    def of(cls, n_cells: int) -> _Labels:
+        return cls(np.full(n_cells, -1, np.int64), np.zeros(n_cells, np.int8))
+
+    def put(self, cells: np.ndarray, number: int | np.ndarray, decision: int) -> None:
+        self.label[cells], self.decision[cells] = number, decision
+
+
+def analyse(point: Point, search: Search) -> Work[Found]:
+    """Find the sets that the cells of a parameter point are on, with their kind, stability and evidence."""
+    labels = _Labels.of(point.n_cells)
+    if search.options.polish and (yield from _preserves_volume(point, search)):
+        return _describe(point, [], [_conservative(point, labels)], labels, search)
+    state = yield from search_orbits(point, search)
+    groups = _label_orbits(point, state, labels, search)
+    if search.options.polish:
+        yield from _probe(point, state, labels, search)
+    options = search.options
+    budget = options.budget if options.extend and options.polish else 0.0
+    loose = np.where(_is_elsewhere(point), 0, labels.label)
+    found = yield from extend(point, state.orbits, loose, search.settings, budget, options.n_sample)
+    state.orbits = found.orbits
+    _label_courses(point, found, labels, groups, search)
+    raw = _label_raw(point, state, groups, labels, search)
+    _label_sets(point, len(state.orbits) + len(raw), found.sets, labels, groups, search)
+    result = _describe(point, [*state.orbits, *raw], found.sets, labels, search)
+    result.ran_out = found.ran_out
+    return result
+
+
+def _is_elsewhere(point: Point) -> np.ndarray:
+    """Return which cells are at an equilibrium, or on a limit cycle of a flow sampled at equal times."""
+    found = np.zeros(point.n_cells, bool)
+    for told in (point.at_rest, point.on_cycle):
+        if told is not None:
+            found |= told >= 0
+    return found
+
+
+# ---- conservative systems ----------------------------------------------------------------------
+
+
+def _preserves_volume(point: Point, search: Search) -> Work[bool]:
+    """Return whether the flow or the section map preserves volumes at a sample of points."""
+    before = _some_points(point)
+    if not len(before):
+        return False
+    # integrate anew: the run's own next section has the error of the run's tolerance
+    after, derivatives = yield Slopes(before, VOLUME_RTOL)
+    if not np.isfinite(derivatives).all():
+        return False
+    return bool((np.abs(point.volumes(derivatives, before, after)) <= PRESERVED).all())
+
+
+def _some_points(point: Point, n: int = 16) -> np.ndarray:
+    """Return the last section points of the `n` bounded cells with the least hashes, shape (n, state)."""
+    found = np.zeros((0, 1, point.n_states))
+    for block in point.blocks():
+        more = np.concatenate([found, block.section[block.is_closed | block.is_bounded, -1:]])
+        found = more[np.unique(marks_of(more), return_index=True)[1][:n]]
+    return found[:, 0]
+
+
+def _conservative(point: Point, labels: _Labels) -> BoundedSet:
+    """Label all cells of a flow that preserves volume as one neutral set."""
+    for block in point.blocks():
+        own = np.flatnonzero(block.is_closed | block.is_bounded)
+        labels.put(own + block.cells.start, 0, SAME_SET)
+    return BoundedSet.neutral()
+
+
+# ---- labels ------------------------------------------------------------------------------------
+
+
+def _label_orbits(point: Point, state: State, labels: _Labels, search: Search) -> np.ndarray:
+    """Label the cells on orbits; return the group of each closed cell without an orbit, -1 for all others."""
+    groups = np.full(point.n_cells, -1, np.int64)
+    for block in point.blocks():
+        own = block.cells
+        labels.label[own], labels.decision[own] = decide(block, state.orbits, search.tolerance, search.geometry)
+        if search.is_loose:
+            _label_ends(block, state.ends, labels.label, labels.decision)
+            continue
+        group = state.closed.group_of(block, state.keys, state.group)
+        groups[own] = np.where(labels.label[own] >= 0, -1, group)
+    return groups
+
+
+def _probe(point: Point, state: State, labels: _Labels, search: Search) -> Work[None]:
+    """Probe degenerate orbits and equilibria by nearby trajectories, and label the cells that approach."""
+    neutral = [i for i, orbit in enumerate(state.orbits) if orbit.is_polished and orbit.stability == NEUTRAL]
+    for i in neutral[:MOST_PROBES]:
+        within = yield from probe_orbit(state.orbits[i], search.geometry)
+        if within:
+            state.orbits[i] = replace(state.orbits[i], approached_within=within)
+            for block in point.blocks():
+                rows = np.flatnonzero((block.is_closed | block.is_bounded) & (labels.label[block.cells] < 0))
+                near = is_approaching(block.section[rows], state.orbits[i], search.geometry)
+                labels.put(rows[near] + block.cells.start, i, APPROACHING)
+    degenerate = [k for k, one in enumerate(point.equilibria) if one.stability == NEUTRAL]
+    for k in degenerate[:MOST_PROBES]:
+        within = yield from probe_equilibrium(point.equilibria[k], search.geometry)
+        if within:
+            point.equilibria[k] = replace(point.equilibria[k], approached_within=within)
+    if any(one.approached_within for one in point.equilibria):
+        put_at_rest(point, search.tolerance, search.geometry)
+
+
+def _label_courses(point: Point, found: Outcome, labels: _Labels, groups: np.ndarray, search: Search) -> None:
+    """Label the sampled cells that reached an end, and all cells in their boxes or groups, by this end."""
+    ends = {course.key: course.end for course in found.courses if not course.goes_on}
+    if not ends:
+        return
+    by_group = {int(groups[c.cell]): c.end for c in found.courses if not c.goes_on and groups[c.cell] >= 0}
+    elsewhere = _is_elsewhere(point)
+    for block in point.blocks():
+        rows = np.flatnonzero((block.is_closed | block.is_bounded) & (labels.label[block.cells] < 0))
+        keys = keys_of(block.section[rows], search.settings.closure, search.geometry)
+        for cell, key in zip((rows + block.cells.start).tolist(), keys.tolist(), strict=True):
+            end = ends.get(key, by_group.get(int(groups[cell])) if groups[cell] >= 0 else None)
+            if end is None or elsewhere[cell]:
+                continue
+            if end >= 0:
+                labels.put(np.array([cell]), end, EXTENDED)
+            elif end == DIVERGED:
+                labels.decision[cell] = DIVERGES
+            elif (number := rest_number(end)) is not None and point.at_rest is not None:
+                point.at_rest[cell] = number
+
+
+def _label_raw(point: Point, state: State, groups: np.ndarray, labels: _Labels, search: Search) -> list[Orbit]:
+    """Label the closed cells without a polished orbit, one raw orbit per group."""
+    left = np.where((labels.label < 0) & (labels.decision != DIVERGES) & ~_is_elsewhere(point), groups, -1)
+    best: dict[int, tuple[float, int, np.ndarray]] = {}
+    for block in point.blocks():
+        _representatives(block, left[block.cells], best, search.geometry)
+    for i, g in enumerate(sorted(best)):
+        labels.put(left == g, len(state.orbits) + i, CLOSED)
+    return [raw_orbit(best[g][2], search.geometry) for g in sorted(best)]
+
+
+def _label_sets(
+    point: Point, first: int, sets: Sequence[BoundedSet], labels: _Labels, groups: np.ndarray, search: Search
+) -> None:
+    """Label the sampled cells of each set, and all other cells whose section points lie on the set."""
+    for i, one in enumerate(sets):
+        own = one.cells[labels.label[one.cells] < 0]
+        labels.put(own, first + i, SAME_SET)
+    if not sets:
+        return
+    clouds, elsewhere = [one.cloud for one in sets if one.cloud is not None], _is_elsewhere(point)
+    for block in point.blocks():
+        free = (labels.label[block.cells] < 0) & (labels.decision[block.cells] != DIVERGES)
+        rows = np.flatnonzero(block.is_bounded & free & ~elsewhere[block.cells])
+        own = members(block.section[rows], clouds, search.geometry)
+        labels.put(rows[own >= 0] + block.cells.start, first + own[own >= 0], SAME_SET)
+
+
+def _label_ends(block: Block, ends: Mapping[int, int], label: np.ndarray, decision: np.ndarray) -> None:
+    """Label the closed cells that were integrated further by their ends, in place."""
+    rest = np.flatnonzero(block.is_closed & (label[block.cells] < 0))
+    for row, mark in zip(rest, marks_of(block.section[rest]), strict=True):
+        if int(mark) in ends:
+            label[row + block.cells.start], decision[row + block.cells.start] = ends[int(mark)], EXTENDED
+
+
+def _representatives(
+    block: Block, group: np.ndarray, best: dict[int, tuple[float, int, np.ndarray]], geometry: Geometry
+) -> None:
+    """Keep the last period of the best closed cell of each group, among those not on a polished orbit."""
+    rows = np.flatnonzero(group >= 0)
+    if not len(rows):
+        return
+    marks = marks_of(block.section[rows])
+    for row, mark in zip(rows, marks, strict=True):
+        p = min(int(block.orbit_period[row]), block.section.shape[1])
+        section = block.section[row]
+        back = section[-1 - p] if section.shape[0] > p else section[-1]
+        entry = (float(geometry.distance(section[-1], back)), int(mark), section[-p:])
+        g = int(group[row])
+        if g not in best or entry[:2] < best[g][:2]:
+            best[g] = entry
+
+
+# ---- description -------------------------------------------------------------------------------
+
+
+def _describe(
+    point: Point, orbits: Sequence[Orbit], sets: Sequence[BoundedSet], labels: _Labels, search: Search
+) -> Found:
+    """Compute the features of all sets that have cells, and renumber the labels in canonical order."""
+    resting = len(orbits) + len(sets)
+    _label_elsewhere(point, resting, labels)
+    cells: dict[int, Cells] = {}
+    for block in point.blocks():
+        own = labels.label[block.cells]
+        sides = feature.sides_of(block.section, block.turns, point.frequency, point.parameters)
+        for number in np.unique(own[own >= 0]):
+            found = cells.setdefault(int(number), Cells(search.options.n_points))
+            found.add(block, np.flatnonzero(own == number), sides, search.geometry)
+    features = {n: _features_of(n, found, orbits, sets, point, search) for n, found in cells.items()}
+    numbers = list(features)
+    order = [numbers[i] for i in order_by_points([features[n].points for n in numbers], search.geometry)]
+    ranked = [features[n] for n in order]
+    model = search.dynamics.model
+    if model is not None and model.mirror is not None:
+        feature.pair_mirrors(ranked, model.mirror, search.options.mirror_threshold, search.geometry)
+    table = np.full(max(numbers, default=0) + 2, -1, np.int32)
+    table[order] = np.arange(len(order))
+    _number_ends(ranked, order, sets, len(orbits), resting, table)
+    decided = (labels.label >= 0) | (labels.decision == DIVERGES)
+    return Found(
+        table[labels.label],
+        np.where(decided, labels.decision, UNDECIDED).astype(np.int8),
+        ranked,
+        [cells[n].n for n in order],
+    )
+
+
+def _label_elsewhere(point: Point, first: int, labels: _Labels) -> None:
+    """Label the cells at equilibria, then those on limit cycles of a flow sampled at equal times."""
+    for told, known, code in ((point.at_rest, point.equilibria, AT_REST), (point.on_cycle, point.cycles, CLOSED)):
+        if told is not None:
+            own = told >= 0
+            labels.put(own, first + told[own], code)
+        first += len(known)
+
+
+def _number_ends(
+    ranked: Sequence[Features],
+    order: Sequence[int],
+    sets: Sequence[BoundedSet],
+    first: int,
+    resting: int,
+    table: np.ndarray,
+) -> None:
+    """Fill `n_to`: count the cells that left each set by the final number of the set they reached."""
+    for features, number in zip(ranked, order, strict=True):
+        if first <= number < resting:
+            ended = np.zeros(len(order), np.int64)
+            for end, n in sets[number - first].ended.items():
+                rest = rest_number(end)
+                at = end if end >= 0 else -1 if rest is None else resting + rest
+                if 0 <= at < len(table) and table[at] >= 0:
+                    ended[table[at]] += n
+            features.n_to = ended
+
+
+def _features_of(
+    number: int, cells: Cells, orbits: Sequence[Orbit], sets: Sequence[BoundedSet], point: Point, search: Search
+) -> Features:
+    """Return the features of the set with a provisional number, from its cells."""
+    resting = len(orbits) + len(sets)
+    if number < len(orbits):
+        return _of_orbit(cells, orbits[number], point, search)
+    if number < resting:
+        return _of_set(cells, sets[number - len(orbits)], point, search)
+    told = number - resting
+    if told < len(point.equilibria):
+        return feature.of_equilibrium(point.equilibria[told], point.parameters, point.n_angles)
+    found = _of_points(cells, BOUNDED_SET, 0, point, search)
+    feature.fill_cycle(found, point.cycles[told - len(point.equilibria)])
+    return found
+
+
+def _of_points(cells: Cells, kind: int, period: int, point: Point, search: Search) -> Features:
+    """Return the features that the section points of a set's cells show."""
+    assert cells.points is not None
+    points = feature.sorted_points(cells.points, search.geometry)
+    found = Features(points, kind, period, cells.mean_rotation, UNKNOWN, cells.low, cells.high)
+    if point.parameters is not None:
+        found.side = cells.side(point.parameters, point.frequency)
+        if search.options.polish:
+            feature.follow_points(found, point.parameters, point.frequency)
+    return found
+
+
+def _of_set(cells: Cells, one: BoundedSet, point: Point, search: Search) -> Features:
+    found = _of_points(cells, one.kind, 0, point, search)
+    found.stability, found.evidence = one.stability, one.evidence
+    found.closes_above = one.closes_above
+    found.n_sampled, found.n_left, found.n_leaving = one.n_sampled, one.n_left, one.n_leaving
+    if one.time_at_risk > 0.0:
+        found.time_at_risk = one.time_at_risk
+        found.mean_lifetime = one.time_at_risk / one.n_left if one.n_left else np.nan
+        found.lifetime_low, found.lifetime_high = lifetime_interval(
+            one.n_left, one.time_at_risk, search.options.lifetime_confidence
+        )
+    if one.growth is not None:
+        # at crossings the section map lacks the exponent along the flow, which is 0
+        rates = np.array([one.growth.rate, one.growth.low, one.growth.high]) / cells.mean_seconds
+        rates = np.maximum(rates, 0.0) if point.is_flow else rates
+        found.lyapunov_max, found.lyapunov_low, found.lyapunov_high = rates.tolist()
+    return found
+
+
+def _of_orbit(cells: Cells, orbit: Orbit, point: Point, search: Search) -> Features:
+    found = Features(
+        orbit.points,
+        PERIODIC_ORBIT,
+        orbit.period,
+        cells.mean_rotation,
+        UNKNOWN,
+        cells.low,
+        cells.high,
+        stability=orbit.stability,
+    )
+    frequency, is_flow = point.frequency, search.dynamics.is_flow
+    if point.parameters is not None:
+        found.side = cells.side(point.parameters, frequency)
+    if orbit.is_polished:
+        frequency = orbit.period / orbit.seconds if is_flow else frequency
+        _fill_orbit(found, orbit, is_flow)
+    if point.parameters is None or not search.options.polish:
+        return found
+    if not found.is_polished:
+        feature.follow_points(found, point.parameters, point.frequency)
+        return found
+    feature.follow_orbit(found, point.parameters, frequency, search.geometry)
+    turns = np.round(found.rotation * found.orbit_period).astype(np.int64)
+    found.side = int(feature.sides_of(orbit.points[None], turns[None], point.frequency, point.parameters)[0])
+    return found
+
+
+def _fill_orbit(found: Features, orbit: Orbit, is_flow: bool) -> None:
+    found.multipliers, found.residual, found.is_polished = orbit.multipliers, orbit.residual, True
+    found.multiplier_error = orbit.multiplier_error
+    found.evidence = stability.BY_APPROACH if orbit.approached_within else stability.BY_MULTIPLIERS
+    exponents = orbit_exponents(orbit.multipliers, orbit.seconds, is_flow)
+    found.lyapunov_max = found.lyapunov_low = found.lyapunov_high = float(exponents[0])
+    found.period_s = orbit.seconds
+    # round to whole turns per period: the mean over cells has not closed to the last digit
+    found.rotation = np.round(found.rotation * orbit.period) / orbit.period + 0.0  # no -0.0

@@ -1,0 +1,197 @@
+"""Describe sets that do not close, from the extended trajectories of their cells."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.analysis.attractors.extension.clouds import OTHER, Cloud, is_stationary, mixing, thinned
+from pipeline.analysis.attractors.extension.courses import Course
+from pipeline.analysis.attractors.extension.growth import Growth, growth_of, kind_of
+from pipeline.analysis.attractors.finding import stability
+from pipeline.analysis.attractors.finding.points import Point
+from pipeline.analysis.attractors.finding.requests import LEG, Settings, Slopes, Work
+from pipeline.layout.vocabulary import ATTRACTS, BOUNDED_SET, NEUTRAL, NOT_SETTLED, TRANSIENT
+
+SLOPES = (1024, 4096)
+"""Most derivatives of the section map for the exponents of a set: at first, and if the first are too few."""
+
+MOST_SHAPED = 1024
+"""Most section points that the test for a torus uses."""
+
+
+@dataclass(frozen=True, eq=False)
+class BoundedSet:
+    """A set that does not close: its kind, stability and evidence.
+
+    Attributes
+    ----------
+    cells : ndarray of int64
+        Sampled cells that are on it at the end.
+    cloud : Cloud or None
+        Section points to compare other cells with.
+    points : ndarray, (n, state)
+        Some of its section points.
+    kind, stability, evidence : int
+        Codes of `vocabulary.KINDS`, `STABILITIES` and `EVIDENCE`.
+    growth : Growth or None
+        None if there are not enough sections.
+    n_sampled, n_left, n_leaving : int
+        Numbers of cells that were extended, that left it, and that were near their end from the start.
+    time_at_risk : float
+        Sum over all sampled cells [drive periods or returns].
+    ended : dict
+        Numbers of cells that left it, by `Course.end`.
+    closes_above : int
+        Period with which it may close, longer than the search allows; 0 if none is seen.
+    """
+
+    cells: np.ndarray
+    cloud: Cloud | None
+    points: np.ndarray
+    kind: int
+    stability: int
+    evidence: int
+    growth: Growth | None
+    n_sampled: int
+    n_left: int
+    n_leaving: int
+    time_at_risk: float
+    ended: dict[int, int]
+    closes_above: int = 0
+
+    @classmethod
+    def neutral(cls) -> BoundedSet:
+        """Return the set of all cells of a flow that preserves volume."""
+        none = np.zeros(0, np.int64)
+        evidence = stability.BY_VOLUME
+        return cls(none, None, none, BOUNDED_SET, NEUTRAL, evidence, None, 0, 0, 0, 0.0, {})
+
+
+def describe(
+    own: Sequence[Course], left: Sequence[Course], point: Point, settings: Settings, has_stayed: bool
+) -> Work[BoundedSet]:
+    """Return the kind, stability and lifetimes of a set, from the cells that stayed and those that left.
+
+    Parameters
+    ----------
+    own
+        Cells on the set.
+    left
+        Cells that left it.
+    point
+        Parameter point of the cells.
+    settings
+        Tolerances and the integration.
+    has_stayed
+        Whether the cells stayed long enough for a verdict.
+    """
+    paths = [course.stayed for course in own]
+    pooled = np.concatenate(paths)
+    growth, kind = None, BOUNDED_SET
+    for most in SLOPES if has_stayed else ():
+        growth = yield from _growth(own, point, settings, most)
+        if growth is None:
+            break
+        kind = kind_of(growth, thinned(pooled, MOST_SHAPED), settings.geometry)
+        if kind != BOUNDED_SET or growth.contracts or growth.preserves_volume:
+            break
+    verdict, evidence = _verdict(own, left, growth, has_stayed, settings)
+    return BoundedSet(
+        np.array([c.cell for c in own], np.int64),
+        Cloud.of(paths, settings.geometry, settings.closure),
+        pooled,
+        kind,
+        verdict,
+        evidence,
+        growth,
+        len(own) + len(left),
+        len(left),
+        0,
+        float(sum(c.length for c in own) + sum(c.periods for c in left)),
+        ends_of(left),
+        _closes_above(own, growth, settings),
+    )
+
+
+def left_behind(left: Sequence[Course], settings: Settings) -> BoundedSet:
+    """Return the transient set that cells were on before they left, when no sampled cell stayed."""
+    paths = [course.stayed for course in left]
+    return BoundedSet(
+        np.zeros(0, np.int64),
+        Cloud.of(paths, settings.geometry, settings.closure),
+        np.concatenate(paths),
+        BOUNDED_SET,
+        TRANSIENT,
+        stability.BY_LEAVING,
+        None,
+        len(left),
+        len(left),
+        0,
+        float(sum(course.periods for course in left)),
+        ends_of(left),
+    )
+
+
+def ends_of(left: Iterable[Course]) -> dict[int, int]:
+    """Count cells by their end."""
+    ended: dict[int, int] = {}
+    for course in left:
+        ended[course.end] = ended.get(course.end, 0) + 1
+    return ended
+
+
+def were_on(course: Course, own: Sequence[Course], settings: Settings) -> bool:
+    """Return whether a cell was on the set of `own` before it left."""
+    points = np.concatenate([other.stayed for other in own])
+    return bool(mixing(course.stayed, points, settings.geometry, settings.closure) >= OTHER)
+
+
+def _verdict(
+    own: Sequence[Course], left: Sequence[Course], growth: Growth | None, has_stayed: bool, settings: Settings
+) -> tuple[int, int]:
+    """Stability and evidence."""
+    if growth is not None and growth.preserves_volume:
+        return NEUTRAL, stability.BY_VOLUME
+    if left:
+        return TRANSIENT, stability.BY_LEAVING
+    if not has_stayed or growth is None or growth.contracts:
+        return NOT_SETTLED, stability.BY_NOTHING
+    if not all(is_stationary(course.stayed, settings.geometry, settings.closure) for course in own):
+        return NOT_SETTLED, stability.BY_NOTHING
+    return ATTRACTS, stability.BY_STAYING
+
+
+def _growth(own: Sequence[Course], point: Point, settings: Settings, most: int) -> Work[Growth | None]:
+    """Compute the exponents of the section map along extended cells; None if there are too few sections."""
+    n = min(course.length for course in own)
+    if n < LEG:
+        return None
+    n_states = settings.geometry.n_states
+    most = min(most, max(256, 20_000_000 // n_states**2))
+    n_cells = max(1, min(len(own), most // min(n, most)))
+    n = min(n, most // n_cells)
+    # use the last sections, when transients are over
+    paths = np.stack([course.extension[-n:] for course in own[:n_cells]])
+    before = paths[:, :-1].reshape(-1, n_states)
+    after, slopes = yield Slopes(before)
+    volumes = point.volumes(slopes, before, after).reshape(n_cells, n - 1)
+    derivatives = slopes.reshape(n_cells, n - 1, n_states, n_states)
+    whole = np.isfinite(derivatives).all(axis=(1, 2, 3))
+    if not whole.any():
+        return None
+    scales = np.asarray(settings.geometry.scales)
+    return growth_of(derivatives[whole] * scales / scales[:, None], point.n_neutral, volumes[whole])
+
+
+def _closes_above(own: Sequence[Course], growth: Growth | None, settings: Settings) -> int:
+    """Return the least period beyond the search limit with which a contracting set recurs; 0 if none."""
+    if growth is None or not growth.contracts:
+        return 0
+    path = min((c.extension for c in own), key=len)
+    for p in range(settings.longest + 1, len(path) // 2):
+        if (settings.geometry.distance(path[-p:], path[-2 * p : -p]) <= 100.0 * settings.closure).all():
+            return p
+    return 0

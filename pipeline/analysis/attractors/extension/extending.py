@@ -1,0 +1,359 @@
+"""Extend cells that are on no known orbit or equilibrium, until their set is known.
+
+A sample of these cells is integrated further from the last section, leg by leg. After each leg, cells that
+reached an orbit or an equilibrium, known or new, leave the sample. The others are grouped into sets
+(`clouds`), and each set gets a kind (`growth`) and a stability (`stability`). A round ends when the sample
+has stayed long enough and no set is in doubt, or when the budget is spent. Then the remaining cells are
+compared with the points of the sets. Cells that match none are sampled again, in the next round.
+
+The budget is `options.budget` times the periods that the run integrated at the parameter point, and at least
+`LEAST_BUDGET` periods. Nothing here depends on the clock, so the same run gives the same verdicts.
+
+Reading order: `extend` has the rounds, `_Extension.run` a round, `_take` one leg, `_tell_sets` the verdicts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from magpend_core.status import Status
+from pipeline.analysis.attractors.extension.bounded_sets import BoundedSet, describe, left_behind, were_on
+from pipeline.analysis.attractors.extension.clouds import group, members
+from pipeline.analysis.attractors.extension.courses import AT_REST, DIVERGED, FAILED, Course
+from pipeline.analysis.attractors.extension.lifetimes import lifetime_interval
+from pipeline.analysis.attractors.finding import stability
+from pipeline.analysis.attractors.finding.assigning import REACH, decide
+from pipeline.analysis.attractors.finding.cell_blocks import Block, ClosedCells, Guesses, marks_of
+from pipeline.analysis.attractors.finding.closed_orbits import Orbit, number_of
+from pipeline.analysis.attractors.finding.equilibria import approaching, rest_near, rest_of_orbit
+from pipeline.analysis.attractors.finding.points import Point
+from pipeline.analysis.attractors.finding.requests import LEG, Extended, Leg, Polish, Settings, Work
+from pipeline.analysis.attractors.finding.spirals import closes_in, keys_of, leap, near_closed
+from pipeline.analysis.sets import Geometry
+from pipeline.layout.vocabulary import ATTRACTS, NEUTRAL, NOT_SETTLED
+
+LEAST_BUDGET = 16_384
+"""Least budget of a parameter point [periods], however short the run was."""
+
+LEAST_STAY = 512
+"""Least extension of a cell [sections]: enough points to separate two sets, and chaos from a torus."""
+
+DOUBLINGS = 3
+"""Most doublings of the extension while a set is in doubt."""
+
+ROUNDS = 6
+"""Most samples of a parameter point; each is twice as large as the one before."""
+
+SEARCH_EACH = 32
+"""Orbits are searched after 1, 2, 4, ... legs and every `SEARCH_EACH` legs: Newton steps are expensive."""
+
+LOOK_BACK = 4
+"""Legs searched for a period: four legs show periods of up to two legs."""
+
+
+@dataclass
+class Outcome:
+    """Result of the extension of a parameter point.
+
+    Attributes
+    ----------
+    orbits : list of Orbit
+        Known orbits, old and new.
+    courses : list of Course
+        Sampled cells.
+    sets : list of BoundedSet
+        Sets that do not close.
+    spent : int
+        Periods integrated.
+    ran_out : bool
+        Whether the budget ended the work.
+    """
+
+    orbits: list[Orbit]
+    courses: list[Course]
+    sets: list[BoundedSet]
+    spent: int = 0
+    ran_out: bool = False
+
+
+def extend(
+    point: Point, orbits: Sequence[Orbit], label: np.ndarray, settings: Settings, budget: float, n_sample: int
+) -> Work[Outcome]:
+    """Extend samples of a point's cells with label -1 until their sets are known.
+
+    Parameters
+    ----------
+    point
+        Parameter point with its equilibria.
+    orbits
+        Known orbits.
+    label
+        Label of each cell, shape (cell,); not changed.
+    settings
+        Tolerances and the integration.
+    budget
+        Budget in units of the periods that the run integrated; 0 extends nothing.
+    n_sample
+        Number of cells in the first sample.
+    """
+    work = _Extension(point, list(orbits), settings, budget)
+    loose = np.flatnonzero(label < 0)
+    for _ in range(ROUNDS):
+        chosen = work.sample(loose, n_sample)
+        if not chosen:
+            break
+        work.courses += chosen
+        if work.ran_out:
+            break
+        yield from (work.run() if work.budget else work.conclude())
+        loose = work.left_of(loose)
+        n_sample *= 2
+    if any(course.goes_on for course in work.courses):
+        yield from work.conclude()
+    work.add_transient()
+    n_leaving = sum(course.is_leaving for course in work.courses)
+    sets = [replace(one, n_leaving=n_leaving) for one in work.sets]
+    return Outcome(work.orbits, work.courses, sets, work.spent, work.ran_out)
+
+
+class _Extension:
+    """The extension of one parameter point."""
+
+    def __init__(self, point: Point, orbits: list[Orbit], settings: Settings, budget: float) -> None:
+        self.point, self.orbits, self.settings = point, orbits, settings
+        self.geometry: Geometry = settings.geometry
+        self.budget = int(max(budget * point.n_periods, LEAST_BUDGET)) if budget > 0.0 else 0
+        self.courses: list[Course] = []
+        self.sets: list[BoundedSet] = []
+        self.spent, self.ran_out = 0, False
+        self._tried: set[int] = set()
+
+    @property
+    def has_budget(self) -> bool:
+        """Whether some of the budget is left."""
+        return self.spent < self.budget
+
+    # ---- samples -------------------------------------------------------------------------------
+
+    def sample(self, loose: np.ndarray, n: int) -> list[Course]:
+        """Return the next `n` cells by rising hash of their sections, one per box of last sections."""
+        known = {course.key for course in self.courses}
+        best: dict[int, tuple[int, int, np.ndarray, float]] = {}
+        is_loose = np.zeros(self.point.n_cells, bool)
+        is_loose[loose] = True
+        for block in self.point.blocks():
+            rows = np.flatnonzero(is_loose[block.cells] & (block.is_bounded | block.is_closed))
+            section = block.section[rows]
+            keys, marks = keys_of(section, self.settings.closure, self.geometry), marks_of(section)
+            for row, key, mark in zip(rows, keys.tolist(), marks.tolist(), strict=True):
+                if key not in known and (key not in best or mark < best[key][0]):
+                    step = 0.0 if block.step is None else float(np.nan_to_num(block.step[row]))
+                    best[key] = mark, int(row) + block.cells.start, block.section[row], step
+            if len(best) > 4 * n:  # keep those of least hash, to bound the memory
+                best = dict(sorted(best.items(), key=lambda item: item[1][0])[: 2 * n])
+        chosen = sorted(best.items(), key=lambda item: item[1][0])[:n]
+        return [Course(cell, key, kept, kept[-1], step) for key, (_, cell, kept, step) in chosen]
+
+    def left_of(self, loose: np.ndarray) -> np.ndarray:
+        """Return the loose cells that were not sampled and lie on no final set."""
+        done = np.zeros(self.point.n_cells, bool)
+        done[self.told(loose)[0]] = True
+        done[[course.cell for course in self.courses]] = True
+        return np.asarray(loose[~done[loose]])
+
+    def told(self, loose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the loose cells on sets whose verdict is final, and the sets' numbers."""
+        final = [i for i, one in enumerate(self.sets) if one.stability in (ATTRACTS, NEUTRAL) or not self.budget]
+        clouds = [one for i in final if (one := self.sets[i].cloud) is not None]
+        is_loose = np.zeros(self.point.n_cells, bool)
+        is_loose[loose] = True
+        cells, numbers = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
+        for block in self.point.blocks() if final else ():
+            rows = np.flatnonzero(is_loose[block.cells] & (block.is_bounded | block.is_closed))
+            own = members(block.section[rows], clouds, self.geometry)
+            cells.append(rows[own >= 0] + block.cells.start)
+            numbers.append(np.array(final, np.int64)[own[own >= 0]])
+        return np.concatenate(cells), np.concatenate(numbers)
+
+    def add_transient(self) -> None:
+        """Add the set that cells have left, unless it is a set on which other cells stayed."""
+        left = [course for course in self.courses if course.has_left]
+        if left and not any(one.n_left for one in self.sets):
+            self.sets.append(left_behind(left, self.settings))
+
+    # ---- legs ----------------------------------------------------------------------------------
+
+    def run(self) -> Work[None]:
+        """Extend unfinished cells until the sample has stayed, and longer while a set is in doubt."""
+        target = LEAST_STAY
+        for _ in range(DOUBLINGS + 1):
+            yield from self._extend(target)
+            if not any(course.goes_on for course in self.courses):
+                self.sets = []
+                return
+            in_doubt = yield from self._tell_sets()
+            if not in_doubt or not self.has_budget:
+                return
+            target = 2 * max(c.length for c in self.courses if c.goes_on)
+
+    def conclude(self) -> Work[None]:
+        """Describe the sets of unfinished cells without extending them."""
+        yield from self._tell_sets()
+
+    def _extend(self, target: int) -> Work[None]:
+        while True:
+            going = [course for course in self.courses if course.goes_on]
+            if not going or self._has_stayed(going, target):
+                return
+            if not self.has_budget:
+                self.ran_out = True
+                return
+            # extend the shortest courses first: those of a later round
+            least = min(course.length for course in going)
+            going = [course for course in going if course.length == least]
+            leg: Extended = yield Leg(np.array([c.state for c in going]), np.array([c.step for c in going]))
+            self.spent += LEG * len(going)
+            yield from self._take(going, leg)
+
+    def _has_stayed(self, going: Sequence[Course], target: int) -> bool:
+        """Whether the unfinished cells have stayed long enough for a verdict."""
+        least = min(course.length for course in going)
+        if least < target:
+            return False
+        longest = stability.TIMES_LONGEST * self._longest_transient()
+        at_risk = float(sum(course.length for course in going))
+        return least >= longest or lifetime_interval(0, at_risk)[0] >= longest
+
+    def _longest_transient(self) -> float:
+        """Return the longest time that a cell of the point was seen away from its end."""
+        left = [c.periods for c in self.courses if not c.goes_on and not c.is_leaving]
+        return self.settings.seen + max(left, default=0.0)
+
+    def _take(self, going: Sequence[Course], leg: Extended) -> Work[None]:
+        """Record the results of a leg, and end the cells that reached an orbit or an equilibrium."""
+        computed = np.isin(leg.status, (Status.PERIODIC, Status.BOUNDED))
+        for course, state, step, section, ok in zip(going, leg.state, leg.step, leg.section, computed, strict=True):
+            course.state, course.step = state, float(step)
+            if ok:
+                course.legs.append(section)
+        for i in np.flatnonzero(~computed).tolist():
+            self._fail(going[i], int(leg.status[i]))
+        rows = np.flatnonzero(computed)
+        if not len(rows):
+            return
+        block = Block(slice(0, 0), leg.section[rows], leg.status[rows], leg.orbit_period[rows], leg.turns[rows])
+        own = [going[i] for i in rows.tolist()]
+        n = len(own[0].legs)
+        if n.bit_count() == 1 or n % SEARCH_EACH == 0:
+            yield from self._search(own, block)
+        label, _ = decide(block, self.orbits, 10.0 * self.settings.closure, self.geometry)
+        for course, number in zip(own, label.tolist(), strict=True):
+            if number >= 0 and self.orbits[number].is_stable:
+                self._leave(course, number)
+        self._rest(own, leg.section[rows], leg.seconds[rows])
+        self._leap(own, leg.section[rows])
+
+    def _fail(self, course: Course, status: int) -> None:
+        """End a cell that did not finish its leg: at rest, diverged, or failed."""
+        course.periods = float(course.length)
+        course.is_leaving = not course.length
+        course.end = DIVERGED if status == Status.DIVERGED else FAILED
+        if status == Status.NO_RETURN and self.point.can_rest:
+            number = rest_near(self.point, course.state, self.geometry)
+            if number is not None:
+                course.end = AT_REST - number
+
+    def _search(self, own: Sequence[Course], block: Block) -> Work[None]:
+        """Find orbits by Newton's method, from cells that close or nearly close."""
+        label, _ = decide(block, self.orbits, 10.0 * self.settings.closure, self.geometry)
+        rest = np.flatnonzero(label < 0).tolist()
+        closed = ClosedCells(self.geometry, 10.0 * self.settings.closure, Guesses.none(block.section.shape[2]))
+        closed.add(block.take(np.array(rest, np.int64)))
+        found = closed.guesses
+        depths = [min(LOOK_BACK, len(own[i].legs)) for i in rest]
+        for depth in set(depths):
+            rows = [i for i, d in zip(rest, depths, strict=True) if d == depth and block.is_bounded[i]]
+            if rows:
+                section = np.stack([np.concatenate(own[i].legs[-depth:]) for i in rows])
+                section = section[closes_in(section, self.settings.longest, self.geometry)]
+                found = found.joined(near_closed(section, self.settings.longest, self.geometry))
+        new = [i for i, key in enumerate(found.key.tolist()) if key not in self._tried]
+        self._tried.update(found.key[new].tolist())
+        if not new:
+            return
+        polished: list[Orbit | None] = yield Polish(found.take(np.array(new, np.int64)))
+        for orbit in polished:
+            if orbit is None or self._rests(orbit):
+                continue
+            if number_of(orbit, self.orbits, self.geometry) == len(self.orbits):
+                self.orbits.append(orbit)
+
+    def _rests(self, orbit: Orbit) -> bool:
+        """Whether an orbit is an equilibrium that lies on the section."""
+        return self.point.can_rest and rest_of_orbit(self.point, orbit.points[0], self.geometry) is not None
+
+    def _leave(self, course: Course, number: int) -> None:
+        """End a cell on an orbit, and record when it came near the orbit for good."""
+        orbit, states = self.orbits[number], np.concatenate([course.kept, course.extension])
+        phase = int(np.argmin(self.geometry.distance(orbit.points, states[-1])))
+        back = np.arange(len(states))
+        on_phase = orbit.points[(phase - back) % orbit.period]
+        near = self.geometry.distance(states[::-1], on_phase) <= REACH
+        entered = len(states) - (len(near) if near.all() else int(np.argmin(near)))
+        course.end, course.periods = number, float(max(entered - len(course.kept), 0))
+        course.is_leaving = entered <= len(course.kept)
+
+    def _rest(self, own: Sequence[Course], section: np.ndarray, seconds: np.ndarray) -> None:
+        """End the cells that approach a stable equilibrium."""
+        if not self.point.can_rest:
+            return
+        going = [i for i, course in enumerate(own) if course.goes_on]
+        if not going:
+            return
+        number = approaching(self.point, section[going], seconds[going], self.settings.closure, self.geometry)
+        for i, k in zip(going, number.tolist(), strict=True):
+            if k >= 0:
+                own[i].end, own[i].periods = AT_REST - k, float(own[i].length)
+                own[i].is_leaving = len(own[i].legs) <= 1
+
+    def _leap(self, own: Sequence[Course], section: np.ndarray) -> None:
+        """Move cells that leave an unstable orbit slowly farther from it along their way."""
+        rows = [i for i, course in enumerate(own) if course.goes_on]
+        if not rows:
+            return
+        states = leap(section[rows], self.orbits, self.geometry)
+        for i, state in zip(rows, states, strict=True):
+            if np.isfinite(state).all():
+                own[i].state, own[i].step = state, 0.0
+
+    # ---- sets ----------------------------------------------------------------------------------
+
+    def _tell_sets(self) -> Work[bool]:
+        """Group the unfinished cells into sets and describe them; return whether a set is in doubt."""
+        going = [course for course in self.courses if course.goes_on]
+        has_stayed = bool(going[0].legs) and self._has_stayed(going, LEAST_STAY)
+        numbers, is_sure = group([c.stayed for c in going], self.geometry, self.settings.closure)
+        groups = [
+            [course for course, n in zip(going, numbers, strict=True) if n == k] for k in range(int(numbers.max()) + 1)
+        ]
+        gone = [] if has_stayed else [course for course in self.courses if course.has_left]
+        self.sets, in_doubt = [], not is_sure
+        for own, left in self._with_those_left(groups, gone):
+            one = yield from describe(own, left, self.point, self.settings, has_stayed)
+            self.sets.append(one)
+            in_doubt |= one.stability == NOT_SETTLED
+        return in_doubt
+
+    def _with_those_left(
+        self, groups: Sequence[list[Course]], gone: Sequence[Course]
+    ) -> list[tuple[list[Course], list[Course]]]:
+        """Pair each group with the cells that left it; merge all groups that cells left into one set."""
+        left = [[course for course in gone if were_on(course, own, self.settings)] for own in groups]
+        joined = [course for own, some in zip(groups, left, strict=True) if some for course in own]
+        found = [(own, some) for own, some in zip(groups, left, strict=True) if not some]
+        if joined:
+            found.insert(0, (joined, [c for c in gone if any(c is x for some in left for x in some)]))
+        return found

@@ -1,0 +1,294 @@
+"""Polish closed orbits by Newton's method, integrate guesses until they close, and compare orbits.
+
+`polish` runs Newton's method of the core, and `run_on` runs the engine. Both take one section point per
+guess.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from magpend_core.engine.system import System
+from magpend_core.orbits import RTOL, polish_orbits, stroboscopic_map
+from magpend_core.sections import run_branches
+from pipeline.analysis.attractors.finding.stability import MATRIX_ERROR, by_margin, largest_error
+from pipeline.analysis.sets import Geometry, rounded_points
+from pipeline.layout.vocabulary import ATTRACTS, NEUTRAL, NOT_SETTLED
+
+SAME_ORBIT = 1e-7
+"""Largest distance between two polished orbits that are one, on top of the errors from their residuals."""
+
+PLACE_ERROR = 30.0
+"""Error of a multiplier near a fold per root of the residual: twice the root of the map's curvature."""
+
+NEAR, NEARLY, NEAR_STEPS, NEAR_RTOL = 1e-5, 1e-3, 8, 1e-8
+"""First polish: target residual, largest residual that continues, most Newton steps, tolerance.
+
+Many guesses lead to the same orbit, and only one of them is polished further.
+"""
+
+RUN_ON_PERIODS, RUN_ON_TOLERANCE, RUN_ON_RTOL = 2000, 1e-5, 1e-8
+"""Integration of `run_on`: most drive periods, closure tolerance, tolerance of the steps."""
+
+
+@dataclass(frozen=True)
+class Orbit:
+    """A closed orbit at one parameter point.
+
+    Attributes
+    ----------
+    points : ndarray, (period, state)
+        Section points in the order of time, the least one (rounded, scaled, lexicographic) first.
+    multipliers : ndarray of complex, (state,)
+        NaN if not polished.
+    residual : float
+        Residual of `polish_orbits`; NaN if not polished.
+    derivative : ndarray, (state, state)
+        Monodromy matrix at the first point; NaN if not polished.
+    seconds : float
+        Period [s]; NaN if not polished.
+    approached_within : float
+        Scaled distance from which trajectories on both sides came nearer; 0 if not tried or not seen.
+    """
+
+    points: np.ndarray
+    multipliers: np.ndarray
+    residual: float
+    derivative: np.ndarray
+    seconds: float = np.nan
+    approached_within: float = 0.0
+
+    @property
+    def period(self) -> int:
+        """Number of drive periods, or returns, until the orbit closes."""
+        return len(self.points)
+
+    @property
+    def is_polished(self) -> bool:
+        """Whether Newton's method converged on it."""
+        return bool(np.isfinite(self.residual))
+
+    @cached_property
+    def multiplier_error(self) -> float:
+        """Error of the largest modulus of the multipliers.
+
+        It adds the error of the monodromy matrix and the error of the orbit's place: near a fold the
+        multiplier changes with the square root of the residual.
+        """
+        of_matrix = MATRIX_ERROR * float(np.abs(self.derivative).max(initial=1.0))
+        return largest_error(self.derivative, of_matrix) + PLACE_ERROR * float(np.sqrt(self.residual))
+
+    @cached_property
+    def stability(self) -> int:
+        """Stability by the multipliers and their error, or by trajectories on both sides."""
+        if not self.is_polished:
+            return NOT_SETTLED
+        found = by_margin(float(np.abs(self.multipliers).max()), 1.0, self.multiplier_error)
+        return ATTRACTS if found == NEUTRAL and self.approached_within > 0.0 else found
+
+    @property
+    def is_stable(self) -> bool:
+        """Whether it is shown to attract."""
+        return self.stability == ATTRACTS
+
+    @property
+    def error(self) -> float:
+        """Estimate of the distance from the true orbit, from the residual."""
+        return float(10.0 * self.residual / max(np.abs(1.0 - self.multipliers).min(), 1e-6))
+
+
+def scaled_derivative(orbit: Orbit, geometry: Geometry) -> np.ndarray:
+    """Return the monodromy matrix for states in units of their scales."""
+    scales = np.asarray(geometry.scales)
+    return np.asarray(orbit.derivative * scales[None, :] / scales[:, None])
+
+
+def raw_orbit(points: np.ndarray, geometry: Geometry) -> Orbit:
+    """Make an unpolished orbit of section points (period, state)."""
+    n = points.shape[1]
+    return Orbit(_rolled(points, geometry), np.full(n, np.nan + 0j), np.nan, np.full((n, n), np.nan))
+
+
+def _rolled(points: np.ndarray, geometry: Geometry) -> np.ndarray:
+    rounded = rounded_points(points, geometry).tolist()
+    return np.roll(points, -min(range(len(points)), key=rounded.__getitem__), axis=0)
+
+
+def polish(
+    packed: np.ndarray,
+    frequency: np.ndarray,
+    points: np.ndarray,
+    period: np.ndarray,
+    *,
+    geometry: Geometry,
+    system: System,
+    tolerance: float,
+) -> list[Orbit | None]:
+    """Polish guesses at any parameter points in one call.
+
+    Parameters
+    ----------
+    packed, frequency, points, period
+        Parameters, frequency [Hz], section point and period, a row per guess; see `polish_orbits`.
+    geometry, system
+        Geometry of the states, and the system to integrate.
+    tolerance
+        Scaled residual to reach.
+
+    Returns
+    -------
+    list
+        An orbit per guess; None where Newton's method did not converge. An orbit depends on its guess
+        alone.
+    """
+    if not len(points):
+        return []
+    near = polish_orbits(
+        packed,
+        frequency,
+        points,
+        period,
+        tolerance=NEAR,
+        max_iterations=NEAR_STEPS,
+        rtol=NEAR_RTOL,
+        least_period=False,
+        system=system,
+    )
+    first, own = near.section.copy(), np.flatnonzero(near.converged)
+    images, _ = _images(packed[own], frequency[own], first[own], near.orbit_period[own], NEAR_RTOL, system)
+    for row, image in zip(own, images, strict=True):
+        first[row] = _rolled(image, geometry)[0]
+    # very unstable orbits miss NEAR at the loose tolerance: keep them up to NEARLY and polish on
+    good = np.flatnonzero(near.residual <= NEARLY)
+    rounded = rounded_points(first[good], geometry)
+    key = np.column_stack([packed[good], frequency[good], near.orbit_period[good], rounded])
+    _, once, place = np.unique(key, axis=0, return_index=True, return_inverse=True)
+    rows = good[once]
+    # start from the rounded point, so that an orbit does not depend on which guess came first
+    orbits = _polished(
+        packed[rows],
+        frequency[rows],
+        rounded[once] * np.asarray(geometry.scales),
+        near.orbit_period[rows],
+        geometry,
+        system,
+        tolerance,
+    )
+    found: list[Orbit | None] = [None] * len(points)
+    for i, k in zip(good, place.ravel(), strict=True):
+        found[i] = orbits[k]
+    return found
+
+
+def _polished(
+    packed: np.ndarray,
+    frequency: np.ndarray,
+    points: np.ndarray,
+    period: np.ndarray,
+    geometry: Geometry,
+    system: System,
+    tolerance: float,
+    turned: bool = False,
+) -> list[Orbit | None]:
+    """Polish guesses to a residual; polish an orbit again from its least point if it started elsewhere."""
+    found = polish_orbits(packed, frequency, points, period, tolerance=tolerance, system=system)
+    orbits: list[Orbit | None] = [None] * len(points)
+    rows = np.flatnonzero(found.converged)
+    images, derivatives = _images(
+        packed[rows], frequency[rows], found.section[rows], found.orbit_period[rows], RTOL, system
+    )
+    for i, row in enumerate(rows):
+        in_time = np.concatenate([found.section[row][None], images[i][:-1]])
+        residual, seconds = float(found.residual[row]), float(found.seconds[row])
+        orbits[row] = Orbit(in_time, found.multipliers[row], residual, derivatives[i], seconds)
+        first = _rolled(in_time, geometry)[0]
+        if not turned and (first != in_time[0]).any():
+            one = slice(row, row + 1)
+            (orbits[row],) = _polished(
+                packed[one],
+                frequency[one],
+                first[None],
+                found.orbit_period[one],
+                geometry,
+                system,
+                tolerance,
+                turned=True,
+            )
+    return orbits
+
+
+def run_on(
+    packed: np.ndarray, frequency: np.ndarray, points: np.ndarray, max_orbit_period: int, system: System
+) -> tuple[np.ndarray, np.ndarray]:
+    """Integrate section points (n, state) until they close within `RUN_ON_TOLERANCE`.
+
+    Returns
+    -------
+    points : ndarray, (n, state)
+        Last sections.
+    period : ndarray of int64, (n,)
+        Drive periods; 0 for points that have not closed after `RUN_ON_PERIODS`.
+    """
+    if not len(points):
+        return points, np.zeros(0, np.int64)
+    result = run_branches(
+        packed[:, None],
+        frequency[:, None],
+        points,
+        n_transient=RUN_ON_PERIODS,
+        n_keep=1,
+        rtol=RUN_ON_RTOL,
+        atol=RUN_ON_RTOL,
+        stop_when_closed=True,
+        closure_tolerance=RUN_ON_TOLERANCE,
+        max_orbit_period=max_orbit_period,
+        system=system,
+    )
+    return result.section[:, 0, -1], result.orbit_period[:, 0].astype(np.int64)
+
+
+def _images(
+    packed: np.ndarray, frequency: np.ndarray, points: np.ndarray, period: np.ndarray, rtol: float, system: System
+) -> tuple[list[np.ndarray], np.ndarray]:
+    """Return per row the section points after 1, ..., period drive periods and the last one's derivative."""
+    images: list[np.ndarray] = [points[:0]] * len(points)
+    derivatives = np.full((len(points), system.n_states, system.n_states), np.nan)
+    for p in np.unique(period):
+        rows = np.flatnonzero(period == p)
+        image, derivatives[rows] = stroboscopic_map(
+            packed[rows], frequency[rows], points[rows], int(p), rtol=rtol, system=system
+        )
+        for row, states in zip(rows, image, strict=True):
+            images[row] = states
+    return images, derivatives
+
+
+def distinct(orbits: Sequence[Orbit], geometry: Geometry) -> list[Orbit]:
+    """Merge orbits that coincide; return them sorted, whatever their order was."""
+
+    def key(orbit: Orbit) -> tuple[int, tuple[float, ...], bytes]:
+        least = rounded_points(orbit.points[:1], geometry)[0]
+        return orbit.period, tuple(least.tolist()), orbit.points.tobytes()
+
+    kept: list[Orbit] = []
+    for orbit in sorted(orbits, key=key):
+        if not any(_coincide(orbit, other, geometry) for other in kept):
+            kept.append(orbit)
+    return kept
+
+
+def number_of(orbit: Orbit, orbits: Sequence[Orbit], geometry: Geometry) -> int:
+    """Return the index of an orbit in a list, or the length of the list if it is not there."""
+    return next((i for i, other in enumerate(orbits) if _coincide(orbit, other, geometry)), len(orbits))
+
+
+def _coincide(a: Orbit, b: Orbit, geometry: Geometry) -> bool:
+    if a.period != b.period:
+        return False
+    allowed = SAME_ORBIT + a.error + b.error
+    start = int(np.argmin(geometry.distance(b.points, a.points[0])))
+    return bool(geometry.distance(np.roll(b.points, -start, axis=0), a.points).max() <= allowed)

@@ -1,0 +1,321 @@
+"""Find the equilibria of flows, and the cells that are at an equilibrium or approach one.
+
+Newton's method on the rates starts from the last states of cells, near or far. A cell belongs to a stable
+equilibrium in three cases: it had no return and stopped near the equilibrium; it lies on it within the
+tolerance of closed cells; or its sections follow the linear flow towards it (`approaching`), since a
+trajectory crosses the section thousands of times around a slow focus. A cell belongs to any other
+equilibrium only if it lies on it within `ON_IT`. Cells without a return far from all equilibria are
+integrated further, up to `WAITS` times as long, until they come near one or return.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.linalg import expm, solve_continuous_lyapunov
+
+from magpend_core.equilibria import find_equilibria, newton_steps
+from magpend_core.sections import run_branches
+from magpend_core.status import Status
+from pipeline.analysis.attractors.finding.points import Point
+from pipeline.analysis.attractors.finding.stability import RATE_ERROR, by_margin, largest_error
+from pipeline.analysis.sets import Geometry, hashes, rounded_points
+from pipeline.layout.vocabulary import ATTRACTS, NEUTRAL
+
+NEAR = 0.1
+"""Largest scaled distance from a stable equilibrium at which a cell without a return counts as at rest."""
+
+WAITS = 16
+"""Most repetitions of the wait for a return, for cells that are near no equilibrium yet."""
+
+RTOL = 1e-8
+"""Tolerance of the trajectories of cells that wait for a return."""
+
+ON_IT = 1e-9
+"""Scaled distance from an equilibrium, stable or not, within which a cell is on it."""
+
+SAME = 1e-6
+"""Equilibria at most this far apart are one, and an orbit at most this far from one is that equilibrium."""
+
+MOST = 64
+"""Most equilibria of a parameter point: a line of equilibria has infinitely many."""
+
+ITERATIONS = 100
+"""Most Newton steps: near a degenerate equilibrium convergence is only linear."""
+
+GUESSES, GUESS_BOX = 64, 0.1
+"""Most far states from which Newton's method starts, and the side of the boxes with one start each."""
+
+
+@dataclass(frozen=True)
+class Equilibrium:
+    """A state at which the rate is zero.
+
+    Attributes
+    ----------
+    state : ndarray, (state,)
+    eigenvalues : ndarray of complex, (state,)
+        Eigenvalues of the Jacobian [1/s], by falling real part.
+    residual : float
+        Scaled length of the last Newton step.
+    jacobian : ndarray, (state, state)
+        Jacobian in units of the scales [1/s].
+    approached_within : float
+        Scaled distance from which trajectories on both sides came nearer; 0 if not tried or not seen.
+    """
+
+    state: np.ndarray
+    eigenvalues: np.ndarray
+    residual: float
+    jacobian: np.ndarray
+    approached_within: float = 0.0
+
+    @cached_property
+    def eigenvalue_error(self) -> float:
+        """Error of the largest real part of the eigenvalues [1/s]."""
+        # the error of the state is its residual, or more if degenerate, and carries over to the Jacobian
+        size = max(RATE_ERROR, 1e-4 * float(np.sqrt(self.residual))) * float(np.abs(self.jacobian).max(initial=1.0))
+        return largest_error(self.jacobian, size, real=True)
+
+    @cached_property
+    def stability(self) -> int:
+        """Stability by the real parts of the eigenvalues and their error, or by trajectories beside it."""
+        found = by_margin(float(self.eigenvalues.real[0]), 0.0, self.eigenvalue_error)
+        return ATTRACTS if found == NEUTRAL and self.approached_within > 0.0 else found
+
+    @property
+    def is_stable(self) -> bool:
+        """Whether it is shown to attract."""
+        return self.stability == ATTRACTS
+
+    @cached_property
+    def _norm(self) -> tuple[np.ndarray, float] | None:
+        """Root S of a norm |S x| that falls at least as exp(-rate t), and the rate; None if there is none."""
+        rate = -0.5 * float(self.eigenvalues.real[0])
+        shifted = self.jacobian + rate * np.eye(len(self.jacobian))
+        try:
+            weight = solve_continuous_lyapunov(shifted.T, -np.eye(len(shifted)))
+            return np.linalg.cholesky(0.5 * (weight + weight.T)).T, rate
+        except np.linalg.LinAlgError:
+            return None
+
+    def is_approached(self, section: np.ndarray, seconds: np.ndarray, noise: float, geometry: Geometry) -> np.ndarray:
+        """Return which trajectories follow the linear flow towards it, shape (n,).
+
+        With A the Jacobian, t the time between two sections and r = exp(-rate t) the bound on the linear
+        flow in its norm, let d be the distances and e = ``|d' - exp(A t) d|`` the error of the linear flow.
+        A trajectory approaches if e is at most half of (1 - r)|d| over the younger half of the sections:
+        closer to the equilibrium the error is smaller still.
+
+        Parameters
+        ----------
+        section
+            Sections, shape (n, k, state).
+        seconds
+            Time from the previous section to each, shape (n, k) [s].
+        noise
+            Scaled error of the sections.
+        geometry
+            Geometry of the states.
+        """
+        if self.approached_within or self._norm is None or section.shape[1] < 3:
+            return np.zeros(len(section), bool)
+        root, rate = self._norm
+        half = section.shape[1] // 2
+        away = geometry.difference(section[:, half:], self.state)
+        times = seconds[:, half + 1 :]
+        predicted = np.einsum("nkij,nkj->nki", self._flow(times), away[:, :-1])
+        size = np.linalg.norm(away @ root.T, axis=-1)
+        error = np.linalg.norm((away[:, 1:] - predicted) @ root.T, axis=-1)
+        allowed = 0.5 * (1.0 - np.exp(-rate * times)) * size[:, :-1]
+        known = noise * float(np.linalg.norm(root, 2)) * np.sqrt(len(root))
+        return np.asarray((error <= allowed + known).all(axis=1) & (size[:, -1] <= size[:, 0] + known))
+
+    def _flow(self, times: np.ndarray) -> np.ndarray:
+        """Return the linear flow over each time, shape (..., state, state)."""
+        values, vectors = np.linalg.eig(self.jacobian)
+        if np.linalg.cond(vectors) > 1e8:  # nearly defective: the eigenvectors are no basis
+            return np.asarray(expm(self.jacobian * times[..., None, None]))
+        found = (vectors * np.exp(values * times[..., None])[..., None, :]) @ np.linalg.inv(vectors)
+        return np.asarray(found.real)
+
+
+def tell_rest(points: Iterable[Point], tolerance: float, geometry: Geometry) -> None:
+    """Find the equilibria that cells of some parameter points are at, in place.
+
+    Parameters
+    ----------
+    points
+        Parameter points of a flow.
+    tolerance
+        Scaled distance within which a closed cell is on a stable equilibrium.
+    geometry
+        Geometry of the states.
+    """
+    for point in points:
+        states, reach = _ends(point, tolerance)
+        rows = np.flatnonzero(np.isfinite(states).all(axis=1))
+        point.equilibria = _found(point, states[rows], reach[rows], geometry)
+        point.at_rest = _settled(point, states, reach, geometry)
+        _label_approaching(point, tolerance, geometry)
+
+
+def _ends(point: Point, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return each cell's last state, NaN if it has none, and the largest distance that counts as at rest."""
+    states = np.full((point.n_cells, point.n_states), np.nan)
+    reach = np.full(point.n_cells, tolerance)
+    for block in point.blocks():
+        own = block.is_closed | block.is_bounded
+        states[block.cells][own] = block.section[own, -1]
+        if block.rest is not None:
+            left = block.status == Status.NO_RETURN
+            states[block.cells][left] = _waited(point, block.rest[left])
+            reach[block.cells][left] = NEAR
+    return states, reach
+
+
+def _waited(point: Point, states: np.ndarray) -> np.ndarray:
+    """Integrate cells without a return until they are near an equilibrium; NaN for those that do return."""
+    states, system = states.copy(), point.integrates
+    far = np.flatnonzero(np.isfinite(states).all(axis=1))
+    for _ in range(WAITS):
+        steps, _ = newton_steps(system, states[far], point.packed)
+        away = np.abs(steps / np.asarray(system.scales)).max(axis=1, initial=0.0)
+        far = far[~(away <= 0.5 * NEAR)]
+        if not len(far):
+            break
+        result = run_branches(
+            np.tile(point.packed, (len(far), 1, 1)),
+            np.full((len(far), 1), point.frequency),
+            states[far],
+            n_transient=0,
+            n_keep=1,
+            rtol=RTOL,
+            atol=RTOL,
+            system=system,
+        )
+        waits = result.status[:, 0] == Status.NO_RETURN
+        states[far] = np.where(waits[:, None], result.final_state[:, 0], np.nan)
+        far = far[waits]
+    return states
+
+
+def _found(point: Point, states: np.ndarray, reach: np.ndarray, geometry: Geometry) -> list[Equilibrium]:
+    """Find equilibria by Newton's method from near states and a sample of far ones, in canonical order."""
+    if not len(states):
+        return []
+    steps, _ = newton_steps(point.integrates, states, point.packed)
+    length = np.abs(steps / np.asarray(geometry.scales)).max(axis=1, initial=0.0)
+    # a state with a Newton step beyond twice its reach is unlikely to be within reach of an equilibrium
+    near = np.flatnonzero(length <= 2.0 * reach)
+    _, first = np.unique(geometry.boxes(states[near], SAME), axis=0, return_index=True)
+    _, other = np.unique(hashes(geometry.boxes(states, GUESS_BOX)), return_index=True)
+    guesses = states[np.concatenate([near[first], other[:GUESSES]])]
+    return equilibria_near(point, guesses, geometry)
+
+
+def equilibria_near(point: Point, states: np.ndarray, geometry: Geometry) -> list[Equilibrium]:
+    """Return the distinct equilibria that Newton's method finds from states (n, state), at most `MOST`."""
+    found = find_equilibria(point.integrates, states, point.packed, max_iterations=ITERATIONS)
+    scales = np.asarray(geometry.scales)
+    kept: list[Equilibrium] = []
+    for i in np.flatnonzero(found.converged):
+        if all(geometry.distance(found.states[i], other.state) > SAME for other in kept):
+            jacobian = found.jacobians[i] * scales / scales[:, None]
+            kept.append(Equilibrium(found.states[i], found.eigenvalues[i], float(found.residual[i]), jacobian))
+        if len(kept) == MOST:
+            break
+    if not kept:
+        return []
+    order = np.lexsort(rounded_points(np.array([e.state for e in kept]), geometry).T[::-1])
+    return [kept[i] for i in order]
+
+
+def _settled(point: Point, states: np.ndarray, reach: np.ndarray, geometry: Geometry) -> np.ndarray:
+    """Return the equilibrium that each cell is at; -1 for none."""
+    at_rest = np.full(len(states), -1, np.int64)
+    rows = np.flatnonzero(np.isfinite(states).all(axis=1))
+    for k, one in enumerate(point.equilibria):
+        away = geometry.distance(states[rows], one.state)
+        at_rest[rows[away <= (reach[rows] if one.is_stable else ON_IT)]] = k
+    return at_rest
+
+
+def put_at_rest(point: Point, tolerance: float, geometry: Geometry) -> None:
+    """Label the cells near degenerate equilibria that were seen to attract, in place."""
+    states, _ = _ends(point, tolerance)
+    assert point.at_rest is not None
+    for k, one in enumerate(point.equilibria):
+        if one.approached_within:
+            near = geometry.distance(np.nan_to_num(states, nan=np.inf), one.state) <= one.approached_within
+            point.at_rest[near & (point.at_rest < 0)] = k
+
+
+def _label_approaching(point: Point, tolerance: float, geometry: Geometry) -> None:
+    """Label the cells that approach a stable equilibrium, in place."""
+    assert point.at_rest is not None
+    for block in point.blocks():
+        rows = np.flatnonzero(block.is_closed | block.is_bounded)
+        assert block.seconds is not None
+        number = approaching(point, block.section[rows], block.seconds[rows], tolerance, geometry)
+        own = rows[number >= 0]
+        point.at_rest[own + block.cells.start] = number[number >= 0]
+
+
+def approaching(
+    point: Point, section: np.ndarray, seconds: np.ndarray, tolerance: float, geometry: Geometry
+) -> np.ndarray:
+    """Return the stable equilibrium that each trajectory approaches; -1 for none.
+
+    Parameters
+    ----------
+    point
+        Parameter point with its equilibria.
+    section, seconds
+        Sections (n, k, state) and times between them (n, k) [s], see `Equilibrium.is_approached`.
+    tolerance
+        Scaled distance within which a closed cell is on a set; sections err by a hundredth of it.
+    geometry
+        Geometry of the states.
+    """
+    found = np.full(len(section), -1, np.int64)
+    for k, one in enumerate(point.equilibria):
+        rows = np.flatnonzero(found < 0)
+        if one.is_stable and len(rows):
+            near = one.is_approached(section[rows], seconds[rows], 0.01 * tolerance, geometry)
+            found[rows[near]] = k
+    return found
+
+
+def rest_near(point: Point, state: np.ndarray, geometry: Geometry) -> int | None:
+    """Return the stable equilibrium near the last state of a cell without a return; add it if it is new."""
+    if not np.isfinite(state).all():
+        return None
+    state = _waited(point, state[None])[0]
+    for one in equilibria_near(point, state[None], geometry) if np.isfinite(state).all() else ():
+        if one.is_stable and geometry.distance(one.state, state) <= NEAR:
+            return number_of(one, point, geometry)
+    return None
+
+
+def number_of(one: Equilibrium, point: Point, geometry: Geometry) -> int:
+    """Return the index of an equilibrium among those of a point; append it if it is new."""
+    for k, other in enumerate(point.equilibria):
+        if geometry.distance(one.state, other.state) <= SAME:
+            return k
+    point.equilibria.append(one)
+    return len(point.equilibria) - 1
+
+
+def rest_of_orbit(point: Point, state: np.ndarray, geometry: Geometry) -> int | None:
+    """Return the number of the equilibrium that a polished orbit degenerates to; None if the orbit moves."""
+    steps, _ = newton_steps(point.integrates, state[None], point.packed)
+    if not np.abs(steps / np.asarray(geometry.scales)).max() <= 10.0 * SAME:
+        return None
+    for one in equilibria_near(point, state[None], geometry):
+        if geometry.distance(one.state, state) <= 10.0 * SAME:
+            return number_of(one, point, geometry)
+    return None

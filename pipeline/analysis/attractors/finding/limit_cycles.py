@@ -1,0 +1,164 @@
+"""Find the limit cycles of autonomous flows that are sampled at equal times.
+
+Sampled once per strobe period, a limit cycle is a curve, which sections fill if the two periods have no
+common multiple. If they have one, every cell closes at its own phase: there are as many closed orbits as
+cells, and Newton's method on the stroboscopic map fails at the multiplier 1 along the flow. So this module
+takes the crossings of a level of one state instead, the level of one of the cells. The return map there has
+the cycle as a periodic point (`magpend_core.orbits`), and all cells on the cycle cross at the same points.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from magpend_core.engine.crossing import with_section
+from magpend_core.orbits import polish_orbits
+from magpend_core.pointwise import rates_at
+from magpend_core.sections import run_branches
+from pipeline.analysis.attractors.finding.points import Point
+from pipeline.analysis.sets import Geometry, hashes
+
+RETURNS = 32
+"""Most crossings of the level per period."""
+
+CLOSE = 1e-2
+"""Scaled distance within which a return is tried as the period of a cycle."""
+
+TRIES = 3
+"""Cells without a cycle after which the search at a parameter point ends."""
+
+RTOL = 1e-9
+"""Tolerance of the trajectories between crossings."""
+
+
+@dataclass(frozen=True)
+class Cycle:
+    """A stable limit cycle.
+
+    Attributes
+    ----------
+    seconds : float
+        Period [s].
+    multipliers : ndarray of complex, (state,)
+        Floquet multipliers by falling modulus; one is 1, along the flow.
+    residual : float
+        Residual of `polish_orbits`.
+    """
+
+    seconds: float
+    multipliers: np.ndarray
+    residual: float
+
+
+class _Crossings:
+    """The crossings of a level by one state, upwards, for cells of a parameter point.
+
+    Parameters
+    ----------
+    point
+        Parameter point of the cells.
+    state
+        Index of the state that crosses.
+    longest_s
+        Longest wait for a crossing [s].
+    """
+
+    def __init__(self, point: Point, state: int, longest_s: float) -> None:
+        self._packed, self._rate = point.packed, 1.0 / longest_s
+        self._system = with_section(point.integrates, point.integrates.state_names[state], 1)
+        self.state = state
+
+    def of(self, states: np.ndarray, level: float) -> np.ndarray:
+        """Return successive crossings, shape (cell, RETURNS, state), padded with NaN."""
+        n = len(states)
+        found = run_branches(
+            np.tile(np.append(self._packed, level), (n, 1, 1)),
+            np.full((n, 1), self._rate),
+            states,
+            n_transient=0,
+            n_keep=RETURNS,
+            rtol=RTOL,
+            atol=RTOL,
+            system=self._system,
+        )
+        return np.asarray(found.section[:, 0])
+
+    def cycle_of(self, start: np.ndarray, geometry: Geometry, residual: float) -> tuple[Cycle, np.ndarray] | None:
+        """Return the stable cycle that a state is on and the cycle's crossings of the level, or None."""
+        level = float(start[self.state])
+        path = self.of(start[None], level)[0]
+        # a state almost tangent to the level may start with a crossing that is not the cycle's
+        near = np.flatnonzero(geometry.distance(path[1:], path[0]) <= CLOSE)
+        if not len(near):
+            return None
+        packed, rate = np.append(self._packed, level)[None], np.array([self._rate])
+        found = polish_orbits(packed, rate, path[-1:], np.array([near[0] + 1]), tolerance=residual, system=self._system)
+        if not found.converged[0] or not found.is_stable[0]:
+            return None
+        own = found.multipliers[0][:-1]  # the last one is 0: the direction of the flow
+        cycle = Cycle(float(found.seconds[0]), np.append(1.0 + 0.0j, own), float(found.residual[0]))
+        return cycle, self.of(found.section, level)[0, : int(found.orbit_period[0])]
+
+
+def tell_cycles(points: Iterable[Point], tolerance: float, longest: int, residual: float, geometry: Geometry) -> None:
+    """Find the limit cycles that cells of some parameter points are on, in place.
+
+    Parameters
+    ----------
+    points
+        Parameter points of a flow sampled at equal times, with known equilibria.
+    tolerance
+        Scaled distance within which a cell is on a cycle.
+    longest
+        Longest period [strobe periods].
+    residual
+        Scaled residual that Newton's method is to reach.
+    geometry
+        Geometry of the states.
+    """
+    for point in points:
+        _tell(point, tolerance, longest, residual, geometry)
+
+
+def _tell(point: Point, tolerance: float, longest: int, residual: float, geometry: Geometry) -> None:
+    states, is_closed = _ends(point)
+    rows = np.flatnonzero(np.isfinite(states).all(axis=1))
+    if not len(rows):
+        return
+    spread = np.ptp(geometry.scaled(states[rows]), axis=0)
+    crossings = _Crossings(point, int(np.argmax(spread)), longest / point.frequency)
+    # try closed cells first, then fast crossings: crossings almost tangent to the level scatter
+    speed = np.abs(rates_at(point.integrates, states[rows], point.packed)[:, crossings.state])
+    left = rows[np.lexsort((hashes(states[rows]), -speed, ~is_closed[rows]))]
+    on_cycle = np.full(point.n_cells, -1, np.int64)
+    cycles: list[Cycle] = []
+    failures = 0
+    while len(left) and failures < TRIES:
+        found = crossings.cycle_of(states[left[0]], geometry, residual)
+        if found is None:
+            failures, left = failures + 1, left[1:]
+            continue
+        cycle, where = found
+        seen = crossings.of(states[left], float(states[left[0]][crossings.state]))
+        # compare last crossings: the first ones may still show the cell's distance from the cycle
+        away = np.stack([geometry.distance(seen[:, -1], x) for x in where]).min(axis=0)
+        own = np.nan_to_num(away, nan=np.inf) <= tolerance
+        own[0] = True
+        on_cycle[left[own]] = len(cycles)
+        cycles.append(cycle)
+        left = left[~own]
+    point.cycles, point.on_cycle = cycles, on_cycle
+
+
+def _ends(point: Point) -> tuple[np.ndarray, np.ndarray]:
+    """Return the last state of each cell, NaN unless bounded, and whether the cell is closed."""
+    states = np.full((point.n_cells, point.n_states), np.nan)
+    is_closed = np.zeros(point.n_cells, bool)
+    for block in point.blocks():
+        own = block.is_closed | block.is_bounded
+        states[block.cells][own] = block.section[own, -1]
+        is_closed[block.cells] = block.is_closed
+    return states, is_closed

@@ -1,0 +1,267 @@
+"""Read the parameter points of a cube: their cells in blocks, their parameters and their system."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import xarray as xr
+
+from magpend_core.engine.system import System
+from magpend_core.models.model import Model
+from magpend_core.models.parameters import Parameters
+from magpend_core.orbits import crossed_state
+from magpend_core.pointwise import rates_at
+from magpend_core.status import Status
+from pipeline.analysis.attractors.extension.growth import volumes_of
+from pipeline.analysis.attractors.finding.cell_blocks import Block
+from pipeline.analysis.sets import Geometry
+from pipeline.layout.vocabulary import FREQUENCY_DIM, frequency_of, model_of, parameters_of, split_dims
+
+if TYPE_CHECKING:
+    from pipeline.analysis.attractors.finding.equilibria import Equilibrium
+    from pipeline.analysis.attractors.finding.limit_cycles import Cycle
+
+_READ = ("section", "status", "orbit_period", "turns", "rest_state", "return_time", "n_periods", "step_size")
+"""Variables that are read from a cube."""
+
+BUDGET = 256 * 2**20
+"""Most memory for sections held at once [bytes]."""
+
+
+@dataclass(frozen=True)
+class Dynamics:
+    """The model, parameters and system of a cube's cells.
+
+    Attributes
+    ----------
+    model : Model or None
+        None if another system was given.
+    parameters : Parameters, ndarray or None
+        Parameters of the run; swept values are replaced at each point. A packed vector if another system was
+        given. None if nothing is integrated.
+    system : System or None
+        None if nothing is integrated, since a system imports the compiler.
+    geometry : Geometry
+        Geometry of the states.
+    """
+
+    model: Model | None
+    parameters: Parameters | np.ndarray | None
+    system: System | None
+    geometry: Geometry
+
+    @classmethod
+    def of(
+        cls,
+        ds: xr.Dataset,
+        parameters: Parameters | np.ndarray | None = None,
+        system: System | None = None,
+        *,
+        needed: bool = True,
+    ) -> Dynamics:
+        """Collect the parameters and the system that are given, or else those of the run.
+
+        Raises
+        ------
+        ValueError
+            If the parameters are `needed` and missing.
+        """
+        if system is not None:
+            return cls(None, parameters, system, Geometry.of(system))
+        if parameters is None and (needed or ds.attrs.get("parameters")):
+            parameters = parameters_of(ds)
+        model = parameters.model if isinstance(parameters, Parameters) else model_of(ds)
+        return cls(model, parameters, model.system if needed else None, Geometry.of(model))
+
+    @property
+    def integrates(self) -> System:
+        """What is integrated; it must be there."""
+        assert self.system is not None
+        return self.system
+
+    @property
+    def can_rest(self) -> bool:
+        """Whether equilibria are searched: for autonomous models whose equations are integrated."""
+        return self.model is not None and self.model.autonomous and self.system is not None
+
+    @property
+    def is_flow(self) -> bool:
+        """Whether sections are crossings of a flow."""
+        return self.model is not None and self.model.crossing is not None
+
+    @property
+    def n_angles(self) -> int:
+        """Number of states on circles."""
+        return sum(self.geometry.is_angle)
+
+
+@dataclass
+class Point:
+    """One parameter point: its cells, parameters and system.
+
+    Attributes
+    ----------
+    parameters : Parameters or None
+        Parameters with the swept values of this point; None for a system without a model.
+    packed : ndarray
+        Packed parameter vector for the engine.
+    frequency : float
+        Drive frequency [Hz]; for a flow seen at crossings, one over the longest wait for a return.
+    system : System or None
+        System to integrate.
+    equilibria : list of Equilibrium
+        Equilibria that cells are at, see `equilibria.tell_rest`.
+    at_rest : ndarray, (cell,), or None
+        Index of the equilibrium that each cell is at, -1 for none. Cells at rest count as neither closed nor
+        bounded.
+    cycles : list of Cycle
+        Limit cycles that cells are on, for a flow sampled at equal times; see `limit_cycles.tell_cycles`.
+    on_cycle : ndarray, (cell,), or None
+        Index of the limit cycle that each cell is on, -1 for none. These cells, too, count as neither closed
+        nor bounded.
+    n_periods : int
+        Drive periods or returns that the run integrated here, summed over cells.
+    is_flow : bool
+        Whether sections are crossings of a flow.
+    can_rest : bool
+        Whether equilibria are searched.
+    """
+
+    cube: xr.Dataset
+    start_dims: tuple[str, ...]
+    frequency: float
+    packed: np.ndarray
+    parameters: Parameters | None
+    n_angles: int
+    block_cells: int
+    system: System | None = None
+    equilibria: list[Equilibrium] = field(default_factory=list)
+    at_rest: np.ndarray | None = None
+    cycles: list[Cycle] = field(default_factory=list)
+    on_cycle: np.ndarray | None = None
+    n_periods: int = 0
+    is_flow: bool = False
+    can_rest: bool = False
+
+    @property
+    def n_neutral(self) -> int:
+        """Number of the section map's exponents that are 0 by construction: 1 for a flow at equal times."""
+        return int(self.can_rest and not self.is_flow)
+
+    def volumes(self, derivatives: np.ndarray, before: np.ndarray, after: np.ndarray) -> np.ndarray:
+        """Compute the log change of a volume along the flow over each step of the section map, shape (n,)."""
+
+        def flow(states: np.ndarray) -> np.ndarray:
+            return rates_at(self.integrates, states, self.packed)
+
+        return volumes_of(derivatives, before, after, crossed_state(self.integrates), flow)
+
+    @property
+    def integrates(self) -> System:
+        """What is integrated; it must be there."""
+        assert self.system is not None
+        return self.system
+
+    @property
+    def n_cells(self) -> int:
+        """Number of cells."""
+        return math.prod(self.cube.sizes[d] for d in self.start_dims)
+
+    @property
+    def n_states(self) -> int:
+        """Number of states."""
+        return int(self.cube.sizes["state"])
+
+    def blocks(self) -> Iterator[Block]:
+        """Yield all cells in blocks, in the order of the start dims."""
+        first = self.start_dims[0] if self.start_dims else None
+        length = self.cube.sizes[first] if first else 1
+        inner = self.n_cells // max(length, 1)
+        step = max(1, self.block_cells // max(inner, 1))
+        for begin in range(0, length, step):
+            part = self.cube.isel({first: slice(begin, begin + step)}) if first else self.cube
+            n = min(step, length - begin) * inner
+            yield self._block(part, slice(begin * inner, begin * inner + n), n)
+
+    def _block(self, part: xr.Dataset, cells: slice, n: int) -> Block:
+        def values(name: str, *own: Any) -> np.ndarray:
+            array = part[name].transpose(*self.start_dims, *own)
+            return np.asarray(array.values).reshape(n, *array.shape[len(self.start_dims) :])
+
+        section = values("section", "period_index", "state").astype(np.float64)
+        turns = values("turns", ...) if "turns" in part else np.zeros((n, self.n_angles), np.int64)
+        status = values("status")
+        for told in (self.at_rest, self.on_cycle):
+            if told is not None:
+                status = np.where(told[cells] >= 0, np.int8(Status.NO_RETURN), status)
+        rest = values("rest_state", "state") if "rest_state" in part else None
+        if "return_time" in part:
+            seconds = values("return_time", "period_index")
+        else:
+            seconds = np.full(section.shape[:2], 1.0 / self.frequency)
+        step = values("step_size") if "step_size" in part else None
+        return Block(cells, section, status, values("orbit_period"), turns, rest, seconds, step)
+
+
+def slabs(ds: xr.Dataset, dynamics: Dynamics, budget: int) -> Iterator[dict[tuple[int, ...], Point]]:
+    """Yield groups of parameter points by index; a group that fits the budget is loaded in one read."""
+    names = [name for name in _READ if name in ds]
+    cube = ds[names].reset_coords(drop=True) if FREQUENCY_DIM in ds.dims else ds[names]
+    dims, start_dims = split_dims(ds["status"])
+    shape = [ds.sizes[d] for d in dims]
+    per_point = ds["section"].size * 8 // max(math.prod(shape), 1)
+    cell = 8 * math.prod(ds.sizes[d] for d in ("period_index", "state"))
+    rows = max(1, budget // max(per_point * math.prod(shape[1:]), 1))
+    for begin in range(0, shape[0] if dims else 1, rows):
+        slab = cube.isel({dims[0]: slice(begin, begin + rows)}) if dims else cube
+        if slab["section"].size * 8 <= budget:
+            slab = slab.load()
+        points = {}
+        for local in np.ndindex(*(slab.sizes[d] for d in dims)):
+            index = (local[0] + begin, *local[1:]) if dims else ()
+            one = slab.isel(dict(zip(dims, local, strict=True)))
+            values = {d: float(ds[d].values[i]) for d, i in zip(dims, index, strict=True)}
+            values = {**_fixed(ds), **values}
+            points[index] = _point(one, start_dims, values, dynamics, max(1, budget // (4 * cell)))
+        yield points
+
+
+def _fixed(ds: xr.Dataset) -> dict[str, float]:
+    """Return the parameters that are scalar coordinates."""
+    return {str(name): float(c) for name, c in ds.coords.items() if not c.ndim and c.dtype.kind in "fiu"}
+
+
+def _point(
+    one: xr.Dataset, start_dims: tuple[str, ...], values: Mapping[str, float], dynamics: Dynamics, block_cells: int
+) -> Point:
+    frequency, base = frequency_of(dynamics.model, values), dynamics.parameters
+    own: dict[str, Any] = {
+        "is_flow": dynamics.is_flow,
+        "can_rest": dynamics.can_rest,
+        "n_periods": int(one["n_periods"].sum())
+        if "n_periods" in one
+        else one["status"].size * one.sizes["period_index"],
+    }
+    if isinstance(base, Parameters):
+        parameters = base.replace(**{name: value for name, value in values.items() if name in base})
+        return Point(
+            one,
+            start_dims,
+            frequency,
+            parameters.pack(),
+            parameters,
+            dynamics.n_angles,
+            block_cells,
+            dynamics.system,
+            **own,
+        )
+    names = dynamics.system.parameter_names if dynamics.system is not None else ()
+    packed = np.zeros(len(names)) if base is None else np.array(base, np.float64)
+    for name, value in values.items():
+        if name in names:
+            packed[names.index(name)] = value
+    return Point(one, start_dims, frequency, packed, None, dynamics.n_angles, block_cells, dynamics.system, **own)

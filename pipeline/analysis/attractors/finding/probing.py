@@ -1,0 +1,81 @@
+"""Test whether degenerate orbits and equilibria attract, by trajectories beside them.
+
+If a multiplier lies on the unit circle within its error, the linear map does not decide stability.
+Trajectories start on both sides along the critical directions. If all come nearer, the orbit attracts, as for
+``x' = -x**3``, where distances fall as one over the square root of time. In a centre distances do not fall.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from magpend_core.status import Status
+from pipeline.analysis.attractors.finding.closed_orbits import Orbit, scaled_derivative
+from pipeline.analysis.attractors.finding.equilibria import Equilibrium
+from pipeline.analysis.attractors.finding.requests import LEG, Extended, Leg, Work
+from pipeline.analysis.sets import Geometry
+
+DISTANCES = (0.05, 0.01)
+"""Scaled distances at which trajectories start, tried in turn until one shows an approach."""
+
+LEGS, FALL = 32, 0.7
+"""Number of legs, and the largest share of the distance left after them that shows an approach."""
+
+
+def probe_orbit(orbit: Orbit, geometry: Geometry) -> Work[float]:
+    """Return the scaled distance from which trajectories on both sides approach an orbit, or 0."""
+    matrix = scaled_derivative(orbit, geometry)
+    values, vectors = np.linalg.eig(matrix)
+    critical = vectors[:, np.abs(np.abs(values) - 1.0) <= orbit.multiplier_error]
+    return (yield from _probe(orbit.points, critical, geometry))
+
+
+def probe_equilibrium(one: Equilibrium, geometry: Geometry) -> Work[float]:
+    """Return the scaled distance from which trajectories on both sides approach an equilibrium, or 0."""
+    values, vectors = np.linalg.eig(one.jacobian)
+    critical = vectors[:, np.abs(values.real) <= one.eigenvalue_error]
+    return (yield from _probe(one.state[None], critical, geometry))
+
+
+def _probe(points: np.ndarray, critical: np.ndarray, geometry: Geometry) -> Work[float]:
+    directions = np.concatenate([critical.T.real, critical.T.imag])
+    length = np.abs(directions).max(axis=1, initial=0.0)
+    directions = directions[length > 1e-6] / length[length > 1e-6, None]
+    if not len(directions):
+        return 0.0
+    for size in DISTANCES:
+        offset = size * np.concatenate([directions, -directions]) * np.asarray(geometry.scales)
+        if (yield from _falls(points[0] + offset, points, size, geometry)):
+            return size
+    return 0.0
+
+
+def _falls(state: np.ndarray, points: np.ndarray, size: float, geometry: Geometry) -> Work[bool]:
+    """Return whether all trajectories come nearer to the points, leg by leg, from a distance `size`."""
+    step, before = np.zeros(len(state)), np.full(len(state), np.inf)
+    for _ in range(LEGS):
+        leg: Extended = yield Leg(state, step)
+        waits = leg.status == Status.NO_RETURN
+        if not (np.isin(leg.status, (Status.PERIODIC, Status.BOUNDED)) | waits).all():
+            return False
+        state, step = leg.state, np.where(waits, 0.0, leg.step)
+        sections = np.where(waits[:, None, None], leg.state[:, None], leg.section[:, LEG // 2 :])
+        away = _distance(sections, points, geometry)
+        if (away > np.minimum(before, 2.0 * size) + 1e-9).any():
+            return False
+        before = away
+    return bool(before.max() <= FALL * size)
+
+
+def _distance(section: np.ndarray, points: np.ndarray, geometry: Geometry) -> np.ndarray:
+    """Return each trajectory's largest distance from the points, over its sections."""
+    away = np.stack([geometry.distance(section, point) for point in points])
+    return np.asarray(away.min(axis=0).max(axis=1))
+
+
+def is_approaching(section: np.ndarray, orbit: Orbit, geometry: Geometry) -> np.ndarray:
+    """Return which cells approach a probed orbit, by their sections (cell, period_index, state)."""
+    half = section.shape[1] // 2
+    early = _distance(section[:, :half], orbit.points, geometry) if half else np.full(len(section), np.inf)
+    late = _distance(section[:, half:], orbit.points, geometry)
+    return np.asarray((early <= orbit.approached_within) & (late <= early))

@@ -1,0 +1,289 @@
+"""Collect the engine requests of all parameter points, and answer them in common calls.
+
+The work on a point is a generator: it yields a request and receives the answer. All points advance in step,
+so that their trajectories fill the engine's lanes together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, TypeVar
+
+import numpy as np
+import xarray as xr
+
+from magpend_core.engine.system import System
+from magpend_core.orbits import section_map
+from magpend_core.sections import run_branches
+from pipeline.analysis.attractors.finding.assigning import STRICT
+from pipeline.analysis.attractors.finding.cell_blocks import Guesses
+from pipeline.analysis.attractors.finding.closed_orbits import Orbit, polish, run_on
+from pipeline.analysis.attractors.finding.points import Point
+from pipeline.analysis.sets import Geometry, hashes
+from pipeline.products.reporting import report
+
+LEG = 64
+"""Number of drive periods or returns in a leg of an extension."""
+
+SLOPE_RTOL = 1e-8
+"""Tolerance of the derivatives along extended cells, sufficient for exponents."""
+
+
+@dataclass(frozen=True)
+class Leg:
+    """A request to extend trajectories by `LEG` sections, from states (n, state) and step sizes (n,).
+
+    With a step size of 0 the engine chooses the step.
+    """
+
+    state: np.ndarray
+    step: np.ndarray
+
+
+@dataclass(frozen=True)
+class Extended:
+    """The answer to a `Leg`.
+
+    Attributes
+    ----------
+    section : ndarray, (n, LEG, state)
+    status, orbit_period : ndarray, (n,)
+    turns : ndarray, (n, angle)
+    state, step : ndarray
+        State (n, state) and step size (n,) that continue the trajectory bit for bit.
+    seconds : ndarray, (n, LEG)
+        Time from the previous section to each [s].
+    """
+
+    section: np.ndarray
+    status: np.ndarray
+    orbit_period: np.ndarray
+    turns: np.ndarray
+    state: np.ndarray
+    step: np.ndarray
+    seconds: np.ndarray
+
+
+@dataclass(frozen=True)
+class Polish:
+    """A request to polish guesses; the answer is a list of `Orbit` or None, one per guess.
+
+    Guesses without a period are first integrated until they close.
+    """
+
+    guesses: Guesses
+
+
+@dataclass(frozen=True)
+class Slopes:
+    """A request for the images of points (n, state) under the section map, and its derivatives there.
+
+    The answer is a pair of arrays, shapes (n, state) and (n, state, state).
+    """
+
+    point: np.ndarray
+    rtol: float = SLOPE_RTOL
+
+
+Request = Leg | Polish | Slopes
+T = TypeVar("T")
+Work = Generator[Request, Any, T]
+"""The analysis of a point: a generator that yields requests, receives answers and returns its result."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """The settings by which trajectories of a run are extended.
+
+    Attributes
+    ----------
+    rtol, atol : float
+        Tolerances of the run.
+    max_steps : int
+        Most steps per period.
+    closure : float
+        Scaled distance at which extended cells count as closed.
+    longest : int
+        Longest orbit period in the search.
+    residual : float
+        Scaled residual that Newton's method is to reach.
+    seen : int
+        Drive periods or returns for which the run integrated a cell.
+    system : System or None
+        System to integrate.
+    method : str
+        Integration method of the run, also used for legs.
+    geometry : Geometry
+        Geometry of the states.
+    """
+
+    rtol: float
+    atol: float
+    max_steps: int
+    closure: float
+    longest: int
+    residual: float
+    seen: int
+    system: System | None
+    method: str
+    geometry: Geometry
+
+    @classmethod
+    def of(cls, ds: xr.Dataset, system: System | None, geometry: Geometry, **asked: Any) -> Settings:
+        """Read the settings of the run from a cube's attributes."""
+        given = ds.attrs
+        method = str(given.get("method", system.method if system is not None else ""))
+        seen = int(given.get("n_transient", 0)) + int(given.get("n_keep", ds.sizes["period_index"]))
+        return cls(
+            float(given.get("rtol", 1e-8)),
+            float(given.get("atol", 1e-8)),
+            int(given.get("max_steps_per_period", 20_000)),
+            seen=seen,
+            system=system,
+            method=method,
+            geometry=geometry,
+            **asked,
+        )
+
+
+def answer_all(
+    works: Mapping[tuple[int, ...], Work[T]], points: Mapping[tuple[int, ...], Point], settings: Settings, what: str
+) -> dict[tuple[int, ...], T]:
+    """Carry out the work on all points in step, and return the result of each point."""
+    answers: dict[tuple[int, ...], Any] = dict.fromkeys(works)
+    results: dict[tuple[int, ...], T] = {}
+    while answers:
+        report(what, len(results), len(works))
+        asked: dict[tuple[int, ...], Request] = {}
+        for index, answer in answers.items():
+            try:
+                asked[index] = works[index].send(answer)
+            except StopIteration as stop:
+                results[index] = stop.value
+        legs = {index: request for index, request in asked.items() if isinstance(request, Leg)}
+        guesses = {index: request for index, request in asked.items() if isinstance(request, Polish)}
+        slopes = {index: request for index, request in asked.items() if isinstance(request, Slopes)}
+        answers = _legs(legs, points, settings) if legs else {}
+        answers |= _polished(guesses, points, settings) if guesses else {}
+        answers |= _slopes(slopes, points, settings) if slopes else {}
+    report(what, len(results), len(works))
+    return results
+
+
+def _gathered(
+    sizes: Sequence[int], asked: Mapping[tuple[int, ...], Any], points: Mapping[tuple[int, ...], Point]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the packed parameters and the frequency of each row, and the end of each point's rows."""
+    packed = np.repeat([points[i].packed for i in asked], sizes, axis=0)
+    frequency = np.repeat([points[i].frequency for i in asked], sizes)
+    return packed, frequency, np.cumsum(sizes)
+
+
+def _legs(
+    asked: Mapping[tuple[int, ...], Leg], points: Mapping[tuple[int, ...], Point], settings: Settings
+) -> dict[tuple[int, ...], Extended]:
+    assert settings.system is not None
+    sizes = [len(leg.state) for leg in asked.values()]
+    packed, frequency, ends = _gathered(sizes, asked, points)
+    found = run_branches(
+        packed[:, None],
+        frequency[:, None],
+        np.concatenate([leg.state for leg in asked.values()]),
+        n_transient=0,
+        n_keep=LEG,
+        rtol=settings.rtol,
+        atol=settings.atol,
+        max_steps_per_period=settings.max_steps,
+        closure_tolerance=settings.closure,
+        max_orbit_period=settings.longest,
+        system=replace(settings.system, method=settings.method),
+        step_size=np.concatenate([leg.step for leg in asked.values()]),
+    )
+    seconds = np.broadcast_to(1.0 / frequency[:, None], (len(frequency), LEG))
+    if found.return_time is not None:
+        seconds = found.return_time[:, 0]
+    return {
+        index: Extended(
+            found.section[own, 0],
+            found.status[own, 0],
+            found.orbit_period[own, 0],
+            found.turns[own, 0],
+            found.final_state[own, 0],
+            np.nan_to_num(found.step_size[own, 0]),
+            seconds[own],
+        )
+        for index, own in _slices(asked, sizes, ends)
+    }
+
+
+def _slices(
+    asked: Mapping[tuple[int, ...], Any], sizes: Sequence[int], ends: np.ndarray
+) -> list[tuple[tuple[int, ...], slice]]:
+    return [(i, slice(end - n, end)) for i, n, end in zip(asked, sizes, ends.tolist(), strict=True)]
+
+
+def _polished(
+    asked: Mapping[tuple[int, ...], Polish], points: Mapping[tuple[int, ...], Point], settings: Settings
+) -> dict[tuple[int, ...], list[Orbit | None]]:
+    assert settings.system is not None
+    guesses = [request.guesses for request in asked.values()]
+    sizes = [len(g.key) for g in guesses]
+    packed, frequency, ends = _gathered(sizes, asked, points)
+    start = np.concatenate([g.point for g in guesses])
+    period = np.concatenate([g.period for g in guesses])
+    mark = np.concatenate([g.mark for g in guesses])
+    unknown = np.flatnonzero(period == 0)
+    start[unknown], period[unknown] = run_on(
+        packed[unknown], frequency[unknown], start[unknown], settings.longest, settings.system
+    )
+    rows, place = _each_once(np.repeat(np.arange(len(sizes)), sizes), start, period, mark, unknown, settings.geometry)
+    polished = polish(
+        packed[rows],
+        frequency[rows],
+        start[rows],
+        period[rows],
+        geometry=settings.geometry,
+        system=settings.system,
+        tolerance=settings.residual,
+    )
+    found = [polished[i] if i >= 0 else None for i in place]
+    return {index: found[own] for index, own in _slices(asked, sizes, ends)}
+
+
+def _each_once(
+    search: np.ndarray, start: np.ndarray, period: np.ndarray, mark: np.ndarray, ended: np.ndarray, geometry: Geometry
+) -> tuple[np.ndarray, np.ndarray]:
+    """Choose the rows to polish; return them, and for each row the index of its representative (-1: none).
+
+    Rows that were integrated further and ended in one box are on one orbit; the row of least hash represents
+    them. Rows without a period have no representative.
+    """
+    rows = np.arange(len(period))
+    key = mark.copy()
+    boxes = geometry.boxes(start[ended], STRICT)
+    key[ended] = hashes(np.concatenate([period[ended, None], boxes], axis=1))
+    group = np.stack([search.astype(np.uint64), np.isin(rows, ended).astype(np.uint64), key], axis=1)
+    order = rows[np.lexsort((mark, *group.T[::-1]))]
+    order = order[period[order] > 0]
+    new = np.ones(len(order), bool)
+    new[1:] = (group[order][1:] != group[order][:-1]).any(axis=1) | ~np.isin(order[1:], ended)
+    place = np.full(len(period), -1)
+    place[order] = np.cumsum(new) - 1
+    return order[new], place
+
+
+def _slopes(
+    asked: Mapping[tuple[int, ...], Slopes], points: Mapping[tuple[int, ...], Point], settings: Settings
+) -> dict[tuple[int, ...], tuple[np.ndarray, np.ndarray]]:
+    assert settings.system is not None
+    found: dict[tuple[int, ...], tuple[np.ndarray, np.ndarray]] = {}
+    for rtol in {request.rtol for request in asked.values()}:
+        own = {index: request for index, request in asked.items() if request.rtol == rtol}
+        sizes = [len(request.point) for request in own.values()]
+        packed, frequency, ends = _gathered(sizes, own, points)
+        start = np.concatenate([request.point for request in own.values()])
+        ways = section_map(packed, frequency, start, 1, rtol=rtol, system=settings.system)
+        for index, rows in _slices(own, sizes, ends):
+            found[index] = ways.images[rows, -1], ways.derivatives[rows]
+    return found

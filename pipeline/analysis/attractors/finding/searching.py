@@ -1,0 +1,168 @@
+"""Search for the closed orbits of a parameter point, block by block.
+
+Cells are read in blocks, several times. The data kept between blocks (boxes, best guesses, least hashes,
+sums) do not depend on how the cells were cut into blocks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.analysis.attractors.finding.assigning import LOOSE_SHARE, STRICT, decide
+from pipeline.analysis.attractors.finding.cell_blocks import ClosedCells, Guesses, marks_of
+from pipeline.analysis.attractors.finding.closed_orbits import Orbit, distinct, number_of
+from pipeline.analysis.attractors.finding.equilibria import rest_of_orbit
+from pipeline.analysis.attractors.finding.points import Dynamics, Point
+from pipeline.analysis.attractors.finding.requests import Polish, Settings, Work
+from pipeline.analysis.attractors.finding.spirals import MAX_GUESSES, beside, near_closed
+from pipeline.analysis.sets import Geometry
+from pipeline.products.attractors import IdentifyOptions
+
+ROUNDS, ROUNDS_LOOSE = 3, 6
+"""Most rounds of guessing and polishing, with a strict and with a loose tolerance."""
+
+
+@dataclass(frozen=True)
+class Search:
+    """The options of a search, with the run's dynamics and settings.
+
+    Attributes
+    ----------
+    options : IdentifyOptions
+        Options of `identify`.
+    tolerance : float
+        Tolerance of the options, or the default that follows from the run.
+    dynamics : Dynamics
+        Model, parameters and system.
+    settings : Settings
+        Settings by which trajectories are extended.
+    """
+
+    options: IdentifyOptions
+    tolerance: float
+    dynamics: Dynamics
+    settings: Settings
+
+    @property
+    def geometry(self) -> Geometry:
+        """Geometry of the states."""
+        return self.dynamics.geometry
+
+    @property
+    def longest(self) -> int:
+        """Longest orbit period in the search."""
+        return self.options.max_orbit_period
+
+    @property
+    def is_loose(self) -> bool:
+        """Whether the tolerance is too loose for a closed cell to show an orbit without Newton's method."""
+        return self.options.polish and self.tolerance > STRICT
+
+    @property
+    def box(self) -> float:
+        """Side of the boxes that group closed cells."""
+        return LOOSE_SHARE * self.tolerance if self.is_loose else self.tolerance
+
+
+@dataclass
+class State:
+    """The result of the search at one point, before its cells are labelled.
+
+    Attributes
+    ----------
+    orbits : list of Orbit
+        Orbits, those of the last rounds last.
+    keys, group : ndarray
+        Keys of the boxes of closed cells, and the group of each box.
+    closed : ClosedCells
+        Closed cells by group.
+    ends : dict
+        Index of the orbit that a closed cell reached after further integration, by the cell's mark.
+    """
+
+    orbits: list[Orbit]
+    keys: np.ndarray
+    group: np.ndarray
+    closed: ClosedCells
+    ends: dict[int, int]
+
+
+def search_orbits(point: Point, search: Search) -> Work[State]:
+    """Find the orbits that cells of a point have closed on or approach."""
+    n_states = len(search.geometry.scales)
+    closed = ClosedCells(search.geometry, search.box, Guesses.none(n_states))
+    for block in point.blocks():
+        closed.add(block)
+    keys, group = closed.close()
+    orbits: list[Orbit] = []
+    if search.options.polish:
+        guesses = closed.guesses
+        guesses = guesses.best(group[np.searchsorted(keys, guesses.key)].astype(np.uint64))
+        if search.is_loose:
+            guesses = guesses.least(MAX_GUESSES)
+        for _ in range(ROUNDS_LOOSE if search.is_loose else ROUNDS):
+            if len(guesses.key):
+                polished = moving((yield Polish(guesses)), point, search.geometry)
+                more = distinct([*orbits, *(o for o in polished if o is not None)], search.geometry)
+                if len(more) == len(orbits):
+                    break
+                orbits = more
+            guesses = _undecided(point, orbits, search)
+            if not len(guesses.key):
+                break
+    ends: dict[int, int] = {}
+    if search.is_loose:
+        rest = _closed_undecided(point, orbits, search)
+        if len(rest.key):
+            answers = moving((yield Polish(rest)), point, search.geometry)
+            for mark, orbit in zip(rest.mark, answers, strict=True):
+                if orbit is not None and orbit.is_stable:
+                    number = number_of(orbit, orbits, search.geometry)
+                    orbits = orbits if number < len(orbits) else [*orbits, orbit]
+                    ends[int(mark)] = number
+    return State(orbits, keys, group, closed, ends)
+
+
+def moving(orbits: Sequence[Orbit | None], point: Point, geometry: Geometry) -> list[Orbit | None]:
+    """Replace orbits that are equilibria by None, and add these equilibria to the point, in place."""
+    if not point.can_rest:
+        return list(orbits)
+    return [None if o is None or rest_of_orbit(point, o.points[0], geometry) is not None else o for o in orbits]
+
+
+def _closed_undecided(point: Point, orbits: Sequence[Orbit], search: Search) -> Guesses:
+    """Return the closed cells that are on no known orbit, as guesses without a period."""
+    found = Guesses.none(len(search.geometry.scales))
+    for block in point.blocks():
+        label, _ = decide(block, orbits, search.tolerance, search.geometry)
+        rest = np.flatnonzero(block.is_closed & (label < 0))
+        section = block.section[rest]
+        marks = marks_of(section)
+        zero = np.zeros(len(rest))
+        own = Guesses(marks, zero, marks, section[:, -1], zero.astype(np.int64))
+        found = found.joined(own)
+    return found
+
+
+def _undecided(point: Point, orbits: Sequence[Orbit], search: Search) -> Guesses:
+    """Make guesses from the cells that are on no known orbit."""
+    closed = ClosedCells(search.geometry, search.box, Guesses.none(len(search.geometry.scales)))
+    near = Guesses.none(len(search.geometry.scales))
+    for block in point.blocks():
+        label, _ = decide(block, orbits, search.tolerance, search.geometry)
+        rest = np.flatnonzero(label < 0)
+        closed.add(block.take(rest))
+        loose = rest[block.is_bounded[rest]]
+        near = near.joined(near_closed(block.section[loose], search.longest, search.geometry))
+    keys, group = closed.close()
+    own = closed.guesses.best(group[np.searchsorted(keys, closed.guesses.key)].astype(np.uint64))
+    if search.is_loose:
+        # the observed period may be half the true one, or the orbit unstable: try without a period as well
+        own = closed.guesses.least(MAX_GUESSES)
+        own = own.followed_by(own.without_period())
+    if len(near.key):
+        own = own.followed_by(beside(orbits, search.longest, search.geometry))
+    return own.followed_by(near.least(MAX_GUESSES))

@@ -1,0 +1,230 @@
+"""Guess the orbits that slowly spiralling cells approach.
+
+A slow spiral looks like a bounded set: near a bifurcation of its orbit a motion takes thousands of periods
+to close. Its sections show the spiral in two ways. They recur: sections p apart lie close together, whether
+the distance falls (towards the orbit) or still rises (away from an unstable orbit). Or they contract: the
+sections of each phase scatter less and less about their mean, however fast they turn about it. Both give
+guesses for Newton's method. Cells that are on no orbit afterwards are extended.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.analysis.attractors.finding.cell_blocks import Guesses, marks_of
+from pipeline.analysis.attractors.finding.closed_orbits import Orbit, scaled_derivative
+from pipeline.analysis.sets import Geometry, hashes
+
+NEAR = 0.05
+"""Largest scaled distance between recurring sections at which a cell makes a guess."""
+
+SPREAD = 0.3
+"""Largest scaled distance of sections from the mean of their phase at which this mean is a guess."""
+
+N_PARTS, SHRINKS = 4, 0.7
+"""Sections contract if their spread falls over `N_PARTS` parts, to at most `SHRINKS` times the first."""
+
+PER_PHASE = 4
+"""Fewest sections of a phase in each part."""
+
+SAME_LAG = 1.5
+"""The shortest period is taken whose distance is at most this factor above the smallest distance."""
+
+MAX_GUESSES = 64
+"""Most guesses per parameter point from cells that are not closed."""
+
+SLOWLY, BESIDE = 1.2, (0.005, 0.01, 0.02, 0.04, 0.08)
+"""Largest multiplier of an unstable orbit near which other orbits are guessed, and the guesses' distances."""
+
+CHEAP = 4
+"""Longest period at which every recurrence is a guess: chaos passes many orbits, and long ones cost more."""
+
+CLOSES_IN = 0.9
+"""Largest ratio of the distances between recurring sections, later half to earlier half, that closes in."""
+
+LEAP, LINEAR = 2.0, 0.1
+"""Factor by which a leap increases the distance from an unstable orbit; and the largest error of the linear
+map that allows it, in units of the growth."""
+
+
+@dataclass(frozen=True)
+class Recurrence:
+    """The recurrence of cells' sections.
+
+    Attributes
+    ----------
+    period : ndarray of int64, (cell,)
+        Period after which the younger half of the sections recurs within `NEAR`; 0 if there is none.
+    lag : ndarray, (cell,)
+        Distance of the last section from that one period before; infinite without a period.
+    centred : ndarray of int64, (cell,)
+        Period at which sections contract to the mean of their phase; 0 if there is none.
+    centre : ndarray, (cell, state)
+        Mean of the last section's phase over the last part.
+    """
+
+    period: np.ndarray
+    lag: np.ndarray
+    centred: np.ndarray
+    centre: np.ndarray
+
+    @classmethod
+    def of(cls, section: np.ndarray, max_period: int, geometry: Geometry) -> Recurrence:
+        """Compute the recurrence of sections (cell, period_index, state)."""
+        period, lag = _recurring(section, max_period, geometry)
+        centred, centre = _contracting(section, max_period, geometry)
+        return cls(period, lag, centred, centre)
+
+    @property
+    def is_near(self) -> np.ndarray:
+        """Whether each cell may approach an orbit."""
+        return np.asarray((self.period > 0) | (self.centred > 0))
+
+
+def _recurring(section: np.ndarray, max_period: int, geometry: Geometry) -> tuple[np.ndarray, np.ndarray]:
+    n, k = section.shape[:2]
+    longest = min(max_period, k // 2)
+    farthest, last = np.full((n, longest + 1), np.inf), np.full((n, longest + 1), np.inf)
+    for p in range(1, longest + 1):
+        half = max((k - p) // 2, 1)
+        lag = geometry.distance(section[:, k - half :], section[:, k - half - p : k - p])
+        farthest[:, p], last[:, p] = lag.max(axis=1), lag[:, -1]
+    near = farthest <= np.minimum(NEAR, SAME_LAG * farthest.min(axis=1))[:, None]
+    period = near.argmax(axis=1)  # 0 where none is near
+    return period, last[np.arange(n), period]
+
+
+def _contracting(section: np.ndarray, max_period: int, geometry: Geometry) -> tuple[np.ndarray, np.ndarray]:
+    n, k, n_states = section.shape
+    period, centre = np.zeros(n, np.int64), section[:, -1].copy()
+    # limit the periods: among many long ones, one would shrink by chance
+    for p in range(1, min(max_period, CHEAP, k // (N_PARTS * PER_PHASE)) + 1):
+        m = k // (N_PARTS * p)
+        rest = np.flatnonzero(period == 0)
+        own = section[rest, k - N_PARTS * m * p :].reshape(len(rest), N_PARTS, m, p, n_states)
+        # measure from the last section, so that a circle of angles is cut on its far side
+        away = geometry.difference(own, own[:, -1:, -1:])
+        mean = away.mean(axis=2, keepdims=True)
+        spread = np.abs(away - mean).max(axis=(2, 3, 4))
+        falls = (spread[:, 1:] < spread[:, :-1]).all(axis=1)
+        found = falls & (spread[:, -1] <= np.minimum(SPREAD, SHRINKS * spread[:, 0]))
+        period[rest[found]] = p
+        centre[rest[found]] += mean[found, -1, 0, -1] * np.asarray(geometry.scales)
+    return period, centre
+
+
+def near_closed(section: np.ndarray, max_period: int, geometry: Geometry) -> Guesses:
+    """Return guesses from cells that are not closed but recur, the best one of each box.
+
+    Each cell gives its last section with the period of recurrence and, if its sections contract, the mean of
+    the last section's phase.
+    """
+    found = Recurrence.of(section, max_period, geometry)
+    marks = marks_of(section)
+    worth = (found.period > 0) & ((found.period <= CHEAP) | closes_in(section, max_period, geometry))
+    recurring, contracting = np.flatnonzero(worth), np.flatnonzero(found.centred)
+    spirals = _guesses(
+        found.period[recurring], found.lag[recurring], marks[recurring], section[recurring, -1], geometry
+    )
+    # rank means after recurring sections, since a mean is not a section
+    away = geometry.distance(found.centre[contracting], section[contracting, -1]) + NEAR
+    means = _guesses(found.centred[contracting], away, marks[contracting], found.centre[contracting], geometry)
+    return spirals.joined(means)
+
+
+def closes_in(section: np.ndarray, max_period: int, geometry: Geometry) -> np.ndarray:
+    """Return which cells recur at falling distances, unlike chaos that merely passes an orbit."""
+    found = Recurrence.of(section, max_period, geometry)
+    closes = found.centred > 0
+    half = section.shape[1] // 2
+    for p in np.unique(found.period[found.period > 0]).tolist():
+        rows = np.flatnonzero(found.period == p)
+        lag = geometry.distance(section[rows, p:], section[rows, :-p])
+        early, late = lag[:, : half - p // 2].max(axis=1), lag[:, half - p // 2 :].max(axis=1)
+        closes[rows] |= late <= CLOSES_IN * early
+    return np.asarray(closes)
+
+
+def _guesses(period: np.ndarray, score: np.ndarray, mark: np.ndarray, point: np.ndarray, geometry: Geometry) -> Guesses:
+    # separate decades of the score: a cell may guess well nearby after failing from far
+    decade = np.floor(np.log10(np.maximum(score, 1e-12))).astype(np.int64)
+    rows = np.concatenate([period[:, None], decade[:, None], geometry.boxes(point, NEAR)], axis=1)
+    return Guesses(hashes(rows), score, mark, point, period).best()
+
+
+def beside(orbits: Sequence[Orbit], max_period: int, geometry: Geometry) -> Guesses:
+    """Guess the orbits that bifurcated from slightly unstable orbits, along their unstable directions.
+
+    Cells that leave an orbit shortly after it lost stability go to the orbit that replaced it. That orbit has
+    twice the period if the multiplier is below -1, and the same period if it is above 1.
+    """
+    points, periods = [], []
+    for orbit in orbits:
+        values, vectors = np.linalg.eig(scaled_derivative(orbit, geometry))
+        k = int(np.abs(values).argmax())
+        period = orbit.period * (1 if values[k].real > 0.0 else 2)
+        if not 1.0 < np.abs(values[k]) < SLOWLY or values[k].imag != 0.0 or period > max_period:
+            continue
+        direction = vectors[:, k].real / np.abs(vectors[:, k].real).max()
+        for size in BESIDE:
+            points += [orbit.points[0] + sign * size * direction * np.asarray(geometry.scales) for sign in (1, -1)]
+            periods += [period, period]
+    if not points:
+        return Guesses.none(len(geometry.scales))
+    point, period_of = np.array(points), np.array(periods, np.int64)
+    mark = hashes(np.concatenate([period_of[:, None], geometry.boxes(point, 1e-6)], axis=1))
+    return Guesses(mark, np.zeros(len(mark)), mark, point, period_of).best()
+
+
+def keys_of(section: np.ndarray, side: float, geometry: Geometry) -> np.ndarray:
+    """Return a hash of the box that the last section of each cell lies in."""
+    return hashes(geometry.boxes(section[:, -1], side))
+
+
+def leap(section: np.ndarray, orbits: Sequence[Orbit], geometry: Geometry) -> np.ndarray:
+    """Move cells that leave an unstable orbit slowly to about `LEAP` times their distance from it.
+
+    Near a bifurcation leaving takes thousands of periods, in which the motion follows the orbit's monodromy
+    matrix. Let u be the components of a cell's distance along the unstable eigenvectors, at the sections that
+    share the phase of the orbit's first point, and lambda the multipliers. A cell leaps if
+    ``|u'' - lambda**2 u| <= 0.1 (|lambda|**2 - 1) |u|`` over the younger half of these sections. Here u'' is
+    u two returns later: near a period doubling the quadratic terms cancel over two returns.
+
+    Parameters
+    ----------
+    section
+        Sections of a leg, shape (n, LEG, state).
+    orbits
+        Known orbits.
+    geometry
+        Geometry of the states.
+
+    Returns
+    -------
+    ndarray, (n, state)
+        Predicted states; NaN for cells that do not leap.
+    """
+    states = np.full((len(section), section.shape[2]), np.nan)
+    scales = np.asarray(geometry.scales)
+    for orbit in orbits:
+        growth = float(np.abs(orbit.multipliers).max())
+        # skip orbits that cells leave fast: a leap gains nothing
+        if not 1.0 < growth < LEAP ** (orbit.period / section.shape[1]):
+            continue
+        values, vectors = np.linalg.eig(scaled_derivative(orbit, geometry))
+        grows = np.abs(values) > 1.0
+        values, onto = values[grows], np.linalg.inv(vectors)[grows].T
+        n = 2 * int(np.log(LEAP) / np.log(growth) / 2)
+        for phase in range(orbit.period):
+            index = np.arange(section.shape[1] - 1 - phase, -1, -orbit.period)[::-1]
+            distance = geometry.difference(section[:, index[len(index) // 2 :]], orbit.points[0])
+            along = distance @ onto
+            error = np.abs(along[:, 2:] - along[:, :-2] * values**2)
+            allowed = LINEAR * (np.abs(values) ** 2 - 1.0) * np.abs(along[:, :-2])
+            linear = (error <= allowed).all(axis=(1, 2)) & (distance.shape[1] > PER_PHASE)
+            more = ((along[linear, -1] * (values**n - 1.0)) @ vectors[:, grows].T).real
+            states[linear] = orbit.points[0] + (distance[linear, -1] + more) * scales
+    return states

@@ -1,0 +1,1 @@
+"""Match attractors along the swept parameters: ids, connected branches, hysteresis."""

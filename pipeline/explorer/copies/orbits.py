@@ -1,0 +1,229 @@
+"""Integrate the orbits of a copy when it is made: one per attractor and parameter point."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from pipeline.explorer.copies.content import Copied
+from pipeline.explorer.copies.packing import packed
+from pipeline.explorer.data.arrays import unpack_arrays
+from pipeline.explorer.data.clicked_orbit import orbit
+from pipeline.explorer.data.explored import ExploredRun, ExplorerError
+from pipeline.products.reporting import report
+
+NONE = np.uint32(0xFFFFFFFF)
+SAME_ATTRACTOR, ALIKE, NEAREST = 1, 2, 3
+"""What an orbit is to a cell: of its attractor, of a cell like it at its parameters, or the nearest."""
+
+BLOCK = 32
+"""Orbits in an object."""
+
+SERIES = ("time", "states", "quantities", "drawing")
+"""Arrays of an orbit that run over time."""
+
+BRIEF_PERIODS = 5
+"""Periods that a page shows of a motion that does not close."""
+
+SAMPLE = 6
+"""Orbits by which the size of all is judged."""
+
+
+@dataclass(frozen=True)
+class Room:
+    """The limits for the orbits of a copy.
+
+    Attributes
+    ----------
+    orbits : int
+    n_bytes : float
+        Before they are written as text.
+    brief : bool
+        Whether fewer digits and periods are kept, so that there are more of them.
+    """
+
+    orbits: int
+    n_bytes: float
+    brief: bool
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """The choice of an orbit for each cell.
+
+    Attributes
+    ----------
+    cells : ndarray of int64, (n,)
+        Cells whose orbits are integrated.
+    orbit : ndarray of uint32, (n_cells,)
+        Index into `cells`, or `NONE`.
+    how : ndarray of uint8, (n_cells,)
+    groups : int
+        Attractors at all parameter points; `cells` are fewer where there was no room.
+    """
+
+    cells: np.ndarray
+    orbit: np.ndarray
+    how: np.ndarray
+    groups: int
+
+
+def choose(run: ExploredRun, layers: Mapping[str, np.ndarray], count: np.ndarray, most: int) -> Chosen:
+    """Choose the cells whose orbits stand for all cells.
+
+    Parameters
+    ----------
+    run
+        The run.
+    layers
+        Codes by cell: ``colour_attractor``, or else ``colour_motion``; ``orbit_period`` and ``status``.
+    count
+        Number of each cell's points.
+    most
+        Orbits at most. Where there are more attractors, some values of the horizontal axis go without.
+    """
+    labels = _labels(layers)
+    point, axis = _parameter_points(run)
+    there = np.flatnonzero(count > 0)
+    keys = np.stack([point[there], labels[there]], axis=1)
+    unique, first, inverse = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+    taken = np.arange(len(unique))
+    if len(unique) > most:
+        # whole parameter points, evenly along the axes
+        each = -(-len(unique) // max(most, 1))
+        taken = np.flatnonzero(unique[:, 0] % each == 0)[:most]
+    orbit_of = np.full(len(count), NONE, np.uint32)
+    how = np.zeros(len(count), np.uint8)
+    if not len(taken):
+        return Chosen(np.empty(0, np.int64), orbit_of, how, len(unique))
+    same = SAME_ATTRACTOR if "colour_attractor" in layers else ALIKE
+    number, means = _nearest(unique, taken, axis, same)
+    orbit_of[there], how[there] = number[inverse.ravel()], means[inverse.ravel()]
+    return Chosen(there[first[taken]], orbit_of, how, len(unique))
+
+
+def _labels(layers: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Return a number that distinguishes the cells of a parameter point."""
+    if "colour_attractor" in layers:
+        return np.asarray(layers["colour_attractor"], np.int64)
+    motion = layers.get("colour_motion", np.zeros_like(layers["status"])).astype(np.int64)
+    return np.asarray((motion * 1000 + layers["orbit_period"].astype(np.int64)) * 100 + layers["status"])
+
+
+def _parameter_points(run: ExploredRun) -> tuple[np.ndarray, np.ndarray]:
+    """Return each cell's parameter point, and the points' axis positions, each from 0 to 1."""
+    swept = [a.name for a in run.axes if a.swept]
+    sizes = [run.plan.shape[run.plan.dims.index(d)] for d in swept]
+    index = dict(zip(run.plan.dims, np.indices(run.plan.shape).reshape(len(run.plan.dims), -1), strict=True))
+    if not swept:
+        return np.zeros(run.plan.n_cells, np.int64), np.zeros((1, 1))
+    point = np.ravel_multi_index([index[d] for d in swept], sizes).astype(np.int64)
+    grid = np.stack(np.unravel_index(np.arange(int(np.prod(sizes))), sizes), axis=1)
+    return point, grid / np.maximum(np.array(sizes) - 1, 1)
+
+
+def _nearest(groups: np.ndarray, taken: np.ndarray, axis: np.ndarray, same: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the orbit for each group of cells: its own, else the nearest, same label preferred."""
+    number = np.full(len(groups), NONE, np.uint32)
+    means = np.full(len(groups), NEAREST, np.uint8)
+    number[taken], means[taken] = np.arange(len(taken)), same
+    for group in np.flatnonzero(number == NONE):
+        point, label = groups[group]
+        alike = np.flatnonzero(groups[taken, 1] == label)
+        among = alike if len(alike) else np.arange(len(taken))
+        distance = np.abs(axis[groups[taken[among], 0]] - axis[point]).sum(axis=1)
+        number[group] = among[int(np.argmin(distance))]
+    return number, means
+
+
+def add_orbits(copied: Copied, choosing: Callable[[int], Chosen], count: np.ndarray, room: Room) -> int:
+    """Integrate orbits and add them to a copy; return their number.
+
+    Parameters
+    ----------
+    copied
+        What they are added to.
+    choosing
+        Gives the choice for a number of orbits at most.
+    count
+        Number of each cell's points; an orbit starts from the last.
+    room
+        What they may take.
+    """
+    if copied.run.spec.recorded is not None:
+        missing = "This copy has no orbits: the drive of the run is a recording, which does not repeat."
+        copied.about["orbits"] = {"blocks": [], "missing": missing}
+        copied.sentences.append(missing)
+        return 0
+    chosen = choosing(room.orbits)
+    each = _bytes_each(copied, chosen, count, room)
+    if each * len(chosen.cells) > room.n_bytes:
+        chosen = choosing(int(room.n_bytes / each))
+    n = len(chosen.cells)
+    blocks = list(range(0, n, BLOCK))
+    report("integrating orbits", 0, n)
+    for number, first in enumerate(blocks):
+        held: dict[str, np.ndarray] = {}
+        said: dict[str, Any] = {}
+        for k in range(first, min(first + BLOCK, n)):
+            arrays, said[str(k)] = _orbit(copied.run, int(chosen.cells[k]), count, room)
+            held |= {f"{k}.{name}": values for name, values in arrays.items()}
+            report("integrating orbits", k + 1, n)
+        copied.objects[f"orbits-{number}"] = packed(held, said)
+    copied.objects["orbit-index"] = packed({"orbit": chosen.orbit, "how": chosen.how})
+    missing = "" if n else "This copy was made without orbits; magpend explore integrates them."
+    copied.about["orbits"] = {"blocks": blocks, "missing": missing}
+    copied.sentences += [missing] if missing else []
+    if 0 < n < chosen.groups:
+        copied.sentences.append(
+            f"Of {chosen.groups:,} orbits, one for each attractor (or period and motion) at its parameters, "
+            f"this copy has {n:,}; elsewhere the nearest is shown."
+        )
+    return n
+
+
+def _bytes_each(copied: Copied, chosen: Chosen, count: np.ndarray, room: Room) -> float:
+    """Estimate the bytes per orbit from a sample; at least 1."""
+    some = chosen.cells[:: max(1, len(chosen.cells) // SAMPLE)][:SAMPLE]
+    sizes = []
+    for cell in some.tolist():
+        arrays, attrs = _orbit(copied.run, cell, count, room)
+        sizes.append(len(packed(arrays, attrs)))
+    return max(1.0, float(np.mean(sizes))) if sizes else 1.0
+
+
+def _orbit(run: ExploredRun, cell: int, count: np.ndarray, room: Room) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Integrate the orbit from a cell's last section, at the precision that fits."""
+    try:
+        arrays, attrs = unpack_arrays(orbit(run, cell, int(count[cell]) - 1))
+    except (ExplorerError, ArithmeticError) as error:  # of one cell: the page says so where it is asked for
+        return {}, {"cell": cell, "failed": str(error)}
+    del arrays["section"]  # the columns have it, of every cell
+    if room.brief:
+        arrays = brief(arrays, closed=attrs["period"] is not None)
+    return {
+        name: rounded(values, room.brief) if values.dtype.kind == "f" else values for name, values in arrays.items()
+    }, attrs
+
+
+def brief(arrays: Mapping[str, np.ndarray], closed: bool) -> dict[str, np.ndarray]:
+    """Shorten an orbit for a page: first periods at every second instant unless it closes."""
+    sections = arrays["section_times"][: BRIEF_PERIODS + 1]
+    if closed or len(sections) <= BRIEF_PERIODS:
+        return dict(arrays)
+    n = int(np.searchsorted(arrays["time"], sections[-1], side="right"))
+    series = {name: values[:n:2] for name, values in arrays.items() if name in SERIES}
+    return {**arrays, **series, "section_times": sections}
+
+
+def rounded(values: np.ndarray, short: bool) -> np.ndarray:
+    """Round numbers to 24 bits, or to 16 for a page, so that gzip compresses them better."""
+    single = np.ascontiguousarray(values, np.float32)
+    if not short:
+        return single
+    bits = single.view(np.uint32)
+    shorter = ((bits + np.uint32(0x80)) & np.uint32(0xFFFFFF00)).view(np.float32)
+    return np.where(np.isfinite(single), shorter, single)

@@ -1,0 +1,1 @@
+"""Read a run for the page: diagrams, planes, orbits, overlays, tables."""

@@ -1,0 +1,180 @@
+"""Define the colour schemes of a diagram: a code per cell, with labels and colours for codes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from magpend_core.status import Status
+from pipeline.analysis.outcomes import outcomes
+from pipeline.layout.vocabulary import BRANCH, split_dims
+from pipeline.plots import palette, style
+from pipeline.plots.motions import motion_codes, motions_of
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from pipeline.explorer.data.explored import ExploredRun
+
+NONE = 65535
+"""Code of a cell that has none."""
+
+MOST_SEEDS = 64
+"""Initial states that are told apart by colour: more could not be."""
+
+_DIRECTIONS = ("up", "down")
+
+_STATUS = {
+    Status.PERIODIC: style.BLUE,
+    Status.BOUNDED: style.VERMILLION,
+    Status.INFERRED: style.SKY,
+    Status.DIVERGED: "#000000",
+    Status.STEP_LIMIT: "#595959",
+    Status.STEP_UNDERFLOW: "#595959",
+    Status.UNREACHED: "#8C8C8C",
+    Status.NO_RETURN: "#404040",
+    Status.CHATTER: "#2E2619",
+    Status.PENDING: "#BFBFBF",
+}
+
+
+@dataclass(frozen=True)
+class Category:
+    """One colour of a scheme, and its meaning."""
+
+    number: int
+    label: str
+    colour: str
+
+
+@dataclass(frozen=True)
+class Scheme:
+    """A way to colour cells.
+
+    Attributes
+    ----------
+    name, title : str
+    categories : tuple of Category
+    codes : callable
+        ``codes(block)``: code of each cell of a loaded part of the cube, an array that broadcasts to those
+        of ``status``; negative for none.
+    needs : tuple of str
+        Variables of the cube that `codes` reads besides ``status``.
+    """
+
+    name: str
+    title: str
+    categories: tuple[Category, ...]
+    codes: Callable[[xr.Dataset], xr.DataArray]
+    needs: tuple[str, ...] = ()
+
+    def describe(self) -> dict[str, Any]:
+        """Return the scheme in the page's form."""
+        return {
+            "name": self.name,
+            "title": self.title,
+            "categories": [{"id": c.number, "label": c.label, "colour": c.colour} for c in self.categories],
+        }
+
+
+def schemes(run: ExploredRun) -> list[Scheme]:
+    """Return the colour schemes of a run, the default first."""
+    return run.remembered("schemes", lambda: list(_schemes(run)))
+
+
+def _schemes(run: ExploredRun) -> Iterator[Scheme]:
+    cube = run.cube()
+    motions = motions_of(cube)
+    if motions.told:
+        yield Scheme(
+            "motion",
+            "motion",
+            tuple(Category(c, motions.words[c], rgb(motions.colours[c])) for c in motions.drawn),
+            lambda block: _told(motion_codes(block)),
+            ("section", "turns"),
+        )
+    if (found := run.kept("attractors")) is not None:
+        cast, (codes, others) = palette.cast_of(found), _ends(found)
+        yield Scheme(
+            "attractor",
+            "attractor",
+            (*(Category(i, cast.names[i], rgb(cast.colours[i])) for i in sorted(cast.names)), *others),
+            lambda block: codes.isel({d: block[f"_{d}"].values for d in codes.dims}),
+        )
+    if BRANCH in run.plan.dims:
+        present = [d for d in _DIRECTIONS if d in set(cube["direction"].values.tolist())]
+        if len(present) > 1:
+            yield Scheme(
+                "direction",
+                "direction of the walk",
+                tuple(
+                    Category(_DIRECTIONS.index(d), d, c)
+                    for d, c in zip(present, (style.BLUE, style.ORANGE), strict=False)
+                ),
+                lambda block: _directions(block["direction"]),
+            )
+    yield from _seeds(run)
+    yield Scheme(
+        "status",
+        "what became of the cell",
+        tuple(Category(int(s), s.name.lower().replace("_", " "), c) for s, c in _STATUS.items()),
+        lambda block: block["status"],
+    )
+
+
+def _seeds(run: ExploredRun) -> Iterator[Scheme]:
+    """Colour by the initial state, if there are few."""
+    cube, dims = run.cube(), run.start_dims
+    sizes = [run.plan.shape[run.plan.dims.index(d)] for d in dims]
+    walked = BRANCH in dims
+    count = int(cube["seed"].max()) + 1 if walked else int(np.prod(sizes, dtype=np.int64))
+    if not 2 <= count <= MOST_SEEDS:
+        return
+    n_colours = len(palette.COLOURS)
+    categories = tuple(Category(k, f"start {k}", rgb(palette.COLOURS[k % n_colours])) for k in range(count))
+
+    def codes(block: xr.Dataset) -> xr.DataArray:
+        if walked:
+            return block["seed"]
+        number = block[f"_{dims[0]}"]
+        for dim, size in zip(dims[1:], sizes[1:], strict=True):
+            number = number * size + block[f"_{dim}"]
+        return number
+
+    yield Scheme("seed", "initial state", categories, codes)
+
+
+def _ends(found: xr.Dataset) -> tuple[xr.DataArray, tuple[Category, ...]]:
+    """Return codes of the cells' ends: an attractor id, or a grey beyond all ids; and the greys.
+
+    Cells that diverged, failed or are pending have none.
+    """
+    codes = outcomes(found).astype(np.int32)
+    codes = codes.where(codes >= 0, -1)
+    dims, starts = split_dims(codes)
+    table, others = codes.transpose(*dims, *starts), []
+    for name, which in palette.other_cells(found).items():
+        if name in palette.SETS:
+            number = found.sizes["attractor"] + list(palette.GREYS).index(name)
+            table = table.where(~which, number)
+            others.append(Category(number, name, rgb(palette.GREYS[name])))
+    return table, tuple(others)
+
+
+def _told(codes: xr.DataArray) -> xr.DataArray:
+    """Return motion codes, with none for cells that were not classified."""
+    return codes.where(codes > 0, -1)
+
+
+def _directions(words: xr.DataArray) -> xr.DataArray:
+    return words.copy(data=np.array([_DIRECTIONS.index(str(w)) for w in words.values], np.int16))
+
+
+def rgb(colour: str) -> str:
+    """Convert a figure colour to ``#rrggbb``."""
+    from matplotlib.colors import to_hex
+
+    return str(to_hex(colour))

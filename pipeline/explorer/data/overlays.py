@@ -1,0 +1,323 @@
+"""Read the curves, branches and attractors shown with a diagram.
+
+All of it is read from the cube and from ``derived/``; what no analysis has found is not there.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from pipeline.analysis.branches.bifurcations import KINDS
+from pipeline.analysis.branches.dataset import CRITICALITIES
+from pipeline.analysis.outcomes import share_interval
+from pipeline.explorer.data.clicked_orbit import finite, shown
+from pipeline.explorer.data.colours import rgb
+from pipeline.explorer.data.explored import ExploredRun
+from pipeline.explorer.data.verticals import vertical
+from pipeline.layout.attractor_letters import letter
+from pipeline.layout.period_names import periods_of
+from pipeline.layout.vocabulary import ATTRACTS, BRANCH, FREQUENCY_DIM, PERIODIC_ORBIT, model_of
+from pipeline.plots import palette
+from pipeline.plots.branches import NAMES, SHORT, pieces
+from pipeline.plots.labels import state_measure
+from pipeline.plots.lyapunov import EXPONENT_COLOURS
+from pipeline.store.run import Run
+
+SAME_VALUE = 1e-9
+"""Largest relative difference between a value of an axis and that at which branches were followed."""
+
+MOST_SECTION = 2000
+"""Section points of an attractor that are listed."""
+
+
+# ---------------------------------------------------------------- curves under a diagram
+
+
+def curves(run: Run, x: str, at: Mapping[str, int]) -> dict[str, Any]:
+    """Return exponents and basin fractions over the horizontal axis.
+
+    Parameters
+    ----------
+    run
+        An opened run.
+    x
+        Name of the horizontal axis.
+    at
+        Index on each other swept axis.
+
+    Returns
+    -------
+    dict
+        ``curves``: each with a name, a title, a unit, a group (``exponents``, ``fractions``), a colour, ``x``
+        rising, and ``y`` with None for gaps; ``low`` and ``high`` where an interval is known.
+
+    Raises
+    ------
+    ExplorerError
+        If an axis or an index is not there.
+    """
+    explored = ExploredRun.of(run)
+    axis, place = explored.axis(x), explored.place(at, but=x)
+    found = [*_cube_exponents(explored, x, place), *_attractor_curves(explored, x, place)]
+    for one in found:
+        one["x"] = axis.values.tolist()
+        for key in {"y", "low", "high"} & one.keys():
+            one[key] = [finite(v) for v in np.asarray(one[key], np.float64)]
+    return {"curves": found}
+
+
+def _cube_exponents(run: ExploredRun, x: str, place: Mapping[str, int]) -> Iterator[dict[str, Any]]:
+    """Return the mean exponents over the starts, with the least and largest as a band."""
+    cube = run.cube()
+    if "lyapunov" not in cube:
+        return
+    part = cube["lyapunov"].isel(place).load()
+    axes = [d for d in part.dims if d not in (x, "exponent")]
+    values = part.transpose(*(d for d in (x, "exponent") if d in part.dims), *axes).values
+    values = values.reshape(-1 if x in part.dims else 1, part.sizes["exponent"], max(1, _size(part, axes)))
+    for k in range(values.shape[1]):
+        own = values[:, k]
+        known = np.isfinite(own).any(axis=1)
+        rows = np.where(known[:, None], own, 0.0)
+        yield {
+            "name": f"lyapunov{k + 1}",
+            "title": f"Lyapunov exponent {k + 1}, mean over the starts",
+            "unit": "1/s",
+            "group": "exponents",
+            "colour": rgb(EXPONENT_COLOURS[k % len(EXPONENT_COLOURS)]),
+            **{
+                key: np.where(known, function(rows, axis=1), np.nan)
+                for key, function in (("y", np.nanmean), ("low", np.nanmin), ("high", np.nanmax))
+            },
+        }
+
+
+def _size(array: xr.DataArray, dims: list[Any]) -> int:
+    return math.prod(array.sizes[d] for d in dims)
+
+
+def _attractor_curves(run: ExploredRun, x: str, place: Mapping[str, int]) -> Iterator[dict[str, Any]]:
+    """Return each attractor's largest exponent and share, with gaps where it does not attract."""
+    found = run.kept("attractors")
+    if found is None:
+        return
+    cast = palette.cast_of(found)
+    part = found[["share", "n_cells", "lyapunov_max", "kind", "stability"]].isel(place)
+    walked = BRANCH in run.start_dims
+    for number in range(part.sizes["attractor"]):
+        one = part.isel(attractor=number)
+        present = np.atleast_1d(one["kind"].values) > 0
+        if not present.any():
+            continue
+        name, colour = cast.names[number], rgb(cast.colours[number])
+        exponent = np.atleast_1d(one["lyapunov_max"].values)
+        if np.isfinite(exponent).any():
+            yield {
+                "name": f"exponent {letter(number)}",
+                "title": f"largest exponent of {name}",
+                "unit": "1/s",
+                "group": "exponents",
+                "colour": colour,
+                "attractor": number,
+                "y": exponent,
+            }
+        attracts = np.atleast_1d(one["stability"].values) == ATTRACTS
+        if not attracts.any():
+            continue
+        share = np.where(attracts, np.atleast_1d(one["share"].values), np.nan)
+        shares: dict[str, Any] = {"y": share}
+        if not walked:  # walks are no sample of initial states: their shares have no interval
+            low, high = share_interval(np.atleast_1d(one["n_cells"].values), share)
+            shares |= {"low": low, "high": high}
+        yield {
+            "name": f"share {letter(number)}",
+            "title": f"share of {name}",
+            "unit": "1",
+            "group": "fractions",
+            "colour": colour,
+            "attractor": number,
+            **shares,
+        }
+
+
+# ---------------------------------------------------------------- branches over a diagram
+
+
+def branches(run: Run, x: str, y: str, at: Mapping[str, int]) -> dict[str, Any]:
+    """Return the branches of periodic orbits over a diagram, and their bifurcations.
+
+    Parameters
+    ----------
+    run
+        An opened run.
+    x, y
+        Names of its axes; branches have section points, so there are none for an extreme.
+    at
+        Index on each other swept axis; branches that were followed at other values are left out.
+
+    Returns
+    -------
+    dict
+        ``branches`` with segments of one stability, cut where an angle wraps; ``points``; ``note``: why there
+        is nothing, if there is not.
+
+    Raises
+    ------
+    ExplorerError
+        If an axis or an index is not there.
+    """
+    explored = ExploredRun.of(run)
+    place, upwards = explored.place(at, but=x), vertical(explored, y)
+    explored.axis(x)
+    found = explored.kept("branches")
+    nothing: dict[str, Any] = {"branches": [], "points": []}
+    if found is None:
+        return {**nothing, "note": "not computed: magpend analyse branches DIR"}
+    if str(found.attrs["parameter"]) != x:
+        return {**nothing, "note": f"the branches were followed along {found.attrs['parameter']}"}
+    if upwards.variable != "section":
+        return {**nothing, "note": "branches have section points, and no extremes"}
+    chosen = [i for i in range(found.sizes["branch"]) if _is_at(explored, found, i, place)]
+    measure = state_measure(found, y)
+    return {
+        "branches": [
+            {
+                "id": i,
+                "period": int(found["orbit_period"][i]),
+                "motion": _motion(found, i),
+                "segments": [s for piece in pieces(found, i, measure) for s in _segments(*piece)],
+            }
+            for i in chosen
+        ],
+        "points": [
+            _event(found, k, y) for k in range(found.sizes["bifurcation"]) if int(found["of_branch"][k]) in chosen
+        ],
+        "note": None if chosen else "no branch was followed at these values of the other axes",
+    }
+
+
+def _is_at(run: ExploredRun, found: xr.Dataset, branch: int, place: Mapping[str, int]) -> bool:
+    """Tell whether a branch was followed at given values of the other axes."""
+    for name, index in place.items():
+        value = float(run.axis(name).values[index])
+        there = float(found[name][branch]) if name in found else _base(run, name)
+        if not math.isclose(there, value, rel_tol=SAME_VALUE, abs_tol=1e-300):
+            return False
+    return True
+
+
+def _base(run: ExploredRun, axis: str) -> float:
+    """Return the base value of a swept parameter in the specification."""
+    if axis == FREQUENCY_DIM:
+        own = run.spec.frequency_hz
+        return math.nan if own is None else float(own)
+    return float(run.parameters[axis])
+
+
+def _segments(x: np.ndarray, y: np.ndarray, stable: bool) -> Iterator[dict[str, Any]]:
+    """Split a polyline at NaN."""
+    gaps = np.flatnonzero(~np.isfinite(x))
+    for first, stop in zip([0, *(gaps + 1)], [*gaps, len(x)], strict=True):
+        if stop - first >= 2:
+            yield {"stable": bool(stable), "x": x[first:stop].tolist(), "y": y[first:stop].tolist()}
+
+
+def _motion(found: xr.Dataset, branch: int) -> str | None:
+    """Return the class of motion along a branch, as the model's label."""
+    classifier = model_of(found).classifier
+    if classifier is None or "side" not in found:
+        return None
+    codes = {int(c) for c in found["side"].values[branch]} - {0, *classifier.neutral}
+    return " or ".join(classifier.words[c] for c in sorted(codes)) or None
+
+
+def _event(found: xr.Dataset, k: int, y: str) -> dict[str, Any]:
+    """Return a located bifurcation in the page's form."""
+    branch, kind = int(found["of_branch"][k]), KINDS[int(found["kind"][k])]
+    period = int(found["orbit_period"][branch])
+    criticality = CRITICALITIES[int(found["criticality"][k])]
+    values = found["bifurcation_section"].sel(state=y).values[k, :period]
+    unstable = [int(found[f"n_unstable_{side}"][k]) for side in ("before", "after")]
+    return {
+        "kind": NAMES[kind],
+        "x": float(found["value"][k]),
+        "y": [float(v) for v in values if np.isfinite(v)],
+        "label": f"{SHORT[kind]}{period}",
+        "branch": branch,
+        "period": period,
+        "criticality": criticality or None,
+        "of_stable": min(unstable) == 0,
+    }
+
+
+# ---------------------------------------------------------------- attractors at a point
+
+
+def attractors(run: Run, at: Mapping[str, int]) -> dict[str, Any]:
+    """Return the attractors that coexist at a parameter point, the largest share first, then its other sets.
+
+    Parameters
+    ----------
+    run
+        An opened run.
+    at
+        Index on every swept axis.
+
+    Returns
+    -------
+    dict
+        ``attractors``, and ``note``: how to get them, where they are not known.
+
+    Raises
+    ------
+    ExplorerError
+        If an axis or an index is not there.
+    """
+    explored = ExploredRun.of(run)
+    place = explored.place(at)
+    found = explored.kept("attractors")
+    if found is None:
+        return {"attractors": [], "note": "not computed: magpend analyse attractors DIR"}
+    cast = palette.cast_of(found)
+    here = found.isel(place)
+    present = np.flatnonzero(here["kind"].values > 0).tolist()
+    listed = [_attractor(explored, here.isel(attractor=i), i, cast) for i in present]
+    return {"attractors": sorted(listed, key=lambda a: -(a["share"] or 0.0)), "note": None}
+
+
+def _attractor(run: ExploredRun, one: xr.Dataset, number: int, cast: palette.Cast) -> dict[str, Any]:
+    classifier = run.model.classifier
+    side = int(one["side"]) if "side" in one else 0
+    points = one["attractor_points"].transpose("point", "state").values
+    points = points[np.isfinite(points).all(axis=1)][:MOST_SECTION]
+    multipliers = one["multiplier_real"].values + 1j * one["multiplier_imag"].values
+    closed = int(one["kind"]) == PERIODIC_ORBIT and np.isfinite(multipliers).all()
+    count = int(one["n_cells"])
+    interval: tuple[float | None, float | None] = (None, None)
+    if BRANCH not in run.start_dims:
+        low, high = share_interval(np.array([count]), np.array([float(one["share"])]))
+        interval = (finite(low[0]), finite(high[0]))
+    exponent = finite(one["lyapunov_max"])
+    return {
+        "id": number,
+        "name": cast.names[number],
+        "letter": letter(number),
+        **shown(one),
+        "period": int(one["orbit_period"]) or None,
+        "period_s": finite(one["period_s"]),
+        "periods": periods_of(run.model),
+        "motion": classifier.words[side] if classifier is not None and side > 0 else None,
+        "share": finite(one["share"]),
+        "low": interval[0],
+        "high": interval[1],
+        "n_starts": count,
+        "colour": rgb(cast.colours[number]),
+        "multipliers": [[float(m.real), float(m.imag)] for m in multipliers] if closed else None,
+        "exponents": None if exponent is None else [exponent],
+        "section": points.tolist(),
+    }

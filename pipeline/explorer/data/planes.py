@@ -1,0 +1,211 @@
+"""Label the plane of initial states at a parameter point by the known ends of the starts."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import xarray as xr
+
+from pipeline.explorer.data.arrays import pack_arrays
+from pipeline.explorer.data.colours import Category, Scheme, rgb, schemes
+from pipeline.explorer.data.explored import ExploredRun
+from pipeline.layout.vocabulary import DIVERGED, grid_dim, is_grid_dim
+from pipeline.store.run import Run
+
+NONE = -1
+"""Label of a start that leads to nothing known."""
+
+_DIVERGED = -2
+"""Label of a start that diverges, as in `pipeline.analysis.outcomes`."""
+
+
+@dataclass(frozen=True)
+class Plane:
+    """Labels over a plane of initial states.
+
+    Attributes
+    ----------
+    states : tuple of str
+        Across and upwards.
+    u, v : ndarray
+        Their values, ascending; empty if the starts are no grid.
+    label : ndarray of int16, (v, u)
+    fixed : dict
+        Values of the other states, those that all starts share.
+    categories : list of Category
+    source : str or None
+        ``basins`` where labels are attractors, ``starts`` where they say what the cells themselves tell; None
+        where there is no grid.
+    starts : ndarray, (n, 2)
+        Starts that are no grid.
+    start_label : ndarray of int16, (n,)
+    """
+
+    states: tuple[str, str]
+    u: np.ndarray
+    v: np.ndarray
+    label: np.ndarray
+    fixed: Mapping[str, float]
+    categories: list[Category]
+    source: str | None
+    starts: np.ndarray
+    start_label: np.ndarray
+
+
+def plane(run: Run, at: Mapping[str, int]) -> bytes:
+    """Return the plane of initial states at a parameter point in the page's form.
+
+    Parameters
+    ----------
+    run
+        An opened run.
+    at
+        Index on every swept axis.
+
+    Raises
+    ------
+    ExplorerError
+        If an axis or an index is not there.
+    DamagedError
+        If a chunk is not what was written.
+    """
+    found = plane_of(ExploredRun.of(run), at)
+    arrays = {
+        "u": found.u,
+        "v": found.v,
+        "label": found.label,
+        "starts": found.starts,
+        "start_label": found.start_label,
+    }
+    attrs = {
+        "states": list(found.states),
+        "fixed": dict(found.fixed),
+        "labels": [{"id": c.number, "label": c.label, "colour": c.colour} for c in found.categories],
+        "source": found.source,
+    }
+    return pack_arrays(arrays, attrs)
+
+
+def plane_of(run: ExploredRun, at: Mapping[str, int]) -> Plane:
+    """Read the plane; arguments as for `plane`.
+
+    Of a grid of more than two states the first two are shown, at the middle of the others.
+    """
+    place = run.place(at)
+    scheme = _scheme(run)
+    dims = [d for d in run.start_dims if is_grid_dim(d) and run.cube().sizes[d] > 1]
+    if len(dims) >= 2:
+        return _of_grid(run, place, scheme, dims)
+    return _of_starts(run, place, scheme)
+
+
+def _scheme(run: ExploredRun) -> Scheme:
+    """Return the scheme for starts: attractors if known, else motions, else status."""
+    known = {s.name: s for s in schemes(run)}
+    return next(known[name] for name in ("attractor", "motion", "status") if name in known)
+
+
+def _of_grid(run: ExploredRun, place: Mapping[str, int], scheme: Scheme, dims: list[str]) -> Plane:
+    cube = run.cube()
+    middle = {d: cube.sizes[d] // 2 for d in dims[2:]}
+    rest = {d: 0 for d in run.start_dims if d not in dims}
+    part = _part(run, scheme, {**place, **middle, **rest})
+    across, upwards = dims[:2]
+    label = _labels(part, scheme).transpose(upwards, across)
+    u, v = (np.asarray(part[d].values, np.float64) for d in (across, upwards))
+    columns, rows = np.argsort(u, kind="stable"), np.argsort(v, kind="stable")
+    states = (_state_of(run, across), _state_of(run, upwards))
+    return Plane(
+        states,
+        u[columns],
+        v[rows],
+        label.values[np.ix_(rows, columns)],
+        _fixed(run, part, states),
+        _categories(scheme, label.values),
+        "basins" if scheme.name == "attractor" else "starts",
+        np.empty((0, 2)),
+        np.empty(0, np.int16),
+    )
+
+
+def _of_starts(run: ExploredRun, place: Mapping[str, int], scheme: Scheme) -> Plane:
+    """Return starts that form no grid, one by one; for a continuation the starts of its branches."""
+    from pipeline.explorer.data.view import planes
+
+    pairs = planes(run)
+    names = run.model.state_names
+    states = pairs[0] if pairs else (names[0], names[-1])
+    part = _part(run, scheme, place)
+    label = _labels(part, scheme)
+    columns = [_spread(part, grid_dim(name), label) for name in states]
+    shown = label.values.ravel()
+    source = None
+    return Plane(
+        states,
+        np.empty(0),
+        np.empty(0),
+        np.empty((0, 0), np.int16),
+        _fixed(run, part, states),
+        _categories(scheme, shown),
+        source,
+        np.stack(columns, axis=1),
+        shown,
+    )
+
+
+def _part(run: ExploredRun, scheme: Scheme, index: Mapping[str, int]) -> xr.Dataset:
+    """Load the cells at a parameter point, with their indices in the cube."""
+    cube = run.cube()
+    names = [n for n in cube.data_vars if n in {"status", *scheme.needs}]
+    numbered = cube[names].assign_coords(
+        {f"_{d}": (d, np.arange(n)) for d, n in zip(run.plan.dims, run.plan.shape, strict=True)}
+    )
+    # slices of one, so that codes find every dim; dropped afterwards
+    kept = numbered.isel({d: slice(i, i + 1) for d, i in index.items()}).load()
+    codes = scheme.codes(kept)
+    status = kept["status"]
+    codes = xr.zeros_like(status, dtype=np.int32) + codes.drop_vars(list(kept.coords), errors="ignore")
+    found = kept.drop_vars([n for n in names if n != "status"]).assign(_code=codes)
+    return found.isel(dict.fromkeys(index, 0))
+
+
+def _labels(part: xr.Dataset, scheme: Scheme) -> xr.DataArray:
+    """Return the label of each start."""
+    codes = part["_code"].values
+    told = np.where(codes < 0, NONE, codes)
+    if scheme.name != "status":
+        told = np.where(part["status"].values == DIVERGED, _DIVERGED, told)
+    return part["status"].copy(data=told.astype(np.int16))
+
+
+def _categories(scheme: Scheme, labels: np.ndarray) -> list[Category]:
+    """Return the meaning of each label that occurs."""
+    present = set(np.unique(labels).tolist())
+    found = [c for c in scheme.categories if c.number in present]
+    if _DIVERGED in present:
+        found.append(Category(_DIVERGED, "diverged", rgb("black")))
+    return found
+
+
+def _state_of(run: ExploredRun, dim: str) -> str:
+    return next(s.name for s in run.model.states if grid_dim(s.name) == dim)
+
+
+def _fixed(run: ExploredRun, part: xr.Dataset, states: tuple[str, str]) -> dict[str, float]:
+    """Return the values of hidden states that all starts share."""
+    found = {}
+    for state in run.model.states:
+        values = np.unique(np.asarray(part.coords[grid_dim(state.name)].values, np.float64))
+        if state.name not in states and values.size == 1:
+            found[state.name] = float(values[0])
+    return found
+
+
+def _spread(part: xr.Dataset, name: str, like: xr.DataArray) -> np.ndarray:
+    """Return a coordinate of the starts, one value for each cell."""
+    coordinate = part.coords[name]
+    values = xr.DataArray(coordinate.values.astype(np.float64), dims=coordinate.dims)
+    plain = xr.DataArray(np.zeros(like.shape), dims=like.dims)
+    return np.asarray((plain + values).transpose(*like.dims).values.ravel())

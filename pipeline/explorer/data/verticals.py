@@ -1,0 +1,129 @@
+"""List the possible vertical axes of a diagram: states, quantities, kept extremes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipeline.explorer.data.explored import ExplorerError
+from pipeline.explorer.data.plain_text import plain
+from pipeline.layout.vocabulary import FREQUENCY_DIM, is_start_dim, parameter_name
+from pipeline.specification.problems import unknown_name
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from pipeline.explorer.data.explored import ExploredRun
+
+_WORDS = {"min": "least", "max": "largest", "mean": "mean"}
+
+
+@dataclass(frozen=True)
+class Vertical:
+    """A possible vertical axis of a diagram.
+
+    Attributes
+    ----------
+    name, label, unit : str
+    angle : bool
+        Whether full turns do not matter.
+    variable : str
+        Of the cube.
+    values : callable
+        ``values(part)``: of a part of the cube, on the dims of its cells and ``period_index``.
+    """
+
+    name: str
+    label: str
+    unit: str
+    angle: bool
+    variable: str
+    values: Callable[[xr.Dataset], xr.DataArray]
+
+    def describe(self) -> dict[str, Any]:
+        """Return the axis in the page's form."""
+        return {"name": self.name, "label": self.label, "unit": self.unit, "angle": self.angle}
+
+
+def verticals(run: ExploredRun) -> list[Vertical]:
+    """Return a run's vertical axes, first the model's first state that differs between sections."""
+    return run.remembered("verticals", lambda: _verticals(run))
+
+
+def _verticals(run: ExploredRun) -> list[Vertical]:
+    model = run.model
+    ordered = sorted(model.states, key=lambda s: s.name not in model.section_states)
+    found = [Vertical(s.name, plain(s.symbol, s.name), s.unit, s.on_circle, "section", _state(s.name)) for s in ordered]
+    if run.spec.recorded is None:  # the drive of a recording is another one at each section
+        found += [
+            Vertical(q.name, plain(q.symbol, q.name), q.unit, False, "section", _quantity(run, q.name))
+            for q in model.quantities
+        ]
+    cube = run.cube()
+    if "extremes" in cube:
+        for name in map(str, cube["quantity"].values):
+            one = model.state(name) if name in model.state_names else model.quantity(name)
+            label = plain(one.symbol, one.name)
+            found += [
+                Vertical(f"{name}.{kind}", f"{word} {label}", one.unit, False, "extremes", _extreme(name, kind))
+                for kind, word in _WORDS.items()
+            ]
+    return found
+
+
+def vertical(run: ExploredRun, name: str) -> Vertical:
+    """Return a vertical axis by name; raise `ExplorerError` with the nearest names if unknown."""
+    known = {v.name: v for v in verticals(run)}
+    if name not in known:
+        raise ExplorerError(unknown_name("vertical axis", name, list(known)))
+    return known[name]
+
+
+def _state(name: str) -> Callable[[xr.Dataset], xr.DataArray]:
+    return lambda part: part["section"].sel(state=name, drop=True)
+
+
+def _quantity(run: ExploredRun, name: str) -> Callable[[xr.Dataset], xr.DataArray]:
+    """Return a model quantity at the sections, from the kept states."""
+    model = run.model.flow
+    column = [q.name for q in model.quantities].index(name)
+
+    def values(part: xr.Dataset) -> xr.DataArray:
+        from magpend_core.pointwise import evaluate_packed
+
+        dims = [str(d) for d in part["status"].dims]
+        section = part["section"].transpose(*dims, "period_index", "state")
+        outer = [d for d in dims if not is_start_dim(d)]
+        rows = section.transpose(*outer, ...)
+        found = np.full(rows.shape[:-1], np.nan)
+        for index in np.ndindex(*(rows.sizes[d] for d in outer)):
+            packed, hertz = _point(run, {d: float(part[d].values[i]) for d, i in zip(outer, index, strict=True)})
+            states = rows.values[index].reshape(-1, len(model.states))
+            finite = np.isfinite(states).all(axis=1)
+            out = np.empty((int(finite.sum()), len(model.quantities)))
+            if len(out):
+                evaluate_packed(model.system, np.zeros(len(out)), states[finite], packed, hertz, out)
+            own = np.full(len(states), np.nan)
+            own[finite] = out[:, column]
+            found[index] = own.reshape(found[index].shape)
+        return rows.isel(state=0, drop=True).copy(data=found)
+
+    return values
+
+
+def _point(run: ExploredRun, values: Mapping[str, float]) -> tuple[np.ndarray, float]:
+    """Return packed flow parameters and frequency at values of the swept axes."""
+    changed = {parameter_name(d): v for d, v in values.items() if d != FREQUENCY_DIM}
+    own = run.parameters
+    packed = np.array([changed.get(n, own[n]) for n in run.model.flow.parameter_names], np.float64)
+    crossing, fixed = run.model.crossing, run.spec.frequency_hz
+    if crossing is not None:
+        return packed, crossing.frequency_hz
+    return packed, values[FREQUENCY_DIM] if FREQUENCY_DIM in values else float(fixed or 1.0)
+
+
+def _extreme(quantity: str, kind: str) -> Callable[[xr.Dataset], xr.DataArray]:
+    return lambda part: part["extremes"].sel(quantity=quantity, extreme=kind, drop=True)

@@ -1,0 +1,260 @@
+"""Describe a run for the page's start: content, names, drawing and colours."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import shlex
+from typing import Any
+
+import numpy as np
+
+from magpend_core.models.model import Model
+from magpend_core.models.parameters import FRACTION, NON_NEGATIVE, POSITIVE, Parameter
+from pipeline.explorer.data.colours import schemes
+from pipeline.explorer.data.explored import Axis, ExploredRun
+from pipeline.explorer.data.plain_text import plain
+from pipeline.explorer.data.series import fixed_points
+from pipeline.explorer.data.verticals import verticals
+from pipeline.layout.period_names import period_of, section_name
+from pipeline.layout.vocabulary import DIVERGED, FAILED, FREQUENCY_DIM, PENDING, grid_dim
+from pipeline.products.registry import ANALYSES
+from pipeline.runs.derive import AnalysedRun, prepared
+from pipeline.specification.problems import SpecError
+from pipeline.store.run import Run
+
+FORMAT = 1
+"""Of the answers; a page refuses another one."""
+
+_LOWEST = {POSITIVE: 0.0, NON_NEGATIVE: 0.0, FRACTION: 0.0}
+
+
+def describe_view(run: Run, live: bool) -> dict[str, Any]:
+    """Describe a run: its content, with names, drawing and colours.
+
+    Parameters
+    ----------
+    run
+        An opened run; only coordinates, the cells' status and what is kept in ``derived/`` are read.
+    live
+        Whether the page can have trajectories integrated while one watches.
+
+    Returns
+    -------
+    dict
+        What JSON can say. Values of states and parameters are in the model's own units.
+
+    Raises
+    ------
+    DamagedError
+        If a chunk is not what was written.
+    """
+    explored = ExploredRun.of(run)
+    return {
+        "format": FORMAT,
+        "title": run.info.title,
+        "name": _name(run),
+        "digest": run.digest,
+        "kind": run.plan.kind,
+        "version": _version(),
+        "complete": run.complete,
+        "cells": _cells(explored),
+        "live": live,
+        "n_keep": explored.n_keep,
+        "model": _model(explored),
+        "axes": [_axis(explored, axis) for axis in explored.axes],
+        "starts": {"dims": list(explored.start_dims), "count": _n_starts(explored)},
+        "verticals": [v.describe() for v in verticals(explored)],
+        "colours": [s.describe() for s in schemes(explored)],
+        "has": _has(explored),
+        "planes": [list(pair) for pair in planes(explored)],
+        "commands": commands(explored, _name(run)),
+    }
+
+
+def _name(run: Run) -> str:
+    """Return the directory's name without its path."""
+    files = run.info.files
+    return files.local.resolve().name if files.local else files.name.rstrip("/").rpartition("/")[2]
+
+
+def _version() -> str:
+    from importlib import metadata
+
+    return metadata.version("magpend")
+
+
+def _cells(run: ExploredRun) -> dict[str, int]:
+    """Count the cells: all, not yet computed, and failed or diverged."""
+    committed = sum(run.plan.cells_in(task) for task in run.commits)
+    counts = np.zeros(1 + max(DIVERGED, *FAILED, PENDING), np.int64)
+    if committed:
+        status = run.cube()["status"].values.ravel()
+        found = np.bincount(status, minlength=counts.size)
+        counts = found
+    pending = int(counts[PENDING]) if committed else run.plan.n_cells
+    return {
+        "total": run.plan.n_cells,
+        "pending": pending,
+        "failed": int(sum(counts[code] for code in (DIVERGED, *FAILED))),
+    }
+
+
+def _n_starts(run: ExploredRun) -> int:
+    sizes = dict(zip(run.plan.dims, run.plan.shape, strict=True))
+    return math.prod(sizes[d] for d in run.start_dims)
+
+
+# ---------------------------------------------------------------- the model
+
+
+def _model(run: ExploredRun) -> dict[str, Any]:
+    model = run.model
+    return {
+        "name": model.name,
+        "title": model.title,
+        "section": _section(model),
+        "period": period_of(model),
+        "forced": not model.autonomous,
+        "states": [_state(s) for s in model.states],
+        "quantities": [
+            {
+                "name": q.name,
+                "label": plain(q.symbol, q.name),
+                "meaning": q.meaning,
+                "unit": q.unit,
+                "angle": False,
+                "scale": 1.0,
+                "rate": None,
+            }
+            for q in model.quantities
+        ],
+        "parameters": [_parameter(run, p) for p in model.parameters],
+        "portraits": [list(pair) for pair in model.portraits],
+        "drawing": _drawing(run),
+    }
+
+
+def _state(state: Any) -> dict[str, Any]:
+    return {
+        "name": state.name,
+        "label": plain(state.symbol, state.name),
+        "meaning": state.meaning,
+        "unit": state.unit,
+        "angle": state.on_circle,
+        "scale": state.scale,
+        "rate": state.rate or None,
+    }
+
+
+def _section(model: Model) -> str:
+    """Describe the section in words."""
+    where = model.section if model.crossing is None else model.crossing.sentence
+    return f"{section_name(model)} at {where}"
+
+
+def _parameter(run: ExploredRun, parameter: Parameter) -> dict[str, Any]:
+    """Return a parameter, its value if all cells share one, and its range for dragging.
+
+    That is the range of its axis; else from half to one and a half times its value, within its bound.
+    """
+    swept = {a.parameter: a.values for a in run.axes if a.swept}
+    if parameter.name in swept:
+        values = swept[parameter.name]
+        value, low, high = None, float(values.min()), float(values.max())
+    else:
+        value = float(run.parameters[parameter.name])
+        reach = 0.5 * abs(value) or 1.0
+        low = max(value - reach, _LOWEST.get(parameter.bound, -math.inf))
+        high = min(value + reach, 1.0) if parameter.bound == FRACTION else value + reach
+    return {
+        "name": parameter.name,
+        "label": plain(parameter.symbol, parameter.name),
+        "meaning": parameter.meaning,
+        "unit": parameter.unit,
+        "value": value,
+        "low": low,
+        "high": high,
+    }
+
+
+def _drawing(run: ExploredRun) -> dict[str, Any] | None:
+    """Return the model's drawing; fixed points use the run's own parameters."""
+    drawing, model = run.model.drawing, run.model
+    if drawing is None:
+        return None
+    values = {**{a.parameter: float(a.values[0]) for a in run.axes}, **run.parameters.as_dict()}
+    moving = drawing.points(np.zeros((1, len(model.states))), values)
+    return {
+        "lines": [list(line) for line in drawing.lines],
+        "fixed": fixed_points(model, values),
+        "trace": drawing.trace,
+        "unit": drawing.unit,
+        "points": list(moving),
+    }
+
+
+# ---------------------------------------------------------------- axes, planes, results
+
+
+def _axis(run: ExploredRun, axis: Axis) -> dict[str, Any]:
+    if axis.name == FREQUENCY_DIM:
+        driven = not run.model.autonomous
+        label, unit = "drive frequency" if driven else "strobe frequency", "Hz"
+        meaning = label
+        if run.spec.recorded is not None:
+            label = meaning = "mean frequency of the recorded drive"
+    else:
+        parameter = run.model.parameter(axis.parameter)
+        label, unit = plain(parameter.symbol, parameter.name), parameter.unit
+        meaning = parameter.meaning
+    path = run.path == axis.name
+    return {
+        "name": axis.name,
+        "parameter": axis.parameter,
+        "label": label,
+        "meaning": meaning,
+        "unit": unit,
+        "values": axis.values.tolist(),
+        "path": path,
+    }
+
+
+def planes(run: ExploredRun) -> list[tuple[str, str]]:
+    """Return the state pairs worth showing as a plane of initial states.
+
+    First that of the run's own grid, then pairs of angles, then what phase portraits show.
+    """
+    model = run.model
+    gridded = [s.name for s in model.states if grid_dim(s.name) in run.start_dims]
+    found = [*itertools.combinations(gridded, 2), *itertools.combinations(model.angles, 2), *model.portraits]
+    return [pair for pair in dict.fromkeys(found) if pair[0] != pair[1]]
+
+
+def _has(run: ExploredRun) -> dict[str, bool]:
+    return {
+        "attractors": run.kept("attractors") is not None,
+        "branches": run.kept("branches") is not None,
+        "basins": run.kept("basins") is not None,
+        "lyapunov": any(str(n).startswith("lyapunov") for n in run.cube().data_vars) or run.kept("chaos") is not None,
+        "drawing": run.model.drawing is not None,
+        "mirror": run.model.mirror is not None,
+    }
+
+
+def commands(run: ExploredRun, directory: str) -> dict[str, str]:
+    """Return the command for each missing analysis that the run can have."""
+    wanted = [name for name in ("attractors", "branches", "basins") if run.kept(name) is None]
+    return {name: f"magpend analyse {name} {shlex.quote(directory)}" for name in wanted if _can_have(run, name)}
+
+
+def _can_have(run: ExploredRun, name: str) -> bool:
+    """Tell whether the run has the input of an analysis with default options."""
+    if run.spec.recorded is not None:
+        return False
+    analysis = ANALYSES[name]
+    try:
+        prepared(AnalysedRun.of(run), analysis, analysis.options())
+    except SpecError:
+        return False
+    return True

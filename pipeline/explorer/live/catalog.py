@@ -1,0 +1,418 @@
+"""List the known attractors at a parameter point, and tell which one a live trajectory has reached.
+
+Where the run's attractors are kept in ``derived/``, those of the point are taken from there with their ids,
+and a trajectory is matched as `pipeline.analysis.attractors` matches the cube's cells: closed or on its way
+to a polished orbit (`assigning.decide`), at an equilibrium, on a limit cycle, or on a set that does not close
+by the section points that it shares with it (`clouds.members`). What closes elsewhere is polished and
+becomes an entry of its own, without an id: so live trajectories are told apart by the same rules where no
+analysis was made. There is no search for sets that do not close then: cells that do not close have one entry
+for each motion that the model's classifier tells, and are not settled.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from magpend_core.models.model import Model
+from magpend_core.status import Status
+from pipeline.analysis.attractors.describing import features
+from pipeline.analysis.attractors.extension.clouds import Cloud, members
+from pipeline.analysis.attractors.finding.assigning import STRICT, decide
+from pipeline.analysis.attractors.finding.cell_blocks import Block
+from pipeline.analysis.attractors.finding.closed_orbits import Orbit, number_of, polish, raw_orbit
+from pipeline.analysis.attractors.finding.equilibria import tell_rest
+from pipeline.analysis.attractors.finding.limit_cycles import tell_cycles
+from pipeline.analysis.attractors.finding.points import Point
+from pipeline.analysis.attractors.finding.spirals import Recurrence
+from pipeline.analysis.sets import Geometry
+from pipeline.explorer.data.series import orbit_series
+from pipeline.explorer.live.settling import Place
+from pipeline.layout.vocabulary import ABSENT, APERIODIC, ATTRACTS, EQUILIBRIUM, NOT_SETTLED, PERIODIC_ORBIT, split_dims
+from pipeline.products.attractors import IdentifyOptions
+
+MOST_ENTRIES = 64
+"""Attractors told apart besides those of the run; what closes elsewhere is told by its period alone."""
+
+SAME_REST = 1e-5
+"""Largest scaled distance between an equilibrium of the run and the same one found again."""
+
+SAME_SECONDS = 1e-6
+"""Largest relative difference between the periods of a limit cycle found twice."""
+
+
+@dataclass(frozen=True, eq=False)
+class Entry:
+    """An attractor, or a class of cells, on which trajectories end.
+
+    Attributes
+    ----------
+    number : int
+        By which slices name it: the run's id of an attractor, and larger numbers for everything else.
+    attractor : int or None
+        The run's id.
+    kind : int
+        Of `vocabulary.KINDS`; absent for a class of cells that is no attractor.
+    period : int
+        Drive periods or returns; 0 if not closed.
+    motion : int
+        Code of the model's classifier.
+    status : int
+        Code of `Status`, of a class of cells that ended; 0 else.
+    points : ndarray, (n, state)
+        Section points; none of a class of cells.
+    seconds : float
+        Period of a limit cycle; NaN else.
+    stability : int
+        Of `vocabulary.STABILITIES`; 0 of a class of cells that ended.
+    """
+
+    number: int
+    attractor: int | None
+    kind: int
+    period: int
+    motion: int
+    status: int
+    points: np.ndarray
+    seconds: float = np.nan
+    stability: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Known:
+    """The stored analysis at a parameter point.
+
+    Attributes
+    ----------
+    attractors : Dataset or None
+        Of all points of the run.
+    cells : Dataset or None
+        The cube at the point; None where it has no such point.
+    index : tuple of int or None
+        Of the point.
+    """
+
+    attractors: xr.Dataset | None = None
+    cells: xr.Dataset | None = None
+    index: tuple[int, ...] | None = None
+
+    def here(self) -> xr.Dataset | None:
+        """Return the attractors at the point."""
+        if self.attractors is None or self.index is None or self.cells is None:
+            return None
+        dims, _ = split_dims(self.attractors["attractor_id"])
+        return self.attractors.isel(dict(zip(dims, self.index, strict=True)))
+
+
+class Catalog:
+    """Attractors of a parameter point; several threads may ask at once.
+
+    Parameters
+    ----------
+    place
+        The point.
+    known
+        What the run's analysis says of it.
+    closure_tolerance
+        Of the run.
+    """
+
+    def __init__(self, place: Place, known: Known, closure_tolerance: float) -> None:
+        self.place, self.model = place, place.parameters.model
+        self._packed = place.parameters.pack()
+        self._geometry = Geometry.of(self.model)
+        here = known.here()
+        self.options = _options_of(here)
+        self.tolerance = _tolerance_of(here, closure_tolerance)
+        self._lock = threading.RLock()
+        self.entries: list[Entry] = []
+        self._orbits: list[Orbit] = []
+        self._orbit_entries: list[int] = []
+        self._sets: list[tuple[Entry, Cloud]] = []
+        self.n_ids = 0 if known.attractors is None else known.attractors.sizes["attractor"]
+        if here is not None and known.cells is not None:
+            self._take(here, known.cells)
+
+    # ---- what the run knows ------------------------------------------------------------------
+
+    def _take(self, here: xr.Dataset, cells: xr.Dataset) -> None:
+        """Add the run's attractors as entries."""
+        present = np.flatnonzero(here["kind"].values != ABSENT)
+        points = {int(i): _finite(here["attractor_points"].values[i]) for i in present}
+        periods = here["orbit_period"].values
+        closed = [i for i in points if here["kind"].values[i] == PERIODIC_ORBIT and periods[i] > 0]
+        orbits = self._polished(
+            np.array([points[i][0] for i in closed]), np.array([periods[i] for i in closed], np.int64)
+        )
+        found = dict(zip(closed, orbits, strict=True))
+        for i, own in points.items():
+            kind = int(here["kind"].values[i])
+            side = int(here["side"].values[i]) if "side" in here else 0
+            seconds = float(here["period_s"].values[i])
+            stability = int(here["stability"].values[i])
+            entry = Entry(i, i, kind, int(periods[i]), side, 0, own, seconds, stability)
+            self.entries.append(entry)
+            if i in found:
+                self._add_orbit(found[i] or raw_orbit(own, self._geometry), entry)
+            elif kind in APERIODIC:
+                cloud = self._cloud_of(here, cells, i)
+                if cloud is not None:
+                    self._sets.append((entry, cloud))
+
+    def _cloud_of(self, here: xr.Dataset, cells: xr.Dataset, number: int) -> Cloud | None:
+        """Return the cloud of the cube's cells on a set that does not close."""
+        block = self._point(cells).whole()
+        ids = here["attractor_id"].transpose(*split_dims(cells["status"])[1]).values.ravel()
+        own = np.flatnonzero((ids == number) & block.is_bounded)
+        if not len(own):
+            return None
+        return Cloud.of(list(block.section[own]), self._geometry, self.tolerance)
+
+    def _polished(self, points: np.ndarray, period: np.ndarray) -> list[Orbit | None]:
+        n = len(points)
+        return polish(
+            np.tile(self._packed, (n, 1)),
+            np.full(n, self.place.frequency),
+            points,
+            period,
+            geometry=self._geometry,
+            system=self.model.system,
+            tolerance=self.options.residual,
+        )
+
+    def _add_orbit(self, orbit: Orbit, entry: Entry) -> None:
+        self._orbits.append(orbit)
+        self._orbit_entries.append(entry.number)
+
+    # ---- where trajectories are ----------------------------------------------------------------
+
+    def on_orbits(self, block: Block) -> np.ndarray:
+        """Return the entry of the orbit that each cell has reached or is certain to reach, -1 for none."""
+        with self._lock:
+            orbits, numbers = list(self._orbits), np.array([*self._orbit_entries, -1])
+        if not orbits:
+            return np.full(len(block.status), -1, np.int64)
+        label, _ = decide(block, orbits, self.tolerance, self._geometry)
+        return np.asarray(numbers[label])
+
+    def unsure(self, block: Block, numbers: np.ndarray) -> np.ndarray:
+        """Return the undecided cells worth integrating further, by the rule of the analysis."""
+        rows = np.flatnonzero(block.is_bounded & (numbers < 0))
+        near = np.zeros(len(numbers), bool)
+        longest = self.options.max_orbit_period
+        near[rows] = Recurrence.of(block.section[rows], longest, self._geometry).is_near
+        if self.tolerance > STRICT:
+            near |= block.is_closed & (numbers < 0)
+        return near
+
+    def conclude(self, block: Block, *, final: bool = True, strictly: bool = False) -> np.ndarray:
+        """Return the entry of each cell; an unknown closed orbit gets a new entry.
+
+        Parameters
+        ----------
+        block
+            Cells at their end.
+        final
+            Whether every cell is to get one; else -1 stays for what is neither on an orbit nor at rest.
+        strictly
+            Whether cells count as closed within a small distance, however loosely the run's own do.
+        """
+        numbers = np.full(len(block.status), -1, np.int64)
+        if self.model.autonomous:
+            block = self._rest(block, numbers)
+        numbers = np.where(numbers < 0, self.on_orbits(block), numbers)
+        if strictly or self.tolerance <= STRICT:
+            self._learn(block, numbers)
+        if final:
+            self._in_sets(block, numbers)
+            for row in np.flatnonzero(numbers < 0):
+                numbers[row] = self._class_of(block, int(row)).number
+        return numbers
+
+    def _rest(self, block: Block, numbers: np.ndarray) -> Block:
+        """Assign cells at equilibria and on limit cycles of a flow, in place; return the other cells."""
+        point = self._point(_dataset_of(block, self.model))
+        tell_rest([point], self.tolerance, self._geometry)
+        for k, found in enumerate(point.equilibria):
+            here = self._entry_near(EQUILIBRIUM, found.state)
+            entry = here or self._new(EQUILIBRIUM, 0, found.state[None], stability=found.stability)
+            assert point.at_rest is not None
+            numbers[point.at_rest == k] = entry.number
+        if self.model.crossing is None:
+            options = self.options
+            tell_cycles([point], self.tolerance, options.max_orbit_period, options.residual, self._geometry)
+            for k, cycle in enumerate(point.cycles):
+                assert point.on_cycle is not None
+                own = point.on_cycle == k
+                last = block.section[own][0, -1:]
+                entry = self._entry_of_seconds(cycle.seconds) or self._new(
+                    PERIODIC_ORBIT, 0, last, seconds=cycle.seconds, stability=ATTRACTS
+                )
+                numbers[own] = entry.number
+        status = np.where(numbers >= 0, np.int8(Status.NO_RETURN), block.status)
+        return Block(block.cells, block.section, status, block.orbit_period, block.turns, block.rest)
+
+    def _learn(self, block: Block, numbers: np.ndarray) -> None:
+        """Polish closed orbits that match no known one, and add them, in place."""
+        for row in np.flatnonzero(block.is_closed & (numbers < 0)):
+            if numbers[row] >= 0 or self._n_new >= MOST_ENTRIES:
+                continue
+            own = block.section[row]
+            period = min(int(block.orbit_period[row]), len(own))
+            orbit = self._polished(own[-1:], np.array([period]))[0]
+            self._enter(orbit or raw_orbit(own[-period:], self._geometry))
+            again = self.on_orbits(block)
+            numbers[numbers < 0] = again[numbers < 0]
+
+    def _enter(self, orbit: Orbit) -> None:
+        with self._lock:
+            if number_of(orbit, self._orbits, self._geometry) == len(self._orbits):
+                motion = self._motion_of(orbit)
+                entry = self._new(
+                    PERIODIC_ORBIT, orbit.period, orbit.points, motion, seconds=orbit.seconds, stability=orbit.stability
+                )
+                self._add_orbit(orbit, entry)
+
+    def _in_sets(self, block: Block, numbers: np.ndarray) -> None:
+        """Assign the remaining bounded cells to the run's sets that do not close, in place."""
+        rows = np.flatnonzero(block.is_bounded & (numbers < 0))
+        if not len(rows) or not self._sets:
+            return
+        own = members(block.section[rows], [cloud for _, cloud in self._sets], self._geometry)
+        for row, k in zip(rows[own >= 0], own[own >= 0].tolist(), strict=True):
+            numbers[row] = self._sets[k][0].number
+
+    # ---- entries -------------------------------------------------------------------------------
+
+    @property
+    def _n_new(self) -> int:
+        return sum(entry.attractor is None and entry.kind != ABSENT for entry in self.entries)
+
+    def _new(
+        self,
+        kind: int,
+        period: int,
+        points: np.ndarray,
+        motion: int = 0,
+        status: int = 0,
+        seconds: float = np.nan,
+        stability: int = 0,
+    ) -> Entry:
+        with self._lock:
+            number = max([self.n_ids, *(e.number + 1 for e in self.entries)])
+            entry = Entry(number, None, kind, period, motion, status, points, seconds, stability)
+            self.entries.append(entry)
+            return entry
+
+    def entry(self, number: int) -> Entry:
+        """Return the entry of a number."""
+        return next(entry for entry in self.entries if entry.number == number)
+
+    def _entry_near(self, kind: int, state: np.ndarray) -> Entry | None:
+        for entry in self.entries:
+            if entry.kind == kind and self._geometry.distance(entry.points[0], state) <= SAME_REST:
+                return entry
+        return None
+
+    def _entry_of_seconds(self, seconds: float) -> Entry | None:
+        for entry in self.entries:
+            same = abs(entry.seconds - seconds) <= SAME_SECONDS * seconds
+            if entry.kind == PERIODIC_ORBIT and not entry.period and same:
+                return entry
+        return None
+
+    def _class_of(self, block: Block, row: int) -> Entry:
+        """Return the entry for a cell on no known attractor: one per status, period and motion."""
+        status = int(block.status[row])
+        alive = bool(block.is_bounded[row] or block.is_closed[row])
+        period = int(block.orbit_period[row]) if alive else 0
+        motion = int(self.motions(block)[row]) if alive else 0
+        key = (period, motion, 0 if alive else status)
+        with self._lock:
+            for entry in self.entries:
+                if entry.kind == ABSENT and (entry.period, entry.motion, entry.status) == key:
+                    return entry
+            stability = NOT_SETTLED if alive else 0
+            return self._new(ABSENT, period, block.section[row][:0], motion, key[2], stability=stability)
+
+    # ---- motions -------------------------------------------------------------------------------
+
+    def motions(self, block: Block) -> np.ndarray:
+        """Return the classifier's code for each cell."""
+        return features.sides_of(block.section, block.turns, self.place.frequency, self.place.parameters)
+
+    def _motion_of(self, orbit: Orbit) -> int:
+        """Return the motion code of an orbit; its turns are counted over its period."""
+        if self.model.classifier is None:
+            return 0
+        is_flow = self.model.crossing is not None
+        known = np.isfinite(orbit.seconds)
+        seconds = orbit.seconds if known else orbit.period / self.place.frequency
+        clock = orbit.period / seconds if is_flow and known else self.place.frequency
+        states = orbit_series(self.place.parameters, clock, orbit.points[0], orbit.period, seconds)["states"]
+        angles = np.flatnonzero(self._geometry.is_angle)
+        turns = np.round((states[-1] - states[0])[angles] / (2.0 * np.pi)).astype(np.int64)
+        place = self.place
+        return int(features.sides_of(orbit.points[None], turns[None], place.frequency, place.parameters)[0])
+
+    def _point(self, cells: xr.Dataset) -> _WholePoint:
+        return _WholePoint(
+            cells,
+            split_dims(cells["status"])[1],
+            self.place.frequency,
+            self._packed,
+            self.place.parameters,
+            sum(self._geometry.is_angle),
+            cells["status"].size,
+            self.model.system,
+            is_flow=self.model.crossing is not None,
+            can_rest=self.model.autonomous,
+        )
+
+
+class _WholePoint(Point):
+    """A parameter point whose cells form one block."""
+
+    def whole(self) -> Block:
+        """Return all cells."""
+        return next(self.blocks())
+
+
+def _finite(points: np.ndarray) -> np.ndarray:
+    return np.asarray(points[np.isfinite(points).all(axis=-1)])
+
+
+def _options_of(here: xr.Dataset | None) -> IdentifyOptions:
+    """Return the options that found the run's attractors, else the defaults."""
+    attrs: Mapping[Any, Any] = {} if here is None else here.attrs
+    given = {}
+    for name, field in IdentifyOptions.model_fields.items():
+        value = attrs.get(f"identify_{name}")
+        if value is not None:
+            given[name] = type(field.default)(value)
+    return IdentifyOptions(**given)
+
+
+def _tolerance_of(here: xr.Dataset | None, closure_tolerance: float) -> float:
+    """Return the distance within which a closed cell belongs to an orbit, as in `identify`."""
+    found = 0.0 if here is None else float(here.attrs.get("identify_tolerance", 0.0))
+    return found or max(1e-4, 10.0 * closure_tolerance)
+
+
+def _dataset_of(block: Block, model: Model) -> xr.Dataset:
+    """Return cells as a dataset of one parameter point."""
+    dims = "initial_condition"
+    variables: dict[str, Any] = {
+        "section": ((dims, "period_index", "state"), block.section),
+        "status": ((dims,), block.status),
+        "orbit_period": ((dims,), block.orbit_period),
+        "turns": ((dims, model.angle_dim), block.turns),
+    }
+    if block.rest is not None:
+        variables["rest_state"] = ((dims, "state"), block.rest)
+    return xr.Dataset(variables)

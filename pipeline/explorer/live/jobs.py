@@ -1,0 +1,170 @@
+"""Run live jobs: one of each kind at a time; a newer job cancels the older one."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from magpend_core.models.parameters import ParameterError
+from pipeline.explorer.data.arrays import pack_arrays
+from pipeline.explorer.live.messages import Request, RequestError
+from pipeline.explorer.live.settling import CancelledError
+from pipeline.specification.problems import SpecError
+from pipeline.store.errors import StoreError
+
+LOG = logging.getLogger(__name__)
+
+Answer = dict[str, Any] | bytes
+"""JSON, or what `pack_arrays` gives."""
+
+Emit = Callable[[Answer], None]
+
+
+class Job:
+    """A request in progress.
+
+    Parameters
+    ----------
+    request
+        What is asked for.
+    """
+
+    def __init__(self, request: Request) -> None:
+        self.request, self.id = request, request.id
+        self._cancelled = threading.Event()
+        self._emit: Emit = _nowhere
+        self.began = time.perf_counter()
+
+    def answers_to(self, emit: Emit) -> None:
+        """Set the receiver of answers."""
+        self._emit = emit
+
+    def cancel(self) -> None:
+        """Ask the job to end at its next check."""
+        self._cancelled.set()
+
+    def check(self) -> None:
+        """Raise `CancelledError` if the job is cancelled."""
+        if self._cancelled.is_set():
+            raise CancelledError
+
+    def wait(self, seconds: float) -> None:
+        """Wait, and raise `CancelledError` as soon as the job is cancelled."""
+        self._cancelled.wait(seconds)
+        self.check()
+
+    def tell(self, kind: str, **fields: Any) -> None:
+        """Send a JSON answer."""
+        if kind != "done" or not fields.get("cancelled"):
+            self.check()
+        self._emit({"id": self.id, "kind": kind, **fields})
+
+    def show(self, kind: str, arrays: Mapping[str, np.ndarray], **attrs: Any) -> None:
+        """Send an answer of arrays."""
+        self.check()
+        self._emit(pack_arrays(arrays, {"id": self.id, "kind": kind, **attrs}))
+
+
+def _nowhere(answer: Answer) -> None:
+    """Discard an answer that has no receiver."""
+
+
+Work = Callable[[Job], None]
+
+
+class Desk:
+    """The worker for jobs of one kind, one at a time, in a thread that runs only while there are jobs.
+
+    Parameters
+    ----------
+    emit
+        Takes answers.
+    work
+        Does a job.
+    """
+
+    def __init__(self, emit: Emit, work: Work) -> None:
+        self._emit, self._work = emit, work
+        self._lock = threading.Lock()
+        self._waiting: Job | None = None
+        self._current: Job | None = None
+        self._thread: threading.Thread | None = None
+        self._closed = False
+
+    def put(self, job: Job) -> None:
+        """Accept a job; it replaces the waiting and the running one."""
+        job.answers_to(self._emit)
+        with self._lock:
+            if self._closed:
+                return
+            left, self._waiting = self._waiting, job
+            if self._current is not None:
+                self._current.cancel()
+            if self._thread is None:
+                self._thread = threading.Thread(target=self._serve, name="magpend-desk", daemon=True)
+                self._thread.start()
+        if left is not None:
+            left.tell("done", cancelled=True)
+
+    def cancel(self, number: int) -> None:
+        """Cancel the job with a given number, if it is here."""
+        left = None
+        with self._lock:
+            if self._waiting is not None and self._waiting.id == number:
+                left, self._waiting = self._waiting, None
+            if self._current is not None and self._current.id == number:
+                self._current.cancel()
+        if left is not None:
+            left.tell("done", cancelled=True)
+
+    def close(self) -> None:
+        """Cancel all jobs, and accept no more."""
+        with self._lock:
+            self._closed, self._waiting = True, None
+            if self._current is not None:
+                self._current.cancel()
+
+    @property
+    def is_busy(self) -> bool:
+        """Tell whether a job is running or waiting."""
+        return self._thread is not None
+
+    def join(self, timeout: float) -> None:
+        """Wait until no job is running."""
+        thread = self._thread
+        if thread is not None:
+            thread.join(timeout)
+
+    def _serve(self) -> None:
+        while True:
+            with self._lock:
+                self._current, self._waiting = self._waiting, None
+                if self._current is None:
+                    self._thread = None
+                    return
+                job = self._current
+            self._do(job)
+
+    def _do(self, job: Job) -> None:
+        try:
+            self._work(job)
+        except CancelledError:
+            self._emit({"id": job.id, "kind": "done", "cancelled": True})
+        except Exception as error:
+            self._emit({"id": job.id, "kind": "error", "error": sentence_of_error(error)})
+
+
+def sentence_of_error(error: Exception) -> str:
+    """Return one sentence for the user; log unexpected errors."""
+    problems = getattr(error, "problems", None)
+    if isinstance(error, SpecError | ParameterError) and problems:
+        return str(problems[0])
+    if isinstance(error, RequestError | StoreError | ArithmeticError):
+        return str(error)
+    LOG.error("a live job failed", exc_info=error)
+    return f"this could not be computed ({type(error).__name__}); the server's log has more."

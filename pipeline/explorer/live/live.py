@@ -1,0 +1,390 @@
+"""Compute live requests: starts, slices, orbits that follow a parameter, runs of a region.
+
+`LiveRun` is what all who watch a run share: compiled code, the attractors of parameter points, threads for
+the kernel. `LiveSession` is one of those who watch: it takes messages (see `messages`) and gives answers to
+a callback, dictionaries for JSON and bytes of `arrays.pack_arrays`. There is one job of a kind at a time; a
+newer one takes the place of the one before. Neither knows how messages travel.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import threading
+import time
+from collections import OrderedDict
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import xarray as xr
+
+from magpend_core.equilibria import newton_steps
+from magpend_core.models.parameters import ParameterError
+from magpend_core.orbits import section_map
+from pipeline.explorer.data.series import orbit_series
+from pipeline.explorer.live.catalog import Catalog, Known
+from pipeline.explorer.live.jobs import Answer, Desk, Job
+from pipeline.explorer.live.legend import Legend
+from pipeline.explorer.live.messages import CancelRequest, Request, RequestError, read_request
+from pipeline.explorer.live.regions import PATIENCE_S
+from pipeline.explorer.live.settling import Flight, Place
+from pipeline.layout.cells import CellMap, parameter_axes
+from pipeline.layout.domains import check_states
+from pipeline.layout.vocabulary import axis_name
+from pipeline.runs.derive import stored
+from pipeline.specification.tables import FREQUENCY
+from pipeline.store.run import Run
+
+LOG = logging.getLogger(__name__)
+
+MOST_CATALOGS = 64
+"""Parameter points of which the attractors are remembered."""
+
+FAR = 10.0
+"""How many times higher or lower than the run's own a drive frequency may be."""
+
+SAME_VALUE = 1e-12
+"""Relative difference at which a value is that of the cube."""
+
+MOST_THREADS = 8
+
+CLOSING_S = PATIENCE_S + 2.0
+"""Time that all jobs have to end when the run is closed [s]."""
+
+
+def live_problem(run: Run) -> str | None:
+    """Return the reason why a run allows no live computing; None if it does."""
+    if run.spec.recorded is not None:
+        return (
+            f"the drive of {run.name} is the recording {run.spec.recorded.file}, and a live trajectory would "
+            "go on where it ends; make a run at its mean frequency."
+        )
+    try:
+        run.model.flow.system  # noqa: B018
+    except (ParameterError, ImportError) as error:
+        return str(error)
+    return None
+
+
+class LiveRun:
+    """The state shared by all live sessions of a run.
+
+    Parameters
+    ----------
+    run
+        An opened run for which `live_problem` has nothing to say.
+    """
+
+    def __init__(self, run: Run) -> None:
+        problem = live_problem(run)
+        if problem is not None:
+            raise RequestError(problem)
+        self.run, self.model, self.spec = run, run.model, run.spec
+        self.integration = run.spec.integration
+        self.threads = max(1, min(os.cpu_count() or 1, MOST_THREADS))
+        self.pool = ThreadPoolExecutor(self.threads, "magpend-live")
+        self.region_lock = threading.Lock()
+        self._lock = threading.Lock()
+        self._catalogs: OrderedDict[tuple[float, ...], Catalog] = OrderedDict()
+        self._attractors: xr.Dataset | None = None
+        self._cube: xr.Dataset | None = None
+        self._sessions: set[LiveSession] = set()
+        self._warming = Warming(self)
+
+    def close(self) -> None:
+        """End all sessions and their jobs, including runs of a region; wait until they have ended."""
+        with self._lock:
+            sessions = list(self._sessions)
+        for session in sessions:
+            session.close()
+        until = time.monotonic() + CLOSING_S
+        for session in sessions:
+            session.join(max(0.0, until - time.monotonic()))
+        self.pool.shutdown(wait=False, cancel_futures=True)
+
+    def enter(self, session: LiveSession) -> None:
+        """Register a session, so that it ends with the run."""
+        with self._lock:
+            self._sessions.add(session)
+
+    def leave(self, session: LiveSession) -> None:
+        """Forget a session once it is closed and its jobs have ended."""
+        with self._lock:
+            self._sessions = {s for s in self._sessions if s is not session and not s.is_over}
+
+    def warm(self, tell: Callable[[int, int], None] | None = None) -> None:
+        """Compile and read in the background; `tell` receives the progress."""
+        self._warming.begin(tell)
+
+    def is_warm(self, what: str) -> bool:
+        """Tell whether a step is compiled: ``series``, ``sections``, ``maps`` or ``attractors``."""
+        return self._warming.has_done(what)
+
+    # ---- parameter points --------------------------------------------------------------------
+
+    def place(self, values: Mapping[str, float], frequency: float | None) -> Place:
+        """Return a parameter point; missing values are the run's own.
+
+        Raises
+        ------
+        RequestError, ParameterError
+            If a name is unknown, or a value out of bounds.
+        """
+        parameters = self.spec.values.replace(**values)
+        hertz = self._frequency(frequency)
+        index = self._index(parameters, hertz)
+        if index is not None:  # use the cube's exact value: the request may have lost the last digit
+            for axis, i in zip(parameter_axes(self.spec), index, strict=True):
+                if axis.parameter == FREQUENCY:
+                    hertz = float(axis.values[i])
+                else:
+                    parameters = parameters.replace(**{axis.parameter: float(axis.values[i])})
+        return Place(parameters, hertz, index)
+
+    def _frequency(self, given: float | None) -> float:
+        crossing = self.model.crossing
+        if crossing is not None:
+            return crossing.frequency_hz
+        axis = self.spec.axes.get(FREQUENCY)
+        own = self.spec.frequency_hz
+        if given is None:
+            if own is None:
+                raise RequestError(f"frequency: the run sweeps it; give one of {self.model.name}'s drive [Hz].")
+            return own
+        values = np.array([own]) if axis is None else axis.array()
+        low, high = float(values.min()) / FAR, float(values.max()) * FAR
+        if not low <= given <= high:
+            raise RequestError(f"frequency = {given:g} Hz: must be from {low:g} to {high:g} Hz here.")
+        return given
+
+    def _index(self, parameters: Mapping[str, float], frequency: float) -> tuple[int, ...] | None:
+        axes = parameter_axes(self.spec)
+        swept = {axis.parameter for axis in axes}
+        own = self.spec.values
+        if any(not _same(parameters[n], own[n]) for n in own if n not in swept):
+            return None
+        fixed = self.spec.frequency_hz
+        if FREQUENCY not in swept and fixed is not None and not _same(frequency, fixed):
+            return None
+        found = []
+        for axis in axes:
+            value = frequency if axis.parameter == FREQUENCY else parameters[axis.parameter]
+            i = int(np.abs(axis.values - value).argmin())
+            if not _same(value, float(axis.values[i])):
+                return None
+            found.append(i)
+        return tuple(found)
+
+    def state(self, values: Mapping[str, float], place: Place) -> np.ndarray:
+        """Return an initial state by name; missing values are 0.
+
+        Raises
+        ------
+        RequestError
+            If the model has no such state.
+        """
+        names = self.model.state_names
+        unknown = [name for name in values if name not in names]
+        if unknown:
+            known = ", ".join(names)
+            raise RequestError(f"{unknown[0]!r} is no state of {self.model.name}; it has {known}.")
+        state = np.array([float(values.get(name, 0.0)) for name in names])
+        self.check_states(state[None], place)
+        return state
+
+    def check_states(self, states: np.ndarray, place: Place) -> None:
+        """Raise `SpecError` for states at which the equations of a text model have no value."""
+        point = {**place.parameters, FREQUENCY: place.frequency}
+        check_states(self.model.flow, states, [point])
+
+    # ---- attractors --------------------------------------------------------------------------
+
+    @property
+    def attractors(self) -> xr.Dataset | None:
+        """Return the run's attractors stored in ``derived/``, if any; compute nothing."""
+        with self._lock:
+            if self._attractors is None:
+                self._attractors = stored(self.run, "attractors")
+            return self._attractors
+
+    def catalog(self, place: Place) -> Catalog:
+        """Return the known attractors of a parameter point; the same object for the same point."""
+        known = self._known(place)
+        key = (float(known.attractors is not None), *place.key)
+        with self._lock:
+            found = self._catalogs.get(key)
+        if found is None:
+            found = Catalog(place, known, self.integration.closure_tolerance)
+        with self._lock:
+            found = self._catalogs.setdefault(key, found)
+            self._catalogs.move_to_end(key)
+            while len(self._catalogs) > MOST_CATALOGS:
+                self._catalogs.popitem(last=False)
+        return found
+
+    def _known(self, place: Place) -> Known:
+        attractors = self.attractors
+        if attractors is None or place.index is None:
+            return Known(attractors)
+        dims = [axis_name(name) for name in self.spec.axes]
+        cells = self.cube.isel(dict(zip(dims, place.index, strict=True)))
+        return Known(attractors, cells, place.index)
+
+    @property
+    def cube(self) -> xr.Dataset:
+        """Return the run's cube, opened once."""
+        with self._lock:
+            if self._cube is None:
+                self._cube = self.run.cube()
+            return self._cube
+
+    def legend(self, catalog: Catalog) -> Legend:
+        """Return the names and colours of a point's attractors."""
+        return Legend(catalog, self.attractors)
+
+    def first_start(self) -> tuple[Place, np.ndarray]:
+        """Return a parameter point of the run, and a start there."""
+        cells = CellMap(self.spec)
+        block = tuple(slice(0, 1) if i != cells.path else slice(0, n) for i, n in enumerate(cells.shape))
+        inputs = cells.inputs(block)
+        values = dict(zip(self.spec.values.names, map(float, inputs.parameters[0, 0]), strict=True))
+        frequency = None if self.model.crossing is not None else float(inputs.frequency_hz[0, 0])
+        return self.place(values, frequency), inputs.initial_states[0]
+
+
+def _same(a: float, b: float) -> bool:
+    return abs(a - b) <= SAME_VALUE * max(abs(a), abs(b))
+
+
+class Warming:
+    """The thread that compiles the code for jobs, once."""
+
+    def __init__(self, live: LiveRun) -> None:
+        self._live, self._lock = live, threading.Lock()
+        self._thread: threading.Thread | None = None
+        self._done, self._listeners = 0, list[Callable[[int, int], None]]()
+        # the orbit behind a point is usually requested first
+        self._steps = (self._series, self._sections, self._maps, self._attractors)
+
+    def begin(self, tell: Callable[[int, int], None] | None) -> None:
+        """Begin unless already begun; `tell` receives every step from now on."""
+        with self._lock:
+            if tell is not None and self._done < len(self._steps):
+                self._listeners.append(tell)
+            done, begun = self._done, self._thread is not None
+            if not begun:
+                self._thread = threading.Thread(target=self._run, name="magpend-warm", daemon=True)
+                self._thread.start()
+        if tell is not None:
+            tell(done, len(self._steps))
+
+    def has_done(self, what: str) -> bool:
+        """Tell whether a step has ended, with or without success."""
+        with self._lock:
+            return f"_{what}" in [step.__name__ for step in self._steps[: self._done]]
+
+    def _run(self) -> None:
+        for step in self._steps:
+            try:
+                step()
+            except Exception as error:  # the job that needs it will report the error
+                LOG.info("warming: %s", error)
+            with self._lock:
+                self._done += 1
+                listeners = list(self._listeners)
+            for tell in listeners:
+                tell(self._done, len(self._steps))
+        with self._lock:
+            self._listeners.clear()
+
+    def _sections(self) -> None:
+        live = self._live
+        place, start = live.first_start()
+        flight = Flight(place, live.integration, start[None], lambda: None)
+        section, _ = flight.advance(np.array([0]), 1)
+        flight.closed(section, live.integration)
+        if live.model.autonomous:  # where it rests is told at its end
+            newton_steps(live.model.system, start[None], place.parameters.pack())
+
+    def _series(self) -> None:
+        live = self._live
+        place, start = live.first_start()
+        rtol, atol = live.integration.rtol, live.integration.atol
+        orbit_series(place.parameters, place.frequency, start, 1, 0.01 / place.frequency, rtol=rtol, atol=atol)
+
+    def _maps(self) -> None:
+        place, start = self._live.first_start()
+        packed, frequency = place.parameters.pack()[None], np.array([place.frequency])
+        section_map(packed, frequency, start[None], 1, system=self._live.model.system)
+
+    def _attractors(self) -> None:
+        place, _ = self._live.first_start()
+        self._live.catalog(place)
+
+
+class LiveSession:
+    """One user's live session.
+
+    Parameters
+    ----------
+    live
+        What is shared with others.
+    emit
+        Takes an answer; called from threads of jobs, one call at a time for a kind of job.
+    """
+
+    def __init__(self, live: LiveRun, emit: Callable[[Answer], None]) -> None:
+        from pipeline.explorer.live import handlers
+
+        self.live = live
+        self._emit, self._closed = emit, threading.Event()
+        self._desks = {kind: Desk(self._emit_open, work) for kind, work in handlers.works(live).items()}
+        live.enter(self)
+        live.warm(self._tell_warming)
+
+    def _tell_warming(self, done: int, total: int) -> None:
+        self._emit_open({"id": None, "kind": "progress", "what": "warming", "done": done, "total": total})
+
+    def _emit_open(self, answer: Answer) -> None:
+        if not self._closed.is_set():
+            self._emit(answer)
+
+    def receive(self, text: str | bytes) -> None:
+        """Handle a message; errors are answered, never raised."""
+        try:
+            request: Request = read_request(text)
+        except RequestError as error:
+            self._emit_open({"id": error.job, "kind": "error", "error": str(error)})
+            return
+        except Exception as error:  # a message never ends the server
+            LOG.warning("message refused: %s", error)
+            self._emit_open({"id": None, "kind": "error", "error": "the message cannot be read."})
+            return
+        if isinstance(request, CancelRequest):
+            for desk in self._desks.values():
+                desk.cancel(request.job)
+            self._emit_open({"id": request.id, "kind": "done"})
+            return
+        self._desks[request.do].put(Job(request))
+
+    def close(self) -> None:
+        """Cancel all jobs; emit nothing from now on."""
+        self._closed.set()
+        for desk in self._desks.values():
+            desk.close()
+        if self.is_over:  # else it is still waited for when the run is closed
+            self.live.leave(self)
+
+    @property
+    def is_over(self) -> bool:
+        """Tell whether the session is closed and no job is running."""
+        return self._closed.is_set() and not any(desk.is_busy for desk in self._desks.values())
+
+    def join(self, timeout: float = 30.0) -> None:
+        """Wait until no job is at work."""
+        for desk in self._desks.values():
+            desk.join(timeout)
+
+
+__all__ = ["LiveRun", "LiveSession", "live_problem"]

@@ -1,0 +1,357 @@
+"""Follow periodic orbits, stable or not, while a parameter is dragged.
+
+The orbit is a fixed point of the stroboscopic or return map. From one value of the parameter to the next it
+is predicted along its tangent and corrected by Newton's method at that value
+(`branches.arclength.correct`); a step that fails is halved. At a fold the orbit turns back, so that beyond
+it there is none: it is lost. What goes round folds is `magpend analyse branches`.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import OrderedDict
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from magpend_core.multipliers import orbit_exponents
+from magpend_core.status import Status
+from pipeline.analysis.attractors.describing import features
+from pipeline.analysis.branches.arclength import Point, Settings, correct
+from pipeline.analysis.branches.lockstep import run_alone
+from pipeline.analysis.branches.problems import FREQUENCY, Family, OrbitProblem
+from pipeline.explorer.data.series import fixed_points, orbit_series
+from pipeline.explorer.live.jobs import Job
+from pipeline.explorer.live.messages import CellPoint, FollowRequest, RequestError
+from pipeline.explorer.live.settling import Place, system_at
+from pipeline.layout.cells import parameter_axes
+from pipeline.layout.vocabulary import PERIODIC_ORBIT, axis_name
+
+if TYPE_CHECKING:
+    from pipeline.explorer.live.live import LiveRun
+
+MOST_ORBITS = 256
+"""Orbits that a session remembers."""
+
+MOST_SECONDS = 3.0
+"""Time for one answer [s]; then the orbit is shown as far as it was followed."""
+
+FIRST_STEP, LONGEST_STEP, SHORTEST_STEP = 0.01, 0.05, 1e-6
+"""Steps of the parameter, in units of its scale."""
+
+LONGEST_MOVE = 0.3
+"""Largest change of a state in a step, in units of its scale; a longer one is halved."""
+
+LARGEST_TURN = 0.3
+"""Largest angle between the tangents at the ends of a step [rad]: what turns more may be another orbit."""
+
+NEWTON = Settings(max_iterations=6, tolerance=1e-9)
+
+NEAR_ONE = 0.15
+"""Distance of a multiplier from 1 at which an orbit that ends has come to a fold."""
+
+HALVED = 1e-6
+"""Scaled distance between the halves of an orbit below which they are one."""
+
+
+@dataclass(frozen=True, eq=False)
+class Held:
+    """An orbit at a parameter point.
+
+    Attributes
+    ----------
+    place : Place
+    period : int
+        Drive periods or returns.
+    state : ndarray
+        A section point.
+    """
+
+    place: Place
+    period: int
+    state: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Reached:
+    """The result of following an orbit.
+
+    Attributes
+    ----------
+    value : float
+        Of the parameter.
+    point : Point
+        The orbit there.
+    sentence : str
+        Why no farther; empty if it was followed to the value wanted.
+    lost : bool
+        Whether there is none beyond, rather than no time.
+    """
+
+    value: float
+    point: Point
+    sentence: str
+    lost: bool
+
+
+class Follower:
+    """The worker that follows the orbits of a session.
+
+    Parameters
+    ----------
+    live
+        The run.
+    """
+
+    def __init__(self, live: LiveRun) -> None:
+        self._live, self._lock = live, threading.Lock()
+        self._held: OrderedDict[int, Held] = OrderedDict()
+        self._next = 0
+
+    def follow(self, job: Job) -> None:
+        """Run a job."""
+        request = job.request
+        assert isinstance(request, FollowRequest)
+        if self._live.model.autonomous and self._live.model.crossing is None:
+            raise RequestError(
+                f"{self._live.model.name} is a flow seen at even times, where orbits are no points; make a "
+                "run with a [section] to follow them."
+            )
+        held = self._origin(request)
+        name = self._name(request.parameter)
+        target = self._place_at(held.place, name, request.value)
+        family = self._family(held, name, request.value)
+        found = _followed(family, held.state, _value(held.place, name), request.value, job)
+        value = found.value if found.sentence else request.value
+        place = self._place_at(held.place, name, value) if found.sentence else target
+        number = self._keep(Held(place, held.period, family.state(found.point.u)))
+        arrays, attrs = described(self._live, place, family, found.point)
+        job.show(
+            "orbit",
+            arrays,
+            **attrs,
+            parameter=request.parameter,
+            value=value,
+            wanted=request.value,
+            lost=found.lost,
+            sentence=found.sentence or None,
+            orbit=number,
+        )
+
+    def _keep(self, held: Held) -> int:
+        with self._lock:
+            number, self._next = self._next, self._next + 1
+            self._held[number] = held
+            while len(self._held) > MOST_ORBITS:
+                self._held.popitem(last=False)
+            return number
+
+    def _origin(self, request: FollowRequest) -> Held:
+        origin = request.origin
+        if isinstance(origin, CellPoint):
+            return cell_orbit(self._live, origin.cell, origin.point)
+        with self._lock:
+            held = self._held.get(origin.orbit)
+        if held is None:
+            raise RequestError(f"from.orbit = {origin.orbit}: is no orbit of this page, or one of long ago.")
+        return held
+
+    def _name(self, given: str) -> str:
+        name = axis_name(given)
+        model = self._live.model
+        if name == FREQUENCY and not model.autonomous:
+            return name
+        if name not in model.parameter_names:
+            known = ", ".join(model.parameter_names)
+            raise RequestError(f"parameter: {given!r} is no parameter of {model.name}; it has {known}.")
+        return name
+
+    def _place_at(self, place: Place, name: str, value: float) -> Place:
+        if name == FREQUENCY:
+            return self._live.place(place.parameters, value)
+        frequency = None if self._live.model.crossing is not None else place.frequency
+        return self._live.place({**place.parameters, name: value}, frequency)
+
+    def _family(self, held: Held, name: str, target: float) -> Family:
+        place = held.place
+        axis = next((a for a in parameter_axes(self._live.spec) if axis_name(a.parameter) == name), None)
+        here = _value(place, name)
+        scale = max(abs(here), abs(target - here), 1e-9)
+        if axis is not None and len(axis.values) > 1:
+            scale = float(np.ptp(axis.values))
+        return Family(
+            system_at(place, self._live.integration.model_copy(update={"method": "dopri5"})),
+            held.period,
+            place.frequency,
+            place.parameters.pack(),
+            (name,),
+            (scale,),
+        )
+
+
+def _value(place: Place, name: str) -> float:
+    return place.frequency if name == FREQUENCY else place.parameters[name]
+
+
+def cell_orbit(live: LiveRun, cell: int, point: int) -> Held:
+    """Return the closed orbit of a cell of the cube.
+
+    Parameters
+    ----------
+    live
+        The run.
+    cell
+        Number of the cell in C order.
+    point
+        Which of its kept sections.
+
+    Raises
+    ------
+    RequestError
+        If there is no such cell, or it is on no closed orbit.
+    """
+    status = live.cube["status"]
+    if cell >= status.size:
+        raise RequestError(f"from.cell = {cell}: the cube has {status.size} cells.")
+    at = dict(zip(map(str, status.dims), map(int, np.unravel_index(cell, status.shape)), strict=True))
+    one = live.cube.isel(at)
+    section = one["section"].transpose("period_index", "state").values
+    if point >= len(section):
+        raise RequestError(f"from.point = {point}: a cell has {len(section)} sections.")
+    dims = [axis_name(name) for name in live.spec.axes]
+    values = {n: float(live.cube[d].values[at[d]]) for n, d in zip(live.spec.axes, dims, strict=True)}
+    frequency = values.pop(next((n for n in values if axis_name(n) == FREQUENCY), ""), None)
+    place = live.place(values, frequency)
+    if not np.isfinite(section[point]).all():
+        word = Status(int(one["status"].values)).sentence
+        raise RequestError(f"cell {cell} has no orbit to follow: {word}.")
+    period = int(one["orbit_period"].values) or _period_of_attractor(live, at)
+    if not period:
+        raise RequestError(
+            f"cell {cell} has no orbit to follow: its sections close on none; take a point of a periodic motion."
+        )
+    return Held(place, period, section[point])
+
+
+def _period_of_attractor(live: LiveRun, at: Mapping[str, int]) -> int:
+    """Return the period of the closed orbit on which a cell ends; 0 if there is none."""
+    attractors = live.attractors
+    if attractors is None:
+        return 0
+    here = attractors.isel({d: i for d, i in at.items() if d in attractors["attractor_id"].dims})
+    number = int(here["attractor_id"].values)
+    if number < 0 or int(here["kind"].isel(attractor=number).values) != PERIODIC_ORBIT:
+        return 0
+    return int(here["orbit_period"].isel(attractor=number).values)
+
+
+def _followed(family: Family, state: np.ndarray, begin: float, target: float, job: Job) -> Reached:
+    """Follow an orbit from one parameter value to another."""
+    problem, scale = OrbitProblem(family), family.scales[0]
+    normal = np.zeros(problem.size)
+    normal[-1] = 1.0
+    here = run_alone(correct(problem, family.unknowns(state, [begin]), normal, NEWTON))
+    if here is None:
+        raise RequestError("the point is too far from a closed orbit for Newton's method to find one.")
+    until, step = time.perf_counter() + MOST_SECONDS, FIRST_STEP
+    goal = target / scale
+    while here.u[-1] != goal:
+        job.check()
+        if time.perf_counter() > until:
+            reached = float(here.u[-1] * scale)
+            return Reached(reached, here, f"followed to {reached:.6g} in the time; ask again to go on.", False)
+        left = goal - here.u[-1]
+        move = left if abs(left) <= step else np.copysign(step, left)
+        there = _step(problem, here, move, normal)
+        if there is None:
+            step = 0.5 * abs(move)
+            if step < SHORTEST_STEP:
+                return Reached(float(here.u[-1] * scale), here, _why(here, family, target), True)
+            continue
+        if move == left:
+            there.u[-1] = goal
+        here, step = there, min(1.5 * step, LONGEST_STEP) if there.n_iterations <= 3 else step
+    return Reached(target, here, "", False)
+
+
+def _step(problem: OrbitProblem, here: Point, move: float, normal: np.ndarray) -> Point | None:
+    """Return the orbit after a parameter step; None if none is found nearby."""
+    slope = here.tangent / here.tangent[-1] if abs(here.tangent[-1]) > 1e-6 else normal
+    ahead = move * slope
+    if np.abs(ahead[:-1]).max(initial=0.0) > LONGEST_MOVE:
+        return None
+    there = run_alone(correct(problem, here.u + ahead, normal, NEWTON))
+    if there is None:
+        return None
+    corrected = np.abs((there.u - here.u - ahead)[:-1]).max(initial=0.0)
+    turned = float(here.tangent @ there.tangent) < np.cos(LARGEST_TURN)
+    if corrected > 0.5 * np.abs(ahead).max() or turned or _has_halved(problem.family, there):
+        return None
+    return there
+
+
+def _has_halved(family: Family, point: Point) -> bool:
+    """Tell whether an orbit of even period also closes after half of it."""
+    if family.period % 2:
+        return False
+    half = family.mismatch(point.u, point.value.images[family.period // 2 - 1])
+    return bool(np.abs(half).max() < HALVED)
+
+
+def _why(point: Point, family: Family, target: float) -> str:
+    """Explain why an orbit could not be followed beyond a point."""
+    value = float(point.u[-1] * family.scales[0])
+    multipliers = np.linalg.eigvals(point.value.monodromy)
+    name = family.free[0]
+    if np.abs(multipliers - 1.0).min() < NEAR_ONE:
+        half = ", or joins that of half its period" if family.period % 2 == 0 else ""
+        return (
+            f"lost at {name} = {value:.7g} on the way to {target:.6g}: a multiplier is near 1, as at a fold, "
+            f"where an orbit turns back{half}."
+        )
+    return f"lost at {name} = {value:.7g} on the way to {target:.6g}: Newton's method finds no orbit beyond."
+
+
+def described(
+    live: LiveRun, place: Place, family: Family, point: Point
+) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Return an orbit's arrays and attributes in the page's form."""
+    model, is_flow = live.model, live.model.crossing is not None
+    seconds = point.value.seconds
+    images = point.value.images
+    clock = family.period / seconds if is_flow else place.frequency
+    arrays = orbit_series(place.parameters, clock, images[-1], family.period, seconds)
+    arrays["section"] = np.ascontiguousarray(images)
+    angles = np.flatnonzero(model.is_angle)
+    turned = (arrays["states"][-1] - arrays["states"][0])[angles]
+    turns = np.round(turned / (2.0 * np.pi)).astype(np.int64)
+    multipliers = np.linalg.eigvals(point.value.monodromy)
+    multipliers = multipliers[np.argsort(-np.abs(multipliers), kind="stable")]
+    code = int(features.sides_of(images[None], turns[None], place.frequency, place.parameters)[0])
+    words = model.classifier.words if model.classifier is not None else ()
+    known = bool(words and code)
+    attrs: dict[str, Any] = {
+        "cell": None,
+        "parameters": {k: v for k, v in place.parameters.items()},
+        "frequency": None if is_flow else place.frequency,
+        "status": Status.PERIODIC.name.lower(),
+        "period": family.period,
+        "seconds": seconds,
+        "motion": words[code] if known else None,
+        "attractor": None,
+        "share": None,
+        "stable": bool(np.abs(multipliers).max() < 1.0),
+        "multipliers": [[float(m.real), float(m.imag)] for m in multipliers],
+        "exponents": [float(x) for x in orbit_exponents(multipliers, seconds, is_flow)],
+        "seeds": [],
+        "at": None,
+        "start": None,
+        "fixed": fixed_points(model.flow, place.parameters),
+    }
+    return arrays, attrs
+
+
+__all__ = ["Follower", "cell_orbit", "described"]

@@ -1,0 +1,1 @@
+"""Serve the page on loopback: requests for data, the websocket, the token."""

@@ -1,0 +1,405 @@
+"""Serve one read-only page of a run on loopback.
+
+What takes long to import is imported once the address is known, while a browser starts.
+
+Reading goes on in a few threads, so that the page stays at hand; what waits is bounded. `security` says who
+is answered.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import errno
+import json
+import logging
+import socket
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from importlib import resources
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tornado import httpserver, web
+
+from pipeline.explorer.serving import page_html
+from pipeline.explorer.serving.security import Guard, Rate, headers_of, new_token
+from pipeline.specification.problems import SpecError
+from pipeline.store.errors import StoreError
+from pipeline.store.run import Run
+
+LOG = logging.getLogger(__name__)
+
+if TYPE_CHECKING:
+    from pipeline.explorer.serving.answers import Answer
+
+HOST = "127.0.0.1"
+
+MOST_BODY, MOST_HEADERS = 64 * 1024, 16 * 1024
+"""Bytes of a request."""
+
+LIMITS: dict[str, Any] = {
+    "max_body_size": MOST_BODY,
+    "max_header_size": MOST_HEADERS,
+    "max_buffer_size": MOST_BODY + MOST_HEADERS,
+    "idle_connection_timeout": 300.0,
+    "body_timeout": 20.0,
+}
+"""What a connection may take."""
+
+MOST_ADDRESS = 4096
+"""Characters of an address: more is none that the page makes."""
+
+THREADS, MOST_WAITING = 3, 12
+"""Requests that are worked on at once, and those that may wait besides."""
+
+PER_SECOND, BURST = 40.0, 120
+STRANGERS_PER_SECOND, STRANGERS_BURST = 4.0, 20
+"""Requests without the token, which are all refused."""
+"""Requests that are answered."""
+
+STATIC = {
+    "explorer.js": "text/javascript; charset=utf-8",
+    "explorer.css": "text/css; charset=utf-8",
+    "LICENSES.txt": "text/plain; charset=utf-8",
+}
+"""Files of the page, by name: no other is served, and none is looked up by what a request says."""
+
+
+def static_files() -> dict[str, tuple[bytes, str]]:
+    """Return content and type of the page's files, read once."""
+    folder = resources.files("pipeline.explorer") / "static"
+    return {name: ((folder / name).read_bytes(), kind) for name, kind in STATIC.items() if (folder / name).is_file()}
+
+
+class Service:
+    """The state shared by the request handlers.
+
+    Parameters
+    ----------
+    run
+        What is looked at.
+    guard
+        Who is answered.
+    """
+
+    def __init__(self, run: Run, guard: Guard) -> None:
+        from pipeline.explorer.data.explored import ExploredRun
+        from pipeline.explorer.live.live import LiveRun, live_problem
+
+        self.run = ExploredRun.of(run)
+        self.guard, self.rate = guard, Rate(PER_SECOND, BURST)
+        self.strangers = Rate(STRANGERS_PER_SECOND, STRANGERS_BURST)
+        self.files = Rate(PER_SECOND, BURST)
+        self.static = static_files()
+        self.live_problem = live_problem(self.run)
+        self.live = None if self.live_problem else LiveRun(self.run)
+        self.pool = ThreadPoolExecutor(THREADS, "explorer")
+        self.waiting = 0
+        self.compiled: asyncio.Event | None = None
+
+    def refresh(self) -> None:
+        """Read the directory again, for new cells and analyses."""
+        self.run = self.run.refreshed()
+
+    def warm(self) -> None:
+        """Prepare the page's first requests while the browser starts.
+
+        Called in the loop that answers: those who wait for something to be compiled wait there.
+        """
+        from pipeline.explorer.serving.answers import first_answers
+
+        first = self.pool.submit(first_answers, self.run, self.live)
+        if self.live is None:
+            return
+        live, loop = self.live, asyncio.get_running_loop()
+        self.compiled = waiting = asyncio.Event()
+
+        def tell(done: int, total: int) -> None:
+            if live.is_warm("series"):
+                with contextlib.suppress(RuntimeError):  # the loop has ended
+                    loop.call_soon_threadsafe(waiting.set)
+
+        # what is compiled would hold up the first picture
+        first.add_done_callback(lambda done: None if done.cancelled() else live.warm(tell))
+
+    async def work(self, function: Callable[[], Any], *, integrates: bool = False) -> Any:
+        """Call a function in a thread; raises `TooManyError` if too many wait.
+
+        One that integrates waits until what it needs is compiled, once, and not in these threads.
+        """
+        if self.waiting >= THREADS + MOST_WAITING:
+            raise TooManyError("the server has more to do than it may; try again in a moment")
+        self.waiting += 1
+        try:
+            if integrates and self.compiled is not None:
+                await self.compiled.wait()
+            return await asyncio.get_running_loop().run_in_executor(self.pool, function)
+        finally:
+            self.waiting -= 1
+
+    def close(self) -> None:
+        """Drop the waiting requests."""
+        self.pool.shutdown(wait=False, cancel_futures=True)
+        if self.live is not None:
+            self.live.close()
+
+
+class TooManyError(ValueError):
+    """More requests than the server handles at once."""
+
+
+class Handler(web.RequestHandler):
+    """The base of all handlers."""
+
+    needs_token = True
+    service: Service
+
+    def initialize(self, service: Service) -> None:
+        """Store the shared state."""
+        self.service = service
+
+    def set_default_headers(self) -> None:
+        """Set the headers of every answer, errors included."""
+        service: Service | None = getattr(self, "service", None) or self.application.settings.get("service")
+        if service is not None:
+            for name, value in headers_of(service.guard.port).items():
+                self.set_header(name, value)
+
+    def compute_etag(self) -> str | None:
+        """None: nothing is to be stored, and a digest of a large diagram would hold up everybody."""
+        return None
+
+    def prepare(self) -> None:
+        """Refuse invalid requests before any work."""
+        guard, headers = self.service.guard, self.request.headers
+        if len(self.request.uri or "") > MOST_ADDRESS:
+            self.refuse(414, "the address is too long")
+            return
+        foreign = guard.foreign(headers)
+        known = not foreign and guard.authorised(headers, self.get_query_argument("token", ""))
+        # requests without a token must not use up the rate of valid ones
+        free = known or not self.needs_token
+        budget = self.service.rate if known else self.service.files if free else self.service.strangers
+        if foreign is None and not budget.allows():
+            self.refuse(429, "too many requests; wait a moment")
+        elif foreign is not None:
+            self.refuse(403, foreign)
+        elif not free:
+            self.refuse(403, "the token is missing or wrong; use the address that magpend explore printed")
+
+    def refuse(self, status: int, sentence: str) -> None:
+        """Answer with one sentence, and end."""
+        self.set_status(status)
+        self.set_header("Content-Type", "application/json; charset=utf-8")
+        self.finish(json.dumps({"error": sentence}))
+
+    def write_error(self, status_code: int, **kwargs: Any) -> None:
+        """Report an error without internal details."""
+        self.refuse(status_code, self._reason)
+
+
+class PageHandler(Handler):
+    """The handler of the page itself."""
+
+    def refuse(self, status: int, sentence: str) -> None:
+        """Answer with a page that has one sentence: a person is reading."""
+        self.set_status(status)
+        self.set_header("Content-Type", "text/html; charset=utf-8")
+        self.finish(page_html.note(sentence))
+
+    async def get(self) -> None:
+        """The page of the run."""
+        if "explorer.js" not in self.service.static:
+            self.refuse(500, "the page's script is not installed: install magpend again")
+            return
+        self.set_header("Content-Type", "text/html; charset=utf-8")
+        self.finish(page_html.page(self.service.run.info.title, self.service.guard.token))
+
+
+class StaticHandler(Handler):
+    """The handler of the page's script and style, which are public."""
+
+    needs_token = False
+
+    async def get(self, name: str) -> None:
+        """One of `STATIC`."""
+        if name not in self.service.static:
+            self.refuse(404, "there is no such file")
+            return
+        content, kind = self.service.static[name]
+        self.set_header("Content-Type", kind)
+        self.finish(content)
+
+
+class ApiHandler(Handler):
+    """The handler of one kind of answer."""
+
+    answer: Answer
+
+    def initialize(self, service: Service, answer: Answer) -> None:  # type: ignore[override]
+        """Store the shared state and the kind of answer."""
+        self.service, self.answer = service, answer
+
+    async def get(self) -> None:
+        """Answer from what the address says."""
+        if self.answer.method != "GET":
+            self.refuse(405, f"api/{self.answer.name} takes {self.answer.method}")
+            return
+        await self._reply(b"")
+
+    async def post(self) -> None:
+        """Answer from what the body says."""
+        if self.answer.method != "POST":
+            self.refuse(405, f"api/{self.answer.name} takes {self.answer.method}")
+            return
+        await self._reply(self.request.body)
+
+    async def _reply(self, body: bytes) -> None:
+        from pipeline.explorer.serving.answers import Query
+
+        query = Query({k: v[-1].decode("utf-8", "replace") for k, v in self.request.query_arguments.items()}, body)
+        service, answer = self.service, self.answer
+
+        def work() -> Any:
+            if answer.fresh:
+                service.refresh()
+            service.run.check_axes(query.at)
+            return answer.give(service.run, query, service.live)
+
+        try:
+            reply = await service.work(work, integrates=answer.integrates)
+        except TooManyError as error:
+            self.refuse(429, str(error))
+        except (StoreError, OSError) as error:
+            self.refuse(500, str(error))
+        except SpecError as error:
+            self.refuse(400, " ".join(error.problems))
+        except (ValueError, ArithmeticError) as error:
+            self.refuse(400, str(error))
+        except Exception:
+            LOG.exception("api/%s", answer.name)
+            self.refuse(500, "something went wrong that magpend did not expect; its terminal says what")
+        else:
+            self.set_header("Content-Type", reply.kind)
+            if reply.filename:
+                self.set_header("Content-Disposition", f'attachment; filename="{reply.filename}"')
+            with contextlib.suppress(Exception):  # the client has disconnected
+                await self.finish(reply.content)
+
+
+class NothingHandler(Handler):
+    """The handler of all other addresses."""
+
+    def prepare(self) -> None:
+        """Refuse, and say no more than that there is nothing."""
+        super().prepare()
+        if not self._finished:
+            self.refuse(404, "there is no such page")
+
+
+def application(service: Service) -> web.Application:
+    """Return the web application that answers requests for a run."""
+    from pipeline.explorer.serving.answers import ANSWERS
+
+    shared = {"service": service}
+    routes: list[Any] = [
+        (r"/", PageHandler, shared),
+        (r"/static/([A-Za-z.]+)", StaticHandler, shared),
+        *((rf"/api/{name}", ApiHandler, {**shared, "answer": a}) for name, a in ANSWERS.items()),
+        *_live_routes(service),
+    ]
+    return web.Application(
+        routes,
+        default_handler_class=NothingHandler,
+        default_handler_args=shared,
+        service=service,
+        compress_response=False,
+        log_function=lambda handler: None,
+    )
+
+
+def _live_routes(service: Service) -> list[Any]:
+    """Return the websocket route for live computing, if the run allows it."""
+    if service.live is None:
+        return []
+
+    from pipeline.explorer.serving.socket import socket_routes
+
+    def authorised(handler: web.RequestHandler) -> bool:
+        headers, guard = handler.request.headers, service.guard
+        token = handler.get_query_argument("token", "")
+        return guard.foreign(headers) is None and guard.authorised(headers, token)
+
+    return socket_routes(service.live, authorised)
+
+
+def listening(port: int) -> socket.socket:
+    """Return a socket on loopback.
+
+    Raises
+    ------
+    SpecError
+        If the port is taken or not ours to take.
+    """
+    if not 0 <= port <= 65535:
+        raise SpecError([f"--port {port}: must be 0 to 65535; 0 takes a free one."])
+    found = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+    try:
+        found.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        found.bind((HOST, port))
+        found.listen(64)
+        found.setblocking(False)
+    except OSError as error:
+        found.close()
+        reason = "is taken" if error.errno == errno.EADDRINUSE else f"cannot be used ({error.strerror})"
+        raise SpecError([f"--port {port}: {reason}; give another one, or none for a free one."]) from None
+    return found
+
+
+def serve(
+    source: str | Path | Run, port: int = 0, *, echo: Callable[[str], None], opened: Callable[[str], None] | None = None
+) -> None:
+    """Serve the page of a run until the process is stopped.
+
+    Parameters
+    ----------
+    source
+        Run directory, ``s3://BUCKET/PREFIX``, or an opened run.
+    port
+        On loopback; 0 takes a free one.
+    echo
+        Prints a line.
+    opened
+        Called with the address once it can be asked, such as to open a browser.
+
+    Raises
+    ------
+    SpecError
+        If the port cannot be had.
+    RefusedError, DamagedError, UnreadableError
+        As `Run.open`.
+    """
+    run = Run.open(source)
+    taken = listening(port)
+    guard = Guard(new_token(), taken.getsockname()[1])
+    address = f"http://{HOST}:{guard.port}/?token={guard.token}"
+    echo(address)
+    if opened is not None:
+        opened(address)
+    # a browser takes a moment to start, and so does what answers it: who asks meanwhile waits in the queue
+    try:
+        service = Service(run, guard)
+        try:
+            asyncio.run(_answer(service, taken))
+        finally:
+            service.close()
+    finally:
+        taken.close()
+
+
+async def _answer(service: Service, taken: socket.socket) -> None:
+    server = httpserver.HTTPServer(application(service), **LIMITS)
+    server.add_socket(taken)
+    service.warm()
+    await asyncio.Event().wait()

@@ -1,0 +1,186 @@
+"""Read the ``[cluster]`` table, which describes a job of a batch system, from its own TOML file."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, ValidationError, field_validator, model_validator
+
+from pipeline.specification.files import read_toml
+from pipeline.specification.problems import SpecError, problems_of, unknown_key
+from pipeline.specification.tables import Table
+
+QUEUES = ("slurm", "pbs", "sge", "lsf")
+"""Batch systems that can start workers."""
+
+_TIME = re.compile(r"(\d{1,4}):([0-5]\d):([0-5]\d)")
+_MEMORY = re.compile(r"(\d+(?:\.\d+)?) ?([kMGT]i?)B")
+_UNITS = {"k": 10**3, "M": 10**6, "G": 10**9, "T": 10**12, "ki": 2**10, "Mi": 2**20, "Gi": 2**30, "Ti": 2**40}
+_LEAST_MARGIN_S, _MOST_MARGIN_S = 30, 900
+
+Lines = Annotated[tuple[str, ...], Field(strict=False)]
+
+
+def seconds_of(time: str) -> int:
+    """Return the seconds of a time such as ``04:00:00``; raise `ValueError` for any other text."""
+    match = _TIME.fullmatch(time)
+    if match is None or not any(map(int, match.groups())):
+        raise ValueError(f"{time!r}: must be hours, minutes and seconds above zero, such as '04:00:00'.")
+    hours, minutes, seconds = map(int, match.groups())
+    return 3600 * hours + 60 * minutes + seconds
+
+
+def bytes_of(memory: str) -> int:
+    """Return the bytes of a size such as ``16 GB``; raise `ValueError` for any other text."""
+    match = _MEMORY.fullmatch(memory)
+    if match is None or not float(match[1]):
+        raise ValueError(f"{memory!r}: must be a number and kB, MB, GB or TB, such as '16 GB'.")
+    return int(float(match[1]) * _UNITS[match[2]])
+
+
+def clock(seconds: int) -> str:
+    """Format seconds as ``HH:MM:SS``, which `seconds_of` reads."""
+    return f"{seconds // 3600:02d}:{seconds // 60 % 60:02d}:{seconds % 60:02d}"
+
+
+def hours_and_minutes(seconds: int) -> str:
+    """Format seconds for LSF: whole minutes, at least one."""
+    minutes = max(1, seconds // 60)
+    return f"{minutes // 60:02d}:{minutes % 60:02d}"
+
+
+class Cluster(Table):
+    """The ``[cluster]`` table: a job that holds workers, and the number of jobs."""
+
+    kind: Literal["slurm", "pbs", "sge", "lsf"] = Field(description="Batch system.")
+    queue: str | None = Field(None, description="Queue or partition.")
+    account: str | None = Field(None, description="Account or project that is charged.")
+    cores: int = Field(ge=1, le=4096, description="Cores of a job; each runs one worker process.")
+    memory: str = Field(description="Memory of a job, such as '16 GB'.")
+    walltime: str = Field(description="Time after which the batch system ends a job, such as '04:00:00'.")
+    lifetime: str | None = Field(
+        None, description="Time after which workers leave; by default shortly before the walltime."
+    )
+    lifetime_stagger: str | None = Field(
+        None, description="Spread of the times at which workers leave, so that they do not leave at once."
+    )
+    min_jobs: int = Field(1, ge=1, le=10_000, description="Jobs that are always kept.")
+    max_jobs: int = Field(1, ge=1, le=10_000, description="Most jobs at a time.")
+    coordinator_memory: str = Field(
+        "4 GB", description="Memory of the coordinator, the job that sends tasks to several other jobs."
+    )
+    coordinator_walltime: str | None = Field(
+        None, description="Time of the coordinator's job; by default the walltime of the others."
+    )
+    wait: str = Field("24:00:00", description="Longest time to wait for the first worker.")
+    prologue: Lines = Field((), description="Shell lines before the workers start, such as 'module load python'.")
+    directives: Lines = Field((), description="More lines for the batch system, such as '--constraint=avx512'.")
+    interface: str | None = Field(None, description="Network interface, such as 'ib0'.")
+    scratch: str | None = Field(None, description="Folder on a node's local disk, such as '$TMPDIR'.")
+    python: str | None = Field(None, description="Python on the nodes; by default the Python that runs this command.")
+
+    @field_validator("walltime", "lifetime", "lifetime_stagger", "coordinator_walltime", "wait")
+    @classmethod
+    def _time(cls, value: str | None) -> str | None:
+        if value is not None:
+            seconds_of(value)
+        return value
+
+    @field_validator("memory", "coordinator_memory")
+    @classmethod
+    def _size(cls, value: str) -> str:
+        bytes_of(value)
+        return value
+
+    @field_validator("queue", "account", "interface", "scratch", "python", "prologue", "directives")
+    @classmethod
+    def _one_line(cls, value: Any) -> Any:
+        for text in (value,) if isinstance(value, str) else value or ():
+            if not text.strip() or not text.isprintable():
+                raise ValueError(f"{text!r}: must be one line of text, and not empty.")
+        return value
+
+    @field_validator("queue", "account", "interface", "python")
+    @classmethod
+    def _one_word(cls, value: str | None) -> str | None:
+        if value is not None and re.search(r"[\s'\"`;|&<>()]", value):
+            raise ValueError(f"{value!r}: must be one word, without blanks, quotes or signs of the shell.")
+        return value
+
+    @model_validator(mode="after")
+    def _fits(self) -> Cluster:
+        problems = []
+        if self.min_jobs > self.max_jobs:
+            problems.append(f"min_jobs = {self.min_jobs}: must be at most max_jobs = {self.max_jobs}.")
+        if self.kind == "sge" and self.cores > 1 and not any("-pe" in line for line in self.directives):
+            problems.append(
+                "directives: with cores above 1, Grid Engine wants a parallel environment; "
+                f"add its line, such as '-pe smp {self.cores}' (its name is your site's: qconf -spl)."
+            )
+        if self.lifetime_s + self.stagger_s >= self.walltime_s:
+            problems.append(
+                f"lifetime = {clock(self.lifetime_s)!r} with lifetime_stagger = {clock(self.stagger_s)!r}: "
+                f"must end before walltime = {self.walltime!r}; leave both out to have them chosen."
+            )
+        if problems:
+            raise ValueError("\n".join(problems))
+        return self
+
+    @property
+    def walltime_s(self) -> int:
+        """Time of a job [s]."""
+        return seconds_of(self.walltime)
+
+    @property
+    def margin_s(self) -> int:
+        """Default time between the last worker's leave and the end of its job [s]."""
+        tenth = self.walltime_s // 10
+        return max(1, min(max(tenth, _LEAST_MARGIN_S), _MOST_MARGIN_S, self.walltime_s // 2))
+
+    @property
+    def lifetime_s(self) -> int:
+        """Time after which a worker leaves [s]."""
+        if self.lifetime is not None:
+            return seconds_of(self.lifetime)
+        return max(1, self.walltime_s - self.margin_s - self.stagger_s)
+
+    @property
+    def stagger_s(self) -> int:
+        """Spread of the times at which workers leave [s]."""
+        if self.lifetime_stagger is not None:
+            return seconds_of(self.lifetime_stagger)
+        return self.margin_s // 3
+
+    @property
+    def memory_bytes(self) -> int:
+        """Memory of a job [bytes]."""
+        return bytes_of(self.memory)
+
+    @property
+    def wait_s(self) -> int:
+        """Longest time to wait for the first worker [s]."""
+        return seconds_of(self.wait)
+
+
+def load_cluster(path: str | Path) -> Cluster:
+    """Read a file with a ``[cluster]`` table.
+
+    Raises
+    ------
+    SpecError
+        If the file is not valid; the message lists all problems.
+    """
+    tables = read_toml(path)
+    if not isinstance(tables.get("cluster"), dict):
+        raise SpecError([f"{path}: has no table [cluster]; docs/clusters.md has an example."])
+    problems = [f"{path}: {unknown_key(name, name, ['cluster'])}" for name in tables if name != "cluster"]
+    try:
+        found = Cluster.model_validate(tables["cluster"])
+    except ValidationError as error:
+        lines = "\n".join(problems_of(error, Cluster, "cluster")).splitlines()
+        problems += [f"{path}: {line.removeprefix('cluster: ')}" for line in lines]
+    if problems:
+        raise SpecError(problems)
+    return found

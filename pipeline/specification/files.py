@@ -1,0 +1,126 @@
+"""Read TOML files and texts as plain tables, and merge tables."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from pipeline.specification.problems import SpecError
+
+MOST_BYTES = 1_000_000
+MOST_ELEMENTS = 100_000
+"""Most elements of an array."""
+MOST_DEPTH = 32
+MOST_KEY = 200
+"""Most characters of a key."""
+WHOLE_NUMBERS = range(-(2**63), 2**63)
+
+
+def read_toml(path: str | Path) -> dict[str, Any]:
+    """Return the tables of a TOML file.
+
+    Raises
+    ------
+    SpecError
+        If the file cannot be read, or holds data that no specification can have (see `odd_data`).
+    """
+    try:
+        with open(path, "rb") as file:
+            content = file.read(MOST_BYTES + 1)
+    except OSError as error:
+        raise SpecError([f"{path}: {_unreadable(error)}"]) from None
+    return toml_tables(content, str(path))
+
+
+def toml_tables(content: bytes, name: str) -> dict[str, Any]:
+    """Return the tables of a TOML text; messages call the text `name`.
+
+    Raises
+    ------
+    SpecError
+        If the text is not TOML, or holds data that no specification can have.
+    """
+    try:
+        if len(content) > MOST_BYTES:
+            raise SpecError(
+                [
+                    f"{name}: has more than {MOST_BYTES // 1_000_000} MB, the most that a specification has; "
+                    "give ranges, or random starts with a seed, instead of lists."
+                ]
+            )
+        data = tomllib.loads(content.decode("utf-8"))
+    except (ValueError, RecursionError) as error:
+        if isinstance(error, SpecError):
+            raise
+        raise SpecError([f"{name}: {_unreadable(error)}"]) from None
+    problems = odd_data(data)
+    if problems:
+        raise SpecError([f"{name}: {problem}" for problem in problems])
+    return data
+
+
+def _unreadable(error: Exception) -> str:
+    """Explain why a file is no specification."""
+    if isinstance(error, OSError):
+        return f"cannot be read ({error.strerror or error})."
+    if isinstance(error, UnicodeDecodeError):
+        return "is not text in UTF-8; a specification is a TOML file."
+    if isinstance(error, tomllib.TOMLDecodeError):
+        return f"is not valid TOML: {error}."
+    if isinstance(error, RecursionError):
+        return f"is nested too deep; a specification has at most {MOST_DEPTH} tables and lists within another."
+    # Python's own bound on the digits of a whole number; or a path with a null character
+    return f"is not valid TOML: {str(error).partition(';')[0].partition(':')[0]}."
+
+
+def odd_data(data: Any) -> list[str]:
+    """Return problems of data that no specification can have: too deep, too long, or too large numbers.
+
+    Later code may then recurse into the data, convert whole numbers to floats and repeat keys in messages.
+    """
+    todo: list[tuple[str, Any, int]] = [("", data, 0)]
+    while todo:
+        place, value, depth = todo.pop()
+        if depth > MOST_DEPTH:
+            return [f"{place[:MOST_KEY]}: is nested too deep: more than {MOST_DEPTH} tables or lists in another."]
+        if isinstance(value, Mapping):
+            for key, inner in value.items():
+                if not isinstance(key, str):
+                    return [f"{place or 'specification'}: the key {key!r} is no text; keys are texts."]
+                if len(key) > MOST_KEY:
+                    return [f"{key[:40]}...: this key has {len(key)} characters; {MOST_KEY} are the most."]
+                todo.append((f"{place}.{key}" if place else key, inner, depth + 1))
+        elif isinstance(value, (list, tuple)):
+            if len(value) > MOST_ELEMENTS:
+                return [
+                    f"{place[:MOST_KEY]}: has {len(value)} elements; {MOST_ELEMENTS} are the most of an "
+                    "array. Give ranges, or random starts with a seed."
+                ]
+            todo += [(place, v, depth + 1) for v in value if not isinstance(v, (float, str, bool))]
+        elif isinstance(value, int) and value not in WHOLE_NUMBERS:
+            bits = value.bit_length()
+            return [f"{place}: a whole number of {bits} bits is none in TOML, whose have 64; write it as 1e300."]
+    return []
+
+
+def nested(table: Mapping[str, Any]) -> dict[str, Any]:
+    """Spread quoted dotted keys: ``{"a.b": 1}`` becomes ``{"a": {"b": 1}}``."""
+    result: dict[str, Any] = {}
+    for key, value in table.items():
+        *parents, last = key.split(".")
+        inner = nested(value) if isinstance(value, dict) else value
+        for parent in reversed(parents):
+            inner, last = {last: inner}, parent
+        result = merged(result, {last: inner})
+    return result
+
+
+def merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Return `base` with the leaves of `changes` put in; tables merge, everything else is replaced."""
+    result = dict(base)
+    for key, value in changes.items():
+        old = result.get(key)
+        result[key] = merged(old, value) if isinstance(old, dict) and isinstance(value, dict) else value
+    return result

@@ -1,0 +1,455 @@
+"""Parse and validate the specification of a run as a whole.
+
+There are two kinds: a *sweep*, in which every cell is independent, and a *continuation*, in which branches
+follow a parameter path and each point starts where the previous one ended. Keys carry units. Angles in
+degrees are converted once, in `pipeline.layout.cells`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+from unicodedata import category
+
+import numpy as np
+from pydantic import BaseModel, ValidationError
+
+from magpend_core.models import DEFAULT, load_model
+from magpend_core.models.model import Model
+from magpend_core.models.parameters import ParameterError, Parameters, unknown_name_problem
+from magpend_core.models.presets import Preset, is_file
+from pipeline.products.product import Options
+from pipeline.products.registry import CELL_PRODUCTS
+from pipeline.specification.drive_files import RecordedDrive
+from pipeline.specification.files import merged, nested, odd_data, read_toml
+from pipeline.specification.methods import method_problems
+from pipeline.specification.models import A_MODEL, KEPT, add_model, stand_in, with_model_table
+from pipeline.specification.problems import SpecError, problems_of, shown, unknown_choice, unknown_key
+from pipeline.specification.ranges import corner_problems, size_problems
+from pipeline.specification.recorded_drive import DriveTable, recorded, run_problems, with_drive
+from pipeline.specification.section import SectionTable, section_of, seen_through
+from pipeline.specification.starts import STARTS, GridStarts, Starts, refine_problems, starts_model
+from pipeline.specification.tables import FREQUENCY, Continuation, Execution, Integration, ParametersTable, Range, Table
+
+KINDS = ("sweep", "continuation")
+IDENTIFICATION = "identification"
+"""Kind of the specifications that `pipeline.rig.identify` reads."""
+
+
+@dataclass(frozen=True)
+class Spec:
+    """A valid specification; each attribute is a key or table of the TOML file."""
+
+    kind: str
+    title: str
+    reference: str | Mapping[str, Any]
+    parameters: ParametersTable
+    axes: dict[str, Range]
+    initial_conditions: Starts
+    continuation: Continuation | None
+    integration: Integration
+    products: dict[str, Options]
+    execution: Execution
+    drive: DriveTable | None = None
+    section: SectionTable | None = None
+
+    @cached_property
+    def recorded(self) -> RecordedDrive | None:
+        """The recording that drives the model; None for the model's own drive."""
+        return recorded(self.drive, [])
+
+    @property
+    def frequency_hz(self) -> float | None:
+        """Drive frequency [Hz], for a recording its mean frequency; None if it is swept.
+
+        With a section by crossing it is one over the longest time between crossings, as in the engine.
+        """
+        if self.section is not None:
+            return self.section.crossing.frequency_hz
+        return self.parameters.frequency_hz if self.recorded is None else self.recorded.frequency_hz
+
+    @property
+    def refine(self) -> int | None:
+        """Stride of a refined grid; None for a full grid and for other starts."""
+        starts = self.initial_conditions
+        return starts.refine if isinstance(starts, GridStarts) else None
+
+    @cached_property
+    def model(self) -> Model:
+        """Model that is integrated, with its section by crossing if there is one."""
+        return seen_through(load_model(self.reference), self.section)
+
+    @cached_property
+    def values(self) -> Parameters:
+        """Values of the parameters that are not swept."""
+        return self.model.load(self.parameters.chosen, **self.parameters.overrides)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain data with all defaults filled in; `parse_spec` reads it back."""
+        tables: dict[str, Any] = {"kind": self.kind, "title": self.title, "model": self.reference}
+        for name in _TABLES:
+            table = getattr(self, name)
+            if table is not None:
+                tables[name] = table.model_dump(mode="json", exclude_none=True)
+        tables["initial_conditions"] = self.initial_conditions.model_dump(mode="json", exclude_none=True)
+        tables["products"] = {name: options.plain() for name, options in self.products.items()}
+        tables["axes"] = {name: axis.model_dump(mode="json", exclude_none=True) for name, axis in self.axes.items()}
+        return tables
+
+
+_TABLES: dict[str, type[Table]] = {
+    "parameters": ParametersTable,
+    "continuation": Continuation,
+    "integration": Integration,
+    "execution": Execution,
+    "drive": DriveTable,
+    "section": SectionTable,
+}
+_OPTIONAL = ("drive", "section")
+_KEYS = (
+    "kind",
+    "title",
+    "model",
+    "parameters",
+    "axes",
+    "initial_conditions",
+    "continuation",
+    "integration",
+    "products",
+    "execution",
+    "drive",
+    "section",
+)
+
+
+def load_spec(path: str | Path, *, smoke: bool = False) -> Spec:
+    """Read and validate a specification.
+
+    Parameters
+    ----------
+    path
+        A TOML file.
+    smoke
+        Whether to apply the file's ``[smoke]`` table, with which the run takes seconds.
+
+    Raises
+    ------
+    SpecError
+        With all problems at once; also if the file cannot be read or is not TOML.
+    """
+    return spec_of_tables(read_toml(path), Path(path).parent, smoke=smoke)
+
+
+def spec_of_tables(data: dict[str, Any], folder: Path, *, smoke: bool = False) -> Spec:
+    """Validate the tables of a file or a text, ``[smoke]`` included; see `load_spec`."""
+    return parse_spec(_with_smoke(data, smoke, folder), folder)
+
+
+def kept_spec(data: Mapping[str, Any]) -> Spec:
+    """Parse the specification that a run keeps; no other file is read, nothing is imported.
+
+    Raises
+    ------
+    SpecError
+        With all problems at once.
+    """
+    return parse_spec(data, KEPT)
+
+
+def _with_smoke(data: dict[str, Any], smoke: bool, folder: Path) -> dict[str, Any]:
+    """Remove ``[smoke]``, check it in any case, and merge it into the tables if asked."""
+    plain = {key: value for key, value in data.items() if key != "smoke"}
+    if "smoke" not in data:
+        if smoke:
+            raise SpecError(["smoke: this specification has no [smoke] table; add one or run it in full."])
+        return plain
+    table = data["smoke"]
+    if not isinstance(table, dict):
+        raise SpecError([f"smoke = {shown(table)}: must be a table of keys to replace."])
+    changes = nested(table)
+    base = with_model_table(plain, folder) if isinstance(changes.get("model"), dict) else plain
+    small = merged(base, changes)
+    try:
+        parse_spec(small, folder)
+    except SpecError as error:
+        _raise_new(plain, folder, error)
+    return small if smoke else plain
+
+
+def _raise_new(plain: dict[str, Any], folder: Path, smoke_error: SpecError) -> None:
+    """Raise the problems of the specification together with those that only ``[smoke]`` causes."""
+    try:
+        parse_spec(plain, folder)
+        own: list[str] = []
+    except SpecError as error:
+        own = error.problems
+    raise SpecError(own + [f"with [smoke]: {p}" for p in smoke_error.problems if p not in own])
+
+
+def parse_spec(data: Mapping[str, Any], folder: str | Path | None = ".") -> Spec:
+    """Validate the tables of a specification.
+
+    Every table is validated on its own, so that errors in one do not hide errors in others. Then the valid
+    tables are checked against each other. Files of presets, drives and models are read here, and their
+    content replaces their names: a run does not need the files any more. A model that is a Python object is
+    imported, unless `folder` is None.
+
+    Parameters
+    ----------
+    data
+        Tables from TOML or from `Spec.as_dict`.
+    folder
+        Folder that paths of files are relative to; None for data that a run keeps, see `kept_spec`.
+
+    Raises
+    ------
+    SpecError
+        With all problems at once.
+    """
+    if odd := odd_data(data):
+        raise SpecError(odd)
+    if data.get("kind") == IDENTIFICATION:
+        raise SpecError([f'kind = "{IDENTIFICATION}": is no run; use magpend identify SPEC --out DIR.'])
+    if "kind" not in data and "equations" in data:
+        raise SpecError([A_MODEL])
+    problems = [unknown_key(key, key, _KEYS) for key in data if key not in _KEYS]
+    data = _with_preset(data, folder, problems)
+    data = data if folder is None else with_drive(data, folder, problems)
+    kind, title = _kind(data, problems), _title(data, problems)
+    model = add_model(data.get("model", DEFAULT), folder, problems)
+    tables = {name: _table(data, name, table, problems) for name, table in _TABLES.items()}
+    axes = _axes(data, problems)
+    walk = _walk(kind, data, tables["continuation"], axes, problems)
+    if model is None:  # the remaining checks need the model's states and parameters
+        model = stand_in(data.get("model"), folder, forced="section" not in data)
+    if model is None:
+        raise SpecError(problems)
+    section = section_of(tables["section"], model, data, problems)
+    seen = seen_through(model, section)
+    starts = _starts(data, model, problems)
+    problems += refine_problems(kind, starts, tables["integration"], model)
+    products = _products(data, model, problems)
+    problems += run_problems(recorded(tables["drive"], problems), model, data, tables["integration"], starts)
+    problems += size_problems(axes, starts)
+    problems += method_problems(tables["integration"], products, "drive" in data)
+    known = _valid_keys(ParametersTable, data.get("parameters", {}))
+    has_periods = "drive" in data or "section" in data or model.autonomous
+    complete = not has_periods and not any(p.startswith(("axes", "parameters")) for p in problems)
+    problems += _parameter_problems(known, seen, _declared(data), axes, complete)
+    if problems:
+        raise SpecError(problems)
+    assert starts is not None
+    return Spec(
+        kind,
+        title,
+        model.reference,
+        tables["parameters"],
+        axes,
+        starts,
+        walk,
+        tables["integration"],
+        products,
+        tables["execution"],
+        tables["drive"],
+        section,
+    )
+
+
+def _with_preset(data: Mapping[str, Any], folder: str | Path | None, problems: list[str]) -> Mapping[str, Any]:
+    """Replace the name of a preset's file by its content; drop the name if the file cannot be read."""
+    table = data.get("parameters")
+    name = table.get("preset") if isinstance(table, dict) else None
+    if table is None or not isinstance(name, str) or not is_file(name):
+        return data
+    rest = {key: value for key, value in table.items() if key != "preset"}
+    if folder is None:
+        problems.append(f"parameters.preset = {name!r}: a run keeps the content of a preset's file.")
+        return {**data, "parameters": rest}
+    try:
+        content = asdict(Preset.read(Path(folder) / name))
+    except ParameterError as error:
+        problems += [f"parameters.preset: {p}" for p in error.problems]
+        return {**data, "parameters": rest}
+    return {**data, "parameters": {"preset": content, **rest}}
+
+
+def _products(data: Mapping[str, Any], model: Model, problems: list[str]) -> dict[str, Options]:
+    """Return the valid products of the specification, with options that follow from the model filled in."""
+    if not _is_table(data, "products", problems):
+        return {}
+    found: dict[str, Options] = {}
+    for name, table in data.get("products", {}).items():
+        path = f"products.{name}"
+        if name not in CELL_PRODUCTS:
+            problems.append(unknown_key(path, name, CELL_PRODUCTS))
+            continue
+        product = CELL_PRODUCTS[name]
+        options = _validate(product.options, table, path, problems)
+        if options is None:
+            continue
+        try:
+            found[name] = product.settle(options, model)
+        except ValueError as error:
+            problems.append(f"{path}.{error}")
+    # a fixed order, independent of the file's: the cube's layout follows from it
+    return {name: found[name] for name in CELL_PRODUCTS if name in found}
+
+
+def _declared(data: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return the names of all axes, valid or not."""
+    axes = data.get("axes", {})
+    return tuple(axes) if isinstance(axes, dict) else ()
+
+
+def _valid_keys(model: type[ParametersTable], table: Any) -> ParametersTable:
+    """Return the valid keys of a table, so that its errors do not hide others."""
+    valid: dict[str, Any] = {}
+    for key, value in table.items() if isinstance(table, dict) else ():
+        if _validate(model, {key: value}, "", []) is not None:
+            valid[key] = value
+    return model.model_validate(valid)
+
+
+def _kind(data: Mapping[str, Any], problems: list[str]) -> str:
+    kind = data.get("kind")
+    if kind is None:
+        problems.append('kind: missing; add kind = "sweep" or kind = "continuation".')
+    elif kind not in KINDS:
+        problems.append(unknown_choice("kind", kind, KINDS))
+    return str(kind)
+
+
+def _title(data: Mapping[str, Any], problems: list[str]) -> str:
+    title = data.get("title", "")
+    if not isinstance(title, str):
+        problems.append(f"title = {shown(title)}: must be a text in quotes.")
+    elif not all(c.isprintable() or category(c) == "Zs" for c in title):
+        problems.append(f"title = {shown(title)}: has control characters or line breaks; take them out.")
+    return str(title)
+
+
+def _is_table(data: Mapping[str, Any], name: str, problems: list[str]) -> bool:
+    if isinstance(data.get(name, {}), dict):
+        return True
+    problems.append(f"{name} = {shown(data[name])}: must be a table; write [{name}].")
+    return False
+
+
+def _validate(model: type[BaseModel], value: Any, path: str, problems: list[str]) -> Any:
+    """Return the validated table, or None after adding its problems."""
+    try:
+        return model.model_validate(value)
+    except ValidationError as error:
+        problems += problems_of(error, model, path)
+        return None
+
+
+def _table(data: Mapping[str, Any], name: str, model: type[Table], problems: list[str]) -> Any:
+    if not _is_table(data, name, problems) or (name not in data and name in _OPTIONAL):
+        return None
+    return _validate(model, data.get(name, {}), name, problems)
+
+
+def _axes(data: Mapping[str, Any], problems: list[str]) -> dict[str, Range]:
+    """Return the valid axes in the order of the file; add the problems of others."""
+    if not _is_table(data, "axes", problems):
+        return {}
+    axes = {n: _validate(Range, value, f"axes.{n}", problems) for n, value in data.get("axes", {}).items()}
+    return {name: axis for name, axis in axes.items() if axis is not None}
+
+
+def _starts(data: Mapping[str, Any], model: Model, problems: list[str]) -> Starts | None:
+    if "initial_conditions" not in data:
+        problems.append('initial_conditions: missing; add this table with kind = "grid", "list" or "random".')
+        return None
+    if not _is_table(data, "initial_conditions", problems):
+        return None
+    table = data["initial_conditions"]
+    kind = table.get("kind")
+    if not isinstance(kind, str) or kind not in STARTS:
+        choices = list(STARTS)
+        problems.append(
+            'initial_conditions.kind: missing; set it to "grid", "list" or "random".'
+            if kind is None
+            else unknown_choice("initial_conditions.kind", kind, choices)
+        )
+        return None
+    if kind != "grid" and "refine" in table:
+        problems.append(
+            f'initial_conditions.refine: only a grid can be refined; drop the key, or set kind = "grid" '
+            f"instead of {kind!r}."
+        )
+        table = {key: value for key, value in table.items() if key != "refine"}
+    starts: Starts | None = _validate(starts_model(kind, model), table, "initial_conditions", problems)
+    return starts
+
+
+def _walk(
+    kind: str, data: Mapping[str, Any], walk: Continuation | None, axes: dict[str, Range], problems: list[str]
+) -> Continuation | None:
+    """Check ``[continuation]`` against the kind and the axes."""
+    if kind != "continuation":
+        if kind == "sweep" and "continuation" in data:
+            problems.append('continuation: a sweep has none; set kind = "continuation" or drop the table.')
+        return None
+    declared = _declared(data)
+    if walk is not None and walk.path not in declared:
+        known = ", ".join(declared) or "none yet"
+        problems.append(
+            f"continuation.path = {walk.path!r}: must be an axis (axes: {known}); add it to [axes] or set the path."
+        )
+    return walk
+
+
+def _parameter_problems(
+    table: ParametersTable, model: Model, declared: tuple[str, ...], axes: dict[str, Range], complete: bool
+) -> list[str]:
+    """Return the problems with names and values of parameters, swept or not."""
+    problems = _frequency_problems(table, declared, axes, complete)
+    swept = {name: axis.array() for name, axis in axes.items() if name != FREQUENCY}
+    try:
+        base = model.load(table.chosen)
+    except ParameterError as error:
+        return problems + [f"parameters.preset: {p}" for p in error.problems]
+    try:
+        base = model.load(table.chosen, **table.overrides)
+    except ParameterError as error:
+        problems += [f"parameters.overrides: {p}" for p in error.problems]
+    known = (*base.names, FREQUENCY)
+    problems += [f"axes.{n}: {unknown_name_problem(n, known)}" for n in declared if n not in known]
+    for name in table.overrides:
+        if name in declared:
+            problems.append(f"axes.{name}: is also in parameters.overrides; keep one of the two.")
+    for name, values in swept.items():
+        problems += [f"axes.{name}: {p}" for p in _axis_problems(base, name, values)]
+    return problems or [f"axes: {p}" for p in corner_problems(base, swept)]
+
+
+def _frequency_problems(
+    table: ParametersTable, declared: tuple[str, ...], axes: dict[str, Range], complete: bool
+) -> list[str]:
+    problems = []
+    if FREQUENCY in declared and table.frequency_hz is not None:
+        problems.append("axes.frequency_hz: is also in parameters; keep one of the two.")
+    if FREQUENCY in axes:
+        least = float(axes[FREQUENCY].array()[0])
+        if least <= 0:
+            problems.append(f"axes.frequency_hz: its least value {least!r} must be greater than 0 Hz.")
+    if FREQUENCY not in declared and table.frequency_hz is None and complete:
+        return ["parameters.frequency_hz: missing; set it there, or sweep it as axes.frequency_hz."]
+    return problems
+
+
+def _axis_problems(base: Parameters, name: str, values: np.ndarray) -> list[str]:
+    if name not in base.names:
+        return []
+    problems: list[str] = []
+    for value in dict.fromkeys((float(values.min()), float(values.max()))):
+        try:
+            base.replace(**{name: value})
+        except ParameterError as error:
+            problems += [p for p in error.problems if p not in problems]
+    return problems

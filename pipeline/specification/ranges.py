@@ -1,0 +1,67 @@
+"""Check ranges of parameters and starts together: the number of cells, and bounds between parameters."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+
+from magpend_core.models.parameters import Parameters
+from pipeline.specification.starts import GridStarts, Starts
+from pipeline.specification.tables import Range
+
+MAX_CELLS = 10**15
+MOST_RELATED = 12
+"""Most swept parameters that a model may relate to each other: all corners of their box are checked."""
+
+
+def size_problems(axes: dict[str, Range], starts: Starts | None) -> list[str]:
+    """Return a problem if there are too many cells to count, so that later code does not overflow."""
+    sizes = {f"axes.{name}": axis.n for name, axis in axes.items()}
+    if isinstance(starts, GridStarts):
+        sizes |= {f"initial_conditions.{name}": axis.n for name, axis in starts.ranges.items()}
+    if math.prod(sizes.values()) <= MAX_CELLS:
+        return []
+    return [
+        f"{' x '.join(sizes)}: {math.prod(sizes.values()):.3g} cells; {MAX_CELLS:.0e} are the most: take fewer values."
+    ]
+
+
+def corner_problems(base: Parameters, swept: dict[str, np.ndarray]) -> list[str]:
+    """Return problems between parameters at the corners of the box of swept values.
+
+    Bounds are intervals, so the corners decide. Only the axes of parameters that the model's relations read
+    are varied. They are found by asking the model, again whenever its answer has read further parameters.
+    """
+    ends = {name: (float(v.min()), float(v.max())) for name, v in swept.items()}
+    asked = _Asked(base)
+    problems, looked_at = base.model.relations(asked), set[str]()
+    while not problems and looked_at != asked.names & set(ends):
+        looked_at = asked.names & set(ends)
+        if len(looked_at) > MOST_RELATED:
+            return [f"{base.model.name} relates more than {MOST_RELATED} of them; fix some."]
+        for corner in itertools.product(*(dict.fromkeys(ends[name]) for name in sorted(looked_at))):
+            asked.values_now = {**base, **dict(zip(sorted(looked_at), corner, strict=True))}
+            problems = base.model.relations(asked)
+            if problems:
+                return list(problems)
+    return list(problems)
+
+
+class _Asked(Mapping[str, float]):
+    """Parameter values that note which of them were read."""
+
+    def __init__(self, values: Mapping[str, float]) -> None:
+        self.values_now, self.names = dict(values), set[str]()
+
+    def __getitem__(self, name: str) -> float:
+        self.names.add(name)
+        return self.values_now[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.values_now)
+
+    def __len__(self) -> int:
+        return len(self.values_now)

@@ -1,0 +1,104 @@
+"""Define the table ``[section]`` of a specification: sections by crossing, for models without a drive."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING, Any, Literal
+
+from pydantic import Field
+
+from magpend_core.crossing import LEVEL, Crossing
+from magpend_core.models.parameters import near_names
+from magpend_core.models.sectioned import sectioned
+from pipeline.specification.tables import FREQUENCY, Table
+
+if TYPE_CHECKING:
+    from magpend_core.models.model import Model
+
+
+class SectionTable(Table):
+    """The table ``[section]``: the crossing at which a flow without a drive has its sections."""
+
+    of: str = Field(min_length=1, description="State that crosses the level.")
+    value: float = Field(0.0, description="Level in the state's unit; for an angle, modulo 2 pi.")
+    direction: Literal["up", "down"] = Field("up", description="Whether the state rises or falls there.")
+    longest: float = Field(
+        100.0, gt=0, description="Longest time between crossings [s]; a cell that takes longer does not return."
+    )
+
+    @property
+    def crossing(self) -> Crossing:
+        """The section as the core takes it."""
+        return Crossing(self.of, self.value, self.direction, self.longest)
+
+
+def seen_through(model: Model, section: SectionTable | None) -> Model:
+    """Return the model with its section by crossing, if there is one."""
+    return model if section is None else sectioned(model, section.crossing)
+
+
+def section_of(
+    table: SectionTable | None, model: Model, data: Mapping[str, Any], problems: list[str]
+) -> SectionTable | None:
+    """Return the section of a specification, or None; add problems between it and other tables.
+
+    Parameters
+    ----------
+    table
+        Valid table ``[section]``, or None.
+    model
+        Model of the specification.
+    data
+        Tables of the specification; axes, parameters and drive are checked.
+    problems
+        List to which problems are added.
+    """
+    if "section" not in data:
+        if model.autonomous:
+            problems += _missing(model, data)
+        return None
+    if table is None:
+        return None
+    if not model.autonomous:
+        problems.append(
+            f"section: {model.name} is forced, and its sections are once per period of the drive "
+            f"({model.section}); drop [section], or take the time out of the equations."
+        )
+        return None
+    found = _found(table, model, problems)
+    clash = "a section by crossing needs no frequency; drop one of the two"
+    if FREQUENCY in _keys(data, "parameters"):
+        problems.append(f"parameters.{FREQUENCY}: {clash}.")
+    if FREQUENCY in _keys(data, "axes"):
+        problems.append(f"axes.{FREQUENCY}: {clash}.")
+    if "drive" in data:
+        problems.append(f"drive: {model.name} has no drive that a recording could take the place of; drop it.")
+    return found
+
+
+def _found(table: SectionTable, model: Model, problems: list[str]) -> SectionTable | None:
+    if LEVEL in model.parameter_names:
+        problems.append(
+            f"section: {model.name} has a parameter named {LEVEL}, which is the name of the level; rename it."
+        )
+        return None
+    if table.of not in model.state_names:
+        hint = near_names(table.of, model.state_names, "states")
+        problems.append(f"section.of = {table.of!r}: is not a state of {model.name}; {hint}")
+        return None
+    return table
+
+
+def _missing(model: Model, data: Mapping[str, Any]) -> list[str]:
+    """Return a problem if an autonomous model has neither a section nor a frequency."""
+    if FREQUENCY in _keys(data, "parameters") or FREQUENCY in _keys(data, "axes") or "drive" in data:
+        return []
+    return [
+        f'section: missing; {model.name} has no drive. Add [section] with of = "{model.state_names[0]}", '
+        f"value and direction, to see it at crossings; or parameters.{FREQUENCY}, to see it at even times."
+    ]
+
+
+def _keys(data: Mapping[str, Any], table: str) -> Iterable[str]:
+    found = data.get(table, {})
+    return found if isinstance(found, Mapping) else ()

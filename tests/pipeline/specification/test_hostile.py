@@ -1,0 +1,384 @@
+"""Specifications that nobody means well: one clear message each, quickly, and nothing created."""
+
+import os
+import time
+import tomllib
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, example, given, settings
+from hypothesis import strategies as st
+
+from pipeline.layout.plan import make_plan
+from pipeline.specification.parsing import Range, load_spec, parse_spec
+from pipeline.specification.problems import SpecError, shown
+
+LONG = os.environ.get("MAGPEND_LONG") == "1"
+
+BASE = """
+kind = "sweep"
+title = "small"
+model = "duffing"
+[parameters]
+frequency_hz = 0.2
+overrides = { damping = 0.1 }
+[axes]
+amplitude = { start = 0.2, stop = 0.3, num = 3 }
+[initial_conditions]
+kind = "grid"
+x = { start = -1.0, stop = 1.0, num = 4 }
+v = 0.0
+[integration]
+n_transient = 2
+n_keep = 3
+[products.lyapunov]
+n_exponents = 1
+[execution]
+trajectories_per_task = 16
+[smoke]
+integration.n_keep = 2
+"""
+
+HUGE = "9" * 5000
+DEEP = 5000
+ODD = {
+    "list as kind": 'kind = []\nmodel = "duffing"\n',
+    "table as kind": "kind = {}\n",
+    "list as kind of starts": BASE.replace('kind = "grid"', "kind = [1]"),
+    "list as model": BASE.replace('"duffing"', "[]"),
+    "number as product": BASE.replace("n_exponents = 1", "n_exponents = []"),
+    "5000 digits": BASE.replace("n_keep = 3", f"n_keep = {HUGE}"),
+    "5000 hexadecimal digits": BASE.replace("n_keep = 3", "n_keep = 0x" + "F" * 5000),
+    "5000 digits in a list": BASE.replace("v = 0.0", f"v = {{ values = [{HUGE}] }}"),
+    "5000 digits of a float": BASE.replace("v = 0.0", f"v = {HUGE}.0"),
+    "digits of an overridden value": BASE.replace("damping = 0.1", "damping = 0x" + "F" * 300),
+    "deep lists": "kind = " + "[" * DEEP + "]" * DEEP,
+    "deep tables": "kind = " + "{a = " * DEEP + "1" + "}" * DEEP,
+    "deep key": "a." * DEEP + "b = 1",
+    "deep quoted key": BASE + '"' + "a." * DEEP + 'b" = 1',
+    "rather deep": "kind = " + "[" * 60 + "]" * 60,
+    "endless key": "a" * 100_000 + " = 1",
+    "dates": "kind = 2020-01-01\ntitle = 12:00:00",
+    "no text": "kind = \x00",
+    "empty": "",
+    "escape in a title": BASE.replace('"small"', r'"\u001b[31mred\u001b[0m"'),
+    "lines in a title": BASE.replace('"small"', '"""a\nb"""'),
+    "escape in a key": BASE + '"\\u001b[2J" = 1',
+    "infinite": BASE.replace("v = 0.0", "v = inf"),
+    "beyond floats": BASE.replace("v = 0.0", "v = 1e999"),
+}
+
+
+@pytest.fixture
+def refused(monkeypatch, capsys, tmp_path):
+    """Give a specification to the command, which must refuse it; returns what it says."""
+    import sys
+
+    from pipeline.cli.main import main
+
+    spec = tmp_path / "spec.toml"
+
+    def call(text, *options):
+        spec.write_bytes(text if isinstance(text, bytes) else text.encode("utf-8", "surrogatepass"))
+        monkeypatch.chdir(tmp_path)
+        for words in (["run", "spec.toml", "--out", "run"], ["run", "spec.toml", "--dry-run"]):
+            monkeypatch.setattr(sys, "argv", ["magpend", *words, *options])
+            with pytest.raises(SystemExit) as end:
+                main()
+            said = capsys.readouterr()
+            assert end.value.code == 2, said.err
+            assert said.err.startswith("magpend: ")
+            assert "Traceback" not in said.err
+            assert len(said.err) < 20_000
+            assert all(c.isprintable() or c == "\n" for c in said.err)
+        assert sorted(p.name for p in tmp_path.iterdir()) == ["spec.toml"]
+        return said.err
+
+    return call
+
+
+@pytest.mark.parametrize("text", ODD.values(), ids=ODD.keys())
+def test_run__odd_specifications_are_refused_in_words(refused, text):
+    refused(text)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (ODD["list as kind of starts"], ["initial_conditions.kind = [1]", "'grid'"]),
+        (ODD["5000 digits"], ["digits"]),
+        (ODD["5000 hexadecimal digits"], ["integration.n_keep", "20000 bits"]),
+        (ODD["deep lists"], ["nested too deep"]),
+        (ODD["rather deep"], ["kind", "nested too deep"]),
+        (ODD["escape in a title"], ["title", r"\x1b[31mred", "control characters"]),
+        (ODD["escape in a key"], [r"\x1b[2J: unknown key"]),
+    ],
+)
+def test_run__says_what_is_odd(refused, text, words):
+    said = refused(text)
+    for word in words:
+        assert word in said
+
+
+def test_load_spec__endless_files(tmp_path):
+    path = tmp_path / "spec.toml"
+    with open(path, "wb") as file:
+        file.truncate(40_000_000)
+    with pytest.raises(SpecError, match="has more than 1 MB, the most that a specification has"):
+        load_spec(path)
+    with pytest.raises(SpecError, match="has more than 1 MB"):
+        load_spec("/dev/zero")
+
+
+def test_load_spec__endless_arrays(tmp_path):
+    path = tmp_path / "spec.toml"
+    path.write_text(f"[axes]\namplitude = [{'0,' * 100_001}]")
+    with pytest.raises(SpecError, match=r"axes\.amplitude: has 100001 elements; 100000 are the most"):
+        load_spec(path)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "\n".join(f"{'x' * 150}{i} = 1" for i in range(500)),
+        f"kind = '{'é' * 50_000}'",
+        'kind = "sweep"\n[model]\nname = "a"\n[model.equations]\n'
+        + "\n".join(f"x{i} = '{'(' * 50}'" for i in range(60)),
+    ],
+    ids=["many keys", "a long word", "many problems"],
+)
+def test_run__a_refusal_is_short(main, tmp_path, text):
+    (tmp_path / "spec.toml").write_text(text, "utf-8")
+    code, _, said = main("run", "spec.toml", "--dry-run")
+    assert code == 2
+    assert 20 < len(said.encode()) <= 2000
+
+
+# ---- mutations --------------------------------------------------------------------------------------
+
+VALUES = st.one_of(
+    st.none(),
+    st.booleans(),
+    st.integers(),
+    st.sampled_from([2**63, -(2**70), 10**400, 0, -1]),
+    st.floats(),
+    st.sampled_from([1e308, 1e-308, 5e-324, -0.0, 1e180]),
+    st.text(max_size=8),
+    st.sampled_from(["sweep", "grid", "list", "random", "up", "both", "nan", "duffing", "x"]),
+    st.lists(st.one_of(st.integers(), st.floats(), st.text(max_size=3), st.lists(st.floats(), max_size=2)), max_size=3),
+    st.dictionaries(
+        st.sampled_from(["start", "stop", "num", "step", "values", "kind", "a.b", "", "\x1b"]),
+        st.one_of(st.integers(), st.floats(), st.lists(st.floats(), max_size=3)),
+        max_size=4,
+    ),
+)
+KEYS = st.one_of(
+    st.sampled_from(
+        [
+            "kind",
+            "title",
+            "model",
+            "axes",
+            "smoke",
+            "drive",
+            "section",
+            "products",
+            "continuation",
+            "step",
+            "refine",
+            "n",
+            "seed",
+            "points",
+            "x",
+            "x_deg",
+            "frequency_hz",
+            "preset",
+            "stop_when_closed",
+            "lyapunov",
+            "extremes",
+            "path",
+            "file",
+            "of",
+            "values",
+        ]
+    ),
+    st.text(max_size=6),
+)
+
+
+def places(table, at=()):
+    """Paths of all entries of a table."""
+    for key, value in table.items():
+        yield (*at, key)
+        if isinstance(value, dict):
+            yield from places(value, (*at, key))
+
+
+@st.composite
+def mutations(draw):
+    """A specification with some entries replaced, dropped, renamed or added."""
+    data = tomllib.loads(BASE)
+    for _ in range(draw(st.integers(1, 3))):
+        *above, key = draw(st.sampled_from(sorted(places(data))))
+        table = data
+        for part in above:
+            table = table[part]
+        kind = draw(st.sampled_from(["replace", "drop", "rename", "add"]))
+        if kind == "drop":
+            del table[key]
+        elif kind == "rename":
+            table[draw(KEYS)] = table.pop(key)
+        else:
+            table[key if kind == "replace" else draw(KEYS)] = draw(VALUES)
+        if not data:
+            break
+    return data
+
+
+def spelled(value):
+    """Plain data as TOML within a line, valid or not."""
+    from pipeline.specification.toml import toml_key, toml_value
+
+    if isinstance(value, dict):
+        return "{ " + ", ".join(f"{toml_key(k)} = {spelled(v)}" for k, v in value.items()) + " }"
+    if isinstance(value, list):
+        return "[" + ", ".join(map(spelled, value)) + "]"
+    return hex(value) if isinstance(value, int) and abs(value) > 10**300 else toml_value(value)
+
+
+@pytest.mark.parametrize("smoke", [False, True])
+def test_outcome__what_is_mutated_can_be_planned(write_spec, smoke):
+    assert outcome(write_spec(BASE), smoke)
+
+
+def outcome(path, smoke):
+    """Whether a specification can be planned, in its own size or in its small one."""
+    try:
+        make_plan(load_spec(path, smoke=smoke))
+    except SpecError:
+        return False
+    return True
+
+
+FUZZ = settings(
+    max_examples=1000 if LONG else 25, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
+)
+
+
+@FUZZ
+@given(mutations())
+@example({"kind": []})
+@example({"kind": "sweep", "model": "duffing", "initial_conditions": {"kind": []}})
+@example(tomllib.loads(BASE) | {"\t": {"num": 3}})
+@example(tomllib.loads(BASE) | {"smoke": {"initial_conditions.none": 1}})
+def test_run__mutated_tables_are_planned_or_refused(refused, tmp_path, data):
+    text = "\n".join(f"{spelled_key} = {spelled(value)}" for spelled_key, value in _top(data))
+    path = tmp_path / "spec.toml"
+    path.write_bytes(text.encode("utf-8", "surrogatepass"))
+    for smoke, options in ((False, ()), (True, ("--smoke",))):
+        if not outcome(path, smoke):
+            refused(text, *options)
+
+
+def _top(data):
+    from pipeline.specification.toml import toml_key
+
+    return [(toml_key(key), value) for key, value in data.items()]
+
+
+@FUZZ
+@given(st.data())
+def test_run__mutated_bytes_are_planned_or_refused(refused, tmp_path, data):
+    content = bytearray(BASE.encode())
+    for _ in range(data.draw(st.integers(1, 4))):
+        at = data.draw(st.integers(0, len(content) - 1))
+        kind = data.draw(st.sampled_from(["byte", "cut", "double", "swap"]))
+        end = at + data.draw(st.integers(1, 40))
+        if kind == "byte":
+            content[at] = data.draw(st.integers(0, 255))
+        elif kind == "cut":
+            del content[at:end]
+        elif kind == "double":
+            content[at:at] = content[at:end]
+        else:
+            content[at:end] = content[at:end][::-1]
+        if not content:
+            break
+    path = tmp_path / "spec.toml"
+    path.write_bytes(content)
+    for smoke, options in ((False, ()), (True, ("--smoke",))):
+        if not outcome(path, smoke):
+            refused(bytes(content), *options)
+
+
+# ---- sizes ------------------------------------------------------------------------------------------
+
+
+def seconds_of(call):
+    started = time.process_time()
+    call()
+    return time.process_time() - started
+
+
+def test_range__ten_million_points_take_seconds():
+    for axis in (
+        {"start": 2.0, "stop": 2.8, "num": 10_000_000},
+        {"start": 0.1234567890123456, "stop": 1.9876543210987654, "num": 3_000_000},
+    ):
+        assert seconds_of(Range(**axis).array) < 60
+
+
+@given(st.floats(-1e6, 1e6), st.floats(1e-6, 1e6), st.integers(2, 40), st.booleans(), st.integers(0, 12))
+def test_range__values_are_the_nearest_floats(start, span, num, by_step, digits):
+    from fractions import Fraction
+
+    start, stop = round(start, digits), round(start, digits) + span
+    if not stop > start:
+        return
+    axis = Range(start=start, stop=stop, num=num)
+    low, high = Fraction(repr(start)), Fraction(repr(stop))
+    exact = [low + i * (high - low) / (num - 1) for i in range(num)]
+    if by_step:
+        step = span / num
+        axis = Range(start=start, stop=stop, step=step)
+        exact = [low + i * Fraction(repr(step)) for i in range((high - low) // Fraction(repr(step)) + 1)]
+    assert axis.array().tolist() == [float(x) for x in exact]
+
+
+def test_parse_spec__many_axes_take_a_moment():
+    names = ["T1", "T2", "c", "mu", "mu0", "c0", "q", "alpha1", "alpha2", "beta1", "beta2", "g"]
+    data = {
+        "kind": "sweep",
+        "parameters": {"frequency_hz": 2.0},
+        "axes": {name: {"values": [0.1, 0.2]} for name in names},
+        "initial_conditions": {"kind": "list", "points": [[0.0, 0.0]]},
+    }
+    assert seconds_of(lambda: parse_spec(data)) < 2
+
+
+def test_parse_spec__corners_of_related_parameters_are_looked_at():
+    """The dipoles' relation holds on the sides of the box, and not in one of its corners."""
+    from magpend_core import load_model
+
+    p = load_model("pendulum-dipole").load()
+    room = p["h"] - p["l1"] - p["l2"]
+    data = {
+        "kind": "sweep",
+        "model": "pendulum-dipole",
+        "parameters": {"frequency_hz": 2.0},
+        "axes": {name: {"values": [p[name], p[name] + 0.6 * room]} for name in ("l1", "l2")}
+        | {"q": {"values": [1.0, 2.0]}},
+        "initial_conditions": {"kind": "list", "points": [[0.0, 0.0]]},
+    }
+    with pytest.raises(SpecError, match="magnets can meet"):
+        parse_spec(data)
+    del data["axes"]["l2"]
+    parse_spec(data)
+
+
+def test_shown__is_short_whatever_is_given():
+    endless = []
+    endless.append(endless)
+    for value in ("x" * 1000, 10**5000, endless, np.zeros(10_000), {"a": 10**5000}):
+        assert len(shown(value)) <= 130
+    assert shown("no") == "'no'"

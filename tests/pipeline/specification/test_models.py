@@ -1,0 +1,272 @@
+"""Models in specifications: text, files, Python objects, and what a run keeps of them."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tomllib
+
+import pytest
+
+from magpend_core.models import import_model, load_model
+from magpend_core.models.imported import DescribedModel, origin
+from magpend_core.models.parameters import ParameterError
+from pipeline.runs.zoom import Changes, Source, write_zoom
+from pipeline.specification.models import find_model, model_toml, read_model_file
+from pipeline.specification.parsing import kept_spec, load_spec, parse_spec
+from pipeline.specification.problems import SpecError
+
+
+def problems_of(call, *arguments):
+    with pytest.raises(SpecError) as caught:
+        call(*arguments)
+    return caught.value.problems
+
+
+@pytest.fixture
+def module(own, tmp_path, request):
+    """A module beside the specification, under a name that no other test has imported."""
+    name = f"own_{abs(hash(request.node.nodeid)) % 10**8}"
+    trace = own.write_module(tmp_path, name)
+    yield name, trace
+    sys.modules.pop(name, None)
+    sys.path[:] = [p for p in sys.path if p != str(tmp_path)]
+
+
+def test_parse_spec__keeps_the_text_and_reads_it_back(own):
+    spec = parse_spec(tomllib.loads(own.spec(own.text)))
+    assert spec.model.name == "duffing5"
+    assert spec.as_dict()["model"]["equations"] == {"x": "v", "v": "drive - d*v - x**3"}
+    kept = json.loads(json.dumps(spec.as_dict()))
+    assert kept_spec(kept) == spec
+    assert kept_spec(kept).model is spec.model  # parameters compare their models by identity
+
+
+def test_load_spec__file_of_a_model_takes_the_place_of_its_name(own, tmp_path, write_spec):
+    (tmp_path / "shared.toml").write_text(own.text.replace("[model]", "").replace('name = "duffing5"', ""))
+    path = write_spec(own.spec('model = "shared.toml"'))
+    spec = load_spec(path)
+    assert spec.model.name == "shared"
+    (tmp_path / "shared.toml").unlink()
+    assert kept_spec(spec.as_dict()) == spec
+
+
+def test_read_model_file__below_its_head_or_at_the_top(own, tmp_path):
+    (tmp_path / "a.toml").write_text(own.text)
+    (tmp_path / "b.toml").write_text(own.text.replace("[model]", ""))
+    assert read_model_file(tmp_path / "a.toml") == read_model_file(tmp_path / "b.toml")
+    (tmp_path / "c.toml").write_text(own.spec(own.text))  # a whole specification
+    assert read_model_file(tmp_path / "c.toml") == read_model_file(tmp_path / "a.toml")
+
+
+def test_parse_spec__errors_of_the_text_come_with_the_others(own):
+    text = own.spec(own.text).replace("- d*v", "- dd*v").replace("rtol = 1e-7", "rtol = -1.0")
+    found = problems_of(parse_spec, tomllib.loads(text))
+    assert any(p.startswith("model.equations.v: ") and "did you mean d" in p for p in found)
+    assert any(p.startswith("integration.rtol = -1.0") for p in found)
+
+
+def test_load_spec__errors_of_a_file_name_it(own, tmp_path, write_spec):
+    (tmp_path / "shared.toml").write_text(own.text.replace("- d*v", "- dd*v"))
+    found = problems_of(load_spec, write_spec(own.spec('model = "shared.toml"', "[execute]")))
+    assert any(p.startswith("shared.toml: equations.v: ") for p in found)
+    assert any(p.startswith("execute: unknown key") for p in found)
+    found = problems_of(load_spec, write_spec(own.spec('model = "absent.toml"')))
+    assert [p for p in found if p.startswith("model: ") and "absent.toml: cannot be read" in p]
+
+
+def test_load_spec__smoke_replaces_keys_of_a_text_and_of_a_file(own, tmp_path, write_spec):
+    smoke = '[smoke]\n"model.parameters.d" = 0.5\n'
+    assert load_spec(write_spec(own.spec(own.text, smoke)), smoke=True).values["d"] == 0.5
+    (tmp_path / "shared.toml").write_text(own.text)
+    path = write_spec(own.spec('model = "shared.toml"', smoke))
+    assert load_spec(path, smoke=True).values["d"] == 0.5
+    assert load_spec(path).values["d"] == 0.08
+
+
+@pytest.mark.parametrize("model", [3, ["duffing"], True])
+def test_find_model__says_what_a_model_can_be(model):
+    (found,) = problems_of(find_model, model)
+    assert all(word in found for word in (f"model = {model!r}", "FILE.toml", "package.module:NAME", "table"))
+
+
+def test_find_model__unknown_name():
+    (found,) = problems_of(find_model, "dufing")
+    assert found.startswith("model: ")
+    assert "did you mean duffing" in found
+
+
+@pytest.mark.parametrize("reference", ["belt.toml", "os:system", {"python": "os:system"}, "no-such-model"])
+def test_kept_spec__reads_no_file_and_imports_nothing(own, tmp_path, monkeypatch, reference):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "belt.toml").write_text(own.text)
+    data = {**tomllib.loads(own.spec("")), "model": reference}
+    assert problems_of(kept_spec, data)
+
+
+def test_kept_spec__reads_no_file_of_a_preset(own, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "p.toml").write_text(
+        'model = "duffing5"\nbase = "default"\n[values]\nd = 0.3\n[provenance]\nd = "mine"\n'
+    )
+    text = own.spec(own.text).replace("[parameters]\n", '[parameters]\npreset = "p.toml"\n', 1)
+    spec = parse_spec(tomllib.loads(text), tmp_path)
+    assert spec.values["d"] == 0.3
+    assert kept_spec(spec.as_dict()) == spec
+    (found,) = problems_of(kept_spec, tomllib.loads(text))
+    assert found.startswith("parameters.preset = 'p.toml'")
+
+
+def test_parse_spec__imports_the_object_that_a_person_names(own, tmp_path, module):
+    name, trace = module
+    spec = parse_spec(tomllib.loads(own.spec(f'model = "{name}:MINE"')), tmp_path)
+    assert trace.read_text() == "x"
+    assert spec.model.system.name == "mine"
+    assert origin(spec.model) == (f"{name}:MINE", str(tmp_path))
+    plain = json.loads(json.dumps(spec.as_dict()))
+    assert plain["model"]["python"] == f"{name}:MINE"
+    assert kept_spec(plain) == spec
+    assert kept_spec(plain).model is spec.model
+
+
+def test_kept_spec__describes_an_object_without_importing_it(own, tmp_path, module, monkeypatch):
+    from magpend_core.models import imported
+
+    name, trace = module
+    spec = parse_spec(tomllib.loads(own.spec(f'model = "{name}:MINE"')), tmp_path)
+    plain = json.loads(json.dumps(spec.as_dict()))
+    trace.unlink()
+    sys.modules.pop(name)
+    monkeypatch.setattr(imported, "_imported", {})
+    model = kept_spec(plain).model
+    assert isinstance(model, DescribedModel)
+    assert not trace.exists()
+    assert name not in sys.modules
+    for field in ("name", "title", "states", "parameters", "presets", "section", "mirror", "digest"):
+        assert getattr(model, field) == getattr(spec.model, field)
+    with pytest.raises(ParameterError, match=f"--import-model {name}:MINE"):
+        _ = model.system
+    assert load_model(model.reference) is model  # so that parameters compare
+
+
+def test_kept_spec__place_of_an_object_is_refused_unread(own, tmp_path, module, monkeypatch):
+    """The module could be imported: it lies on the path."""
+    name, trace = module
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    (found,) = problems_of(kept_spec, tomllib.loads(own.spec(f'model = "{name}:MINE"')))
+    assert f"--import-model {name}:MINE" in found
+    with pytest.raises(ParameterError):
+        load_model(f"{name}:MINE")
+    assert not trace.exists()
+
+
+def test_import_model__digest_is_that_of_the_module(own, tmp_path, module):
+    """What is commented does not count, what is computed does."""
+    name, _ = module
+    digests = []
+    for i, change in enumerate([("", ""), ("def rhs", "# a remark\ndef rhs"), ("- y[0]", "- 2.0 * y[0]")]):
+        folder = tmp_path / str(i)
+        own.write_module(folder, name)
+        path = folder / f"{name}.py"
+        path.write_text(path.read_text().replace(*change) if change[0] else path.read_text())
+        code = f"from magpend_core.models import import_model as i; print(i('{name}:MINE', '.').digest)"
+        found = subprocess.run(
+            [sys.executable, "-c", code],
+            cwd=folder,
+            capture_output=True,
+            text=True,
+            check=True,
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)},
+        )
+        digests.append(found.stdout.strip())
+    assert digests[0] == digests[1] != digests[2]
+
+
+def test_described_model__object_that_was_changed_is_not_the_run_s(own, tmp_path, module):
+    name, _ = module
+    spec = parse_spec(tomllib.loads(own.spec(f'model = "{name}:MINE"')), tmp_path)
+    plain = json.loads(json.dumps(spec.as_dict()))
+    plain["model"]["digest"] = "0123456789abcdef"
+    with pytest.raises(ParameterError, match="restore the code"):
+        _ = kept_spec(plain).model.system
+
+
+@pytest.mark.parametrize(
+    ("path", "words"),
+    [
+        ("no_such_module_here:NAME", "cannot be imported"),
+        ("magpend_core.models:load_model", "must be a Model"),
+        ("magpend_core.models:NO_SUCH", "cannot be imported"),
+    ],
+)
+def test_import_model__says_why(path, words):
+    with pytest.raises(ParameterError, match=words):
+        import_model(path)
+    assert problems_of(find_model, path)[0].startswith("model: ")
+
+
+@pytest.mark.parametrize(
+    ("change", "place"),
+    [
+        ({"python": "a b"}, "python"),
+        ({"states": {}}, "states"),
+        ({"states": {"x": {"unit": 3, "meaning": "place"}}}, "states.x.unit"),
+        ({"states": {"x; import os": {"unit": "m", "meaning": "place"}}}, "states"),
+        ({"states": {"x": {"unit": "m", "meaning": "place", "scale": "1"}}}, "states.x.scale"),
+        ({"parameters": {"d": {"unit": "m", "meaning": "place", "bound": "any"}}}, "parameters.d.bound"),
+        ({"parameters": {"d": "m"}}, "parameters.d"),
+        ({"presets": {"p": {"values": {"d": "1"}}}}, "presets.p.values"),
+        ({"mirror": {"signs": [1], "half_period": True}}, "mirror"),
+        ({"title": 3}, "title"),
+        ({"sources": ["/etc/passwd"]}, "sources"),
+    ],
+)
+def test_described_model__checks_what_a_stranger_wrote(own, tmp_path, module, change, place):
+    name, _ = module
+    spec = parse_spec(tomllib.loads(own.spec(f'model = "{name}:MINE"')), tmp_path)
+    found = problems_of(find_model, {**spec.as_dict()["model"], **change})
+    assert any(place in p for p in found)
+
+
+def test_model_toml__reads_back(own):
+    table = tomllib.loads(own.text)["model"]
+    reference = load_model(table).reference
+    assert tomllib.loads(model_toml(reference))["model"] == reference
+    assert tomllib.loads(model_toml("duffing"))["model"] == "duffing"
+    assert tomllib.loads(model_toml({"python": "a.b:C", "name": "x"}))["model"] == "a.b:C"
+
+
+def test_find_model__specification_that_names_its_model(own, tmp_path):
+    (tmp_path / "shared.toml").write_text(own.text)
+    (tmp_path / "spec.toml").write_text(own.spec('model = "shared.toml"'))
+    (tmp_path / "named.toml").write_text(own.spec('model = "duffing"'))
+    assert find_model("spec.toml", tmp_path).name == "duffing5"
+    assert find_model("named.toml", tmp_path) is load_model("duffing")
+    (tmp_path / "circle.toml").write_text('model = "circle.toml"')
+    assert problems_of(find_model, "circle.toml", tmp_path)
+
+
+def test_write_zoom__names_the_object_and_says_that_it_is_imported(own, tmp_path, module):
+    name, _ = module
+    spec = parse_spec(tomllib.loads(own.spec(f'model = "{name}:MINE"')), tmp_path)
+    notes = write_zoom(Source(spec, "a run"), Changes(ranges={"x": (0.0, 0.5)}), tmp_path / "z.toml")
+    assert any(f"imports the Python object {name}:MINE" in note for note in notes)
+    assert f'model = "{name}:MINE"' in (tmp_path / "z.toml").read_text()
+    assert load_spec(tmp_path / "z.toml").model is spec.model
+
+
+def test_write_zoom__text_goes_with_it(own, tmp_path):
+    spec = parse_spec(tomllib.loads(own.spec(own.text)), tmp_path)
+    assert write_zoom(Source(spec, "a run"), Changes(pins={"A": 0.3}), tmp_path / "z.toml") == []
+    again = load_spec(tmp_path / "z.toml")
+    assert again.model is spec.model
+    assert again.values["A"] == 0.3
+
+
+def test_load_spec__file_of_a_model_is_no_specification(own, tmp_path):
+    (tmp_path / "shared.toml").write_text(own.text.replace("[model]", ""))
+    (found,) = problems_of(load_spec, tmp_path / "shared.toml")
+    assert "magpend model show" in found

@@ -1,0 +1,121 @@
+"""A specification whose preset is a file: read once, from where the specification is, and kept whole."""
+
+from __future__ import annotations
+
+import pytest
+
+from magpend_core import load_model
+from magpend_core.models.presets import write_preset
+from pipeline.layout.identity import digest_of
+from pipeline.layout.plan import make_plan
+from pipeline.runs.run import identity_here, run
+from pipeline.runs.zoom import Changes, to_toml, zoom
+from pipeline.specification.parsing import load_spec, parse_spec
+from pipeline.specification.problems import SpecError
+from pipeline.store.run import Run
+
+FIT, SOURCES = {"c1": 0.068, "alpha1": 1.75}, {"c1": "fit of curve 3", "alpha1": "fit"}
+HEAD = "model = 'pendulum'\nbase = 'wojna2018'"
+
+
+def write(folder, preset="rig.toml", **fit):
+    write_preset(folder / "rig.toml", "pendulum", FIT | fit, SOURCES, "test rig", base="wojna2018")
+    text = f"""
+    kind = "sweep"
+    [parameters]
+    preset = "{preset}"
+    frequency_hz = 2.2
+    overrides = {{ q = 1.5 }}
+    [initial_conditions]
+    kind = "list"
+    points = [[0.1, 0.2, 0.0, 0.0]]
+    [integration]
+    n_transient = 1
+    n_keep = 2
+    """
+    path = folder / "spec.toml"
+    path.write_text(text)
+    return path
+
+
+def digest(spec):
+    return digest_of(identity_here(spec, make_plan(spec)))
+
+
+def test_load_spec__reads_the_preset_beside_it_and_keeps_it_whole(tmp_path):
+    path = write(tmp_path)
+    spec = load_spec(path)
+    (tmp_path / "rig.toml").unlink()
+    assert spec.values == load_model("pendulum").load("wojna2018", **FIT, q=1.5)
+    again = parse_spec(spec.as_dict())
+    assert again == spec
+    assert again.parameters.chosen.provenance["c1"] == "fit of curve 3"
+
+
+def test_load_spec__smoke_may_choose_another_preset(tmp_path):
+    path = write(tmp_path, preset="wojna2018")
+    path.write_text(path.read_text() + '\n[smoke]\n"parameters.preset" = "rig.toml"')
+    assert load_spec(path).values["c1"] == 0.05338
+    assert load_spec(path, smoke=True).values["c1"] == FIT["c1"]
+
+
+def test_identity__covers_values_and_provenance_of_the_file(tmp_path):
+    first = digest(load_spec(write(tmp_path)))
+    assert digest(load_spec(write(tmp_path))) == first
+    assert digest(load_spec(write(tmp_path, c1=0.069))) != first
+    path = write(tmp_path)
+    rig = tmp_path / "rig.toml"
+    rig.write_text(rig.read_text().replace("fit of curve 3", "fit of curve 4"))
+    assert digest(load_spec(path)) != first
+
+
+def test_zoom__carries_the_preset_along(tmp_path):
+    spec = load_spec(write(tmp_path))
+    (tmp_path / "rig.toml").unlink()
+    narrower, _ = zoom(spec, Changes(ranges={"q": (1.5, 1.6)}, num=3))
+    assert narrower.values["c1"] == FIT["c1"]
+    assert "fit of curve 3" in to_toml(narrower)
+
+
+def test_run__explains_itself_when_the_file_is_gone(tmp_path):
+    path = write(tmp_path)
+    run(path, tmp_path / "run", workers=0, scheduler="none", echo=lambda line: None)
+    (tmp_path / "rig.toml").unlink()
+    path.unlink()
+    opened = Run.open(tmp_path / "run")
+    assert opened.parameters["alpha1"] == FIT["alpha1"]
+    assert opened.spec.parameters.chosen.provenance["alpha1"] == "fit"
+    assert opened.info.identity["spec"]["parameters"]["preset"]["title"] == "test rig"
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (None, "cannot be read"),
+        ("model = 'duffing'", "is of model 'duffing'"),
+        ("model = 'pendulum'\nbase = 'wojna2018'\n[values]\nc1 = 'x'\n[provenance]\nc1 = 'y'", "must be a number"),
+        ("model = 'pendulum'\nbase = 'wojna2018'\n[values]\nc1 = -1\n[provenance]\nc1 = 'y'", "greater than 0"),
+    ],
+)
+def test_load_spec__says_what_is_wrong_with_the_file_beside_all_else(tmp_path, content, words):
+    path = write(tmp_path)
+    path.write_text(path.read_text().replace("n_keep = 2", "n_keep = 0"))
+    rig = tmp_path / "rig.toml"
+    rig.unlink() if content is None else rig.write_text(content)
+    with pytest.raises(SpecError) as caught:
+        load_spec(path)
+    own = [p for p in caught.value.problems if p.startswith("parameters.preset")]
+    assert len(own) == 1
+    assert words in own[0]
+    assert any(p.startswith("integration.n_keep") for p in caught.value.problems)
+
+
+def test_parse_spec__a_preset_is_a_name_or_a_table():
+    with pytest.raises(SpecError, match=r"parameters.preset = 3: must be a text in quotes"):
+        parse_spec(
+            {
+                "kind": "sweep",
+                "parameters": {"preset": 3, "frequency_hz": 2.0},
+                "initial_conditions": {"kind": "list", "points": [[0.0] * 4]},
+            }
+        )

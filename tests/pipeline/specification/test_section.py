@@ -1,0 +1,118 @@
+"""Sections by crossing in a specification: what is read, and what is refused."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+
+import numpy as np
+import pytest
+
+from pipeline.layout.cells import CellMap, coordinates
+from pipeline.layout.identity import identity_of
+from pipeline.layout.plan import make_plan
+from pipeline.specification.parsing import parse_spec
+from pipeline.specification.problems import SpecError
+from tests.core.flows import VAN_DER_POL
+
+SPEC = {
+    "kind": "sweep",
+    "model": VAN_DER_POL,
+    "section": {"of": "v", "value": 0.5, "direction": "down", "longest": 50.0},
+    "axes": {"mu": {"values": [0.5, 1.0]}},
+    "initial_conditions": {"kind": "list", "points": [[1.0, 0.0], [2.0, 0.0]]},
+}
+
+
+def problems(**changes):
+    data = {k: v for k, v in {**copy.deepcopy(SPEC), **changes}.items() if v is not None}
+    with pytest.raises(SpecError) as error:
+        parse_spec(data)
+    return error.value.problems
+
+
+def test_parse_spec__section():
+    spec = parse_spec(SPEC)
+    assert spec.model.crossing.sentence == "v = 0.5 going down"
+    assert spec.values.as_dict() == {"mu": 1.0, "section_value": 0.5}
+    assert spec.frequency_hz == 1.0 / 50.0
+    again = parse_spec(spec.as_dict())
+    assert again == spec
+    assert again.model is spec.model
+    assert pickle.loads(pickle.dumps(spec.values)) == spec.values
+
+
+def test_parse_spec__section_default():
+    spec = parse_spec({**SPEC, "section": {"of": "x"}})
+    assert spec.section.model_dump() == {"of": "x", "value": 0.0, "direction": "up", "longest": 100.0}
+
+
+def test_cells__no_frequency():
+    """The cube has no drive, the engine gets the longest wait and the level."""
+    spec = parse_spec(SPEC)
+    names = [c.name for c in coordinates(spec)]
+    assert "frequency" not in names
+    plan = make_plan(spec)
+    assert plan.dims == ("mu", "initial_condition")
+    assert {"return_time", "rest_state"} <= {v.name for v in plan.variables}
+    assert "returns" in next(v.long_name for v in plan.variables if v.name == "n_periods")
+    inputs = CellMap(spec).inputs((slice(0, 2), slice(0, 2)))
+    np.testing.assert_array_equal(inputs.frequency_hz, 0.02)
+    np.testing.assert_array_equal(inputs.parameters[:, 0], [[0.5, 0.5], [0.5, 0.5], [1.0, 0.5], [1.0, 0.5]])
+
+
+@pytest.mark.parametrize(
+    "change", [{"of": "x"}, {"value": 0.4}, {"direction": "up"}, {"longest": 40.0}], ids=lambda c: next(iter(c))
+)
+def test_identity__every_key_of_the_section(change):
+    spec = parse_spec(SPEC)
+    other = parse_spec({**SPEC, "section": {**SPEC["section"], **change}})
+    assert identity_of(spec, make_plan(spec), "0") != identity_of(other, make_plan(other), "0")
+
+
+def test_parse_spec__swept_level():
+    spec = parse_spec({**SPEC, "axes": {"section_value": {"values": [-0.5, 0.5]}}})
+    inputs = CellMap(spec).inputs((slice(0, 2), slice(0, 1)))
+    np.testing.assert_array_equal(inputs.parameters[:, 0, 1], [-0.5, 0.5])
+
+
+def test_parse_spec__neither_section_nor_frequency():
+    (text,) = problems(section=None)
+    assert text.startswith("section: missing; van_der_pol has no drive. Add [section]")
+    assert "or parameters.frequency_hz" in text
+
+
+def test_parse_spec__strobed_flow():
+    data = {k: v for k, v in SPEC.items() if k != "section"} | {"parameters": {"frequency_hz": 0.15}}
+    spec = parse_spec(data)
+    assert spec.section is None
+    assert "frequency" in [c.name for c in coordinates(spec)]
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({"section": {"of": "w"}}, "section.of = 'w': is not a state of van_der_pol; known states: x, v."),
+        ({"section": {"of": "x", "direction": "left"}}, "section.direction = 'left': must be 'up' or 'down'."),
+        ({"section": {"of": "x", "longest": 0.0}}, "section.longest = 0.0: must be greater than 0.0."),
+        ({"section": {"value": 0.0}}, "section.of: missing"),
+        ({"section": 3}, "section = 3: must be a table; write [section]."),
+        (
+            {"parameters": {"frequency_hz": 1.0}},
+            "parameters.frequency_hz: a section by crossing needs no frequency; drop one of the two.",
+        ),
+        (
+            {"axes": {"frequency_hz": {"values": [1.0]}}},
+            "axes.frequency_hz: a section by crossing needs no frequency; drop one of the two.",
+        ),
+    ],
+)
+def test_parse_spec__refused(changes, text):
+    found = problems(**changes)
+    assert any(p.startswith(text) for p in found), found
+
+
+def test_parse_spec__forced_model():
+    data = {"model": "duffing", "axes": {"amplitude": {"values": [0.3]}}}
+    found = problems(**data)
+    assert any(p.startswith("section: duffing is forced") for p in found), found

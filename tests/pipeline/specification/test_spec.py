@@ -1,0 +1,192 @@
+"""What a specification may say, and what is said about a bad one."""
+
+from __future__ import annotations
+
+import math
+import tomllib
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.specification.parsing import Range, load_spec, parse_spec
+from pipeline.specification.problems import SpecError
+
+
+def problems_of(text: str) -> list[str]:
+    with pytest.raises(SpecError) as caught:
+        parse_spec(tomllib.loads(text))
+    return caught.value.problems
+
+
+def test_parse_spec__reads_back_what_as_dict_says(sweep_text, walk_text):
+    for text in (sweep_text, walk_text):
+        spec = parse_spec(tomllib.loads(text))
+        assert parse_spec(spec.as_dict()) == spec
+
+
+def test_parse_spec__all_errors_at_once():
+    problems = problems_of(
+        """
+        kind = "continuatio"
+        titel = "x"
+        [parameters]
+        overrides = { qq = 1.5, m1 = -1.0 }
+        frequncy_hz = 2.0
+        [axes]
+        q = { start = 2, stop = 3, num = 0, stp = 3 }
+        duty_cycle = { start = 0.5, stop = 1.5, num = 3 }
+        J9 = { values = [1.0] }
+        eps = { values = [3.0, "a"] }
+        [initial_conditions]
+        kind = "grid"
+        psi1_deg = { start = 1 }
+        psi2 = nan
+        psi1_dott = 0
+        [continuation]
+        direction = "upp"
+        path = "frequency_hz"
+        [integration]
+        rtol = 0.0
+        n_keep = 1.5
+        stop_when_closed = 1
+        [execution]
+        trajectories_per_task = 0
+        """
+    )
+    expected = [
+        ("kind = 'continuatio'", "Did you mean 'continuation'"),
+        ("titel", "did you mean title"),
+        ("parameters.overrides: 'qq'", "did you mean q"),
+        ("parameters.overrides: m1 = -1.0", "greater than 0"),
+        ("parameters.frequncy_hz", "did you mean frequency_hz"),
+        ("axes.q.num = 0", "at least 2"),
+        ("axes.q.stp", "did you mean st"),
+        ("axes.duty_cycle: duty_cycle = 1.5", "between 0 and 1"),
+        ("axes.J9", "did you mean J"),
+        ("axes.eps.values[1] = 'a'", "must be a number"),
+        ("initial_conditions.psi1_deg", "give start, stop and num"),
+        ("initial_conditions.psi2 = nan", "finite"),
+        ("initial_conditions.psi1_dott", "did you mean psi1_dot"),
+        ("continuation.direction = 'upp'", "Did you mean 'up'"),
+        ("integration.rtol = 0.0", "at least 1e-13"),
+        ("integration.n_keep = 1.5", "whole number"),
+        ("integration.stop_when_closed = 1", "true or false"),
+        ("execution.trajectories_per_task = 0", "at least 1"),
+    ]
+    for path, remedy in expected:
+        assert any(p.startswith(path) and remedy in p for p in problems), (path, problems)
+    assert len(problems) == len(expected)
+
+
+@pytest.mark.parametrize(
+    ("change", "path", "remedy"),
+    [
+        (("q = { values", "frequency_hz2 = { values"), "axes.frequency_hz2", "did you mean frequency_hz"),
+        (("[axes]", "[parameters]\nfrequency_hz = 2.0\n[axes]"), "axes.frequency_hz", "keep one"),
+        (("[axes]", "[parameters]\noverrides = { q = 1.0 }\n[axes]"), "axes.q", "keep one"),
+        (("[axes]", "[continuation]\n[axes]"), "continuation", "a sweep has none"),
+        (("start = 2.0, stop = 3.0", "start = 0.0, stop = 3.0"), "axes.frequency_hz", "greater than 0 Hz"),
+        (("start = 2.0, stop = 3.0", "start = 3.0, stop = 2.0"), "axes.frequency_hz", "must be greater than start"),
+        (("[1.5, 1.6]", "[1.6, 1.5]"), "axes.q", "rise strictly"),
+        (("[1.5, 1.6]", "[]"), "axes.q.values", "at least 1"),
+        (('kind = "grid"', 'kind = "gird"'), "initial_conditions.kind", "Did you mean 'grid'"),
+        (('kind = "grid"\n', ""), "initial_conditions.kind", "missing"),
+        (("psi1_dot = 0.1", "psi1_dot = 0.1\npsi1_dot_deg = 2"), "initial_conditions", "keep one"),
+        (("[axes]", "[parameters]\npreset = 'wojna2019'\n[axes]"), "parameters.preset", "wojna2018"),
+        (("n_keep = 3", "n_keep = true"), "integration.n_keep", "whole number"),
+        (("rtol = 1e-6", "rtol = '1e-6'"), "integration.rtol", "a number"),
+        (("[integration]", "[[integration]]"), "integration", "must be a table"),
+    ],
+)
+def test_parse_spec__single_problem(sweep_text, change, path, remedy):
+    assert change[0] in sweep_text
+    problems = problems_of(sweep_text.replace(*change))
+    assert len(problems) == 1
+    assert problems[0].startswith(path)
+    assert remedy in problems[0]
+
+
+def test_parse_spec__frequency_must_be_somewhere(sweep_text):
+    problems = problems_of(sweep_text.replace("frequency_hz = { start = 2.0, stop = 3.0, num = 5 }", ""))
+    assert problems == ["parameters.frequency_hz: missing; set it there, or sweep it as axes.frequency_hz."]
+
+
+def test_parse_spec__path_must_be_an_axis(walk_text):
+    problems = problems_of(walk_text.replace("[continuation]", '[continuation]\npath = "q"'))
+    assert problems[0].startswith("continuation.path = 'q'")
+    assert "frequency_hz" in problems[0]
+
+
+@pytest.mark.parametrize("rows", ["[[0.1]]", "[[0.1, 0.2, 0.3]]", "[]", "[0.1, 0.2]", "[[0.1, nan]]"])
+def test_parse_spec__bad_rows(rows):
+    head = 'kind = "sweep"\n[parameters]\nfrequency_hz = 2\n[initial_conditions]\nkind = "list"'
+    text = f"{head}\npoints = {rows}"
+    assert problems_of(text)[0].startswith("initial_conditions")
+
+
+def test_load_spec__unreadable(tmp_path, write_spec):
+    for path, words in [(tmp_path / "absent.toml", "cannot be read"), (write_spec("kind = \n"), "not valid TOML")]:
+        with pytest.raises(SpecError) as caught:
+            load_spec(path)
+        assert len(caught.value.problems) == 1
+        assert words in str(caught.value)
+    binary = tmp_path / "binary.toml"
+    binary.write_bytes(b"\xff\xfe")
+    with pytest.raises(SpecError, match="UTF-8"):
+        load_spec(binary)
+
+
+@pytest.mark.parametrize("form", ["axes.frequency_hz.num = 2", '"axes.frequency_hz.num" = 2'])
+def test_load_spec__smoke_replaces_leaves(write_spec, sweep_text, form):
+    path = write_spec(f"{sweep_text}\n[smoke]\n{form}\nintegration.n_transient = 0\n")
+    full, small = load_spec(path), load_spec(path, smoke=True)
+    assert len(full.axes["frequency_hz"].array()) == 5
+    assert small.axes["frequency_hz"].array().tolist() == [2.0, 3.0]
+    assert (small.integration.n_transient, small.integration.n_keep) == (0, 3)
+
+
+def test_load_spec__bad_smoke_is_found_in_a_full_run(write_spec, sweep_text):
+    path = write_spec(f"{sweep_text}\n[smoke]\nintegration.n_kep = 0\n")
+    with pytest.raises(SpecError, match=r"with \[smoke\]: integration.n_kep.*n_keep"):
+        load_spec(path)
+
+
+def test_load_spec__smoke_without_table(write_spec, sweep_text):
+    with pytest.raises(SpecError, match="no \\[smoke\\] table"):
+        load_spec(write_spec(sweep_text), smoke=True)
+
+
+def test_range__values_are_the_decimals_a_person_would_write():
+    values = Range(start=2.0, stop=3.0, num=101).array()
+    assert values.tolist() == [float(f"{2 + i / 100:.2f}") for i in range(101)]
+    assert Range(start=0.1, stop=0.7, step=0.1).array().tolist() == [0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7]
+    assert Range(start=0.0, stop=1.0, step=0.3).array().tolist() == [0.0, 0.3, 0.6, 0.9]
+
+
+@given(st.floats(-1e6, 1e6), st.floats(1e-3, 1e6), st.integers(2, 50))
+def test_range__linspace(start, width, num):
+    stop = start + width
+    values = Range(start=start, stop=stop, num=num).array()
+    assert values[0] == start
+    assert values[-1] == stop
+    # linspace rounds each of its two operations
+    assert np.allclose(values, np.linspace(start, stop, num), rtol=1e-14, atol=1e-9)
+    assert (np.diff(values) > 0).all()
+
+
+def test_spec__degrees_convert_once():
+    from pipeline.layout.cells import initial_states
+
+    text = """
+    kind = "sweep"
+    [parameters]
+    frequency_hz = 2
+    [initial_conditions]
+    kind = "list"
+    points_deg = [[90, -45], [180, 0, 360, -180]]
+    """
+    states = initial_states(parse_spec(tomllib.loads(text)).initial_conditions).at(np.arange(2))
+    expected = [[math.pi / 2, -math.pi / 4, 0, 0], [math.pi, 0, 2 * math.pi, -math.pi]]
+    assert np.allclose(states, expected, rtol=1e-15)
