@@ -15,15 +15,19 @@ from dataclasses import dataclass
 import numpy as np
 
 from magpend_core.crossing import LEVEL
+from magpend_core.engine.entry import integrate
+from magpend_core.engine.observers import MAP, MapSettings
 from magpend_core.engine.system import System
 from magpend_core.engine.variational import with_tangents
 from magpend_core.models.pendulum.systems import PENDULUM_FITTED
 from magpend_core.pointwise import rates_packed
-from magpend_core.sections import run_branches
 from magpend_core.validation import check_array, check_frequency, check_states, check_tolerance
 
 RTOL = 1e-12
 """Tolerance of the integrations here: the residual can then go below 1e-10."""
+
+MOST_STEPS = 20_000
+"""Most attempted steps per period."""
 
 TRUST = 0.5
 """Longest Newton step in units of the system's scales; a longer one is shortened to this."""
@@ -50,6 +54,11 @@ class PeriodicOrbits:
         Newton steps taken.
     seconds : ndarray, (n,)
         Period [s]; NaN for rows that did not converge.
+    points : ndarray, (n, longest period, n_states)
+        The orbit's section points in the order of time, `section` first; NaN beyond the period and for rows
+        that did not converge.
+    derivative : ndarray, (n, n_states, n_states)
+        Monodromy matrix at `section`; NaN for rows that did not converge.
     """
 
     section: np.ndarray
@@ -59,6 +68,8 @@ class PeriodicOrbits:
     converged: np.ndarray
     n_iterations: np.ndarray
     seconds: np.ndarray
+    points: np.ndarray
+    derivative: np.ndarray
 
     @property
     def is_stable(self) -> np.ndarray:
@@ -73,7 +84,8 @@ class Returns:
     Attributes
     ----------
     images : ndarray, (n, n_periods, n_states)
-        Sections after 1, 2, ... periods, angles in (-pi, pi]; NaN where the integration failed.
+        Sections after 1, 2, ... periods, angles in (-pi, pi]; NaN where the integration failed, and beyond the
+        periods of the row.
     derivatives : ndarray, (n, n_states, n_states)
         Derivative of the last image by the point, on the section if that is one by crossing: the monodromy
         matrix of a periodic orbit.
@@ -119,33 +131,39 @@ def section_map(
     """
     n, packed, frequency = system.n_states, np.asarray(parameters), np.asarray(frequency_hz)
     rows, most = np.arange(len(points)), int(np.max(n_periods, initial=1))
-    last = np.broadcast_to(n_periods, len(points)) - 1
+    periods = np.broadcast_to(n_periods, len(points))
     starts = on_section(points, packed, system)
     is_finite = np.isfinite(starts).all(axis=1)
-    # tangents in the error control: near a rest the trajectory alone would allow any step, and a corner in
-    # the Jacobian leaves an error in the multipliers that the tolerance does not bound
-    extended = dataclasses.replace(with_tangents(system, n), n_controlled=None)
     identity = np.broadcast_to(np.eye(n).ravel(), (len(starts), n * n))
-    result = run_branches(
-        packed[:, None, :],
-        frequency[:, None],
-        np.concatenate([np.where(is_finite[:, None], starts, 0.0), identity], axis=1),
-        n_transient=0,
+    extended = np.concatenate([np.where(is_finite[:, None], starts, 0.0), identity], axis=1)
+    # the longest first, so that the last of them do not run alone
+    order = np.argsort(-periods, kind="stable")
+    cells = integrate(
+        # tangents in the error control: near a rest the trajectory alone would allow any step, and a corner in
+        # the Jacobian leaves an error in the multipliers that the tolerance does not bound
+        dataclasses.replace(with_tangents(system, n), n_controlled=None),
+        MAP,
+        MapSettings(),
+        parameters=packed[order, None, :],
+        frequency_hz=frequency[order, None],
+        initial_states=extended[order],
         n_keep=most,
+        n_measures=1,
+        measures=periods[order, None, None],
         rtol=rtol,
         atol=rtol,
-        system=extended,
+        max_steps_per_period=MOST_STEPS,
     )
-    states = np.where(is_finite[:, None, None], result.section[:, 0], np.nan)
+    back = np.argsort(order)
+    states = np.where(is_finite[:, None, None], cells.section[back, 0], np.nan)
     images = states[:, :, :n]
     # tangent vector k, the derivative by state k, is a column
-    derivatives = states[rows, last, n:].reshape(len(starts), n, n).transpose(0, 2, 1)
+    derivatives = states[rows, periods - 1, n:].reshape(len(starts), n, n).transpose(0, 2, 1)
     crossed = crossed_state(system)
     if crossed is None:
         return Returns(images, derivatives, np.repeat(1.0 / frequency[:, None], most, axis=1))
-    slopes = rates_packed(system, images[rows, last], packed, frequency)
-    times = np.asarray(result.return_time)[:, 0]
-    return Returns(images, on_section_derivative(derivatives, slopes, crossed), times)
+    slopes = rates_packed(system, images[rows, periods - 1], packed, frequency)
+    return Returns(images, on_section_derivative(derivatives, slopes, crossed), cells.return_times[back, 0])
 
 
 def stroboscopic_map(
@@ -280,7 +298,7 @@ def polish_orbits(
         )
     if len(periods) and (not np.issubdtype(periods.dtype, np.integer) or periods.min() < 1):
         raise ValueError(f"orbit_period = {periods.tolist()} must be whole numbers of 1 or more.")
-    n = system.n_states
+    n, longest = system.n_states, int(periods.max(initial=1))
     found = PeriodicOrbits(
         section=on_section(guesses, packed, system),
         orbit_period=periods.astype(np.int64),
@@ -289,50 +307,52 @@ def polish_orbits(
         converged=np.zeros(len(guesses), dtype=bool),
         n_iterations=np.zeros(len(guesses), dtype=np.int64),
         seconds=np.full(len(guesses), np.nan),
+        points=np.full((len(guesses), longest, n), np.nan),
+        derivative=np.full((len(guesses), n, n), np.nan),
     )
-    for period in np.unique(found.orbit_period):
-        rows = np.flatnonzero(found.orbit_period == period)
-        _newton(found, rows, int(period), packed, frequency, tolerance, max_iterations, rtol, least_period, system)
+    rows = np.arange(len(guesses))
+    while len(rows):
+        ends = section_map(
+            packed[rows], frequency[rows], found.section[rows], found.orbit_period[rows], rtol=rtol, system=system
+        )
+        going = _take(found, rows, ends, tolerance, least_period, system)
+        # a row with a smaller period starts again from its point: no step yet
+        again = going & (found.n_iterations[rows] < 0)
+        stepping = going & ~again & (found.n_iterations[rows] < max_iterations)
+        last = ends.images[np.arange(len(rows)), found.orbit_period[rows] - 1]
+        mismatch = wrap_angles(last - found.section[rows], system)[stepping]
+        steps = _newton_steps(ends.derivatives[stepping], mismatch, system)
+        own = rows[stepping]
+        found.section[own] = wrap_angles(found.section[own] + steps, system)
+        found.n_iterations[rows[again | stepping]] += 1
+        rows = rows[again | stepping]
     return found
 
 
-def _newton(
-    found: PeriodicOrbits,
-    rows: np.ndarray,
-    period: int,
-    packed: np.ndarray,
-    frequency: np.ndarray,
-    tolerance: float,
-    max_iterations: int,
-    rtol: float,
-    least_period: bool,
-    system: System,
-) -> None:
-    """Iterate the orbits of one period in place."""
-    for iteration in range(max_iterations + 1):
-        ends = section_map(packed[rows], frequency[rows], found.section[rows], period, rtol=rtol, system=system)
-        images, derivatives = ends.images, ends.derivatives
-        found.residual[rows] = scaled_distance(images[:, -1], found.section[rows], system)
-        found.n_iterations[rows] = iteration
-        done = found.residual[rows] <= tolerance
-        for row, orbit, derivative, times in zip(
-            rows[done], images[done], derivatives[done], ends.times[done], strict=True
-        ):
-            least = _least_period(orbit, tolerance, system) if least_period else period
-            if least < period:
-                again = np.array([row])
-                _newton(found, again, least, packed, frequency, tolerance, max_iterations, rtol, True, system)
-                continue
-            multipliers = np.linalg.eigvals(derivative)
-            found.orbit_period[row] = period
-            found.multipliers[row] = multipliers[np.argsort(-np.abs(multipliers), kind="stable")]
-            found.converged[row], found.seconds[row] = True, times.sum()
-        going = np.isfinite(found.residual[rows]) & ~done
-        rows, images, derivatives = rows[going], images[going], derivatives[going]
-        if not len(rows) or iteration == max_iterations:
-            return
-        mismatch = wrap_angles(images[:, -1] - found.section[rows], system)
-        found.section[rows] = wrap_angles(found.section[rows] + _newton_steps(derivatives, mismatch, system), system)
+def _take(
+    found: PeriodicOrbits, rows: np.ndarray, ends: Returns, tolerance: float, least_period: bool, system: System
+) -> np.ndarray:
+    """Record the residuals of some rows and the orbits among them that have converged; return which go on.
+
+    A row that closes after a divisor of its period gets this period, and -1 iterations.
+    """
+    last = ends.images[np.arange(len(rows)), found.orbit_period[rows] - 1]
+    residual = found.residual[rows] = scaled_distance(last, found.section[rows], system)
+    going = np.isfinite(residual)
+    for i in np.flatnonzero(residual <= tolerance):
+        row, period = rows[i], int(found.orbit_period[rows[i]])
+        images = ends.images[i, :period]
+        least = _least_period(images, tolerance, system) if least_period else period
+        if least < period:
+            found.orbit_period[row], found.n_iterations[row] = least, -1
+            continue
+        going[i] = False
+        multipliers = np.linalg.eigvals(ends.derivatives[i])
+        found.multipliers[row] = multipliers[np.argsort(-np.abs(multipliers), kind="stable")]
+        found.converged[row], found.seconds[row] = True, ends.times[i, :period].sum()
+        found.points[row, 0], found.points[row, 1:period] = found.section[row], images[:-1]
+        found.derivative[row] = ends.derivatives[i]
+    return np.asarray(going)
 
 
 def _newton_steps(derivatives: np.ndarray, mismatch: np.ndarray, system: System) -> np.ndarray:

@@ -152,6 +152,7 @@ def sample(
     rtol: float = 1e-8,
     atol: float = 1e-8,
     max_steps_per_interval: int = 1_000_000,
+    limits_first_step: bool = True,
     n_lanes: int = N_LANES,
 ) -> Samples:
     """Return the states of many trajectories at the instants of recordings.
@@ -177,6 +178,9 @@ def sample(
         Relative and absolute tolerance of the error control; `rtol` at least 1e-13.
     max_steps_per_interval
         Limit on the attempted steps in one interval of the drive.
+    limits_first_step
+        Whether a first step is at most the spacing of the times. An interval can be as long as a piece, and the
+        first step is a share of the interval; not needed if intervals are drive periods.
     n_lanes
         Trajectories in flight; no number depends on it.
 
@@ -209,6 +213,7 @@ def sample(
         np.concatenate([*grids, np.zeros(0)]),
         _offsets(grids),
         *table,
+        np.array([spacing_of(grid) if limits_first_step else np.inf for grid in grids]),
         np.array(list(columns), np.int64),
         slack_of(rtol, atol),
         np.full((len(which), longest, len(columns)), np.nan),
@@ -222,6 +227,11 @@ def sample(
         lanes = check_count("n_lanes", n_lanes, 1)
         engine.sampler_of(system)(samples, lanes, rtol, atol, attempts)
     return Samples(samples.out, samples.status, samples.n_steps)
+
+
+def spacing_of(grid: np.ndarray) -> float:
+    """Return the mean spacing of times; infinite for a single one."""
+    return float((grid[-1] - grid[0]) / (len(grid) - 1)) if len(grid) > 1 else np.inf
 
 
 def _check_times(number: int, times: np.ndarray) -> np.ndarray:

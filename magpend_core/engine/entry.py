@@ -81,6 +81,7 @@ def integrate(
     step_size: Any = None,
     n_lanes: int = N_LANES,
     quantities: Sequence[str] | None = None,
+    measures: np.ndarray | None = None,
 ) -> Cells:
     """Walk branches through their points under an observer.
 
@@ -100,9 +101,12 @@ def integrate(
     n_keep
         Rows of n_states numbers that the observer may write per cell; NaN before.
     n_measures
-        Numbers that the observer may write per cell; 0 before.
+        Numbers that the observer may write per cell.
     rtol, atol, max_steps_per_period, step_size, n_lanes, quantities
         As for `magpend_core.sections.run_branches`.
+    measures
+        Numbers that the observer finds in its measures at first, shape (branch, point, n_measures); 0 by
+        default.
 
     Returns
     -------
@@ -150,7 +154,7 @@ def integrate(
         final_state=np.full((*per_cell, system.n_states), np.nan),
         next_step=np.full(per_cell, np.nan),
         section=np.full((*per_cell, n_keep, system.n_states), np.nan),
-        measures=np.zeros((*per_cell, n_measures)),
+        measures=np.zeros((*per_cell, n_measures)) if measures is None else np.array(measures, np.float64),
         status=np.zeros(per_cell, np.int64),
         n_periods=np.zeros(per_cell, np.int64),
         n_steps=np.zeros(per_cell, np.int64),

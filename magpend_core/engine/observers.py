@@ -7,7 +7,8 @@ An observer is a pair of functions bound at compile time.
     (-pi, pi]; `turns` counts the full turns of each angle since the branch's start; `memory` is the
     cell's own scratch vector, zero at the start (with a section by crossing it has one entry more, the
     last: the time since the section before [s]); `record` (n_keep, n_states) and `measures` are the
-    cell's outputs. Returns ``PENDING`` to go on, any other status to end the cell.
+    cell's outputs; `measures` holds what the caller put there, or zeros. Returns ``PENDING`` to go on, any
+    other status to end the cell.
 ``memory_size(settings, n_states) -> int``
     Length of `memory`.
 ``n_kept(memory) -> int`` and ``keeps_next(i_period, memory, settings) -> bool``, only where it keeps sections
@@ -242,3 +243,38 @@ def _keeps_next(i_period: int, memory: Any, settings: Settings) -> bool:
 
 RECORD = Observer("record", _record, _memory_size, n_kept=_n_kept, keeps_next=_keeps_next)
 """Keep `n_keep` sections after the transient, see `_record`."""
+
+
+class MapSettings(NamedTuple):
+    """The settings of `MAP`: none, since the number of periods is a cell's own."""
+
+    n_memory: int = 1
+
+
+def _keep_all(
+    section: Any, turns: Any, i_period: int, memory: Any, record: Any, measures: Any, settings: MapSettings
+) -> int:
+    """Keep each section, and end the cell after as many periods as `measures` asks for."""
+    for k in range(N):
+        record[i_period - 1, k] = section[k]
+    memory[0] = float(i_period)
+    return BOUNDED if i_period >= measures[0] else PENDING
+
+
+@inline
+def _map_memory(settings: MapSettings, n_states: int) -> int:
+    return settings.n_memory
+
+
+@inline
+def _n_mapped(memory: Any) -> int:
+    return int(memory[0])
+
+
+@inline
+def _keeps_every(i_period: int, memory: Any, settings: MapSettings) -> bool:
+    return True
+
+
+MAP = Observer("map", _keep_all, _map_memory, n_kept=_n_mapped, keeps_next=_keeps_every)
+"""Keep every section for as many periods as the cell's first measure says: each cell has its own number."""

@@ -59,6 +59,7 @@ class Samples(NamedTuple):
     first_interval: Any  # int64 (piece + 1,)
     changed: Any  # int64 (n_changed,): the parameters that `values` are of
     start: Any  # (piece,) s, of a piece within its first interval
+    first_step: Any  # (piece,) s: bound of the first step
     columns: Any  # int64: the states that are written
     slack: float
     out: Any  # (trajectory, longest, n_columns)
@@ -131,12 +132,8 @@ def begin_trajectory(samples: Samples, seats: Seats, lane: int, number: int, scr
     w[base + ROWS.fresh + column] = 1.0
     w[base + ROWS.after_rejection + column] = 0.0
     w[base + ROWS.event + column] = NOTHING
-    w[base + ROWS.wish + column] = FIRST_STEP * w[base + ROWS.period + column]
-    # an interval can be as long as a piece: the first step must not depend on that
-    first, end = samples.first_time[piece], samples.first_time[piece + 1]
-    spacing = (samples.times[end - 1] - samples.times[first]) / max(end - first - 1, 1)
-    if spacing > 0.0:
-        w[base + ROWS.wish + column] = min(w[base + ROWS.wish + column], spacing)
+    cautious = FIRST_STEP * w[base + ROWS.period + column]
+    w[base + ROWS.wish + column] = min(cautious, samples.first_step[piece])
 
 
 def remember(samples: Samples, w: Any, before: Any, clock: Any, group: int) -> None:

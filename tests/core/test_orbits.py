@@ -13,7 +13,7 @@ from magpend_core import load_preset, polish_orbits, run_branches
 from magpend_core.engine.variational import with_tangents
 from magpend_core.models.duffing.system import DUFFING
 from magpend_core.models.pendulum.systems import PENDULUM_FITTED
-from magpend_core.orbits import scaled_distance, stroboscopic_map, wrap_angles
+from magpend_core.orbits import scaled_distance, section_map, stroboscopic_map, wrap_angles
 
 # made by Newton's method on the stroboscopic map at rtol 1e-12 with other integrators: points agree
 # among them to 3e-11, multipliers are good to 1e-6
@@ -91,6 +91,36 @@ def test_stroboscopic_map__derivatives(packed, reference):
     differences = (plain[:4] - plain[4:]).T / (2.0 * step)
     # integration error over the step, and the step's square
     assert np.abs(derivatives[0] - differences).max() < 1e-4 * np.abs(differences).max()
+
+
+def test_section_map__a_number_of_periods_for_each_row(packed, reference):
+    """Rows of one call have the bits that each has alone, and nothing beyond their own periods."""
+    points, frequency, _ = reference
+    periods = np.array([1, 3, 2])
+    found = section_map(packed[:3], frequency[:3], points[:3] + 0.01, periods, rtol=1e-9)
+    for row, n in enumerate(periods):
+        one = slice(row, row + 1)
+        alone = section_map(packed[one], frequency[one], points[one] + 0.01, int(n), rtol=1e-9)
+        assert (found.images[row, :n] == alone.images[0]).all()
+        assert np.isnan(found.images[row, n:]).all()
+        assert (found.derivatives[row] == alone.derivatives[0]).all()
+
+
+def test_polish_orbits__points_and_derivative(packed, reference):
+    """Orbits of several periods in one call, one of them from a multiple of its period."""
+    points, frequency, _ = reference
+    settled = run_branches(
+        packed[:1, None], [[2.48]], [[0.05, 0.1, 0.0, 0.0]], n_transient=600, n_keep=1, rtol=1e-9, atol=1e-9
+    )
+    guesses, drives = np.vstack([settled.section[0, 0], points[:2]]), np.array([2.48, *frequency[:2]])
+    found = polish_orbits(packed[:1].repeat(3, 0), drives, guesses, np.array([2, 1, 3]))
+    assert found.orbit_period.tolist() == [2, 1, 1]
+    for row, n in enumerate(found.orbit_period):
+        one = slice(row, row + 1)
+        images, derivatives = stroboscopic_map(packed[:1], drives[one], found.section[one], int(n))
+        assert scaled_distance(found.points[row, :n], np.vstack([found.section[one], images[0, :-1]])).max() < 1e-9
+        assert np.isnan(found.points[row, n:]).all()
+        assert np.abs(found.derivative[row] - derivatives[0]).max() < 1e-6
 
 
 def test_with_tangents__trajectory_unchanged(packed):

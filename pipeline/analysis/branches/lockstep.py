@@ -13,7 +13,6 @@ from typing import TypeVar
 
 import numpy as np
 
-from magpend_core.engine.simd import WIDTH
 from magpend_core.engine.system import System
 from magpend_core.orbits import section_map
 from pipeline.analysis.branches.problems import RTOL, Ends, Problem, Rows, Value
@@ -81,28 +80,19 @@ def run_alone(computation: Steps[T]) -> T:
 def _evaluate(queries: Sequence[Query]) -> list[Value]:
     rows = [q.problem.rows(q.u) for q in queries]
     ends: list[Ends | None] = [None] * len(rows)
-    for chosen in _calls(rows, [q.problem.system for q in queries]):
+    for chosen in _calls([q.problem.system for q in queries]):
         system = queries[chosen[0]].problem.system
         for i, found in zip(chosen, _integrate([rows[i] for i in chosen], system), strict=True):
             ends[i] = found
     return [q.problem.value(q.u, e) for q, e in zip(queries, ends, strict=True) if e is not None]
 
 
-def _calls(rows: Sequence[Rows], systems: Sequence[System]) -> list[list[int]]:
-    """Group queries into calls: by system, and by period if they are too many for one set of lanes."""
+def _calls(systems: Sequence[System]) -> list[list[int]]:
+    """Group queries into calls, by system."""
     by_system: dict[str, list[int]] = {}
     for i, system in enumerate(systems):
         by_system.setdefault(system.label, []).append(i)
-    calls: list[list[int]] = []
-    for members in by_system.values():
-        if sum(len(rows[i].states) for i in members) <= WIDTH:
-            calls.append(members)
-            continue
-        by_period: dict[int, list[int]] = {}
-        for i in members:
-            by_period.setdefault(rows[i].period, []).append(i)
-        calls.extend(by_period.values())
-    return calls
+    return list(by_system.values())
 
 
 def _integrate(rows: Sequence[Rows], system: System) -> list[Ends]:

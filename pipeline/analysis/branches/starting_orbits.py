@@ -10,7 +10,7 @@ import xarray as xr
 
 from magpend_core.engine.system import System
 from magpend_core.models.parameters import Parameters
-from magpend_core.orbits import polish_orbits, scaled_distance, stroboscopic_map
+from magpend_core.orbits import polish_orbits, scaled_distance
 from pipeline.analysis.branches.exploring import Start
 from pipeline.analysis.branches.problems import FREQUENCY, Family
 from pipeline.layout.vocabulary import BOUNDED, EQUILIBRIUM, PERIODIC_ORBIT, frequency_of, is_start_dim
@@ -231,13 +231,13 @@ def orbits_near(
     polished = polish_orbits(
         np.tile(packed, (n, 1)), np.full(n, frequency_hz), np.array(guesses), np.array(periods), system=system
     )
-    found: list[tuple[np.ndarray, int]] = []
+    found: list[np.ndarray] = []
     order = np.argsort(polished.orbit_period, kind="stable")
     for row in order[polished.converged[order]]:
-        state, period = polished.section[row], int(polished.orbit_period[row])
-        if not any(p == period and _on_orbit(state, x, p, frequency_hz, packed, system) for x, p in found):
-            found.append((state, period))
-    return found
+        points = polished.points[row, : polished.orbit_period[row]]
+        if not any(_on_orbit(points[0], other, system) for other in found if len(other) == len(points)):
+            found.append(points)
+    return [(points[0], len(points)) for points in found]
 
 
 def _spread(
@@ -254,8 +254,5 @@ def _spread(
     return chosen
 
 
-def _on_orbit(
-    state: np.ndarray, other: np.ndarray, period: int, frequency_hz: float, packed: np.ndarray, system: System
-) -> bool:
-    images, _ = stroboscopic_map(packed[None], np.array([frequency_hz]), other[None], period, system=system)
-    return bool(scaled_distance(images[0], state, system).min() < 1e-6)
+def _on_orbit(state: np.ndarray, points: np.ndarray, system: System) -> bool:
+    return bool(scaled_distance(points, state, system).min() < 1e-6)

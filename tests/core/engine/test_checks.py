@@ -343,9 +343,9 @@ def test_check_system__comes_before_compiling(broken, monkeypatch):
 
 def test_check_system__is_asked_by_trajectory(monkeypatch):
     asked = []
-    module = importlib.import_module("magpend_core.trajectory")
+    module = importlib.import_module("magpend_core.sampling")
     monkeypatch.setattr(module, "check_system", lambda *a: asked.append(a[0].name))
-    trajectory(load_preset(), 2.2, [0.1, 0.0, 0.0, 0.0], np.empty(0))
+    trajectory(load_preset(), 2.2, [0.1, 0.0, 0.0, 0.0], [0.1])
     assert asked == ["pendulum_fitted"]
 
 

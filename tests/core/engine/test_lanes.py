@@ -13,8 +13,7 @@ from magpend_core.engine.jit import OPTIONS, inline
 from magpend_core.engine.lanes import FADED, engine_bindings, rows_of
 from magpend_core.engine.observers import RECORD
 from magpend_core.engine.simd import WIDTH, store
-from magpend_core.engine.tableau import ERROR, N_STAGES, NODES, STAGES
-from magpend_core.trajectory import DENSE
+from magpend_core.engine.tableau import DENSE, ERROR, N_STAGES, NODES, STAGES
 
 # row 6 of the tableau holds the weights of the solution of order 5
 WEIGHTS = np.append(STAGES[6], 0.0)

@@ -21,6 +21,7 @@ from magpend_core.models.model import Mirror
 from magpend_core.models.parameters import Parameters
 from magpend_core.models.sectioned import of_flow
 from magpend_core.pointwise import evaluate
+from magpend_core.sampling import Drive, sample
 from magpend_core.trajectory import trajectory
 from pipeline.analysis.attractors.finding.cell_blocks import Block
 from pipeline.analysis.attractors.finding.equilibria import Equilibrium
@@ -230,8 +231,19 @@ def follow_points(found: Features, parameters: Parameters, frequency: float) -> 
         return
     ends = found.points
     if mirror.half_period:
-        times = np.array([0.5 / frequency])
-        ends = np.array([trajectory(parameters, frequency, x, times, rtol=RTOL, atol=RTOL)[0] for x in found.points])
+        half = Drive(np.array([1.0 / frequency]))
+        followed = sample(
+            parameters.model.system,
+            np.tile(parameters.pack(), (len(ends), 1)),
+            ends,
+            [np.array([0.5 / frequency])],
+            piece=np.zeros(len(ends), np.int64),
+            drives=[half],
+            rtol=RTOL,
+            atol=RTOL,
+            limits_first_step=False,
+        )
+        ends = followed.states[:, 0]
     found.image = ends * np.array(mirror.signs)
 
 

@@ -31,7 +31,7 @@ from pipeline.analysis.attractors.finding.closed_orbits import Orbit, number_of
 from pipeline.analysis.attractors.finding.equilibria import approaching, rest_near, rest_of_orbit
 from pipeline.analysis.attractors.finding.points import Point
 from pipeline.analysis.attractors.finding.requests import LEG, Extended, Leg, Polish, Settings, Work
-from pipeline.analysis.attractors.finding.spirals import closes_in, keys_of, leap, near_closed
+from pipeline.analysis.attractors.finding.spirals import keys_of, leap, near_closed
 from pipeline.analysis.sets import Geometry
 from pipeline.layout.vocabulary import ATTRACTS, NEUTRAL, NOT_SETTLED
 
@@ -130,6 +130,7 @@ class _Extension:
         self.sets: list[BoundedSet] = []
         self.spent, self.ran_out = 0, False
         self._tried: set[int] = set()
+        self._told: list[tuple[int, bool]] = []
 
     @property
     def has_budget(self) -> bool:
@@ -200,8 +201,12 @@ class _Extension:
             target = 2 * max(c.length for c in self.courses if c.goes_on)
 
     def conclude(self) -> Work[None]:
-        """Describe the sets of unfinished cells without extending them."""
-        yield from self._tell_sets()
+        """Describe the sets of unfinished cells without extending them, unless they were told as they are."""
+        if self._told != self._lengths():
+            yield from self._tell_sets()
+
+    def _lengths(self) -> list[tuple[int, bool]]:
+        return [(course.length, course.goes_on) for course in self.courses]
 
     def _extend(self, target: int) -> Work[None]:
         while True:
@@ -278,8 +283,7 @@ class _Extension:
             rows = [i for i, d in zip(rest, depths, strict=True) if d == depth and block.is_bounded[i]]
             if rows:
                 section = np.stack([np.concatenate(own[i].legs[-depth:]) for i in rows])
-                section = section[closes_in(section, self.settings.longest, self.geometry)]
-                found = found.joined(near_closed(section, self.settings.longest, self.geometry))
+                found = found.joined(near_closed(section, self.settings.longest, self.geometry, closing_only=True))
         new = [i for i, key in enumerate(found.key.tolist()) if key not in self._tried]
         self._tried.update(found.key[new].tolist())
         if not new:
@@ -340,7 +344,7 @@ class _Extension:
             [course for course, n in zip(going, numbers, strict=True) if n == k] for k in range(int(numbers.max()) + 1)
         ]
         gone = [] if has_stayed else [course for course in self.courses if course.has_left]
-        self.sets, in_doubt = [], not is_sure
+        self.sets, in_doubt, self._told = [], not is_sure, self._lengths()
         for own, left in self._with_those_left(groups, gone):
             one = yield from describe(own, left, self.point, self.settings, has_stayed)
             self.sets.append(one)

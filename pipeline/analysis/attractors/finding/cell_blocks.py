@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
@@ -42,19 +43,19 @@ class Block:
         """Return the cells of some rows; `cells` no longer gives their places."""
         return Block(self.cells, self.section[rows], self.status[rows], self.orbit_period[rows], self.turns[rows])
 
-    @property
+    @cached_property
     def is_closed(self) -> np.ndarray:
         """Whether each cell's sections close, or its period was inferred from its neighbours."""
         closed = np.isin(self.status, (Status.PERIODIC, Status.INFERRED))
         return np.asarray(closed & (self.orbit_period > 0) & self._finite)
 
-    @property
+    @cached_property
     def is_bounded(self) -> np.ndarray:
         """Whether each cell was computed to the end and does not close."""
         computed = np.isin(self.status, (Status.PERIODIC, Status.BOUNDED))
         return np.asarray(computed & self._finite & ~self.is_closed)
 
-    @property
+    @cached_property
     def _finite(self) -> np.ndarray:
         return np.asarray(np.isfinite(self.section).all(axis=(1, 2)))
 

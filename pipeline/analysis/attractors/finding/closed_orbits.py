@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 
 from magpend_core.engine.system import System
-from magpend_core.orbits import RTOL, polish_orbits, stroboscopic_map
+from magpend_core.orbits import PeriodicOrbits, polish_orbits
 from magpend_core.sections import run_branches
 from pipeline.analysis.attractors.finding.stability import MATRIX_ERROR, by_margin, largest_error
 from pipeline.analysis.sets import Geometry, rounded_points
@@ -158,10 +158,9 @@ def polish(
         least_period=False,
         system=system,
     )
-    first, own = near.section.copy(), np.flatnonzero(near.converged)
-    images, _ = _images(packed[own], frequency[own], first[own], near.orbit_period[own], NEAR_RTOL, system)
-    for row, image in zip(own, images, strict=True):
-        first[row] = _rolled(image, geometry)[0]
+    first = near.section.copy()
+    for row in np.flatnonzero(near.converged):
+        first[row] = _rolled(near.points[row, : near.orbit_period[row]], geometry)[0]
     # very unstable orbits miss NEAR at the loose tolerance: keep them up to NEARLY and polish on
     good = np.flatnonzero(near.residual <= NEARLY)
     rounded = rounded_points(first[good], geometry)
@@ -192,33 +191,30 @@ def _polished(
     geometry: Geometry,
     system: System,
     tolerance: float,
-    turned: bool = False,
 ) -> list[Orbit | None]:
-    """Polish guesses to a residual; polish an orbit again from its least point if it started elsewhere."""
+    """Polish guesses to a residual, and those again whose least point is another one, from this point."""
     found = polish_orbits(packed, frequency, points, period, tolerance=tolerance, system=system)
-    orbits: list[Orbit | None] = [None] * len(points)
-    rows = np.flatnonzero(found.converged)
-    images, derivatives = _images(
-        packed[rows], frequency[rows], found.section[rows], found.orbit_period[rows], RTOL, system
-    )
-    for i, row in enumerate(rows):
-        in_time = np.concatenate([found.section[row][None], images[i][:-1]])
-        residual, seconds = float(found.residual[row]), float(found.seconds[row])
-        orbits[row] = Orbit(in_time, found.multipliers[row], residual, derivatives[i], seconds)
-        first = _rolled(in_time, geometry)[0]
-        if not turned and (first != in_time[0]).any():
-            one = slice(row, row + 1)
-            (orbits[row],) = _polished(
-                packed[one],
-                frequency[one],
-                first[None],
-                found.orbit_period[one],
-                geometry,
-                system,
-                tolerance,
-                turned=True,
-            )
+    orbits = [_orbit_of(found, row) if found.converged[row] else None for row in range(len(points))]
+    least = {row: _rolled(one.points, geometry)[0] for row, one in enumerate(orbits) if one is not None}
+    rows = [row for row, point in least.items() if (point != orbits[row].points[0]).any()]  # type: ignore[union-attr]
+    if rows:
+        starts = np.array([least[row] for row in rows])
+        again = polish_orbits(
+            packed[rows], frequency[rows], starts, found.orbit_period[rows], tolerance=tolerance, system=system
+        )
+        for i, row in enumerate(rows):
+            orbits[row] = _orbit_of(again, i) if again.converged[i] else None
     return orbits
+
+
+def _orbit_of(found: PeriodicOrbits, row: int) -> Orbit:
+    return Orbit(
+        found.points[row, : found.orbit_period[row]],
+        found.multipliers[row],
+        float(found.residual[row]),
+        found.derivative[row],
+        float(found.seconds[row]),
+    )
 
 
 def run_on(
@@ -249,22 +245,6 @@ def run_on(
         system=system,
     )
     return result.section[:, 0, -1], result.orbit_period[:, 0].astype(np.int64)
-
-
-def _images(
-    packed: np.ndarray, frequency: np.ndarray, points: np.ndarray, period: np.ndarray, rtol: float, system: System
-) -> tuple[list[np.ndarray], np.ndarray]:
-    """Return per row the section points after 1, ..., period drive periods and the last one's derivative."""
-    images: list[np.ndarray] = [points[:0]] * len(points)
-    derivatives = np.full((len(points), system.n_states, system.n_states), np.nan)
-    for p in np.unique(period):
-        rows = np.flatnonzero(period == p)
-        image, derivatives[rows] = stroboscopic_map(
-            packed[rows], frequency[rows], points[rows], int(p), rtol=rtol, system=system
-        )
-        for row, states in zip(rows, image, strict=True):
-            images[row] = states
-    return images, derivatives
 
 
 def distinct(orbits: Sequence[Orbit], geometry: Geometry) -> list[Orbit]:

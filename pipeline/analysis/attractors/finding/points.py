@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -146,6 +146,7 @@ class Point:
     n_periods: int = 0
     is_flow: bool = False
     can_rest: bool = False
+    _whole: Block | None = None
 
     @property
     def n_neutral(self) -> int:
@@ -182,29 +183,37 @@ class Point:
         length = self.cube.sizes[first] if first else 1
         inner = self.n_cells // max(length, 1)
         step = max(1, self.block_cells // max(inner, 1))
+        if step >= length:
+            self._whole = self._whole or self._read(self.cube, slice(0, self.n_cells), self.n_cells)
+            yield self._known(self._whole)
+            return
         for begin in range(0, length, step):
-            part = self.cube.isel({first: slice(begin, begin + step)}) if first else self.cube
+            part = self.cube.isel({first: slice(begin, begin + step)})
             n = min(step, length - begin) * inner
-            yield self._block(part, slice(begin * inner, begin * inner + n), n)
+            yield self._known(self._read(part, slice(begin * inner, begin * inner + n), n))
 
-    def _block(self, part: xr.Dataset, cells: slice, n: int) -> Block:
+    def _known(self, block: Block) -> Block:
+        """Return a block in which cells at rest or on a limit cycle count as neither closed nor bounded."""
+        for told in (self.at_rest, self.on_cycle):
+            if told is not None:
+                status = np.where(told[block.cells] >= 0, np.int8(Status.NO_RETURN), block.status)
+                block = replace(block, status=status)
+        return block
+
+    def _read(self, part: xr.Dataset, cells: slice, n: int) -> Block:
         def values(name: str, *own: Any) -> np.ndarray:
             array = part[name].transpose(*self.start_dims, *own)
             return np.asarray(array.values).reshape(n, *array.shape[len(self.start_dims) :])
 
-        section = values("section", "period_index", "state").astype(np.float64)
+        section = values("section", "period_index", "state").astype(np.float64, copy=False)
         turns = values("turns", ...) if "turns" in part else np.zeros((n, self.n_angles), np.int64)
-        status = values("status")
-        for told in (self.at_rest, self.on_cycle):
-            if told is not None:
-                status = np.where(told[cells] >= 0, np.int8(Status.NO_RETURN), status)
         rest = values("rest_state", "state") if "rest_state" in part else None
         if "return_time" in part:
             seconds = values("return_time", "period_index")
         else:
             seconds = np.full(section.shape[:2], 1.0 / self.frequency)
         step = values("step_size") if "step_size" in part else None
-        return Block(cells, section, status, values("orbit_period"), turns, rest, seconds, step)
+        return Block(cells, section, values("status"), values("orbit_period"), turns, rest, seconds, step)
 
 
 def slabs(ds: xr.Dataset, dynamics: Dynamics, budget: int) -> Iterator[dict[tuple[int, ...], Point]]:

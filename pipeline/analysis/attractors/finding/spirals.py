@@ -116,28 +116,28 @@ def _contracting(section: np.ndarray, max_period: int, geometry: Geometry) -> tu
     return period, centre
 
 
-def near_closed(section: np.ndarray, max_period: int, geometry: Geometry) -> Guesses:
+def near_closed(section: np.ndarray, max_period: int, geometry: Geometry, closing_only: bool = False) -> Guesses:
     """Return guesses from cells that are not closed but recur, the best one of each box.
 
     Each cell gives its last section with the period of recurrence and, if its sections contract, the mean of
-    the last section's phase.
+    the last section's phase. Cells whose sections recur at falling distances guess at every period, unlike
+    chaos that merely passes an orbit; others up to the period `CHEAP`, unless `closing_only`.
     """
     found = Recurrence.of(section, max_period, geometry)
-    marks = marks_of(section)
-    worth = (found.period > 0) & ((found.period <= CHEAP) | closes_in(section, max_period, geometry))
+    closes = _closes_in(section, found, geometry)
+    worth = (found.period > 0) & (closes if closing_only else closes | (found.period <= CHEAP))
     recurring, contracting = np.flatnonzero(worth), np.flatnonzero(found.centred)
     spirals = _guesses(
-        found.period[recurring], found.lag[recurring], marks[recurring], section[recurring, -1], geometry
+        found.period[recurring], found.lag[recurring], marks_of(section[recurring]), section[recurring, -1], geometry
     )
     # rank means after recurring sections, since a mean is not a section
-    away = geometry.distance(found.centre[contracting], section[contracting, -1]) + NEAR
-    means = _guesses(found.centred[contracting], away, marks[contracting], found.centre[contracting], geometry)
-    return spirals.joined(means)
+    centre, marks = found.centre[contracting], marks_of(section[contracting])
+    away = geometry.distance(centre, section[contracting, -1]) + NEAR
+    return spirals.joined(_guesses(found.centred[contracting], away, marks, centre, geometry))
 
 
-def closes_in(section: np.ndarray, max_period: int, geometry: Geometry) -> np.ndarray:
-    """Return which cells recur at falling distances, unlike chaos that merely passes an orbit."""
-    found = Recurrence.of(section, max_period, geometry)
+def _closes_in(section: np.ndarray, found: Recurrence, geometry: Geometry) -> np.ndarray:
+    """Return which cells recur at falling distances."""
     closes = found.centred > 0
     half = section.shape[1] // 2
     for p in np.unique(found.period[found.period > 0]).tolist():
