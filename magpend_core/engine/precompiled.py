@@ -47,6 +47,7 @@ from numba.core.untyped_passes import (
     TranslateByteCode,
 )
 
+from magpend_core.compilation import compiling
 from magpend_core.engine.code_cache import PartFolder, say
 from magpend_core.engine.digests import lookups, reached
 from magpend_core.engine.linking import EntryLibrary, PartLibrary
@@ -133,6 +134,11 @@ class EntryCompiler(CompilerBase):
     """numba's compiler of functions, with products fused by our rule (see `fusing`)."""
 
     _gives: type[FunctionPass] = _GiveEntryLibrary
+
+    def compile_extra(self, func: Any) -> Any:
+        """Compile an engine, its parts included, and say so to whoever listens."""
+        with compiling():
+            return super().compile_extra(func)
 
     def define_pipelines(self) -> list[Any]:
         """Return numba's own passes with two more."""

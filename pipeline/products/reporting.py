@@ -16,6 +16,8 @@ from collections.abc import Iterable, Iterator
 from contextvars import ContextVar
 from typing import Protocol, TypeVar
 
+from magpend_core.compilation import heard_by
+
 T = TypeVar("T")
 
 
@@ -27,6 +29,9 @@ class Listener(Protocol):
 
 
 _listener: ContextVar[Listener | None] = ContextVar("listener", default=None)
+
+COMPILING = "compiling"
+"""Name of the work while the compiler runs."""
 
 
 def report(what: str, done: float, total: float, expected_s: float = 0.0) -> None:
@@ -72,9 +77,23 @@ def track(items: Iterable[T], what: str, total: int | None = None) -> Iterator[T
 
 @contextlib.contextmanager
 def reporting(listener: Listener) -> Iterator[None]:
-    """Send all reports from inside this context to a listener."""
-    token = _listener.set(listener)
+    """Send all reports from inside this context to a listener, and say when the compiler runs."""
+    last: tuple[str, float, float, float] = ("", 0.0, 0.0, 0.0)
+
+    def heard(what: str, done: float, total: float, expected_s: float = 0.0) -> None:
+        nonlocal last
+        last = what, done, total, expected_s
+        listener(what, done, total, expected_s)
+
+    def compiler(begins: bool) -> None:
+        if begins:
+            listener(COMPILING, 0, 0)
+        elif last[0]:
+            listener(*last)
+
+    token = _listener.set(heard)
     try:
-        yield
+        with heard_by(compiler):
+            yield
     finally:
         _listener.reset(token)

@@ -14,7 +14,6 @@ from pipeline.layout.domains import check_starts
 from pipeline.layout.identity import identity_of
 from pipeline.layout.limits import check_plan, check_space
 from pipeline.layout.plan import Plan, make_plan
-from pipeline.products.reporting import report
 from pipeline.runs.mending import sound_commits
 from pipeline.runs.progress import Progress, duration
 from pipeline.runs.status import State, state
@@ -179,7 +178,6 @@ def _complete(
     check_space(plan, info.files.local, plan.n_cells - before)
     echo(f"{plan.n_cells} cells in {plan.n_tasks} tasks" + (f", {before} cells done before" if before else ""))
     clients.reach(where)
-    report("compiling the kernel", 0, 0)
     seconds = task.warm_up(spec)
     if seconds > 1:
         echo(f"kernel compiled in {duration(seconds)}")

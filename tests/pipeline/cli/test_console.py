@@ -6,6 +6,7 @@ import csv
 import io
 import json
 import logging
+import os
 import subprocess
 import sys
 import time
@@ -13,6 +14,7 @@ import time
 import numpy as np
 import pytest
 
+from magpend_core.engine import jit
 from pipeline.cli import console
 from pipeline.cli.common import tell
 from pipeline.cli.console import Display, Work, progress
@@ -98,6 +100,22 @@ def test_track__reports_each_item():
     assert [said[:3] for said in heard] == [("work", 0, 2), ("work", 1, 2), ("work", 2, 2), ("more", 1, 3)]
     report("nobody listens", 0, 1)
     assert len(heard) == 4
+
+
+@pytest.mark.skipif(os.environ.get("NUMBA_DISABLE_JIT") == "1", reason="nothing is compiled")
+def test_reporting__says_when_it_compiles():
+    """The work is named again afterwards, and what is compiled says nothing."""
+
+    def twice(x, out):
+        out[0] = 2.0 * x
+
+    compiled, out, heard = jit.entry(twice, "of_a_test", {}, None), np.zeros(1), []
+    with reporting(lambda what, *_: heard.append(what)):
+        report("work", 0, 1)
+        for _ in range(2):
+            compiled(1.5, out)
+    assert out[0] == 3.0
+    assert heard == ["work", "compiling", "work"]
 
 
 def test_display__a_bar_is_taken_away(capsys):

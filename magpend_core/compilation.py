@@ -1,0 +1,35 @@
+"""Tell a listener when functions are compiled, so that a command can say what it waits for."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator
+from contextvars import ContextVar
+
+_listener: ContextVar[Callable[[bool], None] | None] = ContextVar("listener", default=None)
+
+
+@contextlib.contextmanager
+def heard_by(listener: Callable[[bool], None]) -> Iterator[None]:
+    """Call a listener with True when a compilation begins inside this context, and with False at its end."""
+    token = _listener.set(listener)
+    try:
+        yield
+    finally:
+        _listener.reset(token)
+
+
+@contextlib.contextmanager
+def compiling() -> Iterator[None]:
+    """Tell the listener, if there is one, that what runs inside this context is the compiler."""
+    listener = _listener.get()
+    if listener is None:
+        yield
+        return
+    listener(True)
+    token = _listener.set(None)  # parts of an engine are compiled inside
+    try:
+        yield
+    finally:
+        _listener.reset(token)
+        listener(False)
