@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from magpend_core.engine.variational import with_tangents
 from magpend_core.models.model import Classifier
 from magpend_core.models.parameters import Parameters
 from magpend_core.models.sectioned import of_flow
 from magpend_core.orbits import on_section
+from magpend_core.sampling import Drive, sample
 from magpend_core.sections import run_branches
-from magpend_core.trajectory import trajectory
 from pipeline.analysis.branches.following import Branch
 from pipeline.analysis.branches.problems import FREQUENCY, RTOL
 from pipeline.products.reporting import track
@@ -41,20 +39,27 @@ def sides_of(branches: Sequence[Branch], base: Parameters) -> list[np.ndarray]:
 def _sides(branch: Branch, base: Parameters, classifier: Classifier) -> np.ndarray:
     family = branch.family
     own = base.replace(**dict(zip(base.names, map(float, family.parameters), strict=True)))
-    name = family.free[0]
+    name, flow = family.free[0], of_flow(own).model.system
     angles = np.flatnonzero(family.system.is_angle)
-    found = np.empty(len(branch.points), np.int8)
-    for j, point in enumerate(branch.points):
+    n_samples = family.period * SAMPLES
+    parameters, times, drives = [], [], []
+    for point in branch.points:
         value = float(family.values(point.u)[0])
         frequency = value if name == FREQUENCY else family.frequency_hz
-        parameters = own if name == FREQUENCY else own.replace(**{name: value})
+        parameters.append(own if name == FREQUENCY else own.replace(**{name: value}))
         if base.model.crossing is not None:
             frequency = family.period / point.value.seconds
-        times = np.arange(family.period * SAMPLES + 1) / (SAMPLES * frequency)
-        states = trajectory(of_flow(parameters), frequency, family.state(point.u), times)
-        turns = np.round((states[-1, angles] - states[0, angles]) / (2.0 * np.pi)).astype(np.int64)
-        found[j] = classifier.classify(states, turns, _SEEN_WHOLE, _values(parameters))
-    return found
+        times.append(np.arange(n_samples + 1) / (SAMPLES * frequency))
+        drives.append(Drive(np.full(family.period, 1.0 / frequency)))
+    packed = np.array([of_flow(one).pack() for one in parameters])
+    starts = np.array([family.state(point.u) for point in branch.points])
+    found = sample(flow, packed, starts, times, drives=drives, limits_first_step=False).states
+    turns = np.round((found[:, -1, angles] - found[:, 0, angles]) / (2.0 * np.pi)).astype(np.int64)
+    codes = [
+        classifier.classify(states, n, _SEEN_WHOLE, _values(one))
+        for states, n, one in zip(found, turns, parameters, strict=True)
+    ]
+    return np.array(codes, np.int8)
 
 
 _SEEN_WHOLE = np.array(np.inf)
@@ -70,18 +75,15 @@ def rotation_of(branch: Branch) -> np.ndarray:
     family = branch.family
     if not any(family.system.is_angle):
         return np.zeros(0)
-    n = family.system.n_states
     rows = family.rows(branch.points[0].u[None])
-    # use the system with tangents, whose code is compiled already
-    extended = dataclasses.replace(with_tangents(family.system, n), n_controlled=None)
     result = run_branches(
         rows.parameters[:, None],
         rows.frequency_hz[:, None],
-        np.append(on_section(rows.states[0], rows.parameters[0], family.system), np.eye(n))[None],
+        on_section(rows.states, rows.parameters, family.system),
         n_transient=0,
         n_keep=family.period + 1,
         rtol=RTOL,
         atol=RTOL,
-        system=extended,
+        system=family.system,
     )
     return np.asarray(result.turns[0, 0] / family.period, np.float64)
