@@ -79,7 +79,7 @@ def test_write_results__what_is_held_keeps_its_own_origin(rig, tmp_path):
     report = json.loads((tmp_path / "fit.json").read_text())
     assert report["joint"]["held"] == ["eps_mag"]
     assert report["joint_with_nothing_held"]["values"] == pytest.approx(TRUE, rel=1e-8)
-    assert any(line.startswith("all at once, nothing held") for line in summary_of(outcome))
+    assert any(line.startswith("joint fit, nothing held") for line in summary_of(outcome))
 
 
 def test_report__holds_curves_joint_fit_and_dipoles(rig, tmp_path):
