@@ -168,7 +168,7 @@ def test_run__damaged_drive_is_found_and_rebuilt(recorded, tmp_path, bytes_of):
 def test_derive__refuses_what_goes_on_beyond_the_recording(recorded, tmp_path, name):
     run(recorded(), tmp_path / "run", workers=0, echo=silent)
     with pytest.raises(
-        SpecError, match=rf"drive is the recording drive\.csv, and which ends, but {name} integrates further"
+        SpecError, match=rf"drive is the recording drive\.csv, which ends, but {name} integrates further"
     ):
         derive(tmp_path / "run", name)
     with pytest.raises(SpecError, match="integrates further"):

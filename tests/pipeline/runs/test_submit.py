@@ -250,5 +250,5 @@ def test_templates__are_in_order():
 
 def test_prepare__no_cluster_file(write_spec, sweep_text, monkeypatch):
     monkeypatch.delenv("MAGPEND_CLUSTER", raising=False)
-    with pytest.raises(SpecError, match="what is a job"):
+    with pytest.raises(SpecError, match="a job is not described"):
         prepare(write_spec(sweep_text), None, None)

@@ -135,7 +135,7 @@ def test_fit_magnet__takes_a_measurement_that_ships_by_name(main, tmp_path):
     code, result, notes = main("fit-magnet", "discs", "--no-figures")
     assert code == 0
     assert result.startswith("SYNTHETIC: two 33 mm x 10 mm N38 discs")
-    assert "what is left over is the law's, not noise" in notes
+    assert "the law does not fit, and they are more than noise" in notes
     assert (tmp_path / "discs-fit" / "preset.toml").is_file()
     code, _, notes = main("fit-magnet", "disks")
     assert code == 2
