@@ -109,7 +109,7 @@ def animate(
         raise SpecError(problems)
     film = animation(run, options, attractors=attractor or (), cells=cell or (), start=start, echo=console.note)
     if target.exists():
-        console.note(f"note: {target} was there already, and is replaced")
+        console.note(f"note: {target} existed and is replaced")
     make_folder(target.parent)
     console.note(film.summary)
     console.result(f"animation: {save_animation(film, target)}")
@@ -132,7 +132,7 @@ def _start(
     states = {name: values[0] for name, values in read_named(words, 1).items()}
     given = {"--model": model, "--frequency": frequency_hz, "--preset": preset, "--set": settings}
     if not alone and any(given.values()):
-        raise SpecError([f"{k}: a run has its own; drop it, or the directory." for k, v in given.items() if v])
+        raise SpecError([f"{k}: the run sets this; drop the option, or the directory." for k, v in given.items() if v])
     if not alone and not states and not transient:
         return None
     overrides = read_pairs("--set", settings or [], "q=1.5")
@@ -151,13 +151,13 @@ def _contradictions(
     of_run: dict[str, Any] = {"--at": at, "--attractor": attractor, "--cell": cell}
     problems = []
     if directory is None:
-        problems += [f"{k}: is for a run; name its directory." for k, v in of_run.items() if v]
+        problems += [f"{k}: needs a run; give its directory." for k, v in of_run.items() if v]
     of_run["a start (--transient, or a state)"] = start
     chosen = [k for k, v in of_run.items() if v and k != "--at"]
     if directory is not None and len(chosen) > 1:
         problems.append(f"{' and '.join(chosen)}: a film shows one of these; drop the others.")
     if cell and at:
-        problems.append("--at: a cell has its own point; drop --at or --cell.")
+        problems.append("--at: a cell already has a parameter point; drop --at or --cell.")
     return problems
 
 

@@ -30,7 +30,7 @@ def explore(
     def serving(address: str) -> None:
         console.at_rest()
         console.result(address)
-        console.note("the page is at this address, for this machine alone; Ctrl-C ends it")
+        console.note("open this address in a browser on this machine; Ctrl-C ends the server")
 
     with contextlib.nullcontext() if no_browser else browser() as opened:
         serve(directory, port, echo=serving, opened=opened)

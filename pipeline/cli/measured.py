@@ -65,7 +65,9 @@ def _load(paths: list[Path], mappings: list[Path]) -> list[Mapping]:
     loaded = [load_mapping(m) for m in mappings] * (len(paths) if len(mappings) == 1 else 1)
     models = sorted({m.system for m in loaded}, key=lambda model: model.name)
     if len(models) > 1:
-        raise SpecError([f"--mapping: of the models {', '.join(m.name for m in models)}; a diagram is one model's."])
+        raise SpecError(
+            [f"--mapping: the mappings name several models ({', '.join(m.name for m in models)}); a diagram has one."]
+        )
     return loaded
 
 

@@ -108,7 +108,9 @@ def _latex(model: Model, found: Description) -> None:
     from pipeline.specification.problems import SpecError
 
     if not found.latex:
-        raise SpecError([f"--latex: {model.name} is no text, and has no equations to be written; drop it."])
+        raise SpecError(
+            [f"--latex: {model.name} is not a text model, so its equations cannot be written; drop the option."]
+        )
     console.result("\\begin{align}")
     console.result(" \\\\\n".join(f"  {line}" for line in found.latex))
     console.result("\\end{align}")

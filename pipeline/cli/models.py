@@ -49,7 +49,7 @@ def models(
     else:
         width = max(len(model.name) for model in chosen)
         lines = [f"{m.name:{width}}  {m.title}; states {', '.join(m.state_names)}" for m in chosen]
-        lines.append('all of one: magpend models NAME; a specification chooses with: model = "NAME"')
+        lines.append('details of one: magpend models NAME; to use it in a specification: model = "NAME"')
     tell(Table(rows, lines), None, json)
 
 
@@ -72,7 +72,7 @@ def described(model: Model) -> dict[str, Any]:
 
 def all_of(model: Model) -> list[str]:
     """Return lines on all properties of a model."""
-    seen = "no drive: time enters through the states alone" if model.autonomous else ""
+    seen = "no drive: the equations do not depend on time" if model.autonomous else ""
     seen = seen or f"period 1/f, f the drive's frequency [Hz]; sections are taken at {model.section}"
     lines = [f"{model.name}: {model.title}", seen, "", "states"]
     lines += _table([(s.name, s.unit, s.meaning) for s in model.states])

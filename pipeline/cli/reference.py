@@ -207,7 +207,7 @@ def mapping() -> str:
         _keys("piece = {...}", found.PieceMap, "", ()),
         _keys("[channels.NAME]", found.ChannelMap, "NAME is a state of the model, or a quantity.", ()),
         _keys("[drive]", found.DriveMap, 'Or `drive = "none"`.', ()),
-        _keys("[csv]", found.CsvMap, "For CSV files alone; what is not stated is found out.", ()),
+        _keys("[csv]", found.CsvMap, "For CSV files only; missing keys are detected from the file.", ()),
     ]
     return "\n\n".join(parts)
 
@@ -373,7 +373,7 @@ def main() -> None:
     check = "--check" in sys.argv[1:]
     stale = [page for page in pages() if rendered(page.read_text("utf-8")) != page.read_text("utf-8")]
     for page in stale:
-        print(f"{'not true any more' if check else 'written'}: {page.relative_to(ROOT)}")
+        print(f"{'out of date' if check else 'written'}: {page.relative_to(ROOT)}")
         if not check:
             page.write_text(rendered(page.read_text("utf-8")), "utf-8")
     if check and stale:

@@ -141,7 +141,9 @@ def read_named(words: list[str], n: int) -> dict[str, Any]:
             found[name[2:].replace("-", "_")] = tuple(map(float, own))
         except ValueError:
             numbers = "a number" if n == 1 else f"{n} numbers"
-            problems.append(f"{' '.join([word, *own])}: no option of this command, and no name with {numbers}.")
+            problems.append(
+                f"{' '.join([word, *own])}: is neither an option of this command nor a name with {numbers}."
+            )
     if problems:
         raise SpecError(problems)
     return found

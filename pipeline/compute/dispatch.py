@@ -184,8 +184,8 @@ class Window:
 
     def _lost(self) -> str:
         return (
-            f"The scheduler {self._client.scheduler.address} is gone. What is committed stays; the same "
-            "command goes on once a scheduler is there."
+            f"The scheduler {self._client.scheduler.address} is gone. Committed results stay; the same "
+            "command continues once a scheduler is there."
         )
 
     def _look(self) -> None:

@@ -39,8 +39,8 @@ def check_means(cluster: Cluster) -> None:
         problems.append(f"{cluster.kind}: needs dask-jobqueue, which is not installed: pip install 'magpend[cluster]'.")
     if not shutil.which(COMMANDS[cluster.kind]):
         problems.append(
-            f"{cluster.kind}: there is no command {COMMANDS[cluster.kind]!r} here; give the command on a "
-            "machine that sends jobs, such as the login node."
+            f"{cluster.kind}: there is no command {COMMANDS[cluster.kind]!r} here; use a machine that "
+            "sends jobs, such as the login node."
         )
     if problems:
         raise SpecError(problems)

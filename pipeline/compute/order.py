@@ -44,8 +44,8 @@ class TaskFailedError(Exception):
     def _note(self) -> str:
         it = "it" if len(self.failed) == 1 else "they"
         return (
-            f"All others are done; {it} failed again when tried alone. What is committed stays, and the same "
-            "command tries again what is missing."
+            f"All others are done; {it} failed again when tried alone. Committed results stay, and the same "
+            "command tries the missing tasks again."
         )
 
 
@@ -138,8 +138,10 @@ class Order:
         self._second.append(index)
         self._in_a_row += 1
         if self._in_a_row >= MOST_IN_A_ROW or len(self._failed) >= MOST_FAILED:
-            note = "Given up: so many fail that it is hardly the tasks. What is committed stays, and the same "
-            raise TaskFailedError(self._failed, note=note + "command goes on when the cause is gone.")
+            note = (
+                "Given up: so many tasks fail that the cause is hardly in them. Committed results stay, and the same "
+            )
+            raise TaskFailedError(self._failed, note=note + "command continues when the cause is removed.")
 
     def close(self) -> None:
         """Raise TaskFailedError if tasks failed twice.

@@ -137,8 +137,7 @@ def _recording(
         return None
     if frequency_hz is not None:
         problems.append(
-            f"frequency_hz = {frequency_hz!r}: the drive is the recording {drive}, which has its own; drop "
-            "one of the two."
+            f"frequency_hz = {frequency_hz!r}: the recorded drive {drive} has its own; drop one of the two."
         )
     try:
         found = load_drive(drive)

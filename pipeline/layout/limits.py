@@ -42,8 +42,8 @@ def check_plan(plan: Plan) -> None:
     problems = _task_problems(plan) + _chunk_problems(plan)
     if plan.path is not None and plan.shape[-1] > MOST_BRANCHES:
         problems.append(
-            f"initial_conditions: {plan.shape[-1]} branches; {MOST_BRANCHES} are the most: begin from fewer "
-            "states, or make it a sweep."
+            f"initial_conditions: {plan.shape[-1]} branches; the limit is {MOST_BRANCHES}: begin from fewer "
+            'states, or set kind = "sweep".'
         )
     if problems:
         raise SpecError(problems)
@@ -56,8 +56,8 @@ def _task_problems(plan: Plan) -> list[str]:
     wanted = math.ceil(cells / plan.n_points * plan.n_tasks / MOST_TASKS) if plan.path is None else 0
     more = f"set execution.trajectories_per_task to {2 * wanted} or more" if wanted else "let tasks take more"
     return [
-        f"execution: {plan.n_cells} cells in tasks of {cells} are {plan.n_tasks} tasks; {MOST_TASKS} are the "
-        f"most: {more}, or ask for fewer cells."
+        f"execution: {plan.n_cells} cells in tasks of {cells} are {plan.n_tasks} tasks; the limit is "
+        f"{MOST_TASKS}: {more}, or use fewer cells."
     ]
 
 
@@ -72,8 +72,8 @@ def _chunk_problems(plan: Plan) -> list[str]:
         fitting = MOST_CHUNK_BYTES * cells // n_bytes
         remedy = f"set execution.trajectories_per_task to {fitting} or less" if fitting else "keep less"
         problems.append(
-            f"{variable.name}: {cells} cells of a task take {in_words(n_bytes)} in one piece, and "
-            f"{in_words(MOST_CHUNK_BYTES)} are the most that can be compressed; {remedy}, or lower "
+            f"{variable.name}: {cells} cells of a task take {in_words(n_bytes)} in one piece; "
+            f"the limit of compression is {in_words(MOST_CHUNK_BYTES)}; {remedy}, or lower "
             "integration.n_keep."
         )
     return problems

@@ -73,7 +73,7 @@ def _cells(results: Results, name: str) -> tuple[xr.Dataset, str]:
     axes, starts = split_dims(cube["status"])
     wide = [d for d in axes if cube.sizes[d] > 1] or list(axes[:1])
     if len(wide) != 1:
-        raise SpecError([f"{name}: measured along one axis, and it has {', '.join(axes) or 'none'}."])
+        raise SpecError([f"{name}: is measured along one axis, and the run has {', '.join(axes) or 'none'}."])
     keep = ["orbit_period", "status", *(n for n in ("lyapunov", "lyapunov_flag") if n in cube)]
     found = cube[keep]
     words = classify(cube)
@@ -116,7 +116,7 @@ def _matches(ds: xr.Dataset, options: Options) -> np.ndarray:
         found &= np.isin(periods, np.atleast_1d(wanted))
     if "motion" in options:
         if "motion" not in ds:
-            raise SpecError([f"motion = {options['motion']!r}: the model of this run has no words for motions."])
+            raise SpecError([f"motion = {options['motion']!r}: the model of this run has no labels for motions."])
         words = str(ds["motion"].attrs["flag_meanings"]).split()
         if options["motion"] not in words:
             raise SpecError([f"motion = {options['motion']!r}: must be one of {', '.join(words)}."])
@@ -269,7 +269,7 @@ def located_bifurcation(results: Results, of: Sequence[str], options: Options) -
     found = results.run(of[0]).derive("branches", **given, generations=1)
     rows = [row for row in table_of(found) if row["type"] == options["type"]]
     if not rows:
-        return absent(f"no {options['type'].replace('_', ' ')} was met {_asked(options)}")
+        return absent(f"no {options['type'].replace('_', ' ')} was found {_asked(options)}")
     name = parameter_name(str(found.attrs["parameter"]))
     low = min(row[name] - row["bracket"] for row in rows)
     high = max(row[name] + row["bracket"] for row in rows)
@@ -357,13 +357,13 @@ def share_above(results: Results, of: Sequence[str], options: Options) -> Estima
     signs = values(grid) > 0.0
     changes = np.flatnonzero(signs[1:] != signs[:-1])
     if not signs[0] or changes.size != 1:
-        text = "is not positive from the begin of the period on" if not signs[0] else "changes sign more than once"
+        text = "is not positive from the beginning of the period on" if not signs[0] else "changes sign more than once"
         return Estimate(0.0, 0.0, 0.0, f"{options['quantity']} {text}")
     low, high = grid[changes[0]], grid[changes[0] + 1]
     while high - low > 1e-12:
         middle = 0.5 * (low + high)
         low, high = (middle, high) if values(np.array([middle]))[0] > 0 else (low, middle)
-    text = f"positive from the begin of the period to {low:.8f} of it, found by bisection"
+    text = f"positive from the beginning of the period to {low:.8f} of it, found by bisection"
     return Estimate(low, low, high, text)
 
 

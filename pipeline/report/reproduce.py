@@ -158,23 +158,23 @@ def judge(results: Results, figure: str, claim: ClaimTable) -> Judgement:
         plain, reason = Verdict.UNDECIDED, f"Not measured: {found.missing}.{_decides(claim)}"
     elif claim.step and found.step and found.step > claim.step * (1 + 1e-6):
         plain = Verdict.UNDECIDED
-        reason = f"The axis has steps of {found.step:.4g}; {claim.step:g} and less decide."
+        reason = f"The axis has steps of {found.step:.4g}; the claim needs steps of at most {claim.step:g}."
     elif claim.n and found.n is not None and found.n < claim.n:
-        plain, reason = Verdict.UNDECIDED, f"Rests on {found.n}; {claim.n} and more decide."
+        plain, reason = Verdict.UNDECIDED, f"The sample is {found.n}; the claim needs at least {claim.n}."
     elif plain is Verdict.UNDECIDED:
-        reason = "The interval reaches beyond what is claimed: a larger sample, or a finer axis, decides."
+        reason = "The interval lies partly outside the claimed range; a larger sample or a finer axis can decide."
     if claim.calibrated and plain is not Verdict.UNDECIDED:
-        agrees = "agrees with it" if plain is Verdict.MET else "contradicts it"
-        return Judgement(figure, claim, found, Verdict.CALIBRATED, plain, f"What came out {agrees}.")
+        agrees = "agrees with the claim" if plain is Verdict.MET else "contradicts the claim"
+        return Judgement(figure, claim, found, Verdict.CALIBRATED, plain, f"The result {agrees}.")
     return Judgement(figure, claim, found, Verdict.CALIBRATED if claim.calibrated else plain, plain, reason)
 
 
 def _decides(claim: ClaimTable) -> str:
     """Return a sentence on the size of a run that would decide an unmeasured claim."""
-    steps = f"steps of {claim.step:g} and less" if claim.step else ""
-    cells = f"{claim.n} cells and more" if claim.n else ""
-    both = " with ".join(part for part in (steps, cells) if part)
-    return f" {both[0].upper()}{both[1:]} decide." if both else ""
+    steps = f"steps of at most {claim.step:g}" if claim.step else ""
+    cells = f"at least {claim.n} cells" if claim.n else ""
+    both = " and ".join(part for part in (steps, cells) if part)
+    return f" The claim needs {both}." if both else ""
 
 
 def _part(results: Results, figure: FigureTable, judgements: Sequence[Judgement]) -> Part:
@@ -182,7 +182,7 @@ def _part(results: Results, figure: FigureTable, judgements: Sequence[Judgement]
     many = len(figure.numbers) > 1
     blocks: list[Block] = []
     if figure.says:
-        blocks.append(Text(f"What the text says: {figure.says}"))
+        blocks.append(Text(f"The paper's text: {figure.says}"))
     if figure.note:
         blocks.append(Note(figure.note))
     blocks += [picture(results, table) for table in figure.pictures]
@@ -260,7 +260,7 @@ def _summary(results: Results, judgements: Sequence[Judgement]) -> list[Block]:
         for j in decided_first(judgements)
     ]
     if rows:
-        heads = ("figure", "claim", "came out (95 % interval)", "verdict")
+        heads = ("figure", "claim", "result (95 % interval)", "verdict")
         blocks.append(Grid(heads, rows, "Claims that are tests", stacked=True))
     if calibrated := calibrated_on(judgements):
         blocks.append(Text(calibrated))
@@ -311,7 +311,7 @@ def _provenance(results: Results) -> list[Part]:
         spec = results.study.table.runs[name].spec
         words = "SPEC" if spec.endswith(".toml") else spec + (" --smoke" if results.smoke else "")
         own.append(Part(f"Run {name}", list(provenance_of(run, words))))
-    return [Part("Where this comes from", [table], own)]
+    return [Part("Provenance", [table], own)]
 
 
 def _rows(judgements: Sequence[Judgement]) -> str:

@@ -47,13 +47,13 @@ _HEADINGS = {
 }
 
 _CAPTIONS = {
-    "hysteresis": "Jumps of the walks: from where to where, from which attractor to which",
-    "basins": "What the initial states of the grid end on",
+    "hysteresis": "Jumps of the branches: the parameter values, and the attractors before and after",
+    "basins": "Attractors on which the initial states of the grid end",
     "branches": "Located bifurcations",
     "curves": "Curves of bifurcations",
-    "chaos": "What kind of motion each attractor is",
+    "chaos": "Kind of motion of each attractor",
     "dimension": "Correlation dimensions of the attractors that do not close",
-    "settling": "Sets that do not close, and what their extended cells showed",
+    "settling": "Sets that do not close, and the results of extending their cells",
 }
 
 
@@ -109,7 +109,7 @@ def part_of(source: str | AnalysedRun, echo: Callable[[str], None], computed: tu
         *_analyses(shown),
         Part("Exponents", list(_exponents(shown))),
         Part("Parameters", list(_parameters(shown))),
-        Part("Where this comes from", list(provenance_of(shown.run))),
+        Part("Provenance", list(provenance_of(shown.run))),
     ]
     return Part(title, list(_state(shown)), [part for part in parts if part.blocks])
 
@@ -131,7 +131,7 @@ def _state(shown: Shown) -> Iterator[Block]:
     )
     if not run.complete:
         yield Note(
-            "This run is not complete: what is not computed is left out everywhere below.",
+            "This run is not complete: the page omits cells that are not computed.",
             f"magpend run SPEC --out {shown.directory}",
         )
 
@@ -204,17 +204,19 @@ def _attractors(shown: Shown) -> Iterator[Block]:
     if len(shown.axes) == 1 and shown.cube.sizes[shown.axes[0]] > 1:
         yield from _drawn(shown, "attractors", "All coexisting attractors", **options)
         if "fraction" in (rows or [{}])[0]:
-            yield from _drawn(shown, "fractions", "Shares of the initial states that end on each attractor", **options)
+            yield from _drawn(
+                shown, "fractions", "Fractions of the initial states that end on each attractor", **options
+            )
     elif len(shown.axes) == 2:
-        yield from _drawn(shown, "regimes", "Which periods coexist", **options)
-        yield from _drawn(shown, "regimes", "How many attractors coexist", **options, show="number")
+        yield from _drawn(shown, "regimes", "Periods that coexist", **options)
+        yield from _drawn(shown, "regimes", "Number of coexisting attractors", **options, show="number")
     if rows:
         where = _richest(rows, shown.axes)
         place = ", ".join(f"{name} = {value:g}" for name, value in where.items())
         if any(row["stability"] == "attracts" for row in rows):
             words = f"Attractors at {place}, where most coexist" if place else "Attractors"
         else:
-            words = f"Sets that cells are on at {place}" if place else "Sets that cells are on"
+            words = f"Sets on which cells end at {place}" if place else "Sets on which cells end"
         yield from _drawn(shown, "gallery", words, **options, at=where)
 
 
@@ -242,7 +244,7 @@ def _attractor_grid(
     """Return a row per attractor: kind, period, motion, ranges, largest fraction with its interval."""
     motion, sampled = any("side" in r for r in rows), any("fraction" in r for r in rows)
     names = ["", "kind", "stability", "shown by", "period", *(["motion"] if motion else []), *axes, "cells"]
-    names += ["share (95 % interval)"] if sampled else []
+    names += ["basin fraction (95 % interval)"] if sampled else []
     lines = []
     for i in sorted({row["attractor_id"] for row in rows}):
         own = [row for row in rows if row["attractor_id"] == i]

@@ -134,7 +134,7 @@ def derive(
     except DamagedError as error:
         run.echo(f"{name}: damaged ({error}); computing it again")
     if place.local is not None and (problem := unwritable(place.local.parent)):
-        run.echo(f"{problem}: what {name} finds is shown, and not kept")
+        run.echo(f"{problem}: the result of {name} is shown but not kept")
     return _kept(run, place, _compute(run, analysis, wanted).assign_attrs(key))
 
 
@@ -203,9 +203,9 @@ def _refuse_recorded(run: Run, name: str) -> None:
     if run.spec.recorded is not None:
         raise SpecError(
             [
-                f"{run.name}: its drive is the recording {run.spec.recorded.file}, and {name} goes on where "
-                "it ends. For attractors and what rests on them make a run at its mean frequency (frequency_hz = "
-                f"{run.spec.frequency_hz:.6g} instead of [drive]); this one's sections can be drawn: magpend "
+                f"{run.name}: its drive is the recording {run.spec.recorded.file}, which ends, but {name} "
+                "integrates further. Make a run at its mean frequency instead (frequency_hz = "
+                f"{run.spec.frequency_hz:.6g} instead of [drive]). You can draw this run's sections: magpend "
                 "plot bifurcation, or section."
             ]
         )
@@ -284,7 +284,7 @@ def refused(directory: str | Path) -> Iterator[None]:
         raise
     except ValueError as error:
         if "checksum" in str(error).lower():
-            raise DamagedError(f"{directory}: a chunk is damaged; look with: magpend verify {directory}") from None
+            raise DamagedError(f"{directory}: a chunk is damaged; check with: magpend verify {directory}") from None
         if hasattr(error, "problems"):  # parameters out of bounds say enough themselves
             raise
         raise SpecError([f"{directory}: {error}"]) from None
@@ -315,7 +315,7 @@ def _kept(run: AnalysedRun, place: Files, result: xr.Dataset) -> xr.Dataset:
         write_product(place, result)
     except OSError as error:
         kept = place.name.rpartition("/")[2]
-        run.echo(f"{kept}: not kept ({error}); what was found is shown all the same")
+        run.echo(f"{kept}: not kept ({error}); the result is shown all the same")
         return result
     return _placed(open_product(place), place)
 

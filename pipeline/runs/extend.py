@@ -87,7 +87,7 @@ class Extension:
         yield from self.notes
         n = self.plan.n_cells
         for run, count in zip(self.runs, self.counts, strict=True):
-            how = "go on from their last section in" if self._more(run) else "are taken from"
+            how = "continue from their last section in" if self._more(run) else "are reused from"
             yield f"{count} of {n} cells {how} {run.name}"
         bound = "at most " if self.spec.refine is not None else ""
         yield f"{bound}{n - self.reused} cells are left to integrate"
@@ -124,8 +124,8 @@ def plan_extension(
     if not sum(counts):
         reasons = notes + [line for run in fitting for line in _strangers(run, wide)]
         raise RefusedError(
-            "no cell is there to be taken, so a run of its own is as quick (magpend run SPEC --out NEW). "
-            "What differs:\n  " + "\n  ".join(reasons)
+            "no cell can be reused, so a new run is as quick (magpend run SPEC --out NEW). "
+            "Differences:\n  " + "\n  ".join(reasons)
         )
     return Extension(wide, text, plan, identity, tuple(fitting), tuple(counts), tuple(notes))
 
@@ -160,14 +160,13 @@ def _fitting(runs: Sequence[Run], wide: Spec, identity: Mapping[str, Any]) -> tu
     for run in runs:
         lines = obstacles(run, wide, identity)
         if lines:
-            notes.append(f"{run.name}: none of its cells can be taken ({'; '.join(lines)})")
+            notes.append(f"{run.name}: none of its cells can be reused ({'; '.join(lines)})")
             continue
         fitting.append(run)
         if not run.complete:
             done = sum(run.plan.cells_in(i) for i in run.commits)
             notes.append(
-                f"{run.name}: is not complete; {done} of {run.plan.n_cells} cells are committed, and "
-                "these alone are taken"
+                f"{run.name}: is not complete; only its {done} of {run.plan.n_cells} committed cells are reused"
             )
     return fitting, notes
 
@@ -187,7 +186,7 @@ def _census(wide: Spec, plan: Plan, runs: Sequence[Run]) -> list[int]:
 def _strangers(run: Run, wide: Spec) -> list[str]:
     """Explain why a compatible run contributes no cells."""
     if not run.commits:
-        return [f"{run.name}: nothing of it is committed"]
+        return [f"{run.name}: it has no committed cells"]
     return [f"{run.name}: {line}" for line in apart(run.spec, wide)]
 
 
@@ -319,7 +318,7 @@ def _record(extension: Extension, files: Files) -> None:
 def _folder(files: Files) -> Path:
     """Return the folder of a run; refuse a run in an object store, which cannot be replaced."""
     if files.local is None:
-        raise RefusedError(f"{files.name}: is no folder of this machine, which can be renamed; give --out.")
+        raise RefusedError(f"{files.name}: is not a folder on this machine, so it cannot be replaced; give --out.")
     return files.local
 
 
@@ -339,10 +338,10 @@ def _aside(directory: Path) -> Path:
 def _as_it_is(run: Run, echo: Echo) -> State:
     if not run.complete:
         raise RefusedError(
-            f"{run.name}: this is its own specification, and it is not complete; complete it with: "
+            f"{run.name}: this is its own specification, and the run is not complete; complete it with: "
             f"magpend run SPEC --out {run.name}"
         )
-    echo(f"{run.name} holds all this already; nothing to do.")
+    echo(f"{run.name} has all these cells already; nothing to do.")
     return state(run)
 
 
@@ -357,8 +356,8 @@ def _refuse_loss(run: Run, wide: Spec) -> None:
     what += [f"its product {name}" for name in absent]
     if what:
         raise RefusedError(
-            f"{run.name}: {' and '.join(what)} would not be in the wider run, which would take its "
-            "place; give another directory with --out, or a specification that has them all."
+            f"{run.name}: {' and '.join(what)} would be lost, because the wider run replaces this "
+            "run and lacks them; give another directory with --out, or a specification that includes them."
         )
 
 
@@ -369,7 +368,7 @@ def _exchange(directory: Path, built: Path, echo: Echo) -> None:
     sync_folder(real.parent)
     built.rename(real)
     sync_folder(real.parent)
-    echo(f"the run as it was lies in {aside}; remove it when nobody needs it any more")
+    echo(f"the old run is in {aside}; remove it when you no longer need it")
 
 
 def _finish_exchange(directory: Path, echo: Echo) -> None:
@@ -378,7 +377,7 @@ def _finish_exchange(directory: Path, echo: Echo) -> None:
     if directory.exists() or not is_run(open_files(built)):
         return
     if not state(built).complete:
-        raise RefusedError(f"{directory}: is not there, and {built} is not complete; put one in its place.")
+        raise RefusedError(f"{directory}: is missing, and {built} is not complete; restore one of them.")
     built.rename(directory)
     sync_folder(directory.parent)
-    echo(f"{directory}: the extension was complete and has taken its place")
+    echo(f"{directory}: the complete extension has replaced it")

@@ -43,8 +43,7 @@ def sound_commits(info: RunInfo, plan: Plan, echo: Echo, *, alone: bool = True) 
     seconds = time.perf_counter() - started
     if contents and seconds > _LONG_SECONDS:
         echo(
-            f"{len(records)} committed tasks compared with their records in {duration(seconds)} "
-            f"({VERIFY}=0 leaves that out)"
+            f"{len(records)} committed tasks compared with their records in {duration(seconds)} ({VERIFY}=0 skips this)"
         )
     for problem in list(damaged.values())[:_NAMED]:
         echo(f"{problem}: computed again")

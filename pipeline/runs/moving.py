@@ -86,11 +86,13 @@ def _chosen(name: str, here: xr.Dataset, letters: Sequence[str]) -> tuple[list[i
         raise SpecError([f"{name}: no attractor was found at this point; look with magpend analyse attractors."])
     by_letter = {letter(i): i for i in there}
     if wrong := [text for text in letters if text.upper() not in by_letter]:
-        raise SpecError([f"--attractor {text}: is not at this point; there: {', '.join(by_letter)}." for text in wrong])
+        raise SpecError(
+            [f"--attractor {text}: does not exist at this point; there are: {', '.join(by_letter)}." for text in wrong]
+        )
     if letters:
         chosen = list(dict.fromkeys(by_letter[text.upper()] for text in letters))
         if len(chosen) > MOST_MOTIONS:
-            raise SpecError([f"--attractor: {len(chosen)} are asked for; at most {MOST_MOTIONS} fit a frame."])
+            raise SpecError([f"--attractor: {len(chosen)} are requested; at most {MOST_MOTIONS} fit a frame."])
         return chosen, []
     attract = here["stability"].values == ATTRACTS
     wanted = attract if attract.any() else ~attract
@@ -151,7 +153,7 @@ def of_cells(run: AnalysedRun, numbers: Sequence[int]) -> list[Moving]:
         if not 0 <= i < n
     ]
     if len(numbers) > MOST_MOTIONS:
-        problems.append(f"--cell: {len(numbers)} are asked for; at most {MOST_MOTIONS} fit a frame.")
+        problems.append(f"--cell: {len(numbers)} are requested; at most {MOST_MOTIONS} fit a frame.")
     if problems:
         raise SpecError(problems)
     moving = []
@@ -164,7 +166,7 @@ def of_cells(run: AnalysedRun, numbers: Sequence[int]) -> list[Moving]:
             from magpend_core.status import Status
 
             status = Status(int(one["status"]))
-            problems.append(f"--cell {number}: has no sections to begin at ({status.sentence}).")
+            problems.append(f"--cell {number}: has no sections to start from ({status.sentence}).")
             continue
         parameters, frequency = _at_point(cube, one)
         period = int(one["orbit_period"]) / frequency if "orbit_period" in one else 0.0
@@ -196,8 +198,8 @@ def _refuse_recorded(run: AnalysedRun) -> None:
     if run.spec.recorded is not None:
         raise SpecError(
             [
-                f"{run.name}: its drive is the recording {run.spec.recorded.file}; an animation takes a run at a "
-                "frequency. Draw this one's sections: magpend plot section."
+                f"{run.name}: its drive is the recording {run.spec.recorded.file}; an animation needs a "
+                "run at a fixed frequency. To draw this run's sections: magpend plot section."
             ]
         )
 

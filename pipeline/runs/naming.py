@@ -81,7 +81,7 @@ def _swept(run: Run) -> str:
     known = ", ".join(run.model.parameter_names)
     raise SpecError(
         [
-            f"{run.name} sweeps no parameter, and {run.model.name} has no drive's frequency to follow; give "
+            f"{run.name} sweeps no parameter, and {run.model.name} has no drive frequency to follow; give "
             f"--parameter: {known}."
         ]
     )

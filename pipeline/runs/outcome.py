@@ -93,7 +93,7 @@ def summary(run: Run) -> list[str]:
     if lost:
         lines.append(f"what each status means: magpend status {run.name}")
         zoom = _zoom(lost, run)
-        lines += [f"look closer at the cells that were lost: {zoom}"] if zoom else []
+        lines += [f"look closer at the lost cells: {zoom}"] if zoom else []
     return lines
 
 
@@ -114,7 +114,7 @@ def warning(run: Run) -> str:
     )
     return (
         f"warning: {n_lost} of {computed} cells ({100 * n_lost / computed:.1f} %) diverged or failed; "
-        f"figures leave them out. {told}."
+        f"figures omit them. {told}."
     )
 
 

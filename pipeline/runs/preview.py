@@ -134,10 +134,10 @@ def time_line(spec: Spec, plan: Plan, share: float, n_tasks: int, workers: int |
     used = default_workers() if workers is None else workers
     cores, by_clock = max(1, min(used, n_tasks)), wall_seconds(seconds, n_tasks, used)
     bound = "about" if spec.refine is None else "at most"
-    compiled = f"; the kernel was compiled for it in {duration(found.compiled_s)}" if found.compiled_s > 1 else ""
+    compiled = f"; compiling its kernel took {duration(found.compiled_s)}" if found.compiled_s > 1 else ""
     whole = duration(found.core_seconds)
     rests = f"{found.how}; writing a task takes {1000 * writing_s:.0f} ms{compiled}"
     return (
         f"time: {bound} {duration(seconds)} of one core, {duration(by_clock)} on {cores} ({rests}); "
-        f"analyse attractors may extend cells for up to {whole} of one core after it"
+        f"after it, analyse attractors may extend cells for up to {whole} of one core"
     )

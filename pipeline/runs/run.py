@@ -212,8 +212,8 @@ def _require_all(info: RunInfo, plan: Plan, echo: Echo) -> None:
     if absent:
         why = f" {next(iter(problems.values()))}." if problems else ""
         raise IncompleteError(
-            f"{info.name}: {len(absent)} of {plan.n_tasks} tasks were computed and are not committed "
-            f"here (the first is {absent[0]}).{why} Every worker must see this very folder, by this path, "
-            "and have room to write; then give the same command again: it computes these tasks alone."
+            f"{info.name}: {len(absent)} of {plan.n_tasks} tasks were computed but are not committed "
+            f"here (the first is {absent[0]}).{why} Every worker must see this folder under this path, "
+            "and have space to write. Then give the same command again; it computes only these tasks."
         )
     sweep(info, plan, commits, echo)

@@ -101,7 +101,7 @@ def leave(number: int) -> NoReturn:
     if hasattr(local, "abandon"):  # absent while the module is being imported
         local.abandon()
     shown = "\x1b[?25h" if sys.stderr.isatty() else ""
-    how = "stopped" if _listener.first is None else "stopped at once; what is committed stays"
+    how = "stopped" if _listener.first is None else "stopped at once; committed results stay"
     with contextlib.suppress(OSError):
         os.write(2, f"{shown}\nmagpend: {how}.\n".encode())
     os._exit(128 + number)
@@ -121,7 +121,7 @@ def stoppable(directory: str | Path) -> Iterator[None]:
             yield
     except KeyboardInterrupt as error:
         number = error.number if isinstance(error, Stopped) else signal.SIGINT
-        message = f"Stopped. What is committed in {directory} stays; the same command goes on from there."
+        message = f"Stopped. Committed results in {directory} stay; the same command continues from there."
         raise InterruptedRunError(number, message) from None
 
 

@@ -74,7 +74,7 @@ class Submission:
             f"follow: magpend status {shlex.quote(self.name)}; {words.follow} {self.job}; "
             f"tail -F {self.folder}/coordinator*",
             f"cancel: {words.cancel} {self.job}",
-            "after a cancel, or where time ran out: give this command again, and it goes on",
+            "after a cancel, or if time ran out: give this command again to continue",
         ]
 
 
@@ -103,7 +103,7 @@ def prepare(
     if not file:
         raise SpecError(
             [
-                f"what is a job? Say it in a file with a [cluster] table and give --cluster FILE, or set "
+                f"a job is not described; write a file with a [cluster] table and give --cluster FILE, or set "
                 f"{CLUSTER_FILE}; docs/clusters.md has an example."
             ]
         )
@@ -113,8 +113,8 @@ def prepare(
     if _AWKWARD.search(str(folder)):
         raise SpecError(
             [
-                f"{folder}: batch systems do not take this path for what a job says; give an --out of letters, "
-                "digits, and . _ - + , : = @ alone."
+                f"{folder}: batch systems do not accept this path for a job's output; give an --out with only letters, "
+                "digits, and . _ - + , : = @."
             ]
         )
     check_starts(parsed)
@@ -163,8 +163,8 @@ def send(submission: Submission) -> Submission:
     if not shutil.which(words.send[0]):
         raise SpecError(
             [
-                f"{kind}: there is no command {words.send[0]!r} here; give the command on a machine that sends "
-                "jobs, such as the login node, or --dry-run to see the script."
+                f"{kind}: there is no command {words.send[0]!r} here; use a machine that sends "
+                "jobs, such as the login node, or use --dry-run to see the script."
             ]
         )
     _refuse_second(submission)
@@ -198,7 +198,7 @@ def _refuse_second(submission: Submission) -> None:
     if done.returncode == 0 and state and not re.fullmatch(words.over, state):
         named = f" ({state})" if "\n" not in state else ""
         raise LockedError(
-            f"{submission.name}: job {job} of this run is there already{named}; wait for it "
+            f"{submission.name}: job {job} of this run exists already{named}; wait for it "
             f"({words.follow} {job}) or cancel it ({words.cancel} {job})."
         )
 

@@ -63,11 +63,11 @@ def describe(found: Verification, directory: str | Path, *, repaired: bool) -> l
     ]
     lines += [f"  rebuilt: {text}" for text in found.rebuilt]
     if found.leftovers:
-        lines.append(f"  {len(found.leftovers)} uncommitted files, read by nobody; the next run removes them")
+        lines.append(f"  {len(found.leftovers)} uncommitted files, which nothing reads; the next run removes them")
     if found.skeleton and repaired:
         lines.append(
-            "Metadata or coordinates come out otherwise here than they were written: another version of "
-            "magpend or zarr made them (run.json names it). Repair with that one, or run "
+            "Metadata or coordinates differ from those that this version writes: another version of "
+            "magpend or zarr made them (run.json names it). Repair the run with that version, or run "
             "the specification again."
         )
     elif found.skeleton:
@@ -77,9 +77,9 @@ def describe(found: Verification, directory: str | Path, *, repaired: bool) -> l
     if found.odd:
         lines.append(f"{len(found.odd)} moved into {directory}/{ASIDE}." if repaired else "--repair moves these aside.")
     if found.derived and repaired:
-        lines.append(f"{len(found.derived)} products removed: they are computed again when asked for.")
+        lines.append(f"{len(found.derived)} products removed: they are computed again on demand.")
     elif found.derived:
-        lines.append("Damaged products are computed again when asked for; --repair removes them.")
+        lines.append("Damaged products are computed again on demand; --repair removes them.")
     if found.damaged and not repaired:
         lines.append("Withdraw them with --repair, then run the specification again to compute these tasks.")
     return lines

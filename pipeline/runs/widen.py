@@ -67,8 +67,8 @@ def _problems(spec: Spec, widening: Widening) -> list[str]:
     kind = spec.initial_conditions.kind
     if states and not isinstance(spec.initial_conditions, GridStarts):
         problems.append(
-            f"axis {states[0]}: the initial conditions are a {kind} and no grid, which a range could widen; "
-            "give a SPEC with the starts that are wanted."
+            f"axis {states[0]}: the initial conditions are a {kind}, and a range widens only a grid; "
+            "give a SPEC with the new starts."
         )
     if widening.starts is not None and not isinstance(spec.initial_conditions, RandomStarts):
         problems.append(

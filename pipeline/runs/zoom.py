@@ -132,7 +132,7 @@ def write_zoom(source: Source, changes: Changes, out: Path) -> list[str]:
     spec, notes = zoom(source.spec, changes)
     text = f"# Zoom. Derived from {_one_line(source.origin)}.\n{to_toml(spec)}"
     if isinstance(spec.reference, Mapping) and (place := spec.reference.get(KEY)):
-        notes = [*notes, f"model: running {out} imports the Python object {place}; look at it before."]
+        notes = [*notes, f"model: running {out} imports the Python object {place}; read its code first."]
     try:
         with out.open("x", encoding="utf-8") as file:
             file.write(text)
@@ -166,7 +166,7 @@ def _check(spec: Spec, changes: Changes) -> list[str]:
     starts = spec.initial_conditions
     if not isinstance(starts, GridStarts | RandomStarts):
         problems += [
-            f"{key}: the initial conditions are a list, which has no ranges; zoom into parameters alone."
+            f"{key}: the initial conditions are a list, which has no ranges; zoom into parameters only."
             for key in keys
             if _state(spec, key)
         ]
@@ -181,7 +181,7 @@ def _check(spec: Spec, changes: Changes) -> list[str]:
         if name not in ranged:
             problems.append(f"points of {name}: no range is given for it; give one or drop it.")
         elif sampled and name in spec.model.state_names:
-            problems.append(f"number of points of {name}: samples have none; --samples says how many are drawn.")
+            problems.append(f"number of points of {name}: random samples have no grid; give --samples instead.")
     for key in changes.ranges:
         if not (sampled and _state(spec, key)) and _points(spec, key, changes) < 2:
             problems.append(f"{key}: a range has 2 points or more; say how many, such as --num 101.")

@@ -245,7 +245,7 @@ def _columns(kind: str, rows: list[tuple[int, list[str]]], file: str) -> tuple[n
         try:
             first[k], second[k] = map(float, fields)
         except ValueError:
-            problems.append(f"{file}, line {line}: {','.join(fields)[:60]!r} is not two numbers; mend it.")
+            problems.append(f"{file}, line {line}: {','.join(fields)[:60]!r} is not two numbers; correct it.")
             continue
         if not (math.isfinite(first[k]) and math.isfinite(second[k])):
             problems.append(
@@ -259,12 +259,12 @@ def _columns(kind: str, rows: list[tuple[int, list[str]]], file: str) -> tuple[n
 def _few(problems: list[str], file: str) -> list[str]:
     if len(problems) <= MOST_PROBLEMS:
         return problems
-    return [*problems[:MOST_PROBLEMS], f"{file}: and {len(problems) - MOST_PROBLEMS} lines more like these."]
+    return [*problems[:MOST_PROBLEMS], f"{file}: and {len(problems) - MOST_PROBLEMS} more lines like these."]
 
 
 def _edge_problems(rising: np.ndarray, falling: np.ndarray, file: str) -> list[str]:
     if len(rising) < 2:
-        return [f"{file}: has {len(rising)} rising edges; two make a period: record longer."]
+        return [f"{file}: has {len(rising)} rising edges; a period needs two: record longer."]
     problems = [
         f"{file}: rising_s = {rising[i + 1]:.9g} s follows {rising[i]:.9g} s; rising edges must rise: sort them."
         for i in np.flatnonzero(np.diff(rising) <= 0)
@@ -280,7 +280,7 @@ def _edge_problems(rising: np.ndarray, falling: np.ndarray, file: str) -> list[s
 
 def _torque_problems(time: np.ndarray, level: np.ndarray, file: str) -> list[str]:
     if len(time) < 2:
-        return [f"{file}: has {len(time)} samples; two make a line: record longer."]
+        return [f"{file}: has {len(time)} samples; a line needs two: record longer."]
     problems = [
         f"{file}: time_s = {time[i + 1]:.9g} s follows {time[i]:.9g} s; time must rise: sort or thin it."
         for i in np.flatnonzero(np.diff(time) <= 0)

@@ -46,7 +46,7 @@ def toml_tables(content: bytes, name: str) -> dict[str, Any]:
         if len(content) > MOST_BYTES:
             raise SpecError(
                 [
-                    f"{name}: has more than {MOST_BYTES // 1_000_000} MB, the most that a specification has; "
+                    f"{name}: has more than {MOST_BYTES // 1_000_000} MB, the limit of a specification; "
                     "give ranges, or random starts with a seed, instead of lists."
                 ]
             )
@@ -70,7 +70,7 @@ def _unreadable(error: Exception) -> str:
     if isinstance(error, tomllib.TOMLDecodeError):
         return f"is not valid TOML: {error}."
     if isinstance(error, RecursionError):
-        return f"is nested too deep; a specification has at most {MOST_DEPTH} tables and lists within another."
+        return f"is nested too deeply; a specification has at most {MOST_DEPTH} levels of tables and lists."
     # Python's own bound on the digits of a whole number; or a path with a null character
     return f"is not valid TOML: {str(error).partition(';')[0].partition(':')[0]}."
 
@@ -84,24 +84,24 @@ def odd_data(data: Any) -> list[str]:
     while todo:
         place, value, depth = todo.pop()
         if depth > MOST_DEPTH:
-            return [f"{place[:MOST_KEY]}: is nested too deep: more than {MOST_DEPTH} tables or lists in another."]
+            return [f"{place[:MOST_KEY]}: is nested too deeply; the limit is {MOST_DEPTH} levels of tables and lists."]
         if isinstance(value, Mapping):
             for key, inner in value.items():
                 if not isinstance(key, str):
-                    return [f"{place or 'specification'}: the key {key!r} is no text; keys are texts."]
+                    return [f"{place or 'specification'}: the key {key!r} is not a text."]
                 if len(key) > MOST_KEY:
-                    return [f"{key[:40]}...: this key has {len(key)} characters; {MOST_KEY} are the most."]
+                    return [f"{key[:40]}...: this key has {len(key)} characters; the limit is {MOST_KEY}."]
                 todo.append((f"{place}.{key}" if place else key, inner, depth + 1))
         elif isinstance(value, (list, tuple)):
             if len(value) > MOST_ELEMENTS:
                 return [
-                    f"{place[:MOST_KEY]}: has {len(value)} elements; {MOST_ELEMENTS} are the most of an "
+                    f"{place[:MOST_KEY]}: has {len(value)} elements; the limit is {MOST_ELEMENTS} in an "
                     "array. Give ranges, or random starts with a seed."
                 ]
             todo += [(place, v, depth + 1) for v in value if not isinstance(v, (float, str, bool))]
         elif isinstance(value, int) and value not in WHOLE_NUMBERS:
             bits = value.bit_length()
-            return [f"{place}: a whole number of {bits} bits is none in TOML, whose have 64; write it as 1e300."]
+            return [f"{place}: has {bits} bits; a whole number in TOML has at most 64. Write it as 1e300."]
     return []
 
 

@@ -20,8 +20,8 @@ from pipeline.specification.toml import table_lines, toml_value
 
 SUFFIX = ".toml"
 A_MODEL = (
-    'model: this is the text of a model, not a specification; write one with model = "FILE.toml", which '
-    "names it, with kind, parameters and initial_conditions. magpend model show FILE.toml looks at it."
+    'model: this is the text of a model, not a specification. Write a specification with model = "FILE.toml", '
+    "kind, parameters and initial_conditions. To show the model: magpend model show FILE.toml."
 )
 KEPT = None
 """Value of `folder` for data that a run keeps: no file is read, nothing is imported."""

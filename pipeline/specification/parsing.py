@@ -212,7 +212,7 @@ def parse_spec(data: Mapping[str, Any], folder: str | Path | None = ".") -> Spec
     if odd := odd_data(data):
         raise SpecError(odd)
     if data.get("kind") == IDENTIFICATION:
-        raise SpecError([f'kind = "{IDENTIFICATION}": is no run; use magpend identify SPEC --out DIR.'])
+        raise SpecError([f'kind = "{IDENTIFICATION}": is not a run; use magpend identify SPEC --out DIR.'])
     if "kind" not in data and "equations" in data:
         raise SpecError([A_MODEL])
     problems = [unknown_key(key, key, _KEYS) for key in data if key not in _KEYS]
@@ -327,7 +327,7 @@ def _title(data: Mapping[str, Any], problems: list[str]) -> str:
     if not isinstance(title, str):
         problems.append(f"title = {shown(title)}: must be a text in quotes.")
     elif not all(c.isprintable() or category(c) == "Zs" for c in title):
-        problems.append(f"title = {shown(title)}: has control characters or line breaks; take them out.")
+        problems.append(f"title = {shown(title)}: has control characters or line breaks; remove them.")
     return str(title)
 
 
@@ -393,7 +393,7 @@ def _walk(
     """Check ``[continuation]`` against the kind and the axes."""
     if kind != "continuation":
         if kind == "sweep" and "continuation" in data:
-            problems.append('continuation: a sweep has none; set kind = "continuation" or drop the table.')
+            problems.append('continuation: a sweep has no such table; set kind = "continuation" or drop the table.')
         return None
     declared = _declared(data)
     if walk is not None and walk.path not in declared:

@@ -25,7 +25,7 @@ def size_problems(axes: dict[str, Range], starts: Starts | None) -> list[str]:
     if math.prod(sizes.values()) <= MAX_CELLS:
         return []
     return [
-        f"{' x '.join(sizes)}: {math.prod(sizes.values()):.3g} cells; {MAX_CELLS:.0e} are the most: take fewer values."
+        f"{' x '.join(sizes)}: {math.prod(sizes.values()):.3g} cells; the limit is {MAX_CELLS:.0e}: use fewer values."
     ]
 
 
@@ -41,7 +41,7 @@ def corner_problems(base: Parameters, swept: dict[str, np.ndarray]) -> list[str]
     while not problems and looked_at != asked.names & set(ends):
         looked_at = asked.names & set(ends)
         if len(looked_at) > MOST_RELATED:
-            return [f"{base.model.name} relates more than {MOST_RELATED} of them; fix some."]
+            return [f"{base.model.name} relates more than {MOST_RELATED} of the swept parameters; fix some of them."]
         for corner in itertools.product(*(dict.fromkeys(ends[name]) for name in sorted(looked_at))):
             asked.values_now = {**base, **dict(zip(sorted(looked_at), corner, strict=True))}
             problems = base.model.relations(asked)

@@ -54,8 +54,8 @@ def recorded(table: DriveTable | None, problems: list[str]) -> RecordedDrive | N
         return None
     if hashlib.sha256(table.text.encode()).hexdigest() != table.sha256:
         problems.append(
-            f"drive.sha256 = {table.sha256!r}: is not that of {table.file}; drop the key, or find the "
-            "file that it names."
+            f"drive.sha256 = {table.sha256!r}: is not the digest of {table.file}; drop the key, or "
+            "restore the file with this digest."
         )
         return None
     try:
@@ -70,10 +70,10 @@ def model_problems(drive: RecordedDrive, model: Model) -> list[str]:
     from magpend_core.engine.placeholders import no_forcing
 
     if model.system.forcing is no_forcing:
-        return [f"drive: {model.name} has no drive that a recording could take the place of; drop it."]
+        return [f"drive: {model.name} has no drive that a recording could replace; drop the drive."]
     if drive.kind == EDGES and DUTY not in model.parameter_names:
         return [
-            f"drive: measured edges ask for a model with a parameter {DUTY}, and {model.name} has none; give "
+            f"drive: measured edges need a model with a parameter {DUTY}, and {model.name} has none; give "
             "its drive as a torque (columns time_s,drive)."
         ]
     return []
@@ -100,8 +100,8 @@ def run_problems(
     problems = model_problems(drive, model)
     if data.get("kind") == "continuation":
         problems.append(
-            "drive: a continuation goes from one value to the next where the last one ended, and a recording "
-            'does not begin again there; set kind = "sweep", or drop [drive].'
+            "drive: a continuation starts each value from the last state of the one before, and a recording "
+            'cannot start again there; set kind = "sweep", or drop [drive].'
         )
     for table in ("axes", "parameters.overrides", "parameters"):
         problems += _replaced_problems(drive, table, data)
@@ -115,13 +115,13 @@ def run_problems(
         )
     if integration is not None and integration.stop_when_closed:
         problems.append(
-            "integration.stop_when_closed: how long a recording is used is said by n_transient and n_keep "
-            "alone; drop the key."
+            "integration.stop_when_closed: under a recorded drive only n_transient and n_keep set the "
+            "length; drop the key."
         )
     if getattr(starts, "refine", None) is not None:
         problems.append(
-            "initial_conditions.refine: cells are inferred from closed orbits, and a recording repeats "
-            "itself to its jitter alone; drop the key, or [drive]."
+            "initial_conditions.refine: cells are inferred from closed orbits, and the jitter of a "
+            "recording keeps orbits from closing; drop the key, or [drive]."
         )
     problems += _idle_problems(drive, model, data.get("axes", {}))
     return problems + _product_problems(drive, data.get("products", {}))
@@ -135,8 +135,8 @@ def _idle_problems(drive: RecordedDrive, model: Model, axes: Any) -> list[str]:
 
     idle = drive_parameters(model.system, model.load().pack())
     return [
-        f"axes.{name}: acts on the model's own drive alone, and the torque of {drive.file} takes its "
-        "place; drop the axis, or give the drive as edges."
+        f"axes.{name}: changes only the model's own drive, which the torque of {drive.file} "
+        "replaces; drop the axis, or give the drive as edges."
         for name in axes
         if name in idle and name != DUTY
     ]
@@ -149,7 +149,7 @@ def _replaced_problems(drive: RecordedDrive, table: str, data: Mapping[str, Any]
         found = found.get(key, {}) if isinstance(found, Mapping) else {}
     names = (DUTY,) if table.endswith("overrides") else (FREQUENCY,) if table == "parameters" else (FREQUENCY, DUTY)
     return [
-        f"{table}.{name}: the drive is the recording {drive.file}, which has its own; drop it, or [drive]."
+        f"{table}.{name}: the recorded drive {drive.file} has its own; drop the key, or [drive]."
         for name in names
         if isinstance(found, Mapping) and name in found
     ]
@@ -160,12 +160,12 @@ def _product_problems(drive: RecordedDrive, products: Any) -> list[str]:
     problems = []
     if "lyapunov" in names:
         problems.append(
-            "products.lyapunov: exponents are means over ever more periods of one drive, and a recording "
+            "products.lyapunov: exponents are averages over many periods, and a recording "
             "ends; drop the product, or [drive]."
         )
     if "extremes" in names and drive.kind == TORQUE:
         problems.append(
-            "products.extremes: are taken over the intervals of a drive, and those of a torque are no "
+            "products.extremes: extremes are taken over drive periods, and the intervals of a torque are not "
             "periods; drop the product, or give the drive as edges (columns rising_s,falling_s)."
         )
     return problems

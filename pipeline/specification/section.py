@@ -61,8 +61,8 @@ def section_of(
         return None
     if not model.autonomous:
         problems.append(
-            f"section: {model.name} is forced, and its sections are once per period of the drive "
-            f"({model.section}); drop [section], or take the time out of the equations."
+            f"section: {model.name} has a drive, so its sections are once per drive period "
+            f"({model.section}); drop [section], or remove time from the equations."
         )
         return None
     found = _found(table, model, problems)
@@ -72,7 +72,7 @@ def section_of(
     if FREQUENCY in _keys(data, "axes"):
         problems.append(f"axes.{FREQUENCY}: {clash}.")
     if "drive" in data:
-        problems.append(f"drive: {model.name} has no drive that a recording could take the place of; drop it.")
+        problems.append(f"drive: {model.name} has no drive that a recording could replace; drop the drive.")
     return found
 
 
@@ -95,7 +95,7 @@ def _missing(model: Model, data: Mapping[str, Any]) -> list[str]:
         return []
     return [
         f'section: missing; {model.name} has no drive. Add [section] with of = "{model.state_names[0]}", '
-        f"value and direction, to see it at crossings; or parameters.{FREQUENCY}, to see it at even times."
+        f"value and direction, for sections by crossing; or parameters.{FREQUENCY}, for sections at even times."
     ]
 
 

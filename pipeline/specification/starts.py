@@ -190,7 +190,7 @@ def refine_problems(kind: str, starts: Starts | None, integration: Integration |
         return []
     stride, key = starts.refine, f"initial_conditions.refine = {starts.refine}"
     if kind == "continuation":
-        return [f"{key}: branches are not refined; drop the key, or make it a sweep."]
+        return [f'{key}: a continuation cannot be refined; drop the key, or set kind = "sweep".']
     lengths = {name: len(axis.array()) for name, axis in starts.ranges.items()}
     if not lengths:
         return [f"{key}: there is no range to refine; give a state a range, or drop the key."]

@@ -54,7 +54,7 @@ class Range(Table):
             if self.stop <= self.start:
                 raise ValueError(
                     f"stop = {self.stop!r} must be greater than start = {self.start!r}; "
-                    "for one value give values = [x]; to walk downwards set continuation.direction."
+                    "for one value give values = [x]; to continue downwards set continuation.direction."
                 )
             if self.step is not None and (self.stop - self.start) / self.step >= MAX_POINTS:
                 raise ValueError(f"step = {self.step!r} makes more than {MAX_POINTS} points; make it larger.")

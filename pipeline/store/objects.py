@@ -45,7 +45,7 @@ RETRIES, FIRST_WAIT_S, LONGEST_WAIT_S = 6, 0.2, 5.0
 """Number of times a request is repeated, and the waits in between [s]: about ten seconds in total."""
 
 _URL = re.compile(r"s3://([a-z0-9][a-z0-9.-]{1,61}[a-z0-9])((?:/[^/?#@\s]+)*)/?")
-_AGAIN = "what is committed stays; give the same command again, it goes on."
+_AGAIN = "committed results stay; give the same command again to continue."
 
 
 def parse_url(text: str) -> ObjectFiles:

@@ -114,7 +114,7 @@ def _refuse_format(path: str, data: Mapping[str, Any], content: bytes) -> None:
 def _remedy(directory: str) -> str:
     return (
         f"give the command that made it again (magpend run SPEC --out {directory}): "
-        "it is rebuilt, and what is committed stays."
+        "it is rebuilt, and committed results stay."
     )
 
 

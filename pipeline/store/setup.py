@@ -62,7 +62,7 @@ def check(place: str | Path | Files, identity: Mapping[str, Any]) -> RunInfo | N
     lines = differences(info.identity, identity)
     if lines:
         raise RefusedError(
-            f"{files.name}: holds another run. Give another --out, or remove it. What differs:\n  " + "\n  ".join(lines)
+            f"{files.name}: holds another run. Give another --out, or remove it. Differences:\n  " + "\n  ".join(lines)
         )
     return info
 

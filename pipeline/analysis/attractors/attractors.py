@@ -81,7 +81,7 @@ lexicographic order of the least section point; from `match` it follows a set (`
 where that set is absent its row holds the fill values. `match` adds ``match_basis`` (int8, parameter
 dims, attractor): the evidence for the id there. `matching` defines an id.
 
-Each row lists a *set* that cells are on. Only a set with the stability ``attracts`` is an attractor; see
+Each row lists a *set* on which cells end. Only a set with the stability ``attracts`` is an attractor; see
 `stability` for the criteria. `decision` is 0 undecided (no id), 1 closed on the orbit, 2 certain to end on
 the orbit, 3 approaching the orbit, 4 one of the set, 5 ended there when it was extended, 6 at rest (see
 `equilibria`), 7 diverged when it was extended (no id); `assigning.decide` has the criteria. A cell that is

@@ -1,4 +1,4 @@
-"""Tabulate the attractors and the other sets that cells are on."""
+"""Tabulate the attractors and the other sets on which cells end."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ def attractor_lines(ds: xr.Dataset, rows: Sequence[Row]) -> list[str]:
     n, others = int(attracts.sum()), int((~attracts).sum())
     lines = [f"{n} attractor{'s' * (n != 1)} at {n_points} parameter point{'s' * (n_points != 1)}"]
     if others:
-        lines[0] += f", and {others} other set{'s' * (others != 1)} that cells are on"
+        lines[0] += f", and {others} other set{'s' * (others != 1)} on which cells end"
     if n_points > FEW_POINTS:
         lines += summary(ds, rows, dims, _id_summary)
     else:
@@ -131,20 +131,20 @@ def _remarks(ds: xr.Dataset, rows: Sequence[Row]) -> list[str]:
     if above:
         text = ", ".join(map(str, above))
         lines.append(
-            f"cells come back after {text} periods, above the longest looked for: --max-orbit-period "
-            f"{above[-1]} (now {longest}) finds such orbits"
+            f"cells return after {text} periods, which is above the longest detected period: --max-orbit-period "
+            f"{above[-1]} (now {longest}) detects such orbits"
         )
     elif any(row["kind"] == "bounded_set" and row["lyapunov_high"] < 0.0 for row in unsettled):
         lines.append(
             f"cells that are not settled contract: they may close with a period above {longest}; "
-            "--max-orbit-period looks for longer ones"
+            "--max-orbit-period detects longer ones"
         )
     if int(ds.attrs.get("identify_extend", 1)) == 0 and unsettled:
-        lines.append("nothing was extended (--no-extend): without it, samples of these cells are followed")
+        lines.append("nothing was extended (--no-extend): without this option, samples of these cells are extended")
     elif int(ds["ran_out"].sum()):
         n = int(ds["ran_out"].sum())
         lines.append(
-            f"the extension ended before all was told at {n} parameter point{'s' * (n != 1)}: "
+            f"the extension used up its time before all sets were classified at {n} parameter point{'s' * (n != 1)}: "
             f"--budget {2.0 * float(ds.attrs.get('identify_budget', 1.0)):g} allows twice as much"
         )
     return lines

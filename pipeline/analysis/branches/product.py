@@ -31,7 +31,7 @@ def _refuse_frequency_of_flow(run: Run, parameter: str) -> None:
     if axis_name(parameter) == FREQUENCY_DIM and run.model.crossing is not None:
         swept = [name for name in run.spec.axes if _axis(run, name) is not None]
         known = ", ".join(swept or run.model.parameter_names)
-        raise SpecError([f"{run.model.name} has no drive's frequency to follow; give --parameter: {known}."])
+        raise SpecError([f"{run.model.name} has no drive frequency to follow; give --parameter: {known}."])
 
 
 def branches(run: Any, options: BranchOptions) -> xr.Dataset:

@@ -143,7 +143,7 @@ def read_request(text: str | bytes) -> Request:
         With one sentence that says what is wrong with it.
     """
     if len(text) > MOST_BYTES:
-        raise RequestError(f"the message has {len(text)} bytes; {MOST_BYTES} are the most.")
+        raise RequestError(f"the message has {len(text)} bytes; the limit is {MOST_BYTES}.")
     try:
         return _READER.validate_json(text)
     except ValidationError as error:

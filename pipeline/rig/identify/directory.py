@@ -231,7 +231,7 @@ def check(directory: Path, identity: Mapping[str, Any]) -> Info | None:
     lines = differences(info.identity, identity)
     if lines:
         raise RefusedError(
-            f"{directory}: holds another identification. Give another --out, or remove it. What differs:\n  "
+            f"{directory}: holds another identification. Give another --out, or remove it. Differences:\n  "
             + "\n  ".join(_short(line) for line in lines)
         )
     return info

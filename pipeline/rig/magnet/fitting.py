@@ -294,7 +294,7 @@ def fit_jointly(measured: Measurement, start: Mapping[str, float], hold: Mapping
             problem
             if best is None
             else ArithmeticError(
-                "joint fit: the change between the bumps came out backwards (eps_mag < 0); it is no result."
+                "joint fit: the fitted change between the bumps is backwards (eps_mag < 0), so there is no result."
             )
         )
     return _judged(measured, best, free, _upright(named(best.x)))

@@ -375,7 +375,7 @@ def _numbers(header: Header, table: Mapping[str, list[str]], problems: list[str]
         found[key] = values = np.array([_number(text, header.decimal) for text in table[key]])
         bad = np.flatnonzero(~np.isfinite(values)) + 1
         if bad.size:
-            problems.append(f"{where}: {key}: {_places(bad)}: no finite number; mend it or drop the row.")
+            problems.append(f"{where}: {key}: {_places(bad)}: no finite number; correct it or drop the row.")
     for key in (laws.ANGLE, laws.LOCKED):
         column = getattr(header.columns, key)
         low, high = column.limits

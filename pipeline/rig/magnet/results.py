@@ -153,16 +153,16 @@ def summary_of(outcome: Outcome) -> list[str]:
     line = laws.transition(joint.values)
     lines = [
         m.label,
-        f"{len(m.torque)} readings in {len(r2)} curves; each by itself: R2 {min(r2):.4f} to {max(r2):.4f}",
+        f"{len(m.torque)} readings in {len(r2)} curves; each fitted alone: R2 {min(r2):.4f} to {max(r2):.4f}",
         *_table(joint, m),
         f"transition: {laws.ANGLE} = {line.slope:.4f} {laws.LOCKED} {line.offset:+.5f} rad",
-        f"all at once: {_quality(joint.quality)}",
+        f"joint fit: {_quality(joint.quality)}",
     ]
     if outcome.unheld:
-        lines.append(f"all at once, nothing held: {_quality(outcome.unheld.quality)}")
-    for what, fit in (("the magnet is", outcome.dipoles), ("it fits best", outcome.placed_dipoles)):
+        lines.append(f"joint fit, nothing held: {_quality(outcome.unheld.quality)}")
+    for what, fit in (("at the magnet", outcome.dipoles), ("where it fits best", outcome.placed_dipoles)):
         h = fit.values["h"]
-        lines.append(f"point dipoles, the fixed one where {what} (h = {h:.4f} m): {_quality(fit.quality)}")
+        lines.append(f"point dipoles, the fixed one {what} (h = {h:.4f} m): {_quality(fit.quality)}")
     return lines
 
 
@@ -187,11 +187,11 @@ def warnings_of(outcome: Outcome) -> list[str]:
     for name, partner in joint.undetermined.items():
         found.append(
             f"{name} is hardly determined by these readings (standard error {joint.errors[name]:.2g} of "
-            f"{joint.values[name]:.3g}): it goes with {partner}; hold one of them by its name in hold."
+            f"{joint.values[name]:.3g}): it correlates with {partner}; hold one of them by its name in hold."
         )
     if joint.neighbours > ALIKE:
         found.append(
-            f"residuals of neighbouring readings are alike (correlation {joint.neighbours:.2f}): what is left"
-            " over is the law's, not noise; of the standard errors take those by curve."
+            f"residuals of neighbouring readings correlate ({joint.neighbours:.2f}): the law does not fit, and"
+            " they are more than noise; use the standard errors by curve."
         )
     return found

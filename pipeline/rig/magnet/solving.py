@@ -101,7 +101,7 @@ def solve(
         )
         finite = bool(np.isfinite(found.x).all() and np.isfinite(found.fun).all())
         if found.status < 1 or not finite:
-            raise ArithmeticError(f"{what}: the fit did not converge ({found.message}); it is no result.")
+            raise ArithmeticError(f"{what}: the fit did not converge ({found.message}), so there is no result.")
         jacobian = slopes(found.x)
         variance = found.fun @ found.fun / max(len(found.fun) - len(found.x), 1)
         try:
@@ -109,7 +109,7 @@ def solve(
         except np.linalg.LinAlgError:
             errors = np.full(len(found.x), np.nan)
     if not np.isfinite(errors).all():
-        raise ArithmeticError(f"{what}: the readings do not determine all that is fitted; it is no result.")
+        raise ArithmeticError(f"{what}: the readings do not determine all fitted parameters, so there is no result.")
     return Solution(found.x, errors, jacobian, found.fun)
 
 

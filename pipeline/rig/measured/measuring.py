@@ -103,7 +103,7 @@ def measure(
     if len(models) != 1:
         raise SpecError(
             [
-                f"recordings: of the models {', '.join(m.name for m in models) or 'none'}; a diagram is drawn of "
+                f"recordings: their models are {', '.join(m.name for m in models) or 'none'}; a diagram is drawn of "
                 "one: give recordings whose mappings name the same model."
             ]
         )

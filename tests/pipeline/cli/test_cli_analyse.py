@@ -170,7 +170,7 @@ def test_settling__without_extending_nothing_is_shown(main, chaotic):
     assert code == 0, err
     assert re.search(r"bounded set +not settled .* - +- +", out)
     assert "8 of 16 cells end on attractors; 8 not settled" in out
-    assert "2 attractors at 2 parameter points, and 1 other set that cells are on" in out
+    assert "2 attractors at 2 parameter points, and 1 other set on which cells end" in out
     assert "nothing was extended (--no-extend)" in out
     code, out, err = main("analyse", "attractors", chaotic)
     assert code == 0, err

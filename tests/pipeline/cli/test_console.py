@@ -244,7 +244,7 @@ def test_zoom__both_names_of_the_frequency(main, write_spec, sweep_text, tmp_pat
         (["--psi1-dg", "0", "1"], "unknown axis 'psi1_dg'; did you mean psi1_deg"),
         (["--axis", "freqency=2:3"], "unknown axis 'freqency'; did you mean frequency_hz"),
         (["--at", "qq=1"], "unknown axis 'qq'; did you mean q"),
-        (["--frequency", "2.1"], "no name with 2 numbers"),
+        (["--frequency", "2.1"], "a name with 2 numbers"),
     ],
     ids=" ".join,
 )

@@ -121,7 +121,7 @@ def test_show__file_of_a_model_and_one_that_ships(main, tmp_path, own):
     assert "checks: passed" in out
     code, _, said = main("model", "show", "duffing", "--latex")
     assert code == 2
-    assert "is no text" in said
+    assert "is not a text model" in said
 
 
 @pytest.mark.parametrize(

@@ -87,7 +87,7 @@ def test_commands__replace_what_is_their_own_alone(whole, main, tmp_path, name):
     path.write_bytes(theirs)
     code, _, said = main(*COMMANDS[name], path)
     assert code == 2, said
-    assert f"{path}: is there already, and magpend has not written it" in said
+    assert f"{path}: exists, and magpend did not write it" in said
     assert path.read_bytes() == theirs
     code, _, said = main(*COMMANDS[name], path, "--force")
     assert code == 0, said
@@ -102,7 +102,7 @@ def test_analyse__table_of_other_columns_is_a_strangers(whole, main, tmp_path):
     path.write_text("time,x\n0,1\n")
     code, _, said = main(*ANALYSE, path)
     assert code == 2, said
-    assert "magpend has not written it; give another name, or --force" in said
+    assert "magpend did not write it; give another name, or --force" in said
     assert path.read_text() == "time,x\n0,1\n"
 
 

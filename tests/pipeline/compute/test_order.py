@@ -70,7 +70,7 @@ def test_order__gives_up_where_all_fail():
     order = Order(range(100))
     for index in range(ordering.MOST_IN_A_ROW - 1):
         order.failed(index, "full")
-    with pytest.raises(TaskFailedError, match=r"task 0: full.* Given up: so many fail"):
+    with pytest.raises(TaskFailedError, match=r"task 0: full.* Given up: so many tasks fail"):
         order.failed(99, "full")
 
 

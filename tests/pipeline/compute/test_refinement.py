@@ -386,7 +386,7 @@ def test_identity__refinement_counts():
         (
             ('kind = "sweep"', 'kind = "continuation"'),
             "initial_conditions.refine = 8",
-            "branches are not refined; drop the key",
+            "a continuation cannot be refined; drop the key",
         ),
         (('kind = "grid"', 'kind = "list"\npoints = [[0, 0]]'), "initial_conditions.refine:", "only a grid"),
         (('kind = "grid"', 'kind = "random"\nn = 3'), "initial_conditions.refine", "only a grid"),

@@ -99,11 +99,11 @@ def test_plot_trajectory__marks_the_sections_of_the_recording(even):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"frequency_hz": 2.0}, "frequency_hz = 2.0: the drive is the recording"),
+        ({"frequency_hz": 2.0}, "frequency_hz = 2.0: the recorded drive"),
         ({"n_periods": 9}, "n_transient = 0 and n_periods = 9 are 9 drive periods, and even.csv has 8"),
         ({"n_transient": 8}, "n_transient = 8 and n_periods = 1 are 9 drive periods"),
         ({"n_periods": 0}, "n_periods = 0: must be at least 1"),
-        ({"model": "duffing"}, "measured edges ask for a model with a parameter duty_cycle"),
+        ({"model": "duffing"}, "measured edges need a model with a parameter duty_cycle"),
     ],
 )
 def test_simulate__refuses(even, options, words):

@@ -179,7 +179,7 @@ def test_walk__interrupted_and_resumed(write_spec, tmp_path, bytes_of, monkeypat
 
     with monkeypatch.context() as patch:
         patch.setattr(task, "write_task", stop)
-        with pytest.raises(Exception, match="the same command goes on"):
+        with pytest.raises(Exception, match="the same command continues"):
             run(path, tmp_path / "run", workers=0, echo=silent)
     assert len(state(tmp_path / "run").done) == n_committed
     assert run(path, tmp_path / "run", workers=0, echo=silent).complete

@@ -158,7 +158,7 @@ def test_workers__scheduler_dies(faulty, tmp_path, monkeypatch):
         results = run_tasks(task, range(1000), scheduler=str(tmp_path / "scheduler.json"))
         next(results)
         scheduler.kill()
-        with pytest.raises(SchedulerError, match=r"is gone\. What is committed stays"):
+        with pytest.raises(SchedulerError, match=r"is gone\. Committed results stay"):
             list(results)
 
 

@@ -548,7 +548,7 @@ def test_explore__serves_until_it_is_stopped(made_run, start, environment, monke
     said = process.stderr.read()
     assert "stopped" in said
     assert list(Path(environment["TMPDIR"]).glob("magpend-explore-*")) == []
-    assert "so far" not in said.partition("Ctrl-C ends it")[2]
+    assert "so far" not in said.partition("Ctrl-C ends the server")[2]
     assert {p: (p.stat().st_mtime_ns, p.stat().st_size) for p in made_run.rglob("*")} == before
 
 

@@ -138,7 +138,7 @@ def test_largest_exponent__mean_over_cells_that_are_not_closed(known):
 
 
 def test_matches__words_of_the_model(known):
-    with pytest.raises(SpecError, match="no words for motions"):
+    with pytest.raises(SpecError, match="no labels for motions"):
         MEASURES["least_share"](known, ["run"], {"at": 2.2, "motion": "left"})
 
 
@@ -176,7 +176,7 @@ def test_judge__what_decides(known, given, verdict, fails):
     found = judge(known, "1", claim(**given))
     assert (found.verdict, found.fails) == (verdict, fails)
     if "contains" in given.get("options", {}):
-        assert found.reason.endswith("Steps of 0.02 and less decide.")
+        assert found.reason.endswith("The claim needs steps of at most 0.02.")
     assert found.reason or verdict in (Verdict.MET, Verdict.NOT_MET)
 
 
@@ -185,7 +185,7 @@ def test_judge__never_met_by_a_coarse_grid():
     coarse = np.array([1.95, 2.1, 2.2, 2.3, 2.45])
     known = Known(run=cube_of([0, 1, 1, 1, 0], coarse))
     assert judge(known, "1", claim(step=0.02)).verdict is Verdict.UNDECIDED
-    assert "0.02 and less decide" in judge(known, "1", claim(step=0.02)).reason
+    assert "steps of at most 0.02" in judge(known, "1", claim(step=0.02)).reason
 
 
 def test_spelled__digits_follow_the_interval(known):

@@ -199,6 +199,6 @@ def test_cli__does_not_write_a_mapping_over_its_source(main, tmp_path):
     (tmp_path / "rig.toml").write_text(RIG, "utf-8")
     code, _, err = main("recordings", "simulate", "rig.toml", "--out", "rig.tdms")
     assert code == 2
-    assert "its mapping would be written over rig.toml; give another name" in err
+    assert "its mapping would replace rig.toml; give another name" in err
     assert (tmp_path / "rig.toml").read_text("utf-8") == RIG
     assert not (tmp_path / "rig.tdms").exists()

@@ -303,7 +303,7 @@ def test_in_place__the_old_run_stays_beside(place, bytes_of, count):
     assert sorted(p.name for p in mine.parent.iterdir()) == ["mine", "mine.before"]
     lines = []
     extend(mine, wide, workers=0, echo=lines.append)
-    assert lines == [f"{mine} holds all this already; nothing to do."]
+    assert lines == [f"{mine} has all these cells already; nothing to do."]
     assert count.cells == 10
 
 
@@ -342,7 +342,7 @@ def test_in_place__the_same_command_goes_on(place, bytes_of, monkeypatch, count,
 def test_in_place__nothing_is_lost(place, write_spec):
     mine, *_ = place
     moved = write_spec(BASE.replace("start = 0.10, stop = 0.14", "start = 0.12, stop = 0.16"), "moved.toml")
-    with pytest.raises(RefusedError, match="10 of its cells would not be in the wider run"):
+    with pytest.raises(RefusedError, match="10 of its cells would be lost"):
         extend(mine, moved, echo=silent)
     assert [p.name for p in mine.parent.iterdir()] == ["mine"]
 
@@ -353,8 +353,8 @@ def test_incomplete__what_is_committed_is_taken(place, tmp_path, monkeypatch, by
         record.unlink()
     lines = []
     extend(mine, wide, tmp_path / "new", workers=0, echo=lines.append)
-    assert f"{mine}: is not complete; 15 of 25 cells are committed, and these alone are taken" in lines
-    assert f"15 of 35 cells are taken from {mine}" in lines
+    assert f"{mine}: is not complete; only its 15 of 25 committed cells are reused" in lines
+    assert f"15 of 35 cells are reused from {mine}" in lines
     assert count.cells == 20
     assert bytes_of(tmp_path / "new") == bytes_of(fresh)
 
@@ -385,12 +385,12 @@ def test_command__says_what_is_taken(place, main, bytes_of, tmp_path):
     words = ("extend", mine, "--axis", "frequency=0.1:0.16:7")
     code, out, err = main(*words, "--dry-run")
     assert code == 0, err
-    assert f"25 of 35 cells are taken from {mine}\n10 cells are left to integrate\n" in out
+    assert f"25 of 35 cells are reused from {mine}\n10 cells are left to integrate\n" in out
     assert "time: about" in out
     assert [p.name for p in mine.parent.iterdir()] == ["mine"]
     code, out, err = main(*words, "--workers", 0)
     assert code == 0, err
-    assert f"the run as it was lies in {mine}.before" in err
+    assert f"the old run is in {mine}.before" in err
     assert open_run(mine).section.equals(open_run(fresh).section)
     # the text that was written is a specification like any other
     text = tmp_path / "again.toml"

@@ -203,10 +203,10 @@ def test_animate__files_open_with_their_frames_and_loop(main, run, tmp_path):
     with xr.open_dataset(tmp_path / "film.nc", engine="scipy") as stored:
         assert stored.orbit.dims == ("motion", "sample", "state")
         assert stored.attrs["n_frames"] == said
-    assert "film.webp was there already" not in err
+    assert "film.webp existed and is replaced" not in err
     code, _, err = main(*map(str, [*words, "--size", "300", "--out", "film.webp"]))
     assert code == 0
-    assert "note: film.webp was there already, and is replaced" in err
+    assert "note: film.webp existed and is replaced" in err
     code, out, _ = main(*map(str, [*words, "--size", "300"]))
     assert out.splitlines()[0] == f"animation: {run}/figures/animation_frequency_0.16_attractor_b.gif"
     code, _, err = main(*map(str, [*words, "--size", "301", "--out", "film.mp4"]))
@@ -245,15 +245,15 @@ def test_animate__mp4_without_ffmpeg_is_refused(main, tmp_path, monkeypatch):
     [
         (["RUN", "--at", "frequency=0.1595"], "frequency = 0.1595 is not on its axis"),
         (["RUN"], "frequency (2 values): choose a value of each"),
-        (["RUN", "--at", "frequency=0.16", "--attractor", "Z"], "--attractor Z: is not at this point; there"),
+        (["RUN", "--at", "frequency=0.16", "--attractor", "Z"], "--attractor Z: does not exist at this point; there"),
         (["RUN", "--cell", "6"], "--cell 6: the run has the cells 0 to 5, counted through frequency, i"),
         (["RUN", "--cell", "1", "--attractor", "A"], "--attractor and --cell: a film shows one of these"),
-        (["RUN", "--cell", "1", "--at", "frequency=0.16"], "--at: a cell has its own point"),
-        (["RUN", "--model", "duffing"], "--model: a run has its own"),
+        (["RUN", "--cell", "1", "--at", "frequency=0.16"], "--at: a cell already has a parameter point"),
+        (["RUN", "--model", "duffing"], "--model: the run sets this"),
         (["RUN", "--at", "frequency=0.16", "--y", "1"], "unknown state of duffing 'y'"),
         (["RUN", "--at", "frequency=0.16", "--degrees"], "have no angle"),
         (["RUN", "--at", "frequency=0.16", "--portrait", "y"], "unknown portrait 'y'; there are portr"),
-        (["--at", "q=1"], "--at: is for a run; name its directory."),
+        (["--at", "q=1"], "--at: needs a run; give its directory."),
         (["--out", "film.avi"], "film.avi: the suffix must be one of .gif, .webp, .mp4."),
         (["--out", "gone/film.gif"], "gone: no such folder; make it first."),
         (["--fps", "60"], "--fps 60: a GIF has at most 50 frames a second"),

@@ -167,9 +167,11 @@ def test_run__damaged_drive_is_found_and_rebuilt(recorded, tmp_path, bytes_of):
 @pytest.mark.parametrize("name", ["attractors", "basins", "chaos", "settling"])
 def test_derive__refuses_what_goes_on_beyond_the_recording(recorded, tmp_path, name):
     run(recorded(), tmp_path / "run", workers=0, echo=silent)
-    with pytest.raises(SpecError, match=rf"drive is the recording drive\.csv, and {name} goes on where it ends"):
+    with pytest.raises(
+        SpecError, match=rf"drive is the recording drive\.csv, which ends, but {name} integrates further"
+    ):
         derive(tmp_path / "run", name)
-    with pytest.raises(SpecError, match="goes on where it ends"):
+    with pytest.raises(SpecError, match="integrates further"):
         figure(tmp_path / "run", "gallery", {"at": {"q": 1.6}})
 
 

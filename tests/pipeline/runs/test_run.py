@@ -145,7 +145,7 @@ def test_run__failed_task_then_only_the_rest(write_spec, sweep_text, tmp_path, m
 
 def test_run__ctrl_c_in_process(write_spec, sweep_text, tmp_path, monkeypatch):
     counted(monkeypatch, fail_at=2, error=KeyboardInterrupt())
-    with pytest.raises(InterruptedRunError, match="the same command goes on") as caught:
+    with pytest.raises(InterruptedRunError, match="the same command continues") as caught:
         run(write_spec(sweep_text), tmp_path / "run", workers=0, echo=silent)
     assert caught.value.signal_number == signal.SIGINT
     assert state(tmp_path / "run").done == {0}
@@ -268,7 +268,7 @@ def test_signal__stops_cleanly_and_resumes(uninterrupted, start, tmp_path, bytes
     os.killpg(process.pid, number) if number == signal.SIGINT else process.send_signal(number)
     out, err = process.communicate(timeout=200)
     assert process.returncode == code, (out, err)
-    assert "the same command goes on" in err
+    assert "the same command continues" in err
     assert "Traceback" not in err
     assert not state(directory).complete
     assert run(spec, directory, workers=0, echo=silent).complete

@@ -117,12 +117,12 @@ def test_submit__follow_cancel_and_go_on(tmp_path, shell, magpend, bytes_of):
     assert f"magpend status out; squeue -j {job}; tail -F {logs}/coordinator*" in said
     assert job in shell("squeue", "-h", "-o", "%i")
     refused = magpend("submit", "spec.toml", "--cluster", "one.toml", "--out", "out", code=3)
-    assert f"job {job} of this run is there already" in refused
+    assert f"job {job} of this run exists already" in refused
     wait(lambda: is_run(out) and len(state(out).done) >= 2, logs)
     shell("scancel", job)
     wait(lambda: not shell("squeue", "-h"), logs)
     assert "incomplete" in magpend("status", "out")
-    assert "Stopped. What is committed" in (logs / f"coordinator-{job}.out").read_text()
+    assert "Stopped. Committed results" in (logs / f"coordinator-{job}.out").read_text()
     assert 2 <= len(state(out).done) < 12
 
     # gone on with by a coordinator in a job, with workers in jobs of their own

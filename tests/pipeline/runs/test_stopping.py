@@ -100,7 +100,7 @@ def test_stopping__hang_up_while_workers_start(begin, tmp_path):
     process = begin()
     wait_for(process, lambda: list((tmp_path / "temporary").glob(f"{local.PREFIX}*/key.pem")))
     os.killpg(process.pid, signal.SIGHUP)
-    assert "the same command goes on" in ended(process, tmp_path, 129)
+    assert "the same command continues" in ended(process, tmp_path, 129)
 
 
 def test_stopping__twice(begin, tmp_path):

@@ -195,7 +195,7 @@ def test_submit__refusals(main, tmp_path, write_spec, sweep_text, cluster, monke
     monkeypatch.setenv("MAGPEND_CLUSTER", str(cluster("slurm")))
     code, _, errors = main("submit", path, "--out", tmp_path / "my run")
     assert code == 2
-    assert "batch systems do not take this path" in errors
+    assert "batch systems do not accept this path" in errors
     monkeypatch.setenv("PATH", str(tmp_path))
     code, _, errors = main("submit", path, "--out", "out")
     assert code == 2
@@ -226,7 +226,7 @@ def test_submit__what_the_batch_system_says(main, tmp_path, write_spec, sweep_te
     assert json.loads((tmp_path / "out.jobs" / "job.json").read_text()) == {"kind": "slurm", "job": "7"}
     code, _, errors = main(*words)
     assert code == 3
-    assert "job 7 of this run is there already (PENDING)" in errors
+    assert "job 7 of this run exists already (PENDING)" in errors
     command("squeue", "exit 1")
     assert main(*words)[0] == 0
     (tmp_path / "out.jobs" / "job.json").write_text('{"kind": "slurm", "job": "--help; rm"}')
@@ -250,5 +250,5 @@ def test_templates__are_in_order():
 
 def test_prepare__no_cluster_file(write_spec, sweep_text, monkeypatch):
     monkeypatch.delenv("MAGPEND_CLUSTER", raising=False)
-    with pytest.raises(SpecError, match="what is a job"):
+    with pytest.raises(SpecError, match="a job is not described"):
         prepare(write_spec(sweep_text), None, None)

@@ -172,7 +172,7 @@ def test_zoom__refused_for_lists_samples_and_paths(walk):
         zoom(parse_spec(tomllib.loads(LIST)), Changes({"psi1": (0, 1)}))
     with pytest.raises(SpecError, match="num = 4: no new range has points"):
         zoom(walk, Changes({"psi1": (0, 1)}, num=4))
-    with pytest.raises(SpecError, match="samples have none"):
+    with pytest.raises(SpecError, match="random samples have no grid"):
         zoom(walk, Changes({"psi1": (0, 1)}, nums={"psi1": 4}))
     with pytest.raises(SpecError, match=r"continuation\.path"):
         zoom(walk, Changes({}, {"frequency_hz": 2.2}))

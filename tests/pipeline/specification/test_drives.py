@@ -84,14 +84,14 @@ def test_rising_edges__noise_on_a_flank_is_one_edge():
     [
         ("", "its columns are ''"),
         ("a,b\n1,2\n", "begins with the line 'rising_s,falling_s' or 'time_s,drive'"),
-        ("rising_s,falling_s\n1,1.2\n", "1 rising edges; two make a period"),
+        ("rising_s,falling_s\n1,1.2\n", "1 rising edges; a period needs two"),
         ("rising_s,falling_s\n1,1.2\n0.5,\n", "rising edges must rise"),
         ("rising_s,falling_s\n1,1.8\n1.5,\n", "falling_s = 1.8 s must lie between"),
         ("rising_s,falling_s\n1,x\n1.5,\n", "line 2: '1,x' is not two numbers"),
         ("rising_s,falling_s\n1,nan\n1.5,\n", "line 2: '1,nan' is not finite"),
         ("rising_s,falling_s\n1,\n1.5,\n", "line 2: '1,' is not two numbers"),
         ("time_s,drive\n0,1,2\n1,1\n", "line 2: '0,1,2' is not two numbers"),
-        ("time_s,drive\n0,1\n", "1 samples; two make a line"),
+        ("time_s,drive\n0,1\n", "1 samples; a line needs two"),
         ("time_s,drive\n0,1\n1,inf\n", "line 3: '1,inf' is not finite"),
         ("time_s,drive\n0,1\n0,2\n", "time must rise"),
     ],
@@ -106,7 +106,7 @@ def test_parse_drive__names_a_few_of_many_lines():
     with pytest.raises(SpecError) as caught:
         drive("time_s,drive\n" + "0,x\n" * 100)
     assert len(caught.value.problems) == 6
-    assert "95 lines more" in caught.value.problems[-1]
+    assert "95 more lines" in caught.value.problems[-1]
 
 
 def test_load_drive__file_that_is_not_there(tmp_path):
@@ -157,7 +157,7 @@ def test_identity__is_of_the_values_and_not_of_the_name(tmp_path):
 def test_parse_spec__drive_that_is_not_the_one_of_its_digest(tmp_path):
     plain = parsed(tmp_path).as_dict()
     plain["drive"]["text"] = EDGES.replace("2.3", "2.31")
-    with pytest.raises(SpecError, match=r"drive\.sha256 = .* is not that of drive\.csv"):
+    with pytest.raises(SpecError, match=r"drive\.sha256 = .* is not the digest of drive\.csv"):
         parse_spec(plain)
 
 
@@ -184,8 +184,8 @@ def test_parse_spec__all_that_makes_no_sense_at_once(tmp_path):
         parsed(tmp_path, text.replace("start = 0, stop = 1,", "start = 0.0, stop = 1.0,"))
     wanted = (
         "drive: a continuation",
-        "axes.frequency_hz: the drive is the recording drive.csv",
-        "axes.duty_cycle: the drive is",
+        "axes.frequency_hz: the recorded drive drive.csv",
+        "axes.duty_cycle: the recorded drive",
         "n_transient = 300 and n_keep = 60 are 360 drive periods",
         "integration.stop_when_closed",
         "initial_conditions.refine",
@@ -203,9 +203,9 @@ def test_parse_spec__all_that_makes_no_sense_at_once(tmp_path):
         ('file = "drive.csv"', 'file = "none.csv"', "drive.file = 'none.csv'"),
         ('file = "drive.csv"', "", "drive.file: missing"),
         ('file = "drive.csv"', 'file = "drive.csv"\nsection_hz = 2.0', "sections under measured edges"),
-        ("[initial", "[parameters]\nfrequency_hz = 2.2\n[initial", "parameters.frequency_hz: the drive is"),
+        ("[initial", "[parameters]\nfrequency_hz = 2.2\n[initial", "parameters.frequency_hz: the recorded drive"),
         ("[initial", "[parameters]\noverrides = { duty_cycle = 0.5 }\n[initial", "overrides.duty_cycle"),
-        ("[drive]", 'model = "duffing"\n[drive]', "ask for a model with a parameter duty_cycle"),
+        ("[drive]", 'model = "duffing"\n[drive]', "need a model with a parameter duty_cycle"),
     ],
 )
 def test_parse_spec__refuses(tmp_path, old, new, words):
@@ -217,7 +217,7 @@ def test_parse_spec__refuses(tmp_path, old, new, words):
 
 def test_parse_spec__refuses_extremes_and_no_section_of_a_torque(tmp_path):
     spec = SPEC + '[products]\nextremes = { quantities = ["psi1"] }\n'
-    with pytest.raises(SpecError, match=r"products\.extremes: are taken over the intervals"):
+    with pytest.raises(SpecError, match=r"products\.extremes: extremes are taken over drive periods"):
         parsed(tmp_path, spec, TORQUE)
     with pytest.raises(SpecError, match=r"no rising edge after its start, so no section; set drive\.section_hz"):
         parsed(tmp_path, SPEC, "time_s,drive\n0,1\n5,1\n")
@@ -226,7 +226,7 @@ def test_parse_spec__refuses_extremes_and_no_section_of_a_torque(tmp_path):
 def test_parse_spec__refuses_an_axis_along_which_nothing_changes(tmp_path):
     """The amplitude of the model's own drive does nothing where a torque takes its place."""
     spec = SPEC.replace("[initial", "[axes]\n{} = {{ values = [1.0, 2.0] }}\n[initial")
-    with pytest.raises(SpecError, match=r"axes\.q: acts on the model's own drive alone") as caught:
+    with pytest.raises(SpecError, match=r"axes\.q: changes only the model's own drive") as caught:
         parsed(tmp_path, spec.format("q"), TORQUE)
     assert len(caught.value.problems) == 1
     assert parsed(tmp_path, spec.format("q")).axes
@@ -238,5 +238,5 @@ def test_parse_spec__refuses_a_model_without_a_drive(tmp_path, monkeypatch):
     from magpend_core.models import load_model
 
     monkeypatch.setattr(placeholders, "no_forcing", load_model("pendulum").system.forcing)
-    with pytest.raises(SpecError, match="pendulum has no drive that a recording could take the place of"):
+    with pytest.raises(SpecError, match="pendulum has no drive that a recording could replace"):
         parsed(tmp_path)

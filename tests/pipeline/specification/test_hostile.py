@@ -108,8 +108,8 @@ def test_run__odd_specifications_are_refused_in_words(refused, text):
         (ODD["list as kind of starts"], ["initial_conditions.kind = [1]", "'grid'"]),
         (ODD["5000 digits"], ["digits"]),
         (ODD["5000 hexadecimal digits"], ["integration.n_keep", "20000 bits"]),
-        (ODD["deep lists"], ["nested too deep"]),
-        (ODD["rather deep"], ["kind", "nested too deep"]),
+        (ODD["deep lists"], ["nested too deeply"]),
+        (ODD["rather deep"], ["kind", "nested too deeply"]),
         (ODD["escape in a title"], ["title", r"\x1b[31mred", "control characters"]),
         (ODD["escape in a key"], [r"\x1b[2J: unknown key"]),
     ],
@@ -124,7 +124,7 @@ def test_load_spec__endless_files(tmp_path):
     path = tmp_path / "spec.toml"
     with open(path, "wb") as file:
         file.truncate(40_000_000)
-    with pytest.raises(SpecError, match="has more than 1 MB, the most that a specification has"):
+    with pytest.raises(SpecError, match="has more than 1 MB, the limit of a specification"):
         load_spec(path)
     with pytest.raises(SpecError, match="has more than 1 MB"):
         load_spec("/dev/zero")
@@ -133,7 +133,7 @@ def test_load_spec__endless_files(tmp_path):
 def test_load_spec__endless_arrays(tmp_path):
     path = tmp_path / "spec.toml"
     path.write_text(f"[axes]\namplitude = [{'0,' * 100_001}]")
-    with pytest.raises(SpecError, match=r"axes\.amplitude: has 100001 elements; 100000 are the most"):
+    with pytest.raises(SpecError, match=r"axes\.amplitude: has 100001 elements; the limit is 100000"):
         load_spec(path)
 
 

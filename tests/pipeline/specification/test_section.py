@@ -115,4 +115,4 @@ def test_parse_spec__refused(changes, text):
 def test_parse_spec__forced_model():
     data = {"model": "duffing", "axes": {"amplitude": {"values": [0.3]}}}
     found = problems(**data)
-    assert any(p.startswith("section: duffing is forced") for p in found), found
+    assert any(p.startswith("section: duffing has a drive") for p in found), found

@@ -86,7 +86,7 @@ def test_parse_spec__all_errors_at_once():
         (("q = { values", "frequency_hz2 = { values"), "axes.frequency_hz2", "did you mean frequency_hz"),
         (("[axes]", "[parameters]\nfrequency_hz = 2.0\n[axes]"), "axes.frequency_hz", "keep one"),
         (("[axes]", "[parameters]\noverrides = { q = 1.0 }\n[axes]"), "axes.q", "keep one"),
-        (("[axes]", "[continuation]\n[axes]"), "continuation", "a sweep has none"),
+        (("[axes]", "[continuation]\n[axes]"), "continuation", "a sweep has no such table"),
         (("start = 2.0, stop = 3.0", "start = 0.0, stop = 3.0"), "axes.frequency_hz", "greater than 0 Hz"),
         (("start = 2.0, stop = 3.0", "start = 3.0, stop = 2.0"), "axes.frequency_hz", "must be greater than start"),
         (("[1.5, 1.6]", "[1.6, 1.5]"), "axes.q", "rise strictly"),

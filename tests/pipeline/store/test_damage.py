@@ -384,7 +384,7 @@ def test_run__workers_that_wrote_elsewhere(write_spec, sweep_text, tmp_path, mon
         yield from ({"task": i, "cells": 1} for i in indices)
 
     monkeypatch.setattr(execute, "run_tasks", elsewhere)
-    with pytest.raises(IncompleteError, match=r"5 of 5 tasks were computed and are not committed here"):
+    with pytest.raises(IncompleteError, match=r"5 of 5 tasks were computed but are not committed here"):
         run(write_spec(sweep_text), tmp_path / "run", workers=0, echo=silent)
 
 

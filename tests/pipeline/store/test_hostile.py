@@ -314,7 +314,7 @@ def test_derive__says_before_computing_that_nothing_is_kept(hostile):
     (hostile / "derived").write_text("")
     said = []
     found = derive(hostile, "attractors", QUICK, echo=said.append)
-    assert "is no folder: what attractors finds is shown, and not kept" in said[0]
+    assert "is no folder: the result of attractors is shown but not kept" in said[0]
     assert "attractors: computed" in said[-2]
     assert "not kept" in said[-1]
     assert found.sizes

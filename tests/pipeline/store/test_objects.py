@@ -211,7 +211,7 @@ def test_run__an_outage_is_one_line_and_the_same_command_goes_on(s3, write_spec,
         return "503" if down else None
 
     s3.harm = harm
-    with pytest.raises(Exception, match=r"127\.0\.0\.1:\d+ answers 503 Harm; what is committed stays") as caught:
+    with pytest.raises(Exception, match=r"127\.0\.0\.1:\d+ answers 503 Harm; committed results stay") as caught:
         run(spec, PLACE, workers=0, echo=silent)
     assert KEY_ID not in str(caught.value)
     s3.reset()

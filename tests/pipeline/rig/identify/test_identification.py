@@ -399,7 +399,7 @@ def test_identify__stopped_by_a_signal_says_so(bench, tmp_path, start):
     process.send_signal(signal.SIGTERM)
     _, err = process.communicate(timeout=120)
     assert process.returncode == 143
-    assert "the same command goes on from there" in err
+    assert "the same command continues from there" in err
 
 
 def test_judgement__without_a_spread_has_no_correlation():

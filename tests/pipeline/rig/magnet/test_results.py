@@ -79,7 +79,7 @@ def test_write_results__what_is_held_keeps_its_own_origin(rig, tmp_path):
     report = json.loads((tmp_path / "fit.json").read_text())
     assert report["joint"]["held"] == ["eps_mag"]
     assert report["joint_with_nothing_held"]["values"] == pytest.approx(TRUE, rel=1e-8)
-    assert any(line.startswith("all at once, nothing held") for line in summary_of(outcome))
+    assert any(line.startswith("joint fit, nothing held") for line in summary_of(outcome))
 
 
 def test_report__holds_curves_joint_fit_and_dipoles(rig, tmp_path):
@@ -135,7 +135,7 @@ def test_fit_magnet__takes_a_measurement_that_ships_by_name(main, tmp_path):
     code, result, notes = main("fit-magnet", "discs", "--no-figures")
     assert code == 0
     assert result.startswith("SYNTHETIC: two 33 mm x 10 mm N38 discs")
-    assert "what is left over is the law's, not noise" in notes
+    assert "the law does not fit, and they are more than noise" in notes
     assert (tmp_path / "discs-fit" / "preset.toml").is_file()
     code, _, notes = main("fit-magnet", "disks")
     assert code == 2

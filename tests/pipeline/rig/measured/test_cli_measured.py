@@ -161,4 +161,4 @@ def test_measured_compare__a_run_that_does_not_fit_is_refused_before_anything_is
         "measured", "steps", *[files / "up.tdms"] * 2, "--mapping", sine, "--mapping", files / "rig.toml"
     )
     assert code == 2
-    assert "of the models pendulum, pendulum-sine" in err
+    assert "several models (pendulum, pendulum-sine" in err

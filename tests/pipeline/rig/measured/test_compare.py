@@ -204,7 +204,7 @@ def test_compare__an_axis_that_is_not_there_is_refused(measured, run_directory):
 
 def test_measure__recordings_that_do_not_fit_are_refused(swept):
     (up, _), (down, _) = swept
-    with pytest.raises(SpecError, match="of the models duffing, pendulum"):
+    with pytest.raises(SpecError, match="their models are duffing, pendulum"):
         measure([up, down.assign_attrs(model="duffing")], WAY)
     with pytest.raises(SpecError, match="different states"):
         measure([up, down.drop_vars("psi2")], WAY)
