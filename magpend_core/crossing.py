@@ -12,8 +12,6 @@ from magpend_core.validation import check_array
 if TYPE_CHECKING:
     from magpend_core.engine.system import System
 
-LEVEL = "section_value"
-"""Name of the level among the parameters of a system with such a section; the last of them."""
 
 DIRECTIONS = {"up": 1, "down": -1}
 """Sign of the rate with which the level is crossed."""

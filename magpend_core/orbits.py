@@ -14,13 +14,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from magpend_core.crossing import LEVEL
 from magpend_core.engine.entry import integrate
 from magpend_core.engine.observers import MAP, MapSettings
 from magpend_core.engine.system import System
 from magpend_core.engine.variational import with_tangents
 from magpend_core.models.pendulum.systems import PENDULUM_FITTED
 from magpend_core.pointwise import rates_packed
+from magpend_core.sizes import LEVEL
 from magpend_core.validation import check_array, check_frequency, check_states, check_tolerance
 
 RTOL = 1e-12

@@ -1,4 +1,4 @@
-"""Define the sizes shared by the engine, the models and the pipeline."""
+"""Define the sizes and names shared by the engine, the models and the pipeline."""
 
 from __future__ import annotations
 
@@ -12,6 +12,9 @@ For a larger system the engine loops over the vectors (see `engine.tangents`), a
 text leaves out its zeros. The code then grows with the number of entries, not with that of entries times
 vectors.
 """
+
+LEVEL = "section_value"
+"""Name of the level among the parameters of a system with such a section; the last of them."""
 
 
 def too_many_states(name: str, n_states: int) -> str | None:

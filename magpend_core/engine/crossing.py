@@ -5,9 +5,9 @@ from __future__ import annotations
 import dataclasses
 from functools import cache
 
-from magpend_core.crossing import LEVEL
 from magpend_core.engine.placeholders import no_forcing
 from magpend_core.engine.system import System
+from magpend_core.sizes import LEVEL
 
 
 @cache

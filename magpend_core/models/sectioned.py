@@ -9,10 +9,11 @@ from functools import cache, cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from magpend_core.crossing import LEVEL, Crossing
+from magpend_core.crossing import Crossing
 from magpend_core.models.model import Mirror, Model
 from magpend_core.models.parameters import Parameter, Parameters
 from magpend_core.models.presets import Preset
+from magpend_core.sizes import LEVEL
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -6,17 +6,11 @@ import math
 import os
 import shutil
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.layout.plan import MOST_TASKS, Plan
 from pipeline.specification.problems import SpecError
-
-if TYPE_CHECKING:
-    from pipeline.layout.plan import Plan
-
-MOST_TASKS = 100_000
-"""Most tasks of a run. Reading the records of more tasks would take longer than computing their cells."""
 
 MOST_BRANCHES = 10_000_000
 """Most branches of a continuation. The cube keeps the initial state of each as coordinates."""

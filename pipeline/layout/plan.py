@@ -17,7 +17,6 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from pipeline.layout.cells import CellMap
-from pipeline.layout.limits import MOST_TASKS
 from pipeline.layout.schema import sizes_of, variables_of
 from pipeline.layout.vocabulary import FREQUENCY_DIM
 from pipeline.products.registry import CELL_PRODUCTS
@@ -46,6 +45,9 @@ A basin boundary is followed within a tile but not into the next one, so smaller
 
 LANES = 16
 """Tasks take multiples of this number of trajectories, so that the kernel's lanes are full."""
+
+MOST_TASKS = 100_000
+"""Most tasks of a run. Reading the records of more tasks would take longer than computing their cells."""
 
 WANTED_TASKS = 32
 LEAST_SECONDS, MOST_SECONDS = 2.0, 20.0

@@ -14,7 +14,7 @@ from matplotlib.ticker import MaxNLocator
 
 from pipeline.plots import labels, style
 from pipeline.plots.bifurcation import swept_parameters
-from pipeline.plots.lyapunov import UNITS, demand, exponent_values, left_out, rate_unit
+from pipeline.plots.exponents import UNITS, demand, exponent_values, left_out, rate_unit
 from pipeline.plots.selection import at_points
 
 _NO_EXPONENT = "0.8"

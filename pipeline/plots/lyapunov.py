@@ -11,18 +11,17 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 
-from pipeline.analysis.chaos.lyapunov import GOOD, period_seconds
-from pipeline.layout.period_names import period_of
-from pipeline.layout.vocabulary import model_of
+from pipeline.analysis.chaos.lyapunov import GOOD
 from pipeline.plots import labels, pixels, style
 from pipeline.plots.bifurcation import Diagram, with_diagram
+from pipeline.plots.exponent_map import plot_lyapunov_map
+from pipeline.plots.exponents import UNITS, demand, exponent_values, rate_unit
 from pipeline.plots.figure import Run, frame_of, noted, values_of
 from pipeline.plots.missing_cells import absent_handles, draw_absent, shade_blank
-from pipeline.plots.motions import motion_codes, motions_of
-from pipeline.plots.points import ABSENT, DRAWN, Survey
+from pipeline.plots.motions import motions_of
+from pipeline.plots.points import Survey
 from pipeline.products.figures import LyapunovFigureOptions
 
-UNITS = ("s", "period")
 EXPONENT_COLOURS = ("#332288", style.ORANGE, style.SKY, "#882255", "#5B3A1E", "#999933", "#44AA99", "#AA4499")
 """Others than those of the motions in the panel above; a ninth begins again."""
 
@@ -117,53 +116,6 @@ def _draw_lost(top: Axes, bottom: Axes, strip: Axes, diagram: Diagram, lost: Sur
     bottom.tick_params(labelbottom=False)
 
 
-def left_out(part: xr.Dataset) -> str:
-    """Count the cells without an exponent, by reason; empty if all have one."""
-    status = part["status"]
-    missing = part["lyapunov"].isel(exponent=0, drop=True).isnull().transpose(*status.dims)
-    counts = {name: int((missing & status.isin(codes)).sum()) for name, codes in ABSENT.items()}
-    counts["without exponent"] = int((missing & status.isin(DRAWN)).sum())
-    listed = style.join(f"{n} {name}" for name, n in counts.items() if n)
-    return f"left out of {status.size} cells: {listed}" if listed else ""
-
-
-def demand(ds: xr.Dataset) -> None:
-    """Raise ValueError if a cube has no exponents."""
-    if "lyapunov" not in ds:
-        raise ValueError(
-            "the cube has no Lyapunov exponents; run it with [products] lyapunov = {} in its specification"
-        )
-
-
-def exponent_values(part: xr.Dataset, per: str, spectrum: bool) -> xr.Dataset:
-    """Return exponents and errors in the unit asked for, with flags and classes of motion."""
-    scale = period_seconds(part) if per == "period" else xr.DataArray(1.0)
-    chosen = part if spectrum else part.isel(exponent=slice(1))
-    dims = chosen["lyapunov"].dims
-    variables = {
-        "exponent_value": (chosen["lyapunov"] * scale).transpose(*dims),
-        "exponent_stderr": (chosen["lyapunov_stderr"] * scale).transpose(*dims),
-        "lyapunov_flag": part["lyapunov_flag"],
-    }
-    if motions_of(part).told:
-        variables["motion"] = motion_codes(part)
-    data = xr.Dataset(variables).load()
-    for name in ("exponent_value", "exponent_stderr"):
-        data[name].attrs.update(
-            units="1/s" if per == "s" else "1", per="unit time" if per == "s" else period_of(model_of(part))
-        )
-    # NetCDF cannot store object labels; the numbers of branches and starts suffice
-    keep = {"exponent", *data["lyapunov_flag"].dims}
-    keep |= {str(c) for c, v in data.coords.items() if not v.ndim and v.dtype.kind == "f"}
-    return data.drop_vars([c for c in data.coords if c not in keep]).assign_attrs(title="Lyapunov exponents")
-
-
-def rate_unit(data: xr.Dataset) -> str:
-    """Return the unit of the exponents for an axis."""
-    per = str(data["exponent_value"].attrs["per"])
-    return "1/s" if per == "unit time" else f"1/{per.split()[-1]}"
-
-
 def _draw_exponents(ax: Axes, data: xr.Dataset, parameter: str, spectrum: bool, colours: tuple[str, ...]) -> list[Any]:
     style.style_axes(ax)
     x = data[parameter].values.astype(np.float64)
@@ -238,8 +190,6 @@ def _union(value: np.ndarray, error: np.ndarray) -> list[tuple[float, float]]:
 
 def draw(run: Run, options: LyapunovFigureOptions) -> style.DataFigure:
     """Draw the figure ``lyapunov`` of a run, over one parameter or as a map."""
-    from pipeline.plots.exponent_map import plot_lyapunov_map
-
     cube = run.cube()
     at, notes = values_of(run, options)
     if options.as_map:

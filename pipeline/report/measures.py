@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
@@ -20,6 +19,7 @@ from pipeline.analysis.intervals import binomial_interval
 from pipeline.analysis.selection import place
 from pipeline.analysis.sides import classify
 from pipeline.layout.vocabulary import split_dims
+from pipeline.report.estimates import Estimate, absent
 from pipeline.specification.problems import SpecError
 
 if TYPE_CHECKING:
@@ -29,42 +29,6 @@ if TYPE_CHECKING:
 
 Options = Mapping[str, Any]
 Measure = Callable[["Results", Sequence[str], Options], "Estimate"]
-
-NOWHERE = math.nan
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """A measured value with its interval.
-
-    Attributes
-    ----------
-    value : float
-        The estimate; NaN if nothing could be measured.
-    low, high : float
-        95 % interval; NaN if nothing could be measured.
-    text : str
-        A phrase on the counted or located objects.
-    step : float or None
-        Largest step of the axis there, if it limits the resolution.
-    n : int or None
-        Number of independent cells, curves or periods behind the estimate.
-    missing : str
-        Reason why nothing could be measured; otherwise empty.
-    """
-
-    value: float
-    low: float
-    high: float
-    text: str = ""
-    step: float | None = None
-    n: int | None = None
-    missing: str = ""
-
-
-def absent(why: str, step: float | None = None) -> Estimate:
-    """Return the estimate for a missing measurement, with the reason."""
-    return Estimate(NOWHERE, NOWHERE, NOWHERE, step=step, missing=why)
 
 
 def _cells(results: Results, name: str) -> tuple[xr.Dataset, str]:

@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.layout.writing import write_atomically
-from pipeline.report.measures import MEASURES, Estimate
+from pipeline.report.estimates import Estimate
+from pipeline.report.measures import MEASURES
 from pipeline.report.page import Block, Facts, Grid, Note, Outcome, Page, Part, Text, write
 from pipeline.report.pictures import picture
 from pipeline.report.report import made_by

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline.report.measures import Estimate
+from pipeline.report.estimates import Estimate
 from pipeline.specification.problems import SpecError, unknown_name
 
 if TYPE_CHECKING:

@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import Field
 
-from magpend_core.crossing import LEVEL, Crossing
+from magpend_core.crossing import Crossing
 from magpend_core.models.parameters import near_names
 from magpend_core.models.sectioned import sectioned
+from magpend_core.sizes import LEVEL
 from pipeline.specification.tables import FREQUENCY, Table
 
 if TYPE_CHECKING:

@@ -1,64 +1,43 @@
-"""Open a run directory as a labelled dataset."""
+"""Make a labelled dataset of an opened run."""
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
+from magpend_core.models.model import Model
 from pipeline.layout.attributes import netcdf_safe
 from pipeline.layout.cells import DIRECTION_CODES
+from pipeline.layout.plan import Plan
 from pipeline.layout.vocabulary import model_attribute, section_attributes
+from pipeline.specification.parsing import Spec
 from pipeline.store.parallel_reads import quick_reading
-from pipeline.store.run import Run
+from pipeline.store.records import Commit
+from pipeline.store.runfile import RunInfo
 from pipeline.store.view import committed_view
 
 if TYPE_CHECKING:
     import xarray as xr
 
 
-def open_run(path: str | Path | Run, *, chunks: Any = None, check: bool | None = None) -> xr.Dataset:
-    """Open a run directory; only coordinates are read until variables are used.
+class OpenedRun(Protocol):
+    """The parts of a run that its cube is made of; see `pipeline.store.run.Run`."""
 
-    Cells that are not committed read as pending: ``status`` 0, ``section`` NaN. Open the run again to see
-    cells that were committed later.
-
-    Parameters
-    ----------
-    path
-        Run directory.
-    chunks
-        As in `xarray.open_zarr`: None indexes lazily and loads what is selected; ``{}`` makes dask
-        arrays in the chunks of the store, for cubes larger than the memory.
-    check
-        Whether every chunk is compared with the sha256 in its commit record when it is read. The default is
-        True, unless the environment has ``MAGPEND_VERIFY=0``.
-
-    Returns
-    -------
-    xarray.Dataset
-        The cube. Its attributes hold the model's name, the specification's TOML text, the settings of the
-        integration by name, those of products as ``<product>_<name>`` (such as ``lyapunov_n_periods``), and
-        the provenance (``source``, ``created``, ``host``, ``git_commit``). It can be written as NetCDF.
-
-    Raises
-    ------
-    RefusedError
-        If there is no run in `path`.
-    DamagedError
-        If ``run.json``, metadata or coordinates have changed since they were written. When a cell is used
-        later: if its chunk is missing or has changed.
-
-    Examples
-    --------
-    >>> ds = open_run("runs/quickstart")                                    # doctest: +SKIP
-    >>> ds.section.isel(state=0).sel(frequency=2.2, method="nearest")       # doctest: +SKIP
-    """
-    return Run.open(path).cube(chunks, check=check)
+    @property
+    def info(self) -> RunInfo: ...  # noqa: D102
+    @property
+    def plan(self) -> Plan: ...  # noqa: D102
+    @property
+    def commits(self) -> Mapping[int, Commit]: ...  # noqa: D102
+    @property
+    def spec(self) -> Spec: ...  # noqa: D102
+    @property
+    def model(self) -> Model: ...  # noqa: D102
 
 
-def cube_of(run: Run, *, chunks: Any = None, check: bool | None = None) -> xr.Dataset:
+def cube_of(run: OpenedRun, *, chunks: Any = None, check: bool | None = None) -> xr.Dataset:
     """Return the cube of an opened run; cells without a commit record read as pending."""
     import xarray as xr
 
@@ -73,7 +52,7 @@ def cube_of(run: Run, *, chunks: Any = None, check: bool | None = None) -> xr.Da
     return netcdf_safe(ds.assign_attrs(_attributes(run)))
 
 
-def _attributes(run: Run) -> dict[str, Any]:
+def _attributes(run: OpenedRun) -> dict[str, Any]:
     """Return the attributes of an opened cube."""
     info = run.info
     attrs: dict[str, Any] = {

@@ -154,3 +154,43 @@ class Run:
         from pipeline.store.reading import cube_of
 
         return cube_of(self, chunks=chunks, check=check)
+
+
+def open_run(path: str | Path | Run, *, chunks: Any = None, check: bool | None = None) -> xr.Dataset:
+    """Open a run directory; only coordinates are read until variables are used.
+
+    Cells that are not committed read as pending: ``status`` 0, ``section`` NaN. Open the run again to see
+    cells that were committed later.
+
+    Parameters
+    ----------
+    path
+        Run directory.
+    chunks
+        As in `xarray.open_zarr`: None indexes lazily and loads what is selected; ``{}`` makes dask
+        arrays in the chunks of the store, for cubes larger than the memory.
+    check
+        Whether every chunk is compared with the sha256 in its commit record when it is read. The default is
+        True, unless the environment has ``MAGPEND_VERIFY=0``.
+
+    Returns
+    -------
+    xarray.Dataset
+        The cube. Its attributes hold the model's name, the specification's TOML text, the settings of the
+        integration by name, those of products as ``<product>_<name>`` (such as ``lyapunov_n_periods``), and
+        the provenance (``source``, ``created``, ``host``, ``git_commit``). It can be written as NetCDF.
+
+    Raises
+    ------
+    RefusedError
+        If there is no run in `path`.
+    DamagedError
+        If ``run.json``, metadata or coordinates have changed since they were written. When a cell is used
+        later: if its chunk is missing or has changed.
+
+    Examples
+    --------
+    >>> ds = open_run("runs/quickstart")                                    # doctest: +SKIP
+    >>> ds.section.isel(state=0).sel(frequency=2.2, method="nearest")       # doctest: +SKIP
+    """
+    return Run.open(path).cube(chunks, check=check)

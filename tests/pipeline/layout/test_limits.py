@@ -9,8 +9,8 @@ from collections import namedtuple
 import pytest
 
 from pipeline.layout import limits
-from pipeline.layout.limits import MOST_CHUNK_BYTES, MOST_TASKS, check_plan, check_space, in_words
-from pipeline.layout.plan import make_plan
+from pipeline.layout.limits import MOST_CHUNK_BYTES, check_plan, check_space, in_words
+from pipeline.layout.plan import MOST_TASKS, make_plan
 from pipeline.runs.preview import describe_plan
 from pipeline.runs.run import run
 from pipeline.specification.parsing import parse_spec

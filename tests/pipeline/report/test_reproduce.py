@@ -13,7 +13,7 @@ import time
 import pytest
 
 from pipeline.cli.exits import Exit
-from pipeline.report.measures import Estimate
+from pipeline.report.estimates import Estimate
 from pipeline.report.reproduce import Judgement, calibrated_on, decided_first, headline
 from pipeline.report.study import ClaimTable, load_study, shipped_studies
 from pipeline.report.verdicts import Verdict

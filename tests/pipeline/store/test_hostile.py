@@ -18,8 +18,7 @@ from pipeline.runs.run import run
 from pipeline.specification.parsing import kept_spec
 from pipeline.store.declared import Declared, declared_bytes
 from pipeline.store.errors import DamagedError, StoreError
-from pipeline.store.reading import open_run
-from pipeline.store.run import Run
+from pipeline.store.run import Run, open_run
 from pipeline.store.runfile import read_run
 
 ROOT = Path(__file__).parents[3]

@@ -16,7 +16,7 @@ import pytest
 import xarray as xr
 
 from pipeline.runs.run import run
-from pipeline.store.reading import open_run
+from pipeline.store.run import open_run
 from tests.pipeline.explorer.browser.conftest import reused, served
 
 WAIT_S = 60.0  # a machine that is busy with other tests

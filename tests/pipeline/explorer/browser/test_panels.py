@@ -14,8 +14,7 @@ import xarray as xr
 
 from pipeline.layout.attractor_letters import letter
 from pipeline.runs.derive import stored
-from pipeline.store.reading import open_run
-from pipeline.store.run import Run
+from pipeline.store.run import Run, open_run
 from tests.pipeline.explorer.browser.conftest import HOSTILE, WAIT_MS, reused, served
 from tests.pipeline.explorer.browser.test_diagram import click_on, drawn, places_of
 
