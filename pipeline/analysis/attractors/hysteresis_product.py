@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
-
 import xarray as xr
 
+from pipeline.analysis.run import Run
 from pipeline.products.attractors import AttractorOptions
-
-if TYPE_CHECKING:
-    from pipeline.store.run import Run
 
 
 def needs_directions(run: Run, options: AttractorOptions) -> None:
@@ -19,7 +15,7 @@ def needs_directions(run: Run, options: AttractorOptions) -> None:
     check_directions(run.cube())
 
 
-def hysteresis(run: Any, options: AttractorOptions) -> xr.Dataset:
+def hysteresis(run: Run, options: AttractorOptions) -> xr.Dataset:
     """Compute the hysteresis loops of a run and the jumps between its attractors."""
     from pipeline.analysis.attractors.matching.hysteresis import hysteresis as compute
 

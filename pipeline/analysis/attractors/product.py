@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
-
 import xarray as xr
 
+from pipeline.analysis.run import Run
 from pipeline.products.attractors import AttractorOptions, IdentifyOptions
-
-if TYPE_CHECKING:
-    from pipeline.store.run import Run
 
 
 def identified(run: Run, options: IdentifyOptions) -> xr.Dataset:
@@ -19,7 +15,7 @@ def identified(run: Run, options: IdentifyOptions) -> xr.Dataset:
     return identify(run.cube(), options)
 
 
-def attractors(run: Any, options: AttractorOptions) -> xr.Dataset:
+def attractors(run: Run, options: AttractorOptions) -> xr.Dataset:
     """Find the attractors of a run and give them ids that follow them along its axes."""
     from pipeline.analysis.attractors.attractors import match
 

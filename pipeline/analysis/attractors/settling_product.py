@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import xarray as xr
 
+from pipeline.analysis.run import Run
 from pipeline.products.attractors import AttractorOptions
 
 VARIABLES = (
@@ -31,7 +30,7 @@ VARIABLES = (
 """Variables of the attractors that the settling table shows."""
 
 
-def settling(run: Any, options: AttractorOptions) -> xr.Dataset:
+def settling(run: Run, options: AttractorOptions) -> xr.Dataset:
     """Return the evidence on whether each set that does not close is transient or attracts."""
     found: xr.Dataset = run.derive("attractors", **options.plain())
     return found[list(VARIABLES)]

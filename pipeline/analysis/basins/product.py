@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
-
 import xarray as xr
 
+from pipeline.analysis.run import Run
 from pipeline.products.attractors import AttractorOptions
 from pipeline.products.basins import BasinOptions
-
-if TYPE_CHECKING:
-    from pipeline.store.run import Run
 
 
 def needs_starts(run: Run, options: BasinOptions) -> None:
@@ -20,7 +16,7 @@ def needs_starts(run: Run, options: BasinOptions) -> None:
     check_starts(run.cube())
 
 
-def basins(run: Any, options: BasinOptions) -> xr.Dataset:
+def basins(run: Run, options: BasinOptions) -> xr.Dataset:
     """Compute the basins of a sweep: outcomes of cells, fractions, boundaries."""
     from pipeline.analysis.basins.basins import basins as compute
 

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
-
 import xarray as xr
 
+from pipeline.analysis.run import Run
 from pipeline.layout.vocabulary import FREQUENCY_DIM, axis_name, parameters_of
 from pipeline.products.branches import BranchOptions, CurveOptions
-
-if TYPE_CHECKING:
-    from pipeline.store.run import Run
 
 LEAST_PERIOD = 4
 """Least limit for the periods of followed branches, however short the orbits of the run are."""
@@ -34,7 +30,7 @@ def _refuse_frequency_of_flow(run: Run, parameter: str) -> None:
         raise SpecError([f"{run.model.name} has no drive frequency to follow; give --parameter: {known}."])
 
 
-def branches(run: Any, options: BranchOptions) -> xr.Dataset:
+def branches(run: Run, options: BranchOptions) -> xr.Dataset:
     """Follow branches of periodic orbits along a parameter, from the orbits that attract a run's cells."""
     from pipeline.analysis.branches import Scope, attracting, dataset_of, explore, recurrent
 
@@ -76,7 +72,7 @@ def settle_curves(run: Run, options: CurveOptions) -> CurveOptions:
     return settled
 
 
-def curves(run: Any, options: CurveOptions) -> xr.Dataset:
+def curves(run: Run, options: CurveOptions) -> xr.Dataset:
     """Continue the bifurcations located by `branches` in the plane of its parameter and a second one."""
     from pipeline.analysis.branches import curves_dataset, curves_from
 

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
-
 import xarray as xr
 
+from pipeline.analysis.run import Run
 from pipeline.products.attractors import AttractorOptions
 from pipeline.products.chaos import ChaosOptions, DimensionOptions
-
-if TYPE_CHECKING:
-    from pipeline.store.run import Run
 
 
 def needs_chaos(run: Run, options: ChaosOptions) -> None:
@@ -20,7 +16,7 @@ def needs_chaos(run: Run, options: ChaosOptions) -> None:
     check_chaos(run.cube(), options)
 
 
-def chaos(run: Any, options: ChaosOptions) -> xr.Dataset:
+def chaos(run: Run, options: ChaosOptions) -> xr.Dataset:
     """Compute exponents, dimensions and 0-1 test of the cells and of each attractor."""
     from pipeline.analysis.chaos.chaos import chaos as compute
 
@@ -42,7 +38,7 @@ def settle_dimension(run: Run, options: DimensionOptions) -> DimensionOptions:
     return options.model_copy(update={"at": {name: float(part[name].values[0]) for name in options.at}})
 
 
-def dimension(run: Any, options: DimensionOptions) -> xr.Dataset:
+def dimension(run: Run, options: DimensionOptions) -> xr.Dataset:
     """Compute the correlation dimension of each attractor that does not close."""
     from pipeline.analysis.chaos.correlation import section_dimension
 
