@@ -19,6 +19,9 @@ from pipeline.store.errors import StoreError
 
 LOG = logging.getLogger(__name__)
 
+PATIENCE_S = 8.0
+"""Time that the run of a region has to end in order, until it is killed [s]."""
+
 Answer = dict[str, Any] | bytes
 """JSON, or what `pack_arrays` gives."""
 

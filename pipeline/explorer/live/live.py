@@ -1,10 +1,4 @@
-"""Compute live requests: starts, slices, orbits that follow a parameter, runs of a region.
-
-`LiveRun` is what all who watch a run share: compiled code, the attractors of parameter points, threads for
-the kernel. `LiveSession` is one of those who watch: it takes messages (see `messages`) and gives answers to
-a callback, dictionaries for JSON and bytes of `arrays.pack_arrays`. There is one job of a kind at a time; a
-newer one takes the place of the one before. Neither knows how messages travel.
-"""
+"""Hold the parts of a run that all its live sessions share: compiled code, attractors, threads for the kernel."""
 
 from __future__ import annotations
 
@@ -15,6 +9,7 @@ import time
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from typing import Protocol
 
 import numpy as np
 import xarray as xr
@@ -24,10 +19,9 @@ from magpend_core.models.parameters import ParameterError
 from magpend_core.orbits import section_map
 from pipeline.explorer.data.series import orbit_series
 from pipeline.explorer.live.catalog import Catalog, Known
-from pipeline.explorer.live.jobs import Answer, Desk, Job
+from pipeline.explorer.live.jobs import PATIENCE_S
 from pipeline.explorer.live.legend import Legend
-from pipeline.explorer.live.messages import CancelRequest, Request, RequestError, read_request
-from pipeline.explorer.live.regions import PATIENCE_S
+from pipeline.explorer.live.messages import RequestError
 from pipeline.explorer.live.settling import Flight, Place
 from pipeline.layout.cells import CellMap, parameter_axes
 from pipeline.layout.domains import check_states
@@ -67,6 +61,20 @@ def live_problem(run: Run) -> str | None:
     return None
 
 
+class Session(Protocol):
+    """A live session as its run sees it; see `pipeline.explorer.live.session`."""
+
+    @property
+    def is_over(self) -> bool:
+        """Whether the session is closed and no job is running."""
+
+    def close(self) -> None:
+        """Cancel all jobs."""
+
+    def join(self, timeout: float) -> None:
+        """Wait until no job is at work."""
+
+
 class LiveRun:
     """The state shared by all live sessions of a run.
 
@@ -89,7 +97,7 @@ class LiveRun:
         self._catalogs: OrderedDict[tuple[float, ...], Catalog] = OrderedDict()
         self._attractors: xr.Dataset | None = None
         self._cube: xr.Dataset | None = None
-        self._sessions: set[LiveSession] = set()
+        self._sessions: set[Session] = set()
         self._warming = Warming(self)
 
     def close(self) -> None:
@@ -103,12 +111,12 @@ class LiveRun:
             session.join(max(0.0, until - time.monotonic()))
         self.pool.shutdown(wait=False, cancel_futures=True)
 
-    def enter(self, session: LiveSession) -> None:
+    def enter(self, session: Session) -> None:
         """Register a session, so that it ends with the run."""
         with self._lock:
             self._sessions.add(session)
 
-    def leave(self, session: LiveSession) -> None:
+    def leave(self, session: Session) -> None:
         """Forget a session once it is closed and its jobs have ended."""
         with self._lock:
             self._sessions = {s for s in self._sessions if s is not session and not s.is_over}
@@ -321,70 +329,3 @@ class Warming:
     def _attractors(self) -> None:
         place, _ = self._live.first_start()
         self._live.catalog(place)
-
-
-class LiveSession:
-    """One user's live session.
-
-    Parameters
-    ----------
-    live
-        What is shared with others.
-    emit
-        Takes an answer; called from threads of jobs, one call at a time for a kind of job.
-    """
-
-    def __init__(self, live: LiveRun, emit: Callable[[Answer], None]) -> None:
-        from pipeline.explorer.live import handlers
-
-        self.live = live
-        self._emit, self._closed = emit, threading.Event()
-        self._desks = {kind: Desk(self._emit_open, work) for kind, work in handlers.works(live).items()}
-        live.enter(self)
-        live.warm(self._tell_warming)
-
-    def _tell_warming(self, done: int, total: int) -> None:
-        self._emit_open({"id": None, "kind": "progress", "what": "warming", "done": done, "total": total})
-
-    def _emit_open(self, answer: Answer) -> None:
-        if not self._closed.is_set():
-            self._emit(answer)
-
-    def receive(self, text: str | bytes) -> None:
-        """Handle a message; errors are answered, never raised."""
-        try:
-            request: Request = read_request(text)
-        except RequestError as error:
-            self._emit_open({"id": error.job, "kind": "error", "error": str(error)})
-            return
-        except Exception as error:  # a message never ends the server
-            LOG.warning("message refused: %s", error)
-            self._emit_open({"id": None, "kind": "error", "error": "the message cannot be read."})
-            return
-        if isinstance(request, CancelRequest):
-            for desk in self._desks.values():
-                desk.cancel(request.job)
-            self._emit_open({"id": request.id, "kind": "done"})
-            return
-        self._desks[request.do].put(Job(request))
-
-    def close(self) -> None:
-        """Cancel all jobs; emit nothing from now on."""
-        self._closed.set()
-        for desk in self._desks.values():
-            desk.close()
-        if self.is_over:  # else it is still waited for when the run is closed
-            self.live.leave(self)
-
-    @property
-    def is_over(self) -> bool:
-        """Tell whether the session is closed and no job is running."""
-        return self._closed.is_set() and not any(desk.is_busy for desk in self._desks.values())
-
-    def join(self, timeout: float = 30.0) -> None:
-        """Wait until no job is at work."""
-        for desk in self._desks.values():
-            desk.join(timeout)
-
-
-__all__ = ["LiveRun", "LiveSession", "live_problem"]

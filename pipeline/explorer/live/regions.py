@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from magpend_core.models.imported import KEY
-from pipeline.explorer.live.jobs import Job
+from pipeline.explorer.live.jobs import PATIENCE_S, Job
 from pipeline.explorer.live.messages import Region, RequestError, RunRequest
 from pipeline.layout.cells import parameter_axes
 from pipeline.layout.identity import canonical
@@ -38,9 +38,6 @@ MOST_CELLS = 2_000_000
 
 LOOK_EVERY_S = 0.4
 """How often progress is looked at [s]."""
-
-PATIENCE_S = 8.0
-"""Time that a run has to end in order, until it is killed [s]."""
 
 DIGITS = 4
 """Decimal digits of an interval's length that its ends keep."""

@@ -5,22 +5,20 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 
 from magpend_core.engine.observers import window_of
 from magpend_core.engine.system import System
 from magpend_core.extension import more_sections, orbit_periods
+from magpend_core.models.model import Model
 from magpend_core.models.parameters import Parameters
 from magpend_core.status import Status
 from pipeline.analysis.attractors.finding.cell_blocks import Block
 from pipeline.analysis.attractors.finding.closed_orbits import RUN_ON_RTOL, RUN_ON_TOLERANCE
 from pipeline.explorer.live.messages import RequestError
 from pipeline.specification.tables import Integration
-
-if TYPE_CHECKING:
-    from pipeline.explorer.live.catalog import Catalog
 
 MOST_STEPS = 200_000
 """Attempted steps of a period beyond which a live trajectory is given up, if the run goes on longer."""
@@ -33,6 +31,21 @@ MOST_KEPT, MOST_KEPT_OF_SLICE, MOST_TRANSIENT = 100_000, 512, 4096
 
 LEG = 32
 """Periods between two looks at the cells of a slice."""
+
+
+class Ends(Protocol):
+    """The known ends of trajectories at a parameter point; see `pipeline.explorer.live.catalog.Catalog`."""
+
+    model: Model
+
+    def on_orbits(self, block: Block) -> np.ndarray:
+        """Return the entry of the orbit that each cell has reached, -1 for none."""
+
+    def unsure(self, block: Block, numbers: np.ndarray) -> np.ndarray:
+        """Return the undecided cells worth integrating further."""
+
+    def conclude(self, block: Block, *, final: bool = True, strictly: bool = False) -> np.ndarray:
+        """Return the entry of each cell."""
 
 
 class CancelledError(Exception):
@@ -231,7 +244,7 @@ RUN_ON_LEG = 64
 def run_on(
     place: Place,
     integration: Integration,
-    ends: Catalog,
+    ends: Ends,
     block: Block,
     states: np.ndarray,
     check: Check,
@@ -275,13 +288,7 @@ def run_on(
 
 
 def _look(
-    flight: Flight,
-    rows: np.ndarray,
-    last: np.ndarray,
-    integration: Integration,
-    ends: Catalog,
-    *,
-    strictly: bool = False,
+    flight: Flight, rows: np.ndarray, last: np.ndarray, integration: Integration, ends: Ends, *, strictly: bool = False
 ) -> np.ndarray:
     """Return the entries of moving cells, -1 for those not yet on an orbit."""
     no_turns = np.zeros((len(rows), sum(ends.model.is_angle)), np.int64)
@@ -294,7 +301,7 @@ def _look(
     return ends.conclude(block, final=False, strictly=strictly)
 
 
-def settle_cells(place: Place, integration: Integration, ends: Catalog, starts: np.ndarray, check: Check) -> np.ndarray:
+def settle_cells(place: Place, integration: Integration, ends: Ends, starts: np.ndarray, check: Check) -> np.ndarray:
     """Return the entry on which each start ends.
 
     A cell is given up as soon as it is on an orbit that is known, or certain to end there; the others go on
@@ -344,7 +351,7 @@ def settle_cells(place: Place, integration: Integration, ends: Catalog, starts: 
 def conclude(
     place: Place,
     integration: Integration,
-    ends: Catalog,
+    ends: Ends,
     block: Block,
     states: np.ndarray,
     check: Check,

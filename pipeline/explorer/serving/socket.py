@@ -15,8 +15,9 @@ from tornado.web import RequestHandler
 from tornado.websocket import WebSocketClosedError, WebSocketHandler
 
 from pipeline.explorer.live.jobs import Answer
-from pipeline.explorer.live.live import LiveRun, LiveSession
+from pipeline.explorer.live.live import LiveRun
 from pipeline.explorer.live.messages import MOST_BYTES, number_in
+from pipeline.explorer.live.session import LiveSession
 
 LOG = logging.getLogger(__name__)
 

@@ -19,9 +19,10 @@ from pipeline.explorer.data.colours import rgb
 from pipeline.explorer.live import slices
 from pipeline.explorer.live.catalog import Entry
 from pipeline.explorer.live.legend import Legend
-from pipeline.explorer.live.live import LiveRun, LiveSession, live_problem
+from pipeline.explorer.live.live import LiveRun, live_problem
 from pipeline.explorer.live.messages import MOST_BYTES, Region, RequestError, read_request
 from pipeline.explorer.live.regions import zoom_toml, zoomed
+from pipeline.explorer.live.session import LiveSession
 from pipeline.explorer.live.settling import settle_cells
 from pipeline.layout.identity import identity_of
 from pipeline.layout.plan import make_plan

@@ -24,8 +24,7 @@ from magpend_core.pointwise import evaluate
 from magpend_core.sampling import Drive, sample
 from magpend_core.trajectory import trajectory
 from pipeline.analysis.attractors.finding.cell_blocks import Block
-from pipeline.analysis.attractors.finding.equilibria import Equilibrium
-from pipeline.analysis.attractors.finding.limit_cycles import Cycle
+from pipeline.analysis.attractors.finding.known_sets import Cycle, Equilibrium
 from pipeline.analysis.attractors.finding.stability import BY_APPROACH, BY_EIGENVALUES, BY_MULTIPLIERS
 from pipeline.analysis.sets import TWO_PI, Geometry, hashes, mean_distance, rounded_points
 from pipeline.analysis.sides import UNKNOWN

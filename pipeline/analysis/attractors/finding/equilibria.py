@@ -11,19 +11,15 @@ integrated further, up to `WAITS` times as long, until they come near one or ret
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
-from scipy.linalg import expm, solve_continuous_lyapunov
 
 from magpend_core.equilibria import find_equilibria, newton_steps
 from magpend_core.sections import run_branches
 from magpend_core.status import Status
+from pipeline.analysis.attractors.finding.known_sets import Equilibrium
 from pipeline.analysis.attractors.finding.points import Point
-from pipeline.analysis.attractors.finding.stability import RATE_ERROR, by_margin, largest_error
 from pipeline.analysis.sets import Geometry, hashes, rounded_points
-from pipeline.layout.vocabulary import ATTRACTS, NEUTRAL
 
 NEAR = 0.1
 """Largest scaled distance from a stable equilibrium at which a cell without a return counts as at rest."""
@@ -48,99 +44,6 @@ ITERATIONS = 100
 
 GUESSES, GUESS_BOX = 64, 0.1
 """Most far states from which Newton's method starts, and the side of the boxes with one start each."""
-
-
-@dataclass(frozen=True)
-class Equilibrium:
-    """A state at which the rate is zero.
-
-    Attributes
-    ----------
-    state : ndarray, (state,)
-    eigenvalues : ndarray of complex, (state,)
-        Eigenvalues of the Jacobian [1/s], by falling real part.
-    residual : float
-        Scaled length of the last Newton step.
-    jacobian : ndarray, (state, state)
-        Jacobian in units of the scales [1/s].
-    approached_within : float
-        Scaled distance from which trajectories on both sides came nearer; 0 if not tried or not seen.
-    """
-
-    state: np.ndarray
-    eigenvalues: np.ndarray
-    residual: float
-    jacobian: np.ndarray
-    approached_within: float = 0.0
-
-    @cached_property
-    def eigenvalue_error(self) -> float:
-        """Error of the largest real part of the eigenvalues [1/s]."""
-        # the error of the state is its residual, or more if degenerate, and carries over to the Jacobian
-        size = max(RATE_ERROR, 1e-4 * float(np.sqrt(self.residual))) * float(np.abs(self.jacobian).max(initial=1.0))
-        return largest_error(self.jacobian, size, real=True)
-
-    @cached_property
-    def stability(self) -> int:
-        """Stability by the real parts of the eigenvalues and their error, or by trajectories beside it."""
-        found = by_margin(float(self.eigenvalues.real[0]), 0.0, self.eigenvalue_error)
-        return ATTRACTS if found == NEUTRAL and self.approached_within > 0.0 else found
-
-    @property
-    def is_stable(self) -> bool:
-        """Whether it is shown to attract."""
-        return self.stability == ATTRACTS
-
-    @cached_property
-    def _norm(self) -> tuple[np.ndarray, float] | None:
-        """Root S of a norm |S x| that falls at least as exp(-rate t), and the rate; None if there is none."""
-        rate = -0.5 * float(self.eigenvalues.real[0])
-        shifted = self.jacobian + rate * np.eye(len(self.jacobian))
-        try:
-            weight = solve_continuous_lyapunov(shifted.T, -np.eye(len(shifted)))
-            return np.linalg.cholesky(0.5 * (weight + weight.T)).T, rate
-        except np.linalg.LinAlgError:
-            return None
-
-    def is_approached(self, section: np.ndarray, seconds: np.ndarray, noise: float, geometry: Geometry) -> np.ndarray:
-        """Return which trajectories follow the linear flow towards it, shape (n,).
-
-        With A the Jacobian, t the time between two sections and r = exp(-rate t) the bound on the linear
-        flow in its norm, let d be the distances and e = ``|d' - exp(A t) d|`` the error of the linear flow.
-        A trajectory approaches if e is at most half of (1 - r)|d| over the younger half of the sections:
-        closer to the equilibrium the error is smaller still.
-
-        Parameters
-        ----------
-        section
-            Sections, shape (n, k, state).
-        seconds
-            Time from the previous section to each, shape (n, k) [s].
-        noise
-            Scaled error of the sections.
-        geometry
-            Geometry of the states.
-        """
-        if self.approached_within or self._norm is None or section.shape[1] < 3:
-            return np.zeros(len(section), bool)
-        root, rate = self._norm
-        half = section.shape[1] // 2
-        away = geometry.difference(section[:, half:], self.state)
-        times = seconds[:, half + 1 :]
-        predicted = np.einsum("nkij,nkj->nki", self._flow(times), away[:, :-1])
-        size = np.linalg.norm(away @ root.T, axis=-1)
-        error = np.linalg.norm((away[:, 1:] - predicted) @ root.T, axis=-1)
-        allowed = 0.5 * (1.0 - np.exp(-rate * times)) * size[:, :-1]
-        known = noise * float(np.linalg.norm(root, 2)) * np.sqrt(len(root))
-        return np.asarray((error <= allowed + known).all(axis=1) & (size[:, -1] <= size[:, 0] + known))
-
-    def _flow(self, times: np.ndarray) -> np.ndarray:
-        """Return the linear flow over each time, shape (..., state, state)."""
-        values, vectors = np.linalg.eig(self.jacobian)
-        if np.linalg.cond(vectors) > 1e8:  # nearly defective: the eigenvectors are no basis
-            return np.asarray(expm(self.jacobian * times[..., None, None]))
-        found = (vectors * np.exp(values * times[..., None])[..., None, :]) @ np.linalg.inv(vectors)
-        return np.asarray(found.real)
 
 
 def tell_rest(points: Iterable[Point], tolerance: float, geometry: Geometry) -> None:

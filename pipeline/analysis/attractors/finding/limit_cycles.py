@@ -10,7 +10,6 @@ the cycle as a periodic point (`magpend_core.orbits`), and all cells on the cycl
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -18,6 +17,7 @@ from magpend_core.engine.crossing import with_section
 from magpend_core.orbits import polish_orbits
 from magpend_core.pointwise import rates_at
 from magpend_core.sections import run_branches
+from pipeline.analysis.attractors.finding.known_sets import Cycle
 from pipeline.analysis.attractors.finding.points import Point
 from pipeline.analysis.sets import Geometry, hashes
 
@@ -32,25 +32,6 @@ TRIES = 3
 
 RTOL = 1e-9
 """Tolerance of the trajectories between crossings."""
-
-
-@dataclass(frozen=True)
-class Cycle:
-    """A stable limit cycle.
-
-    Attributes
-    ----------
-    seconds : float
-        Period [s].
-    multipliers : ndarray of complex, (state,)
-        Floquet multipliers by falling modulus; one is 1, along the flow.
-    residual : float
-        Residual of `polish_orbits`.
-    """
-
-    seconds: float
-    multipliers: np.ndarray
-    residual: float
 
 
 class _Crossings:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -18,12 +18,9 @@ from magpend_core.pointwise import rates_at
 from magpend_core.status import Status
 from pipeline.analysis.attractors.extension.growth import volumes_of
 from pipeline.analysis.attractors.finding.cell_blocks import Block
+from pipeline.analysis.attractors.finding.known_sets import Cycle, Equilibrium
 from pipeline.analysis.sets import Geometry
 from pipeline.layout.vocabulary import FREQUENCY_DIM, frequency_of, model_of, parameters_of, split_dims
-
-if TYPE_CHECKING:
-    from pipeline.analysis.attractors.finding.equilibria import Equilibrium
-    from pipeline.analysis.attractors.finding.limit_cycles import Cycle
 
 _READ = ("section", "status", "orbit_period", "turns", "rest_state", "return_time", "n_periods", "step_size")
 """Variables that are read from a cube."""

@@ -11,7 +11,7 @@ import numpy as np
 
 from magpend_core.status import Status
 from pipeline.analysis.attractors.finding.closed_orbits import Orbit, scaled_derivative
-from pipeline.analysis.attractors.finding.equilibria import Equilibrium
+from pipeline.analysis.attractors.finding.known_sets import Equilibrium
 from pipeline.analysis.attractors.finding.requests import LEG, Extended, Leg, Work
 from pipeline.analysis.sets import Geometry
 

@@ -1,0 +1,81 @@
+"""Take a user's live requests and answer them: starts, slices, orbits that follow a parameter, runs of a region.
+
+A session takes messages (see `messages`) and passes its answers to a callback: dictionaries for JSON, and bytes of
+`arrays.pack_arrays`. One job of each kind runs at a time, and a newer one replaces it. A session does not know how
+messages travel.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable
+
+from pipeline.explorer.live import handlers
+from pipeline.explorer.live.jobs import Answer, Desk, Job
+from pipeline.explorer.live.live import LiveRun
+from pipeline.explorer.live.messages import CancelRequest, Request, RequestError, read_request
+
+LOG = logging.getLogger(__name__)
+
+
+class LiveSession:
+    """One user's live session.
+
+    Parameters
+    ----------
+    live
+        What is shared with others.
+    emit
+        Takes an answer; called from threads of jobs, one call at a time for a kind of job.
+    """
+
+    def __init__(self, live: LiveRun, emit: Callable[[Answer], None]) -> None:
+        self.live = live
+        self._emit, self._closed = emit, threading.Event()
+        self._desks = {kind: Desk(self._emit_open, work) for kind, work in handlers.works(live).items()}
+        live.enter(self)
+        live.warm(self._tell_warming)
+
+    def _tell_warming(self, done: int, total: int) -> None:
+        self._emit_open({"id": None, "kind": "progress", "what": "warming", "done": done, "total": total})
+
+    def _emit_open(self, answer: Answer) -> None:
+        if not self._closed.is_set():
+            self._emit(answer)
+
+    def receive(self, text: str | bytes) -> None:
+        """Handle a message; errors are answered, never raised."""
+        try:
+            request: Request = read_request(text)
+        except RequestError as error:
+            self._emit_open({"id": error.job, "kind": "error", "error": str(error)})
+            return
+        except Exception as error:  # a message never ends the server
+            LOG.warning("message refused: %s", error)
+            self._emit_open({"id": None, "kind": "error", "error": "the message cannot be read."})
+            return
+        if isinstance(request, CancelRequest):
+            for desk in self._desks.values():
+                desk.cancel(request.job)
+            self._emit_open({"id": request.id, "kind": "done"})
+            return
+        self._desks[request.do].put(Job(request))
+
+    def close(self) -> None:
+        """Cancel all jobs; emit nothing from now on."""
+        self._closed.set()
+        for desk in self._desks.values():
+            desk.close()
+        if self.is_over:  # else it is still waited for when the run is closed
+            self.live.leave(self)
+
+    @property
+    def is_over(self) -> bool:
+        """Tell whether the session is closed and no job is running."""
+        return self._closed.is_set() and not any(desk.is_busy for desk in self._desks.values())
+
+    def join(self, timeout: float = 30.0) -> None:
+        """Wait until no job is at work."""
+        for desk in self._desks.values():
+            desk.join(timeout)
