@@ -16,7 +16,8 @@ from typing import Any
 from pipeline.compute.addresses import SchedulerError
 from pipeline.layout.writing import TEMPORARY
 from pipeline.store.errors import StoreError
-from pipeline.store.files import COMMITS, open_files
+from pipeline.store.files import COMMITS
+from pipeline.store.places import open_files
 
 PACKAGES = ("numpy", "numba", "zarr", "numcodecs", "dask", "distributed")
 _ROOMS = ("specification", "layout", "products", "compute", "store")

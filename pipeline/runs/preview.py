@@ -16,7 +16,7 @@ from pipeline.runs.run import identity_here
 from pipeline.runs.workflows import default_directory, find_spec
 from pipeline.specification.parsing import Spec, load_spec
 from pipeline.store.commits import read_commits
-from pipeline.store.files import open_files
+from pipeline.store.places import open_files
 from pipeline.store.run import Run
 from pipeline.store.setup import check
 

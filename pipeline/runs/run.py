@@ -23,8 +23,9 @@ from pipeline.specification.parsing import Spec
 from pipeline.store.checking import damaged_records, name_of
 from pipeline.store.commits import log_timing, sweep
 from pipeline.store.errors import IncompleteError
-from pipeline.store.files import Files, open_files
+from pipeline.store.files import Files
 from pipeline.store.packing import Packer
+from pipeline.store.places import open_files
 from pipeline.store.records import Records
 from pipeline.store.runfile import RunInfo
 from pipeline.store.setup import check, establish

@@ -163,27 +163,6 @@ class Files(Protocol):
         ...
 
 
-def open_files(place: str | Path | Files) -> Files:
-    """Return the files of a run by its place: a folder, or ``s3://bucket/prefix``.
-
-    `Files` are returned unchanged.
-
-    Raises
-    ------
-    RefusedError
-        If `place` is another URL, or the object store cannot be used.
-    """
-    if not isinstance(place, (str, Path)):
-        return place
-    if is_url(place):
-        from pipeline.store.objects import parse_url
-
-        return parse_url(str(place))
-    from pipeline.store.local import LocalFiles
-
-    return LocalFiles(local_path(place))
-
-
 def is_url(place: str | Path) -> bool:
     """Return whether a place is in an object store."""
     return str(place).startswith("s3://")

@@ -14,15 +14,12 @@ import os
 import platform
 import threading
 import uuid
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 from pipeline.store.errors import LockedError, StoreError
 from pipeline.store.files import LOCK
-
-if TYPE_CHECKING:
-    from pipeline.store.objects import ObjectFiles
 
 RENEW_S, LEASE_S = 30.0, 150.0
 """Seconds between renewals of a lease, and seconds without renewal after which it lapses."""
@@ -68,8 +65,35 @@ def _has_ended(content: bytes) -> bool:
     return False
 
 
+class Leased(Protocol):
+    """The files of an object store as a lease uses them; see `pipeline.store.objects.ObjectFiles`."""
+
+    @property
+    def name(self) -> str:
+        """Return the URL."""
+
+    @property
+    def store(self) -> Any:
+        """Return obstore's store."""
+
+    def put_lines(self) -> None:
+        """Write the lines that were appended."""
+
+    def is_there(self, key: str) -> bool:
+        """Return whether there is an object."""
+
+    def read(self, key: str) -> bytes:
+        """Return an object's content."""
+
+    def write(self, key: str, content: bytes) -> None:
+        """Write an object."""
+
+    def remove(self, keys: Iterable[str]) -> None:
+        """Remove objects."""
+
+
 @contextlib.contextmanager
-def lease(files: ObjectFiles) -> Iterator[None]:
+def lease(files: Leased) -> Iterator[None]:
     """Hold the lease of a run in an object store.
 
     Raises
@@ -106,7 +130,7 @@ class _TakenError(Exception):
     """An error for a lease that another process has put meanwhile."""
 
 
-def _take(files: ObjectFiles, content: bytes) -> str:
+def _take(files: Leased, content: bytes) -> str:
     """Put the lease unless another one holds; return its tag."""
     import obstore
 
@@ -133,7 +157,7 @@ def _take(files: ObjectFiles, content: bytes) -> str:
     )
 
 
-def _found(files: ObjectFiles) -> tuple[bytes, str, float] | None:
+def _found(files: Leased) -> tuple[bytes, str, float] | None:
     """Return content, tag and age in seconds of the present lease; None if there is none."""
     import obstore
 
@@ -149,7 +173,7 @@ def _found(files: ObjectFiles) -> tuple[bytes, str, float] | None:
     return bytes(found.bytes()), str(found.meta["e_tag"]), age.total_seconds()
 
 
-def _replace(files: ObjectFiles, content: bytes, tag: str) -> str:
+def _replace(files: Leased, content: bytes, tag: str) -> str:
     """Replace the lease that has a tag; return the tag of the new one."""
     import obstore
 

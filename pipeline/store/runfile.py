@@ -14,7 +14,8 @@ from pipeline.specification.parsing import Spec
 from pipeline.specification.recorded_drive import is_whole
 from pipeline.store.checksums import CHECKSUM, fits, has_seal, seal
 from pipeline.store.errors import DamagedError, RefusedError
-from pipeline.store.files import RUN_FILE, Files, open_files
+from pipeline.store.files import RUN_FILE, Files
+from pipeline.store.places import open_files
 from pipeline.store.provenance import provenance, versions
 
 

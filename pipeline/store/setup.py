@@ -12,10 +12,11 @@ from pipeline.layout.plan import Plan
 from pipeline.specification.parsing import Spec
 from pipeline.store.checking import ODD, odd_keys, verify
 from pipeline.store.errors import DamagedError, RefusedError
-from pipeline.store.files import COMMITS, CUBE, HOLDER, OWN_NAMES, RUN_FILE, TIMINGS, Files, is_temporary, open_files
+from pipeline.store.files import COMMITS, CUBE, HOLDER, OWN_NAMES, RUN_FILE, TIMINGS, Files, is_temporary
 from pipeline.store.lease import is_note
 from pipeline.store.local import run_around
 from pipeline.store.packing import withdraw
+from pipeline.store.places import open_files
 from pipeline.store.runfile import RunInfo, is_run, read_run, write_run
 from pipeline.store.skeleton import (
     GROUP_KEY,

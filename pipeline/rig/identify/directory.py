@@ -31,18 +31,9 @@ from pipeline.rig.identify.specification import IdentificationSpec
 from pipeline.rig.recordings import load_mapping
 from pipeline.specification.models import is_model_file
 from pipeline.store.errors import DamagedError, RefusedError
-from pipeline.store.files import (
-    FIGURES,
-    HOLDER,
-    LOCK,
-    RUN_FILE,
-    entry_of,
-    is_temporary,
-    local_path,
-    open_files,
-    problems_of,
-)
+from pipeline.store.files import FIGURES, HOLDER, LOCK, RUN_FILE, entry_of, is_temporary, local_path, problems_of
 from pipeline.store.local import is_there, refuse_place, unreadable
+from pipeline.store.places import open_files
 from pipeline.store.provenance import provenance, versions
 
 T = TypeVar("T")

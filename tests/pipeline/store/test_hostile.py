@@ -167,7 +167,7 @@ def test_open_product__bombs_are_computed_again(hostile):
     chunk = next(f for f in sorted(product.rglob("c*")) if f.is_file())
     chunk.write_bytes(bomb(2**31 - 17))
     from pipeline.store import products
-    from pipeline.store.files import open_files
+    from pipeline.store.places import open_files
 
     path = product / "zarr.json"
     data = json.loads(path.read_text())

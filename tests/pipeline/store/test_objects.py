@@ -21,7 +21,7 @@ from pipeline.runs.zoom import read_source
 from pipeline.store import lease, objects
 from pipeline.store.commits import read_commits, sweep, write_task
 from pipeline.store.errors import DamagedError, LockedError, RefusedError
-from pipeline.store.files import open_files
+from pipeline.store.places import open_files
 from pipeline.store.products import open_product, products_in, remove_product, write_product
 from pipeline.store.setup import check, create, establish
 from tests.pipeline.store.s3 import BUCKET, KEY_ID, SECRET, Server, in_turn, once
