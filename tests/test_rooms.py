@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import ast
+import graphlib
 import re
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 
 from magpend_core.models import load_model, model_names
@@ -14,6 +15,7 @@ ROOT = Path(__file__).parents[1]
 PIPELINE = sorted((ROOT / "pipeline").rglob("*.py"))
 CORE = sorted((ROOT / "magpend_core").rglob("*.py"))
 MAX_FUNCTION, MAX_MODULE = 60, 480
+MODELS = "magpend_core.models"
 
 # every model as text has a preset of the name that is left out, which is a common word
 PRESETS = "|".join(sorted({p for name in model_names() for p in load_model(name).preset_names} - {DEFAULT_PRESET}))
@@ -76,6 +78,28 @@ def lengths_in(path: Path) -> Iterator[tuple[str, int]]:
         if isinstance(node, ast.FunctionDef):
             first = node.body[1] if ast.get_docstring(node) and len(node.body) > 1 else node.body[0]
             yield f"{name_of(path)}: {node.name}", (node.end_lineno or 0) - first.lineno + 1
+
+
+def test_imports__make_no_circle():
+    """Imports inside functions and for types count too; those among the models' modules are left out."""
+    modules = {module_of(path): path for path in (*PIPELINE, *CORE)}
+    graph: dict[str, list[str]] = {}
+    for name, path in modules.items():
+        found = set(imported_by(path, modules)) - {name}
+        graph[name] = [other for other in found if not (name.startswith(MODELS) and other.startswith(MODELS))]
+    graphlib.TopologicalSorter(graph).prepare()  # raises CycleError with the circle
+
+
+def module_of(path: Path) -> str:
+    return name_of(path).removesuffix(".py").removesuffix("/__init__").replace("/", ".")
+
+
+def imported_by(path: Path, modules: Collection[str]) -> Iterator[str]:
+    """Names of the modules that a file imports from."""
+    for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+        if isinstance(node, ast.ImportFrom) and node.module:
+            of_names = {name for alias in node.names if (name := f"{node.module}.{alias.name}") in modules}
+            yield from of_names or {node.module} & set(modules)
 
 
 def test_exceptions__are_still_needed():

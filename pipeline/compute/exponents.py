@@ -6,7 +6,7 @@ import numpy as np
 
 from magpend_core import LyapunovExponents, Status, lyapunov_exponents
 from magpend_core.lyapunov import MOST_LOSS
-from pipeline.compute.task import Job
+from pipeline.compute.integrate import Job
 from pipeline.products.lyapunov import LYAPUNOV_VARIABLES, LyapunovFlag, LyapunovOptions
 
 AUDIT = 0.01

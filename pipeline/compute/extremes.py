@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.compute.task import Job
+from pipeline.compute.integrate import Job
 from pipeline.products.extremes import ExtremesOptions
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from magpend_core import Sections, Status
 from pipeline.compute.continuation import WALKED, going_on
 from pipeline.compute.extension import kept_on, obstacle
-from pipeline.compute.task import Integrate, Job, integrate
+from pipeline.compute.integrate import Integrate, Job, integrate
 from pipeline.layout.cells import CellMap, Inputs
 from pipeline.layout.identity import code_version
 from pipeline.layout.matching import NOWHERE, Finder, Way, unlike, way_of
@@ -180,7 +180,7 @@ class Pool:
         return counts
 
     def integrator(self, cells: CellMap, block: tuple[slice, ...], tally: list[int]) -> Integrate:
-        """Return what gives the cells of a block as `task.integrate` does, bit for bit, with less work.
+        """Return what gives the cells of a block as `integrate.integrate` does, bit for bit, with less work.
 
         The numbers of cells that were taken are appended to `tally`.
         """

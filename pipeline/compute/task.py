@@ -7,53 +7,27 @@ A task is named by the run directory, the run's digest and its index; it reads t
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
-from magpend_core import Sections, Status, kernel_version
-from magpend_core.engine.system import System
+from magpend_core import Status, kernel_version
 from magpend_core.models import import_model
-from pipeline.compute.continuation import WALKED, going_on, walk
-from pipeline.compute.recorded_drive import under_recording
+from pipeline.compute.continuation import WALKED, going_on
+from pipeline.compute.integrate import Integrate, integrate
 from pipeline.compute.refinement import infer
 from pipeline.layout.cells import CellMap, Inputs
 from pipeline.layout.identity import differences, digest_of, identity_of
 from pipeline.layout.plan import Plan, make_plan
-from pipeline.layout.schema import REST_STATE, base_variables
-from pipeline.products.product import function_of
 from pipeline.products.registry import CELL_PRODUCTS
 from pipeline.specification.parsing import Spec, kept_spec
 from pipeline.store.commits import write_task
 from pipeline.store.errors import RefusedError
 from pipeline.store.runfile import RunInfo, read_run
 from pipeline.store.task_cells import read_cells
-
-
-@dataclass(frozen=True)
-class Job:
-    """Cells that were integrated, for the products that go on from them.
-
-    Attributes
-    ----------
-    spec : Spec
-    inputs : Inputs
-        What `run_branches` took.
-    cells : Sections
-        What it returned, with leading dims (branch, point).
-    """
-
-    spec: Spec
-    inputs: Inputs
-    cells: Sections
-
-    @property
-    def system(self) -> System:
-        """What was integrated, by which method."""
-        return replace(self.spec.model.system, method=self.spec.integration.method)
 
 
 @lru_cache(maxsize=4)
@@ -72,37 +46,6 @@ def _prepare(directory: str, digest: str, origin: tuple[str, str] | None) -> tup
             "install the same version everywhere."
         )
     return info, spec, plan, CellMap(spec)
-
-
-def integrate(spec: Spec, inputs: Inputs) -> dict[str, np.ndarray]:
-    """Return all variables of some branches, with leading dims (branch, point)."""
-    keywords: dict[str, Any] = spec.integration.model_dump()
-    for name, options in spec.products.items():
-        keywords |= CELL_PRODUCTS[name].integrate(options)
-    if spec.recorded is not None:
-        del keywords["method"]  # the specification allows no other
-        cells = under_recording(spec.recorded, inputs, system=spec.model.system, **keywords)
-    else:
-        cells = walk(inputs, system=spec.model.system, **keywords)
-    own = {REST_STATE.name: rest_states(cells)} if spec.section is not None else {}
-    values = {
-        v.name: np.asarray(own.get(v.name, getattr(cells, v.name, None)), dtype=v.dtype)
-        for v in base_variables(spec.model)
-    }
-    job = Job(spec, inputs, cells)
-    for name, options in spec.products.items():
-        values |= function_of(CELL_PRODUCTS[name].compute)(job, options)
-    return values
-
-
-def rest_states(cells: Sections) -> np.ndarray:
-    """Return the last states of cells without a return to the section, NaN for all others."""
-    is_left = cells.status == Status.NO_RETURN
-    return np.where(is_left[..., None], cells.final_state, np.nan)
-
-
-Integrate = Callable[[Spec, Inputs], dict[str, np.ndarray]]
-"""From branches to all their variables, with leading dims (branch, point)."""
 
 
 def compute(

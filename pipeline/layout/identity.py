@@ -20,7 +20,7 @@ from pipeline.products.registry import CELL_PRODUCTS
 from pipeline.specification.parsing import Spec
 
 _PIPELINE = Path(__file__).parents[1]
-CODE = ("layout.cells", "compute.task")
+CODE = ("layout.cells", "compute.integrate", "compute.task")
 """Modules of the pipeline that decide the numbers of every task.
 
 Modules for refined grids and for products are added where they are used. The numerical core and the model

@@ -113,7 +113,7 @@ class CellProduct:
     cost : callable
         ``cost(options)`` returns the work per cell, in drive periods of a plain integration.
     compute : str
-        ``"module:function"``: ``compute(job, options)`` with a `pipeline.compute.task.Job`, which holds
+        ``"module:function"``: ``compute(job, options)`` with a `pipeline.compute.integrate.Job`, which holds
         integrated cells, returns the variables with leading dims (branch, point).
     settle : callable
         ``settle(options, model)`` returns the options with values that follow from the model filled in. It

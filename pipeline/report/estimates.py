@@ -1,9 +1,15 @@
-"""Define the estimate that a measure of a study returns."""
+"""Define the estimate that a measure of a study returns, and the results that it reads."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Protocol
+
+from pipeline.runs.derive import AnalysedRun
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 NOWHERE = math.nan
 
@@ -40,3 +46,16 @@ class Estimate:
 def absent(why: str, step: float | None = None) -> Estimate:
     """Return the estimate for a missing measurement, with the reason."""
     return Estimate(NOWHERE, NOWHERE, NOWHERE, step=step, missing=why)
+
+
+class Results(Protocol):
+    """The results of a study by name; see `pipeline.report.results.Results`."""
+
+    def run(self, name: str) -> AnalysedRun:
+        """Return a run."""
+
+    def recording(self, name: str) -> xr.Dataset:
+        """Return the recording of a virtual rig."""
+
+    def torques(self, name: str) -> Any:
+        """Return the fit of torque readings."""

@@ -19,16 +19,14 @@ from pipeline.analysis.intervals import binomial_interval
 from pipeline.analysis.selection import place
 from pipeline.analysis.sides import classify
 from pipeline.layout.vocabulary import split_dims
-from pipeline.report.estimates import Estimate, absent
+from pipeline.report.estimates import Estimate, Results, absent
 from pipeline.specification.problems import SpecError
 
 if TYPE_CHECKING:
     import xarray as xr
 
-    from pipeline.report.results import Results
-
 Options = Mapping[str, Any]
-Measure = Callable[["Results", Sequence[str], Options], "Estimate"]
+Measure = Callable[[Results, Sequence[str], Options], Estimate]
 
 
 def _cells(results: Results, name: str) -> tuple[xr.Dataset, str]:

@@ -203,7 +203,7 @@ def _stretch(spec: Spec, inputs: Inputs, n_periods: int) -> tuple[np.ndarray, fl
 
     The time is processor time, so that other programs do not count.
     """
-    from pipeline.compute.task import integrate
+    from pipeline.compute.integrate import integrate
 
     # a tolerance that no cell meets, since an integration without the test would need another kernel
     integration = spec.integration.model_copy(
@@ -223,7 +223,7 @@ def _periods_until_closed(spec: Spec, plan: Plan, most: float, ratio: float) -> 
 
     A first sample gives the number of cells for which there is time.
     """
-    from pipeline.compute.task import integrate
+    from pipeline.compute.integrate import integrate
 
     rng, n_keep = np.random.default_rng(1), spec.integration.n_keep
     found, n_branches, left = np.empty(0), BRANCHES, CLOSING_S

@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from pipeline.compute import integrate as branches
 from pipeline.compute import task
 from pipeline.compute.task import warm_up
 from pipeline.layout.cells import CellMap
@@ -88,7 +89,7 @@ def test_estimate__within_a_factor_of_what_it_takes(monkeypatch):
     """On a machine of which the clock goes on by what the rule of thumb says: no other time counts."""
     spec, plan = read(CLOSING)
     warm_up(spec)
-    clock, original = [0.0], task.integrate
+    clock, original = [0.0], branches.integrate
 
     def integrate(spec, inputs):
         values = original(spec, inputs)
@@ -100,7 +101,7 @@ def test_estimate__within_a_factor_of_what_it_takes(monkeypatch):
     for block in plan.tasks():
         task.compute(spec, cells, block, integrate=integrate)
     true, clock[0] = clock[0], 0.0
-    monkeypatch.setattr(task, "integrate", integrate)
+    monkeypatch.setattr(branches, "integrate", integrate)
     monkeypatch.setattr(estimates, "time", SimpleNamespace(process_time=lambda: clock[0]))
     found = estimate(spec, plan)
     assert true / 1.5 < found.core_seconds < 1.5 * true
