@@ -1,4 +1,4 @@
-"""Machine code on disk: used only if it is whole, for what it says, and written by nobody else.
+"""Keep machine code on disk, and use it only if it is whole, belongs to this code, and this user wrote it.
 
 numba unpickles what it finds in its cache and jumps into the machine code in there. So an entry here is one
 file that begins with the sha256 of the rest, and the rest begins with what it was compiled from: one that is

@@ -1,4 +1,4 @@
-"""Sections by crossing: a system with periods that end where a state crosses a level."""
+"""Give a system a section by crossing: its periods end where a state crosses a level."""
 
 from __future__ import annotations
 

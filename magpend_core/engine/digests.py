@@ -1,4 +1,4 @@
-"""Digests of compiled functions from outside the package: what decides the machine code that they become.
+"""Compute digests of compiled functions from outside the package, and of all that decides their machine code.
 
 Machine code may be kept for such functions only under a digest of everything that they reach, since
 `jit.source_digest` does not change with them. What cannot be followed to its end has none, and is not kept.

@@ -1,4 +1,4 @@
-"""A system under a recorded drive: its forcing is a line in each interval, given by two more parameters."""
+"""Put a system under a recorded drive: its forcing is a line in each interval, given by two more parameters."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The one entry to the engine: arguments are checked, arrays allocated, all branches integrated."""
+"""Enter the engine: check the arguments, allocate the arrays, integrate all branches."""
 
 from __future__ import annotations
 

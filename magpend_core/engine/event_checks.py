@@ -1,4 +1,4 @@
-"""Whether a system's switches and impacts are what they say; see `checks`."""
+"""Check a system's switches and impacts against their declaration; see `checks`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which products are fused with sums: a rule of our own, in place of the compiler's choice.
+"""Fuse products with sums by a rule of our own, in place of the compiler's choice.
 
 A fused product and sum, ``a * b + c`` rounded once, costs half as much as the two apart, so that every
 compiler wants to fuse. Left to it, what is fused depends on the CPU, on its version and on what was inlined

@@ -1,4 +1,4 @@
-"""Which entries a system's Jacobian has, and the whole matrix from those that its function returns."""
+"""List the entries that a system's Jacobian function returns, and expand them to the whole matrix."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How magpend compiles: the decorators, and a compile cache that cannot return an old answer.
+"""Compile functions: the decorators, and a compile cache that cannot return an old answer.
 
 numba's own ``cache=True`` watches the file of the cached function alone: after an edit of a callee
 in another file the cached caller goes on returning the old result. Here the cache folder is named

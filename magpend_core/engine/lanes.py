@@ -12,6 +12,10 @@ any CPU.
 
 The functions here are templates: names in capitals and the system's functions are bound by
 `engine_of`, then compiled.
+
+Reading order, from the bottom of the file: `advance` is the main loop. `attempt` makes one step of all groups
+(`run_stages`, `choose_step`, `finish_step`). `serve` is the scalar pass over lanes with an event. `start_branch`,
+`start_point`, `end_cell` and `end_branch` fill and empty lanes. `engine_bindings` binds the names.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""LLVM code of an engine's parts, and what links them: libraries of numba's with sizes that come late.
+"""Link the LLVM code of an engine's parts: numba libraries whose sizes are set when they are linked.
 
 A *size* of a system, such as the number of its states, is a constant without a value in the code of a part.
 While numba compiles the part, an integer that occurs nowhere else stands for it (`placeholder`). In the LLVM

@@ -8,6 +8,9 @@ changes by the saltation matrix, v + (f+ - f-) (grad g . v)/(dg/dt-), where g is
 impact with the map R it becomes R'(v + f- s) - f+ s with s = -(grad g . v)/(dg/dt-), the shift of the
 impact's time (di Bernardo et al., Piecewise-smooth Dynamical Systems, Springer 2008, section 2.5). R' is a
 difference of order four, exact for maps up to the fourth power.
+
+Reading order: `act_on_events` is called by `lanes.serve`. It finds the event that happened, then switches a mode or
+applies an impact, and corrects the tangent vectors.
 """
 
 from __future__ import annotations
@@ -25,24 +28,23 @@ STEP = 1e-3
 """Step of the differences of an impact's map, in units of the states' scales."""
 
 NEAR = 1e-12
-"""An impact that leaves its function so near to zero, in units of rate and period, leaves it there."""
-
+"""An impact that leaves its function within this distance of zero, in units of rate and period, leaves it at zero."""
 
 AWAY = 1e-7
 """A switch further from zero after an edge, in units of its rate and the period, is not on its surface."""
 
 CHATTERED = 6.0
-"""What the scalar pass finds at an event, beside `lanes.NOTHING` and so on: the lane's cell ends."""
+"""Code of an event, like `lanes.NOTHING`: the impacts chatter, and the lane's cell ends."""
 
 CHATTER, LEAST_LOSS = 1e-6, 0.3
-"""A flight between impacts shorter than the product of both numbers [periods] is taken for the last of
-infinitely many; if an impact takes a larger share of the speed than the second says, that share counts.
+"""A flight between impacts that is shorter than the product of both numbers [periods] counts as the last of
+infinitely many. If an impact takes a larger share of the speed than `LEAST_LOSS`, its own share is the factor.
 
-What is left of the series then lasts for 1e-6 periods, or longer if less speed is lost.
+The rest of the series then lasts for 1e-6 periods, or longer if less speed is lost.
 """
 
 ELASTIC = 1e-9
-"""An impact that takes less than this share of the speed takes none."""
+"""An impact that takes less than this share of the speed counts as elastic."""
 
 LOOK = 1e-6
 """Step of the difference that gives a second derivative [periods]."""

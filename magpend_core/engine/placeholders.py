@@ -1,4 +1,4 @@
-"""What stands for the functions that a system does without."""
+"""Define placeholders for the functions that a system does not have."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Compiled functions as the plain Python that they were written in, and all that they call.
+"""Turn compiled functions back into the plain Python that they were written in, with all that they call.
 
 `function.py_func` alone would still call compiled functions, and compile them for the types that it meets.
 """

@@ -1,4 +1,4 @@
-"""Many trajectories in step, each seen at its own instants: the engine's dense output on all lanes.
+"""Sample many trajectories in step, each at its own instants: the engine's dense output on all lanes.
 
 Where `lanes.advance` sees a trajectory once a period, this loop writes states at given times, by the
 continuous extension of the Dormand-Prince pair, and lets the drive change from interval to interval: each has

@@ -1,4 +1,4 @@
-"""What the engine needs to know of a dynamical system."""
+"""Describe a dynamical system for the engine."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The engine's system of a definition: derived, written out, compiled when it is first run."""
+"""Derive, write out and compile the engine's system of a definition, when it is first run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Contacts: motion at rest on the surface of an impact, on which infinitely many impacts have ended.
+"""Describe contacts: motion at rest on the surface of an impact, on which infinitely many impacts have ended.
 
 The surface pushes along the direction n in which an impact changes the states. While a state rests on it,
 the impact's value g and its rate stay 0: the rates f become f - n a/b, where a is the second derivative that

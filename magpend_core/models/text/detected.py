@@ -1,4 +1,4 @@
-"""What was found in a text, in words: the places that steps are chosen by."""
+"""Describe the steep places, corners and jumps that were detected in a text, by which steps are chosen."""
 
 from __future__ import annotations
 

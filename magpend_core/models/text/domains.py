@@ -1,4 +1,4 @@
-"""Where an expression has no value: the part of the text, and the numbers that it met.
+"""Find where an expression has no value: the part of the text, and the numbers that it met.
 
 Looked for before anything is derived or compiled, by numpy on the text as it was written.
 """

@@ -1,4 +1,4 @@
-"""Expressions as a graph in which equal parts are one node, simplified where that is exact or nearly so.
+"""Hold expressions as a graph in which equal parts are one node, simplified where that is exact or nearly so.
 
 A graph belongs to one model and grows in an order that the model's meaning decides alone, so that the code
 generated from it is the same in every process. Sums and products are brought into a form in which what needs

@@ -1,4 +1,4 @@
-"""Where equations are steep: found in their expressions, with the nearest complex singularity and the jump.
+"""Find where equations are steep, with the nearest complex singularity and the jump.
 
 A step that crosses such a place must be in proportion to the distance from the singularity (see
 `engine.lanes.choose_step`). Places on the state are *layers*, places in time alone are *edges*.

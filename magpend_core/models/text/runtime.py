@@ -1,4 +1,4 @@
-"""What generated functions call besides arithmetic: instants of a period in their order. Plain numbers."""
+"""Sort the instants of a period, for generated functions. Plain numbers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a text says of its look and its kinds of motion, as functions of states and parameters."""
+"""Build a text model's drawing and its classifier of motions, as functions of states and parameters."""
 
 from __future__ import annotations
 

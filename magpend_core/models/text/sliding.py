@@ -1,4 +1,4 @@
-"""What stands for the side of a surface: the mode of the engine, and on the surface Filippov's equivalent.
+"""Describe the side of a switching surface: the mode of the engine, or Filippov's equivalent on the surface.
 
 Where the motions of both sides point to the surface, the state stays on it. What then stands for the side is
 the number sigma in [-1, 1] for which the surface's value does not change: with the rate of that value, r(s),

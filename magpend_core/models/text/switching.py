@@ -1,4 +1,4 @@
-"""Where equations have corners and jumps: ``sign``, ``abs``, ``min``, ``max``, ``where`` and ``square``.
+"""Find corners and jumps of equations: ``sign``, ``abs``, ``min``, ``max``, ``where`` and ``square``.
 
 Each is smooth between the places at which an expression passes zero, so it is written with the *side* on
 which that expression is: +1 or -1, a number that changes at these places alone and is the same throughout a

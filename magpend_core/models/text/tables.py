@@ -1,4 +1,4 @@
-"""Tables of text and numbers, read with all their problems at once, each with its place."""
+"""Read tables of text and numbers, and report all their problems at once, each with its place."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Trees written as text in one way, so that texts which mean the same are spelled the same."""
+"""Write expression trees as text in one canonical way, so that texts which mean the same are spelled the same."""
 
 from __future__ import annotations
 
