@@ -144,7 +144,7 @@ def _remarks(ds: xr.Dataset, rows: Sequence[Row]) -> list[str]:
     elif int(ds["ran_out"].sum()):
         n = int(ds["ran_out"].sum())
         lines.append(
-            f"the extension used up its time before all sets were classified at {n} parameter point{'s' * (n != 1)}: "
+            f"the extension reached its budget before all sets were classified at {n} parameter point{'s' * (n != 1)}: "
             f"--budget {2.0 * float(ds.attrs.get('identify_budget', 1.0)):g} allows twice as much"
         )
     return lines
