@@ -80,6 +80,14 @@ def lengths_in(path: Path) -> Iterator[tuple[str, int]]:
             yield f"{name_of(path)}: {node.name}", (node.end_lineno or 0) - first.lineno + 1
 
 
+def test_tolerances__of_the_analyses_stand_in_one_table():
+    table = ROOT / "pipeline" / "analysis" / "tolerances.py"
+    own = re.compile(r"^[A-Z_, ]*RTOL[A-Z_, ]* = ", re.MULTILINE)
+    others = [path for path in PIPELINE if table.parent in path.parents and path != table]
+    assert own.search(table.read_text("utf-8"))
+    assert [name_of(path) for path in others if own.search(path.read_text("utf-8"))] == []
+
+
 def test_imports__make_no_circle():
     """Imports inside functions and for types count too; those among the models' modules are left out."""
     modules = {module_of(path): path for path in (*PIPELINE, *CORE)}

@@ -116,6 +116,7 @@ from pipeline.analysis.attractors.finding.searching import Search
 from pipeline.analysis.attractors.matching.matching import match
 from pipeline.analysis.chaos.lyapunov import on_attractor, pooled_mean
 from pipeline.analysis.sides import flags_of
+from pipeline.analysis.tolerances import CLOSURE
 from pipeline.layout.vocabulary import (
     APERIODIC,
     ATTRACTS,
@@ -131,9 +132,6 @@ from pipeline.products.attractors import IdentifyOptions
 from pipeline.products.chaos import ChaosOptions
 
 __all__ = ["identify", "match"]
-
-CLOSURE = 1e-5
-"""Scaled distance at which extended cells count as closed."""
 
 
 def identify(

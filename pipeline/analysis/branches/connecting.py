@@ -26,6 +26,7 @@ from pipeline.analysis.branches.arclength import Point, Settings, correct, trace
 from pipeline.analysis.branches.following import first_point, half_orbit, has_halved, opposite
 from pipeline.analysis.branches.lockstep import Steps, run_together
 from pipeline.analysis.branches.problems import Family, OrbitProblem
+from pipeline.analysis.tolerances import SAME_ON_BRANCH
 
 CONNECT = Settings(first_step=2e-3, longest_step=0.05, shortest_step=1e-6, max_points=300)
 """Settings with longer steps than for a branch, since no bifurcations are located."""
@@ -35,9 +36,6 @@ NEAR = 0.1
 
 LONGEST = 0.1
 """Longest step along a tangent that is compared with a neighbour."""
-
-SAME = 1e-6
-"""Scaled distance within which two orbits at one parameter value are the same."""
 
 LINKED, APART, OPEN = "linked", "apart", "open"
 
@@ -224,7 +222,7 @@ class _Meeting:
             normal = np.zeros(len(guess))
             normal[-1] = 1.0
             there = yield from correct(OrbitProblem(self.family), guess, normal, self.settings)
-            if there is not None and target.distance(there.u)[0] <= SAME:
+            if there is not None and target.distance(there.u)[0] <= SAME_ON_BRANCH:
                 self.met = target
                 break
         return True

@@ -21,9 +21,7 @@ from pipeline.analysis.branches.following import (
 )
 from pipeline.analysis.branches.lockstep import Steps, run_together
 from pipeline.analysis.branches.problems import FREQUENCY, Family, OrbitProblem
-
-SAME = 1e-6
-"""Scaled distance within which two orbits at one parameter value are the same."""
+from pipeline.analysis.tolerances import SAME_ON_BRANCH
 
 FOLLOWING = "following branches"
 """First words of the work's name in progress reports."""
@@ -121,7 +119,7 @@ def _lie_on(starts: Sequence[Start], branches: Sequence[Branch]) -> list[bool]:
     found = run_together([_at_value(starts[i].family, guess, settings) for i, guess in asked])
     known = [False] * len(starts)
     for (i, _), point in zip(asked, found, strict=True):
-        if point is not None and _distance(starts[i], point) <= SAME:
+        if point is not None and _distance(starts[i], point) <= SAME_ON_BRANCH:
             known[i] = True
     return known
 

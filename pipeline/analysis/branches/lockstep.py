@@ -15,7 +15,8 @@ import numpy as np
 
 from magpend_core.engine.system import System
 from magpend_core.orbits import section_map
-from pipeline.analysis.branches.problems import RTOL, Ends, Problem, Rows, Value
+from pipeline.analysis.branches.problems import Ends, Problem, Rows, Value
+from pipeline.analysis.tolerances import BRANCH_RTOL
 from pipeline.products.reporting import report
 
 T = TypeVar("T")
@@ -101,7 +102,7 @@ def _integrate(rows: Sequence[Rows], system: System) -> list[Ends]:
         np.concatenate([r.frequency_hz for r in rows]),
         np.concatenate([r.states for r in rows]),
         np.concatenate([np.full(len(r.states), r.period) for r in rows]),
-        rtol=RTOL,
+        rtol=BRANCH_RTOL,
         system=system,
     )
     found, first = [], 0

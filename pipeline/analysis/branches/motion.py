@@ -14,7 +14,8 @@ from magpend_core.orbits import on_section
 from magpend_core.sampling import Drive, sample
 from magpend_core.sections import run_branches
 from pipeline.analysis.branches.following import Branch
-from pipeline.analysis.branches.problems import FREQUENCY, RTOL
+from pipeline.analysis.branches.problems import FREQUENCY
+from pipeline.analysis.tolerances import BRANCH_RTOL
 from pipeline.products.reporting import track
 
 SAMPLES = 64
@@ -82,8 +83,8 @@ def rotation_of(branch: Branch) -> np.ndarray:
         on_section(rows.states, rows.parameters, family.system),
         n_transient=0,
         n_keep=family.period + 1,
-        rtol=RTOL,
-        atol=RTOL,
+        rtol=BRANCH_RTOL,
+        atol=BRANCH_RTOL,
         system=family.system,
     )
     return np.asarray(result.turns[0, 0] / family.period, np.float64)

@@ -21,9 +21,6 @@ from pipeline.layout.vocabulary import FREQUENCY_DIM
 FREQUENCY = FREQUENCY_DIM
 """Name of the drive frequency as a free parameter: that of its axis in a cube."""
 
-RTOL = 1e-12
-"""Tolerance of the integrations."""
-
 PARAMETER_STEP = 1e-6
 """Step of central differences by a parameter, in units of its scale.
 

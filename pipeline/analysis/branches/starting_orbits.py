@@ -13,10 +13,8 @@ from magpend_core.models.parameters import Parameters
 from magpend_core.orbits import polish_orbits, scaled_distance
 from pipeline.analysis.branches.exploring import Start
 from pipeline.analysis.branches.problems import FREQUENCY, Family
+from pipeline.analysis.tolerances import RECURRENCE, SAME_ON_BRANCH
 from pipeline.layout.vocabulary import BOUNDED, EQUILIBRIUM, PERIODIC_ORBIT, frequency_of, is_start_dim
-
-CLOSE = 0.1
-"""Largest scaled distance of a recurrence that is tried."""
 
 TRIES = 16
 """Most recurrences tried per period."""
@@ -243,16 +241,16 @@ def orbits_near(
 def _spread(
     section: np.ndarray, places: Sequence[tuple[np.intp, ...]], distance: np.ndarray, system: System
 ) -> list[np.ndarray]:
-    """Choose the points of the closest recurrences, each farther than `CLOSE` from the others."""
+    """Choose the points of the closest recurrences, each farther than `RECURRENCE` from the others."""
     chosen: list[np.ndarray] = []
     for place in places:
-        if len(chosen) == TRIES or not distance[place] <= CLOSE:
+        if len(chosen) == TRIES or not distance[place] <= RECURRENCE:
             break
         point = section[place]
-        if all(scaled_distance(point, other, system) > CLOSE for other in chosen):
+        if all(scaled_distance(point, other, system) > RECURRENCE for other in chosen):
             chosen.append(point)
     return chosen
 
 
 def _on_orbit(state: np.ndarray, points: np.ndarray, system: System) -> bool:
-    return bool(scaled_distance(points, state, system).min() < 1e-6)
+    return bool(scaled_distance(points, state, system).min() < SAME_ON_BRANCH)

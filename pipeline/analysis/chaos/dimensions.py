@@ -14,8 +14,9 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
-from pipeline.analysis.chaos.section_samples import FLOOR, Floats, at_least, computed, geometry_of, with_coords
+from pipeline.analysis.chaos.section_samples import Floats, at_least, computed, geometry_of, with_coords
 from pipeline.analysis.sets import Geometry
+from pipeline.analysis.tolerances import SAME_POINT
 from pipeline.products.lyapunov import LyapunovFlag
 from pipeline.products.reporting import track
 
@@ -126,7 +127,7 @@ def correlation_dimension(
     pool: Sequence[str] = (),
     theiler: int = 1,
     n_max: int = 10_000,
-    floor: float = FLOOR,
+    floor: float = SAME_POINT,
     geometry: Geometry | None = None,
 ) -> xr.Dataset:
     """Compute the correlation dimension of each cell's sections, with the curve and the range of the fit.

@@ -15,9 +15,6 @@ from pipeline.layout.vocabulary import model_of
 
 Floats = npt.NDArray[np.float64]
 
-FLOOR = 1e-6
-"""Scaled distance below which sections count as one point."""
-
 
 def geometry_of(ds: xr.Dataset, geometry: Geometry | None = None) -> Geometry:
     """Return the given geometry, or else the geometry of the cube's model."""

@@ -7,8 +7,9 @@ import numpy.typing as npt
 import xarray as xr
 from scipy import fft
 
-from pipeline.analysis.chaos.section_samples import FLOOR, Floats, at_least, computed, geometry_of, with_coords
+from pipeline.analysis.chaos.section_samples import Floats, at_least, computed, geometry_of, with_coords
 from pipeline.analysis.sets import Geometry
+from pipeline.analysis.tolerances import SAME_POINT
 from pipeline.products.reporting import report
 
 BUDGET = 64 * 2**20
@@ -143,7 +144,7 @@ def _observable(section: Floats, state: int | None, geometry: Geometry) -> Float
     phi = np.full(section.shape[:2], np.nan)
     covariance = np.einsum("cni,cnj->cij", points[known], points[known])
     phi[known] = np.einsum("cni,ci->cn", points[known], np.linalg.eigh(covariance)[1][..., -1])
-    phi[known & (np.abs(points).max(axis=(1, 2)) < FLOOR)] = 0.0
+    phi[known & (np.abs(points).max(axis=(1, 2)) < SAME_POINT)] = 0.0
     return np.asarray(phi - phi.mean(axis=1, keepdims=True))
 
 

@@ -23,7 +23,7 @@ from magpend_core.models.model import Model
 from magpend_core.status import Status
 from pipeline.analysis.attractors.describing import features
 from pipeline.analysis.attractors.extension.clouds import Cloud, members
-from pipeline.analysis.attractors.finding.assigning import STRICT, decide
+from pipeline.analysis.attractors.finding.assigning import decide
 from pipeline.analysis.attractors.finding.cell_blocks import Block
 from pipeline.analysis.attractors.finding.closed_orbits import Orbit, number_of, polish, raw_orbit
 from pipeline.analysis.attractors.finding.equilibria import tell_rest
@@ -31,6 +31,7 @@ from pipeline.analysis.attractors.finding.limit_cycles import tell_cycles
 from pipeline.analysis.attractors.finding.points import Point
 from pipeline.analysis.attractors.finding.spirals import Recurrence
 from pipeline.analysis.sets import Geometry
+from pipeline.analysis.tolerances import STRICT
 from pipeline.explorer.data.series import orbit_series
 from pipeline.explorer.live.settling import Place
 from pipeline.layout.vocabulary import ABSENT, APERIODIC, ATTRACTS, EQUILIBRIUM, NOT_SETTLED, PERIODIC_ORBIT, split_dims

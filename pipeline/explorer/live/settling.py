@@ -16,7 +16,7 @@ from magpend_core.models.model import Model
 from magpend_core.models.parameters import Parameters
 from magpend_core.status import Status
 from pipeline.analysis.attractors.finding.cell_blocks import Block
-from pipeline.analysis.attractors.finding.closed_orbits import RUN_ON_RTOL, RUN_ON_TOLERANCE
+from pipeline.analysis.tolerances import EXTEND_CLOSURE, EXTEND_RTOL
 from pipeline.explorer.live.messages import RequestError
 from pipeline.specification.tables import Integration
 
@@ -268,7 +268,7 @@ def run_on(
         See `Flight` and `Tell`; sections of the first cell are told.
     """
     settings = integration.model_copy(
-        update={"rtol": RUN_ON_RTOL, "atol": RUN_ON_RTOL, "closure_tolerance": RUN_ON_TOLERANCE}
+        update={"rtol": EXTEND_RTOL, "atol": EXTEND_RTOL, "closure_tolerance": EXTEND_CLOSURE}
     )
     flight = Flight(place, settings, states, check)
     numbers = np.full(len(states), -1, np.int64)

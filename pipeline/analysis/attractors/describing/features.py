@@ -28,6 +28,7 @@ from pipeline.analysis.attractors.finding.known_sets import Cycle, Equilibrium
 from pipeline.analysis.attractors.finding.stability import BY_APPROACH, BY_EIGENVALUES, BY_MULTIPLIERS
 from pipeline.analysis.sets import TWO_PI, Geometry, hashes, mean_distance, rounded_points
 from pipeline.analysis.sides import UNKNOWN
+from pipeline.analysis.tolerances import PORTRAIT_RTOL
 from pipeline.layout.vocabulary import ATTRACTS, EQUILIBRIUM, NOT_SETTLED, PERIODIC_ORBIT
 
 ENERGY = "energy"
@@ -35,9 +36,6 @@ ENERGY = "energy"
 
 SAMPLES = 256
 """Times per drive period or return at which a polished orbit is sampled for its ranges; even."""
-
-RTOL = 1e-9
-"""Tolerance of these trajectories: integration errors stay far below those of the sampling."""
 
 
 @dataclass
@@ -177,7 +175,7 @@ def follow_orbit(found: Features, parameters: Parameters, frequency: float, geom
     """
     p, flow = found.orbit_period, of_flow(parameters)
     times = np.arange(p * SAMPLES + 1) / (SAMPLES * frequency)
-    states = trajectory(flow, frequency, found.points[0], times, rtol=RTOL, atol=RTOL)
+    states = trajectory(flow, frequency, found.points[0], times, rtol=PORTRAIT_RTOL, atol=PORTRAIT_RTOL)
     angles = np.flatnonzero(geometry.is_angle)
     turns = np.round((states[-1] - states[0])[angles] / TWO_PI)
     found.rotation = turns / p + 0.0  # no -0.0
@@ -238,8 +236,8 @@ def follow_points(found: Features, parameters: Parameters, frequency: float) -> 
             [np.array([0.5 / frequency])],
             piece=np.zeros(len(ends), np.int64),
             drives=[half],
-            rtol=RTOL,
-            atol=RTOL,
+            rtol=PORTRAIT_RTOL,
+            atol=PORTRAIT_RTOL,
             limits_first_step=False,
         )
         ends = followed.states[:, 0]

@@ -27,6 +27,7 @@ from pipeline.analysis.attractors.finding.searching import Search, State, search
 from pipeline.analysis.attractors.finding.spirals import keys_of
 from pipeline.analysis.sets import Geometry, order_by_points
 from pipeline.analysis.sides import UNKNOWN
+from pipeline.analysis.tolerances import PRESERVED_VOLUME, VOLUME_RTOL
 from pipeline.layout.vocabulary import (
     APPROACHING,
     AT_REST,
@@ -39,9 +40,6 @@ from pipeline.layout.vocabulary import (
     SAME_SET,
     UNDECIDED,
 )
-
-PRESERVED, VOLUME_RTOL = 1e-7, 1e-11
-"""Largest log change of a volume over a period that counts as 0, and the tolerance of its integration."""
 
 MOST_PROBES = 8
 """Most degenerate orbits, and most degenerate equilibria, of a point that are probed by trajectories."""
@@ -130,7 +128,7 @@ def _preserves_volume(point: Point, search: Search) -> Work[bool]:
     after, derivatives = yield Slopes(before, VOLUME_RTOL)
     if not np.isfinite(derivatives).all():
         return False
-    return bool((np.abs(point.volumes(derivatives, before, after)) <= PRESERVED).all())
+    return bool((np.abs(point.volumes(derivatives, before, after)) <= PRESERVED_VOLUME).all())
 
 
 def _some_points(point: Point, n: int = 16) -> np.ndarray:

@@ -13,9 +13,8 @@ from magpend_core.models.sectioned import of_flow
 from magpend_core.sections import run_branches
 from magpend_core.trajectory import trajectory
 from pipeline.analysis.selection import choose, start_dims
+from pipeline.analysis.tolerances import PORTRAIT_RTOL
 from pipeline.layout.vocabulary import APERIODIC, EQUILIBRIUM, PERIODIC_ORBIT, frequency_of, parameters_of, told_by
-
-RTOL = 1e-9
 
 
 def portraits(
@@ -100,8 +99,8 @@ def _mean_return(starts: np.ndarray, parameters: Parameters, frequency: float) -
         starts,
         n_transient=0,
         n_keep=16,
-        rtol=RTOL,
-        atol=RTOL,
+        rtol=PORTRAIT_RTOL,
+        atol=PORTRAIT_RTOL,
         system=parameters.model.system,
     )
     assert result.return_time is not None
@@ -118,7 +117,9 @@ def _orbit(one: xr.Dataset, parameters: Parameters, step: float, n_samples: int,
     if kind == PERIODIC_ORBIT and (parameters.model.crossing is not None or not periods):
         n = math.ceil(float(one["period_s"]) / step)
     times = np.arange(n + 1) * step
-    return trajectory(of_flow(parameters), 1.0 / (step * n_samples), start, times, rtol=RTOL, atol=RTOL)
+    return trajectory(
+        of_flow(parameters), 1.0 / (step * n_samples), start, times, rtol=PORTRAIT_RTOL, atol=PORTRAIT_RTOL
+    )
 
 
 def _dataset(here: xr.Dataset, orbits: list[np.ndarray], parameters: Parameters, step: float) -> xr.Dataset:

@@ -25,7 +25,7 @@ from pipeline.analysis.attractors.extension.clouds import group, members
 from pipeline.analysis.attractors.extension.courses import AT_REST, DIVERGED, FAILED, Course
 from pipeline.analysis.attractors.extension.lifetimes import lifetime_interval
 from pipeline.analysis.attractors.finding import stability
-from pipeline.analysis.attractors.finding.assigning import REACH, decide
+from pipeline.analysis.attractors.finding.assigning import decide
 from pipeline.analysis.attractors.finding.cell_blocks import Block, ClosedCells, Guesses, marks_of
 from pipeline.analysis.attractors.finding.closed_orbits import Orbit, number_of
 from pipeline.analysis.attractors.finding.equilibria import approaching, rest_near, rest_of_orbit
@@ -33,6 +33,7 @@ from pipeline.analysis.attractors.finding.points import Point
 from pipeline.analysis.attractors.finding.requests import LEG, Extended, Leg, Polish, Settings, Work
 from pipeline.analysis.attractors.finding.spirals import keys_of, leap, near_closed
 from pipeline.analysis.sets import Geometry
+from pipeline.analysis.tolerances import REACH
 from pipeline.layout.vocabulary import ATTRACTS, NEUTRAL, NOT_SETTLED
 
 LEAST_BUDGET = 16_384

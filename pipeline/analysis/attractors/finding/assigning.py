@@ -11,16 +11,8 @@ from scipy.linalg import solve_discrete_lyapunov
 from pipeline.analysis.attractors.finding.cell_blocks import Block
 from pipeline.analysis.attractors.finding.closed_orbits import Orbit, scaled_derivative
 from pipeline.analysis.sets import Geometry
+from pipeline.analysis.tolerances import LOOSE_SHARE, REACH, STRICT
 from pipeline.layout.vocabulary import APPROACHING, CERTAIN, CLOSED, UNDECIDED
-
-REACH = 0.3
-"""Scaled distance from an orbit within which cells are tested for spiralling in."""
-
-STRICT = 1e-3
-"""Largest tolerance at which a closed cell shows an orbit without Newton's method."""
-
-LOOSE_SHARE = 0.1
-"""Share of a tolerance above `STRICT` within which a closed cell counts as on an orbit."""
 
 
 @dataclass(frozen=True)

@@ -15,24 +15,25 @@ import numpy as np
 from magpend_core.engine.system import System
 from magpend_core.orbits import PeriodicOrbits, polish_orbits
 from magpend_core.sections import run_branches
-from pipeline.analysis.attractors.finding.stability import MATRIX_ERROR, by_margin, largest_error
+from pipeline.analysis.attractors.finding.stability import by_margin, largest_error
 from pipeline.analysis.sets import Geometry, rounded_points
+from pipeline.analysis.tolerances import (
+    EXTEND_CLOSURE,
+    EXTEND_RTOL,
+    MATRIX_ERROR,
+    NEAR_RESIDUAL,
+    NEAR_RTOL,
+    NEARLY_RESIDUAL,
+    PLACE_ERROR,
+    SAME_ORBIT,
+)
 from pipeline.layout.vocabulary import ATTRACTS, NEUTRAL, NOT_SETTLED
 
-SAME_ORBIT = 1e-7
-"""Largest distance between two polished orbits that are one, on top of the errors from their residuals."""
+NEAR_STEPS = 8
+"""Most Newton steps of the first polish."""
 
-PLACE_ERROR = 30.0
-"""Error of a multiplier near a fold per root of the residual: twice the root of the map's curvature."""
-
-NEAR, NEARLY, NEAR_STEPS, NEAR_RTOL = 1e-5, 1e-3, 8, 1e-8
-"""First polish: target residual, largest residual that continues, most Newton steps, tolerance.
-
-Many guesses lead to the same orbit, and only one of them is polished further.
-"""
-
-RUN_ON_PERIODS, RUN_ON_TOLERANCE, RUN_ON_RTOL = 2000, 1e-5, 1e-8
-"""Integration of `run_on`: most drive periods, closure tolerance, tolerance of the steps."""
+RUN_ON_PERIODS = 2000
+"""Most drive periods for which a guess is integrated until it closes."""
 
 
 @dataclass(frozen=True)
@@ -152,7 +153,7 @@ def polish(
         frequency,
         points,
         period,
-        tolerance=NEAR,
+        tolerance=NEAR_RESIDUAL,
         max_iterations=NEAR_STEPS,
         rtol=NEAR_RTOL,
         least_period=False,
@@ -161,8 +162,8 @@ def polish(
     first = near.section.copy()
     for row in np.flatnonzero(near.converged):
         first[row] = _rolled(near.points[row, : near.orbit_period[row]], geometry)[0]
-    # very unstable orbits miss NEAR at the loose tolerance: keep them up to NEARLY and polish on
-    good = np.flatnonzero(near.residual <= NEARLY)
+    # very unstable orbits miss NEAR_RESIDUAL at the loose tolerance: keep them up to NEARLY_RESIDUAL and polish on
+    good = np.flatnonzero(near.residual <= NEARLY_RESIDUAL)
     rounded = rounded_points(first[good], geometry)
     key = np.column_stack([packed[good], frequency[good], near.orbit_period[good], rounded])
     _, once, place = np.unique(key, axis=0, return_index=True, return_inverse=True)
@@ -220,7 +221,7 @@ def _orbit_of(found: PeriodicOrbits, row: int) -> Orbit:
 def run_on(
     packed: np.ndarray, frequency: np.ndarray, points: np.ndarray, max_orbit_period: int, system: System
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Integrate section points (n, state) until they close within `RUN_ON_TOLERANCE`.
+    """Integrate section points (n, state) until they close within `EXTEND_CLOSURE`.
 
     Returns
     -------
@@ -237,10 +238,10 @@ def run_on(
         points,
         n_transient=RUN_ON_PERIODS,
         n_keep=1,
-        rtol=RUN_ON_RTOL,
-        atol=RUN_ON_RTOL,
+        rtol=EXTEND_RTOL,
+        atol=EXTEND_RTOL,
         stop_when_closed=True,
-        closure_tolerance=RUN_ON_TOLERANCE,
+        closure_tolerance=EXTEND_CLOSURE,
         max_orbit_period=max_orbit_period,
         system=system,
     )

@@ -4,7 +4,7 @@ Newton's method on the rates starts from the last states of cells, near or far. 
 equilibrium in three cases: it had no return and stopped near the equilibrium; it lies on it within the
 tolerance of closed cells; or its sections follow the linear flow towards it (`approaching`), since a
 trajectory crosses the section thousands of times around a slow focus. A cell belongs to any other
-equilibrium only if it lies on it within `ON_IT`. Cells without a return far from all equilibria are
+equilibrium only if it lies on it within `AT_EQUILIBRIUM`. Cells without a return far from all equilibria are
 integrated further, up to `WAITS` times as long, until they come near one or return.
 """
 
@@ -20,21 +20,10 @@ from magpend_core.status import Status
 from pipeline.analysis.attractors.finding.known_sets import Equilibrium
 from pipeline.analysis.attractors.finding.points import Point
 from pipeline.analysis.sets import Geometry, hashes, rounded_points
-
-NEAR = 0.1
-"""Largest scaled distance from a stable equilibrium at which a cell without a return counts as at rest."""
+from pipeline.analysis.tolerances import AT_EQUILIBRIUM, NEAR_REST, SAME_EQUILIBRIUM, WAIT_RTOL
 
 WAITS = 16
 """Most repetitions of the wait for a return, for cells that are near no equilibrium yet."""
-
-RTOL = 1e-8
-"""Tolerance of the trajectories of cells that wait for a return."""
-
-ON_IT = 1e-9
-"""Scaled distance from an equilibrium, stable or not, within which a cell is on it."""
-
-SAME = 1e-6
-"""Equilibria at most this far apart are one, and an orbit at most this far from one is that equilibrium."""
 
 MOST = 64
 """Most equilibria of a parameter point: a line of equilibria has infinitely many."""
@@ -76,7 +65,7 @@ def _ends(point: Point, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
         if block.rest is not None:
             left = block.status == Status.NO_RETURN
             states[block.cells][left] = _waited(point, block.rest[left])
-            reach[block.cells][left] = NEAR
+            reach[block.cells][left] = NEAR_REST
     return states, reach
 
 
@@ -87,7 +76,7 @@ def _waited(point: Point, states: np.ndarray) -> np.ndarray:
     for _ in range(WAITS):
         steps, _ = newton_steps(system, states[far], point.packed)
         away = np.abs(steps / np.asarray(system.scales)).max(axis=1, initial=0.0)
-        far = far[~(away <= 0.5 * NEAR)]
+        far = far[~(away <= 0.5 * NEAR_REST)]
         if not len(far):
             break
         result = run_branches(
@@ -96,8 +85,8 @@ def _waited(point: Point, states: np.ndarray) -> np.ndarray:
             states[far],
             n_transient=0,
             n_keep=1,
-            rtol=RTOL,
-            atol=RTOL,
+            rtol=WAIT_RTOL,
+            atol=WAIT_RTOL,
             system=system,
         )
         waits = result.status[:, 0] == Status.NO_RETURN
@@ -114,7 +103,7 @@ def _found(point: Point, states: np.ndarray, reach: np.ndarray, geometry: Geomet
     length = np.abs(steps / np.asarray(geometry.scales)).max(axis=1, initial=0.0)
     # a state with a Newton step beyond twice its reach is unlikely to be within reach of an equilibrium
     near = np.flatnonzero(length <= 2.0 * reach)
-    _, first = np.unique(geometry.boxes(states[near], SAME), axis=0, return_index=True)
+    _, first = np.unique(geometry.boxes(states[near], SAME_EQUILIBRIUM), axis=0, return_index=True)
     _, other = np.unique(hashes(geometry.boxes(states, GUESS_BOX)), return_index=True)
     guesses = states[np.concatenate([near[first], other[:GUESSES]])]
     return equilibria_near(point, guesses, geometry)
@@ -126,7 +115,7 @@ def equilibria_near(point: Point, states: np.ndarray, geometry: Geometry) -> lis
     scales = np.asarray(geometry.scales)
     kept: list[Equilibrium] = []
     for i in np.flatnonzero(found.converged):
-        if all(geometry.distance(found.states[i], other.state) > SAME for other in kept):
+        if all(geometry.distance(found.states[i], other.state) > SAME_EQUILIBRIUM for other in kept):
             jacobian = found.jacobians[i] * scales / scales[:, None]
             kept.append(Equilibrium(found.states[i], found.eigenvalues[i], float(found.residual[i]), jacobian))
         if len(kept) == MOST:
@@ -143,7 +132,7 @@ def _settled(point: Point, states: np.ndarray, reach: np.ndarray, geometry: Geom
     rows = np.flatnonzero(np.isfinite(states).all(axis=1))
     for k, one in enumerate(point.equilibria):
         away = geometry.distance(states[rows], one.state)
-        at_rest[rows[away <= (reach[rows] if one.is_stable else ON_IT)]] = k
+        at_rest[rows[away <= (reach[rows] if one.is_stable else AT_EQUILIBRIUM)]] = k
     return at_rest
 
 
@@ -199,7 +188,7 @@ def rest_near(point: Point, state: np.ndarray, geometry: Geometry) -> int | None
         return None
     state = _waited(point, state[None])[0]
     for one in equilibria_near(point, state[None], geometry) if np.isfinite(state).all() else ():
-        if one.is_stable and geometry.distance(one.state, state) <= NEAR:
+        if one.is_stable and geometry.distance(one.state, state) <= NEAR_REST:
             return number_of(one, point, geometry)
     return None
 
@@ -207,7 +196,7 @@ def rest_near(point: Point, state: np.ndarray, geometry: Geometry) -> int | None
 def number_of(one: Equilibrium, point: Point, geometry: Geometry) -> int:
     """Return the index of an equilibrium among those of a point; append it if it is new."""
     for k, other in enumerate(point.equilibria):
-        if geometry.distance(one.state, other.state) <= SAME:
+        if geometry.distance(one.state, other.state) <= SAME_EQUILIBRIUM:
             return k
     point.equilibria.append(one)
     return len(point.equilibria) - 1
@@ -216,9 +205,9 @@ def number_of(one: Equilibrium, point: Point, geometry: Geometry) -> int:
 def rest_of_orbit(point: Point, state: np.ndarray, geometry: Geometry) -> int | None:
     """Return the number of the equilibrium that a polished orbit degenerates to; None if the orbit moves."""
     steps, _ = newton_steps(point.integrates, state[None], point.packed)
-    if not np.abs(steps / np.asarray(geometry.scales)).max() <= 10.0 * SAME:
+    if not np.abs(steps / np.asarray(geometry.scales)).max() <= 10.0 * SAME_EQUILIBRIUM:
         return None
     for one in equilibria_near(point, state[None], geometry):
-        if geometry.distance(one.state, state) <= 10.0 * SAME:
+        if geometry.distance(one.state, state) <= 10.0 * SAME_EQUILIBRIUM:
             return number_of(one, point, geometry)
     return None

@@ -8,8 +8,9 @@ from functools import cached_property
 import numpy as np
 from scipy.linalg import expm, solve_continuous_lyapunov
 
-from pipeline.analysis.attractors.finding.stability import RATE_ERROR, by_margin, largest_error
+from pipeline.analysis.attractors.finding.stability import by_margin, largest_error
 from pipeline.analysis.sets import Geometry
+from pipeline.analysis.tolerances import RATE_ERROR
 from pipeline.layout.vocabulary import ATTRACTS, NEUTRAL
 
 

@@ -20,18 +20,13 @@ from magpend_core.sections import run_branches
 from pipeline.analysis.attractors.finding.known_sets import Cycle
 from pipeline.analysis.attractors.finding.points import Point
 from pipeline.analysis.sets import Geometry, hashes
+from pipeline.analysis.tolerances import CROSSING_RTOL, SAME_RETURN
 
 RETURNS = 32
 """Most crossings of the level per period."""
 
-CLOSE = 1e-2
-"""Scaled distance within which a return is tried as the period of a cycle."""
-
 TRIES = 3
 """Cells without a cycle after which the search at a parameter point ends."""
-
-RTOL = 1e-9
-"""Tolerance of the trajectories between crossings."""
 
 
 class _Crossings:
@@ -61,8 +56,8 @@ class _Crossings:
             states,
             n_transient=0,
             n_keep=RETURNS,
-            rtol=RTOL,
-            atol=RTOL,
+            rtol=CROSSING_RTOL,
+            atol=CROSSING_RTOL,
             system=self._system,
         )
         return np.asarray(found.section[:, 0])
@@ -72,7 +67,7 @@ class _Crossings:
         level = float(start[self.state])
         path = self.of(start[None], level)[0]
         # a state almost tangent to the level may start with a crossing that is not the cycle's
-        near = np.flatnonzero(geometry.distance(path[1:], path[0]) <= CLOSE)
+        near = np.flatnonzero(geometry.distance(path[1:], path[0]) <= SAME_RETURN)
         if not len(near):
             return None
         packed, rate = np.append(self._packed, level)[None], np.array([self._rate])

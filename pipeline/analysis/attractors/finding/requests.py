@@ -16,18 +16,15 @@ import xarray as xr
 from magpend_core.engine.system import System
 from magpend_core.orbits import section_map
 from magpend_core.sections import run_branches
-from pipeline.analysis.attractors.finding.assigning import STRICT
 from pipeline.analysis.attractors.finding.cell_blocks import Guesses
 from pipeline.analysis.attractors.finding.closed_orbits import Orbit, polish, run_on
 from pipeline.analysis.attractors.finding.points import Point
 from pipeline.analysis.sets import Geometry, hashes
+from pipeline.analysis.tolerances import SLOPE_RTOL, STRICT
 from pipeline.products.reporting import report
 
 LEG = 64
 """Number of drive periods or returns in a leg of an extension."""
-
-SLOPE_RTOL = 1e-8
-"""Tolerance of the derivatives along extended cells, sufficient for exponents."""
 
 
 @dataclass(frozen=True)

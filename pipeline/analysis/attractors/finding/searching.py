@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.analysis.attractors.finding.assigning import LOOSE_SHARE, STRICT, decide
+from pipeline.analysis.attractors.finding.assigning import decide
 from pipeline.analysis.attractors.finding.cell_blocks import ClosedCells, Guesses, marks_of
 from pipeline.analysis.attractors.finding.closed_orbits import Orbit, distinct, number_of
 from pipeline.analysis.attractors.finding.equilibria import rest_of_orbit
@@ -19,6 +19,7 @@ from pipeline.analysis.attractors.finding.points import Dynamics, Point
 from pipeline.analysis.attractors.finding.requests import Polish, Settings, Work
 from pipeline.analysis.attractors.finding.spirals import MAX_GUESSES, beside, near_closed
 from pipeline.analysis.sets import Geometry
+from pipeline.analysis.tolerances import LOOSE_SHARE, STRICT
 from pipeline.products.attractors import IdentifyOptions
 
 ROUNDS, ROUNDS_LOOSE = 3, 6

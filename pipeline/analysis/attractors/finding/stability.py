@@ -31,12 +31,6 @@ BY_NOTHING, BY_EIGENVALUES, BY_MULTIPLIERS, BY_APPROACH, BY_STAYING, BY_LEAVING,
 TIMES_LONGEST = 10.0
 """A sample has stayed long enough after this many times the longest transient seen."""
 
-MATRIX_ERROR = 1e-9
-"""Relative error of a monodromy matrix: two methods at tolerance 1e-12 agree to 1e-10."""
-
-RATE_ERROR = 1e-9
-"""Relative error of a Jacobian's entries at a polished equilibrium."""
-
 _TRIALS = 8
 
 
