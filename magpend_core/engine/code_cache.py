@@ -109,7 +109,7 @@ def _exposed(found: os.stat_result) -> str:
 
 
 class _InItsFolder(CompileResultCacheImpl):
-    """What numba would keep beside the sources, where its folder cannot be used, is not kept."""
+    """A locator of numba's cache that keeps nothing beside the sources."""
 
     _locator_classes = [UserProvidedCacheLocator]  # noqa: RUF012 # as declared there
 

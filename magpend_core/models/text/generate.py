@@ -90,7 +90,7 @@ class Writer:
         self.lines.append(f"{target} = {self._value(node)}")
 
     def _by_root(self, above: Node, x: Node, n: int) -> str:
-        """A number over the n-th power of a root, without division; no bare product: it could be fused."""
+        """Divide a number by the n-th power of a root without a division, and without a product that could be fused."""
         root = f"w{x.number}"
         if x.number not in self.inverse_roots:
             self.inverse_roots.add(x.number)

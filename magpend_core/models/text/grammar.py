@@ -364,7 +364,7 @@ class _Parser:
             )
 
     def prefix(self) -> Tree:
-        """Read what an expression can begin with."""
+        """Read the beginning of an expression: a sign, a number, a name or a bracket."""
         token = self.take()
         if token.kind == "number":
             value = float(token.text)

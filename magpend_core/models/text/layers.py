@@ -151,7 +151,7 @@ def _jump(graph: Graph, changes: list[Node], scales: tuple[float, ...]) -> Node 
 
 
 def largest(graph: Graph, nodes: list[Node]) -> Node:
-    """The largest of some numbers; a NaN counts for nothing if it is not the last."""
+    """Return the largest of some numbers; a NaN is ignored unless it is the last."""
     found = nodes[0]
     for node in nodes[1:]:
         if not node.is_number(0.0):

@@ -178,7 +178,7 @@ def _joint(
     modes: Sequence[Node],
     zeros: Mapping[Node, Node],
 ) -> Node:
-    """What stands for side k while the state may slide on surface j, too: two linear equations."""
+    """Return the equivalent of side k while the state may also slide on surface j, from two linear equations."""
     rest_k, rest_j, kk, kj, jk, jj = substituted(
         graph, [speeds[k], speeds[j], pulls[k][k], pulls[k][j], pulls[j][k], pulls[j][j]], zeros
     )

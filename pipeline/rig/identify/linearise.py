@@ -63,7 +63,7 @@ def _information(
     prior: np.ndarray,
     scale: float,
 ) -> np.ndarray:
-    """Return the information matrix: that of the samples, or with continuity that of the fit."""
+    """Return the information matrix of the samples, or of the whole fit if pieces are continuous."""
     if problem.continuity is not None:
         return eliminate_starts(fit.jacobian, len(problem.free))[0]
     total = np.diag(prior)

@@ -80,7 +80,7 @@ class _Search:
         self._base: _Point | None = None
 
     def split(self, x: Array) -> tuple[Array, Array]:
-        """Return the unknowns, and the starts from the vector or as given."""
+        """Split the vector into the unknowns and the starts; return the given starts if they are not free."""
         full = x * self.sizes
         if not self.joint:
             return full, self.starts

@@ -323,7 +323,7 @@ def _missing(time: np.ndarray, step: float) -> np.ndarray:
 
 
 def _skipped(time: np.ndarray, step: float, late: np.ndarray, is_sure: np.ndarray) -> np.ndarray:
-    """Return the samples missing at late stamps, by how much the stamps after are later than those before.
+    """Return the number of samples missing at each late stamp, from the delay of the stamps behind it.
 
     Stamps beyond another gap are not used. Of neighbouring doubtful stamps the one with the largest shift
     counts.
