@@ -135,7 +135,7 @@ def _hide_others(module: Any, own: set[str]) -> None:
 
 
 def _link(module: Any, library: Any) -> None:
-    """Link to a module the libraries that one reaches, and the sizes that these are of."""
+    """Link a module with all libraries that it reaches, and with the values of their sizes."""
     sizes: dict[str, Any] = dict(library.dispatcher.sizes) if isinstance(library, PartLibrary) else {}
     for reached_one in _reached_libraries(library):
         if isinstance(reached_one, PartLibrary):

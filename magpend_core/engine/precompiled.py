@@ -367,4 +367,4 @@ class PartCache:
 
 
 class _Key:
-    """Stands for a function that Python cannot call; numba finds compiled code by it."""
+    """A key in place of a function that Python cannot call; numba finds compiled code by it."""

@@ -148,7 +148,7 @@ PLUS, MINUS, PER_STEP = "_plus", "_minus", "per_step"
 
 @cache
 def with_parameter_tangent(system: System) -> System:
-    """Return `system` extended by one tangent vector that also feels a change of the parameters.
+    """Return `system` extended by one tangent vector with a source term: a change of the parameters.
 
     The vector v obeys v' = J v + (f(c_plus) - f(c_minus)) per_step: the Jacobian J is analytic, the direct
     effect of the parameters on the right-hand side f, and on the forcing, a central difference at each stage.

@@ -167,7 +167,7 @@ def _look(tree: Tree, place: str, known: Mapping[str, Any], rows: np.ndarray, fo
 
 
 def _taken(tree: Tree, known: Mapping[str, Any], rows: np.ndarray) -> list[np.ndarray]:
-    """Points at which each argument counts."""
+    """Return the sample points at which each argument's value matters."""
     if tree.kind == "call" and tree.value == "where":
         chosen = np.broadcast_to(value_of(tree.args[0], known), rows.shape).astype(bool)
         return [rows, rows & chosen, rows & ~chosen]

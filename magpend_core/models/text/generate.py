@@ -35,7 +35,7 @@ class Writer:
         self.inverse_roots: set[int] = set()
 
     def write(self, roots: Iterable[Node]) -> list[str]:
-        """Write all that some nodes need; return how they are called."""
+        """Write the lines that compute some nodes; return the names of their values."""
         roots = list(roots)
         wanted = self._wanted(roots)
         for node in in_order(wanted.values()):
