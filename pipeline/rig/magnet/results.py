@@ -121,7 +121,7 @@ def write_presets(outcome: Outcome, folder: Path) -> list[Path]:
 
 
 def _base(measured: Measurement, model: str) -> str | Preset:
-    """Return the preset of the parameters that are not fitted; a file's values are limited to the model's parameters."""
+    """Return the preset of the parameters that are not fitted; of a file, only the model's parameters are used."""
     name = measured.header.preset
     if name is None:
         return load_model(model).presets[0].name
