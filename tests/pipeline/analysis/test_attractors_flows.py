@@ -12,7 +12,7 @@ from magpend_core import run_branches
 from magpend_core.crossing import Crossing
 from magpend_core.models.sectioned import sectioned
 from pipeline.analysis.attractors.attractors import identify
-from pipeline.compute.task import rest_states
+from pipeline.compute.integrate import rest_states
 from pipeline.layout.vocabulary import ATTRACTS, BOUNDED_SET, EQUILIBRIUM, PERIODIC_ORBIT, section_attributes
 from tests.core.flows import BAUTIN, HOPF, flow
 
