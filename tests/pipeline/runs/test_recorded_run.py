@@ -11,6 +11,7 @@ import pytest
 
 from magpend_core import load_preset
 from pipeline import open_run
+from pipeline.compute import integrate as branches
 from pipeline.compute import task
 from pipeline.compute.execute import TaskFailedError
 from pipeline.runs.derive import derive
@@ -202,13 +203,13 @@ def test_extend__cells_under_the_same_recording(recorded, tmp_path, bytes_of, mo
     wider = recorded(RECORDED.replace("[0.6, 1.6]", "[0.6, 1.1, 1.6]"))
     run(wider, tmp_path / "fresh", workers=0, echo=silent)
     calls = []
-    original = task.under_recording
+    original = branches.under_recording
 
     def counted(drive, inputs, **options):
         calls.append(len(inputs.initial_states))
         return original(drive, inputs, **options)
 
-    monkeypatch.setattr(task, "under_recording", counted)
+    monkeypatch.setattr(branches, "under_recording", counted)
     monkeypatch.setattr(task, "warm_up", lambda spec: 0.0)
     extend(tmp_path / "old", wider, tmp_path / "new", workers=0, echo=silent)
     assert sum(calls) == 12
