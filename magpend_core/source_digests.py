@@ -44,12 +44,16 @@ def meaning_digest(paths: Iterable[Path]) -> str:
     digest = hashlib.sha256()
     for name, path in sorted(_files(paths)):
         content = path.read_bytes()
-        if path.suffix == ".py":
-            tokens: list[str] = []
-            _write(ast.parse(content), tokens)
-            content = "".join(tokens).encode()
-        digest.update(name.encode() + b"\0" + hashlib.sha256(content).digest())
+        meaning = _python_meaning(content) if path.suffix == ".py" else hashlib.sha256(content).digest()
+        digest.update(name.encode() + b"\0" + meaning)
     return digest.hexdigest()[:16]
+
+
+@cache  # a command asks for the same modules several times
+def _python_meaning(source: bytes) -> bytes:
+    tokens: list[str] = []
+    _write(ast.parse(source), tokens)
+    return hashlib.sha256("".join(tokens).encode()).digest()
 
 
 @cache
@@ -78,12 +82,13 @@ def _write(node: object, out: list[str]) -> None:
     `ast.dump` would do but for its changes from one version of Python to the next: empty fields come and
     go, new ones are added.
     """
-    if isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call):
-        node = ast.Raise(node.exc.func, node.cause)
     if isinstance(node, ast.AST):
+        if isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call):
+            node = ast.Raise(node.exc.func, node.cause)
         out.append(f"{type(node).__name__}(")
-        for field, value in ast.iter_fields(node):
-            if field not in _WITHOUT_MEANING and value is not None and value != []:
+        for field in node._fields:
+            value = getattr(node, field, None)
+            if value is not None and value != [] and field not in _WITHOUT_MEANING:
                 out.append(f"{field}=")
                 _write(value, out)
         out.append(")")

@@ -20,6 +20,14 @@ if TYPE_CHECKING:
 
 TWO_PI = 2.0 * np.pi
 
+_MIXING = (
+    (np.uint64(30), np.uint64(0xBF58476D1CE4E5B9)),
+    (np.uint64(27), np.uint64(0x94D049BB133111EB)),
+)
+"""Shifts and factors of the generator splitmix64, which `hashes` mixes bits with."""
+
+_LAST_SHIFT = np.uint64(31)
+
 
 @dataclass(frozen=True)
 class Geometry:
@@ -110,11 +118,16 @@ def hashes(rows: np.ndarray) -> np.ndarray:
     values = np.ascontiguousarray(rows)
     bits = (values + 0.0 if values.dtype.kind == "f" else values.astype(np.int64)).view(np.uint64)
     total = np.full(bits.shape[:-1], 0x9E3779B97F4A7C15, np.uint64)
-    for i in range(bits.shape[-1]):
-        x = total ^ bits[..., i]
-        for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
-            x = (x ^ (x >> np.uint64(shift))) * np.uint64(factor)
-        total = x ^ (x >> np.uint64(31))
+    if not total.size:
+        return total
+    shifted = np.empty_like(total)
+    # in place: rows are few and long, so that an operation's overhead counts
+    for column in np.ascontiguousarray(np.moveaxis(bits, -1, 0)):
+        np.bitwise_xor(total, column, out=total)
+        for shift, factor in _MIXING:
+            np.bitwise_xor(total, np.right_shift(total, shift, out=shifted), out=total)
+            np.multiply(total, factor, out=total)
+        np.bitwise_xor(total, np.right_shift(total, _LAST_SHIFT, out=shifted), out=total)
     return total
 
 
