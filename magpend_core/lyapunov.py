@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from magpend_core.defaults import ATOL, MOST_STEPS, RTOL
 from magpend_core.engine.entry import N_LANES, integrate
 from magpend_core.engine.jit import inline
 from magpend_core.engine.observers import PENDING, Observer
@@ -174,9 +175,9 @@ def lyapunov_exponents(
     n_transient: int = 200,
     n_periods: int = 400,
     n_blocks: int = 16,
-    rtol: float = 1e-8,
-    atol: float = 1e-8,
-    max_steps_per_period: int = 20_000,
+    rtol: float = RTOL,
+    atol: float = ATOL,
+    max_steps_per_period: int = MOST_STEPS,
     system: System = PENDULUM_FITTED,
     n_lanes: int = N_LANES,
 ) -> LyapunovExponents:

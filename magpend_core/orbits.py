@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from magpend_core.defaults import MOST_STEPS
 from magpend_core.engine.entry import integrate
 from magpend_core.engine.observers import MAP, MapSettings
 from magpend_core.engine.system import System
@@ -25,9 +26,6 @@ from magpend_core.validation import check_array, check_frequency, check_states, 
 
 RTOL = 1e-12
 """Tolerance of the integrations here: the residual can then go below 1e-10."""
-
-MOST_STEPS = 20_000
-"""Most attempted steps per period."""
 
 TRUST = 0.5
 """Longest Newton step in units of the system's scales; a longer one is shortened to this."""

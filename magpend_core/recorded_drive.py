@@ -12,6 +12,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from magpend_core.defaults import ATOL, CLOSURE, LONGEST_PERIOD, MOST_STEPS, MOST_STEPS_BETWEEN, RTOL
 from magpend_core.engine.driven import LEVEL, with_recorded_drive
 from magpend_core.engine.entry import N_LANES, check_quantities, integrate
 from magpend_core.engine.lanes import Cells
@@ -48,11 +49,11 @@ def recorded_sections(
     ends: np.ndarray | None = None,
     n_transient: int,
     n_keep: int,
-    rtol: float = 1e-8,
-    atol: float = 1e-8,
-    max_steps_per_period: int = 20_000,
-    closure_tolerance: float = 1e-6,
-    max_orbit_period: int = 16,
+    rtol: float = RTOL,
+    atol: float = ATOL,
+    max_steps_per_period: int = MOST_STEPS,
+    closure_tolerance: float = CLOSURE,
+    max_orbit_period: int = LONGEST_PERIOD,
     system: System,
     n_lanes: int = N_LANES,
     quantities: Sequence[str] | None = None,
@@ -263,9 +264,9 @@ def recorded_trajectory(
     initial_state: np.ndarray,
     times: np.ndarray,
     *,
-    rtol: float = 1e-8,
-    atol: float = 1e-8,
-    max_steps_per_interval: int = 1_000_000,
+    rtol: float = RTOL,
+    atol: float = ATOL,
+    max_steps_per_interval: int = MOST_STEPS_BETWEEN,
 ) -> np.ndarray:
     """Return the states of one trajectory on a time grid, under a recorded drive.
 

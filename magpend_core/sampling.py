@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from magpend_core.defaults import ATOL, MOST_STEPS_BETWEEN, RTOL
 from magpend_core.engine import sampling as engine
 from magpend_core.engine.checks import check_system
 from magpend_core.engine.driven import with_recorded_drive
@@ -149,9 +150,9 @@ def sample(
     piece: np.ndarray | None = None,
     drives: Sequence[Drive | None] | None = None,
     columns: Sequence[int] | None = None,
-    rtol: float = 1e-8,
-    atol: float = 1e-8,
-    max_steps_per_interval: int = 1_000_000,
+    rtol: float = RTOL,
+    atol: float = ATOL,
+    max_steps_per_interval: int = MOST_STEPS_BETWEEN,
     limits_first_step: bool = True,
     n_lanes: int = N_LANES,
 ) -> Samples:

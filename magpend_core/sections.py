@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from magpend_core.crossing import Crossing
+from magpend_core.defaults import ATOL, CLOSURE, LONGEST_PERIOD, MOST_STEPS, RTOL
 from magpend_core.engine.entry import N_LANES, integrate
 from magpend_core.engine.observers import FIRST_TURN, ORBIT_PERIOD, RECORD, Settings, window_of
 from magpend_core.engine.system import System
@@ -71,10 +72,10 @@ def run_branches(
     n_keep: int,
     rtol: float,
     atol: float,
-    max_steps_per_period: int = 20_000,
+    max_steps_per_period: int = MOST_STEPS,
     stop_when_closed: bool = False,
-    closure_tolerance: float = 1e-6,
-    max_orbit_period: int = 16,
+    closure_tolerance: float = CLOSURE,
+    max_orbit_period: int = LONGEST_PERIOD,
     step_size: np.ndarray | None = None,
     system: System = PENDULUM_FITTED,
     n_lanes: int = N_LANES,
@@ -201,8 +202,8 @@ def sections(
     *,
     n_transient: int,
     n_keep: int,
-    rtol: float = 1e-8,
-    atol: float = 1e-8,
+    rtol: float = RTOL,
+    atol: float = ATOL,
     **options: Any,
 ) -> Sections:
     """Return stroboscopic sections of many independent trajectories of one model.

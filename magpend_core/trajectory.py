@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from magpend_core.defaults import ATOL, MOST_STEPS, RTOL
 from magpend_core.models.parameters import Parameters
 from magpend_core.sampling import Drive, sample
 from magpend_core.status import Status
@@ -21,9 +22,9 @@ def trajectory(
     initial_state: np.ndarray,
     times: np.ndarray,
     *,
-    rtol: float = 1e-8,
-    atol: float = 1e-8,
-    max_steps_per_period: int = 20_000,
+    rtol: float = RTOL,
+    atol: float = ATOL,
+    max_steps_per_period: int = MOST_STEPS,
 ) -> np.ndarray:
     """Return the states of one trajectory on a time grid, started at the drive's rising edge.
 

@@ -20,10 +20,7 @@ if TYPE_CHECKING:
 
 TWO_PI = 2.0 * np.pi
 
-_MIXING = (
-    (np.uint64(30), np.uint64(0xBF58476D1CE4E5B9)),
-    (np.uint64(27), np.uint64(0x94D049BB133111EB)),
-)
+_MIXING = ((np.uint64(30), np.uint64(0xBF58476D1CE4E5B9)), (np.uint64(27), np.uint64(0x94D049BB133111EB)))
 """Shifts and factors of the generator splitmix64, which `hashes` mixes bits with."""
 
 _LAST_SHIFT = np.uint64(31)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from magpend_core.defaults import ATOL, RTOL
 from pipeline.cli.common import read_pairs
 from pipeline.cli.models import DEFAULT, names
 from pipeline.cli.options import completing
@@ -53,8 +54,8 @@ def simulate(
         int | None, typer.Option(help="Drive periods of the series; by default 10, or all that a drive file has.")
     ] = None,
     samples: Annotated[int, typer.Option(help="Samples per period.")] = 200,
-    rtol: Annotated[float, typer.Option(help="Relative tolerance.")] = 1e-8,
-    atol: Annotated[float, typer.Option(help="Absolute tolerance.")] = 1e-8,
+    rtol: Annotated[float, typer.Option(help="Relative tolerance.")] = RTOL,
+    atol: Annotated[float, typer.Option(help="Absolute tolerance.")] = ATOL,
     out: Annotated[Path, typer.Option(help="Series, .csv or .nc.")] = Path("trajectory.csv"),
     figure: Annotated[
         Path | None, typer.Option(help="Figure, .png, .pdf or .svg; by default beside the series.")

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
 
 from magpend_core import Sections, Status, run_branches
+from magpend_core.engine.system import System
 from pipeline.layout.cells import Inputs
+from pipeline.specification.tables import Integration
 
 WALKED = ("section", "rest_state", "status", "step_size")
 """Variables that say where a branch was left; the last kept section is the state at the cell's end."""
@@ -35,21 +37,40 @@ def going_on(inputs: Inputs, before: Mapping[str, np.ndarray]) -> Inputs:
     return replace(inputs, initial_states=states, step_size=before["step_size"].reshape(n_branches))
 
 
-def walk(inputs: Inputs, **keywords: Any) -> Sections:
+def walk(inputs: Inputs, system: System, integration: Integration, quantities: Sequence[str] | None) -> Sections:
     """Integrate branches by `magpend_core.run_branches`; those that ended before are marked as unreached.
 
     Parameters
     ----------
     inputs
         The branches.
-    keywords
-        As for `magpend_core.run_branches`.
+    system
+        What is integrated.
+    integration
+        The table ``[integration]``.
+    quantities
+        Names of the quantities to watch.
     """
-    if inputs.step_size is None:
-        return run_branches(inputs.parameters, inputs.frequency_hz, inputs.initial_states, **keywords)
-    alive = np.isfinite(inputs.step_size)
+    alive = np.ones(len(inputs.initial_states), bool) if inputs.step_size is None else np.isfinite(inputs.step_size)
     some = inputs.take(alive)
-    cells = run_branches(some.parameters, some.frequency_hz, some.initial_states, step_size=some.step_size, **keywords)
+    cells = run_branches(
+        some.parameters,
+        some.frequency_hz,
+        some.initial_states,
+        n_transient=integration.n_transient,
+        n_keep=integration.n_keep,
+        rtol=integration.rtol,
+        atol=integration.atol,
+        max_steps_per_period=integration.max_steps_per_period,
+        stop_when_closed=integration.stop_when_closed,
+        closure_tolerance=integration.closure_tolerance,
+        max_orbit_period=integration.max_orbit_period,
+        step_size=some.step_size,
+        system=replace(system, method=integration.method),
+        quantities=quantities,
+    )
+    if alive.all():
+        return cells
     found: dict[str, Any] = {f.name: getattr(cells, f.name) for f in fields(cells)}
     return Sections(**{name: _spread(name, array, alive) for name, array in found.items()})
 

@@ -11,8 +11,8 @@ import numpy as np
 from magpend_core import Status
 from magpend_core.engine.observers import window_of
 from magpend_core.extension import more_sections, orbit_periods
+from pipeline.compute.integrate import watched_quantities
 from pipeline.layout.cells import Inputs
-from pipeline.products.registry import CELL_PRODUCTS
 from pipeline.specification.parsing import Spec
 
 Values = dict[str, np.ndarray]
@@ -101,9 +101,6 @@ def kept_on(spec: Spec, inputs: Inputs, stored: Mapping[str, np.ndarray], n_old:
 
 def _more(spec: Spec, inputs: Inputs, last: np.ndarray, step_size: np.ndarray, n_old: int) -> Values:
     """Integrate the further periods and return their variables."""
-    watched: dict[str, Any] = {}
-    for name, options in spec.products.items():
-        watched |= CELL_PRODUCTS[name].integrate(options)
     integration = spec.integration
     cells = more_sections(
         inputs.parameters,
@@ -115,7 +112,7 @@ def _more(spec: Spec, inputs: Inputs, last: np.ndarray, step_size: np.ndarray, n
         atol=integration.atol,
         max_steps_per_period=integration.max_steps_per_period,
         system=replace(spec.model.system, method=integration.method),
-        **watched,
+        quantities=watched_quantities(spec),
     )
     names = ("status", "step_size", *SUMS, *PER_SECTION)
     return {name: np.asarray(getattr(cells, name)) for name in names if getattr(cells, name) is not None}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -44,14 +43,8 @@ class Job:
 
 def integrate(spec: Spec, inputs: Inputs) -> dict[str, np.ndarray]:
     """Return all variables of some branches, with leading dims (branch, point)."""
-    keywords: dict[str, Any] = spec.integration.model_dump()
-    for name, options in spec.products.items():
-        keywords |= CELL_PRODUCTS[name].integrate(options)
-    if spec.recorded is not None:
-        del keywords["method"]  # the specification allows no other
-        cells = under_recording(spec.recorded, inputs, system=spec.model.system, **keywords)
-    else:
-        cells = walk(inputs, system=spec.model.system, **keywords)
+    how = spec.model.system, spec.integration, watched_quantities(spec)
+    cells = walk(inputs, *how) if spec.recorded is None else under_recording(spec.recorded, inputs, *how)
     own = {REST_STATE.name: rest_states(cells)} if spec.section is not None else {}
     values = {
         v.name: np.asarray(own.get(v.name, getattr(cells, v.name, None)), dtype=v.dtype)
@@ -61,6 +54,11 @@ def integrate(spec: Spec, inputs: Inputs) -> dict[str, np.ndarray]:
     for name, options in spec.products.items():
         values |= function_of(CELL_PRODUCTS[name].compute)(job, options)
     return values
+
+
+def watched_quantities(spec: Spec) -> list[str] | None:
+    """Return the names of the quantities that products watch while cells are integrated; None if there are none."""
+    return [name for k, options in spec.products.items() for name in CELL_PRODUCTS[k].watches(options)] or None
 
 
 def rest_states(cells: Sections) -> np.ndarray:

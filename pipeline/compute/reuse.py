@@ -147,7 +147,7 @@ def obstacles(run: Run, wanted: Spec, identity: Mapping[str, Any]) -> list[str]:
     return lines + [
         f"products.{name}: is watched while cells are integrated, and not as asked for in the directory"
         for name, options in wanted.products.items()
-        if name not in same and CELL_PRODUCTS[name].integrate(options)
+        if name not in same and CELL_PRODUCTS[name].watches(options)
     ]
 
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from magpend_core.defaults import ATOL, RTOL
 from magpend_core.models import DEFAULT, load_model
 from magpend_core.models.model import Model, Quantity, State
 from magpend_core.models.presets import Preset
@@ -59,8 +60,8 @@ def simulate(
     n_transient: int = 0,
     n_periods: int | None = None,
     samples_per_period: int = 200,
-    rtol: float = 1e-8,
-    atol: float = 1e-8,
+    rtol: float = RTOL,
+    atol: float = ATOL,
 ) -> xr.Dataset:
     """Integrate one trajectory from the instant of a section.
 

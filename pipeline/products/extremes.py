@@ -55,8 +55,8 @@ def _cost(options: ExtremesOptions) -> float:
     return 0.0
 
 
-def _engine(options: ExtremesOptions) -> dict[str, Any]:
-    return {"quantities": options.quantities}
+def _watched(options: ExtremesOptions) -> tuple[str, ...]:
+    return options.quantities
 
 
 EXTREMES = CellProduct(
@@ -69,5 +69,5 @@ EXTREMES = CellProduct(
     "pipeline.compute.extremes:extremes",
     settle=_settled,
     coordinates=_names,
-    integrate=_engine,
+    watches=_watched,
 )

@@ -120,8 +120,8 @@ class CellProduct:
         raises ValueError with a sentence that begins with the option's name if they do not fit the model.
     coordinates : callable
         ``coordinates(options, model)`` returns the labels along the product's own dims, by dim.
-    integrate : callable
-        ``integrate(options)`` returns keywords of `magpend_core.run_branches` that the product needs.
+    watches : callable
+        ``watches(options)`` returns the names of the quantities to watch while cells are integrated.
     shortest : callable
         ``shortest(options)`` returns the options with the least work, for compiling ahead.
     """
@@ -135,7 +135,7 @@ class CellProduct:
     compute: str
     settle: Callable[[Any, Any], Any] = lambda options, model: options
     coordinates: Callable[[Any, Any], dict[str, Sequence[Any]]] = lambda options, model: {}
-    integrate: Callable[[Any], dict[str, Any]] = lambda options: {}
+    watches: Callable[[Any], Sequence[str]] = lambda options: ()
     shortest: Callable[[Any], Any] = lambda options: options
 
 

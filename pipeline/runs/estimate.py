@@ -80,7 +80,7 @@ def estimate(spec: Spec, plan: Plan) -> Estimate:
     compiled_s = warm_up(spec)
     most, products = periods_per_cell(spec)
     # products that the engine computes while integrating are measured with it
-    watched = {name: o for name, o in spec.products.items() if CELL_PRODUCTS[name].integrate(o)}
+    watched = {name: o for name, o in spec.products.items() if CELL_PRODUCTS[name].watches(o)}
     spec = replace(spec, products=watched)
     products -= periods_per_cell(spec)[1]
     inputs = _sample(spec, plan, np.random.default_rng(0), BRANCHES, pairs=False)

@@ -13,7 +13,7 @@ def method_problems(integration: Integration | None, products: Mapping[str, Opti
     """Return problems with `integration.method`: only the method of order 5 can interpolate in a step."""
     if integration is None or integration.method == "dopri5":
         return []
-    inside = [f"products.{n} looks" for n, o in products.items() if CELL_PRODUCTS[n].integrate(o)]
+    inside = [f"products.{n} looks" for n, o in products.items() if CELL_PRODUCTS[n].watches(o)]
     inside += ["a recorded drive has edges"] * is_recorded
     key = f'integration.method = "{integration.method}"'
     return [f'{key}: {what} within steps; drop one of the two, or set method = "dopri5".' for what in inside]

@@ -10,6 +10,7 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, model_validator
 
+from magpend_core import defaults
 from magpend_core.models.presets import Preset
 
 FREQUENCY = "frequency_hz"
@@ -143,8 +144,8 @@ class Continuation(Table):
 class Integration(Table):
     """The table ``[integration]``: tolerances, transient, and kept sections of each cell."""
 
-    rtol: float = Field(1e-8, ge=1e-13, lt=1, description="Relative tolerance of a step.")
-    atol: float = Field(1e-8, gt=0, lt=1, description="Absolute tolerance of a step, in the states' units.")
+    rtol: float = Field(defaults.RTOL, ge=1e-13, lt=1, description="Relative tolerance of a step.")
+    atol: float = Field(defaults.ATOL, gt=0, lt=1, description="Absolute tolerance of a step, in the states' units.")
     method: Literal["dopri5", "dop853"] = Field(
         "dopri5", description="Runge-Kutta method: dopri5 of order 5, or dop853 of order 8 for smooth equations."
     )
@@ -153,16 +154,22 @@ class Integration(Table):
     )
     n_keep: int = Field(60, ge=1, le=1_000_000, description="Sections kept, one per drive period or return.")
     max_steps_per_period: int = Field(
-        20_000, ge=1, le=1_000_000_000, description="Attempted steps after which a cell is given up."
+        defaults.MOST_STEPS, ge=1, le=1_000_000_000, description="Attempted steps after which a cell is given up."
     )
     stop_when_closed: bool = Field(
         False, description="Keep sections as soon as the orbit has closed, without waiting for n_transient."
     )
     closure_tolerance: float = Field(
-        1e-6, gt=0, lt=1, description="Scaled distance to a closed orbit below which a cell counts as closed."
+        defaults.CLOSURE,
+        gt=0,
+        lt=1,
+        description="Scaled distance to a closed orbit below which a cell counts as closed.",
     )
     max_orbit_period: int = Field(
-        16, ge=1, le=32_000, description="Longest orbit period that is detected [drive periods or returns]."
+        defaults.LONGEST_PERIOD,
+        ge=1,
+        le=32_000,
+        description="Longest orbit period that is detected [drive periods or returns].",
     )
 
 

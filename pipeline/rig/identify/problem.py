@@ -9,6 +9,7 @@ from functools import cached_property
 
 import numpy as np
 
+from magpend_core.defaults import RTOL
 from magpend_core.engine.system import System
 from magpend_core.models.model import Model
 from magpend_core.models.parameters import Parameters
@@ -129,7 +130,7 @@ class Problem:
     loss: str = "linear"
     loss_scale: float = 1.0
     continuity: float | None = None
-    rtol: float = 1e-8
+    rtol: float = RTOL
     slopes: str = "differences"
     recorded: bool = False
 

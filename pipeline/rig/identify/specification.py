@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
+from magpend_core.defaults import RTOL
 from magpend_core.models import model_names
 from magpend_core.models.model import Model
 from magpend_core.models.parameters import Parameters, near_names
@@ -77,7 +78,7 @@ class FitTable(Table):
         "all channels of a unit",
     )
     decimate: Annotated[int, Field(ge=1)] = Field(1, description="Step between the samples that are used")
-    rtol: Annotated[float, Field(gt=0, le=1e-3)] = Field(1e-8, description="Tolerance of the integration")
+    rtol: Annotated[float, Field(gt=0, le=1e-3)] = Field(RTOL, description="Tolerance of the integration")
     slopes: Literal["differences", "variational"] = Field(
         "differences",
         description="Sensitivities: differences between lanes, or variational equations (more exact, slower)",

@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 import numpy as np
 import xarray as xr
 
+from magpend_core.defaults import ATOL, MOST_STEPS, RTOL
 from magpend_core.engine.system import System
 from magpend_core.orbits import section_map
 from magpend_core.sections import run_branches
@@ -133,9 +134,9 @@ class Settings:
         method = str(given.get("method", system.method if system is not None else ""))
         seen = int(given.get("n_transient", 0)) + int(given.get("n_keep", ds.sizes["period_index"]))
         return cls(
-            float(given.get("rtol", 1e-8)),
-            float(given.get("atol", 1e-8)),
-            int(given.get("max_steps_per_period", 20_000)),
+            float(given.get("rtol", RTOL)),
+            float(given.get("atol", ATOL)),
+            int(given.get("max_steps_per_period", MOST_STEPS)),
             seen=seen,
             system=system,
             method=method,
