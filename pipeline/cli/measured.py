@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pipeline.cli.common import EXIT_HELP, Csv, Directory, Json, check_csv, json_rows, read_pairs, tell
-from pipeline.cli.groups import SETTINGS
-from pipeline.cli.options import speaking
+from pipeline.cli.common import Csv, Directory, Json, check_csv, json_rows, read_pairs, tell
+from pipeline.cli.groups import SETTINGS, made, registry_group
+from pipeline.cli.options import taking
 from pipeline.cli.outputs import check_place
 
 if TYPE_CHECKING:
@@ -22,15 +22,7 @@ if TYPE_CHECKING:
 
     from magpend_core.models.model import Model
     from magpend_core.models.parameters import Parameters
-    from pipeline.rig.measured.measuring import Way
     from pipeline.rig.recordings import Mapping
-
-measured_app = typer.Typer(
-    help="Diagrams of recorded sweeps, beside and over computed ones.",
-    no_args_is_help=True,
-    rich_markup_mode=None,
-    context_settings=SETTINGS,
-)
 
 Recordings = Annotated[
     list[Path], typer.Argument(metavar="RECORDING...", help="Recordings of sweeps of the drive frequency.")
@@ -38,19 +30,6 @@ Recordings = Annotated[
 Mappings = Annotated[
     list[Path], typer.Option("--mapping", metavar="MAP", help="Mapping file, one for all recordings or one for each.")
 ]
-Transient = Annotated[int, typer.Option(help="Drive periods dropped after each step of the frequency.")]
-Window = Annotated[
-    int | None, typer.Option(help="Drive periods of a window of a slow sweep; by default detected; 0: steps only.")
-]
-WindowS = Annotated[float, typer.Option(help="Width of the polynomials' window about an edge [s].")]
-Hysteresis = Annotated[
-    float | None, typer.Option(help="Band about the drive's middle that an edge must cross, in its unit.")
-]
-MaxPeriod = Annotated[int, typer.Option(help="Longest orbit period that is detected [drive periods].")]
-State = Annotated[str, typer.Option(help="State to draw; by default the first measured one.")]
-Degrees = Annotated[bool, typer.Option("--degrees", help="Use degrees instead of radians.")]
-Width = Annotated[float, typer.Option(help="Width of the figure [mm]; 85 is a journal's column.")]
-At = Annotated[list[str] | None, typer.Option("--at", metavar="NAME=VALUE", help="Value of another axis of the run.")]
 Preset = Annotated[str | None, typer.Option(help="Preset of the parameters; by default the model's first.")]
 Set = Annotated[list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="Change a parameter.")]
 
@@ -83,15 +62,6 @@ def _read(paths: list[Path], mappings: list[Mapping]) -> list[xr.Dataset]:
     return found
 
 
-def _way(transient: int, window: int | None, window_s: float, hysteresis: float | None, max_period: int) -> Way:
-    from pipeline.rig.measured.measuring import Way
-    from pipeline.specification.problems import SpecError
-
-    if max_period < 1:
-        raise SpecError([f"--max-period {max_period}: must be at least 1."])
-    return Way(transient, window, window_s, hysteresis=hysteresis, max_period=max_period)
-
-
 def _loaded(model: Model, preset: str | None, settings: list[str] | None) -> Parameters:
     return model.load(preset, **read_pairs("--set", settings or [], "q=1.5"))
 
@@ -112,16 +82,10 @@ def _save(figure: Any, target: Path) -> None:
     console.result(f"data: {save_data(figure, target)}")
 
 
-@measured_app.command(epilog=EXIT_HELP, context_settings=SETTINGS)
-@speaking
 def steps(
     recordings: Recordings,
     mapping: Mappings,
-    transient: Transient = 20,
-    window: Window = None,
-    window_s: WindowS = 0.08,
-    hysteresis: Hysteresis = None,
-    max_period: MaxPeriod = 16,
+    options: Any,
     preset: Preset = None,
     settings: Set = None,
     csv: Csv = None,
@@ -135,29 +99,17 @@ def steps(
     from pipeline.rig.measured.tables import steps_table
 
     _check_targets(None, csv)
-    way = _way(transient, window, window_s, hysteresis, max_period)
     mappings = _load(recordings, mapping)
     parameters = _loaded(mappings[0].system, preset, settings)
-    tell(steps_table(measure(_read(recordings, mappings), way, parameters=parameters)), csv, as_json)
+    tell(steps_table(measure(_read(recordings, mappings), options, parameters=parameters)), csv, as_json)
 
 
-@measured_app.command(epilog=EXIT_HELP, context_settings=SETTINGS)
-@speaking
 def diagram(
     recordings: Recordings,
     mapping: Mappings,
     out: Annotated[Path, typer.Option(help="Figure, .png, .pdf or .svg.")],
+    options: Any,
     run: Annotated[Path | None, typer.Option(metavar="DIR", help="Run whose diagram is drawn for comparison.")] = None,
-    layout: Annotated[str, typer.Option(help="side: beside the computed diagram; over: over it.")] = "side",
-    state: State = "",
-    degrees: Degrees = False,
-    width: Width = 178.0,
-    at: At = None,
-    transient: Transient = 20,
-    window: Window = None,
-    window_s: WindowS = 0.08,
-    hysteresis: Hysteresis = None,
-    max_period: MaxPeriod = 16,
 ) -> None:
     """Draw the measured bifurcation diagram, alone or with a run's diagram on the same axes."""
     from pipeline.plots import Frame
@@ -166,23 +118,21 @@ def diagram(
     from pipeline.runs.derive import refused
 
     _check_targets(out)
-    way = _way(transient, window, window_s, hysteresis, max_period)
     mappings = _load(recordings, mapping)
     cube = parameters = None
     if run is not None:
         from pipeline.rig.measured.computed import cube_and_parameters
         from pipeline.runs.derive import AnalysedRun
 
-        pairs = read_pairs("--at", at or [], "q=1.5")
-        cube, parameters = cube_and_parameters(AnalysedRun.of(run), mappings[0].system, pairs)
-    found = measure(_read(recordings, mappings), way, parameters=parameters)
+        cube, parameters = cube_and_parameters(AnalysedRun.of(run), mappings[0].system, options.at)
+    found = measure(_read(recordings, mappings), options, parameters=parameters)
     with refused(run or out):
-        figure = plot_measured(found, cube, state=state, degrees=degrees, layout=layout, frame=Frame(width))
+        figure = plot_measured(
+            found, cube, frame=Frame(options.width), state=options.state, degrees=options.degrees, layout=options.layout
+        )
     _save(figure, out)
 
 
-@measured_app.command(epilog=EXIT_HELP, context_settings=SETTINGS)
-@speaking
 def compare(
     directory: Directory,
     recordings: Recordings,
@@ -190,15 +140,7 @@ def compare(
     out: Annotated[
         Path, typer.Option(metavar="FOLDER", help="Folder for figures, tables and data; made if necessary.")
     ],
-    state: State = "",
-    degrees: Degrees = False,
-    width: Width = 178.0,
-    at: At = None,
-    transient: Transient = 20,
-    window: Window = None,
-    window_s: WindowS = 0.08,
-    hysteresis: Hysteresis = None,
-    max_period: MaxPeriod = 16,
+    options: Any,
     csv: Csv = None,
     as_json: Json = False,
 ) -> None:
@@ -219,16 +161,16 @@ def compare(
 
     _check_targets(None, csv)
     check_place(out)
-    way = _way(transient, window, window_s, hysteresis, max_period)
-    pairs = read_pairs("--at", at or [], "q=1.5")
     run = AnalysedRun.of(directory, console.note)
     mappings = _load(recordings, mapping)
-    _, parameters = cube_and_parameters(run, mappings[0].system, pairs)
-    found = measure(_read(recordings, mappings), way, parameters=parameters)
-    computed = Computed.of(run, mappings[0].system, pairs)
+    _, parameters = cube_and_parameters(run, mappings[0].system, options.at)
+    found = measure(_read(recordings, mappings), options, parameters=parameters)
+    computed = Computed.of(run, mappings[0].system, options.at)
     compared = compare_with(found, computed)
     with refused(directory):
-        written = write_comparison(compared, computed, out, state=state, degrees=degrees, frame=Frame(width))
+        written = write_comparison(
+            compared, computed, out, frame=Frame(options.width), state=options.state, degrees=options.degrees
+        )
     steps_of, ends = steps_table(compared), edges_table(compared)
     if as_json:
         console.result(json.dumps({"steps": json_rows(steps_of), "edges": json_rows(ends)}, indent=1))
@@ -242,20 +184,13 @@ def compare(
         console.note(f"written: {path}")
 
 
-@measured_app.command(epilog=EXIT_HELP, context_settings=SETTINGS)
-@speaking
 def series(
     recording: Annotated[Path, typer.Argument(metavar="RECORDING", help="Recording with a drive.")],
     mapping: Annotated[Path, typer.Option("--mapping", metavar="MAP", help="Mapping file.")],
     out: Annotated[Path, typer.Option(help="Figure, .png, .pdf or .svg; the series goes beside it.")],
+    options: Any,
     preset: Preset = None,
     settings: Set = None,
-    start_s: Annotated[float | None, typer.Option(help="Start at the first rising edge from this time on [s].")] = None,
-    periods: Annotated[int, typer.Option(help="Number of drive periods.")] = 10,
-    degrees: Degrees = False,
-    width: Width = 178.0,
-    window_s: WindowS = 0.08,
-    hysteresis: Hysteresis = None,
 ) -> None:
     """Draw a recording and the model from the same state: time series and phase portraits."""
     from pipeline.cli import console
@@ -268,9 +203,41 @@ def series(
     mappings = _load([recording], [mapping])
     parameters = _loaded(mappings[0].system, preset, settings)
     (found,) = _read([recording], mappings)
-    ds = series_of(found, parameters, start_s=start_s, n_periods=periods, window_s=window_s, hysteresis=hysteresis)
+    ds = series_of(
+        found,
+        parameters,
+        start_s=options.start_s,
+        n_periods=options.periods,
+        window_s=options.window_s,
+        hysteresis=options.hysteresis,
+    )
     with refused(recording):
-        figure = plot_series(ds, degrees=degrees, frame=Frame(width))
+        figure = plot_series(ds, degrees=options.degrees, frame=Frame(options.width))
     for name, value in json.loads(str(ds.attrs["rms"])).items():
         console.result(f"rms of {name}: {value:.4g} {ds[name].attrs['units']}")
     _save(figure, out)
+
+
+_COMMANDS: dict[str, tuple[Any, str]] = {
+    "steps": (steps, "SweepOptions"),
+    "diagram": (diagram, "DiagramOptions"),
+    "compare": (compare, "ComparisonOptions"),
+    "series": (series, "SeriesOptions"),
+}
+"""Commands, and the names of their options in `pipeline.products.measured`."""
+
+
+def _make(name: str) -> Any:
+    from pipeline.products import measured
+
+    function, options = _COMMANDS[name]
+    return made(name, taking(getattr(measured, options), function), str(function.__doc__))
+
+
+measured_app = typer.Typer(
+    cls=registry_group("measured", lambda: list(_COMMANDS), _make),
+    help="Diagrams of recorded sweeps, beside and over computed ones.",
+    no_args_is_help=True,
+    rich_markup_mode=None,
+    context_settings=SETTINGS,
+)

@@ -13,44 +13,18 @@ from magpend_core.models.model import Model
 from magpend_core.models.parameters import Parameters
 from pipeline.analysis.sides import UNKNOWN, flags_of
 from pipeline.layout.vocabulary import model_attribute, model_of
+from pipeline.products.measured import SweepOptions
 from pipeline.rig.edges import Edges, edges_of
 from pipeline.rig.measured.phase import section_phase
-from pipeline.rig.measured.recorded_sections import ORDER, WINDOW_S, find_sections, name_of
-from pipeline.rig.measured.regimes import LIMIT, MAX_PERIOD, Regime, find_period
-from pipeline.rig.measured.steps import LEAST, TRANSIENT, Stretch, cut
+from pipeline.rig.measured.recorded_sections import find_sections, name_of
+from pipeline.rig.measured.regimes import Regime, find_period
+from pipeline.rig.measured.steps import LEAST, Stretch, cut
 from pipeline.specification.problems import SpecError
 
 _MEMORY = 3.0
 """Scatter of a jittered motion relative to the effect of one edge: each period has two, and effects last."""
 _PARTS = ("section", "section_noise", "kink")
 DIRECTIONS = {1: "up", -1: "down", 0: "none"}
-
-
-@dataclass(frozen=True)
-class Way:
-    """The settings for cutting, sectioning and judging recordings.
-
-    Attributes
-    ----------
-    transient : int
-        Drive periods dropped after each step.
-    window : int, optional
-        Drive periods of a window of a slow sweep; see `pipeline.rig.measured.steps.cut`.
-    window_s, order
-        Window and order of the local polynomials; see `pipeline.rig.measured.recorded_sections.find_sections`.
-    hysteresis : float, optional
-        Band that the drive's edges must cross; see `pipeline.rig.edges.find_edges`.
-    limit, max_period
-        Settings for the period; see `pipeline.rig.measured.regimes.find_period`.
-    """
-
-    transient: int = TRANSIENT
-    window: int | None = None
-    window_s: float = WINDOW_S
-    order: int = ORDER
-    hysteresis: float | None = None
-    limit: float = LIMIT
-    max_period: int = MAX_PERIOD
 
 
 @dataclass(frozen=True)
@@ -66,7 +40,7 @@ class _Step:
 
 
 def measure(
-    recordings: Sequence[xr.Dataset], way: Way | None = None, *, parameters: Parameters | None = None
+    recordings: Sequence[xr.Dataset], options: SweepOptions | None = None, *, parameters: Parameters | None = None
 ) -> xr.Dataset:
     """Return sections and regimes at each step of one or more recorded sweeps.
 
@@ -74,8 +48,8 @@ def measure(
     ----------
     recordings
         Recordings from `pipeline.rig.recordings.read_recording`, all of one model, each with a drive.
-    way
-        Settings for cutting and judging them.
+    options
+        How they are cut, sectioned and judged.
     parameters
         Parameters of the model, which its classifier needs; without them motions are not classified. The
         model's forcing gives the phase of the sections in the drive period.
@@ -98,7 +72,7 @@ def measure(
         For recordings of different models or states, without a drive, without a stretch of one frequency or
         without sections.
     """
-    way = way or Way()
+    options = options or SweepOptions()
     models = sorted({model_of(r) for r in recordings}, key=lambda model: model.name)
     if len(models) != 1:
         raise SpecError(
@@ -109,18 +83,18 @@ def measure(
         )
     (model,) = models
     known = model.load() if parameters is None else parameters
-    steps = [step for i, r in enumerate(recordings) for step in _steps(r, i, way, known)]
+    steps = [step for i, r in enumerate(recordings) for step in _steps(r, i, options, known)]
     _check(steps, recordings)
     found = _dataset(steps, model, recordings)
     return found if parameters is None else with_sides(found, parameters)
 
 
-def _steps(recording: xr.Dataset, number: int, way: Way, parameters: Parameters) -> list[_Step]:
+def _steps(recording: xr.Dataset, number: int, options: SweepOptions, parameters: Parameters) -> list[_Step]:
     model = parameters.model
-    edges = edges_of(recording, hysteresis=way.hysteresis)
-    stretches = cut(edges, transient=way.transient, window=way.window)
+    edges = edges_of(recording, hysteresis=options.hysteresis)
+    stretches = cut(edges, transient=options.transient, window=options.window)
     instants = _instants(edges, stretches, section_phase(parameters, stretches[0].timing.frequency_hz))
-    sections = find_sections(recording, instants, window_s=way.window_s, order=way.order)
+    sections = find_sections(recording, instants, window_s=options.window_s)
     names = tuple(str(n) for n in sections["state"].values)
     scale = np.array([model.state(n).scale for n in names])
     section, noise, kink = (_in_place(sections, n, instants.rising.size) for n in _PARTS)
@@ -135,7 +109,7 @@ def _steps(recording: xr.Dataset, number: int, way: Way, parameters: Parameters)
         points = section[inner]
         blur = _with_instants(points, noise[inner], names, model, stretch.instant_scatter_s)
         shaken = _shaken(points, blur, np.abs(kink[inner]), names, model, stretch.shake_s)
-        regime = find_period(points / scale, shaken / scale, limit=way.limit, max_period=way.max_period)
+        regime = find_period(points / scale, shaken / scale, max_period=options.max_period)
         found.append(_Step(stretch, number, names, points, blur, regime))
     return found
 

@@ -19,13 +19,12 @@ import xarray as xr
 
 from magpend_core.models.model import Model, State
 from pipeline.layout.vocabulary import model_attribute, model_of
+from pipeline.products.measured import WINDOW_S
 from pipeline.rig.edges import Edges
 from pipeline.specification.problems import SpecError
 
 Floats = npt.NDArray[np.float64]
 
-WINDOW_S = 0.08
-"""Width of the window about an edge [s]."""
 ORDER = 3
 _LEAST_SPARE = 3
 """Fewest samples on either side beyond the number of its own coefficients."""

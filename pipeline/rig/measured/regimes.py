@@ -15,11 +15,12 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from pipeline.products.measured import MAX_PERIOD
+
 Floats = npt.NDArray[np.float64]
 
 LIMIT = 2.5
 """Root mean square of second differences, in units of noise, below which a motion is closed."""
-MAX_PERIOD = 16
 _LEAST = 6
 """Fewest second differences that decide on a period."""
 _RESAMPLES = 200

@@ -10,9 +10,10 @@ import xarray as xr
 
 from magpend_core.models.parameters import Parameters
 from pipeline.layout.vocabulary import model_attribute, model_of
+from pipeline.products.measured import WINDOW_S
 from pipeline.rig.edges import DRIVE, Edges, edges_of
 from pipeline.rig.measured.phase import section_phase
-from pipeline.rig.measured.recorded_sections import ORDER, WINDOW_S, find_sections, name_of
+from pipeline.rig.measured.recorded_sections import ORDER, find_sections, name_of
 from pipeline.rig.measured.steps import constant_spans
 from pipeline.specification.problems import SpecError
 

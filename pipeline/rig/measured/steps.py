@@ -8,13 +8,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
+from pipeline.products.measured import TRANSIENT
 from pipeline.rig.edges import Edges, Timing
 from pipeline.specification.problems import SpecError
 
 Floats = npt.NDArray[np.float64]
 
-TRANSIENT, WINDOW, LEAST = 20, 40, 8
-"""Default numbers of periods: dropped after a step; in a window of a slow sweep; at least in a stretch."""
+WINDOW, LEAST = 40, 8
+"""Default numbers of periods: in a window of a slow sweep; at least in a stretch."""
 _OFF = 5.0
 """Deviation from the line through earlier edges, in standard deviations, that marks a step.
 

@@ -8,17 +8,18 @@ import xarray as xr
 
 from magpend_core.sections import run_branches
 from pipeline.plots.files import save_data, save_figure
+from pipeline.products.measured import SweepOptions
 from pipeline.rig.measured.compare import compare, compare_with
 from pipeline.rig.measured.computed import Computed
 from pipeline.rig.measured.figures import plot_comparison, plot_measured
-from pipeline.rig.measured.measuring import Way, measure
+from pipeline.rig.measured.measuring import measure
 from pipeline.rig.measured.tables import edges_table, steps_table, summary_lines
 from pipeline.runs.derive import AnalysedRun
 from pipeline.specification.problems import SpecError
 
 SWEPT = np.array([2.46, 2.48, 2.5, 2.52, 2.54])
 LEFT, RIGHT = 1, 2
-WAY = Way(transient=60)
+WAY = SweepOptions(transient=60)
 
 
 @pytest.fixture(scope="module")

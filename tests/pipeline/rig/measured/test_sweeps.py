@@ -9,7 +9,8 @@ import pytest
 
 from magpend_core.models import load_model
 from magpend_core.sections import run_branches
-from pipeline.rig.measured.measuring import Way, measure
+from pipeline.products.measured import SweepOptions
+from pipeline.rig.measured.measuring import measure
 from pipeline.rig.measured.overlays import plot_series
 from pipeline.rig.measured.phase import section_phase
 from pipeline.rig.measured.series import series_of
@@ -47,7 +48,9 @@ def test_measure__a_drive_that_truly_jitters_hides_no_period(pendulum, record_st
     for f in (2.46, 2.48, 2.54, 2.56):
         edges = np.arange(151) / f + rng.normal(0, 5e-4, 151)
         steps += [(1 / d, 1) for d in np.diff(edges)]
-    found = measure([record_steps(pendulum, steps, RIGHT)[0]], Way(transient=80, window=0), parameters=pendulum)
+    found = measure(
+        [record_steps(pendulum, steps, RIGHT)[0]], SweepOptions(transient=80, window=0), parameters=pendulum
+    )
     np.testing.assert_allclose(found["frequency"].values, [2.46, 2.48, 2.54, 2.56], atol=3e-4)
     # the edges' own scatter and that of sampling
     np.testing.assert_allclose(found["jitter_s"].values, np.hypot(5e-4, 1e-3 / np.sqrt(12)), rtol=0.2)
@@ -71,7 +74,7 @@ def test_measure__sections_of_another_model_are_where_it_takes_them():
     times = np.arange(0.0, sum(s.duration_s for s in steps) - 0.02, 0.02)
     sensors = {"x": Sensor(noise=1e-3), "drive": DriveSensor("torque", 1e-3)}
     ds = record(parameters, steps, [0.1, 0.0], times, sensors=sensors, seed=3)
-    found = measure([ds], Way(transient=45, window_s=0.8), parameters=parameters)
+    found = measure([ds], SweepOptions(transient=45, window_s=0.8), parameters=parameters)
     assert "side" not in found
     np.testing.assert_allclose(found["frequency"].values, [0.16, 0.18, 0.2], rtol=1e-4)
     assert found["orbit_period"].values.tolist() == [1, 1, 1]

@@ -1,0 +1,51 @@
+"""Define the options of measured diagrams: how recorded sweeps are cut, sectioned, judged and drawn."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pipeline.products.product import Options, option
+
+TRANSIENT, WINDOW_S, MAX_PERIOD = 20, 0.08, 16
+
+
+class SweepOptions(Options):
+    """Options for cutting, sectioning and judging recorded sweeps."""
+
+    transient: int = option(TRANSIENT, "Drive periods dropped after each step of the frequency.", ge=0)
+    window: int | None = option(
+        None, "Drive periods of a window of a slow sweep; by default detected; 0 takes steps only.", ge=0
+    )
+    window_s: float = option(WINDOW_S, "Width of the polynomials' window about an edge.", unit="s", gt=0.0)
+    hysteresis: float | None = option(
+        None, "Band about the drive's middle that an edge must cross, in its unit.", gt=0.0
+    )
+    max_period: int = option(MAX_PERIOD, "Longest orbit period that is detected.", unit="drive periods", ge=1)
+
+
+class ComparisonOptions(SweepOptions):
+    """Options of the comparison of a measured sweep with a run, and of its figures."""
+
+    state: str = option("", "State to draw; by default the first measured one.")
+    degrees: bool = option(False, "Use degrees instead of radians.")
+    width: float = option(178.0, "Width of the figure; 85 is a journal's column.", unit="mm", gt=0.0)
+    at: dict[str, float] = option({}, "Value of another axis of the run.")
+
+
+class DiagramOptions(ComparisonOptions):
+    """Options of the measured diagram, alone or with a computed one."""
+
+    layout: Literal["side", "over"] = option("side", "Draw the computed diagram beside the measured one, or under it.")
+
+
+class SeriesOptions(Options):
+    """Options of a recording beside the model's motion from the same state."""
+
+    start_s: float | None = option(None, "Start at the first rising edge from this time on.", unit="s")
+    periods: int = option(10, "Number of drive periods.", ge=1)
+    window_s: float = option(WINDOW_S, "Width of the polynomials' window about an edge.", unit="s", gt=0.0)
+    hysteresis: float | None = option(
+        None, "Band about the drive's middle that an edge must cross, in its unit.", gt=0.0
+    )
+    degrees: bool = option(False, "Use degrees instead of radians.")
+    width: float = option(178.0, "Width of the figure; 85 is a journal's column.", unit="mm", gt=0.0)
