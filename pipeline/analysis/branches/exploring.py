@@ -32,11 +32,12 @@ GUESS = 0.05
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """A starting orbit: its family, a section point, the parameter's value."""
+    """A starting orbit: its family, a section point, the parameter's value, the attractor's id (-1: none)."""
 
     family: Family
     state: np.ndarray
     value: float
+    attractor: int = -1
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,15 +85,40 @@ def explore(starts: Sequence[Start], scope: Scope) -> list[Branch]:
 
 
 def _follow_starts(starts: Sequence[Start], branches: list[Branch], scope: Scope) -> None:
-    """Append the branches of starts that lie on no branch yet, one parameter value at a time."""
-    for value in dict.fromkeys(start.value for start in starts):
-        group = [s for s in starts if s.value == value and s.family.period <= scope.max_period]
-        known = _lie_on(group, branches)
-        group = [s for s, is_known in zip(group, known, strict=True) if not is_known]
-        what = f"{FOLLOWING} from {value:g}"
-        for start, branch in zip(group, _both_ways(group, scope, what), strict=True):
-            if branch is not None and not _lie_on([start], branches)[0]:
-                branches.append(branch)
+    """Append the branches of starts that lie on no branch yet, in the order of the parameter values.
+
+    When a start is followed, so are the others at its value, and the first start of each other attractor, on
+    lanes that would be idle. Most of these are needed later; one that turns out to lie on a known branch is
+    dropped.
+    """
+    values = {value: i for i, value in enumerate(dict.fromkeys(start.value for start in starts))}
+    starts = [s for s in starts if s.family.period <= scope.max_period]
+    starts.sort(key=lambda start: values[start.value])
+    followed: dict[int, Branch | None] = {}
+    is_known, n_compared = np.zeros(len(starts), bool), 0
+    for i, start in enumerate(starts):
+        if n_compared < len(branches):
+            rest = i + np.flatnonzero(~is_known[i:])
+            is_known[rest] = _lie_on([starts[k] for k in rest], branches[n_compared:])
+            n_compared = len(branches)
+        if is_known[i]:
+            continue
+        if i not in followed:
+            here = [k for k in range(i, len(starts)) if starts[k].value == start.value and not is_known[k]]
+            here += _first_of_each(starts, {*followed, *here})
+            what = f"{FOLLOWING} from {start.value:g}"
+            followed |= zip(here, _both_ways([starts[k] for k in here], scope, what), strict=True)
+        branch = followed[i]
+        if branch is not None:
+            branches.append(branch)
+
+
+def _first_of_each(starts: Sequence[Start], followed: set[int]) -> list[int]:
+    """Return the first start of each attractor and period of which no start was followed."""
+    kinds = [(start.attractor, start.family.period) for start in starts]
+    done = {kinds[i] for i in followed}
+    firsts = {kind: i for i, kind in reversed(list(enumerate(kinds))) if kind[0] >= 0 and kind not in done}
+    return sorted(firsts.values())
 
 
 def _both_ways(starts: Sequence[Start], scope: Scope, what: str) -> list[Branch | None]:

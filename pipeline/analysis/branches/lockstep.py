@@ -79,19 +79,20 @@ def run_alone(computation: Steps[T]) -> T:
 
 
 def _evaluate(queries: Sequence[Query]) -> list[Value]:
-    rows = [q.problem.rows(q.u) for q in queries]
-    ends: list[Ends | None] = [None] * len(rows)
-    for chosen in _calls([q.problem.system for q in queries]):
-        system = queries[chosen[0]].problem.system
-        for i, found in zip(chosen, _integrate([rows[i] for i in chosen], system), strict=True):
-            ends[i] = found
-    return [q.problem.value(q.u, e) for q, e in zip(queries, ends, strict=True) if e is not None]
+    values: list[Value | None] = [None] * len(queries)
+    while open_ones := [i for i, value in enumerate(values) if value is None]:
+        rows = {i: queries[i].problem.rows(queries[i].u) for i in open_ones}
+        for chosen in _calls([(i, queries[i].problem.system) for i in open_ones]):
+            system = queries[chosen[0]].problem.system
+            for i, ends in zip(chosen, _integrate([rows[i] for i in chosen], system), strict=True):
+                values[i] = queries[i].problem.value(queries[i].u, ends)
+    return [value for value in values if value is not None]
 
 
-def _calls(systems: Sequence[System]) -> list[list[int]]:
+def _calls(systems: Sequence[tuple[int, System]]) -> list[list[int]]:
     """Group queries into calls, by system."""
     by_system: dict[str, list[int]] = {}
-    for i, system in enumerate(systems):
+    for i, system in systems:
         by_system.setdefault(system.label, []).append(i)
     return list(by_system.values())
 
@@ -108,6 +109,6 @@ def _integrate(rows: Sequence[Rows], system: System) -> list[Ends]:
     found, first = [], 0
     for r in rows:
         own = slice(first, first + len(r.states))
-        found.append(Ends(ends.images[own, : r.period], ends.derivatives[own], ends.times[own, : r.period]))
+        found.append(Ends(r.states, ends.images[own, : r.period], ends.derivatives[own], ends.times[own, : r.period]))
         first += len(r.states)
     return found

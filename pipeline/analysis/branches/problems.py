@@ -8,7 +8,7 @@ the trajectories of many problems run in one call of the engine (see `lockstep`)
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from itertools import combinations
 from typing import Protocol
 
@@ -28,8 +28,18 @@ Neighbouring trajectories take the same steps, so that differences of the map ar
 from 1e-4 to 1e-7 the differences by the frequency agree to 1e-8.
 """
 
+ONE_SIDED_STEP = 1e-7
+"""Step of one-sided differences of an orbit by a parameter: its slope needs seven digits for Newton's method."""
+
 STATE_STEP = 1e-6
 """Step of central differences of the monodromy matrix, in units of the system's scales."""
+
+
+SMALL_GAP, SMALL_RESIDUAL = 1e-9, 1e-8
+"""Largest gap between the periods of an orbit whose residual is small: its multipliers are wanted to nine digits."""
+
+WIDEST_GAP, MOST_TRIES = 0.05, 6
+"""Gap, and number of tries, beyond which an orbit is integrated as a whole."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +48,8 @@ class Ends:
 
     Attributes
     ----------
+    starts : ndarray, (m, n_states)
+        Where they began.
     images : ndarray, (m, period, n_states)
         Sections after 1, 2, ... drive periods or returns.
     monodromy : ndarray, (m, n_states, n_states)
@@ -46,6 +58,7 @@ class Ends:
         How long each took [s].
     """
 
+    starts: np.ndarray
     images: np.ndarray
     monodromy: np.ndarray
     times: np.ndarray
@@ -94,8 +107,8 @@ class Problem(Protocol):
     def rows(self, u: np.ndarray) -> Rows:
         """Return the trajectories that the value at `u` needs."""
 
-    def value(self, u: np.ndarray, ends: Ends) -> Value:
-        """Compute F and its derivative from the trajectories' ends."""
+    def value(self, u: np.ndarray, ends: Ends) -> Value | None:
+        """Compute F and its derivative from the trajectories' ends; None to ask for other trajectories."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,10 +181,31 @@ class Family:
 
 
 @dataclass(frozen=True, eq=False)
+class _Segments:
+    """Section points (period, n_states) of an orbit at `u`, scaled, and their derivatives by the unknowns."""
+
+    u: np.ndarray
+    points: np.ndarray
+    slopes: np.ndarray
+
+    def at(self, u: np.ndarray) -> np.ndarray:
+        """Return the points at other unknowns, to first order; the first one is exact."""
+        return np.asarray(self.points + self.slopes @ (u - self.u))
+
+
+@dataclass(eq=False)
 class OrbitProblem:
-    """Fixed points of the p-fold stroboscopic or return map, with one free parameter."""
+    """Fixed points of the p-fold stroboscopic or return map, with one free parameter.
+
+    An orbit of several periods is evaluated by multiple shooting: all its periods are integrated side by side,
+    on lanes that would be idle, from the section points that the last evaluation predicts. Where these miss
+    the images of the periods before by too much, they are put there and integrated again (see
+    `_is_joined`). A problem serves one computation: it remembers the last orbit.
+    """
 
     family: Family
+    _known: _Segments | None = field(default=None, init=False, repr=False)
+    _tries: int = field(default=0, init=False, repr=False)
 
     @property
     def size(self) -> int:
@@ -184,19 +218,78 @@ class OrbitProblem:
         return self.family.system
 
     def rows(self, u: np.ndarray) -> Rows:
-        """Return the trajectories of the orbit and of its two neighbours in the parameter."""
+        """Return the trajectories of the orbit, or of each of its periods, and of a neighbour in the parameter."""
         step = np.zeros(self.size)
-        step[-1] = PARAMETER_STEP
-        return self.family.rows(np.stack([u, u + step, u - step]))
+        step[-1] = ONE_SIDED_STEP
+        if self._known is None:
+            return self.family.rows(np.stack([u, u + step]))
+        points = self._known.at(u)
+        own = np.column_stack([points, np.full(len(points), u[-1])])
+        return replace(self.family.rows(np.concatenate([own, own + step])), period=1)
 
-    def value(self, u: np.ndarray, ends: Ends) -> Value:
-        """Compute the mismatch after the period, and its derivative."""
+    def value(self, u: np.ndarray, ends: Ends) -> Value | None:
+        """Compute the mismatch after the period, and its derivative; None to ask for other trajectories."""
+        is_whole = ends.images.shape[1] == self.family.period
+        return self._of_whole(u, ends) if is_whole else self._of_segments(u, ends)
+
+    def _of_whole(self, u: np.ndarray, ends: Ends) -> Value | None:
         n = self.size - 1
         last = [self.family.mismatch(u, image) for image in ends.images[:, -1]]
-        slope = _wrapped(last[1] - last[2], self.family) / (2.0 * PARAMETER_STEP)
+        slope = _wrapped(last[1] - last[0], self.family) / ONE_SIDED_STEP
         matrix = self.family.scaled(ends.monodromy[0]) - np.eye(n)
         derivative = np.column_stack([matrix, slope])
-        return Value(last[0], derivative, ends.images[0], ends.monodromy[0], float(ends.times[0].sum()))
+        found = Value(last[0], derivative, ends.images[0], ends.monodromy[0], float(ends.times[0].sum()))
+        if self.family.period == 1 or not found.is_finite or self._tries == MOST_TRIES:
+            self._tries = 0
+            return found
+        points = np.concatenate([u[None, :n], ends.images[0, :-1] / np.asarray(self.system.scales)])
+        self._known = _Segments(u, points, np.zeros((len(points), n, n + 1)))
+        return None
+
+    def _of_segments(self, u: np.ndarray, ends: Ends) -> Value | None:
+        """Put the periods together: images, derivatives and the mismatch follow from period to period."""
+        n, scales = self.size - 1, np.asarray(self.system.scales)
+        starts = np.split(ends.starts / scales, 2)[0]
+        images, beside = np.split(ends.images[:, 0], 2)
+        slopes = _wrapped((beside - images) / scales, self.family) / ONE_SIDED_STEP
+        here, by_u, gap = u[:n], np.eye(n, n + 1), 0.0
+        points, by_unknowns = [here], [by_u]
+        for start, image, monodromy, slope in zip(starts, images, ends.monodromy, slopes, strict=False):
+            away, one = _wrapped(here - start, self.family), self.family.scaled(monodromy)
+            gap = max(gap, float(np.abs(away).max()))
+            here, by_u = image / scales + one @ away, one @ by_u
+            by_u[:, -1] += slope
+            points.append(here)
+            by_unknowns.append(by_u)
+        derivative = by_u - np.eye(n, n + 1)
+        product = by_u[:, :n] * scales[:, None] / scales
+        found = Value(
+            _wrapped(here - u[:n], self.family),
+            derivative,
+            wrap_angles(np.array(points[1:]) * scales, self.system),
+            product,
+            float(ends.times[: len(starts), 0].sum()),
+        )
+        self._tries += 1
+        self._known = _Segments(u, np.array(points[:-1]), np.array(by_unknowns[:-1]))
+        residual = float(np.abs(found.residual).max())
+        if found.is_finite and _is_joined(gap, residual):
+            self._tries = 0
+            return found
+        if not found.is_finite or gap > WIDEST_GAP or self._tries >= MOST_TRIES:
+            self._known, self._tries = None, MOST_TRIES  # as a whole, this once
+        return None
+
+
+def _is_joined(gap: float, residual: float) -> bool:
+    """Return whether the gaps between periods are small enough beside the residual.
+
+    F errs by the square of the gap, the derivative by the gap. Far from the solution Newton's method needs
+    neither to be exact.
+    """
+    if residual <= SMALL_RESIDUAL:
+        return gap <= SMALL_GAP
+    return gap <= 1e-3 and gap * gap <= 1e-2 * residual
 
 
 def _wrapped(difference: np.ndarray, family: Family) -> np.ndarray:

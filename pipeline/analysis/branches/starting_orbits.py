@@ -55,7 +55,7 @@ def listed(attractors: xr.Dataset, parameters: Parameters, parameter: str, scale
             if int(one["is_polished"]) and period >= 1:
                 family = family_of(parameters.model.system, period, frequency, packed, parameter, scale)
                 state = np.asarray(one["attractor_points"].values[0])
-                start = Start(family, state, value_of(family, frequency, packed))
+                start = Start(family, state, value_of(family, frequency, packed), int(i))
             yield Listed(int(i), where, period, start, kind == EQUILIBRIUM, kind == PERIODIC_ORBIT and not period)
 
 

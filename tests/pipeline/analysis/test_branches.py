@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -22,7 +24,7 @@ from pipeline.analysis.branches.bifurcations import Bifurcation, multipliers_of,
 from pipeline.analysis.branches.curves import continue_curves
 from pipeline.analysis.branches.exploring import _cross
 from pipeline.analysis.branches.following import first_point
-from pipeline.analysis.branches.lockstep import run_alone, run_together
+from pipeline.analysis.branches.lockstep import Query, run_alone, run_together
 from pipeline.analysis.branches.problems import Family, OrbitProblem, Value, doubling_test, fold_test, torus_test
 from pipeline.analysis.branches.table import branches_table
 from pipeline.layout.vocabulary import BOUNDED_SET, PERIODIC_ORBIT
@@ -441,16 +443,73 @@ def test_orbits_near__chaotic_well():
 def test_run_together__same_bits():
     """Values do not depend on what else is computed, nor on the periods beside."""
     settings = Settings()
-    problems = [
-        (OrbitProblem(o), o.unknowns(np.array([0.4, 0.1]), [0.1]))
-        for o in (family(0.1, [0.1, 0, 1.0, 1.0, 0.3], "frequency", 0.3, period=p) for p in (1, 2, 3))
-    ]
-    alone = [run_alone(first_point(p, u, settings)) for p, u in problems]
+    orbits = [family(0.1, [0.1, 0, 1.0, 1.0, 0.3], "frequency", 0.3, period=p) for p in (1, 2, 3)]
+
+    def corrected(o):
+        return first_point(OrbitProblem(o), o.unknowns(np.array([0.4, 0.1]), [0.1]), settings)
+
+    alone = [run_alone(corrected(o)) for o in orbits]
     for count in (3, 9):
-        together = run_together([first_point(p, u, settings) for p, u in problems * (count // 3)])
+        together = run_together([corrected(o) for o in orbits * (count // 3)])
         for a, b in zip(alone * (count // 3), together, strict=True):
             np.testing.assert_array_equal(a.u, b.u)
             np.testing.assert_array_equal(a.value.monodromy, b.value.monodromy)
+
+
+def evaluated(problem, u):
+    value = yield Query(problem, u)
+    return value
+
+
+def test_orbit_problem__periods_side_by_side_are_the_whole_orbit():
+    """Three periods from a point that is on no orbit: image, monodromy matrix and slope are scipy's."""
+    parameters = [0.1, 0.0, 1.0, 1.0, 0.3]
+    orbits = family(0.2, parameters, "amplitude", 0.5, period=3)
+    problem = OrbitProblem(orbits)
+
+    def by_scipy(state, amplitude):
+        matrix = np.eye(2)
+        for _ in range(3):
+            state, one = flow(state, 0.2, [*parameters[:4], amplitude])
+            matrix = one @ matrix
+        return state, matrix
+
+    for x, amplitude in ((0.4, 0.3), (0.401, 0.3), (0.43, 0.32), (-0.6, 0.2)):
+        state, step = np.array([x, 0.1]), 1e-5
+        u = orbits.unknowns(state, [amplitude])
+        value = run_alone(evaluated(problem, u))
+        image, monodromy = by_scipy(state, amplitude)
+        above, below = (by_scipy(state, amplitude + d)[0] for d in (step, -step))
+        np.testing.assert_allclose(value.images[-1], image, atol=1e-9)
+        np.testing.assert_allclose(value.residual, image - state, atol=1e-9)
+        # off a solution the derivative may err by the gaps between the periods
+        np.testing.assert_allclose(value.monodromy, monodromy, atol=1e-4)
+        # a difference over 1e-7 of a map that is known to 1e-12
+        np.testing.assert_allclose(value.derivative[:, 2], 0.5 * (above - below) / (2.0 * step), atol=1e-4)
+        assert value.seconds == pytest.approx(15.0)
+        assert problem.rows(u).period == (1 if x > 0.0 else 3)  # the last one is too far from the one before
+    start = orbits.unknowns(settled([0.4, 0.1], 0.2, parameters), [0.3])
+    closed = run_alone(first_point(problem, start, Settings()))
+    image, monodromy = by_scipy(orbits.state(closed.u), 0.3)
+    np.testing.assert_allclose(closed.value.images[-1], image, atol=1e-9)
+    np.testing.assert_allclose(closed.value.monodromy, monodromy, atol=1e-8)
+
+
+def test_explore__followed_ahead(resonance):
+    """The first starts of other attractors are followed beside; the branches are those without this."""
+    orbits, branch = resonance
+    starts = [
+        Start(orbits, orbits.state(branch.points[i].u), float(branch.values[i]), attractor)
+        for i, attractor in ((3, 0), (9, 0), (12, 1), (20, 2))
+    ]
+    scope = Scope(0.1, 0.4, settings=Settings(longest_step=0.03))
+    ahead, alone = (
+        explore([replace(s, attractor=a(s)) for s in starts], scope) for a in (lambda s: s.attractor, lambda s: -1)
+    )
+    assert len(ahead) == len(alone) == 1
+    assert len(ahead[0].points) > 20
+    for a, b in zip(ahead[0].points, alone[0].points, strict=True):
+        np.testing.assert_array_equal(a.u, b.u)
 
 
 def test_watch__neutral_saddle():

@@ -205,9 +205,9 @@ def test_extend__cells_under_the_same_recording(recorded, tmp_path, bytes_of, mo
     calls = []
     original = branches.under_recording
 
-    def counted(drive, inputs, **options):
+    def counted(drive, inputs, *how):
         calls.append(len(inputs.initial_states))
-        return original(drive, inputs, **options)
+        return original(drive, inputs, *how)
 
     monkeypatch.setattr(branches, "under_recording", counted)
     monkeypatch.setattr(task, "warm_up", lambda spec: 0.0)

@@ -102,7 +102,7 @@ def test_measured_series__prints_how_far_off_it_is(main, files, tmp_path):
         ({"more": ("--transient", 500)}, "lower transient"),
         ({"more": ("--window-s", 0.002)}, "window_s = 0.002"),
         ({"more": ("--window", 3)}, "window = 3"),
-        ({"more": ("--max-period", 0)}, "--max-period 0"),
+        ({"more": ("--max-period", 0)}, "max_period = 0"),
         ({"recording": "gone.tdms"}, "gone.tdms"),
         ({"more": ("--csv", "/nowhere/at/all.csv")}, "--csv"),
     ],
