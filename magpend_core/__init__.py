@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from magpend_core.crossing import Crossing
     from magpend_core.lyapunov import LyapunovExponents, lyapunov_exponents
     from magpend_core.models import ModelError, load_model, load_preset, model_names, preset_names, preset_provenance
-    from magpend_core.models.model import Model
-    from magpend_core.models.parameters import ParameterError, Parameters
+    from magpend_core.models.model import Model, Parameters
+    from magpend_core.models.parameters import ParameterError
     from magpend_core.models.pendulum.mechanics import Torques, accelerations, energy, torques
     from magpend_core.orbits import PeriodicOrbits, polish_orbits
     from magpend_core.pointwise import evaluate, jacobian, rates
@@ -60,8 +60,8 @@ _HOMES = {
     "lyapunov": ("LyapunovExponents", "lyapunov_exponents"),
     "source_digests": ("kernel_version",),
     "models": ("ModelError", "load_model", "load_preset", "model_names", "preset_names", "preset_provenance"),
-    "models.model": ("Model",),
-    "models.parameters": ("ParameterError", "Parameters"),
+    "models.model": ("Model", "Parameters"),
+    "models.parameters": ("ParameterError",),
     "models.pendulum.mechanics": ("Torques", "accelerations", "energy", "torques"),
     "orbits": ("PeriodicOrbits", "polish_orbits"),
     "pointwise": ("evaluate", "jacobian", "rates"),

@@ -15,7 +15,7 @@ from magpend_core.engine.jit import bound_part, entry, keeping
 from magpend_core.engine.modes import mode_bindings
 from magpend_core.engine.simd import WIDTH, load, load_rows, store_rows
 from magpend_core.engine.system import System
-from magpend_core.models.parameters import Parameters
+from magpend_core.models.model import Parameters
 from magpend_core.validation import check_frequency, check_states, check_times
 
 

@@ -19,7 +19,7 @@ from magpend_core.engine.lanes import Cells
 from magpend_core.engine.observers import FIRST_TURN, RECORD, Settings
 from magpend_core.engine.system import System
 from magpend_core.extension import judge_of
-from magpend_core.models.parameters import Parameters
+from magpend_core.models.model import Parameters
 from magpend_core.pointwise import evaluate_packed
 from magpend_core.sampling import Drive, sample
 from magpend_core.sections import Sections
@@ -36,7 +36,7 @@ def driven_system(system: System, drive: Drive) -> System:
 
 
 def _padded(packed: np.ndarray, system: System) -> np.ndarray:
-    """Return parameters with room for those that the recorded drive sets."""
+    """Append zeros to packed parameters for the entries that the recorded drive sets."""
     more = len(system.parameter_names) - packed.shape[-1]
     return np.pad(packed, [(0, 0)] * (packed.ndim - 1) + [(0, more)])
 

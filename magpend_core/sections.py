@@ -13,7 +13,7 @@ from magpend_core.defaults import ATOL, CLOSURE, LONGEST_PERIOD, MOST_STEPS, RTO
 from magpend_core.engine.entry import N_LANES, integrate
 from magpend_core.engine.observers import FIRST_TURN, ORBIT_PERIOD, RECORD, Settings, window_of
 from magpend_core.engine.system import System
-from magpend_core.models.parameters import Parameters
+from magpend_core.models.model import Parameters
 from magpend_core.models.pendulum.systems import PENDULUM_FITTED
 from magpend_core.status import Status
 from magpend_core.validation import check_array, check_count, check_flag, check_frequency, check_states, check_tolerance

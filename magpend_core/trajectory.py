@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from magpend_core.defaults import ATOL, MOST_STEPS, RTOL
-from magpend_core.models.parameters import Parameters
+from magpend_core.models.model import Parameters
 from magpend_core.sampling import Drive, sample
 from magpend_core.status import Status
 from magpend_core.validation import check_array, check_count, check_frequency, check_states

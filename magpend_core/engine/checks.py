@@ -38,7 +38,7 @@ _NOT_RUN = object()
 
 
 class SystemCheckError(ValueError):
-    """A system is not what it says.
+    """A system's functions contradict its declaration.
 
     Attributes
     ----------
@@ -187,14 +187,14 @@ def _extremes(packed: np.ndarray, frequency: np.ndarray, checked: _Checked | Non
 
 
 class _Functions:
-    """The functions of a system as plain Python, and what is wrong with those that run once per cell."""
+    """A system's functions as plain Python, with the problems of those that run once per cell."""
 
     def __init__(self, system: System) -> None:
         self.system = system
         self.problems: list[str] = []
 
     def call(self, name: str, *arguments: Any) -> Any:
-        """Call a function; return `_NOT_RUN` if it cannot be run, and say so if that is its fault."""
+        """Call a function; return `_NOT_RUN`, and report a problem, if it raises."""
         function: Callable[..., Any] = plain(getattr(self.system, name))
         try:
             return function(*arguments)
@@ -391,7 +391,7 @@ class _Motion:
                 )
 
     def _check_jacobian(self, rates: np.ndarray) -> None:
-        """Compare with differences of two steps, whose own difference bounds their error."""
+        """Compare the Jacobian with differences of two step sizes; their difference bounds the error."""
         n, names = self.system.n_states, self.system.state_names
         what = "the derivatives of each rate by each state, row by row"
         if self.system.jacobian_entries is not None:

@@ -37,11 +37,11 @@ def code_length(function: Callable[..., Any]) -> int:
 
 
 class _UnknownError(Exception):
-    """Something that a function reaches cannot be followed."""
+    """A function refers to an object that has no digest."""
 
 
 def functions_digest(*functions: Callable[..., Any]) -> str | None:
-    """Return a digest of compiled functions and of all that they reach.
+    """Return a digest of compiled functions and of everything they refer to.
 
     It covers the bytecode, its constants, the compiler's options, default values, and each global and
     closed-over value that is looked up: other compiled functions in the same way; numbers, strings, tuples
@@ -138,7 +138,7 @@ def reached(function: Any, path: tuple[str, ...]) -> Any:
 
 
 def _found(value: Any, attributes: tuple[str, ...]) -> Any:
-    """What stands at the end of a path through modules."""
+    """Return the object at the end of a dotted path."""
     for name in attributes:
         if not isinstance(value, ModuleType):
             break

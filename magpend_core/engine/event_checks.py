@@ -52,7 +52,7 @@ def modes_at(system: System, times: np.ndarray, edges: np.ndarray) -> tuple[np.n
 
 
 def motion_problems(motion: Any, rates: np.ndarray) -> None:
-    """Add what is wrong with the functions of events at the samples of `checks._Motion`."""
+    """Append the problems of the event functions at the samples of `checks._Motion`."""
     system, functions = motion.system, motion.functions
     for name, n in (("switches", system.n_switches), ("impacts", system.n_impacts)):
         if n:

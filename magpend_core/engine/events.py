@@ -130,7 +130,9 @@ def event_bindings(system: System) -> dict[str, Any]:
 
 
 def cubic_dip(a: Any, da: Any, b: Any, db: Any) -> Any:
-    """Where in (0, 1) the cubic with values `a`, `b` and slopes `da`, `db` at the ends dips below 0, or 2."""
+    """Return the place in (0, 1) where a cubic dips below 0, or 2 if it does not; `a`, `b` are its end values, `da`,
+    `db` its slopes.
+    """
     c3 = 2.0 * (a - b) + (da + db)
     c2 = multiply_add(3.0, b - a, -(da + da) - db)
     square = multiply_add(c2, c2, (-3.0 * c3) * da)
@@ -274,7 +276,7 @@ def settle_events(w: Any, base: int, failed: Any) -> Any:
 
 
 def turn_sides(w: Any, base: int, accepted: Any, lands: Any) -> None:
-    """Turn the sides of events of which an accepted step ends beyond zero; note those that happened."""
+    """Turn the sides of the events that are beyond zero after an accepted step; mark the events as fired."""
     for k in range(N_EVENTS):
         row = base + k * WIDTH
         _, _, b, _ = margin(w, base, k, pair(w, base + ROWS.known, k), pair(w, base + ROWS.found, k))

@@ -10,7 +10,7 @@ from magpend_core.engine.system import System
 
 
 def places_of(system: System) -> Sequence[int]:
-    """Return the places, row by row, of the numbers that `system.jacobian` returns."""
+    """Return the (row, column) places of the entries that `system.jacobian` returns, row by row."""
     return range(system.n_states**2) if system.jacobian_entries is None else system.jacobian_entries
 
 
@@ -24,7 +24,7 @@ def rows_of_entries(system: System) -> list[dict[int, int]]:
 
 
 def whole_jacobian(system: System, entries: np.ndarray) -> np.ndarray:
-    """Return Jacobians (..., n_states, n_states) from what the function returns, shape (..., n_entries)."""
+    """Expand the returned entries (..., n_entries) to Jacobians (..., n_states, n_states)."""
     n, leading = system.n_states, entries.shape[:-1]
     whole = np.zeros((*leading, n * n))
     whole[..., list(places_of(system))] = entries

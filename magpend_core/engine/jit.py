@@ -117,7 +117,7 @@ class _Uncollected(event.Listener):
         self._lock, self._depth, self._resumes = threading.Lock(), 0, False
 
     def on_start(self, event: Any) -> None:
-        """Compilation begins, of a function or of one that it calls."""
+        """Report that the compilation of a function, or of its callee, begins."""
         with self._lock:
             if self._depth == 0:
                 self._resumes = gc.isenabled()
@@ -218,7 +218,7 @@ def _without_size(name: str, value: Any, names: set[str], sizes: dict[str, Any])
 def _template_digest(
     template: Callable[..., Any], used: Mapping[str, Any], dissolves: bool, names: set[str]
 ) -> str | None:
-    """Digest of what decides the code of a part; None for a template from outside the package.
+    """Return the digest of everything that determines a part's code; None for a template from outside the package.
 
     Compiled functions count as where they are found: they are linked, whatever they are.
     """
@@ -237,13 +237,14 @@ def _template_digest(
 
 
 def _names_in(code: CodeType) -> set[str]:
-    """Names that a function looks up, and those that functions within it do."""
+    """Return the global names that a function and its inner functions use."""
     within = (_names_in(c) for c in code.co_consts if isinstance(c, CodeType))
     return set(code.co_names).union(*within)
 
 
 def _identity(value: Any, names: set[str]) -> Any:
-    """What decides how a value is compiled: equal numbers of two types are two things.
+    """Return the identity of a value for compilation: its type and value, since equal numbers of two types compile
+    differently.
 
     Of a tuple with named fields it is the fields that are in `names`: they are looked up by name alone.
     """
@@ -264,7 +265,7 @@ def is_covered(*functions: Callable[..., Any]) -> bool:
 
 
 def keeping(*functions: Callable[..., Any]) -> str | None:
-    """Return under what the machine code of an entry point that calls `functions` is kept.
+    """Return the cache key of the machine code of an entry point that calls `functions`.
 
     Returns
     -------

@@ -139,7 +139,7 @@ class Rows(NamedTuple):
 
 
 def rows_of(system: System, n_watched: int = 0) -> Rows:
-    """Lay out a group for a system of which `n_watched` quantities are watched."""
+    """Lay out a group of a system with `n_watched` watched quantities."""
     n = system.n_events
     counts = [
         system.n_states,
@@ -712,7 +712,7 @@ def serve(cells: Cells, work: Work, lane: int, settings: Any, section: Any, scra
 
 
 def keep_time(w: Any, base: int, lane: int, memory: Any, out: Any) -> None:
-    """Write the time since the last section to the observer's memory, and to the row of the next to keep."""
+    """Write the time since the last section to the observer's memory and to the next kept row."""
     time = w[base + ROWS.time + lane]
     memory[len(memory) - 1] = time
     if n_kept(memory) < len(out):

@@ -35,7 +35,7 @@ def placeholder(name: str) -> int:
 
 
 class PartLibrary(FusedLibrary):
-    """LLVM code of one part: neither linked to what it calls, nor machine code."""
+    """LLVM code of one part, before it is linked and compiled to machine code."""
 
     dispatcher: Any = None
     symbol = ""
@@ -58,7 +58,7 @@ class PartLibrary(FusedLibrary):
         self.add_llvm_module(module)
 
     def finalize(self) -> None:
-        """Take in what is no part, such as numba's ``max``; the engine's library links the rest."""
+        """Link functions that are no parts, such as numba's ``max``; the engine's library links the parts."""
         own = _defined(self._final_module)
         for library in dict.fromkeys(self._linking_libraries):
             # the other library that is no part counts references, of which there are none here
@@ -78,7 +78,7 @@ class PartLibrary(FusedLibrary):
         return super()._get_module_for_linking()
 
     def _get_module_for_linking(self) -> Any:
-        """Return the code with all that it needs, for a function that numba compiles in its own way."""
+        """Return the code with its dependencies, for functions that numba compiles by its own rules."""
         if self._whole is None:
             self._whole = self.own_module().clone()
             _link(self._whole, self)
@@ -179,7 +179,7 @@ def _definitions(sizes: Mapping[str, Any]) -> str:
 
 
 def placeholder_of_array(name: str, array: np.ndarray) -> np.ndarray:
-    """Return the array that stands for one of the system's, of float64 or int64."""
+    """Return the placeholder of one of the system's arrays of float64 or int64."""
     return np.array([placeholder(name)]).view(array.dtype)
 
 

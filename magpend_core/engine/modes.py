@@ -310,7 +310,7 @@ def turn_switch(w: Any, base: int, lane: int, k: int) -> None:
 
 
 def vector_row(base: int, lane: int, j: int) -> int:
-    """Where vector number `j` of those that go through an impact begins: tangents, then unit vectors."""
+    """Return the first row of vector `j` among those that pass through an impact: tangents, then unit vectors."""
     if j < N_VECTORS:
         return base + ROWS.state + N_BASE * (1 + j) * WIDTH + lane
     return base + ROWS.slopes + N_BASE * (j - N_VECTORS) * WIDTH + lane
@@ -411,7 +411,7 @@ def jump(w: Any, base: int, lane: int, k: int) -> None:
 
 
 def act_on_events(w: Any, base: int, lane: int) -> bool:
-    """Do what the events ask for on which a lane's step has ended; return whether it is on a section."""
+    """Apply the events at which a lane's step has ended; return whether it is on a section."""
     on_section = False
     if HAS_SECTION:
         on_section = section_counts(w, base, lane)

@@ -21,7 +21,7 @@ class _PlainModule:
 
 
 def plain(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a compiled function as plain Python, down to what it calls.
+    """Return the plain Python of a compiled function and of its callees.
 
     Parameters
     ----------

@@ -219,7 +219,7 @@ class PartDispatcher(CPUDispatcher):
 
     @property
     def key(self) -> str | None:
-        """What the code is kept under; None if it is not."""
+        """Cache key of the code; None if the code is not cached."""
         if not self._identified:
             self._key, self._identified = self._identify(), True
         return self._key
@@ -239,7 +239,7 @@ class PartDispatcher(CPUDispatcher):
                 _COMPILED_NOW.pop()
 
     def add_overload(self, cres: Any) -> None:
-        """Take note of what was compiled, which Python cannot call."""
+        """Record a compiled signature; Python code cannot call it."""
         self.overloads[tuple(cres.signature.args)] = cres
         cres.library.symbol = cres.fndesc.mangled_name
         _OWNERS[cres.library] = tuple(cres.signature.args)
@@ -270,7 +270,7 @@ class PartCache:
         self.cache_path = None
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """Return what was compiled for a signature, None if nothing fits."""
+        """Return the cached code for a signature; None if there is none."""
         name = self._name(sig)
         if name is None:
             return None
@@ -291,7 +291,7 @@ class PartCache:
         return found
 
     def save_overload(self, sig: Any, cres: Any) -> None:
-        """Keep what was compiled, if it can be found again."""
+        """Write compiled code to the cache if it has a key."""
         name = self._name(sig)
         callees = self._callees(cres.library)
         if name is None or callees is None:

@@ -68,7 +68,7 @@ class Samples(NamedTuple):
 
 
 class Seats(NamedTuple):
-    """What each lane is at."""
+    """The trajectory, the next instant and the interval of each lane."""
 
     lanes: Any  # float64, the groups' rows
     before: Any  # float64: rows of each group's written states, then their first slopes, before the attempt
@@ -137,7 +137,7 @@ def begin_trajectory(samples: Samples, seats: Seats, lane: int, number: int, scr
 
 
 def remember(samples: Samples, w: Any, before: Any, clock: Any, group: int) -> None:
-    """Keep what the continuous extension needs and an accepted step overwrites."""
+    """Copy the numbers that the continuous extension needs before an accepted step overwrites them."""
     base = group * ROWS.size
     n_columns = len(samples.columns)
     kept = group * 2 * n_columns * WIDTH
@@ -214,7 +214,7 @@ def go_on(samples: Samples, seats: Seats, lane: int, scratch: Any) -> int:
 
 
 def end_trajectory(samples: Samples, seats: Seats, lane: int, status: int) -> None:
-    """Write how a trajectory ended; what it did not reach stays NaN."""
+    """Write the status of an ended trajectory; instants beyond its end stay NaN."""
     base, column = (lane // WIDTH) * ROWS.size, lane % WIDTH
     samples.status[seats.trajectory[lane]] = status
     samples.n_steps[seats.trajectory[lane]] = int(seats.lanes[base + ROWS.steps + column])
@@ -242,7 +242,7 @@ def copy_seat(seats: Seats, source: int, target: int) -> None:
 
 
 def seats_for(system: System, samples: Samples, n_lanes: int) -> Seats:
-    """Allocate what so many lanes work on."""
+    """Allocate the arrays of a number of lanes."""
     n_groups = -(-min(n_lanes, len(samples.piece)) // WIDTH)
     size, n = n_groups * WIDTH, system.n_states
     return Seats(

@@ -196,7 +196,7 @@ def upper(x: Any) -> Any:
 
 
 def inverse_sqrt_rough(x: Any) -> Any:
-    """One over the square root of a positive normal number, to 3.5 %."""
+    """Compute the inverse square root of a positive normal number to 3.5 %."""
     bits = np.int64(_INVERSE_ROOT) - (np.asarray(x, np.float64).view(np.int64) >> np.int64(1))
     return bits.view(np.float64)[()]
 

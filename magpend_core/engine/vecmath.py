@@ -150,7 +150,9 @@ def exp2_falling(x: Any) -> Any:
 
 @inline
 def _quarter_turns(x: Any) -> Any:
-    """Sine and cosine of what is left of `x` after whole quarter turns, and their number (shifted)."""
+    """Compute sine and cosine of the remainder of `x` after whole quarter turns, and the (shifted) number of these
+    turns.
+    """
     shifted = x * TWO_OVER_PI + _ROUND
     n = shifted - _ROUND
     r = (x - n * _PIO2_1) - n * _PIO2_2
@@ -378,7 +380,7 @@ def power(x: Any, y: Any) -> Any:
 
 @inline
 def inverse_sqrt(x: Any) -> Any:
-    """One over the square root; NaN of what is below 2.2e-308, 0 included; not finite for infinity.
+    """Compute the inverse square root; NaN below 2.2e-308, 0 included; not finite for infinity.
 
     A dozen products, where a root and a division keep the dividers busy for several times as long.
     """

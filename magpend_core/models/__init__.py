@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import copyreg
 import importlib
 import json
 from collections.abc import Mapping
@@ -12,11 +13,13 @@ from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
-from magpend_core.models import imported
+from magpend_core.crossing import Crossing
+from magpend_core.models import imported, model
 from magpend_core.models.imported import import_model as import_model
-from magpend_core.models.model import Model
+from magpend_core.models.model import Model, Parameters
 from magpend_core.models.model import ModelError as ModelError
-from magpend_core.models.parameters import ParameterError, Parameters, near_names
+from magpend_core.models.parameters import ParameterError, near_names
+from magpend_core.models.sectioned import sectioned
 
 DEFAULT = "pendulum"
 """The model of a specification that names none."""
@@ -157,3 +160,20 @@ def preset_provenance(name: str | None = None, model: str = DEFAULT) -> dict[str
     """
     known, preset = load_model(model).parameter_names, load_model(model).preset(name)
     return {n: phrase for n, phrase in preset.provenance.items() if n in known}
+
+
+def _reduced(parameters: Parameters) -> tuple[Any, ...]:
+    own = parameters.model
+    return _again, (own.reference, parameters.as_dict(), own.crossing)
+
+
+def _again(
+    reference: str | Mapping[str, Any], values: dict[str, float], crossing: Crossing | None = None
+) -> Parameters:
+    """Unpickle parameters: models are known by name, or by their text, and by their section."""
+    found = load_model(reference)
+    return Parameters(found if crossing is None else sectioned(found, crossing), values)
+
+
+copyreg.pickle(Parameters, _reduced)
+model.model_named = load_model

@@ -117,7 +117,7 @@ def _plain(one: Any) -> dict[str, Any]:
 
 @dataclass(frozen=True, eq=False)
 class DescribedModel(Model):
-    """A model of which the description alone is known: it names everything and integrates nothing."""
+    """A model known only by its description: it names its states and parameters, and cannot be integrated."""
 
     @cached_property
     def digest(self) -> str:
@@ -209,7 +209,7 @@ def _outer_problems(table: Mapping[str, Any]) -> list[str]:
 
 
 def _entries(kind: Any, table: Mapping[str, Any], key: str, problems: list[str]) -> tuple[Any, ...]:
-    """Read what a description says of states, parameters, ...: plain values of the right types."""
+    """Read the states, parameters, ... of a description as plain values of the right types."""
     found = []
     for name, entry in table[key].items():
         where = f"{key}.{name}"

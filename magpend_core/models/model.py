@@ -10,15 +10,15 @@ from __future__ import annotations
 import importlib
 import itertools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from magpend_core.models.parameters import Parameter, ParameterError, Parameters, near_names
+from magpend_core.models.parameters import Parameter, ParameterError, near_names, unknown_name_problem
 from magpend_core.models.presets import Preset as Preset
 from magpend_core.models.presets import completed, find_preset
 
@@ -29,6 +29,14 @@ if TYPE_CHECKING:
 
 class ModelError(ParameterError):
     """There is no model of this name, or what describes one does not hold together."""
+
+
+def _no_model(name: str) -> Model:
+    raise ModelError([f"model {name!r} does not exist."])
+
+
+model_named: Callable[[str], Model] = _no_model
+"""`magpend_core.models.load_model`. The package sets it, since it knows all models and imports this module."""
 
 
 @dataclass(frozen=True)
@@ -307,7 +315,7 @@ class Model:
         raise ParameterError([f"{name!r} is not a parameter of {self.name}; {hint}"])
 
     def preset(self, name: str | Path | Preset | None = None) -> Preset:
-        """Return a preset with all that it has values for.
+        """Return a preset with all values that it defines, those of its base included.
 
         Parameters
         ----------
@@ -324,7 +332,7 @@ class Model:
             return self.presets[0]
         found = name if isinstance(name, Preset) else find_preset(name)
         if isinstance(found, Preset):
-            return found if found in self.presets else completed(found, self)
+            return found if found in self.presets else completed(found, self, model_named)
         for p in self.presets:
             if p.name == found:
                 return p
@@ -349,3 +357,93 @@ class Model:
         values = self.preset(preset).values
         own = {name: values[name] for name in self.parameter_names if name in values}
         return Parameters(self, {**own, **overrides})
+
+
+class Parameters(Mapping[str, float]):
+    """The values of all parameters of a model; the drive's frequency is not one of them.
+
+    A mapping from names to values, in the order of `pack`; it cannot be changed. Make one with
+    `Model.load`.
+
+    Parameters
+    ----------
+    model
+        Whose parameters they are.
+    values
+        A value for every parameter.
+
+    Raises
+    ------
+    ParameterError
+        With all problems at once: missing and unknown names, values that are not numbers, NaN or infinite
+        values, values out of bounds, and what the model forbids between values.
+    """
+
+    __slots__ = ("_values", "model")
+
+    def __init__(self, model: Model, values: Mapping[str, Any]) -> None:
+        self.model = model
+        known = model.parameter_names
+        problems = [unknown_name_problem(n, known) for n in values if n not in known]
+        problems += [f"{n} has no value; give one." for n in known if n not in values]
+        problems += [
+            problem for p in model.parameters if p.name in values and (problem := p.problem(values[p.name])) is not None
+        ]
+        if not problems:
+            self._values = {name: float(values[name]) for name in known}
+            problems = list(model.relations(self._values))
+        if problems:
+            raise ParameterError(problems)
+
+    def __getitem__(self, name: str) -> float:
+        if name not in self._values:
+            raise KeyError(unknown_name_problem(name, self.names))
+        return self._values[name]
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._values
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._values)
+
+    def __len__(self) -> int:
+        return len(self._values)
+
+    def __hash__(self) -> int:
+        return hash((self.model.name, *self._values.values()))
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Parameters):
+            return NotImplemented
+        return self.model is other.model and self._values == other._values
+
+    def __repr__(self) -> str:
+        return f"Parameters({self.model.name}: {', '.join(f'{n}={v:g}' for n, v in self.items())})"
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Return the names of all parameters in the order of `pack`."""
+        return self.model.parameter_names
+
+    def as_dict(self) -> dict[str, float]:
+        """Return all values by name, in the order of `pack`."""
+        return dict(self._values)
+
+    def pack(self) -> np.ndarray:
+        """Return all values as a float64 vector of shape ``(len(names),)``, in the model's units."""
+        return np.array(list(self._values.values()), dtype=np.float64)
+
+    def replace(self, **overrides: float) -> Self:
+        """Return a copy with some values replaced.
+
+        Parameters
+        ----------
+        overrides
+            New values by parameter name.
+
+        Raises
+        ------
+        ParameterError
+            See the class.
+        """
+        return type(self)(self.model, {**self._values, **overrides})

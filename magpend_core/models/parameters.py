@@ -8,15 +8,14 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 if TYPE_CHECKING:
-    from magpend_core.crossing import Crossing
-    from magpend_core.models.model import Model
+    pass
 
 POSITIVE = "greater than 0"
 NON_NEGATIVE = "0 or greater"
@@ -89,105 +88,3 @@ def near_names(name: str, known: Iterable[str], what: str) -> str:
 def unknown_name_problem(name: str, known: Iterable[str]) -> str:
     """Return the sentence for an unknown parameter name, with the nearest known names."""
     return f"{name!r} is not a parameter; {near_names(name, known, 'names')}"
-
-
-class Parameters(Mapping[str, float]):
-    """Everything that a model needs besides the drive's frequency: a value for each of its parameters.
-
-    A mapping from names to values, in the order of `pack`; it cannot be changed. Make one with
-    `Model.load`.
-
-    Parameters
-    ----------
-    model
-        Whose parameters they are.
-    values
-        A value for every parameter.
-
-    Raises
-    ------
-    ParameterError
-        With all problems at once: missing and unknown names, values that are not numbers, NaN or infinite
-        values, values out of bounds, and what the model forbids between values.
-    """
-
-    __slots__ = ("_values", "model")
-
-    def __init__(self, model: Model, values: Mapping[str, Any]) -> None:
-        self.model = model
-        known = model.parameter_names
-        problems = [unknown_name_problem(n, known) for n in values if n not in known]
-        problems += [f"{n} has no value; give one." for n in known if n not in values]
-        problems += [
-            problem for p in model.parameters if p.name in values and (problem := p.problem(values[p.name])) is not None
-        ]
-        if not problems:
-            self._values = {name: float(values[name]) for name in known}
-            problems = list(model.relations(self._values))
-        if problems:
-            raise ParameterError(problems)
-
-    def __getitem__(self, name: str) -> float:
-        if name not in self._values:
-            raise KeyError(unknown_name_problem(name, self.names))
-        return self._values[name]
-
-    def __contains__(self, name: object) -> bool:
-        return name in self._values
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._values)
-
-    def __len__(self) -> int:
-        return len(self._values)
-
-    def __hash__(self) -> int:
-        return hash((self.model.name, *self._values.values()))
-
-    def __eq__(self, other: object) -> bool:
-        if not isinstance(other, Parameters):
-            return NotImplemented
-        return self.model is other.model and self._values == other._values
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return _again, (self.model.reference, self._values, self.model.crossing)
-
-    def __repr__(self) -> str:
-        return f"Parameters({self.model.name}: {', '.join(f'{n}={v:g}' for n, v in self.items())})"
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Return the names of all parameters in the order of `pack`."""
-        return self.model.parameter_names
-
-    def as_dict(self) -> dict[str, float]:
-        """Return all values by name, in the order of `pack`."""
-        return dict(self._values)
-
-    def pack(self) -> np.ndarray:
-        """Return all values as a float64 vector of shape ``(len(names),)``, in the model's units."""
-        return np.array(list(self._values.values()), dtype=np.float64)
-
-    def replace(self, **overrides: float) -> Self:
-        """Return a copy with some values replaced.
-
-        Parameters
-        ----------
-        overrides
-            New values by parameter name.
-
-        Raises
-        ------
-        ParameterError
-            See the class.
-        """
-        return type(self)(self.model, {**self._values, **overrides})
-
-
-def _again(model: str | Mapping[str, Any], values: dict[str, float], crossing: Crossing | None = None) -> Parameters:
-    """Unpickle: models are known by name, or by their text, and by the section that they are seen through."""
-    from magpend_core.models import load_model
-    from magpend_core.models.sectioned import sectioned
-
-    found = load_model(model)
-    return Parameters(found if crossing is None else sectioned(found, crossing), values)

@@ -17,18 +17,13 @@ Those that ship name no model: several models of a room share them.
 
 from __future__ import annotations
 
-import json
 import tomllib
-import uuid
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
-from magpend_core.models.parameters import ParameterError, near_names
-
-if TYPE_CHECKING:
-    from magpend_core.models.model import Model
+from magpend_core.models.parameters import Parameter, ParameterError, near_names
 
 SUFFIX = ".toml"
 KEYS = ("model", "base", "title")
@@ -118,7 +113,7 @@ def is_file(name: str | Path) -> bool:
 
 
 def find_preset(name: str | Path, folder: str | Path = ".") -> str | Preset:
-    """Return what `Model.load` takes for a preset as a person names it: a file is read.
+    """Convert a preset's name or file to the argument of `Model.load`; a file is read.
 
     Parameters
     ----------
@@ -135,7 +130,33 @@ def find_preset(name: str | Path, folder: str | Path = ".") -> str | Preset:
     return Preset.read(Path(folder) / name) if is_file(name) else str(name)
 
 
-def completed(preset: Preset, model: Model) -> Preset:
+class Owner(Protocol):
+    """The part of a `Model` that its presets need."""
+
+    @property
+    def name(self) -> str:
+        """Name of the model."""
+
+    @property
+    def presets(self) -> tuple[Preset, ...]:
+        """Presets that ship."""
+
+    @property
+    def preset_names(self) -> tuple[str, ...]:
+        """Names of the presets that ship."""
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """Names of the parameters."""
+
+    def preset(self, name: str) -> Preset:
+        """Return a preset by name."""
+
+    def parameter(self, name: str) -> Parameter:
+        """Return a parameter by name."""
+
+
+def completed(preset: Preset, model: Owner, model_named: Callable[[str], Owner]) -> Preset:
     """Return a preset with the values of its base, checked against the model that it is to serve.
 
     Raises
@@ -144,13 +165,11 @@ def completed(preset: Preset, model: Model) -> Preset:
         If it is of a model that shares no presets with this one, lacks a phrase of provenance, or has an
         unknown name, a value out of bounds or an unknown base; all problems at once.
     """
-    from magpend_core.models import load_model
-
     where = f"{preset.name}{SUFFIX}"
     if not preset.model:
         raise ParameterError([f'{where}: model: missing; add model = "{model.name}".'])
     try:
-        owner = model if preset.model == model.name else load_model(preset.model)
+        owner = model if preset.model == model.name else model_named(preset.model)
     except ParameterError as error:
         raise ParameterError([f"{where}: {p}" for p in error.problems]) from None
     if owner.presets != model.presets:
@@ -176,7 +195,7 @@ def completed(preset: Preset, model: Model) -> Preset:
     return Preset(preset.name, values, origin, preset.model, preset.base, preset.title)
 
 
-def value_problems(model: Model, values: Mapping[str, Any], sources: Mapping[str, str]) -> list[str]:
+def value_problems(model: Owner, values: Mapping[str, Any], sources: Mapping[str, str]) -> list[str]:
     """Return sentences on names, values and provenance that do not fit a model."""
     problems = []
     for name, value in values.items():
@@ -188,72 +207,3 @@ def value_problems(model: Model, values: Mapping[str, Any], sources: Mapping[str
         if not sources.get(name, "").strip():
             problems.append(f"{name}: has no provenance; say in [provenance] where the value comes from.")
     return problems
-
-
-def write_preset(
-    path: str | Path,
-    model: str | Model,
-    values: Mapping[str, float],
-    sources: Mapping[str, str],
-    title: str = "",
-    *,
-    base: str | Preset | None = None,
-) -> Path:
-    """Write a preset that specifications can name: ``preset = "FILE.toml"``.
-
-    Parameters
-    ----------
-    path
-        Ends in ``.toml``; written whole or not at all, over what was there.
-    model
-        The model, or the name of one that ships.
-    values
-        By parameter name, in the model's units; numbers that read back the same.
-    sources
-        Where each of `values` comes from, by its name.
-    title
-        What it is, in a line.
-    base
-        Has the values that `values` does not have: one that ships, by name, or one from a file, whose
-        values and sources are written with these; None if there are no others.
-
-    Raises
-    ------
-    ParameterError
-        As `Model.load` of what is written; nothing is written then.
-    """
-    from magpend_core.models import load_model
-
-    path = Path(path)
-    if path.suffix != SUFFIX:
-        raise ParameterError([f"{path}: the suffix must be {SUFFIX}."])
-    values = {name: float(value) for name, value in values.items()}
-    sources = {name: phrase for name, phrase in sources.items() if name in values}
-    shipped = base.name if isinstance(base, Preset) else base or ""
-    if isinstance(base, Preset) and base.model:  # from a file, which may be gone when this one is read
-        values, sources = {**base.values, **values}, {**base.provenance, **sources}
-        shipped = base.base
-    chosen = load_model(model)
-    preset = Preset(path.stem, values, sources, chosen.name, shipped, title)
-    chosen.load(preset)
-    whole = path.with_name(f".{path.name}.{uuid.uuid4().hex}")
-    with whole.open("x", encoding="utf-8") as file:
-        file.write(_text(preset, chosen))
-    whole.replace(path)
-    return path
-
-
-def _text(preset: Preset, model: Model) -> str:
-    lines = [f"{key} = {_quoted(getattr(preset, key))}" for key in KEYS if getattr(preset, key)]
-    ordered = [p for p in model.parameters if p.name in preset.values]
-    width = max((len(f"{p.name} = {preset.values[p.name]!r}") for p in ordered), default=0)
-    lines += ["", "[values]"]
-    lines += [f"{f'{p.name} = {preset.values[p.name]!r}':{width}}  # {p.unit}, {p.meaning}" for p in ordered]
-    lines += ["", "[provenance]"]
-    lines += [f"{p.name} = {_quoted(preset.provenance[p.name])}" for p in ordered]
-    return "\n".join(lines) + "\n"
-
-
-def _quoted(text: str) -> str:
-    # JSON escapes what TOML must have escaped, but for DEL
-    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from magpend_core.crossing import Crossing
-from magpend_core.models.model import Mirror, Model
-from magpend_core.models.parameters import Parameter, Parameters
+from magpend_core.models.model import Mirror, Model, Parameters
+from magpend_core.models.parameters import Parameter
 from magpend_core.models.presets import Preset
 from magpend_core.sizes import LEVEL
 

@@ -7,8 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from magpend_core.models.model import Model
-from magpend_core.models.parameters import Parameters
+from magpend_core.models.model import Model, Parameters
 
 
 def checks_of(model: Model) -> list[str]:
@@ -85,7 +84,7 @@ def _written(model: Model) -> tuple[dict[str, str], dict[str, str], list[str]]:
 
 
 def _found(parameters: Parameters, frequency_hz: float, states: np.ndarray) -> Iterator[str]:
-    """Sentences on what steps are chosen by."""
+    """Yield a sentence on each edge, layer, switch and impact that limits the steps."""
     from magpend_core.engine.plain_python import plain
     from magpend_core.models.text.model import TextModel
 

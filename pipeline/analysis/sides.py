@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from magpend_core.models.model import Classifier
-from magpend_core.models.parameters import Parameters
+from magpend_core.models.model import Classifier, Parameters
 from pipeline.layout.vocabulary import BOUNDED, FREQUENCY_DIM, INFERRED, PERIODIC, model_of, parameters_of
 
 UNKNOWN = 0

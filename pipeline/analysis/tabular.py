@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -25,6 +25,26 @@ def where_of(ds: xr.Dataset, at: Mapping[str, int]) -> Row:
 def words_of(array: xr.DataArray) -> list[str]:
     """Return the labels of an array of codes, in the order of the codes."""
     return str(array.attrs["flag_meanings"]).split()
+
+
+def labels(one: xr.Dataset, *names: str) -> Row:
+    """Return the labels of variables that hold a code each; those that are missing are left out."""
+    return {name: words_of(one[name])[int(one[name])] for name in names if name in one}
+
+
+def points_of(ds: xr.Dataset, dims: Sequence[str]) -> Iterator[tuple[dict[str, int], Row]]:
+    """Yield the parameter points: the indices by dim, and the parameter values."""
+    for index in np.ndindex(*(ds.sizes[d] for d in dims)):
+        at = dict(zip(dims, index, strict=True))
+        yield at, where_of(ds, at)
+
+
+def point_table(
+    ds: xr.Dataset, where: Row, rows: Sequence[Row], words: Callable[[Row], Mapping[str, str]]
+) -> list[str]:
+    """Return the lines of the table of one parameter point, with its heading."""
+    here = [row for row in rows if all(row[k] == v for k, v in where.items())]
+    return heading(ds, where) + aligned([words(row) for row in here])
 
 
 def unit_of(ds: xr.Dataset, dim: str) -> str:

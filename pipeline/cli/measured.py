@@ -20,8 +20,7 @@ from pipeline.cli.outputs import check_place
 if TYPE_CHECKING:
     import xarray as xr
 
-    from magpend_core.models.model import Model
-    from magpend_core.models.parameters import Parameters
+    from magpend_core.models.model import Model, Parameters
     from pipeline.rig.recordings import Mapping
 
 Recordings = Annotated[

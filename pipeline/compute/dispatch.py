@@ -157,7 +157,7 @@ class Window:
             fetch.add_done_callback(lambda fetched: self._news.put(("end", ticket, fetched.result())))
 
     def _wait(self) -> Iterator[tuple[str, int, Any]]:
-        """Wait for news for at most `TICK_S`, and yield all that have come."""
+        """Wait at most `TICK_S` for results, and yield those that have arrived."""
         with contextlib.suppress(queue.Empty):
             yield self._news.get(timeout=TICK_S)
             while True:
@@ -275,7 +275,7 @@ class Watch:
         return self.now - self._looked >= max(TICK_S, len(self._heard) / MOST_LOOKED_AT)
 
     def look(self, workers: dict[str, Any]) -> list[str]:
-        """Take what the scheduler knows of its workers, and return those that have fallen silent."""
+        """Read the scheduler's list of workers, and return those that do not answer any more."""
         now = self._looked = self.now
         self.n_threads = sum(w["nthreads"] for w in workers.values())
         heard = {}

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 
-from magpend_core import Sections, Status
+from magpend_core import Sections, Status, run_branches
 from magpend_core.engine.system import System
-from pipeline.compute.continuation import walk
 from pipeline.compute.recorded_drive import under_recording
 from pipeline.layout.cells import Inputs
 from pipeline.layout.schema import REST_STATE, base_variables
 from pipeline.products.product import function_of
 from pipeline.products.registry import CELL_PRODUCTS
 from pipeline.specification.parsing import Spec
+from pipeline.specification.tables import Integration
 
 
 @dataclass(frozen=True)
@@ -37,7 +38,7 @@ class Job:
 
     @property
     def system(self) -> System:
-        """What was integrated, by which method."""
+        """Integrated system, with the run's method."""
         return replace(self.spec.model.system, method=self.spec.integration.method)
 
 
@@ -54,6 +55,54 @@ def integrate(spec: Spec, inputs: Inputs) -> dict[str, np.ndarray]:
     for name, options in spec.products.items():
         values |= function_of(CELL_PRODUCTS[name].compute)(job, options)
     return values
+
+
+def walk(inputs: Inputs, system: System, integration: Integration, quantities: Sequence[str] | None) -> Sections:
+    """Integrate branches by `magpend_core.run_branches`; those that ended before are marked as unreached.
+
+    Parameters
+    ----------
+    inputs
+        The branches.
+    system
+        What is integrated.
+    integration
+        The table ``[integration]``.
+    quantities
+        Names of the quantities to watch.
+    """
+    alive = np.ones(len(inputs.initial_states), bool) if inputs.step_size is None else np.isfinite(inputs.step_size)
+    some = inputs.take(alive)
+    cells = run_branches(
+        some.parameters,
+        some.frequency_hz,
+        some.initial_states,
+        n_transient=integration.n_transient,
+        n_keep=integration.n_keep,
+        rtol=integration.rtol,
+        atol=integration.atol,
+        max_steps_per_period=integration.max_steps_per_period,
+        stop_when_closed=integration.stop_when_closed,
+        closure_tolerance=integration.closure_tolerance,
+        max_orbit_period=integration.max_orbit_period,
+        step_size=some.step_size,
+        system=replace(system, method=integration.method),
+        quantities=quantities,
+    )
+    if alive.all():
+        return cells
+    found: dict[str, Any] = {f.name: getattr(cells, f.name) for f in fields(cells)}
+    return Sections(**{name: _spread(name, array, alive) for name, array in found.items()})
+
+
+def _spread(name: str, found: Any, alive: np.ndarray) -> Any:
+    """Spread the results of living branches over all branches, with fill values for the others."""
+    if found is None:
+        return None
+    fill = int(Status.UNREACHED) if name == "status" else np.nan if found.dtype.kind == "f" else 0
+    whole = np.full((len(alive), *found.shape[1:]), fill, found.dtype)
+    whole[alive] = found
+    return whole
 
 
 def watched_quantities(spec: Spec) -> list[str] | None:

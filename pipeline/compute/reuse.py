@@ -167,7 +167,7 @@ class Pool:
         self.sources = [Source(run, spec) for run in runs]
 
     def count(self, inputs: Inputs, way: Way | None) -> list[int]:
-        """Return how many of some cells are taken from each source, as they begin and what they walk."""
+        """Count the cells that each source provides."""
         counts, rest = [], np.arange(len(inputs.initial_states))
         for source in self.sources:
             place = source.find(inputs.take(rest), way)

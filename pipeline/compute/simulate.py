@@ -28,7 +28,7 @@ from pipeline.specification.tables import FREQUENCY, Integration
 if TYPE_CHECKING:
     import xarray as xr
 
-    from magpend_core.models.parameters import Parameters
+    from magpend_core.models.model import Parameters
 
 SUFFIXES = (".csv", ".nc")
 MAX_SAMPLES = 100_000_000
@@ -131,7 +131,7 @@ def simulate(
 def _recording(
     drive: str | Path | None, frequency_hz: float | None, model: Model, series: Series, problems: list[str]
 ) -> RecordedDrive | None:
-    """Read the recorded drive, if there is one; add what is wrong with it, or with the frequency."""
+    """Read the recorded drive, if there is one; append problems with it or with the frequency."""
     if drive is None:
         if frequency_hz is None or not (math.isfinite(frequency_hz) and frequency_hz > 0):
             problems.append(f"frequency_hz = {frequency_hz!r}: must be a finite number greater than 0.")

@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from magpend_core.crossing import Crossing
 from magpend_core.models import DEFAULT, load_model
-from magpend_core.models.model import Model
-from magpend_core.models.parameters import Parameters
+from magpend_core.models.model import Model, Parameters
 from magpend_core.models.sectioned import sectioned
 from magpend_core.status import Status
 from pipeline.specification.tables import FREQUENCY
@@ -128,7 +127,7 @@ def section_attributes(crossing: Crossing | None) -> dict[str, Any]:
 
 
 def told_by(attrs: Mapping[Any, Any]) -> dict[str, Any]:
-    """Return a dataset's attributes that describe what was integrated: model, parameters, section."""
+    """Return the attributes of a dataset that describe the integration: model, parameters, section."""
     return {
         str(key): value
         for key, value in attrs.items()

@@ -160,7 +160,7 @@ def fixed_handles(drawing: Drawing, parameters: Mapping[str, float], shown: Coll
 
 
 def _near(fixed: Mapping[str, np.ndarray], place: np.ndarray) -> list[str]:
-    """Select fixed points near enough not to shrink the path: the nearest up to three times its size."""
+    """Select the fixed points near the path; farther ones would shrink it in the panel."""
     if not place.size:
         return list(fixed)
     size = max(float(np.ptp(place, axis=0).max()), 1e-12)

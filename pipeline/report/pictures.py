@@ -16,7 +16,7 @@ from pipeline.runs.drawing import figure
 from pipeline.specification.problems import SpecError
 
 if TYPE_CHECKING:
-    from magpend_core.models.parameters import Parameters
+    from magpend_core.models.model import Parameters
     from pipeline.plots.style import DataFigure
 
 _FINE = 2001

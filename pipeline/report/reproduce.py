@@ -94,7 +94,7 @@ def reproduce(
     workers: int | None = None,
     echo: Echo = print,
 ) -> Reproduced:
-    """Compute what is missing of a study, judge its claims and write its page.
+    """Compute the missing runs of a study, judge its claims and write its page.
 
     Parameters
     ----------

@@ -11,8 +11,8 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
-from magpend_core.models.model import Model
-from magpend_core.models.parameters import ParameterError, Parameters
+from magpend_core.models.model import Model, Parameters
+from magpend_core.models.parameters import ParameterError
 from magpend_core.models.presets import find_preset
 from pipeline.rig.recordings.mapping import DRIVE, Mapping, TimeMap
 from pipeline.rig.recordings.raw import Raw

@@ -24,7 +24,7 @@ from pipeline.specification.problems import SpecError, unknown_name
 if TYPE_CHECKING:
     import xarray as xr
 
-    from magpend_core.models.parameters import Parameters
+    from magpend_core.models.model import Parameters
 
 GROUP = "rig"
 """Group of the channels in a file."""

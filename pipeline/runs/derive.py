@@ -229,7 +229,7 @@ def prepared(run: AnalysedRun, product: Any, options: Options) -> Options:
 
 
 def most_evidence(run: Run, options: Options) -> Options:
-    """Return options with the largest effort of extension among the kept attractors of the same search.
+    """Return the options of the kept result with the largest extension, for the same search.
 
     Options without an effort are returned unchanged.
     """

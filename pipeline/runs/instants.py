@@ -17,8 +17,7 @@ from pipeline.specification.problems import SpecError
 if TYPE_CHECKING:
     import xarray as xr
 
-    from magpend_core.models.model import Model
-    from magpend_core.models.parameters import Parameters
+    from magpend_core.models.model import Model, Parameters
 
 RTOL = 1e-9
 PERIOD_IN_FILM_S = 2.0
@@ -94,7 +93,7 @@ class Schedule:
 
 
 def schedule(moving: Sequence[Moving], options: AnimationOptions) -> Schedule:
-    """Lay out the instants of a film, which lasts what was asked, to the nearest frame.
+    """Choose the instants of a film's frames; the length is right to the nearest frame.
 
     The speed is changed so that whole periods are shown, where all motions repeat: by `MOST_CHANGE` at most,
     of a speed that was given by `MOST_CHANGE_OF_SPEED`.

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from magpend_core.models.model import Model
-from magpend_core.models.parameters import Parameters
+from magpend_core.models.model import Model, Parameters
 from pipeline.layout.cells import CellMap
 from pipeline.layout.domains import check_starts, check_states
 from pipeline.runs.workflows import find_spec

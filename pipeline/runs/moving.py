@@ -23,7 +23,7 @@ from pipeline.specification.problems import SpecError
 if TYPE_CHECKING:
     import xarray as xr
 
-    from magpend_core.models.parameters import Parameters
+    from magpend_core.models.model import Parameters
 
 MOST_MOTIONS = 8
 

@@ -18,8 +18,8 @@ import numpy as np
 from pydantic import BaseModel, ValidationError
 
 from magpend_core.models import DEFAULT, load_model
-from magpend_core.models.model import Model
-from magpend_core.models.parameters import ParameterError, Parameters, unknown_name_problem
+from magpend_core.models.model import Model, Parameters
+from magpend_core.models.parameters import ParameterError, unknown_name_problem
 from magpend_core.models.presets import Preset, is_file
 from pipeline.products.product import Options
 from pipeline.products.registry import CELL_PRODUCTS

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from magpend_core.models.parameters import Parameters
+from magpend_core.models.model import Parameters
 from pipeline.specification.starts import GridStarts, Starts
 from pipeline.specification.tables import Range
 

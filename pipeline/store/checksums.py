@@ -16,7 +16,7 @@ _END = '"}\n'
 
 
 class SealError(ValueError):
-    """An error for a text that differs from what was sealed; the message says how this shows."""
+    """A text differs from its checksum; the message says how."""
 
 
 def seal(text: str, before: bytes = b"") -> str:

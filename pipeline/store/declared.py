@@ -50,7 +50,7 @@ class Declared:
         self._texts: set[str] = set()
 
     def problem(self, key: str, content: Any) -> str | None:
-        """Return what a file wrongly declares; None if its declarations fit the plan."""
+        """Return the wrong declaration in a file; None if it fits the plan."""
         name, _, rest = key.partition("/")
         if not rest:
             return None
@@ -101,7 +101,7 @@ def _codecs_problem(codecs: tuple[Any, ...]) -> str:
 
 
 def product_problem(contents: Iterable[tuple[str, bytes]]) -> str | None:
-    """Return what the files of a product wrongly declare; None if their declarations fit."""
+    """Return the wrong declaration in a product's files; None if all are right."""
     chunk_bytes: dict[str, int] = {}
     total, on_disk = 0, 0
     chunks: list[tuple[str, int]] = []

@@ -359,7 +359,7 @@ def _endpoint() -> str:
 
 
 def explain(place: str, error: Exception, *, writing: bool = False) -> Exception:
-    """Translate an error of a store into one line in magpend's words, without what was sent.
+    """Translate an error of an object store into one line, without request data.
 
     Parameters
     ----------

@@ -20,8 +20,7 @@ from pipeline.store.skeleton import check_skeleton
 if TYPE_CHECKING:
     import xarray as xr
 
-    from magpend_core.models.model import Model
-    from magpend_core.models.parameters import Parameters
+    from magpend_core.models.model import Model, Parameters
 
 
 _NEXT = (

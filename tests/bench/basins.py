@@ -28,7 +28,7 @@ import xarray as xr
 from scalar_peers import scipy_runner
 
 from magpend_core import load_preset, sections
-from magpend_core.models.parameters import Parameters
+from magpend_core.models.model import Parameters
 from pipeline.analysis.attractors.attractors import identify
 from pipeline.layout.vocabulary import PERIODIC_ORBIT
 

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from magpend_core.models.parameters import Parameters
+from magpend_core.models.model import Parameters
 from magpend_core.models.pendulum.models import STATES
 from magpend_core.pointwise import evaluate, rates
 from magpend_core.validation import check_states

@@ -28,7 +28,7 @@ class Jump:
 
 @dataclass(frozen=True)
 class _Contact:
-    """What a surface does to a state at rest on it.
+    """The effect of a surface on a state that rests on it.
 
     Attributes
     ----------

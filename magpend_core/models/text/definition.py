@@ -131,7 +131,9 @@ class Definition:
         ]
 
     def meaning(self) -> str:
-        """What decides numbers, in one way of writing: the same for texts that differ in layout or words."""
+        """Return the parts of the text that determine numbers, in a normal form: equal for texts that differ only in
+        layout or wording.
+        """
         bounds = [[p.name, p.bound] for p in self.parameters]
         plain = {
             "states": [[s.name, s.on_circle, repr(s.scale), repr(s.escape)] for s in self.states],

@@ -27,7 +27,7 @@ SCANNED = 256
 
 @dataclass(frozen=True)
 class Layer:
-    """What `System.layers` returns for a layer."""
+    """The expressions that `System.layers` returns for one layer."""
 
     value: Node
     rate: Node
@@ -50,7 +50,7 @@ class Wave:
 
 @dataclass(frozen=True)
 class Derived:
-    """What is computed.
+    """The expressions derived from a text: rates, Jacobian, layers, edges.
 
     Attributes
     ----------
@@ -104,7 +104,7 @@ class Derived:
 
 
 def derive(definition: Definition) -> Derived:
-    """Derive what is computed.
+    """Derive the rates, the Jacobian, the layers and the edges of a text.
 
     Raises
     ------

@@ -60,7 +60,7 @@ def found_in(
 def _numbers(
     nodes: Sequence[Node], own: Definition, parameters: Mapping[str, float], frequency_hz: float, state: Sequence[float]
 ) -> list[float]:
-    """Values of nodes at one point; 1 stands for what a side or a mode may be."""
+    """Compute the values of nodes at one point, with 1 for each possible side or mode."""
     given = {"parameter": [parameters[p.name] for p in own.parameters], "state": list(state)}
     leaves: dict[int, Any] = {}
     pending = list(nodes)

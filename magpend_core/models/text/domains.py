@@ -51,7 +51,7 @@ class Fault:
 
 
 def domain_faults(definition: Definition, values: Mapping[str, Any]) -> list[Fault]:
-    """Find what has no finite value in the equations of a text, and in what they need.
+    """Find the subexpressions of a text's equations that have no finite value.
 
     Parameters
     ----------
@@ -145,7 +145,7 @@ def _start_faults(definition: Definition, values: Mapping[str, Any]) -> list[Fau
 
 
 def _look(tree: Tree, place: str, known: Mapping[str, Any], rows: np.ndarray, found: list[Fault]) -> np.ndarray:
-    """Add the faults of a part, the innermost first; returns where it has no finite value."""
+    """Append the faults of an expression, the innermost first; return where it has no finite value."""
     if tree.kind == "inverse":  # told with its product
         return _look(tree.args[0], place, known, rows, found)
     bad = np.zeros(rows.shape, bool)

@@ -139,7 +139,9 @@ class Writer:
 
 
 def root_under(node: Node) -> tuple[Node, int] | None:
-    """For a quotient by sqrt(x), x sqrt(x) or x x sqrt(x) that changes with the state: x, and 1, 3 or 5."""
+    """Return x and the power 1, 3 or 5 of a quotient by sqrt(x), x sqrt(x) or x x sqrt(x) whose x changes with the
+    state.
+    """
     if node.op != "div" or node.args[1].kind != STATED:
         return None
     below = node.args[1]
@@ -158,7 +160,7 @@ def root_under(node: Node) -> tuple[Node, int] | None:
 
 
 def _twin(node: Node, wanted: Mapping[int, Node]) -> Node | None:
-    """The cosine of a sine's argument, or the other way round, if that is wanted, too."""
+    """Return the cosine of a sine's argument, or the sine of a cosine's, if the code needs both."""
     other = "cos" if node.op == "sin" else "sin"
     for candidate in wanted.values():
         if candidate.op == other and candidate.args[0] is node.args[0]:
@@ -167,7 +169,7 @@ def _twin(node: Node, wanted: Mapping[int, Node]) -> Node | None:
 
 
 def constants_of(roots: Iterable[Node]) -> list[Node]:
-    """What changes with the cell alone, and is wanted or used by what changes with time or state."""
+    """Return the expressions that change only with the cell and are used by others that change with time or state."""
     roots = list(roots)
     found = {root.number: root for root in roots if root.kind == CONSTANT}
     for node in in_order(roots):
@@ -288,7 +290,7 @@ def _scalar(name: str, arguments: str, roots: list[Node]) -> str:
 
 
 def _edges(derived: Derived) -> list[str]:
-    """Functions of the instants of a period: those of jumps, then the zeros of waves."""
+    """Write the functions of the edge times in a period: first of the jumps, then of the waves' zeros."""
     n_instants, parts, names = len(derived.instants), [], []
     for i, instant in enumerate(derived.instants):
         parts.append(_scalar(f"instant{i}", "frequency, p", [instant.time]))

@@ -239,7 +239,7 @@ class _Token:
 
 
 def _tokens(text: str) -> tuple[list[_Token], list[str]]:
-    """Tokens of a text, and what is wrong with its characters, the first time that each stands there."""
+    """Split a text into tokens; report each bad character once."""
     found: list[_Token] = []
     odd: dict[str, int] = {}
     place = 0
@@ -285,7 +285,7 @@ class _Parser:
         return tree
 
     def unexpected(self, token: _Token) -> GrammarError:
-        """What is wrong with a token that cannot follow, with a remedy where one is known."""
+        """Return the sentence for a token that cannot follow here, with a remedy if one is known."""
         hints = {
             "==": "; compare with < or >",
             "!=": "; compare with < or >",
@@ -304,7 +304,7 @@ class _Parser:
         return GrammarError(f"{token.text!r} at character {token.at} cannot stand here{hints.get(token.text, '')}")
 
     def expression(self, least: int) -> Tree:
-        """Read as far as signs bind at least as strongly as `least`."""
+        """Parse an expression whose operators bind at least as strongly as `least`."""
         self.depth += 1
         if self.depth > MAX_DEPTH:
             raise GrammarError(f"is nested more than {MAX_DEPTH} deep; use define for parts")
@@ -327,7 +327,7 @@ class _Parser:
         return is_operand and token.text not in ("and", "or", "not")
 
     def joined(self, left: Tree, token: _Token, binding: int) -> Tree:
-        """Read what follows a sign."""
+        """Parse the operand after a sign."""
         if binding == _POWER:
             begin = self.next
             right = self.expression(_SIGN)
@@ -352,7 +352,7 @@ class _Parser:
         return _flat("sum" if binding == _SUM else "product", left, right)
 
     def check_tower(self, token: _Token, begin: int) -> None:
-        """Note a power of a power with ^ and without brackets: languages read it from different sides."""
+        """Report a power of a power without brackets: languages evaluate ``a^b^c`` in different orders."""
         depth, powers = 0, [token]
         for inner in self.tokens[begin : self.next]:
             depth += (inner.text == "(") - (inner.text == ")")
@@ -464,6 +464,6 @@ def _name(token: _Token) -> Tree:
 
 
 def _flat(kind: str, left: Tree, right: Tree) -> Tree:
-    """Join to what is joined already, so that long sums are not deep."""
+    """Append a term to a joined sum, so that long sums do not nest deeply."""
     args = left.args if left.kind == kind else (left,)
     return Tree(kind, left.at, "", (*args, right))

@@ -177,7 +177,7 @@ class Graph:
     # ---- products --------------------------------------------------------------------------------
 
     def mul(self, *factors: Node) -> Node:
-        """Product: what changes with the cell alone first, then with time alone, then the rest."""
+        """Multiply nodes: first the factors that depend on the cell alone, then those on time alone, then the rest."""
         total, negative, groups = 1.0, False, ([], [], [])  # type: ignore[var-annotated]
         pending = list(factors)[::-1]
         while pending:
@@ -211,7 +211,7 @@ class Graph:
         return found
 
     def div(self, a: Node, b: Node) -> Node:
-        """Quotient; a division by what changes with the cell alone is a product with its inverse."""
+        """Divide nodes; a divisor that depends on the cell alone becomes a factor, its inverse."""
         if a.is_number(0.0) or b.is_number(1.0):
             return a
         if a.op == "number" and b.op == "number" and b.value != 0.0 and math.isfinite(a.value / b.value):

@@ -64,7 +64,7 @@ class TextModel(Model):
 
     @cached_property
     def derived(self) -> Derived:
-        """What follows from the text: rates, Jacobian, layers, edges, switches. Needs no compiler.
+        """Expressions derived from the text: rates, Jacobian, layers, edges, switches. Needs no compiler.
 
         Raises
         ------
@@ -83,7 +83,7 @@ class TextModel(Model):
 
     @cached_property
     def digest(self) -> str:
-        """Digest of what the text means, and of what makes a system of it."""
+        """Digest of the text's normal form and of the code that makes a system of it."""
         from magpend_core.source_digests import meaning_digest
 
         # the source, too: what is found at the default parameters, edges say, is in it
@@ -99,7 +99,7 @@ class TextModel(Model):
 
 
 def model_of(definition: Definition, shipped: bool = False) -> TextModel:
-    """Make a model of what a text says."""
+    """Make a model from the definition of a text."""
     section = "" if definition.autonomous else "the start of the drive's period"
     return TextModel(
         name=definition.name,

@@ -144,7 +144,7 @@ class _Reading(ViewsReader):
         return True
 
     def _entry(self, value: Any, place: str, keys: tuple[str, ...], short: str) -> dict[str, Any]:
-        """Return a table, of which `short` may stand alone."""
+        """Return a table; a plain value stands for its key `short`."""
         if not isinstance(value, Mapping):
             return {short: value}
         entry = self.table(value, place, 20, "keys")
@@ -302,7 +302,7 @@ def _with_rate(state: State, tree: Tree | None, states: Iterable[str]) -> State:
 
 
 def _plain(value: Any) -> Any:
-    """Tables and lists of text and numbers alone, as JSON has them."""
+    """Return tables and lists with only texts and numbers, as in JSON."""
     if isinstance(value, Mapping):
         return {str(key): _plain(inner) for key, inner in value.items()}
     if isinstance(value, (list, tuple)):

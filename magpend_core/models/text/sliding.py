@@ -23,7 +23,7 @@ MAX_JOINT = 3
 
 @dataclass(frozen=True)
 class Sliding:
-    """How sides are written in the engine's functions.
+    """The source code for sides in the engine's functions.
 
     Attributes
     ----------
@@ -139,7 +139,7 @@ def _solved(
     switches: Sequence[Switch],
     modes: Sequence[Node],
 ) -> list[Node]:
-    """What stands for each side on its surface; the mode for those that are not slid on."""
+    """Return the expression for each side on its surface; its mode for surfaces without sliding."""
     zeros = {s.side: graph.zero for s in switches}
     found = []
     for k in range(len(switches)):

@@ -75,7 +75,7 @@ class Instant:
 
 @dataclass
 class Sides:
-    """Rewrites expressions with sides; collects what they need.
+    """A rewriter of expressions with sides, which collects the surfaces and modes that they use.
 
     Attributes
     ----------
@@ -116,7 +116,7 @@ class Sides:
         return [known[root.number] for root in roots]
 
     def _as_surface(self, node: Node, rewritten: Node) -> Node:
-        """Return a node as it stands in the value of a surface: with what the edges tell, without modes.
+        """Return a node in the form for surface values: known edges put in, modes left out.
 
         Engines find out on which sides a start is one after the other, so that none may need another.
         """

@@ -30,7 +30,7 @@ MOST_PROBLEMS = 8
 
 
 class Reader:
-    """Reads entries of tables; what is wrong goes to `problems`, and something harmless is returned."""
+    """A reader of table entries. It appends problems to `problems` and returns a harmless value for a bad entry."""
 
     def __init__(self) -> None:
         self.problems: list[str] = []

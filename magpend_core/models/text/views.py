@@ -25,11 +25,11 @@ class ViewsReader(Reader):
         self.known: dict[str, str] = dict.fromkeys(BUILT_IN, "built-in name")
 
     def at(self, *keys: str) -> str:
-        """A place below the model's."""
+        """Return the path of a key below the model's path."""
         return ".".join((self.place, *(k[:60] for k in keys)))
 
     def _timeless(self, tree: Tree | None, place: str, define: dict[str, Tree], only: set[str] | None = None) -> bool:
-        """Whether an expression needs no time, and of the states none but `only`; reports what it does."""
+        """Return whether an expression uses neither time nor states other than `only`; report those that it uses."""
         if tree is None:
             return False
         wanted = list(needed(tree, define))

@@ -105,7 +105,7 @@ import numpy as np
 import xarray as xr
 
 from magpend_core.engine.system import System
-from magpend_core.models.parameters import Parameters
+from magpend_core.models.model import Parameters
 from pipeline.analysis.attractors.describing.features import ENERGY, Features
 from pipeline.analysis.attractors.describing.labelling import Found, analyse
 from pipeline.analysis.attractors.finding.equilibria import tell_rest

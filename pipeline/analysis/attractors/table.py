@@ -13,14 +13,14 @@ from pipeline.analysis.outcomes import outcomes, sentence
 from pipeline.analysis.tabular import (
     FEW_POINTS,
     Row,
-    aligned,
     distinct,
-    heading,
+    labels,
     largest_share,
     number,
+    point_table,
+    points_of,
     ranges,
     summary,
-    where_of,
     with_interval,
     words_of,
 )
@@ -51,14 +51,13 @@ def attractor_rows(ds: xr.Dataset, *, interval: Interval = "wilson", confidence:
             outcomes(ds), dims=start_dims, ids=ds["attractor"].values.tolist(), confidence=confidence, method=interval
         )
     rows = []
-    for index in np.ndindex(*(ds.sizes[d] for d in dims)):
-        at = dict(zip(dims, index, strict=True))
+    for at, where in points_of(ds, dims):
         one = ds.isel(at)
         cells = one["attractor_id"].values.ravel()
         decisions = np.zeros((len(words), ds.sizes["attractor"]), np.int64)
         np.add.at(decisions, (one["decision"].values.ravel()[cells >= 0], cells[cells >= 0]), 1)
         for i in np.flatnonzero(one["kind"].values > 0):
-            row = {**where_of(ds, at), **_attractor(one.isel(attractor=i))}
+            row = {**where, **_attractor(one.isel(attractor=i))}
             if fractions is not None:
                 own = fractions.isel(at).sel(label=i)
                 counts = row["stability"] == STABILITIES[ATTRACTS]
@@ -72,14 +71,11 @@ def _attractor(one: xr.Dataset) -> Row:
     largest = np.hypot(one["multiplier_real"].values, one["multiplier_imag"].values)
     row: Row = {
         "attractor_id": int(one["attractor"]),
-        "kind": words_of(one["kind"])[int(one["kind"])],
-        "stability": words_of(one["stability"])[int(one["stability"])],
-        "evidence": words_of(one["evidence"])[int(one["evidence"])],
+        **labels(one, "kind", "stability", "evidence"),
         "orbit_period": int(one["orbit_period"]),
         "period_s": float(one["period_s"]),
     }
-    if "side" in one:
-        row["side"] = words_of(one["side"])[int(one["side"])]
+    row |= labels(one, "side")
     if "rotation" in one:
         (dim,) = one["rotation"].dims
         names = one[dim].values if dim in one.coords else range(one.sizes[dim])
@@ -95,9 +91,7 @@ def _attractor(one: xr.Dataset) -> Row:
         row["mirror_partner"] = int(one["mirror_partner"])
         row["mirror_distance"] = float(one["mirror_distance"])
     row["n_cells"] = int(one["n_cells"])
-    if "match_basis" in one:
-        row["match_basis"] = words_of(one["match_basis"])[int(one["match_basis"])]
-    return row
+    return row | labels(one, "match_basis")
 
 
 def attractor_lines(ds: xr.Dataset, rows: Sequence[Row]) -> list[str]:
@@ -112,11 +106,8 @@ def attractor_lines(ds: xr.Dataset, rows: Sequence[Row]) -> list[str]:
     if n_points > FEW_POINTS:
         lines += summary(ds, rows, dims, _id_summary)
     else:
-        for index in np.ndindex(*(ds.sizes[d] for d in dims)):
-            at = dict(zip(dims, index, strict=True))
-            where = where_of(ds, at)
-            here = [row for row in rows if all(row[k] == v for k, v in where.items())]
-            lines += heading(ds, where) + aligned([_attractor_words(row, n_points) for row in here])
+        for _, where in points_of(ds, dims):
+            lines += point_table(ds, where, rows, lambda row: _attractor_words(row, n_points))
     return [*lines, sentence(ds), *_remarks(ds, rows)]
 
 

@@ -11,12 +11,11 @@ from pipeline.analysis.outcomes import DIVERGED, sentence
 from pipeline.analysis.tabular import (
     FEW_POINTS,
     Row,
-    aligned,
-    heading,
     largest_share,
+    point_table,
+    points_of,
     ranges,
     summary,
-    where_of,
     with_interval,
 )
 from pipeline.layout.attractor_letters import letter
@@ -35,11 +34,10 @@ def basin_rows(ds: xr.Dataset) -> list[Row]:
     dims, _ = split_dims(ds["attractor_id"])
     names = ("fraction", "low", "high", "fraction_if_none", "fraction_if_all", "low_if_none", "high_if_all")
     rows = []
-    for index in np.ndindex(*(ds.sizes[d] for d in dims)):
-        at = dict(zip(dims, index, strict=True))
+    for at, where in points_of(ds, dims):
         one = ds.isel(at)
         for i, label in enumerate(ds["label"].values.tolist()):
-            row = {**where_of(ds, at), "label": label, "n_cells": int(one["count"][i])}
+            row = {**where, "label": label, "n_cells": int(one["count"][i])}
             row["n_inferred"] = int(one["n_inferred"][i])
             rows.append(row | {name: float(one[name][i]) for name in names})
     return rows
@@ -56,13 +54,11 @@ def basin_lines(ds: xr.Dataset, rows: Sequence[Row]) -> list[str]:
         lines += summary(ds, seen, dims, _label_summary)
         lines += [_range_line(ds, name, text) for name, text in _BOUNDARY.items() if name in ds]
     else:
-        for index in np.ndindex(*(ds.sizes[d] for d in dims)):
-            at = dict(zip(dims, index, strict=True))
-            where = where_of(ds, at)
-            here = [row for row in seen if all(row[k] == v for k, v in where.items())]
+        for at, where in points_of(ds, dims):
             one = ds.isel(at)
-            lines += heading(ds, where) + aligned([_basin_words(row) for row in here])
-            if here:
+            table = point_table(ds, where, seen, _basin_words)
+            lines += table
+            if len(table) > 1:
                 bound = float(one["unseen_high"])
                 lines.append(f"  an attractor that no cell shows: at most {bound:.3g} of the region")
             lines += _boundary_lines(one)

@@ -9,8 +9,7 @@ from itertools import pairwise
 import numpy as np
 import xarray as xr
 
-from magpend_core.models.model import Model
-from magpend_core.models.parameters import Parameters
+from magpend_core.models.model import Model, Parameters
 from pipeline.analysis.branches.arclength import Point, Settings, Trace, correct, kernel_of, trace
 from pipeline.analysis.branches.bifurcations import KINDS, TORUS, multipliers_of
 from pipeline.analysis.branches.following import opposite

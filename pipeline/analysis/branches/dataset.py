@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from magpend_core.models.model import Model
-from magpend_core.models.parameters import Parameters
+from magpend_core.models.model import Model, Parameters
 from pipeline.analysis.branches.bifurcations import KINDS, Bifurcation, multipliers_of, n_unstable
 from pipeline.analysis.branches.following import ENDS, Branch
 from pipeline.analysis.branches.motion import rotation_of, sides_of

@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from magpend_core.models.model import Classifier
-from magpend_core.models.parameters import Parameters
+from magpend_core.models.model import Classifier, Parameters
 from magpend_core.models.sectioned import of_flow
 from magpend_core.orbits import on_section
 from magpend_core.sampling import Drive, sample

@@ -102,7 +102,7 @@ class Problem(Protocol):
 
     @property
     def system(self) -> System:
-        """What is integrated."""
+        """System to integrate."""
 
     def rows(self, u: np.ndarray) -> Rows:
         """Return the trajectories that the value at `u` needs."""
@@ -214,7 +214,7 @@ class OrbitProblem:
 
     @property
     def system(self) -> System:
-        """What is integrated."""
+        """System to integrate."""
         return self.family.system
 
     def rows(self, u: np.ndarray) -> Rows:
@@ -340,7 +340,7 @@ class BifurcationProblem:
 
     @property
     def system(self) -> System:
-        """What is integrated."""
+        """System to integrate."""
         return self.family.system
 
     @property

@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 
 from magpend_core.engine.system import System
-from magpend_core.models.parameters import Parameters
+from magpend_core.models.model import Parameters
 from magpend_core.orbits import polish_orbits, scaled_distance
 from pipeline.analysis.branches.exploring import Start
 from pipeline.analysis.branches.problems import FREQUENCY, Family

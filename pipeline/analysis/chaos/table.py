@@ -13,8 +13,10 @@ from pipeline.analysis.tabular import (
     Row,
     aligned,
     axis_ranges,
-    heading,
+    labels,
     number,
+    point_table,
+    points_of,
     unit_of,
     where_of,
     with_error,
@@ -45,10 +47,8 @@ def chaos_table(ds: xr.Dataset) -> Table:
     if n_points > FEW_POINTS:
         lines += _summary(ds, rows, dims)
     else:
-        for index in np.ndindex(*(ds.sizes[d] for d in dims)):
-            place = where_of(ds, dict(zip(dims, index, strict=True)))
-            here = [row for row in rows if all(row[k] == v for k, v in place.items())]
-            lines += heading(ds, place) + aligned([_words(row) for row in here])
+        for _, where in points_of(ds, dims):
+            lines += point_table(ds, where, rows, _words)
     lines += [f"not computed: {reason}" for reason in ds.attrs["not_computed"].splitlines()]
     return Table(rows, lines)
 
@@ -64,8 +64,7 @@ def _rows(ds: xr.Dataset) -> list[Row]:
         row: Row = {
             **where_of(ds, at),
             "attractor_id": int(one["attractor"]),
-            "kind": words_of(one["kind"])[int(one["kind"])],
-            "stability": words_of(one["stability"])[int(one["stability"])],
+            **labels(one, "kind", "stability"),
             "nature": natures[int(one["nature"])],
             "orbit_period": int(one["orbit_period"]),
             "n_cells": int(one["n_cells"]),

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
-from magpend_core.models.parameters import Parameters
+from magpend_core.models.model import Parameters
 from magpend_core.status import Status
 from pipeline.analysis.outcomes import share_interval
 from pipeline.explorer.data.arrays import pack_arrays

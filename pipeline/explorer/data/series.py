@@ -7,8 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from magpend_core import evaluate, trajectory
-from magpend_core.models.model import Model
-from magpend_core.models.parameters import Parameters
+from magpend_core.models.model import Model, Parameters
 from magpend_core.models.sectioned import of_flow
 
 SAMPLES = 128

@@ -12,8 +12,7 @@ import numpy as np
 from magpend_core.engine.observers import window_of
 from magpend_core.engine.system import System
 from magpend_core.extension import more_sections, orbit_periods
-from magpend_core.models.model import Model
-from magpend_core.models.parameters import Parameters
+from magpend_core.models.model import Model, Parameters
 from magpend_core.status import Status
 from pipeline.analysis.attractors.finding.cell_blocks import Block
 from pipeline.analysis.tolerances import EXTEND_CLOSURE, EXTEND_RTOL

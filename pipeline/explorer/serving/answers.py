@@ -79,7 +79,7 @@ Give = Callable[[ExploredRun, Query, LiveRun | None], Reply]
 
 @dataclass(frozen=True)
 class Answer:
-    """One kind of answer.
+    """A kind of request with the function that answers it.
 
     Attributes
     ----------

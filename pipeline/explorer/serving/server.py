@@ -189,7 +189,7 @@ class Handler(web.RequestHandler):
             self.refuse(403, "the token is missing or wrong; use the address that magpend explore printed")
 
     def refuse(self, status: int, sentence: str) -> None:
-        """Answer with one sentence, and end."""
+        """Answer with one sentence as JSON, and end the request."""
         self.set_status(status)
         self.set_header("Content-Type", "application/json; charset=utf-8")
         self.finish(json.dumps({"error": sentence}))
@@ -203,7 +203,7 @@ class PageHandler(Handler):
     """The handler of the page itself."""
 
     def refuse(self, status: int, sentence: str) -> None:
-        """Answer with a page that has one sentence: a person is reading."""
+        """Answer with a page that holds one sentence."""
         self.set_status(status)
         self.set_header("Content-Type", "text/html; charset=utf-8")
         self.finish(page_html.note(sentence))

@@ -54,7 +54,7 @@ class LiveSocket(WebSocketHandler):
     """The live connection of one page."""
 
     def initialize(self, live: LiveRun, authorised: Authorised, others: set[LiveSocket]) -> None:
-        """Take what the route gives."""
+        """Store the arguments of the route."""
         self._live, self._authorised, self._others = live, authorised, others
         self._session: LiveSession | None = None
         self._allowance, self._heard = MOST_AT_ONCE, time.monotonic()

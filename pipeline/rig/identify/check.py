@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from magpend_core.models import load_model
-from magpend_core.models.parameters import Parameters
+from magpend_core.models.model import Parameters
 from pipeline.rig.identify.build import drive_problems, pieces_of
 from pipeline.rig.identify.directory import Info, read_info, read_result
 from pipeline.rig.identify.identification import require_starts

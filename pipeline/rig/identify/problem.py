@@ -11,8 +11,7 @@ import numpy as np
 
 from magpend_core.defaults import RTOL
 from magpend_core.engine.system import System
-from magpend_core.models.model import Model
-from magpend_core.models.parameters import Parameters
+from magpend_core.models.model import Model, Parameters
 from magpend_core.sampling import Drive, with_recorded_drive
 
 ZERO = "zero"

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from magpend_core.models.presets import write_preset
+from magpend_core.models.preset_writing import write_preset
 from pipeline.layout.vocabulary import model_attribute
 from pipeline.rig.identify.directory import Source
 from pipeline.rig.identify.identifiability import Direction

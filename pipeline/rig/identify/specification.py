@@ -13,8 +13,8 @@ from pydantic import Field
 
 from magpend_core.defaults import RTOL
 from magpend_core.models import model_names
-from magpend_core.models.model import Model
-from magpend_core.models.parameters import Parameters, near_names
+from magpend_core.models.model import Model, Parameters
+from magpend_core.models.parameters import near_names
 from magpend_core.models.presets import is_file
 from pipeline.rig.identify.settings import setting_problems
 from pipeline.rig.identify.unknowns import Pair, ParameterTables, Unknown, table_at, validate

@@ -11,15 +11,8 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, Field, ValidationError
 
-from magpend_core.models.model import Model
-from magpend_core.models.parameters import (
-    FRACTION,
-    NON_NEGATIVE,
-    POSITIVE,
-    ParameterError,
-    Parameters,
-    unknown_name_problem,
-)
+from magpend_core.models.model import Model, Parameters
+from magpend_core.models.parameters import FRACTION, NON_NEGATIVE, POSITIVE, ParameterError, unknown_name_problem
 from pipeline.specification.problems import problems_of
 from pipeline.specification.tables import Table
 

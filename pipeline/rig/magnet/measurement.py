@@ -20,7 +20,8 @@ import numpy as np
 from pydantic import Field, create_model, model_validator
 
 from magpend_core.models import load_model
-from magpend_core.models.parameters import ParameterError, Parameters
+from magpend_core.models.model import Parameters
+from magpend_core.models.parameters import ParameterError
 from magpend_core.models.pendulum import magnet_torque as laws
 from magpend_core.models.presets import find_preset
 from pipeline.rig.recordings import units

@@ -10,8 +10,7 @@ import numpy.typing as npt
 import xarray as xr
 
 from magpend_core.models import load_model
-from magpend_core.models.model import Model
-from magpend_core.models.parameters import Parameters
+from magpend_core.models.model import Model, Parameters
 from pipeline.analysis.selection import choose, select_points, start_dims
 from pipeline.analysis.sets import Geometry
 from pipeline.layout.vocabulary import ABSENT, APERIODIC, FREQUENCY_DIM, PERIODIC_ORBIT, UNSTABLE, split_dims

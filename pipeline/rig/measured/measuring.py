@@ -9,8 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import xarray as xr
 
-from magpend_core.models.model import Model
-from magpend_core.models.parameters import Parameters
+from magpend_core.models.model import Model, Parameters
 from pipeline.analysis.sides import UNKNOWN, flags_of
 from pipeline.layout.vocabulary import model_attribute, model_of
 from pipeline.products.measured import SweepOptions

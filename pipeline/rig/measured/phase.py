@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from magpend_core.models.parameters import Parameters
+from magpend_core.models.model import Parameters
 from pipeline.rig.edges import find_edges
 from pipeline.specification.problems import SpecError
 

@@ -8,7 +8,7 @@ import math
 import numpy as np
 import xarray as xr
 
-from magpend_core.models.parameters import Parameters
+from magpend_core.models.model import Parameters
 from pipeline.layout.vocabulary import model_attribute, model_of
 from pipeline.products.measured import WINDOW_S
 from pipeline.rig.edges import DRIVE, Edges, edges_of

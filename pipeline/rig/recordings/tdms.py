@@ -83,7 +83,7 @@ def _numbers(data: Any, zero: int) -> np.ndarray | None:
 
 
 def _earliest(file: Any) -> int:
-    """Return the whole second before all starts on TDMS's scale, so that differences keep their digits."""
+    """Return the whole second before all starts, as the origin of times: differences then keep their digits."""
     starts = [c.properties.get("wf_start_time") for g in file.groups() for c in g.channels()]
     return min((int(s.seconds) for s in starts if s is not None), default=0)
 

@@ -7,7 +7,8 @@ import tomllib
 import pytest
 
 from magpend_core import ParameterError, load_model
-from magpend_core.models.presets import Preset, find_preset, write_preset
+from magpend_core.models.preset_writing import write_preset
+from magpend_core.models.presets import Preset, find_preset
 
 FIT = {"alpha1": 1.7512345678901234, "alpha2": -1.7, "c1": 0.068}
 SOURCES = {

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import xarray as xr
 
-from magpend_core.models.presets import write_preset
+from magpend_core.models.preset_writing import write_preset
 
 
 @pytest.fixture

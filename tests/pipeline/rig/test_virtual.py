@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from magpend_core import load_model, load_preset, trajectory
-from magpend_core.models.presets import write_preset
+from magpend_core.models.preset_writing import write_preset
 from pipeline.rig.recordings import findings_of, parse_mapping, read_recording, write_raw
 from pipeline.rig.simulation import load_rig, parse_rig, simulated
 from pipeline.rig.virtual import TOLERANCE, DriveSensor, Sensor, Step, readings, record

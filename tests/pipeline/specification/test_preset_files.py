@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from magpend_core import load_model
-from magpend_core.models.presets import write_preset
+from magpend_core.models.preset_writing import write_preset
 from pipeline.layout.identity import digest_of
 from pipeline.layout.plan import make_plan
 from pipeline.runs.run import identity_here, run

@@ -17,8 +17,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from magpend_core.models.model import Mirror
-from magpend_core.models.parameters import Parameters
+from magpend_core.models.model import Mirror, Parameters
 from magpend_core.models.sectioned import of_flow
 from magpend_core.pointwise import evaluate
 from magpend_core.sampling import Drive, sample

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 import xarray as xr
 
-from magpend_core.models.parameters import Parameters
+from magpend_core.models.model import Parameters
 from magpend_core.models.sectioned import of_flow
 from magpend_core.sections import run_branches
 from magpend_core.trajectory import trajectory

@@ -11,8 +11,7 @@ import numpy as np
 import xarray as xr
 
 from magpend_core.engine.system import System
-from magpend_core.models.model import Model
-from magpend_core.models.parameters import Parameters
+from magpend_core.models.model import Model, Parameters
 from magpend_core.orbits import crossed_state
 from magpend_core.pointwise import rates_at
 from magpend_core.status import Status
@@ -76,7 +75,7 @@ class Dynamics:
 
     @property
     def integrates(self) -> System:
-        """What is integrated; it must be there."""
+        """System to integrate; there must be one."""
         assert self.system is not None
         return self.system
 
@@ -160,7 +159,7 @@ class Point:
 
     @property
     def integrates(self) -> System:
-        """What is integrated; it must be there."""
+        """System to integrate; there must be one."""
         assert self.system is not None
         return self.system
 

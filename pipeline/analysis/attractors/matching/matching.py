@@ -29,7 +29,7 @@ import xarray as xr
 from scipy.optimize import linear_sum_assignment
 
 from magpend_core.engine.system import System
-from magpend_core.models.parameters import Parameters
+from magpend_core.models.model import Parameters
 from pipeline.analysis.attractors.matching.connections import Connections, Place, connections, followable
 from pipeline.analysis.sets import Geometry, mean_distance, order_by_points
 from pipeline.layout.vocabulary import frequency_of, model_of, parameters_of
