@@ -22,9 +22,9 @@ from typing import Any
 
 _HOMES = {
     "magpend_core.models": ("import_model", "load_preset", "model_names", "preset_names"),
-    "magpend_core.models.model": ("Model",),
-    "magpend_core.models.parameters": ("ParameterError", "Parameters"),
-    "magpend_core.models.presets": ("write_preset",),
+    "magpend_core.models.model": ("Model", "Parameters"),
+    "magpend_core.models.parameters": ("ParameterError",),
+    "magpend_core.models.preset_writing": ("write_preset",),
     "magpend_core.sections": ("Sections", "run_branches", "sections"),
     "magpend_core.trajectory": ("trajectory",),
     "magpend_core.sampling": ("Drive",),
