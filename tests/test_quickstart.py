@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -40,9 +41,17 @@ def magpend(*arguments, **environment):
 
 @pytest.fixture(scope="module")
 def directory(tmp_path_factory):
+    """The run of README's main job: a copy of the one in this checkout if the same code made it, or a new one."""
     folder = tmp_path_factory.mktemp("quickstart") / "run"
-    done = magpend("run", "quickstart", "--out", folder, "--plot")
-    assert done.returncode == 0, done.stderr
+    made = ROOT / "runs" / "quickstart"
+    if made.is_dir():
+        shutil.copytree(made, folder)
+        # other code, or damage, is refused; what is missing is computed
+        if magpend("run", "quickstart", "--out", folder, "--plot").returncode != 0:
+            shutil.rmtree(folder)
+    if not folder.exists():
+        done = magpend("run", "quickstart", "--out", folder, "--plot")
+        assert done.returncode == 0, done.stderr
     return folder
 
 
