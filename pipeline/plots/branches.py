@@ -20,14 +20,15 @@ from pipeline.plots.labels import Measure
 from pipeline.products.branches import BranchOptions
 from pipeline.products.figures import BranchFigureOptions
 
-KINDS = ("fold", "period_doubling", "neimark_sacker", "branch_point")
-MARKERS = {"fold": "^", "period_doubling": "s", "neimark_sacker": "o", "branch_point": "D"}
-SHORT = {"fold": "F", "period_doubling": "PD", "neimark_sacker": "NS", "branch_point": "BP"}
+KINDS = ("fold", "period_doubling", "neimark_sacker", "branch_point", "hopf")
+MARKERS = {"fold": "^", "period_doubling": "s", "neimark_sacker": "o", "branch_point": "D", "hopf": "p"}
+SHORT = {"fold": "F", "period_doubling": "PD", "neimark_sacker": "NS", "branch_point": "BP", "hopf": "H"}
 NAMES = {
     "fold": "fold",
     "period_doubling": "period doubling",
     "neimark_sacker": "Neimark-Sacker",
     "branch_point": "branch point",
+    "hopf": "Hopf",
 }
 _STABLE: dict[str, Any] = {"color": "black", "linewidth": 1.3, "linestyle": "-", "zorder": 6.0}
 _UNSTABLE: dict[str, Any] = {"color": "0.3", "linewidth": 0.7, "linestyle": (0, (4, 2)), "zorder": 5.0}
@@ -134,7 +135,7 @@ def _stored(ds: xr.Dataset) -> xr.Dataset:
 def pieces(ds: xr.Dataset, branch: int, measure: Measure) -> Iterator[tuple[np.ndarray, np.ndarray, bool]]:
     """Return polylines of one stability of a branch, one per orbit point, cut where an angle wraps."""
     n = int(ds["n_points"][branch])
-    period = int(ds["orbit_period"][branch])
+    period = max(int(ds["orbit_period"][branch]), 1)
     x = ds["parameter"].values[branch, :n]
     y = ds["section"].sel(state=measure.name).values[branch, :n, :period]
     stable = ds["n_unstable"].values[branch, :n] == 0
@@ -179,10 +180,11 @@ def _mark(ax: Axes, ds: xr.Dataset, chosen: list[int], measure: Measure, scale: 
             continue
         kind, period = KINDS[int(ds["kind"][k])], int(ds["orbit_period"][branch])
         x = float(ds["value"][k])
-        y = measure.shown(ds["bifurcation_section"].sel(state=measure.name).values[k, :period])
+        n = max(period, 1)
+        y = measure.shown(ds["bifurcation_section"].sel(state=measure.name).values[k, :n])
         stable = min(int(ds["n_unstable_before"][k]), int(ds["n_unstable_after"][k])) == 0
         ax.plot(
-            np.full(period, x),
+            np.full(n, x),
             y,
             linestyle="none",
             marker=MARKERS[kind],
@@ -195,7 +197,7 @@ def _mark(ax: Axes, ds: xr.Dataset, chosen: list[int], measure: Measure, scale: 
             scaley=scale,
         )
         if stable:
-            names.append(_Name(period, x, float(y.min()), float(y.max()), f"{SHORT[kind]}{period}"))
+            names.append(_Name(period, x, float(y.min()), float(y.max()), f"{SHORT[kind]}{period or ''}"))
     return sorted(names, key=lambda n: (n.period, n.x, n.low))
 
 

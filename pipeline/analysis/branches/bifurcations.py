@@ -9,11 +9,13 @@ from typing import Any
 import numpy as np
 
 from pipeline.analysis.branches.arclength import Point, Settings, correct, cubic
+from pipeline.analysis.branches.equilibria import OneParameter, first_lyapunov, hopf_test
 from pipeline.analysis.branches.lockstep import Steps
-from pipeline.analysis.branches.problems import OrbitProblem, doubling_test, torus_test
+from pipeline.analysis.branches.problems import Family, doubling_test, torus_test
 
 FOLD, DOUBLING, TORUS, BRANCHING = "fold", "period_doubling", "neimark_sacker", "branch_point"
-KINDS = (FOLD, DOUBLING, TORUS, BRANCHING)
+HOPF = "hopf"
+KINDS = (FOLD, DOUBLING, TORUS, BRANCHING, HOPF)
 
 WIDTH = 1e-8
 """Width to which a bifurcation is bracketed [arclength]; in its scale, the parameter changes by less."""
@@ -22,13 +24,25 @@ Test = Callable[[Point], float]
 
 
 def multipliers_of(point: Point) -> np.ndarray:
-    """Return the Floquet multipliers by falling modulus, shape (state,)."""
+    """Return the Floquet multipliers by falling modulus, shape (state,); NaN for an equilibrium."""
+    if point.value.is_rest:
+        return np.full(len(point.value.monodromy), complex(np.nan, np.nan))
     found = np.linalg.eigvals(point.value.monodromy)
     return found[np.argsort(-np.abs(found), kind="stable")]
 
 
+def eigenvalues_of(point: Point) -> np.ndarray:
+    """Return the eigenvalues of an equilibrium by falling real part [1/s], shape (state,); NaN for an orbit."""
+    if not point.value.is_rest:
+        return np.full(len(point.value.monodromy), complex(np.nan, np.nan))
+    found = np.linalg.eigvals(point.value.monodromy)
+    return found[np.lexsort((found.imag, -found.real))]
+
+
 def n_unstable(point: Point) -> int:
-    """Count the multipliers outside the unit circle."""
+    """Count the multipliers outside the unit circle, or the eigenvalues with positive real parts."""
+    if point.value.is_rest:
+        return int((np.linalg.eigvals(point.value.monodromy).real > 0.0).sum())
     return int((np.abs(np.linalg.eigvals(point.value.monodromy)) > 1.0).sum())
 
 
@@ -36,11 +50,17 @@ def _branching_test(point: Point) -> float:
     return float(np.linalg.det(np.vstack([point.value.derivative, point.tangent])))
 
 
+def _of_orbits(test: Callable[[np.ndarray], float]) -> Test:
+    """Return a test of the monodromy matrix that never vanishes at equilibria."""
+    return lambda point: 1.0 if point.value.is_rest else test(point.value.monodromy)
+
+
 TESTS: dict[str, Test] = {
     FOLD: lambda point: float(point.tangent[-1]),
-    DOUBLING: lambda point: doubling_test(point.value.monodromy),
-    TORUS: lambda point: torus_test(point.value.monodromy),
+    DOUBLING: _of_orbits(doubling_test),
+    TORUS: _of_orbits(torus_test),
     BRANCHING: _branching_test,
+    HOPF: lambda point: hopf_test(point.value.monodromy) if point.value.is_rest else 1.0,
 }
 """Functions of a point that change their sign at a bifurcation.
 
@@ -69,7 +89,9 @@ class Bifurcation:
         Index of the point of the branch after which it comes.
     criticality : str
         Of a period doubling whose branch was followed: ``supercritical`` if the doubled orbits lie where
-        the orbit is less stable, else ``subcritical``.
+        the orbit is less stable, else ``subcritical``. Of a Hopf point by the sign of `coefficient`.
+    coefficient, coefficient_error : float
+        First Lyapunov coefficient of a Hopf point and its error [1/s]; NaN for others.
     child : Branch or None
         The other branch through it, if that is known.
     """
@@ -83,10 +105,19 @@ class Bifurcation:
     after: int = -1
     criticality: str = ""
     child: Any = None
+    coefficient: float = np.nan
+    coefficient_error: float = np.nan
 
     @property
     def critical_multiplier(self) -> complex:
-        """The multiplier on the unit circle; of a complex pair the one with positive imaginary part."""
+        """The multiplier on the unit circle, or the eigenvalue on the imaginary axis [1/s].
+
+        Of a complex pair it is the one with positive imaginary part.
+        """
+        if self.point.value.is_rest:
+            values = eigenvalues_of(self.point)
+            upper = values[values.imag > 0.0] if self.kind == HOPF else values
+            return complex(upper[np.argmin(np.abs(upper.real))])
         multipliers = multipliers_of(self.point)
         if self.kind == TORUS:
             upper = multipliers[multipliers.imag > 0.0]
@@ -95,14 +126,14 @@ class Bifurcation:
         return complex(multipliers[np.argmin(np.abs(multipliers - target))])
 
 
-_CHANGES = {FOLD: 1, DOUBLING: 1, TORUS: 2, BRANCHING: 1}
+_CHANGES = {FOLD: 1, DOUBLING: 1, TORUS: 2, BRANCHING: 1, HOPF: 2}
 
 
 @dataclass(eq=False)
 class Watch:
     """A detector of bifurcations between neighbouring points of a trace, with those located so far."""
 
-    problem: OrbitProblem
+    problem: OneParameter
     settings: Settings
     skip_first: bool = False
     found: list[Bifurcation] = field(default_factory=list)
@@ -125,9 +156,18 @@ class Watch:
             if one is not None:
                 one.after = self.n_steps
                 located.append(one)
+                _judge(one, self.problem.family)
         self.found += tell_apart(located, a)
         self.n_steps += 1
         return True
+
+
+def _judge(one: Bifurcation, family: Family) -> None:
+    """Decide the criticality of a Hopf point by its first Lyapunov coefficient, in place."""
+    if one.kind == HOPF and _is_pair(one):
+        one.coefficient, one.coefficient_error = first_lyapunov(family, one.point.u)
+        if abs(one.coefficient) > one.coefficient_error:
+            one.criticality = "supercritical" if one.coefficient < 0.0 else "subcritical"
 
 
 def _explains(kinds: list[str], change: int) -> bool:
@@ -140,7 +180,7 @@ def _explains(kinds: list[str], change: int) -> bool:
     return change in reachable
 
 
-def locate(problem: OrbitProblem, a: Point, b: Point, kind: str, settings: Settings) -> Steps[Bifurcation | None]:
+def locate(problem: OneParameter, a: Point, b: Point, kind: str, settings: Settings) -> Steps[Bifurcation | None]:
     """Find where a test function vanishes between two points; None if an orbit between is not found."""
     test = TESTS[kind]
     chord = b.u - a.u
@@ -197,7 +237,7 @@ def tell_apart(located: list[Bifurcation], a: Point) -> list[Bifurcation]:
     branching = [one.point.u for one in located if one.kind == BRANCHING]
     kept = []
     for one in located:
-        if one.kind == TORUS and not _is_torus(one):
+        if (one.kind == TORUS and not _is_torus(one)) or (one.kind == HOPF and not _is_pair(one)):
             continue
         if one.kind == FOLD and any(np.abs(one.point.u - u).max() < 1e-5 for u in branching):
             continue
@@ -210,3 +250,10 @@ def _is_torus(one: Bifurcation) -> bool:
     multipliers = multipliers_of(one.point)
     complex_pairs = multipliers[multipliers.imag > 0.0]
     return bool(len(complex_pairs)) and bool(np.abs(np.abs(complex_pairs) - 1.0).min() < 1e-4)
+
+
+def _is_pair(one: Bifurcation) -> bool:
+    """Return whether the eigenvalues with the sum 0 are a complex pair; a real pair is only a neutral saddle."""
+    values = eigenvalues_of(one.point)
+    upper = values[values.imag > 0.0]
+    return bool(len(upper)) and bool(np.abs(upper.real / np.abs(upper)).min() < 1e-4)

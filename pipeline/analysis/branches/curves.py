@@ -113,7 +113,7 @@ def _starts(
     for k in range(ds.sizes["bifurcation"]):
         branch = int(ds["of_branch"][k])
         period, kind = int(ds["orbit_period"][branch]), KINDS[int(ds["kind"][k])]
-        if period > max_period or kind not in TESTS:
+        if not 0 < period <= max_period or kind not in TESTS:
             continue
         own = parameters.replace(**{n: float(ds[n][branch]) for n in parameters.names if n in ds})
         frequency = float(ds[FREQUENCY][branch]) if FREQUENCY in ds else frequency_of(parameters.model, {})

@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 
 from magpend_core.models.model import Model, Parameters
-from pipeline.analysis.branches.bifurcations import KINDS, Bifurcation, multipliers_of, n_unstable
+from pipeline.analysis.branches.bifurcations import HOPF, KINDS, Bifurcation, eigenvalues_of, multipliers_of, n_unstable
 from pipeline.analysis.branches.following import ENDS, Branch
 from pipeline.analysis.branches.motion import rotation_of, sides_of
 from pipeline.analysis.branches.problems import FREQUENCY
@@ -40,7 +40,7 @@ def dataset_of(
     system = branches[0].family.system if branches else (None if model is None else model.system)
     names = () if system is None else system.state_names
     n_angles = 0 if system is None else sum(system.is_angle)
-    longest = max((b.family.period for b in branches), default=1)
+    longest = max([1, *(b.family.period for b in branches)])
     shape = (len(branches), max((len(b.points) for b in branches), default=0))
     arrays = _Arrays(shape, longest, len(names))
     for i, branch in enumerate(branches):
@@ -110,6 +110,7 @@ class _Arrays:
         self.parameter = np.full(shape, np.nan)
         self.section = np.full((*shape, longest, n_states), np.nan)
         self.multiplier = np.full((*shape, n_states), np.nan, np.complex128)
+        self.eigenvalue = np.full((*shape, n_states), np.nan, np.complex128)
         self.n_unstable = np.full(shape, -1, np.int8)
         self.side = np.zeros(shape, np.int8)
         self.residual = np.full(shape, np.nan)
@@ -118,8 +119,9 @@ class _Arrays:
     def put(self, i: int, j: int, branch: Branch, point: Any) -> None:
         """Write point number `j` of branch number `i`."""
         self.parameter[i, j] = branch.family.values(point.u)[0]
-        self.section[i, j, : branch.family.period] = _orbit(branch, point)
+        self.section[i, j, : max(branch.family.period, 1)] = _orbit(branch, point)
         self.multiplier[i, j] = multipliers_of(point)
+        self.eigenvalue[i, j] = eigenvalues_of(point)
         self.n_unstable[i, j] = n_unstable(point)
         self.residual[i, j] = point.residual
         self.period_s[i, j] = point.value.seconds
@@ -127,7 +129,7 @@ class _Arrays:
     def variables(self, units: str, state_units: str) -> dict[str, Any]:
         """Return the arrays as (dims, values, attributes) for xarray; `units` are those of the parameter."""
         dims = ("branch", "point")
-        return {
+        return self._eigenvalues() | {
             "parameter": (dims, self.parameter, {"units": units, "long_name": "value of the parameter"}),
             "section": (
                 (*dims, "phase", "state"),
@@ -157,11 +159,21 @@ class _Arrays:
             "period_s": (dims, self.period_s, {"units": "s", "long_name": "period of the orbit"}),
         }
 
+    def _eigenvalues(self) -> dict[str, Any]:
+        """Return the eigenvalues of equilibria, if there are any."""
+        if np.isnan(self.eigenvalue).all():
+            return {}
+        dims, about = ("branch", "point", "multiplier"), "eigenvalues of an equilibrium"
+        return {
+            "eigenvalue_real": (dims, self.eigenvalue.real, {"units": "1/s", "long_name": f"{about}, real part"}),
+            "eigenvalue_imag": (dims, self.eigenvalue.imag, {"units": "1/s", "long_name": f"{about}, imaginary part"}),
+        }
+
 
 def _orbit(branch: Branch, point: Any) -> np.ndarray:
-    """Return the section points of an orbit (period, state), the point itself first."""
+    """Return the section points of an orbit (period, state), the point itself first; the state of an equilibrium."""
     images = np.asarray(point.value.images)
-    return np.concatenate([branch.family.state(point.u)[None], images[: branch.family.period - 1]])
+    return np.concatenate([branch.family.state(point.u)[None], images[: max(branch.family.period, 1) - 1]])
 
 
 def _flags(words: Sequence[str]) -> dict[str, Any]:
@@ -180,7 +192,7 @@ def _per_branch(
     frequencies = [np.nan if FREQUENCY in b.family.free else b.family.frequency_hz for b in branches]
     first, last = ([ENDS.index(b.ends[i]) for b in branches] for i in (0, 1))
     columns = {
-        "orbit_period": _column(periods, "int32", f"period in {periods_of(model)}"),
+        "orbit_period": _column(periods, "int32", f"period in {periods_of(model)}, 0 for equilibria"),
         "n_points": _column([len(b.points) for b in branches], "int32", "points of the branch"),
         "origin": _column(
             [numbers.get(id(b.origin), -1) for b in branches], "int32", "bifurcation it sprang from, -1 none"
@@ -197,6 +209,13 @@ def _per_branch(
     return found
 
 
+def _seconds(one: Bifurcation) -> float:
+    """Return the period of the orbit at a bifurcation; at a Hopf point that of its small cycles [s]."""
+    if one.kind == HOPF:
+        return 2.0 * np.pi / one.critical_multiplier.imag
+    return one.point.value.seconds
+
+
 def _per_event(
     branches: Sequence[Branch],
     events: Sequence[tuple[int, Bifurcation]],
@@ -210,7 +229,7 @@ def _per_event(
     multipliers = multipliers.reshape(len(ones), len(names))
     section = np.full((len(events), longest, len(names)), np.nan)
     for k, (i, b) in enumerate(events):
-        section[k, : branches[i].family.period] = _orbit(branches[i], b.point)
+        section[k, : max(branches[i].family.period, 1)] = _orbit(branches[i], b.point)
     numbers = {id(b): i for i, b in enumerate(branches)}
     kinds, degrees = [KINDS.index(b.kind) for b in ones], [CRITICALITIES.index(b.criticality) for b in ones]
     values = [branches[i].family.values(b.point.u)[0] for i, b in events]
@@ -219,7 +238,7 @@ def _per_event(
         "kind": _column(kinds, "int8", "kind of bifurcation", **_flags(KINDS)),
         "value": _column(values, "float64", "parameter value of the bifurcation"),
         "bifurcation_period_s": _column(
-            [b.point.value.seconds for b in ones], "float64", "period of the orbit there", units="s"
+            [_seconds(b) for b in ones], "float64", "period of the orbit, or of a Hopf point's cycles", units="s"
         ),
         "bracket": _column([b.bracket for b in ones], "float64", "width of the bracket in the parameter"),
         "of_branch": _column([i for i, _ in events], "int32", "branch on which it lies"),
@@ -235,8 +254,14 @@ def _per_event(
             [b.rises_before for b in ones], "int8", "1 if the parameter rises along the branch before"
         ),
         "criticality": _column(degrees, "int8", "criticality", **_flags(["unknown", *CRITICALITIES[1:]])),
-        "critical_real": _column(critical.real, "float64", "critical multiplier, real part"),
-        "critical_imag": _column(critical.imag, "float64", "critical multiplier, imaginary part"),
+        "critical_real": _column(critical.real, "float64", "critical multiplier or eigenvalue [1/s], real part"),
+        "critical_imag": _column(critical.imag, "float64", "critical multiplier or eigenvalue [1/s], imaginary part"),
+        "first_lyapunov": _column(
+            [b.coefficient for b in ones], "float64", "first Lyapunov coefficient of a Hopf point", units="1/s"
+        ),
+        "first_lyapunov_error": _column(
+            [b.coefficient_error for b in ones], "float64", "error of the first Lyapunov coefficient", units="1/s"
+        ),
     }
     found: dict[str, Any] = {name: ("bifurcation", *column) for name, column in columns.items()}
     dims = ("bifurcation", "multiplier")

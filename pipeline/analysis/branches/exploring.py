@@ -8,7 +8,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from pipeline.analysis.branches.arclength import Point, Settings, correct
-from pipeline.analysis.branches.bifurcations import BRANCHING, DOUBLING, Bifurcation
+from pipeline.analysis.branches.bifurcations import BRANCHING, DOUBLING, HOPF, Bifurcation
+from pipeline.analysis.branches.cycles import cycle_family, cycles_from
 from pipeline.analysis.branches.following import (
     Branch,
     crossing_half,
@@ -18,13 +19,17 @@ from pipeline.analysis.branches.following import (
     half_orbit,
     joined,
     opposite,
+    problem_of,
 )
 from pipeline.analysis.branches.lockstep import Steps, run_together
-from pipeline.analysis.branches.problems import FREQUENCY, Family, OrbitProblem
+from pipeline.analysis.branches.problems import FREQUENCY, Family
 from pipeline.analysis.tolerances import SAME_ON_BRANCH
 
 FOLLOWING = "following branches"
 """First words of the work's name in progress reports."""
+
+AT_HOPF = 0.05
+"""Largest scaled distance of the last cycle of a branch from the Hopf point at which it ends."""
 
 GUESS = 0.05
 """Largest scaled distance from a branch's chord at which an orbit is tested for lying on the branch."""
@@ -78,9 +83,11 @@ def explore(starts: Sequence[Start], scope: Scope) -> list[Branch]:
         _follow_starts(_adopt(branches), branches, scope)
         _adopt(branches)
         _switch(branches, scope, f"{FOLLOWING} that spring from others, round {generation + 1}")
+        _leave_equilibria(branches, scope)
         if len(branches) == n_known:
             break
     _adopt(branches)
+    _adopt_cycles(branches)
     return branches
 
 
@@ -123,7 +130,7 @@ def _first_of_each(starts: Sequence[Start], followed: set[int]) -> list[int]:
 
 def _both_ways(starts: Sequence[Start], scope: Scope, what: str) -> list[Branch | None]:
     firsts = run_together(
-        [first_point(OrbitProblem(s.family), s.family.unknowns(s.state, [s.value]), scope.settings) for s in starts]
+        [first_point(problem_of(s.family), s.family.unknowns(s.state, [s.value]), scope.settings) for s in starts]
     )
     pairs = [(s.family, p) for s, p in zip(starts, firsts, strict=True) if p is not None]
     halves = run_together(
@@ -153,7 +160,7 @@ def _lie_on(starts: Sequence[Start], branches: Sequence[Branch]) -> list[bool]:
 def _at_value(family: Family, guess: np.ndarray, settings: Settings) -> Steps[Point | None]:
     normal = np.zeros(len(guess))
     normal[-1] = 1.0
-    found = yield from correct(OrbitProblem(family), guess, normal, settings)
+    found = yield from correct(problem_of(family), guess, normal, settings)
     return found
 
 
@@ -321,3 +328,48 @@ def _is_crossing(parent: Branch, one: Bifurcation, branches: Sequence[Branch]) -
                 one.child = other.child = branch
                 return True
     return False
+
+
+# ---- Hopf points -------------------------------------------------------------------------------
+
+
+def _adopt_cycles(branches: Sequence[Branch]) -> None:
+    """Connect branches of cycles that end at an equilibrium to the Hopf point there."""
+    for branch in branches:
+        for which in (0, 1):
+            if branch.ends[which] == "equilibrium":
+                at = _hopf_at(branches, branch, branch.points[-which])
+                if at is not None:
+                    at.child = at.child or branch
+                    branch.origin = branch.origin or at
+
+
+def _hopf_at(branches: Sequence[Branch], cycles: Branch, end: Point) -> Bifurcation | None:
+    """Return the nearest Hopf point to the last cycle of a branch, if it is within `AT_HOPF`."""
+    near = [
+        (max(_gap(cycles.family, end, one), abs(end.u[-1] - one.point.u[-1])), one)
+        for other in branches
+        if not other.family.period and other.family.free == cycles.family.free
+        for one in other.bifurcations
+        if one.kind == HOPF
+    ]
+    away, nearest = min(near, key=lambda pair: pair[0], default=(np.inf, None))
+    return nearest if away < AT_HOPF else None
+
+
+def _leave_equilibria(branches: list[Branch], scope: Scope) -> None:
+    """Follow the cycles that leave the Hopf points at which no known branch of cycles ends."""
+    _adopt_cycles(branches)
+    points = [
+        (branch, one) for branch in branches for one in branch.bifurcations if one.kind == HOPF and one.child is None
+    ]
+    families = [cycle_family(branch.family, one) for branch, one in points]
+    ready = [(one, family) for (_, one), family in zip(points, families, strict=True) if family is not None]
+    halves = run_together(
+        [cycles_from(family, one, scope.low, scope.high, scope.settings) for one, family in ready], FOLLOWING
+    )
+    for (one, family), half in zip(ready, halves, strict=True):
+        if half is not None and len(half.trace.points) > 2 and one.child is None:
+            child = Branch(family, half.trace.points, half.bifurcations, ("start", half.trace.end), one)
+            one.child = child
+            branches.append(child)

@@ -11,6 +11,7 @@ from magpend_core.orbits import crossed_state
 from magpend_core.pointwise import rates_packed
 from pipeline.analysis.branches.arclength import Point, Settings, Trace, correct, kernel_of, trace
 from pipeline.analysis.branches.bifurcations import FOLD, Bifurcation, Watch
+from pipeline.analysis.branches.equilibria import EquilibriumProblem, OneParameter
 from pipeline.analysis.branches.lockstep import Query, Steps
 from pipeline.analysis.branches.problems import Family, OrbitProblem
 
@@ -21,9 +22,14 @@ REST = 0.01
 the state that crosses]."""
 
 
+def problem_of(family: Family) -> OneParameter:
+    """Return the equations of a family, for one computation."""
+    return OrbitProblem(family) if family.period else EquilibriumProblem(family)
+
+
 @dataclass(eq=False)
 class Branch:
-    """A branch: the orbits of one period along one parameter.
+    """A branch: the orbits of one period, or equilibria, along one parameter.
 
     Attributes
     ----------
@@ -73,7 +79,7 @@ class _Stop:
             return "bound"
         if self._is_closed(points):
             return "closed"
-        if reach(self.family, here) < REST:
+        if self.family.period and reach(self.family, here) < REST:
             return "equilibrium"
         return "period_halving" if len(points) > 2 and has_halved(self.family, points) else ""
 
@@ -110,7 +116,7 @@ def reach(family: Family, point: Point) -> float:
 
 def has_halved(family: Family, points: list[Point]) -> bool:
     """Return whether the trace passed an orbit of half the period: the orbit's halves changed places."""
-    if family.period % 2 or len(points) < 2:
+    if not family.period or family.period % 2 or len(points) < 2:
         return False
     before, here = (_half_way(family, p) for p in points[-2:])
     return bool(float(before @ here) < 0.0 and max(np.linalg.norm(before), np.linalg.norm(here)) < 0.2)
@@ -127,7 +133,7 @@ def half_orbit(family: Family, point: Point) -> tuple[np.ndarray, float]:
     return family.state(u), float(family.values(u)[0])
 
 
-def first_point(problem: OrbitProblem, u: np.ndarray, settings: Settings) -> Steps[Point | None]:
+def first_point(problem: OneParameter, u: np.ndarray, settings: Settings) -> Steps[Point | None]:
     """Correct an orbit at its parameter value; its tangent points to rising parameter values."""
     normal = np.zeros(problem.size)
     normal[-1] = 1.0
@@ -142,7 +148,7 @@ def half_branch(
     family: Family, start: Point, low: float, high: float, settings: Settings, from_bifurcation: bool = False
 ) -> Steps[Half]:
     """Follow orbits from a point along its tangent; the last point lies on the bound that was passed."""
-    problem = OrbitProblem(family)
+    problem = problem_of(family)
     watch = Watch(problem, settings, skip_first=from_bifurcation)
     found = yield from trace(problem, start, settings, _Stop(family, low, high), watch.between)
     n_last = len(found.points) - 2
@@ -170,7 +176,7 @@ def _is_known(one: Bifurcation, found: list[Bifurcation]) -> bool:
     )
 
 
-def _cut(problem: OrbitProblem, found: Trace, low: float, high: float, settings: Settings) -> Steps[None]:
+def _cut(problem: OneParameter, found: Trace, low: float, high: float, settings: Settings) -> Steps[None]:
     """Replace the point beyond the bound by one on it."""
     family = problem.family
     before, beyond = found.points[-2:]
@@ -247,7 +253,7 @@ def crossing_half(
     normal = kernel.T @ np.array([-own[1], own[0]])
     normal *= way / np.linalg.norm(normal)
     start = Point(at.point.u, normal, at.point.value, 0)
-    problem = OrbitProblem(family)
+    problem = problem_of(family)
     # at a pitchfork the parameter stands still
     level = kernel.T @ np.array([-kernel[1, -1], kernel[0, -1]])
     slanted = float(level @ normal)

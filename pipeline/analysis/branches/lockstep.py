@@ -98,6 +98,10 @@ def _calls(systems: Sequence[tuple[int, System]]) -> list[list[int]]:
 
 
 def _integrate(rows: Sequence[Rows], system: System) -> list[Ends]:
+    if not any(len(r.states) for r in rows):  # equilibria alone
+        n = system.n_states
+        none = np.zeros((0, n))
+        return [Ends(none, none[:, None], none[:, None], none[:, :0]) for _ in rows]
     ends = section_map(
         np.concatenate([r.parameters for r in rows]),
         np.concatenate([r.frequency_hz for r in rows]),

@@ -38,6 +38,8 @@ def sides_of(branches: Sequence[Branch], base: Parameters) -> list[np.ndarray]:
 
 def _sides(branch: Branch, base: Parameters, classifier: Classifier) -> np.ndarray:
     family = branch.family
+    if not family.period:
+        return _rest_sides(branch, base, classifier)
     own = base.replace(**dict(zip(base.names, map(float, family.parameters), strict=True)))
     name, flow = family.free[0], of_flow(own).model.system
     angles = np.flatnonzero(family.system.is_angle)
@@ -62,6 +64,18 @@ def _sides(branch: Branch, base: Parameters, classifier: Classifier) -> np.ndarr
     return np.array(codes, np.int8)
 
 
+def _rest_sides(branch: Branch, base: Parameters, classifier: Classifier) -> np.ndarray:
+    """Classify equilibria, whose states stay where they are."""
+    name, n_angles = branch.family.free[0], sum(branch.family.system.is_angle)
+    own = base.replace(**dict(zip(base.names, map(float, branch.family.parameters), strict=True)))
+    codes = []
+    for point in branch.points:
+        values = own.replace(**{name: float(branch.family.values(point.u)[0])})
+        states = np.repeat(branch.family.state(point.u)[None], 2, axis=0)
+        codes.append(classifier.classify(states, np.zeros(n_angles, np.int64), _SEEN_WHOLE, _values(values)))
+    return np.array(codes, np.int8)
+
+
 _SEEN_WHOLE = np.array(np.inf)
 """Frequency given to the classifier: infinite, since samples of the whole orbit leave no gap."""
 
@@ -73,8 +87,8 @@ def _values(parameters: Parameters) -> Mapping[str, Any]:
 def rotation_of(branch: Branch) -> np.ndarray:
     """Compute the mean turns of each angle per drive period or return, from the branch's first orbit."""
     family = branch.family
-    if not any(family.system.is_angle):
-        return np.zeros(0)
+    if not any(family.system.is_angle) or not family.period:
+        return np.zeros(sum(family.system.is_angle))
     rows = family.rows(branch.points[0].u[None])
     result = run_branches(
         rows.parameters[:, None],

@@ -78,7 +78,8 @@ class Rows:
 class Value:
     """The value of a problem at `u`: F (m,), its derivative (m, m + 1), and the orbit's data.
 
-    `images` are the orbit's sections, `monodromy` its monodromy matrix, `seconds` its period [s].
+    `images` are the orbit's sections, `monodromy` its monodromy matrix, `seconds` its period [s]. For an
+    equilibrium (`is_rest`) they are its state, the Jacobian [1/s] and NaN.
     """
 
     residual: np.ndarray
@@ -86,6 +87,7 @@ class Value:
     images: np.ndarray
     monodromy: np.ndarray
     seconds: float = np.nan
+    is_rest: bool = False
 
     @property
     def is_finite(self) -> bool:
@@ -113,13 +115,13 @@ class Problem(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Family:
-    """Orbits of one period with some parameters free.
+    """Orbits of one period, or equilibria, with some parameters free.
 
     Attributes
     ----------
     system : System
     period : int
-        In drive periods or returns.
+        In drive periods or returns; 0 for equilibria.
     frequency_hz : float
         Used unless it is free.
     parameters : ndarray

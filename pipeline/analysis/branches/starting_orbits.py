@@ -22,7 +22,7 @@ TRIES = 16
 
 @dataclass(frozen=True)
 class Listed:
-    """An attractor of a run at one parameter point: its id, where it is, its period (0: bounded set)."""
+    """An attractor of a run at one parameter point: its id, where it is, its period (0: none)."""
 
     identity: int
     where: Mapping[str, float]
@@ -52,7 +52,7 @@ def listed(attractors: xr.Dataset, parameters: Parameters, parameter: str, scale
         for i in np.flatnonzero(point["kind"].values > 0):
             one = point.isel(attractor=int(i))
             kind, period, start = int(one["kind"]), int(one["orbit_period"]), None
-            if int(one["is_polished"]) and period >= 1:
+            if int(one["is_polished"]) and (period >= 1 or kind == EQUILIBRIUM):
                 family = family_of(parameters.model.system, period, frequency, packed, parameter, scale)
                 state = np.asarray(one["attractor_points"].values[0])
                 start = Start(family, state, value_of(family, frequency, packed), int(i))
@@ -99,11 +99,9 @@ def attracting(
 
 def _why_not(one: Listed, interval: tuple[float, float], max_period: int) -> str:
     """Return the reason why an attractor is no start; empty if it is one."""
-    if one.is_rest:
-        return "an equilibrium, not a periodic orbit"
     if one.is_cycle:
         return "a limit cycle seen at even times; see it at crossings: [section] of a new run"
-    if not one.period:
+    if not one.period and not one.is_rest:
         return "a set that does not close; --recurrences P starts from orbits that it comes near"
     if one.start is None:
         return f"Newton's method found no orbit of period {one.period} there"

@@ -26,8 +26,10 @@ def words(variable: xr.DataArray) -> list[str]:
 def branches_table(ds: xr.Dataset) -> Table:
     """Return the table of bifurcations, with lines on stable segments and attractors left out.
 
-    ``unstable_below`` and ``unstable_above`` say how many multipliers are unstable on the two sides of the
-    parameter; at a fold both orbits lie on one side, and the other says ``none``.
+    Equilibria have the period 0, and eigenvalues [1/s] in place of multipliers. A Hopf point has the period of
+    its small cycles and its first Lyapunov coefficient. ``unstable_below`` and ``unstable_above`` say how many
+    multipliers are unstable on the two sides of the parameter; at a fold both orbits lie on one side, and the
+    other says ``none``.
     """
     rows = table_of(ds)
     if not ds.sizes["branch"]:
@@ -70,6 +72,7 @@ def table_of(ds: xr.Dataset) -> list[Row]:
                 **({} if sides is None else {"side": sides[k]}),
                 "multiplier_real": float(one["critical_real"]),
                 "multiplier_imag": float(one["critical_imag"]),
+                **({"first_lyapunov": float(one["first_lyapunov"])} if "hopf" in kinds else {}),
                 "unstable_below": below,
                 "unstable_above": above,
                 "period_s": float(one["bifurcation_period_s"]),
@@ -109,10 +112,10 @@ def _lines(ds: xr.Dataset, rows: Sequence[Row]) -> list[str]:
             _with_unit(ds): f"{row[parameter]:.7f}",
             "type": row["type"],
             "criticality": row["criticality"],
-            "period": str(row["period"]),
+            "period": str(row["period"] or "equilibrium"),
             "seconds": f"{row['period_s']:.6g}",
             "side": row.get("side", ""),
-            "multiplier": _number(z),
+            "multiplier": _number(z) + (" 1/s" if not row["period"] else ""),
             "unstable below, above": f"{row['unstable_below']}, {row['unstable_above']}",
             "branch": f"{row['branch']}{to}{_at(ds, row['branch'])}",
         }
@@ -154,7 +157,8 @@ def _windows(ds: xr.Dataset) -> list[str]:
     for w in windows_of(ds):
         ends = f"{w['from']:.7f} ({w['begins']}) to {w['to']:.7f} ({w['ends']})"
         side = f", {w['side']}" if w["side"] else ""
-        lines.append(f"  period {w['period']}{side}, branch {w['branch']}{_at(ds, w['branch'])}: {ends}")
+        what = f"period {w['period']}" if w["period"] else "equilibrium"
+        lines.append(f"  {what}{side}, branch {w['branch']}{_at(ds, w['branch'])}: {ends}")
     return lines if len(lines) > 1 else ["no stable segment"]
 
 
@@ -210,11 +214,11 @@ def _bound(ds: xr.Dataset, branch: int, point: int, after: int, end: int) -> tup
         return value, "not located"
     origins = np.flatnonzero(ds["to_branch"].values == branch)
     name = _ends_of(ds, branch)[end]
-    if name in ("start", "period_halving") and len(origins):
+    if name in ("start", "period_halving", "equilibrium") and len(origins):
         nearest = origins[np.argmin(np.abs(ds["value"].values[origins] - value))]
         parent = int(ds["orbit_period"][int(ds["of_branch"][nearest])])
         at, kind = _named(ds, int(nearest))
-        return at, f"{kind} of period {parent}"
+        return at, f"{kind} of {f'period {parent}' if parent else 'an equilibrium'}"
     return value, name
 
 

@@ -241,13 +241,13 @@ def _event(found: xr.Dataset, k: int, y: str) -> dict[str, Any]:
     branch, kind = int(found["of_branch"][k]), KINDS[int(found["kind"][k])]
     period = int(found["orbit_period"][branch])
     criticality = CRITICALITIES[int(found["criticality"][k])]
-    values = found["bifurcation_section"].sel(state=y).values[k, :period]
+    values = found["bifurcation_section"].sel(state=y).values[k, : max(period, 1)]
     unstable = [int(found[f"n_unstable_{side}"][k]) for side in ("before", "after")]
     return {
         "kind": NAMES[kind],
         "x": float(found["value"][k]),
         "y": [float(v) for v in values if np.isfinite(v)],
-        "label": f"{SHORT[kind]}{period}",
+        "label": f"{SHORT[kind]}{period or ''}",
         "branch": branch,
         "period": period,
         "criticality": criticality or None,

@@ -1,0 +1,216 @@
+"""Branches of equilibria of flows: folds, branch points, Hopf points, and the cycles that leave them."""
+
+from __future__ import annotations
+
+import tomllib
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from magpend_core.crossing import Crossing
+from magpend_core.models import load_model
+from magpend_core.models.sectioned import sectioned
+from pipeline.analysis.branches import Scope, Start, dataset_of, explore
+from pipeline.analysis.branches.equilibria import EquilibriumProblem, first_lyapunov
+from pipeline.analysis.branches.problems import Family
+from pipeline.analysis.branches.table import branches_table
+
+BRUSSELATOR = """
+name = "brusselator"
+[states]
+x = { unit = "1" }
+y = { unit = "1" }
+[parameters]
+a = 1.2
+b = 2.0
+[equations]
+x = "a + x^2*y - (b + 1)*x"
+y = "b*x - x^2*y"
+"""
+
+CUBIC = """
+name = "cubic"
+[states]
+x = { unit = "1" }
+[parameters]
+m = 0.0
+[equations]
+x = "m + 3*x - x^3"
+"""
+
+
+def branches_of(model, parameter, interval, state, value, section=None, **overrides):
+    """Follow the branches of an equilibrium of a model."""
+    seen = model if section is None else sectioned(model, section)
+    parameters = seen.load(**overrides)
+    low, high = interval
+    family = Family(
+        seen.system, 0, 1.0 / (section.longest if section else 1.0), parameters.pack(), (parameter,), (high - low,)
+    )
+    found = explore([Start(family, np.array(state, float), value)], Scope(low, high, 2))
+    return found, parameters
+
+
+def only(branch, kind):
+    (found,) = [b for b in branch.bifurcations if b.kind == kind]
+    return found, branch.family.values(found.point.u)[0]
+
+
+def test_equilibria__folds_of_a_cubic():
+    """m = x^3 - 3 x: folds at x = -1 and 1, m = 2 and -2; stable, unstable, stable."""
+    model = load_model(tomllib.loads(CUBIC))
+    (branch,), _ = branches_of(model, "m", (-4.0, 4.0), [2.1], 2.1**3 - 6.3)
+    folds = sorted((branch.family.values(b.point.u)[0], branch.family.state(b.point.u)[0]) for b in branch.bifurcations)
+    np.testing.assert_allclose(folds, [(-2.0, 1.0), (2.0, -1.0)], atol=1e-7)
+    states = np.array([branch.family.state(p.u)[0] for p in branch.points])
+    np.testing.assert_allclose(branch.values, states**3 - 3.0 * states, atol=1e-8)
+    unstable = [p.value.monodromy[0, 0] > 0.0 for p in branch.points]
+    assert unstable == (np.abs(states) < 1.0).tolist()
+    assert branch.ends == ("bound", "bound")
+
+
+def test_equilibria__lorenz():
+    """Pitchfork at rho = 1, subcritical Hopf at sigma (sigma + beta + 3)/(sigma - beta - 1) = 470/19."""
+    x = np.sqrt(8.0 / 3.0 * 19.0)
+    section = Crossing("z", 19.0, "up", 50.0)
+    found, parameters = branches_of(load_model("lorenz"), "rho", (0.5, 30.0), [x, x, 19.0], 20.0, section)
+    wing = found[0]
+    hopf, rho = only(wing, "hopf")
+    assert rho == pytest.approx(470.0 / 19.0, abs=1e-7)
+    assert hopf.criticality == "subcritical"
+    # the characteristic polynomial there is (s + sigma + beta + 1)(s^2 + beta (sigma + rho))
+    assert hopf.critical_multiplier.imag == pytest.approx(np.sqrt(8.0 / 3.0 * (10.0 + rho)), rel=1e-7)
+    rest = [b for b in found[1:] if not b.family.period]
+    assert any(
+        abs(b.family.values(one.point.u)[0] - 1.0) < 1e-6
+        for b in [wing, *rest]
+        for one in b.bifurcations
+        if one.kind == "branch_point"
+    )
+    cycles = hopf.child
+    assert cycles is not None
+    assert cycles.family.period == 1
+    assert cycles.ends[0] == "start"
+    assert (np.diff(cycles.values[:20]) < 0.0).all()
+    assert {int((np.abs(np.linalg.eigvals(p.value.monodromy)) > 1.0).sum()) for p in cycles.points[1:20]} == {1}
+    lines = branches_table(dataset_of(found, "rho", parameters)).lines
+    assert any("hopf" in line and "subcritical" in line and "equilibrium" in line for line in lines)
+
+
+def test_hopf__of_the_brusselator_has_the_amplitude_of_its_cycles():
+    """b = 1 + a^2, w = a, supercritical; amplitudes by the coefficient and by scipy."""
+    a, model = 1.2, load_model(tomllib.loads(BRUSSELATOR))
+    section = Crossing("x", a, "up", 100.0)
+    found, parameters = branches_of(model, "b", (1.5, 3.5), [a, 2.0 / a], 2.0, section)
+    hopf, b = only(found[0], "hopf")
+    assert b == pytest.approx(1.0 + a * a, abs=1e-8)
+    assert hopf.critical_multiplier.imag == pytest.approx(a, rel=1e-8)
+    assert hopf.criticality == "supercritical"
+    assert hopf.coefficient_error < 1e-5 * abs(hopf.coefficient)
+    family, near = found[0].family, 4e-3
+    # real part of the eigenvalues: (b - 1 - a^2)/2
+    radius = np.sqrt(-0.5 * near / (a * hopf.coefficient))
+    vector = np.linalg.eig(hopf.point.value.monodromy)[1][:, 0]
+
+    def rates(t, z):
+        x, y = z
+        return [a + x * x * y - (b + near + 1.0) * x, (b + near) * x - x * x * y]
+
+    settled = solve_ivp(rates, (0.0, 6e3), [a + 0.08, (b + near) / a], method="DOP853", rtol=1e-9, atol=1e-11).y[:, -1]
+    last = solve_ivp(rates, (0.0, 12.0), settled, method="DOP853", rtol=1e-10, atol=1e-12, max_step=0.01).y
+    assert 2.0 * radius * abs(vector[0]) == pytest.approx(0.5 * np.ptp(last[0]), rel=0.01)
+    cycles = hopf.child
+    assert cycles is not None
+    assert cycles.family.parameters[-1] == pytest.approx(a)
+    ds = dataset_of(found, "b", parameters)
+    assert ds["bifurcation_period_s"].values[ds["kind"].values == 4][0] == pytest.approx(2.0 * np.pi / a, rel=1e-7)
+    assert family.period == 0
+
+
+def test_equilibrium_problem__derivative():
+    """Differences of the rates."""
+    seen = sectioned(load_model("lorenz"), Crossing("z", 27.0))
+    family = Family(seen.system, 0, 0.02, seen.load().pack(), ("rho",), (10.0,))
+    problem = EquilibriumProblem(family)
+    u = family.unknowns(np.array([3.0, 4.0, 12.0]), [14.0])
+    value, h = problem.value(u, None), 1e-6
+    by_differences = [
+        (problem.value(u + h * e, None).residual - problem.value(u - h * e, None).residual) / (2.0 * h)
+        for e in np.eye(4)
+    ]
+    np.testing.assert_allclose(value.derivative, np.transpose(by_differences), atol=1e-7)
+
+
+FLUTTER = {"b": 0.15, "a": -0.5, "rho": 1.204, "mw": 5.3, "mT": 16.9, "c1": 0.165, "c2": 0.0455, "c3": 0.335, "c4": 0.3}
+RIG = {"Ia": 0.1724, "ca": 0.5628, "ch": 14.5756, "ka": 54.1162, "k2": 751.6, "k3": 5006.7, "kh": 3529.4, "xa": 0.24}
+
+
+def flutter():
+    """The flutter rig of Lee, Barton and Renson as text: heave, pitch, lag and their rates."""
+    p = type("P", (), FLUTTER | RIG)
+    pi, s = np.pi, 1.0 - p.c1 - p.c3
+    mass = np.array(
+        [
+            [p.mT + pi * p.rho * p.b**2, p.mw * p.xa * p.b - p.a * pi * p.rho * p.b**3, 0.0],
+            [p.mw * p.xa * p.b - p.a * pi * p.rho * p.b**3, p.Ia + pi * (0.125 + p.a**2) * p.rho * p.b**4, 0.0],
+            [0.0, 0.0, 1.0],
+        ]
+    )
+    half, lag = p.a + 0.5, p.c1 * p.c2 + p.c3 * p.c4
+    # coefficients of 1, U, U^2, U^3
+    damping, stiffness = np.zeros((4, 3, 3)), np.zeros((4, 3, 3))
+    damping[0, 0, 0], damping[0, 1, 1] = p.ch, p.ca
+    damping[0, 2, 0], damping[0, 2, 1] = -1.0 / p.b, p.a - 0.5
+    damping[1, 0, 0] = 2.0 * pi * p.rho * p.b * s
+    damping[1, 0, 1] = (1.0 + s * (1.0 - 2.0 * p.a)) * pi * p.rho * p.b**2
+    damping[1, 1, 0] = -2.0 * pi * half * p.rho * p.b**2 * s
+    damping[1, 1, 1] = (0.5 - p.a) * (1.0 - s * (1.0 + 2.0 * p.a)) * pi * p.rho * p.b**3
+    damping[1, 2, 2] = (p.c2 + p.c4) / p.b
+    damping[2, 0, 2] = 2.0 * pi * p.rho * p.b * lag
+    damping[2, 1, 2] = -2.0 * pi * p.rho * p.b**2 * half * lag
+    stiffness[0, 0, 0], stiffness[0, 1, 1] = p.kh, p.ka
+    stiffness[1, 2, 1] = -1.0 / p.b
+    stiffness[2, 0, 1] = 2.0 * pi * p.rho * p.b * s
+    stiffness[2, 1, 1] = -2.0 * pi * half * p.rho * s * p.b**2
+    stiffness[2, 2, 2] = p.c2 * p.c4 / p.b**2
+    stiffness[3, 0, 2] = 2.0 * pi * p.rho * p.c2 * p.c4 * (p.c1 + p.c3)
+    stiffness[3, 1, 2] = -2.0 * pi * p.rho * p.b * half * p.c2 * p.c4 * (p.c1 + p.c3)
+    inverse = np.linalg.inv(mass)
+    terms = [("", 1.0), ("*U", 1.0), ("*U^2", 1.0), ("*U^3", 1.0)]
+    equations = {"h": "vh", "al": "va", "w": "vw"}
+    for i, name in enumerate(("vh", "va", "vw")):
+        parts = [f"({-(inverse[i, 1] * p.k2)!r})*al^2", f"({-(inverse[i, 1] * p.k3)!r})*al^3"]
+        for power, (factor, _) in enumerate(terms):
+            for matrix, states in ((damping, ("vh", "va", "vw")), (stiffness, ("h", "al", "w"))):
+                row = -(inverse @ matrix[power])[i]
+                parts += [f"({float(c)!r}){factor}*{state}" for c, state in zip(row, states, strict=True) if c != 0.0]
+        equations[name] = " + ".join(parts)
+    scales = {"h": 0.05, "al": 0.3, "w": 0.3, "vh": 1.0, "va": 5.0, "vw": 5.0}
+    states = {name: {"unit": "1", "scale": scale} for name, scale in scales.items()}
+    return load_model({"name": "flutter", "states": states, "parameters": {"U": 16.0}, "equations": equations})
+
+
+def test_equilibria__flutter_rig():
+    """Hopf point and fold of the cycles as own shooting with DOP853 found them (Lee, Barton and Renson's model)."""
+    found, _ = branches_of(flutter(), "U", (14.0, 20.0), [0.0] * 6, 19.0, Crossing("h", 0.0, "up", 5.0))
+    hopf, speed = only(found[0], "hopf")
+    assert speed == pytest.approx(17.957265, abs=1e-6)
+    assert hopf.criticality == "subcritical"
+    cycles = hopf.child
+    assert cycles is not None
+    _, fold = only(cycles, "fold")
+    assert fold == pytest.approx(14.6601239, abs=1e-6)
+
+
+def test_first_lyapunov__sign_does_not_depend_on_the_scales():
+    """The same flow in other units."""
+    a, model = 1.2, tomllib.loads(BRUSSELATOR)
+    wide = {**model, "states": {"x": {"unit": "1", "scale": 10.0}, "y": {"unit": "1", "scale": 0.1}}}
+    signs = []
+    for table in (model, wide):
+        seen = load_model(table)
+        family = Family(seen.system, 0, 1.0, seen.load(a=a).pack(), ("b",), (1.0,))
+        u = family.unknowns(np.array([a, (1.0 + a * a) / a]), [1.0 + a * a])
+        signs.append(np.sign(first_lyapunov(family, u)[0]))
+    assert signs == [-1.0, -1.0]
