@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import product
 
 import numpy as np
@@ -200,14 +200,13 @@ def joined(family: Family, backward: Half, forward: Half) -> Branch:
     back = [Point(p.u, -p.tangent, p.value, p.n_iterations) for p in reversed(backward.trace.points)]
     n = len(back) - 1
     turned = [
-        Bifurcation(
-            b.kind,
-            Point(b.point.u, -b.point.tangent, b.point.value, b.point.n_iterations),
-            b.bracket,
-            b.n_unstable_after,
-            b.n_unstable_before,
-            b.rises_before != (b.kind != FOLD),
-            n - 1 - b.after,
+        replace(
+            b,
+            point=opposite(b.point),
+            n_unstable_before=b.n_unstable_after,
+            n_unstable_after=b.n_unstable_before,
+            rises_before=b.rises_before != (b.kind != FOLD),
+            after=n - 1 - b.after,
         )
         for b in reversed(backward.bifurcations)
     ]

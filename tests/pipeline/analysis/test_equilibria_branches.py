@@ -12,6 +12,7 @@ from magpend_core.crossing import Crossing
 from magpend_core.models import load_model
 from magpend_core.models.sectioned import sectioned
 from pipeline.analysis.branches import Scope, Start, dataset_of, explore
+from pipeline.analysis.branches.arclength import Settings
 from pipeline.analysis.branches.equilibria import EquilibriumProblem, first_lyapunov
 from pipeline.analysis.branches.problems import Family
 from pipeline.analysis.branches.table import branches_table
@@ -40,7 +41,7 @@ x = "m + 3*x - x^3"
 """
 
 
-def branches_of(model, parameter, interval, state, value, section=None, **overrides):
+def branches_of(model, parameter, interval, state, value, section=None, step=5e-3, **overrides):
     """Follow the branches of an equilibrium of a model."""
     seen = model if section is None else sectioned(model, section)
     parameters = seen.load(**overrides)
@@ -48,7 +49,9 @@ def branches_of(model, parameter, interval, state, value, section=None, **overri
     family = Family(
         seen.system, 0, 1.0 / (section.longest if section else 1.0), parameters.pack(), (parameter,), (high - low,)
     )
-    found = explore([Start(family, np.array(state, float), value)], Scope(low, high, 2))
+    found = explore(
+        [Start(family, np.array(state, float), value)], Scope(low, high, 2, settings=Settings(longest_step=step))
+    )
     return found, parameters
 
 
@@ -71,23 +74,16 @@ def test_equilibria__folds_of_a_cubic():
 
 
 def test_equilibria__lorenz():
-    """Pitchfork at rho = 1, subcritical Hopf at sigma (sigma + beta + 3)/(sigma - beta - 1) = 470/19."""
-    x = np.sqrt(8.0 / 3.0 * 19.0)
-    section = Crossing("z", 19.0, "up", 50.0)
-    found, parameters = branches_of(load_model("lorenz"), "rho", (0.5, 30.0), [x, x, 19.0], 20.0, section)
+    """Subcritical Hopf point at sigma (sigma + beta + 3)/(sigma - beta - 1) = 470/19."""
+    x = np.sqrt(8.0 / 3.0 * 23.0)
+    section = Crossing("z", 23.0, "up", 50.0)
+    found, parameters = branches_of(load_model("lorenz"), "rho", (23.0, 26.0), [x, x, 23.0], 24.0, section, 0.05)
     wing = found[0]
     hopf, rho = only(wing, "hopf")
     assert rho == pytest.approx(470.0 / 19.0, abs=1e-7)
     assert hopf.criticality == "subcritical"
     # the characteristic polynomial there is (s + sigma + beta + 1)(s^2 + beta (sigma + rho))
     assert hopf.critical_multiplier.imag == pytest.approx(np.sqrt(8.0 / 3.0 * (10.0 + rho)), rel=1e-7)
-    rest = [b for b in found[1:] if not b.family.period]
-    assert any(
-        abs(b.family.values(one.point.u)[0] - 1.0) < 1e-6
-        for b in [wing, *rest]
-        for one in b.bifurcations
-        if one.kind == "branch_point"
-    )
     cycles = hopf.child
     assert cycles is not None
     assert cycles.family.period == 1
@@ -96,6 +92,19 @@ def test_equilibria__lorenz():
     assert {int((np.abs(np.linalg.eigvals(p.value.monodromy)) > 1.0).sum()) for p in cycles.points[1:20]} == {1}
     lines = branches_table(dataset_of(found, "rho", parameters)).lines
     assert any("hopf" in line and "subcritical" in line and "equilibrium" in line for line in lines)
+
+
+def test_equilibria__pitchfork_of_lorenz():
+    """At rho = 1 the branches of both wings cross that of rest, whose stability changes."""
+    found, _ = branches_of(load_model("lorenz"), "rho", (0.5, 3.0), [0.0, 0.0, 0.0], 0.7, step=0.02)
+    rest, wings = found
+    at, rho = only(rest, "branch_point")
+    assert rho == pytest.approx(1.0, abs=1e-7)
+    assert (at.n_unstable_before, at.n_unstable_after) == (0, 1)
+    states = np.array([wings.family.state(p.u) for p in wings.points])
+    np.testing.assert_allclose(states[:, 0] ** 2, 8.0 / 3.0 * (wings.values - 1.0), atol=1e-7)
+    assert states[:, 0].min() < -2.0
+    assert states[:, 0].max() > 2.0
 
 
 def test_hopf__of_the_brusselator_has_the_amplitude_of_its_cycles():
@@ -180,7 +189,7 @@ def flutter():
     terms = [("", 1.0), ("*U", 1.0), ("*U^2", 1.0), ("*U^3", 1.0)]
     equations = {"h": "vh", "al": "va", "w": "vw"}
     for i, name in enumerate(("vh", "va", "vw")):
-        parts = [f"({-(inverse[i, 1] * p.k2)!r})*al^2", f"({-(inverse[i, 1] * p.k3)!r})*al^3"]
+        parts = [f"({float(-inverse[i, 1] * p.k2)!r})*al^2", f"({float(-inverse[i, 1] * p.k3)!r})*al^3"]
         for power, (factor, _) in enumerate(terms):
             for matrix, states in ((damping, ("vh", "va", "vw")), (stiffness, ("h", "al", "w"))):
                 row = -(inverse @ matrix[power])[i]
