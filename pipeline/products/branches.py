@@ -38,9 +38,9 @@ class CurveOptions(BranchOptions):
 
 BRANCHES = Analysis(
     "branches",
-    """Follow periodic orbits along a parameter, stable or not; locate and name their bifurcations.
+    """Follow periodic orbits and equilibria along a parameter, stable or not; locate and name their bifurcations.
 
-    Starts from the closed orbits that attract cells of the run. Orbits that are left out are listed, with
+    Starts from the closed orbits and equilibria on which cells of the run end. Those left out are listed, with
     the option that includes them.""",
     BranchOptions,
     compute=f"{_ROOM}:branches",

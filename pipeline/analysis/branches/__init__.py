@@ -1,4 +1,4 @@
-"""Follow branches of periodic orbits along a parameter, and locate their bifurcations.
+"""Follow branches of periodic orbits and equilibria along a parameter, and locate their bifurcations.
 
     starts, left_out = attracting(attractors, parameters, "frequency", (2.0, 3.0))
     branches = explore(starts, Scope(2.0, 3.0))
@@ -9,7 +9,8 @@ seen at crossings (`magpend_core.orbits` has its derivative); its branch is foll
 pseudo-arclength continuation, whether it is stable or not. `problems` has the equations, `lockstep`
 evaluates many of them in one call of the engine, `arclength` traces, `bifurcations` notices and locates,
 `following` makes one branch, `exploring` all that hang together, `curves` continues located points in two
-parameters. `connecting` says which orbits found along an axis lie on one branch. Any
+parameters. `equilibria` has the equations of equilibria and the normal form of Hopf points, `cycles` follows the
+cycles that leave them. `connecting` says which orbits found along an axis lie on one branch. Any
 `magpend_core.engine.system.System` will do; names, units and the class of a motion are the model's.
 
 Located bifurcations
@@ -21,6 +22,7 @@ kind                 test function                            at the point
 ``period_doubling``  det(M + 1)                               a real multiplier is -1
 ``neimark_sacker``   product of mu_i mu_j - 1, i < j          a complex pair lies on the unit circle
 ``branch_point``     det of the derivative and the tangent    another branch of the same period crosses
+``hopf``             product of l_i + l_j, i < j              a pair of eigenvalues of an equilibrium is imaginary
 ==================== ======================================== =============================================
 
 M is the monodromy matrix. A step is halved if the sign changes do not explain its change of the number of
@@ -67,7 +69,9 @@ variable                          dims                     meaning
 ``side``                          branch, point            class of the motion, from the whole orbit
 ``residual``                      branch, point            scaled distance of the point from its image
 ``period_s``                      branch, point            period of the orbit [s]
-``orbit_period``, ``n_points``    branch                   drive periods or returns; points
+``eigenvalue_real``, ``_imag``    branch, point,           eigenvalues of an equilibrium [1/s]; absent if there
+                                  multiplier               are no equilibria
+``orbit_period``, ``n_points``    branch                   drive periods or returns, 0 for equilibria; points
 ``origin``                        branch                   bifurcation that it sprang from, -1 none
 ``first_end``, ``last_end``       branch                   why it ends: at a bound of the parameter, closed on
                                                            itself, on the orbit of half the period, after too
@@ -90,7 +94,8 @@ variable                          dims                     meaning
 ``bifurcation_section``           bifurcation, phase,      the orbit
                                   state
 ``bifurcation_side``              bifurcation              its side
-``bifurcation_period_s``          bifurcation              its period [s]
+``bifurcation_period_s``          bifurcation              its period [s]; of a Hopf point that of its cycles
+``first_lyapunov``, ``_error``    bifurcation              first Lyapunov coefficient of a Hopf point [1/s]
 ================================= ======================== ===================================================
 """
 

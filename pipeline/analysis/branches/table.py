@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from magpend_core.sizes import LEVEL
 from pipeline.analysis.branches.bifurcations import FOLD
 from pipeline.analysis.branches.problems import FREQUENCY
 from pipeline.layout.vocabulary import model_of, parameter_name
@@ -144,6 +145,7 @@ def _at(ds: xr.Dataset, branch: int) -> str:
     found = [
         f"{value:g} Hz" if name == parameter_name(FREQUENCY) else f"{name} {value:g}"
         for name, value in fixed_of(ds, branch).items()
+        if int(ds["orbit_period"][branch]) or name != LEVEL  # equilibria are on no section
     ]
     return f" at {', '.join(found)}" if found else ""
 
