@@ -4,7 +4,7 @@ The first Lyapunov coefficient of a Hopf point decides whether the cycles that l
 (supercritical, negative) or not. With A q = i w q, A^T p = -i w p, <p, q> = 1, and the second and third
 derivatives B and C of the rates (Kuznetsov, Elements of Applied Bifurcation Theory, 3rd ed., 2004, Eq. 5.62)
 
-    l1 = Re(<p, C(q, q, q')> - 2 <p, B(q, A^-1 B(q, q'))> + <p, B(q', (2 i w - A)^-1 B(q, q))>) / (2 w)
+    c = Re(<p, C(q, q, q')> - 2 <p, B(q, A^-1 B(q, q'))> + <p, B(q', (2 i w - A)^-1 B(q, q))>) / (2 w)
 
 where q' is the conjugate of q. B and C are differences of the analytic Jacobian.
 """
