@@ -12,7 +12,7 @@ from pipeline import open_run
 from pipeline.analysis.attractors.table import attractors_table
 from pipeline.analysis.branches.table import branches_table
 from pipeline.analysis.chaos.table import chaos_table
-from pipeline.compute import continuation, task
+from pipeline.compute import integrate, task
 from pipeline.layout.vocabulary import model_of, parameters_of
 from pipeline.runs.derive import derive
 from pipeline.runs.extend import extend
@@ -123,13 +123,13 @@ def test_extend__takes_what_stands_there(directory, tmp_path, bytes_of, monkeypa
     (tmp_path / "spec.toml").write_text(text)
     run(tmp_path / "spec.toml", tmp_path / "fresh", workers=0)
     calls = []
-    original = continuation.run_branches
+    original = integrate.run_branches
 
     def counted(parameters, *words, **options):
         calls.append(len(parameters))
         return original(parameters, *words, **options)
 
-    monkeypatch.setattr(continuation, "run_branches", counted)
+    monkeypatch.setattr(integrate, "run_branches", counted)
     monkeypatch.setattr(task, "warm_up", lambda spec: 0.0)
     extend(directory, tmp_path / "spec.toml", tmp_path / "new", workers=0)
     assert sum(calls) == 2 * 6
