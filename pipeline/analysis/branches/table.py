@@ -167,7 +167,7 @@ def _stable_runs(stable: np.ndarray, closed: bool) -> list[tuple[int, int]]:
 
 
 def _ends_of(ds: xr.Dataset, branch: int) -> tuple[str, str]:
-    ends = values(ds.isel(branch=branch), "first_end", "last_end")
+    ends = values(ds[["first_end", "last_end"]].isel(branch=branch), "first_end", "last_end")
     return ends["first_end"], ends["last_end"]
 
 
@@ -190,7 +190,8 @@ def _bound(ds: xr.Dataset, branch: int, point: int, after: int, end: int) -> tup
 
 
 def _named(ds: xr.Dataset, k: int) -> tuple[float, str]:
-    one = values(ds.isel(bifurcation=k), "value", "criticality", "kind")
+    names = ["value", "criticality", "kind"]
+    one = values(ds[names].isel(bifurcation=k), *names)
     return one["value"], f"{one['criticality']} {one['kind']}".removeprefix("unknown ")
 
 

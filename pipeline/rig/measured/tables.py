@@ -22,20 +22,16 @@ def steps_table(measured: xr.Dataset) -> Table:
     return Table(rows, [counted(len(rows), "step"), *aligned([_words(r) for r in rows])])
 
 
-_MEASURED = (
-    *("direction", "recording", "start_s", "jitter_s", "duty_cycle", "duty_cycle_error"),
-    *("n_sections", "orbit_period", "confidence", "closure"),
-)
-_COMPARED = (
-    *("distance", "distance_in_noise", "runner_up", "noise_floor"),
-    *("winner", "computed_period", "same_period", "same_side"),
-)
+_MEASURED = ("frequency_error_hz", "direction", "recording", "start_s", "jitter_s", "duty_cycle", "duty_cycle_error")
+_ORBIT = ("n_sections", "orbit_period", "confidence", "closure", "side")
+_NEAREST = ("distance", "distance_in_noise", "runner_up", "noise_floor", "winner")
+_COMPUTED = ("computed_period", "same_period", "same_side")
 
 
 def _row(one: xr.Dataset) -> Row:
-    row: Row = {"frequency_hz": float(one["frequency"])}
-    row |= values(one, "frequency_error_hz", *_MEASURED, "side", *_COMPARED)
-    return row | (values(one, "computed_side") if model_of(one).classifier else {})
+    labelled = ("computed_side",) if model_of(one).classifier else ()
+    names = (*_MEASURED, *_ORBIT, *_NEAREST, *_COMPUTED, *labelled)
+    return {"frequency_hz": float(one["frequency"]), **values(one, *names)}
 
 
 def words_of(measured: xr.Dataset) -> tuple[str, ...]:
