@@ -8,6 +8,8 @@ the products by name.
 
 from __future__ import annotations
 
+import csv
+import io
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pkgutil import resolve_name
@@ -92,6 +94,14 @@ class Table:
     rows: Sequence[Mapping[str, Any]]
     lines: Sequence[str]
     nothing: str = ""
+
+    def csv(self) -> str:
+        """Return the rows as CSV, NaN as empty fields."""
+        text = io.StringIO()
+        writer = csv.DictWriter(text, dict.fromkeys(name for row in self.rows for name in row), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows({k: "" if v != v else v for k, v in row.items()} for row in self.rows)
+        return text.getvalue()
 
 
 @dataclass(frozen=True)
