@@ -43,7 +43,7 @@ def values(one: xr.Dataset, *names: str) -> Row:
 
 def counted(n: int, noun: str) -> str:
     """Return a number and its noun, in the plural unless the number is 1."""
-    return f"{n} {noun}{'s' * (n != 1)}"
+    return f"{n} {noun}{'' if n == 1 else 's'}"
 
 
 def points_of(ds: xr.Dataset, dims: Sequence[str]) -> Iterator[tuple[dict[str, int], Row]]:
