@@ -90,7 +90,7 @@ def all_of(model: Model) -> list[str]:
 
 
 def _preset(model: Model, name: str | Preset) -> list[str]:
-    """Return lines on the values of a preset and their origins."""
+    """Return lines with the values of a preset and their sources."""
     from pipeline.analysis.tabular import padded
 
     found = model.preset(name)

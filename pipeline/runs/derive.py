@@ -229,7 +229,7 @@ def prepared(run: AnalysedRun, product: Any, options: Options) -> Options:
 
 
 def most_evidence(run: Run, options: Options) -> Options:
-    """Return the options of the kept result with the largest extension, for the same search.
+    """Return the options of the stored attractors with the longest extension, among those of the same search.
 
     Options without an effort are returned unchanged.
     """
