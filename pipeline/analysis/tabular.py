@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from pipeline.products.product import padded
+
 FEW_POINTS = 6
 """Most parameter points that get a table each."""
 
@@ -131,13 +133,6 @@ def aligned(rows: Sequence[Words], indent: str = "  ", *, right: bool = False) -
     """Align rows under their headings; with `right` all columns but the first are aligned to the right."""
     names = list(dict.fromkeys(name for row in rows for name, text in row.items() if text is not None))
     return padded([names, *([row.get(name) or "" for name in names] for row in rows)], indent, right) if rows else []
-
-
-def padded(table: Sequence[Sequence[str]], indent: str = "  ", right: bool = False) -> list[str]:
-    """Return the lines of a table of texts with columns of even width."""
-    widths = [max(map(len, column)) for column in zip(*table, strict=True)]
-    lines = ([(t.rjust if right and k else t.ljust)(widths[k]) for k, t in enumerate(line)] for line in table)
-    return [indent + "  ".join(line).rstrip() for line in lines]
 
 
 def with_error(value: float, error: float, most: int = 6) -> str:

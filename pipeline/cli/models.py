@@ -72,7 +72,7 @@ def described(model: Model) -> dict[str, Any]:
 
 def all_of(model: Model) -> list[str]:
     """Return lines on all properties of a model."""
-    from pipeline.analysis.tabular import padded
+    from pipeline.products.product import padded
 
     seen = "no drive: the equations do not depend on time" if model.autonomous else ""
     seen = seen or f"period 1/f, f the drive's frequency [Hz]; sections are taken at {model.section}"
@@ -91,7 +91,7 @@ def all_of(model: Model) -> list[str]:
 
 def _preset(model: Model, name: str | Preset) -> list[str]:
     """Return lines with the values of a preset and their sources."""
-    from pipeline.analysis.tabular import padded
+    from pipeline.products.product import padded
 
     found = model.preset(name)
     known, origin = model.load(found), found.provenance

@@ -104,6 +104,13 @@ class Table:
         return text.getvalue()
 
 
+def padded(table: Sequence[Sequence[str]], indent: str = "  ", right: bool = False) -> list[str]:
+    """Return the lines of a table of texts with columns of even width."""
+    widths = [max(map(len, column)) for column in zip(*table, strict=True)]
+    lines = ([(t.rjust if right and k else t.ljust)(widths[k]) for k, t in enumerate(line)] for line in table)
+    return [indent + "  ".join(line).rstrip() for line in lines]
+
+
 @dataclass(frozen=True)
 class CellProduct:
     """A product that a run computes of every cell, requested by ``[products] NAME = {...}``.

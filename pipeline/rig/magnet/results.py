@@ -14,8 +14,8 @@ from magpend_core.models import load_model
 from magpend_core.models.pendulum import magnet_torque as laws
 from magpend_core.models.preset_writing import write_preset
 from magpend_core.models.presets import Preset, find_preset
-from pipeline.analysis.tabular import padded
 from pipeline.layout.writing import write_atomically
+from pipeline.products.product import padded
 from pipeline.rig.magnet.fitting import DipoleFit, JointFit, Outcome
 from pipeline.rig.magnet.measurement import Measurement
 from pipeline.rig.magnet.solving import Quality
