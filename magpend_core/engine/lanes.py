@@ -92,7 +92,7 @@ ENDS_IN_CHATTER = int(Status.CHATTER)
 
 
 class Rows(NamedTuple):
-    """Where a group's rows start, in float64 numbers from the group's base."""
+    """The offsets of the rows of a group of lanes, in float64 numbers from the group's first."""
 
     state: int
     slopes: int  # N_STAGES * n_states rows

@@ -163,7 +163,7 @@ def _suggestion(name: str, table: str, used: Iterable[str]) -> str:
 
 
 def needed(tree: Tree, define: Mapping[str, Tree]) -> Iterator[str]:
-    """All names that an expression needs, through definitions."""
+    """Yield the names that an expression uses, directly or through definitions."""
     seen: set[str] = set()
     pending = [name for name, _ in names(tree)]
     while pending:

@@ -114,7 +114,7 @@ def _follow_starts(starts: Sequence[Start], branches: list[Branch], scope: Scope
 
 
 def _first_of_each(starts: Sequence[Start], followed: set[int]) -> list[int]:
-    """Return the first start of each attractor and period of which no start was followed."""
+    """Return the first start of each pair of attractor and period, without pairs of which a start was followed."""
     kinds = [(start.attractor, start.family.period) for start in starts]
     done = {kinds[i] for i in followed}
     firsts = {kind: i for i, kind in reversed(list(enumerate(kinds))) if kind[0] >= 0 and kind not in done}
