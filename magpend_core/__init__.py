@@ -85,7 +85,7 @@ def __dir__() -> list[str]:
 
 
 class _Package(ModuleType):
-    """Keeps `sections` and `trajectory` functions: imports bind the modules of these names here."""
+    """A package in which `sections` and `trajectory` stay functions when the modules of these names are imported."""
 
     def __setattr__(self, name: str, value: Any) -> None:
         if not (name in _HOME_OF and isinstance(value, ModuleType)):

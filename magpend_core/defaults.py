@@ -9,7 +9,7 @@ ATOL = 1e-8
 """Absolute tolerance of a step, in the states' units."""
 
 MOST_STEPS = 20_000
-"""Most attempted steps per period: a pendulum's period takes about 100 at a tolerance of 1e-8."""
+"""Most attempted steps per period: a period of the pendulum takes about 140 at a tolerance of 1e-8."""
 
 MOST_STEPS_BETWEEN = 1_000_000
 """Most attempted steps per interval of a drive or between two asked instants, which may be many periods apart."""

@@ -85,7 +85,7 @@ def more_sections(
 def orbit_periods(
     sections: np.ndarray, *, closure_tolerance: float, max_orbit_period: int, system: System
 ) -> np.ndarray:
-    """Return the period of the orbit on which each cell closes, 0 if none, as `run_branches` does.
+    """Return for each cell the period of the orbit on which it closes, 0 if none, by the rule of `run_branches`.
 
     Parameters
     ----------

@@ -36,7 +36,7 @@ def driven_system(system: System, drive: Drive) -> System:
 
 
 def _padded(packed: np.ndarray, system: System) -> np.ndarray:
-    """Append zeros to packed parameters for the entries that the recorded drive sets."""
+    """Append zeros to packed parameters, as places for the parameters that the recorded drive sets."""
     more = len(system.parameter_names) - packed.shape[-1]
     return np.pad(packed, [(0, 0)] * (packed.ndim - 1) + [(0, more)])
 

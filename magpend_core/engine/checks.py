@@ -187,7 +187,7 @@ def _extremes(packed: np.ndarray, frequency: np.ndarray, checked: _Checked | Non
 
 
 class _Functions:
-    """A system's functions as plain Python, with the problems of those that run once per cell."""
+    """The functions of a system as plain Python; calls collect their problems."""
 
     def __init__(self, system: System) -> None:
         self.system = system

@@ -37,7 +37,7 @@ def code_length(function: Callable[..., Any]) -> int:
 
 
 class _UnknownError(Exception):
-    """A function refers to an object that has no digest."""
+    """A function depends on an object whose code cannot be followed, so that it has no digest."""
 
 
 def functions_digest(*functions: Callable[..., Any]) -> str | None:

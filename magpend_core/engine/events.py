@@ -172,7 +172,7 @@ def cubic_root(a: Any, da: Any, b: Any, db: Any, right: Any) -> Any:
 
 
 def margin(w: Any, base: int, k: int, near: Any, far: Any) -> Any:
-    """Values of event `k` at two ends as margins, positive on its side, and its rates likewise.
+    """Return the values and rates of event `k` at both ends of a step, with the sign that makes its own side positive.
 
     `near` and `far` are pairs of value and rate. A value at the near end that is beyond zero, by rounding
     or after an event, counts as zero.

@@ -315,7 +315,7 @@ def kernel(function: F, kept: str | None = "") -> F:
 
 
 def specialise(template: Callable[..., Any], name: str, **bindings: Any) -> Callable[..., Any]:
-    """Return `template` as a new plain function in which the given global names are bound.
+    """Return a copy of the function `template` with given values for global names; it is not compiled yet.
 
     numba inlines jitted functions that it finds as globals, but a function that closes over them
     can never be found again in the compile cache. So the engine is written once as plain

@@ -92,7 +92,7 @@ ENDS_IN_CHATTER = int(Status.CHATTER)
 
 
 class Rows(NamedTuple):
-    """Where a group's rows start, in float64 numbers from the group's base."""
+    """The offsets of the rows of a group of lanes, in float64 numbers from the group's first."""
 
     state: int
     slopes: int  # N_STAGES * n_states rows
@@ -582,7 +582,9 @@ def start_branch(cells: Cells, work: Work, lane: int, branch: int, settings: Any
 
 
 def start_point(cells: Cells, work: Work, lane: int, point: int, settings: Any, scratch: Any) -> None:
-    """Begin the cell `point` of a lane's branch from the lane's state."""
+    """Start the cell at the parameter point `point` of a lane's branch, from the state in which the lane ended the
+    last one.
+    """
     base, column = (lane // WIDTH) * ROWS.size, lane % WIDTH
     branch = work.branch[lane]
     frequency = cells.frequency[branch, point]

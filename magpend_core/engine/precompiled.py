@@ -263,7 +263,7 @@ _MEMORY: dict[str, bytes] = {}
 
 
 class PartCache:
-    """Records of one part: its LLVM code, and which functions it calls with which types."""
+    """The cache entry of one part: its LLVM code, and the functions that it calls with their argument types."""
 
     def __init__(self, dispatcher: PartDispatcher, folder: PartFolder | None) -> None:
         self._dispatcher, self._folder = dispatcher, folder

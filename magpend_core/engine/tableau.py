@@ -42,7 +42,7 @@ MIDDLE = DENSE @ 0.5 ** np.arange(1.0, 5.0)
 
 
 class Tableau(NamedTuple):
-    """An explicit method whose last stage is the new state; its slope is the first of the next step.
+    """Coefficients of an explicit Runge-Kutta method whose last stage is the new state (first same as last).
 
     Attributes
     ----------

@@ -108,7 +108,9 @@ def with_tangents(system: System, n_vectors: int, divergence: bool = False, writ
 
 
 def _extended_functions(system: System, n_vectors: int, divergence: bool) -> dict[str, Any]:
-    """Return functions of the extended system, with the products of Jacobian and vectors written out."""
+    """Return the functions of the system extended by its variational equations, with the products of Jacobian and
+    tangent vectors written out.
+    """
     n = system.n_states
     bindings = {"_rhs": system.rhs, "_jacobian": system.jacobian, "_layers": system.layers}
     parts = [f"dy[{i}]" for i in range(n)] + _products(system, n_vectors)

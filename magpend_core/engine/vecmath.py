@@ -267,7 +267,7 @@ def atan2(y: Any, x: Any) -> Any:
 
 @inline
 def _asin_rest(u: Any) -> Any:
-    """The function R of asin(s) = s + s R(s**2), for arguments up to 1/4 (fdlibm)."""
+    """Return R(z), z = s**2 up to 1/4, of asin(s) = s + s R(s**2) (fdlibm)."""
     p = 3.479331075960212e-05
     p = p * u + 0.0007915349942898145
     p = p * u - 0.04005553450067941

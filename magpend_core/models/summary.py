@@ -22,7 +22,7 @@ def checks_of(model: Model) -> list[str]:
 
 @dataclass(frozen=True)
 class Description:
-    """The result of `describe`.
+    """The description of a model: its features, and the results of its checks.
 
     Attributes
     ----------

@@ -1,4 +1,8 @@
-"""Format the tables of analyses: rows of numbers for programs, aligned lines for people."""
+"""Format the tables of analyses: rows of numbers for programs, aligned lines for people.
+
+A table is declared by dicts. A row for programs lists the names of its variables (`values`). A row for people
+maps each heading to a text; a column with None is not shown for that row (`aligned`).
+"""
 
 from __future__ import annotations
 
@@ -8,13 +12,19 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from pipeline.products.product import padded
+
 FEW_POINTS = 6
 """Most parameter points that get a table each."""
 
 MOST_RANGES = 6
 """Most ranges of an axis that are listed."""
 
+FRACTION = ("fraction", "low", "high")
+"""Names of a fraction and its interval."""
+
 Row = dict[str, Any]
+Words = Mapping[str, str | None]
 
 
 def where_of(ds: xr.Dataset, at: Mapping[str, int]) -> Row:
@@ -27,9 +37,15 @@ def words_of(array: xr.DataArray) -> list[str]:
     return str(array.attrs["flag_meanings"]).split()
 
 
-def labels(one: xr.Dataset, *names: str) -> Row:
-    """Return the labels of variables that hold a code each; those that are missing are left out."""
-    return {name: words_of(one[name])[int(one[name])] for name in names if name in one}
+def values(one: xr.Dataset, *names: str) -> Row:
+    """Return the values of scalar variables, codes as their labels; missing variables are left out."""
+    found = {name: one[name].item() for name in names if name in one}
+    return {n: words_of(one[n])[v] if "flag_meanings" in one[n].attrs else v for n, v in found.items()}
+
+
+def counted(n: int, noun: str) -> str:
+    """Return a number and its noun, in the plural unless the number is 1."""
+    return f"{n} {noun}{'' if n == 1 else 's'}"
 
 
 def points_of(ds: xr.Dataset, dims: Sequence[str]) -> Iterator[tuple[dict[str, int], Row]]:
@@ -39,12 +55,23 @@ def points_of(ds: xr.Dataset, dims: Sequence[str]) -> Iterator[tuple[dict[str, i
         yield at, where_of(ds, at)
 
 
-def point_table(
-    ds: xr.Dataset, where: Row, rows: Sequence[Row], words: Callable[[Row], Mapping[str, str]]
-) -> list[str]:
-    """Return the lines of the table of one parameter point, with its heading."""
+def sets_of(ds: xr.Dataset, there: xr.DataArray, dims: Sequence[str]) -> Iterator[tuple[Row, xr.Dataset]]:
+    """Yield the sets for which `there` is true: the parameter values, and the variables of the set."""
+    for *index, i in np.argwhere(there.transpose(*dims, "attractor").values).tolist():
+        at = dict(zip(dims, index, strict=True))
+        yield where_of(ds, at), ds.isel({**at, "attractor": i})
+
+
+def point_table(ds: xr.Dataset, where: Row, rows: Sequence[Row], words: Callable[[Row], Words]) -> list[str]:
+    """Return the lines of the table of one parameter point; its heading is empty if nothing is swept."""
+    text = ", ".join(f"{d} {v:g}{unit_of(ds, d)}" for d, v in where.items())
     here = [row for row in rows if all(row[k] == v for k, v in where.items())]
-    return heading(ds, where) + aligned([words(row) for row in here])
+    return [f"{text}:"] * bool(text) + aligned([words(row) for row in here])
+
+
+def at_point(ds: xr.Dataset, row: Row, dims: Sequence[str]) -> Words:
+    """Return the columns with a row's parameter values."""
+    return {f"{d}{unit_of(ds, d)}": f"{row[d]:g}" for d in dims}
 
 
 def unit_of(ds: xr.Dataset, dim: str) -> str:
@@ -53,20 +80,20 @@ def unit_of(ds: xr.Dataset, dim: str) -> str:
     return "" if unit == "1" else f" {unit}"
 
 
-def heading(ds: xr.Dataset, where: Row) -> list[str]:
-    """Return the heading of a parameter point as a list of lines; empty if nothing is swept."""
-    text = ", ".join(f"{d} {v:g}{unit_of(ds, d)}" for d, v in where.items())
-    return [f"{text}:"] if text else []
-
-
 def number(value: float, spec: str) -> str:
     """Format a number; return a dash if it is not finite."""
     return format(value, spec) if np.isfinite(value) else "-"
 
 
-def with_interval(row: Row) -> str:
-    """Format a fraction with its interval."""
-    return f"{row['fraction']:.4f} ({row['low']:.4f} to {row['high']:.4f})"
+def plain(label: str) -> str:
+    """Return a label with blanks instead of underscores."""
+    return label.replace("_", " ")
+
+
+def with_interval(row: Row, names: Sequence[str], spec: str) -> str:
+    """Format the columns of a number and its interval; return a dash if the number is not finite."""
+    value, low, high = (row[name] for name in names)
+    return f"{value:{spec}} ({low:{spec}} to {high:{spec}})" if np.isfinite(value) else "-"
 
 
 def distinct(values: Iterable[Any]) -> str:
@@ -93,23 +120,19 @@ def largest_share(ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str]) -> s
 
 
 def summary(
-    ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str], describe: Callable[..., dict[str, str]]
+    ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str], describe: Callable[..., Words], key: str
 ) -> list[str]:
-    """Return the lines of a table with one row per id."""
-    key = "attractor_id" if rows and "attractor_id" in rows[0] else "label"
+    """Return the lines of a table with one row per value of `key`."""
     groups: dict[int, list[Row]] = {}
     for row in rows:
         groups.setdefault(row[key], []).append(row)
     return aligned([describe(ds, groups[i], dims) for i in sorted(groups)])
 
 
-def aligned(rows: Sequence[Mapping[str, str]]) -> list[str]:
-    """Align rows under their headings."""
-    names = list(dict.fromkeys(name for row in rows for name in row))
-    cells = [names] + [[row.get(name, "") for name in names] for row in rows]
-    widths = [max(len(line[k]) for line in cells) for k in range(len(names))]
-    lines = ["  ".join(w.ljust(n) for w, n in zip(line, widths, strict=True)).rstrip() for line in cells]
-    return [f"  {line}" for line in lines] if rows else []
+def aligned(rows: Sequence[Words], indent: str = "  ", *, right: bool = False) -> list[str]:
+    """Align rows under their headings; with `right` all columns but the first are aligned to the right."""
+    names = list(dict.fromkeys(name for row in rows for name, text in row.items() if text is not None))
+    return padded([names, *([row.get(name) or "" for name in names] for row in rows)], indent, right) if rows else []
 
 
 def with_error(value: float, error: float, most: int = 6) -> str:

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import math
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -67,9 +64,7 @@ def tell(table: Table, csv: str | None, as_json: bool) -> None:
     if as_json:
         console.result(json.dumps(json_rows(table), indent=1))
     elif csv == "-":
-        text = io.StringIO()
-        write_csv(table.rows, text)
-        console.result(text.getvalue().rstrip("\n"))
+        console.result(table.csv().rstrip("\n"))
     else:
         for line in table.lines:
             console.result(line)
@@ -77,24 +72,15 @@ def tell(table: Table, csv: str | None, as_json: bool) -> None:
         from pipeline.cli.outputs import check_table
         from pipeline.layout.writing import write_atomically
 
-        text = io.StringIO()
-        write_csv(table.rows, text)
-        check_table(Path(str(csv)), text.getvalue().partition("\n")[0])
-        write_atomically(Path(str(csv)), text.getvalue())
+        text = table.csv()
+        check_table(Path(str(csv)), text.partition("\n")[0])
+        write_atomically(Path(str(csv)), text)
         console.note(f"table: {csv}")
 
 
 def json_rows(table: Table) -> list[dict[str, Any]]:
     """Return the rows of a table in types that JSON can hold."""
     return [{name: _json(value) for name, value in row.items()} for row in table.rows]
-
-
-def write_csv(rows: Sequence[Mapping[str, Any]], file: Any) -> None:
-    """Write rows as CSV, NaN as empty fields."""
-    names = list(dict.fromkeys(name for row in rows for name in row))
-    writer = csv.DictWriter(file, names, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows({k: "" if v != v else v for k, v in row.items()} for row in rows)
 
 
 def _json(value: Any) -> Any:

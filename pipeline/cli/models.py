@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -72,14 +72,16 @@ def described(model: Model) -> dict[str, Any]:
 
 def all_of(model: Model) -> list[str]:
     """Return lines on all properties of a model."""
+    from pipeline.products.product import padded
+
     seen = "no drive: the equations do not depend on time" if model.autonomous else ""
     seen = seen or f"period 1/f, f the drive's frequency [Hz]; sections are taken at {model.section}"
     lines = [f"{model.name}: {model.title}", seen, "", "states"]
-    lines += _table([(s.name, s.unit, s.meaning) for s in model.states])
+    lines += padded([(s.name, s.unit, s.meaning) for s in model.states])
     lines += ["", "parameters"]
-    lines += _table([(p.name, p.unit, p.meaning) for p in model.parameters])
+    lines += padded([(p.name, p.unit, p.meaning) for p in model.parameters])
     if model.quantities:
-        lines += ["", "quantities", *_table([(q.name, q.unit, q.meaning) for q in model.quantities])]
+        lines += ["", "quantities", *padded([(q.name, q.unit, q.meaning) for q in model.quantities])]
     if model.classifier:
         lines += ["", f"motions: {', '.join(model.classifier.words)} ({model.classifier.meaning})"]
     for preset in model.preset_names:
@@ -87,20 +89,15 @@ def all_of(model: Model) -> list[str]:
     return lines
 
 
-def _table(rows: Sequence[tuple[str, ...]]) -> list[str]:
-    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))] if rows else []
-    return [
-        "  " + "  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip() for row in rows
-    ]
-
-
 def _preset(model: Model, name: str | Preset) -> list[str]:
-    """Return lines on the values of a preset and their origins."""
+    """Return lines with the values of a preset and their sources."""
+    from pipeline.products.product import padded
+
     found = model.preset(name)
     known, origin = model.load(found), found.provenance
     rows = [(p.name, f"{known[p.name]:g}", p.unit, p.meaning, origin.get(p.name, "")) for p in model.parameters]
     title = f": {found.title}" if found.title else ""
-    return [f"preset {found.name}{title}", *_table(rows)]
+    return [f"preset {found.name}{title}", *padded(rows)]
 
 
 def presets(

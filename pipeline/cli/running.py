@@ -125,7 +125,7 @@ def _plot(run: Run) -> None:
 
 
 def status(directory: Directory, json: Json = False) -> None:
-    """Print how much of a run is committed, and the status of its cells."""
+    """Print how much of a run is computed and stored, and how many cells have each status."""
     from pipeline.cli.common import tell
     from pipeline.products.product import Table
     from pipeline.runs.status import describe_state, state

@@ -48,7 +48,7 @@ def unlike(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
 
 @dataclass(frozen=True)
 class Way:
-    """The path of a continuation, and the part of it that a block covers.
+    """The order in which a continuation visits the values of its path, and the part of it that a block covers.
 
     Attributes
     ----------

@@ -20,15 +20,17 @@ from pipeline.plots.labels import Measure
 from pipeline.products.branches import BranchOptions
 from pipeline.products.figures import BranchFigureOptions
 
-KINDS = ("fold", "period_doubling", "neimark_sacker", "branch_point", "hopf")
-MARKERS = {"fold": "^", "period_doubling": "s", "neimark_sacker": "o", "branch_point": "D", "hopf": "p"}
-SHORT = {"fold": "F", "period_doubling": "PD", "neimark_sacker": "NS", "branch_point": "BP", "hopf": "H"}
+KINDS = ("fold", "period_doubling", "neimark_sacker", "branch_point", "hopf", "pitchfork", "transcritical")
+MARKERS = dict(zip(KINDS, "^soDpvX", strict=True))
+SHORT = dict(zip(KINDS, ("F", "PD", "NS", "BP", "H", "PF", "TC"), strict=True))
 NAMES = {
     "fold": "fold",
     "period_doubling": "period doubling",
     "neimark_sacker": "Neimark-Sacker",
     "branch_point": "branch point",
     "hopf": "Hopf",
+    "pitchfork": "pitchfork",
+    "transcritical": "transcritical",
 }
 _STABLE: dict[str, Any] = {"color": "black", "linewidth": 1.3, "linestyle": "-", "zorder": 6.0}
 _UNSTABLE: dict[str, Any] = {"color": "0.3", "linewidth": 0.7, "linestyle": (0, (4, 2)), "zorder": 5.0}

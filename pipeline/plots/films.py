@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import subprocess
 from collections.abc import Iterator
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ import numpy as np
 from PIL import Image, features
 
 from pipeline.layout.writing import temporary_beside, writing
-from pipeline.plots.animation import Animation, Pixels
+from pipeline.plots.animation import Animation
 
 SUFFIXES = (".gif", ".webp", ".mp4")
 MOST_GIF_FPS = 50.0
@@ -93,23 +94,25 @@ def durations(n: int, fps: float, grain_ms: int) -> list[int]:
 def _gif(film: Animation, path: Path) -> None:
     palette = _palette(film)
     images = (Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in film.frames())
-    first = next(images)
-    first.save(
-        path,
-        save_all=True,
-        append_images=images,
-        loop=0,
-        duration=durations(film.n_frames, film.fps, 10),
-        optimize=False,
-        disposal=1,
-        comment=_about(film).encode("utf-8")[:250],
-    )
+    comment = _about(film).encode("utf-8")[:250]
+    _save(film, path, images, 10, optimize=False, disposal=1, comment=comment)
+
+
+def _webp(film: Animation, path: Path) -> None:
+    images = (Image.fromarray(frame) for frame in film.frames())
+    _save(film, path, images, 1, quality=75, method=4, xmp=_about(film).encode("utf-8"))
+
+
+def _save(film: Animation, path: Path, images: Iterator[Image.Image], grain_ms: int, **options: Any) -> None:
+    """Write images by Pillow as a film that loops for ever."""
+    duration = durations(film.n_frames, film.fps, grain_ms)
+    next(images).save(path, save_all=True, append_images=images, loop=0, duration=duration, **options)
 
 
 def _palette(film: Animation) -> Image.Image:
     """Return one palette for all frames, from a sample of them; a palette per frame would flicker."""
     chosen = np.unique(np.linspace(0, film.n_frames - 1, PALETTE_FRAMES).astype(int))
-    frames = np.vstack([f for k, f in enumerate(_until(film, int(chosen[-1]))) if k in chosen])
+    frames = np.vstack([f for k, f in enumerate(islice(film.frames(), int(chosen[-1]) + 1)) if k in chosen])
     inked = frames[(frames != 255).any(axis=-1)]
     # keep the background pure white: quantisation would average it with nearly white pixels
     found = Image.fromarray(inked[None]).quantize(PALETTE_COLOURS - 1, Image.Quantize.MEDIANCUT)
@@ -121,64 +124,16 @@ def _palette(film: Animation) -> Image.Image:
     return palette
 
 
-def _until(film: Animation, last: int) -> Iterator[Pixels]:
-    for k, frame in enumerate(film.frames()):
-        yield frame
-        if k == last:
-            return
-
-
-def _webp(film: Animation, path: Path) -> None:
-    images = (Image.fromarray(frame) for frame in film.frames())
-    first = next(images)
-    first.save(
-        path,
-        save_all=True,
-        append_images=images,
-        loop=0,
-        duration=durations(film.n_frames, film.fps, 1),
-        quality=75,
-        method=4,
-        xmp=_about(film).encode("utf-8"),
-    )
-
-
 def _mp4(film: Animation, path: Path) -> None:
     frames = film.frames()
     first = next(frames)
     height, width = first.shape[:2]
-    command = [
-        "ffmpeg",
-        "-y",
-        "-loglevel",
-        "error",
-        "-f",
-        "rawvideo",
-        "-pix_fmt",
-        "rgb24",
-        "-s",
-        f"{width}x{height}",
-        "-r",
-        f"{film.fps:.10g}",
-        "-i",
-        "-",
-        "-an",
-        "-c:v",
-        "libx264",
-        "-pix_fmt",
-        "yuv420p",
-        "-crf",
-        "20",
-        "-movflags",
-        "+faststart",
-        "-metadata",
-        f"comment={_about(film)}",
-        str(path),
-    ]
+    pixels = f"-f rawvideo -pix_fmt rgb24 -s {width}x{height} -r {film.fps:.10g} -i - -an"
+    coded = "-c:v libx264 -pix_fmt yuv420p -crf 20 -movflags +faststart -metadata"
+    command = [*f"ffmpeg -y -loglevel error {pixels} {coded}".split(), f"comment={_about(film)}", str(path)]
     process: Any = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE)
     try:
-        process.stdin.write(first.tobytes())
-        for frame in frames:
+        for frame in chain([first], frames):
             process.stdin.write(frame.tobytes())
     except BrokenPipeError:
         pass  # ffmpeg has ended; its message follows

@@ -181,7 +181,7 @@ def _draw_one(
 
 
 def _parameters(one: xr.Dataset) -> dict[str, float]:
-    """Return the parameter values at the point of a portrait."""
+    """Return the parameter values at which a portrait is drawn."""
     values = parameters_of(one).as_dict()
     return {name: float(one[name]) if name in one.coords else value for name, value in values.items()}
 

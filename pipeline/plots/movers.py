@@ -105,19 +105,16 @@ def _point(ax: Axes, path: Floats, colour: str, trail: Trail, *, jumps: float, s
     way = None
     if not trail.closed:
         (way,) = ax.plot([], [], color=colour, linewidth=0.6, alpha=0.55, animated=True)
-    (dot,) = ax.plot(
-        [],
-        [],
-        linestyle="none",
-        marker="o",
-        markersize=size,
-        color=colour,
-        markeredgecolor="white",
-        markeredgewidth=0.8,
-        animated=True,
-        zorder=5,
-    )
+    dot = _dots(ax, size, colour, "white", 0.8)
+    dot.set_zorder(5)
     return Point(path, jumps, trail, comet, colours, way, dot)
+
+
+def _dots(ax: Axes, size: float, colour: str, edge: str, thick: float) -> Any:
+    """Make the artist of moving dots."""
+    look: dict[str, Any] = {"markersize": size, "color": colour, "markeredgecolor": edge, "markeredgewidth": thick}
+    (dots,) = ax.plot([], [], linestyle="none", marker="o", animated=True, **look)
+    return dots
 
 
 def moving_portrait(ax: Axes, one: xr.Dataset, pair: tuple[str, str], trail: Trail, degrees: bool) -> Point:
@@ -229,17 +226,7 @@ def moving_machine(ax: Axes, scene: Scene, one: xr.Dataset, trail: Trail, *, nam
         for _ in drawing.lines
     )
     places = np.stack([p for name, p in moved.items() if name != drawing.trace] or [path], axis=1)
-    (joints,) = ax.plot(
-        [],
-        [],
-        linestyle="none",
-        marker="o",
-        markersize=5.5,
-        color="white",
-        markeredgecolor="0.25",
-        markeredgewidth=1.4,
-        animated=True,
-    )
+    joints = _dots(ax, 5.5, "white", "0.25", 1.4)
     traced = _point(ax, path, colour, trail, jumps=math.inf, size=9.0, thick=2.2)
     return Machine(lines, corners, joints, places, traced)
 
@@ -295,12 +282,11 @@ class Clock:
     text: Any
     time: Floats
     period: float
-    word: str
 
     def at(self, i: int) -> list[Artist]:
         """Artists at a sample."""
         if self.period:
-            self.text.set_text(f"{self.time[i] / self.period:.2f} {self.word}")
+            self.text.set_text(f"{self.time[i] / self.period:.2f} drive periods")
         else:
             self.text.set_text(f"{self.time[i]:.2f} s")
         return [self.text]
@@ -323,4 +309,4 @@ def moving_clock(fig: style.DataFigure, ds: xr.Dataset) -> Clock:
             fig.text(1.0 - 0.1 / width, y, words, fontsize=size, color="0.35", va="bottom", ha="right")
             break
     period = 1.0 / float(frequencies[0]) if forced else 0.0
-    return Clock(text, ds["time"].values, period, "drive periods")
+    return Clock(text, ds["time"].values, period)

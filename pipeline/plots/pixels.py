@@ -257,7 +257,7 @@ def _opacity(counts: np.ndarray, faintest: float, reference: float) -> np.ndarra
 
 
 def _disc(diameter: float) -> list[tuple[int, int]]:
-    """Return the pixel offsets (row, column) of a dot."""
+    """Return the offsets (row, column) of the pixels of a round dot from its centre."""
     radius = max(0.5, 0.5 * diameter)
     reach = math.ceil(radius)
     around = range(-reach, reach + 1)

@@ -160,7 +160,7 @@ def fixed_handles(drawing: Drawing, parameters: Mapping[str, float], shown: Coll
 
 
 def _near(fixed: Mapping[str, np.ndarray], place: np.ndarray) -> list[str]:
-    """Select the fixed points near the path; farther ones would shrink it in the panel."""
+    """Return the fixed points to draw: those so near to the path that it is not shrunk by the axis limits."""
     if not place.size:
         return list(fixed)
     size = max(float(np.ptp(place, axis=0).max()), 1e-12)

@@ -8,6 +8,8 @@ the products by name.
 
 from __future__ import annotations
 
+import csv
+import io
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pkgutil import resolve_name
@@ -92,6 +94,21 @@ class Table:
     rows: Sequence[Mapping[str, Any]]
     lines: Sequence[str]
     nothing: str = ""
+
+    def csv(self) -> str:
+        """Return the rows as CSV, NaN as empty fields."""
+        text = io.StringIO()
+        writer = csv.DictWriter(text, dict.fromkeys(name for row in self.rows for name in row), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows({k: "" if v != v else v for k, v in row.items()} for row in self.rows)
+        return text.getvalue()
+
+
+def padded(table: Sequence[Sequence[str]], indent: str = "  ", right: bool = False) -> list[str]:
+    """Return the lines of a table of texts with columns of even width."""
+    widths = [max(map(len, column)) for column in zip(*table, strict=True)]
+    lines = ([(t.rjust if right and k else t.ljust)(widths[k]) for k, t in enumerate(line)] for line in table)
+    return [indent + "  ".join(line).rstrip() for line in lines]
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipeline.analysis.outcomes import sentence
-from pipeline.analysis.tabular import axis_ranges, distinct, number
+from pipeline.analysis.tabular import axis_ranges, counted, distinct, number
 from pipeline.layout.attractor_letters import letter
 from pipeline.layout.vocabulary import is_grid_dim, parameter_name, split_dims
 from pipeline.products.product import function_of
@@ -224,8 +224,8 @@ def _counted(rows: list[dict[str, Any]], told: str) -> str:
     """Return the numbers of attractors and of other sets, and the sentence on the cells' ends."""
     attract = {r["attractor_id"] for r in rows if r["stability"] == "attracts"}
     others = {r["attractor_id"] for r in rows} - attract
-    more = f", {len(others)} other set{'s' * (len(others) != 1)}" if others else ""
-    return f"{len(attract)} attractor{'s' * (len(attract) != 1)}{more}; {told}"
+    more = f", {counted(len(others), 'other set')}" if others else ""
+    return f"{counted(len(attract), 'attractor')}{more}; {told}"
 
 
 def _richest(rows: list[dict[str, Any]], axes: tuple[str, ...]) -> dict[str, float]:

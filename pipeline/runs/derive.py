@@ -229,7 +229,7 @@ def prepared(run: AnalysedRun, product: Any, options: Options) -> Options:
 
 
 def most_evidence(run: Run, options: Options) -> Options:
-    """Return the options of the kept result with the largest extension, for the same search.
+    """Return the options of the stored attractors with the longest extension, among those of the same search.
 
     Options without an effort are returned unchanged.
     """
@@ -241,7 +241,7 @@ def most_evidence(run: Run, options: Options) -> Options:
 
 
 def _kept_efforts(run: Run) -> list[tuple[dict[str, Any], tuple[float, int]]]:
-    """Return other options and effort of each kept search for attractors of these cells by this code."""
+    """Return the options and the effort of each stored search for attractors that is up to date."""
     try:
         kept_here = products_in(run.info.files.below(DERIVED))
     except NotADirectoryError:

@@ -1,4 +1,4 @@
-"""Estimate the time of a run on this machine by integrating some of its own cells for a moment.
+"""Estimate the time of a run on this machine by integrating a sample of its cells over a few periods.
 
 The rule of thumb in `pipeline.layout.plan` gives the dependence of the time on frequency and tolerance. Two
 further quantities are measured: the speed of this processor for this system, and, if the run stops when

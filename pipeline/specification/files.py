@@ -118,7 +118,7 @@ def nested(table: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Return `base` with the leaves of `changes` put in; tables merge, everything else is replaced."""
+    """Return `base` updated by `changes`: nested tables are merged key by key, other values are replaced."""
     result = dict(base)
     for key, value in changes.items():
         old = result.get(key)

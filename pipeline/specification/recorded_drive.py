@@ -143,7 +143,7 @@ def _idle_problems(drive: RecordedDrive, model: Model, axes: Any) -> list[str]:
 
 
 def _replaced_problems(drive: RecordedDrive, table: str, data: Mapping[str, Any]) -> list[str]:
-    """Return problems with values that the recording itself determines."""
+    """Return a problem for each given value that the recording itself determines."""
     found: Any = data
     for key in table.split("."):
         found = found.get(key, {}) if isinstance(found, Mapping) else {}

@@ -88,7 +88,7 @@ def _power_of_two(stride: int) -> int:
 
 
 class GridStarts(_PerState):
-    """The table ``[initial_conditions]`` of a grid: ranges span it, numbers are fixed, the rest is 0.
+    """The table ``[initial_conditions]`` of a grid: ranges span it, single numbers are fixed, other states are 0.
 
     With `refine` a sweep computes every `refine`-th cell first; see `pipeline.compute.refinement`.
     """

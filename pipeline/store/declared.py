@@ -33,7 +33,7 @@ MOST_PRODUCT_BYTES, MOST_RATIO = 2_000_000_000, 50
 
 
 def declared_bytes(chunk: Any) -> int:
-    """Return the size that a blosc chunk declares for its content; -1 if it has no header."""
+    """Return the uncompressed size in the header of a blosc chunk; -1 if there is no header."""
     header = bytes(memoryview(chunk)[:_HEADER])
     return int.from_bytes(header[4:8], "little") if len(header) == _HEADER else -1
 

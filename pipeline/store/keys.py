@@ -30,7 +30,7 @@ def keys_of(plan: Plan, index: int) -> list[str]:
 
 
 class Owners:
-    """A map from the keys of chunks to tasks.
+    """A map from the keys of stored chunks to the tasks that write them.
 
     Parameters
     ----------

@@ -162,7 +162,7 @@ def _refuse_declared(files: Files, contents: Iterable[tuple[str, bytes | FileNot
 
 
 def _sealed_attrs(files: Files, group: bytes | FileNotFoundError | None, digests: Digests) -> dict[str, Any]:
-    """Return the attributes of a product after comparing its seal with the digests of its files."""
+    """Return the attributes of a product, after checking its seal against the digests of its files."""
     if not isinstance(group, bytes):
         if digests:
             raise DamagedError(f"{files.name}: it has no {_GROUP}")
@@ -208,7 +208,7 @@ def leftover_products(files: Files, older_than: float) -> list[Files]:
 
 
 def products_in(files: Files) -> list[Files]:
-    """Return the products in a folder, sound or not.
+    """Return all products in a folder, also damaged ones.
 
     Raises
     ------
@@ -283,7 +283,7 @@ def _sha256(content: bytes) -> str:
 
 
 def _product_chunks(values: np.ndarray) -> tuple[int, ...]:
-    """Return the chunk shape: whole arrays, or parts of some megabytes cut along the first dims."""
+    """Return the chunk shape of an array: all of a small one, else pieces of some megabytes along the first dims."""
     chunks = [max(n, 1) for n in values.shape]
     for i, n in enumerate(chunks):
         rest = values.itemsize * int(np.prod(chunks[i + 1 :]))

@@ -195,7 +195,7 @@ class Records(Mapping[int, Commit]):
         self._lock = threading.Lock()
 
     def is_packed(self, index: int) -> bool:
-        """Return whether a task's record lies in a pack."""
+        """Return whether the record of a task lies in a pack, a file of many records."""
         block = index // BLOCK
         return block in self.packs and index not in self._without[block]
 

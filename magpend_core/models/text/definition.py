@@ -131,8 +131,8 @@ class Definition:
         ]
 
     def meaning(self) -> str:
-        """Return the parts of the text that determine numbers, in a normal form: equal for texts that differ only in
-        layout or wording.
+        """Return the part of a text model that determines its numbers, in a standard form: equal for models that
+        differ only in layout or wording.
         """
         bounds = [[p.name, p.bound] for p in self.parameters]
         plain = {
@@ -163,7 +163,7 @@ def _suggestion(name: str, table: str, used: Iterable[str]) -> str:
 
 
 def needed(tree: Tree, define: Mapping[str, Tree]) -> Iterator[str]:
-    """All names that an expression needs, through definitions."""
+    """Yield the names that an expression uses, directly or through definitions."""
     seen: set[str] = set()
     pending = [name for name, _ in names(tree)]
     while pending:

@@ -145,7 +145,9 @@ def _start_faults(definition: Definition, values: Mapping[str, Any]) -> list[Fau
 
 
 def _look(tree: Tree, place: str, known: Mapping[str, Any], rows: np.ndarray, found: list[Fault]) -> np.ndarray:
-    """Append the faults of an expression, the innermost first; return where it has no finite value."""
+    """Append a message for each part of an expression without a finite value, the innermost first; return where the
+    whole has none.
+    """
     if tree.kind == "inverse":  # told with its product
         return _look(tree.args[0], place, known, rows, found)
     bad = np.zeros(rows.shape, bool)

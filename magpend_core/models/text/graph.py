@@ -304,7 +304,7 @@ class Graph:
 
 
 def in_order(roots: Iterable[Node]) -> list[Node]:
-    """All parts of some nodes, each after its arguments."""
+    """Return the nodes of some expressions with all their arguments, each after its own arguments."""
     found: dict[int, Node] = {}
     pending = list(roots)
     while pending:

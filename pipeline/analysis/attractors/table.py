@@ -8,19 +8,22 @@ import numpy as np
 import xarray as xr
 
 from pipeline.analysis.basins.numbers import basin_fractions
-from pipeline.analysis.intervals import Interval
 from pipeline.analysis.outcomes import outcomes, sentence
 from pipeline.analysis.tabular import (
     FEW_POINTS,
+    FRACTION,
     Row,
+    Words,
+    counted,
     distinct,
-    labels,
     largest_share,
     number,
+    plain,
     point_table,
     points_of,
     ranges,
     summary,
+    values,
     with_interval,
     words_of,
 )
@@ -32,12 +35,24 @@ _NUMBERS = ("lyapunov_max", "lyapunov_low", "lyapunov_high", "mean_lifetime", "l
 
 
 def attractors_table(ds: xr.Dataset) -> Table:
-    """Return the table of attractors, per parameter point or per id."""
-    rows = attractor_rows(ds)
-    return Table(rows, attractor_lines(ds, rows))
+    """Return the table of attractors: lines per parameter point if there are few, otherwise per id."""
+    rows = _rows(ds)
+    dims, _ = split_dims(ds["attractor_id"])
+    n_points = int(np.prod([ds.sizes[d] for d in dims]))
+    attracts = (ds["stability"] == ATTRACTS).any(dims)
+    n, others = int(attracts.sum()), int((~attracts).sum())
+    lines = [f"{counted(n, 'attractor')} at {counted(n_points, 'parameter point')}"]
+    if others:
+        lines[0] += f", and {counted(others, 'other set')} on which cells end"
+    if n_points > FEW_POINTS:
+        lines += summary(ds, rows, dims, _id_summary, "attractor_id")
+    else:
+        for _, where in points_of(ds, dims):
+            lines += point_table(ds, where, rows, lambda row: _attractor_words(row, n_points))
+    return Table(rows, [*lines, sentence(ds), *_remarks(ds, rows)])
 
 
-def attractor_rows(ds: xr.Dataset, *, interval: Interval = "wilson", confidence: float = 0.95) -> list[Row]:
+def _rows(ds: xr.Dataset) -> list[Row]:
     """Return a row per set and parameter point.
 
     `fraction` is a share of the cells that attract or diverge, with its interval; it is NaN for a set that
@@ -47,9 +62,7 @@ def attractor_rows(ds: xr.Dataset, *, interval: Interval = "wilson", confidence:
     words = words_of(ds["decision"])
     fractions = None
     if start_dims and start_dims != ("branch",):
-        fractions = basin_fractions(
-            outcomes(ds), dims=start_dims, ids=ds["attractor"].values.tolist(), confidence=confidence, method=interval
-        )
+        fractions = basin_fractions(outcomes(ds), dims=start_dims, ids=ds["attractor"].values.tolist())
     rows = []
     for at, where in points_of(ds, dims):
         one = ds.isel(at)
@@ -61,54 +74,26 @@ def attractor_rows(ds: xr.Dataset, *, interval: Interval = "wilson", confidence:
             if fractions is not None:
                 own = fractions.isel(at).sel(label=i)
                 counts = row["stability"] == STABILITIES[ATTRACTS]
-                row |= {n: float(own[n]) if counts else np.nan for n in ("fraction", "low", "high")}
+                row |= {n: float(own[n]) if counts else np.nan for n in FRACTION}
             rows.append(row | {f"by_{name}": int(decisions[k, i]) for k, name in enumerate(words) if k})
     return rows
 
 
 def _attractor(one: xr.Dataset) -> Row:
     """Return the columns of one attractor, without those that its model lacks."""
-    largest = np.hypot(one["multiplier_real"].values, one["multiplier_imag"].values)
-    row: Row = {
-        "attractor_id": int(one["attractor"]),
-        **labels(one, "kind", "stability", "evidence"),
-        "orbit_period": int(one["orbit_period"]),
-        "period_s": float(one["period_s"]),
-    }
-    row |= labels(one, "side")
+    row: Row = {"attractor_id": int(one["attractor"])}
+    row |= values(one, "kind", "stability", "evidence", "orbit_period", "period_s", "side")
     if "rotation" in one:
         (dim,) = one["rotation"].dims
         names = one[dim].values if dim in one.coords else range(one.sizes[dim])
         row |= {f"rotation_{n}": float(v) for n, v in zip(names, one["rotation"].values, strict=True)}
+    largest = np.hypot(one["multiplier_real"].values, one["multiplier_imag"].values)
     row["multiplier_modulus"] = float(largest[0]) if np.isfinite(largest).any() else np.nan
-    row["multiplier_error"] = float(one["multiplier_error"])
-    row |= {name: float(one[name]) for name in _NUMBERS}
-    row |= {name: int(one[name]) for name in ("n_sampled", "n_left", "closes_above")}
+    row |= values(one, "multiplier_error", *_NUMBERS, "n_sampled", "n_left", "closes_above")
     if "eigenvalue_real" in one:
         row["eigenvalue_real"] = float(one["eigenvalue_real"][0])
         row["eigenvalue_imag"] = float(np.abs(one["eigenvalue_imag"][0]))
-    if "mirror_partner" in one:
-        row["mirror_partner"] = int(one["mirror_partner"])
-        row["mirror_distance"] = float(one["mirror_distance"])
-    row["n_cells"] = int(one["n_cells"])
-    return row | labels(one, "match_basis")
-
-
-def attractor_lines(ds: xr.Dataset, rows: Sequence[Row]) -> list[str]:
-    """Return the table per parameter point if there are few, otherwise a line per attractor."""
-    dims, _ = split_dims(ds["attractor_id"])
-    n_points = int(np.prod([ds.sizes[d] for d in dims]))
-    attracts = (ds["stability"] == ATTRACTS).any(dims) if dims else ds["stability"] == ATTRACTS
-    n, others = int(attracts.sum()), int((~attracts).sum())
-    lines = [f"{n} attractor{'s' * (n != 1)} at {n_points} parameter point{'s' * (n_points != 1)}"]
-    if others:
-        lines[0] += f", and {others} other set{'s' * (others != 1)} on which cells end"
-    if n_points > FEW_POINTS:
-        lines += summary(ds, rows, dims, _id_summary)
-    else:
-        for _, where in points_of(ds, dims):
-            lines += point_table(ds, where, rows, lambda row: _attractor_words(row, n_points))
-    return [*lines, sentence(ds), *_remarks(ds, rows)]
+    return row | values(one, "mirror_partner", "mirror_distance", "n_cells", "match_basis")
 
 
 def _remarks(ds: xr.Dataset, rows: Sequence[Row]) -> list[str]:
@@ -135,41 +120,36 @@ def _remarks(ds: xr.Dataset, rows: Sequence[Row]) -> list[str]:
     elif int(ds["ran_out"].sum()):
         n = int(ds["ran_out"].sum())
         lines.append(
-            f"the extension reached its budget before all sets were classified at {n} parameter point{'s' * (n != 1)}: "
+            f"the extension reached its budget before all sets were classified at {counted(n, 'parameter point')}: "
             f"--budget {2.0 * float(ds.attrs.get('identify_budget', 1.0)):g} allows twice as much"
         )
     return lines
 
 
-def _attractor_words(row: Row, n_points: int) -> dict[str, str]:
-    turns = [v for k, v in row.items() if k.startswith("rotation_")]
-    decided = ", ".join(f"{n} {k[3:].replace('_', ' ')}" for k, n in row.items() if k.startswith("by_") and n)
-    words = {
+def _attractor_words(row: Row, n_points: int) -> Words:
+    turns = [f"{round(v, 3) + 0.0:.3f}" for k, v in row.items() if k.startswith("rotation_")]
+    decided = [f"{n} {plain(k.removeprefix('by_'))}" for k, n in row.items() if k.startswith("by_") and n]
+    flow = "eigenvalue_real" in row  # returns of a flow differ in length
+    open_set = row["kind"] in ("torus", "chaotic_set", "bounded_set")
+    return {
         "id": str(row["attractor_id"]),
-        "kind": row["kind"].replace("_", " "),
-        "stability": row["stability"].replace("_", " "),
+        "kind": plain(row["kind"]),
+        "stability": plain(row["stability"]),
         "period": str(row["orbit_period"] or "-"),
+        "seconds": number(row["period_s"], ".6g") if flow else None,
+        "side": row.get("side"),
+        "rotation": " ".join(turns) or None,
+        "|multiplier|": number(row["multiplier_modulus"], ".4g" if flow else ".4f"),
+        "eigenvalue": _eigenvalue(row) if flow else None,
+        "exponent per s": with_interval(row, _NUMBERS[:3], ".3g") if open_set else None,
+        "cells": str(row["n_cells"]),
+        "share": with_interval(row, FRACTION, ".4f") if "fraction" in row else None,
+        "mirror": _known(row["mirror_partner"]) if "mirror_partner" in row else None,
+        "letter": letter(row["attractor_id"]),
+        "id by": plain(row["match_basis"]) if n_points > 1 and "match_basis" in row else None,
+        "decided": ", ".join(decided),
+        "shown by": _shown_by(row),
     }
-    if "eigenvalue_real" in row:  # returns of a flow differ in length
-        words["seconds"] = number(row["period_s"], ".6g")
-    if "side" in row:
-        words["side"] = row["side"]
-    if turns:
-        words["rotation"] = " ".join(f"{round(v, 3) + 0.0:.3f}" for v in turns)
-    words["|multiplier|"] = number(row["multiplier_modulus"], ".4g" if "eigenvalue_real" in row else ".4f")
-    if "eigenvalue_real" in row:
-        words["eigenvalue"] = _eigenvalue(row)
-    if row["kind"] in ("torus", "chaotic_set", "bounded_set"):
-        words["exponent per s"] = _exponent(row)
-    words["cells"] = str(row["n_cells"])
-    if "fraction" in row:
-        words["share"] = with_interval(row) if np.isfinite(row["fraction"]) else "-"
-    if "mirror_partner" in row:
-        words["mirror"] = str(row["mirror_partner"]) if row["mirror_partner"] >= 0 else "-"
-    words["letter"] = letter(row["attractor_id"])
-    if n_points > 1 and "match_basis" in row:
-        words["id by"] = row["match_basis"].replace("_", " ")
-    return words | {"decided": decided, "shown by": _shown_by(row)}
 
 
 _SHOWN_BY = {
@@ -192,13 +172,6 @@ def _shown_by(row: Row) -> str:
     return _SHOWN_BY[row["evidence"]]
 
 
-def _exponent(row: Row) -> str:
-    """Format the largest exponent with its interval [1/s]."""
-    if not np.isfinite(row["lyapunov_max"]):
-        return "-"
-    return f"{row['lyapunov_max']:.3g} ({row['lyapunov_low']:.3g} to {row['lyapunov_high']:.3g})"
-
-
 def _eigenvalue(row: Row) -> str:
     """Format the leading eigenvalue of an equilibrium [1/s]."""
     if not np.isfinite(row["eigenvalue_real"]):
@@ -207,28 +180,29 @@ def _eigenvalue(row: Row) -> str:
     return f"{row['eigenvalue_real']:.4g}{imaginary}"
 
 
-def _id_summary(ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str]) -> dict[str, str]:
-    words = {
-        "id": str(rows[0]["attractor_id"]),
-        "kind": distinct(r["kind"].replace("_", " ") for r in rows),
-        "stability": distinct(r["stability"].replace("_", " ") for r in rows),
+def _id_summary(ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str]) -> Words:
+    first = rows[0]
+    seconds = [r["period_s"] for r in rows if np.isfinite(r["period_s"])]
+    span = f"{min(seconds):.4g} to {max(seconds):.4g}" if seconds else "-"
+    return {
+        "id": str(first["attractor_id"]),
+        "kind": distinct(plain(r["kind"]) for r in rows),
+        "stability": distinct(plain(r["stability"]) for r in rows),
         "periods": distinct(r["orbit_period"] for r in rows if r["orbit_period"]) or "-",
+        "seconds": span if "eigenvalue_real" in first else None,
+        "side": distinct(r["side"] for r in rows) if "side" in first else None,
+        **ranges(ds, rows, dims),
+        "cells": str(sum(r["n_cells"] for r in rows)),
+        "letter": letter(first["attractor_id"]),
+        "id rests on": _evidence([r["match_basis"] for r in rows]) if "match_basis" in first else None,
+        "max share": largest_share(ds, rows, dims) if "fraction" in first else None,
+        "mirror": _known(*(r["mirror_partner"] for r in rows)) if "mirror_partner" in first else None,
     }
-    if "eigenvalue_real" in rows[0]:
-        seconds = [r["period_s"] for r in rows if np.isfinite(r["period_s"])]
-        words["seconds"] = f"{min(seconds):.4g} to {max(seconds):.4g}" if seconds else "-"
-    if "side" in rows[0]:
-        words["side"] = distinct(r["side"] for r in rows)
-    words |= {**ranges(ds, rows, dims), "cells": str(sum(r["n_cells"] for r in rows))}
-    words["letter"] = letter(rows[0]["attractor_id"])
-    if "match_basis" in rows[0]:
-        words["id rests on"] = _evidence([r["match_basis"] for r in rows])
-    if "fraction" in rows[0]:
-        words["max share"] = largest_share(ds, rows, dims)
-    if "mirror_partner" in rows[0]:
-        partners = distinct(r["mirror_partner"] for r in rows if r["mirror_partner"] >= 0)
-        words["mirror"] = partners or "-"
-    return words
+
+
+def _known(*ids: int) -> str:
+    """Format the distinct ids; a negative one stands for no set."""
+    return distinct(i for i in ids if i >= 0) or "-"
 
 
 def _evidence(bases: Sequence[str]) -> str:

@@ -10,12 +10,15 @@ import xarray as xr
 from pipeline.analysis.outcomes import DIVERGED, sentence
 from pipeline.analysis.tabular import (
     FEW_POINTS,
+    FRACTION,
     Row,
+    Words,
     largest_share,
     point_table,
     points_of,
     ranges,
     summary,
+    values,
     with_interval,
 )
 from pipeline.layout.attractor_letters import letter
@@ -24,34 +27,17 @@ from pipeline.products.product import Table
 
 
 def basins_table(ds: xr.Dataset) -> Table:
-    """Return the table of fractions, with lines on the boundaries."""
-    rows = basin_rows(ds)
-    return Table(rows, basin_lines(ds, rows))
+    """Return a row per outcome and parameter point: number of cells, and fraction with its intervals.
 
-
-def basin_rows(ds: xr.Dataset) -> list[Row]:
-    """Return a row per outcome and parameter point: number of cells, and fraction with its intervals."""
+    The lines have a table per point if there are few, otherwise ranges; the boundaries follow.
+    """
+    rows = _rows(ds)
     dims, _ = split_dims(ds["attractor_id"])
-    names = ("fraction", "low", "high", "fraction_if_none", "fraction_if_all", "low_if_none", "high_if_all")
-    rows = []
-    for at, where in points_of(ds, dims):
-        one = ds.isel(at)
-        for i, label in enumerate(ds["label"].values.tolist()):
-            row = {**where, "label": label, "n_cells": int(one["count"][i])}
-            row["n_inferred"] = int(one["n_inferred"][i])
-            rows.append(row | {name: float(one[name][i]) for name in names})
-    return rows
-
-
-def basin_lines(ds: xr.Dataset, rows: Sequence[Row]) -> list[str]:
-    """Return lines on fractions and boundaries: a table per point if there are few, otherwise ranges."""
-    dims, _ = split_dims(ds["attractor_id"])
-    n_points = int(np.prod([ds.sizes[d] for d in dims]))
     seen = [row for row in rows if row["n_cells"]]
     confidence = f"{100 * ds.attrs['basin_confidence']:g} %"
     lines = [f"fractions of the cells that end on attractors or diverge, {ds.attrs['basin_interval']}, {confidence}"]
-    if n_points > FEW_POINTS:
-        lines += summary(ds, seen, dims, _label_summary)
+    if int(np.prod([ds.sizes[d] for d in dims])) > FEW_POINTS:
+        lines += summary(ds, seen, dims, _label_summary, "label")
         lines += [_range_line(ds, name, text) for name, text in _BOUNDARY.items() if name in ds]
     else:
         for at, where in points_of(ds, dims):
@@ -62,40 +48,42 @@ def basin_lines(ds: xr.Dataset, rows: Sequence[Row]) -> list[str]:
                 bound = float(one["unseen_high"])
                 lines.append(f"  an attractor that no cell shows: at most {bound:.3g} of the region")
             lines += _boundary_lines(one)
-    if ds.attrs["not_computed"]:
-        lines += [f"not computed: {reason}" for reason in ds.attrs["not_computed"].splitlines()]
-    return [*lines, sentence(ds)]
+    lines += [f"not computed: {reason}" for reason in ds.attrs["not_computed"].splitlines()]
+    return Table(rows, [*lines, sentence(ds)])
 
 
-def _label(code: int) -> str:
-    return "diverged" if code == DIVERGED else str(code)
+def _rows(ds: xr.Dataset) -> list[Row]:
+    dims, _ = split_dims(ds["attractor_id"])
+    names = ("n_inferred", *FRACTION, "fraction_if_none", "fraction_if_all", "low_if_none", "high_if_all")
+    rows = []
+    for at, where in points_of(ds, dims):
+        for i, label in enumerate(ds["label"].values.tolist()):
+            one = ds.isel({**at, "label": i})
+            rows.append({**where, "label": label, "n_cells": int(one["count"]), **values(one, *names)})
+    return rows
 
 
-def _letter(code: int) -> str:
-    return "-" if code == DIVERGED else letter(code)
-
-
-def _basin_words(row: Row) -> dict[str, str]:
-    words = {"id": _label(row["label"]), "cells": str(row["n_cells"]), "fraction": with_interval(row)}
-    if row["fraction_if_all"] > row["fraction_if_none"]:
-        words["with the unfinished"] = f"{row['low_if_none']:.4f} to {row['high_if_all']:.4f}"
-    return words | {"letter": _letter(row["label"])} | _inferred([row])
-
-
-def _inferred(rows: Sequence[Row]) -> dict[str, str]:
-    """Return the column with the number of inferred cells, if there are any."""
-    n = sum(row["n_inferred"] for row in rows)
-    return {"inferred cells": str(n)} if n else {}
-
-
-def _label_summary(ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str]) -> dict[str, str]:
+def _basin_words(row: Row) -> Words:
+    unfinished = row["fraction_if_all"] > row["fraction_if_none"]
     return {
-        "id": _label(rows[0]["label"]),
+        "id": "diverged" if row["label"] == DIVERGED else str(row["label"]),
+        "cells": str(row["n_cells"]),
+        "fraction": with_interval(row, FRACTION, ".4f"),
+        "with the unfinished": f"{row['low_if_none']:.4f} to {row['high_if_all']:.4f}" if unfinished else None,
+        "letter": "-" if row["label"] == DIVERGED else letter(row["label"]),
+        "inferred cells": str(row["n_inferred"] or "") or None,
+    }
+
+
+def _label_summary(ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str]) -> Words:
+    first = _basin_words(rows[0])
+    return {
+        "id": first["id"],
         **ranges(ds, rows, dims),
         "cells": str(sum(r["n_cells"] for r in rows)),
         "max fraction": largest_share(ds, rows, dims),
-        "letter": _letter(rows[0]["label"]),
-        **_inferred(rows),
+        "letter": first["letter"],
+        "inferred cells": str(sum(r["n_inferred"] for r in rows) or "") or None,
     }
 
 

@@ -9,13 +9,16 @@ from typing import Any
 import numpy as np
 
 from pipeline.analysis.branches.arclength import Point, Settings, correct, cubic
-from pipeline.analysis.branches.equilibria import OneParameter, first_lyapunov, hopf_test
+from pipeline.analysis.branches.equilibria import OneParameter, hopf_test
 from pipeline.analysis.branches.lockstep import Steps
-from pipeline.analysis.branches.problems import Family, doubling_test, torus_test
+from pipeline.analysis.branches.problems import doubling_test, torus_test
 
 FOLD, DOUBLING, TORUS, BRANCHING = "fold", "period_doubling", "neimark_sacker", "branch_point"
-HOPF = "hopf"
-KINDS = (FOLD, DOUBLING, TORUS, BRANCHING, HOPF)
+HOPF, PITCHFORK, TRANSCRITICAL = "hopf", "pitchfork", "transcritical"
+KINDS = (FOLD, DOUBLING, TORUS, BRANCHING, HOPF, PITCHFORK, TRANSCRITICAL)
+
+CONTRADICTORY = "contradictory"
+"""Criticality of a period doubling whose coefficient and whose doubled branch disagree."""
 
 WIDTH = 1e-8
 """Width to which a bifurcation is bracketed [arclength]; in its scale, the parameter changes by less."""
@@ -88,10 +91,10 @@ class Bifurcation:
     after : int
         Index of the point of the branch after which it comes.
     criticality : str
-        Of a period doubling whose branch was followed: ``supercritical`` if the doubled orbits lie where
-        the orbit is less stable, else ``subcritical``. Of a Hopf point by the sign of `coefficient`.
+        ``supercritical``, ``subcritical`` or, if unknown, empty, by the sign of `coefficient`. The branch that
+        leaves a period doubling tells it as well: `CONTRADICTORY` if the two disagree.
     coefficient, coefficient_error : float
-        First Lyapunov coefficient of a Hopf point and its error [1/s]; NaN for others.
+        Normal form coefficient and its error (see `normal_forms`); NaN if unknown.
     child : Branch or None
         The other branch through it, if that is known.
     """
@@ -144,7 +147,7 @@ class Watch:
         if self.skip_first and self.n_steps == 0:
             self.n_steps += 1
             return True
-        kinds = [kind for kind in KINDS if TESTS[kind](a) * TESTS[kind](b) < 0.0]
+        kinds = [kind for kind in TESTS if TESTS[kind](a) * TESTS[kind](b) < 0.0]
         long = np.linalg.norm(b.u - a.u) > 100.0 * self.settings.shortest_step
         if long and not _explains(kinds, n_unstable(b) - n_unstable(a)):
             return False
@@ -156,18 +159,9 @@ class Watch:
             if one is not None:
                 one.after = self.n_steps
                 located.append(one)
-                _judge(one, self.problem.family)
         self.found += tell_apart(located, a)
         self.n_steps += 1
         return True
-
-
-def _judge(one: Bifurcation, family: Family) -> None:
-    """Decide the criticality of a Hopf point by its first Lyapunov coefficient, in place."""
-    if one.kind == HOPF and _is_pair(one):
-        one.coefficient, one.coefficient_error = first_lyapunov(family, one.point.u)
-        if abs(one.coefficient) > one.coefficient_error:
-            one.criticality = "supercritical" if one.coefficient < 0.0 else "subcritical"
 
 
 def _explains(kinds: list[str], change: int) -> bool:

@@ -1,7 +1,8 @@
-"""Follow the cycles of a flow that leave a Hopf point.
+"""Follow the cycles of a flow that leave a Hopf point, and find them again on another section.
 
 The section of such cycles is the level of the crossing state at the Hopf point, so that small cycles cross it.
 The first cycle has a given amplitude along the critical eigenvector; Newton's method finds its parameter value.
+Larger cycles often cross the section of the run as well.
 """
 
 from __future__ import annotations
@@ -10,15 +11,23 @@ from dataclasses import replace
 
 import numpy as np
 
-from magpend_core.orbits import crossed_state
+from magpend_core.orbits import crossed_state, section_map
+from magpend_core.sections import run_branches
 from pipeline.analysis.branches.arclength import Settings, correct
 from pipeline.analysis.branches.bifurcations import Bifurcation
-from pipeline.analysis.branches.following import Half, half_branch
+from pipeline.analysis.branches.following import Branch, Half, half_branch
 from pipeline.analysis.branches.lockstep import Steps
 from pipeline.analysis.branches.problems import Family, OrbitProblem
+from pipeline.analysis.tolerances import BRANCH_RTOL
 
 AMPLITUDES = (0.02, 0.05, 0.1)
 """Amplitudes of the first cycle that are tried, in units of the scales."""
+
+SAME_LEVEL = 1e-9
+"""Two sections this close are one [scales of the state that crosses]."""
+
+SAME_TIME = 1e-6
+"""Relative difference within which the times of some returns add up to the period of a cycle."""
 
 
 def cycle_family(equilibria: Family, at: Bifurcation) -> Family | None:
@@ -30,7 +39,9 @@ def cycle_family(equilibria: Family, at: Bifurcation) -> Family | None:
     if crossed is None or _direction(equilibria, at) is None:
         return None
     level = equilibria.parameters.copy()
-    level[-1] = at.point.value.images[0, crossed]
+    at_rest = float(at.point.value.images[0, crossed])
+    if abs(at_rest - level[-1]) > SAME_LEVEL * equilibria.system.scales[crossed]:
+        level[-1] = at_rest
     for name, value in zip(equilibria.free, equilibria.values(at.point.u), strict=True):
         level[equilibria.system.parameter_names.index(name)] = value
     return replace(equilibria, period=1, parameters=level)
@@ -66,3 +77,38 @@ def _direction(family: Family, at: Bifurcation) -> np.ndarray | None:
     found[crossed] = 0.0
     largest = np.abs(found).max()
     return found / largest if largest > 1e-9 * np.abs(vector).max() else None
+
+
+def crossings_of(cycles: Branch, section: Family, most: int) -> list[tuple[np.ndarray, int]]:
+    """Find where the cycles of a branch cross another section of the same flow.
+
+    Parameters
+    ----------
+    cycles
+        The branch.
+    section
+        A family of the same flow with the other section.
+    most
+        Largest number of crossings per cycle that is looked for.
+
+    Returns
+    -------
+    list of (ndarray, int)
+        For each cycle a point on the section, and the number of crossings per period, 0 if there is none.
+    """
+    rows = section.rows(np.array([point.u for point in cycles.points]))
+    first = run_branches(
+        rows.parameters[:, None],
+        rows.frequency_hz[:, None],
+        rows.states,
+        n_transient=1,
+        n_keep=1,
+        rtol=BRANCH_RTOL,
+        atol=BRANCH_RTOL,
+        system=section.system,
+    ).section[:, 0, 0]
+    found = section_map(rows.parameters, rows.frequency_hz, first, most, rtol=BRANCH_RTOL, system=section.system)
+    seconds = np.array([point.value.seconds for point in cycles.points])[:, None]
+    closes = np.abs(np.cumsum(found.times, axis=1) - seconds) < SAME_TIME * seconds
+    periods = np.where(closes.any(axis=1), closes.argmax(axis=1) + 1, 0)
+    return list(zip(first, map(int, periods), strict=True))

@@ -9,7 +9,15 @@ import numpy as np
 import xarray as xr
 
 from magpend_core.models.model import Model, Parameters
-from pipeline.analysis.branches.bifurcations import HOPF, KINDS, Bifurcation, eigenvalues_of, multipliers_of, n_unstable
+from pipeline.analysis.branches.bifurcations import (
+    CONTRADICTORY,
+    HOPF,
+    KINDS,
+    Bifurcation,
+    eigenvalues_of,
+    multipliers_of,
+    n_unstable,
+)
 from pipeline.analysis.branches.following import ENDS, Branch
 from pipeline.analysis.branches.motion import rotation_of, sides_of
 from pipeline.analysis.branches.problems import FREQUENCY
@@ -17,7 +25,7 @@ from pipeline.analysis.branches.units import parameter_units, state_units
 from pipeline.layout.period_names import period_of, periods_of
 from pipeline.layout.vocabulary import model_attribute, section_attributes
 
-CRITICALITIES = ("", "supercritical", "subcritical")
+CRITICALITIES = ("", "supercritical", "subcritical", CONTRADICTORY)
 
 
 def dataset_of(
@@ -256,12 +264,10 @@ def _per_event(
         "criticality": _column(degrees, "int8", "criticality", **_flags(["unknown", *CRITICALITIES[1:]])),
         "critical_real": _column(critical.real, "float64", "critical multiplier or eigenvalue [1/s], real part"),
         "critical_imag": _column(critical.imag, "float64", "critical multiplier or eigenvalue [1/s], imaginary part"),
-        "first_lyapunov": _column(
-            [b.coefficient for b in ones], "float64", "first Lyapunov coefficient of a Hopf point", units="1/s"
+        "normal_form": _column(
+            [b.coefficient for b in ones], "float64", "normal form coefficient; of a Hopf point in 1/s"
         ),
-        "first_lyapunov_error": _column(
-            [b.coefficient_error for b in ones], "float64", "error of the first Lyapunov coefficient", units="1/s"
-        ),
+        "normal_form_error": _column([b.coefficient_error for b in ones], "float64", "error of the coefficient"),
     }
     found: dict[str, Any] = {name: ("bifurcation", *column) for name, column in columns.items()}
     dims = ("bifurcation", "multiplier")

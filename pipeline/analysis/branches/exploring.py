@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -9,7 +10,7 @@ import numpy as np
 
 from pipeline.analysis.branches.arclength import Point, Settings, correct
 from pipeline.analysis.branches.bifurcations import BRANCHING, DOUBLING, HOPF, Bifurcation
-from pipeline.analysis.branches.cycles import cycle_family, cycles_from
+from pipeline.analysis.branches.cycles import crossings_of, cycle_family, cycles_from
 from pipeline.analysis.branches.following import (
     Branch,
     crossing_half,
@@ -22,6 +23,7 @@ from pipeline.analysis.branches.following import (
     problem_of,
 )
 from pipeline.analysis.branches.lockstep import Steps, run_together
+from pipeline.analysis.branches.normal_forms import judge
 from pipeline.analysis.branches.problems import FREQUENCY, Family
 from pipeline.analysis.tolerances import SAME_ON_BRANCH
 
@@ -30,6 +32,9 @@ FOLLOWING = "following branches"
 
 AT_HOPF = 0.05
 """Largest scaled distance of the last cycle of a branch from the Hopf point at which it ends."""
+
+CLEAR = 2
+"""Points of a branch by which cycles are away from where they touch a section."""
 
 GUESS = 0.05
 """Largest scaled distance from a branch's chord at which an orbit is tested for lying on the branch."""
@@ -88,6 +93,7 @@ def explore(starts: Sequence[Start], scope: Scope) -> list[Branch]:
             break
     _adopt(branches)
     _adopt_cycles(branches)
+    judge([(branch.family, one) for branch in branches for one in branch.bifurcations])
     return branches
 
 
@@ -121,7 +127,7 @@ def _follow_starts(starts: Sequence[Start], branches: list[Branch], scope: Scope
 
 
 def _first_of_each(starts: Sequence[Start], followed: set[int]) -> list[int]:
-    """Return the first start of each attractor and period of which no start was followed."""
+    """Return the first start of each pair of attractor and period, without pairs of which a start was followed."""
     kinds = [(start.attractor, start.family.period) for start in starts]
     done = {kinds[i] for i in followed}
     firsts = {kind: i for i, kind in reversed(list(enumerate(kinds))) if kind[0] >= 0 and kind not in done}
@@ -364,12 +370,59 @@ def _leave_equilibria(branches: list[Branch], scope: Scope) -> None:
         (branch, one) for branch in branches for one in branch.bifurcations if one.kind == HOPF and one.child is None
     ]
     families = [cycle_family(branch.family, one) for branch, one in points]
-    ready = [(one, family) for (_, one), family in zip(points, families, strict=True) if family is not None]
+    ready = [(*point, family) for point, family in zip(points, families, strict=True) if family is not None]
     halves = run_together(
-        [cycles_from(family, one, scope.low, scope.high, scope.settings) for one, family in ready], FOLLOWING
+        [cycles_from(family, one, scope.low, scope.high, scope.settings) for _, one, family in ready], FOLLOWING
     )
-    for (one, family), half in zip(ready, halves, strict=True):
+    for (rest, one, family), half in zip(ready, halves, strict=True):
         if half is not None and len(half.trace.points) > 2 and one.child is None:
             child = Branch(family, half.trace.points, half.bifurcations, ("start", half.trace.end), one)
-            one.child = child
-            branches.append(child)
+            parts = _without_known(child, rest.family, branches, scope)
+            one.child = parts[0] if parts else None
+            branches += parts
+
+
+def _without_known(cycles: Branch, own: Family, branches: list[Branch], scope: Scope) -> list[Branch]:
+    """Return the parts of a branch from a Hopf point whose cycles are on no branch on another section.
+
+    Diagrams show the section of the run, `own`. So cycles that cross it are followed there, unless they have
+    been, and are left out here.
+    """
+    wanted = np.ones(len(cycles.points), bool)
+    for section in _other_sections(cycles, own, branches):
+        crossings = crossings_of(cycles, section, scope.max_period)
+        starts = {}
+        for first, last in _equal_runs(np.where(wanted, [period for _, period in crossings], 0)):
+            state, period = crossings[min(first + CLEAR, last)]
+            value = float(cycles.values[min(first + CLEAR, last)])
+            starts[first, last] = Start(replace(section, period=period), state, value)
+        if section is own:
+            _follow_starts(list(starts.values()), branches, scope)
+        for (first, last), is_known in zip(starts, _lie_on(list(starts.values()), branches), strict=True):
+            wanted[first : last + 1] &= not is_known
+    return _parts(cycles, wanted)
+
+
+def _equal_runs(periods: np.ndarray) -> list[tuple[int, int]]:
+    """Return the first and last places of runs of equal numbers above 0."""
+    bounds = np.flatnonzero(np.diff(periods, prepend=-1, append=-1))
+    return [(a, b - 1) for a, b in itertools.pairwise(map(int, bounds)) if periods[a] > 0]
+
+
+def _other_sections(cycles: Branch, own: Family, branches: Sequence[Branch]) -> list[Family]:
+    """Return a family on each section other than that of the cycles, the run's own first."""
+    families = [own, *(b.family for b in branches if b.family.period and b.family.free == own.free)]
+    by_section = {_fixed(family).tobytes(): family for family in reversed(families)}
+    by_section.pop(_fixed(cycles.family).tobytes(), None)
+    return list(reversed(by_section.values()))
+
+
+def _parts(cycles: Branch, wanted: np.ndarray) -> list[Branch]:
+    """Return the parts of a branch whose points are wanted, each with one more point on both sides."""
+    n, parts = len(wanted), []
+    for first, last in [(max(a - 1, 0), min(b + 1, n - 1)) for a, b in _equal_runs(wanted.astype(int))]:
+        ends = cycles.ends[0] if first == 0 else "other_section", cycles.ends[1] if last == n - 1 else "other_section"
+        inside = [replace(one, after=one.after - first) for one in cycles.bifurcations if first <= one.after < last]
+        origin = cycles.origin if first == 0 else None
+        parts.append(Branch(cycles.family, cycles.points[first : last + 1], inside, ends, origin))
+    return parts

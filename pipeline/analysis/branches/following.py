@@ -15,11 +15,16 @@ from pipeline.analysis.branches.equilibria import EquilibriumProblem, OneParamet
 from pipeline.analysis.branches.lockstep import Query, Steps
 from pipeline.analysis.branches.problems import Family, OrbitProblem
 
-ENDS = ("bound", "closed", "period_halving", "max_points", "stuck", "start", "equilibrium")
+ENDS = ("bound", "closed", "period_halving", "max_points", "stuck", "start", "equilibrium", "tangent", "other_section")
+"""Reasons why a branch ends: ``tangent`` where its cycles touch the section, ``other_section`` where it goes on as
+a branch on another section."""
 
-REST = 0.01
-"""A cycle counts as an equilibrium if its crossing speed times its period is below this distance [scales of
-the state that crosses]."""
+TANGENT = 0.01
+"""A branch of cycles ends where the crossing speed times the period is below this distance [scales of the state
+that crosses]."""
+
+REST = 0.5
+"""At such an end the cycle has shrunk to an equilibrium if this product is below this distance for all states."""
 
 
 def problem_of(family: Family) -> OneParameter:
@@ -79,8 +84,8 @@ class _Stop:
             return "bound"
         if self._is_closed(points):
             return "closed"
-        if self.family.period and reach(self.family, here) < REST:
-            return "equilibrium"
+        if self.family.period and (end := _end_of_crossings(self.family, here)):
+            return end
         return "period_halving" if len(points) > 2 and has_halved(self.family, points) else ""
 
     def _is_closed(self, points: list[Point]) -> bool:
@@ -104,14 +109,17 @@ class _Stop:
         return np.append(self.family.mismatch(u, state), parameter - u[-1])
 
 
-def reach(family: Family, point: Point) -> float:
-    """Compute the scaled crossing speed times the period; infinite for a driven system."""
+def _end_of_crossings(family: Family, point: Point) -> str:
+    """Return ``tangent`` or ``equilibrium`` where a cycle hardly crosses its section; empty elsewhere."""
     crossed = crossed_state(family.system)
     if crossed is None:
-        return np.inf
+        return ""
     rows = family.rows(point.u[None])
-    rates = rates_packed(family.system, rows.states, rows.parameters, rows.frequency_hz)
-    return float(abs(rates[0, crossed]) * point.value.seconds / family.system.scales[crossed])
+    rates = rates_packed(family.system, rows.states, rows.parameters, rows.frequency_hz)[0]
+    reach = np.abs(rates) * point.value.seconds / np.asarray(family.system.scales)
+    if reach[crossed] >= TANGENT:
+        return ""
+    return "equilibrium" if reach.max() < REST else "tangent"
 
 
 def has_halved(family: Family, points: list[Point]) -> bool:

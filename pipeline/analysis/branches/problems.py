@@ -36,7 +36,13 @@ STATE_STEP = 1e-6
 
 
 SMALL_GAP, SMALL_RESIDUAL = 1e-9, 1e-8
-"""Largest gap between the periods of an orbit whose residual is small: its multipliers are wanted to nine digits."""
+"""Largest gap between the periods of an orbit whose residual is small: its multipliers are wanted to nine digits.
+
+Every tolerance of Newton's method on orbits is below `SMALL_RESIDUAL`, so this holds for all that are found.
+"""
+
+FAR_GAP, GAP_SHARE = 1e-3, 1e-2
+"""Far from the solution: the largest gap, and the largest square of it in units of the residual."""
 
 WIDEST_GAP, MOST_TRIES = 0.05, 6
 """Gap, and number of tries, beyond which an orbit is integrated as a whole."""
@@ -291,7 +297,7 @@ def _is_joined(gap: float, residual: float) -> bool:
     """
     if residual <= SMALL_RESIDUAL:
         return gap <= SMALL_GAP
-    return gap <= 1e-3 and gap * gap <= 1e-2 * residual
+    return gap <= FAR_GAP and gap * gap <= GAP_SHARE * residual
 
 
 def _wrapped(difference: np.ndarray, family: Family) -> np.ndarray:

@@ -239,7 +239,7 @@ def orbits_near(
 def _spread(
     section: np.ndarray, places: Sequence[tuple[np.intp, ...]], distance: np.ndarray, system: System
 ) -> list[np.ndarray]:
-    """Choose the points of the closest recurrences, each farther than `RECURRENCE` from the others."""
+    """Choose starting points at the closest recurrences, skipping any within `RECURRENCE` of a chosen one."""
     chosen: list[np.ndarray] = []
     for place in places:
         if len(chosen) == TRIES or not distance[place] <= RECURRENCE:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,23 +11,17 @@ import xarray as xr
 from magpend_core.sizes import LEVEL
 from pipeline.analysis.branches.bifurcations import FOLD
 from pipeline.analysis.branches.problems import FREQUENCY
+from pipeline.analysis.tabular import Row, Words, aligned, counted, values
 from pipeline.layout.vocabulary import model_of, parameter_name
 from pipeline.products.product import Table
-
-Row = dict[str, Any]
-
-
-def words(variable: xr.DataArray) -> list[str]:
-    """Return the label of each value of a flag variable."""
-    meanings = str(variable.attrs["flag_meanings"]).split()
-    return [meanings[int(v)] for v in variable.values]
 
 
 def branches_table(ds: xr.Dataset) -> Table:
     """Return the table of bifurcations, with lines on stable segments and attractors left out.
 
     Equilibria have the period 0, and eigenvalues [1/s] in place of multipliers. A Hopf point has the period of
-    its small cycles and its first Lyapunov coefficient. ``unstable_below`` and ``unstable_above`` say how many
+    its small cycles. ``normal_form`` is the coefficient of the normal form (see
+    `pipeline.analysis.branches.normal_forms`). ``unstable_below`` and ``unstable_above`` say how many
     multipliers are unstable on the two sides of the parameter; at a fold both orbits lie on one side, and the
     other says ``none``.
     """
@@ -37,7 +30,7 @@ def branches_table(ds: xr.Dataset) -> Table:
         lines = ["no branch: no closed orbit to begin with", *_left_out(ds)]
         return Table(rows, lines, _why_none(ds))
     head = f"{ds.sizes['bifurcation']} bifurcations on {ds.sizes['branch']} branches"
-    return Table(rows, [head, "", *_lines(ds, rows), "", *_windows(ds), *_left_out(ds)])
+    return Table(rows, [head, "", *aligned([_words(ds, row) for row in rows], ""), "", *_windows(ds), *_left_out(ds)])
 
 
 def _why_none(ds: xr.Dataset) -> str:
@@ -56,24 +49,24 @@ def table_of(ds: xr.Dataset) -> list[Row]:
     The parameter's column has its name and, for the drive's frequency, its unit: ``frequency_hz``. Parameters
     that have other values than the run's own follow, and ``side`` where the model has words for motions.
     """
-    kinds, criticality = words(ds["kind"]), ["" if w == "unknown" else w for w in words(ds["criticality"])]
-    sides = words(ds["bifurcation_side"]) if "bifurcation_side" in ds else None
+    parameter = parameter_name(str(ds.attrs["parameter"]))
     rows = []
     for k in np.argsort(ds["value"].values, kind="stable"):
         one = ds.isel(bifurcation=int(k))
-        branch = int(one["of_branch"])
-        below, above = _unstable(one, kinds[k])
+        branch, told = int(one["of_branch"]), values(one, "kind", "criticality", "bifurcation_side")
+        below, above = _unstable(one, told["kind"])
         rows.append(
             {
-                parameter_name(str(ds.attrs["parameter"])): float(one["value"]),
+                parameter: float(one["value"]),
                 "bracket": float(one["bracket"]),
-                "type": kinds[k],
-                "criticality": criticality[k],
+                "type": told["kind"],
+                "criticality": "" if told["criticality"] == "unknown" else told["criticality"],
                 "period": int(ds["orbit_period"].values[branch]),
-                **({} if sides is None else {"side": sides[k]}),
+                **({"side": told["bifurcation_side"]} if "bifurcation_side" in told else {}),
                 "multiplier_real": float(one["critical_real"]),
                 "multiplier_imag": float(one["critical_imag"]),
-                **({"first_lyapunov": float(one["first_lyapunov"])} if "hopf" in kinds else {}),
+                "normal_form": float(one["normal_form"]),
+                "normal_form_error": float(one["normal_form_error"]),
                 "unstable_below": below,
                 "unstable_above": above,
                 "period_s": float(one["bifurcation_period_s"]),
@@ -103,41 +96,22 @@ def _unstable(one: xr.Dataset, kind: str) -> tuple[str, str]:
     return (str(before), str(after)) if rises else (str(after), str(before))
 
 
-def _lines(ds: xr.Dataset, rows: Sequence[Row]) -> list[str]:
-    parameter = parameter_name(str(ds.attrs["parameter"]))
-    table = []
-    for row in rows:
-        to = f" -> {row['to_branch']}" if row["to_branch"] >= 0 else ""
-        z = complex(row["multiplier_real"], row["multiplier_imag"])
-        known = {
-            _with_unit(ds): f"{row[parameter]:.7f}",
-            "type": row["type"],
-            "criticality": row["criticality"],
-            "period": str(row["period"] or "equilibrium"),
-            "seconds": f"{row['period_s']:.6g}",
-            "side": row.get("side", ""),
-            "multiplier": _number(z) + (" 1/s" if not row["period"] else ""),
-            "unstable below, above": f"{row['unstable_below']}, {row['unstable_above']}",
-            "branch": f"{row['branch']}{to}{_at(ds, row['branch'])}",
-        }
-        if model_of(ds).crossing is None:  # the period in drive periods says the same
-            known.pop("seconds")
-        table.append(known if "side" in row else {n: v for n, v in known.items() if n != "side"})
-    return _aligned(table)
-
-
-def _with_unit(ds: xr.Dataset) -> str:
-    units = str(ds.attrs["parameter_units"])
-    return f"{ds.attrs['parameter']} {units}".rstrip() if units not in ("", "1") else str(ds.attrs["parameter"])
-
-
-def _aligned(rows: Sequence[Mapping[str, str]]) -> list[str]:
-    """Align rows under their headings."""
-    if not rows:
-        return []
-    cells = [list(rows[0]), *(list(row.values()) for row in rows)]
-    widths = [max(len(line[k]) for line in cells) for k in range(len(cells[0]))]
-    return ["  ".join(w.ljust(n) for w, n in zip(line, widths, strict=True)).rstrip() for line in cells]
+def _words(ds: xr.Dataset, row: Row) -> Words:
+    name, unit = str(ds.attrs["parameter"]), str(ds.attrs["parameter_units"])
+    to = f" -> {row['to_branch']}" if row["to_branch"] >= 0 else ""
+    return {
+        name if unit == "1" else f"{name} {unit}".rstrip(): f"{row[parameter_name(name)]:.7f}",
+        "type": row["type"],
+        "criticality": row["criticality"],
+        "normal_form": _with_error(row["normal_form"], row["normal_form_error"]),
+        "period": str(row["period"] or "equilibrium"),
+        # the period in drive periods says the same
+        "seconds": f"{row['period_s']:.6g}" if model_of(ds).crossing is not None else None,
+        "side": row.get("side"),
+        "multiplier": _number(complex(row["multiplier_real"], row["multiplier_imag"]), row["period"]),
+        "unstable below, above": f"{row['unstable_below']}, {row['unstable_above']}",
+        "branch": f"{row['branch']}{to}{_at(ds, row['branch'])}",
+    }
 
 
 def _at(ds: xr.Dataset, branch: int) -> str:
@@ -150,8 +124,17 @@ def _at(ds: xr.Dataset, branch: int) -> str:
     return f" at {', '.join(found)}" if found else ""
 
 
-def _number(z: complex) -> str:
-    return f"{z.real:.5f}" if abs(z.imag) < 1e-9 else f"{z.real:.5f}{z.imag:+.5f}i"
+def _with_error(value: float, error: float) -> str:
+    """Format a coefficient by the digits that its error leaves, at most four; ``?`` if it leaves none."""
+    if not abs(value) > error:
+        return "?"
+    digits = int(np.clip(np.floor(np.log10(abs(value) / max(error, 1e-300))), 1, 4))
+    return f"{value:.{digits}g}"
+
+
+def _number(z: complex, period: int) -> str:
+    """Format a multiplier, or with period 0 an eigenvalue."""
+    return (f"{z.real:.5f}" if abs(z.imag) < 1e-9 else f"{z.real:.5f}{z.imag:+.5f}i") + ("" if period else " 1/s")
 
 
 def _windows(ds: xr.Dataset) -> list[str]:
@@ -184,7 +167,7 @@ def windows_of(ds: xr.Dataset) -> list[dict[str, Any]]:
                     "begins": ends[0][1],
                     "ends": ends[1][1],
                     "period": int(ds["orbit_period"][i]),
-                    "side": words(ds["side"][i, middle : middle + 1])[0] if "side" in ds else "",
+                    "side": values(ds[["side"]].isel(branch=i, point=middle), "side")["side"] if "side" in ds else "",
                     **fixed_of(ds, i),
                     "branch": i,
                 }
@@ -202,8 +185,8 @@ def _stable_runs(stable: np.ndarray, closed: bool) -> list[tuple[int, int]]:
 
 
 def _ends_of(ds: xr.Dataset, branch: int) -> tuple[str, str]:
-    rows = ds.isel(branch=slice(branch, branch + 1))
-    return words(rows["first_end"])[0], words(rows["last_end"])[0]
+    ends = values(ds[["first_end", "last_end"]].isel(branch=branch), "first_end", "last_end")
+    return ends["first_end"], ends["last_end"]
 
 
 def _bound(ds: xr.Dataset, branch: int, point: int, after: int, end: int) -> tuple[float, str]:
@@ -225,9 +208,9 @@ def _bound(ds: xr.Dataset, branch: int, point: int, after: int, end: int) -> tup
 
 
 def _named(ds: xr.Dataset, k: int) -> tuple[float, str]:
-    criticality = words(ds["criticality"][k : k + 1])[0]
-    name = words(ds["kind"][k : k + 1])[0]
-    return float(ds["value"][k]), name if criticality == "unknown" else f"{criticality} {name}"
+    names = ["value", "criticality", "kind"]
+    one = values(ds[names].isel(bifurcation=k), *names)
+    return one["value"], f"{one['criticality']} {one['kind']}".removeprefix("unknown ")
 
 
 # ---- curves ------------------------------------------------------------------------------------
@@ -236,16 +219,16 @@ def _named(ds: xr.Dataset, k: int) -> tuple[float, str]:
 def curves_table(ds: xr.Dataset) -> Table:
     """Return the table of curves: kind, period, points, and the ranges of both parameters."""
     names = [parameter_name(str(ds.attrs[f"{role}_parameter"])) for role in ("first", "second")]
-    kinds = words(ds["kind"])
     rows: list[Row] = []
     for i in range(ds.sizes["curve"]):
         one, n = ds.isel(curve=i), int(ds["n_points"][i])
-        row: Row = {"curve": i, "type": kinds[i], "period": int(one["orbit_period"]), "n_points": n}
+        told = values(one, "kind", "orbit_period")
+        row: Row = {"curve": i, "type": told["kind"], "period": told["orbit_period"], "n_points": n}
         for role, name in zip(("first", "second"), names, strict=True):
-            values = one[role].values[:n]
-            row |= {f"{name}_min": float(values.min()), f"{name}_max": float(values.max())}
+            line = one[role].values[:n]
+            row |= {f"{name}_min": float(line.min()), f"{name}_max": float(line.max())}
         rows.append(row)
-    lines = [f"{len(rows) or 'no'} curve{'s' * (len(rows) != 1)} in the plane of {names[0]} and {names[1]}"]
+    lines = [f"{counted(len(rows), 'curve') if rows else 'no curves'} in the plane of {' and '.join(names)}"]
     for row in rows:
         spans = ", ".join(f"{n} {row[f'{n}_min']:.7g} to {row[f'{n}_max']:.7g}" for n in names)
         lines.append(f"  {row['curve']}: {row['type']}, period {row['period']}: {spans}")

@@ -11,21 +11,24 @@ from pipeline.analysis.chaos.per_attractor import Nature
 from pipeline.analysis.tabular import (
     FEW_POINTS,
     Row,
+    Words,
     aligned,
+    at_point,
     axis_ranges,
-    labels,
+    counted,
     number,
+    plain,
     point_table,
     points_of,
+    sets_of,
     unit_of,
-    where_of,
+    values,
     with_error,
-    words_of,
+    with_interval,
 )
 from pipeline.layout.vocabulary import APERIODIC, KINDS, split_dims
 from pipeline.products.product import Table
 
-_COUNTS = ("n_transient", "n_contradicting", "n_drifting", "n_audit_failed", "n_unresolved", "n_failed")
 _FLAGS = {
     "n_transient": "transient",
     "n_contradicting": "closed with a positive exponent",
@@ -40,10 +43,10 @@ _TEST = ("median_zero_one", "least_zero_one", "largest_zero_one")
 
 def chaos_table(ds: xr.Dataset) -> Table:
     """Return the table of exponents, multipliers, dimensions and 0-1 test per attractor and point."""
-    rows = _rows(ds)
     dims, _ = split_dims(ds["motion"])
+    rows = [{**where, **_row(one)} for where, one in sets_of(ds, ds["kind"] > 0, dims)]
     n_points = int(np.prod([ds.sizes[d] for d in dims]))
-    lines = [f"{ds['motion'].size} cells at {n_points} parameter point{'s' * (n_points != 1)}"]
+    lines = [f"{ds['motion'].size} cells at {counted(n_points, 'parameter point')}"]
     if n_points > FEW_POINTS:
         lines += _summary(ds, rows, dims)
     else:
@@ -53,29 +56,15 @@ def chaos_table(ds: xr.Dataset) -> Table:
     return Table(rows, lines)
 
 
-def _rows(ds: xr.Dataset) -> list[Row]:
-    dims, _ = split_dims(ds["motion"])
-    natures, sources = words_of(ds["nature"]), words_of(ds["exponents_from"])
-    rows = []
-    present = ds["kind"].transpose(*dims, "attractor").values > 0
-    for *index, i in np.argwhere(present).tolist():
-        at = dict(zip(dims, index, strict=True))
-        one = ds.isel(at).isel(attractor=i)
-        row: Row = {
-            **where_of(ds, at),
-            "attractor_id": int(one["attractor"]),
-            **labels(one, "kind", "stability"),
-            "nature": natures[int(one["nature"])],
-            "orbit_period": int(one["orbit_period"]),
-            "n_cells": int(one["n_cells"]),
-            "share": float(one["share"]),
-            "exponents_from": sources[int(one["exponents_from"])],
-        }
-        row |= {name: int(one[name]) for name in _COUNTS}
-        row |= _spectrum(one)
-        row |= {name: float(one[f"attractor_{name}"]) for name in _NUMBERS}
-        rows.append(row | {name: float(one[name]) for name in _TEST})
-    return rows
+def _row(one: xr.Dataset) -> Row:
+    names = ("kind", "stability", "nature", "orbit_period", "n_cells", "share", "exponents_from", *_FLAGS)
+    return {
+        "attractor_id": int(one["attractor"]),
+        **values(one, *names),
+        **_spectrum(one),
+        **{name: float(one[f"attractor_{name}"]) for name in _NUMBERS},
+        **values(one, *_TEST),
+    }
 
 
 def _spectrum(one: xr.Dataset) -> Row:
@@ -92,11 +81,11 @@ def _spectrum(one: xr.Dataset) -> Row:
     return row
 
 
-def _words(row: Row) -> dict[str, str]:
-    found = {
+def _words(row: Row) -> Words:
+    return {
         "id": str(row["attractor_id"]),
-        "kind": row["kind"].replace("_", " "),
-        "stability": row["stability"].replace("_", " "),
+        "kind": plain(row["kind"]),
+        "stability": plain(row["stability"]),
         "motion": _nature_words(row),
         "period": str(row["orbit_period"] or "-"),
         "cells": str(row["n_cells"]),
@@ -105,12 +94,15 @@ def _words(row: Row) -> dict[str, str]:
         "|multipliers|": _multipliers(row),
         "Kaplan-Yorke": with_error(row["kaplan_yorke"], row["kaplan_yorke_stderr"]),
         "correlation": with_error(row["correlation"], row["correlation_stderr"]),
+        "0-1 K": with_interval(row, _TEST, ".2f") if np.isfinite(row[_TEST[0]]) else None,
+        "flags": _flags([row]) or "-",
     }
-    if np.isfinite(row["median_zero_one"]):
-        low, high = (number(row[f"{name}_zero_one"], ".2f") for name in ("least", "largest"))
-        found["0-1 K"] = f"{number(row['median_zero_one'], '.2f')} ({low} to {high})"
-    flags = [f"{row[name]} {text}" for name, text in _FLAGS.items() if row[name]]
-    return found | {"flags": ", ".join(flags) or "-"}
+
+
+def _flags(rows: Sequence[Row]) -> str:
+    """Format the flags with their numbers of cells."""
+    counts = [(sum(row[name] for row in rows), text) for name, text in _FLAGS.items()]
+    return ", ".join(f"{n} {text}" for n, text in counts if n)
 
 
 def _nature_words(row: Row) -> str:
@@ -135,20 +127,16 @@ def _summary(ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str]) -> list[s
     """Return lines on where each motion occurs, on the largest exponent, and on the flags."""
     table = []
     for nature in Nature:
-        own = [row for row in rows if row["nature"] == nature.name.lower()]
-        if own:
+        if own := [row for row in rows if row["nature"] == nature.name.lower()]:
             ids = sorted({row["attractor_id"] for row in own})
-            places = {tuple(row[d] for d in dims) for row in own}
             words = {
                 "motion": nature.words,
                 "ids": ", ".join(map(str, ids[:8])) + (f" and {len(ids) - 8} more" if len(ids) > 8 else ""),
                 "cells": str(sum(r["n_cells"] for r in own)),
-                "points": str(len(places)),
+                "points": str(len({tuple(row[d] for d in dims) for row in own})),
             }
             table.append(words | {f"{d}{unit_of(ds, d)}": axis_ranges(ds, d, own, len(dims) == 1) for d in dims})
-    counts = [(text, sum(row[name] for row in rows)) for name, text in _FLAGS.items()]
-    flags = ", ".join(f"{n} {text}" for text, n in counts if n)
-    return aligned(table) + _extremes(ds, rows, dims) + [f"  cells flagged: {flags or 'none'}"]
+    return aligned(table) + _extremes(ds, rows, dims) + [f"  cells flagged: {_flags(rows) or 'none'}"]
 
 
 def _extremes(ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str]) -> list[str]:
@@ -187,39 +175,25 @@ _OPEN = tuple(KINDS[code] for code in APERIODIC)
 
 def dimension_table(ds: xr.Dataset) -> Table:
     """Return the table of dimensions per attractor and point, with the reason if there is none."""
-    rows = _dimension_rows(ds)
     dims = [str(d) for d in ds["reason"].dims if d != "attractor"]
+    names = ("kind", "reason", "n_cells", "n_sampled", "n_left", "n_points", "lifetime_low", *_CURVE)
+    found = sets_of(ds, ds["kind"] > 0, dims)
+    rows = [{**where, "attractor_id": int(one["attractor"]), **values(one, *names)} for where, one in found]
     lines = ["correlation dimension of the sections of attractors that do not close"]
     open_rows = [row for row in rows if row["kind"] in _OPEN]
     if not open_rows:
         lines.append("  none: all sets close, and have the dimension 0 on the section")
-    table = [_dimension_words(ds, row, dims) for row in open_rows]
-    return Table(rows, lines + aligned(table))
+    return Table(rows, lines + aligned([_dimension_words(ds, row, dims) for row in open_rows]))
 
 
-def _dimension_rows(ds: xr.Dataset) -> list[Row]:
-    reasons, kinds = words_of(ds["reason"]), words_of(ds["kind"])
-    dims = [str(d) for d in ds["reason"].dims]
-    rows = []
-    for index in np.argwhere(ds["kind"].transpose(*dims).values > 0).tolist():
-        at = dict(zip(dims, index, strict=True))
-        one = ds.isel(at)
-        row: Row = where_of(ds, {d: i for d, i in at.items() if d != "attractor"})
-        row |= {"attractor_id": int(one["attractor"]), "kind": kinds[int(one["kind"])]}
-        row |= {"reason": reasons[int(one["reason"])]}
-        row |= {name: int(one[name]) for name in ("n_cells", "n_sampled", "n_left", "n_points")}
-        rows.append(row | {name: float(one[name]) for name in ("lifetime_low", *_CURVE)})
-    return rows
-
-
-def _dimension_words(ds: xr.Dataset, row: Row, dims: Sequence[str]) -> dict[str, str]:
+def _dimension_words(ds: xr.Dataset, row: Row, dims: Sequence[str]) -> Words:
     value = with_error(row["correlation_dimension"], row["correlation_dimension_stderr"])
     stays = f"{row['n_left']} of {row['n_sampled']} left"
     if not row["n_left"] and np.isfinite(row["lifetime_low"]):
         stays = f"stays, lifetime above {row['lifetime_low']:.0f} periods"
     ends = f"{row['fit_low']:.3g} to {row['fit_high']:.3g}" if np.isfinite(row["fit_low"]) else "-"
     return {
-        **{f"{d}{unit_of(ds, d)}": f"{row[d]:g}" for d in dims},
+        **at_point(ds, row, dims),
         "id": str(row["attractor_id"]),
         "cells": str(row["n_cells"]),
         "extended": stays,

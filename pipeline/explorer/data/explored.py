@@ -135,7 +135,7 @@ class ExploredRun(Run):
 
     @property
     def path(self) -> str | None:
-        """Return the continuation axis; None in a sweep."""
+        """Return the axis that a continuation follows; None in a sweep."""
         return None if self.plan.path is None else self.plan.dims[self.plan.path]
 
     @property

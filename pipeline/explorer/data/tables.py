@@ -99,19 +99,9 @@ def _words(scheme: Scheme) -> np.ndarray:
 def _curves(run: ExploredRun, asked: Asked) -> xr.Dataset:
     x = _needed(asked, "x")
     rows = [
-        {
-            "curve": one["title"],
-            "group": one["group"],
-            "unit": one["unit"],
-            x: value,
-            "value": y,
-            "low": low,
-            "high": high,
-        }
+        (one["title"], one["group"], one["unit"], *numbers)
         for one in curves(run, x, asked["at"])["curves"]
-        for value, y, low, high in zip(
-            one["x"], one["y"], one.get("low", one["y"]), one.get("high", one["y"]), strict=True
-        )
+        for numbers in zip(one["x"], one["y"], one.get("low", one["y"]), one.get("high", one["y"]), strict=True)
     ]
     names = ("curve", "group", "unit", x, "value", "low", "high")
     return _of_rows(rows, names).assign_attrs(_place(run, x, asked["at"]))
@@ -121,20 +111,13 @@ def _branches(run: ExploredRun, asked: Asked) -> xr.Dataset:
     x, y = _needed(asked, "x"), _needed(asked, "y")
     found = branches(run, x, y, asked["at"])
     rows = [
-        {
-            "branch": one["id"],
-            "period": one["period"],
-            "what": "stable" if part["stable"] else "unstable",
-            "segment": k,
-            x: value,
-            y: height,
-        }
+        (one["id"], one["period"], "stable" if part["stable"] else "unstable", k, value, height)
         for one in found["branches"]
         for k, part in enumerate(one["segments"])
         for value, height in zip(part["x"], part["y"], strict=True)
     ]
     rows += [
-        {"branch": one["branch"], "period": one["period"], "what": one["kind"], "segment": -1, x: one["x"], y: height}
+        (one["branch"], one["period"], one["kind"], -1, one["x"], height)
         for one in found["points"]
         for height in one["y"]
     ]
@@ -186,12 +169,12 @@ _OF_SET = ("id", "name", *_SHOWN, "period", "motion", "share", "low", "high")
 
 
 def _attractors(run: ExploredRun, asked: Asked) -> xr.Dataset:
-    states = run.model.state_names
-    rows = []
-    for one in attractors(run, asked["at"])["attractors"]:
-        plain = {key: one[key] for key in _OF_SET}
-        rows += [{**plain, "point": k, **dict(zip(states, row, strict=True))} for k, row in enumerate(one["section"])]
-    names = (*_OF_SET, "point", *states)
+    rows = [
+        (*(one[key] for key in _OF_SET), k, *point)
+        for one in attractors(run, asked["at"])["attractors"]
+        for k, point in enumerate(one["section"])
+    ]
+    names = (*_OF_SET, "point", *run.model.state_names)
     return _of_rows(rows, names).assign_attrs(_place(run, "", asked["at"]))
 
 
@@ -221,11 +204,10 @@ def _place(run: ExploredRun, x: str, at: Mapping[str, int]) -> dict[str, float]:
     return {f"at_{n}": float(run.axis(n).values[i]) for n, i in run.place(at, but=x).items()}
 
 
-def _of_rows(rows: list[dict[str, Any]], names: tuple[str, ...]) -> xr.Dataset:
+def _of_rows(rows: list[tuple[Any, ...]], names: tuple[str, ...]) -> xr.Dataset:
     """Return rows as a dataset; missing values are NaN or an empty text."""
     variables = {}
-    for name in names:
-        column = [row[name] for row in rows]
+    for name, column in zip(names, zip(*rows, strict=True) if rows else [()] * len(names), strict=True):
         if any(isinstance(value, str) for value in column):
             variables[name] = ("row", np.array(["" if v is None else v for v in column], dtype=str))
         else:

@@ -266,7 +266,7 @@ def _same(a: float, b: float) -> bool:
 
 
 class Warming:
-    """The thread that compiles the code for jobs, once."""
+    """A thread that compiles the code for jobs once, so that the first job does not wait for it."""
 
     def __init__(self, live: LiveRun) -> None:
         self._live, self._lock = live, threading.Lock()

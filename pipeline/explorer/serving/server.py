@@ -167,7 +167,7 @@ class Handler(web.RequestHandler):
                 self.set_header(name, value)
 
     def compute_etag(self) -> str | None:
-        """None: nothing is to be stored, and a digest of a large diagram would hold up everybody."""
+        """Return no etag: browsers must not store answers, and hashing a large diagram would block the server."""
         return None
 
     def prepare(self) -> None:

@@ -345,7 +345,7 @@ def _usable(ds: xr.Dataset, stretch: Stretch, channels: Sequence[str], drive: _D
 
 
 def _start(model: Model, own: xr.Dataset) -> np.ndarray:
-    """Return a first guess of the state at the first sample; 0 for states without a smoothed value."""
+    """Return a first guess of the state at the first sample: smoothed measurements, and 0 for the other states."""
     found = []
     for state in model.states:
         value = float(own[state.name].values[0]) if state.name in own else 0.0

@@ -207,7 +207,7 @@ class Problem:
         return found
 
     def pack(self, thetas: np.ndarray) -> np.ndarray:
-        """Return packed parameters for rows of unknowns, (n, n_parameters)."""
+        """Return the model's packed parameters for each row of unknowns of the fit, shape (n, n_parameters)."""
         names = list(self.fixed.names)
         packed = np.tile(self.fixed.pack(), (len(thetas), 1))
         for i in self.moving:

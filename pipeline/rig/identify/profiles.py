@@ -122,7 +122,7 @@ def profile(problem: Problem, best: Fit, name: str, about: Curvature, fit_local:
 
 
 def following(information: np.ndarray, index: int) -> np.ndarray:
-    """Return the derivative of the optimum of all parameters by one of them, (n_free,)."""
+    """Return the derivative of the best-fit parameters by one parameter that is held fixed, shape (n_free,)."""
     others = np.delete(np.arange(len(information)), index)
     moves = np.ones(len(information))
     both = information[np.ix_(others, others)]

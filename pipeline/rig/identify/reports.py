@@ -29,7 +29,7 @@ SAME = 1e-3
 
 @dataclass(frozen=True)
 class Finding:
-    """All results of an identification before they are written.
+    """The results of an identification, before they are written to files.
 
     Attributes
     ----------

@@ -15,6 +15,7 @@ from magpend_core.models.pendulum import magnet_torque as laws
 from magpend_core.models.preset_writing import write_preset
 from magpend_core.models.presets import Preset, find_preset
 from pipeline.layout.writing import write_atomically
+from pipeline.products.product import padded
 from pipeline.rig.magnet.fitting import DipoleFit, JointFit, Outcome
 from pipeline.rig.magnet.measurement import Measurement
 from pipeline.rig.magnet.solving import Quality
@@ -178,8 +179,7 @@ def _table(joint: JointFit, m: Measurement) -> list[str]:
         if name in joint.free:
             errors = (f"{joint.errors[name]:.2g}", f"{joint.errors_by_curve[name]:.2g}")
         rows.append((name, f"{joint.values[name]:.6g}", *errors, _unit(name, m)))
-    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-    return ["  " + "  ".join(t.ljust(w) for t, w in zip(row, widths, strict=True)).rstrip() for row in rows]
+    return padded(rows)
 
 
 def warnings_of(outcome: Outcome) -> list[str]:

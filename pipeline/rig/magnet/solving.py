@@ -114,7 +114,7 @@ def solve(
 
 
 def _inverse(jacobian: np.ndarray) -> np.ndarray:
-    """Return the inverse of the normal matrix; columns are scaled to one size on the way."""
+    """Return the inverse of the fit's normal matrix; columns are scaled to equal size for accuracy."""
     size = np.linalg.norm(jacobian, axis=0)
     _, s, right = np.linalg.svd(jacobian / size, full_matrices=False)
     if not s[-1] > len(jacobian) * _EPS * s[0]:

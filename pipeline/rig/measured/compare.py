@@ -102,7 +102,7 @@ def compare_with(measured: xr.Dataset, computed: Computed, *, seed: int = 0) -> 
 
 
 def _step(measured: xr.Dataset, step: int, computed: Computed, distances: np.ndarray, seed: int) -> dict[str, float]:
-    """Return the comparison of one step; fill its row of `distances`."""
+    """Compare model and measurement at one step of the frequency; fill the step's row of `distances`."""
     states = [str(s) for s in measured["state"].values]
     geometry = geometry_of(states, computed.model.state_names, Geometry.of(computed.model))
     points, noise = measured["section"].values[step], measured["section_noise"].values[step]

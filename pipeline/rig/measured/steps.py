@@ -246,7 +246,9 @@ def _stretch(own: Edges, curve: Floats, transient: int) -> Stretch:
 
 
 def _line(rising: Floats) -> Floats:
-    """Return times on the line through edges; a missing edge does not shift the others."""
+    """Fit edge times by a line over the edge number, and return the times on it; a missing edge does not renumber
+    later ones.
+    """
     gaps = np.diff(rising)
     n = np.concatenate([[0.0], np.cumsum(np.maximum(np.rint(gaps / np.median(gaps)), 1.0))])
     centred = n - n.mean()

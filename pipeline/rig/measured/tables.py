@@ -7,7 +7,7 @@ import math
 import numpy as np
 import xarray as xr
 
-from pipeline.analysis.tabular import Row, aligned, number
+from pipeline.analysis.tabular import Row, Words, aligned, counted, number, values
 from pipeline.layout.vocabulary import model_of
 from pipeline.products.product import Table
 from pipeline.rig.measured.windows import CONFIDENT, words_for
@@ -18,36 +18,20 @@ FAR = 5.0
 
 def steps_table(measured: xr.Dataset) -> Table:
     """Return the table of steps: frequency, jitter, duty cycle, period, confidence, and any comparison."""
-    rows = [_row(measured, i) for i in range(measured.sizes["step"])]
-    plural = "s" * (len(rows) != 1)
-    return Table(rows, [f"{len(rows)} step{plural}", *aligned([_words(r) for r in rows])])
+    rows = [_row(measured.isel(step=i)) for i in range(measured.sizes["step"])]
+    return Table(rows, [counted(len(rows), "step"), *aligned([_words(r) for r in rows])])
 
 
-def _row(measured: xr.Dataset, step: int) -> Row:
-    one = measured.isel(step=step)
-    words = words_of(measured)
-    row: Row = {
-        "frequency_hz": float(one["frequency"]),
-        "frequency_error_hz": float(one["frequency_error_hz"]),
-        "direction": str(one["direction"].values),
-        "recording": int(one["recording"]),
-        "start_s": float(one["start_s"]),
-        "jitter_s": float(one["jitter_s"]),
-        "duty_cycle": float(one["duty_cycle"]),
-        "duty_cycle_error": float(one["duty_cycle_error"]),
-        "n_sections": int(one["n_sections"]),
-        "orbit_period": int(one["orbit_period"]),
-        "confidence": float(one["confidence"]),
-        "closure": float(one["closure"]),
-    }
-    if "side" in one:
-        row["side"] = words[int(one["side"])]
-    if "winner" in one:
-        row |= {n: float(one[n]) for n in ("distance", "distance_in_noise", "runner_up", "noise_floor")}
-        row |= {n: int(one[n]) for n in ("winner", "computed_period", "same_period", "same_side")}
-        if words:
-            row["computed_side"] = words[int(one["computed_side"])]
-    return row
+_MEASURED = ("frequency_error_hz", "direction", "recording", "start_s", "jitter_s", "duty_cycle", "duty_cycle_error")
+_ORBIT = ("n_sections", "orbit_period", "confidence", "closure", "side")
+_NEAREST = ("distance", "distance_in_noise", "runner_up", "noise_floor", "winner")
+_COMPUTED = ("computed_period", "same_period", "same_side")
+
+
+def _row(one: xr.Dataset) -> Row:
+    labelled = ("computed_side",) if model_of(one).classifier else ()
+    names = (*_MEASURED, *_ORBIT, *_NEAREST, *_COMPUTED, *labelled)
+    return {"frequency_hz": float(one["frequency"]), **values(one, *names)}
 
 
 def words_of(measured: xr.Dataset) -> tuple[str, ...]:
@@ -56,30 +40,30 @@ def words_of(measured: xr.Dataset) -> tuple[str, ...]:
     return classifier.words if classifier is not None else ()
 
 
-def _words(row: Row) -> dict[str, str]:
-    ms, error = 1e3 * row["jitter_s"], row["frequency_error_hz"]
+def _words(row: Row) -> Words:
+    error = row["frequency_error_hz"]
     digits = int(np.clip(1 - math.floor(math.log10(error)), 0, 8)) if 0 < error < 1 else 6
     words = {
         "frequency Hz": f"{row['frequency_hz']:.{digits}f} ± {error:.{digits}f}",
         "way": row["direction"],
-        "jitter ms": number(ms, ".3f"),
+        "jitter ms": number(1e3 * row["jitter_s"], ".3f"),
         "duty cycle": f"{row['duty_cycle']:.5f} ± {row['duty_cycle_error']:.5f}",
         "sections": str(row["n_sections"]),
         "period": str(row["orbit_period"] or "-"),
         "sure": f"{row['confidence']:.2f}",
+        "side": row.get("side"),
     }
-    if "side" in row:
-        words["side"] = row["side"]
-    if "winner" in row:
-        nobody = row["winner"] < 0
-        words["nearest"] = "-" if nobody else str(row["winner"])
-        words["its period"] = "-" if nobody else str(row["computed_period"] or "-")
-        if "computed_side" in row:
-            words["its side"] = "-" if nobody else row["computed_side"]
-        words["distance"] = number(row["distance"], ".4f")
-        words["in noise"] = number(row["distance_in_noise"], ".2f")
-        words["next"] = number(row["runner_up"], ".4f")
-    return words
+    if "winner" not in row:
+        return words
+    nobody = row["winner"] < 0
+    return words | {
+        "nearest": "-" if nobody else str(row["winner"]),
+        "its period": "-" if nobody else str(row["computed_period"] or "-"),
+        "its side": "-" if nobody and "computed_side" in row else row.get("computed_side"),
+        "distance": number(row["distance"], ".4f"),
+        "in noise": number(row["distance_in_noise"], ".2f"),
+        "next": number(row["runner_up"], ".4f"),
+    }
 
 
 def edges_table(compared: xr.Dataset) -> Table:
@@ -94,12 +78,10 @@ def edges_table(compared: xr.Dataset) -> Table:
         for n in ("measured", "computed", "shift"):
             row |= {f"{n}_hz": float(one[f"edge_{n}_hz"]), f"{n}_error_hz": float(one[f"edge_{n}_error_hz"])}
         rows.append(row | {"note": str(one["edge_note"].values)})
-    plural = "s" * (len(rows) != 1)
-    lines = [f"{len(rows)} window edge{plural}", *aligned([_edge_words(r) for r in rows])]
-    return Table(rows, lines)
+    return Table(rows, [counted(len(rows), "window edge"), *aligned([_edge_words(r) for r in rows])])
 
 
-def _edge_words(row: Row) -> dict[str, str]:
+def _edge_words(row: Row) -> Words:
     return {
         "way": row["direction"],
         "from": row["before"],

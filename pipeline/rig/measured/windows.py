@@ -22,7 +22,7 @@ Regime = tuple[int, int]
 
 @dataclass(frozen=True)
 class Window:
-    """Successive steps of one recording and direction with the same regime."""
+    """Successive frequency steps of one recording, swept in one direction, with the same regime."""
 
     regime: Regime
     steps: tuple[int, ...]

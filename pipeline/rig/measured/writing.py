@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from pathlib import Path
 
 import xarray as xr
@@ -11,7 +9,6 @@ import xarray as xr
 from pipeline.layout.writing import write_atomically
 from pipeline.plots.files import save_data, save_figure
 from pipeline.plots.style import WIDE, Frame
-from pipeline.products.product import Table
 from pipeline.rig.measured.computed import Computed
 from pipeline.rig.measured.figures import plot_comparison, plot_measured
 from pipeline.rig.measured.tables import edges_table, steps_table
@@ -57,15 +54,6 @@ def write_comparison(
         figure.data = figure.data.assign_attrs(run=computed.title, cube_digest=computed.digest)
         written += [save_figure(figure, folder / f"{name}.png"), save_data(figure, folder / f"{name}.nc")]
     for name, table in (("steps", steps_table(compared)), ("edges", edges_table(compared))):
-        written.append(_write(table, folder / f"{name}.csv"))
+        written.append(folder / f"{name}.csv")
+        write_atomically(written[-1], table.csv())
     return written
-
-
-def _write(table: Table, path: Path) -> Path:
-    names = list(dict.fromkeys(name for row in table.rows for name in row))
-    text = io.StringIO()
-    writer = csv.DictWriter(text, names, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows({k: "" if v != v else v for k, v in row.items()} for row in table.rows)
-    write_atomically(path, text.getvalue())
-    return path

@@ -100,7 +100,7 @@ def _label(ds: xr.Dataset, names: Sequence[str]) -> str:
 
 
 def _draw(ax: Axes, ds: xr.Dataset, name: str, span: tuple[float, float], colour: str) -> None:
-    """Draw a quantity as a line that breaks between pieces."""
+    """Draw a quantity against time as a line with gaps between the pieces of the recording."""
     time, values, piece = ds["time"].values, ds[name].values, ds["piece"].values
     inside = (time >= span[0]) & (time <= span[1])
     time, values, piece = time[inside], values[inside].astype(np.float64), piece[inside]

@@ -122,7 +122,7 @@ class Mapping(Table):
 
     @property
     def drive_map(self) -> DriveMap | None:
-        """Channel of the drive; None if there is none."""
+        """Mapping of the drive's channel; None if no drive was recorded."""
         return None if isinstance(self.drive, str) else self.drive
 
     def unit_of(self, name: str) -> str:

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 import xarray as xr
 
+from pipeline.analysis.tabular import aligned, number
 from pipeline.layout.vocabulary import model_of
 from pipeline.products.product import Table
 from pipeline.rig.recordings.clock import step_of
-from pipeline.rig.recordings.findings import Finding, findings_of, summary
+from pipeline.rig.recordings.findings import findings_of, summary
 from pipeline.rig.recordings.mapping import DRIVE
 from pipeline.rig.recordings.raw import Raw
 
@@ -30,21 +31,19 @@ def describe_file(raw: Raw) -> Table:
     if len(raw.stretches) > 1:
         head += f" in {len(raw.stretches)} stretches"
     lines = [head + (", simulated" if raw.simulated else "")]
-    lines += _aligned(
-        ("channel", "samples", "rate [Hz]", "start [s]", "unit", "least", "greatest"),
-        [
-            (
-                row["channel"],
-                _counted(row),
-                _number(row["sampling_rate_hz"]),
-                _number(row["start_s"]),
-                row["unit"] or "-",
-                _number(row["least"]),
-                _number(row["greatest"]),
-            )
-            for row in rows
-        ],
-    )
+    words = [
+        {
+            "channel": row["channel"],
+            "samples": f"{row['samples']} ({row['no_numbers']} are none)" if row["no_numbers"] else str(row["samples"]),
+            "rate [Hz]": number(row["sampling_rate_hz"], ".6g"),
+            "start [s]": number(row["start_s"], ".6g"),
+            "unit": row["unit"] or "-",
+            "least": number(row["least"], ".6g"),
+            "greatest": number(row["greatest"], ".6g"),
+        }
+        for row in rows
+    ]
+    lines += aligned(words, "", right=True)
     lines += [f"{f.severity}: {f.channel}{': ' if f.channel else ''}{f.text}" for f in raw.findings]
     return Table(rows, lines)
 
@@ -66,11 +65,6 @@ def _channel_row(raw: Raw, name: str) -> dict[str, Any]:
         "greatest": float(known.max()) if known.size else math.nan,
         "no_numbers": len(values) - int(known.size),
     }
-
-
-def _counted(row: dict[str, Any]) -> str:
-    n = f"{row['samples']}"
-    return f"{n} ({row['no_numbers']} are none)" if row["no_numbers"] else n
 
 
 def describe_recording(ds: xr.Dataset) -> tuple[Table, Table]:
@@ -98,22 +92,21 @@ def describe_recording(ds: xr.Dataset) -> tuple[Table, Table]:
         f"piece{'s' if n_pieces > 1 else ''}, model {model_of(ds).name}"
         + (", simulated" if ds.attrs.get("simulated") else "")
     ]
-    lines += _aligned(
-        ("quantity", "unit", "least", "greatest", "not measured", "noise", "window [s]"),
-        [
-            (
-                row["quantity"],
-                row["unit"],
-                _number(row["least"]),
-                _number(row["greatest"]),
-                str(row["not_measured"]),
-                _number(row["noise"]),
-                _number(row["window_s"]),
-            )
-            for row in rows
-        ],
-    )
-    return Table(rows, lines), _findings_table(findings_of(ds))
+    words = [
+        {
+            "quantity": row["quantity"],
+            "unit": row["unit"],
+            "least": number(row["least"], ".6g"),
+            "greatest": number(row["greatest"], ".6g"),
+            "not measured": str(row["not_measured"]),
+            "noise": number(row["noise"], ".6g"),
+            "window [s]": number(row["window_s"], ".6g"),
+        }
+        for row in rows
+    ]
+    lines += aligned(words, "", right=True)
+    findings = findings_of(ds)
+    return Table(rows, lines), Table([asdict(f) for f in findings], summary(findings) or ["findings: none"])
 
 
 def _quantity_row(ds: xr.Dataset, smoothed: xr.Dataset, name: str) -> dict[str, Any]:
@@ -129,33 +122,3 @@ def _quantity_row(ds: xr.Dataset, smoothed: xr.Dataset, name: str) -> dict[str, 
         "noise": float(attrs.get("noise", math.nan)),
         "window_s": float(attrs.get("window_s", math.nan)),
     }
-
-
-def _findings_table(findings: Sequence[Finding]) -> Table:
-    rows = [
-        {
-            "kind": f.kind,
-            "channel": f.channel,
-            "start_s": f.start_s,
-            "end_s": f.end_s,
-            "severity": f.severity,
-            "text": f.text,
-        }
-        for f in findings
-    ]
-    lines = summary(findings)
-    return Table(rows, lines or ["findings: none"])
-
-
-def _number(value: float) -> str:
-    return "-" if math.isnan(value) else f"{value:.6g}"
-
-
-def _aligned(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """Return the lines of a table: first column left-aligned, others right-aligned."""
-    table = [list(head), *(list(row) for row in rows)]
-    widths = [max(len(row[j]) for row in table) for j in range(len(head))]
-    return [
-        "  ".join([row[0].ljust(widths[0]), *(t.rjust(w) for t, w in zip(row[1:], widths[1:], strict=True))])
-        for row in table
-    ]

@@ -83,7 +83,7 @@ def _numbers(data: Any, zero: int) -> np.ndarray | None:
 
 
 def _earliest(file: Any) -> int:
-    """Return the whole second before all starts, as the origin of times: differences then keep their digits."""
+    """Return a whole second before the start of all channels; times counted from it lose no digits."""
     starts = [c.properties.get("wf_start_time") for g in file.groups() for c in g.channels()]
     return min((int(s.seconds) for s in starts if s is not None), default=0)
 

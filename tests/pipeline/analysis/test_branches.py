@@ -339,7 +339,7 @@ def test_explore__symmetry_breaking():
     branches = explore(
         [Start(orbits, settled([0.0, 0.0], orbits.frequency_hz, parameters), 0.3)], Scope(0.1, 2.5, max_period=1)
     )
-    pitchfork = only(branches[0], "branch_point")[0]
+    pitchfork = only(branches[0], "pitchfork")[0]
     broken = pitchfork.child
     assert broken is not None
 

@@ -13,7 +13,7 @@ from magpend_core.models import load_model
 from magpend_core.models.sectioned import sectioned
 from pipeline.analysis.branches import Scope, Start, dataset_of, explore
 from pipeline.analysis.branches.arclength import Settings
-from pipeline.analysis.branches.equilibria import EquilibriumProblem, first_lyapunov
+from pipeline.analysis.branches.equilibria import EquilibriumProblem
 from pipeline.analysis.branches.problems import Family
 from pipeline.analysis.branches.table import branches_table
 
@@ -98,9 +98,10 @@ def test_equilibria__pitchfork_of_lorenz():
     """At rho = 1 the branches of both wings cross that of rest, whose stability changes."""
     found, _ = branches_of(load_model("lorenz"), "rho", (0.5, 3.0), [0.0, 0.0, 0.0], 0.7, step=0.02)
     rest, wings = found
-    at, rho = only(rest, "branch_point")
+    at, rho = only(rest, "pitchfork")
     assert rho == pytest.approx(1.0, abs=1e-7)
     assert (at.n_unstable_before, at.n_unstable_after) == (0, 1)
+    assert at.criticality == "supercritical"
     states = np.array([wings.family.state(p.u) for p in wings.points])
     np.testing.assert_allclose(states[:, 0] ** 2, 8.0 / 3.0 * (wings.values - 1.0), atol=1e-7)
     assert states[:, 0].min() < -2.0
@@ -109,7 +110,10 @@ def test_equilibria__pitchfork_of_lorenz():
 
 def test_hopf__of_the_brusselator_has_the_amplitude_of_its_cycles():
     """b = 1 + a^2, w = a, supercritical; amplitudes by the coefficient and by scipy."""
-    a, model = 1.2, load_model(tomllib.loads(BRUSSELATOR))
+    a, table, scales = 1.2, tomllib.loads(BRUSSELATOR), (2.0, 0.5)
+    for state, scale in zip(table["states"].values(), scales, strict=True):
+        state["scale"] = scale
+    model = load_model(table)
     section = Crossing("x", a, "up", 100.0)
     found, parameters = branches_of(model, "b", (1.5, 3.5), [a, 2.0 / a], 2.0, section)
     hopf, b = only(found[0], "hopf")
@@ -120,7 +124,7 @@ def test_hopf__of_the_brusselator_has_the_amplitude_of_its_cycles():
     family, near = found[0].family, 4e-3
     # real part of the eigenvalues: (b - 1 - a^2)/2
     radius = np.sqrt(-0.5 * near / (a * hopf.coefficient))
-    vector = np.linalg.eig(hopf.point.value.monodromy)[1][:, 0]
+    vector = np.linalg.eig(family.scaled(hopf.point.value.monodromy))[1][:, 0]
 
     def rates(t, z):
         x, y = z
@@ -128,7 +132,7 @@ def test_hopf__of_the_brusselator_has_the_amplitude_of_its_cycles():
 
     settled = solve_ivp(rates, (0.0, 6e3), [a + 0.08, (b + near) / a], method="DOP853", rtol=1e-9, atol=1e-11).y[:, -1]
     last = solve_ivp(rates, (0.0, 12.0), settled, method="DOP853", rtol=1e-10, atol=1e-12, max_step=0.01).y
-    assert 2.0 * radius * abs(vector[0]) == pytest.approx(0.5 * np.ptp(last[0]), rel=0.01)
+    assert 2.0 * radius * abs(vector[0]) * scales[0] == pytest.approx(0.5 * np.ptp(last[0]), rel=0.01)
     cycles = hopf.child
     assert cycles is not None
     assert cycles.family.parameters[-1] == pytest.approx(a)
@@ -210,16 +214,3 @@ def test_equilibria__flutter_rig():
     assert cycles is not None
     _, fold = only(cycles, "fold")
     assert fold == pytest.approx(14.6601239, abs=1e-6)
-
-
-def test_first_lyapunov__sign_does_not_depend_on_the_scales():
-    """The same flow in other units."""
-    a, model = 1.2, tomllib.loads(BRUSSELATOR)
-    wide = {**model, "states": {"x": {"unit": "1", "scale": 10.0}, "y": {"unit": "1", "scale": 0.1}}}
-    signs = []
-    for table in (model, wide):
-        seen = load_model(table)
-        family = Family(seen.system, 0, 1.0, seen.load(a=a).pack(), ("b",), (1.0,))
-        u = family.unknowns(np.array([a, (1.0 + a * a) / a]), [1.0 + a * a])
-        signs.append(np.sign(first_lyapunov(family, u)[0]))
-    assert signs == [-1.0, -1.0]

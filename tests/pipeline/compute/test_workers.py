@@ -152,7 +152,9 @@ def test_workers__scheduler_dies(faulty, tmp_path, monkeypatch):
         dask_command("scheduler", tmp_path, "--port", "0", *nothing_shown) as scheduler,
         dask_command("worker", tmp_path, "--no-nanny", "--nthreads", "1"),
     ):
-        while not (tmp_path / "scheduler.json").exists():
+        written = tmp_path / "scheduler.json"
+        # the file is there before it is whole
+        while not (written.exists() and written.read_text("utf-8").rstrip().endswith("}")):
             time.sleep(0.02)
         task = partial(faulty.slow, str(tmp_path / "log"))
         results = run_tasks(task, range(1000), scheduler=str(tmp_path / "scheduler.json"))

@@ -161,16 +161,16 @@ def test_describe_plan__complete_run_takes_nothing(write_spec, sweep_text, tmp_p
 
 @pytest.mark.parametrize("stops", [True, False])
 def test_estimate__compiles_no_kernel_that_the_run_does_not_need(monkeypatch, stops):
-    from pipeline.compute import continuation
+    from pipeline.compute import integrate
 
     asked = []
-    original = continuation.run_branches
+    original = integrate.run_branches
 
     def run_branches(*arguments, **options):
         asked.append((options["stop_when_closed"], options.get("quantities")))
         return original(*arguments, **options)
 
-    monkeypatch.setattr(continuation, "run_branches", run_branches)
+    monkeypatch.setattr(integrate, "run_branches", run_branches)
     text = CLOSING if stops else CLOSING.replace("= true", "= false")
     estimate(*read(text))
     assert set(asked) == {(stops, None)}

@@ -12,7 +12,7 @@ import pytest
 
 from magpend_core import Status
 from pipeline import open_run
-from pipeline.compute import continuation, exponents, extension, task
+from pipeline.compute import exponents, extension, integrate, task
 from pipeline.compute.execute import TaskFailedError
 from pipeline.runs import extend as extending
 from pipeline.runs.extend import extend
@@ -61,7 +61,7 @@ class Count:
 
     def __init__(self, monkeypatch):
         self.cells, self.tangents, self.more = 0, 0, 0
-        branches, tangents = continuation.run_branches, exponents.lyapunov_exponents
+        branches, tangents = integrate.run_branches, exponents.lyapunov_exponents
 
         def run_branches(parameters, frequency, states, **options):
             self.cells += parameters.shape[0] * parameters.shape[1]
@@ -78,7 +78,7 @@ class Count:
             return more_sections(parameters, *words, **options)
 
         monkeypatch.setattr(extension, "more_sections", go_on)
-        monkeypatch.setattr(continuation, "run_branches", run_branches)
+        monkeypatch.setattr(integrate, "run_branches", run_branches)
         monkeypatch.setattr(exponents, "lyapunov_exponents", lyapunov_exponents)
         monkeypatch.setattr(task, "warm_up", lambda spec: 0.0)
 

@@ -12,7 +12,7 @@ from pipeline import open_run
 from pipeline.analysis.attractors.table import attractors_table
 from pipeline.analysis.branches.table import branches_table
 from pipeline.analysis.chaos.table import chaos_table
-from pipeline.compute import continuation, task
+from pipeline.compute import integrate, task
 from pipeline.layout.vocabulary import model_of, parameters_of
 from pipeline.runs.derive import derive
 from pipeline.runs.extend import extend
@@ -106,8 +106,10 @@ def test_derive__attractors_chaos_and_branches(directory):
     assert {row["exponents_from"] for row in chaos.rows} == {"multipliers", "eigenvalues"}
     assert not any("drive" in line for line in chaos.lines)
     branches = branches_table(derive(directory, "branches", {"low": -0.3, "high": 0.1}))
-    assert [row["type"] for row in branches.rows] == ["fold"]
-    assert branches.rows[0]["mu"] == pytest.approx(-0.25, abs=1e-9)
+    # the cycles leave the Hopf point on another section than the run's, and are found on both only once
+    assert [row["type"] for row in branches.rows] == ["fold", "hopf"]
+    assert [row["mu"] for row in branches.rows] == pytest.approx([-0.25, 0.0], abs=1e-8)
+    assert branches.rows[1]["normal_form"] == pytest.approx(1.0, rel=1e-6)
     assert any("equilibrium" in line for line in branches.lines)
 
 
@@ -123,13 +125,13 @@ def test_extend__takes_what_stands_there(directory, tmp_path, bytes_of, monkeypa
     (tmp_path / "spec.toml").write_text(text)
     run(tmp_path / "spec.toml", tmp_path / "fresh", workers=0)
     calls = []
-    original = continuation.run_branches
+    original = integrate.run_branches
 
     def counted(parameters, *words, **options):
         calls.append(len(parameters))
         return original(parameters, *words, **options)
 
-    monkeypatch.setattr(continuation, "run_branches", counted)
+    monkeypatch.setattr(integrate, "run_branches", counted)
     monkeypatch.setattr(task, "warm_up", lambda spec: 0.0)
     extend(directory, tmp_path / "spec.toml", tmp_path / "new", workers=0)
     assert sum(calls) == 2 * 6

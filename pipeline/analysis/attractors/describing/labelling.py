@@ -72,7 +72,9 @@ class Found:
 
 @dataclass
 class _Labels:
-    """Provisional labels of the cells, numbered in the order orbits, raw orbits, sets, equilibria, cycles."""
+    """Provisional set numbers of the cells: first polished orbits, then raw orbits, bounded sets, equilibria, limit
+    cycles.
+    """
 
     label: np.ndarray
     decision: np.ndarray

@@ -121,7 +121,7 @@ def extend(
 
 
 class _Extension:
-    """The extension of one parameter point."""
+    """The state of the extension at one parameter point: the sampled cells, the orbits and the sets found so far."""
 
     def __init__(self, point: Point, orbits: list[Orbit], settings: Settings, budget: float) -> None:
         self.point, self.orbits, self.settings = point, orbits, settings

@@ -51,7 +51,7 @@ class Block:
 
     @cached_property
     def is_bounded(self) -> np.ndarray:
-        """Whether each cell was computed to the end and does not close."""
+        """Whether each cell was computed to the end and closes on no periodic orbit."""
         computed = np.isin(self.status, (Status.PERIODIC, Status.BOUNDED))
         return np.asarray(computed & self._finite & ~self.is_closed)
 

@@ -81,7 +81,7 @@ class Dynamics:
 
     @property
     def can_rest(self) -> bool:
-        """Whether equilibria are searched: for autonomous models whose equations are integrated."""
+        """Whether equilibria are searched: only for autonomous models whose equations are integrated."""
         return self.model is not None and self.model.autonomous and self.system is not None
 
     @property

@@ -135,7 +135,7 @@ def moving(orbits: Sequence[Orbit | None], point: Point, geometry: Geometry) -> 
 
 
 def _closed_undecided(point: Point, orbits: Sequence[Orbit], search: Search) -> Guesses:
-    """Return the closed cells that are on no known orbit, as guesses without a period."""
+    """Return the last points of closed cells that are on no known orbit, as guesses of orbits of unknown period."""
     found = Guesses.none(len(search.geometry.scales))
     for block in point.blocks():
         label, _ = decide(block, orbits, search.tolerance, search.geometry)

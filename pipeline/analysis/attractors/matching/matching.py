@@ -342,7 +342,7 @@ def _lookup(ids: np.ndarray, rows: np.ndarray) -> np.ndarray:
 
 
 def _destinations(values: np.ndarray, ids: np.ndarray, n_ids: int) -> np.ndarray:
-    """Convert counts by row number into counts by id."""
+    """Convert the counts of cells that left a set, by the row of their destination, into counts by its id."""
     moved = np.zeros((*values.shape[:-1], n_ids), values.dtype)
     for *index, row in np.argwhere(ids >= 0).tolist():
         point = tuple(index)

@@ -1,0 +1,194 @@
+"""Coefficients of normal forms, against exact maps and the shape of the branches."""
+
+from __future__ import annotations
+
+import tomllib
+
+import numpy as np
+import pytest
+
+from magpend_core import run_branches
+from magpend_core.models import load_model
+from pipeline.analysis.branches import Scope, Start, explore
+from pipeline.analysis.branches.bifurcations import CONTRADICTORY, Bifurcation
+from pipeline.analysis.branches.normal_forms import critical_vectors, judge
+from pipeline.analysis.branches.problems import Family
+
+FREQUENCY = 0.5
+PERIOD = 1.0 / FREQUENCY
+
+RADIAL = """
+name = "radial"
+[states]
+x = {}
+y = {}
+[parameters]
+mu = 0.0
+w = 1.3
+a = -0.7
+F = 0.0
+[equations]
+x = "mu*x - w*y + a*x*(x^2 + y^2) + F*cos(2*pi*f*t)"
+y = "w*x + mu*y + a*y*(x^2 + y^2)"
+"""
+
+BRUSSELATOR = """
+name = "brusselator"
+[states]
+x = {}
+y = {}
+[parameters]
+a = 1.2
+b = 2.0
+F = 0.0
+[equations]
+x = "a + x^2*y - (b + 1)*x DRIVE"
+y = "b*x - x^2*y"
+"""
+
+SCALAR = """
+name = "scalar"
+[states]
+x = {}
+y = {}
+[parameters]
+mu = 0.0
+a = 0.0
+b = 0.0
+F = 0.0
+[equations]
+x = "mu*x + a*x^2 + b*x^3 + F*cos(2*pi*f*t)"
+y = "-y"
+"""
+
+
+def at_rest(text, interval=(-0.5, 0.4), **values):
+    """Follow the orbit at 0 of a model along `mu`, and return its branches."""
+    model = load_model(tomllib.loads(text))
+    family = Family(model.system, 1, FREQUENCY, model.load(**values).pack(), ("mu",), (1.0,))
+    low, high = interval
+    return explore([Start(family, np.zeros(2), low + 0.03)], Scope(low, high, max_period=1, max_generations=1))
+
+
+def only(branch, kind):
+    (found,) = [b for b in branch.bifurcations if b.kind == kind]
+    return found
+
+
+@pytest.mark.parametrize("a", [-0.7, 0.4])
+def test_neimark_sacker__of_a_radial_flow(a):
+    """r' = a r^3 at mu = 0, so that the map over T is r + a T r^3 + ..., and r^2 = 2 |z|^2 with |q| = 1."""
+    one = only(at_rest(RADIAL, a=a)[0], "neimark_sacker")
+    assert one.point.u[-1] == pytest.approx(0.0, abs=1e-8)
+    assert one.coefficient == pytest.approx(2.0 * a * PERIOD, rel=1e-6)
+    assert abs(one.coefficient - 2.0 * a * PERIOD) < 3.0 * one.coefficient_error + 1e-7
+    assert one.criticality == ("supercritical" if a < 0.0 else "subcritical")
+
+
+def test_neimark_sacker__of_a_flow_seen_at_even_times():
+    """The map over T of a flow at its Hopf point: d = T w l1, quadratic terms included (Brusselator)."""
+    found = {}
+    for drive in ("", " + F*cos(2*pi*f*t)"):
+        model = load_model(tomllib.loads(BRUSSELATOR.replace("DRIVE", drive)))
+        family = Family(model.system, 1 if drive else 0, FREQUENCY, model.load().pack(), ("b",), (1.0,))
+        (branch, *_) = explore([Start(family, np.array([1.2, 2.0 / 1.2]), 2.0)], Scope(1.8, 2.8, 1, max_generations=1))
+        (one,) = branch.bifurcations
+        found[one.kind] = one
+    hopf, torus = found["hopf"], found["neimark_sacker"]
+    assert torus.point.u[-1] == pytest.approx(hopf.point.u[-1], abs=1e-8)
+    assert torus.coefficient == pytest.approx(PERIOD * 1.2 * hopf.coefficient, rel=1e-5)
+
+
+@pytest.mark.parametrize("b", [-1.0, 0.5])
+def test_branch_point__pitchfork(b):
+    """x' = b x^3 at mu = 0: the map is x + b T x^3 + ..."""
+    one = only(at_rest(SCALAR, b=b)[0], "pitchfork")
+    assert one.coefficient == pytest.approx(b * PERIOD, rel=1e-6)
+    assert one.criticality == ("supercritical" if b < 0.0 else "subcritical")
+
+
+def test_branch_point__transcritical():
+    """x' = a x^2 at mu = 0: the map is x + a T x^2 + ..."""
+    one = only(at_rest(SCALAR, a=0.8, b=-1.0)[0], "transcritical")
+    assert abs(one.coefficient) == pytest.approx(0.8 * PERIOD, rel=1e-6)
+    assert one.criticality == ""
+
+
+def duffing(linear, damping, omega, amplitude, interval, start):
+    """Follow an orbit of a Duffing oscillator along the amplitude."""
+    parameters = load_model("duffing").load(damping=damping, linear=linear, cubic=1.0, amplitude=amplitude)
+    settled = run_branches(
+        parameters.pack()[None, None],
+        np.array([[omega / (2.0 * np.pi)]]),
+        np.array([start]),
+        n_transient=100,
+        n_keep=1,
+        rtol=1e-8,
+        atol=1e-8,
+        system=parameters.model.system,
+    ).section[0, 0, 0]
+    scale = interval[1] - interval[0]
+    family = Family(parameters.model.system, 1, omega / (2.0 * np.pi), parameters.pack(), ("amplitude",), (scale,))
+    return explore([Start(family, settled, amplitude)], Scope(*interval, max_period=2))
+
+
+@pytest.fixture(scope="module")
+def cascade():
+    """One of two wells, whose orbit doubles."""
+    return duffing(-1.0, 0.3, 1.2, 0.2, (0.15, 0.3), [1.2, 0.0])
+
+
+def test_fold__bends_the_branch_as_its_coefficient_says():
+    """On the centre manifold x = x + beta + b x^2: the orbits lie at x^2 = -beta/b, beta = <p, dF/dmu>."""
+    branch = duffing(1.0, 0.1, 1.4, 0.1, (0.05, 2.0), [0.0, 0.0])[0]
+    folds = [one for one in branch.bifurcations if one.kind == "fold"]
+    assert len(folds) == 2
+    for one in folds:
+        family, u = branch.family, one.point.u
+        _, _q, p = critical_vectors(family.scaled(one.point.value.monodromy), "fold")
+        slope = np.vdot(p, one.point.value.derivative[:, -1]).real
+        along = np.array([np.vdot(p, point.u[:-1] - u[:-1]).real for point in branch.points])
+        beta = slope * np.array([point.u[-1] - u[-1] for point in branch.points])
+        away = np.array([np.linalg.norm(point.u - u) for point in branch.points])
+        near = (away < 0.04) & (np.abs(along) > 2e-3)
+        assert near.sum() > 4
+        # the next order is odd: both sides together cancel it
+        ratio = np.polynomial.Polynomial.fit(along[near], -beta[near] / along[near] ** 2, 2)(0.0)
+        assert one.coefficient == pytest.approx(ratio, rel=1e-3)
+        assert one.coefficient_error < 1e-5 * abs(one.coefficient)
+
+
+def test_doubling__orbits_of_twice_the_period_are_as_far_as_its_coefficient_says(cascade):
+    """x -> -(1 + beta) x + c x^3: the orbits lie at x^2 = beta/c."""
+    branches = cascade
+    found = [(b, one) for b in branches for one in b.bifurcations if one.kind == "period_doubling" and one.child]
+    assert found
+    for parent, one in found:
+        family, u, child = parent.family, one.point.u, one.child
+        _, _q, p = critical_vectors(family.scaled(one.point.value.monodromy), "period_doubling")
+        multipliers = [np.linalg.eigvals(point.value.monodromy) for point in parent.points]
+        least = np.array([m.real.min() for m in multipliers])
+        values = np.array([point.u[-1] for point in parent.points])
+        near = np.abs(values - u[-1]) < 0.03
+        slope = np.polynomial.Polynomial.fit(values[near] - u[-1], least[near] + 1.0, 3).deriv()(0.0)
+        shares = []
+        for point in child.points:
+            orbit = np.array([family.unknowns(x, [0.0])[:-1] for x in point.value.images])
+            half = 0.5 * np.vdot(p, orbit[0] - orbit[1]).real
+            if 3e-3 < abs(half) < 0.03:
+                shares.append((half**2, -slope * (point.u[-1] - u[-1]) / half**2))
+        assert len(shares) > 3
+        ratio = np.polynomial.Polynomial.fit(*np.transpose(shares), 1)(0.0)
+        assert one.coefficient == pytest.approx(ratio, rel=0.02)
+        assert one.criticality == ("supercritical" if one.coefficient > 0.0 else "subcritical")
+
+
+def test_judge__a_branch_that_disagrees_is_told(cascade):
+    parent, one = next(
+        (b, one) for b in cascade for one in b.bifurcations if one.kind == "period_doubling" and one.child
+    )
+    wrong = "subcritical" if one.criticality == "supercritical" else "supercritical"
+    other = Bifurcation("period_doubling", one.point, 0.0, 0, 1, True, criticality=wrong)
+    judge([(parent.family, other)])
+    assert other.criticality == CONTRADICTORY
+    assert other.coefficient == pytest.approx(one.coefficient, rel=1e-12)
