@@ -33,7 +33,9 @@ class CurveOptions(BranchOptions):
     second: str = option(..., "Second parameter: its name, such as q, or frequency_hz.")
     second_low: float = option(..., "Least value of the second parameter.", unit="SI", flag="--second-from")
     second_high: float = option(..., "Largest value of the second parameter.", unit="SI", flag="--second-to")
-    curve_period: int = option(1, "Longest orbit period.", unit="drive periods or returns", ge=1)
+    curve_period: int = option(
+        0, "Longest orbit period; 0 takes all periods of the branches.", unit="drive periods or returns", ge=0
+    )
 
 
 BRANCHES = Analysis(

@@ -11,7 +11,7 @@ import numpy as np
 from pipeline.analysis.branches.arclength import Point, Settings, correct, cubic
 from pipeline.analysis.branches.equilibria import OneParameter, hopf_test
 from pipeline.analysis.branches.lockstep import Steps
-from pipeline.analysis.branches.problems import doubling_test, torus_test
+from pipeline.analysis.branches.problems import Problem, doubling_test, torus_test
 
 FOLD, DOUBLING, TORUS, BRANCHING = "fold", "period_doubling", "neimark_sacker", "branch_point"
 HOPF, PITCHFORK, TRANSCRITICAL = "hopf", "pitchfork", "transcritical"
@@ -177,9 +177,33 @@ def _explains(kinds: list[str], change: int) -> bool:
 def locate(problem: OneParameter, a: Point, b: Point, kind: str, settings: Settings) -> Steps[Bifurcation | None]:
     """Find where a test function vanishes between two points; None if an orbit between is not found."""
     test = TESTS[kind]
-    chord = b.u - a.u
+
+    def tested(point: Point) -> Steps[float]:
+        return test(point)
+        yield  # a computation that asks for nothing
+
+    found = yield from find_root(problem, (a, test(a)), (b, test(b)), tested, settings)
+    if found is None:
+        return None
+    (low, at_low), (high, at_high) = found
+    bracket = abs(high.u[-1] - low.u[-1]) * problem.family.scales[0]
+    nearest = low if abs(at_low) <= abs(at_high) else high
+    rises = bool(low.tangent[-1] > 0.0)
+    return Bifurcation(kind, nearest, float(bracket), n_unstable(low), n_unstable(high), rises)
+
+
+Tested = tuple[Point, float]
+"""A point and the value of a test function there."""
+
+
+def find_root(
+    problem: Problem, a: Tested, b: Tested, test: Callable[[Point], Steps[float]], settings: Settings
+) -> Steps[tuple[Tested, Tested] | None]:
+    """Bracket a zero of a test function between two points to `WIDTH`; None if a solution between is not found."""
+    (first, at_first), (last_point, at_last) = a, b
+    chord = last_point.u - first.u
     length = float(np.linalg.norm(chord))
-    low, high = (0.0, a, test(a)), (1.0, b, test(b))
+    low, high = (0.0, first, at_first), (1.0, last_point, at_last)
     known = [low[::2], high[::2]]
     least, last = WIDTH / length, np.inf
     for trial in range(60):
@@ -192,20 +216,16 @@ def locate(problem: OneParameter, a: Point, b: Point, kind: str, settings: Setti
         away = 0.4 * least if abs(root - last) < 0.3 * least else 0.0
         last, at = root, root - away if root - low[0] > least else root + away
         at = min(max(at, low[0] + 0.4 * least), high[0] - 0.4 * least)
-        middle = yield from correct(problem, _between(a, b, at), chord / length, settings, along=a.tangent)
+        middle = yield from correct(problem, _between(first, last_point, at), chord / length, settings, first.tangent)
         if middle is None:
             return None
-        value = test(middle)
+        value = yield from test(middle)
         known.append((at, value))
         if value * low[2] > 0.0:
             low = (at, middle, value)
         else:
             high = (at, middle, value)
-    scale = problem.family.scales[0]
-    bracket = abs(high[1].u[-1] - low[1].u[-1]) * scale
-    nearest = low if abs(low[2]) <= abs(high[2]) else high
-    rises = bool(low[1].tangent[-1] > 0.0)
-    return Bifurcation(kind, nearest[1], float(bracket), n_unstable(low[1]), n_unstable(high[1]), rises)
+    return low[1:], high[1:]
 
 
 def _root(known: list[tuple[float, float]]) -> float:

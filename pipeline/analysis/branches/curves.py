@@ -3,37 +3,84 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
 import xarray as xr
 
-from magpend_core.models.model import Model, Parameters
+from magpend_core.models.model import Parameters
 from pipeline.analysis.branches.arclength import Point, Settings, Trace, correct, kernel_of, trace
-from pipeline.analysis.branches.bifurcations import KINDS, TORUS, multipliers_of
-from pipeline.analysis.branches.following import opposite
-from pipeline.analysis.branches.lockstep import Steps, run_together
+from pipeline.analysis.branches.bifurcations import DOUBLING, FOLD, KINDS, TORUS, multipliers_of
+from pipeline.analysis.branches.codimension_two import (
+    DOUBLING_TORUS,
+    FOLD_FLIP,
+    FOLD_TORUS,
+    GENERALISED,
+    R1,
+    R2,
+    Detector,
+    SpecialPoint,
+    merged,
+)
+from pipeline.analysis.branches.following import has_halved, opposite
+from pipeline.analysis.branches.lockstep import Query, Steps, run_together
+from pipeline.analysis.branches.normal_forms import critical_vectors
 from pipeline.analysis.branches.problems import FREQUENCY, TESTS, BifurcationProblem, Family
-from pipeline.analysis.branches.units import parameter_units, state_units
 from pipeline.layout.vocabulary import frequency_of
 
 CURVE = Settings(first_step=2e-3, longest_step=0.02, max_points=400, tolerance=1e-8, max_iterations=8)
 """Settings with longer steps than on a branch, since nothing is located in between. The residual includes the
 test function, and is limited by finite differences of monodromy matrices."""
 
-CURVE_ENDS = ("bound", "closed", "resonance", "max_points", "stuck")
+LOCATE = replace(CURVE, tolerance=1e-11, max_iterations=12)
+"""Settings for locating points of codimension two, in both parameters to 1e-8."""
+
+CURVE_ENDS = ("bound", "closed", "resonance", "max_points", "stuck", "period_halving")
+
+GENERATIONS = 3
+"""Number of generations of curves that spring from points of codimension two."""
+
+SPRINGING = {
+    R1: ((FOLD, 1), (TORUS, 1)),
+    R2: ((DOUBLING, 1), (TORUS, 1), (TORUS, 2)),
+    GENERALISED: ((FOLD, 2),),
+    FOLD_FLIP: ((FOLD, 1), (DOUBLING, 1)),
+    FOLD_TORUS: ((FOLD, 1), (TORUS, 1)),
+    DOUBLING_TORUS: ((DOUBLING, 1), (TORUS, 1)),
+}
+"""Curves through a point of codimension two: the kind, and the period in units of that of the point's orbit."""
+
+AMPLITUDES = (0.02, 0.05, 0.1)
+"""Scaled distances, tried in turn, of orbits of twice the period from the point at which their curve begins."""
 
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """A curve of bifurcations: its points, the reasons for both ends, the located point it started from."""
+    """A curve of bifurcations.
+
+    Attributes
+    ----------
+    family : Family
+        Of the orbits, with two free parameters.
+    kind : str
+        Kind of bifurcation.
+    points : list of Point
+        Orbits in order.
+    ends : tuple of str
+        Reasons for both ends, of `CURVE_ENDS`.
+    start : int
+        Number of the located bifurcation it started from; -1 if it springs from a point of codimension two.
+    special : list of SpecialPoint
+        Points of codimension two on it.
+    """
 
     family: Family
     kind: str
     points: list[Point]
     ends: tuple[str, str]
     start: int
+    special: list[SpecialPoint] = field(default_factory=list)
 
     @property
     def values(self) -> np.ndarray:
@@ -45,7 +92,7 @@ def curves_from(
     branches: xr.Dataset,
     parameters: Parameters,
     second: str,
-    bounds: tuple[tuple[float, float], tuple[float, float]],
+    bounds: Bounds,
     max_period: int,
     settings: Settings = CURVE,
 ) -> list[Curve]:
@@ -62,7 +109,7 @@ def curves_from(
     bounds
         Interval of the branches' parameter, and that of the second.
     max_period
-        Longest period of the orbits taken.
+        Longest period of the orbits; 0 takes the longest of the branches.
     settings
         Settings of the traces; arclengths are in units of the intervals.
 
@@ -71,41 +118,81 @@ def curves_from(
     list of Curve
         Curves in the order of the located points they start from, none twice.
     """
-    return continue_curves(_starts(branches, parameters, second, bounds, max_period), bounds, settings)
+    longest = max_period or int(branches["orbit_period"].values.max(initial=0))
+    starts = _starts(branches, parameters, second, bounds, longest)
+    return continue_curves(starts, bounds, settings, longest)
 
 
 CurveStart = tuple[int, Family, str, np.ndarray]
 """Number of a located point, its family with two free parameters, its kind, its unknowns."""
 
+Bounds = tuple[tuple[float, float], tuple[float, float]]
+"""Intervals of both parameters."""
+
 
 def continue_curves(
-    starts: Sequence[CurveStart], bounds: tuple[tuple[float, float], tuple[float, float]], settings: Settings = CURVE
+    starts: Sequence[CurveStart], bounds: Bounds, settings: Settings = CURVE, max_period: int = 0
 ) -> list[Curve]:
-    """Follow each start both ways until a bound, its own start, or a resonance; see `curves_from`."""
+    """Follow each start both ways until a bound, its own start, or a resonance; see `curves_from`.
+
+    Curves that spring from the points of codimension two are followed as well, up to orbits of `max_period`.
+    """
     problems = [BifurcationProblem(family, kind) for _, family, kind, _ in starts]
-    firsts = run_together(
-        [_first(problem, u, settings) for problem, (_, _, _, u) in zip(problems, starts, strict=True)]
-    )
-    found = [(s, p, f) for s, p, f in zip(starts, problems, firsts, strict=True) if f is not None]
-    traces = run_together(
-        [_follow(p, way, bounds, settings) for _, p, f in found for way in (opposite(f), f)], "following curves"
-    )
+    firsts = run_together([_first(p, u, settings) for p, (_, _, _, u) in zip(problems, starts, strict=True)])
+    ready = [(s[0], p, f) for s, p, f in zip(starts, problems, firsts, strict=True) if f is not None]
     curves: list[Curve] = []
-    for i, ((number, family, kind, _), _, first) in enumerate(found):
-        back, ahead = traces[2 * i : 2 * i + 2]
-        points = [opposite(p) for p in reversed(back.points)] + ahead.points[1:]
-        if not any(_passes(curve, kind, family, first) for curve in curves):
-            curves.append(Curve(family, kind, points, (back.end, ahead.end), number))
+    seen: list[SpecialPoint] = []
+    for _ in range(1 + GENERATIONS):
+        _follow_all(ready, curves, bounds, settings)
+        points = merged({i: curve.special for i, curve in enumerate(curves)})
+        fresh = [one for one in points if not any(one.point is other.point for other in seen)]
+        seen += fresh
+        sprung = [
+            _sprung(BifurcationProblem(replace(one.family, period=times * one.family.period), kind), one)
+            for one in fresh
+            for kind, times in SPRINGING.get(one.kind, ())
+            if times == 1 or times * one.family.period <= max_period
+        ]
+        ready = [(-1, *pair) for pair in run_together(sprung) if pair is not None]
+        if not ready:
+            break
     return curves
 
 
-def _starts(
-    ds: xr.Dataset,
-    parameters: Parameters,
-    second: str,
-    bounds: tuple[tuple[float, float], tuple[float, float]],
-    max_period: int,
-) -> list[CurveStart]:
+Ready = tuple[int, BifurcationProblem, Point]
+"""Number of a located point (-1: none), the problem of its curve, and the curve's first point."""
+
+
+def _follow_all(ready: Sequence[Ready], curves: list[Curve], bounds: Bounds, settings: Settings) -> None:
+    """Append the curves through some points, each once and unless it is known."""
+    ready = [r for r in ready if not any(_passes(curve, r[1].kind, r[1].family, r[2]) for curve in curves)]
+    traces = run_together(
+        [_follow(p, way, bounds, settings) for _, p, f in ready for way in (opposite(f), f)], "following curves"
+    )
+    for i, (number, problem, first) in enumerate(ready):
+        (back, before), (ahead, after) = traces[2 * i : 2 * i + 2]
+        points = [opposite(p) for p in reversed(back.points)] + ahead.points[1:]
+        is_known = any(_passes(curve, problem.kind, problem.family, first) for curve in curves)
+        if not is_known and (number >= 0 or len(points) > 2):
+            ends = back.end, ahead.end
+            curves.append(Curve(problem.family, problem.kind, points, ends, number, before + after))
+
+
+def _sprung(problem: BifurcationProblem, at: SpecialPoint) -> Steps[tuple[BifurcationProblem, Point] | None]:
+    """Find the first point of a curve that springs from a point of codimension two; None if there is none."""
+    if problem.family.period == at.family.period:
+        found = yield from _first(problem, at.point.u, CURVE)
+        return None if found is None else (problem, found)
+    _, q, _ = critical_vectors(at.family.scaled(at.point.value.monodromy), DOUBLING)
+    normal = np.append(q.real, [0.0, 0.0])
+    for amplitude in AMPLITUDES:
+        found = yield from correct(problem, at.point.u + amplitude * normal, normal, CURVE)
+        if found is not None:
+            return problem, found
+    return None
+
+
+def _starts(ds: xr.Dataset, parameters: Parameters, second: str, bounds: Bounds, max_period: int) -> list[CurveStart]:
     """Return the located points with their two-parameter families and unknowns."""
     first = str(ds.attrs["parameter"])
     scales = tuple(high - low for low, high in bounds)
@@ -125,9 +212,8 @@ def _starts(
 
 
 def _first(problem: BifurcationProblem, u: np.ndarray, settings: Settings) -> Steps[Point | None]:
-    normal = np.zeros(problem.size)
-    normal[-1] = 1.0
-    found = yield from correct(problem, u, normal, settings)
+    value = yield Query(problem, u)
+    found = (yield from correct(problem, u, kernel_of(value), settings)) if value.is_finite else None
     if found is None:
         return None
     tangent = kernel_of(found.value)
@@ -135,34 +221,41 @@ def _first(problem: BifurcationProblem, u: np.ndarray, settings: Settings) -> St
 
 
 def _follow(
-    problem: BifurcationProblem,
-    start: Point,
-    bounds: tuple[tuple[float, float], tuple[float, float]],
-    settings: Settings,
-) -> Steps[Trace]:
-    """Follow a curve one way, and drop the point beyond a bound."""
+    problem: BifurcationProblem, start: Point, bounds: Bounds, settings: Settings
+) -> Steps[tuple[Trace, list[SpecialPoint]]]:
+    """Follow a curve one way, locate its points of codimension two, and drop the point beyond a bound.
+
+    A Neimark-Sacker curve ends at the resonance R1 or R2 where its pair of multipliers becomes real.
+    """
+
+    def is_inside(u: np.ndarray) -> bool:
+        pairs = zip(problem.family.values(u), bounds, strict=True)
+        return all(low <= value <= high for value, (low, high) in pairs)
 
     def stop(points: list[Point]) -> str:
         here = points[-1]
-        values = problem.family.values(here.u)
-        if any(not low <= v <= high for v, (low, high) in zip(values, bounds, strict=True)):
+        if not is_inside(here.u):
             return "bound"
         if problem.kind == TORUS and not _has_torus(here):
             return "resonance"
+        if has_halved(problem.family, points):
+            return "period_halving"
         step = np.linalg.norm(here.u - points[-2].u)
         if len(points) > 5 and np.linalg.norm(here.u - points[0].u) < 0.7 * step:
             return "closed"
         return ""
 
-    found = yield from trace(problem, start, settings, stop, _anything)
+    detector = Detector(problem, LOCATE)
+    found = yield from trace(problem, start, settings, stop, detector.between)
+    special = [one for one in detector.found if is_inside(one.point.u)]
+    if found.end == "period_halving":  # coefficients of twice the period vanish where the orbit is that of one
+        last, before = (p.u for p in found.points[:-3:-1])
+        special = [one for one in special if np.linalg.norm(one.point.u - last) > np.linalg.norm(before - last)]
     if found.end in ("bound", "resonance"):
         found.points.pop()
-    return found
-
-
-def _anything(a: Point, b: Point) -> Steps[bool]:
-    return True
-    yield  # a computation that asks for nothing
+    if found.end == "resonance":
+        found.points += [one.point for one in special if one.kind in (R1, R2)][-1:]
+    return found, special
 
 
 def _has_torus(point: Point) -> bool:
@@ -172,65 +265,15 @@ def _has_torus(point: Point) -> bool:
 
 
 def _passes(curve: Curve, kind: str, family: Family, start: Point) -> bool:
-    """Return whether a curve passes through a start, within the accuracy of its chords."""
+    """Return whether a curve passes through a start, at any phase, within the accuracy of its chords."""
     if curve.kind != kind or curve.family.period != family.period:
         return False
-    u = np.array([p.u for p in curve.points])
-    for a, b in pairwise(u):
+    for a, b in pairwise(np.array([p.u for p in curve.points])):
         chord = b - a
         length = float(np.linalg.norm(chord))
-        offset = np.append(family.mismatch(a, family.state(start.u)), start.u[-2:] - a[-2:])
-        share = float(offset @ chord) / length**2
-        if -0.01 <= share <= 1.01 and np.linalg.norm(offset - share * chord) < 0.02 * length + 1e-6:
-            return True
+        for image in start.value.images:
+            offset = np.append(family.mismatch(a, image), start.u[-2:] - a[-2:])
+            share = float(offset @ chord) / length**2
+            if -0.01 <= share <= 1.01 and np.linalg.norm(offset - share * chord) < 0.02 * length + 1e-6:
+                return True
     return False
-
-
-def curves_dataset(curves: Sequence[Curve], first: str, second: str, model: Model | None = None) -> xr.Dataset:
-    """Return curves as a dataset: dims ``curve``, ``point`` (NaN beyond a curve's own) and ``state``.
-
-    Parameters
-    ----------
-    curves
-        From `curves_from`; if there are none, so are the dataset's.
-    first, second
-        Names of the two parameters.
-    model
-        Tells names and units.
-    """
-    names = curves[0].family.system.state_names if curves else (model.state_names if model else ())
-    n = max((len(c.points) for c in curves), default=0)
-    values = np.full((len(curves), n, 2), np.nan)
-    section = np.full((len(curves), n, len(names)), np.nan)
-    residual = np.full((len(curves), n), np.nan)
-    for i, curve in enumerate(curves):
-        values[i, : len(curve.points)] = curve.values
-        section[i, : len(curve.points)] = [curve.family.state(p.u) for p in curve.points]
-        residual[i, : len(curve.points)] = [p.residual for p in curve.points]
-    kinds = {"flag_values": np.arange(len(KINDS), dtype=np.int8), "flag_meanings": " ".join(KINDS)}
-    ends = {"flag_values": np.arange(len(CURVE_ENDS), dtype=np.int8), "flag_meanings": " ".join(CURVE_ENDS)}
-    dims = ("curve", "point")
-    one, units = {"units": "1"}, state_units(model)
-
-    def codes(i: int) -> np.ndarray:
-        return np.array([CURVE_ENDS.index(c.ends[i]) for c in curves], np.int8)
-
-    def numbers(values: list[int]) -> np.ndarray:
-        return np.array(values, np.int32)
-
-    return xr.Dataset(
-        {
-            "first": (dims, values[..., 0], {"units": parameter_units(first, model), "long_name": first}),
-            "second": (dims, values[..., 1], {"units": parameter_units(second, model), "long_name": second}),
-            "section": ((*dims, "state"), section, {"units": units, "long_name": "a section point"}),
-            "residual": (dims, residual, {**one, "long_name": "largest residual, test function included"}),
-            "kind": ("curve", np.array([KINDS.index(c.kind) for c in curves], np.int8), {**one, **kinds}),
-            "orbit_period": ("curve", numbers([c.family.period for c in curves]), one),
-            "start": ("curve", numbers([c.start for c in curves]), {**one, "long_name": "located point"}),
-            "n_points": ("curve", numbers([len(c.points) for c in curves]), one),
-            "first_end": ("curve", codes(0), {**one, **ends}),
-            "last_end": ("curve", codes(1), {**one, **ends}),
-        },
-        coords={"state": list(names)},
-        attrs={"first_parameter": first, "second_parameter": second},
-    )

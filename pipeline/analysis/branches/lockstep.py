@@ -84,7 +84,7 @@ def _evaluate(queries: Sequence[Query]) -> list[Value]:
         rows = {i: queries[i].problem.rows(queries[i].u) for i in open_ones}
         for chosen in _calls([(i, queries[i].problem.system) for i in open_ones]):
             system = queries[chosen[0]].problem.system
-            for i, ends in zip(chosen, _integrate([rows[i] for i in chosen], system), strict=True):
+            for i, ends in zip(chosen, integrated([rows[i] for i in chosen], system), strict=True):
                 values[i] = queries[i].problem.value(queries[i].u, ends)
     return [value for value in values if value is not None]
 
@@ -97,7 +97,8 @@ def _calls(systems: Sequence[tuple[int, System]]) -> list[list[int]]:
     return list(by_system.values())
 
 
-def _integrate(rows: Sequence[Rows], system: System) -> list[Ends]:
+def integrated(rows: Sequence[Rows], system: System) -> list[Ends]:
+    """Integrate the trajectories of some requests in one call."""
     if not any(len(r.states) for r in rows):  # equilibria alone
         n = system.n_states
         none = np.zeros((0, n))

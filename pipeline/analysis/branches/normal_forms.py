@@ -27,7 +27,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from magpend_core.orbits import section_map
+from magpend_core.engine.system import System
 from magpend_core.pointwise import jacobian_at
 from pipeline.analysis.branches.bifurcations import (
     BRANCHING,
@@ -40,8 +40,8 @@ from pipeline.analysis.branches.bifurcations import (
     TRANSCRITICAL,
     Bifurcation,
 )
-from pipeline.analysis.branches.problems import Family
-from pipeline.analysis.tolerances import BRANCH_RTOL
+from pipeline.analysis.branches.lockstep import integrated
+from pipeline.analysis.branches.problems import Ends, Family, Rows, Value
 
 STEPS = 0.125 * 2.0 ** -np.arange(13.0)
 """Sizes of the steps in units of the system's scales. The largest fit smooth maps, the smallest maps that are
@@ -53,95 +53,135 @@ SAME = 1e-5
 
 @dataclass(frozen=True, eq=False)
 class Bend:
-    """First and second derivatives (n, n) of the matrix A along a direction, one of each per size of the step."""
+    """First and second derivatives of the matrix A along a direction, (n, n)."""
 
     first: np.ndarray
     second: np.ndarray
 
 
+class Case:
+    """An orbit or equilibrium at a bifurcation, with its critical eigenvectors.
+
+    Parameters
+    ----------
+    family, kind, u
+        Family of the orbit, kind of bifurcation, and scaled unknowns.
+    monodromy
+        Derivative of the section map, or the Jacobian [1/s].
+    steps
+        Sizes of the steps, each half of the one before.
+    towards
+        Eigenvector to whose side the critical one is turned; by default it has any sign.
+    """
+
+    def __init__(
+        self,
+        family: Family,
+        kind: str,
+        u: np.ndarray,
+        monodromy: np.ndarray,
+        steps: np.ndarray = STEPS,
+        towards: np.ndarray | None = None,
+    ) -> None:
+        self.family, self.kind, self.u, self.steps = family, kind, u, steps
+        self.matrix = family.scaled(monodromy)
+        self.critical, self.q, self.p = critical_vectors(self.matrix, kind)
+        if towards is not None and np.vdot(towards, self.q).real < 0.0:
+            self.q, self.p = -self.q, -self.p
+
+    def neighbours(self) -> np.ndarray:
+        """Return the scaled unknowns of the orbit's neighbours along the eigenvector's real and imaginary parts."""
+        parts = [self.q.real, self.q.imag] if self.kind in (TORUS, HOPF) else [self.q.real]
+        shifts = np.concatenate([np.outer(sign * self.steps, part) for part in parts for sign in (1.0, -1.0)])
+        return np.asarray(self.u + np.pad(shifts, ((0, 0), (0, len(self.u) - len(self.q)))))
+
+    def coefficients(self, form: Form, neighbours: np.ndarray) -> np.ndarray:
+        """Compute a coefficient with each size of the step but the largest.
+
+        `neighbours` are the derivatives of the map, or Jacobians, at `self.neighbours()`, unscaled.
+        """
+        scaled = np.array([self.family.scaled(one) for one in neighbours])
+        parts = np.split(scaled, len(scaled) // (2 * len(self.steps)))
+        halves = [np.split(part, 2) for part in parts]
+        bends = [_bend(self.matrix, ahead, behind, self.steps) for ahead, behind in halves]
+        return np.array([form(self, [one[k] for one in bends]) for k in range(len(self.steps) - 1)])
+
+
 def judge(bifurcations: Sequence[tuple[Family, Bifurcation]]) -> None:
     """Set the coefficient, its error and the criticality of bifurcations, and tell branch points apart, in place."""
-    cases = [_Case(family, one) for family, one in bifurcations]
-    neighbours = [case.neighbours() for case in cases]
-    matrices = _matrices(cases, neighbours)
-    for case, found in zip(cases, matrices, strict=True):
-        case.judge(found)
+    cases = [Case(family, one.kind, one.point.u, one.point.value.monodromy) for family, one in bifurcations]
+    for (_, one), case, matrices in zip(bifurcations, cases, _matrices(cases), strict=True):
+        if one.kind == BRANCHING:
+            _tell_branch_point(one, case, matrices)
+        else:
+            _judge(one, case, matrices)
 
 
-def _matrices(cases: Sequence[_Case], neighbours: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Return the derivatives of the map, or Jacobians, at neighbours of each bifurcation, in scaled states."""
+def _judge(one: Bifurcation, case: Case, matrices: np.ndarray) -> None:
+    one.coefficient, one.coefficient_error, _ = settled(case.coefficients(FORMS[one.kind], matrices))
+    side = _SUPERCRITICAL.get(one.kind)
+    if side is not None and abs(one.coefficient) > one.coefficient_error:
+        found = "supercritical" if one.coefficient * side > 0.0 else "subcritical"
+        one.criticality = CONTRADICTORY if one.criticality not in ("", found) else found
+
+
+def _tell_branch_point(one: Bifurcation, case: Case, matrices: np.ndarray) -> None:
+    square, error, _ = settled(case.coefficients(_quadratic, matrices))
+    size, _, _ = settled(case.coefficients(_size, matrices))
+    if not np.isfinite(square + size):
+        return
+    if abs(square) > max(SAME * size, 3.0 * error):
+        one.kind, one.coefficient, one.coefficient_error = TRANSCRITICAL, square, error
+    elif error <= SAME * size:
+        one.kind = PITCHFORK
+        one.coefficient, one.coefficient_error, _ = settled(case.coefficients(_cubic, matrices))
+        if abs(one.coefficient) > one.coefficient_error:
+            one.criticality = "supercritical" if one.coefficient < 0.0 else "subcritical"
+
+
+def _matrices(cases: Sequence[Case]) -> list[np.ndarray]:
+    """Return the derivatives of the map, or Jacobians, at the neighbours of each case."""
     found: dict[int, np.ndarray] = {}
     by_system: dict[str, list[int]] = {}
     for i, case in enumerate(cases):
         if case.family.period:
             by_system.setdefault(case.family.system.label, []).append(i)
         else:
-            rows = case.family.rows(neighbours[i])
+            rows = case.family.rows(case.neighbours())
             found[i] = jacobian_at(case.family.system, rows.states, rows.parameters[0])
     for chosen in by_system.values():
-        rows = [cases[i].family.rows(neighbours[i]) for i in chosen]
-        derivatives = section_map(
-            np.concatenate([r.parameters for r in rows]),
-            np.concatenate([r.frequency_hz for r in rows]),
-            np.concatenate([r.states for r in rows]),
-            np.concatenate([np.full(len(r.states), r.period) for r in rows]),
-            rtol=BRANCH_RTOL,
-            system=cases[chosen[0]].family.system,
-        ).derivatives
-        bounds = np.cumsum([len(r.states) for r in rows])[:-1]
-        found |= zip(chosen, np.split(derivatives, bounds), strict=True)
-    return [np.array([case.family.scaled(one) for one in found[i]]) for i, case in enumerate(cases)]
+        ends = integrated([cases[i].family.rows(cases[i].neighbours()) for i in chosen], cases[chosen[0]].family.system)
+        found |= {i: one.monodromy for i, one in zip(chosen, ends, strict=True)}
+    return [found[i] for i in range(len(cases))]
 
 
-class _Case:
-    """A bifurcation with its critical eigenvectors."""
+@dataclass(frozen=True, eq=False)
+class CoefficientProblem:
+    """The coefficient of a bifurcation of orbits as a request for trajectories; there is nothing to solve.
 
-    def __init__(self, family: Family, one: Bifurcation) -> None:
-        self.family, self.one = family, one
-        self.matrix = family.scaled(one.point.value.monodromy)
-        self.critical, self.q, self.p = critical_vectors(self.matrix, one.kind)
+    The residual of its value has the coefficient for each size of the step but the largest.
+    """
 
-    def neighbours(self) -> np.ndarray:
-        """Return the scaled unknowns of the orbit's neighbours along the eigenvector's real and imaginary parts."""
-        n = len(self.q)
-        parts = [self.q.real, self.q.imag] if self.one.kind in (TORUS, HOPF) else [self.q.real]
-        shifts = np.concatenate([np.outer(sign * STEPS, part) for part in parts for sign in (1.0, -1.0)])
-        return np.asarray(self.one.point.u + np.pad(shifts, ((0, 0), (0, len(self.one.point.u) - n))))
+    case: Case
 
-    def judge(self, matrices: np.ndarray) -> None:
-        """Set what the bifurcation's coefficient tells, in place."""
-        parts = np.split(matrices, len(matrices) // (2 * len(STEPS)))
-        bends = [_bend(self.matrix, *np.split(part, 2)) for part in parts]
-        one = self.one
-        if one.kind == BRANCHING:
-            self._tell_branch_point(bends)
-            return
-        one.coefficient, one.coefficient_error = _settled(self._coefficients(FORMS[one.kind], bends))
-        side = _SUPERCRITICAL.get(one.kind)
-        if side is None or not abs(one.coefficient) > one.coefficient_error:
-            return
-        found = "supercritical" if one.coefficient * side > 0.0 else "subcritical"
-        one.criticality = CONTRADICTORY if one.criticality not in ("", found) else found
+    @property
+    def size(self) -> int:
+        """Number of unknowns."""
+        return len(self.case.u)
 
-    def _coefficients(self, form: Form, bends: Sequence[Bend]) -> np.ndarray:
-        """Compute a coefficient with each size of the step."""
-        return np.array(
-            [form(self, [Bend(bend.first[k], bend.second[k]) for bend in bends]) for k in range(len(bends[0].first))]
-        )
+    @property
+    def system(self) -> System:
+        """System to integrate."""
+        return self.case.family.system
 
-    def _tell_branch_point(self, bends: Sequence[Bend]) -> None:
-        one = self.one
-        square, error = _settled(self._coefficients(_quadratic, bends))
-        size, _ = _settled(self._coefficients(_size, bends))
-        if not np.isfinite(square + size):
-            return
-        if abs(square) > max(SAME * size, 3.0 * error):
-            one.kind, one.coefficient, one.coefficient_error = TRANSCRITICAL, square, error
-        elif error <= SAME * size:
-            one.kind = PITCHFORK
-            one.coefficient, one.coefficient_error = _settled(self._coefficients(_cubic, bends))
-            if abs(one.coefficient) > one.coefficient_error:
-                one.criticality = "supercritical" if one.coefficient < 0.0 else "subcritical"
+    def rows(self, u: np.ndarray) -> Rows:
+        """Return the neighbours of the orbit."""
+        return self.case.family.rows(self.case.neighbours())
+
+    def value(self, u: np.ndarray, ends: Ends) -> Value:
+        """Compute the coefficient."""
+        found = self.case.coefficients(FORMS[self.case.kind], ends.monodromy)
+        return Value(found, np.zeros((len(found), self.size)), ends.images[0], ends.monodromy[0])
 
 
 def critical_vectors(matrix: np.ndarray, kind: str) -> tuple[complex, np.ndarray, np.ndarray]:
@@ -159,79 +199,89 @@ def critical_vectors(matrix: np.ndarray, kind: str) -> tuple[complex, np.ndarray
     if kind not in (TORUS, HOPF):
         q, p = q.real.astype(complex), p.real.astype(complex)
     q = q / np.linalg.norm(q)
-    return complex(values[k]), q, p / np.vdot(p, q).conj()
+    with np.errstate(divide="ignore", invalid="ignore"):  # at R1 and R2 p is normal to q
+        return complex(values[k]), q, p / np.vdot(p, q).conj()
 
 
-def _bend(middle: np.ndarray, ahead: np.ndarray, behind: np.ndarray) -> Bend:
-    """Compute derivatives of fourth order from matrices at steps `STEPS` ahead and behind."""
-    h = STEPS[1:, None, None]  # each size needs the next larger one as well
+def _bend(middle: np.ndarray, ahead: np.ndarray, behind: np.ndarray, steps: np.ndarray) -> list[Bend]:
+    """Compute derivatives of fourth order from matrices at steps ahead and behind, for each step but the largest."""
+    h = steps[1:, None, None]
     odd, even = ahead - behind, ahead + behind
     first = (8.0 * odd[1:] - odd[:-1]) / (12.0 * h)
     second = (16.0 * even[1:] - even[:-1] - 30.0 * middle) / (12.0 * h * h)
-    return Bend(first, second)
+    return [Bend(*pair) for pair in zip(first, second, strict=True)]
 
 
-def _settled(values: np.ndarray) -> tuple[float, float]:
-    """Return the value that differs least from those of the next sizes, and the larger difference."""
+def settled(values: np.ndarray) -> tuple[float, float, int]:
+    """Return the value that differs least from those of the next sizes, the larger difference, and its place."""
     changes = np.abs(np.diff(values))
     errors = np.maximum(changes[:-1], changes[1:])
     if np.isnan(errors).all():
-        return np.nan, np.nan
+        return np.nan, np.nan, -1
     k = int(np.nanargmin(errors))
-    return float(values[k + 1]), float(errors[k])
+    return float(values[k + 1]), float(errors[k]), k + 1
 
 
 # ---- coefficients ------------------------------------------------------------------------------
 
-Form = Callable[[_Case, Sequence[Bend]], float]
+Form = Callable[[Case, Sequence[Bend]], float]
+"""Computes a coefficient from the derivatives along the real and, if it is complex, imaginary part of q."""
 
 
-def _quadratic(case: _Case, bends: Sequence[Bend]) -> float:
+def _solved(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Solve linear equations; NaN if the matrix is singular, as where two bifurcations meet."""
+    try:
+        return np.asarray(np.linalg.solve(matrix, right))
+    except np.linalg.LinAlgError:
+        return np.full(len(right), np.nan)
+
+
+def _quadratic(case: Case, bends: Sequence[Bend]) -> float:
     (bend,) = bends
     return float(0.5 * np.vdot(case.p, bend.first @ case.q).real)
 
 
-def _size(case: _Case, bends: Sequence[Bend]) -> float:
+def _size(case: Case, bends: Sequence[Bend]) -> float:
     """Compute how large the quadratic coefficient could be."""
     (bend,) = bends
-    return float(0.5 * np.linalg.norm(case.p) * np.linalg.norm(bend.first, 2))
+    return float(0.5 * np.linalg.norm(case.p) * np.linalg.norm(bend.first))
 
 
-def _doubling(case: _Case, bends: Sequence[Bend]) -> float:
+def _doubling(case: Case, bends: Sequence[Bend]) -> float:
     (bend,) = bends
-    inner = np.linalg.solve(case.matrix - np.eye(len(case.q)), bend.first @ case.q)
+    inner = _solved(case.matrix - np.eye(len(case.q)), bend.first @ case.q)
     return float(np.vdot(case.p, bend.second @ case.q - 3.0 * bend.first @ inner).real / 6.0)
 
 
-def _cubic(case: _Case, bends: Sequence[Bend]) -> float:
+def _cubic(case: Case, bends: Sequence[Bend]) -> float:
     (bend,) = bends
     n = len(case.q)
     bordered = np.block([[case.matrix - np.eye(n), case.q[:, None]], [case.p.conj()[None], np.zeros((1, 1))]])
-    inner = np.linalg.solve(bordered, np.append(bend.first @ case.q, 0.0))[:n]
+    inner = _solved(bordered, np.append(bend.first @ case.q, 0.0))[:n]
     return float(np.vdot(case.p, bend.second @ case.q - 3.0 * bend.first @ inner).real / 6.0)
 
 
-def _complex_parts(case: _Case, bends: Sequence[Bend]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _complex_parts(case: Case, bends: Sequence[Bend]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the matrices of B(q, .) and B(q', .), and C(q, q, q')."""
     real, imag = bends
     along, against = real.first + 1j * imag.first, real.first - 1j * imag.first
     return along, against, (real.second + imag.second) @ case.q
 
 
-def _torus(case: _Case, bends: Sequence[Bend]) -> float:
+def _torus(case: Case, bends: Sequence[Bend]) -> float:
     along, against, third = _complex_parts(case, bends)
     one, mu, q = np.eye(len(case.q)), case.critical, case.q
-    mean = np.linalg.solve(one - case.matrix, along @ q.conj())
-    double = np.linalg.solve(mu * mu * one - case.matrix, along @ q)
+    mean = _solved(one - case.matrix, along @ q.conj())
+    double = _solved(mu * mu * one - case.matrix, along @ q)
     total = third + 2.0 * along @ mean + against @ double
     return float((np.conj(mu) * np.vdot(case.p, total)).real / 2.0)
 
 
-def _hopf(case: _Case, bends: Sequence[Bend]) -> float:
+def _hopf(case: Case, bends: Sequence[Bend]) -> float:
     along, against, third = _complex_parts(case, bends)
     one, omega, q = np.eye(len(case.q)), case.critical.imag, case.q
-    mean = np.linalg.solve(case.matrix.astype(complex), along @ q.conj())
-    double = np.linalg.solve(2j * omega * one - case.matrix, along @ q)
+    mean = _solved(case.matrix.astype(complex), along @ q.conj())
+    double = _solved(2j * omega * one - case.matrix, along @ q)
     total = third - 2.0 * along @ mean + against @ double
     return float(np.vdot(case.p, total).real / (2.0 * omega))
 

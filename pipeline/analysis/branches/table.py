@@ -217,19 +217,41 @@ def _named(ds: xr.Dataset, k: int) -> tuple[float, str]:
 
 
 def curves_table(ds: xr.Dataset) -> Table:
-    """Return the table of curves: kind, period, points, and the ranges of both parameters."""
+    """Return the table of the points of codimension two, with lines on the curves.
+
+    ``error`` is the larger of the errors of both parameters, in units of the ranges that the curves cover.
+    """
     names = [parameter_name(str(ds.attrs[f"{role}_parameter"])) for role in ("first", "second")]
-    rows: list[Row] = []
-    for i in range(ds.sizes["curve"]):
-        one, n = ds.isel(curve=i), int(ds["n_points"][i])
-        told = values(one, "kind", "orbit_period")
-        row: Row = {"curve": i, "type": told["kind"], "period": told["orbit_period"], "n_points": n}
-        for role, name in zip(("first", "second"), names, strict=True):
-            line = one[role].values[:n]
-            row |= {f"{name}_min": float(line.min()), f"{name}_max": float(line.max())}
-        rows.append(row)
-    lines = [f"{counted(len(rows), 'curve') if rows else 'no curves'} in the plane of {' and '.join(names)}"]
-    for row in rows:
-        spans = ", ".join(f"{n} {row[f'{n}_min']:.7g} to {row[f'{n}_max']:.7g}" for n in names)
-        lines.append(f"  {row['curve']}: {row['type']}, period {row['period']}: {spans}")
+    rows = [_special(ds, names, k) for k in range(ds.sizes["special"])]
+    rows.sort(key=lambda row: (row["type"], row[names[0]]))
+    lines = [f"{counted(ds.sizes['curve'], 'curve')} in the plane of {' and '.join(names)}"]
+    lines += [_curve_line(ds.isel(curve=i), i, names) for i in range(ds.sizes["curve"])]
+    if rows:
+        lines += ["", f"{counted(len(rows), 'point')} of codimension two", *aligned([_special_words(r) for r in rows])]
     return Table(rows, lines)
+
+
+def _special(ds: xr.Dataset, names: list[str], k: int) -> Row:
+    one = ds.isel(special=k)
+    ranges = [float(np.nanmax(ds[role].values) - np.nanmin(ds[role].values)) for role in ("first", "second")]
+    errors = [float(one[f"special_{role}_error"]) for role in ("first", "second")]
+    return {
+        "type": values(one, "special_kind")["special_kind"],
+        names[0]: float(one["special_first"]),
+        names[1]: float(one["special_second"]),
+        "period": int(one["special_period"]),
+        "error": max(e / r for e, r in zip(errors, ranges, strict=True) if r > 0.0),
+        "curve": int(one["special_curve"]),
+    }
+
+
+def _special_words(row: Row) -> Words:
+    words = {name: f"{value:.7f}" if isinstance(value, float) else str(value) for name, value in row.items()}
+    return words | {"error": f"{row['error']:.1g}"}
+
+
+def _curve_line(one: xr.Dataset, number: int, names: list[str]) -> str:
+    told, n = values(one, "kind", "orbit_period"), int(one["n_points"])
+    lines = [one[role].values[:n] for role in ("first", "second")]
+    spans = ", ".join(f"{name} {line.min():.7g} to {line.max():.7g}" for name, line in zip(names, lines, strict=True))
+    return f"  {number}: {told['kind']}, period {told['orbit_period']}: {spans}"

@@ -1,0 +1,269 @@
+"""Detect points of codimension two on bifurcation curves by test functions, and locate them in both parameters.
+
+M is the monodromy matrix, P its characteristic polynomial, and kappa half the sum of the pair of multipliers with
+product 1. "Others" are the multipliers besides the critical ones (Kuznetsov, Elements of Applied Bifurcation
+Theory, 3rd ed., 2004, Ch. 9; Kuznetsov and Meijer, SIAM J. Sci. Comput. 26, 2005, 1932).
+
+============================ ========================= =======================================================
+point                        on curves of              test function
+============================ ========================= =======================================================
+``cusp``                     folds                     the normal form coefficient
+``generalised_doubling``     doublings                 the same
+``chenciner``                Neimark-Sacker points     the same
+``r1``                       folds; Neimark-Sacker     P'(1); kappa - 1
+``r2``                       doublings; Neimark-Sacker P'(-1); kappa + 1
+``r3``, ``r4``               Neimark-Sacker points     kappa + 1/2; kappa
+``fold_flip``                folds; doublings          det(M + 1); det(M - 1)
+``fold_neimark_sacker``      folds; Neimark-Sacker     product of mu_i mu_j - 1 of others; of mu - 1 of others
+``doubling_neimark_sacker``  doublings; Neimark-Sacker the same; product of mu + 1 of others
+``double_neimark_sacker``    Neimark-Sacker points     product of mu_i mu_j - 1 of others
+============================ ========================= =======================================================
+
+On a Neimark-Sacker curve the pair may also pass -1 (or 1) and stay on the circle: M - (-1) vanishes on the plane
+of the pair, as where a flow is seen at even times. There kappa touches -1, and the rotation in the plane changes
+its direction instead: ``turn`` in `_torus_tests`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from itertools import combinations
+
+import numpy as np
+
+from pipeline.analysis.branches.arclength import Point, Settings
+from pipeline.analysis.branches.bifurcations import DOUBLING, FOLD, TORUS, Tested, find_root
+from pipeline.analysis.branches.lockstep import Query, Steps
+from pipeline.analysis.branches.normal_forms import STEPS, Case, CoefficientProblem, settled
+from pipeline.analysis.branches.problems import BifurcationProblem, Family
+
+CUSP, GENERALISED, CHENCINER = "cusp", "generalised_doubling", "chenciner"
+R1, R2, R3, R4 = "r1", "r2", "r3", "r4"
+FOLD_FLIP, FOLD_TORUS = "fold_flip", "fold_neimark_sacker"
+DOUBLING_TORUS, DOUBLE_TORUS = "doubling_neimark_sacker", "double_neimark_sacker"
+POINT_KINDS = (CUSP, GENERALISED, CHENCINER, R1, R2, R3, R4, FOLD_FLIP, FOLD_TORUS, DOUBLING_TORUS, DOUBLE_TORUS)
+
+TURN = "turn"
+"""Test function of a pair that passes 1 or -1 and stays on the circle; the point is an R1 or R2."""
+
+OF_COEFFICIENT = {FOLD: CUSP, DOUBLING: GENERALISED, TORUS: CHENCINER}
+"""The point at which the normal form coefficient of each bifurcation vanishes."""
+
+VANISHES = 1e-3
+"""A sign change is a zero if the test function falls below this share of its values on both sides; else it jumps."""
+
+ON_AXIS = 1e-6
+"""Largest distance of kappa from 1 or -1 where a pair passes that multiplier."""
+
+
+@dataclass(frozen=True, eq=False)
+class SpecialPoint:
+    """A located point of codimension two.
+
+    Attributes
+    ----------
+    kind : str
+        One of `POINT_KINDS`.
+    family : Family
+        Of the orbit.
+    point : Point
+        The orbit there.
+    bracket : ndarray, (2,)
+        Distance of the values of both parameters between which the test function changes its sign.
+    curve : int
+        Number of the curve on which it was located.
+    """
+
+    kind: str
+    family: Family
+    point: Point
+    bracket: np.ndarray
+    curve: int = -1
+
+    @property
+    def values(self) -> np.ndarray:
+        """Values of both parameters."""
+        return self.family.values(self.point.u)
+
+
+@dataclass(eq=False)
+class Detector:
+    """A detector of points of codimension two between neighbouring points of a curve, with those located so far.
+
+    Eigenvectors and planes of the pair are turned to those at the point before, so that test functions with
+    a sign of theirs are continuous.
+    """
+
+    problem: BifurcationProblem
+    settings: Settings
+    found: list[SpecialPoint] = field(default_factory=list)
+    _level: int | None = None
+    _last: tuple[Point, _Frame, dict[str, float]] | None = None
+
+    def between(self, a: Point, b: Point) -> Steps[bool]:
+        """Locate the points between two points of the curve; True."""
+        if self._last is None or self._last[0] is not a:
+            first = yield from self._tests(a, None)
+            self._last = a, *first
+        _, frame, before = self._last
+        turned, after = yield from self._tests(b, frame)
+        for kind, value in before.items():
+            if value * after[kind] < 0.0:
+                one = yield from self._locate(kind, (a, value), (b, after[kind]), frame)
+                if one is not None and not any(_is_same(one, other) for other in self.found):
+                    self.found.append(one)
+        self._last = b, turned, after
+        return True
+
+    def _tests(self, point: Point, frame: _Frame | None) -> Steps[tuple[_Frame, dict[str, float]]]:
+        """Compute all test functions at a point of the curve."""
+        family, kind = self.problem.family, self.problem.kind
+        case = Case(family, kind, point.u, point.value.monodromy, STEPS, frame.vector if frame else None)
+        turned = _Frame.of(case, frame)
+        values = _matrix_tests(kind, case.matrix, turned)
+        values[OF_COEFFICIENT[kind]] = yield from self._coefficient(case)
+        return turned, values
+
+    def _coefficient(self, case: Case) -> Steps[float]:
+        """Compute the normal form coefficient with the size of the step that is best at the curve's first point."""
+        if case.kind == TORUS and case.critical.imag == 0.0:  # beyond R1 or R2
+            return float("nan")
+        if self._level is None:
+            value = yield Query(CoefficientProblem(case), case.u)
+            _, _, self._level = settled(value.residual)
+        if self._level < 0:
+            return float("nan")
+        case.steps = STEPS[self._level : self._level + 2]
+        value = yield Query(CoefficientProblem(case), case.u)
+        return float(value.residual[0])
+
+    def _locate(self, kind: str, a: Tested, b: Tested, frame: _Frame) -> Steps[SpecialPoint | None]:
+        def test(point: Point) -> Steps[float]:
+            if kind == OF_COEFFICIENT[self.problem.kind]:
+                _, values = yield from self._tests(point, frame)
+                return values[kind]
+            case = Case(self.problem.family, self.problem.kind, point.u, point.value.monodromy)
+            return _matrix_tests(self.problem.kind, case.matrix, _Frame.of(case, frame))[kind]
+
+        ends = yield from find_root(self.problem, a, b, test, self.settings)
+        if ends is None:
+            return None
+        (low, at_low), (high, at_high) = ends
+        if not min(abs(at_low), abs(at_high)) <= VANISHES * max(abs(a[1]), abs(b[1])):
+            return None
+        nearest = low if abs(at_low) <= abs(at_high) else high
+        if kind == TURN:
+            cosine = _cosine(np.linalg.eigvals(nearest.value.monodromy))
+            if abs(cosine) < 1.0 - ON_AXIS:
+                return None
+            kind = R1 if cosine > 0.0 else R2
+        bracket = np.abs(self.problem.family.values(high.u) - self.problem.family.values(low.u))
+        return SpecialPoint(kind, self.problem.family, nearest, bracket)
+
+
+def _is_same(one: SpecialPoint, other: SpecialPoint) -> bool:
+    return one.kind == other.kind and bool(np.abs(one.point.u - other.point.u).max() < 1e-5)
+
+
+# ---- test functions ----------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class _Frame:
+    """The critical eigenvector at a point of a curve, and an orthonormal basis (n, 2) of the plane of a pair."""
+
+    vector: np.ndarray
+    plane: np.ndarray | None
+
+    @classmethod
+    def of(cls, case: Case, before: _Frame | None) -> _Frame:
+        """Return the frame at a point, turned to that of the point before."""
+        if case.kind != TORUS:
+            return cls(case.q, None)
+        values, vectors = np.linalg.eig(case.matrix)
+        i, j = _pair(values)
+        both = np.concatenate([vectors[:, [i, j]].real, vectors[:, [i, j]].imag], axis=1)
+        plane = np.linalg.svd(both)[0][:, :2]
+        if before is not None and before.plane is not None:
+            left, _, right = np.linalg.svd(plane.T @ before.plane)
+            plane = plane @ left @ right
+        return cls(case.q, plane)
+
+
+def _matrix_tests(kind: str, matrix: np.ndarray, frame: _Frame) -> dict[str, float]:
+    """Compute the test functions of a monodromy matrix on a curve of a kind."""
+    if kind == TORUS:
+        return _torus_tests(matrix, frame)
+    critical = 1.0 if kind == FOLD else -1.0
+    values = np.linalg.eigvals(matrix)
+    others = np.delete(values, int(np.argmin(np.abs(values - critical))))
+    names = {FOLD: (R1, FOLD_TORUS), DOUBLING: (R2, DOUBLING_TORUS)}[kind]
+    return {
+        names[0]: _slope(matrix, critical),
+        names[1]: _pairs(others),
+        FOLD_FLIP: float(np.linalg.det(matrix + critical * np.eye(len(matrix)))),
+    }
+
+
+def _torus_tests(matrix: np.ndarray, frame: _Frame) -> dict[str, float]:
+    values = np.linalg.eigvals(matrix)
+    others, cosine = np.delete(values, _pair(values)), _cosine(values)
+    assert frame.plane is not None
+    inside = frame.plane.T @ matrix @ frame.plane
+    return {
+        R1: cosine - 1.0,
+        R2: cosine + 1.0,
+        R3: cosine + 0.5,
+        R4: cosine,
+        TURN: float(inside[1, 0] - inside[0, 1]),
+        FOLD_TORUS: float(np.prod(others - 1.0).real),
+        DOUBLING_TORUS: float(np.prod(others + 1.0).real),
+        DOUBLE_TORUS: _pairs(others),
+    }
+
+
+def _slope(matrix: np.ndarray, at: float) -> float:
+    """Compute the derivative of the characteristic polynomial."""
+    return float(np.polyval(np.polyder(np.poly(matrix)), at).real)
+
+
+def _pairs(values: np.ndarray) -> float:
+    """Compute the product of mu_i mu_j - 1 over pairs."""
+    return float(np.prod([a * b - 1.0 for a, b in combinations(values, 2)]).real)
+
+
+def _pair(values: np.ndarray) -> list[int]:
+    """Return the places of the two multipliers with product 1."""
+    i, j = np.triu_indices(len(values), 1)
+    k = int(np.argmin(np.abs(values[i] * values[j] - 1.0)))
+    return [int(i[k]), int(j[k])]
+
+
+def _cosine(values: np.ndarray) -> float:
+    """Return half the sum of the two multipliers with product 1: the cosine of their angle on the circle."""
+    return float(0.5 * values[_pair(values)].sum().real)
+
+
+def merged(points: Mapping[int, list[SpecialPoint]]) -> list[SpecialPoint]:
+    """Return the points of all curves, each once; `points` has them by the number of the curve."""
+    found: list[SpecialPoint] = []
+    for number, ones in points.items():
+        for one in ones:
+            if not any(_is_known(one, other) for other in found):
+                found.append(SpecialPoint(one.kind, one.family, one.point, one.bracket, number))
+    return found
+
+
+def _is_known(one: SpecialPoint, other: SpecialPoint) -> bool:
+    """Return whether two points are the same orbit, at any phase."""
+    if one.kind != other.kind or one.family.period != other.family.period:
+        return False
+    if np.abs(one.point.u[-2:] - other.point.u[-2:]).max() > SAME_POINT:
+        return False
+    return any(np.abs(one.family.mismatch(one.point.u, x)).max() < SAME_STATE for x in other.point.value.images)
+
+
+SAME_POINT, SAME_STATE = 1e-5, 1e-2
+"""Largest distances of one point located on two curves: in the parameters, and in the state, which is steep at
+some of these points."""

@@ -1,0 +1,196 @@
+"""Points of codimension two on bifurcation curves, against closed forms."""
+
+from __future__ import annotations
+
+import tomllib
+
+import numpy as np
+import pytest
+
+from magpend_core.models import load_model
+from pipeline.analysis.branches import Scope, Start, curves_dataset, explore
+from pipeline.analysis.branches.curves import continue_curves
+from pipeline.analysis.branches.problems import Family
+from pipeline.analysis.branches.table import curves_table
+
+# z' = (1 + i w0) z - |z|^2 z + F exp(i W t) for z = x + i y
+STUART_LANDAU = """
+name = "stuart_landau"
+[states]
+x = {}
+y = {}
+[parameters]
+w0 = 1.3
+F = 0.2
+[equations]
+x = "x - w0*y - (x^2 + y^2)*x + F*cos(2*pi*f*t)"
+y = "w0*x + y - (x^2 + y^2)*y + F*sin(2*pi*f*t)"
+"""
+
+# three oscillators that do not feel each other: u in a frame that turns by half a turn per period, so that its
+# multiplier is -exp(mu T); the radius of (p, q); and z with a fold
+UNCOUPLED = """
+name = "uncoupled"
+[states]
+x = {}
+y = {}
+p = {}
+q = {}
+z = {}
+[parameters]
+mu = -0.1
+a = -1.0
+nu = -0.1
+b = -1.0
+m = 0.3
+[define]
+c = "cos(pi*f*t)"
+s = "sin(pi*f*t)"
+u = "x*c + y*s"
+v = "y*c - x*s"
+growth = "mu + a*u^2 - u^4"
+radius = "nu + b*(p^2 + q^2) - (p^2 + q^2)^2"
+[equations]
+x = "growth*u*c + v*s - pi*f*y"
+y = "growth*u*s - v*c + pi*f*x"
+p = "radius*p - 1.7*q"
+q = "1.7*p + radius*q"
+z = "m - z^2"
+"""
+
+FREQUENCY = 0.5
+
+
+def curves_through(kind, state, free, values, bounds, max_period=1, **parameters):
+    """Follow the curve of a bifurcation of the uncoupled oscillators."""
+    model = load_model(tomllib.loads(UNCOUPLED))
+    scales = tuple(high - low for low, high in bounds)
+    family = Family(model.system, 1, FREQUENCY, model.load(**parameters).pack(), free, scales)
+    start = family.unknowns(np.array(state, float), values)
+    return continue_curves([(0, family, kind, start)], bounds, max_period=max_period)
+
+
+def located(curves):
+    """Return the kind and the values of all points of codimension two, each once."""
+    ds = curves_dataset(curves, "first", "second")
+    names = ds["special_kind"].attrs["flag_meanings"].split()
+    values = np.stack([ds["special_first"].values, ds["special_second"].values], axis=1)
+    return [(names[k], value) for k, value in zip(ds["special_kind"].values, values, strict=True)]
+
+
+@pytest.fixture(scope="module")
+def stuart_landau():
+    """All curves of the forced Stuart-Landau oscillator, from the folds along F at w0 - W = 0.3."""
+    model, sigma, force = load_model(tomllib.loads(STUART_LANDAU)), 0.3, 1.2
+    frequency = 1.0 / (2.0 * np.pi)
+    rho = max(r.real for r in np.roots([1.0, -2.0, 1.0 + sigma**2, -(force**2)]) if abs(r.imag) < 1e-9)
+    z = force / (rho - 1.0 - 1j * sigma)
+    packed = model.load(w0=1.0 + sigma).pack()
+    family = Family(model.system, 1, frequency, packed, ("F",), (1.0,))
+    (branch,) = explore([Start(family, np.array([z.real, z.imag]), force)], Scope(0.05, 1.5, 1))
+    both = Family(model.system, 1, frequency, packed, ("w0", "F"), (1.9, 1.45))
+    starts = [
+        (k, both, one.kind, both.unknowns(family.state(one.point.u), [1.0 + sigma, family.values(one.point.u)[0]]))
+        for k, one in enumerate(branch.bifurcations)
+    ]
+    return continue_curves(starts, ((0.05, 1.95), (0.05, 1.5)), max_period=1)
+
+
+def test_stuart_landau__curves(stuart_landau):
+    """Folds (1 - rho)(1 - 3 rho) + sigma^2 = 0; the Neimark-Sacker curves spring from R1."""
+    assert sorted(c.kind for c in stuart_landau) == ["fold", "neimark_sacker", "neimark_sacker"]
+    for curve in stuart_landau:
+        sigma, force = curve.values[:, 0] - 1.0, curve.values[:, 1]
+        rho = np.array([np.sum(curve.family.state(p.u) ** 2) for p in curve.points])
+        np.testing.assert_allclose(rho * ((1.0 - rho) ** 2 + sigma**2), force**2, atol=1e-7)
+        if curve.kind == "fold":
+            np.testing.assert_allclose((1.0 - rho) * (1.0 - 3.0 * rho) + sigma**2, 0.0, atol=1e-7)
+        else:
+            np.testing.assert_allclose(force**2, (0.25 + sigma**2) / 2.0, atol=1e-7)
+            assert "resonance" in curve.ends
+            assert curve.start == -1
+
+
+def test_stuart_landau__points(stuart_landau):
+    """Cusps, R1, and the other resonances where the angle is 2 pi sqrt(sigma^2 - 1/4)."""
+    expected = [("cusp", s / np.sqrt(3.0), np.sqrt(8.0 / 27.0)) for s in (-1.0, 1.0)]
+    expected += [("r1", s / 2.0, 0.5) for s in (-1.0, 1.0)]
+    # angles of a half, a third and a quarter turn, and of two thirds and three quarters
+    for kind, share in (("r2", 1 / 2), ("r3", 1 / 3), ("r4", 1 / 4), ("r3", 2 / 3), ("r4", 3 / 4)):
+        sigma = np.sqrt(0.25 + share**2)
+        expected += [(kind, s * sigma, np.sqrt((0.25 + sigma**2) / 2.0)) for s in (-1.0, 1.0)]
+    found = [(kind, value[0] - 1.0, value[1]) for kind, value in located(stuart_landau)]
+    assert len(found) == len(expected)
+    for one, other in zip(sorted(found), sorted(expected), strict=True):
+        assert one[0] == other[0]
+        assert one[1:] == pytest.approx(other[1:], abs=1e-7)
+
+
+def test_curves_table__names_the_points(stuart_landau):
+    ds = curves_dataset(stuart_landau, "w0", "F", load_model(tomllib.loads(STUART_LANDAU)))
+    table = curves_table(ds)
+    points = [row for row in table.rows if row["type"] == "cusp"]
+    assert len(points) == 2
+    assert set(points[0]) >= {"type", "w0", "F", "period", "error"}
+    assert all(0.0 <= row["error"] < 1e-6 for row in points)
+    assert any("cusp" in line for line in table.lines)
+
+
+def test_duffing__cusp():
+    """x'' + .1 x' + x + x^3 = F cos wt: cusp at w = 1.0901095, F = .0513635."""
+    model = load_model("duffing")
+    packed = model.load(damping=0.1, linear=1.0, cubic=1.0, amplitude=0.4).pack()
+    omega = 1.4 / (2.0 * np.pi)
+    family = Family(model.system, 1, omega, packed, ("amplitude",), (2.0,))
+    (branch, *_) = explore([Start(family, np.zeros(2), 0.011)], Scope(0.01, 2.0, 1))
+    both = Family(model.system, 1, omega, packed, ("frequency", "amplitude"), (0.3, 2.0))
+    one = branch.bifurcations[0]
+    start = both.unknowns(family.state(one.point.u), [omega, family.values(one.point.u)[0]])
+    ((kind, value),) = located(continue_curves([(0, both, one.kind, start)], ((0.1, 0.4), (0.01, 2.0))))
+    assert kind == "cusp"
+    assert 2.0 * np.pi * value[0] == pytest.approx(1.0901095, abs=1e-7)
+    assert value[1] == pytest.approx(0.0513635, abs=1e-7)
+
+
+def test_generalised_doubling__and_the_folds_that_spring_from_it():
+    """u' = u (mu + a u^2 - u^4): the doubling is degenerate at a = 0; folds of twice the period at mu = -a^2/4."""
+    bounds = ((-0.5, 0.5), (-1.0, 1.5))
+    curves = curves_through(
+        "period_doubling", [0, 0, 0, 0, np.sqrt(0.3)], ("mu", "a"), [0.0, -0.4], bounds, max_period=2
+    )
+    ((kind, value),) = located(curves)
+    assert kind == "generalised_doubling"
+    np.testing.assert_allclose(value, 0.0, atol=1e-7)
+    doubling, fold = curves
+    np.testing.assert_allclose(doubling.values[:, 0], 0.0, atol=1e-8)
+    assert (fold.kind, fold.family.period) == ("fold", 2)
+    assert np.ptp(fold.values[:, 1]) > 1.0
+    np.testing.assert_allclose(fold.values[:, 0], -(fold.values[:, 1] ** 2) / 4.0, atol=1e-7)
+
+
+def test_chenciner():
+    """r' = r (nu + b r^2 - r^4)."""
+    bounds = ((-0.5, 0.5), (-1.0, 1.0))
+    curves = curves_through("neimark_sacker", [0, 0, 0, 0, np.sqrt(0.3)], ("nu", "b"), [0.0, -0.4], bounds)
+    ((kind, value),) = located(curves)
+    assert kind == "chenciner"
+    np.testing.assert_allclose(value, 0.0, atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("kind", "free", "bifurcations"),
+    [
+        ("fold_flip", ("mu", "m"), ("fold", "period_doubling")),
+        ("fold_neimark_sacker", ("nu", "m"), ("fold", "neimark_sacker")),
+        ("doubling_neimark_sacker", ("mu", "nu"), ("period_doubling", "neimark_sacker")),
+    ],
+)
+def test_two_bifurcations_at_once(kind, free, bifurcations):
+    """Both curves are found from the one, and cross at the origin."""
+    z = 0.0 if "m" in free else np.sqrt(0.3)
+    values = [-0.3, 0.0] if free[0] != "mu" or "m" in free else [0.0, -0.3]
+    curves = curves_through(bifurcations[0], [0, 0, 0, 0, z], free, values, ((-0.5, 0.5), (-0.4, 0.4)))
+    assert {c.kind for c in curves} == set(bifurcations)
+    assert {name for name, _ in located(curves)} == {kind}
+    for _, value in located(curves):
+        np.testing.assert_allclose(value, 0.0, atol=1e-7)
