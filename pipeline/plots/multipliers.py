@@ -1,4 +1,4 @@
-"""Draw Floquet multipliers along a branch, and two-parameter bifurcation curves."""
+"""Draw Floquet multipliers along a branch, in the complex plane."""
 
 from __future__ import annotations
 
@@ -11,21 +11,13 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
 
 from pipeline.plots import labels, style
-from pipeline.plots.branches import KINDS, MARKERS, NAMES, SHORT
+from pipeline.plots.branches import KINDS, MARKERS, SHORT
 from pipeline.plots.figure import Run, frame_of
-from pipeline.products.branches import BranchOptions, CurveOptions
-from pipeline.products.figures import CurveFigureOptions, MultiplierOptions
+from pipeline.products.branches import BranchOptions
+from pipeline.products.figures import MultiplierOptions
 
 MOST = 2.0
 """Multipliers beyond this modulus are left out."""
-
-_COLOURS = {
-    "fold": style.BLUE,
-    "period_doubling": style.VERMILLION,
-    "neimark_sacker": style.GREEN,
-    "branch_point": style.PURPLE,
-}
-_DASHES: tuple[Any, ...] = ("-", (0, (6, 2)), (0, (1, 1.2)), (0, (5, 1.5, 1, 1.5)), (0, (8, 1.5, 1, 1.5, 1, 1.5)))
 
 
 def plot_multipliers(ds: xr.Dataset, branch: int = 0, *, frame: style.Frame = style.WIDE) -> style.DataFigure:
@@ -124,56 +116,7 @@ def _crossings(ax: Axes, ds: xr.Dataset, here: np.ndarray) -> list[Line2D]:
     return handles
 
 
-def plot_curves(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.DataFigure:
-    """Draw two-parameter bifurcation curves.
-
-    Parameters
-    ----------
-    ds
-        From `pipeline.analysis.branches.curves_dataset`.
-    frame
-        Width of the figure and ranges of its axes.
-
-    Returns
-    -------
-    DataFigure
-        The colour shows the kind, the dashes show the period. Its `data` are the curves.
-    """
-    stored = ds.drop_vars([k for k, v in ds.variables.items() if v.dtype == object])
-    fig = style.new_figure(4.4, stored.assign_attrs(title="curves of bifurcations"), frame)
-    ax = fig.add_subplot()
-    style.style_axes(ax)
-    periods = sorted({int(p) for p in ds["orbit_period"].values})
-    seen: dict[tuple[int, str], Line2D] = {}
-    for i in range(ds.sizes["curve"]):
-        n, period, kind = int(ds["n_points"][i]), int(ds["orbit_period"][i]), KINDS[int(ds["kind"][i])]
-        (line,) = ax.plot(
-            ds["first"].values[i, :n],
-            ds["second"].values[i, :n],
-            color=_COLOURS[kind],
-            linestyle=_DASHES[periods.index(period) % len(_DASHES)],
-            linewidth=1.2,
-            label=f"{NAMES[kind]}, period {period}",
-        )
-        seen.setdefault((period, kind), line)
-    style.label_axes(
-        ax,
-        labels.swept_label(str(ds.attrs["first_parameter"]), str(ds["first"].attrs["units"])),
-        labels.swept_label(str(ds.attrs["second_parameter"]), str(ds["second"].attrs["units"])),
-    )
-    style.limits(ax, frame)
-    style.caption(ax, labels.caption(ds, with_start=False))
-    style.legend_above(fig, [seen[key] for key in sorted(seen)], size=fig.look.tick)
-    style.finish(fig)
-    return fig
-
-
 def draw_multipliers(run: Run, options: MultiplierOptions) -> style.DataFigure:
     """Draw the figure ``multipliers`` of a run."""
     found = run.derive("branches", **options.part(BranchOptions))
     return plot_multipliers(found, options.branch, frame=frame_of(options))
-
-
-def draw_curves(run: Run, options: CurveFigureOptions) -> style.DataFigure:
-    """Draw the figure ``curves`` of a run."""
-    return plot_curves(run.derive("curves", **options.part(CurveOptions)), frame=frame_of(options))

@@ -18,8 +18,9 @@ from pipeline.analysis.basins.numbers import basin_fractions
 from pipeline.analysis.outcomes import left_out, outcomes, share_interval
 from pipeline.analysis.selection import choose, parameter_dims, start_dims
 from pipeline.layout.attractor_letters import letter
-from pipeline.layout.vocabulary import ATTRACTS
+from pipeline.layout.vocabulary import ATTRACTS, parameter_name
 from pipeline.plots import labels, palette, style
+from pipeline.plots.curve_lines import draw_over
 from pipeline.plots.figure import Run, attractors_of, frame_of, noted, values_of
 from pipeline.products.figures import RegimeOptions
 
@@ -42,6 +43,7 @@ def plot_regimes(
     *,
     show: str = "periods",
     at: Mapping[str, float] | None = None,
+    curves: xr.Dataset | None = None,
     frame: style.Frame = style.WIDE,
 ) -> style.DataFigure:
     """Draw the coexisting attractors or periods at each point of two swept parameters.
@@ -55,6 +57,8 @@ def plot_regimes(
         ``attractors``: which ids do; ``number``: how many attractors.
     at
         Values of further swept parameters.
+    curves
+        Bifurcation curves in the plane of the map, drawn over it (`pipeline.analysis.branches.curves_dataset`).
     frame
         Width of the figure and ranges of its axes.
 
@@ -74,7 +78,7 @@ def plot_regimes(
     Raises
     ------
     ValueError
-        For an unknown `show`, and if there are not two swept parameters left.
+        For an unknown `show`, if there are not two swept parameters left, and for curves in another plane.
     """
     style.check_choice("show", show, KINDS)
     x, y = _axes(attractors, at)
@@ -85,9 +89,26 @@ def plot_regimes(
     fixed = labels.caption(part, drop=[x, y])
     text = style.join([titles.get(show, "number of attractors"), fixed, _about(data), left_out(part)])
     several = show != "number" and np.unique(data["regime"]).size > len(palette.COLOURS)
+    if curves is not None:
+        data = _with_curves(data, curves, x, y)
     if several:
-        return _draw_multiples(data, x, y, show, text, frame, palette.cast_of(attractors, part))
-    return _draw_one(data, x, y, show, text, frame)
+        fig = _draw_multiples(data, x, y, show, text, frame, palette.cast_of(attractors, part))
+    else:
+        fig = _draw_one(data, x, y, show, text, frame)
+    if curves is not None:
+        draw_over(fig, [ax for ax in fig.axes if ax.get_visible()], curves, x)
+    style.finish(fig)
+    return fig
+
+
+def _with_curves(data: xr.Dataset, curves: xr.Dataset, x: str, y: str) -> xr.Dataset:
+    """Add the numbers of the curves to those of the map, under names that end in ``_curves``."""
+    plane = [str(curves.attrs[f"{role}_parameter"]) for role in ("first", "second")]
+    if sorted(plane) != sorted([x, y]):
+        raise ValueError(f"the curves lie in the plane of {' and '.join(plane)}, and the map in that of {x} and {y}.")
+    numbers = curves.drop_vars([k for k, v in curves.variables.items() if v.dtype == object])
+    names = {str(n): f"{n}_curves" for n in (*numbers.data_vars, *numbers.dims)}
+    return data.merge(numbers.rename(names)).assign_attrs(data.attrs)
 
 
 def _draw_one(data: xr.Dataset, x: str, y: str, show: str, text: str, frame: style.Frame) -> style.DataFigure:
@@ -110,7 +131,6 @@ def _draw_one(data: xr.Dataset, x: str, y: str, show: str, text: str, frame: sty
     _dress(ax, data, x, y, frame)
     style.label_axes(ax, labels.parameter_label(data[x]), labels.parameter_label(data[y]))
     style.caption(ax, text)
-    style.finish(fig)
     return fig
 
 
@@ -148,7 +168,6 @@ def _draw_multiples(
     more = f"{rest} more, met by {met} of the cells, are not shown" if rest else ""
     note = style.join([text, "depth of colour: share of the cells", more])
     fig.suptitle(style.folded(note, frame.width_in - 0.3, fig.look.legend), fontsize=fig.look.legend, x=0.01, ha="left")
-    style.finish(fig)
     return fig
 
 
@@ -290,4 +309,28 @@ def draw(run: Run, options: RegimeOptions) -> style.DataFigure:
     """Draw the figure ``regimes`` of a run."""
     at, notes = values_of(run, options)
     found = attractors_of(run, options)
-    return noted(plot_regimes(found, show=options.show, at=at, frame=frame_of(options)), notes)
+    curves = _curves_of(run.of(options.curves), found, at) if options.curves else None
+    return noted(plot_regimes(found, show=options.show, at=at, curves=curves, frame=frame_of(options)), notes)
+
+
+def _curves_of(run: Run, attractors: xr.Dataset, at: Mapping[str, float]) -> xr.Dataset:
+    """Return the bifurcation curves of a run in the plane and the ranges of a map."""
+    x, y = _axes(attractors, at)
+    axis = _swept_of(run, x, y)
+    other = y if axis == x else x
+    ranges = {name: (float(attractors[name].min()), float(attractors[name].max())) for name in (x, y)}
+    return run.derive(
+        "curves",
+        parameter=parameter_name(axis),
+        low=ranges[axis][0],
+        high=ranges[axis][1],
+        second=parameter_name(other),
+        second_low=ranges[other][0],
+        second_high=ranges[other][1],
+    )
+
+
+def _swept_of(run: Run, x: str, y: str) -> str:
+    """Return the parameter along which a run's branches are followed: the one of the map's that it sweeps."""
+    swept = [name for name in (x, y) if run.cube().sizes.get(name, 1) > 1]
+    return swept[0] if len(swept) == 1 else x

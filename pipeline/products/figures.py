@@ -59,6 +59,7 @@ class RegimeOptions(AttractorFigureOptions):
     """Options of a map over two parameters."""
 
     show: Literal["periods", "attractors", "number"] = option("periods", "Property that is coloured.")
+    curves: str = option("", "Run along one axis whose bifurcation curves are drawn over the map.")
 
 
 class LyapunovFigureOptions(StateOptions):
@@ -107,6 +108,8 @@ class MultiplierOptions(_AlongOptions):
 
 class CurveFigureOptions(CurveOptions, _AlongOptions):
     """Options of a figure of bifurcation curves."""
+
+    over: str = option("", "Run over both parameters whose map of regimes is drawn below.")
 
 
 BIFURCATION = Figure(
@@ -201,5 +204,5 @@ CURVES = Figure(
     "curves",
     "Draw curves of folds, period doublings and Neimark-Sacker points in the plane of two parameters.",
     CurveFigureOptions,
-    "pipeline.plots.multipliers:draw_curves",
+    "pipeline.plots.curves:draw",
 )

@@ -22,14 +22,17 @@ kind                 test function                            at the point
 ``period_doubling``  det(M + 1)                               a real multiplier is -1
 ``neimark_sacker``   product of mu_i mu_j - 1, i < j          a complex pair lies on the unit circle
 ``branch_point``     det of the derivative and the tangent    another branch of the same period crosses
+``pitchfork``,       the same                                 the two kinds of branch points
+``transcritical``
 ``hopf``             product of l_i + l_j, i < j              a pair of eigenvalues of an equilibrium is imaginary
 ==================== ======================================== =============================================
 
 M is the monodromy matrix. A step is halved if the sign changes do not explain its change of the number of
 unstable multipliers. A real pair with product 1 (a neutral saddle) is no bifurcation and is dropped. Each
 point is bracketed to 1e-8 of arclength. A doubling is *supercritical* if the branch of twice the period lies
-where the single orbit has more unstable multipliers. The criticality of a torus bifurcation is not
-determined. Two sign changes of the same test function within one step are missed.
+where the single orbit has more unstable multipliers, and so says its normal form (`normal_forms`, also for
+the other kinds); ``contradictory`` if the two disagree. A branch point is a pitchfork or transcritical if the
+quadratic coefficient tells. Two sign changes of the same test function within one step are missed.
 
 Friction's corner
 -----------------
@@ -78,7 +81,10 @@ variable                          dims                     meaning
                                                            many points, stuck (Newton's method fails for the
                                                            shortest step), start (it sprang off there),
                                                            equilibrium (a cycle of a flow that shrinks to a
-                                                           point there, as at a Hopf bifurcation)
+                                                           point there, as at a Hopf bifurcation), tangent
+                                                           (its cycles only touch the section),
+                                                           other_section (its cycles go on as a branch on
+                                                           the run's section)
 ``frequency``                     branch                   drive frequency, NaN if that is the parameter; a
                                                            flow has none
 ``rotation``                      branch, angle            mean turns per drive period or return
@@ -87,7 +93,7 @@ variable                          dims                     meaning
 ``to_branch``                     bifurcation              the other branch through it, -1 none or unknown
 ``n_unstable_before``, ``_after`` bifurcation              along the branch
 ``rises_before``                  bifurcation              whether the parameter rises along the branch before
-``criticality``                   bifurcation              unknown, supercritical, subcritical
+``criticality``                   bifurcation              unknown, supercritical, subcritical, contradictory
 ``critical_real``, ``_imag``      bifurcation              the multiplier on the circle
 ``bifurcation_multiplier_real``,  bifurcation,             all of them
 ``_imag``                         multiplier
@@ -95,7 +101,7 @@ variable                          dims                     meaning
                                   state
 ``bifurcation_side``              bifurcation              its side
 ``bifurcation_period_s``          bifurcation              its period [s]; of a Hopf point that of its cycles
-``first_lyapunov``, ``_error``    bifurcation              first Lyapunov coefficient of a Hopf point [1/s]
+``normal_form``, ``_error``       bifurcation              coefficient of the normal form, NaN if unknown
 ================================= ======================== ===================================================
 """
 

@@ -251,7 +251,8 @@ def _special_words(row: Row) -> Words:
 
 
 def _curve_line(one: xr.Dataset, number: int, names: list[str]) -> str:
-    told, n = values(one, "kind", "orbit_period"), int(one["n_points"])
+    told, n = values(one, "kind", "orbit_period", "first_end", "last_end"), int(one["n_points"])
     lines = [one[role].values[:n] for role in ("first", "second")]
     spans = ", ".join(f"{name} {line.min():.7g} to {line.max():.7g}" for name, line in zip(names, lines, strict=True))
-    return f"  {number}: {told['kind']}, period {told['orbit_period']}: {spans}"
+    ends = ", ".join(end for end in (told["first_end"], told["last_end"]) if end != "bound")
+    return f"  {number}: {told['kind']}, period {told['orbit_period']}: {spans}" + (f"; ends: {ends}" if ends else "")

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.analysis.attractors.table import attractors_table
+from pipeline.analysis.branches.bifurcations import KINDS
 from pipeline.analysis.branches.table import branches_table, curves_table
 from pipeline.cli.exits import Exit
 from pipeline.layout.vocabulary import ABSENT, CHAOTIC_SET
@@ -123,10 +124,12 @@ def test_curves__in_the_plane_of_amplitude_and_damping(directory):
     """Both wells' first doublings: two curves over each other, by the mirror symmetry."""
     plane = {"second": "damping", "second_low": 0.25, "second_high": 0.4, "max_period": 1, **ALONG}
     ds = derive(directory, "curves", plane)
-    rows = curves_table(ds).rows
-    assert {(row["type"], row["period"]) for row in rows} == {("period_doubling", 1)}
-    assert len(rows) == 2
-    assert rows[0]["damping_max"] == pytest.approx(rows[1]["damping_max"], rel=0.05)
+    assert ds.sizes["curve"] == 2
+    assert set(ds["kind"].values) == {KINDS.index("period_doubling")}
+    assert set(ds["orbit_period"].values) == {1}
+    highest = np.nanmax(ds["second"].values, axis=1)
+    assert highest[0] == pytest.approx(highest[1], rel=0.05)
+    assert sum("period_doubling, period 1" in line for line in curves_table(ds).lines) == 2
     assert ds["second"].attrs["units"] == "1/s"
     with pytest.raises(SpecError, match="did you mean damping"):
         derive(directory, "curves", {**plane, "second": "dampin"})

@@ -162,7 +162,7 @@ def test_generalised_doubling__and_the_folds_that_spring_from_it():
     assert kind == "generalised_doubling"
     np.testing.assert_allclose(value, 0.0, atol=1e-7)
     doubling, fold = curves
-    np.testing.assert_allclose(doubling.values[:, 0], 0.0, atol=1e-8)
+    np.testing.assert_allclose(doubling.values[:, 0], 0.0, atol=1e-7)
     assert (fold.kind, fold.family.period) == ("fold", 2)
     assert np.ptp(fold.values[:, 1]) > 1.0
     np.testing.assert_allclose(fold.values[:, 0], -(fold.values[:, 1] ** 2) / 4.0, atol=1e-7)

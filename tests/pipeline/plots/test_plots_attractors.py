@@ -15,8 +15,15 @@ from matplotlib.colors import to_rgb
 
 from magpend_core.models import load_model
 from magpend_core.models.pendulum.sides import Side
+from magpend_core.models.pendulum.systems import PENDULUM_FITTED
 from magpend_core.status import Status
 from pipeline.analysis.attractors.matching.hysteresis import hysteresis
+from pipeline.analysis.branches.arclength import Point
+from pipeline.analysis.branches.codimension_two import SpecialPoint
+from pipeline.analysis.branches.curves import Curve
+from pipeline.analysis.branches.curves_dataset import curves_dataset
+from pipeline.analysis.branches.problems import Family, Value
+from pipeline.analysis.branches.table import curves_table
 from pipeline.layout import vocabulary
 from pipeline.layout.attractor_letters import letter
 from pipeline.layout.vocabulary import ATTRACTS, PERIODIC_ORBIT
@@ -24,6 +31,7 @@ from pipeline.plots import (
     palette,
     plot_basins,
     plot_coexisting,
+    plot_curves,
     plot_fractions,
     plot_gallery,
     plot_regimes,
@@ -531,6 +539,44 @@ def test_attractor_figures__say_how_many_cells_are_left_out_and_why(map_of_two, 
     assert "26 of 30 cells end on attractors; 1 diverged, 2 not settled, 1 pending" in told
     settled = sweep.isel(frequency=[0])
     assert "cells end on attractors" not in caption_of(plot_coexisting(settled))
+
+
+@pytest.fixture
+def curves_of_two():
+    """A fold along q, and a cusp on it."""
+    family = Family(PENDULUM_FITTED, 1, 2.0, np.zeros(1), ("q", "frequency"), (1.0, 1.0))
+    value = Value(np.zeros(5), np.zeros((5, 6)), np.zeros((1, 4)), np.eye(4))
+    points = [Point(np.array([0.0, 0.0, 0.0, 0.0, q, 2.0 + 0.1 * q]), np.zeros(6), value, 0) for q in (1.0, 1.5, 2.0)]
+    cusp = SpecialPoint("cusp", family, points[1], np.array([1e-9, 1e-9]))
+    return curves_dataset([Curve(family, "fold", points, ("bound", "stuck"), 0, [cusp])], "q", "frequency")
+
+
+def test_plot_regimes__curves_over_the_map(map_of_two, curves_of_two):
+    """Lines have the map's axes, whichever parameter was followed first; another plane is refused."""
+    fig = plot_regimes(map_of_two, curves=curves_of_two)
+    (line,) = [one for one in fig.axes[0].lines if one.get_gid() == "curve:0"]
+    np.testing.assert_allclose(line.get_xdata(), [2.1, 2.15, 2.2])
+    np.testing.assert_allclose(line.get_ydata(), [1.0, 1.5, 2.0])
+    assert [text.get_text() for text in fig.axes[0].texts] == ["CP"]
+    assert "fold" in [text.get_text() for legend in fig.legends for text in legend.get_texts()]
+    np.testing.assert_allclose(fig.data["special_first_curves"], [1.5])
+    with pytest.raises(ValueError, match="plane of q and damping"):
+        plot_regimes(map_of_two, curves=curves_of_two.assign_attrs(second_parameter="damping"))
+
+
+def test_plot_curves__names_points_of_codimension_two(curves_of_two):
+    fig = plot_curves(curves_of_two)
+    assert [text.get_text() for text in fig.axes[0].texts if text.get_text()] == ["CP"]
+    table = curves_table(curves_of_two)
+    assert table.rows[0] == {
+        "type": "cusp",
+        "q": 1.5,
+        "frequency_hz": 2.15,
+        "period": 1,
+        "error": pytest.approx(1e-8),
+        "curve": 0,
+    }
+    assert table.lines[1].endswith("; ends: stuck")
 
 
 def test_plot_regimes__only_what_attracts_is_counted(map_of_two):

@@ -1,0 +1,74 @@
+"""Draw bifurcation curves over the panels of a map, and mark their points of codimension two."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import xarray as xr
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+from matplotlib.patheffects import withStroke
+
+from pipeline.plots import style
+from pipeline.plots.branches import KINDS, NAMES
+
+DASHES: tuple[Any, ...] = ("-", (0, (6, 2)), (0, (1, 1.2)), (0, (5, 1.5, 1, 1.5)), (0, (8, 1.5, 1, 1.5, 1, 1.5)))
+"""Line styles that can be told apart."""
+
+_ON_MAP = dict(zip(KINDS[:3], DASHES[:3], strict=True))
+
+POINT_NAMES = {
+    "cusp": "CP",
+    "generalised_doubling": "GPD",
+    "chenciner": "CH",
+    "r1": "R1",
+    "r2": "R2",
+    "r3": "R3",
+    "r4": "R4",
+    "fold_flip": "LPPD",
+    "fold_neimark_sacker": "LPNS",
+    "doubling_neimark_sacker": "PDNS",
+    "double_neimark_sacker": "NSNS",
+}
+"""Short names of points of codimension two, as MatContM writes them."""
+
+
+def draw_over(fig: style.DataFigure, axes: Sequence[Axes], ds: xr.Dataset, x: str) -> None:
+    """Draw curves in black over the panels of a map whose horizontal axis is the parameter `x`, with a legend."""
+    along, across = ("first", "second") if str(ds.attrs["first_parameter"]) == x else ("second", "first")
+    halo = [withStroke(linewidth=2.4, foreground="white")]
+    seen: dict[str, Line2D] = {}
+    for ax in axes:
+        low, high = ax.get_xlim(), ax.get_ylim()
+        for i in range(ds.sizes["curve"]):
+            n, kind = int(ds["n_points"][i]), KINDS[int(ds["kind"][i])]
+            look: dict[str, Any] = {"color": "black", "linewidth": 1.1, "linestyle": _ON_MAP[kind]}
+            values = ds[along].values[i, :n], ds[across].values[i, :n]
+            ax.plot(*values, path_effects=halo, gid=f"curve:{i}", zorder=4.0, **look)
+            seen.setdefault(kind, Line2D([], [], label=NAMES[kind], **look))
+        ax.set_xlim(low)
+        ax.set_ylim(high)
+        mark_points(ax, ds, along, across, fig.look.tick)
+    handles = [seen[kind] for kind in _ON_MAP if kind in seen]
+    if handles:
+        fig.legend(handles=handles, loc="outside lower right", ncols=3, frameon=False, fontsize=fig.look.tick)
+
+
+def mark_points(ax: Axes, ds: xr.Dataset, along: str, across: str, size: float) -> None:
+    """Mark the points of codimension two with their short names."""
+    names = str(ds["special_kind"].attrs["flag_meanings"]).split()
+    halo = [withStroke(linewidth=2.0, foreground="white")]
+    for k in range(ds.sizes["special"]):
+        at = float(ds[f"special_{along}"][k]), float(ds[f"special_{across}"][k])
+        ax.plot(*at, marker="o", markersize=3.2, color="black", markeredgecolor="white", markeredgewidth=0.5, zorder=6)
+        ax.annotate(
+            POINT_NAMES[names[int(ds["special_kind"][k])]],
+            at,
+            (3.0, 3.0),
+            textcoords="offset points",
+            fontsize=size,
+            path_effects=halo,
+            annotation_clip=True,
+            zorder=7,
+        )

@@ -1,0 +1,70 @@
+"""Draw two-parameter bifurcation curves and their points of codimension two, alone or over a map of regimes."""
+
+from __future__ import annotations
+
+import xarray as xr
+from matplotlib.lines import Line2D
+
+from pipeline.plots import labels, style
+from pipeline.plots.branches import KINDS, NAMES
+from pipeline.plots.curve_lines import DASHES, mark_points
+from pipeline.plots.figure import Run, attractors_of, frame_of
+from pipeline.plots.regimes import plot_regimes
+from pipeline.products.branches import CurveOptions
+from pipeline.products.figures import CurveFigureOptions, RegimeOptions
+
+_COLOURS = dict(zip(KINDS[:4], (style.BLUE, style.VERMILLION, style.GREEN, style.PURPLE), strict=True))
+
+
+def plot_curves(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.DataFigure:
+    """Draw two-parameter bifurcation curves.
+
+    Parameters
+    ----------
+    ds
+        From `pipeline.analysis.branches.curves_dataset`.
+    frame
+        Width of the figure and ranges of its axes.
+
+    Returns
+    -------
+    DataFigure
+        The colour shows the kind, the dashes show the period. Points of codimension two have a dot and their
+        short name. Its `data` are the curves.
+    """
+    stored = ds.drop_vars([k for k, v in ds.variables.items() if v.dtype == object])
+    fig = style.new_figure(4.4, stored.assign_attrs(title="curves of bifurcations"), frame)
+    ax = fig.add_subplot()
+    style.style_axes(ax)
+    periods = sorted({int(p) for p in ds["orbit_period"].values})
+    seen: dict[tuple[int, str], Line2D] = {}
+    for i in range(ds.sizes["curve"]):
+        n, period, kind = int(ds["n_points"][i]), int(ds["orbit_period"][i]), KINDS[int(ds["kind"][i])]
+        (line,) = ax.plot(
+            ds["first"].values[i, :n],
+            ds["second"].values[i, :n],
+            color=_COLOURS[kind],
+            linestyle=DASHES[periods.index(period) % len(DASHES)],
+            linewidth=1.2,
+            label=f"{NAMES[kind]}, period {period}",
+        )
+        seen.setdefault((period, kind), line)
+    style.label_axes(
+        ax,
+        labels.swept_label(str(ds.attrs["first_parameter"]), str(ds["first"].attrs["units"])),
+        labels.swept_label(str(ds.attrs["second_parameter"]), str(ds["second"].attrs["units"])),
+    )
+    style.limits(ax, frame)
+    mark_points(ax, ds, "first", "second", fig.look.tick)
+    style.caption(ax, labels.caption(ds, with_start=False))
+    style.legend_above(fig, [seen[key] for key in sorted(seen)], size=fig.look.tick)
+    style.finish(fig)
+    return fig
+
+
+def draw(run: Run, options: CurveFigureOptions) -> style.DataFigure:
+    """Draw the figure ``curves`` of a run, alone or over the map of another run."""
+    found = run.derive("curves", **options.part(CurveOptions))
+    if not options.over:
+        return plot_curves(found, frame=frame_of(options))
+    return plot_regimes(attractors_of(run.of(options.over), RegimeOptions()), curves=found, frame=frame_of(options))
