@@ -38,6 +38,16 @@ class CurveOptions(BranchOptions):
     )
 
 
+class OrbitOptions(Options):
+    """Options for searching all periodic orbits at a parameter point."""
+
+    at: dict[str, float] = option({}, "Value of an axis of the run, for the parameter point.")
+    max_period: int = option(2, "Longest orbit period.", unit="drive periods or returns", ge=1, flag="--period")
+    starts: int = option(400, "Number of starts for each period: half of them sections of cells, half random.", ge=2)
+    rounds: int = option(6, "Most rounds in which known orbits are deflated.", ge=0)
+    seed: int = option(0, "Seed of the random starts.", ge=0)
+
+
 BRANCHES = Analysis(
     "branches",
     """Follow periodic orbits and equilibria along a parameter, stable or not; locate and name their bifurcations.
@@ -63,4 +73,16 @@ CURVES = Analysis(
     settle=f"{_ROOM}:settle_curves",
     builds_on=("branches",),
     figure="curves",
+)
+
+ORBITS = Analysis(
+    "orbits",
+    """Search all periodic orbits up to a period at a parameter point, stable or not, from many starts.
+
+    Counts how many starts lead to each orbit, estimates how many orbits are missing, and checks the sum of the
+    indices.""",
+    OrbitOptions,
+    compute="pipeline.analysis.branches.orbit_search:orbits",
+    table="pipeline.analysis.branches.orbit_search:orbits_table",
+    needs="pipeline.analysis.branches.orbit_search:needs_point",
 )

@@ -52,6 +52,7 @@ ANALYSES: Registry[Analysis] = Registry(
         "dimension": "pipeline.products.chaos:DIMENSION",
         "branches": "pipeline.products.branches:BRANCHES",
         "curves": "pipeline.products.branches:CURVES",
+        "orbits": "pipeline.products.branches:ORBITS",
     },
 )
 

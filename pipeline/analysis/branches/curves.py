@@ -271,6 +271,8 @@ def _passes(curve: Curve, kind: str, family: Family, start: Point) -> bool:
     for a, b in pairwise(np.array([p.u for p in curve.points])):
         chord = b - a
         length = float(np.linalg.norm(chord))
+        if not length:
+            continue
         for image in start.value.images:
             offset = np.append(family.mismatch(a, image), start.u[-2:] - a[-2:])
             share = float(offset @ chord) / length**2

@@ -10,10 +10,11 @@ import xarray as xr
 
 from magpend_core.engine.system import System
 from magpend_core.models.model import Parameters
-from magpend_core.orbits import polish_orbits, scaled_distance
+from magpend_core.orbits import scaled_distance
+from pipeline.analysis.branches.deflation import search_orbits
 from pipeline.analysis.branches.exploring import Start
 from pipeline.analysis.branches.problems import FREQUENCY, Family
-from pipeline.analysis.tolerances import RECURRENCE, SAME_ON_BRANCH
+from pipeline.analysis.tolerances import RECURRENCE
 from pipeline.layout.vocabulary import BOUNDED, EQUILIBRIUM, PERIODIC_ORBIT, frequency_of, is_start_dim
 
 TRIES = 16
@@ -47,7 +48,7 @@ def listed(attractors: xr.Dataset, parameters: Parameters, parameter: str, scale
         Change of it that counts as 1.
     """
     for point in _points(attractors):
-        frequency, packed = _parameters_at(point, parameters)
+        frequency, packed = parameters_at(point, parameters)
         where = {d: float(point[d]) for d in _dims(attractors)}
         for i in np.flatnonzero(point["kind"].values > 0):
             one = point.isel(attractor=int(i))
@@ -152,7 +153,7 @@ def _points(ds: xr.Dataset) -> list[xr.Dataset]:
     return [ds.isel(dict(zip(dims, map(int, index), strict=True))) for index in indices]
 
 
-def _parameters_at(point: xr.Dataset, base: Parameters) -> tuple[float, np.ndarray]:
+def parameters_at(point: xr.Dataset, base: Parameters) -> tuple[float, np.ndarray]:
     """Return the frequency [Hz] and the packed parameters of a point of the cube."""
     axes = {n: float(point.coords[n]) for n in base.names if n in point.coords and not point.coords[n].dims}
     return frequency_of(base.model, {str(k): v for k, v in point.coords.items()}), base.replace(**axes).pack()
@@ -184,7 +185,7 @@ def recurrent(cube: xr.Dataset, parameters: Parameters, parameter: str, scale: f
         section = section.reshape(-1, *section.shape[len(dims) :])[point["status"].values.ravel() == BOUNDED]
         if not len(section):
             continue
-        frequency, packed = _parameters_at(point, parameters)
+        frequency, packed = parameters_at(point, parameters)
         for state, period in orbits_near(section, frequency, packed, max_period, system):
             family = family_of(system, period, frequency, packed, parameter, scale)
             starts.append(Start(family, state, value_of(family, frequency, packed)))
@@ -223,17 +224,8 @@ def orbits_near(
         periods += [period] * len(chosen)
     if not guesses:
         return []
-    n = len(guesses)
-    polished = polish_orbits(
-        np.tile(packed, (n, 1)), np.full(n, frequency_hz), np.array(guesses), np.array(periods), system=system
-    )
-    found: list[np.ndarray] = []
-    order = np.argsort(polished.orbit_period, kind="stable")
-    for row in order[polished.converged[order]]:
-        points = polished.points[row, : polished.orbit_period[row]]
-        if not any(_on_orbit(points[0], other, system) for other in found if len(other) == len(points)):
-            found.append(points)
-    return [(points[0], len(points)) for points in found]
+    found = search_orbits(np.array(guesses), np.array(periods), frequency_hz, packed, system)
+    return [(one.points[0], one.period) for one in found]
 
 
 def _spread(
@@ -248,7 +240,3 @@ def _spread(
         if all(scaled_distance(point, other, system) > RECURRENCE for other in chosen):
             chosen.append(point)
     return chosen
-
-
-def _on_orbit(state: np.ndarray, points: np.ndarray, system: System) -> bool:
-    return bool(scaled_distance(points, state, system).min() < SAME_ON_BRANCH)

@@ -7,6 +7,7 @@ import pytest
 
 from pipeline.analysis.attractors.table import attractors_table
 from pipeline.analysis.branches.bifurcations import KINDS
+from pipeline.analysis.branches.orbit_search import orbits_table
 from pipeline.analysis.branches.table import branches_table, curves_table
 from pipeline.cli.exits import Exit
 from pipeline.layout.vocabulary import ABSENT, CHAOTIC_SET
@@ -184,3 +185,14 @@ def test_branches__an_empty_table_is_refused(directory, main, tmp_path):
     assert "2 of 3: outside of amplitude 0.4 to 0.6" in err
     assert "1 of 3: a set that does not close" in err
     assert not (tmp_path / "found.csv").exists()
+
+
+def test_orbits__at_a_point(directory):
+    """All orbits of period 1 by their index, both wells' among them."""
+    ds = derive(directory, "orbits", {"at": {"amplitude": 0.25}, "max_period": 1, "starts": 100})
+    table = orbits_table(ds)
+    assert int(ds["index_sum"][0]) == 1
+    assert sorted(row["index"] for row in table.rows) == [-1, 1, 1]
+    assert any("add up to 1" in line for line in table.lines)
+    with pytest.raises(SpecError, match="choose a value of each, such as --at amplitude"):
+        derive(directory, "orbits", {"max_period": 1})

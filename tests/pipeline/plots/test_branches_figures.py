@@ -103,6 +103,7 @@ def test_plot_curves__lines():
             "kind": ("curve", [0, 1]),
             "orbit_period": ("curve", [1, 2]),
             "n_points": ("curve", [3, 2]),
+            "special_kind": ("special", [], {"flag_meanings": "cusp"}),
         },
         attrs={"first_parameter": "frequency_hz", "second_parameter": "q"},
     )

@@ -1,0 +1,230 @@
+"""Search all periodic orbits of some periods at a parameter point, by deflated Newton iterations from many starts.
+
+Newton's method from many starts finds the same orbits again and again. After the first round the map's mismatch is
+multiplied by ``1 + 1/|x - x_k|^2`` for every known section point x_k, so that iterations are driven away from known
+orbits and find others (Farrell, Birkisson and Funke, SIAM J. Sci. Comput. 37, 2015, A2026). Each round starts
+elsewhere.
+The factor does not need to be computed: the deflated Newton step is the plain one times a number.
+
+Two figures tell how complete the result is. ``coverage`` estimates the share of all starts that end on a known orbit,
+from the orbits that the first round met only once (Good, Biometrika 40, 1953, 237). The index of an orbit is the
+sign of det(1 - M); over all fixed points of the p-fold map the indices add up to the Euler characteristic of the
+state space, 1, or 0 if a state is an angle, provided that all trajectories stay bounded (Lefschetz).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from magpend_core.engine.system import System
+from magpend_core.orbits import polish_orbits, scaled_distance, section_map, wrap_angles
+from pipeline.analysis.tolerances import BRANCH_RTOL, SAME_ON_BRANCH
+from pipeline.products.reporting import report
+
+ROUNDS = 6
+"""Most rounds of deflated iterations; the search ends earlier with a round that finds nothing."""
+
+ELSEWHERE = 0.3
+"""Standard deviation by which starts move from round to round, as a share of that of all starts."""
+
+ITERATIONS = 30
+"""Newton steps of one iteration."""
+
+LONGEST_STEP = 0.5
+"""Longest step [scaled]; a longer one is shortened to this."""
+
+CLOSE = 1e-9
+"""Scaled residual at which an iteration ends; the orbits found are polished further."""
+
+
+@dataclass(frozen=True, eq=False)
+class FoundOrbit:
+    """A periodic orbit and how it was found.
+
+    Attributes
+    ----------
+    points : ndarray, (period, n_states)
+        Section points in the order of time.
+    monodromy : ndarray, (n_states, n_states)
+        Derivative of the section map over the period.
+    n_hits : int
+        Starts of the first round, in which nothing is deflated, that led to it.
+    search_round : int
+        Round in which it was found, from 0.
+    """
+
+    points: np.ndarray
+    monodromy: np.ndarray
+    n_hits: int
+    search_round: int
+
+    @property
+    def period(self) -> int:
+        """Least period [drive periods or returns]."""
+        return len(self.points)
+
+    @property
+    def multipliers(self) -> np.ndarray:
+        """Floquet multipliers by falling modulus."""
+        found = np.linalg.eigvals(self.monodromy)
+        return found[np.argsort(-np.abs(found), kind="stable")]
+
+    def index(self, times: int = 1) -> int:
+        """Return the sign of det(1 - M) of the orbit run through some times."""
+        power = np.linalg.matrix_power(self.monodromy, times)
+        return int(np.sign(np.linalg.det(np.eye(len(power)) - power)))
+
+
+def search_orbits(
+    starts: np.ndarray,
+    periods: np.ndarray,
+    frequency_hz: float,
+    packed: np.ndarray,
+    system: System,
+    *,
+    rounds: int = ROUNDS,
+) -> list[FoundOrbit]:
+    """Find periodic orbits from many starts, each orbit once.
+
+    Parameters
+    ----------
+    starts
+        Section points to start from, shape (n, n_states) [the model's units].
+    periods
+        Period that is looked for from each start, shape (n,) [drive periods or returns].
+    frequency_hz
+        Drive frequency [Hz].
+    packed
+        Packed parameters.
+    system
+        What is integrated.
+    rounds
+        Most rounds with deflation.
+
+    Returns
+    -------
+    list of FoundOrbit
+        By rising period, then by falling number of hits.
+    """
+    found: list[FoundOrbit] = []
+    generator, spread = np.random.default_rng(0), ELSEWHERE * starts.std(axis=0)
+    for number in range(1 + rounds):
+        report("searching orbits", number, 1 + rounds)
+        moved = starts + spread * generator.standard_normal(starts.shape) if number else starts
+        ends = _iterate(moved, periods, frequency_hz, packed, system, found)
+        n_before = len(found)
+        _add(found, *ends, number, frequency_hz, packed, system)
+        if len(found) == n_before:
+            break
+    return sorted(found, key=lambda one: (one.period, -one.n_hits))
+
+
+def _iterate(
+    starts: np.ndarray,
+    periods: np.ndarray,
+    frequency_hz: float,
+    packed: np.ndarray,
+    system: System,
+    known: Sequence[FoundOrbit],
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the section points at which iterations converged to no known orbit, and their periods."""
+    state, scales = starts.astype(np.float64), np.asarray(system.scales)
+    rows, done = np.arange(len(state)), []
+    for _ in range(ITERATIONS):
+        ends = section_map(
+            np.tile(packed, (len(rows), 1)),
+            np.full(len(rows), frequency_hz),
+            state[rows],
+            periods[rows],
+            rtol=BRANCH_RTOL,
+            system=system,
+        )
+        image = ends.images[np.arange(len(rows)), periods[rows] - 1]
+        mismatch = wrap_angles(image - state[rows], system) / scales
+        is_finite = np.isfinite(mismatch).all(axis=1) & np.isfinite(ends.derivatives).all(axis=(1, 2))
+        has_converged = is_finite & (np.abs(mismatch).max(axis=1) < CLOSE)
+        done.append(rows[has_converged])
+        going = is_finite & ~has_converged
+        rows = rows[going]
+        if not len(rows):
+            break
+        matrices = ends.derivatives[going] * scales / scales[:, None] - np.eye(len(scales))
+        steps = _newton(matrices, mismatch[going])
+        steps *= _stretch(state[rows], periods[rows], steps, known, system)[:, None]
+        longest = np.abs(steps).max(axis=1, keepdims=True)
+        steps *= np.minimum(1.0, LONGEST_STEP / np.maximum(longest, LONGEST_STEP * 1e-9))
+        state[rows] = wrap_angles(state[rows] + steps * scales, system)
+    ended = np.concatenate(done)
+    return state[ended], periods[ended]
+
+
+def _newton(matrices: np.ndarray, mismatch: np.ndarray) -> np.ndarray:
+    """Solve for the steps; least squares where a matrix is singular."""
+    return np.array([np.linalg.lstsq(a, -b, rcond=None)[0] for a, b in zip(matrices, mismatch, strict=True)])
+
+
+def _stretch(
+    states: np.ndarray, periods: np.ndarray, steps: np.ndarray, known: Sequence[FoundOrbit], system: System
+) -> np.ndarray:
+    """Return the factors of the steps by deflation: 1/(1 - grad(log m) . step), m the product of 1 + 1/d^2."""
+    scales, along = np.asarray(system.scales), np.zeros(len(states))
+    for one in known:
+        own = np.flatnonzero(periods % one.period == 0)
+        for point in one.points:
+            away = wrap_angles(states[own] - point, system) / scales
+            square = np.maximum((away**2).sum(axis=1), 1e-16)
+            along[own] -= 2.0 * (away * steps[own]).sum(axis=1) / (square * (1.0 + square))
+    nearly = np.abs(1.0 - along) < 1e-3  # the step is without bound there
+    return np.asarray(1.0 / np.where(nearly, 1e-3, 1.0 - along))
+
+
+def _add(
+    found: list[FoundOrbit],
+    states: np.ndarray,
+    periods: np.ndarray,
+    number: int,
+    frequency_hz: float,
+    packed: np.ndarray,
+    system: System,
+) -> None:
+    """Append the orbits at some section points that are not known yet, and count the hits of the first round."""
+    if not len(states):
+        return
+    n = len(states)
+    polished = polish_orbits(np.tile(packed, (n, 1)), np.full(n, frequency_hz), states, periods, system=system)
+    for row in np.flatnonzero(polished.converged):
+        points = polished.points[row, : polished.orbit_period[row]]
+        place = next((k for k, one in enumerate(found) if _is_same(one, points, system)), -1)
+        if place < 0:
+            found.append(FoundOrbit(points, polished.derivative[row], int(number == 0), number))
+        elif number == 0:
+            found[place] = replace(found[place], n_hits=found[place].n_hits + 1)
+
+
+def _is_same(one: FoundOrbit, points: np.ndarray, system: System) -> bool:
+    return one.period == len(points) and bool(scaled_distance(one.points, points[0], system).min() < SAME_ON_BRANCH)
+
+
+# ---- completeness ------------------------------------------------------------------------------
+
+
+def coverage(found: Sequence[FoundOrbit]) -> float:
+    """Estimate the probability that one more start leads to a known orbit; NaN without any hit."""
+    hits = np.array([one.n_hits for one in found])
+    return float(1.0 - (hits == 1).sum() / hits.sum()) if hits.sum() else float("nan")
+
+
+def index_sums(found: Sequence[FoundOrbit], longest: int) -> dict[int, int]:
+    """Return the sum of the indices of all fixed points of the p-fold section map, for p up to `longest`."""
+    return {
+        p: sum(one.period * one.index(p // one.period) for one in found if p % one.period == 0)
+        for p in range(1, longest + 1)
+    }
+
+
+def expected_index(system: System) -> int:
+    """Return the Euler characteristic of the state space: 0 if a state is an angle, else 1."""
+    return 0 if any(system.is_angle) else 1

@@ -1,0 +1,159 @@
+"""Search all periodic orbits at a parameter point of a run, as an analysis (`pipeline.products.branches`)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from magpend_core.engine.system import System
+from pipeline.analysis.branches.deflation import FoundOrbit, coverage, expected_index, index_sums, search_orbits
+from pipeline.analysis.branches.starting_orbits import parameters_at
+from pipeline.analysis.branches.units import state_units
+from pipeline.analysis.run import Run
+from pipeline.analysis.selection import select_points
+from pipeline.analysis.tabular import Row, Words, aligned, counted
+from pipeline.layout.period_names import periods_of
+from pipeline.layout.vocabulary import model_attribute, model_of, parameters_of, section_attributes, split_dims
+from pipeline.products.branches import OrbitOptions
+from pipeline.products.product import Table
+
+WIDER = 1.5
+"""Side of the box of random starts, in units of that which the cells' sections span."""
+
+
+def needs_point(run: Run, options: OrbitOptions) -> None:
+    """Raise ValueError unless the values choose one parameter point."""
+    _point(run.cube(), options)
+
+
+def _point(cube: xr.Dataset, options: OrbitOptions) -> xr.Dataset:
+    part = select_points(cube, options.at, purpose="orbits are searched at one parameter point")
+    return part.isel(dict.fromkeys(split_dims(part["status"])[0], 0))
+
+
+def orbits(run: Run, options: OrbitOptions) -> xr.Dataset:
+    """Search the periodic orbits up to a period, stable or not."""
+    cube = run.cube()
+    point, base = _point(cube, options), parameters_of(cube)
+    frequency, packed = parameters_at(point, base)
+    system = base.model.system
+    starts = _starts(point, system, options)
+    periods = np.arange(1, options.max_period + 1)
+    found = search_orbits(
+        np.tile(starts, (len(periods), 1)),
+        np.repeat(periods, len(starts)),
+        frequency,
+        packed,
+        system,
+        rounds=options.rounds,
+    )
+    return _dataset(found, system, options, point)
+
+
+def _starts(point: xr.Dataset, system: System, options: OrbitOptions) -> np.ndarray:
+    """Return the starts: half of them sections of the cells, half random in a wider box."""
+    generator = np.random.default_rng(options.seed)
+    section = point["section"].transpose(..., "state").values.reshape(-1, system.n_states)
+    section = section[np.isfinite(section).all(axis=1)]
+    if not len(section):
+        section = np.zeros((1, system.n_states)) + np.asarray(system.scales) * [[-1.0], [1.0]]
+    low, high = section.min(axis=0), section.max(axis=0)
+    middle, half = (low + high) / 2.0, WIDER * np.maximum(high - low, np.asarray(system.scales)) / 2.0
+    low, high = middle - half, middle + half
+    angles = np.flatnonzero(system.is_angle)
+    low[angles], high[angles] = -np.pi, np.pi
+    n_drawn = options.starts // 2
+    drawn = section[generator.integers(len(section), size=n_drawn)]
+    return np.concatenate([drawn, generator.uniform(low, high, (options.starts - n_drawn, system.n_states))])
+
+
+def _dataset(found: list[FoundOrbit], system: System, options: OrbitOptions, point: xr.Dataset) -> xr.Dataset:
+    model = model_of(point)
+    section = np.full((len(found), options.max_period, system.n_states), np.nan)
+    multipliers = np.full((len(found), system.n_states), np.nan, np.complex128)
+    for i, one in enumerate(found):
+        section[i, : one.period] = one.points
+        multipliers[i] = one.multipliers
+    sums = index_sums(found, options.max_period)
+
+    def column(values: Any, long_name: str) -> tuple[str, Any, dict[str, str]]:
+        return "orbit", np.asarray(values, np.int32), {"units": "1", "long_name": long_name}
+
+    about = {"units": "1", "long_name": "Floquet multipliers"}
+    expected = {} if model.crossing is not None else {"expected_index_sum": expected_index(system)}
+    return xr.Dataset(
+        {
+            "section": (("orbit", "phase", "state"), section, {"units": state_units(model)}),
+            "orbit_period": column([one.period for one in found], f"least period in {periods_of(model)}"),
+            "n_unstable": column((np.abs(multipliers) > 1.0).sum(axis=1), "multipliers outside the unit circle"),
+            "n_hits": column([one.n_hits for one in found], "starts of the first round that led to it"),
+            "search_round": column([one.search_round for one in found], "round in which it was found, from 0"),
+            "index": column([one.index() for one in found], "sign of det(1 - M)"),
+            "multiplier_real": (("orbit", "multiplier"), multipliers.real, about),
+            "multiplier_imag": (("orbit", "multiplier"), multipliers.imag, about),
+            "index_sum": ("times", np.array(list(sums.values()), np.int32), {"units": "1"}),
+        },
+        coords={"state": list(system.state_names), "times": list(sums)},
+        attrs={
+            "model": model_attribute(model),
+            **section_attributes(model.crossing),
+            **expected,
+            "n_starts": options.starts,
+            "coverage": coverage(found),
+        },
+    )
+
+
+def orbits_table(ds: xr.Dataset) -> Table:
+    """Return the table of the orbits, with lines on how complete it is."""
+    rows = [_row(ds.isel(orbit=i)) for i in range(ds.sizes["orbit"])]
+    lines = [f"{counted(len(rows), 'orbit')} from {counted(int(ds.attrs['n_starts']), 'start')} per period", ""]
+    lines += [*aligned([_words(row) for row in rows], ""), ""]
+    if np.isfinite(ds.attrs["coverage"]):
+        lines.append(f"coverage: {100.0 * ds.attrs['coverage']:.1f} % of the starts lead to one of them (estimate)")
+    if "expected_index_sum" in ds.attrs:
+        lines += _index_lines(ds, int(ds.attrs["expected_index_sum"]))
+    return Table(rows, lines, "" if rows else "no periodic orbit was found; try more --starts.")
+
+
+def _index_lines(ds: xr.Dataset, expected: int) -> list[str]:
+    """Return lines on the periods whose indices do not add up."""
+    sums = {int(p): int(total) for p, total in zip(ds["times"].values, ds["index_sum"].values, strict=True)}
+    wrong = [f"{p}: {total}" for p, total in sums.items() if total != expected]
+    if not wrong:
+        return [f"the indices add up to {expected} for every period, as they do if no orbit is missing"]
+    return [
+        f"the indices should add up to {expected} if all trajectories stay bounded; orbits are missing of periods "
+        f"(index sum) {', '.join(wrong)}: try more --starts"
+    ]
+
+
+def _row(one: xr.Dataset) -> Row:
+    values = one["multiplier_real"].values + 1j * one["multiplier_imag"].values
+    return {
+        "period": int(one["orbit_period"]),
+        "n_unstable": int(one["n_unstable"]),
+        "multiplier_real": float(values[0].real),
+        "multiplier_imag": float(values[0].imag),
+        **{str(name): float(v) for name, v in zip(one["state"].values, one["section"].values[0], strict=True)},
+        "n_hits": int(one["n_hits"]),
+        "index": int(one["index"]),
+    }
+
+
+def _words(row: Row) -> Words:
+    largest = complex(row["multiplier_real"], row["multiplier_imag"])
+    states = [name for name in row if name not in _COLUMNS]
+    return {
+        "period": str(row["period"]),
+        "unstable": str(row["n_unstable"]),
+        "multiplier": f"{largest.real:.5g}" + (f"{largest.imag:+.5g}i" if largest.imag else ""),
+        **{name: f"{row[name]:.6f}" for name in states},
+        "hits": str(row["n_hits"]),
+        "index": str(row["index"]),
+    }
+
+
+_COLUMNS = ("period", "n_unstable", "multiplier_real", "multiplier_imag", "n_hits", "index")
