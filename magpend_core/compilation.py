@@ -1,4 +1,4 @@
-"""Tell a listener when functions are compiled, so that a command can say what it waits for."""
+"""Call a listener when functions are compiled, so that a command can say what it waits for."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def heard_by(listener: Callable[[bool], None]) -> Iterator[None]:
 
 @contextlib.contextmanager
 def compiling() -> Iterator[None]:
-    """Tell the listener, if there is one, that what runs inside this context is the compiler."""
+    """Report to the listener, if there is one, that a compilation runs inside this context."""
     listener = _listener.get()
     if listener is None:
         yield

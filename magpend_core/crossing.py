@@ -1,4 +1,4 @@
-"""Define a section by crossing, where trajectories of a flow without a drive are sampled."""
+"""Define a Poincare section of a flow without a drive: where a state crosses a level."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ DIRECTIONS = {"up": 1, "down": -1}
 
 @dataclass(frozen=True)
 class Crossing:
-    """A section of a flow without forcing: where a state crosses a level.
+    """A Poincare section of a flow without forcing: where a state crosses a level.
 
     A period is then the time from one crossing to the next, a *return*. Crossings are steps of the
     integration that end on the level (see `engine.events`, which says what can be missed). An angle crosses
@@ -56,21 +56,22 @@ class Crossing:
 
     @property
     def sign(self) -> int:
-        """Return +1 if the level is crossed upwards, -1 if downwards."""
+        """Direction of the crossing: +1 upwards, -1 downwards."""
         return DIRECTIONS[self.direction]
 
     @property
     def frequency_hz(self) -> float:
-        """Return the value passed as the drive frequency: one over the longest wait [Hz]."""
+        """Value passed to the engine as the drive frequency: one over the longest wait for a crossing [Hz]."""
         return 1.0 / float(self.longest)
 
     @property
     def sentence(self) -> str:
-        """Describe the section in words."""
+        """Description of the section in words: state, level and direction."""
         return f"{self.of} = {self.value:g} going {self.direction}"
 
     def applied(self, parameters: np.ndarray, system: System) -> tuple[System, np.ndarray, np.ndarray]:
-        """Return the system with this section, its packed parameters and the frequency to integrate with.
+        """Return the system with this Poincare section, its packed parameters with the level added, and the frequency
+        to integrate with.
 
         Parameters
         ----------

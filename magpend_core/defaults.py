@@ -1,4 +1,4 @@
-"""Hold the defaults of all integrations. Specifications, functions and commands take them from here."""
+"""Define the default tolerances and limits of all integrations."""
 
 from __future__ import annotations
 

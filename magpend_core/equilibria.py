@@ -15,7 +15,7 @@ TRUST = 0.5
 
 @dataclass(frozen=True, eq=False)
 class Equilibria:
-    """Equilibria near given states, one per row.
+    """Equilibria found near given states, one per row, with their eigenvalues.
 
     Attributes
     ----------
@@ -39,12 +39,12 @@ class Equilibria:
 
     @property
     def is_stable(self) -> np.ndarray:
-        """Tell whether all eigenvalues have negative real parts."""
+        """Whether all eigenvalues of each equilibrium have negative real parts."""
         return np.asarray(self.eigenvalues.real.max(axis=1) < 0.0)
 
 
 def newton_steps(system: System, states: np.ndarray, packed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return Newton steps to an equilibrium, and the Jacobians, at states with common parameters.
+    """Return the Newton step towards an equilibrium, and the Jacobian, at each of several states.
 
     Parameters
     ----------
@@ -72,7 +72,7 @@ def newton_steps(system: System, states: np.ndarray, packed: np.ndarray) -> tupl
 def find_equilibria(
     system: System, states: np.ndarray, packed: np.ndarray, *, tolerance: float = 1e-10, max_iterations: int = 30
 ) -> Equilibria:
-    """Find the equilibria near given states.
+    """Find the equilibria near given states by Newton's method.
 
     Parameters
     ----------

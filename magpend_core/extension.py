@@ -1,4 +1,4 @@
-"""Extend the sections of cells from the last one, bit for bit like a longer run."""
+"""Continue trajectories from their last stored section, with the same bits as one longer run."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def more_sections(
     system: System,
     quantities: Sequence[str] | None = None,
 ) -> Sections:
-    """Return the sections of the drive periods that follow the last known one.
+    """Continue trajectories from their last section, and return the sections of the drive periods that follow.
 
     Parameters
     ----------
@@ -85,7 +85,8 @@ def more_sections(
 def orbit_periods(
     sections: np.ndarray, *, closure_tolerance: float, max_orbit_period: int, system: System
 ) -> np.ndarray:
-    """Return for each cell the period of the orbit on which it closes, 0 if none, by the rule of `run_branches`.
+    """Return for each trajectory the period of the orbit on which its sections close, 0 if none, by the rule of
+    `run_branches`.
 
     Parameters
     ----------
@@ -112,14 +113,14 @@ def orbit_periods(
 
 
 def judge(rings: Any, last: int, settings: Settings, found: Any) -> None:
-    """Find the orbit on which each ring of sections closes."""
+    """Write to `found`, for each trajectory, the period of the orbit on which its last sections close, or 0."""
     for i in range(len(rings)):
         found[i] = closed_period(rings[i], last, settings)
 
 
 @cache
 def judge_of(system: System) -> Callable[..., None]:
-    """Compile `judge` for the angles and scales of a system."""
+    """Compile `judge` for a system, with its angles and scales."""
     bindings: dict[str, Any] = {
         "N": system.n_states,
         "IS_ANGLE": np.array(system.is_angle, np.int64),

@@ -1,4 +1,4 @@
-"""Estimate Lyapunov exponents of many trajectories by the variational equations inside the engine.
+"""Estimate Lyapunov exponents of many trajectories from variational equations integrated by the engine.
 
 Method of Benettin, Galgani, Giorgilli and Strelcyn, Meccanica 15 (1980) 9-30: tangent vectors are carried
 along by the analytic Jacobian and made orthonormal again (QR by modified Gram-Schmidt) at set times; the
@@ -46,7 +46,7 @@ MOST_NUMBERS = 2**24
 
 @dataclass(frozen=True)
 class LyapunovExponents:
-    """Outcome of `lyapunov_exponents`; the leading dim is the cell.
+    """Lyapunov exponents with errors, block averages and status; the first dimension is the trajectory.
 
     Attributes
     ----------
@@ -102,7 +102,7 @@ class _Settings(NamedTuple):
 
 
 def _orthonormalise(state: Any, memory: Any, settings: Any) -> None:
-    """Make the tangent vectors orthonormal, and add the logarithms of their lengths to the memory."""
+    """Make the tangent vectors orthonormal, and add the logarithms of their former lengths to the memory."""
     n_vectors = N_TANGENTS // N_BASE
     for k in range(n_vectors):
         own = N_BASE * (1 + k)
@@ -130,7 +130,7 @@ def _orthonormalise(state: Any, memory: Any, settings: Any) -> None:
 
 
 def _average(section: Any, turns: Any, i_period: int, memory: Any, record: Any, measures: Any, settings: Any) -> int:
-    """Add each period to its block (a row of the record), and its weighted value to the measures."""
+    """Add the growth rates of a period to its block (a row of the record), and weighted to the measures."""
     n_vectors = N_TANGENTS // N_BASE
     i = i_period - settings.n_transient
     n_periods = settings.n_blocks * settings.periods_per_block
@@ -288,7 +288,7 @@ def lyapunov_exponents(
 
 
 def _parts(n_cells: int, per_cell: int, n_lanes: int) -> list[slice]:
-    """Split cells into parts that are integrated in turn, each of limited size."""
+    """Split trajectories into slices of limited size that are integrated one after the other."""
     most = max(n_lanes, MOST_NUMBERS // per_cell // n_lanes * n_lanes)
     return [slice(i, i + most) for i in range(0, max(n_cells, 1), most)]
 
@@ -306,7 +306,7 @@ def _settings(n_exponents: int, n_transient: int, n_periods: int, n_blocks: int,
 
 
 def _with_vectors(states: np.ndarray, n_vectors: int) -> np.ndarray:
-    """Append the first unit vectors as tangents, and the divergence's integral."""
+    """Append the first unit vectors as tangent vectors, and a 0 for the integral of the divergence, to each state."""
     n = states.shape[1]
     vectors = np.broadcast_to(LENGTH * np.eye(n)[:n_vectors].ravel(), (len(states), n * n_vectors))
     return np.concatenate([states, vectors, np.zeros((len(states), 1))], axis=1)

@@ -1,4 +1,4 @@
-"""Convert Floquet multipliers of an orbit to Lyapunov exponents."""
+"""Convert Floquet multipliers of a periodic orbit to Lyapunov exponents."""
 
 from __future__ import annotations
 

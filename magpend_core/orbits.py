@@ -33,7 +33,7 @@ TRUST = 0.5
 
 @dataclass(frozen=True)
 class PeriodicOrbits:
-    """Polished orbits, one per row.
+    """Periodic orbits that Newton's method found from guesses, one per row.
 
     Attributes
     ----------
@@ -71,13 +71,13 @@ class PeriodicOrbits:
 
     @property
     def is_stable(self) -> np.ndarray:
-        """Tell whether all multipliers lie inside the unit circle."""
+        """Whether all Floquet multipliers of each orbit lie inside the unit circle."""
         return np.asarray(np.abs(self.multipliers).max(axis=1) < 1.0)
 
 
 @dataclass(frozen=True, eq=False)
 class Returns:
-    """The images of section points, one per row.
+    """Images of section points under the stroboscopic or return map, one row per point.
 
     Attributes
     ----------
@@ -105,7 +105,7 @@ def section_map(
     rtol: float = RTOL,
     system: System = PENDULUM_FITTED,
 ) -> Returns:
-    """Follow section points for some periods, with the derivatives of their images.
+    """Map section points through a number of periods, and compute the derivative of the last image by the point.
 
     Parameters
     ----------
@@ -173,18 +173,18 @@ def stroboscopic_map(
     rtol: float = RTOL,
     system: System = PENDULUM_FITTED,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return `Returns.images` and `Returns.derivatives` of `section_map`."""
+    """Compute the images of section points and the derivatives of the last images; see `section_map`."""
     found = section_map(parameters, frequency_hz, points, n_periods, rtol=rtol, system=system)
     return found.images, found.derivatives
 
 
 def crossed_state(system: System) -> int | None:
-    """Return the number of the state whose crossings define the section; None for a driven system."""
+    """Return the index of the state whose crossings define the Poincare section; None for a driven system."""
     return None if system.section is None else system.section[0]
 
 
 def on_section(points: np.ndarray, parameters: np.ndarray, system: System) -> np.ndarray:
-    """Return points with the crossing state set to its level; unchanged for a driven system.
+    """Return points with the state that defines the Poincare section set to its level; unchanged for a driven system.
 
     Parameters
     ----------
@@ -250,7 +250,7 @@ def polish_orbits(
     least_period: bool = True,
     system: System = PENDULUM_FITTED,
 ) -> PeriodicOrbits:
-    """Find the periodic orbits near given section points.
+    """Find the periodic orbits near given section points by Newton's method.
 
     Parameters
     ----------
@@ -330,7 +330,7 @@ def polish_orbits(
 def _take(
     found: PeriodicOrbits, rows: np.ndarray, ends: Returns, tolerance: float, least_period: bool, system: System
 ) -> np.ndarray:
-    """Record the residuals of some rows and the orbits among them that have converged; return which go on.
+    """Store the residuals of some rows, and those orbits that have converged; return which rows need more iterations.
 
     A row that closes after a divisor of its period gets this period, and -1 iterations.
     """
@@ -354,7 +354,9 @@ def _take(
 
 
 def _newton_steps(derivatives: np.ndarray, mismatch: np.ndarray, system: System) -> np.ndarray:
-    """Solve (1 - M) step = mismatch for each orbit, in the least-squares sense if singular."""
+    """Solve (1 - M) step = mismatch for each orbit, in the least-squares sense if singular; too long steps are
+    shortened.
+    """
     matrices = np.eye(system.n_states) - derivatives
     steps = np.einsum("nij,nj->ni", np.linalg.pinv(matrices, rcond=1e-14), mismatch)
     longest = np.abs(steps / np.asarray(system.scales)).max(axis=1, keepdims=True)

@@ -33,7 +33,7 @@ def _named(t: Any, y: Any, c: Any) -> Any:
 
 
 def _set_modes(t: float, y: Any, rows: Any, lane: int, edge_times: Any) -> None:
-    """Set one lane's switch modes from its state and time, without sliding."""
+    """Set the switch modes of one SIMD lane from its state and time, without sliding."""
     for k in range(N_OWN, NC):
         rows[k * WIDTH + lane] = 1.0
     if HAS_SWITCHES:
@@ -48,7 +48,7 @@ def _set_modes(t: float, y: Any, rows: Any, lane: int, edge_times: Any) -> None:
 
 
 class _Desk(NamedTuple):
-    """Arrays that `_evaluate` works on, each with a row for `WIDTH` lanes but the first and the last."""
+    """Work arrays of `_evaluate`, most with `WIDTH` SIMD lanes per row."""
 
     c: Any  # constants
     rows: Any  # constants and modes
@@ -71,7 +71,7 @@ def _desk_for(system: System, n_out: int) -> _Desk:
 
 
 def _evaluate(desk: _Desk, t: Any, states: Any, frequency: float, p: Any, out: Any) -> None:
-    """Fill `out` (n, n_out) with the bound function at `t` (n,) and `states` (n, N)."""
+    """Fill `out` (n, n_out) with the values of the bound function at times `t` (n,) and `states` (n, N)."""
     c, rows, time, y, values, edge_table = desk
     constants(frequency, p, c)
     for i in range(N_OWN):
@@ -130,7 +130,9 @@ def _evaluator(system: System, kind: str) -> Any:
 
 
 def _at(kind: str, n_out: int, t: Any, state: Any, parameters: Parameters, frequency_hz: float) -> np.ndarray:
-    """Evaluate; the result has the leading shape of `state` and one last dim."""
+    """Evaluate rates, Jacobian, quantities or forcing; the result has the leading shape of `state` and one last
+    dimension.
+    """
     system = parameters.model.system
     frequency = check_frequency(frequency_hz, ndim=0)
     states = check_states(state, tuple(range(1, np.ndim(state) + 1)), system.n_states)
@@ -171,7 +173,7 @@ def evaluate_packed(
 
 
 def rates_at(system: System, states: np.ndarray, packed: np.ndarray) -> np.ndarray:
-    """Return a flow's rates at many finite states with common, already checked parameters.
+    """Return the rates of a system without drive at many finite states with common, already checked parameters.
 
     Parameters
     ----------
@@ -203,7 +205,7 @@ def _flow_at(kind: str, n_out: int, system: System, states: np.ndarray, packed: 
 
 
 def rates_packed(system: System, states: np.ndarray, packed: np.ndarray, frequency_hz: np.ndarray) -> np.ndarray:
-    """Return a flow's rates at many states, each with its own, already checked parameters.
+    """Return the rates of a system without drive at many states, each with its own, already checked parameters.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Compute sections and quantities under a recorded drive, whose intervals are points of a branch.
+"""Compute sections and quantities under a recorded drive, whose intervals the engine treats as points of a branch.
 
 A branch of `engine.entry.integrate` goes from point to point with its state and its step, and each point has
 a drive frequency and parameters of its own. That is a recorded drive: an interval is a period of its own
@@ -31,7 +31,7 @@ CHUNK_NUMBERS = 4_000_000
 
 
 def driven_system(system: System, drive: Drive) -> System:
-    """Return the system for a drive: its own, or one with a recorded forcing."""
+    """Return the system for a drive: unchanged, or with its forcing replaced by the recorded one."""
     return with_recorded_drive(system) if LEVEL in drive.names else system
 
 
@@ -150,14 +150,14 @@ def _check_marks(marks: np.ndarray, total: int, n_intervals: int, start_s: float
 
 
 def _chunks(first_kept: int, last: int, most: int) -> Iterator[tuple[int, int]]:
-    """Ranges of intervals; one ends with the first section that is kept: turns are counted from there."""
+    """Yield ranges of drive intervals of limited length; one range ends with the first section that is stored."""
     for begin, end in ((0, first_kept), (first_kept, last)):
         for first in range(begin, end, most):
             yield first, min(first + most, end)
 
 
 def _points(system: System, drive: Drive, packed: np.ndarray, part: slice) -> tuple[np.ndarray, np.ndarray]:
-    """Return parameters and frequency of each interval for each branch."""
+    """Return parameters and frequency in each drive interval, for each trajectory."""
     durations = drive.durations_s[part]
     shape = (len(packed), len(durations))
     points = np.repeat(packed[:, None], len(durations), axis=1)
@@ -167,7 +167,7 @@ def _points(system: System, drive: Drive, packed: np.ndarray, part: slice) -> tu
 
 
 class _Walk:
-    """The current states of the branches, and the results so far."""
+    """Progress of the integration under a recorded drive: current states of the trajectories, and results so far."""
 
     def __init__(
         self,
@@ -192,7 +192,7 @@ class _Walk:
             raise ValueError(f"parameters has {len(packed)} rows; initial_states has {n}.")
 
     def take(self, cells: Cells, first: int) -> None:
-        """Store the engine's results of the intervals from number `first` on."""
+        """Store the engine's results for the drive intervals from number `first` on."""
         alive, n = self.alive, cells.status.shape[1]
         good = np.isin(cells.status, (Status.PERIODIC, Status.BOUNDED))
         number = np.searchsorted(self.marks, np.arange(first, first + n))
@@ -216,7 +216,7 @@ class _Walk:
         self.alive = alive[~failed]
 
     def outcome(self, with_extremes: bool) -> Sections:
-        """Return the result of the branches."""
+        """Return the results of all trajectories as `Sections`."""
         failed = self.status != Status.BOUNDED
         self.seen[failed], self.watched[failed], self.turns[failed] = np.nan, np.nan, 0
         period = np.zeros(len(failed), np.int64)
@@ -241,7 +241,7 @@ class _Walk:
 
 
 def closed_periods(sections: np.ndarray, settings: Settings, system: System) -> np.ndarray:
-    """Return the period at which each row of sections closes, 0 if none; see `observers.closed_period`.
+    """Return the period at which each trajectory's sections close, 0 if they do not; see `observers.closed_period`.
 
     Parameters
     ----------
@@ -316,7 +316,7 @@ def recorded_trajectory(
 def evaluate_recorded(
     names: Sequence[str], t: np.ndarray, state: np.ndarray, parameters: Parameters, drive: Drive
 ) -> np.ndarray:
-    """Return named quantities under a recorded drive, each instant in its own interval.
+    """Compute named quantities under a recorded drive, at instants that each lie in one interval of the drive.
 
     Parameters
     ----------

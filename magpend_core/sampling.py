@@ -20,7 +20,7 @@ __all__ = ["Drive", "Samples", "sample", "with_recorded_drive"]
 
 @dataclass(frozen=True)
 class Drive:
-    """A drive in intervals, each with its own length and its own values of some parameters.
+    """A drive in consecutive intervals, each with its own length and its own values of some parameters.
 
     The periods between measured rising edges, each with its duty cycle; or the intervals between the samples
     of a measured torque, for `with_recorded_drive`. Within an interval the system's forcing is that of a
@@ -100,7 +100,8 @@ class Drive:
         return cls(steps, ("recorded_drive", "recorded_drive_slope"), table)
 
     def window(self, begin_s: float, end_s: float) -> Drive:
-        """Return the part that a stretch from `begin_s` to `end_s` [s since the first interval] needs.
+        """Return the intervals of the drive that cover the times from `begin_s` to `end_s` [s since the first
+        interval].
 
         Raises
         ------
@@ -123,7 +124,7 @@ class Drive:
 
 @dataclass(frozen=True)
 class Samples:
-    """Outcome of `sample`.
+    """States of trajectories at the sampled instants, with status and step counts.
 
     Attributes
     ----------
@@ -231,7 +232,7 @@ def sample(
 
 
 def spacing_of(grid: np.ndarray) -> float:
-    """Return the mean spacing of times; infinite for a single one."""
+    """Return the mean spacing of a time grid; infinite for a single time."""
     return float((grid[-1] - grid[0]) / (len(grid) - 1)) if len(grid) > 1 else np.inf
 
 
@@ -249,7 +250,9 @@ def _offsets(parts: Sequence[np.ndarray]) -> np.ndarray:
 def _drive_table(
     system: System, grids: list[np.ndarray], drives: Sequence[Drive | None] | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return durations, values, first intervals, changed parameters and starts for the engine."""
+    """Return arrays of the drives for the engine: durations, values, first intervals, changed parameters, and
+    starts.
+    """
     given = [None] * len(grids) if drives is None else list(drives)
     if len(given) != len(grids):
         raise ValueError(f"{len(given)} drives for {len(grids)} pieces; give one for each.")
@@ -275,7 +278,7 @@ def _drive_table(
 
 
 def _check_drive(number: int, drive: Drive, names: tuple[str, ...], end_s: float) -> np.ndarray:
-    """Return the durations of a drive that covers its piece."""
+    """Return the interval durations of a drive, after checking that it covers its piece of the recording."""
     durations = check_array(f"drives[{number}].durations_s", drive.durations_s, 1)
     if drive.names != names or (names and np.shape(drive.values) != (len(durations), len(names))):
         raise ValueError(

@@ -1,4 +1,4 @@
-"""Compute sections of many trajectories, stroboscopic or by crossing, with the engine."""
+"""Compute the section points of many trajectories, stroboscopic or at crossings of a level, with the engine."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from magpend_core.validation import check_array, check_count, check_flag, check_
 
 @dataclass(frozen=True)
 class Sections:
-    """Outcome of `run_branches` and `sections`.
+    """Section points, orbit periods, status and step counts of trajectories, from `run_branches` or `sections`.
 
     Leading dims are (branch, point) from `run_branches` and (cell,) from `sections`.
 
@@ -83,7 +83,7 @@ def run_branches(
     method: str | None = None,
     section: Crossing | None = None,
 ) -> Sections:
-    """Integrate many branches through their points; each point starts where the previous one ended.
+    """Integrate many branches, each a sequence of parameter points; each point starts where the previous one ended.
 
     A sweep is the case of one point per branch. All start at the drive's rising edge. The numbers of
     a branch depend on that branch alone, to the last bit: not on its neighbours, `n_lanes` or the

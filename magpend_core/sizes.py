@@ -18,7 +18,7 @@ LEVEL = "section_value"
 
 
 def too_many_states(name: str, n_states: int) -> str | None:
-    """Return why a system has too many states for tangent vectors; None if it has not."""
+    """Return an error sentence if a system has too many states for tangent vectors, else None."""
     if n_states <= MAX_STATES:
         return None
     return (

@@ -77,7 +77,7 @@ def _files(paths: Iterable[Path]) -> Iterator[tuple[str, Path]]:
 
 
 def _write(node: object, out: list[str]) -> None:
-    """Write a syntax tree as text.
+    """Append the text of a syntax tree to `out`, without docstrings and error messages.
 
     `ast.dump` would do but for its changes from one version of Python to the next: empty fields come and
     go, new ones are added.
@@ -103,7 +103,7 @@ def _write(node: object, out: list[str]) -> None:
 
 
 def _is_remark(node: object) -> bool:
-    """Tell whether a statement does nothing: a docstring, another bare string, ``pass`` or ``...``."""
+    """Return whether a statement does nothing: a docstring, another bare string, ``pass`` or ``...``."""
     if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
         return isinstance(node.value.value, str) or node.value.value is ...
     return isinstance(node, ast.Pass)

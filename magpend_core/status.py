@@ -1,4 +1,4 @@
-"""Define the status of a cell: one code, one sentence each."""
+"""Define the status codes of a computed trajectory, each with a sentence that explains it."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from enum import IntEnum
 
 
 class Status(IntEnum):
-    """Outcome of one cell (one parameter set and initial condition)."""
+    """Outcome of one trajectory (one parameter set and initial condition), as a code."""
 
     PENDING = 0
     PERIODIC = 1

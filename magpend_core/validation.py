@@ -71,7 +71,7 @@ def check_states(values: Any, ndim: int | tuple[int, ...], n_states: int, name: 
 
 
 def check_frequency(values: Any, ndim: int | tuple[int, ...]) -> np.ndarray:
-    """Return drive frequencies [Hz], all positive.
+    """Return drive frequencies [Hz] as an array; raise if one is not positive.
 
     Raises
     ------
@@ -86,7 +86,7 @@ def check_frequency(values: Any, ndim: int | tuple[int, ...]) -> np.ndarray:
 
 
 def check_count(name: str, value: Any, least: int) -> int:
-    """Return a whole number of at least `least`.
+    """Return a whole number; raise if it is below `least`.
 
     Raises
     ------
@@ -101,7 +101,7 @@ def check_count(name: str, value: Any, least: int) -> int:
 
 
 def check_flag(name: str, value: Any) -> bool:
-    """Return a truth value; raise for texts, because ``"no"`` would count as true.
+    """Return a truth value; raise for anything but True and False, such as the text ``"no"``.
 
     Raises
     ------
@@ -114,7 +114,7 @@ def check_flag(name: str, value: Any) -> bool:
 
 
 def check_tolerance(name: str, value: Any, least: float = 0.0) -> float:
-    """Return a tolerance: positive, at least `least`, below 1.
+    """Return a tolerance as a number; raise if it is not positive, at least `least` and below 1.
 
     Raises
     ------

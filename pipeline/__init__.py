@@ -1,4 +1,5 @@
-"""From a specification to a cube and its figures: sweeps and continuations of forced and autonomous systems.
+"""Sweep parameters and continue solutions of forced and autonomous systems: from a specification to a data cube and its
+figures.
 
 `open_run` opens a run directory. It is imported at its first use, so that the
 command line answers quickly.

@@ -1,1 +1,1 @@
-"""The engine: many trajectories in step, observed and linearised; knows no model."""
+"""The numerical engine: integrates many trajectories of any system at a time, with observers and tangent vectors."""

@@ -1,4 +1,4 @@
-"""Check a system against its declaration, once, on plain numbers, before compilation.
+"""Check the functions of a system against its declaration, in plain Python, before they are compiled.
 
 The engine trusts its functions. One that returns a number too few reads what lies beside it; a wrong Jacobian
 gives wrong exponents, whose audit it passes; an edge outside of the period never comes. So the functions are
@@ -38,7 +38,7 @@ _NOT_RUN = object()
 
 
 class SystemCheckError(ValueError):
-    """A system's functions contradict its declaration.
+    """An error for a system whose functions contradict its declaration.
 
     Attributes
     ----------
@@ -53,7 +53,7 @@ class SystemCheckError(ValueError):
 
 @dataclass
 class _Checked:
-    """Ranges of the parameters, and at their end of the frequency, at which a system has been checked."""
+    """Ranges of the parameters and, as the last entry, of the frequency, over which a system has been checked."""
 
     low: np.ndarray
     high: np.ndarray
@@ -70,7 +70,7 @@ _CHECKED: dict[tuple[System, bool], _Checked] = {}
 def check_system(
     system: System, parameters: np.ndarray, frequency_hz: np.ndarray, states: np.ndarray, *, jacobian: bool = False
 ) -> None:
-    """Check a system where it is about to be integrated.
+    """Check a system before it is integrated; raise `SystemCheckError` if its functions contradict its declaration.
 
     The lengths of what the functions return, the edges' times and widths, that constants are finite, that
     the forcing has the drive's period and that nothing changes as an angle goes round once; and the Jacobian
@@ -126,7 +126,9 @@ def _problems(
     frequency: np.ndarray,
     states: np.ndarray,
 ) -> list[str]:
-    """Look at the declaration, at the cells with extreme parameters, at the motion from a few states."""
+    """Check the declaration, the constants at extreme parameters, and the motion from a few states; return the
+    problems.
+    """
     if checked is None:
         problems = list(_declaration(system, linearised))
         if problems:
@@ -145,7 +147,7 @@ def _problems(
 
 
 def _declaration(system: System, linearised: bool) -> Iterator[str]:
-    """Return the problems of the fields that are not functions."""
+    """Yield the problems of a system's fields that are not functions, such as names, scales and counts."""
     n, names = system.n_states, ", ".join(system.state_names)
     if not n:
         yield "state_names is empty; a system has one state at least."
@@ -177,7 +179,7 @@ def _declaration(system: System, linearised: bool) -> Iterator[str]:
 
 
 def _extremes(packed: np.ndarray, frequency: np.ndarray, checked: _Checked | None) -> list[int]:
-    """Numbers of the cells at which a parameter is least or greatest, beyond what has been looked at."""
+    """Return the indices of the cells at which a parameter is least or greatest, beyond the ranges checked before."""
     cells = {0} if checked is None else set()
     for i, column in enumerate((*packed.T, frequency)):
         for cell in (int(column.argmin()), int(column.argmax())):
@@ -187,14 +189,14 @@ def _extremes(packed: np.ndarray, frequency: np.ndarray, checked: _Checked | Non
 
 
 class _Functions:
-    """The functions of a system as plain Python; calls collect their problems."""
+    """The functions of a system as plain Python; problems in their calls are collected."""
 
     def __init__(self, system: System) -> None:
         self.system = system
         self.problems: list[str] = []
 
     def call(self, name: str, *arguments: Any) -> Any:
-        """Call a function; return `_NOT_RUN`, and report a problem, if it raises."""
+        """Call a function of the system; if it raises an error, report a problem and return `_NOT_RUN`."""
         function: Callable[..., Any] = plain(getattr(self.system, name))
         try:
             return function(*arguments)
@@ -205,7 +207,9 @@ class _Functions:
             return _NOT_RUN
 
     def numbers(self, name: str, wanted: int, what: str, *arguments: Any) -> tuple[np.ndarray, ...] | None:
-        """Call a function that returns a tuple of numbers; return it if it has the right length."""
+        """Call a function that must return a tuple of `wanted` numbers; return None, and report a problem, if it does
+        not.
+        """
         values = self.call(name, *arguments)
         if values is _NOT_RUN:
             return None
@@ -217,23 +221,27 @@ class _Functions:
         return None
 
     def constants(self, frequency: np.float64, p: np.ndarray) -> tuple[np.float64, ...]:
-        """Return the constants of a cell."""
+        """Return the constants that the system computes from the frequency and the parameters."""
         out = np.full(self.system.n_constants, np.nan)
         self.call("constants", frequency, p, out)
         return tuple(out)
 
     def has_values(self, frequency: np.float64, p: np.ndarray) -> bool:
-        """Tell whether a cell lies at no pole of the constants."""
+        """Return whether the constants are finite at one frequency and parameter vector; True for a system without
+        poles.
+        """
         return not self.system.has_poles or bool(np.isfinite(self.constants(frequency, p)).all())
 
     def edges(self, frequency: np.float64, p: np.ndarray) -> np.ndarray:
-        """Times, half-widths and jumps of a cell, shape (3, n_edges)."""
+        """Return times, half-widths and jumps of the forcing's edges, shape (3, n_edges)."""
         table = np.full((3, self.system.n_edges), np.nan)
         self.call("edges", frequency, p, *table)
         return table
 
     def cell_problems(self, frequency: np.float64, p: np.ndarray) -> list[str]:
-        """Problems of the constants and the edges of a cell."""
+        """Check the constants and the edges of the forcing at one frequency and parameter vector; return the
+        problems.
+        """
         self.problems = []
         at = f"at frequency_hz = {frequency:g}"
         values = self.constants(frequency, p)
@@ -269,7 +277,7 @@ def _edge_problems(table: np.ndarray, period: float, at: str) -> Iterator[str]:
 
 
 class _Motion:
-    """The functions that run at every step, at generic states and instants near those of a run."""
+    """Checks of the functions that are called at every step, on sample states and times like those of a run."""
 
     def __init__(
         self, system: System, functions: _Functions, p: np.ndarray, frequency: np.float64, states: np.ndarray
@@ -287,11 +295,13 @@ class _Motion:
         self.u: Any = 0.0
 
     def _constants_at(self, times: np.ndarray) -> tuple[Any, ...]:
-        """Constants and modes."""
+        """Return the constants of the system, then the modes of its switches, contacts and segments at the given
+        times.
+        """
         return (*self.own, *event_checks.modes_at(self.system, times, self.edges))
 
     def _states(self, states: np.ndarray) -> np.ndarray:
-        """Samples around the first states that a run starts from, shape (n_states, sample)."""
+        """Return random sample states around the first initial states of a run, shape (n_states, sample)."""
         spread = np.random.default_rng(7).uniform(-1.0, 1.0, (N_SAMPLES, self.system.n_states))
         starts = states[np.arange(N_SAMPLES) % min(len(states), 4), : self.system.n_states]
         samples = starts + spread * self.scales
@@ -302,7 +312,7 @@ class _Motion:
         return np.ascontiguousarray(samples.T)
 
     def problems(self, linearised: bool) -> list[str]:
-        """Run everything once; later checks rest on what earlier ones found."""
+        """Run all checks and return the problems; stop early if the forcing or the rates fail."""
         found = self.functions.problems
         self._check_forcing()
         if found:
@@ -351,7 +361,9 @@ class _Motion:
             )
 
     def _check_period(self) -> None:
-        """Compare the rates at the begin and at the end of a period, where the forcing is the time."""
+        """Check that the rates are equal at the start and the end of a drive period, for a forcing that is the time
+        itself.
+        """
         ends = []
         for time in (0.0, self.period):
             self.u = np.full(N_SAMPLES, time)
@@ -391,7 +403,7 @@ class _Motion:
                 )
 
     def _check_jacobian(self, rates: np.ndarray) -> None:
-        """Compare the Jacobian with differences of two step sizes; their difference bounds the error."""
+        """Compare the Jacobian with finite differences of the rates, whose error is bounded by two step sizes."""
         n, names = self.system.n_states, self.system.state_names
         what = "the derivatives of each rate by each state, row by row"
         if self.system.jacobian_entries is not None:
@@ -418,7 +430,7 @@ class _Motion:
                 )
 
     def _slopes(self, j: int, step: float) -> np.ndarray:
-        """Central differences of the rates by state `j`, shape (n_states, sample)."""
+        """Return central differences of the rates with respect to state `j`, shape (n_states, sample)."""
         right, left = self.y.copy(), self.y.copy()
         right[j] += step
         left[j] -= step

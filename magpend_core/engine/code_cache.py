@@ -1,4 +1,4 @@
-"""Keep machine code on disk, and use it only if it is whole, belongs to this code, and this user wrote it.
+"""Cache machine code on disk; use a cache file only if it is undamaged, of this code, and written by this user.
 
 numba unpickles what it finds in its cache and jumps into the machine code in there. So an entry here is one
 file that begins with the sha256 of the rest, and the rest begins with what it was compiled from: one that is
@@ -36,13 +36,13 @@ _PICKING = threading.Lock()
 
 @cache
 def say(line: str) -> None:
-    """Tell people, once and from the main process alone: workers meet the same folder."""
+    """Log a warning once, and only from the main process, since all worker processes meet the same problem."""
     if multiprocessing.parent_process() is None:
         LOG.warning(line)
 
 
 def keep(dispatcher: Any, home: Path, folder: Path) -> Any:
-    """Let a compiled function keep its machine code.
+    """Give a compiled function an on-disk cache for its machine code.
 
     Parameters
     ----------
@@ -77,7 +77,9 @@ def keep(dispatcher: Any, home: Path, folder: Path) -> Any:
 
 @cache
 def _made(home: Path, folder: Path) -> str:
-    """Make a folder for its owner alone, and those above it up to `home`; return why it cannot be used."""
+    """Create a folder for its owner alone, and its parents up to `home`; return why it cannot be used, or an empty
+    text.
+    """
     try:
         home.parent.mkdir(parents=True, exist_ok=True)
         for path in (home, *_below(home, folder)):
@@ -99,7 +101,7 @@ def _below(home: Path, folder: Path) -> list[Path]:
 
 
 def _exposed(found: os.stat_result) -> str:
-    """Say who else can write to a file or folder; empty if nobody can, or the system knows no owners."""
+    """Describe who else can write to a file or folder; empty if nobody can, or if the system has no file owners."""
     if not hasattr(os, "geteuid"):
         return ""
     mode = f"mode {stat.S_IMODE(found.st_mode):04o}"
@@ -109,13 +111,13 @@ def _exposed(found: os.stat_result) -> str:
 
 
 class _InItsFolder(CompileResultCacheImpl):
-    """A locator of numba's cache that keeps nothing beside the sources."""
+    """Variant of numba's cache that uses only the given folder, never one beside the sources."""
 
     _locator_classes = [UserProvidedCacheLocator]  # noqa: RUF012 # as declared there
 
 
 class KeptCode(FunctionCache):
-    """The cache of one function; what goes wrong with it costs a compilation, never the computation."""
+    """On-disk cache of one compiled function; an unusable cache file causes a new compilation, not an error."""
 
     _impl_class = _InItsFolder
 
@@ -133,7 +135,7 @@ class KeptCode(FunctionCache):
         self._cache_file = _Entries(self._cache_path, self._impl.filename_base, stamp)  # type: ignore[no-untyped-call]
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """Return the machine code for a signature, None if there is none that can be used."""
+        """Return the cached machine code for a signature; None if there is no usable one."""
         try:
             return super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
         except Exception as error:
@@ -142,7 +144,7 @@ class KeptCode(FunctionCache):
             return None
 
     def save_overload(self, sig: Any, data: Any) -> None:
-        """Keep the machine code of a signature, if that is possible."""
+        """Save the machine code for a signature, if the folder can be written to."""
         try:
             super().save_overload(sig, data)  # type: ignore[no-untyped-call]
         except OSError as error:
@@ -150,13 +152,13 @@ class KeptCode(FunctionCache):
 
 
 class PartFolder:
-    """Records of an engine's parts, each a sealed file; see `precompiled`."""
+    """Folder of precompiled engine functions (parts), each in a file with a checksum; see `precompiled`."""
 
     def __init__(self, folder: Path) -> None:
         self._home, self._folder = folder.parent, folder / "parts"
 
     def read(self, name: str) -> bytes | None:
-        """Return a record, None if there is none that can be used."""
+        """Return the record of a precompiled function; None if there is no usable one."""
         try:
             return None if _made(self._home, self._folder) else _read_sealed(self._path(name))
         except OSError as error:
@@ -164,7 +166,7 @@ class PartFolder:
             return None
 
     def write(self, name: str, record: bytes) -> None:
-        """Keep a record, if that is possible."""
+        """Write the record of a precompiled function, if the folder can be used."""
         if _made(self._home, self._folder):
             return
         path = self._path(name)
@@ -186,7 +188,9 @@ def _for_the_owner(path: str, flags: int) -> int:
 
 
 def _read_sealed(path: str) -> bytes | None:
-    """Return the content of a file that is whole and nobody else's; None, and say why, if it is not."""
+    """Return the content of a cache file if its checksum fits and nobody else can write to it; else return None and
+    warn.
+    """
     try:
         with open(path, "rb") as file:
             problem = _exposed(os.fstat(file.fileno()))
@@ -209,7 +213,7 @@ def _say_not_kept(folder: str, error: OSError) -> None:
 
 
 class _Entries(IndexDataCacheFile):
-    """A file for each signature, without numba's index, in which two processes could mix them up."""
+    """Cache files of numba, one per signature, without numba's index, which two processes could garble."""
 
     def load(self, key: Any) -> Any:
         path = self._path(key)

@@ -1,4 +1,4 @@
-"""Give a system a section by crossing: its periods end where a state crosses a level."""
+"""Give a system a Poincare section: its periods end where a state crosses a level."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from magpend_core.sizes import LEVEL
 
 @cache
 def with_section(system: System, of: str, direction: int) -> System:
-    """Return `system` with periods that end where a state crosses a level.
+    """Return `system` with a Poincare section: its periods end where a state crosses a level.
 
     The reciprocal of the drive frequency is then the longest wait for a crossing [s]; a cell that has none
     within it ends as `Status.NO_RETURN`. An angle crosses its level modulo 2 pi. The crossing that a

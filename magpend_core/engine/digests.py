@@ -1,4 +1,4 @@
-"""Compute digests of compiled functions from outside the package, and of all that decides their machine code.
+"""Compute digests of compiled functions defined outside the package, with everything that decides their machine code.
 
 Machine code may be kept for such functions only under a digest of everything that they reach, since
 `jit.source_digest` does not change with them. What cannot be followed to its end has none, and is not kept.
@@ -25,7 +25,7 @@ _GLOBALS, _ATTRIBUTES = ("LOAD_GLOBAL", "LOAD_NAME"), ("LOAD_ATTR", "LOAD_METHOD
 
 
 def code_length(function: Callable[..., Any]) -> int:
-    """Bytes of bytecode of a compiled function and of the compiled functions that it calls, once per name."""
+    """Return the length in bytes of the bytecode of a compiled function and of the compiled functions that it calls."""
     source = getattr(function, "py_func", None)
     if source is None:
         return 0
@@ -37,7 +37,7 @@ def code_length(function: Callable[..., Any]) -> int:
 
 
 class _UnknownError(Exception):
-    """A function depends on an object whose code cannot be followed, so that it has no digest."""
+    """An error for a function that depends on an object whose code is unknown, so that it has no digest."""
 
 
 def functions_digest(*functions: Callable[..., Any]) -> str | None:
@@ -92,7 +92,7 @@ def _parts(value: Any, seen: dict[int, int]) -> Iterator[bytes]:
 
 
 def _plain(value: Any) -> bytes:
-    """A number by its bits, a function that the compiler knows by its name."""
+    """Return bytes that identify a number or text by its value, or a function that the compiler knows by its name."""
     if value is None or isinstance(value, bool | int | float | complex | str | bytes | np.generic):
         return f"{type(value).__name__} {value!r}".encode()
     module = getattr(value, "__module__", None) or ""
@@ -104,7 +104,7 @@ def _plain(value: Any) -> bytes:
 
 
 def _options(dispatcher: Any) -> bytes:
-    """Options of the compiler; sets in order."""
+    """Return the compiler options of a numba function as bytes, in a fixed order."""
     options = {**dispatcher.targetoptions, "locals": dispatcher.locals}
     rows = []
     for name, option in sorted(options.items()):
@@ -133,12 +133,12 @@ def _function(function: FunctionType, seen: dict[int, int]) -> Iterator[bytes]:
 
 
 def reached(function: Any, path: tuple[str, ...]) -> Any:
-    """Return the global value that a function finds at a path (see `lookups`), None if there is none."""
+    """Return the global object that a function finds at a dotted path (see `lookups`); None if there is none."""
     return _found(function.__globals__.get(path[0]), path[1:])
 
 
 def _found(value: Any, attributes: tuple[str, ...]) -> Any:
-    """Return the object at the end of a dotted path."""
+    """Return the object that a dotted path of attributes leads to; only attributes of modules are followed."""
     for name in attributes:
         if not isinstance(value, ModuleType):
             break
@@ -147,7 +147,7 @@ def _found(value: Any, attributes: tuple[str, ...]) -> Any:
 
 
 def code_digest(code: CodeType) -> str:
-    """Return a digest of bytecode and its constants, without anything that it looks up."""
+    """Return a digest of a function's bytecode and constants, without the globals that it looks up."""
     digest = hashlib.sha256(sys.version.encode())
     for part in _code(code, {}):
         digest.update(len(part).to_bytes(8, "little"))
@@ -170,7 +170,7 @@ def _code(code: CodeType, seen: dict[int, int]) -> Iterator[bytes]:
 
 
 def lookups(code: CodeType) -> list[tuple[str, ...]]:
-    """Globals that a function and those defined in it look up, with the attributes read of each."""
+    """Return the global names that a function and its inner functions look up, with the attributes read of each."""
     found: set[tuple[str, ...]] = set()
     path: tuple[str, ...] = ()
     for instruction in dis.get_instructions(code):

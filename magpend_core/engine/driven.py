@@ -1,4 +1,6 @@
-"""Put a system under a recorded drive: its forcing is a line in each interval, given by two more parameters."""
+"""Replace the forcing of a system by a recorded drive: linear in time on each interval, set by two additional
+parameters.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,7 @@ LEVEL, SLOPE = "recorded_drive", "recorded_drive_slope"
 
 
 def _wrapped(source: str, module: str, **bindings: Any) -> Any:
-    """Compile a one-function source; it passes for a function of `module` (see `jit.keeping`)."""
+    """Compile a function given as source text, as if it were defined in `module` (see `jit.keeping`)."""
     scope: dict[str, Any] = {"__name__": module, **bindings}
     exec(source, scope)
     return inline(scope["function"])
@@ -26,7 +28,7 @@ def _wrapped(source: str, module: str, **bindings: Any) -> Any:
 
 @cache
 def with_recorded_drive(system: System) -> System:
-    """Return `system` with a forcing that is a recording instead of its own.
+    """Return `system` with its forcing replaced by a recorded drive, which is linear in time on each interval.
 
     The forcing is ``recorded_drive + recorded_drive_slope * t`` at time `t` [s] since the interval's start,
     in the unit of the system's own forcing; so measured values are joined by lines, or held between switches.
@@ -99,7 +101,7 @@ def with_recorded_drive(system: System) -> System:
 
 
 def drive_parameters(system: System, packed: np.ndarray) -> tuple[str, ...]:
-    """Return the parameters that act on a system's forcing and on nothing else: its amplitude, say.
+    """Return the parameters that affect a system's forcing and nothing else, such as its amplitude.
 
     They have no effect once a recording takes the forcing's place. Found by changing each by itself, in plain
     Python at a few instants and states; nothing is compiled.

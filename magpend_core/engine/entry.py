@@ -1,4 +1,4 @@
-"""Enter the engine: check the arguments, allocate the arrays, integrate all branches."""
+"""Call the engine: check the arguments, allocate the arrays, integrate all branches."""
 
 from __future__ import annotations
 
@@ -36,13 +36,15 @@ LEAST_RTOL = 1e-13
 
 
 def slack_of(rtol: float, atol: float) -> float:
-    """Slack of the step limiter for given tolerances."""
+    """Return the slack for given tolerances: the constant that limits steps near layers and edges (see
+    `lanes.step_ratio`).
+    """
     tolerance = rtol + atol
     return SLACK * tolerance * max(1.0, tolerance / LOOSE) ** 2
 
 
 def check_tolerances(rtol: Any, atol: Any) -> tuple[float, float]:
-    """Return both tolerances as numbers.
+    """Check the relative and the absolute tolerance, and return both as floats.
 
     Raises
     ------
@@ -53,7 +55,7 @@ def check_tolerances(rtol: Any, atol: Any) -> tuple[float, float]:
 
 
 def check_quantities(names: Sequence[str] | None, system: System) -> tuple[int, ...]:
-    """Return the numbers of states and quantities in ``state_names + quantity_names``.
+    """Return the indices of the named states and quantities in ``state_names + quantity_names``.
 
     Raises
     ------
@@ -91,7 +93,8 @@ def integrate(
     quantities: Sequence[str] | None = None,
     measures: np.ndarray | None = None,
 ) -> Cells:
-    """Walk branches through their points under an observer.
+    """Integrate branches, sequences of parameter points each started from the last state of the one before, under an
+    observer.
 
     Parameters
     ----------

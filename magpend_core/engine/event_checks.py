@@ -1,4 +1,4 @@
-"""Check a system's switches and impacts against their declaration; see `checks`."""
+"""Check the switches and impacts of a system against their declaration; see `checks`."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ WRONG = 1e-3
 
 
 def declaration(system: System) -> Iterator[str]:
-    """Problems of the fields that are no functions."""
+    """Yield the problems of a system's fields for switches and impacts that are not functions."""
     least = system.n_switches + system.n_contacts + system.has_segments
     if system.n_modes != least:
         yield (
@@ -44,7 +44,9 @@ def declaration(system: System) -> Iterator[str]:
 
 
 def modes_at(system: System, times: np.ndarray, edges: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Modes at instants of the period: all switches on their upper side, no contact, and the segment."""
+    """Return the modes at given times of a period: all switches at 1, no contact, and the number of forcing edges
+    passed.
+    """
     modes = [np.ones(len(times))] * (system.n_switches + system.n_contacts)
     if system.has_segments:
         modes.append(np.searchsorted(edges[0], times, side="right").astype(np.float64))
@@ -52,7 +54,7 @@ def modes_at(system: System, times: np.ndarray, edges: np.ndarray) -> tuple[np.n
 
 
 def motion_problems(motion: Any, rates: np.ndarray) -> None:
-    """Append the problems of the event functions at the samples of `checks._Motion`."""
+    """Check the event functions and impact maps at the samples of `checks._Motion`, and append the problems."""
     system, functions = motion.system, motion.functions
     for name, n in (("switches", system.n_switches), ("impacts", system.n_impacts)):
         if n:
@@ -65,7 +67,7 @@ def motion_problems(motion: Any, rates: np.ndarray) -> None:
 
 
 def _values(motion: Any, name: str, n: int, time: Any, y: np.ndarray, rates: np.ndarray) -> np.ndarray | None:
-    """Values and rates of events, shape (n, 2, sample)."""
+    """Return values and time derivatives of event functions at the samples, shape (n, 2, sample)."""
     found = motion.functions.call(name, time, tuple(y), tuple(rates), motion.c)
     if not isinstance(found, tuple):
         return None

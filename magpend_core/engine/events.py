@@ -1,4 +1,4 @@
-"""Detect events: zeros of functions along a trajectory, at which a step must end.
+"""Detect events, the zeros of functions along a trajectory, and let a step end at each.
 
 Templates for the engine, see `lanes`. An attempted step that ends beyond a zero is taken back; the next
 attempt ends where the cubic through values and rates at both ends has its zero, and so on until an attempt
@@ -66,7 +66,7 @@ ROUNDED = 1e-12
 
 
 def _events_of(system: System) -> Callable[..., Any]:
-    """Return a function that gives values and rates of all events, one after the other, as one flat tuple.
+    """Return a function that gives values and time derivatives of all event functions as one flat tuple.
 
     Switches first, then impacts, then the section. It passes for one of the system's module.
     """
@@ -95,7 +95,7 @@ def _events_of(system: System) -> Callable[..., Any]:
 
 
 def _middle_of(n: int) -> Callable[..., Any]:
-    """Return a function that gives the states in the middle of an attempt, by cubics."""
+    """Return a function that gives the states in the middle of a step by cubic Hermite interpolation."""
     lines = ["def middle_of(y0, dy0, y1, dy1, h):", "eighth = 0.125 * h"]
     parts = [f"multiply_add(eighth, dy0[{i}] - dy1[{i}], 0.5 * (y0[{i}] + y1[{i}]))" for i in range(n)]
     lines.append(f"return ({', '.join(parts)},)")
@@ -105,7 +105,7 @@ def _middle_of(n: int) -> Callable[..., Any]:
 
 
 def event_bindings(system: System) -> dict[str, Any]:
-    """Return the names that the templates of events use, for a system."""
+    """Return the values of the free names in the templates of events, for a system."""
     of, direction = system.section or (0, 0)
     directions = [0.0] * system.n_switches + [float(d) for d in system.impact_directions]
     starts = [1.0] * system.n_switches + [-float(d) for d in system.impact_directions]
@@ -130,8 +130,8 @@ def event_bindings(system: System) -> dict[str, Any]:
 
 
 def cubic_dip(a: Any, da: Any, b: Any, db: Any) -> Any:
-    """Return the place in (0, 1) where a cubic dips below 0, or 2 if it does not; `a`, `b` are its end values, `da`,
-    `db` its slopes.
+    """Return the position in (0, 1) of a cubic's negative minimum, or 2 if it has none; `a`, `b` are its end values,
+    `da`, `db` its slopes.
     """
     c3 = 2.0 * (a - b) + (da + db)
     c2 = multiply_add(3.0, b - a, -(da + da) - db)
@@ -145,14 +145,16 @@ def cubic_dip(a: Any, da: Any, b: Any, db: Any) -> Any:
 
 
 def may_dip(a: Any, da: Any, b: Any, db: Any) -> Any:
-    """1 where the cubic of `cubic_dip` can have a dip, as far as control polygons tell; else 0."""
+    """Return 1 where the cubic of `cubic_dip` may fall below 0 between its ends, judged by its control polygon; else
+    0.
+    """
     least = minimum(multiply_add(1.0 / 3.0, da, a), multiply_add(-1.0 / 3.0, db, b))
     steepest = maximum(maximum(da, db), multiply_add(3.0, b - a, -(da + db)))
     return where_less(least, 0.0, where_less(0.0, steepest, 1.0, 0.0), 0.0)
 
 
 def cubic_root(a: Any, da: Any, b: Any, db: Any, right: Any) -> Any:
-    """Return the zero in [0, right] of the cubic with values `a` >= 0, `b` and end slopes `da`, `db`."""
+    """Return the zero in [0, right] of the cubic on [0, 1] with end values `a` >= 0, `b` and end slopes `da`, `db`."""
     c3 = 2.0 * (a - b) + (da + db)
     c2 = multiply_add(3.0, b - a, -(da + da) - db)
     left = 0.0 * right
@@ -172,7 +174,8 @@ def cubic_root(a: Any, da: Any, b: Any, db: Any, right: Any) -> Any:
 
 
 def margin(w: Any, base: int, k: int, near: Any, far: Any) -> Any:
-    """Return the values and rates of event `k` at both ends of a step, with the sign that makes its own side positive.
+    """Return values and rates of event function `k` at both ends of a step, signed so that its present side is
+    positive.
 
     `near` and `far` are pairs of value and rate. A value at the near end that is beyond zero, by rounding
     or after an event, counts as zero.
@@ -184,17 +187,19 @@ def margin(w: Any, base: int, k: int, near: Any, far: Any) -> Any:
 
 
 def pair(w: Any, row: int, k: int) -> Any:
-    """Return value and rate of event `k` in rows that begin at `row`."""
+    """Return value and time derivative of event function `k` from the rows that begin at `row`."""
     return load(w, row + 2 * k * WIDTH), load(w, row + (2 * k + 1) * WIDTH)
 
 
 def fires(w: Any, base: int, k: int) -> Any:
-    """1 where a change of side of event `k` is an event, 0 where it is only noted."""
+    """Return 1 where a sign change of event function `k` from its present side is an event, else 0."""
     return where_less(DIRECTIONS[k] * load(w, base + ROWS.side + k * WIDTH), 0.5, 1.0, 0.0)
 
 
 def hides_events(w: Any, base: int) -> Any:
-    """1 where a pair of zeros may be hidden: the middle of the attempt is that far off an event's cubic."""
+    """Return 1 where an event function may have two hidden zeros: at mid-step it is far from the cubic through the
+    step's ends.
+    """
     h, t, level = load(w, base + ROWS.step), load(w, base + ROWS.time), load(w, base + ROWS.level)
     y0, y1 = load_rows(w, base + ROWS.state, N_KNOWN), load_rows(w, base + ROWS.trial, N_KNOWN)
     dy0 = load_rows(w, base + ROWS.slopes, N_KNOWN)
@@ -220,7 +225,8 @@ def hides_events(w: Any, base: int) -> Any:
 
 
 def judge_events(w: Any, base: int, failed: Any) -> Any:
-    """Say lane by lane what events make of an attempt that error control has `failed` (1) or not (0).
+    """Return for each lane whether a step is accepted, taken back or ends on an event; `failed` is 1 where error
+    control rejects it.
 
     ACCEPT, TAKE_BACK or LANDED; in the last case `fired` tells on which.
     """
@@ -250,7 +256,7 @@ def judge_events(w: Any, base: int, failed: Any) -> Any:
 
 
 def settle_events(w: Any, base: int, failed: Any) -> Any:
-    """Judge an attempt that may have passed an event, and aim the next one."""
+    """Accept an attempted step that may have passed an event, or take it back; set the length of the next one."""
     h = load(w, base + ROWS.step)
     narrow = load(w, base + ROWS.resolution)
     first = where_less(0.0, narrow, 0.0, 1.0)
@@ -276,7 +282,9 @@ def settle_events(w: Any, base: int, failed: Any) -> Any:
 
 
 def turn_sides(w: Any, base: int, accepted: Any, lands: Any) -> None:
-    """Turn the sides of the events that are beyond zero after an accepted step; mark the events as fired."""
+    """After an accepted step, reverse the stored sign of each event function that has passed zero; mark the events as
+    fired.
+    """
     for k in range(N_EVENTS):
         row = base + k * WIDTH
         _, _, b, _ = margin(w, base, k, pair(w, base + ROWS.known, k), pair(w, base + ROWS.found, k))
@@ -287,7 +295,8 @@ def turn_sides(w: Any, base: int, accepted: Any, lands: Any) -> None:
 
 
 def aim(w: Any, base: int, takes: Any, goes_on: Any, narrow: Any) -> None:
-    """Set the length of the next attempt: to the nearest zero between here and where one was passed.
+    """Set the length of the next attempted step to end at the nearest zero of an event function that an attempt has
+    passed.
 
     After an attempt that is taken back, that is within its length; after a step that ended before the
     zero, within what is left of an earlier one.
@@ -322,7 +331,9 @@ def aim(w: Any, base: int, takes: Any, goes_on: Any, narrow: Any) -> None:
 
 
 def section_counts(w: Any, base: int, lane: int) -> bool:
-    """Tell whether a zero is a section crossing: an angle's sine has another zero half a turn away."""
+    """Return whether the last step ended on the Poincare section; for an angle, exclude the zero of its sine half a
+    turn away.
+    """
     if w[base + ROWS.fired + (N_EVENTS - 1) * WIDTH + lane] < 0.5:
         return False
     if not IS_ANGLE[SECTION_OF]:

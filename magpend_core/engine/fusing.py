@@ -1,4 +1,5 @@
-"""Fuse products with sums by a rule of our own, in place of the compiler's choice.
+"""Fuse products with sums (multiply-add) by a fixed rule instead of the compiler's, so that results are the same bits
+everywhere.
 
 A fused product and sum, ``a * b + c`` rounded once, costs half as much as the two apart, so that every
 compiler wants to fuse. Left to it, what is fused depends on the CPU, on its version and on what was inlined
@@ -26,16 +27,16 @@ from numba.core.codegen import JITCodeLibrary
 
 
 class FusedLibrary(JITCodeLibrary):
-    """Machine code of functions whose products have been fused."""
+    """Code library for numba that fuses products with sums in the functions added to it."""
 
     def add_ir_module(self, ir_module: Any) -> None:
-        """Add a function's intermediate code."""
+        """Add the LLVM code of a function after fusing its products with sums."""
         fuse_products(ir_module)
         super().add_ir_module(ir_module)  # type: ignore[no-untyped-call]
 
 
 def fuse_products(module: ir.Module) -> None:
-    """Fuse products with sums in every function of a module, in place."""
+    """Replace sums with a product by fused multiply-adds in every function of an LLVM module, in place."""
     for function in module.functions:
         _fuse_in(function)
 
@@ -61,7 +62,7 @@ def _fuse_in(function: ir.Function) -> None:
 
 
 def _fused(instruction: ir.Instruction) -> Any:
-    """Put a fused operation before a sum or difference and return it; None if it has no product in it."""
+    """Insert a fused multiply-add before a sum or difference and return it; None if neither term is a product."""
     if getattr(instruction.type, "element", instruction.type) != ir.DoubleType():
         return None
     builder = ir.IRBuilder(instruction.parent)
@@ -80,7 +81,7 @@ def _fused(instruction: ir.Instruction) -> Any:
 
 
 def _is_negation(value: Any) -> bool:
-    """Whether a value is another's negative, which numba also writes as a difference from minus zero."""
+    """Return whether an instruction negates a value, which numba also writes as a difference from minus zero."""
     opname = getattr(value, "opname", None)
     if opname != "fsub":
         return bool(opname == "fneg")
@@ -90,7 +91,7 @@ def _is_negation(value: Any) -> bool:
 
 
 def _factors(builder: ir.IRBuilder, value: Any) -> tuple[Any, Any] | None:
-    """Factors of a product, also of a scalar one that is spread over lanes; None of anything else."""
+    """Return the factors of a product, also of a scalar product spread over SIMD lanes; None for anything else."""
     opname = getattr(value, "opname", None)
     if opname == "fmul":
         return tuple(value.operands)
@@ -104,7 +105,7 @@ def _factors(builder: ir.IRBuilder, value: Any) -> tuple[Any, Any] | None:
 
 
 def _like(builder: ir.IRBuilder, spread: Any, scalar: Any) -> Any:
-    """Spread a number over the lanes as another was spread."""
+    """Spread a scalar over the SIMD lanes by the same instructions with which another value was spread."""
     inserted, undefined, mask = spread.operands
     first = builder.insert_element(inserted.operands[0], scalar, inserted.operands[2])
     return builder.shuffle_vector(first, undefined, mask)

@@ -10,12 +10,14 @@ from magpend_core.engine.system import System
 
 
 def places_of(system: System) -> Sequence[int]:
-    """Return the (row, column) places of the entries that `system.jacobian` returns, row by row."""
+    """Return the flat indices, row by row, of the Jacobian entries that `system.jacobian` returns."""
     return range(system.n_states**2) if system.jacobian_entries is None else system.jacobian_entries
 
 
 def rows_of_entries(system: System) -> list[dict[int, int]]:
-    """Return where the tuple of `system.jacobian` has the entries of each row, by column."""
+    """Return for each row of the Jacobian the index in the tuple of `system.jacobian` of each returned entry, by
+    column.
+    """
     n = system.n_states
     rows: list[dict[int, int]] = [{} for _ in range(n)]
     for k, place in enumerate(places_of(system)):
@@ -24,7 +26,9 @@ def rows_of_entries(system: System) -> list[dict[int, int]]:
 
 
 def whole_jacobian(system: System, entries: np.ndarray) -> np.ndarray:
-    """Expand the returned entries (..., n_entries) to Jacobians (..., n_states, n_states)."""
+    """Expand the returned Jacobian entries, shape (..., n_entries), to full matrices, shape (..., n_states,
+    n_states).
+    """
     n, leading = system.n_states, entries.shape[:-1]
     whole = np.zeros((*leading, n * n))
     whole[..., list(places_of(system))] = entries
@@ -32,7 +36,7 @@ def whole_jacobian(system: System, entries: np.ndarray) -> np.ndarray:
 
 
 def declaration_problems(system: System) -> Iterator[str]:
-    """Sentences on a declaration of the entries that is none."""
+    """Yield a problem if a system's `jacobian_entries` are not rising, valid indices."""
     most, entries = system.n_states**2 - 1, system.jacobian_entries
     good = sorted({i for i in entries or () if 0 <= i <= most})
     if entries is not None and (not entries or list(entries) != good):

@@ -1,4 +1,4 @@
-"""Compile functions: the decorators, and a compile cache that cannot return an old answer.
+"""Compile functions with numba, with an on-disk cache that never returns outdated code.
 
 numba's own ``cache=True`` watches the file of the cached function alone: after an edit of a callee
 in another file the cached caller goes on returning the old result. Here the cache folder is named
@@ -66,7 +66,7 @@ _PACKAGE = Path(__file__).parents[1]
 
 
 def source_digest() -> str:
-    """Digest of the numerical core for the compile cache: the bytes of every source, in name order."""
+    """Return a digest of all source files of the numerical core, for the compile cache."""
     digest = hashlib.sha256()
     for path in sorted(_PACKAGE.rglob("*.py")):
         digest.update(path.relative_to(_PACKAGE).as_posix().encode())
@@ -96,7 +96,7 @@ PARTS = PartFolder(CACHE_FOLDER) if CACHE_FOLDER is not None else None
 
 
 def inline(function: F) -> F:
-    """Compile a helper of the hot path, which allocates nothing; it dissolves into its caller."""
+    """Compile a helper function that allocates no memory and is inlined into its compiled callers."""
     if _SETTINGS.DISABLE_JIT:
         return function
 
@@ -108,7 +108,7 @@ def inline(function: F) -> F:
 
 
 class _Uncollected(event.Listener):
-    """Lets the garbage collector rest while numba compiles: its trees live until the end, and are many.
+    """Listener that turns the garbage collector off while numba compiles, which saves time.
 
     A tenth of the time went into looking at them again and again.
     """
@@ -117,7 +117,7 @@ class _Uncollected(event.Listener):
         self._lock, self._depth, self._resumes = threading.Lock(), 0, False
 
     def on_start(self, event: Any) -> None:
-        """Report that the compilation of a function, or of its callee, begins."""
+        """Turn the garbage collector off when the compilation of a function begins."""
         with self._lock:
             if self._depth == 0:
                 self._resumes = gc.isenabled()
@@ -125,7 +125,7 @@ class _Uncollected(event.Listener):
             self._depth += 1
 
     def on_end(self, event: Any) -> None:
-        """It has ended."""
+        """Turn the garbage collector on again when the outermost compilation has ended."""
         with self._lock:
             self._depth -= 1
             if self._depth == 0 and self._resumes:
@@ -161,7 +161,8 @@ _ARRAYS = frozenset(("IS_ANGLE", "SCALES", "ESCAPE", "DIRECTIONS", "STARTS", "SA
 
 
 def bound_part(template: Callable[..., Any], bindings: Mapping[str, Any], dissolves: bool) -> Any:
-    """Bind a template and compile it as a part; a part of the same template and values is the same one.
+    """Bind the free names of a template and compile it for use by other compiled functions; equal bindings give the
+    same function.
 
     Parameters
     ----------
@@ -200,7 +201,9 @@ def _part(template: Callable[..., Any], used: Mapping[str, Any], dissolves: bool
 
 
 def _without_size(name: str, value: Any, names: set[str], sizes: dict[str, Any]) -> Any:
-    """Return a placeholder for a size, and note the size."""
+    """Return a placeholder for a system size (such as the number of states) and store the size; return other values
+    unchanged.
+    """
     if type(value) is int and value > 0 and name in _SIZES:
         sizes[name] = value
         return placeholder(name)
@@ -218,7 +221,8 @@ def _without_size(name: str, value: Any, names: set[str], sizes: dict[str, Any])
 def _template_digest(
     template: Callable[..., Any], used: Mapping[str, Any], dissolves: bool, names: set[str]
 ) -> str | None:
-    """Return the digest of everything that determines a part's code; None for a template from outside the package.
+    """Return a digest of everything that determines the code of a bound template; None for a template from outside the
+    package.
 
     Compiled functions count as where they are found: they are linked, whatever they are.
     """
@@ -243,8 +247,7 @@ def _names_in(code: CodeType) -> set[str]:
 
 
 def _identity(value: Any, names: set[str]) -> Any:
-    """Return the identity of a value for compilation: its type and value, since equal numbers of two types compile
-    differently.
+    """Return a hashable key of a value bound to a template; values with equal keys compile to the same code.
 
     Of a tuple with named fields it is the fields that are in `names`: they are looked up by name alone.
     """
@@ -260,12 +263,12 @@ def _identity(value: Any, names: set[str]) -> Any:
 
 
 def is_covered(*functions: Callable[..., Any]) -> bool:
-    """Whether `source_digest` covers the functions: whether all are defined in ``magpend_core``."""
+    """Return whether all functions are defined in ``magpend_core``, so that `source_digest` covers them."""
     return all(f.__module__.partition(".")[0] == PACKAGE for f in functions)
 
 
 def keeping(*functions: Callable[..., Any]) -> str | None:
-    """Return the cache key of the machine code of an entry point that calls `functions`.
+    """Return the cache key of the machine code that calls `functions`; None if the code must not be cached.
 
     Returns
     -------
@@ -279,7 +282,8 @@ def keeping(*functions: Callable[..., Any]) -> str | None:
 def entry(
     template: Callable[..., Any], name: str, bindings: Mapping[str, Any], kept: str | None = ""
 ) -> Callable[..., Any]:
-    """Bind a template and compile it as what Python calls; its machine code is kept.
+    """Bind the free names of a template and compile it as a function that Python calls; keep its machine code in the
+    cache.
 
     The template becomes a part. What Python calls is one line around it, since numba takes long over code
     that is reached from Python.
@@ -304,7 +308,7 @@ def entry(
 
 
 def kernel(function: F, kept: str | None = "") -> F:
-    """Compile a function that Python calls and keep its machine code in the digest-named cache folder.
+    """Compile a function that Python calls, and keep its machine code in the cache folder.
 
     Pass what `keeping` says of the functions that it calls if some may be from outside the package.
     """

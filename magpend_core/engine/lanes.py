@@ -1,4 +1,4 @@
-"""Integrate many trajectories in step, each with its own time, step size and parameters.
+"""Integrate many trajectories at once in SIMD lanes, each with its own time, step size and parameters.
 
 Dormand and Prince's methods of order 5 or 8, with error control. Every trajectory owns a lane; `simd.WIDTH`
 lanes form a group, whose numbers lie row by row in one flat array (see `Rows`). One attempted step advances
@@ -92,7 +92,7 @@ ENDS_IN_CHATTER = int(Status.CHATTER)
 
 
 class Rows(NamedTuple):
-    """The offsets of the rows of a group of lanes, in float64 numbers from the group's first."""
+    """Offsets of the rows in the work array of a group of SIMD lanes, in float64 numbers from the group's first."""
 
     state: int
     slopes: int  # N_STAGES * n_states rows
@@ -139,7 +139,7 @@ class Rows(NamedTuple):
 
 
 def rows_of(system: System, n_watched: int = 0) -> Rows:
-    """Lay out a group of a system with `n_watched` watched quantities."""
+    """Return the row layout of the work array for a group of SIMD lanes, with `n_watched` recorded quantities."""
     n = system.n_events
     counts = [
         system.n_states,
@@ -160,7 +160,7 @@ def rows_of(system: System, n_watched: int = 0) -> Rows:
 
 
 def step_ratio(room: Any) -> Any:
-    """Largest step near a layer, in units of the distance from its complex singularity.
+    """Return the largest step near a layer or forcing edge, as a multiple of the distance from its complex singularity.
 
     The right-hand side near a layer behaves like (J/pi) atan(t/d), whose derivatives at a distance R
     from the poles at +-i d grow like J d n!/R^(n+1): a step h = c R leaves an error in proportion to
@@ -170,7 +170,7 @@ def step_ratio(room: Any) -> Any:
 
 
 def choose_step(w: Any, base: int, slack: float) -> None:
-    """Set the step of the next attempt.
+    """Set the size of the next attempted step from error control, layers, forcing edges and events.
 
     The step is the least of what error control wants and, for each layer and edge, what keeps it in
     proportion to the distance from the nearest complex singularity: with D the distance in time to
@@ -200,7 +200,9 @@ def choose_step(w: Any, base: int, slack: float) -> None:
 
 
 def limited_by_layers(w: Any, base: int, slack: float, t: Any, h: Any) -> Any:
-    """Return the step `h`, or the longest one that the nearest layer allows."""
+    """Return the step size `h`, reduced where the state is near a layer in which the right-hand side changes
+    quickly.
+    """
     y = load_rows(w, base + ROWS.state, N_KNOWN)
     dy = load_rows(w, base + ROWS.slopes, N_KNOWN)
     c = load_rows(w, base + ROWS.constants, NC)
@@ -228,7 +230,7 @@ def limited_by_layers(w: Any, base: int, slack: float, t: Any, h: Any) -> Any:
 
 
 def run_stage(w: Any, base: int, s: int) -> None:
-    """Compute the state and the slope of stage `s` (1, 2, ...)."""
+    """Compute the state and the slope of Runge-Kutta stage `s` (1, 2, ...)."""
     h = load(w, base + ROWS.step)
     for i in range(N_KNOWN):
         row = base + i * WIDTH
@@ -252,13 +254,13 @@ def run_stage(w: Any, base: int, s: int) -> None:
 
 
 def run_stages(w: Any, base: int) -> None:
-    """Compute the states and slopes of all stages but the first, which the last step has computed."""
+    """Compute the states and slopes of all Runge-Kutta stages but the first, which the last step has computed."""
     for s in range(1, N_STAGES):
         run_stage(w, base, s)
 
 
 def unrolled_stages(system: System) -> Callable[..., None]:
-    """Return `run_stages` written out for a small system.
+    """Return `run_stages` for a small system, with its loops written out.
 
     The slopes stay in registers, the tableau's zeros cost nothing. Not for larger systems: many
     copies of a long right-hand side compile for long and gain little.
@@ -294,7 +296,7 @@ def unrolled_stages(system: System) -> Callable[..., None]:
 
 
 def squared_error(w: Any, base: int, rtol: float, atol: float) -> Any:
-    """Return the mean square of the scaled error estimate of the attempt."""
+    """Return the mean square of the scaled error estimate of an attempted step."""
     total = 0.0 * load(w, base + ROWS.step)
     for i in range(N_CONTROLLED):
         row = base + i * WIDTH
@@ -309,7 +311,7 @@ def squared_error(w: Any, base: int, rtol: float, atol: float) -> Any:
 
 
 def squared_error_of_two(w: Any, base: int, rtol: float, atol: float) -> Any:
-    """Mean square of the scaled error of an attempt, from estimates of two orders.
+    """Return the mean square of the scaled error of an attempted step, from estimates of two orders.
 
     With mean squares E and F of the higher and the lower, E**2/(E + F/100): Hairer, Norsett and Wanner,
     Solving Ordinary Differential Equations I, section II.10.
@@ -334,7 +336,7 @@ def squared_error_of_two(w: Any, base: int, rtol: float, atol: float) -> Any:
 
 
 def finish_step(w: Any, base: int, rtol: float, atol: float, max_attempts: float) -> bool:
-    """Accept or reject the attempt, lane by lane, and set the next wish and the event.
+    """Accept or reject the attempted step lane by lane, and set the next step size and the event of each lane.
 
     Return whether a lane of the group has an event.
     """
@@ -400,7 +402,7 @@ def finish_step(w: Any, base: int, rtol: float, atol: float, max_attempts: float
 def attempt(
     w: Any, events: Any, n_watching: Any, n_groups: int, slack: float, rtol: float, atol: float, max_attempts: float
 ) -> None:
-    """Advance all groups by one attempted step.
+    """Attempt one step in all groups of SIMD lanes.
 
     `events` says afterwards which have a lane with an event; `n_watching` holds the number of lanes
     of each that are in a period whose extremes are wanted.
@@ -419,7 +421,7 @@ def attempt(
 def load_cell(
     w: Any, base: int, lane: int, frequency: float, p: Any, slack: float, scratch: Any, edge_table: Any
 ) -> None:
-    """Give a lane the constants and edges of a cell; the lane's state stays."""
+    """Load the constants and forcing edges of a parameter point into a SIMD lane; the state stays."""
     constants(frequency, p, scratch)
     for i in range(N_OWN):
         w[base + ROWS.constants + i * WIDTH + lane] = scratch[i]
@@ -436,7 +438,9 @@ def load_cell(
 
 
 def begin_period(w: Any, base: int, lane: int, edge_table: Any) -> int:
-    """Put a lane's time at the start of a period; return the number of the segment's end edge."""
+    """Set a lane's time to the start of a drive period; return the number of the forcing edge that ends its first
+    segment.
+    """
     w[base + ROWS.time + lane] = 0.0
     w[base + ROWS.attempts + lane] = 0.0
     # the last slope belongs to time `period`, where the forcing can differ from that at time 0 by its
@@ -452,7 +456,9 @@ def begin_period(w: Any, base: int, lane: int, edge_table: Any) -> int:
 
 
 def set_target(w: Any, base: int, lane: int, time: float, edge_table: Any, edge: int) -> None:
-    """Let a segment end at `time`, with the layer of the edge number `edge` (none for n_edges)."""
+    """Let a lane's present time segment end at `time`, with the width of the forcing edge number `edge` (none for
+    n_edges).
+    """
     w[base + ROWS.target + lane] = time
     w[base + ROWS.target_width + lane] = edge_table[1, edge] if edge < NE else np.inf
     ratio = edge_table[2, edge] if edge < NE else 1.0
@@ -461,7 +467,7 @@ def set_target(w: Any, base: int, lane: int, time: float, edge_table: Any, edge:
 
 
 def begin_segment(w: Any, base: int, lane: int, edge_table: Any, edge: int) -> int:
-    """Let a lane run from its last target to the edge number `edge`, or to the period's end."""
+    """Let a lane integrate from its last target time to the forcing edge number `edge`, or to the period's end."""
     w[base + ROWS.start + lane] = w[base + ROWS.target + lane]
     w[base + ROWS.start_width + lane] = w[base + ROWS.target_width + lane]
     w[base + ROWS.start_ratio + lane] = w[base + ROWS.target_ratio + lane]
@@ -482,7 +488,7 @@ def begin_segment(w: Any, base: int, lane: int, edge_table: Any, edge: int) -> i
 
 
 def in_bounds(w: Any, base: int, lane: int) -> bool:
-    """Tell whether all states of a lane are finite and within bounds."""
+    """Return whether all states in a SIMD lane are finite and within their bounds."""
     for i in range(N):
         if not abs(w[base + ROWS.state + i * WIDTH + lane]) <= ESCAPE[i]:
             return False
@@ -490,7 +496,9 @@ def in_bounds(w: Any, base: int, lane: int) -> bool:
 
 
 def take_section(w: Any, base: int, lane: int, section: Any, turns: Any) -> bool:
-    """Copy a lane's state to `section`, angles wrapped in place; return whether it is in bounds."""
+    """Copy the state of a SIMD lane to `section`, with angles wrapped to (-pi, pi] in both; return whether it is in
+    bounds.
+    """
     good = in_bounds(w, base, lane)
     for i in range(N):
         at = base + ROWS.state + i * WIDTH + lane
@@ -509,7 +517,7 @@ def take_section(w: Any, base: int, lane: int, section: Any, turns: Any) -> bool
 
 
 def move_lane(w: Any, source: int, target: int) -> None:
-    """Copy all rows of one lane to another."""
+    """Copy all rows of the work array that belong to one SIMD lane to another lane."""
     a = (source // WIDTH) * ROWS.size + source % WIDTH
     b = (target // WIDTH) * ROWS.size + target % WIDTH
     for row in range(0, ROWS.size, WIDTH):
@@ -517,7 +525,7 @@ def move_lane(w: Any, source: int, target: int) -> None:
 
 
 def renew_state(w: Any, base: int, lane: int, state: Any, memory: Any, settings: Any) -> None:
-    """Let the observer rewrite a lane's state."""
+    """Let the observer's function `renew` rewrite the state in a SIMD lane."""
     for i in range(N):
         state[i] = w[base + ROWS.state + i * WIDTH + lane]
     renew(state, memory, settings)
@@ -527,7 +535,7 @@ def renew_state(w: Any, base: int, lane: int, state: Any, memory: Any, settings:
 
 
 class Work(NamedTuple):
-    """Per-lane bookkeeping of the scalar pass, one entry or row per lane."""
+    """Working arrays and bookkeeping of `advance`, mostly one entry or row per SIMD lane."""
 
     lanes: Any  # float64, the groups' rows
     branch: Any  # int64
@@ -545,7 +553,7 @@ class Work(NamedTuple):
 
 
 class Cells(NamedTuple):
-    """Input and output arrays of `advance`; the first two dims are branch and point."""
+    """Input and output arrays of `advance`; the first two dims are branch and parameter point."""
 
     frequency: Any  # Hz
     parameters: Any  # (..., n_parameters)
@@ -566,7 +574,7 @@ class Cells(NamedTuple):
 
 
 def start_branch(cells: Cells, work: Work, lane: int, branch: int, settings: Any, scratch: Any) -> None:
-    """Put a branch's initial state and first cell into a lane."""
+    """Load the initial state and the first parameter point of a branch into a SIMD lane."""
     base, column = (lane // WIDTH) * ROWS.size, lane % WIDTH
     for i in range(N):
         w_at = base + ROWS.state + i * WIDTH + column
@@ -582,9 +590,7 @@ def start_branch(cells: Cells, work: Work, lane: int, branch: int, settings: Any
 
 
 def start_point(cells: Cells, work: Work, lane: int, point: int, settings: Any, scratch: Any) -> None:
-    """Start the cell at the parameter point `point` of a lane's branch, from the state in which the lane ended the
-    last one.
-    """
+    """Start the parameter point `point` of a lane's branch from the state in which the previous point ended."""
     base, column = (lane // WIDTH) * ROWS.size, lane % WIDTH
     branch = work.branch[lane]
     frequency = cells.frequency[branch, point]
@@ -605,12 +611,12 @@ def start_point(cells: Cells, work: Work, lane: int, point: int, settings: Any, 
 
 
 def has_failed(status: int) -> bool:
-    """Tell whether a cell's sections must not be used."""
+    """Return whether a status means that the trajectory failed and its sections must not be used."""
     return status == DIVERGED or status == STEP_LIMIT or status == STEP_UNDERFLOW or status == ENDS_IN_CHATTER
 
 
 def forget(cells: Cells, branch: int, point: int) -> None:
-    """Take back the sections of a cell that failed."""
+    """Set the recorded sections of a failed trajectory to NaN."""
     for i in range(cells.section.shape[2]):
         for k in range(N):
             cells.section[branch, point, i, k] = np.nan
@@ -621,7 +627,7 @@ def forget(cells: Cells, branch: int, point: int) -> None:
 
 
 def end_cell(cells: Cells, work: Work, lane: int, status: int) -> None:
-    """Write a finished cell's outcome."""
+    """Write status, counts and final state of a trajectory that has ended at one parameter point."""
     base, column = (lane // WIDTH) * ROWS.size, lane % WIDTH
     at = (work.branch[lane], work.point[lane])
     cells.status[at] = status
@@ -637,7 +643,7 @@ def end_cell(cells: Cells, work: Work, lane: int, status: int) -> None:
 
 
 def end_branch(cells: Cells, work: Work, lane: int, status: int) -> None:
-    """Write a branch's last state; mark the points that it did not reach."""
+    """Write the last state of a branch, and mark the parameter points that it did not reach."""
     base, column = (lane // WIDTH) * ROWS.size, lane % WIDTH
     branch = work.branch[lane]
     for point in range(work.point[lane] + 1, cells.frequency.shape[1]):
@@ -650,7 +656,7 @@ def end_branch(cells: Cells, work: Work, lane: int, status: int) -> None:
 
 
 def serve(cells: Cells, work: Work, lane: int, settings: Any, section: Any, scratch: Any) -> bool:
-    """Act on a lane's event; return True when its branch has ended."""
+    """Handle a SIMD lane's event (end of a segment or period, or a failure); return True when its branch has ended."""
     w, base, column = work.lanes, (lane // WIDTH) * ROWS.size, lane % WIDTH
     event = w[base + ROWS.event + column]
     w[base + ROWS.event + column] = NOTHING
@@ -714,7 +720,7 @@ def serve(cells: Cells, work: Work, lane: int, settings: Any, section: Any, scra
 
 
 def keep_time(w: Any, base: int, lane: int, memory: Any, out: Any) -> None:
-    """Write the time since the last section to the observer's memory and to the next kept row."""
+    """Write the time since the last section to the observer's memory and to the next output row."""
     time = w[base + ROWS.time + lane]
     memory[len(memory) - 1] = time
     if n_kept(memory) < len(out):
@@ -722,7 +728,7 @@ def keep_time(w: Any, base: int, lane: int, memory: Any, out: Any) -> None:
 
 
 def work_for(system: System, observer: Observer, cells: Cells, n_lanes: int, settings: Any) -> Work:
-    """Allocate the bookkeeping of so many lanes."""
+    """Allocate the working arrays for `n_lanes` SIMD lanes."""
     n_groups = -(-min(n_lanes, len(cells.frequency)) // WIDTH)
     size = n_groups * WIDTH
     memory_size = getattr(observer.memory_size, "py_func", observer.memory_size)
@@ -748,7 +754,7 @@ def work_for(system: System, observer: Observer, cells: Cells, n_lanes: int, set
 def advance(
     cells: Cells, work: Work, active: int, rtol: float, atol: float, max_attempts: float, settings: Any
 ) -> None:
-    """Integrate all branches, `active` at a time, and fill the output arrays of `cells`."""
+    """Integrate all branches, `active` at a time in SIMD lanes, and fill the output arrays of `cells`."""
     n_branches = cells.frequency.shape[0]
     # a field of a tuple is counted by an atomic operation at every use: too slow per lane
     rows, events, scratch, section = work.lanes, work.events, work.scratch, work.section
@@ -781,7 +787,7 @@ def advance(
 
 
 def copy_lane(work: Work, source: int, target: int) -> None:
-    """Copy everything that belongs to one lane to another."""
+    """Copy all data of one SIMD lane to another lane, bookkeeping included."""
     move_lane(work.lanes, source, target)
     work.branch[target] = work.branch[source]
     work.point[target] = work.point[source]
@@ -840,7 +846,7 @@ def _name(system: System, observer: Observer, watched: tuple[int, ...]) -> str:
 
 
 def _layers_at(system: System) -> Callable[..., Any]:
-    """Return ``system.layers`` with the time in front, whether the system needs it or not."""
+    """Return ``system.layers`` as a function that also takes the time, as its first argument."""
     rates = "dy + (t,)" if system.timed_layers else "dy"
     scope: dict[str, Any] = {"__name__": system.rhs.__module__, "_layers": system.layers}
     exec(f"def layers_at(t, y, dy, c):\n    return _layers(y, {rates}, c)\n", scope)
@@ -848,7 +854,7 @@ def _layers_at(system: System) -> Callable[..., Any]:
 
 
 def engine_bindings(system: System, observer: Observer, watched: tuple[int, ...] = ()) -> dict[str, Any]:
-    """Names that the templates of this module use, bound to a system and an observer."""
+    """Return the values of the free names in the templates of this module, for a system and an observer."""
     bindings: dict[str, Any] = {
         "ROWS": rows_of(system, len(watched)),
         "WATCHES": len(watched) > 0,
@@ -910,7 +916,7 @@ def engine_bindings(system: System, observer: Observer, watched: tuple[int, ...]
 
 
 def engine_of(system: System, observer: Observer, watched: tuple[int, ...] = ()) -> Callable[..., None]:
-    """Compile `advance` for a system and an observer, and for the quantities to be watched.
+    """Compile `advance` for a system, an observer, and the quantities whose minimum, maximum and mean are recorded.
 
     Those are given by their numbers in ``system.state_names + system.quantity_names``.
     """

@@ -1,4 +1,4 @@
-"""Link the LLVM code of an engine's parts: numba libraries whose sizes are set when they are linked.
+"""Link the LLVM code of an engine's precompiled functions (parts); system sizes get their values at link time.
 
 A *size* of a system, such as the number of its states, is a constant without a value in the code of a part.
 While numba compiles the part, an integer that occurs nowhere else stands for it (`placeholder`). In the LLVM
@@ -30,12 +30,14 @@ _SYMBOL = "magpend.size."
 
 
 def placeholder(name: str) -> int:
-    """Return the integer that stands for a size of the system while a part is compiled."""
+    """Return the unique integer that stands for a system size (such as the number of states) while a part is
+    compiled.
+    """
     return _NAMES.setdefault(name, _PLACEHOLDER + len(_NAMES))
 
 
 class PartLibrary(FusedLibrary):
-    """LLVM code of one part, before it is linked and compiled to machine code."""
+    """Code library of one part (a precompiled function of the engine) for numba: LLVM code, not yet machine code."""
 
     dispatcher: Any = None
     symbol = ""
@@ -43,11 +45,11 @@ class PartLibrary(FusedLibrary):
 
     @property
     def codegen(self) -> Any:
-        """The code generator."""
+        """Numba's code generator, wrapped so that numba looks for no machine code."""
         return _NoMachineCode(self._codegen)
 
     def add_ir_module(self, ir_module: Any) -> None:
-        """Add the LLVM code of the function."""
+        """Add the LLVM code of a function, with products fused and with system sizes read from named constants."""
         fuse_products(ir_module)
         sizes_as_loads(ir_module)
         text = _arrays_by_name(cgutils.normalize_ir_text(str(ir_module)))
@@ -58,7 +60,9 @@ class PartLibrary(FusedLibrary):
         self.add_llvm_module(module)
 
     def finalize(self) -> None:
-        """Link functions that are no parts, such as numba's ``max``; the engine's library links the parts."""
+        """Link in the libraries that are not engine parts, such as numba's ``max``; the engine's library links the
+        parts later.
+        """
         own = _defined(self._final_module)
         for library in dict.fromkeys(self._linking_libraries):
             # the other library that is no part counts references, of which there are none here
@@ -69,16 +73,16 @@ class PartLibrary(FusedLibrary):
         self._finalized = True
 
     def get_pointer_to_function(self, name: str) -> int:
-        """Return 0: there is no machine code."""
+        """Return 0 for every name: a part has no machine code to point to."""
         self._ensure_finalized()
         return 0
 
     def own_module(self) -> Any:
-        """Return the code of this part alone."""
+        """Return the LLVM module of this part alone, without its dependencies."""
         return super()._get_module_for_linking()
 
     def _get_module_for_linking(self) -> Any:
-        """Return the code with its dependencies, for functions that numba compiles by its own rules."""
+        """Return the LLVM module linked with all its dependencies, for functions that numba's own compiler compiles."""
         if self._whole is None:
             self._whole = self.own_module().clone()
             _link(self._whole, self)
@@ -87,7 +91,7 @@ class PartLibrary(FusedLibrary):
 
 
 class _NoMachineCode:
-    """Stands for the code generator where numba would look for machine code."""
+    """Wrapper of numba's code generator for LLVM code that is not machine code yet: it forwards all but `set_env`."""
 
     def __init__(self, codegen: Any) -> None:
         self._codegen = codegen
@@ -96,14 +100,16 @@ class _NoMachineCode:
         return getattr(self._codegen, name)
 
     def set_env(self, env_name: str, env: Any) -> None:
-        """Do nothing: without machine code nothing can be told to an environment."""
+        """Do nothing: code that is not machine code yet has no environment to set."""
 
 
 class EntryLibrary(FusedLibrary):
-    """Machine code of an engine: its entry, linked to all parts that it reaches."""
+    """Code library of one engine for numba: its entry function, linked to all precompiled functions (parts) that it
+    calls.
+    """
 
     def finalize(self) -> None:
-        """Link the parts, give the sizes their values, optimise, and make machine code."""
+        """Link the precompiled functions (parts), define the size constants, optimise, and generate machine code."""
         own = _defined(self._final_module)
         _link(self._final_module, self)
         # Parts of two engines have the same names, and other contents. The JIT would take the first for both.
@@ -112,7 +118,7 @@ class EntryLibrary(FusedLibrary):
         super().finalize()
 
     def _optimize_functions(self, ll_module: Any) -> None:
-        """Leave it to the module's optimisation, which sees everything."""
+        """Skip the optimisation of single functions: the later pass over the whole module does it all."""
 
     def _optimize_final_module(self) -> None:
         # Lanes are vectors already, and loops over states are short. numba's two rounds at level 3 with a
@@ -127,7 +133,7 @@ def _defined(module: Any) -> set[str]:
 
 
 def _hide_others(module: Any, own: set[str]) -> None:
-    """Make local to a module the functions that are not its own, and the sizes."""
+    """Give internal linkage to the size constants and to all functions of a module except those named in `own`."""
     for value in (*module.functions, *module.global_variables):
         kind = value.is_function or value.name.startswith(_SYMBOL)
         if kind and not value.is_declaration and value.name not in own:
@@ -135,7 +141,7 @@ def _hide_others(module: Any, own: set[str]) -> None:
 
 
 def _link(module: Any, library: Any) -> None:
-    """Link a module with all libraries that it reaches, and with the values of their sizes."""
+    """Link an LLVM module with all libraries that it depends on, and define the size constants that these use."""
     sizes: dict[str, Any] = dict(library.dispatcher.sizes) if isinstance(library, PartLibrary) else {}
     for reached_one in _reached_libraries(library):
         if isinstance(reached_one, PartLibrary):
@@ -155,7 +161,7 @@ def _unite(sizes: dict[str, Any], others: Mapping[str, Any]) -> None:
 
 
 def _reached_libraries(library: Any) -> Iterator[Any]:
-    """Yield the libraries that one links to, and those that its parts link to, each once."""
+    """Yield all libraries that a library links to, directly or through its precompiled parts, each once."""
     seen, waiting = {library}, list(library._linking_libraries)
     while waiting:
         found = waiting.pop(0)
@@ -167,7 +173,7 @@ def _reached_libraries(library: Any) -> Iterator[Any]:
 
 
 def _definitions(sizes: Mapping[str, Any]) -> str:
-    """Return the sizes as LLVM's constants: integers, and arrays of float64 or int64 by their bits."""
+    """Return LLVM definitions of the named size constants: integers, and arrays of float64 or int64 by their bits."""
     lines = []
     for name, value in sorted(sizes.items()):
         if isinstance(value, int):
@@ -179,12 +185,14 @@ def _definitions(sizes: Mapping[str, Any]) -> str:
 
 
 def placeholder_of_array(name: str, array: np.ndarray) -> np.ndarray:
-    """Return the placeholder of one of the system's arrays of float64 or int64."""
+    """Return the placeholder that stands for an array of a system (float64 or int64) while a part is compiled."""
     return np.array([placeholder(name)]).view(array.dtype)
 
 
 def sizes_as_loads(module: ir.Module) -> None:
-    """Replace placeholders in a module by loads from constants without a value."""
+    """Replace placeholders of system sizes in an LLVM module by loads from named constants, defined when it is
+    linked.
+    """
     names = {value: name for name, value in _NAMES.items()}
     for function in module.functions:
         if function.blocks:
@@ -192,7 +200,9 @@ def sizes_as_loads(module: ir.Module) -> None:
 
 
 def _arrays_by_name(text: str) -> str:
-    """Replace arrays that are placeholders by constants without a value, as `sizes_as_loads` does."""
+    """Replace placeholder arrays in LLVM text by named constants without a value, as `sizes_as_loads` does with
+    numbers.
+    """
     names = {number: name for name, number in _NAMES.items()}
     used: set[str] = set()
     for definition, symbol, content in _ARRAY.findall(text):

@@ -1,4 +1,4 @@
-"""Act on events: change switch modes, apply impacts to states and tangent vectors.
+"""Apply events to a trajectory: change the modes of switches, apply impact maps to states and tangent vectors.
 
 Templates for the engine's scalar pass, see `lanes`; they run once per event, on plain numbers of one lane.
 
@@ -57,7 +57,7 @@ LEAST_VOLUME = 1e-300
 
 
 def _numbers(n: int) -> Callable[..., Any]:
-    """Return a function that reads `n` rows of one lane as a tuple."""
+    """Return a function that reads `n` rows of one SIMD lane as a tuple."""
     entries = "".join(f"w[at + {i * WIDTH}], " for i in range(n))
     scope: dict[str, Any] = {"__name__": __name__}
     exec(f"def numbers(w, at):\n    return ({entries})\n", scope)
@@ -65,7 +65,7 @@ def _numbers(n: int) -> Callable[..., Any]:
 
 
 def _reset_along(system: System, n: int) -> Callable[..., Any]:
-    """Return a function that gives an impact's map on the line through a state and a time."""
+    """Return a function that applies an impact map at a point on a line through a state and a time."""
     line = "".join(f"y[{i}] + s * dy[{i}], " for i in range(n))
     scope: dict[str, Any] = {"__name__": system.rhs.__module__, "_reset": system.reset}
     exec(f"def reset_along(k, t, y, c, dt, dy, s):\n    return _reset(k, t + s * dt, ({line}), c)\n", scope)
@@ -73,7 +73,7 @@ def _reset_along(system: System, n: int) -> Callable[..., Any]:
 
 
 def mode_bindings(system: System) -> dict[str, Any]:
-    """Names that these templates use, for a system."""
+    """Return the values of the free names in these function templates, for a system."""
     base = system.tangents_of or system
     has_divergence = system.tangents_of is not None and system.state_names[-1] == DIVERGENCE
     n_vectors = (system.n_states - has_divergence) // base.n_states - 1
@@ -105,7 +105,9 @@ def mode_bindings(system: System) -> dict[str, Any]:
 
 
 def lane_pairs(w: Any, base: int, lane: int, dy: Any) -> Any:
-    """Return values and rates of a lane's events, for any rates `dy` of its states."""
+    """Return the value and time derivative of each event function in a SIMD lane, for any time derivatives `dy` of its
+    states.
+    """
     y = lane_states(w, base + ROWS.state + lane)
     c = lane_constants(w, base + ROWS.constants + lane)
     level = w[base + ROWS.level + lane] if HAS_SECTION else 0.0
@@ -113,14 +115,16 @@ def lane_pairs(w: Any, base: int, lane: int, dy: Any) -> Any:
 
 
 def lane_rates(w: Any, base: int, lane: int) -> Any:
-    """Return the rates of a lane's states."""
+    """Return the time derivatives of the states in a SIMD lane."""
     c = lane_constants(w, base + ROWS.constants + lane)
     u = forcing(w[base + ROWS.time + lane], c)
     return rhs(lane_states(w, base + ROWS.state + lane), u, c)
 
 
 def seat_switches(w: Any, base: int, lane: int, given: bool) -> None:
-    """Put the switches on the sides where the state is; on the surface on those they have, if `given`."""
+    """Set the switch modes from the side on which the state lies; on a surface to 1, or with `given` to the present
+    mode.
+    """
     for k in range(N_SWITCHES):
         mode = base + ROWS.constants + (N_OWN + k) * WIDTH + lane
         if not given or w[mode] == 0.0:
@@ -134,19 +138,19 @@ def seat_switches(w: Any, base: int, lane: int, given: bool) -> None:
 
 
 def gradient_along(w: Any, base: int, lane: int, k: int, vector: Any) -> float:
-    """Return the derivative of event `k`'s function along a change of the states."""
+    """Return the derivative of event function `k` along a change `vector` of the states."""
     at_rest = lane_pairs(w, base, lane, ZEROS)
     return lane_pairs(w, base, lane, vector)[2 * k + 1] - at_rest[2 * k + 1]
 
 
 def switch_rate(w: Any, base: int, lane: int, k: int, side: float) -> float:
-    """Return the rate of switch `k` under the right-hand side of a given side."""
+    """Set the mode of switch `k` to `side`, and return the time derivative of its event function in that mode."""
     w[base + ROWS.constants + (N_OWN + k) * WIDTH + lane] = side
     return lane_pairs(w, base, lane, lane_rates(w, base, lane))[2 * k + 1]
 
 
 def next_mode(w: Any, base: int, lane: int, k: int, mode: float) -> float:
-    """Return the mode of switch `k` after its event."""
+    """Return the mode of switch `k` after its event: 1, -1, or 0 while it slides."""
     if not SLIDES[k]:
         return -mode
     above, below = switch_rate(w, base, lane, k, 1.0), switch_rate(w, base, lane, k, -1.0)
@@ -162,7 +166,7 @@ def next_mode(w: Any, base: int, lane: int, k: int, mode: float) -> float:
 
 
 def keep_switches(w: Any, base: int, lane: int) -> None:
-    """Change the modes that no longer fit after a jump in time: at an edge values and forces can jump."""
+    """Correct the switch modes after an edge of the forcing, where event values and forces can jump."""
     pairs = lane_pairs(w, base, lane, lane_states(w, base + ROWS.state + lane))
     for k in range(N_SWITCHES):
         own = base + ROWS.constants + (N_OWN + k) * WIDTH + lane
@@ -183,7 +187,7 @@ def keep_switches(w: Any, base: int, lane: int) -> None:
 
 
 def begin_events(w: Any, base: int, lane: int) -> None:
-    """Let a lane know nothing of its events but where its switches are; the rest is found with the slopes."""
+    """Clear the event data of a SIMD lane, set its switch modes from its states, and find the surfaces it rests on."""
     for k in range(N_EVENTS):
         w[base + ROWS.side + k * WIDTH + lane] = 0.0
         w[base + ROWS.fired + k * WIDTH + lane] = 0.0
@@ -198,12 +202,12 @@ def begin_events(w: Any, base: int, lane: int) -> None:
 
 
 def contact_row(base: int, lane: int, k: int) -> int:
-    """Return the row of the contact mode of impact `k`."""
+    """Return the index of the contact mode (0 at rest, else 1) of impact `k` in the engine's work array."""
     return base + ROWS.constants + (N_OWN + N_SWITCHES + k) * WIDTH + lane
 
 
 def bend(w: Any, base: int, lane: int, event: int) -> float:
-    """Return the second time derivative of an event's value along the motion, by a difference."""
+    """Return the second time derivative of an event function along the trajectory, by a finite difference."""
     step = LOOK * w[base + ROWS.period + lane]
     y, t = lane_states(w, base + ROWS.state + lane), w[base + ROWS.time + lane]
     dy = lane_rates(w, base, lane)
@@ -219,7 +223,7 @@ def bend(w: Any, base: int, lane: int, event: int) -> float:
 
 
 def is_chatter(w: Any, base: int, lane: int, k: int, arriving: float) -> bool:
-    """Tell whether an impact, at speed `arriving`, begins an infinite sequence that ends within a moment."""
+    """Return whether an impact at speed `arriving` starts an infinite sequence of impacts that ends almost at once."""
     event = N_SWITCHES + k
     leaving = -DIRECTIONS[event] * lane_pairs(w, base, lane, lane_rates(w, base, lane))[2 * event + 1]
     if not (abs(leaving) < arriving and leaving > -ELASTIC * arriving):
@@ -231,7 +235,7 @@ def is_chatter(w: Any, base: int, lane: int, k: int, arriving: float) -> bool:
 
 
 def rest_on(w: Any, base: int, lane: int, k: int) -> None:
-    """Put a lane at rest on the surface of impact `k`; it ends if it rests on another that would move."""
+    """Put a trajectory at rest on the surface of impact `k`; end it if it rests on another that excludes this one."""
     for i in range(N_IMPACTS):
         if i != k and STICKS[k] == 2 and STICKS[i] == 2 and w[contact_row(base, lane, i)] == 0.0:
             w[base + ROWS.event + lane] = CHATTERED
@@ -248,7 +252,7 @@ def rest_on(w: Any, base: int, lane: int, k: int) -> None:
 
 
 def hold_on(w: Any, base: int, lane: int, k: int) -> None:
-    """Put the states on the surface of impact `k`, at its speed."""
+    """Move the states onto the surface of impact `k`, at rest relative to it."""
     t, y = w[base + ROWS.time + lane], lane_base(w, base + ROWS.state + lane)
     new = reset_along(N_IMPACTS + k, t, y, lane_constants(w, base + ROWS.constants + lane), 0.0, y, 0.0)
     for i in range(N_BASE):
@@ -257,14 +261,17 @@ def hold_on(w: Any, base: int, lane: int, k: int) -> None:
 
 
 def hold_contacts(w: Any, base: int, lane: int) -> None:
-    """Take back what rounding and step errors have moved a lane off the surfaces that it rests on."""
+    """Move the states of a resting trajectory back onto the surfaces that rounding and step errors have moved them
+    off.
+    """
     for k in range(N_IMPACTS):
         if STICKS[k] > 0 and w[contact_row(base, lane, k)] == 0.0:
             hold_on(w, base, lane, k)
 
 
 def seat_contacts(w: Any, base: int, lane: int, begins: bool) -> None:
-    """Let a lane rest on the surfaces to which it is pushed and where it does not move; only where it did.
+    """Let a trajectory rest on each impact surface that it is pressed against without moving and where it rested
+    before.
 
     At the begin of a cell, `begins`, on any.
     """
@@ -282,7 +289,9 @@ def seat_contacts(w: Any, base: int, lane: int, begins: bool) -> None:
 
 
 def turn_switch(w: Any, base: int, lane: int, k: int) -> None:
-    """Change the mode of a switch on whose surface a lane is, and its tangent vectors."""
+    """Change the mode of switch `k` for a trajectory on its surface, and apply the saltation matrix to the tangent
+    vectors.
+    """
     own = base + ROWS.constants + (N_OWN + k) * WIDTH + lane
     mode = w[own]
     if HAS_VECTORS:
@@ -310,14 +319,16 @@ def turn_switch(w: Any, base: int, lane: int, k: int) -> None:
 
 
 def vector_row(base: int, lane: int, j: int) -> int:
-    """Return the first row of vector `j` among those that pass through an impact: tangents, then unit vectors."""
+    """Return the first row of vector `j` among those mapped at an impact: tangent vectors first, then unit vectors."""
     if j < N_VECTORS:
         return base + ROWS.state + N_BASE * (1 + j) * WIDTH + lane
     return base + ROWS.slopes + N_BASE * (j - N_VECTORS) * WIDTH + lane
 
 
 def map_vector(w: Any, base: int, lane: int, k: int, at: int, shift: float, t: float, y: Any) -> None:
-    """Take the vector in rows from `at`, at an instant shifted by `shift` times it, through map `k`."""
+    """Replace the vector stored from row `at` by the derivative of map `k` along it, with the time changing by
+    `shift`.
+    """
     c, size = lane_constants(w, base + ROWS.constants + lane), 0.0
     for i in range(N_BASE):
         size = max(size, abs(w[at + i * WIDTH]) / SCALES[i])
@@ -330,7 +341,7 @@ def map_vector(w: Any, base: int, lane: int, k: int, at: int, shift: float, t: f
 
 
 def jump_vectors(w: Any, base: int, lane: int, k: int) -> None:
-    """Take vectors through the map of impact `k`, and note the shifts of its time in `trial`."""
+    """Map all vectors through impact `k`, and store for each the shift of the impact time in `trial`."""
     t, y = w[base + ROWS.time + lane], lane_base(w, base + ROWS.state + lane)
     before = lane_rates(w, base, lane)
     rate = lane_pairs(w, base, lane, before)[2 * (N_SWITCHES + k) + 1]
@@ -345,14 +356,14 @@ def jump_vectors(w: Any, base: int, lane: int, k: int) -> None:
 
 
 def set_units(w: Any, base: int, lane: int) -> None:
-    """Put unit vectors behind the tangent vectors of `vector_row`; the slopes there are used no more."""
+    """Write unit vectors into the rows after the tangent vectors (see `vector_row`), over slopes no longer needed."""
     for j in range(N_VECTORS, N_THROUGH):
         for i in range(N_BASE):
             w[vector_row(base, lane, j) + i * WIDTH] = 1.0 if i == j - N_VECTORS else 0.0
 
 
 def log_volume(w: Any, at: int) -> float:
-    """Return log |det| of the N_BASE vectors in rows from `at`; overwrites the vectors."""
+    """Return log |det| of the N_BASE vectors stored from row `at` on; overwrites the vectors."""
     total, n = 0.0, N_BASE
     for j in range(n):
         best = j
@@ -372,7 +383,7 @@ def log_volume(w: Any, at: int) -> float:
 
 
 def jump(w: Any, base: int, lane: int, k: int) -> None:
-    """Apply the map of impact `k` to a lane on its surface, and to its tangent vectors."""
+    """Apply the map of impact `k` to the states and tangent vectors of a trajectory on the impact surface."""
     event = N_SWITCHES + k
     pairs = lane_pairs(w, base, lane, lane_rates(w, base, lane))
     value, rate = pairs[2 * event], pairs[2 * event + 1]
@@ -411,7 +422,7 @@ def jump(w: Any, base: int, lane: int, k: int) -> None:
 
 
 def act_on_events(w: Any, base: int, lane: int) -> bool:
-    """Apply the events at which a lane's step has ended; return whether it is on a section."""
+    """Apply the events at which the last step of a SIMD lane ended; return whether it ended on the Poincare section."""
     on_section = False
     if HAS_SECTION:
         on_section = section_counts(w, base, lane)

@@ -1,4 +1,4 @@
-"""Observe each completed period: record, measure, decide.
+"""Define observers: functions called after each period that record the section, measure, and can end the trajectory.
 
 An observer is a pair of functions bound at compile time.
 
@@ -40,7 +40,9 @@ FIRST_TURN = 1
 
 
 class Settings(NamedTuple):
-    """The settings of the recording observers."""
+    """Settings of the recording observers: lengths of transient and record, largest period searched for, and
+    tolerance.
+    """
 
     n_transient: int
     n_keep: int
@@ -51,12 +53,12 @@ class Settings(NamedTuple):
 
 
 def window_of(max_orbit_period: int) -> int:
-    """Return the number of sections examined to tell whether an orbit closes."""
+    """Return the number of last section points that are examined to find whether an orbit is periodic."""
     return max(64, 4 * max_orbit_period)
 
 
 def _leave(state: Any, memory: Any, settings: Any) -> None:
-    """Rewrite nothing."""
+    """Leave the states as they are: the default of `Observer.renew`."""
 
 
 @inline
@@ -71,7 +73,7 @@ def _keeps_none(i_period: int, memory: Any, settings: Any) -> bool:
 
 @dataclass(frozen=True)
 class Observer:
-    """Named functions for the engine, with values for free names in them.
+    """Functions that the engine calls after each period of a trajectory, with the values of their free names.
 
     They are plain Python functions, compiled when they are bound to a system: inside, `N` is the number of
     states, `IS_ANGLE` (0 or 1) and `SCALES` are arrays of the system's, and further free names are those of
@@ -116,7 +118,7 @@ class Observer:
 
     @property
     def rewrites(self) -> bool:
-        """Tell whether `renew` does anything."""
+        """Whether `renew` is able to change the states."""
         return self.renew is not _leave
 
 
@@ -128,7 +130,9 @@ _SETTLED, _PERIOD, _KEPT, _RING = 0, 1, 2, 3
 
 
 def _lag_distance(ring: Any, i: int, j: int, window: int) -> float:
-    """Largest scaled difference of sections number `i` and `j` (1, 2, ...), angles on the circle."""
+    """Return the largest scaled difference between the states at sections `i` and `j` (1, 2, ...), angles on the
+    circle.
+    """
     a, b = ((i - 1) % window) * N, ((j - 1) % window) * N
     largest = 0.0
     for k in range(N):
@@ -140,7 +144,7 @@ def _lag_distance(ring: Any, i: int, j: int, window: int) -> float:
 
 
 def closed_period(ring: Any, last: int, settings: Settings) -> int:
-    """Return the period of the orbit on which the last sections close, or 0.
+    """Return the period of the periodic orbit that the last section points approach, or 0.
 
     For each candidate period p, the distances between sections p apart are split into an older and
     a younger half, with largest values D1 and D2. If they go on shrinking by r = D2/D1 per half
@@ -174,7 +178,7 @@ def closed_period(ring: Any, last: int, settings: Settings) -> int:
 
 
 def _largest_lag(ring: Any, first: int, last: int, p: int, settings: Settings) -> float:
-    """Return the largest distance between sections `i` and ``i - p`` for first < i <= last."""
+    """Return the largest distance between section points `i` and ``i - p``, for first < i <= last."""
     largest = 0.0
     for i in range(first + 1, last + 1):
         largest = max(largest, _lag_distance(ring, i, i - p, settings.window))
@@ -182,7 +186,7 @@ def _largest_lag(ring: Any, first: int, last: int, p: int, settings: Settings) -
 
 
 def _smallest_divisor(ring: Any, last: int, half: int, p: int, settings: Settings) -> int:
-    """Return the smallest divisor of `p` that is a period too.
+    """Return the smallest divisor of the period `p` that is a period of the orbit, too.
 
     Near a slow spiral, sections p apart can settle before successive ones do. All of the younger
     half lie within a few tolerances of the orbit, so ten of them tell the periods apart.
@@ -196,7 +200,7 @@ def _smallest_divisor(ring: Any, last: int, half: int, p: int, settings: Setting
 def _record(
     section: Any, turns: Any, i_period: int, memory: Any, record: Any, measures: Any, settings: Settings
 ) -> int:
-    """Keep `n_keep` sections after the transient, and say whether the orbit closes.
+    """Record `n_keep` section points after the transient, then find whether the orbit is periodic.
 
     The transient lasts `n_transient` periods or, with `stops_early`, until the orbit has closed (see
     `closed_period`; looked at every quarter window), if that comes first.
@@ -246,7 +250,7 @@ RECORD = Observer("record", _record, _memory_size, n_kept=_n_kept, keeps_next=_k
 
 
 class MapSettings(NamedTuple):
-    """The settings of `MAP`: none, since the number of periods is a cell's own."""
+    """Settings of the observer `MAP`: only its memory size, since each trajectory has its own number of periods."""
 
     n_memory: int = 1
 
@@ -254,7 +258,9 @@ class MapSettings(NamedTuple):
 def _keep_all(
     section: Any, turns: Any, i_period: int, memory: Any, record: Any, measures: Any, settings: MapSettings
 ) -> int:
-    """Keep each section, and end the cell after as many periods as `measures` asks for."""
+    """Record the section of each period, and end the trajectory after as many periods as the first of `measures` asks
+    for.
+    """
     for k in range(N):
         record[i_period - 1, k] = section[k]
     memory[0] = float(i_period)

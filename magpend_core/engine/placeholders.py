@@ -9,16 +9,16 @@ from magpend_core.engine.jit import inline
 
 @inline
 def no_forcing(t: Any, c: Any) -> Any:
-    """No explicit time dependence."""
+    """Return 0: the system has no forcing that depends on time explicitly."""
     return 0.0 * t
 
 
 @inline
 def no_edges(frequency: Any, p: Any, times: Any, half_widths: Any, jumps: Any) -> None:
-    """No instant at which the forcing switches."""
+    """Do nothing: the forcing has no instants at which it switches."""
 
 
 @inline
 def no_layers(y: Any, dy: Any, c: Any) -> Any:
-    """No place at which the right-hand side changes quickly."""
+    """Return an empty tuple: the right-hand side has no layer in which it changes quickly."""
     return ()

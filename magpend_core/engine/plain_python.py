@@ -1,4 +1,4 @@
-"""Turn compiled functions back into the plain Python that they were written in, with all that they call.
+"""Turn a compiled function, and all functions that it calls, back into the plain Python they were compiled from.
 
 `function.py_func` alone would still call compiled functions, and compile them for the types that it meets.
 """
@@ -11,7 +11,7 @@ from typing import Any
 
 
 class _PlainModule:
-    """A module whose compiled functions are found in plain Python."""
+    """Proxy of a module that gives the plain Python versions of its compiled functions."""
 
     def __init__(self, module: ModuleType, known: dict[int, Any]) -> None:
         self._module, self._known = module, known
@@ -21,7 +21,7 @@ class _PlainModule:
 
 
 def plain(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return the plain Python of a compiled function and of its callees.
+    """Return the plain Python version of a compiled function, calling plain Python versions of its callees.
 
     Parameters
     ----------
@@ -58,7 +58,7 @@ def _rebuilt(dispatcher: Any, source: FunctionType, known: dict[int, Any]) -> Fu
 
 
 def _names(code: CodeType) -> Iterator[str]:
-    """Names that a function and those defined in it look up."""
+    """Yield the names that the code of a function, and of functions nested in it, looks up."""
     yield from code.co_names
     for constant in code.co_consts:
         if isinstance(constant, CodeType):

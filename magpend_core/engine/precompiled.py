@@ -1,4 +1,4 @@
-"""Compile the parts of an engine, and keep their code for other engines and other processes.
+"""Compile the shared functions (parts) of an engine, and cache their code for other engines and processes.
 
 numba types and lowers every function before LLVM sees it; this is nine tenths of the time that an engine
 takes to compile. Most functions of an engine know no equations. Here such a function, a *part*, is compiled
@@ -55,7 +55,7 @@ from magpend_core.engine.linking import EntryLibrary, PartLibrary
 
 @register_pass(mutates_CFG=False, analysis_only=False)
 class _NameFields(FunctionPass):
-    """Replaces a field of a named tuple of integers by that integer.
+    """Compiler pass that replaces a field of a named tuple of integers by that integer.
 
     numba would make a constant of the whole tuple at each place where one of its fields is read.
     """
@@ -66,7 +66,7 @@ class _NameFields(FunctionPass):
         FunctionPass.__init__(self)
 
     def run_pass(self, state: Any) -> bool:
-        """Look for fields of global named tuples."""
+        """Replace fields of global named tuples by their integers; return whether there were any."""
         found = [block for block in state.func_ir.blocks.values() if _name_fields(block)]
         if found:
             # where they are defined has changed
@@ -108,7 +108,7 @@ class _GiveEntryLibrary(FunctionPass):
         FunctionPass.__init__(self)
 
     def run_pass(self, state: Any) -> bool:
-        """Give a function its library before numba does, and let its machine code be kept."""
+        """Give an entry function its code library before numba does, and allow its machine code to be cached."""
         state.library = EntryLibrary(state.targetctx.codegen(), state.func_id.func_qualname)
         state.library.enable_object_caching()
         return True
@@ -122,7 +122,7 @@ class _GivePartLibrary(FunctionPass):
         FunctionPass.__init__(self)
 
     def run_pass(self, state: Any) -> bool:
-        """Give a part its library, and a number by which its name is the same in all processes."""
+        """Give a part its code library, and an identifier that makes its symbol the same in all processes."""
         dispatcher = _COMPILED_NOW[-1]
         state.library = PartLibrary(state.targetctx.codegen(), state.func_id.func_qualname)
         state.library.dispatcher = dispatcher
@@ -131,17 +131,19 @@ class _GivePartLibrary(FunctionPass):
 
 
 class EntryCompiler(CompilerBase):
-    """numba's compiler of functions, with products fused by our rule (see `fusing`)."""
+    """Numba compiler of an engine's entry function, with products fused by magpend's own rule (see `fusing`)."""
 
     _gives: type[FunctionPass] = _GiveEntryLibrary
 
     def compile_extra(self, func: Any) -> Any:
-        """Compile an engine, its parts included, and say so to whoever listens."""
+        """Compile an engine with its parts, and report begin and end of the compilation to a listener if there is
+        one.
+        """
         with compiling():
             return super().compile_extra(func)
 
     def define_pipelines(self) -> list[Any]:
-        """Return numba's own passes with two more."""
+        """Return numba's own compiler passes, with two of magpend's added."""
         passes = DefaultPassBuilder.define_nopython_pipeline(self.state)
         passes.add_pass_after(_NameFields, IRProcessing)
         passes.add_pass_after(self._gives, NopythonTypeInference)
@@ -150,7 +152,7 @@ class EntryCompiler(CompilerBase):
 
 
 class PartCompiler(EntryCompiler):
-    """The same for parts: without the passes that inline, rewrite or annotate what an engine does not use."""
+    """Numba compiler of engine parts, without the passes that inline, rewrite or annotate code."""
 
     _passes = (
         TranslateByteCode,
@@ -171,7 +173,7 @@ class PartCompiler(EntryCompiler):
     )
 
     def define_pipelines(self) -> list[Any]:
-        """Return the passes."""
+        """Return the compiler passes for an engine part."""
         passes = PassManager("magpend_part")
         for step in self._passes:
             passes.add_pass(step, step.__name__)
@@ -184,7 +186,7 @@ _COMPILED_NOW: list[Any] = []
 
 
 class PartDispatcher(CPUDispatcher):
-    """A function that compiled functions call. A call from Python compiles a copy of it first.
+    """Numba dispatcher of an engine part, for calls from compiled code; a call from Python compiles a copy of it first.
 
     Parameters
     ----------
@@ -226,11 +228,11 @@ class PartDispatcher(CPUDispatcher):
 
     @property
     def number(self) -> int:
-        """A number that no other part's symbol has."""
+        """Number that makes the symbol of this part in compiled code unique."""
         return int(self.key[:14], 16) if self.key else next(_UNKEPT)
 
     def compile(self, sig: Any) -> Any:
-        """Compile for a signature, or take the code from the cache."""
+        """Compile this part for a signature, or load its code from the cache."""
         with global_compiler_lock:
             _COMPILED_NOW.append(self)
             try:
@@ -239,7 +241,7 @@ class PartDispatcher(CPUDispatcher):
                 _COMPILED_NOW.pop()
 
     def add_overload(self, cres: Any) -> None:
-        """Record a compiled signature; Python code cannot call it."""
+        """Register the code compiled for a signature, without an entry point for Python."""
         self.overloads[tuple(cres.signature.args)] = cres
         cres.library.symbol = cres.fndesc.mangled_name
         _OWNERS[cres.library] = tuple(cres.signature.args)
@@ -263,14 +265,16 @@ _MEMORY: dict[str, bytes] = {}
 
 
 class PartCache:
-    """The cache entry of one part: its LLVM code, and the functions that it calls with their argument types."""
+    """Cache of one engine part (a function): its LLVM code, and the functions that it calls with their argument
+    types.
+    """
 
     def __init__(self, dispatcher: PartDispatcher, folder: PartFolder | None) -> None:
         self._dispatcher, self._folder = dispatcher, folder
         self.cache_path = None
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """Return the cached code for a signature; None if there is none."""
+        """Return the cached code for a signature, or None if the cache has none."""
         name = self._name(sig)
         if name is None:
             return None
@@ -291,7 +295,7 @@ class PartCache:
         return found
 
     def save_overload(self, sig: Any, cres: Any) -> None:
-        """Write compiled code to the cache if it has a key."""
+        """Write the code compiled for a signature to the cache, if this part has a cache key."""
         name = self._name(sig)
         callees = self._callees(cres.library)
         if name is None or callees is None:
@@ -314,7 +318,7 @@ class PartCache:
         return f"{self._dispatcher.py_func.__name__[:40]}-{hashlib.sha256(text.encode()).hexdigest()[:24]}"
 
     def _callees(self, library: PartLibrary) -> list[Any] | None:
-        """Return where the function finds each part that it calls; None if it calls something else."""
+        """Return each part that the function calls and where it refers to it; None if it calls something else."""
         source = self._dispatcher.py_func
         paths = {id(reached(source, path)): path for path in lookups(source.__code__)}
         declared = {function.name for function in library._final_module.functions}
@@ -367,4 +371,4 @@ class PartCache:
 
 
 class _Key:
-    """A key in place of a function that Python cannot call; numba finds compiled code by it."""
+    """Entry point of cached code that Python cannot call; numba uses it only as a key to find the code."""

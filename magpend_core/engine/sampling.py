@@ -1,4 +1,4 @@
-"""Sample many trajectories in step, each at its own instants: the engine's dense output on all lanes.
+"""Integrate many trajectories in SIMD lanes, and sample each at its own instants by the engine's dense output.
 
 Where `lanes.advance` sees a trajectory once a period, this loop writes states at given times, by the
 continuous extension of the Dormand-Prince pair, and lets the drive change from interval to interval: each has
@@ -47,7 +47,7 @@ COINCIDENT_S = 1e-9
 
 
 class Samples(NamedTuple):
-    """Input and output arrays of `follow_all`; pieces lie one after the other."""
+    """Input and output arrays of `follow_all`; the recording's pieces are concatenated."""
 
     parameters: Any  # (trajectory, n_parameters)
     initial: Any  # (trajectory, n_states)
@@ -68,7 +68,7 @@ class Samples(NamedTuple):
 
 
 class Seats(NamedTuple):
-    """The trajectory, the next instant and the interval of each lane."""
+    """Arrays with the state of the sampling loop: trajectory, next sample and drive interval of each SIMD lane."""
 
     lanes: Any  # float64, the groups' rows
     before: Any  # float64: rows of each group's written states, then their first slopes, before the attempt
@@ -87,7 +87,7 @@ class Seats(NamedTuple):
 
 
 def begin_interval(samples: Samples, seats: Seats, lane: int, scratch: Any) -> None:
-    """Give a lane the constants of its interval, at the interval's start."""
+    """Load the parameters and constants of a drive interval into a SIMD lane, and start at the interval's begin."""
     base, column = (lane // WIDTH) * ROWS.size, lane % WIDTH
     w, at, p = seats.lanes, seats.interval[lane], seats.p
     steps, rejected = w[base + ROWS.steps + column], w[base + ROWS.rejected + column]
@@ -108,7 +108,7 @@ def begin_interval(samples: Samples, seats: Seats, lane: int, scratch: Any) -> N
 
 
 def begin_trajectory(samples: Samples, seats: Seats, lane: int, number: int, scratch: Any) -> None:
-    """Put a trajectory's initial state into a lane, at its place within the first interval."""
+    """Load a trajectory's initial state into a SIMD lane, at its start time within the first drive interval."""
     base, column = (lane // WIDTH) * ROWS.size, lane % WIDTH
     w, piece = seats.lanes, samples.piece[number]
     for i in range(N):
@@ -137,7 +137,7 @@ def begin_trajectory(samples: Samples, seats: Seats, lane: int, number: int, scr
 
 
 def remember(samples: Samples, w: Any, before: Any, clock: Any, group: int) -> None:
-    """Copy the numbers that the continuous extension needs before an accepted step overwrites them."""
+    """Save the states and slopes at the begin of a step, which dense output needs and an accepted step overwrites."""
     base = group * ROWS.size
     n_columns = len(samples.columns)
     kept = group * 2 * n_columns * WIDTH
@@ -150,7 +150,9 @@ def remember(samples: Samples, w: Any, before: Any, clock: Any, group: int) -> N
 
 
 def write_due(samples: Samples, seats: Seats, lane: int, until: float) -> None:
-    """Write the samples that fall into a lane's last accepted step, up to `until` [s in the interval]."""
+    """Write the samples within a SIMD lane's last accepted step, up to `until` [s since the start of the drive
+    interval].
+    """
     group, column = lane // WIDTH, lane % WIDTH
     base, number = group * ROWS.size, seats.trajectory[lane]
     w, piece, t0, begin = seats.lanes, samples.piece[number], seats.clock[lane, 0], seats.clock[lane, 1]
@@ -175,7 +177,7 @@ def write_due(samples: Samples, seats: Seats, lane: int, until: float) -> None:
 
 
 def go_on(samples: Samples, seats: Seats, lane: int, scratch: Any) -> int:
-    """Act on a lane's attempt; return PENDING, or the status with which its trajectory ended."""
+    """Handle the step that a SIMD lane has attempted; return PENDING, or the status with which its trajectory ended."""
     base, column = (lane // WIDTH) * ROWS.size, lane % WIDTH
     w = seats.lanes
     event = w[base + ROWS.event + column]
@@ -214,14 +216,14 @@ def go_on(samples: Samples, seats: Seats, lane: int, scratch: Any) -> int:
 
 
 def end_trajectory(samples: Samples, seats: Seats, lane: int, status: int) -> None:
-    """Write the status of an ended trajectory; instants beyond its end stay NaN."""
+    """Write the status and step count of an ended trajectory; its samples after the end stay NaN."""
     base, column = (lane // WIDTH) * ROWS.size, lane % WIDTH
     samples.status[seats.trajectory[lane]] = status
     samples.n_steps[seats.trajectory[lane]] = int(seats.lanes[base + ROWS.steps + column])
 
 
 def copy_seat(seats: Seats, source: int, target: int) -> None:
-    """Copy everything that belongs to one lane to another."""
+    """Copy all data of one SIMD lane to another."""
     move_lane(seats.lanes, source, target)
     seats.trajectory[target] = seats.trajectory[source]
     seats.interval[target] = seats.interval[source]
@@ -242,7 +244,7 @@ def copy_seat(seats: Seats, source: int, target: int) -> None:
 
 
 def seats_for(system: System, samples: Samples, n_lanes: int) -> Seats:
-    """Allocate the arrays of a number of lanes."""
+    """Allocate the arrays for a number of SIMD lanes."""
     n_groups = -(-min(n_lanes, len(samples.piece)) // WIDTH)
     size, n = n_groups * WIDTH, system.n_states
     return Seats(
@@ -300,7 +302,7 @@ _CALLED = ("begin_interval", "begin_trajectory", "write_due", "go_on", "end_traj
 
 @cache
 def sampler_of(system: System) -> Callable[..., None]:
-    """Compile `follow_all` for a system."""
+    """Compile the sampling loop `follow_all` for a system."""
     system = replace(system, method="dopri5")
     bindings = engine_bindings(system, RECORD)
     for key in (*_INLINE, *_CALLED):

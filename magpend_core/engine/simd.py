@@ -1,4 +1,4 @@
-"""A numba type for a group of lanes: WIDTH float64 numbers that every operation treats at once.
+"""Define a numba type for a group of SIMD lanes: WIDTH float64 numbers on which every operation acts at once.
 
 The kernels advance many trajectories in step. Instead of hoping that the compiler turns a loop over
 trajectories into vector instructions, they compute with values of the type `Lanes`, a vector of
@@ -34,7 +34,7 @@ _VECTOR = ir.VectorType(_DOUBLE, WIDTH)
 
 
 class LanesType(types.Type):
-    """numba's view of a group of lanes."""
+    """Numba type of a group of SIMD lanes."""
 
     def __init__(self) -> None:
         super().__init__(name=f"Lanes{WIDTH}")
@@ -61,7 +61,7 @@ def _splat(builder: Any, scalar: Any) -> Any:
 
 
 def _as(builder: Any, value: Any, numba_type: Any, target: Any) -> Any:
-    """Spread a scalar over the lanes where the result is a group."""
+    """Broadcast a scalar over the lanes if the result type is a group of lanes."""
     if isinstance(target, LanesType) and not isinstance(numba_type, LanesType):
         return _splat(builder, value)
     return value
@@ -131,7 +131,7 @@ _TYPERS: dict[int, Callable[..., Any]] = {
 
 
 def _primitive(python: Callable[..., Any], emit: Callable[..., Any]) -> None:
-    """Give a plain Python function of numbers its compiled form for float64 and `Lanes`.
+    """Register the compiled form of a plain Python function of numbers, for float64 and for groups of SIMD lanes.
 
     `emit(builder, numba_type, *values)` returns the LLVM value; scalars among the arguments have
     been spread over the lanes if any argument is a group.
@@ -161,17 +161,17 @@ def _call(name: str) -> Callable[..., Any]:
 
 
 def sqrt(x: Any) -> Any:
-    """Square root, correctly rounded."""
+    """Return the square root of `x`, correctly rounded."""
     return np.sqrt(x)
 
 
 def absolute(x: Any) -> Any:
-    """Absolute value."""
+    """Return the absolute value of `x`."""
     return np.abs(x)
 
 
 def multiply_add(a: Any, b: Any, c: Any) -> Any:
-    """``a * b + c``, rounded once.
+    """Return ``a * b + c``, rounded once.
 
     Within a function sums of products are fused by themselves (see `fusing`); of two products that is the
     one on the left, and this can say another.
@@ -180,39 +180,39 @@ def multiply_add(a: Any, b: Any, c: Any) -> Any:
 
 
 def copysign(x: Any, sign: Any) -> Any:
-    """`x` with the sign of `sign`."""
+    """Return `x` with the sign of `sign`."""
     return np.copysign(x, sign)
 
 
 def floor(x: Any) -> Any:
-    """Largest whole number that is not above `x`."""
+    """Return the largest whole number that is not above `x`."""
     return np.floor(x)
 
 
 def upper(x: Any) -> Any:
-    """`x` cut off after 26 binary digits: products of two such numbers are exact."""
+    """Return `x` cut off after 26 binary digits: products of two such numbers are exact."""
     bits = np.asarray(x, np.float64).view(np.int64) & np.int64(-(2**27))
     return bits.view(np.float64)[()]
 
 
 def inverse_sqrt_rough(x: Any) -> Any:
-    """Compute the inverse square root of a positive normal number to 3.5 %."""
+    """Compute the inverse square root of a positive normal number, with a relative error of 3.5 %."""
     bits = np.int64(_INVERSE_ROOT) - (np.asarray(x, np.float64).view(np.int64) >> np.int64(1))
     return bits.view(np.float64)[()]
 
 
 def where_less(a: Any, b: Any, yes: Any, no: Any) -> Any:
-    """`yes` where ``a < b``, else `no`; a NaN on either side counts as not less."""
+    """Return `yes` where ``a < b``, else `no`; a comparison with NaN counts as not less."""
     return np.where(a < b, yes, no)[()]
 
 
 def minimum(a: Any, b: Any) -> Any:
-    """The smaller of two numbers; `b` if either is NaN."""
+    """Return the smaller of two numbers; `b` if either is NaN."""
     return where_less(a, b, a, b)
 
 
 def maximum(a: Any, b: Any) -> Any:
-    """The larger of two numbers; `b` if either is NaN."""
+    """Return the larger of two numbers; `b` if either is NaN."""
     return where_less(b, a, a, b)
 
 
@@ -229,23 +229,23 @@ def negate_if_bit(x: Any, shifted: Any, bit: int) -> Any:
 
 
 def where_odd(shifted: Any, odd: Any, even: Any) -> Any:
-    """`odd` where the integer in the low bits of `shifted` is odd, else `even`."""
+    """Return `odd` where the integer in the low bits of `shifted` is odd, else `even`."""
     low = np.asarray(shifted, np.float64).view(np.int64) & np.int64(1)
     return np.where(low == 1, odd, even)[()]
 
 
 def any_nonzero(x: Any) -> bool:
-    """Whether a number, or any lane of a group, is not 0."""
+    """Return whether a number, or any lane of a group, is not 0."""
     return bool(np.any(x != 0.0))
 
 
 def binary_exponent(x: Any) -> Any:
-    """Exponent e of a positive normal number x = m 2**e with m in [1, 2), as a float."""
+    """Return the exponent e of a positive normal number x = m 2**e with m in [1, 2), as a float."""
     return np.frexp(x)[1] - 1.0
 
 
 def mantissa(x: Any) -> Any:
-    """Mantissa m of a positive normal number x = m 2**e with m in [1, 2)."""
+    """Return the mantissa m of a positive normal number x = m 2**e with m in [1, 2)."""
     return np.frexp(x)[0] * 2.0
 
 
@@ -347,17 +347,17 @@ def _lower_negate_if_bit(context: Any, builder: Any, sig: Any, values: Any) -> A
 
 
 def load(array: np.ndarray, offset: int) -> Any:
-    """The group of lanes at ``array[offset : offset + WIDTH]`` (1-D float64, not checked)."""
+    """Return the group of lanes at ``array[offset : offset + WIDTH]`` (1-D float64, bounds are not checked)."""
     return array[offset : offset + WIDTH].copy()
 
 
 def store(array: np.ndarray, offset: int, value: Any) -> None:
-    """Write a group of lanes to ``array[offset : offset + WIDTH]`` (not checked)."""
+    """Write a group of lanes to ``array[offset : offset + WIDTH]`` (bounds are not checked)."""
     array[offset : offset + WIDTH] = value
 
 
 def load_rows(array: np.ndarray, offset: int, n: int) -> tuple[Any, ...]:
-    """`n` consecutive groups as a tuple; `n` is a compile-time constant."""
+    """Return `n` consecutive lane groups of an array as a tuple; `n` is a compile-time constant."""
     return tuple(load(array, offset + i * WIDTH) for i in range(n))
 
 
@@ -409,7 +409,7 @@ def _lower_load_rows(context: Any, builder: Any, sig: Any, values: Any) -> Any:
 
 
 def store_rows(array: np.ndarray, offset: int, rows: tuple[Any, ...]) -> None:
-    """Write a tuple of groups to consecutive rows."""
+    """Write a tuple of lane groups to consecutive rows of an array."""
     for i, row in enumerate(rows):
         store(array, offset + i * WIDTH, row)
 

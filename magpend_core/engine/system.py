@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def positions(names: Iterable[str]) -> Any:
-    """Return where each name stands: a named tuple of integers 0, 1, 2, ...
+    """Return the index of each name, as a named tuple of the integers 0, 1, 2, ...
 
     Compiled functions read it as a global, so that they say ``p[AT.q]`` and not ``p[16]``; the number
     is a constant of the machine code.
@@ -268,7 +268,7 @@ class System:
 
     @property
     def functions(self) -> tuple[Callable[..., Any], ...]:
-        """All compiled functions."""
+        """All compiled functions of the system, as a tuple."""
         always = self.constants, self.forcing, self.rhs, self.edges, self.layers
         others = self.jacobian, self.quantities, self.switches, self.impacts, self.reset
         return (*always, *(f for f in others if f is not None))
@@ -308,7 +308,7 @@ class System:
 
     @property
     def tableau(self) -> Tableau:
-        """The method's."""
+        """Runge-Kutta coefficients of the system's `method`."""
         from magpend_core.engine.tableau import METHODS
 
         if self.method not in METHODS:
@@ -318,22 +318,24 @@ class System:
 
     @property
     def n_events(self) -> int:
-        """Number of functions on whose zeros steps end."""
+        """Number of event functions; steps end at their zeros."""
         return self.n_switches + self.n_impacts + (self.section is not None)
 
     @property
     def n_contacts(self) -> int:
-        """Number of modes that tell whether a state rests on the surface of an impact."""
+        """Number of modes that say whether the state rests on an impact surface: one per impact, or 0."""
         return self.n_impacts if any(self.sticks) else 0
 
     @property
     def controlled(self) -> int:
-        """Number of states in the error control."""
+        """Number of leading states that enter the error control of the steps."""
         return self.n_states if self.n_controlled is None else self.n_controlled
 
     @property
     def known(self) -> int:
-        """Number of states that the functions know."""
+        """Number of states that the system's functions take; tangent vectors that the engine itself carries are not
+        counted.
+        """
         return self.n_states if self.n_known is None else self.n_known
 
     @property

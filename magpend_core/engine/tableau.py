@@ -70,7 +70,7 @@ class Tableau(NamedTuple):
 
     @property
     def has_two_errors(self) -> bool:
-        """Whether there is a second estimate."""
+        """Whether the method has a second estimate of the error."""
         return bool(self.other_error.any())
 
 

@@ -1,4 +1,4 @@
-"""Carry the tangent vectors of large systems through the stages of a step by loops.
+"""Integrate the tangent vectors of large systems, by loops over the stages of a Runge-Kutta step.
 
 Templates for the engine, see `lanes`. For a small system the products of the Jacobian J and tangent vectors
 are written out in the right-hand side (see `variational.with_tangents`). For a large one the right-hand side
@@ -35,24 +35,26 @@ def order_of(row: dict[int, int]) -> list[int]:
 
 
 def trace_of(rows: list[dict[int, int]], name: str) -> str:
-    """Return the source of the trace of the Jacobian whose tuple is called `name`."""
+    """Return source code for the trace of the Jacobian whose tuple of entries is called `name`."""
     return " + ".join(f"{name}[{row[i]}]" for i, row in enumerate(rows) if i in row)
 
 
 def n_entries(system: System) -> int:
-    """Return how many numbers each stage of a step keeps of the Jacobian; 0 where nothing is carried."""
+    """Return how many numbers each stage of a step stores for the Jacobian; 0 if the engine carries no tangent
+    vectors.
+    """
     if system.known == system.n_states or system.tangents_of is None:
         return 0
     return sum(map(len, rows_of_entries(system.tangents_of))) + _has_trace(system)
 
 
 def _has_trace(system: System) -> bool:
-    """Tell whether a last state integrates the trace of the Jacobian."""
+    """Return whether the last state integrates the trace of the Jacobian."""
     return system.state_names[-1] == DIVERGENCE
 
 
 def tangent_bindings(system: System) -> dict[str, Any]:
-    """Names that these templates use, for a system."""
+    """Return the values of the free names in these function templates, for a system."""
     known, base = system.known, system.tangents_of
     names = {"N_KNOWN": known, "N_ENTRIES": n_entries(system), "CARRIES": n_entries(system) > 0}
     if base is None or not names["CARRIES"]:
@@ -74,7 +76,9 @@ def tangent_bindings(system: System) -> dict[str, Any]:
 
 
 def _tangent_entries(base: System, order: list[int], has_trace: bool) -> Callable[..., Any]:
-    """Return a function that gives the entries of the Jacobian in the order of the loops, and the trace."""
+    """Return a function that evaluates the entries of the Jacobian, in the order in which they are summed, and its
+    trace.
+    """
     parts = [f"entries[{k}]" for k in order]
     if has_trace:
         parts.append(trace_of(rows_of_entries(base), "entries") or "0.0 * y[0]")
@@ -85,7 +89,7 @@ def _tangent_entries(base: System, order: list[int], has_trace: bool) -> Callabl
 
 
 def stage_row(w: Any, row: int, s: int, h: Any) -> None:
-    """Compute one row of the state of stage `s`."""
+    """Compute one component of the state at Runge-Kutta stage `s`."""
     total = STAGES[s, 0] * load(w, row + ROWS.slopes)
     for j in range(1, s):
         # half of the eighth-order method's coefficients are 0, and add nothing
@@ -95,7 +99,7 @@ def stage_row(w: Any, row: int, s: int, h: Any) -> None:
 
 
 def carry_vector(w: Any, base: int, k: int) -> None:
-    """Compute the states and slopes of tangent vector `k` at all stages but the first."""
+    """Compute the states and slopes of tangent vector `k` at all Runge-Kutta stages but the first."""
     h = load(w, base + ROWS.step)
     first = base + N_KNOWN * (1 + k) * WIDTH
     for s in range(1, N_STAGES):
@@ -115,7 +119,7 @@ def carry_vector(w: Any, base: int, k: int) -> None:
 
 
 def carry_trace(w: Any, base: int) -> None:
-    """Compute the integral of the trace, the last row, at all stages but the first."""
+    """Compute the integral of the Jacobian's trace, the last row, at all Runge-Kutta stages but the first."""
     h = load(w, base + ROWS.step)
     row = base + (N - 1) * WIDTH
     for s in range(1, N_STAGES):
@@ -125,7 +129,9 @@ def carry_trace(w: Any, base: int) -> None:
 
 
 def run_stages_and_vectors(w: Any, base: int) -> None:
-    """Compute all stages but the first: of the states, then of each tangent vector, then of the trace."""
+    """Compute all Runge-Kutta stages but the first: of the states, then of each tangent vector, then of the trace
+    integral.
+    """
     for s in range(1, N_STAGES):
         run_stage(w, base, s)
     for k in range(N_VECTORS):

@@ -1,4 +1,4 @@
-"""Tangent vectors beside a trajectory: the system extended by its variational equations.
+"""Extend a system by its variational equations, which integrate tangent vectors beside the trajectory.
 
 `with_tangents` is for changes of the start, `with_parameter_tangent` for those of the parameters, too.
 
@@ -28,7 +28,7 @@ def _first(n: int) -> str:
 
 
 def _products(system: System, n_vectors: int) -> list[str]:
-    """Sources of the entries of J v for each tangent vector v, one vector after the other."""
+    """Return source code for the entries of J v for each tangent vector v, one vector after the other."""
     n, found = system.n_states, []
     for k in range(n_vectors):
         for row in rows_of_entries(system):
@@ -41,7 +41,7 @@ def _products(system: System, n_vectors: int) -> list[str]:
 
 
 def _compile(source: str, name: str, wrapped: Callable[..., Any], bindings: dict[str, Any]) -> Any:
-    """Compile a one-function source; numba cannot build a tuple of given length in a loop.
+    """Compile a function from its source, for example one that returns a tuple of given length.
 
     It passes for a function of the module of `wrapped`, which it calls (see `jit.keeping`).
     """
@@ -108,8 +108,8 @@ def with_tangents(system: System, n_vectors: int, divergence: bool = False, writ
 
 
 def _extended_functions(system: System, n_vectors: int, divergence: bool) -> dict[str, Any]:
-    """Return the functions of the system extended by its variational equations, with the products of Jacobian and
-    tangent vectors written out.
+    """Return the functions of the system extended by its variational equations, with the Jacobian products written
+    out.
     """
     n = system.n_states
     bindings = {"_rhs": system.rhs, "_jacobian": system.jacobian, "_layers": system.layers}
@@ -150,7 +150,7 @@ PLUS, MINUS, PER_STEP = "_plus", "_minus", "per_step"
 
 @cache
 def with_parameter_tangent(system: System) -> System:
-    """Return `system` extended by one tangent vector with a source term: a change of the parameters.
+    """Return `system` extended by the tangent vector of a parameter change: its equation has a source term.
 
     The vector v obeys v' = J v + (f(c_plus) - f(c_minus)) per_step: the Jacobian J is analytic, the direct
     effect of the parameters on the right-hand side f, and on the forcing, a central difference at each stage.

@@ -65,7 +65,7 @@ _LEAST_NORMAL = 2.2250738585072014e-308
 
 @inline
 def _exp_rest(r: Any) -> Any:
-    """The number c of exp(r) = 1 + r + r c/(2 - c) = 1 + 2 r/(2 - c), for |r| < 0.35 (fdlibm)."""
+    """Compute c in exp(r) = 1 + r + r c/(2 - c) = 1 + 2 r/(2 - c), for |r| < 0.35 (fdlibm)."""
     # r coth(r/2) is even in r and needs five coefficients.
     # The quotient costs less than the four products that it saves: dividers are idle here.
     u = r * r
@@ -79,7 +79,7 @@ def _exp_rest(r: Any) -> Any:
 
 @inline
 def exp(x: Any) -> Any:
-    """Exponential function; arguments below -700 count as -700, above 700 as 700."""
+    """Compute the exponential function; arguments beyond +-700 count as +-700."""
     x = minimum(700.0, maximum(-700.0, x))
     shifted = x * LOG2_E + _ROUND
     k = shifted - _ROUND
@@ -90,7 +90,7 @@ def exp(x: Any) -> Any:
 
 @inline
 def expm1(x: Any) -> Any:
-    """Exponential function less 1, without cancellation near 0; arguments beyond +-700 count as these."""
+    """Compute exp(x) - 1 without cancellation near 0; arguments beyond +-700 count as +-700."""
     x = minimum(700.0, maximum(-700.0, x))
     shifted = x * LOG2_E + _ROUND
     k = shifted - _ROUND
@@ -102,21 +102,21 @@ def expm1(x: Any) -> Any:
 
 @inline
 def sinh(x: Any) -> Any:
-    """Hyperbolic sine; arguments beyond +-700 count as these."""
+    """Compute the hyperbolic sine; arguments beyond +-700 count as +-700."""
     t = expm1(absolute(x))
     return copysign(0.5 * (t + t / (t + 1.0)), x)
 
 
 @inline
 def cosh(x: Any) -> Any:
-    """Hyperbolic cosine; arguments beyond +-700 count as these."""
+    """Compute the hyperbolic cosine; arguments beyond +-700 count as +-700."""
     e = exp(absolute(x))
     return 0.5 * e + 0.5 / e
 
 
 @inline
 def tanh(x: Any) -> Any:
-    """Hyperbolic tangent."""
+    """Compute the hyperbolic tangent."""
     a = maximum(-700.0, -2.0 * absolute(x))
     shifted = a * LOG2_E + _ROUND
     k = shifted - _ROUND
@@ -130,7 +130,7 @@ def tanh(x: Any) -> Any:
 
 @inline
 def exp2_falling(x: Any) -> Any:
-    """Two to the power of `x`, which is at most 0; arguments below -1000 count as -1000."""
+    """Compute 2 to the power of `x`, which is at most 0; arguments below -1000 count as -1000."""
     x = maximum(x, -1000.0)
     shifted = x + _ROUND
     r = x - (shifted - _ROUND)
@@ -176,7 +176,7 @@ def _quarter_turns(x: Any) -> Any:
 
 @inline
 def sincos(x: Any) -> Any:
-    """Sine and cosine, for ``|x| < 1e6``."""
+    """Compute sine and cosine, for ``|x| < 1e6``."""
     s, c, shifted = _quarter_turns(x)
     sine = negate_if_bit(where_odd(shifted, c, s), shifted, 1)
     cosine = negate_if_bit(where_odd(shifted, s, c), shifted + 1.0, 1)
@@ -185,14 +185,14 @@ def sincos(x: Any) -> Any:
 
 @inline
 def tan(x: Any) -> Any:
-    """Tangent, for ``|x| < 1e6``."""
+    """Compute the tangent, for ``|x| < 1e6``."""
     s, c, shifted = _quarter_turns(x)
     return where_odd(shifted, -c, s) / where_odd(shifted, s, c)
 
 
 @inline
 def _sine(r: Any) -> Any:
-    """Sine between -pi/2 and pi/2."""
+    """Compute the sine of an argument between -pi/2 and pi/2."""
     u = r * r
     s = 2.731444766986399e-15
     s = s * u - 7.643970296798572e-13
@@ -207,7 +207,7 @@ def _sine(r: Any) -> Any:
 
 @inline
 def sin(x: Any) -> Any:
-    """Sine alone, for ``|x| < 1e6``."""
+    """Compute the sine alone, for ``|x| < 1e6``."""
     shifted = x * _INV_PI + _ROUND
     n = shifted - _ROUND
     return negate_if_bit(_sine((x - n * _PI_1) - n * _PI_2ND), shifted, 0)
@@ -215,7 +215,7 @@ def sin(x: Any) -> Any:
 
 @inline
 def cos(x: Any) -> Any:
-    """Cosine alone, for ``|x| < 1e6``."""
+    """Compute the cosine alone, for ``|x| < 1e6``."""
     # cos(x) = (-1)^n sin((n + 1/2) pi - x)
     shifted = (x * _INV_PI - 0.5) + _ROUND
     n = (shifted - _ROUND) + 0.5
@@ -224,7 +224,7 @@ def cos(x: Any) -> Any:
 
 @inline
 def _atan_core(w: Any) -> Any:
-    """Inverse tangent between -tan(pi/8) and tan(pi/8)."""
+    """Compute the inverse tangent of an argument between -tan(pi/8) and tan(pi/8)."""
     u = w * w
     p = 0.02275052699336167
     p = p * u - 0.04483334622272886
@@ -241,7 +241,7 @@ def _atan_core(w: Any) -> Any:
 
 @inline
 def atan(x: Any) -> Any:
-    """Inverse tangent, in [-pi/2, pi/2]."""
+    """Compute the inverse tangent, in [-pi/2, pi/2]."""
     a = absolute(x)
     # |x| is brought below tan(pi/8) by one quotient: (a - 1)/(a + 1) or -1/a
     top = where_less(a, _TAN_PI_8, a, where_less(a, _TAN_3PI_8, a - 1.0, -1.0))
@@ -252,7 +252,7 @@ def atan(x: Any) -> Any:
 
 @inline
 def atan2(y: Any, x: Any) -> Any:
-    """Angle of the point (x, y), in [-pi, pi], for finite coordinates below 8e307; 0 at the origin."""
+    """Compute the angle of the point (x, y), in [-pi, pi], for finite coordinates below 8e307; 0 at the origin."""
     a, b = absolute(x), absolute(y)
     longer, shorter = maximum(a, b), minimum(b, a)  # a NaN is in one of them
     near = shorter - _TAN_PI_8 * longer
@@ -267,7 +267,7 @@ def atan2(y: Any, x: Any) -> Any:
 
 @inline
 def _asin_rest(u: Any) -> Any:
-    """Return R(z), z = s**2 up to 1/4, of asin(s) = s + s R(s**2) (fdlibm)."""
+    """Compute R(z) in asin(s) = s + s R(z) with z = s**2 up to 1/4 (fdlibm)."""
     p = 3.479331075960212e-05
     p = p * u + 0.0007915349942898145
     p = p * u - 0.04005553450067941
@@ -283,7 +283,7 @@ def _asin_rest(u: Any) -> Any:
 
 @inline
 def asin(x: Any) -> Any:
-    """Inverse sine, in [-pi/2, pi/2]; NaN beyond 1."""
+    """Compute the inverse sine, in [-pi/2, pi/2]; NaN if the argument's absolute value exceeds 1."""
     a = absolute(x)
     # asin(a) = pi/2 - 2 asin(sqrt((1 - a)/2))
     u = where_less(a, 0.5, a * a, 0.5 * (1.0 - a))
@@ -294,7 +294,7 @@ def asin(x: Any) -> Any:
 
 @inline
 def acos(x: Any) -> Any:
-    """Inverse cosine, in [0, pi]; NaN beyond 1."""
+    """Compute the inverse cosine, in [0, pi]; NaN if the argument's absolute value exceeds 1."""
     a = absolute(x)
     u = where_less(a, 0.5, a * a, 0.5 * (1.0 - a))
     s = where_less(a, 0.5, a, sqrt(u))
@@ -305,7 +305,7 @@ def acos(x: Any) -> Any:
 
 @inline
 def _fraction_and_exponent(x: Any) -> Any:
-    """Numbers f and k with x = (1 + f) 2**k and 1 + f between sqrt(1/2) and sqrt(2).
+    """Return f and k with x = (1 + f) 2**k and 1 + f between sqrt(1/2) and sqrt(2).
 
     Both are 0 where `x` is not positive or not finite.
     """
@@ -319,7 +319,7 @@ def _fraction_and_exponent(x: Any) -> Any:
 
 @inline
 def _artanh_rest(u: Any) -> Any:
-    """The function P of log(1 + f) = 2 s + s u P(u) with s = f/(2 + f), u = s**2 (fdlibm)."""
+    """Compute P(u) in log(1 + f) = 2 s + s u P(u) with s = f/(2 + f), u = s**2 (fdlibm)."""
     p = 0.14798198605116586
     p = p * u + 0.15313837699209373
     p = p * u + 0.1818357216161805
@@ -331,7 +331,7 @@ def _artanh_rest(u: Any) -> Any:
 
 @inline
 def log(x: Any) -> Any:
-    """Natural logarithm; minus infinity of 0, NaN of a negative number."""
+    """Compute the natural logarithm; minus infinity of 0, NaN of a negative number."""
     f, k = _fraction_and_exponent(x)
     s = f / (2.0 + f)
     u = s * s
@@ -344,7 +344,7 @@ def log(x: Any) -> Any:
 
 @inline
 def power(x: Any, y: Any) -> Any:
-    """`x` to the real power `y`: NaN of a negative `x`, 0 of 0 to a positive power.
+    """Compute `x` to the real power `y`: NaN of a negative `x`, 0 of 0 to a positive power.
 
     Results beyond exp(+-700) count as these. For whole powers products are better.
     """
@@ -397,19 +397,19 @@ def inverse_sqrt(x: Any) -> Any:
 
 @inline
 def sign(x: Any) -> Any:
-    """-1, 0 or 1; NaN of NaN."""
+    """Return the sign of `x`: -1, 0 or 1; NaN of NaN."""
     return where_less(0.0, x, 1.0, where_less(x, 0.0, -1.0, x))
 
 
 @inline
 def square_wave(phase: Any, duty: Any) -> Any:
-    """1 for the first `duty` of each unit of `phase`, then -1."""
+    """Return 1 for the first fraction `duty` of each unit of `phase`, then -1."""
     return where_less(phase - floor(phase), duty, 1.0, -1.0)
 
 
 @inline
 def log2_rough(x: Any) -> Any:
-    """Binary logarithm of a positive normal number to 5e-4: for step sizes, not for physics."""
+    """Compute the binary logarithm of a positive normal number to 5e-4: for step sizes, not for physics."""
     m = mantissa(x) - 1.0
     p = -0.10782146960672147 * m + 0.3673421951182853
     p = p * m - 0.7020775351811126
@@ -419,7 +419,7 @@ def log2_rough(x: Any) -> Any:
 
 @inline
 def exp2_rough(x: Any) -> Any:
-    """Power of two to 8e-4, for ``|x| < 1000``: for step sizes, not for physics."""
+    """Compute a power of two to 8e-4, for ``|x| < 1000``: for step sizes, not for physics."""
     shifted = x + _ROUND
     r = x - (shifted - _ROUND)
     p = 0.05550360297541146 * r + 0.2402265069591007
@@ -429,13 +429,13 @@ def exp2_rough(x: Any) -> Any:
 
 @inline
 def hypot_rough(x: Any, y: Any) -> Any:
-    """Length of a hypotenuse with sides of at least 0, to 2.2 %: for step sizes, not for physics."""
+    """Compute sqrt(a**2 + b**2) for sides of at least 0, to 2.2 %: for step sizes, not for physics."""
     longer = maximum(x, y)
     return maximum(longer, multiply_add(0.898, longer, 0.486 * minimum(x, y)))
 
 
 @inline
 def wrapped(angle: Any) -> Any:
-    """Angle brought to [-pi, pi] by whole turns."""
+    """Return an angle brought to [-pi, pi] by whole turns."""
     turns = (angle * _INV_TWO_PI + _ROUND) - _ROUND
     return angle - turns * TWO_PI

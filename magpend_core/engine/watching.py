@@ -1,4 +1,4 @@
-"""Track minimum, maximum and mean of named quantities over the periods that end in a kept section.
+"""Track minimum, maximum and mean of named quantities over those drive periods whose end is recorded.
 
 Templates for the engine, see `lanes`. After an accepted step each quantity is known at its begin, its
 middle (from the pair's continuous extension) and its end: the parabola through the three gives the
@@ -38,7 +38,8 @@ LOWEST, HIGHEST, MEAN = 0, 1, 2
 
 
 def watched_function(system: System, watched: tuple[int, ...]) -> Callable[..., Any]:
-    """Return a function of the arguments of ``system.quantities`` that gives the watched values alone.
+    """Return a compiled function with the arguments of ``system.quantities`` that returns only the values to be
+    tracked.
 
     `watched` are numbers in ``system.state_names + system.quantity_names``. numba cannot pick entries of
     a tuple by numbers known at run time only, so the function is written out. It passes for one of the
@@ -55,7 +56,9 @@ def watched_function(system: System, watched: tuple[int, ...]) -> Callable[..., 
 
 
 def evaluate_watched(w: Any, base: int) -> None:
-    """Evaluate the quantities in the middle and at the end of an attempted step, before it is judged."""
+    """Evaluate the tracked quantities in the middle and at the end of an attempted step, before it is accepted or
+    rejected.
+    """
     h = load(w, base + ROWS.step)
     t = load(w, base + ROWS.time)
     for i in range(N):
@@ -75,7 +78,7 @@ def evaluate_watched(w: Any, base: int) -> None:
 
 
 def update_extremes(w: Any, base: int) -> None:
-    """Take an accepted step into the extremes and integrals of the period.
+    """Update the extremes and integrals of the current period with an accepted step.
 
     A step of size 0, the first of every period, leaves the values at its begin behind.
     """
@@ -103,7 +106,7 @@ def update_extremes(w: Any, base: int) -> None:
 
 
 def keep_extremes(w: Any, base: int, lane: int, out: Any) -> None:
-    """Write a lane's extremes and means of the period that has ended to `out` (n_watched, 3)."""
+    """Write minimum, maximum and mean of each tracked quantity over the period just ended to `out` (n_watched, 3)."""
     for i in range(N_WATCHED):
         row = base + i * WIDTH + lane
         out[i, LOWEST] = w[row + ROWS.lowest]
@@ -113,13 +116,15 @@ def keep_extremes(w: Any, base: int, lane: int, out: Any) -> None:
 
 
 def set_watching(work: Any, lane: int, watching: int) -> None:
-    """Note whether a lane is watched, and count it in its group."""
+    """Note whether the quantities in a SIMD lane are tracked, and update the count of such lanes in its group."""
     work.n_watching[lane // WIDTH] += watching - work.watching[lane]
     work.watching[lane] = watching
 
 
 def begin_watch(work: Any, lane: int, wanted: bool) -> None:
-    """Begin a period of a lane: its extremes and integrals start anew if they are wanted."""
+    """Begin a period of a SIMD lane: reset extremes and integrals, and note whether the quantities are to be
+    tracked.
+    """
     set_watching(work, lane, 1 if wanted else 0)
     base, column = (lane // WIDTH) * ROWS.size, lane % WIDTH
     for i in range(N_WATCHED):

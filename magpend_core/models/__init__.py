@@ -1,4 +1,4 @@
-"""Load the models that ship with magpend, by name or as text.
+"""Load the models that ship with magpend by name, and other models from their definition as text.
 
 `load_model` finds a model by name, or reads what a run keeps of it. Nothing here imports the compiler.
 """
@@ -44,12 +44,13 @@ def _texts() -> dict[str, Path]:
 
 
 def model_names() -> tuple[str, ...]:
-    """Return the names of the shipped models, without reading text models."""
+    """Return the names of the shipped models, without reading those that are text files."""
     return (*_models(), *_texts())
 
 
 def load_model(reference: str | Mapping[str, Any] | Model = DEFAULT) -> Model:
-    """Return a model by name, or as text; equal texts give one object. Nothing is imported or executed.
+    """Return a model by its name or from its text, without importing or executing anything; equal texts give one
+    object.
 
     Parameters
     ----------
@@ -89,7 +90,7 @@ def load_model(reference: str | Mapping[str, Any] | Model = DEFAULT) -> Model:
 
 
 def _of_table(table: Mapping[str, Any]) -> Model:
-    """Read a model's table: one object for all texts that are written the same in the end."""
+    """Return the model that a table defines; tables that differ only in their writing give the same object."""
     try:
         # not sorted: the order of the states is the model's
         text = json.dumps(table)
@@ -122,7 +123,7 @@ def _shipped(name: str) -> Model:
 
 
 def load_preset(name: str | None = None, **overrides: float) -> Parameters:
-    """Return the parameters of the default model, the paper's pendulum, some of them replaced.
+    """Return the parameters of the default model, the paper's pendulum, with some values replaced.
 
     Parameters
     ----------
@@ -151,7 +152,7 @@ def preset_names(model: str = DEFAULT) -> tuple[str, ...]:
 
 
 def preset_provenance(name: str | None = None, model: str = DEFAULT) -> dict[str, str]:
-    """Return the source of each parameter of a preset: the paper, or a calibration.
+    """Return for each parameter of a preset where its value comes from: the paper, or a calibration.
 
     Returns
     -------
@@ -170,7 +171,7 @@ def _reduced(parameters: Parameters) -> tuple[Any, ...]:
 def _again(
     reference: str | Mapping[str, Any], values: dict[str, float], crossing: Crossing | None = None
 ) -> Parameters:
-    """Unpickle parameters: models are known by name, or by their text, and by their section."""
+    """Unpickle parameters, given the model's reference, the values, and the Poincare section if it has one."""
     found = load_model(reference)
     return Parameters(found if crossing is None else sectioned(found, crossing), values)
 

@@ -1,4 +1,4 @@
-"""Import models that are Python objects if the user names one; describe them otherwise.
+"""Import models that are Python objects if the user names one; otherwise use a stored description of them.
 
 A run keeps a description: names, units, bounds, presets, and the digest of the files that decide the
 equations. Opening or drawing needs no more, and imports nothing. What integrates needs the object itself,
@@ -35,12 +35,13 @@ _imported: dict[str, Model] = {}
 
 
 def is_object_path(text: str) -> bool:
-    """Tell whether a text names a Python object: ``package.module:NAME``."""
+    """Return whether a text has the form of a path to a Python object, ``package.module:NAME``."""
     return _PATH.fullmatch(text) is not None
 
 
 def import_model(path: str, folder: str | Path | None = None) -> Model:
-    """Import a model; this runs its module's code. Call it only if the user has named the object.
+    """Import a model from ``package.module:NAME``, which runs the module's code: call it only if the user named the
+    object.
 
     Parameters
     ----------
@@ -95,7 +96,7 @@ def import_model(path: str, folder: str | Path | None = None) -> Model:
 
 
 def _description(path: str, model: Model) -> dict[str, Any]:
-    """Return the description of a model that a run stores, as plain data."""
+    """Return a model's description as plain data, as a run stores it."""
     table: dict[str, Any] = {KEY: path, "digest": model.digest}
     table |= {name: getattr(model, name) for name in ("name", "title", "section", "angle_dim")}
     table["autonomous"] = model.autonomous
@@ -110,24 +111,24 @@ def _description(path: str, model: Model) -> dict[str, Any]:
 
 
 def _plain(one: Any) -> dict[str, Any]:
-    """Return the fields of a dataclass except its name and its default values."""
+    """Return the fields of a dataclass as a dict, without its name and without fields that have their default value."""
     values = {f.name: (getattr(one, f.name), f.default) for f in fields(one) if f.name != "name"}
     return {name: value for name, (value, default) in values.items() if value != default}
 
 
 @dataclass(frozen=True, eq=False)
 class DescribedModel(Model):
-    """A model known only by its description: it names its states and parameters, and cannot be integrated."""
+    """A model known only by its stored description: it has names of states and parameters, but cannot be integrated."""
 
     @cached_property
     def digest(self) -> str:
-        """Return the object's digest at the time of the description."""
+        """Return the digest of the model's source files that the description stores."""
         assert self.text is not None
         return str(self.text["digest"])
 
     @cached_property
     def system(self) -> System:
-        """Raise: a described model has no object that could be integrated."""
+        """Raise `ParameterError`: a model known by description alone has no equations to integrate."""
         assert self.text is not None
         path = self.text[KEY]
         known = _imported.get(path)
@@ -142,7 +143,7 @@ class DescribedModel(Model):
 
 
 def origin(model: Model) -> tuple[str, str] | None:
-    """Return the arguments of `import_model` for another process; None if nothing was imported."""
+    """Return the arguments with which another process can call `import_model`; None if the model was not imported."""
     path = "" if model.text is None else str(model.text.get(KEY, ""))
     known = _imported.get(path)
     if known is None or known.text != model.text:
@@ -154,13 +155,13 @@ def origin(model: Model) -> tuple[str, str] | None:
 
 
 def known_model(table: Mapping[str, Any]) -> Model | None:
-    """Return the object of a description, or of its place alone, if it was imported here and is the same."""
+    """Return the model already imported in this process that a description or an object path belongs to, or None."""
     known = _imported.get(str(table[KEY]))
     return known if known is not None and (len(table) == 1 or known.text == table) else None
 
 
 def described_model(table: Mapping[str, Any]) -> Model:
-    """Return a model from its description alone; it names everything and integrates nothing.
+    """Return a model from its stored description alone; it has all names and values, but cannot be integrated.
 
     Parameters
     ----------
@@ -196,7 +197,7 @@ def described_model(table: Mapping[str, Any]) -> Model:
 
 
 def _outer_problems(table: Mapping[str, Any]) -> list[str]:
-    """Return the keys of a description that are missing, unknown or of the wrong kind."""
+    """Return a sentence for each key of a description that is missing, unknown or of the wrong type."""
     known = (KEY, *_TEXTS, *_TABLES, "autonomous", "mirror")
     problems = [f"{key}: no part of a model's description." for key in table if key not in known]
     problems += [f"{key}: must be a text." for key in _TEXTS if not isinstance(table.get(key), str)]
@@ -209,7 +210,9 @@ def _outer_problems(table: Mapping[str, Any]) -> list[str]:
 
 
 def _entries(kind: Any, table: Mapping[str, Any], key: str, problems: list[str]) -> tuple[Any, ...]:
-    """Read the states, parameters, ... of a description as plain values of the right types."""
+    """Convert a description's table of states, parameters, quantities or presets to objects; collect problems in
+    `problems`.
+    """
     found = []
     for name, entry in table[key].items():
         where = f"{key}.{name}"

@@ -1,4 +1,4 @@
-"""Define a model for all code above the engine. Imports no compiler.
+"""Define the class `Model` and its parts, for all code above the engine; imports no compiler.
 
 A model names its states and parameters, its presets with their provenance, and the system that the engine
 integrates. It may bring more: quantities of state and time, a classifier of motions with its words, a
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 
 class ModelError(ParameterError):
-    """There is no model of this name, or what describes one does not hold together."""
+    """Error: no model has the name asked for, or a model's definition is not consistent."""
 
 
 def _no_model(name: str) -> Model:
@@ -41,7 +41,7 @@ model_named: Callable[[str], Model] = _no_model
 
 @dataclass(frozen=True)
 class State:
-    """One state of a model.
+    """Name, unit and properties of one state of a model.
 
     Attributes
     ----------
@@ -73,7 +73,7 @@ class State:
 
 @dataclass(frozen=True)
 class Quantity:
-    """A quantity of state and time that a model can tell: an energy, a torque, a position.
+    """A quantity that a model computes from state and time: an energy, a torque, a position.
 
     Attributes
     ----------
@@ -89,7 +89,7 @@ class Quantity:
 
 @dataclass(frozen=True)
 class Classifier:
-    """Words for the motions of a model, told from stored sections.
+    """Classification of a model's motions into named classes, computed from stored sections.
 
     Attributes
     ----------
@@ -114,7 +114,8 @@ class Classifier:
 
 @dataclass(frozen=True)
 class Mirror:
-    """A symmetry that maps motions on motions: the state's components times `signs`, half a period later.
+    """A symmetry of a model: multiplying the states by `signs`, perhaps half a drive period later, gives a solution
+    again.
 
     Attributes
     ----------
@@ -130,7 +131,7 @@ class Mirror:
 
 @dataclass(frozen=True)
 class Drawing:
-    """A model's appearance, for portraits and animations.
+    """Geometry of a model for portraits and animations: moving and fixed points, and the lines between them.
 
     Attributes
     ----------
@@ -159,7 +160,7 @@ def _no_relations(values: Mapping[str, float]) -> list[str]:
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """A periodically forced system as everyone above the engine sees it.
+    """A forced system with its states, parameters, presets and equations, as the code above the engine uses it.
 
     Attributes
     ----------
@@ -211,7 +212,7 @@ class Model:
 
     @property
     def reference(self) -> str | Mapping[str, Any]:
-        """Return the model's stored reference for `load_model`: its name, or its text."""
+        """Return the model's reference, as stored and as `load_model` reads it: its name, or its text as a table."""
         return self.name if self.text is None else self.text
 
     @property
@@ -221,17 +222,17 @@ class Model:
 
     @property
     def crossing(self) -> Crossing | None:
-        """Return the model's section by crossing; None for a stroboscopic section."""
+        """Return the model's Poincare section at a level of a state; None if the section is stroboscopic."""
         return None
 
     @property
     def flow(self) -> Model:
-        """Return the model without a section by crossing; its trajectories are the same."""
+        """Return the model without its Poincare section (if it has one); its trajectories are the same."""
         return self
 
     @property
     def section_states(self) -> tuple[str, ...]:
-        """Return the names of the states that differ from section to section, in order."""
+        """Return the names of the states that vary on the Poincare section, in order."""
         return self.state_names
 
     @property
@@ -246,17 +247,17 @@ class Model:
 
     @property
     def is_angle(self) -> tuple[bool, ...]:
-        """Return a flag per state: whether it is an angle."""
+        """Return for each state whether it is an angle."""
         return tuple(s.on_circle for s in self.states)
 
     @property
     def angles(self) -> tuple[str, ...]:
-        """Return the names of the angles among the states."""
+        """Return the names of those states that are angles."""
         return tuple(s.name for s in self.states if s.on_circle)
 
     @property
     def scales(self) -> tuple[float, ...]:
-        """Return the scale of each state."""
+        """Return for each state the size that counts as 1 when states are compared."""
         return tuple(s.scale for s in self.states)
 
     @property
@@ -266,7 +267,9 @@ class Model:
 
     @property
     def portraits(self) -> tuple[tuple[str, str], ...]:
-        """Return the state pairs of phase portraits: each with its rate, else neighbours."""
+        """Return the pairs of states for phase portraits: each state with its time derivative, else neighbouring
+        states.
+        """
         pairs = tuple((s.name, s.rate) for s in self.states if s.rate)
         names = self.state_names
         return pairs or tuple(itertools.pairwise(names)) or ((names[0], names[0]),)
@@ -278,14 +281,14 @@ class Model:
 
     @cached_property
     def system(self) -> System:
-        """Return the system for the engine; imports the compiler."""
+        """Return the system that the engine integrates; imports the compiler."""
         module, _, attribute = self.system_path.partition(":")
         found: System = getattr(importlib.import_module(module), attribute)
         return found
 
     @cached_property
     def digest(self) -> str:
-        """Return the digest of the model's own sources, without comments and docstrings."""
+        """Return the digest of the model's source files, comments and docstrings left out."""
         from magpend_core.source_digests import meaning_digest
 
         return meaning_digest(self.sources)
@@ -315,7 +318,7 @@ class Model:
         raise ParameterError([f"{name!r} is not a parameter of {self.name}; {hint}"])
 
     def preset(self, name: str | Path | Preset | None = None) -> Preset:
-        """Return a preset with all values that it defines, those of its base included.
+        """Return a preset by name or file, with all its values and those of the preset it is based on.
 
         Parameters
         ----------
@@ -340,7 +343,7 @@ class Model:
         raise ParameterError([f"preset {found!r} does not exist for {self.name}; {hint}"])
 
     def load(self, preset: str | Path | Preset | None = None, **overrides: float) -> Parameters:
-        """Return the parameters of a preset, some of them replaced.
+        """Return the parameters of a preset, with the given values replaced.
 
         Parameters
         ----------
@@ -426,7 +429,7 @@ class Parameters(Mapping[str, float]):
         return self.model.parameter_names
 
     def as_dict(self) -> dict[str, float]:
-        """Return all values by name, in the order of `pack`."""
+        """Return all values as a dict by parameter name, in the order of `pack`."""
         return dict(self._values)
 
     def pack(self) -> np.ndarray:
@@ -434,7 +437,7 @@ class Parameters(Mapping[str, float]):
         return np.array(list(self._values.values()), dtype=np.float64)
 
     def replace(self, **overrides: float) -> Self:
-        """Return a copy with some values replaced.
+        """Return a copy with the given values replaced.
 
         Parameters
         ----------

@@ -1,4 +1,4 @@
-"""Parameters of a model: named, bounded, validated, packed into one flat vector for the kernels.
+"""Define the parameters of a model: named, bounded, validated, packed into one flat vector for the kernels.
 
 All quantities are in the model's own units (SI for those that ship). Names are unique within a model, so
 that an override or a sweep axis needs the bare name only.
@@ -31,7 +31,7 @@ BOUNDS: dict[str, Callable[[float], bool]] = {
 
 
 class ParameterError(ValueError):
-    """One or more parameters are unknown, missing or out of bounds.
+    """Error: one or more parameters are unknown, missing or out of bounds.
 
     Attributes
     ----------
@@ -46,7 +46,7 @@ class ParameterError(ValueError):
 
 @dataclass(frozen=True)
 class Parameter:
-    """One parameter of a model.
+    """Name, unit, meaning and bound of one parameter of a model.
 
     Attributes
     ----------
@@ -67,7 +67,7 @@ class Parameter:
     symbol: str = ""
 
     def problem(self, value: Any) -> str | None:
-        """Return the sentence for a bad value, or None."""
+        """Return an error sentence if a value is not allowed for this parameter, else None."""
         wanted = self.bound if self.bound == FINITE else f"a number {self.bound}"
         if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
             return f"{self.name} = {value!r} is not a number; give {wanted}."
@@ -79,12 +79,12 @@ class Parameter:
 
 
 def near_names(name: str, known: Iterable[str], what: str) -> str:
-    """Return the hint of a sentence on an unknown name: the nearest known ones, or all."""
+    """Return a hint for an unknown name: "did you mean" with the nearest known names, or else all known names."""
     names = list(known)
     near = difflib.get_close_matches(str(name), names, n=3, cutoff=0.5)
     return f"did you mean {' or '.join(near)}?" if near else f"known {what}: {', '.join(names)}."
 
 
 def unknown_name_problem(name: str, known: Iterable[str]) -> str:
-    """Return the sentence for an unknown parameter name, with the nearest known names."""
+    """Return an error sentence for an unknown parameter name, with the nearest known names."""
     return f"{name!r} is not a parameter; {near_names(name, known, 'names')}"

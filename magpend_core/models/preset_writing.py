@@ -1,4 +1,4 @@
-"""Write presets that specifications can name by their file."""
+"""Write a preset of a model's parameters to a TOML file that specifications can name."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def write_preset(
     *,
     base: str | Preset | None = None,
 ) -> Path:
-    """Write a preset that specifications can name: ``preset = "FILE.toml"``.
+    """Write a preset file that specifications can name by ``preset = "FILE.toml"``.
 
     Parameters
     ----------

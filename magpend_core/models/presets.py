@@ -1,4 +1,4 @@
-"""Presets: named values of a model's parameters, each with a phrase that says where it comes from.
+"""Define presets: named values of a model's parameters, each with a phrase that says where it comes from.
 
 A preset is a TOML file, whether it ships in a model's room or was written by a person or by a fit::
 
@@ -31,7 +31,7 @@ KEYS = ("model", "base", "title")
 
 @dataclass(frozen=True)
 class Preset:
-    """Named values of parameters, and where each comes from.
+    """Named values of parameters, and the source of each value.
 
     Attributes
     ----------
@@ -56,7 +56,7 @@ class Preset:
 
     @classmethod
     def read(cls, path: Path) -> Preset:
-        """Read a file: tables of values, and ``[provenance]`` by parameter or by table.
+        """Read a preset from a TOML file: tables of values, and ``[provenance]`` by parameter or by table.
 
         Raises
         ------
@@ -83,7 +83,7 @@ class Preset:
 
 
 def _problems(tables: Mapping[str, Any]) -> list[str]:
-    """Return sentences on entries that do not belong in a preset's file."""
+    """Return an error sentence for each entry that does not belong in a preset's file."""
     problems = [
         f"{key} = {tables[key]!r}: must be a text in quotes."
         for key in KEYS
@@ -108,12 +108,12 @@ def _problems(tables: Mapping[str, Any]) -> list[str]:
 
 
 def is_file(name: str | Path) -> bool:
-    """Tell whether a preset is named by a file: a path, or a name that ends in ``.toml``."""
+    """Return whether a preset is given by a file: a path, or a name that ends in ``.toml``."""
     return isinstance(name, Path) or str(name).endswith(SUFFIX)
 
 
 def find_preset(name: str | Path, folder: str | Path = ".") -> str | Preset:
-    """Convert a preset's name or file to the argument of `Model.load`; a file is read.
+    """Return a preset read from its file, or the name of one that ships unchanged, as `Model.load` accepts it.
 
     Parameters
     ----------
@@ -131,7 +131,7 @@ def find_preset(name: str | Path, folder: str | Path = ".") -> str | Preset:
 
 
 class Owner(Protocol):
-    """The part of a `Model` that its presets need."""
+    """Protocol with the attributes of a `Model` that its presets need."""
 
     @property
     def name(self) -> str:
@@ -139,25 +139,25 @@ class Owner(Protocol):
 
     @property
     def presets(self) -> tuple[Preset, ...]:
-        """Presets that ship."""
+        """Presets that ship with the model."""
 
     @property
     def preset_names(self) -> tuple[str, ...]:
-        """Names of the presets that ship."""
+        """Names of the presets that ship with the model."""
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
-        """Names of the parameters."""
+        """Names of the model's parameters."""
 
     def preset(self, name: str) -> Preset:
-        """Return a preset by name."""
+        """Return the model's preset of this name."""
 
     def parameter(self, name: str) -> Parameter:
-        """Return a parameter by name."""
+        """Return the model's parameter of this name."""
 
 
 def completed(preset: Preset, model: Owner, model_named: Callable[[str], Owner]) -> Preset:
-    """Return a preset with the values of its base, checked against the model that it is to serve.
+    """Return a preset filled up with the values of its base preset, checked against the model that is to use it.
 
     Raises
     ------
@@ -196,7 +196,7 @@ def completed(preset: Preset, model: Owner, model_named: Callable[[str], Owner])
 
 
 def value_problems(model: Owner, values: Mapping[str, Any], sources: Mapping[str, str]) -> list[str]:
-    """Return sentences on names, values and provenance that do not fit a model."""
+    """Return an error sentence for each name, value or provenance that does not fit a model."""
     problems = []
     for name, value in values.items():
         try:

@@ -1,4 +1,6 @@
-"""A model of a flow seen through a section by crossing: its level is one more parameter, the last."""
+"""Give the model of an autonomous flow a Poincare section at a level of one state; the level becomes its last
+parameter.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SectionedModel(Model):
-    """A model whose sections are crossings; made by `sectioned`.
+    """A model with a Poincare section at a level of one state; made by `sectioned`.
 
     Attributes
     ----------
@@ -38,39 +40,41 @@ class SectionedModel(Model):
 
     @property
     def crossing(self) -> Crossing | None:
-        """Return the section."""
+        """Return the Poincare section: its state, level and direction."""
         return self.through
 
     @property
     def flow(self) -> Model:
-        """Return the model without the section."""
+        """Return the model without its Poincare section."""
         return self.whole
 
     @property
     def section_states(self) -> tuple[str, ...]:
-        """Names of the states but the one that crosses; of a flow of one state that one."""
+        """Names of the states except the one that defines the section; of a one-dimensional flow the name of its only
+        state.
+        """
         return tuple(name for name in self.state_names if name != self.through.of) or self.state_names
 
     @property
     def reference(self) -> str | Mapping[str, Any]:
-        """Return the stored reference of the model without the section."""
+        """Return the reference of the model without its Poincare section, as runs store it."""
         return self.whole.reference
 
     @cached_property
     def system(self) -> System:
-        """Return the system with its crossing, for the engine; imports the compiler."""
+        """Return the system that the engine integrates, with the Poincare section; imports the compiler."""
         from magpend_core.engine.crossing import with_section
 
         return with_section(self.whole.system, self.through.of, self.through.sign)
 
     @cached_property
     def digest(self) -> str:
-        """Return the digest of the model, and of the section's state and direction."""
+        """Return a digest of the model and of the state and direction of its Poincare section."""
         seen = f"{self.whole.digest} {self.through.of} {self.through.direction}"
         return hashlib.sha256(seen.encode()).hexdigest()[: len(self.whole.digest)]
 
     def preset(self, name: str | Path | Preset | None = None) -> Preset:
-        """Return a preset of the model with the section's level added; see `Model.preset`."""
+        """Return a preset of the model, with the level of the Poincare section added; see `Model.preset`."""
         if isinstance(name, Preset) and LEVEL in name.values:
             return name
         return _with_level(self.whole.preset(name), self.through)
@@ -78,7 +82,7 @@ class SectionedModel(Model):
 
 @cache
 def sectioned(model: Model, crossing: Crossing) -> SectionedModel:
-    """Return a model seen through a section: the same object for the same model and section.
+    """Return a model with a Poincare section; equal arguments give the same object.
 
     Parameters
     ----------
@@ -111,7 +115,7 @@ def sectioned(model: Model, crossing: Crossing) -> SectionedModel:
 
 
 def of_flow(parameters: Parameters) -> Parameters:
-    """Return the parameters of the flow without its section; its trajectories are the same."""
+    """Return the parameters for the model without its Poincare section; its trajectories are the same."""
     model = parameters.model.flow
     if model is parameters.model:
         return parameters
@@ -127,7 +131,7 @@ def _with_level(preset: Preset, crossing: Crossing) -> Preset:
 
 
 def _mirror(model: Model, crossing: Crossing) -> Mirror | None:
-    """Return the model's symmetry if it maps the section on itself, and takes no part of a drive's period."""
+    """Return the model's symmetry if it maps the Poincare section onto itself without a shift in time, else None."""
     mirror = model.mirror
     if mirror is None or mirror.half_period or mirror.signs[model.state_names.index(crossing.of)] < 0:
         return None

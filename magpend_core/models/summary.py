@@ -1,4 +1,4 @@
-"""Describe a model: the features found in its equations, and the results of the checks."""
+"""Describe a model: its equations, the features by which steps are chosen, and the results of the checks."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def checks_of(model: Model) -> list[str]:
 
 @dataclass(frozen=True)
 class Description:
-    """The description of a model: its features, and the results of its checks.
+    """Description of a model: equations, features by which steps are chosen, and problems found by the checks.
 
     Attributes
     ----------
@@ -44,7 +44,7 @@ class Description:
 
 
 def describe(parameters: Parameters, frequency_hz: float, states: np.ndarray) -> Description:
-    """Check a model at the parameters of a run; imports the compiler, and compiles nothing.
+    """Check and describe a model at the parameters of a run; imports the compiler, but compiles nothing.
 
     Parameters
     ----------
@@ -69,7 +69,7 @@ def describe(parameters: Parameters, frequency_hz: float, states: np.ndarray) ->
 
 
 def _written(model: Model) -> tuple[dict[str, str], dict[str, str], list[str]]:
-    """Return definitions, equations and LaTeX of a model as text."""
+    """Return the definitions, equations and LaTeX lines of a model given as text; empty for other models."""
     from magpend_core.models.text.model import TextModel
 
     if not isinstance(model, TextModel):
@@ -84,7 +84,7 @@ def _written(model: Model) -> tuple[dict[str, str], dict[str, str], list[str]]:
 
 
 def _found(parameters: Parameters, frequency_hz: float, states: np.ndarray) -> Iterator[str]:
-    """Yield a sentence on each edge, layer, switch and impact that limits the steps."""
+    """Yield a sentence on each edge, layer, switch and impact of the equations that steps are adapted to."""
     from magpend_core.engine.plain_python import plain
     from magpend_core.models.text.model import TextModel
 

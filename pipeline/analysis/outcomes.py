@@ -51,7 +51,9 @@ def outcomes(ids: xr.Dataset) -> xr.DataArray:
 
 
 def stability_of_cells(ids: xr.Dataset) -> np.ndarray:
-    """Return the stability of each cell's set, 0 for none, on the parameter dims and then the start dims."""
+    """Return the stability code of the set that each cell ends on (0: none), on the parameter dims and then the start
+    dims.
+    """
     dims, _ = split_dims(ids["attractor_id"])
     cells, stability = _cells(ids, "attractor_id"), ids["stability"].transpose(*dims, "attractor").values
     found = np.zeros(cells.shape, np.int8)
@@ -83,7 +85,7 @@ def other_cells(ids: xr.Dataset) -> Mapping[str, np.ndarray]:
 
 
 def share_interval(count: np.ndarray, share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Compute the 95 % Wilson interval of shares from numbers of cells; NaN where the share is 0.
+    """Compute the 95 % Wilson interval of basin shares from numbers of cells; NaN where the share is 0.
 
     Parameters
     ----------
@@ -106,7 +108,7 @@ def _cells(ids: xr.Dataset, name: str) -> np.ndarray:
 
 
 def left_out(ids: xr.Dataset) -> str:
-    """Return `sentence` if some cells end on no attractor; otherwise an empty text."""
+    """Return the sentence on outcomes if some cells end on no attractor; otherwise an empty text."""
     return sentence(ids) if other_cells(ids) else ""
 
 

@@ -1,4 +1,4 @@
-"""Define what an analysis may ask of a run."""
+"""Define the interface of a run that analyses use."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ class Run(Protocol):
 
     @property
     def spec(self) -> Spec:
-        """Return the run's specification."""
+        """Specification of the run."""
 
     @property
     def model(self) -> Model:
-        """Return the run's model."""
+        """Model of the run."""
 
     @property
     def echo(self) -> Callable[[str], None]:
-        """Return the function that prints a line."""
+        """Function that prints a line."""
 
     def cube(self, chunks: Any = None) -> xr.Dataset:
-        """Return the cells of the run."""
+        """Return the data cube of the run."""
 
     def derive(self, name: str, **options: Any) -> xr.Dataset:
         """Return the result of another analysis of the same cells."""

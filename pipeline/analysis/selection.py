@@ -88,7 +88,7 @@ def _slack(values: Floats, index: int) -> float:
 
 
 def snap(ds: xr.Dataset, at: Mapping[str, float]) -> dict[str, float]:
-    """Replace values by the nearest axis values; keep values outside of an axis."""
+    """Replace parameter values by the nearest axis values; keep values outside of an axis."""
     found = {}
     for name, value in at.items():
         axis = ds[name].values.astype(np.float64).ravel() if name in ds.dims else np.array([value])
@@ -98,7 +98,7 @@ def snap(ds: xr.Dataset, at: Mapping[str, float]) -> dict[str, float]:
 
 
 def select_points(ds: xr.Dataset, at: Mapping[str, float] | None, *, purpose: str = "") -> xr.Dataset:
-    """Select values of a cube's swept parameters, and keep the dims with length 1.
+    """Select values of a cube's swept parameters; the selected dims stay, with length 1.
 
     Parameters
     ----------

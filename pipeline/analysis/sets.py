@@ -53,7 +53,7 @@ class Geometry:
 
     @property
     def circumference(self) -> np.ndarray:
-        """Scaled length of each component's circle, 0 for those on a line."""
+        """Scaled length of each angle's circle; 0 for components that are no angles."""
         return np.where(self.is_angle, TWO_PI / np.asarray(self.scales), 0.0)
 
     def scaled(self, points: np.ndarray) -> np.ndarray:
@@ -74,7 +74,7 @@ class Geometry:
         return np.asarray(difference)
 
     def distance(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        """Return the largest scaled difference of a component, over the last axis."""
+        """Return the distance of two states: the largest scaled difference of a component, over the last axis."""
         return np.asarray(np.abs(self.difference(a, b)).max(axis=-1))
 
     def tree(self, points: np.ndarray) -> cKDTree:
@@ -82,7 +82,7 @@ class Geometry:
         return cKDTree(self.scaled(points), boxsize=self.circumference)
 
     def boxes(self, points: np.ndarray, side: float) -> np.ndarray:
-        """Return the integer coordinates of each state's box; a circle holds a whole number of boxes."""
+        """Return the integer coordinates of each state's box; the circle of an angle holds a whole number of boxes."""
         scaled = self.scaled(points)
         boxes = np.empty(scaled.shape, np.int64)
         for i, length in enumerate(self.circumference):
@@ -129,7 +129,7 @@ def hashes(rows: np.ndarray) -> np.ndarray:
 
 
 def groups(n: int, pairs: np.ndarray) -> np.ndarray:
-    """Return the number of each node's connected group, for `n` nodes and pairs (m, 2)."""
+    """Return the number of each node's connected component, for `n` nodes and edges (m, 2)."""
     edges = np.asarray(pairs, np.int64).reshape(-1, 2)
     graph = coo_array((np.ones(len(edges), np.int8), (edges[:, 0], edges[:, 1])), shape=(n, n))
     return np.asarray(connected_components(graph, directed=False)[1], np.int64)

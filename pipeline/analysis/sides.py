@@ -1,4 +1,4 @@
-"""Classify the motion of a run's cells by the model's classifier, for example by side.
+"""Classify the motion of a run's cells by the model's classifier.
 
 The model defines the labels, the rule and its evidence (`magpend_core.models.model.Classifier`). This module
 applies the rule with the parameters of the run, swept parameters included.
@@ -74,7 +74,7 @@ def classify(ds: xr.Dataset, *, parameters: Parameters | None = None) -> xr.Data
 
 
 def flags_of(classifier: Classifier) -> dict[str, Any]:
-    """Return the attributes of an array of a classifier's codes."""
+    """Return the xarray attributes of an array of classifier codes: unit, name, flag values and meanings."""
     return {
         "units": "1",
         "long_name": classifier.meaning,
@@ -98,7 +98,9 @@ def _label(
     swept: list[str],
     n_angles: int,
 ) -> np.ndarray:
-    """Classify the cells of a block; leading dims broadcast, a section's last dims are period and state."""
+    """Return the classifier code of each cell of a block; leading dims broadcast, the last dims of sections are period
+    and state.
+    """
     values = {**fixed, **dict(zip(swept, rest, strict=False))}
     turns = rest[len(swept)] if len(rest) > len(swept) else np.zeros((1,) * status.ndim + (n_angles,), int)
     known = np.isfinite(section).all(axis=(-2, -1)) & np.isin(status, _COMPUTED)

@@ -38,7 +38,7 @@ def words_of(array: xr.DataArray) -> list[str]:
 
 
 def values(one: xr.Dataset, *names: str) -> Row:
-    """Return the values of scalar variables, codes as their labels; missing variables are left out."""
+    """Return the values of scalar variables by name, codes as their labels; missing variables are left out."""
     found = {name: one[name].item() for name in names if name in one}
     return {n: words_of(one[n])[v] if "flag_meanings" in one[n].attrs else v for n, v in found.items()}
 
@@ -49,28 +49,30 @@ def counted(n: int, noun: str) -> str:
 
 
 def points_of(ds: xr.Dataset, dims: Sequence[str]) -> Iterator[tuple[dict[str, int], Row]]:
-    """Yield the parameter points: the indices by dim, and the parameter values."""
+    """Yield the index of each parameter point, by dim, and its parameter values."""
     for index in np.ndindex(*(ds.sizes[d] for d in dims)):
         at = dict(zip(dims, index, strict=True))
         yield at, where_of(ds, at)
 
 
 def sets_of(ds: xr.Dataset, there: xr.DataArray, dims: Sequence[str]) -> Iterator[tuple[Row, xr.Dataset]]:
-    """Yield the sets for which `there` is true: the parameter values, and the variables of the set."""
+    """Yield the sets (attractors and others) for which `there` is true: the parameter values, and the variables of the
+    set.
+    """
     for *index, i in np.argwhere(there.transpose(*dims, "attractor").values).tolist():
         at = dict(zip(dims, index, strict=True))
         yield where_of(ds, at), ds.isel({**at, "attractor": i})
 
 
 def point_table(ds: xr.Dataset, where: Row, rows: Sequence[Row], words: Callable[[Row], Words]) -> list[str]:
-    """Return the lines of the table of one parameter point; its heading is empty if nothing is swept."""
+    """Return the lines of the table of one parameter point, without a heading if nothing is swept."""
     text = ", ".join(f"{d} {v:g}{unit_of(ds, d)}" for d, v in where.items())
     here = [row for row in rows if all(row[k] == v for k, v in where.items())]
     return [f"{text}:"] * bool(text) + aligned([words(row) for row in here])
 
 
 def at_point(ds: xr.Dataset, row: Row, dims: Sequence[str]) -> Words:
-    """Return the columns with a row's parameter values."""
+    """Return the table columns with the parameter values of a row."""
     return {f"{d}{unit_of(ds, d)}": f"{row[d]:g}" for d in dims}
 
 
@@ -102,7 +104,7 @@ def distinct(values: Iterable[Any]) -> str:
 
 
 def ranges(ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str]) -> dict[str, str]:
-    """Return the columns with the range of each axis and the number of points."""
+    """Return the table columns with the range of each axis and the number of parameter points."""
     words = {}
     for d in dims:
         values = [row[d] for row in rows]
@@ -111,7 +113,7 @@ def ranges(ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str]) -> dict[str
 
 
 def largest_share(ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str]) -> str:
-    """Format the largest fraction and its parameter point."""
+    """Format the largest basin fraction among rows, and the parameter point at which it occurs."""
     best = max(rows, key=lambda row: (np.nan_to_num(row["fraction"], nan=-1.0),))
     if not np.isfinite(best["fraction"]):
         return "-"
@@ -122,7 +124,7 @@ def largest_share(ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str]) -> s
 def summary(
     ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str], describe: Callable[..., Words], key: str
 ) -> list[str]:
-    """Return the lines of a table with one row per value of `key`."""
+    """Group rows by the value of `key`, and return the lines of a table with one line per group."""
     groups: dict[int, list[Row]] = {}
     for row in rows:
         groups.setdefault(row[key], []).append(row)
@@ -146,7 +148,7 @@ def with_error(value: float, error: float, most: int = 6) -> str:
 
 
 def axis_ranges(ds: xr.Dataset, dim: str, rows: Sequence[Row], alone: bool) -> str:
-    """Format the ranges of neighbouring axis values; the whole range if they are many or not `alone`."""
+    """Format the ranges of neighbouring axis values; the whole range if they are many or the table has several axes."""
     axis = ds[dim].values.astype(np.float64)
     values = np.array(sorted({row[dim] for row in rows}))
     places = np.searchsorted(np.sort(axis), values)

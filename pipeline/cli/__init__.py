@@ -1,1 +1,1 @@
-"""Run the command line: parse, call, print."""
+"""Run the commands of ``magpend``: parse arguments, call the library, print results."""

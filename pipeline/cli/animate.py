@@ -125,7 +125,7 @@ def _start(
     transient: int,
     alone: bool,
 ) -> Start | None:
-    """Return the given start; None if a run is given and no start."""
+    """Return the initial state and model that the options give; None if a run is given and no initial state."""
     from pipeline.runs.filming import Start
     from pipeline.specification.problems import SpecError
 
@@ -147,7 +147,7 @@ def _contradictions(
     cell: list[int] | None,
     start: Start | None,
 ) -> list[str]:
-    """Return problems with options that exclude each other."""
+    """Return a message for each pair of options that exclude each other."""
     of_run: dict[str, Any] = {"--at": at, "--attractor": attractor, "--cell": cell}
     problems = []
     if directory is None:
@@ -162,7 +162,7 @@ def _contradictions(
 
 
 def _place(run: Run | None, at: dict[str, float], attractor: list[str] | None, cell: list[int] | None) -> Path:
-    """Return the default file of a film: in the run's figures, named by its content."""
+    """Return the default file of an animation: among the run's figures, named by its content."""
     if run is None:
         return Path("animation.gif")
     files = run.info.files

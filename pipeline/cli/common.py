@@ -1,4 +1,4 @@
-"""Share arguments, the list of exit codes and the output of tables among commands."""
+"""Define the arguments, the list of exit codes and the output of tables that commands share."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def read_pairs(option: str, texts: list[str], example: str) -> dict[str, float]:
 
 
 def check_csv(path: str | None) -> None:
-    """Refuse a table that cannot be written, before anything is computed."""
+    """Raise SpecError if a CSV file cannot be written, before anything is computed."""
     from pipeline.cli.outputs import check_file
     from pipeline.specification.problems import SpecError
 
@@ -58,7 +58,7 @@ def check_csv(path: str | None) -> None:
 
 
 def tell(table: Table, csv: str | None, as_json: bool) -> None:
-    """Print a table: its lines, or with `as_json` or ``-`` only its rows."""
+    """Print a table: its text lines, its rows as JSON with `as_json`, or its rows as CSV if `csv` is ``-``."""
     from pipeline.cli import console
 
     if as_json:

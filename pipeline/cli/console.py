@@ -25,11 +25,11 @@ FIRST_LINE_S, LINE_EVERY_S, BAR_EVERY_S = 2.0, 10.0, 0.3
 
 
 class EnoughError(Exception):
-    """An error for a standard output that its reader has closed, as ``head`` does."""
+    """Raised when the reader of the standard output, such as ``head``, has closed it."""
 
 
 def visible(text: str) -> str:
-    """Show control characters as escapes: a text from a file must not steer a terminal."""
+    """Replace control characters by their escapes, so that a text from a file cannot control the terminal."""
     if text.isprintable():
         return text
     return "".join(c if c.isprintable() or c == "\n" else repr(c)[1:-1] for c in text)
@@ -46,7 +46,7 @@ def note(line: str) -> None:
 
 
 def result(line: str) -> None:
-    """Write a line of a result to the standard output.
+    """Print one line of a command's result to the standard output.
 
     Raises
     ------
@@ -76,7 +76,7 @@ class _Stderr(logging.Handler):
 
 
 def configure(quiet: bool, verbose: bool, log: Path | None) -> None:
-    """Set up the log: what goes to the standard error, and what to a file.
+    """Set up the log: choose the messages that are printed to the standard error, and open the ``--log`` file.
 
     Raises
     ------
@@ -136,14 +136,14 @@ class Display:
         self._lock, self._over = threading.RLock(), threading.Event()
 
     def __call__(self, what: str, done: float, total: float, expected_s: float = 0.0) -> None:
-        """Take a report; see `pipeline.products.reporting.report`."""
+        """Record a progress report: the name of the work, and the amounts done and in total."""
         with self._lock:
             if what != self._work.what:
                 self._work = Work(what, self._clock(), done, expected_s=expected_s)
             self._work.done, self._work.total, self._work.heard = done, total, self._clock()
 
     def show(self) -> None:
-        """Show the present progress."""
+        """Print the current progress: a bar on a terminal, else a line of the log."""
         with self._lock:
             line = self._work.line(self._clock())
             if not self._terminal:
@@ -154,7 +154,7 @@ class Display:
                 self._drawn = True
 
     def clear(self) -> None:
-        """Remove the bar."""
+        """Remove the progress bar from the terminal."""
         with self._lock:
             if self._drawn:
                 sys.stderr.write("\r\x1b[2K")
@@ -162,7 +162,7 @@ class Display:
                 self._drawn = False
 
     def watch(self) -> None:
-        """Show the progress at intervals until `stop` is called."""
+        """Redraw the progress of the command at intervals until `stop` is called."""
         pause = FIRST_LINE_S
         while not self._over.wait(pause):
             self.show()
@@ -227,7 +227,7 @@ def at_rest() -> None:
 
 @contextlib.contextmanager
 def progress(name: str) -> Iterator[None]:
-    """Show the progress of the work inside this context, under a name."""
+    """Show the progress of the work that runs inside this context, under a name."""
     display = Display(name)
     Display.current = display
     watcher = threading.Thread(target=display.watch, daemon=True)

@@ -1,4 +1,4 @@
-"""Start the command line: install signal handlers first, since loading the rest takes a moment."""
+"""Start the command line; signal handlers are installed before the slow imports."""
 
 from __future__ import annotations
 

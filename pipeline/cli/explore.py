@@ -1,4 +1,4 @@
-"""Define ``magpend explore DIR``: a page to explore a run."""
+"""Define ``magpend explore DIR``, which shows a run on an interactive page in a browser."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Define ``magpend export``: the explorer as files, without a server."""
+"""Define ``magpend export``, which writes the interactive page of a run as files."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def export(
         float, typer.Option(min=1, max=100, help="Largest size of the single file [MB]. Default: 20.")
     ] = 20.0,
 ) -> None:
-    """Write the explorer of a run as files that need no magpend server: to send, to publish, to keep.
+    """Write the interactive page of a run as files that need no magpend server, to send or publish.
 
     The files hold the diagram, its overlays and the orbits of attractors, but no live integration. Parts that
     do not fit into one file are left out, and the page names them.

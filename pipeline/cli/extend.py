@@ -1,4 +1,4 @@
-"""Define ``magpend extend``: widen a run and reuse all computed cells."""
+"""Define ``magpend extend``, which widens a run and reuses all computed cells (trajectories)."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def extend(
     dashboard: Dashboard = False,
     dry_run: DryRun = False,
 ) -> None:
-    """Widen a run; computed cells are reused, not integrated again.
+    """Widen the ranges of a run, or add products to it; computed cells (trajectories) are reused.
 
     The files are the same as those of a fresh run of the wider specification. You can stop the command at any
     time: the same command continues. Without --out the old run is kept as DIR.before.
@@ -81,7 +81,7 @@ def extend(
 
 
 def _axes(texts: list[str]) -> dict[str, dict[str, Any]]:
-    """Read ``NAME=LOW:HIGH:NUM``."""
+    """Parse ``--axis`` texts, ``NAME=LOW:HIGH:NUM``, into ranges by axis name."""
     from pipeline.layout.vocabulary import parameter_name
     from pipeline.specification.problems import SpecError
 
@@ -99,7 +99,7 @@ def _axes(texts: list[str]) -> dict[str, dict[str, Any]]:
 
 
 def _products(texts: list[str]) -> dict[str, dict[str, Any]]:
-    """Read ``NAME`` and ``NAME={key = value, ...}``."""
+    """Parse ``--product`` texts, ``NAME`` or ``NAME={key = value, ...}``, into options by product name."""
     import tomllib
 
     from pipeline.specification.problems import SpecError

@@ -1,4 +1,4 @@
-"""Build groups of commands from a registry, each command when it is needed."""
+"""Build command groups whose commands are created from a registry only when they are used."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ SETTINGS = {"help_option_names": ["-h", "--help"]}
 
 
 def made(name: str, function: Command, help: str) -> Any:
-    """Make a command from a function."""
+    """Create a command-line command from a Python function."""
     app = typer.Typer(add_completion=False, rich_markup_mode=None)
     app.command(name, help=help, epilog=EXIT_HELP, context_settings=SETTINGS)(speaking(function))
     return get_command(app)
 
 
 class RegistryGroup(TyperGroup):
-    """The group ``magpend VERB``: commands from a registry, and its own commands."""
+    """The command group ``magpend VERB``: commands created from a registry, and explicitly defined ones."""
 
     verb = ""
 
@@ -32,7 +32,7 @@ class RegistryGroup(TyperGroup):
         raise NotImplementedError
 
     def make(self, name: str) -> Any:
-        """Make the command with a name."""
+        """Create the registry's command of a given name."""
         raise NotImplementedError
 
     def list_commands(self, ctx: Any) -> list[str]:
@@ -40,11 +40,11 @@ class RegistryGroup(TyperGroup):
         return [*self.names(), *super().list_commands(ctx)]
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        """Return a command; one from the registry is made now."""
+        """Return a command by name; create it if it is one of the registry."""
         return self.make(cmd_name) if cmd_name in self.names() else super().get_command(ctx, cmd_name)
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """Find a command; explain the order if the directory came first."""
+        """Find a command by name; raise an error with the right word order if the directory was given first."""
         if args and args[0] not in self.list_commands(ctx):
             later = [a for a in args[1:] if a in self.list_commands(ctx)]
             if later:
@@ -60,10 +60,10 @@ _MOVED = {"branches": "magpend analyse branches DIR", "analyze": "magpend analys
 
 
 class TopGroup(TyperGroup):
-    """The group ``magpend``: its commands, and hints for moved ones."""
+    """The top-level command group ``magpend``; it suggests a name for an unknown or renamed command."""
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """Find a command; if there is none, name the nearest or the moved one."""
+        """Find a command by name; for an unknown name, raise an error that suggests the nearest or the new name."""
         if args and args[0] not in self.list_commands(ctx) and not args[0].startswith("-"):
             from pipeline.specification.problems import unknown_name
 
@@ -74,7 +74,7 @@ class TopGroup(TyperGroup):
 
 
 def registry_group(verb: str, names: Callable[[], list[str]], make: Callable[[str], Any]) -> type[TyperGroup]:
-    """Return a class of groups whose commands are made by `make`."""
+    """Return a class of command groups whose commands are created by the function `make`."""
 
     class Group(RegistryGroup):
         def names(self) -> list[str]:

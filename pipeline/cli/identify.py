@@ -1,4 +1,4 @@
-"""Define ``magpend identify``: identify parameters from recordings, and judge the result on others."""
+"""Define ``magpend identify``, which fits model parameters to recordings and tests them on other recordings."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ RUN = "spec"
 
 
 class IdentifyGroup(TyperGroup):
-    """The group ``magpend identify``: SPEC itself, ``check`` and ``compare``."""
+    """The command group ``magpend identify``: ``identify SPEC``, ``identify check`` and ``identify compare``."""
 
     default = RUN
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Insert the default command if the first word is not a command."""
+        """Insert the default command if the first argument is not the name of a command."""
         known = (*self.list_commands(ctx), "--help", "-h", "--install-completion", "--show-completion")
         meant = [self.default, *args] if args and args[0] not in known else args
         return list(super().parse_args(ctx, meant))
@@ -85,7 +85,7 @@ def check(
     ] = 0,
     as_json: Json = False,
 ) -> None:
-    """Judge an identification on another recording; only the starts of its pieces are fitted."""
+    """Test identified parameters on another recording; only the initial states of its pieces are fitted."""
     from pipeline.cli import console
     from pipeline.rig.identify import check as checking
     from pipeline.rig.identify.reports import judgement_lines
@@ -109,7 +109,7 @@ def compare(
     as_json: Json = False,
     csv: Csv = None,
 ) -> None:
-    """Compare identifications by their held-out pieces, not by their fits; the best one comes first."""
+    """Compare identifications by their errors on held-out pieces of the recordings; the best one comes first."""
     from pipeline.cli.common import check_csv, tell
     from pipeline.rig.identify.comparison import compare as comparing
 

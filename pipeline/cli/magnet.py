@@ -1,4 +1,4 @@
-"""Define ``magpend fit-magnet``: fit torque curves and write a preset."""
+"""Define ``magpend fit-magnet``, which fits measured torque curves and writes a parameter preset."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def fit_magnet(
 
 
 def _folder(path: Path) -> Path:
-    """Refuse a folder that cannot be written to, before anything is computed."""
+    """Return the folder of the results; raise an error if it cannot be written to."""
     from pipeline.cli.outputs import check_place
     from pipeline.specification.problems import SpecError
 

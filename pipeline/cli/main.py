@@ -128,7 +128,7 @@ def _complain(error: BaseException) -> None:
 
 
 def _short(text: str) -> str:
-    """Cut a message to `MOST_SAID` bytes: long lines in the middle, then lines at the end."""
+    """Shorten an error message to `MOST_SAID` bytes: long lines lose their middle, further lines are dropped."""
     said: list[str] = []
     size = 0
     lines = visible(text).split("\n")
@@ -169,7 +169,7 @@ def main() -> None:
 
 
 def _usage(error: Any) -> None:
-    """Print which word of a command is wrong, and how to get help."""
+    """Print which word of a command line is wrong, and the command that shows the help."""
     context = getattr(error, "ctx", None)
     message = error.format_message()
     near = getattr(error, "possibilities", None)
@@ -182,7 +182,7 @@ def _usage(error: Any) -> None:
 
 
 def _leave_quietly() -> None:
-    """Discard the rest of the output, since its reader has closed it, as ``head`` does."""
+    """Redirect the standard output to the null device, since its reader (such as ``head``) has closed it."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 

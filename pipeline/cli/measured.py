@@ -1,4 +1,4 @@
-"""Define ``magpend measured``: diagrams of recordings, alone and compared with a run.
+"""Define ``magpend measured``: bifurcation diagrams of recorded sweeps, alone or compared with a run.
 
 These commands take recordings and their mapping; a run is only used for comparison. They are therefore not
 among the analyses and figures of a run, which read its cells alone.
@@ -34,7 +34,7 @@ Set = Annotated[list[str] | None, typer.Option("--set", metavar="NAME=VALUE", he
 
 
 def _load(paths: list[Path], mappings: list[Path]) -> list[Mapping]:
-    """Return a mapping for each recording; all must have the same model."""
+    """Load the mapping file of each recording; raise `SpecError` unless all mappings name the same model."""
     from pipeline.rig.recordings import load_mapping
     from pipeline.specification.problems import SpecError
 
@@ -50,7 +50,7 @@ def _load(paths: list[Path], mappings: list[Path]) -> list[Mapping]:
 
 
 def _read(paths: list[Path], mappings: list[Mapping]) -> list[xr.Dataset]:
-    """Read recordings, and print their findings."""
+    """Read recordings, and print the problems found in them."""
     from pipeline.cli import console
     from pipeline.rig.recordings import findings_of, read_recording, summary
 
@@ -90,7 +90,7 @@ def steps(
     csv: Csv = None,
     as_json: Json = False,
 ) -> None:
-    """List the steps of a sweep: frequency, jitter, duty cycle, orbit period and its confidence.
+    """List the frequency steps of a recorded sweep: frequency, jitter, duty cycle, orbit period and its confidence.
 
     Motions are classified, for example by side, with the preset's parameters.
     """

@@ -1,4 +1,4 @@
-"""Define ``magpend model``: show a system as magpend reads it, or begin one from a template."""
+"""Define ``magpend model``: show a model's equations as magpend reads them, or write a template for a new model."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def new(
         Path | None, typer.Argument(metavar="[FILE]", help="TOML file to write; by default the standard output.")
     ] = None,
 ) -> None:
-    """Write a commented specification with an own model as a template; it runs as it is."""
+    """Write a commented specification with a model of your own as a template; it runs unchanged."""
     from pipeline.cli import console
     from pipeline.runs.modelling import write_template
 

@@ -1,4 +1,4 @@
-"""Turn a model of options into a command's options, with their types, defaults, bounds and help."""
+"""Turn the fields of an options class into command-line options, with types, defaults, bounds and help."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _IMPORTED = "import_model"
 
 
 def speaking(command: Command) -> Command:
-    """Add the options that all commands have (see `_VOICES`) to a command, and show its progress."""
+    """Add the options that all commands share (``--quiet``, ``--log``, ...), and show the command's progress."""
     has_force = any(p.name == "force" for p in _own(command))
 
     def run(*args: Any, **given: Any) -> None:
@@ -58,7 +58,7 @@ def speaking(command: Command) -> Command:
 
 
 def taking(model: type[Options], command: Command) -> Command:
-    """Replace a command's parameter ``options`` by one option for each field of a model.
+    """Replace the parameter ``options`` of a command function by one command-line option per field of `model`.
 
     The given values are validated together, and the command is called with the model.
     """
@@ -84,7 +84,7 @@ def taking(model: type[Options], command: Command) -> Command:
 
 
 def completing(words: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]:
-    """Return a function that completes an incomplete word for a shell."""
+    """Return a function that lists the `words` that begin with an incomplete word, for completion in the shell."""
 
     def complete(incomplete: str) -> list[str]:
         return [word for word in words() if word.startswith(incomplete)]
@@ -93,7 +93,7 @@ def completing(words: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]
 
 
 def flag_of(model: type[Options], name: str) -> str:
-    """Return the name of a field on the command line."""
+    """Return the command-line flag of a field, such as ``--max-period``."""
     extra: Any = model.model_fields[name].json_schema_extra or {}
     return str(extra.get("flag") or f"--{name.replace('_', '-')}")
 

@@ -1,4 +1,4 @@
-"""Check where a command may write: not into a run directory, not over files of others."""
+"""Check where a command may write: not into a run directory, not over files of other programs."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ _forced = False
 
 
 def allow(force: bool) -> None:
-    """Set whether files that magpend did not write may be replaced by the present command."""
+    """Set whether the current command may replace files that magpend did not write (``--force``)."""
     global _forced
     _forced = force
 
 
 def check_place(path: Path, option: str = "--out", within: str = "") -> None:
-    """Refuse a place that cannot be written to, before anything is computed.
+    """Raise `RefusedError` if a path lies in a run directory, or is a link to a missing file.
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ def check_file(path: Path, option: str = "--out", within: str = "") -> None:
 
 
 def check_table(path: Path, header: str, option: str = "--csv") -> None:
-    """Refuse to replace a table with other columns, since it may be somebody else's.
+    """Raise `SpecError` if the file exists and its header differs, since it may be another program's table.
 
     Raises
     ------
@@ -72,7 +72,7 @@ def check_table(path: Path, header: str, option: str = "--csv") -> None:
 
 
 def check_log(path: Path) -> None:
-    """Refuse to append to a file that is not a log.
+    """Raise `SpecError` if the file exists and is not a log file.
 
     Raises
     ------
@@ -97,7 +97,7 @@ def _refuse(path: Path, option: str) -> None:
 
 
 def _is_own(path: Path) -> bool:
-    """Return whether a file has magpend's mark, is empty, or may be a table: see `check_table`."""
+    """Return whether a file is empty, mentions magpend at its begin or end, or is a CSV table with a header."""
     with path.open("rb") as file:
         begin = file.read(_LOOKED_AT)
         file.seek(max(0, path.stat().st_size - _LOOKED_AT))

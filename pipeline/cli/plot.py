@@ -70,7 +70,7 @@ def draw(directory: str, name: str, options: FigureOptions) -> None:
 
 
 def _target_of(options: FigureOptions) -> Path:
-    """Return the requested file; ``--format`` is added to a name without it."""
+    """Return the figure file given by ``--out``, with the suffix of ``--format`` added if it is missing."""
     out, suffix = Path(options.out), f".{options.format}"
     return out.with_name(out.name + suffix) if options.format and out.suffix.lower() != suffix else out
 
@@ -82,7 +82,7 @@ def _in_run(files: Files, name: str, options: FigureOptions) -> Path:
 
 
 def check_figure_path(path: Path, within: str = "") -> None:
-    """Refuse a figure file that cannot be written, before anything is computed; see `check_place`."""
+    """Raise an error if a figure file cannot be written, before anything is computed; see `check_file`."""
     from pipeline.cli.outputs import check_file
     from pipeline.specification.problems import SpecError
 

@@ -1,4 +1,4 @@
-"""Define ``magpend recordings``: show, convert and simulate recordings of a rig."""
+"""Define ``magpend recordings``: show, convert and simulate recordings of an experiment."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def show(
     out: Annotated[Path | None, typer.Option(help="Figure, .png, .pdf or .svg.")] = None,
     as_json: Json = False,
 ) -> None:
-    """Describe a recording; with a mapping, list its findings and draw it.
+    """Describe a recording; with a mapping file, list the problems found in it and draw it.
 
     Without --mapping the command lists the channels of the file, which a mapping can name. With a mapping it
     reads them as states of the model, checks them, and with --out draws them. The exit code is 0 whatever the
@@ -76,7 +76,7 @@ def convert(
         float | None, typer.Option(help="Window of the smoothing [s]; by default the data choose.")
     ] = None,
 ) -> None:
-    """Write a recording in SI units in another format; with TDMS and CSV also the mapping that reads it."""
+    """Convert a recording to SI units and another file format; for TDMS and CSV also write its mapping file."""
     from pipeline.cli import console
     from pipeline.rig.recordings import mapping_for, write_recording
     from pipeline.rig.recordings.writing import check_target
@@ -98,7 +98,7 @@ def simulate(
     spec: Annotated[Path, typer.Argument(metavar="SPEC", help="Virtual rig (TOML).")],
     out: Annotated[Path, typer.Option(help="File to write: .tdms or .csv; the mapping goes beside it.")],
 ) -> None:
-    """Write the recording of a virtual rig, marked as simulated, and the mapping that reads it."""
+    """Simulate a recording of an experiment, and write it with the mapping file that reads it."""
     from pipeline.cli import console
     from pipeline.rig.recordings.writing import SUFFIXES, check_target, write_raw
     from pipeline.rig.simulation import load_rig, simulated
@@ -153,7 +153,7 @@ def drive(
 
 
 def _keep(file: Path, out: Path) -> None:
-    """Refuse to overwrite the recording that is read."""
+    """Raise `SpecError` if the output file is the recording that is read."""
     from pipeline.specification.problems import SpecError
 
     if out.exists() and file.exists() and out.samefile(file):
@@ -161,14 +161,16 @@ def _keep(file: Path, out: Path) -> None:
 
 
 def _check_recording(out: Path) -> None:
-    """Refuse to replace a file that magpend did not write; `_beside` decides if a mapping exists."""
+    """Raise an error if the output file exists and magpend did not write it; `_beside` checks a file that has a
+    mapping.
+    """
     check_place(out)
     if not out.with_suffix(".toml").exists():
         check_file(out)
 
 
 def _beside(out: Path, text: str) -> Path:
-    """Return the place of a recording's mapping; refuse to replace another file."""
+    """Return the path of a recording's mapping file; raise `SpecError` if it holds another text."""
     from pipeline.specification.problems import SpecError
 
     path = out.with_suffix(".toml")
@@ -195,7 +197,7 @@ def _smoothed(ds: xr.Dataset, wanted: bool, window_s: float | None) -> xr.Datase
 
 
 def _tell(ds: xr.Dataset, as_json: bool) -> None:
-    """Print quantities and findings, as lines or as one JSON object."""
+    """Print the quantities of a recording and the problems found in it, as lines or as one JSON object."""
     from pipeline.cli import console
     from pipeline.cli.common import json_rows
     from pipeline.rig.recordings.overview import describe_recording

@@ -24,7 +24,7 @@ def pages() -> list[Path]:
 
 
 def rendered(text: str) -> str:
-    """Return a page with all its tables made anew.
+    """Return the text of a page with all its tables regenerated.
 
     Raises
     ------
@@ -35,7 +35,7 @@ def rendered(text: str) -> str:
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Return a table in Markdown."""
+    """Return a Markdown table from its head and rows."""
     lines = [list(head), ["---"] * len(head), *(list(row) for row in rows)]
     return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |" for row in lines)
 
@@ -54,7 +54,7 @@ SHARED = ("plot fractions", "analyse attractors", "analyse branches")
 
 
 def options() -> str:
-    """Return every command with its options."""
+    """Return the description of every command with a table of its options, as Markdown."""
     found, parts = dict(_commands()), []
     listed = {name: dict(_options(found[name])) for name in SHARED}
     for name, command in found.items():
@@ -115,7 +115,7 @@ def _metavar(parameter: Any) -> str:
 
 
 def _help(parameter: Any) -> str:
-    """Return the help of an option, with its default if the help should show one."""
+    """Return the help text of a command-line option, with its default value if the option has one."""
     has_default = isinstance(parameter.default, (int, float, str, Path)) and parameter.default is not False
     return _text(parameter.help or "") + (f" Default: {parameter.default}." if has_default else "")
 
@@ -143,7 +143,7 @@ def workflows() -> str:
 
 
 def specification() -> str:
-    """Return the keys of a specification, table by table."""
+    """Return Markdown tables of the keys of a run's specification."""
     from pipeline.specification import recorded_drive, section, starts, tables
 
     parts = [
@@ -170,7 +170,7 @@ def specification() -> str:
 
 
 def identification() -> str:
-    """Return the keys of an identification's specification, table by table."""
+    """Return Markdown tables of the keys of an identification's TOML file."""
     from pipeline.rig.identify import specification as tables
     from pipeline.rig.identify.unknowns import Identified
 
@@ -188,7 +188,7 @@ _STATES = "Give each state of the model under its own name: {}. For an angle or 
 
 
 def products() -> str:
-    """Return the products of a specification with their keys."""
+    """Return Markdown tables of a specification's products and their keys."""
     from pipeline.products.registry import CELL_PRODUCTS
 
     return "\n\n".join(
@@ -197,7 +197,7 @@ def products() -> str:
 
 
 def mapping() -> str:
-    """Return the keys of a recording's mapping."""
+    """Return Markdown tables of the keys of a recording's mapping file."""
     from pipeline.rig.recordings import mapping as found
 
     top = ("csv", "channels", "drive")
@@ -213,14 +213,14 @@ def mapping() -> str:
 
 
 def findings() -> str:
-    """Return the table of findings in recordings."""
+    """Return the Markdown table of the problems that are searched for in recordings."""
     from pipeline.rig.recordings.findings import KINDS
 
     return table(("finding", "meaning"), ((f"`{kind}`", meaning) for kind, meaning in KINDS.items()))
 
 
 def virtual_rig() -> str:
-    """Return the keys of a virtual rig's specification."""
+    """Return Markdown tables of the keys of a virtual experiment's TOML file."""
     from pipeline.rig import simulation
 
     parts = [
@@ -233,7 +233,7 @@ def virtual_rig() -> str:
 
 
 def study() -> str:
-    """Return the keys of a study."""
+    """Return Markdown tables of the keys of a study's TOML file."""
     from pipeline.report import study as tables
 
     parts = [
@@ -249,7 +249,7 @@ def study() -> str:
 
 
 def measures() -> str:
-    """Return the table of measures for claims, with their options."""
+    """Return the Markdown table of the measures that a study's claims can use, with their options."""
     from pipeline.report import torque_curves
     from pipeline.report.measures import MEASURES
 
@@ -303,7 +303,7 @@ def _bounds(info: Any) -> str:
 
 
 def variables() -> str:
-    """Return the table of a cube's variables; those of products come last."""
+    """Return the Markdown table of a data cube's variables, those of products last."""
     from magpend_core.models import load_model
     from pipeline.layout.schema import REST_STATE, RETURN_TIME, base_variables
     from pipeline.products.registry import CELL_PRODUCTS
@@ -322,7 +322,7 @@ def variables() -> str:
 
 
 def statuses() -> str:
-    """Return the table of a cell's status codes."""
+    """Return the Markdown table of the status codes of a trajectory."""
     from magpend_core.status import Status
 
     return table(("code", "status", "meaning"), ((str(int(s)), f"`{s.name.lower()}`", s.sentence) for s in Status))
@@ -369,7 +369,7 @@ TABLES: dict[str, Callable[[], str]] = {
 
 
 def main() -> None:
-    """Write the pages that are out of date, or with ``--check`` list them."""
+    """Rewrite the pages that are out of date, or list them if ``--check`` is given."""
     check = "--check" in sys.argv[1:]
     stale = [page for page in pages() if rendered(page.read_text("utf-8")) != page.read_text("utf-8")]
     for page in stale:

@@ -1,4 +1,4 @@
-"""Define ``magpend report``: one page on your own runs."""
+"""Define ``magpend report``, which writes one HTML page on runs."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def report(
 
 
 def check_page(path: Path) -> None:
-    """Refuse a page that cannot be written, before anything is computed."""
+    """Raise an error if the HTML page cannot be written, before anything is computed."""
     from pipeline.cli.outputs import check_file
     from pipeline.specification.problems import SpecError
     from pipeline.store.errors import RefusedError

@@ -1,4 +1,4 @@
-"""Define ``magpend reproduce``: compute, draw and judge a study."""
+"""Define ``magpend reproduce``, which computes the figures of a study and tests its claims."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def reproduce(
         int | None, typer.Option(help="Worker processes, 0: none. By default one per core; with --smoke none.", min=0)
     ] = None,
 ) -> None:
-    """Compute, draw and judge the figures of a study, and write one HTML page on them.
+    """Compute and draw the figures of a study, test its claims, and write one HTML page on them.
 
     Complete runs are used, other runs are continued. Every claim gets a measured value with its interval, and
     one of four verdicts. A coarse grid or a small sample leaves a claim undecided.
@@ -71,7 +71,7 @@ def reproduce(
 
 
 def _check_folder(folder: Path) -> None:
-    """Refuse a folder that cannot be written to, before anything is computed."""
+    """Raise an error if the folder cannot be written to, before anything is computed."""
     from pipeline.cli.outputs import check_place
     from pipeline.specification.problems import SpecError
     from pipeline.store.errors import RefusedError

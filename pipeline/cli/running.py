@@ -69,7 +69,7 @@ def run(
         bool, typer.Option("--plot", help="Draw the finished run: a diagram, its exponents, or a map.")
     ] = False,
 ) -> None:
-    """Run a specification, or complete its run.
+    """Compute all cells (trajectories) of a specification, or those still missing in its run directory.
 
     You can stop the command at any time: the same command continues, and the finished files are the same. At
     the end it counts the cells by status. Cells that diverged or failed are results, and the exit code is 0;
@@ -105,7 +105,7 @@ def run(
 
 
 def _plot(run: Run) -> None:
-    """Draw the figure that shows a finished run best; if that fails, print a note, no error."""
+    """Draw the figure that gives the best overview of a finished run; if drawing fails, print the reason."""
     from pipeline.cli import console
     from pipeline.cli.plot import draw
     from pipeline.products.registry import FIGURES
@@ -154,7 +154,7 @@ def verify(
         ),
     ] = False,
 ) -> None:
-    """Check every committed byte against the commit records, and the set-up's files against run.json."""
+    """Compare every committed byte with the commit records, and metadata and coordinates with run.json."""
     from pipeline.cli import console
     from pipeline.runs import verify as verification
 

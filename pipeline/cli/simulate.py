@@ -107,7 +107,7 @@ def simulate(
 
 
 def _draw(ds: xr.Dataset, target: Path, series: Path) -> None:
-    """Write the figure of a series, and its data beside it unless the series is the same file."""
+    """Write the figure of a time series, and its data unless the series file already holds them."""
     from pipeline.cli import console
     from pipeline.plots import plot_trajectory, save_data, save_figure
 
@@ -118,12 +118,12 @@ def _draw(ds: xr.Dataset, target: Path, series: Path) -> None:
 
 
 def _states(words: list[str]) -> dict[str, float]:
-    """Read ``--NAME VALUE`` pairs with the names of states."""
+    """Parse ``--NAME VALUE`` pairs into the values of states by name."""
     return {name: values[0] for name, values in read_named(words, 1).items()}
 
 
 def read_named(words: list[str], n: int) -> dict[str, Any]:
-    """Read ``--NAME VALUE ...`` with `n` numbers each, by name; raise `SpecError` with all mistakes."""
+    """Parse ``--NAME VALUE ...`` with `n` numbers each into a dict; raise `SpecError` with all mistakes."""
     from pipeline.specification.problems import SpecError
 
     found: dict[str, Any] = {}

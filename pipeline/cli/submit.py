@@ -21,7 +21,7 @@ def submit(
         bool, typer.Option("--smoke", help="Run the specification's small size, which takes seconds.")
     ] = False,
 ) -> None:
-    """Run a specification as a job of SLURM, PBS, Grid Engine or LSF, and print how to follow it.
+    """Run a specification as a job of SLURM, PBS, Grid Engine or LSF, and print the commands that follow it.
 
     The job continues where an earlier one was stopped.
     """

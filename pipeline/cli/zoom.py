@@ -57,7 +57,7 @@ def zoom(
 
 
 def _named(words: list[str]) -> tuple[dict[str, Any], dict[str, int]]:
-    """Read ``--NAME LOW HIGH`` and ``--num-NAME N``."""
+    """Parse ``--NAME LOW HIGH`` and ``--num-NAME N`` into ranges and numbers of points, by name."""
     from pipeline.specification.problems import SpecError
 
     numbered: list[str] = []
@@ -78,7 +78,7 @@ def _named(words: list[str]) -> tuple[dict[str, Any], dict[str, int]]:
 
 
 def _axes(texts: list[str]) -> tuple[dict[str, tuple[float, float]], dict[str, int]]:
-    """Read ``NAME=LOW:HIGH`` and ``NAME=LOW:HIGH:NUM``."""
+    """Parse ``--axis`` texts, ``NAME=LOW:HIGH`` or ``NAME=LOW:HIGH:NUM``, into ranges and numbers of points."""
     from pipeline.specification.problems import SpecError
 
     ranges, points, problems = {}, {}, []

@@ -1,1 +1,1 @@
-"""Run tasks: the only room that knows dask, and the pipeline's entry to the kernel."""
+"""Run tasks: the only package that uses dask, and the pipeline's entry to the kernel."""

@@ -28,7 +28,7 @@ _TLS_SETTINGS = (
 
 
 class SchedulerError(Exception):
-    """Error of a scheduler or its workers; the message gives the reason and the remedy."""
+    """Raised for an unusable scheduler or worker; the message gives the reason and the remedy."""
 
 
 @dataclass(frozen=True)
@@ -50,12 +50,12 @@ class Address:
 
     @property
     def url(self) -> str:
-        """Address as dask writes it."""
+        """Address in dask's form, such as ``tcp://host:8786``."""
         return f"{self.scheme}://{self.host}:{self.port}"
 
     @property
     def named(self) -> str:
-        """Address for messages, with its source unless that is the option."""
+        """Address for messages; its source is added unless the option ``--scheduler`` gave it."""
         return self.url if self.source == OPTION else f"{self.url} (from {self.source})"
 
 
@@ -133,7 +133,7 @@ def security_of(address: Address) -> Any:
 
 
 def ask(address: Address) -> None:
-    """Check within seconds that a dask scheduler answers at an address.
+    """Raise `SchedulerError` unless a dask scheduler answers at an address within seconds.
 
     Raises
     ------

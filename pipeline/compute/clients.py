@@ -31,7 +31,7 @@ _SAY_EVERY_S, _CONNECT_S = 30.0, 10.0
 
 @dataclass(frozen=True)
 class Where:
-    """The place where tasks are computed, as the user states it.
+    """The user's choice of where tasks run: this process, local processes, a dask scheduler or a batch system.
 
     Attributes
     ----------
@@ -57,7 +57,7 @@ class Where:
         return scheduler if isinstance(scheduler, Where) else cls(scheduler)
 
     def resolved(self) -> Address | Cluster | str:
-        """Return an address, a batch system's cluster, ``local`` or ``none``, without starting anything.
+        """Return a scheduler's address, a batch system's settings, ``local`` or ``none``; start nothing.
 
         Raises
         ------
@@ -109,7 +109,7 @@ class Where:
 
 
 def reach(where: Where) -> None:
-    """Check within seconds that an existing scheduler answers; do nothing for other places.
+    """Check within seconds that an existing scheduler answers; do nothing if none is named.
 
     Raises
     ------
@@ -172,7 +172,7 @@ def _client(scheduler: Any, security: Any) -> Any:
 
 
 def _patience() -> int:
-    """Return the longest wait for workers of an existing scheduler [s]."""
+    """Return the longest wait for workers of an existing scheduler [s], from the environment or the default."""
     text = os.environ.get(WAIT) or WAIT_FOR_WORKERS
     try:
         return seconds_of(text)

@@ -1,4 +1,4 @@
-"""Decide whether a trajectory has closed on a periodic orbit, and estimate how long it would take."""
+"""Decide whether a trajectory has converged to a periodic orbit, and estimate how long it would take."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ TOLERANCE: float = Integration.model_fields["closure_tolerance"].default
 
 
 class Closing(NamedTuple):
-    """The distance of a motion from a periodic orbit, and the time until it closes.
+    """Distance of a trajectory from a periodic orbit, and the estimated time until it has converged.
 
     Attributes
     ----------
@@ -45,11 +45,11 @@ class Closing(NamedTuple):
 
     @property
     def is_closed(self) -> bool:
-        """Whether the distance is within `TOLERANCE`."""
+        """Whether the trajectory lies within `TOLERANCE` of a periodic orbit."""
         return self.to_go == 0.0
 
     def sentence(self, n_transient: int) -> str:
-        """Return a sentence, with the ``--transient`` that would suffice after `n_transient` periods."""
+        """Return a sentence on the result, with the ``--transient`` that suffices if `n_transient` periods did not."""
         periods = f"{self.period} drive period{'s' if self.period > 1 else ''}"
         if self.is_closed:
             return f"closed: the motion repeats after {periods} (distance {self.distance:.1e})"
@@ -64,7 +64,7 @@ class Closing(NamedTuple):
 
 
 def closing_of(sections: np.ndarray, system: System) -> Closing | None:
-    """Judge from sections whether a motion closes, by comparing sections that are whole periods apart.
+    """Decide whether a trajectory closes, by comparing stroboscopic points that are whole numbers of periods apart.
 
     The distances of a period fall into four quarters. If the largest of each quarter shrinks from quarter
     to quarter, the sum of all that follow bounds the distance from the orbit, as in
@@ -105,7 +105,9 @@ def closing_of(sections: np.ndarray, system: System) -> Closing | None:
 
 
 def _lag_distances(sections: np.ndarray, p: int, system: System) -> np.ndarray:
-    """Return the scaled distances of sections `p` apart, angles on the circle."""
+    """Return the scaled distances of stroboscopic points `p` periods apart, with angle differences taken on the
+    circle.
+    """
     apart = np.abs(sections[p:] - sections[:-p])
     angles = np.array(system.is_angle, dtype=bool)
     turned = apart[:, angles] % (2.0 * np.pi)
@@ -114,12 +116,12 @@ def _lag_distances(sections: np.ndarray, p: int, system: System) -> np.ndarray:
 
 
 def _late(distances: np.ndarray) -> float:
-    """Return the largest distance of the last quarter."""
+    """Return the largest of the last quarter of the distances."""
     return float(distances[-(len(distances) // 4) :].max())
 
 
 def _judged(p: int, distances: np.ndarray) -> Closing:
-    """Judge the period `p` by the distances of sections `p` apart."""
+    """Return the distance from an orbit of period `p`, and the time to converge, from distances of points `p` apart."""
     quarter = len(distances) // 4
     last = distances[len(distances) - 4 * quarter :].reshape(4, quarter).max(axis=1)
     if last[2:].max() <= 0.01 * TOLERANCE:  # errors of integration hide what shrinks

@@ -1,4 +1,4 @@
-"""Continue branches bit for bit from where another task ended them."""
+"""Continue branches of a continuation from the states in which a preceding task ended them, bit for bit."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ WALKED = ("section", "rest_state", "status", "step_size")
 
 
 def going_on(inputs: Inputs, before: Mapping[str, np.ndarray]) -> Inputs:
-    """Return the inputs with branches that start where the task before ended them.
+    """Return the inputs of branches whose initial states are the final states of the preceding task.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Run tasks on the workers of a dask scheduler, a few in flight per thread, and watch them.
+"""Run tasks on the workers of a dask scheduler, a few in flight per thread, and restart workers that hang.
 
 All waiting happens in the client's event loop. Results and starts of tasks arrive in one queue, so that a
 stopped worker cannot hold up the others.
@@ -48,7 +48,7 @@ Echo = Callable[[str], None]
 
 @dataclass
 class _Flight:
-    """A task that was submitted."""
+    """A submitted task: its index, future, start time and worker."""
 
     index: int
     future: Any
@@ -66,7 +66,7 @@ def announced(task: Task, topic: str, ticket: int, index: int) -> dict[str, Any]
 
 
 class Window:
-    """A runner of an `Order`'s tasks on the workers of a dask client.
+    """Runner of an `Order`'s tasks on the workers of a dask client, with a limited number of tasks in flight.
 
     Parameters
     ----------
@@ -124,7 +124,7 @@ class Window:
             self._fill()
 
     def _fill(self) -> None:
-        """Submit tasks that may start, up to the window; when none are left, failed tasks one by one."""
+        """Submit ready tasks until enough are in flight; once none is left, submit failed tasks one at a time."""
         wanted = WINDOW * max(self._watch.n_threads, 1) - len(self._flights)
         chosen: list[int] = []
         while len(chosen) < wanted and (index := self._order.take()) is not None:
@@ -157,7 +157,7 @@ class Window:
             fetch.add_done_callback(lambda fetched: self._news.put(("end", ticket, fetched.result())))
 
     def _wait(self) -> Iterator[tuple[str, int, Any]]:
-        """Wait at most `TICK_S` for results, and yield those that have arrived."""
+        """Wait at most `TICK_S` for events (starts and ends of tasks), and yield those that have arrived."""
         with contextlib.suppress(queue.Empty):
             yield self._news.get(timeout=TICK_S)
             while True:
@@ -189,7 +189,7 @@ class Window:
         )
 
     def _look(self) -> None:
-        """Check which workers there are, and restart those that do not answer."""
+        """Update the record of workers, and restart those that do not answer."""
         try:
             seen = self._client.sync(self._client.scheduler.identity, n_workers=-1, callback_timeout=ANSWER_S)
         except (OSError, TimeoutError) as error:
@@ -210,7 +210,7 @@ class Window:
             self._echo("the scheduler has no workers; waiting for some")
 
     def _give_up_late(self) -> None:
-        """Give up tasks that have run for too long, and restart their workers."""
+        """Cancel tasks that exceed their time limit, and restart their workers."""
         for ticket, flight in list(self._flights.items()):
             if flight.started is None:
                 continue
@@ -232,7 +232,7 @@ class Window:
             self._order.failed(flight.index, text)
 
     def _restart(self, address: str) -> None:
-        """End a worker; its nanny starts a new one, and the scheduler gives its tasks to others."""
+        """Restart a worker process; the scheduler moves its tasks to other workers."""
         self._watch.forget(address)
         threading.Thread(target=_restarted, args=(self._client, address), daemon=True).start()
 
@@ -255,7 +255,7 @@ class Watch:
 
     @property
     def limit_s(self) -> float:
-        """Longest silence of a worker [s].
+        """Time after which a silent worker counts as hung [s].
 
         It doubles with those that were found: on a machine that is far too busy all are slow to answer.
         """
@@ -271,11 +271,11 @@ class Watch:
         return self._time
 
     def due(self) -> bool:
-        """Whether it is time to look again."""
+        """Return whether the next check of the workers is due."""
         return self.now - self._looked >= max(TICK_S, len(self._heard) / MOST_LOOKED_AT)
 
     def look(self, workers: dict[str, Any]) -> list[str]:
-        """Read the scheduler's list of workers, and return those that do not answer any more."""
+        """Update the record from the scheduler's list of workers, and return the addresses of silent workers."""
         now = self._looked = self.now
         self.n_threads = sum(w["nthreads"] for w in workers.values())
         heard = {}
@@ -290,12 +290,12 @@ class Watch:
         return silent
 
     def forget(self, address: str) -> None:
-        """Forget when a worker last reported."""
+        """Delete the record of a worker's last report."""
         self._heard.pop(address, None)
 
 
 async def _fetched(client: Any, future: Any) -> tuple[Any, BaseException | None]:
-    """Fetch a result, or the error instead."""
+    """Fetch the result of a future; return (result, None) or (None, error)."""
     try:
         return await client.gather(future, asynchronous=True), None
     except (Exception, asyncio.CancelledError) as error:

@@ -1,4 +1,4 @@
-"""Compute the product ``lyapunov``: exponents of a task's cells, from each cell's last kept section."""
+"""Compute the product ``lyapunov``: Lyapunov exponents of each cell of a task, from its last stored section point."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SIGMA = 5.0
 
 
 def exponents(job: Job, options: LyapunovOptions) -> dict[str, np.ndarray]:
-    """Return `LYAPUNOV_VARIABLES` for the cells of a task.
+    """Return the variables `LYAPUNOV_VARIABLES` (exponents, errors, flags) for the cells of a task.
 
     Parameters
     ----------
@@ -66,7 +66,7 @@ def _falling(rates: np.ndarray) -> np.ndarray:
 
 
 def flags(found: LyapunovExponents, *, is_flow: bool = False) -> np.ndarray:
-    """Return codes of `LyapunovFlag`, shape (cell,); only a whole spectrum is compared with the divergence.
+    """Return a code of `LyapunovFlag` for each cell, shape (cell,); a full spectrum is compared with the divergence.
 
     One exponent of a flow must be 0, unless the motion comes to rest.
     """

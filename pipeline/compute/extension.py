@@ -1,4 +1,4 @@
-"""Extend cells of a sweep that another run holds, to more kept sections."""
+"""Extend the trajectories of a stored sweep, so that a run that keeps more section points can use them."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ PER_SECTION = ("section", "extremes")
 
 
 def obstacle(old: Spec, new: Spec) -> str:
-    """Return the reason why cells cannot be extended to another run's `n_keep`; empty if they can."""
+    """Return why stored cells cannot be extended to another run's `n_keep`; empty if they can."""
     had, wanted = old.integration.n_keep, new.integration.n_keep
     if had == wanted:
         return ""
@@ -42,13 +42,13 @@ def obstacle(old: Spec, new: Spec) -> str:
 
 
 def _judged(spec: Spec) -> int:
-    """Return the number of last sections by which a cell's closure is judged."""
+    """Return the number of last section points that decide whether a cell's orbit has closed."""
     n_periods = spec.integration.n_transient + spec.integration.n_keep
     return min(n_periods, window_of(spec.integration.max_orbit_period))
 
 
 def kept_on(spec: Spec, inputs: Inputs, stored: Mapping[str, np.ndarray], n_old: int) -> tuple[Any, Values]:
-    """Extend the integration of cells until they have as many sections as a run keeps.
+    """Integrate stored cells further until they have as many section points as the new run keeps.
 
     A cell is left out if its outcome could differ from that of a longer run: if the moment at which its orbit
     closed is not known, or if it fails later.
@@ -100,7 +100,7 @@ def kept_on(spec: Spec, inputs: Inputs, stored: Mapping[str, np.ndarray], n_old:
 
 
 def _more(spec: Spec, inputs: Inputs, last: np.ndarray, step_size: np.ndarray, n_old: int) -> Values:
-    """Integrate the further periods and return their variables."""
+    """Integrate the additional periods from the stored last states, and return their variables."""
     integration = spec.integration
     cells = more_sections(
         inputs.parameters,
@@ -119,7 +119,7 @@ def _more(spec: Spec, inputs: Inputs, last: np.ndarray, step_size: np.ndarray, n
 
 
 def _longer(name: str, old: np.ndarray, more: Mapping[str, np.ndarray], go: np.ndarray, n: int) -> np.ndarray:
-    """Return a variable of all cells, extended in the cells `go`."""
+    """Return a variable of all cells, extended by the values in `more` for the cells `go`."""
     if name in PER_SECTION:
         whole = np.full((*old.shape[:2], n, *old.shape[3:]), np.nan)
         whole[go] = np.concatenate([old[go], more[name]], axis=2)

@@ -1,4 +1,4 @@
-"""Return the product ``extremes``, which the engine recorded during the kept periods."""
+"""Return the product ``extremes``: extremes and means that the integrator recorded in the last `n_keep` periods."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pipeline.products.extremes import ExtremesOptions
 
 
 def extremes(job: Job, options: ExtremesOptions) -> dict[str, np.ndarray]:
-    """Return the least and largest value and the mean of each quantity in each kept period.
+    """Return the minimum, maximum and mean of each quantity in each recorded period.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Integrate branches of a run: sections, and the products that go on from them."""
+"""Integrate branches (chains of cells): their section points, and the products computed from them."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from pipeline.specification.tables import Integration
 
 @dataclass(frozen=True)
 class Job:
-    """Cells that were integrated, for the products that go on from them.
+    """Integrated cells with their specification and inputs, as input of the products computed from them.
 
     Attributes
     ----------
@@ -38,12 +38,12 @@ class Job:
 
     @property
     def system(self) -> System:
-        """Integrated system, with the run's method."""
+        """Integrated system with the integration method of the run."""
         return replace(self.spec.model.system, method=self.spec.integration.method)
 
 
 def integrate(spec: Spec, inputs: Inputs) -> dict[str, np.ndarray]:
-    """Return all variables of some branches, with leading dims (branch, point)."""
+    """Integrate branches and return all their variables, products included, with leading dims (branch, point)."""
     how = spec.model.system, spec.integration, watched_quantities(spec)
     cells = walk(inputs, *how) if spec.recorded is None else under_recording(spec.recorded, inputs, *how)
     own = {REST_STATE.name: rest_states(cells)} if spec.section is not None else {}
@@ -58,7 +58,7 @@ def integrate(spec: Spec, inputs: Inputs) -> dict[str, np.ndarray]:
 
 
 def walk(inputs: Inputs, system: System, integration: Integration, quantities: Sequence[str] | None) -> Sections:
-    """Integrate branches by `magpend_core.run_branches`; those that ended before are marked as unreached.
+    """Integrate branches by `magpend_core.run_branches`; branches that had failed earlier get the status UNREACHED.
 
     Parameters
     ----------
@@ -96,7 +96,7 @@ def walk(inputs: Inputs, system: System, integration: Integration, quantities: S
 
 
 def _spread(name: str, found: Any, alive: np.ndarray) -> Any:
-    """Spread the results of living branches over all branches, with fill values for the others."""
+    """Copy the results of the integrated branches into arrays over all branches; fill the others."""
     if found is None:
         return None
     fill = int(Status.UNREACHED) if name == "status" else np.nan if found.dtype.kind == "f" else 0
@@ -106,12 +106,12 @@ def _spread(name: str, found: Any, alive: np.ndarray) -> Any:
 
 
 def watched_quantities(spec: Spec) -> list[str] | None:
-    """Return the names of the quantities that products watch while cells are integrated; None if there are none."""
+    """Return the names of the quantities that products record during integration; None if there are none."""
     return [name for k, options in spec.products.items() for name in CELL_PRODUCTS[k].watches(options)] or None
 
 
 def rest_states(cells: Sections) -> np.ndarray:
-    """Return the last states of cells without a return to the section, NaN for all others."""
+    """Return the final states of trajectories that never returned to the section; NaN for all others."""
     is_left = cells.status == Status.NO_RETURN
     return np.where(is_left[..., None], cells.final_state, np.nan)
 

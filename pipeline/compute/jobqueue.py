@@ -1,4 +1,4 @@
-"""Start workers in jobs of a batch system, as many jobs as the work needs."""
+"""Start dask workers in jobs of a batch system, as many jobs as the work needs."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _TARGET = "0.1 s"
 
 
 def check_means(cluster: Cluster) -> None:
-    """Check that jobs can be submitted from here.
+    """Raise `SpecError` unless batch jobs can be submitted from this machine.
 
     Raises
     ------
@@ -56,7 +56,7 @@ def jobs_folder(place: str) -> Path:
 
 
 def settings(cluster: Cluster, folder: Path) -> dict[str, Any]:
-    """Return the keywords for the classes of dask-jobqueue.
+    """Return the keyword arguments for the cluster classes of dask-jobqueue.
 
     Parameters
     ----------
@@ -98,7 +98,7 @@ def worker_script(cluster: Cluster, folder: Path) -> str:
 
 
 def _keys(folder: Path) -> Any:
-    """Make keys in a folder that the jobs read; scheduler, workers and client share them."""
+    """Write TLS keys to a folder that the jobs read; scheduler, workers and client share them."""
     from distributed import Security
 
     made = Security.temporary()  # type: ignore[no-untyped-call]
@@ -118,7 +118,7 @@ def _keys(folder: Path) -> Any:
 
 @contextlib.contextmanager
 def job_cluster(cluster: Cluster, folder: Path, *, dashboard: bool, echo: Callable[[str], None]) -> Iterator[Any]:
-    """Yield a cluster of jobs that ends with the block.
+    """Start a dask cluster whose workers are batch jobs, yield it, and end it with the block.
 
     Scheduler and workers identify each other by keys made for this cluster. The keys lie in `folder`,
     readable by their owner alone, until the cluster ends. Others on the network can neither read nor send

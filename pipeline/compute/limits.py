@@ -1,4 +1,4 @@
-"""Limit the time of a task, from its estimate and from the accuracy of earlier estimates."""
+"""Limit the run time of tasks by their estimated times, corrected by the accuracy of earlier estimates."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ SILENT_S = 20.0
 
 
 class Limits:
-    """The time limits of tasks.
+    """Run-time limits of tasks, from estimates and from measured times.
 
     Parameters
     ----------
@@ -34,12 +34,12 @@ class Limits:
         self._worst = 1.0
 
     def finished(self, index: int, took_s: float) -> None:
-        """Update the worst ratio of time to estimate by a finished task."""
+        """Update the worst ratio of measured to estimated time with a finished task."""
         if self._seconds is not None and took_s > SHORT_S:
             self._worst = max(self._worst, took_s / max(self._seconds(index), 1e-9))
 
     def limit_s(self, index: int, tries: int) -> float:
-        """Return the time limit of a task at its n-th try, n = `tries` [s]."""
+        """Return the time limit of a task [s] at its try number `tries`."""
         if self._seconds is None:
             return float("inf")
         return max(LEAST_S, FACTOR * self._worst * self._seconds(index)) * MORE ** (tries - 1)

@@ -58,13 +58,13 @@ _scratch_folders: set[Path] = set()
 
 
 def memory_per_worker(n_workers: int) -> float:
-    """Return the share of the machine's memory at which a worker is ended, before the system intervenes."""
+    """Return the fraction of the machine's memory at which dask restarts a worker."""
     return 1.0 / n_workers
 
 
 @contextlib.contextmanager
 def local_cluster(n_workers: int, *, dashboard: bool = False) -> Iterator[Any]:
-    """Yield a cluster of single-threaded processes that only its own keys can reach.
+    """Start a dask cluster of single-threaded processes, reachable only with its own TLS keys, and yield it.
 
     The first worker has started; others may still be starting. The dashboard shows the computation to
     everyone on this machine.
@@ -115,7 +115,7 @@ def local_cluster(n_workers: int, *, dashboard: bool = False) -> Iterator[Any]:
 
 
 def _await_one(cluster: Any) -> None:
-    """Wait for the first worker; the others may come later."""
+    """Wait for the first worker; raise `SchedulerError` if none starts in time."""
     end = time.monotonic() + START_S
     while not cluster.scheduler.workers:
         if time.monotonic() > end:
@@ -125,7 +125,7 @@ def _await_one(cluster: Any) -> None:
 
 @contextlib.contextmanager
 def _loop() -> Iterator[Any]:
-    """Yield an event loop in a separate thread.
+    """Run an event loop in a separate thread, and yield it.
 
     Ctrl-C goes to every process of the terminal, but only the coordinator should handle it. Workers inherit
     the blocked signals from this thread.
@@ -142,7 +142,7 @@ def _loop() -> Iterator[Any]:
 
 
 def _security(scratch: Path) -> Any:
-    """Make a key and a certificate for this cluster alone; both sides of a connection must show it."""
+    """Create a TLS key and certificate for this cluster, required on both sides of every connection."""
     from distributed import Security
 
     made = Security.temporary()  # type: ignore[no-untyped-call]
@@ -162,7 +162,7 @@ def _security(scratch: Path) -> Any:
 
 @contextlib.contextmanager
 def _scratch() -> Iterator[Path]:
-    """Yield a folder of this process alone, and remove those of processes that were killed."""
+    """Yield a temporary folder of this process, and remove the folders of processes that were killed."""
     _sweep()
     folder = Path(tempfile.mkdtemp(prefix=PREFIX))
     _scratch_folders.add(folder)
@@ -176,7 +176,7 @@ def _scratch() -> Iterator[Path]:
 
 
 def _remove(folder: Path) -> None:
-    """Remove a folder, though workers that were just starting may still be writing into it."""
+    """Remove a folder; retry while workers that were just starting still write into it."""
     for _ in range(REMOVALS):
         kill_workers()
         shutil.rmtree(folder, ignore_errors=True)
@@ -197,7 +197,7 @@ def _sweep() -> None:
 
 
 def _start_tracker() -> None:
-    """Start the process that removes semaphores of killed processes, without its warning about each.
+    """Start the process that removes semaphores of killed processes, without its warnings.
 
     What it removes is what it is there for; nobody can do anything about the warning. It must outlive a
     terminal that closes, as it does Ctrl-C.
@@ -217,7 +217,7 @@ def _start_tracker() -> None:
 
 @contextlib.contextmanager
 def _signals_put_off() -> Iterator[None]:
-    """Postpone handled signals to the end of the block, and raise them there."""
+    """Delay SIGINT, SIGTERM and SIGHUP until the end of the block, and raise them there."""
     if threading.current_thread() is not threading.main_thread():
         yield  # signals are handled by the main thread alone
         return
@@ -237,7 +237,7 @@ def _signals_put_off() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _blocked(numbers: set[signal.Signals]) -> Iterator[None]:
-    """Block signals in this thread, and in the threads and processes that it starts meanwhile."""
+    """Block signals in this thread, and in threads and processes that it starts inside the block."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
     try:
         yield
@@ -247,7 +247,7 @@ def _blocked(numbers: set[signal.Signals]) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _hushed() -> Iterator[None]:
-    """Silence dask's logs of connections; after an exception they stay silent, since its message suffices.
+    """Silence dask's log messages about connections; after an exception they stay silent.
 
     dask logs some connections only after a cluster has closed.
     """
@@ -269,7 +269,7 @@ def kill_workers() -> None:
 
 
 def abandon() -> None:
-    """End the workers and remove their folders, for a process that is about to exit at once."""
+    """Kill the workers and remove their folders; called just before this process exits."""
     kill_workers()
     for folder in list(_scratch_folders):
         _remove(folder)

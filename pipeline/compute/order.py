@@ -56,7 +56,7 @@ def why(error: BaseException) -> str:
 
 
 class Order:
-    """The order of tasks: a task starts after its predecessor, and those with the longest chain come first.
+    """Queue of tasks: each waits for its predecessor, and the start of the longest chain comes first.
 
     Parameters
     ----------
@@ -116,7 +116,7 @@ class Order:
         return self._second.popleft() if self._second else None
 
     def done(self, index: int) -> None:
-        """Count a task as done: those that come after it may start."""
+        """Mark a task as done, so that the tasks that follow it may start."""
         self._in_a_row = 0
         self._left -= 1
         self._failed.pop(index, None)
@@ -124,7 +124,7 @@ class Order:
             heapq.heappush(self._ready, self._key(follower))
 
     def failed(self, index: int, reason: str) -> None:
-        """Set a task aside, for a second try after all others.
+        """Record a failed task for a second try after all others.
 
         Raises
         ------

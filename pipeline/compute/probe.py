@@ -1,4 +1,4 @@
-"""Check that workers have the same programs as this process, and see the same run directory."""
+"""Check that workers have the same software as this process, and see the same run directory."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def installation() -> dict[str, str]:
 
 
 def check_versions(client: Any, workers: Iterable[str]) -> None:
-    """Check that workers have the same programs as this process.
+    """Raise `SchedulerError` unless all workers have the same software versions as this process.
 
     Raises
     ------
@@ -74,7 +74,7 @@ def _difference(here: Mapping[str, str], there: Any) -> str:
 
 
 def check_directory(client: Any, workers: Iterable[str], place: str) -> None:
-    """Check that workers see the run directory and can write to it.
+    """Raise `SchedulerError` unless all workers see the run directory and can write to it.
 
     All workers must read a temporary file there, so that another directory with the same name is detected.
 
@@ -136,11 +136,11 @@ def _listed(problems: Mapping[str, str]) -> str:
 
 
 class MisfitError(Exception):
-    """Error of a late worker whose programs differ from those of the process that sends tasks."""
+    """Raised on a worker whose software differs from that of the process that submitted the task."""
 
 
 class Fitting:
-    """A task that checks the worker's programs first, also on workers that come later.
+    """Task that first compares the software of its worker with this process, also on workers that join later.
 
     Parameters
     ----------
@@ -154,7 +154,7 @@ class Fitting:
         self.task, self.programs = task, programs or installation()
 
     def __call__(self, index: int) -> dict[str, Any]:
-        """Run the task; raise `MisfitError` if the programs differ."""
+        """Run the task; raise `MisfitError` if the software versions differ."""
         if why := _difference(self.programs, installation()):
             raise MisfitError(f"this worker has other programs ({why}); install the same versions everywhere")
         return self.task(index)

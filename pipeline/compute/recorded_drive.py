@@ -14,7 +14,7 @@ from pipeline.specification.tables import Integration
 def under_recording(
     drive: RecordedDrive, inputs: Inputs, system: System, integration: Integration, quantities: Sequence[str] | None
 ) -> Sections:
-    """Integrate the cells of a sweep from the recording's start to the sections that are kept.
+    """Integrate the cells of a sweep from the recording's start, and return their last section points.
 
     Parameters
     ----------

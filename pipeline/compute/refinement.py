@@ -1,4 +1,4 @@
-"""Refine grids of initial conditions from coarse to fine; infer cells well inside a basin.
+"""Refine grids of initial conditions near basin boundaries; infer the attractor of cells well inside a basin.
 
 A tile of cells is cut into boxes by every `stride`-th cell of each dim, and its last. The cells at the
 corners of the boxes are integrated. Then, until nothing changes: a box stays as it is if all integrated
@@ -66,7 +66,8 @@ class Orbits:
     _known: list[tuple[np.ndarray, np.ndarray]] = field(default_factory=list)
 
     def classes(self, cells: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Return the number of each cell's orbit, `NO_ORBIT` if it has none or keeps less than its period.
+        """Return the number of each cell's orbit, `NO_ORBIT` if it is not closed or its period exceeds the kept
+        sections.
 
         Parameters
         ----------
@@ -95,7 +96,7 @@ class Orbits:
         return found
 
     def _on(self, sections: np.ndarray, points: np.ndarray) -> np.ndarray:
-        """Return which sections (cell, period, n_states) are these points in some cyclic order."""
+        """Return which section sequences (cell, period, n_states) equal the given points in some cyclic order."""
         shifts = (np.roll(points, shift, axis=0) for shift in range(len(points)))
         near = [scaled_distance(sections, p, self.system).max(axis=1, initial=0.0) <= self.tolerance for p in shifts]
         return np.asarray(np.any(near, axis=0))
@@ -104,7 +105,7 @@ class Orbits:
 def infer(
     shape: tuple[int, ...], stride: int, integrate: Integrate, *, closure_tolerance: float, system: System
 ) -> dict[str, np.ndarray]:
-    """Return all variables of a tile, computed where necessary and inferred elsewhere.
+    """Return all variables of a tile (block of initial conditions), integrated where necessary, else inferred.
 
     Parameters
     ----------
@@ -147,7 +148,7 @@ def infer(
 
 
 def refine(shape: tuple[int, ...], stride: int, classes_of: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-    """Choose the cells of a tile to integrate, and a representative for each of the others.
+    """Choose the cells of a tile to integrate, and for every other cell the one whose result it takes.
 
     Parameters
     ----------
@@ -199,7 +200,7 @@ def _corners(boxes: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def _halves(boxes: np.ndarray) -> np.ndarray:
-    """Halve each box along each dim in which it has cells between its ends; halves share their cut."""
+    """Halve each box along each dim in which it has inner cells; both parts include the cells of the cut."""
     for i in range(boxes.shape[2]):
         wide = boxes[:, 1, i] - boxes[:, 0, i] > 1
         lower, upper = boxes[wide].copy(), boxes[wide].copy()
@@ -209,7 +210,7 @@ def _halves(boxes: np.ndarray) -> np.ndarray:
 
 
 def _by_extent(boxes: np.ndarray, shape: tuple[int, ...]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yield the boxes by size: their rows, and the flat indices of their cells (box, cell)."""
+    """Yield groups of boxes of equal size: their row numbers, and the flat indices of their cells (box, cell)."""
     first = np.ravel_multi_index(tuple(boxes[:, 0].T), shape)
     extents, which = np.unique(boxes[:, 1] - boxes[:, 0], axis=0, return_inverse=True)
     for i, extent in enumerate(extents):
@@ -219,7 +220,7 @@ def _by_extent(boxes: np.ndarray, shape: tuple[int, ...]) -> Iterator[tuple[np.n
 
 
 def _uniform(boxes: np.ndarray, known: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Return which boxes stay: all integrated cells in and next to them are on one orbit."""
+    """Return which boxes need no division: all integrated cells in and next to them end on one orbit."""
     own = known[np.ravel_multi_index(tuple(boxes[:, 0].T), shape)]
     padded = np.pad(known.reshape(shape), 1, constant_values=NOT_COMPUTED)
     classes = padded.ravel()
@@ -231,7 +232,7 @@ def _uniform(boxes: np.ndarray, known: np.ndarray, shape: tuple[int, ...]) -> np
 
 
 def _sources(boxes: np.ndarray, known: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Return the source of each cell: the least first corner of the boxes that hold it."""
+    """Return for each cell the cell whose result it takes: itself, or the least first corner of the boxes around it."""
     source = np.arange(len(known))
     rest = known == NOT_COMPUTED
     source[rest] = len(known)

@@ -1,4 +1,4 @@
-"""Take cells from other runs with the same inputs, instead of integrating them.
+"""Copy cells (trajectories) with the same inputs from other runs, instead of integrating them.
 
 A worker opens the runs that cells are taken from once. For each task it looks up which of its cells they
 hold, reads these from their committed chunks, compared with the records, and integrates the rest. What a run
@@ -41,7 +41,7 @@ ABSENT = (Status.PENDING, Status.INFERRED)
 
 @dataclass
 class Source:
-    """A run that holds cells of another.
+    """A run from which another run copies cells.
 
     Attributes
     ----------
@@ -73,7 +73,7 @@ class Source:
         self._read = lru_cache(maxsize=2)(partial(read_block, self.run, names=tuple(self.names)))
 
     def find(self, inputs: Inputs, way: Way | None = None) -> np.ndarray:
-        """Return the flat index of each cell that is committed, `NOWHERE` for the others.
+        """Return the flat index in this run of the cell with each input; `NOWHERE` if it is not committed.
 
         In a refined grid some of these were inferred, which `take` leaves out.
         """
@@ -81,7 +81,7 @@ class Source:
         return np.where(self._is_committed[self._task(place)], place, NOWHERE)
 
     def take(self, place: np.ndarray) -> tuple[np.ndarray, Values]:
-        """Return which of some cells were integrated and are whole, and these cells' variables."""
+        """Read cells from the run: return which ones could be used (integrated, undamaged), and their variables."""
         taken = np.zeros(len(place), bool)
         values: Values = {}
         tasks = self._task(place)
@@ -102,7 +102,7 @@ class Source:
         return taken, {name: array[taken] for name, array in values.items()}
 
     def _task(self, place: np.ndarray) -> np.ndarray:
-        """Return the task of each cell; the number of tasks for `NOWHERE`."""
+        """Return the task that contains each cell; the number of tasks for cells that are `NOWHERE`."""
         plan = self.run.plan
         steps = np.unravel_index(np.maximum(place, 0), plan.shape)
         places = tuple(step // b for step, b in zip(steps, plan.block, strict=True))
@@ -110,7 +110,7 @@ class Source:
         return np.where(place == NOWHERE, plan.n_tasks, tasks)
 
     def _inside(self, task: int, place: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Return the indices of cells within their task's block."""
+        """Return the indices of cells relative to the first cell of their task's block."""
         steps = np.unravel_index(place, self.run.plan.shape)
         return tuple(step - s.start for step, s in zip(steps, self.run.plan.task(task), strict=True))
 
@@ -126,7 +126,7 @@ def same_products(run: Run, wanted: Spec) -> list[str]:
 
 
 def _module(product: str) -> str:
-    """Module that computes a product, as `layout.identity` names it."""
+    """Return the name of the module that computes a product, in the form of `layout.identity`."""
     return CELL_PRODUCTS[product].compute.partition(":")[0].removeprefix("pipeline.")
 
 
@@ -152,7 +152,7 @@ def obstacles(run: Run, wanted: Spec, identity: Mapping[str, Any]) -> list[str]:
 
 
 class Pool:
-    """The cells of a run that other runs hold.
+    """Cells of a run that can be copied from other runs.
 
     Parameters
     ----------
@@ -180,7 +180,7 @@ class Pool:
         return counts
 
     def integrator(self, cells: CellMap, block: tuple[slice, ...], tally: list[int]) -> Integrate:
-        """Return what gives the cells of a block as `integrate.integrate` does, bit for bit, with less work.
+        """Return an integrator for a block that copies known cells from other runs; results are the same bit for bit.
 
         The numbers of cells that were taken are appended to `tally`.
         """
@@ -190,7 +190,7 @@ class Pool:
         return lambda spec, inputs: self._give(spec, inputs, cells.inputs(block), way, tally)
 
     def _give(self, spec: Spec, inputs: Inputs, begin: Inputs, way: Way | None, tally: list[int]) -> Values:
-        """Take cells, go on from those where a walk goes on, and integrate the rest."""
+        """Return the variables of branches: copied where possible, continued from copied cells, else integrated."""
         values: Values = {}
         n_branches, n_points = inputs.frequency_hz.shape
         rest = np.arange(n_branches)
@@ -220,7 +220,7 @@ class Pool:
     def _go_on(
         self, spec: Spec, inputs: Inputs, source: Source, taken: np.ndarray, stored: Values
     ) -> tuple[np.ndarray, Values]:
-        """Let cells of a sweep go on to more sections; which of them did, and their variables."""
+        """Extend copied cells of a sweep to more section points; return which succeeded, and their variables."""
         rows = np.flatnonzero(taken)
         points = {name: array[:, None] for name, array in stored.items()}
         is_exact, longer = kept_on(spec, inputs.take(rows), points, source.run.spec.integration.n_keep)
@@ -230,12 +230,12 @@ class Pool:
 
 
 def _leading(taken: np.ndarray) -> np.ndarray:
-    """Count the first points of each branch that are taken: a walk needs all points before one."""
+    """Count for each branch the copied cells before its first missing one; later ones cannot be used."""
     return np.asarray(np.cumprod(taken, axis=1).sum(axis=1))
 
 
 def _points(inputs: Inputs, part: slice) -> Inputs:
-    """Return the inputs of some points of the branches."""
+    """Return the inputs of the parameter points `part` of each branch."""
     return replace(inputs, parameters=inputs.parameters[:, part], frequency_hz=inputs.frequency_hz[:, part])
 
 
@@ -247,7 +247,7 @@ def _put(values: Values, rows: np.ndarray, part: Mapping[str, np.ndarray], n: in
 
 
 def _products(spec: Spec, inputs: Inputs, values: Mapping[str, np.ndarray], names: Sequence[str]) -> Values:
-    """Compute the named products of cells whose other variables are known."""
+    """Compute the named products of cells whose section points and status are known."""
     if not names:
         return {}
     no_turns = np.zeros((*inputs.frequency_hz.shape, 0), np.int32)
@@ -272,7 +272,7 @@ def _products(spec: Spec, inputs: Inputs, values: Mapping[str, np.ndarray], name
 
 @lru_cache(maxsize=2)
 def pool_of(directory: str, digest: str, sources: tuple[Origin, ...]) -> Pool:
-    """Open the runs that a run takes cells from, once per worker.
+    """Open the runs from which a run copies cells, once per worker.
 
     Parameters
     ----------

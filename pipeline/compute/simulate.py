@@ -40,7 +40,7 @@ CLOCK_HZ, FLOW_PERIODS = 1.0, 50
 
 @dataclass(frozen=True)
 class Series:
-    """The requested series: drive periods before it and in it (None: all), density, tolerances."""
+    """Settings of a time series: drive periods before it and in it (None: all), samples per period, tolerances."""
 
     n_transient: int
     n_periods: int | None
@@ -63,7 +63,7 @@ def simulate(
     rtol: float = RTOL,
     atol: float = ATOL,
 ) -> xr.Dataset:
-    """Integrate one trajectory from the instant of a section.
+    """Integrate one trajectory, from time 0 at a section or from the start of a recorded drive.
 
     Parameters
     ----------
@@ -131,7 +131,7 @@ def simulate(
 def _recording(
     drive: str | Path | None, frequency_hz: float | None, model: Model, series: Series, problems: list[str]
 ) -> RecordedDrive | None:
-    """Read the recorded drive, if there is one; append problems with it or with the frequency."""
+    """Load the recorded drive, if one is given; append problems with it or with the frequency to `problems`."""
     if drive is None:
         if frequency_hz is None or not (math.isfinite(frequency_hz) and frequency_hz > 0):
             problems.append(f"frequency_hz = {frequency_hz!r}: must be a finite number greater than 0.")
@@ -156,7 +156,7 @@ def _recording(
 
 
 def _at_frequency(parameters: Parameters, frequency_hz: float, state: np.ndarray, series: Series) -> xr.Dataset:
-    """Integrate under the model's own drive."""
+    """Integrate a trajectory under the model's own drive at a fixed frequency."""
     from magpend_core import evaluate, trajectory
 
     n, samples = series.n_periods or DEFAULT_PERIODS, series.samples_per_period
@@ -178,7 +178,7 @@ def _at_frequency(parameters: Parameters, frequency_hz: float, state: np.ndarray
 
 
 def _closing(sections: np.ndarray, parameters: Parameters, series: Series) -> dict[str, Any]:
-    """Return the attributes on whether the motion has closed; empty if there are too few sections."""
+    """Return attributes that tell whether the motion has closed on an orbit; empty if there are too few points."""
     found = closing_of(sections[-LOOKED_AT:], parameters.model.system)
     if found is None:
         return {}
@@ -186,7 +186,7 @@ def _closing(sections: np.ndarray, parameters: Parameters, series: Series) -> di
 
 
 def _under_recording(parameters: Parameters, drive: RecordedDrive, state: np.ndarray, series: Series) -> xr.Dataset:
-    """Integrate under a recorded drive, from its start."""
+    """Integrate a trajectory under a recorded drive, from the start of the recording."""
     from magpend_core.recorded_drive import evaluate_recorded, recorded_trajectory
 
     marks = np.append(drive.start_s, drive.sections_s)
@@ -208,7 +208,7 @@ def _under_recording(parameters: Parameters, drive: RecordedDrive, state: np.nda
 def _labelled(
     parameters: Parameters, time: np.ndarray, clock: str, states: np.ndarray, values: np.ndarray
 ) -> xr.Dataset:
-    """Make the dataset of a series' states and quantities, with names, units and parameters."""
+    """Build the dataset of a time series: states and quantities with names and units, and the parameters."""
     import xarray as xr
 
     model = parameters.model
@@ -286,7 +286,7 @@ def _problems(series: Series) -> list[str]:
 
 
 def check_output(path: Path) -> None:
-    """Raise `SpecError` if a series cannot be written there."""
+    """Raise `SpecError` if a time series cannot be written to a path."""
     if path.suffix.lower() not in SUFFIXES:
         raise SpecError([f"{path}: the suffix must be one of {', '.join(SUFFIXES)}."])
     if not path.parent.is_dir():

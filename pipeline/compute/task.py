@@ -32,7 +32,7 @@ from pipeline.store.task_cells import read_cells
 
 @lru_cache(maxsize=4)
 def _prepare(directory: str, digest: str, origin: tuple[str, str] | None) -> tuple[RunInfo, Spec, Plan, CellMap]:
-    """Read a run once per worker, and make sure that this installation would compute the same."""
+    """Read a run once per worker; raise `RefusedError` if this installation would compute other results."""
     if origin is not None:
         import_model(*origin)
     info = read_run(directory)
@@ -92,7 +92,7 @@ def run_task(
     origin: tuple[str, str] | None = None,
     sources: tuple[tuple[str, str], ...] = (),
 ) -> dict[str, Any]:
-    """Compute a task and commit it.
+    """Compute one task of a run, and commit its results to the store.
 
     Parameters
     ----------
@@ -129,7 +129,7 @@ def run_task(
 
 
 def _left(info: RunInfo, plan: Plan, cells: CellMap, index: int) -> dict[str, Any]:
-    """Read where the preceding task ended the branches of a task; empty if they begin in it."""
+    """Read the final states of branches that began in the preceding task; empty if they begin in this task."""
     predecessor = plan.predecessor(index)
     if predecessor is None:
         return {}
@@ -146,7 +146,7 @@ def _taking(
     block: tuple[slice, ...],
     taken: list[int],
 ) -> dict[str, Any]:
-    """Return the integrator that takes cells from other runs first; empty if there are no other runs."""
+    """Return the integrator that copies cells from other runs first, as keyword; empty if there are no other runs."""
     if not sources:
         return {}
     from pipeline.compute.reuse import pool_of

@@ -33,7 +33,7 @@ _GAP = 1.5
 
 
 class Timing(NamedTuple):
-    """The frequency, jitter and duty cycle from a line through the rising edges.
+    """Frequency, jitter and duty cycle of a drive signal, from a line through the times of its rising edges.
 
     Errors are standard errors.
 
@@ -78,7 +78,9 @@ class Edges:
 
     @property
     def error_s(self) -> float:
-        """Standard error of an edge's time from sampling and noise [s], without the drive's own jitter."""
+        """Standard error of an edge's time [s] from sampling and measurement noise; the jitter of the drive is not
+        included.
+        """
         return math.hypot(self.resolution_s / math.sqrt(12), self.noise_s)
 
     def between(self, start_s: float, end_s: float) -> Edges:
@@ -87,7 +89,8 @@ class Edges:
         return replace(self, rising=rising, falling=falling)
 
     def frequency(self) -> Timing:
-        """Fit a line through the rising edges against their number; return frequency, jitter and duty cycle.
+        """Fit a line through the times of the rising edges against their numbers; return frequency, jitter and duty
+        cycle.
 
         Missing edges are counted by the median distance of neighbours. The standard errors assume independent
         jitter. They include the rounding to samples: if edges fall on the same few places between samples,
@@ -119,7 +122,9 @@ class Edges:
         return Timing(1 / period, error / period**2, jitter, duty, duty_error, int(number[-1]))
 
     def _duty_cycle(self, fitted: Floats, period: float, jitter: float) -> tuple[float, float]:
-        """Return the mean duty cycle and its standard error; falling edges are paired with rising ones."""
+        """Return the mean duty cycle and its standard error; each falling edge is paired with the last rising edge
+        before it.
+        """
         before = np.searchsorted(self.rising, self.falling, side="right") - 1
         high = np.where(before >= 0, self.falling - self.rising[before], np.inf)
         before, high = before[high < period], high[high < period]

@@ -1,4 +1,4 @@
-"""Parse and validate the specification of a virtual rig as a whole."""
+"""Parse and validate the TOML specification of a virtual rig."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from pipeline.specification.tables import Table
 
 
 class SensorTable(Table):
-    """A table ``[sensors.STATE]``: a sensor of one state."""
+    """Table ``[sensors.STATE]``: kind, noise and resolution of the sensor of one state."""
 
     kind: Literal["potentiometer", "encoder"] = Field(description="Potentiometer (wraps, 0 to 5 V) or encoder.")
     noise: float = Field(default=0.0, ge=0.0, description="Standard deviation [the state's unit].")
@@ -34,7 +34,7 @@ class SensorTable(Table):
 
 
 class SweepTable(Table):
-    """The table ``sweep``: steps of equally many periods at evenly spaced frequencies."""
+    """Table ``sweep`` of the drive: evenly spaced frequencies, each held for the same number of periods."""
 
     start_hz: float = Field(gt=0.0, description="First frequency [Hz].")
     stop_hz: float = Field(gt=0.0, description="Last frequency [Hz]; below the first to sweep downwards.")
@@ -43,7 +43,7 @@ class SweepTable(Table):
 
 
 class DriveTable(Table):
-    """The table ``[drive]``: the steps of the drive, and how it is recorded."""
+    """Table ``[drive]``: the drive's steps of constant frequency, and how the drive is recorded."""
 
     kind: Literal["torque", "signal"] = Field(default="signal", description="Recorded quantity.")
     noise: float = Field(default=0.0, ge=0.0, description="Standard deviation [N m, or V].")
@@ -59,7 +59,7 @@ class DriveTable(Table):
         return self
 
     def tables(self) -> list[dict[str, float]]:
-        """Return the steps; a sweep is expanded to steps."""
+        """Return the steps of the drive as tables; a sweep is expanded into steps."""
         if self.sweep is None:
             return [dict(table) for table in self.steps or ()]
         s = self.sweep
@@ -68,7 +68,7 @@ class DriveTable(Table):
 
 
 class RigTable(Table):
-    """The keys at the top of the file."""
+    """Top level of the specification: model, parameters, initial state, sampling, drive and sensors."""
 
     model: str | dict[str, Any] = Field(description="Model, as in a specification: a name, a file or a table.")
     preset: str | None = Field(default=None, description="Preset of the model; by default the first.")
@@ -91,7 +91,7 @@ NUMBERS = ("sampling_rate_hz", "duration_s", "seed")
 
 @dataclass(frozen=True)
 class Rig:
-    """A valid specification of a virtual rig.
+    """Validated specification of a virtual rig: parameters, initial state, sample times, drive and sensors.
 
     Attributes
     ----------
@@ -118,7 +118,7 @@ class Rig:
 
 
 def load_rig(path: str | Path) -> Rig:
-    """Read the specification of a virtual rig.
+    """Read and validate the TOML specification of a virtual rig.
 
     Raises
     ------
@@ -129,7 +129,7 @@ def load_rig(path: str | Path) -> Rig:
 
 
 def parse_rig(data: AnyMapping[str, Any], folder: str | Path = ".") -> Rig:
-    """Validate the tables of a virtual rig; a preset's file is relative to `folder`.
+    """Validate the tables of a virtual rig's specification; the path of a preset file is relative to `folder`.
 
     Raises
     ------
@@ -166,7 +166,7 @@ def parse_rig(data: AnyMapping[str, Any], folder: str | Path = ".") -> Rig:
 
 
 def simulated(rig: Rig, *, is_csv: bool = False) -> tuple[Raw, Mapping]:
-    """Return the readings of a virtual rig, and the mapping of the file that they are written to.
+    """Simulate a virtual rig; return its readings, and the mapping for the file that they are written to.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Simulate a virtual rig: a model with its drive and sensors, recorded as in a laboratory.
+"""Simulate a virtual rig: integrate a model with its drive, and record it with imperfect sensors.
 
 The readings have noise, finite resolution and dead bands. They go through the same mapping, checks and files
 as measured ones, and are marked as simulated.
@@ -41,7 +41,7 @@ TURN = 2.0 * math.pi
 
 @dataclass(frozen=True)
 class Sensor:
-    """A sensor of one state.
+    """Simulated sensor of one state: kind, noise, resolution, dead band and offset.
 
     Attributes
     ----------
@@ -68,7 +68,7 @@ class Sensor:
 
 @dataclass(frozen=True)
 class DriveSensor:
-    """The recording of the drive.
+    """Sensor of the drive: it records the torque, or a signal that gives the torque's sign.
 
     Attributes
     ----------
@@ -84,7 +84,7 @@ class DriveSensor:
 
 @dataclass(frozen=True)
 class Step:
-    """Consecutive drive periods of one frequency.
+    """Step of the drive: consecutive periods with the same frequency and parameters.
 
     Attributes
     ----------
@@ -102,7 +102,7 @@ class Step:
 
     @property
     def duration_s(self) -> float:
-        """Length of the step [s]."""
+        """Length of the drive step [s]."""
         return self.n_periods / self.frequency_hz
 
 
@@ -121,7 +121,7 @@ def record(
     sensors: Sensors,
     seed: int,
 ) -> xr.Dataset:
-    """Simulate a recording.
+    """Simulate a recording of a model with a given drive and sensors.
 
     Parameters
     ----------
@@ -165,7 +165,7 @@ def readings(
     sensors: Sensors,
     seed: int,
 ) -> tuple[Raw, Mapping]:
-    """Return the readings of the sensors of `record`, and the mapping that converts them to states.
+    """Simulate the sensors' readings, and return them with the mapping that converts them to states.
 
     Returns
     -------
@@ -254,7 +254,7 @@ def _sensor_problems(path: str, sensor: Sensor, is_angle: bool) -> list[str]:
 
 
 def _states(parameters: Parameters, drive: Sequence[Step] | None, start: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """Integrate the model; return states, (n, n_states), angles not wrapped."""
+    """Integrate the model; return its states at the sample times, (n, n_states), angles not wrapped."""
     from magpend_core.sampling import sample
     from magpend_core.status import Status
 
@@ -276,7 +276,7 @@ def _states(parameters: Parameters, drive: Sequence[Step] | None, start: np.ndar
 
 
 def _intervals(parameters: Parameters, drive: Sequence[Step], end_s: float) -> Any:
-    """Return the drive's periods one by one, with the parameters that change."""
+    """Return the drive of all steps, period by period, with the parameter values that change between steps."""
     from magpend_core.sampling import Drive
 
     names = tuple(dict.fromkeys(name for step in drive for name in step.values))
@@ -291,7 +291,7 @@ def _intervals(parameters: Parameters, drive: Sequence[Step], end_s: float) -> A
 def _potentiometer(
     channel: str, angle: np.ndarray, unit: str, sensor: Sensor, rng: np.random.Generator
 ) -> tuple[np.ndarray, ChannelMap, str]:
-    """Return the voltage of the wiper, the mapping that inverts it, and the unit."""
+    """Simulate a potentiometer; return its voltages, the mapping back to the angle, and the unit."""
     low, high = TRACK_V
     middle, per_rad = 0.5 * (low + high), (high - low) / (TURN - sensor.dead_band)
     folded = np.mod(angle + math.pi, TURN) - math.pi
@@ -317,7 +317,9 @@ def _potentiometer(
 def _encoder(
     channel: str, state: np.ndarray, unit: str, sensor: Sensor, rng: np.random.Generator
 ) -> tuple[np.ndarray, ChannelMap, str]:
-    """Return readings in the state's unit or in counts, the mapping that inverts them, and the unit."""
+    """Simulate an encoder; return its readings (counts, or the state's unit), the mapping back to the state, and the
+    unit.
+    """
     noisy = state + sensor.noise * rng.standard_normal(len(state))
     if sensor.bits is None:
         return noisy, ChannelMap(channel=channel, unit=unit), unit
@@ -333,7 +335,7 @@ def _drive_channel(
     rng: np.random.Generator,
     step_s: float,
 ) -> tuple[Channel, DriveMap]:
-    """Return the channel of the drive, and its mapping."""
+    """Return the simulated channel of the drive, and its mapping."""
     from magpend_core.pointwise import drive_level
 
     level = np.zeros(len(times))

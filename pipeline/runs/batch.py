@@ -1,4 +1,4 @@
-"""Write batch scripts, and name each batch system's commands to send, query and cancel a job."""
+"""Write batch scripts for clusters, and define each batch system's commands to submit, query and cancel a job."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pipeline.specification.clusters import Cluster, bytes_of, clock, hours_and_
 
 @dataclass(frozen=True)
 class Words:
-    """The commands of a batch system.
+    """Commands of a batch system to submit, query and cancel jobs, with the patterns of their output.
 
     Attributes
     ----------
@@ -36,7 +36,7 @@ class Words:
     number: str = r"(?P<job>\d+)"
 
     def job(self, output: str) -> str | None:
-        """Return the job's number in the output of `send`; None if there is none."""
+        """Return the job's number found in the output of the submit command, or None without one."""
         match = re.search(self.number, output)
         return match["job"] if match else None
 
@@ -50,12 +50,12 @@ WORDS = {
 
 
 def is_whole(cluster: Cluster) -> bool:
-    """Return whether one job holds the coordinator and all workers."""
+    """Return whether a single job holds the coordinator process and all workers."""
     return cluster.max_jobs == 1
 
 
 def coordinator_script(cluster: Cluster, name: str, log: str, folder: str, command: Sequence[str]) -> str:
-    """Return the batch script of the coordinator's job.
+    """Return the batch script for the job of the coordinator process.
 
     Parameters
     ----------
@@ -149,7 +149,9 @@ _MARKS = {"slurm": "#SBATCH", "pbs": "#PBS", "sge": "#$", "lsf": "#BSUB"}
 
 
 def _directives(cluster: Cluster) -> list[str]:
-    """Return the user's directives; a job of one core needs no parallel environment."""
+    """Return the user's additional batch directives; a job of one core drops those for a parallel environment
+    (``-pe``).
+    """
     return [line for line in cluster.directives if is_whole(cluster) or not line.strip().startswith("-pe")]
 
 

@@ -1,4 +1,4 @@
-"""Compute results of analyses once, and keep them in a run's ``derived/``.
+"""Compute the results of a run's analyses once, and store them in its folder ``derived/``.
 
 A result's key holds everything that decides its numbers: the digest of the committed cells, the analysis'
 name, its options, and the version of its code (`code_version`). `derive` returns the stored result with that
@@ -61,7 +61,7 @@ def _silent(_: str) -> None:
 
 @dataclass(frozen=True, repr=False)
 class AnalysedRun(Run):
-    """A run for analyses, which can use other analyses of the same cells.
+    """Opened run that is passed to analyses; from it, an analysis obtains the results of other analyses.
 
     Attributes
     ----------
@@ -73,21 +73,21 @@ class AnalysedRun(Run):
 
     @classmethod
     def of(cls, source: Source, echo: Echo | None = None) -> AnalysedRun:
-        """Open a run directory with its present commits, or return an opened run's cells."""
+        """Open a run directory for analyses, or wrap a run that is already opened."""
         run = Run.open(source)
         if isinstance(run, AnalysedRun) and echo is None:
             return run
         return cls(**{f.name: getattr(run, f.name) for f in fields(Run)}, echo=echo or _silent)
 
     def derive(self, name: str, **options: Any) -> xr.Dataset:
-        """Return another analysis of the same cells; see `derive`."""
+        """Return the result of another analysis of the same run; see `derive`."""
         return derive(self, name, options)
 
 
 def derive(
     source: Source, name: str, options: Mapping[str, Any] | Options | None = None, *, echo: Echo | None = None
 ) -> xr.Dataset:
-    """Return the result of an analysis of a run, stored or computed.
+    """Return the result of an analysis of a run: the stored one, or a new one, which is then stored.
 
     Parameters
     ----------
@@ -139,7 +139,7 @@ def derive(
 
 
 def stored(source: Source, name: str) -> xr.Dataset | None:
-    """Return the stored result of an analysis of a run's present cells; nothing is computed.
+    """Return the stored result of an analysis of a run's present cells, or None; nothing is computed.
 
     Parameters
     ----------
@@ -173,7 +173,7 @@ def stored(source: Source, name: str) -> xr.Dataset | None:
 
 
 def _changed_options(run: Run, name: str, attrs: Mapping[str, Any]) -> int:
-    """Return the number of a result's options that differ from the defaults."""
+    """Return the number of options of a stored result that differ from the defaults."""
     try:
         options = prepared(AnalysedRun.of(run), ANALYSES[name], validated(ANALYSES[name].options, {})).plain()
     except SpecError:  # the run does not suit the defaults
@@ -182,7 +182,7 @@ def _changed_options(run: Run, name: str, attrs: Mapping[str, Any]) -> int:
 
 
 def _options_of(attrs: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the options of a kept result.
+    """Return the options that a stored result was computed with.
 
     Raises
     ------
@@ -199,7 +199,7 @@ def _options_of(attrs: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _refuse_recorded(run: Run, name: str) -> None:
-    """Refuse a run with a recorded drive: analyses integrate cells further, but the recording ends."""
+    """Raise `SpecError` for a run driven by a recording: analyses integrate further, but the recording ends."""
     if run.spec.recorded is not None:
         raise SpecError(
             [
@@ -212,7 +212,8 @@ def _refuse_recorded(run: Run, name: str) -> None:
 
 
 def prepared(run: AnalysedRun, product: Any, options: Options) -> Options:
-    """Return options with the run's own names, completed from it; refuse a run that does not suit a product.
+    """Return options completed for a run, with names as in its cube; raise `SpecError` if the run does not suit the
+    product.
 
     Raises
     ------
@@ -229,7 +230,8 @@ def prepared(run: AnalysedRun, product: Any, options: Options) -> Options:
 
 
 def most_evidence(run: Run, options: Options) -> Options:
-    """Return the options of the stored attractors with the longest extension, among those of the same search.
+    """Raise the options for integrating trajectories further to the largest values among stored searches for
+    attractors.
 
     Options without an effort are returned unchanged.
     """
@@ -241,7 +243,9 @@ def most_evidence(run: Run, options: Options) -> Options:
 
 
 def _kept_efforts(run: Run) -> list[tuple[dict[str, Any], tuple[float, int]]]:
-    """Return the options and the effort of each stored search for attractors that is up to date."""
+    """Return the options of each up-to-date stored search for attractors, with its (budget, sample size) for further
+    integration.
+    """
     try:
         kept_here = products_in(run.info.files.below(DERIVED))
     except NotADirectoryError:
@@ -261,13 +265,13 @@ def _kept_efforts(run: Run) -> list[tuple[dict[str, Any], tuple[float, int]]]:
 
 
 def _aside(options: IdentifyOptions) -> dict[str, Any]:
-    """Return the options without those of the effort."""
+    """Return the options for identifying attractors, without those on how far trajectories are integrated further."""
     effort = ("extend", "budget", "n_sample")
     return {name: value for name, value in options.plain().items() if name not in effort}
 
 
 def is_outdone(run: Run, attrs: Mapping[str, Any]) -> bool:
-    """Return whether a kept result rests on less evidence than other kept results."""
+    """Return whether another stored result identified its attractors with a longer extension of trajectories."""
     name, given = str(attrs.get("derived_product")), _options_of(attrs)
     if name not in ANALYSES or not issubclass(ANALYSES[name].options, IdentifyOptions):
         return False
@@ -277,7 +281,9 @@ def is_outdone(run: Run, attrs: Mapping[str, Any]) -> bool:
 
 @contextlib.contextmanager
 def refused(directory: str | Path) -> Iterator[None]:
-    """Turn the error of an analysis or figure into one that names the directory."""
+    """Convert an error of an analysis or figure into one whose message names the run directory, as a context
+    manager.
+    """
     try:
         yield
     except SpecError:
@@ -291,7 +297,7 @@ def refused(directory: str | Path) -> Iterator[None]:
 
 
 def _key(run: Run, analysis: Analysis, options: Options) -> dict[str, str]:
-    """Return the attributes that form a result's key."""
+    """Return the attributes that identify a result: analysis, options, digests of the run and of the code."""
     plain = {name: value for name, value in options.plain().items() if name not in analysis.ignores}
     parts = {
         "derived_product": analysis.name,
@@ -326,7 +332,8 @@ def _placed(ds: xr.Dataset, place: Files) -> xr.Dataset:
 
 
 def stale(source: Source) -> list[str]:
-    """Return the places of results that are outdated or damaged, and of leftovers.
+    """Return the paths of stored results that are outdated or damaged, and of results left incomplete by killed
+    processes.
 
     Outdated results belong to an earlier cube or an earlier version of the code. A leftover was begun by a
     process that was killed. Leftovers younger than an hour may belong to a running process and are not
@@ -353,7 +360,7 @@ def _stale(run: Run) -> list[Files]:
 
 
 def prune(source: Source) -> list[str]:
-    """Remove the results that `stale` lists; return their places."""
+    """Remove the outdated, damaged or incomplete results that `stale` lists; return their paths."""
     found = _stale(Run.open(source))
     for place in found:
         remove_product(place)

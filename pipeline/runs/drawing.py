@@ -1,4 +1,4 @@
-"""Draw figures of a run by name, as ``magpend plot`` does."""
+"""Draw the figures of a run by name, as the command ``magpend plot`` does."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def figure(
     echo: Echo | None = None,
     **more: Any,
 ) -> DataFigure:
-    """Draw a figure of a run.
+    """Draw one of the figures of a run, chosen by its name.
 
     Parameters
     ----------
@@ -56,14 +56,14 @@ def figure(
 
 
 def ready(source: Source, name: str, options: FigureOptions, echo: Echo | None) -> tuple[AnalysedRun, FigureOptions]:
-    """Open a run, and return it with the options in its own names."""
+    """Open a run; return it with the figure's options completed and in the names of the run's cube."""
     run = AnalysedRun.of(source, echo)
     settled: Any = prepared(run, FIGURES[name], options)
     return run, settled
 
 
 def drawn(run: AnalysedRun, name: str, options: FigureOptions) -> DataFigure:
-    """Draw a figure with settled options."""
+    """Draw a figure with options that `ready` has completed."""
     from pipeline.plots import draw_figure
 
     with refused(run.name):

@@ -1,4 +1,4 @@
-"""Estimate the time of a run on this machine by integrating a sample of its cells over a few periods.
+"""Estimate a run's computing time on this machine by integrating a sample of its cells over a few periods.
 
 The rule of thumb in `pipeline.layout.plan` gives the dependence of the time on frequency and tolerance. Two
 further quantities are measured: the speed of this processor for this system, and, if the run stops when
@@ -52,7 +52,7 @@ FILE_S = 0.004
 
 @dataclass(frozen=True)
 class Estimate:
-    """The estimated time of a run.
+    """Estimated computing time of a run on one core.
 
     Attributes
     ----------
@@ -70,7 +70,7 @@ class Estimate:
 
 
 def estimate(spec: Spec, plan: Plan) -> Estimate:
-    """Measure the time of a run on one core of this machine.
+    """Estimate a run's computing time on one core of this machine by timing a sample of its cells.
 
     This takes a second or two, after compiling. The time of products (exponents) is their number of periods
     times the measured time of one.
@@ -95,7 +95,7 @@ def estimate(spec: Spec, plan: Plan) -> Estimate:
 
 
 def writing_seconds(spec: Spec, plan: Plan) -> float:
-    """Measure the time to write a task, in a temporary folder; the run's disk may be slower.
+    """Measure the time to write one task's files in a temporary folder; the run's disk may be slower.
 
     Returns
     -------
@@ -128,7 +128,7 @@ def writing_seconds(spec: Spec, plan: Plan) -> float:
 
 
 def wall_seconds(core_seconds: float, n_tasks: int, workers: int) -> float:
-    """Return the elapsed time of a run [s].
+    """Return the elapsed time of a run from its time on one core and the number of worker processes [s].
 
     Parameters
     ----------
@@ -145,7 +145,7 @@ def wall_seconds(core_seconds: float, n_tasks: int, workers: int) -> float:
 
 
 def _sample(spec: Spec, plan: Plan, rng: np.random.Generator, n_branches: int, *, pairs: bool) -> Inputs:
-    """Return the inputs of cells drawn from the whole run.
+    """Return parameters, frequencies and initial states of cells drawn at random from the whole run.
 
     With `pairs`, the points of a continuation's branch come in neighbouring pairs, so that the second point
     of a pair starts where it would start in the run.
@@ -171,7 +171,7 @@ def _sample(spec: Spec, plan: Plan, rng: np.random.Generator, n_branches: int, *
 
 
 def _points(n_points: int, rng: np.random.Generator, *, pairs: bool) -> np.ndarray:
-    """Return indices of points along a path, one or two from each part of it."""
+    """Return indices of random points along a continuation path, one point or one pair from each of its equal parts."""
     n_parts = min(POINTS, n_points // 2 if pairs and n_points > 1 else n_points)
     edges = np.linspace(0, n_points, n_parts + 1)
     first = np.array([rng.integers(math.ceil(a), math.ceil(b)) for a, b in itertools.pairwise(edges)])
@@ -182,7 +182,8 @@ def _points(n_points: int, rng: np.random.Generator, *, pairs: bool) -> np.ndarr
 
 
 def _speed(spec: Spec, inputs: Inputs, most: float) -> tuple[float, int, float]:
-    """Return the ratio of measured time to the rule of thumb, periods per cell, and seconds of measuring.
+    """Measure the integration speed; return the ratio of time to the rule of thumb, periods per cell, and the seconds
+    spent.
 
     Two stretches are measured: one from the initial states, and one from the end of the first, which
     represents the rest of the cell.
@@ -199,7 +200,8 @@ def _speed(spec: Spec, inputs: Inputs, most: float) -> tuple[float, int, float]:
 
 
 def _stretch(spec: Spec, inputs: Inputs, n_periods: int) -> tuple[np.ndarray, float, float]:
-    """Integrate the sample for some periods; return last states, ratio to the rule, and time [s].
+    """Integrate the sample; return its final states, the ratio of processor time to the rule of thumb, and the time
+    [s].
 
     The time is processor time, so that other programs do not count.
     """
@@ -219,7 +221,7 @@ def _stretch(spec: Spec, inputs: Inputs, n_periods: int) -> tuple[np.ndarray, fl
 
 
 def _periods_until_closed(spec: Spec, plan: Plan, most: float, ratio: float) -> float:
-    """Return the mean periods of a cell in a run that stops when orbits have closed.
+    """Return the mean number of periods that a trajectory needs in a run that stops when orbits have closed.
 
     A first sample gives the number of cells for which there is time.
     """
@@ -246,7 +248,7 @@ def _periods_until_closed(spec: Spec, plan: Plan, most: float, ratio: float) -> 
 
 
 def mean_with_tail(periods: np.ndarray, cap: float, most: float) -> float:
-    """Return the mean number of periods if cells that reached `cap` had continued, at most to `most`.
+    """Return the mean number of periods, extrapolated for trajectories that were stopped at `cap` to a limit of `most`.
 
     These cells are assumed to end at the rate at which cells ended in the second half of the observed
     periods.

@@ -1,4 +1,4 @@
-"""Extend a run to a wider specification: reuse all computed cells, and integrate the rest.
+"""Extend a run to a wider specification: reuse all cells that are computed, and integrate the others.
 
 A cell's numbers depend on its inputs alone, bit for bit. A wider run therefore has the same bytes whether it
 begins from nothing or reuses the cells of other runs, which is faster. It is an ordinary run with its own
@@ -38,7 +38,7 @@ from pipeline.store.runfile import is_run
 
 @dataclass(frozen=True)
 class Extension:
-    """The plan of an extension: the wider run, and the cells that it reuses.
+    """Plan of a wider run, with the existing runs whose cells it reuses.
 
     Attributes
     ----------
@@ -62,7 +62,7 @@ class Extension:
 
     @property
     def reused(self) -> int:
-        """Number of reused cells."""
+        """Number of cells that are reused from existing runs."""
         return sum(self.counts)
 
     @property
@@ -72,19 +72,21 @@ class Extension:
 
     @property
     def share(self) -> float:
-        """Remaining work as a fraction of a fresh run's drive periods."""
+        """Drive periods left to integrate, as a fraction of those of a run from nothing."""
         counts = zip(self.runs, self.counts, strict=True)
         left = self.plan.n_cells - self.reused + sum(count * self._more(run) for run, count in counts)
         return left / self.plan.n_cells
 
     def _more(self, run: Run) -> float:
-        """Return the fraction of a cell's periods by which the cells of a run must be integrated further."""
+        """Return the fraction of a cell's periods that reused cells of `run` must still be integrated, if more sections
+        are kept.
+        """
         integration = self.spec.integration
         n_more = integration.n_keep - run.spec.integration.n_keep
         return n_more / (integration.n_transient + integration.n_keep)
 
     def lines(self) -> Iterator[str]:
-        """Yield lines on the reused and the remaining cells."""
+        """Yield printed lines on the numbers of reused and remaining cells."""
         yield from self.notes
         n = self.plan.n_cells
         for run, count in zip(self.runs, self.counts, strict=True):
@@ -97,7 +99,7 @@ class Extension:
 def plan_extension(
     sources: Sequence[str | Path], spec: str | Path | None = None, widening: Widening | None = None
 ) -> Extension:
-    """Plan a wider run that reuses cells of others; nothing is changed.
+    """Plan a wider run that reuses cells of existing runs; no file is changed.
 
     Parameters
     ----------
@@ -132,7 +134,7 @@ def plan_extension(
 
 
 def _wide(run: Run, spec: str | Path | None, widening: Widening) -> tuple[Spec, str]:
-    """Return the wider specification and its text."""
+    """Return the wider specification, parsed and as text."""
     if spec is None and not widening:
         raise SpecError(
             ["extend: nothing to change; give a wider SPEC, or an option such as --axis NAME=LOW:HIGH:NUM."]
@@ -154,7 +156,7 @@ def _printable(text: str) -> str:
 
 
 def _fitting(runs: Sequence[Run], wide: Spec, identity: Mapping[str, Any]) -> tuple[list[Run], list[str]]:
-    """Return the runs whose cells can be reused, and notes on the others."""
+    """Return the runs whose cells can be reused, with notes on those that are incomplete or unsuitable."""
     from pipeline.compute.reuse import obstacles
 
     fitting, notes = [], []
@@ -173,7 +175,7 @@ def _fitting(runs: Sequence[Run], wide: Spec, identity: Mapping[str, Any]) -> tu
 
 
 def _census(wide: Spec, plan: Plan, runs: Sequence[Run]) -> list[int]:
-    """Return the number of the wider run's cells that each run has, each cell counted once."""
+    """Return how many cells of the wider run each old run can supply; a cell is counted for one run only."""
     from pipeline.compute.reuse import Pool
 
     pool, cells = Pool(wide, runs), CellMap(wide)
@@ -185,14 +187,14 @@ def _census(wide: Spec, plan: Plan, runs: Sequence[Run]) -> list[int]:
 
 
 def _strangers(run: Run, wide: Spec) -> list[str]:
-    """Explain why a compatible run contributes no cells."""
+    """Return the reasons why none of a run's cells can be reused although its settings are compatible."""
     if not run.commits:
         return [f"{run.name}: it has no committed cells"]
     return [f"{run.name}: {line}" for line in apart(run.spec, wide)]
 
 
 def describe_extension(extension: Extension, *, workers: int | None = None) -> Iterator[str]:
-    """Yield the lines of a dry run; the time is measured, after the lines that cost nothing."""
+    """Yield the printed lines of a dry run: size, reused and remaining cells, and the measured time estimate."""
     spec, plan = extension.spec, extension.plan
     if spec.title:
         yield spec.title
@@ -219,7 +221,7 @@ def extend(
     dashboard: bool = False,
     echo: Echo = print,
 ) -> State:
-    """Widen a run, reusing every cell that is computed already.
+    """Compute a wider run and reuse every cell that is already computed, in a new directory or in place of the old run.
 
     The result has the same bytes as a run of the wider specification from nothing. If it is killed at any
     moment, the same call continues. The runs whose cells are reused are only read; damaged cells are
@@ -286,7 +288,7 @@ def extend(
 
 
 def _build(extension: Extension, files: Files, *, echo: Echo, **how: Any) -> State:
-    """Compute the wider run in its own directory, or continue it."""
+    """Compute the wider run in its own directory, or continue a stopped computation."""
     for line in extension.lines():
         echo(line)
     sources = [(run.info.files.place, run.info.digest) for run in extension.runs]
@@ -296,7 +298,7 @@ def _build(extension: Extension, files: Files, *, echo: Echo, **how: Any) -> Sta
 
 
 def _record(extension: Extension, files: Files) -> None:
-    """Write which runs the cells come from; this file is not part of the result."""
+    """Write a file that lists the runs from which cells were reused; it is not part of the result."""
     taken: dict[int, int] = {}
     with contextlib.suppress(FileNotFoundError):
         for line in files.read(TIMINGS).decode().splitlines():
@@ -317,20 +319,20 @@ def _record(extension: Extension, files: Files) -> None:
 
 
 def _folder(files: Files) -> Path:
-    """Return the folder of a run; refuse a run in an object store, which cannot be replaced."""
+    """Return the local folder of a run; raise `RefusedError` if it is in an object store."""
     if files.local is None:
         raise RefusedError(f"{files.name}: is not a folder on this machine, so it cannot be replaced; give --out.")
     return files.local
 
 
 def _beside(directory: Path) -> Path:
-    """Return the folder in which the wider run is built before it replaces another."""
+    """Return the folder ``NAME.extending``, in which the wider run is computed before it replaces the old one."""
     real = directory.resolve()
     return real.with_name(f"{real.name}.extending")
 
 
 def _aside(directory: Path) -> Path:
-    """Return a free name for the old run."""
+    """Return a free path ``NAME.before...`` to which the old run is renamed."""
     real = directory.resolve()
     names = (real.with_name(f"{real.name}.before{i}") for i in ("", *(f".{n}" for n in range(2, 10_000))))
     return next(name for name in names if not name.exists())
@@ -347,7 +349,7 @@ def _as_it_is(run: Run, echo: Echo) -> State:
 
 
 def _refuse_loss(run: Run, wide: Spec) -> None:
-    """Refuse to replace a run by one that lacks some of its cells or products."""
+    """Raise `RefusedError` if replacing a run by the wider one would lose some of its cells or products."""
     cells, finder, lost = CellMap(run.spec), Finder(wide), 0
     for index in run.commits:
         block = run.plan.task(index)
@@ -363,7 +365,7 @@ def _refuse_loss(run: Run, wide: Spec) -> None:
 
 
 def _exchange(directory: Path, built: Path, echo: Echo) -> None:
-    """Replace a directory by a finished run; at every moment both exist under some name."""
+    """Replace a run directory by the finished wider run; the old run is renamed, and both exist at every moment."""
     real, aside = directory.resolve(), _aside(directory)
     real.rename(aside)
     sync_folder(real.parent)
@@ -373,7 +375,7 @@ def _exchange(directory: Path, built: Path, echo: Echo) -> None:
 
 
 def _finish_exchange(directory: Path, echo: Echo) -> None:
-    """Rename the finished run if the process was killed between the two renames of an exchange."""
+    """Rename the wider run to its final name if the process was killed after the old run was renamed."""
     built = _beside(directory)
     if directory.exists() or not is_run(open_files(built)):
         return

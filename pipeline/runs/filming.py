@@ -1,4 +1,4 @@
-"""Make animations of a run or of a start, as ``magpend animate`` does."""
+"""Make animations of motions from a run or a given initial state, as the command ``magpend animate`` does."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ CLOCK_HZ, DEFAULT_HZ = 1.0, 2.2
 
 @dataclass(frozen=True)
 class Start:
-    """A motion from a given initial state.
+    """Initial state of a motion to animate, with a model and parameters if no run gives them.
 
     Attributes
     ----------
@@ -55,7 +55,7 @@ def animation(
     echo: Echo | None = None,
     **more: Any,
 ) -> Animation:
-    """Make an animation of motions: the model's moving drawing, and phase portraits.
+    """Make an animation of motions: the model's drawing in motion, and phase portraits.
 
     Parameters
     ----------
@@ -132,7 +132,7 @@ def _of_run(
 
 
 def _alone(start: Start) -> instants.Moving:
-    """Return the motion of a start without a run."""
+    """Return the motion from an initial state of a model, without any run."""
     import numpy as np
 
     from pipeline.compute.simulate import start_of

@@ -1,4 +1,4 @@
-"""Lay out the times of an animation, and integrate its motions over them."""
+"""Choose the frame times of an animation, and integrate its motions over them."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ MOST_SAMPLES = 2_000_000
 
 @dataclass(frozen=True)
 class Moving:
-    """A motion of an animation.
+    """Motion to animate: parameters, initial state, section points, period, name and colour.
 
     Attributes
     ----------
@@ -63,7 +63,7 @@ class Moving:
 
 @dataclass(frozen=True)
 class Schedule:
-    """The times of an animation.
+    """Times of an animation: speed, duration, frames, and samples between frames.
 
     Attributes
     ----------
@@ -93,7 +93,7 @@ class Schedule:
 
 
 def schedule(moving: Sequence[Moving], options: AnimationOptions) -> Schedule:
-    """Choose the instants of a film's frames; the length is right to the nearest frame.
+    """Choose speed and frames of an animation; if possible, it shows a whole number of periods of all motions.
 
     The speed is changed so that whole periods are shown, where all motions repeat: by `MOST_CHANGE` at most,
     of a speed that was given by `MOST_CHANGE_OF_SPEED`.
@@ -133,20 +133,20 @@ def schedule(moving: Sequence[Moving], options: AnimationOptions) -> Schedule:
 
 
 def _cycle(one: Moving) -> float:
-    """Return the time of a visible period [s]: the drive's, or that of a flow's own orbit."""
+    """Return the length of one visible period [s]: the drive period, or for an autonomous model that of the orbit."""
     if not one.parameters.model.autonomous:
         return 1.0 / one.frequency_hz
     return one.period_s if one.period_s > 0.0 else 2.0
 
 
 def _nice(value: float) -> float:
-    """Return the nearest of 1, 2, 5, 10, ... by ratio."""
+    """Round a positive number to the nearest (by ratio) of 1, 2, 5 and 10 times a power of ten."""
     power = 10.0 ** math.floor(math.log10(value))
     return min((factor * power for factor in (1.0, 2.0, 5.0, 10.0)), key=lambda v: abs(math.log(v / value)))
 
 
 def _common(periods: Sequence[float], cycle: float) -> float | None:
-    """Return the least common period of all motions [s]; None if there is none, 0 if all rest."""
+    """Return the least common multiple of the motions' periods [s]; None if there is none, 0 if all motions rest."""
     if any(math.isnan(p) for p in periods):
         return None
     if not periods:
@@ -161,7 +161,7 @@ def _common(periods: Sequence[float], cycle: float) -> float | None:
 
 
 def filmed(moving: Sequence[Moving], plan: Schedule) -> xr.Dataset:
-    """Integrate motions over the times of an animation.
+    """Integrate the motions of an animation over its sample times.
 
     Parameters
     ----------
@@ -228,7 +228,9 @@ def filmed(moving: Sequence[Moving], plan: Schedule) -> xr.Dataset:
 
 
 def _told(moving: Sequence[Moving]) -> dict[str, Any]:
-    """Return attributes that describe the integrated motions; differing parameters are given by motion."""
+    """Return attributes that describe the motions: model, parameters, units; parameters that differ are listed by
+    motion.
+    """
     first = moving[0].parameters
     lines = [f"{name} = {value!r}" for name, value in first.as_dict().items()]
     told = {
@@ -242,7 +244,7 @@ def _told(moving: Sequence[Moving]) -> dict[str, Any]:
 
 
 def _drawn(ds: xr.Dataset, moving: Sequence[Moving], orbits: np.ndarray) -> xr.Dataset:
-    """Add the places of the points of the model's drawing."""
+    """Add the positions of the points of the model's drawing over time, if the model has a drawing."""
     drawing = _model(moving).drawing
     if drawing is None:
         return ds

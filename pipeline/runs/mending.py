@@ -1,4 +1,4 @@
-"""Compare a run directory with its commit records before the run continues, and repair it."""
+"""Check a run's files against its commit records before the run continues, and discard damaged tasks."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _NAMED = 10
 
 
 def sound_commits(info: RunInfo, plan: Plan, echo: Echo, *, alone: bool = True) -> Records:
-    """Return the records whose chunks are intact, byte for byte; withdraw the others.
+    """Return the commit records of tasks whose files are undamaged; damaged tasks are withdrawn, to be computed again.
 
     Equal sizes and times prove nothing, so every committed file is read. With ``MAGPEND_VERIFY=0`` in the
     environment only sizes are compared. Files without a record are removed. Only the holder of the lock may

@@ -1,4 +1,4 @@
-"""Translate all spellings of axes, parameters and states to the names in the cube and the model."""
+"""Translate the accepted spellings of axes, parameters and states to the names in a run's cube and model."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ DEGREES = "_deg"
 
 
 def named(run: Run, options: Options) -> Options:
-    """Return options with axes, parameters and state in the names of the cube and the model.
+    """Return the options of an analysis or a figure, with axis, parameter and state names translated to those of the
+    cube and the model.
 
     ``at`` accepts ``frequency`` or ``frequency_hz``, a parameter, and for a grid of initial states its axis
     ``x_0``, the state ``x`` or, for an angle, ``x_deg``. ``parameter`` and ``second`` accept both names of
@@ -59,7 +60,7 @@ def named(run: Run, options: Options) -> Options:
 
 
 def _swept(run: Run) -> str:
-    """Return the parameter that a run sweeps; the drive frequency if it sweeps none.
+    """Return the name of the parameter that a run sweeps, or of the drive frequency if it sweeps none.
 
     Raises
     ------
@@ -92,7 +93,7 @@ def _unknown(what: str, given: str, name: str, known: Iterable[str]) -> list[str
 
 
 def place(cube: xr.Dataset, name: str, value: float, degrees: bool = False) -> tuple[str, float]:
-    """Return the axis of a cube that a name refers to, and the value in the axis' unit.
+    """Return the cube axis that a name given by the user refers to, and the value converted to the unit of that axis.
 
     Parameters
     ----------

@@ -1,4 +1,6 @@
-"""Summarise a run's cells by status: how many, where, and the command for a closer look."""
+"""Summarise the trajectories (cells) of a run by status: their number, their parameter ranges, and a command that zooms
+in.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,7 @@ Range = tuple[str, float, float, str]
 
 @dataclass(frozen=True)
 class Outcome:
-    """The cells of a run with one status.
+    """Number, fraction and parameter ranges of the cells of a run that have one status, such as diverged.
 
     Attributes
     ----------
@@ -46,12 +48,14 @@ class Outcome:
 
     @property
     def word(self) -> str:
-        """Status in words."""
+        """Name of the status in lower case, with spaces instead of underscores."""
         return self.status.name.lower().replace("_", " ")
 
     @property
     def place(self) -> str:
-        """Place of the cells, such as ``frequency = 2.4 to 2.5 Hz``; empty if they are everywhere."""
+        """Parameter ranges in which the cells lie, such as ``frequency = 2.4 to 2.5 Hz``; empty if they cover all
+        values.
+        """
         return ", ".join(
             f"{name} = {low:.6g}" + (f" to {high:.6g}" if high > low else "") + (f" {unit}" if unit else "")
             for name, low, high, unit in self.where
@@ -59,13 +63,15 @@ class Outcome:
 
     @property
     def line(self) -> str:
-        """Line of a summary."""
+        """Line of the summary: status, number of cells, percentage, and parameter ranges."""
         text = f"  {self.word:15s} {self.n_cells:>10d} {100 * self.share:>6.1f} %"
         return text + (f"  {self.place}" if self.where else "")
 
 
 def outcomes_of(run: Run) -> list[Outcome]:
-    """Return the outcomes of a run's cells by status; this reads ``status`` of every cell."""
+    """Return, for each status, the number of cells of a run and their parameter ranges; this reads ``status`` of every
+    cell.
+    """
     status = run.cube()["status"].load()
     codes = np.flatnonzero(np.bincount(status.values.ravel().astype(np.int64)))
     return [_outcome(status, Status(int(code))) for code in codes]
@@ -85,7 +91,9 @@ def _outcome(status: xr.DataArray, code: Status) -> Outcome:
 
 
 def summary(run: Run) -> list[str]:
-    """Return the last lines of ``magpend run``: cells by status, their places, commands to go on."""
+    """Return the last lines that ``magpend run`` prints: cell counts by status, their parameter ranges, and suggested
+    commands.
+    """
     found = outcomes_of(run)
     lines = [f"{run.plan.n_cells} cells by status:", *(o.line for o in found)]
     lines.append(f"plot it with: {figure_command(run.plan, run.name)}")
@@ -98,12 +106,12 @@ def summary(run: Run) -> list[str]:
 
 
 def lost_cells(found: Iterable[Outcome]) -> list[Outcome]:
-    """Return the outcomes of cells that diverged or failed."""
+    """Return those of the given outcomes whose cells diverged or failed."""
     return [o for o in found if o.status in (DIVERGED, *FAILED)]
 
 
 def warning(run: Run) -> str:
-    """Return a warning if more cells diverged or failed than `WORTH_A_WARNING`; else an empty text."""
+    """Return a warning if the fraction of diverged or failed cells exceeds `WORTH_A_WARNING`; else an empty string."""
     found = outcomes_of(run)
     lost, computed = lost_cells(found), sum(o.n_cells for o in found if o.status != PENDING)
     n_lost = sum(o.n_cells for o in lost)
@@ -119,7 +127,9 @@ def warning(run: Run) -> str:
 
 
 def _zoom(lost: list[Outcome], run: Run) -> str:
-    """Return the command that makes a specification for the range of lost cells; empty without a range."""
+    """Return the ``magpend zoom`` command for the parameter range of the diverged or failed cells; empty without such a
+    range.
+    """
     whole = dict(zip(run.plan.dims, run.plan.shape, strict=True))
     spans: dict[str, tuple[float, float]] = {}
     for dim in (d for d, n in whole.items() if n > 1):

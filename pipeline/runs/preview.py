@@ -1,4 +1,4 @@
-"""Describe a run before it starts, as ``magpend run --dry-run`` does, and choose its first figure."""
+"""Describe a run before it starts (``magpend run --dry-run``), and choose the figure that shows its result."""
 
 from __future__ import annotations
 
@@ -25,7 +25,9 @@ MANY_SECTIONS = 500
 
 
 def first_figure(plan: Plan) -> str:
-    """Return the name of the figure that shows a run as a whole; exponents if the run has them."""
+    """Choose the figure that gives an overview of a run by its swept parameters and products; return the figure's
+    name.
+    """
     n_swept, n_grid = _long(plan)
     if plan.is_recorded:  # its cells cannot be integrated further, so it has no attractors to draw
         return "bifurcation" if n_swept else "section"
@@ -43,20 +45,20 @@ def first_figure(plan: Plan) -> str:
 
 
 def figure_command(plan: Plan, directory: str | Path) -> str:
-    """Return the command that draws the `first_figure` of a run."""
+    """Return the ``magpend plot`` command for the figure that `first_figure` chooses."""
     name = first_figure(plan)
     as_map = name == "lyapunov" and _long(plan)[0] >= 2
     return f"magpend plot {name} {directory}" + (" --map" if as_map else "")
 
 
 def _long(plan: Plan) -> tuple[int, int]:
-    """Return the numbers of swept parameters and of grid axes with more than one value."""
+    """Count the swept parameters, and the axes of the grid of initial conditions, that have more than one value."""
     long = [d for d, n in zip(plan.dims, plan.shape, strict=True) if n > 1]
     return sum(not is_start_dim(d) for d in long), sum(is_grid_dim(d) for d in long)
 
 
 def shown(run: Run) -> tuple[str, dict[str, Any], str]:
-    """Return the figure that ``magpend run --plot`` draws: its name, options, and what is left out.
+    """Return the figure that ``magpend run --plot`` draws: its name, its options, and a note on what it omits.
 
     Returns
     -------
@@ -92,7 +94,7 @@ def shown(run: Run) -> tuple[str, dict[str, Any], str]:
 def describe_plan(
     spec: str | Path, out: str | Path | None, *, workers: int | None = None, smoke: bool = False
 ) -> Iterator[str]:
-    """Yield the lines of a dry run; only the compile cache is written.
+    """Yield the lines that a dry run prints; nothing but the compile cache is written to disk.
 
     The time is measured on some of the run's own cells, after the lines that cost nothing.
 
@@ -123,7 +125,9 @@ def describe_plan(
 
 
 def time_line(spec: Spec, plan: Plan, share: float, n_tasks: int, workers: int | None) -> str:
-    """Return a line on the time of a fraction of a run's cells, in some tasks, measured on a few cells."""
+    """Return a line with the estimated time for a fraction `share` of a run's cells in `n_tasks` tasks, from a few
+    timed cells.
+    """
     from pipeline.compute.execute import default_workers
 
     if not share:

@@ -34,7 +34,7 @@ def size(n_bytes: float) -> str:
 
 
 class Progress:
-    """A context manager that counts cells and reports them to a listener, or shows them itself.
+    """A context manager that counts finished cells, and draws a bar, prints lines or calls a registered listener.
 
     Parameters
     ----------
@@ -81,7 +81,7 @@ class Progress:
             self._bar.stop()
 
     def add(self, cells: int) -> None:
-        """Count finished cells."""
+        """Add newly finished cells to the count, and update the display."""
         self._done += cells
         if is_heard():
             report(WORK, self._done, self._total)
@@ -92,12 +92,12 @@ class Progress:
             self._echo(self.line())
 
     def rate(self) -> float:
-        """Return the cells per second in this session."""
+        """Return the number of cells computed per second since this object was created."""
         elapsed = self._clock() - self._started
         return (self._done - self._before) / elapsed if elapsed > 0 else 0.0
 
     def line(self) -> str:
-        """Return a line of plain text on the progress."""
+        """Return the progress as a line of text: finished cells, percentage, rate and remaining time."""
         rate = self.rate()
         left = f", {duration((self._total - self._done) / rate)} left" if rate > 0 and self._done < self._total else ""
         share = 100 * self._done / self._total

@@ -1,4 +1,6 @@
-"""Define the parts of `import magpend` beyond the commands: opened runs and pandas tables."""
+"""Define two functions of `import magpend`: `run`, which computes and opens a run, and `table`, which returns a pandas
+table.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,7 @@ def run(
     echo: Callable[[str], None] = print,
     **options: Any,
 ) -> Run:
-    """Run a specification, or complete its run, and open the run.
+    """Compute the missing cells of the run that a specification describes, and return the opened run.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Run a specification: from its file to a finished run directory."""
+"""Compute all cells that a specification (TOML file) describes, and store them in a run directory."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def run(
     smoke: bool = False,
     echo: Echo = print,
 ) -> State:
-    """Run a specification, or complete its run.
+    """Compute the tasks of a specification that its run directory lacks; return the progress of the run.
 
     Damaged ``run.json``, metadata or coordinates are rebuilt from the specification. Committed cells that fit
     their records stay.
@@ -109,7 +109,7 @@ def run(
 def carry_out(
     spec: Spec, text: str, files: Files, *, workers: int | None, where: Where, echo: Echo, sources: Sources = ()
 ) -> None:
-    """Run a specification in a run directory, or complete its run.
+    """Compute the missing tasks of a specification in a run directory, which is created if necessary.
 
     Parameters
     ----------
@@ -144,7 +144,8 @@ def carry_out(
 
 
 def identity_here(spec: Spec, plan: Plan) -> dict[str, Any]:
-    """Return the identity of a run with the numerical core installed here.
+    """Return the identity of a run: everything that decides its numbers and layout, the installed kernel version
+    included.
 
     Raises
     ------
@@ -207,7 +208,7 @@ def _complete(
 
 
 def _require_all(info: RunInfo, plan: Plan, echo: Echo) -> None:
-    """Check by the commit records that all tasks are committed, and remove files of stopped workers."""
+    """Raise `IncompleteError` unless every task has a commit record; remove files left by stopped workers."""
     commits, problems = damaged_records(info, plan, contents=False)
     absent = [i for i in range(plan.n_tasks) if i not in commits or name_of(i) in problems]
     if absent:

@@ -13,7 +13,7 @@ from pipeline.store.run import Run
 
 @dataclass(frozen=True)
 class State:
-    """The progress of a run.
+    """Progress of a run: its committed tasks, and the number of committed cells by status.
 
     Attributes
     ----------
@@ -42,17 +42,17 @@ class State:
 
     @property
     def n_committed(self) -> int:
-        """Number of committed cells."""
+        """Number of cells that have been computed and committed."""
         return sum(self.cells.values())
 
     @property
     def complete(self) -> bool:
-        """Whether every task is committed."""
+        """Whether every task of the run has been computed and committed."""
         return len(self.done) == self.plan.n_tasks
 
 
 def state(source: str | Path | Files | Run) -> State:
-    """Return the progress of a run from its commit records.
+    """Read the commit records of a run; return its progress: finished tasks, and cells by status.
 
     Raises
     ------
@@ -64,7 +64,7 @@ def state(source: str | Path | Files | Run) -> State:
 
 
 def describe_state(found: State) -> list[str]:
-    """Return the lines of ``magpend status``."""
+    """Return the lines that ``magpend status`` prints."""
     plan = found.plan
     share = 100 * found.n_committed / plan.n_cells
     lines = [found.title] if found.title else []

@@ -19,7 +19,7 @@ NUMBERS = tuple(getattr(signal, n) for n in ("SIGINT", "SIGTERM", "SIGHUP") if h
 
 
 class Stopped(KeyboardInterrupt):
-    """An exception for a signal, handled like Ctrl-C.
+    """Exception that a received signal raises; a subclass of `KeyboardInterrupt`.
 
     Attributes
     ----------
@@ -32,7 +32,7 @@ class Stopped(KeyboardInterrupt):
 
 
 class InterruptedRunError(Exception):
-    """An error for a run that a signal stopped. Committed tasks stay.
+    """An error for a run that a signal stopped; results of finished tasks stay.
 
     Attributes
     ----------
@@ -45,7 +45,9 @@ class InterruptedRunError(Exception):
 
 
 class _Listener:
-    """The signal handler of the command line."""
+    """Signal handler of the command line: raises `Stopped` for a first signal where that is allowed, else ends the
+    process.
+    """
 
     first: int | None = None
     is_in_order = False
@@ -61,7 +63,9 @@ _listener = _Listener()
 
 
 def listen() -> None:
-    """Install the signal handlers of the command line; signals that the parent ignores stay ignored."""
+    """Install the signal handler of the command line for Ctrl-C, SIGTERM and SIGHUP, except for signals that are
+    ignored.
+    """
     for number in NUMBERS:
         if signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, _listener)
@@ -69,7 +73,7 @@ def listen() -> None:
 
 @contextlib.contextmanager
 def in_order() -> Iterator[None]:
-    """Let the first signal raise `Stopped` inside this context."""
+    """Let the first signal raise `Stopped` inside this context; a second one ends the process."""
     _listener.is_in_order = True
     try:
         yield
@@ -81,12 +85,12 @@ def in_order() -> Iterator[None]:
 
 
 def first_signal() -> int | None:
-    """Return the first signal that came; None if none came."""
+    """Return the number of the first signal that this process received; None if it received none."""
     return _listener.first
 
 
 def end_if_stopped(code: int) -> None:
-    """End this process if a signal came, after the message is printed."""
+    """Flush the output and end this process if a signal was received."""
     if _listener.first is not None:
         logging.shutdown()
         for stream in (sys.stdout, sys.stderr):
@@ -109,7 +113,7 @@ def leave(number: int) -> NoReturn:
 
 @contextlib.contextmanager
 def stoppable(directory: str | Path) -> Iterator[None]:
-    """Turn Ctrl-C, SIGTERM and SIGHUP into `InterruptedRunError`, after everything inside is closed.
+    """Turn Ctrl-C, SIGTERM and SIGHUP inside this context into `InterruptedRunError`, after inner contexts are closed.
 
     Parameters
     ----------
@@ -127,7 +131,7 @@ def stoppable(directory: str | Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _raising() -> Iterator[None]:
-    """Let signals with their default action raise `Stopped`; other handlers stay."""
+    """Let signals that have their default action raise `Stopped` inside this context; other handlers stay installed."""
 
     def stop(number: int, frame: Any) -> None:
         raise Stopped(number)

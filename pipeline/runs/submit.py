@@ -1,4 +1,4 @@
-"""Send a run to a batch system: ``magpend submit``."""
+"""Send a run to the batch system of a computing cluster: ``magpend submit``."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class SubmitError(Exception):
 
 @dataclass(frozen=True)
 class Submission:
-    """A run as a batch job.
+    """Batch job of a run: its script, its folder and, once it is sent, its job number.
 
     Attributes
     ----------
@@ -67,7 +67,7 @@ class Submission:
     job: str | None = None
 
     def lines(self) -> list[str]:
-        """Return lines on how to follow, cancel and continue the job."""
+        """Return lines of text with the commands that follow, cancel and continue the job."""
         words = WORDS[self.cluster.kind]
         return [
             f"sent: job {self.job}",
@@ -81,7 +81,7 @@ class Submission:
 def prepare(
     spec: str | Path, out: str | Path | None, cluster_file: str | Path | None, *, smoke: bool = False
 ) -> Submission:
-    """Make the batch script of a run's job; nothing is created or sent.
+    """Make the batch script that computes a run; create no files and send nothing.
 
     Parameters
     ----------
@@ -128,7 +128,7 @@ def prepare(
 
 
 def _command(cluster: Cluster, file: Path, spec: Path, place: str, smoke: bool) -> list[str]:
-    """Return the command ``magpend run`` for the job."""
+    """Return the ``magpend run`` command line that the batch job executes."""
     where = ["--scheduler", "local", "--workers", str(cluster.cores)]
     if not is_whole(cluster):
         where = ["--scheduler", cluster.kind, "--cluster", str(file.absolute())]
@@ -147,7 +147,7 @@ def _command(cluster: Cluster, file: Path, spec: Path, place: str, smoke: bool) 
 
 
 def send(submission: Submission) -> Submission:
-    """Send the job, and keep its script and its number beside the run directory.
+    """Send the job to the batch system; keep its script and its job number beside the run directory.
 
     Raises
     ------
@@ -184,7 +184,7 @@ def send(submission: Submission) -> Submission:
 
 
 def _refuse_second(submission: Submission) -> None:
-    """Refuse a second job of a run: it would only wait for the first one's lock."""
+    """Raise `LockedError` if an earlier batch job of the same run is still waiting or running."""
     try:
         sent = json.loads((submission.folder / SENT).read_text("utf-8"))
         kind, job = sent["kind"], sent["job"]

@@ -1,4 +1,4 @@
-"""Compute versions of analyses: digests of their code, so that editing one makes no other stale."""
+"""Compute versions of analyses: digests of the code that each one uses, so that editing one leaves the others valid."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def modules_of(name: str) -> set[str]:
 
 @cache
 def _imports(module: str) -> tuple[str, ...]:
-    """Return the modules that count among the imports of a module, anywhere in it."""
+    """Return the modules of `pipeline.analysis` (and `pipeline.layout.vocabulary`) that a module imports."""
     names: list[str] = []
     for node in ast.walk(ast.parse(_file(module).read_bytes())):
         if isinstance(node, ast.ImportFrom) and node.module and not node.level:

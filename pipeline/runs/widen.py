@@ -1,4 +1,6 @@
-"""Make a wider specification from a run's own: longer axes, more starts, sections or products."""
+"""Derive a larger specification from that of a run: longer axes, more initial conditions, section points or
+products.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,7 @@ from pipeline.specification.tables import FREQUENCY
 
 @dataclass(frozen=True)
 class Widening:
-    """Changes to a specification; everything else stays unchanged.
+    """Changes that enlarge a specification; everything else stays unchanged.
 
     Attributes
     ----------
@@ -39,7 +41,7 @@ class Widening:
 
 
 def widened(spec: Spec, widening: Widening) -> Spec:
-    """Return the widened specification.
+    """Return a specification enlarged by longer axes, more initial conditions, section points or products.
 
     Raises
     ------

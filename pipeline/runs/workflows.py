@@ -1,4 +1,4 @@
-"""Find and read specifications: files, shipped workflows, texts and tables."""
+"""Find and read specifications given as TOML files, names of shipped workflows, TOML text or dicts."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def find_spec(name: str | Path) -> Path:
 
 
 def read_given(spec: str | Path | Mapping[str, Any], *, smoke: bool = False) -> tuple[Spec, str, Path]:
-    """Read a specification: a file, a shipped workflow, a TOML text or a table.
+    """Read a specification given as a file, the name of a shipped workflow, TOML text or a dict.
 
     Parameters
     ----------
@@ -66,12 +66,12 @@ def read_given(spec: str | Path | Mapping[str, Any], *, smoke: bool = False) -> 
 
 
 def shipped_workflows() -> dict[str, Path]:
-    """Return the paths of the workflows that ship, by name, for ``magpend run``."""
+    """Return the paths of the run specifications (workflows) shipped with magpend, by name, for ``magpend run``."""
     return {name: path for name, path in _shipped().items() if not _identifies(path)}
 
 
 def shipped_identifications() -> dict[str, Path]:
-    """Return the paths of the identifications that ship, by name, for ``magpend identify``."""
+    """Return the paths of the identification specifications shipped with magpend, by name, for ``magpend identify``."""
     return {name: path for name, path in _shipped().items() if _identifies(path)}
 
 
@@ -88,5 +88,5 @@ def _shipped() -> dict[str, Path]:
 
 
 def default_directory(spec_path: Path, smoke: bool) -> Path:
-    """Return the default directory of a run."""
+    """Return the default run directory of a specification file: ``runs/NAME``."""
     return Path("runs") / (spec_path.stem + ("-smoke" if smoke else ""))

@@ -26,7 +26,7 @@ _ROUNDING = 1e-9
 
 @dataclass(frozen=True)
 class Source:
-    """A specification and its origin.
+    """A specification, and the run or file that it comes from.
 
     Attributes
     ----------
@@ -42,7 +42,7 @@ class Source:
 
 @dataclass(frozen=True)
 class Changes:
-    """The changes of a specification.
+    """Changes of a specification: new ranges, fixed values and numbers of points, by state or parameter.
 
     Attributes
     ----------
@@ -86,7 +86,7 @@ def read_source(path: str | Path) -> Source:
 
 
 def zoom(spec: Spec, changes: Changes) -> tuple[Spec, list[str]]:
-    """Return the changed specification, and notes on ranges that exceed the old ones.
+    """Return a specification with new ranges and fixed values, and notes on ranges that exceed the old ones.
 
     A range keeps its number of points. A state or parameter with one value can get a range with a given
     number of points. New ranges are evenly spaced. A ``[smoke]`` table is not copied.
@@ -117,7 +117,7 @@ def zoom(spec: Spec, changes: Changes) -> tuple[Spec, list[str]]:
 
 
 def write_zoom(source: Source, changes: Changes, out: Path) -> list[str]:
-    """Write the changed specification to a file; return the notes of `zoom`.
+    """Write the changed specification to a TOML file; return notes on ranges that exceed the old ones.
 
     Raises
     ------
@@ -145,12 +145,12 @@ def write_zoom(source: Source, changes: Changes, out: Path) -> list[str]:
 
 
 def _state(spec: Spec, key: str) -> str | None:
-    """Return the name of the state that a key sets; None for a parameter."""
+    """Return the state that a key such as ``x`` or ``x_deg`` sets; None for a parameter."""
     return state_of_key(key, spec.model)
 
 
 def _check(spec: Spec, changes: Changes) -> list[str]:
-    """Return problems with the changes themselves."""
+    """Return messages about requested changes that do not fit the specification."""
     keys = [*changes.ranges, *changes.pins]
     if not keys:
         return ["zoom: nothing to change; give a range such as --axis NAME=LOW:HIGH, or --at frequency_hz=2.2."]
@@ -189,14 +189,14 @@ def _check(spec: Spec, changes: Changes) -> list[str]:
 
 
 def _points(spec: Spec, key: str, changes: Changes) -> int:
-    """Return the number of points of a new range: the requested or the old number, else 0."""
+    """Return the number of points of a new range: as requested, else as in the old range, else 0."""
     asked = changes.nums.get(_state(spec, key) or key, changes.num)
     old = _old_range(spec, key)
     return asked if asked is not None else (len(old.array()) if old is not None else 0)
 
 
 def _old(spec: Spec, key: str) -> tuple[Any, float]:
-    """Return the old value or range of a key, and the factor to the key's unit."""
+    """Return the old value or range of a state or parameter, and the factor that converts it to the unit of `key`."""
     state = _state(spec, key)
     if state is None:
         return spec.axes.get(key), 1.0
@@ -214,7 +214,7 @@ def _old_range(spec: Spec, key: str) -> Range | None:
 
 
 def _extent(spec: Spec, key: str) -> tuple[float, float] | None:
-    """Return the old lowest and highest value in the key's unit; None if there was no range."""
+    """Return the ends of the old range of a state or parameter, in the unit of `key`; None if it had no range."""
     value, factor = _old(spec, key)
     if isinstance(value, Range):
         array = value.array()
@@ -227,7 +227,7 @@ def _slack(extent: tuple[float, float]) -> float:
 
 
 def put_value(spec: Spec, data: dict[str, Any], key: str, value: Any) -> None:
-    """Set a state's or parameter's value or range in plain data, and remove its old one."""
+    """Set the value or range of a state or parameter in a specification's plain data (dicts), replacing the old one."""
     state = _state(spec, key)
     if state is not None:
         data["initial_conditions"].pop(state, None)

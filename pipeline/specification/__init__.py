@@ -1,1 +1,1 @@
-"""Read specifications: tables, starts, parsing, and sentences about their problems."""
+"""Read and validate the specifications (TOML) of runs, and report their problems in sentences."""

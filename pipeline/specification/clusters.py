@@ -24,7 +24,7 @@ Lines = Annotated[tuple[str, ...], Field(strict=False)]
 
 
 def seconds_of(time: str) -> int:
-    """Return the seconds of a time such as ``04:00:00``; raise `ValueError` for any other text."""
+    """Convert a time such as ``04:00:00`` to seconds; raise `ValueError` for any other text."""
     match = _TIME.fullmatch(time)
     if match is None or not any(map(int, match.groups())):
         raise ValueError(f"{time!r}: must be hours, minutes and seconds above zero, such as '04:00:00'.")
@@ -33,7 +33,7 @@ def seconds_of(time: str) -> int:
 
 
 def bytes_of(memory: str) -> int:
-    """Return the bytes of a size such as ``16 GB``; raise `ValueError` for any other text."""
+    """Convert a size such as ``16 GB`` to bytes; raise `ValueError` for any other text."""
     match = _MEMORY.fullmatch(memory)
     if match is None or not float(match[1]):
         raise ValueError(f"{memory!r}: must be a number and kB, MB, GB or TB, such as '16 GB'.")
@@ -46,13 +46,13 @@ def clock(seconds: int) -> str:
 
 
 def hours_and_minutes(seconds: int) -> str:
-    """Format seconds for LSF: whole minutes, at least one."""
+    """Format a time in seconds as ``HH:MM`` for the batch system LSF: rounded down, but at least one minute."""
     minutes = max(1, seconds // 60)
     return f"{minutes // 60:02d}:{minutes % 60:02d}"
 
 
 class Cluster(Table):
-    """The ``[cluster]`` table: a job that holds workers, and the number of jobs."""
+    """The ``[cluster]`` table: resources of a batch job that runs worker processes, and the number of such jobs."""
 
     kind: Literal["slurm", "pbs", "sge", "lsf"] = Field(description="Batch system.")
     queue: str | None = Field(None, description="Queue or partition.")
@@ -130,25 +130,25 @@ class Cluster(Table):
 
     @property
     def walltime_s(self) -> int:
-        """Time of a job [s]."""
+        """Time after which the batch system ends a job (walltime) [s]."""
         return seconds_of(self.walltime)
 
     @property
     def margin_s(self) -> int:
-        """Default time between the last worker's leave and the end of its job [s]."""
+        """Default time between the stop of the last worker and the end of its batch job [s]."""
         tenth = self.walltime_s // 10
         return max(1, min(max(tenth, _LEAST_MARGIN_S), _MOST_MARGIN_S, self.walltime_s // 2))
 
     @property
     def lifetime_s(self) -> int:
-        """Time after which a worker leaves [s]."""
+        """Time after which a worker stops by itself [s]."""
         if self.lifetime is not None:
             return seconds_of(self.lifetime)
         return max(1, self.walltime_s - self.margin_s - self.stagger_s)
 
     @property
     def stagger_s(self) -> int:
-        """Spread of the times at which workers leave [s]."""
+        """Range over which the stop times of workers are spread [s]."""
         if self.lifetime_stagger is not None:
             return seconds_of(self.lifetime_stagger)
         return self.margin_s // 3
@@ -165,7 +165,7 @@ class Cluster(Table):
 
 
 def load_cluster(path: str | Path) -> Cluster:
-    """Read a file with a ``[cluster]`` table.
+    """Read and validate a TOML file with a ``[cluster]`` table.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Read drive files: a recorded drive as a small table of numbers, for runs and simulations.
+"""Read drive files: CSV tables of a recorded drive (its edges or its torque), for runs and simulations.
 
 A drive file is CSV with one of two headers. Lines that begin with ``#`` are comments.
 
@@ -39,7 +39,7 @@ _BAND = 0.5
 
 @dataclass(frozen=True, eq=False)
 class RecordedDrive:
-    """A recorded drive with the times of its sections.
+    """A recorded drive (edges or torque) with the times of its stroboscopic sections.
 
     Attributes
     ----------
@@ -65,22 +65,24 @@ class RecordedDrive:
 
     @property
     def start_s(self) -> float:
-        """Time at which the drive and a trajectory begin [s, the file's clock]."""
+        """Time at which the drive and each trajectory begin [s, as in the file]."""
         return float(self.first[0])
 
     @property
     def end_s(self) -> float:
-        """Time at which the drive ends [s, the file's clock]."""
+        """Time at which the drive ends [s, as in the file]."""
         return float(self.first[-1])
 
     @property
     def n_periods(self) -> int:
-        """Number of sections."""
+        """Number of stroboscopic sections during the drive."""
         return len(self.sections_s)
 
     @property
     def frequency_hz(self) -> float:
-        """Mean frequency of the sections [Hz]; with fewer than two marks, one over the drive's length."""
+        """Mean frequency of the rising edges or sections [Hz]; one over the drive's length if there are fewer than
+        two.
+        """
         marks = self.first if self.kind == EDGES else self.sections_s
         if len(marks) < 2:
             return 1.0 / (self.end_s - self.start_s)
@@ -88,7 +90,7 @@ class RecordedDrive:
 
     @cached_property
     def _times(self) -> np.ndarray:
-        """Ends of a torque's intervals: its samples, and the sections between them [s]."""
+        """Ends of the integration intervals of a torque: its samples, and stroboscopic sections between them [s]."""
         between = np.searchsorted(self.first, self.sections_s)
         gap = np.minimum(
             np.abs(self.first[np.minimum(between, len(self.first) - 1)] - self.sections_s),
@@ -98,7 +100,7 @@ class RecordedDrive:
 
     @cached_property
     def intervals(self) -> Drive:
-        """The drive as the engine takes it; this imports the compiler."""
+        """Recorded drive as the `Drive` object that the engine integrates; this imports the compiler."""
         from magpend_core.sampling import Drive
 
         if self.kind == EDGES:
@@ -107,12 +109,12 @@ class RecordedDrive:
 
     @property
     def n_intervals(self) -> int:
-        """Number of intervals in which the drive is integrated."""
+        """Number of time intervals in which the recorded drive is integrated."""
         return len(self.first if self.kind == EDGES else self._times) - 1
 
     @cached_property
     def section_ends(self) -> np.ndarray:
-        """For each section, the index of the interval at whose end it lies."""
+        """For each stroboscopic section, the index of the integration interval that ends at it."""
         if self.kind == EDGES:
             return np.arange(self.n_periods)
         return np.asarray(np.searchsorted(self._times, self.sections_s - _COINCIDENT_S) - 1)
@@ -146,14 +148,14 @@ def read_drive(path: str | Path) -> tuple[str, str]:
 
 
 def load_drive(path: str | Path, *, section_hz: float | None = None) -> RecordedDrive:
-    """Read a drive file; see `parse_drive`."""
+    """Read a drive file (CSV) and parse it into a `RecordedDrive`."""
     text, digest = read_drive(path)
     return parse_drive(text, Path(path).name, digest, section_hz)
 
 
 @lru_cache(maxsize=8)
 def parse_drive(text: str, file: str, sha256: str, section_hz: float | None = None) -> RecordedDrive:
-    """Parse the text of a drive file.
+    """Parse the text of a drive file into a `RecordedDrive`.
 
     Parameters
     ----------
@@ -224,7 +226,7 @@ def rising_edges(time: np.ndarray, level: np.ndarray) -> np.ndarray:
 
 
 def _rows(text: str, file: str) -> tuple[str, list[tuple[int, list[str]]]]:
-    """Return the kind of a table, and its rows with their line numbers."""
+    """Return the kind of a drive file (edges or torque) by its header, and its rows with their line numbers."""
     lines = [(i, line.strip()) for i, line in enumerate(text.splitlines(), 1)]
     lines = [(i, line) for i, line in lines if line and not line.startswith("#")]
     header = tuple(word.strip().lstrip("\ufeff") for word in lines[0][1].split(",")) if lines else ()
@@ -236,7 +238,7 @@ def _rows(text: str, file: str) -> tuple[str, list[tuple[int, list[str]]]]:
 
 
 def _columns(kind: str, rows: list[tuple[int, list[str]]], file: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return both columns as numbers; the last falling edge may be missing."""
+    """Convert the rows of a drive file to two arrays of numbers; the last falling edge may be missing."""
     first, second = np.full(len(rows), np.nan), np.full(len(rows), np.nan)
     problems = []
     for k, (line, fields) in enumerate(rows):

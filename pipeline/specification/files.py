@@ -35,7 +35,7 @@ def read_toml(path: str | Path) -> dict[str, Any]:
 
 
 def toml_tables(content: bytes, name: str) -> dict[str, Any]:
-    """Return the tables of a TOML text; messages call the text `name`.
+    """Parse TOML text and return its tables; error messages call the text `name`.
 
     Raises
     ------
@@ -62,7 +62,7 @@ def toml_tables(content: bytes, name: str) -> dict[str, Any]:
 
 
 def _unreadable(error: Exception) -> str:
-    """Explain why a file is no specification."""
+    """Return a phrase that says why a file cannot be read as TOML."""
     if isinstance(error, OSError):
         return f"cannot be read ({error.strerror or error})."
     if isinstance(error, UnicodeDecodeError):
@@ -76,7 +76,7 @@ def _unreadable(error: Exception) -> str:
 
 
 def odd_data(data: Any) -> list[str]:
-    """Return problems of data that no specification can have: too deep, too long, or too large numbers.
+    """Return problems of data that no valid specification can have: deep nesting, long lists or keys, huge integers.
 
     Later code may then recurse into the data, convert whole numbers to floats and repeat keys in messages.
     """
@@ -106,7 +106,7 @@ def odd_data(data: Any) -> list[str]:
 
 
 def nested(table: Mapping[str, Any]) -> dict[str, Any]:
-    """Spread quoted dotted keys: ``{"a.b": 1}`` becomes ``{"a": {"b": 1}}``."""
+    """Expand dotted keys to nested dicts: ``{"a.b": 1}`` becomes ``{"a": {"b": 1}}``."""
     result: dict[str, Any] = {}
     for key, value in table.items():
         *parents, last = key.split(".")

@@ -1,4 +1,4 @@
-"""Accept models and specifications as users give them in Python: names, paths, TOML text, tables."""
+"""Read models and specifications that users give in Python as names, paths, TOML text or dicts."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from pipeline.specification.toml import toml_key, toml_value
 
 
 def load_model(reference: str | Path | Mapping[str, Any] | Model = "pendulum") -> Model:
-    """Return a model by its name, path, text or table; warn of unused parts of its text.
+    """Return a model given by name, path, TOML text or table; warn of unused parts of its text.
 
     Parameters
     ----------
@@ -39,7 +39,7 @@ def load_model(reference: str | Path | Mapping[str, Any] | Model = "pendulum") -
 
 
 def _found(reference: str | Path | Mapping[str, Any] | Model) -> Model:
-    """Return the model without warnings."""
+    """Return the model as `load_model` does, but without warnings."""
     if isinstance(reference, str) and not reference.lstrip().startswith("{") and is_toml_text(reference):
         return _model_in(toml_tables(reference.encode(), "the text"), Path())
     if isinstance(reference, Path) or (isinstance(reference, str) and is_model_file(reference)):
@@ -50,7 +50,7 @@ def _found(reference: str | Path | Mapping[str, Any] | Model) -> Model:
 
 
 def _model_in(tables: Mapping[str, Any], folder: Path) -> Model:
-    """Return the model of a specification's tables, or of a model's own table."""
+    """Return the model that the tables of a specification refer to, or that the tables themselves define."""
     if "equations" in tables:
         return find_model({"name": "model", **tables}, folder)
     return find_model(tables["model"], folder) if "model" in tables else named_model()
@@ -67,7 +67,7 @@ def toml_of(table: Mapping[str, Any]) -> str:
 
 
 def _plain(given: Any) -> Any:
-    """Convert numpy numbers and arrays in tables and lists to Python's."""
+    """Convert numpy numbers and arrays inside dicts and lists to plain Python numbers and lists."""
     if isinstance(given, Mapping):
         return {str(key): _plain(value) for key, value in given.items()}
     if isinstance(given, list | tuple):

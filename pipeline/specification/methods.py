@@ -10,7 +10,9 @@ from pipeline.specification.tables import Integration
 
 
 def method_problems(integration: Integration | None, products: Mapping[str, Options], is_recorded: bool) -> list[str]:
-    """Return problems with `integration.method`: only the method of order 5 can interpolate in a step."""
+    """Return the problems of `integration.method`: products that interpolate within steps need the method of order
+    5.
+    """
     if integration is None or integration.method == "dopri5":
         return []
     inside = [f"products.{n} looks" for n, o in products.items() if CELL_PRODUCTS[n].watches(o)]

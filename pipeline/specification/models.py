@@ -1,4 +1,4 @@
-"""Find the model of a specification: one that ships, a text, a file, or a Python object.
+"""Find the model of a specification: one shipped with magpend, a text, a file, or a Python object.
 
 A run never keeps only the path of a file or of an object. It keeps a model's text in ``run.json``, and a
 description of a Python object. Reading a run's model reads no other file and imports nothing.
@@ -28,7 +28,7 @@ KEPT = None
 
 
 def find_model(reference: Any, folder: str | Path | None = ".", at: str = "model") -> Model:
-    """Return the model that a specification or a run names.
+    """Load the model that the key ``model`` of a specification or run refers to.
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ def find_model(reference: Any, folder: str | Path | None = ".", at: str = "model
 
 
 def _placed(problem: str, at: str, reference: Any) -> str:
-    """Prefix a problem with its key path unless it has one."""
+    """Prefix a problem message with the key path of the model in the specification, unless it has one."""
     if not isinstance(reference, Mapping) or KEY in reference:
         return f"{at}: {problem}"
     head = "model."
@@ -75,7 +75,7 @@ def _placed(problem: str, at: str, reference: Any) -> str:
 
 
 def add_model(reference: Any, folder: str | Path | None, problems: list[str], at: str = "model") -> Model | None:
-    """Return the model as `find_model` does; on a problem, add it to `problems` and return None."""
+    """Return the model that `find_model` finds, or None after adding its problems to `problems`."""
     try:
         return find_model(reference, folder, at)
     except SpecError as error:
@@ -84,7 +84,7 @@ def add_model(reference: Any, folder: str | Path | None, problems: list[str], at
 
 
 def stand_in(reference: Any, folder: str | Path | None, *, forced: bool) -> Model | None:
-    """Return a model with the states and parameters of a text whose equations are wrong.
+    """Return a placeholder model with the states and parameters of a faulty model, so that other tables can be checked.
 
     With it the other tables are checked, too. None if the states or parameters are also wrong.
 
@@ -118,12 +118,12 @@ def stand_in(reference: Any, folder: str | Path | None, *, forced: bool) -> Mode
 
 
 def is_model_file(reference: Any) -> bool:
-    """Return whether a reference is the path of a model's file."""
+    """Return whether a reference to a model is the path of a TOML file."""
     return isinstance(reference, str) and reference.endswith(SUFFIX)
 
 
 def read_model_file(path: str | Path) -> dict[str, Any]:
-    """Return the table of a model's file; its keys stand at the top, or below ``[model]``.
+    """Read a model file and return its table; the keys are at the top level or below ``[model]``.
 
     Without the key ``name`` the model is named after the file.
 
@@ -155,13 +155,14 @@ def _of_file(name: str, folder: str | Path | None, at: str) -> Model:
 
 
 def kept_reference(model: Model) -> str | dict[str, Any]:
-    """Return the part of a model that a run keeps, as tables take it: its name or its text."""
+    """Return the form in which a run stores its model: the name of a shipped model, or its definition as a dict."""
     reference = model.reference
     return reference if isinstance(reference, str) else dict(reference)
 
 
 def with_model_table(data: Mapping[str, Any], folder: str | Path) -> Mapping[str, Any]:
-    """Replace the path of a model's file by its table, so that single keys can be replaced.
+    """Replace the path of a model file in a specification by the content of the file, so that single keys can be
+    changed.
 
     The path of a file that cannot be read stays; the parser of the specification reports the problem.
     """
@@ -174,7 +175,7 @@ def with_model_table(data: Mapping[str, Any], folder: str | Path) -> Mapping[str
 
 
 def model_toml(reference: str | Mapping[str, Any]) -> str:
-    """Return a model's reference as TOML: one line for a name, tables for a text.
+    """Format the reference to a model as TOML: one line for a name, or the tables of a model given as text.
 
     For a Python object this is its import path, which is imported when the file is read. Tables must come
     last in a file.

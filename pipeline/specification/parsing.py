@@ -58,12 +58,12 @@ class Spec:
 
     @cached_property
     def recorded(self) -> RecordedDrive | None:
-        """The recording that drives the model; None for the model's own drive."""
+        """Recorded drive that replaces the model's own drive; None without one."""
         return recorded(self.drive, [])
 
     @property
     def frequency_hz(self) -> float | None:
-        """Drive frequency [Hz], for a recording its mean frequency; None if it is swept.
+        """Drive frequency [Hz], for a recorded drive its mean frequency; None if the frequency is swept.
 
         With a section by crossing it is one over the longest time between crossings, as in the engine.
         """
@@ -73,22 +73,22 @@ class Spec:
 
     @property
     def refine(self) -> int | None:
-        """Stride of a refined grid; None for a full grid and for other starts."""
+        """Stride of the cells computed first on a refined grid of initial conditions; None without refinement."""
         starts = self.initial_conditions
         return starts.refine if isinstance(starts, GridStarts) else None
 
     @cached_property
     def model(self) -> Model:
-        """Model that is integrated, with its section by crossing if there is one."""
+        """Model that is integrated, with the Poincare section of the specification if it has one."""
         return seen_through(load_model(self.reference), self.section)
 
     @cached_property
     def values(self) -> Parameters:
-        """Values of the parameters that are not swept."""
+        """Values of the model parameters that are not swept."""
         return self.model.load(self.parameters.chosen, **self.parameters.overrides)
 
     def as_dict(self) -> dict[str, Any]:
-        """Return plain data with all defaults filled in; `parse_spec` reads it back."""
+        """Return the specification as plain dicts with all defaults filled in; `parse_spec` reads them back."""
         tables: dict[str, Any] = {"kind": self.kind, "title": self.title, "model": self.reference}
         for name in _TABLES:
             table = getattr(self, name)
@@ -126,7 +126,7 @@ _KEYS = (
 
 
 def load_spec(path: str | Path, *, smoke: bool = False) -> Spec:
-    """Read and validate a specification.
+    """Read a specification from a TOML file and validate it.
 
     Parameters
     ----------
@@ -144,12 +144,12 @@ def load_spec(path: str | Path, *, smoke: bool = False) -> Spec:
 
 
 def spec_of_tables(data: dict[str, Any], folder: Path, *, smoke: bool = False) -> Spec:
-    """Validate the tables of a file or a text, ``[smoke]`` included; see `load_spec`."""
+    """Validate the tables of a specification, including ``[smoke]``, the changes for a short test run."""
     return parse_spec(_with_smoke(data, smoke, folder), folder)
 
 
 def kept_spec(data: Mapping[str, Any]) -> Spec:
-    """Parse the specification that a run keeps; no other file is read, nothing is imported.
+    """Parse the specification stored in a run's ``run.json``; read no other file and import nothing.
 
     Raises
     ------
@@ -160,7 +160,9 @@ def kept_spec(data: Mapping[str, Any]) -> Spec:
 
 
 def _with_smoke(data: dict[str, Any], smoke: bool, folder: Path) -> dict[str, Any]:
-    """Remove ``[smoke]``, check it in any case, and merge it into the tables if asked."""
+    """Remove and check the table ``[smoke]``, which holds the changes for a short test run; apply it if `smoke` is
+    set.
+    """
     plain = {key: value for key, value in data.items() if key != "smoke"}
     if "smoke" not in data:
         if smoke:
@@ -180,7 +182,9 @@ def _with_smoke(data: dict[str, Any], smoke: bool, folder: Path) -> dict[str, An
 
 
 def _raise_new(plain: dict[str, Any], folder: Path, smoke_error: SpecError) -> None:
-    """Raise the problems of the specification together with those that only ``[smoke]`` causes."""
+    """Raise a `SpecError` with the problems of the full specification and those that only its ``[smoke]`` table
+    causes.
+    """
     try:
         parse_spec(plain, folder)
         own: list[str] = []
@@ -190,7 +194,7 @@ def _raise_new(plain: dict[str, Any], folder: Path, smoke_error: SpecError) -> N
 
 
 def parse_spec(data: Mapping[str, Any], folder: str | Path | None = ".") -> Spec:
-    """Validate the tables of a specification.
+    """Validate the tables of a specification and return it as a `Spec`.
 
     Every table is validated on its own, so that errors in one do not hide errors in others. Then the valid
     tables are checked against each other. Files of presets, drives and models are read here, and their
@@ -259,7 +263,7 @@ def parse_spec(data: Mapping[str, Any], folder: str | Path | None = ".") -> Spec
 
 
 def _with_preset(data: Mapping[str, Any], folder: str | Path | None, problems: list[str]) -> Mapping[str, Any]:
-    """Replace the name of a preset's file by its content; drop the name if the file cannot be read."""
+    """Replace the file name of a parameter preset by the file's content; drop the name if the file cannot be read."""
     table = data.get("parameters")
     name = table.get("preset") if isinstance(table, dict) else None
     if table is None or not isinstance(name, str) or not is_file(name):
@@ -277,7 +281,7 @@ def _with_preset(data: Mapping[str, Any], folder: str | Path | None, problems: l
 
 
 def _products(data: Mapping[str, Any], model: Model, problems: list[str]) -> dict[str, Options]:
-    """Return the valid products of the specification, with options that follow from the model filled in."""
+    """Validate ``[products]``, the results stored for each cell; fill in options that follow from the model."""
     if not _is_table(data, "products", problems):
         return {}
     found: dict[str, Options] = {}
@@ -299,13 +303,13 @@ def _products(data: Mapping[str, Any], model: Model, problems: list[str]) -> dic
 
 
 def _declared(data: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return the names of all axes, valid or not."""
+    """Return the names of all axes that the specification lists, valid or not."""
     axes = data.get("axes", {})
     return tuple(axes) if isinstance(axes, dict) else ()
 
 
 def _valid_keys(model: type[ParametersTable], table: Any) -> ParametersTable:
-    """Return the valid keys of a table, so that its errors do not hide others."""
+    """Return the table ``[parameters]`` without its invalid keys, so that the others can be checked further."""
     valid: dict[str, Any] = {}
     for key, value in table.items() if isinstance(table, dict) else ():
         if _validate(model, {key: value}, "", []) is not None:
@@ -339,7 +343,7 @@ def _is_table(data: Mapping[str, Any], name: str, problems: list[str]) -> bool:
 
 
 def _validate(model: type[BaseModel], value: Any, path: str, problems: list[str]) -> Any:
-    """Return the validated table, or None after adding its problems."""
+    """Return the validated table; if it is not valid, add its problems to `problems` and return None."""
     try:
         return model.model_validate(value)
     except ValidationError as error:
@@ -354,7 +358,7 @@ def _table(data: Mapping[str, Any], name: str, model: type[Table], problems: lis
 
 
 def _axes(data: Mapping[str, Any], problems: list[str]) -> dict[str, Range]:
-    """Return the valid axes in the order of the file; add the problems of others."""
+    """Return the valid axes in the order of the file; add the problems of the other axes to `problems`."""
     if not _is_table(data, "axes", problems):
         return {}
     axes = {n: _validate(Range, value, f"axes.{n}", problems) for n, value in data.get("axes", {}).items()}
@@ -390,7 +394,7 @@ def _starts(data: Mapping[str, Any], model: Model, problems: list[str]) -> Start
 def _walk(
     kind: str, data: Mapping[str, Any], walk: Continuation | None, axes: dict[str, Range], problems: list[str]
 ) -> Continuation | None:
-    """Check ``[continuation]`` against the kind and the axes."""
+    """Check ``[continuation]`` against the kind of run and the axes; return it for a continuation, else None."""
     if kind != "continuation":
         if kind == "sweep" and "continuation" in data:
             problems.append('continuation: a sweep has no such table; set kind = "continuation" or drop the table.')
@@ -407,7 +411,7 @@ def _walk(
 def _parameter_problems(
     table: ParametersTable, model: Model, declared: tuple[str, ...], axes: dict[str, Range], complete: bool
 ) -> list[str]:
-    """Return the problems with names and values of parameters, swept or not."""
+    """Return the problems of the parameters: unknown names, values out of bounds, a missing or repeated frequency."""
     problems = _frequency_problems(table, declared, axes, complete)
     swept = {name: axis.array() for name, axis in axes.items() if name != FREQUENCY}
     try:

@@ -15,7 +15,7 @@ _TAG = "("
 
 
 class SpecError(ValueError):
-    """An error for a specification that cannot be run.
+    """An error for an invalid specification; its message lists all problems.
 
     Attributes
     ----------
@@ -88,7 +88,7 @@ def validated(model: type[M], values: Mapping[str, Any], prefix: str = "") -> M:
 
 
 def _exact(model: type[BaseModel], name: str, value: Any) -> Any:
-    """Convert a value to the type that strict validation takes."""
+    """Convert a whole float to int, or a list to a tuple, where pydantic's strict validation requires it."""
     kind = model.model_fields[name].annotation if name in model.model_fields else None
     if kind is int and isinstance(value, float) and value.is_integer():
         return int(value)
@@ -162,7 +162,7 @@ def _sentence(item: dict[str, Any], model: type[BaseModel], prefix: str) -> str:
 
 
 def _known_keys(model: type[BaseModel], location: Sequence[int | str]) -> list[str]:
-    """Return the keys of the table in which an unknown key lies, nested or not."""
+    """Return the keys that are valid in the table where an unknown key was found."""
     if len([part for part in location if not str(part).startswith(_TAG)]) == 1:
         return list(model.model_fields)
     nested = getattr(model, "nested_model", None)

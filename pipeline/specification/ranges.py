@@ -1,4 +1,4 @@
-"""Check ranges of parameters and starts together: the number of cells, and bounds between parameters."""
+"""Check ranges of parameters and initial conditions together: the number of cells, and bounds between parameters."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ MOST_RELATED = 12
 
 
 def size_problems(axes: dict[str, Range], starts: Starts | None) -> list[str]:
-    """Return a problem if there are too many cells to count, so that later code does not overflow."""
+    """Return a problem if swept values and initial conditions make more than `MAX_CELLS` cells."""
     sizes = {f"axes.{name}": axis.n for name, axis in axes.items()}
     if isinstance(starts, GridStarts):
         sizes |= {f"initial_conditions.{name}": axis.n for name, axis in starts.ranges.items()}
@@ -30,7 +30,7 @@ def size_problems(axes: dict[str, Range], starts: Starts | None) -> list[str]:
 
 
 def corner_problems(base: Parameters, swept: dict[str, np.ndarray]) -> list[str]:
-    """Return problems between parameters at the corners of the box of swept values.
+    """Check relations between parameters at the corners of the box of swept values; return the problems.
 
     Bounds are intervals, so the corners decide. Only the axes of parameters that the model's relations read
     are varied. They are found by asking the model, again whenever its answer has read further parameters.
@@ -51,7 +51,7 @@ def corner_problems(base: Parameters, swept: dict[str, np.ndarray]) -> list[str]
 
 
 class _Asked(Mapping[str, float]):
-    """Parameter values that note which of them were read."""
+    """Mapping of parameter values that records which of them were read."""
 
     def __init__(self, values: Mapping[str, float]) -> None:
         self.values_now, self.names = dict(values), set[str]()

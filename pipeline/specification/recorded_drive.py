@@ -1,4 +1,4 @@
-"""Define the table ``[drive]`` of a specification, and check it against the other tables."""
+"""Define the table ``[drive]`` (recorded drive) of a specification, and check it against the other tables."""
 
 from __future__ import annotations
 
@@ -29,7 +29,9 @@ class DriveTable(Table):
 
 
 def with_drive(data: Mapping[str, Any], folder: str | Path, problems: list[str]) -> Mapping[str, Any]:
-    """Add the content of a drive's file beside its name, unless it is there already."""
+    """Read the drive file that a specification names and add its text and sha256 to ``[drive]``, unless they are
+    there.
+    """
     table = data.get("drive")
     if not isinstance(table, dict) or not isinstance(table.get("file"), str) or "text" in table:
         return data
@@ -42,14 +44,14 @@ def with_drive(data: Mapping[str, Any], folder: str | Path, problems: list[str])
 
 
 def is_whole(table: Any) -> bool:
-    """Return whether the text of a ``[drive]`` table has the digest beside it; True without a table."""
+    """Return whether the recording in a ``[drive]`` table has the sha256 stored with it; True without a table."""
     if not isinstance(table, Mapping):
         return True
     return hashlib.sha256(str(table.get("text", "")).encode()).hexdigest() == table.get("sha256")
 
 
 def recorded(table: DriveTable | None, problems: list[str]) -> RecordedDrive | None:
-    """Return the recorded drive of a table; None if there is none or if it has problems."""
+    """Parse the recording in a ``[drive]`` table; return None if there is no table or if it has problems."""
     if table is None or table.text is None:  # an unreadable file is reported already
         return None
     if hashlib.sha256(table.text.encode()).hexdigest() != table.sha256:
@@ -66,7 +68,7 @@ def recorded(table: DriveTable | None, problems: list[str]) -> RecordedDrive | N
 
 
 def model_problems(drive: RecordedDrive, model: Model) -> list[str]:
-    """Explain why a model cannot follow a recorded drive."""
+    """Return the reasons why a model cannot be driven by a recording; empty if it can."""
     from magpend_core.engine.placeholders import no_forcing
 
     if model.system.forcing is no_forcing:
@@ -128,7 +130,7 @@ def run_problems(
 
 
 def _idle_problems(drive: RecordedDrive, model: Model, axes: Any) -> list[str]:
-    """Return problems with axes that have no effect: drive parameters that a torque replaces."""
+    """Return problems of axes that sweep parameters of the model's own drive while a recorded torque replaces it."""
     if drive.kind != TORQUE or not isinstance(axes, Mapping) or not set(axes) - {FREQUENCY, DUTY}:
         return []
     from magpend_core.engine.driven import drive_parameters
@@ -143,7 +145,7 @@ def _idle_problems(drive: RecordedDrive, model: Model, axes: Any) -> list[str]:
 
 
 def _replaced_problems(drive: RecordedDrive, table: str, data: Mapping[str, Any]) -> list[str]:
-    """Return a problem for each given value that the recording itself determines."""
+    """Return a problem for each drive frequency or duty cycle that is given although the recording determines it."""
     found: Any = data
     for key in table.split("."):
         found = found.get(key, {}) if isinstance(found, Mapping) else {}

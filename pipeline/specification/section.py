@@ -1,4 +1,6 @@
-"""Define the table ``[section]`` of a specification: sections by crossing, for models without a drive."""
+"""Define the table ``[section]`` of a specification: Poincare sections by level crossing, for models without a
+drive.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,9 @@ if TYPE_CHECKING:
 
 
 class SectionTable(Table):
-    """The table ``[section]``: the crossing at which a flow without a drive has its sections."""
+    """The table ``[section]``: the level crossing of a state that defines the Poincare section of a flow without a
+    drive.
+    """
 
     of: str = Field(min_length=1, description="State that crosses the level.")
     value: float = Field(0.0, description="Level in the state's unit; for an angle, modulo 2 pi.")
@@ -29,19 +33,19 @@ class SectionTable(Table):
 
     @property
     def crossing(self) -> Crossing:
-        """The section as the core takes it."""
+        """Poincare section as a `Crossing` object of the numerical core."""
         return Crossing(self.of, self.value, self.direction, self.longest)
 
 
 def seen_through(model: Model, section: SectionTable | None) -> Model:
-    """Return the model with its section by crossing, if there is one."""
+    """Return the model with the Poincare section of a table ``[section]``; without a table, the model unchanged."""
     return model if section is None else sectioned(model, section.crossing)
 
 
 def section_of(
     table: SectionTable | None, model: Model, data: Mapping[str, Any], problems: list[str]
 ) -> SectionTable | None:
-    """Return the section of a specification, or None; add problems between it and other tables.
+    """Return the table ``[section]`` if it is valid for the model, else None; add its problems to `problems`.
 
     Parameters
     ----------
@@ -91,7 +95,9 @@ def _found(table: SectionTable, model: Model, problems: list[str]) -> SectionTab
 
 
 def _missing(model: Model, data: Mapping[str, Any]) -> list[str]:
-    """Return a problem if an autonomous model has neither a section nor a frequency."""
+    """Return a problem if the specification of an autonomous model has neither a ``[section]`` table nor a
+    frequency.
+    """
     if FREQUENCY in _keys(data, "parameters") or FREQUENCY in _keys(data, "axes") or "drive" in data:
         return []
     return [

@@ -1,4 +1,4 @@
-"""Define initial conditions: grids, lists and random samples of a model's own states.
+"""Define the tables of initial conditions: grids, lists and random samples of a model's states.
 
 Keys are the names of the states. Angles and their rates can be given in degrees, with ``_deg`` after the
 name. The pydantic model of each table is created for each `Model`.
@@ -46,26 +46,26 @@ Rows = Annotated[tuple[Annotated[tuple[float, ...], Field(strict=False)], ...], 
 
 
 def degrees_key(state: str) -> str:
-    """Return the key of a state's value in degrees."""
+    """Return the key that gives a state in degrees: its name with ``_deg``."""
     return f"{state}_deg"
 
 
 def state_keys(model: Model) -> tuple[str, ...]:
-    """Return all keys that set a state: names, and names in degrees for angles and their rates."""
+    """Return all keys that set a state: its name and, for angles and their rates, the name with ``_deg``."""
     return tuple(
         key for s in model.states for key in ((s.name, degrees_key(s.name)) if s.unit in IN_DEGREES else (s.name,))
     )
 
 
 def state_of_key(key: str, model: Model) -> str | None:
-    """Return the name of the state that a key sets; None if it sets none."""
+    """Return the state that a key such as ``x`` or ``x_deg`` sets; None if it sets none."""
     if key not in state_keys(model):
         return None
     return key if key in model.state_names else key.removesuffix(degrees_key(""))
 
 
 class _PerState(Table):
-    """A table of values by state; `starts_model` adds the fields."""
+    """Base class of tables with a value or range per state; `starts_model` adds the fields."""
 
     system: ClassVar[Model]
 
@@ -77,7 +77,7 @@ class _PerState(Table):
         return self
 
     def of(self, key: str) -> Any:
-        """Return the value of a key; None if it is not given."""
+        """Return the value given for a state key, such as ``x`` or ``x_deg``; None if it is not given."""
         return getattr(self, key, None)
 
 
@@ -88,7 +88,7 @@ def _power_of_two(stride: int) -> int:
 
 
 class GridStarts(_PerState):
-    """The table ``[initial_conditions]`` of a grid: ranges span it, single numbers are fixed, other states are 0.
+    """The table ``[initial_conditions]`` of kind grid: a range or a fixed number per state; states not given are 0.
 
     With `refine` a sweep computes every `refine`-th cell first; see `pipeline.compute.refinement`.
     """
@@ -102,12 +102,12 @@ class GridStarts(_PerState):
 
     @property
     def ranges(self) -> dict[str, Range]:
-        """Ranges that span the grid, by key."""
+        """Ranges that span the grid, by state key (the name of a state, or the name with ``_deg``)."""
         return {key: value for key, value in self if isinstance(value, Range)}
 
 
 class ListStarts(Table):
-    """The table ``[initial_conditions]`` of a list: rows of states in the model's order.
+    """The table ``[initial_conditions]`` of kind list: rows of states in the model's order.
 
     Rows may leave out the rates at the end of the state; the rates are then 0.
     """
@@ -136,7 +136,7 @@ class ListStarts(Table):
 
 
 def positions(model: Model) -> tuple[str, ...]:
-    """Return the states before the first rate. Rows of a list may end there."""
+    """Return the states before the first velocity; rows of a list of initial conditions may end there."""
     rates = {s.rate for s in model.states if s.rate}
     names = model.state_names
     first = next((i for i, name in enumerate(names) if name in rates), len(names))
@@ -144,7 +144,7 @@ def positions(model: Model) -> tuple[str, ...]:
 
 
 class RandomStarts(_PerState):
-    """The table ``[initial_conditions]`` of uniform samples from a box ``[low, high]`` per state."""
+    """The table ``[initial_conditions]`` of kind random: uniform samples from a box ``[low, high]`` per state."""
 
     kind: Literal["random"]
     n: int = Field(ge=1, le=MAX_POINTS, description="Number of samples.")
@@ -167,7 +167,7 @@ STARTS: dict[str, type[Starts]] = {"grid": GridStarts, "list": ListStarts, "rand
 
 @lru_cache(maxsize=64)
 def starts_model(kind: str, model: Model) -> type[Starts]:
-    """Return the table class of initial conditions for a model's states.
+    """Create the class of the table ``[initial_conditions]``, with fields for each state of a model.
 
     Parameters
     ----------
@@ -185,7 +185,9 @@ def starts_model(kind: str, model: Model) -> type[Starts]:
 
 
 def refine_problems(kind: str, starts: Starts | None, integration: Integration | None, model: Model) -> list[str]:
-    """Return problems with a grid's `refine`: with its ranges, the kind of run, or the kept sections."""
+    """Return the problems of `refine` on a grid of initial conditions: ranges too short, a continuation, too much
+    memory.
+    """
     if not isinstance(starts, GridStarts) or starts.refine is None:
         return []
     stride, key = starts.refine, f"initial_conditions.refine = {starts.refine}"

@@ -29,7 +29,7 @@ class Table(BaseModel):
 
 
 class Range(Table):
-    """Rising values: ``start, stop, num``, or ``start, stop, step``, or ``values``."""
+    """Increasing values of an axis, given as ``start, stop, num``, as ``start, stop, step``, or as ``values``."""
 
     start: float | None = Field(None, description="First value.")
     stop: float | None = Field(None, description="Last value; with step, an upper bound.")
@@ -63,14 +63,14 @@ class Range(Table):
 
     @property
     def n(self) -> int:
-        """Number of values, computed without making them."""
+        """Number of values, computed without creating the array."""
         if self.values is not None or self.num is not None:
             return self.num or len(self.values or ())
         start, stop, step = (Fraction(repr(x)) for x in (self.start, self.stop, self.step))
         return (stop - start) // step + 1
 
     def array(self) -> np.ndarray:
-        """Return the values: the float64 nearest to each exact decimal number."""
+        """Return the values, each rounded once from its exact decimal number to float64."""
         if self.values is not None:
             return np.array(self.values, dtype=np.float64)
         start, stop = Fraction(repr(self.start)), Fraction(repr(self.stop))
@@ -88,7 +88,7 @@ class Range(Table):
 
 
 class PresetTable(Table):
-    """The content of a preset's file, so that a specification does not need the file any more."""
+    """Content of a preset file (parameter values), stored so that the file is no longer needed."""
 
     name: str
     model: str
@@ -98,7 +98,7 @@ class PresetTable(Table):
     provenance: dict[str, str]
 
     def preset(self) -> Preset:
-        """Return the preset of the table."""
+        """Return the table as a `Preset` object."""
         return Preset(**self.model_dump())
 
 
@@ -107,7 +107,9 @@ def _name_or_table(value: Any) -> str:
 
 
 class ParametersTable(Table):
-    """The table ``[parameters]``: the preset, overrides, and the frequency unless it is swept."""
+    """The table ``[parameters]``: the preset, values that replace the preset's, and the drive frequency unless it is
+    swept.
+    """
 
     nested_model: ClassVar[type[BaseModel] | None] = PresetTable
     preset: (
@@ -125,24 +127,24 @@ class ParametersTable(Table):
 
     @property
     def chosen(self) -> str | Preset | None:
-        """The preset as `Model.load` takes it."""
+        """Preset of parameter values, as a name or a `Preset` object for `Model.load`."""
         return self.preset.preset() if isinstance(self.preset, PresetTable) else self.preset
 
 
 class Continuation(Table):
-    """The table ``[continuation]``: the axis that branches follow, and the direction."""
+    """The table ``[continuation]``: the parameter axis along which branches are followed, and the direction."""
 
     path: str = Field(FREQUENCY, description="Axis that the branches follow: the continuation parameter.")
     direction: Literal["up", "down", "both"] = Field("up", description="Direction in which the branches follow it.")
 
     @property
     def directions(self) -> tuple[str, ...]:
-        """Directions of the continuation, one or two."""
+        """Directions of the continuation: up, down, or both in turn."""
         return ("up", "down") if self.direction == "both" else (self.direction,)
 
 
 class Integration(Table):
-    """The table ``[integration]``: tolerances, transient, and kept sections of each cell."""
+    """The table ``[integration]``: tolerances, length of the transient, and section points kept for each trajectory."""
 
     rtol: float = Field(defaults.RTOL, ge=1e-13, lt=1, description="Relative tolerance of a step.")
     atol: float = Field(defaults.ATOL, gt=0, lt=1, description="Absolute tolerance of a step, in the states' units.")
@@ -174,7 +176,7 @@ class Integration(Table):
 
 
 class Execution(Table):
-    """The table ``[execution]``: sizes of tasks. They decide the layout of the store, not the numbers."""
+    """The table ``[execution]``: sizes of tasks, which affect the layout of the store but not the numbers."""
 
     trajectories_per_task: Annotated[int, Field(ge=1, le=MAX_POINTS)] | None = Field(
         None, description="Cells or branches of a task; by default chosen by chunk size and time."

@@ -9,12 +9,12 @@ from typing import Any
 
 
 def toml_key(key: str) -> str:
-    """Format a key, quoted if necessary."""
+    """Format a TOML key, quoted if necessary."""
     return key if re.fullmatch(r"[A-Za-z0-9_-]+", key) else toml_value(key)
 
 
 def toml_value(value: Any) -> str:
-    """Format a number, text, truth value, list or inline table."""
+    """Format a number, text, boolean, list or inline table as TOML."""
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, str):
@@ -31,7 +31,7 @@ def toml_value(value: Any) -> str:
 
 
 def table_lines(head: str, table: Mapping[str, Any]) -> list[str]:
-    """Return the lines of a table and of the tables in it, each below its own header."""
+    """Return the TOML lines of a table and of the tables in it, each below its own header."""
     plain = {key: value for key, value in table.items() if not isinstance(value, Mapping)}
     lines = [f"[{head}]", *(f"{toml_key(key)} = {toml_value(value)}" for key, value in plain.items())]
     for key, inner in table.items():

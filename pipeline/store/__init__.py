@@ -1,1 +1,1 @@
-"""Keep runs in their directories. No other room knows zarr."""
+"""Store runs in run directories, in folders or object stores. No other package uses zarr."""

@@ -1,4 +1,4 @@
-"""Create magpend's zarr arrays: little-endian, lz4, crc32c last, one file per chunk."""
+"""Create zarr arrays in magpend's format: little-endian, lz4-compressed, with a crc32c checksum in each chunk."""
 
 from __future__ import annotations
 

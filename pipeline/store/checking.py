@@ -1,4 +1,4 @@
-"""Compare the stored files with their records: every byte, or every size."""
+"""Compare the stored files of a run with their recorded sizes or sha256 digests."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _TASKS_PER_REPORT = 50
 
 @dataclass(frozen=True)
 class Verification:
-    """The result of `verify`.
+    """Result of `verify`: the number of intact tasks, and lists of damaged and leftover files.
 
     Attributes
     ----------
@@ -52,12 +52,13 @@ class Verification:
 
     @property
     def sound(self) -> bool:
-        """Whether all committed tasks and all products are intact."""
+        """Whether nothing is damaged: committed tasks, metadata, coordinates and products."""
         return not (self.damaged or self.skeleton or self.derived or self.odd)
 
 
 def verify(info: RunInfo, plan: Plan) -> Verification:
-    """Read every committed file and compare its sha256 with its record.
+    """Read every stored file of a run and compare its sha256 with the recorded one; return what is damaged or left
+    over.
 
     Raises
     ------
@@ -81,7 +82,7 @@ def verify(info: RunInfo, plan: Plan) -> Verification:
 
 
 def odd_keys(files: Files, skeleton: Iterable[str]) -> list[str]:
-    """Return folders found where files should be, and files found where folders should be.
+    """Return the keys of folders found where a run should have files, and of files where it should have folders.
 
     Parameters
     ----------
@@ -95,12 +96,12 @@ def odd_keys(files: Files, skeleton: Iterable[str]) -> list[str]:
 
 
 def name_of(index: int) -> str:
-    """Return the file name of a task's record. The record itself may lie in a pack."""
+    """Return the file name of a task's commit record; the record itself may lie in a pack, a file of many records."""
     return marker_key(index).removeprefix(f"{COMMITS}/")
 
 
 def damaged_records(info: RunInfo, plan: Plan, *, contents: bool) -> tuple[Records, dict[str, str]]:
-    """Return the valid records, and the problems of damaged ones by file name.
+    """Return the valid commit records, and the problems of damaged ones by file name.
 
     A record is damaged, too, if a file that it lists is missing or has changed.
 
@@ -118,7 +119,7 @@ def damaged_records(info: RunInfo, plan: Plan, *, contents: bool) -> tuple[Recor
 
 
 def _changed_objects(info: RunInfo, records: Records) -> dict[int, str]:
-    """Return the problems of changed files by task."""
+    """Compare every file of the committed tasks with its recorded sha256; return the problems by task."""
     cube, found = info.files.below(CUBE), {}
     for n, index in enumerate(records):
         if n % _TASKS_PER_REPORT == 0:
@@ -130,7 +131,7 @@ def _changed_objects(info: RunInfo, records: Records) -> dict[int, str]:
 
 
 def damaged_products(info: RunInfo) -> dict[str, str]:
-    """Return the problems of damaged products in ``derived``, by product name."""
+    """Return the problems of damaged analysis results (products) in the folder ``derived``, by name."""
     found: dict[str, str] = {}
     for files in products_in(info.files.below(DERIVED)):
         try:

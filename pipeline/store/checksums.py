@@ -1,4 +1,4 @@
-"""Seal texts by a checksum at their end: ``run.json``, commit records and packs.
+"""Append a sha256 checksum to JSON texts (``run.json``, commit records), and check it when they are read.
 
 A sealed text is a JSON object, or lines that end in one. Its last member is the sha256 of every byte before
 it, so that any changed bit is noticed.
@@ -16,11 +16,13 @@ _END = '"}\n'
 
 
 class SealError(ValueError):
-    """A text differs from its checksum; the message says how."""
+    """An error for a text whose checksum is missing or wrong."""
 
 
 def seal(text: str, before: bytes = b"") -> str:
-    """Append the checksum to a JSON object that is not empty; `before` precedes it in its file."""
+    """Append a checksum to a non-empty JSON object; it also covers `before`, the bytes before the object in its
+    file.
+    """
     body = text.rstrip()
     if not body.endswith("}"):
         raise ValueError("only a JSON object can be sealed.")
@@ -29,19 +31,19 @@ def seal(text: str, before: bytes = b"") -> str:
 
 
 def has_seal(content: bytes) -> bool:
-    """Return whether a content ends with a checksum, fitting or not."""
+    """Return whether a file's content ends with a checksum, right or wrong."""
     return _MARK.encode() in content[-200:]
 
 
 def fits(content: bytes) -> bool:
-    """Return whether a content is, byte for byte, as it was sealed."""
+    """Return whether the checksum at the end of a file's content fits all bytes before it."""
     n = 64 + len(_END)
     body, end = content[:-n], content[-n:]
     return body.endswith(_MARK.encode()) and end == hashlib.sha256(body).hexdigest().encode() + _END.encode()
 
 
 def unseal(content: bytes) -> dict[str, Any]:
-    """Return the data of a sealed JSON object, without the checksum.
+    """Check the checksum at the end of a JSON object; return the object without it.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Write tasks with their commit records, read the records, and sweep files without one.
+"""Write tasks with their commit records, read the records, and remove files that belong to no record.
 
 A commit record is the only proof that a task is done. A task without a valid record is pending: its files are
 swept and it is computed again. Time, workers and order leave no trace in ``cube.zarr`` and ``commits``: an
@@ -52,7 +52,7 @@ _MOST_SCANS = 100
 def write_task(
     info: RunInfo, plan: Plan, index: int, values: Mapping[str, np.ndarray], counts: Mapping[str, int]
 ) -> None:
-    """Write a task's cells, then its commit record.
+    """Write the results of a task, then the commit record that proves them complete.
 
     Parameters
     ----------
@@ -92,7 +92,7 @@ def write_task(
 
 
 def _require_metadata(info: RunInfo, plan: Plan) -> None:
-    """Refuse to encode chunks with damaged metadata: they would be committed and decoded wrongly."""
+    """Raise `DamagedError` if the metadata of a variable have changed; chunks would be encoded wrongly."""
     own = {key: info.skeleton[key] for key in (f"{v.name}/zarr.json" for v in plan.variables)}
     problems = problems_of(info.files.below(CUBE), own)
     if problems:
@@ -102,7 +102,7 @@ def _require_metadata(info: RunInfo, plan: Plan) -> None:
 
 
 def is_packed(info: RunInfo, index: int) -> bool:
-    """Return whether a task's record lies in a pack."""
+    """Return whether a task's commit record lies in a pack, a file of many records."""
     block = index // BLOCK
     if not info.files.is_there(pack_key(block)):
         return False
@@ -111,7 +111,7 @@ def is_packed(info: RunInfo, index: int) -> bool:
 
 
 def write_block(cube: Files, plan: Plan, index: int, name: str, values: np.ndarray) -> list[str]:
-    """Write one variable's chunks of a task and return their keys."""
+    """Write the values of one variable for the cells of a task as chunks; return the keys of the chunks."""
     array = zarr.open_array(cube.zarr(read_only=False), path=name, mode="r+", zarr_format=3)
     # zarr does not store this setting; without it a block of fill values would leave no file
     array = array.with_config({"write_empty_chunks": True})
@@ -129,7 +129,7 @@ def write_block(cube: Files, plan: Plan, index: int, name: str, values: np.ndarr
 
 
 def log_timing(info: RunInfo, entry: Mapping[str, Any]) -> None:
-    """Append a task's timing to ``timings.jsonl``, which is not part of the result and is not synced."""
+    """Append the timing of a task to ``timings.jsonl``, which is not part of the result."""
     info.files.append(TIMINGS, json.dumps(entry, sort_keys=True))
 
 
@@ -137,7 +137,7 @@ def log_timing(info: RunInfo, entry: Mapping[str, Any]) -> None:
 
 
 def read_commits(info: RunInfo, plan: Plan, echo: Echo | None = None) -> Records:
-    """Return the valid records by task: whole, of this run, and of a task in the plan.
+    """Return the valid commit records by task: undamaged, of this run, and of a task in its plan.
 
     If no record is packed, a record counts only if all its files exist with the right sizes. Larger runs
     leave this check to the reading of chunks, to `verify` and to `pipeline.runs.run`, since it takes as long
@@ -171,7 +171,7 @@ def read_commits(info: RunInfo, plan: Plan, echo: Echo | None = None) -> Records
 
 
 def absent_objects(info: RunInfo, records: Mapping[int, Commit]) -> dict[int, str]:
-    """Return the problems of tasks with a file that is missing or has another size, by task."""
+    """Find tasks with a file that is missing or has another size than recorded; return the problems by task."""
     # a chunk is durable before its record is, so a missing one was lost later
     sizes = info.files.below(CUBE).sizes() if records else {}
     found = {}
@@ -184,7 +184,7 @@ def absent_objects(info: RunInfo, records: Mapping[int, Commit]) -> dict[int, st
 
 
 def read_commit(info: RunInfo, plan: Plan, index: int) -> Commit | None:
-    """Return the record of one task; None if it has no valid one. Its files are not checked.
+    """Return the valid commit record of one task, or None; the files that it lists are not checked.
 
     Raises
     ------
@@ -195,7 +195,7 @@ def read_commit(info: RunInfo, plan: Plan, index: int) -> Commit | None:
 
 
 def scan(info: RunInfo, plan: Plan, blocks: Container[int] | None = None) -> tuple[Records, dict[str, str]]:
-    """Return the valid records of the run, and the problems of the others by file name.
+    """Read the folder ``commits``; return the valid commit records, and the problems of the others by file name.
 
     Parameters
     ----------
@@ -239,7 +239,7 @@ def _packs(names: Iterable[str]) -> list[str]:
 
 
 class _Scan:
-    """The records and packs in ``commits``, and the problems of damaged ones."""
+    """Valid commit records and packs (files of many records) found in ``commits``, and the problems of damaged ones."""
 
     def __init__(self, info: RunInfo, plan: Plan, blocks: Container[int] | None) -> None:
         self._info = info
@@ -250,7 +250,7 @@ class _Scan:
         self.rejected: dict[str, str] = {}
 
     def read(self, folder: Files, names: list[str]) -> bool:
-        """Read all packs, then all single records; return whether a file vanished meanwhile."""
+        """Read all packs, then all files with one commit record; return whether a file disappeared meanwhile."""
         vanished = False
         # packs first: they tell which single records are only leftovers of a packing
         blocks = {name: block_of_pack(name) for name in _packs(names)}
@@ -264,7 +264,7 @@ class _Scan:
         return block is not None and (self._blocks is None or block in self._blocks)
 
     def _alone(self, name: str) -> bool:
-        """Return whether a single record has to be read: no valid pack holds it already."""
+        """Return whether a file with one commit record must be read because no valid pack holds its record."""
         stem = name.removesuffix(".json")
         if not stem.isdecimal():
             return self._blocks is None  # no record's name: read in a full scan, to be reported
@@ -305,7 +305,7 @@ class _Scan:
 
 
 def cube_digest(info: RunInfo, commits: Mapping[int, Commit]) -> str:
-    """Return a digest of a run's committed cells: of its identity and all its records."""
+    """Return a digest of a run's committed cells, computed from the run's digest and all commit records."""
     own = isinstance(commits, Records)
     lines = commits.lines() if own else (line_of(commits[i], info.digest) for i in sorted(commits))  # type: ignore[attr-defined]
     digest = hashlib.sha256(info.digest.encode())
@@ -318,7 +318,7 @@ def cube_digest(info: RunInfo, commits: Mapping[int, Commit]) -> str:
 
 
 def leftover_keys(info: RunInfo, plan: Plan, commits: Records) -> list[str]:
-    """Return the keys of files in ``cube.zarr`` and ``commits`` that no valid record lists."""
+    """Return the keys of files in ``cube.zarr`` and ``commits`` that belong to no valid commit record."""
     info.files.refuse_links(CUBE, COMMITS)
     owners = Owners(plan)
 
@@ -333,7 +333,7 @@ def leftover_keys(info: RunInfo, plan: Plan, commits: Records) -> list[str]:
 
 
 def sweep(info: RunInfo, plan: Plan, commits: Records, echo: Echo | None = None) -> int:
-    """Remove chunks and records that no valid record lists; return their number.
+    """Remove files in ``cube.zarr`` and ``commits`` that belong to no valid commit record; return their number.
 
     Only the holder of the lock may call this. Files outside ``cube.zarr`` and ``commits`` stay. A link inside
     them is removed, its target stays.

@@ -1,4 +1,4 @@
-"""Rewrite the cube for readers over plain HTTP: small chunks by column, one file that lists all arrays.
+"""Rewrite the cube for browsers, which read it over HTTP: small chunks, and one file that describes all arrays.
 
 A browser can decompress gzip but not blosc. It cannot list a folder. It asks for one state at a few values
 of the horizontal axis. A chunk here therefore holds one state of all cells at some values of that axis,
@@ -41,7 +41,7 @@ PRIVATE = ("host",)
 
 @dataclass(frozen=True)
 class Layer:
-    """An additional array over the cells.
+    """An additional array that is stored with the cube: one value, or an array of values, for each cell.
 
     Attributes
     ----------
@@ -62,7 +62,7 @@ Layers = Mapping[str, Layer]
 
 
 def write_cube(run: Run, folder: Path, along: str | None, layers: Layers) -> dict[str, dict[str, Any]]:
-    """Write the committed cells of a run as a cube that browsers read column by column.
+    """Write the committed cells of a run as a zarr cube with small chunks, which browsers can read.
 
     Parameters
     ----------
@@ -96,7 +96,9 @@ def write_cube(run: Run, folder: Path, along: str | None, layers: Layers) -> dic
 
 
 class _Columns:
-    """The chunking of the new cube: some values of one dim, all starts, one state."""
+    """Chunking of the rewritten cube: a chunk holds one state of all initial conditions at some values of one
+    parameter.
+    """
 
     def __init__(self, run: Run, along: str | None) -> None:
         self.dims, self.shape, self._sizes = run.plan.dims, run.plan.shape, run.plan.sizes
@@ -108,7 +110,7 @@ class _Columns:
         self._order = [*starts, *([] if along is None else [along]), *others]
 
     def chunks(self, itemsize: int, own: tuple[str, ...] = ()) -> tuple[int, ...]:
-        """Return the chunk shape of an array over the cells, with its own dims."""
+        """Return the chunk shape of an array that has the dims of the cells, followed by the dims `own`."""
         apart = tuple(1 if dim == "state" else self._sizes[dim] for dim in own)
         room = max(1, CHUNK_BYTES // (itemsize * math.prod(apart)))
         found = {}
@@ -118,7 +120,7 @@ class _Columns:
         return (*(found[dim] for dim in self.dims), *apart)
 
     def slabs(self, chunks: tuple[int, ...], bytes_per_cell: int) -> Iterator[tuple[slice, ...]]:
-        """Yield slices along the dim: whole chunks, as many at a time as `SLAB_BYTES` holds."""
+        """Yield slices along the horizontal axis: whole chunks, as many at a time as `SLAB_BYTES` of memory hold."""
         if self._along is None:
             yield (slice(None),) * len(self.dims)
             return
@@ -166,7 +168,7 @@ def _create(
     fill: Any,
     attrs: Mapping[Any, Any],
 ) -> Any:
-    """Create an array with codecs that browsers can decode; checksums stand at the ends of chunks."""
+    """Create a zarr array with codecs that browsers can decode, and a checksum at the end of each chunk."""
     dtype: np.dtype[Any] = like.dtype
     texts = dtype.kind == "U"
     shuffled = [] if texts or dtype.itemsize == 1 else [Shuffle(elementsize=dtype.itemsize)]

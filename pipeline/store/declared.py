@@ -39,7 +39,7 @@ def declared_bytes(chunk: Any) -> int:
 
 
 class Declared:
-    """The checks of a cube's files against the run's plan: sizes, shapes and codecs."""
+    """Checks of a cube's files: the sizes, shapes and codecs that they declare must fit the run's plan."""
 
     def __init__(self, plan: Plan) -> None:
         self._sizes: Mapping[str, int] = {**dict(zip(plan.dims, plan.shape, strict=True)), **plan.sizes}
@@ -50,7 +50,7 @@ class Declared:
         self._texts: set[str] = set()
 
     def problem(self, key: str, content: Any) -> str | None:
-        """Return the wrong declaration in a file; None if it fits the plan."""
+        """Check the size, shape and codecs that a file declares against the plan; return the problem, or None."""
         name, _, rest = key.partition("/")
         if not rest:
             return None
@@ -63,13 +63,15 @@ class Declared:
         return self._text_problem(bytes(content)) if name in self._texts else None
 
     def _text_problem(self, content: bytes) -> str | None:
-        """Check the number of texts that a chunk of texts begins with: decoding allocates so many."""
+        """Check the number of texts that a chunk declares, since decoding allocates memory for it; return a problem or
+        None.
+        """
         number = int.from_bytes(numcodecs.blosc.decompress(content[:-_CHECKSUM])[:4], "little")
         most = max(self._sizes.values(), default=1)
         return None if number <= most else f"declares {number} texts, and may have {most}"
 
     def _most(self, name: str) -> int:
-        """Return the bytes of a chunk: exactly for a variable, at most for a coordinate."""
+        """Return the uncompressed size of a chunk [bytes]: exact for a variable, an upper bound for a coordinate."""
         if name in self._variables:
             _, chunk, dtype = self._variables[name]
             return math.prod(chunk) * np.dtype(dtype).itemsize
@@ -101,7 +103,9 @@ def _codecs_problem(codecs: tuple[Any, ...]) -> str:
 
 
 def product_problem(contents: Iterable[tuple[str, bytes]]) -> str | None:
-    """Return the wrong declaration in a product's files; None if all are right."""
+    """Check the sizes and codecs that the files of a stored analysis result declare; return the first problem, or
+    None.
+    """
     chunk_bytes: dict[str, int] = {}
     total, on_disk = 0, 0
     chunks: list[tuple[str, int]] = []

@@ -1,10 +1,12 @@
-"""Name the errors of a run directory; each message says what to do."""
+"""Define the exceptions for run directories; each message says what to do."""
 
 from __future__ import annotations
 
 
 class StoreError(Exception):
-    """Base class: the run directory cannot be used as asked. The message says why and what to do."""
+    """Base class of errors for a run directory that cannot be used as requested; the message gives the cause and a
+    remedy.
+    """
 
 
 class RefusedError(StoreError):
@@ -20,8 +22,8 @@ class LockedError(StoreError):
 
 
 class UnreadableError(StoreError):
-    """A failure of the file system during a read: it is unknown whether the file is there and whole."""
+    """An error of the file system during a read: whether the file exists and is undamaged is unknown."""
 
 
 class IncompleteError(StoreError):
-    """An error for a run whose tasks all returned while some are not committed."""
+    """An error for a run in which tasks that should be finished have no commit record."""

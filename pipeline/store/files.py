@@ -1,4 +1,4 @@
-"""Define how a run's files are read and written by key, in a folder or in an object store."""
+"""Define how a run's files are read and written by key (relative path), in a folder or in an object store."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/")
 
 
 class Files(Protocol):
-    """The files of a run, or of a part of a run, by key.
+    """Interface to the files of a run, or of a part of a run, by key (relative path).
 
     A key has parts joined by ``/``, such as ``commits/000001.json``.
 
@@ -52,11 +52,11 @@ class Files(Protocol):
     def local(self) -> Path | None: ...  # noqa: D102
 
     def below(self, prefix: str) -> Files:
-        """Return the files whose keys begin with a prefix and ``/``, by the rest of their keys."""
+        """Return the files below a prefix (a subfolder), with keys relative to it."""
         ...
 
     def names(self) -> list[str]:
-        """Return the first parts of all keys, sorted.
+        """Return the first parts of all keys (the top-level names), sorted.
 
         Raises
         ------
@@ -68,7 +68,7 @@ class Files(Protocol):
         ...
 
     def is_there(self, key: str) -> bool:
-        """Return whether a file exists at a key. A link does not count."""
+        """Return whether a file exists at a key; a symbolic link does not count."""
         ...
 
     def read(self, key: str) -> bytes:
@@ -84,30 +84,31 @@ class Files(Protocol):
         ...
 
     def read_each(self, keys: Iterable[str]) -> Iterator[tuple[str, bytes | FileNotFoundError]]:
-        """Yield each key with its content, or with the error if there is none, in the order of the keys.
+        """Read several files; yield each key with its content, or with the error if there is none, in the order of the
+        keys.
 
         This is faster than reading one key at a time.
         """
         ...
 
     def write(self, key: str, content: bytes) -> None:
-        """Write a file whole or not at all. It is durable when this returns."""
+        """Write a file atomically; it is durable when this returns."""
         ...
 
     def write_once(self, key: str, content: bytes) -> None:
-        """Write a file as `write` does; all writers write the same content."""
+        """Write a file that several processes may write at the same time, all with the same content."""
         ...
 
     def append(self, key: str, line: str) -> None:
-        """Add a line to a file that is not part of the result."""
+        """Append a line to a file that is not part of the result, such as a log of timings."""
         ...
 
     def sizes(self) -> dict[str, int]:
-        """Return the size of every file by key; an empty dict if the place does not exist."""
+        """Return the size of every file by key; an empty dict if the folder does not exist."""
         ...
 
     def everything(self) -> list[str]:
-        """Return the keys of all files, links included."""
+        """Return the keys of all files, symbolic links included."""
         ...
 
     def remove(self, keys: Iterable[str]) -> None:
@@ -115,11 +116,11 @@ class Files(Protocol):
         ...
 
     def sync(self, keys: Iterable[str]) -> None:
-        """Make files that zarr wrote durable, with their folders."""
+        """Make files that zarr wrote durable on disk, with their folders."""
         ...
 
     def prepare(self, prefix: str) -> None:
-        """Make a folder, if the place has folders."""
+        """Create a folder; do nothing in an object store, which has no folders."""
         ...
 
     def odd(self, folders: Iterable[str]) -> list[str]:
@@ -133,11 +134,11 @@ class Files(Protocol):
         ...
 
     def move_aside(self, key: str) -> str:
-        """Move a file or folder into the folder `ASIDE`; return its new place."""
+        """Move a file or folder that is in the way into the folder `ASIDE`; return its new path."""
         ...
 
     def refuse_links(self, *prefixes: str) -> None:
-        """Refuse to work below a link: its target does not belong to the run.
+        """Raise `RefusedError` if one of the given files or folders is a symbolic link.
 
         Raises
         ------
@@ -147,11 +148,11 @@ class Files(Protocol):
         ...
 
     def zarr(self, *, read_only: bool) -> Store:
-        """Return the store through which zarr reads and writes here."""
+        """Return a zarr store that reads and writes these files."""
         ...
 
     def lock(self) -> AbstractContextManager[bool | None]:
-        """Hold the lock. It is a courtesy between people; the commit protocol does not rely on it.
+        """Hold the run's lock against other writers inside a context; committed data are safe without it, too.
 
         Yields False where locks do not work; another process may then be writing, too.
 
@@ -164,12 +165,12 @@ class Files(Protocol):
 
 
 def is_url(place: str | Path) -> bool:
-    """Return whether a place is in an object store."""
+    """Return whether a path or URL leads to an object store (``s3://``)."""
     return str(place).startswith("s3://")
 
 
 def local_path(path: str | Path) -> Path:
-    """Return a path of the local file system.
+    """Convert text to a path of the local file system; raise `RefusedError` for a URL.
 
     Raises
     ------
@@ -185,12 +186,12 @@ def local_path(path: str | Path) -> Path:
 
 
 def is_temporary(name: str) -> bool:
-    """Return whether a file name is a `temporary_beside` name: its writer was interrupted."""
+    """Return whether a file name is that of a temporary file, which an interrupted writer has left."""
     return name.startswith(".") and name.endswith(TEMPORARY)
 
 
 def entry_of(data: bytes) -> dict[str, Any]:
-    """Return the size and sha256 of a content, as commit records and ``run.json`` hold them."""
+    """Return the size and sha256 of a file's content, in the form that commit records and ``run.json`` hold."""
     return {"size": len(data), "sha256": hashlib.sha256(data).hexdigest()}
 
 
@@ -205,7 +206,7 @@ def entries_of(files: Files, keys: Iterable[str]) -> dict[str, dict[str, Any]]:
 
 
 def problems_of(files: Files, objects: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """Compare files with their sizes and digests; return a line per file that differs.
+    """Compare files with their recorded sizes and sha256 digests; return a line for each file that differs.
 
     Parameters
     ----------

@@ -8,7 +8,7 @@ from pipeline.layout.plan import Plan
 
 
 def chunk_keys(name: str, region: tuple[slice, ...], chunks: tuple[int, ...], shape: tuple[int, ...]) -> list[str]:
-    """Return the keys of the chunks in a region.
+    """Return the keys of the chunks that an index region of an array covers.
 
     A region that cuts a chunk is refused with a `ValueError`: writing it would lose a neighbour's cells.
     """
@@ -20,7 +20,7 @@ def chunk_keys(name: str, region: tuple[slice, ...], chunks: tuple[int, ...], sh
 
 
 def keys_of(plan: Plan, index: int) -> list[str]:
-    """Return the keys of all chunks of a task."""
+    """Return the keys (relative paths) of all chunks that a task writes."""
     block, found = plan.task(index), []
     for variable in plan.variables:
         own = tuple(plan.sizes[dim] for dim in variable.own_dims)
@@ -30,7 +30,7 @@ def keys_of(plan: Plan, index: int) -> list[str]:
 
 
 class Owners:
-    """A map from the keys of stored chunks to the tasks that write them.
+    """A map from the keys (relative paths) of stored chunks to the tasks that write them.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Name the holder of a run's lock, and hold leases in object stores, which have no locks.
+"""Hold leases in object stores, which have no file locks, and name the process that holds a lock.
 
 An object store has no lock that ends with its process. A lease is the object ``lock``; it names its holder.
 The holder puts it if it is absent, and again every `RENEW_S`. Another process takes the lease over if it has
@@ -26,13 +26,13 @@ RENEW_S, LEASE_S = 30.0, 150.0
 
 
 def holder() -> dict[str, Any]:
-    """Describe this process as a lock's holder: host, process, and the time (UTC)."""
+    """Return a note that names this process as the holder of a lock: host, process id, and the time (UTC)."""
     now = datetime.now(UTC).isoformat(timespec="seconds")
     return {"host": platform.node(), "pid": os.getpid(), "since": now}
 
 
 def in_words(content: bytes) -> str:
-    """Return a phrase that names a lock's holder; empty if the note about it is not whole."""
+    """Return a phrase that names the process holding a lock; empty if the note about it is damaged."""
     found = _holder_in(content)
     return f" (process {found['pid']} on {found['host']} since {found['since']})" if found else ""
 
@@ -47,12 +47,12 @@ def _holder_in(content: bytes) -> dict[str, Any] | None:
 
 
 def is_note(content: bytes) -> bool:
-    """Return whether a content names a lock's holder."""
+    """Return whether a file's content is a note that names the holder of a lock."""
     return _holder_in(content) is not None
 
 
 def _has_ended(content: bytes) -> bool:
-    """Return whether the holder was a process of this machine that has ended."""
+    """Return whether the holder of a lock was a process of this machine that has ended."""
     found = _holder_in(content)
     if found is None or found["host"] != platform.node():
         return False
@@ -66,18 +66,20 @@ def _has_ended(content: bytes) -> bool:
 
 
 class Leased(Protocol):
-    """The files of an object store as a lease uses them; see `pipeline.store.objects.ObjectFiles`."""
+    """Interface to the files of an object store, as far as a lease needs it; see
+    `pipeline.store.objects.ObjectFiles`.
+    """
 
     @property
     def name(self) -> str:
-        """Return the URL."""
+        """URL of the run in the object store."""
 
     @property
     def store(self) -> Any:
-        """Return obstore's store."""
+        """Client of the package obstore for the object store."""
 
     def put_lines(self) -> None:
-        """Write the lines that were appended."""
+        """Write the lines that were appended and kept in memory."""
 
     def is_there(self, key: str) -> bool:
         """Return whether there is an object."""
@@ -94,7 +96,7 @@ class Leased(Protocol):
 
 @contextlib.contextmanager
 def lease(files: Leased) -> Iterator[None]:
-    """Hold the lease of a run in an object store.
+    """Hold the lease of a run in an object store inside this context: a lock that expires unless it is renewed.
 
     Raises
     ------
@@ -127,11 +129,11 @@ def lease(files: Leased) -> Iterator[None]:
 
 
 class _TakenError(Exception):
-    """An error for a lease that another process has put meanwhile."""
+    """An error for a lease that another process has replaced in the meantime."""
 
 
 def _take(files: Leased, content: bytes) -> str:
-    """Put the lease unless another one holds; return its tag."""
+    """Create the lease object, or take over an expired one; return its entity tag."""
     import obstore
 
     try:
@@ -158,7 +160,7 @@ def _take(files: Leased, content: bytes) -> str:
 
 
 def _found(files: Leased) -> tuple[bytes, str, float] | None:
-    """Return content, tag and age in seconds of the present lease; None if there is none."""
+    """Return content, entity tag and age in seconds of the present lease object; None if there is none."""
     import obstore
 
     try:
@@ -174,7 +176,7 @@ def _found(files: Leased) -> tuple[bytes, str, float] | None:
 
 
 def _replace(files: Leased, content: bytes, tag: str) -> str:
-    """Replace the lease that has a tag; return the tag of the new one."""
+    """Replace the lease object if it still has the given entity tag; return its new tag."""
     import obstore
 
     try:

@@ -1,4 +1,4 @@
-"""Read and write a run's files in a local folder: written whole, synced in order, no link followed."""
+"""Read and write a run's files in a local folder: atomically, durably, and without following symbolic links."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from pipeline.store.lease import holder, in_words
 
 @dataclass(frozen=True)
 class LocalFiles:
-    """The files of a folder by key, such as ``commits/000001.json``; see `pipeline.store.files.Files`."""
+    """Files of a local folder by key (relative path), such as ``commits/000001.json``."""
 
     root: Path
 
@@ -45,7 +45,7 @@ class LocalFiles:
         return self.root
 
     def below(self, prefix: str) -> LocalFiles:
-        """Return the files of a folder in this one."""
+        """Return the files of a subfolder, with keys relative to it."""
         return LocalFiles(self.root / prefix)
 
     def names(self) -> list[str]:
@@ -65,7 +65,7 @@ class LocalFiles:
         return content
 
     def read_each(self, keys: Iterable[str]) -> Iterator[tuple[str, bytes | FileNotFoundError]]:
-        """Yield each key with its content, or with the error if there is none."""
+        """Read several files; yield each key with its content, or with the error if there is none."""
         for key in keys:
             try:
                 yield key, self.read(key)
@@ -73,7 +73,7 @@ class LocalFiles:
                 yield key, error
 
     def write(self, key: str, content: bytes) -> None:
-        """Write a file whole or not at all. It is durable when this returns."""
+        """Write a file atomically; it is durable when this returns."""
         path = self.root / key
         with writing(path):
             self.root.stat()  # raises if the folder was removed: it is not made again
@@ -81,17 +81,17 @@ class LocalFiles:
         write_atomically(path, content)
 
     def write_once(self, key: str, content: bytes) -> None:
-        """Write a file as `write` does: of two writers of equal contents one wins, whole."""
+        """Write a file atomically; if two processes write the same content at once, one of the two files stays."""
         self.write(key, content)
 
     def append(self, key: str, line: str) -> None:
-        """Add a line to a file that is not part of the result; it is not synced."""
+        """Append a line to a file that is not part of the result, without syncing it to disk."""
         path = self.root / key
         with writing(path), open_plain(path, "a", encoding="utf-8") as file:
             file.write(line + "\n")
 
     def sizes(self) -> dict[str, int]:
-        """Return the size of every plain file below by key; an empty dict if there is no folder."""
+        """Return the size of every plain file below the folder by key; empty if the folder does not exist."""
         self.refuse_links("")
         found: dict[str, int] = {}
         with contextlib.suppress(FileNotFoundError, NotADirectoryError):
@@ -99,7 +99,7 @@ class LocalFiles:
         return found
 
     def everything(self) -> list[str]:
-        """Return the keys of all files and links below; an empty list if there is no folder."""
+        """Return the keys of all files and links below the folder; empty if the folder does not exist."""
         with unreadable(self.root), contextlib.suppress(FileNotFoundError, NotADirectoryError):
             return [path.relative_to(self.root).as_posix() for path in files_below(self.root)]
         return []
@@ -119,13 +119,13 @@ class LocalFiles:
         sync((self.root / key for key in keys), self.root)
 
     def prepare(self, prefix: str) -> None:
-        """Make a folder if it does not exist, and make its entry durable."""
+        """Create a folder if it does not exist, and make its entry durable on disk."""
         make_folder(self.root / prefix)
         with writing(self.root):
             sync_folder(self.root.parent)
 
     def odd(self, folders: Iterable[str]) -> list[str]:
-        """Return folders found where files should be, and files found where folders should be."""
+        """Return the keys of folders found where files should be, and of files found where folders should be."""
         found, expected = [], list(folders)
         for folder in expected:
             path = self.root / folder
@@ -138,7 +138,7 @@ class LocalFiles:
         return found + [name for name in OWN_FILES if os.path.isdir(self.root / name)]
 
     def move_aside(self, key: str) -> str:
-        """Move a file or folder into the folder `ASIDE` of this one; return its new path."""
+        """Move a file or folder that is in the way into the folder `ASIDE` inside this one; return its new path."""
         path = self.root / key
         target = self.root / ASIDE / f"{key.replace('/', '-')}.{uuid.uuid4().hex[:8]}"
         refuse_links(target.parent)
@@ -150,7 +150,7 @@ class LocalFiles:
         return str(target)
 
     def refuse_links(self, *prefixes: str) -> None:
-        """Refuse folders that are links."""
+        """Raise `RefusedError` if one of the given folders is a symbolic link."""
         refuse_links(*(self.root / prefix for prefix in prefixes))
 
     def zarr(self, *, read_only: bool) -> Store:
@@ -158,12 +158,14 @@ class LocalFiles:
         return LocalStore(self.root, read_only=read_only)
 
     def lock(self) -> AbstractContextManager[bool]:
-        """Hold the folder's lock."""
+        """Return a context manager that holds the folder's file lock."""
         return writer_lock(self.root)
 
 
 def _measure(folder: Path, prefix: str, found: dict[str, int]) -> None:
-    """Add the sizes of the plain files below a folder; refuse links to folders in the topmost one."""
+    """Add the sizes of the files below a folder to `found`; raise `RefusedError` for a folder at its top level that is
+    a link.
+    """
     with unreadable(folder), os.scandir(folder) as entries:
         below = list(entries)
     for entry in below:
@@ -176,7 +178,7 @@ def _measure(folder: Path, prefix: str, found: dict[str, int]) -> None:
 
 
 def unwritable(folder: Path) -> str | None:
-    """Return why a folder, which need not exist yet, cannot be written to; None if it can."""
+    """Return the reason why a folder, which need not exist yet, cannot be written to; None if it can."""
     place = folder.absolute()
     while not os.path.lexists(place):
         place = place.parent
@@ -188,7 +190,7 @@ def unwritable(folder: Path) -> str | None:
 
 
 def make_folder(path: Path) -> None:
-    """Make a folder and its parents, and make their entries durable."""
+    """Create a folder and its parents, and make their entries durable on disk."""
     if path.is_dir():
         return
     make_folder(path.parent)
@@ -198,13 +200,13 @@ def make_folder(path: Path) -> None:
 
 
 def sync_file(path: Path) -> None:
-    """Make a file's content durable."""
+    """Make a file's content durable on disk."""
     with writing(path), open_plain(path, "rb") as file:
         os.fsync(file.fileno())
 
 
 def sync(files: Iterable[Path], top: Path) -> None:
-    """Sync files, then every folder from theirs up to `top`."""
+    """Make files durable on disk, then every folder from theirs up to `top`."""
     folders: set[Path] = set()
     for file in files:
         sync_file(file)
@@ -215,7 +217,7 @@ def sync(files: Iterable[Path], top: Path) -> None:
 
 
 def files_below(folder: Path) -> Iterator[Path]:
-    """Yield all files below a folder. A link counts as a file, wherever it leads."""
+    """Yield all files below a folder; a symbolic link counts as a file and is not followed."""
     with os.scandir(folder) as entries:
         found = sorted(entries, key=lambda entry: entry.name)
     for entry in found:
@@ -242,7 +244,7 @@ def is_there(path: Path) -> bool:
 
 @contextlib.contextmanager
 def unreadable(path: Path) -> Iterator[None]:
-    """Turn errors of the file system into `UnreadableError`, which stops the run.
+    """Turn file system errors inside this context into `UnreadableError`, except for missing files.
 
     A missing file is not turned: it may be missing rightly.
 
@@ -264,7 +266,7 @@ def unreadable(path: Path) -> Iterator[None]:
 
 
 def refuse_links(*paths: Path) -> None:
-    """Refuse a link: its target does not belong to the run.
+    """Raise `RefusedError` if one of the paths is a symbolic link.
 
     Raises
     ------
@@ -289,7 +291,7 @@ def run_around(path: Path) -> Path | None:
 
 
 def refuse_place(path: Path, option: str = "", within: str = "") -> None:
-    """Refuse a place for results inside of a run directory, and a link that leads nowhere.
+    """Raise `RefusedError` for a result path that lies inside a run directory or is a broken symbolic link.
 
     Parameters
     ----------
@@ -324,7 +326,7 @@ def remove_tree(path: Path) -> None:
 
 @contextlib.contextmanager
 def writer_lock(directory: Path) -> Iterator[bool]:
-    """Hold the directory's lock. It is a courtesy; the commit protocol does not rely on it.
+    """Hold a file lock on a run directory against other writers inside this context.
 
     The system frees the lock when its process ends, however it ends. Yields False where locks fail.
 
@@ -361,7 +363,7 @@ def writer_lock(directory: Path) -> Iterator[bool]:
 
 @contextlib.contextmanager
 def _named(path: Path) -> Iterator[None]:
-    """Write beside a lock who holds it, for messages. A killed process leaves this note behind."""
+    """Write a note beside a lock that names its holder; remove the note at the end of the context."""
     content = json.dumps(holder()).encode()
     with contextlib.suppress(OSError):
         write_atomically(path, content)

@@ -49,7 +49,7 @@ _AGAIN = "committed results stay; give the same command again to continue."
 
 
 def parse_url(text: str) -> ObjectFiles:
-    """Return the files at a URL such as ``s3://bucket/prefix``.
+    """Parse a URL such as ``s3://bucket/prefix`` and return the files there.
 
     Raises
     ------
@@ -79,7 +79,7 @@ _CREDENTIALS_HELP = (
 
 
 class ObjectFiles:
-    """The files of a run in a bucket, by key; see `pipeline.store.files.Files`.
+    """Files of a run in a bucket of an object store, by key; see `pipeline.store.files.Files`.
 
     Parameters
     ----------
@@ -116,18 +116,18 @@ class ObjectFiles:
 
     @property
     def place(self) -> str:
-        """URL of the prefix."""
+        """URL of the prefix, by which another process opens the files."""
         return self.name
 
     @property
     def store(self) -> Any:
-        """Client of obstore for the bucket and the prefix."""
+        """Client of the package obstore for the bucket and the prefix."""
         if self._store is None:
             self._store = _client(self.bucket, self.prefix)
         return self._store
 
     def below(self, prefix: str) -> ObjectFiles:
-        """Return the files below a prefix. They are kept, since each has its own connections."""
+        """Return the files below a prefix; repeated calls return the same object, which keeps its connections."""
         if prefix not in self._below:
             self._below[prefix] = ObjectFiles(self.bucket, f"{self.prefix}/{prefix}".lstrip("/"))
         return self._below[prefix]
@@ -137,7 +137,7 @@ class ObjectFiles:
         return f"{self.name}/{key}".rstrip("/")
 
     def names(self) -> list[str]:
-        """Return the first parts of all keys, sorted."""
+        """Return the first parts of all keys (the top-level names), sorted."""
         import obstore
 
         found = self._ask("", lambda: obstore.list_with_delimiter(self.store))
@@ -164,7 +164,7 @@ class ObjectFiles:
         return self._ask(key, lambda: bytes(obstore.get(self.store, key).bytes()))
 
     def read_each(self, keys: Iterable[str]) -> Iterator[tuple[str, bytes | FileNotFoundError]]:
-        """Yield each key with its content, or with the error if there is none; several are read at once."""
+        """Read several objects at once; yield each key with its content, or with the error if there is none."""
 
         def read(key: str) -> bytes | FileNotFoundError:
             try:
@@ -179,7 +179,7 @@ class ObjectFiles:
                 yield from zip(some, pool.map(read, some), strict=True)
 
     def write(self, key: str, content: bytes) -> None:
-        """Put an object; it replaces one with the same key."""
+        """Write an object; it replaces one with the same key."""
         import obstore
 
         self._ask(key, lambda: obstore.put(self.store, key, content, use_multipart=False), writing=True)
@@ -223,11 +223,11 @@ class ObjectFiles:
         return True
 
     def append(self, key: str, line: str) -> None:
-        """Keep a line until the lock is released, since objects cannot grow."""
+        """Keep a line in memory until the lock is released, since objects cannot grow."""
         self._lines.setdefault(key, []).append(line)
 
     def put_lines(self) -> None:
-        """Put the lines that `append` has kept after the lines that are stored."""
+        """Write the lines that `append` has kept in memory to the ends of their objects."""
         for key, lines in self._lines.items():
             before = b"".join(c for _, c in self.read_each([key]) if isinstance(c, bytes))
             self.write(key, before + "".join(f"{line}\n" for line in lines).encode())
@@ -255,25 +255,25 @@ class ObjectFiles:
         """Do nothing: an object is durable once the store has answered."""
 
     def prepare(self, prefix: str) -> None:
-        """Do nothing: there are no folders."""
+        """Do nothing: an object store has no folders."""
 
     def odd(self, folders: Iterable[str]) -> list[str]:
-        """Return nothing: there are no folders."""
+        """Return an empty list: an object store has no folders."""
         return []
 
     def move_aside(self, key: str) -> str:
-        """Do nothing: there are no folders in the way."""
+        """Return the key unchanged: an object store has no folders that could be in the way."""
         return key
 
     def refuse_links(self, *prefixes: str) -> None:
-        """Do nothing: there are no links."""
+        """Do nothing: an object store has no symbolic links."""
 
     def zarr(self, *, read_only: bool) -> Store:
-        """Return the prefix as a zarr store."""
+        """Return the objects below the prefix as a zarr store."""
         return RunStore(self, read_only=read_only)
 
     def lock(self) -> AbstractContextManager[None]:
-        """Hold a lease; see `pipeline.store.lease`."""
+        """Return a context manager that holds a lease, the lock of an object store; see `pipeline.store.lease`."""
         from pipeline.store.lease import lease
 
         return lease(self)
@@ -288,7 +288,7 @@ class ObjectFiles:
 
 
 class RunStore(ObjectStore[Any]):
-    """A zarr store whose errors are in magpend's words. Writers read metadata only once."""
+    """A zarr store in an object store: errors have magpend's messages, and writers read metadata only once."""
 
     def __init__(self, files: ObjectFiles, *, read_only: bool = False) -> None:
         super().__init__(files.store, read_only=read_only)
@@ -298,11 +298,11 @@ class RunStore(ObjectStore[Any]):
         return _run_store, (self._files, self.read_only)
 
     def with_read_only(self, read_only: bool = False) -> RunStore:
-        """Return the same store, read-only or not, as zarr asks for."""
+        """Return the same store for zarr, with the given read-only setting."""
         return RunStore(self._files, read_only=read_only)
 
     async def get(self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None) -> Buffer | None:
-        """Return the content of a key, as zarr asks for; None if there is none."""
+        """Return the content of a key for zarr; None if the object does not exist."""
         kept = self._files.metadata
         if key in kept and not self.read_only:
             return kept[key]
@@ -315,7 +315,7 @@ class RunStore(ObjectStore[Any]):
         return found
 
     async def set(self, key: str, value: Buffer) -> None:
-        """Put the content of a key, as zarr asks for."""
+        """Write the content of a key for zarr."""
         try:
             await super().set(key, value)
         except Exception as error:
@@ -359,7 +359,7 @@ def _endpoint() -> str:
 
 
 def explain(place: str, error: Exception, *, writing: bool = False) -> Exception:
-    """Translate an error of an object store into one line, without request data.
+    """Translate an error of an object store into an exception with a one-line message, without request data.
 
     Parameters
     ----------
@@ -396,7 +396,7 @@ def explain(place: str, error: Exception, *, writing: bool = False) -> Exception
 
 
 def _where() -> str:
-    """Return the host name of the store, without other parts of its URL."""
+    """Return the host name and port of the object store, without other parts of its URL."""
     parts = urlsplit(_endpoint())
     try:
         return f"{parts.hostname}:{parts.port}" if parts.port else parts.hostname or "the object store"

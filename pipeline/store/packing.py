@@ -1,4 +1,4 @@
-"""Pack the commit records of whole blocks of tasks, and rewrite packs when records are withdrawn.
+"""Merge the commit records of each block of tasks into one file (a pack), and remove records from such files.
 
 Only the holder of the lock may call these functions. A pack is durable before the single records that it
 replaces are removed: a crash at any moment leaves every record either there or in the pack.
@@ -17,7 +17,7 @@ from pipeline.store.runfile import RunInfo
 
 
 class Packer:
-    """A packer of records: it packs each block of a run when its last task is committed.
+    """Counter of committed tasks that merges the records of each complete block of tasks into one file (a pack).
 
     Parameters
     ----------
@@ -37,7 +37,9 @@ class Packer:
             self._pack_if_whole(block)
 
     def add(self, index: int) -> None:
-        """Count a task that has been committed for the first time; pack its block if that is whole."""
+        """Count a newly committed task; if its block of tasks is complete, merge the block's commit records into one
+        file.
+        """
         self._counts[index // BLOCK] += 1
         self._pack_if_whole(index // BLOCK)
 
@@ -47,7 +49,7 @@ class Packer:
 
 
 def pack_block(info: RunInfo, plan: Plan, block: int) -> bool:
-    """Put the records of a block into one file if all of them are valid; return whether they are."""
+    """Merge the commit records of a block of tasks into one file if all of them are valid; return whether they are."""
     tasks = range(block * BLOCK, (block + 1) * BLOCK)
     commits, _ = scan(info, plan, blocks={block})
     if not all(index in commits for index in tasks):
@@ -86,7 +88,7 @@ def withdraw(info: RunInfo, names: Iterable[str]) -> None:
 
 
 def _rewrite(info: RunInfo, block: int, tasks: set[int]) -> None:
-    """Rewrite a pack without the records of some tasks, and without damaged ones."""
+    """Rewrite a pack (a file of many commit records) without the records of some tasks and without damaged ones."""
     try:
         content = info.files.read(pack_key(block))
     except FileNotFoundError:

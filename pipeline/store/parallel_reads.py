@@ -1,4 +1,4 @@
-"""Read very many small chunks in threads: faster than zarr's coroutines for every step of every chunk.
+"""Read many small chunks of a zarr array in threads, which is faster than zarr's coroutines.
 
 The result equals that of zarr. A chunk in any other form is left to zarr. The class here derives from the
 registered pipeline class and overrides `read` of `zarr.abc.codec.CodecPipeline`.
@@ -29,7 +29,7 @@ _Registered: Any = get_pipeline_class()
 
 
 class QuickPipeline(_Registered):  # type: ignore[misc]
-    """A codec pipeline for zarr with a shortcut for small chunks of a `CommittedStore` in a local folder."""
+    """A codec pipeline for zarr that reads small chunks of a `CommittedStore` in a local folder faster, in threads."""
 
     async def read(self, batch_info: Iterable[Any], out: Any, drop_axes: tuple[int, ...] = ()) -> None:
         """Read and decode chunks into `out`; see `zarr.abc.codec.CodecPipeline.read`."""
@@ -45,12 +45,12 @@ class QuickPipeline(_Registered):  # type: ignore[misc]
 
 
 def _codecs_of(pipeline: Any) -> tuple[type, ...]:
-    """Return the types of a pipeline's codecs in order; empty if it does not list them."""
+    """Return the types of a codec pipeline's codecs in order; empty if the pipeline does not list them."""
     return tuple(type(codec) for codec in pipeline) if isinstance(pipeline, Iterable) else ()
 
 
 def _put_all(items: list[Any], target: np.ndarray) -> list[Any]:
-    """Decode chunks into an array; return those that are left to zarr."""
+    """Decode chunks into an array where possible; return the chunks that zarr has to decode."""
     return [item for item in items if not _put(item, target)]
 
 
@@ -73,6 +73,6 @@ register_pipeline(QuickPipeline)
 
 @contextlib.contextmanager
 def quick_reading() -> Iterator[None]:
-    """Use `QuickPipeline` for arrays that are opened inside this context."""
+    """Use `QuickPipeline` for zarr arrays that are opened inside this context."""
     with zarr.config.set({"codec_pipeline.path": f"{QuickPipeline.__module__}.{QuickPipeline.__qualname__}"}):
         yield

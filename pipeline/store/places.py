@@ -1,4 +1,4 @@
-"""Open the files of a run by its place, in a folder or in an object store."""
+"""Open the files of a run by path or URL, in a folder or in an object store."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pipeline.store.local import LocalFiles
 
 
 def open_files(place: str | Path | Files) -> Files:
-    """Return the files of a run by its place: a folder, or ``s3://bucket/prefix``.
+    """Return the files of a run, given by a folder or a URL such as ``s3://bucket/prefix``.
 
     `Files` are returned unchanged.
 

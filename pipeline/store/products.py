@@ -1,4 +1,4 @@
-"""Write and read the products of analyses: whole or absent, sealed by a digest of their content.
+"""Write and read the results of analyses (products): whole or not at all, with a digest of their content.
 
 Each product is a zarr group such as ``derived/attractors-1a2b3c4d.zarr``. Labels (``state``, ``direction``,
 classes of motion) are stored as codes; the attribute ``words`` lists the labels.
@@ -48,7 +48,7 @@ Digests = list[tuple[str, str]]
 
 
 def write_product(place: Place, ds: xr.Dataset) -> None:
-    """Write a dataset to its place, whole or not at all.
+    """Write a dataset (the result of an analysis) to its path, whole or not at all.
 
     Labels are stored as codes, which the attribute ``words`` lists, since zarr format 3 has no strings of
     fixed length. If another process first puts a sound product with the same attributes there, that
@@ -80,7 +80,9 @@ def write_product(place: Place, ds: xr.Dataset) -> None:
 
 
 def _put_product(files: Files, ds: xr.Dataset) -> None:
-    """Put a product into an object store; its seal comes last, and makes it a product."""
+    """Write a product into an object store; ``zarr.json`` with the digest of the content comes last and makes it
+    valid.
+    """
     data: dict[str, Any] = {}
 
     def digests() -> Digests:
@@ -96,7 +98,7 @@ def _put_product(files: Files, ds: xr.Dataset) -> None:
 
 
 def open_product(place: Place) -> xr.Dataset:
-    """Read a product into memory.
+    """Read a product (the stored result of an analysis) into memory.
 
     Raises
     ------
@@ -129,7 +131,7 @@ def open_product(place: Place) -> xr.Dataset:
 
 
 def read_product_attrs(place: Place) -> dict[str, Any]:
-    """Return the attributes of a product after checking its seal.
+    """Return the attributes of a product after comparing the digest in them with its files.
 
     Raises
     ------
@@ -156,13 +158,13 @@ def read_product_attrs(place: Place) -> dict[str, Any]:
 
 
 def _refuse_declared(files: Files, contents: Iterable[tuple[str, bytes | FileNotFoundError]]) -> None:
-    """Refuse a product whose files declare more bytes than they have."""
+    """Raise `DamagedError` if a product's files declare other codecs or sizes than they should."""
     if problem := product_problem((key, value) for key, value in contents if isinstance(value, bytes)):
         raise DamagedError(f"{files.name}: {problem}")
 
 
 def _sealed_attrs(files: Files, group: bytes | FileNotFoundError | None, digests: Digests) -> dict[str, Any]:
-    """Return the attributes of a product, after checking its seal against the digests of its files."""
+    """Return the attributes of a product; raise `DamagedError` if the digest in them does not fit its files."""
     if not isinstance(group, bytes):
         if digests:
             raise DamagedError(f"{files.name}: it has no {_GROUP}")
@@ -177,7 +179,7 @@ def _sealed_attrs(files: Files, group: bytes | FileNotFoundError | None, digests
 
 
 def remove_product(place: Place) -> None:
-    """Remove a product; a missing one is no error. The target of a link stays.
+    """Remove a product; a missing one is no error, and of a link only the link is removed.
 
     Raises
     ------
@@ -199,7 +201,7 @@ def remove_product(place: Place) -> None:
 
 
 def leftover_products(files: Files, older_than: float) -> list[Files]:
-    """Return temporary folders of products that have not changed for some seconds."""
+    """Return temporary folders that interrupted writers of products have left, if they are older than some seconds."""
     if files.local is None:  # no temporary folders there: a product without its seal is damaged
         return []
     limit = time.time() - older_than
@@ -208,7 +210,7 @@ def leftover_products(files: Files, older_than: float) -> list[Files]:
 
 
 def products_in(files: Files) -> list[Files]:
-    """Return all products in a folder, also damaged ones.
+    """Return all products (stored results of analyses) in a folder, damaged ones included.
 
     Raises
     ------
@@ -228,7 +230,7 @@ def _own(attrs: Mapping[Any, Any]) -> dict[str, Any]:
 
 
 def _put_in_place(temporary: Path, path: Path, attrs: Mapping[str, Any]) -> None:
-    """Rename a finished product to its place; remove a damaged or different product there."""
+    """Rename a finished product to its final path; remove a damaged or different product there."""
     for _ in range(_MOST_TRIES):
         try:
             temporary.rename(path)
@@ -244,7 +246,9 @@ def _put_in_place(temporary: Path, path: Path, attrs: Mapping[str, Any]) -> None
 
 
 def _write_group(store: Store, ds: xr.Dataset, digests: Callable[[], Digests]) -> dict[str, Any]:
-    """Write all variables, then the attributes with the seal; return the attributes without it."""
+    """Write all variables of a dataset, then its attributes and a digest of the content; return the attributes without
+    the digest.
+    """
     group = zarr.create_group(store, zarr_format=3)
     for name in sorted(map(str, ds.variables)):
         values, attrs = _coded(name, ds.variables[name])
@@ -262,7 +266,7 @@ def _write_group(store: Store, ds: xr.Dataset, digests: Callable[[], Digests]) -
 
 
 def _seal(attrs: Mapping[str, Any], digests: Digests) -> str:
-    """Return the digest of a product's attributes and of its other files."""
+    """Return a digest of a product's attributes and of its files."""
     digest = hashlib.sha256(json.dumps(_own(attrs), sort_keys=True).encode())
     for key, sha256 in sorted(digests, key=lambda entry: entry[0].split("/")):
         digest.update(f"\n{key} {sha256}".encode())
@@ -270,7 +274,7 @@ def _seal(attrs: Mapping[str, Any], digests: Digests) -> str:
 
 
 def _digests(files: Files) -> Digests:
-    """Return the digests of a product's files but ``zarr.json``."""
+    """Return the key and sha256 of each file of a product except ``zarr.json``."""
     return _digests_of(files.read_each(key for key in files.everything() if key != _GROUP))
 
 
@@ -283,7 +287,9 @@ def _sha256(content: bytes) -> str:
 
 
 def _product_chunks(values: np.ndarray) -> tuple[int, ...]:
-    """Return the chunk shape of an array: all of a small one, else pieces of some megabytes along the first dims."""
+    """Return the chunk shape of an array: the whole array if it is small, else pieces of some megabytes along the first
+    dims.
+    """
     chunks = [max(n, 1) for n in values.shape]
     for i, n in enumerate(chunks):
         rest = values.itemsize * int(np.prod(chunks[i + 1 :]))
@@ -294,7 +300,7 @@ def _product_chunks(values: np.ndarray) -> tuple[int, ...]:
 
 
 def _coded(name: str, variable: xr.Variable) -> tuple[np.ndarray, dict[str, Any]]:
-    """Return values and attributes as they are stored, with labels as codes."""
+    """Return the values and attributes of a variable as they are stored: text labels become integer codes."""
     values = np.asarray(variable.values)
     attrs: dict[str, Any] = _plain(variable.attrs)
     if values.dtype.kind not in "UO":
@@ -307,7 +313,7 @@ def _coded(name: str, variable: xr.Variable) -> tuple[np.ndarray, dict[str, Any]
 
 
 def _with_words(ds: xr.Dataset) -> dict[str, Any]:
-    """Return the variables that hold codes, with their labels restored."""
+    """Return the variables that hold integer codes of text labels, with the labels restored."""
     found = {}
     for name, variable in ds.variables.items():
         if _WORDS in variable.attrs:

@@ -1,4 +1,4 @@
-"""Record where, when and with which versions something was made. None of it enters a run's digest."""
+"""Record where, when and with which versions a run was made. None of this enters the run's digest."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _PACKAGES = ("magpend", "numpy", "numba", "zarr", "numcodecs", "xarray")
 
 
 def provenance() -> dict[str, str]:
-    """Return time, host and, if magpend runs from a git repository, its commit.
+    """Return the time, the host name and, if magpend runs from a git repository, its commit.
 
     Returns
     -------
@@ -43,7 +43,7 @@ def versions() -> dict[str, str]:
 
 @lru_cache
 def git_commit() -> str:
-    """Return the commit of the repository that holds magpend's sources; empty if there is none."""
+    """Return the git commit of magpend's sources; empty if they are in no repository."""
     # a package installed below somebody's repository does not belong to it
     if _git("ls-files", "--error-unmatch", str(Path(__file__).relative_to(_ROOT))) is None:
         return ""
@@ -51,7 +51,7 @@ def git_commit() -> str:
 
 
 def _git(*arguments: str) -> str | None:
-    """Return the output of a git command at magpend's sources; None if it fails."""
+    """Run a git command in the folder of magpend's sources and return its output; None if it fails."""
     try:
         done = subprocess.run(
             ["git", "-C", str(_ROOT), *arguments], capture_output=True, text=True, check=True, timeout=_GIT_SECONDS

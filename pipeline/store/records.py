@@ -1,4 +1,4 @@
-"""Read and write commit records: one file per task, then one pack per whole block of tasks.
+"""Read and write commit records: one file per task, later one file (a pack) per block of 1000 tasks.
 
 A record is one line of JSON with its own checksum. When all tasks of a block of `BLOCK` are committed, the
 holder of the lock puts their lines, unchanged, into one file, the pack, and removes the single files. Opening
@@ -31,7 +31,7 @@ _OPEN_PACKS = 8
 
 @dataclass(frozen=True)
 class Commit:
-    """A valid commit record.
+    """A valid commit record: the number of cells by status, and size and sha256 of the task's files.
 
     Attributes
     ----------
@@ -52,17 +52,17 @@ class Commit:
 
 
 def marker_key(index: int) -> str:
-    """Return the key of a task's record, where it lies until it is packed."""
+    """Return the key (path) of the file that holds a task's commit record until it is packed."""
     return f"{COMMITS}/{index:06d}.json"
 
 
 def pack_key(block: int) -> str:
-    """Return the key of a block's pack."""
+    """Return the key (path) of the pack, the file that holds the commit records of a block of tasks."""
     return f"{COMMITS}/{block * BLOCK:06d}-{(block + 1) * BLOCK - 1:06d}.jsonl"
 
 
 def block_of_pack(name: str) -> int | None:
-    """Return the block that a file in ``commits`` is the pack of; None if it is no pack."""
+    """Return the block of tasks whose pack has the given file name; None if the name is not that of a pack."""
     first = name.partition("-")[0]
     if not (first.isascii() and first.isdigit() and int(first) % BLOCK == 0):
         return None
@@ -74,12 +74,12 @@ def block_of_pack(name: str) -> int | None:
 
 
 def record_text(record: Mapping[str, Any]) -> str:
-    """Return a commit record as it is stored: one line with its checksum; equal records give equal lines."""
+    """Return a commit record as it is stored: one line of JSON with a checksum; equal records give equal lines."""
     return seal(json.dumps(record, sort_keys=True, allow_nan=False, ensure_ascii=False))
 
 
 def read_record(content: bytes, digest: str) -> Commit | str:
-    """Return a record if it is whole and belongs to this run; otherwise return the problem."""
+    """Parse a commit record; return it if it is undamaged and of this run, otherwise return the problem as text."""
     try:
         data = unseal(content)
         commit = Commit(int(data["task"]), dict(data["status"]), dict(data["objects"]))
@@ -94,14 +94,14 @@ def read_record(content: bytes, digest: str) -> Commit | str:
 
 
 def line_of(commit: Commit, digest: str) -> bytes:
-    """Return a record's line, byte for byte as `write_task` wrote it."""
+    """Return the line of a commit record, byte for byte as `write_task` wrote it."""
     record = {"digest": digest, "task": commit.task, "status": commit.status, "objects": commit.objects}
     return record_text(record).encode()
 
 
 @dataclass(frozen=True)
 class Pack:
-    """The last line of a pack: a summary of its records.
+    """Summary in the last line of a pack, a file of many commit records.
 
     Attributes
     ----------
@@ -119,13 +119,13 @@ class Pack:
 
     @property
     def tasks(self) -> list[int]:
-        """Tasks with a record in the pack, in the order of its lines."""
+        """Tasks that have a record in the pack, in the order of its lines."""
         absent = set(self.without)
         return [i for i in range(self.block * BLOCK, (self.block + 1) * BLOCK) if i not in absent]
 
 
 def pack_text(commits: Mapping[int, Commit], digest: str, block: int) -> bytes:
-    """Return the pack of a block's records: their lines in the order of tasks, then the summary."""
+    """Return the content of a pack: the commit records of a block of tasks in order, then a summary line."""
     cells: Counter[str] = Counter()
     lines = []
     without = []
@@ -141,7 +141,9 @@ def pack_text(commits: Mapping[int, Commit], digest: str, block: int) -> bytes:
 
 
 def read_pack(content: bytes, digest: str, block: int) -> Pack | str:
-    """Return a pack's summary if it is whole and of this run and block; otherwise return the problem."""
+    """Return the summary of a pack (a file of many commit records) if it is undamaged and of this run; otherwise return
+    the problem.
+    """
     if not fits(content):
         return "torn or damaged"
     try:
@@ -156,7 +158,7 @@ def read_pack(content: bytes, digest: str, block: int) -> Pack | str:
 
 
 def salvage(content: bytes, digest: str, block: int) -> dict[int, Commit]:
-    """Return the records of a damaged pack that are whole, by task."""
+    """Return the undamaged records in a damaged pack (a file of many commit records), by task."""
     found = {}
     for line in content.split(b"\n"):
         commit = read_record(line + b"\n", digest)
@@ -169,7 +171,7 @@ def salvage(content: bytes, digest: str, block: int) -> dict[int, Commit]:
 
 
 class Records(Mapping[int, Commit]):
-    """The valid records of a run by task; packed records are read when they are used.
+    """Valid commit records of a run by task; records in packs (files of many records) are read on demand.
 
     Parameters
     ----------
@@ -222,7 +224,7 @@ class Records(Mapping[int, Commit]):
         return line
 
     def _block(self, block: int) -> dict[int, bytes | Commit]:
-        """Return the lines of a pack by task; a line is replaced by its record after its first use."""
+        """Return the contents of a pack by task: lines of JSON, replaced by parsed records when they are first used."""
         with self._lock:
             if block not in self._open:
                 self._open[block] = self._read(block)
@@ -252,7 +254,7 @@ class Records(Mapping[int, Commit]):
         return dict(found)
 
     def lines(self) -> Iterator[bytes]:
-        """Yield all records as they are written, in the order of tasks."""
+        """Yield all commit records as they are stored, lines of JSON, in the order of tasks."""
         for index in self:
             if index in self.singles:
                 yield line_of(self.singles[index], self._digest)

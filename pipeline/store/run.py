@@ -1,4 +1,4 @@
-"""Open a run directory once: specification, plan, commits and cube."""
+"""Open a run directory: its specification, plan, commit records and cube."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def _short(text: str) -> str:
 
 @dataclass(frozen=True)
 class Run:
-    """A run directory with its commits at one moment, so that all results refer to the same cells.
+    """An opened run directory with the commit records of that moment, so that all results use the same cells.
 
     Attributes
     ----------
@@ -62,7 +62,7 @@ class Run:
 
     @classmethod
     def open(cls, source: str | Path | Files | Run) -> Run:
-        """Open a run directory with its present commits; an opened run is returned unchanged.
+        """Open a run directory with its present commit records; return an opened run unchanged.
 
         Metadata and coordinates are compared with the digests in ``run.json``; no cell is read.
 
@@ -107,7 +107,7 @@ class Run:
 
     @property
     def _facts(self) -> dict[str, str]:
-        """Facts about the run that its `repr` shows, by name."""
+        """Model, cells and progress of the run in words, by name, for its `repr`."""
         states, plan = ", ".join(self.model.state_names), self.plan
         shape = " x ".join(f"{dim} ({n})" for dim, n in zip(plan.dims, plan.shape, strict=True))
         here = sum(plan.cells_in(i) for i in self.commits)
@@ -120,7 +120,7 @@ class Run:
 
     @property
     def directory(self) -> Path:
-        """The run directory; a `RefusedError` if it is not a folder of this machine."""
+        """Path of the run directory; raises `RefusedError` for a run that is not in a folder of this machine."""
         return self.info.directory
 
     @property
@@ -135,28 +135,28 @@ class Run:
 
     @property
     def parameters(self) -> Parameters:
-        """The model's parameters, without those that are swept."""
+        """Values of the model parameters that are not swept."""
         return self.spec.values
 
     @property
     def complete(self) -> bool:
-        """Whether every task is committed."""
+        """Whether every task of the run has been computed and committed."""
         return len(self.commits) == self.plan.n_tasks
 
     @cached_property
     def digest(self) -> str:
-        """Digest of the committed cells."""
+        """Digest of the run's identity and of all its commit records."""
         return cube_digest(self.info, self.commits)
 
     def cube(self, chunks: Any = None, *, check: bool | None = None) -> xr.Dataset:
-        """Open the cube, as `pipeline.open_run` does."""
+        """Open the cube of the run as an xarray dataset; see `pipeline.open_run`."""
         from pipeline.store.reading import cube_of
 
         return cube_of(self, chunks=chunks, check=check)
 
 
 def open_run(path: str | Path | Run, *, chunks: Any = None, check: bool | None = None) -> xr.Dataset:
-    """Open a run directory; only coordinates are read until variables are used.
+    """Open the cube of a run directory as a dataset; only coordinates are read until variables are used.
 
     Cells that are not committed read as pending: ``status`` 0, ``section`` NaN. Open the run again to see
     cells that were committed later.

@@ -1,4 +1,4 @@
-"""Read and write ``run.json``: the specification, its digest, and the files that the set-up wrote."""
+"""Read and write ``run.json``: the specification, the run's digest, and sha256 digests of metadata and coordinates."""
 
 from __future__ import annotations
 
@@ -62,14 +62,14 @@ class RunInfo:
 
     @property
     def directory(self) -> Path:
-        """The run directory; a `RefusedError` if it is not a folder of this machine."""
+        """Path of the run directory; raises `RefusedError` for a run that is not in a folder of this machine."""
         if self.files.local is None:
             raise RefusedError(f"{self.name}: is no folder of this machine, which this needs.")
         return self.files.local
 
 
 def is_run(files: Files) -> bool:
-    """Return whether a run has been set up at a place."""
+    """Return whether a folder or an object store prefix holds a run, that is, a ``run.json``."""
     return files.is_there(RUN_FILE)
 
 
@@ -102,7 +102,7 @@ def read_run(place: str | Path | Files) -> RunInfo:
 
 
 def _refuse_format(path: str, data: Mapping[str, Any], content: bytes) -> None:
-    """Refuse another format, unless the checksum shows that the format number itself is damaged."""
+    """Raise `RefusedError` for a ``run.json`` of another format, unless the format number itself is damaged."""
     found = data["identity"]["format"]
     if isinstance(found, (int, float)) and found != FORMAT and (fits(content) or not has_seal(content)):
         raise RefusedError(

@@ -1,4 +1,4 @@
-"""Set up a run directory, or rebuild the damaged files of its set-up from the specification."""
+"""Create a run directory, or rebuild its damaged metadata and coordinates from the specification."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ Echo = Callable[[str], None]
 
 
 def check(place: str | Path | Files, identity: Mapping[str, Any]) -> RunInfo | None:
-    """Check whether a run can be done in a directory; nothing is changed.
+    """Check whether a run can be started or continued in a directory; change nothing.
 
     Returns
     -------
@@ -69,7 +69,7 @@ def check(place: str | Path | Files, identity: Mapping[str, Any]) -> RunInfo | N
 
 
 def _refuse_place(folder: Path) -> None:
-    """Refuse a link that leads nowhere, and a place inside of another run directory."""
+    """Raise `RefusedError` for a broken symbolic link, or a place inside another run directory."""
     if folder.is_symlink() and not folder.exists():
         raise RefusedError(f"{folder}: is a link that leads nowhere; remove it, or give another --out.")
     outer = run_around(folder.absolute().resolve().parent)
@@ -78,7 +78,9 @@ def _refuse_place(folder: Path) -> None:
 
 
 def _refuse_foreign(files: Files, names: list[str], digest: str) -> None:
-    """Refuse a directory without a sound ``run.json`` unless it is empty or provably holds this run."""
+    """Raise `RefusedError` for a directory without a valid ``run.json``, unless it is empty or holds files of this same
+    run.
+    """
     foreign = [name for name in names if not _is_own(name)]
     if foreign:
         raise RefusedError(
@@ -103,7 +105,7 @@ def _refuse_foreign(files: Files, names: list[str], digest: str) -> None:
 
 
 def _refuse_notes(files: Files) -> None:
-    """Refuse a lock's note or timings that no run wrote: the run would overwrite or extend them."""
+    """Raise `RefusedError` if the directory has a ``lock.json`` or ``timings.jsonl`` that no run wrote."""
     for name, is_own in ((HOLDER, is_note), (TIMINGS, _is_timings)):
         for _, content in files.read_each([name]):
             if isinstance(content, bytes) and not is_own(content):
@@ -111,7 +113,7 @@ def _refuse_notes(files: Files) -> None:
 
 
 def _is_timings(content: bytes) -> bool:
-    """Return whether a file is empty or begins as ``timings.jsonl`` does."""
+    """Return whether a file's content is empty or begins as that of ``timings.jsonl`` does."""
     try:
         first = json.loads(content.split(b"\n")[0] or b'{"task": 0}')
     except (ValueError, RecursionError):
@@ -131,7 +133,7 @@ def _names(files: Files) -> list[str]:
 
 
 def _holds_something(files: Files, name: str) -> bool:
-    """Return whether a place holds more than empty folders and temporary files of a set-up."""
+    """Return whether a file or folder of a run directory holds more than empty folders and temporary files."""
     if name not in _names(files):
         return False
     try:
@@ -142,7 +144,7 @@ def _holds_something(files: Files, name: str) -> bool:
 
 
 def _digests(files: Files) -> set[str]:
-    """Return the digests of runs that the group's metadata and the commit records name."""
+    """Return the digests of runs that the cube's metadata and the commit records name."""
     records = [f"{COMMITS}/{key}" for key in files.below(COMMITS).everything() if key.endswith((".json", ".jsonl"))]
     # a pack names the digest in its first record
     found = {_text_in(content, "digest") for _, content in files.read_each(records)}
@@ -152,7 +154,7 @@ def _digests(files: Files) -> set[str]:
 
 
 def _text_in(content: bytes | FileNotFoundError, *keys: str) -> str | None:
-    """Return a text in a JSON file; None if the file or the text is missing or damaged."""
+    """Return the text at nested keys of a JSON file; None if the file or the text is missing or damaged."""
     if isinstance(content, FileNotFoundError):
         return None
     try:
@@ -165,7 +167,7 @@ def _text_in(content: bytes | FileNotFoundError, *keys: str) -> str | None:
 
 
 def create(place: str | Path | Files, spec: Spec, plan: Plan, identity: Mapping[str, Any], spec_text: str) -> RunInfo:
-    """Make a run directory. ``run.json`` is written last: without it, no run has begun.
+    """Create a run directory: an empty cube (metadata and coordinates), then ``run.json``.
 
     Call `check` first: files with the same names are replaced.
     """
@@ -186,7 +188,7 @@ def establish(
     *,
     alone: bool = True,
 ) -> RunInfo:
-    """Make a run directory, or open it and rebuild its damaged set-up.
+    """Create a run directory or, if it exists, open it and rebuild its damaged metadata and coordinates.
 
     Only the holder of the lock may call this.
 
@@ -232,7 +234,7 @@ def establish(
 
 
 def rebuild_skeleton(info: RunInfo, spec: Spec, plan: Plan) -> list[str]:
-    """Rebuild damaged files of the skeleton; return the problems that remain.
+    """Rebuild damaged metadata and coordinates of the cube; return the problems that remain.
 
     A file is written only if its digest is the one in ``run.json``. Another version of zarr or of magpend may
     write other bytes.

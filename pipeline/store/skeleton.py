@@ -1,4 +1,4 @@
-"""Make the files of a run's set-up: the metadata of all variables, and the coordinates.
+"""Make the files of an empty cube: the metadata of all variables, and the coordinates.
 
 Their bytes follow from the specification, the plan, the identity and the text alone, so that a damaged file
 can be rebuilt.
@@ -29,7 +29,9 @@ GROUP_KEY = "zarr.json"
 
 
 def skeleton_files(spec: Spec, plan: Plan, identity: Mapping[str, Any], spec_text: str, title: str) -> dict[str, bytes]:
-    """Return the contents of all files of an empty cube by key; the group's metadata come first."""
+    """Return the contents of all files of an empty cube (metadata and coordinates) by key; those of the group come
+    first.
+    """
     attrs = {
         "kind": plan.kind,
         "model": model_attribute(spec.model),
@@ -65,13 +67,13 @@ def skeleton_files(spec: Spec, plan: Plan, identity: Mapping[str, Any], spec_tex
 
 
 def skeleton_keys(spec: Spec, plan: Plan) -> list[str]:
-    """Return the keys of the metadata of all variables and coordinates."""
+    """Return the keys of the metadata files of all variables and coordinates."""
     names = [v.name for v in plan.variables] + [c.name for c in (*coordinates(spec), *_labels(spec))]
     return [f"{name}/{GROUP_KEY}" for name in names]
 
 
 def _labels(spec: Spec) -> list[Coordinate]:
-    """Return the coordinates along the dims that are not cell dims."""
+    """Return the coordinates along dims other than those of the cells, such as the names of the states."""
     model = spec.model
     found = [
         Coordinate("state", ("state",), _values(model.state_names), {"long_name": "component of the state"}),
@@ -93,12 +95,12 @@ def _values(labels: Iterable[Any]) -> np.ndarray:
 
 
 def entries_of(files: Mapping[str, bytes]) -> dict[str, dict[str, Any]]:
-    """Return size and sha256 by key, for ``run.json``."""
+    """Return the size and sha256 of each file's content by key, for ``run.json``."""
     return {key: entry_of(content) for key, content in files.items()}
 
 
 def write_skeleton(files: Files, contents: Mapping[str, bytes], keys: Iterable[str]) -> None:
-    """Write some of the skeleton's files, each whole or not at all, in the order given."""
+    """Write some of the metadata and coordinate files of a cube, each atomically, in the given order."""
     files.prepare(CUBE)
     written = [f"{CUBE}/{key}" for key in keys]
     for key in written:
@@ -107,14 +109,14 @@ def write_skeleton(files: Files, contents: Mapping[str, bytes], keys: Iterable[s
 
 
 def skeleton_problems(info: RunInfo) -> list[str]:
-    """Return a line per file of the set-up that is missing or has changed."""
+    """Return a line for each metadata or coordinate file that is missing or has changed."""
     folders = {key.partition("/")[0] for key in info.skeleton if "/" in key}
     info.files.refuse_links(CUBE, *(f"{CUBE}/{folder}" for folder in folders))
     return problems_of(info.files.below(CUBE), info.skeleton)
 
 
 def check_skeleton(info: RunInfo) -> None:
-    """Compare metadata and coordinates with the digests in ``run.json``; no cell is read.
+    """Compare metadata and coordinates with their digests in ``run.json``; raise `DamagedError` if one differs.
 
     Raises
     ------

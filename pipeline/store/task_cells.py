@@ -1,4 +1,4 @@
-"""Read cells of one committed task, compared with its record, for tasks that build on them."""
+"""Read results of one committed task, checked against its commit record, for tasks that start from them."""
 
 from __future__ import annotations
 
@@ -56,7 +56,8 @@ def read_cells(
 
 
 def read_block(run: Run, index: int, names: Iterable[str]) -> dict[str, np.ndarray]:
-    """Read variables of a task of an opened run, in the shape of its block followed by their own dims.
+    """Read variables of a committed task of an opened run; their shape is that of the task's block, then their own
+    dims.
 
     Raises
     ------

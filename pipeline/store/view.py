@@ -1,4 +1,4 @@
-"""Show readers the committed cells of the cube: other cells read as pending, changed chunks raise an error.
+"""Define a view of the cube that shows only committed cells: others read as pending, changed chunks raise an error.
 
 Every chunk is compared with the sha256 in its commit record when it is read; metadata and coordinates are
 compared with ``run.json``. ``MAGPEND_VERIFY=0`` in the environment turns this off. The chunk's own crc32c
@@ -34,12 +34,14 @@ SMALL = 200_000
 
 
 def checks_chunks() -> bool:
-    """Return whether chunks are compared with their records when they are read."""
+    """Return whether chunks are compared with their commit records when read; MAGPEND_VERIFY=0 in the environment turns
+    it off.
+    """
     return os.environ.get(VERIFY, "1").strip().lower() not in ("0", "no", "false", "off")
 
 
 class Shown:
-    """The files that a reader sees, with size and sha256: the set-up's files and committed chunks."""
+    """Files of the cube that readers see (metadata, coordinates and committed chunks), with size and sha256."""
 
     def __init__(self, info: RunInfo, plan: Plan, commits: Mapping[int, Commit]) -> None:
         self._skeleton = info.skeleton
@@ -52,7 +54,7 @@ class Shown:
         return sorted({key.partition("/")[0] for key in self._skeleton})
 
     def entry(self, key: str) -> Mapping[str, Any] | None:
-        """Return size and sha256 of a file; None if readers do not see it."""
+        """Return the recorded size and sha256 of a file; None if readers do not see the file."""
         if key in self._skeleton:
             return self._skeleton[key]
         task = self._owners.task(key)
@@ -62,7 +64,7 @@ class Shown:
 
 
 class CommittedStore(WrapperStore[Store]):
-    """A read-only view of the cube in which a chunk without a valid record does not exist.
+    """A read-only zarr store of the cube, in which chunks without a valid commit record do not exist.
 
     zarr then reads the fill value, which means pending. A chunk that has a record but is missing or has
     changed raises `DamagedError`.
@@ -89,7 +91,7 @@ class CommittedStore(WrapperStore[Store]):
         return type(self)(store, self._files, self._shown, self._checks)
 
     async def get(self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None) -> Buffer | None:
-        """Return the content of a key, as zarr asks for; None if it is not committed.
+        """Return the content of a key for zarr; None if it is not committed.
 
         Raises
         ------
@@ -110,7 +112,7 @@ class CommittedStore(WrapperStore[Store]):
         return whole if byte_range is None else whole[_slice(byte_range, len(whole))]
 
     def small_chunk(self, key: str) -> bytes | None:
-        """Content of a small chunk in a local folder; None for anything else.
+        """Return the content of a small committed chunk in a local folder; None for anything else.
 
         It is compared with its record or, if that is turned off, with the crc32c at its end.
 
@@ -128,7 +130,7 @@ class CommittedStore(WrapperStore[Store]):
         return content
 
     def _read(self, key: str, entry: Mapping[str, Any]) -> bytes:
-        """Read a local file and compare it with its record, unless that is turned off."""
+        """Read a local file and compare it with its recorded size and sha256, unless that is turned off."""
         try:
             content: bytes | None = self._files.read(f"{CUBE}/{key}")
         except FileNotFoundError:
@@ -152,11 +154,11 @@ class CommittedStore(WrapperStore[Store]):
         )
 
     async def exists(self, key: str) -> bool:
-        """Return whether a key is in the set-up or committed."""
+        """Return whether a key belongs to the metadata, the coordinates or a committed chunk."""
         return self._shown.entry(key) is not None
 
     async def list_dir(self, prefix: str) -> AsyncIterator[str]:
-        """Yield the names in a folder; for the cube itself, the arrays of the set-up."""
+        """Yield the names in a folder of the cube; at its top level, the names of its arrays."""
         if prefix.strip("/"):
             async for name in self._store.list_dir(prefix):
                 yield name
@@ -167,7 +169,7 @@ class CommittedStore(WrapperStore[Store]):
     async def get_partial_values(
         self, prototype: BufferPrototype, key_ranges: Iterable[tuple[str, ByteRequest | None]]
     ) -> list[Buffer | None]:
-        """Return parts of the contents of keys, as zarr asks for."""
+        """Return parts (byte ranges) of the contents of keys, for zarr."""
         return [await self.get(key, prototype, byte_range) for key, byte_range in key_ranges]
 
     async def _get_many(
@@ -192,7 +194,7 @@ def _slice(byte_range: ByteRequest, size: int) -> slice:
 def committed_view(
     info: RunInfo, plan: Plan, commits: Mapping[int, Commit], *, check: bool | None = None
 ) -> CommittedStore:
-    """Return the store to read from; it shows the skeleton and the committed chunks.
+    """Return a read-only zarr store that shows the metadata, the coordinates and the committed chunks of a run's cube.
 
     Parameters
     ----------

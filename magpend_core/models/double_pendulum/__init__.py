@@ -1,4 +1,4 @@
-"""Planar double pendulum: what it is in `models`, its equations in `system`."""
+"""Define the planar double pendulum: its description in `models`, its equations in `system`."""
 
 from magpend_core.models.double_pendulum.models import MODELS
 

@@ -1,4 +1,4 @@
-"""A planar double pendulum with friction of its own in each joint and in the air.
+"""Define a planar double pendulum with separate friction in each joint, and with air drag.
 
 The links, angles and signs are those of the pendulum of Wojna et al. (J. Sound Vib. 430, 2018, Eq. 1-6); the
 friction is what recordings of free swings ask for. In joint i, at the relative velocity v, it is

@@ -1,4 +1,4 @@
-"""The double pendulum as a system that the engine integrates; `models` says what it is."""
+"""Define the double pendulum's equations as a system that the engine integrates; `models` describes it."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def _forcing(t: Any, c: Any) -> Any:
 
 @inline
 def _dry(v: Any, c: Any) -> Any:
-    """Factor of the dry friction at the relative velocity `v`, and its slope."""
+    """Compute the factor of the dry friction at the relative velocity `v`, and its derivative by `v`."""
     fading = c[C.drop] * exp2_falling(-(c[C.c0] * absolute(v)))
     size = fading + c[C.floor]
     u = c[C.eps] * v
@@ -90,7 +90,7 @@ def _dry(v: Any, c: Any) -> Any:
 
 @inline
 def _air(c12: Any, w1: Any, w2: Any, c: Any) -> Any:
-    """Sums over the Gauss points of link 2: drag, its moment, and twice |v| with weights 1, s, s**2."""
+    """Sum over the Gauss points of link 2: drag, its moment, and twice |v| with weights 1, s, s**2."""
     across = c[C.l1] * (w1 * c12)
     near, middle, far = c[C.near], c[C.middle], c[C.far]
     v1 = multiply_add(near, w2, across)
@@ -107,7 +107,7 @@ def _air(c12: Any, w1: Any, w2: Any, c: Any) -> Any:
 
 @inline
 def _torques(y: Any, c: Any) -> Any:
-    """Friction of the joints and drag of the air: F1, F2, A1, A2 [N m]."""
+    """Compute the friction torques of both joints and the torques of the air's drag: F1, F2, A1, A2 [N m]."""
     w1, w2 = y[2], y[3]
     c12 = sincos(y[0] - y[1])[1]
     v = w2 - w1
@@ -120,7 +120,9 @@ def _torques(y: Any, c: Any) -> Any:
 
 @inline
 def _accelerations(y: Any, u: Any, c: Any) -> Any:
-    """Accelerations of both links, the sine and cosine between them, and 1/determinant."""
+    """Compute the accelerations of both links; also return sine and cosine of the angle between them, and
+    1/determinant.
+    """
     w1, w2 = y[2], y[3]
     s12, c12 = sincos(y[0] - y[1])
     friction1, friction2, drag1, drag2 = _torques(y, c)
@@ -144,7 +146,7 @@ def _rhs(y: Any, u: Any, c: Any) -> Any:
 
 @inline
 def _solved(d1: Any, d2: Any, cross: Any, per_det: Any, c: Any) -> Any:
-    """Changes of the accelerations for changes of the torques on their left-hand sides."""
+    """Compute the changes of both accelerations that changes of the torques cause."""
     return (multiply_add(c[C.B2], d1, -(cross * d2)) * per_det, multiply_add(c[C.B1], d2, -(cross * d1)) * per_det)
 
 
@@ -208,7 +210,7 @@ def _quantities(t: Any, y: Any, dy: Any, u: Any, c: Any) -> Any:
 
 @inline
 def _layers(y: Any, dy: Any, c: Any) -> Any:
-    """Velocity reversals in the joints: atan(eps v) has its poles at v = +-i/eps."""
+    """Return the layers at velocity reversals in the joints: atan(eps v) has its poles at v = +-i/eps."""
     return (
         (y[2], dy[2], c[C.per_eps], c[C.per_reversal1]),
         (y[3] - y[2], dy[3] - dy[2], c[C.per_eps], c[C.per_reversal2]),

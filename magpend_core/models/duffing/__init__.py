@@ -1,4 +1,4 @@
-"""The forced Duffing oscillator."""
+"""Define the forced Duffing oscillator."""
 
 from magpend_core.models.duffing.models import MODELS
 

@@ -1,4 +1,4 @@
-"""The forced Duffing oscillator: one well or two, softening or hardening, by its parameters.
+"""Describe the forced Duffing oscillator: one well or two, softening or hardening, by its parameters.
 
     x'' + damping x' + linear x + cubic x**3 = amplitude cos(2 pi f t)
 

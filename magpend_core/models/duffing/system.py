@@ -1,4 +1,4 @@
-"""The Duffing oscillator as a system that the engine integrates; `models` says what it is."""
+"""Define the Duffing oscillator's equations as a system that the engine integrates; `models` describes it."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""The models that ship as text: a TOML file each, named after the model."""
+"""Hold the models that ship as text: one TOML file each, named after the model."""

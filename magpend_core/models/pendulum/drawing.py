@@ -1,4 +1,4 @@
-"""Draw the pendulum: joints, links and magnets in the plane, from the upper joint [m]."""
+"""Define the drawings of the pendulum: joints, links and magnets in the plane, from the upper joint [m]."""
 
 from __future__ import annotations
 

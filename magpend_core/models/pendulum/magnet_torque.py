@@ -1,4 +1,5 @@
-"""The magnets' torque about the upper joint with link 2 locked, as it is measured: laws with their slopes.
+"""Compute the magnets' torque about the upper joint with link 2 locked, as on the test rig, and its parameter
+derivatives.
 
 Wojna et al., J. Sound Vib. 430 (2018), section 3, cited by equation number. Link 2 is locked at the angle
 ``psi_rel = psi2 - psi1`` and the torque about joint 1 is read over ``psi1``: positive torques increase the
@@ -48,19 +49,19 @@ def _wrapped(angle: np.ndarray) -> np.ndarray:
 
 
 def bump(psi1: np.ndarray, height: float, position: float, width: float) -> np.ndarray:
-    """One torque curve, ``height*exp(-((psi1 + position)/width)**2)`` [N m] (Eq. 17)."""
+    """Compute one bump of the torque curve, ``height*exp(-((psi1 + position)/width)**2)`` [N m] (Eq. 17)."""
     return np.asarray(height * np.exp(-(((psi1 + position) / width) ** 2)))
 
 
 def bump_slopes(psi1: np.ndarray, height: float, position: float, width: float) -> np.ndarray:
-    """Derivatives of `bump` by height, position and width; shape (..., 3)."""
+    """Compute the derivatives of `bump` by height, position and width; shape (..., 3)."""
     v = (psi1 + position) / width
     e = np.exp(-v * v)
     return np.stack([e, -2.0 * height * e * v / width, 2.0 * height * e * v * v / width], axis=-1)
 
 
 def transition(p: Mapping[str, float]) -> Line:
-    """Return the line midway between the two peaks (Eq. 19)."""
+    """Return the line in the plane of psi_rel and psi1 that lies midway between the two torque peaks (Eq. 19)."""
     return Line(-0.5 * (p["p1"] + p["p2"]), -0.5 * (p["r1"] + p["r2"]))
 
 
@@ -88,7 +89,7 @@ def _parts(psi1: np.ndarray, psi_rel: np.ndarray, p: Mapping[str, float]) -> _Pa
 
 
 def magnet_moment(psi1: np.ndarray, psi_rel: np.ndarray, p: Mapping[str, float]) -> np.ndarray:
-    """Fitted torque M_M of the magnets about joint 1 [N m] (Eq. 18-19).
+    """Compute the fitted torque M_M of the magnets about joint 1 [N m] (Eq. 18-19).
 
     Parameters
     ----------
@@ -102,7 +103,7 @@ def magnet_moment(psi1: np.ndarray, psi_rel: np.ndarray, p: Mapping[str, float])
 
 
 def moment_slopes(psi1: np.ndarray, psi_rel: np.ndarray, p: Mapping[str, float]) -> np.ndarray:
-    """Derivatives of `magnet_moment` by the parameters; shape (..., 13) in the order of `FITTED`."""
+    """Compute the derivatives of `magnet_moment` by the parameters; shape (..., 13) in the order of `FITTED`."""
     parts = _parts(psi1, psi_rel, p)
     stretch = 1.0 + (p["eps_mag"] * parts.x) ** 2
     turning = (parts.f[0] - parts.f[1]) / (np.pi * stretch)
@@ -120,7 +121,8 @@ def moment_slopes(psi1: np.ndarray, psi_rel: np.ndarray, p: Mapping[str, float])
 
 
 def weight_torque(psi1: np.ndarray, psi_rel: np.ndarray, p: Mapping[str, float]) -> np.ndarray:
-    """Torque of the links' weight about joint 1, link 2 locked [N m]: the sum of what Eq. 1 has of it.
+    """Compute the torque of the links' weight about joint 1 with link 2 locked [N m]: the sum of the weight terms of
+    Eq. 1.
 
     Parameters
     ----------
@@ -135,7 +137,7 @@ def weight_torque(psi1: np.ndarray, psi_rel: np.ndarray, p: Mapping[str, float])
 
 
 def dipole_moment(psi1: np.ndarray, psi_rel: np.ndarray, p: Mapping[str, float]) -> np.ndarray:
-    """Torque of point dipoles about joint 1 [N m] (Eq. 16).
+    """Compute the torque of point dipoles about joint 1 [N m] (Eq. 16).
 
     The force mu_0 pole1 pole2/(4 pi r**2) acts along the line between the magnets, which meets the fixed
     one; its moment about joint 1 is that of its horizontal part there, h below the joint.
@@ -155,5 +157,5 @@ def dipole_moment(psi1: np.ndarray, psi_rel: np.ndarray, p: Mapping[str, float])
 
 
 def reach(p: Mapping[str, float]) -> float:
-    """Distance of the moving magnet from joint 1, both links in line [m]."""
+    """Return the distance of the moving magnet from joint 1 with both links in line [m]."""
     return float(p["l1"] + p["l2"])

@@ -1,4 +1,4 @@
-"""Mechanics of the pendulum at given states: accelerations, torques, energy."""
+"""Compute mechanics of the pendulum at given states: accelerations, torques, energy."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from magpend_core.validation import check_states
 
 
 class Torques(NamedTuple):
-    """The loads on the pendulum at a state.
+    """Bearing loads and torques on the pendulum at given states.
 
     Attributes
     ----------
@@ -49,7 +49,7 @@ _TORQUES = (
 
 
 def accelerations(t: float | np.ndarray, state: np.ndarray, parameters: Parameters, frequency_hz: float) -> np.ndarray:
-    """Angular accelerations of both links from the full, implicit model.
+    """Compute the angular accelerations of both links from the full, implicit model.
 
     Parameters
     ----------
@@ -105,7 +105,7 @@ def torques(t: float | np.ndarray, state: np.ndarray, parameters: Parameters, fr
 
 
 def energy(state: np.ndarray, parameters: Parameters) -> np.ndarray:
-    """Mechanical energy of the links, drive and magnets excluded; 0 hanging at rest.
+    """Compute the mechanical energy of the links, drive and magnets excluded; 0 hanging at rest.
 
     Parameters
     ----------

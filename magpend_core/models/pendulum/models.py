@@ -1,4 +1,4 @@
-"""The pendulum's models: fitted magnets, point dipoles or none, driven by a square wave or a sine."""
+"""Define the pendulum's models: fitted magnets, point dipoles or none, driven by a square wave or a sine."""
 
 from __future__ import annotations
 

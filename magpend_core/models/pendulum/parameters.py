@@ -1,4 +1,4 @@
-"""Parameters of the pendulum, in groups: those of the paper (Wojna et al., J. Sound Vib. 430, 2018).
+"""Define the parameters of the pendulum in groups, from the paper (Wojna et al., J. Sound Vib. 430, 2018).
 
 All quantities are in SI units.
 """
@@ -80,7 +80,7 @@ NO_MAGNETS: tuple[Parameter, ...] = ()
 
 
 def keep_dipoles_apart(values: Mapping[str, float]) -> list[str]:
-    """Problems of point dipoles that can meet, where their force is infinite."""
+    """Return an error sentence if point dipoles could meet, where their force is infinite."""
     reach = values["l1"] + values["l2"]
     if values["h"] > reach:
         return []

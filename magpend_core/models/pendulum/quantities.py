@@ -1,4 +1,4 @@
-"""Quantities of the pendulum at a state: energy, powers, torques, loads, the moving magnet's place.
+"""Compute named quantities of the pendulum at a state: energy, powers, torques, loads, position of the moving magnet.
 
 Templates for the engine: ``magnet_torques`` is bound in `systems`. Their order is that of
 `models.QUANTITIES`.
@@ -23,7 +23,7 @@ from magpend_core.models.pendulum.equations import (
 
 @inline
 def _common_quantities(y: Any, dy: Any, u: Any, s1: Any, c1: Any, s2: Any, c2: Any, k: Any) -> Any:
-    """Energy, powers, loads and friction torques, which need no magnets."""
+    """Compute energy, powers, loads and friction torques, which do not depend on the magnets."""
     _, _, w1, w2 = y
     s12, c12 = s1 * c2 - c1 * s2, c1 * c2 + s1 * s2
     kinetic = 0.5 * k.B1 * (w1 * w1) + 0.5 * k.B2 * (w2 * w2) + k.N12 * c12 * (w1 * w2)
@@ -36,14 +36,14 @@ def _common_quantities(y: Any, dy: Any, u: Any, s1: Any, c1: Any, s2: Any, c2: A
 
 
 def free_quantities(t: Any, y: Any, dy: Any, u: Any, c: Any) -> Any:
-    """Quantities without magnets."""
+    """Compute the named quantities of the pendulum without magnets."""
     s1, c1 = sincos(y[0])
     s2, c2 = sincos(y[1])
     return _common_quantities(y, dy, u, s1, c1, s2, c2, LinkConstants(*c[:N_LINK]))
 
 
 def fitted_quantities(t: Any, y: Any, dy: Any, u: Any, c: Any) -> Any:
-    """Quantities with the fitted magnet torque."""
+    """Compute the named quantities of the pendulum with the fitted magnet torque."""
     s1, c1 = sincos(y[0])
     s2, c2 = sincos(y[1])
     common = _common_quantities(y, dy, u, s1, c1, s2, c2, LinkConstants(*c[:N_LINK]))
@@ -54,7 +54,7 @@ def fitted_quantities(t: Any, y: Any, dy: Any, u: Any, c: Any) -> Any:
 
 
 def dipole_quantities(t: Any, y: Any, dy: Any, u: Any, c: Any) -> Any:
-    """Quantities with point dipoles."""
+    """Compute the named quantities of the pendulum with point dipoles."""
     s1, c1 = sincos(y[0])
     s2, c2 = sincos(y[1])
     common = _common_quantities(y, dy, u, s1, c1, s2, c2, LinkConstants(*c[:N_LINK]))

@@ -1,4 +1,4 @@
-"""On which side of the fixed magnet a motion stays, told from its stored sections.
+"""Classify motions by the side of the fixed magnet on which they stay, from their stored section points.
 
 The rule
 --------
@@ -55,7 +55,7 @@ import numpy as np
 
 
 class Side(IntEnum):
-    """Label of a motion."""
+    """Label of a motion by its side of the fixed magnet: left, right, both, or other outcomes."""
 
     UNKNOWN = 0
     LEFT = 1
@@ -70,7 +70,7 @@ NEUTRAL = (int(Side.UNKNOWN), int(Side.UNDECIDED))
 
 
 def magnet_offset(states: np.ndarray, parameters: Mapping[str, Any]) -> np.ndarray:
-    """Horizontal distance of the moving magnet from the fixed one [m], positive to the right.
+    """Compute the horizontal distance of the moving magnet from the fixed one [m], positive to the right.
 
     Parameters
     ----------
@@ -83,7 +83,7 @@ def magnet_offset(states: np.ndarray, parameters: Mapping[str, Any]) -> np.ndarr
 
 
 def slowest_hz(parameters: Mapping[str, Any]) -> np.ndarray:
-    """Frequency [Hz] of the slower small-angle mode of the links without magnets and friction.
+    """Compute the frequency [Hz] of the slower small-angle mode of the links without magnets and friction.
 
     The smaller root w**2 of det(K - w**2 M) = 0 with the linear part of Eq. 1.
     """
@@ -101,7 +101,7 @@ def slowest_hz(parameters: Mapping[str, Any]) -> np.ndarray:
 def classify(
     section: np.ndarray, turns: np.ndarray, frequency_hz: np.ndarray, parameters: Mapping[str, Any]
 ) -> np.ndarray:
-    """Label motions by the side on which they stay; see the text of this module.
+    """Label motions by the side of the fixed magnet on which they stay (rule: see the module's text).
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The pendulum as systems that the engine integrates: one for each kind of magnets and drive."""
+"""Define the pendulum's systems for the engine: one for each kind of magnets and drive."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from magpend_core.models.pendulum.models import DIPOLE, DIPOLE_SINE, FITTED, FIT
 
 
 def _fitted_magnet(p: Any, values: Any, out: Any) -> None:
-    """Fill `out` with `FittedConstants`. A template, as those below."""
+    """Fill `out` with `FittedConstants`. A template."""
     alpha1, alpha2, eps_mag = p[AT.alpha1], p[AT.alpha2], p[AT.eps_mag]
     p1, p2, r1, r2, l1, l2, h = p[AT.p1], p[AT.p2], p[AT.r1], p[AT.r2], p[AT.l1], p[AT.l2], p[AT.h]
     jump = (abs(alpha1) + abs(alpha2)) * values.compliance1
@@ -70,7 +70,7 @@ def _fitted_magnet(p: Any, values: Any, out: Any) -> None:
 
 
 def _dipole_magnet(p: Any, values: Any, out: Any) -> None:
-    """Fill `out` with `DipoleConstants`."""
+    """Fill `out` with `DipoleConstants`. A template."""
     out[N_LINK] = VACUUM_PERMEABILITY * p[AT.pole1] * p[AT.pole2] / (4.0 * math.pi)
     out[N_LINK + 1] = p[AT.l1]
     out[N_LINK + 2] = p[AT.l2]
@@ -78,7 +78,7 @@ def _dipole_magnet(p: Any, values: Any, out: Any) -> None:
 
 
 def _no_magnet(p: Any, values: Any, out: Any) -> None:
-    """There is nothing to fill in."""
+    """Do nothing: without magnets there are no constants to fill in."""
 
 
 @inline
@@ -98,13 +98,13 @@ def _no_magnet_torques(y: Any, s1: Any, c1: Any, s2: Any, c2: Any, c: Any) -> An
 
 @inline
 def _friction_layers(y: Any, dy: Any, k: Any) -> Any:
-    """Velocity reversals in the joints: atan(eps v) has its poles at v = +-i/eps."""
+    """Return the layers at velocity reversals in the joints: atan(eps v) has its poles at v = +-i/eps."""
     return ((y[2], dy[2], k.per_eps, k.per_reversal1), (y[3] - y[2], dy[3] - dy[2], k.per_eps, k.per_reversal2))
 
 
 @inline
 def _fitted_layers(y: Any, dy: Any, c: Any) -> Any:
-    """The friction's layers and that of the magnets, between the two bumps.
+    """Return the layers of the friction, and that of the fitted magnet torque between its two bumps.
 
     The zero of dx, the regularised other singularity of Eq. 20, is so near that of x, and as wide,
     that one layer serves for both.
@@ -120,7 +120,7 @@ def _fitted_layers(y: Any, dy: Any, c: Any) -> Any:
 
 @inline
 def _plain_layers(y: Any, dy: Any, c: Any) -> Any:
-    """The friction's layers; the dipoles' field has none."""
+    """Return the layers of the friction alone; the field of the dipoles has no layer."""
     return _friction_layers(y, dy, LinkConstants(*c[:N_LINK]))
 
 
@@ -144,7 +144,7 @@ def _no_slopes(y: Any, s1: Any, c1: Any, s2: Any, c2: Any, c: Any) -> Any:
 
 
 def _constants(frequency: Any, p: Any, out: Any) -> None:
-    """Fill `out` with `LinkConstants`, then those of the magnets."""
+    """Fill `out` with `LinkConstants`, then the constants of the magnets."""
     values = all_link_constants(frequency, p)
     for i in range(N_LINK):
         out[i] = values[i]
@@ -178,7 +178,9 @@ def _jacobian(y: Any, u: Any, c: Any) -> Any:
 
 
 def _square_wave_edges(frequency: Any, p: Any, times: Any, half_widths: Any, jumps: Any) -> None:
-    """Rising edge at 0, falling edge at d/f; sin(omega t + phase) + a has slope omega cos(phase)."""
+    """Fill in the rising edge at 0 and the falling edge at d/f; sin(omega t + phase) + a has slope omega cos(phase)
+    there.
+    """
     k = all_link_constants(frequency, p)
     width = 1.0 / (k.eps_drive * k.omega * sincos(k.phase)[1])
     jump = math.pi * k.drive_amplitude * k.compliance1
@@ -190,7 +192,7 @@ def _square_wave_edges(frequency: Any, p: Any, times: Any, half_widths: Any, jum
 
 
 def _no_edges(frequency: Any, p: Any, times: Any, half_widths: Any, jumps: Any) -> None:
-    """A sine has none."""
+    """Set no edges: the sine drive is smooth."""
 
 
 _MAGNETS: dict[str, tuple[int, Any, Any, Any, Any]] = {
@@ -205,7 +207,7 @@ _DRIVES: dict[str, tuple[int, Any, Any, Any]] = {
 
 
 def _system(model: Model, magnets: str, driven: str) -> System:
-    """Bind the templates to kinds of magnets and drive."""
+    """Build the system for one kind of magnets and drive from the function templates here."""
     n_magnet, fill, torques, layers, slopes = _MAGNETS[magnets]
     n_edges, drive_constants, drive_torque, edges = _DRIVES[driven]
     name = "pendulum_" + (magnets if driven == "square" else f"{magnets}_{driven}")

@@ -1,4 +1,4 @@
-"""Define models as text: expressions parsed by a whitelist, never evaluated as code."""
+"""Define models as text: expressions parsed with a whitelist, never evaluated as code."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["TextModel", "read_model"]
 
 
 def read_model(table: Mapping[str, Any], place: str = "model") -> TextModel:
-    """Return the model that a text describes; derives and compiles nothing yet.
+    """Return the model that a table of text defines; derives and compiles nothing yet.
 
     Parameters
     ----------
@@ -36,7 +36,8 @@ def read_model(table: Mapping[str, Any], place: str = "model") -> TextModel:
 
 
 def read_shipped(path: Path) -> TextModel:
-    """Return a model that ships as a file: the table at its top level, the name that of the file.
+    """Read a shipped model from its TOML file, which has the model's table at its top level; the file's name is the
+    model's.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Derive, write out and compile the engine's system of a definition, when it is first run."""
+"""Compile the equations of a model given as text into a system for the engine."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _MODULE = __name__  # a module that later processes find, as the compile cache m
 
 
 def system_of(definition: Definition, derived: Derived, source: Source) -> System:
-    """Return the system that the engine integrates.
+    """Return the system that the engine integrates, compiled from a model's generated source.
 
     Parameters
     ----------
@@ -69,7 +69,9 @@ def system_of(definition: Definition, derived: Derived, source: Source) -> Syste
 
 
 def _compiled(source: str) -> dict[str, Any]:
-    """Define the functions of a generated source; it holds numbers and names of arithmetic alone."""
+    """Execute generated source and return its functions, compiled; the source has only numbers and names of
+    arithmetic.
+    """
     scope: dict[str, Any] = {"__name__": _MODULE, "math_inf": math.inf}
     for name in (*SIMD, *vecmath_names()):
         scope[name] = getattr(simd if name in SIMD else vecmath, name)
@@ -84,7 +86,7 @@ def _compiled(source: str) -> dict[str, Any]:
 
 
 def vecmath_names() -> tuple[str, ...]:
-    """Functions of `engine.vecmath` that expressions can need."""
+    """Return the names of the functions of `engine.vecmath` that expressions can need."""
     wanted = (
         "sincos",
         "sin",

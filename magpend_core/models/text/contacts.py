@@ -1,4 +1,4 @@
-"""Describe contacts: motion at rest on the surface of an impact, on which infinitely many impacts have ended.
+"""Derive the motion in contact: at rest on the surface of an impact, after infinitely many impacts in a finite time.
 
 The surface pushes along the direction n in which an impact changes the states. While a state rests on it,
 the impact's value g and its rate stay 0: the rates f become f - n a/b, where a is the second derivative that
@@ -17,7 +17,9 @@ from magpend_core.models.text.graph import Graph, GraphError, Node, in_order, su
 
 @dataclass(frozen=True)
 class Jump:
-    """An impact: its value and rate, all states afterwards, and those at rest on its surface if it sticks."""
+    """An impact: its event function and rate, the states after it, and the states at rest on its surface if it
+    sticks.
+    """
 
     value: Node
     rate: Node
@@ -28,7 +30,7 @@ class Jump:
 
 @dataclass(frozen=True)
 class _Contact:
-    """The effect of a surface on a state that rests on it.
+    """Expressions for the contact of a state with the surface it rests on: push, reaction and direction.
 
     Attributes
     ----------
@@ -51,7 +53,7 @@ class _Contact:
 def with_contacts(
     graph: Graph, free: tuple[Node, ...], jumps: Sequence[Jump], sticks: Sequence[bool]
 ) -> tuple[tuple[Node, ...], list[Jump], tuple[int, ...]]:
-    """Add to rates, and to impacts, what holds while a state rests on surfaces.
+    """Extend rates and impacts by the motion in contact, while a state rests on the surface of an impact.
 
     Parameters
     ----------
@@ -97,7 +99,9 @@ def with_contacts(
 
 
 def along(graph: Graph, nodes: tuple[Node, ...]) -> list[Node]:
-    """Time derivatives of expressions of time and state, with the states' rates as leaves."""
+    """Return the time derivatives of expressions of time and state; the states' time derivatives are symbols in
+    them.
+    """
     states = {n: graph.leaf("rate", int(n.value)) for n in in_order(nodes) if n.op == "state"}
     return derivatives(graph, nodes, {**states, graph.leaf("time"): graph.one})
 
@@ -118,7 +122,9 @@ def _contact(graph: Graph, free: tuple[Node, ...], jump: Jump, place: str) -> _C
 
 
 def _pushed(graph: Graph, states: Sequence[Node], slopes: Sequence[Node]) -> tuple[Node, ...] | None:
-    """Direction in which an impact changes the states: its map's derivative by one that it changes."""
+    """Return the direction in which an impact changes the states: the derivative of its map by a state that it
+    changes.
+    """
     own = [graph.leaf("state", i) for i in range(len(states))]
     changes = tuple(graph.sub(new, old) for new, old in zip(states, own, strict=True))
     for i, slope in enumerate(slopes):
@@ -130,7 +136,9 @@ def _pushed(graph: Graph, states: Sequence[Node], slopes: Sequence[Node]) -> tup
 
 
 def _resting(graph: Graph, free: tuple[Node, ...], jump: Jump, contact: _Contact) -> tuple[Node, ...]:
-    """States at rest on the surface, from those nearby: moved as impacts move them."""
+    """Return the states projected to rest on the surface of an impact, moved along the directions in which impacts move
+    them.
+    """
     own = [graph.leaf("state", i) for i in range(len(free))]
     moved = derivatives(graph, free, dict(zip(own, contact.direction, strict=True)))
     away = graph.div(jump.value, _change(graph, _slopes(graph, jump.value, len(free)), moved))
@@ -141,21 +149,21 @@ def _resting(graph: Graph, free: tuple[Node, ...], jump: Jump, contact: _Contact
 
 
 def _of_motion(graph: Graph, node: Node, free: tuple[Node, ...]) -> Node:
-    """Put the rates of the motion without contact in the place of the states' rates."""
+    """Replace the time derivatives of the states in an expression by the equations of motion without contact."""
     (found,) = substituted(graph, [node], {graph.leaf("rate", i): rate for i, rate in enumerate(free)})
     return found
 
 
 def _slopes(graph: Graph, node: Node, n: int) -> list[Node]:
-    """Derivatives of an expression by all states."""
+    """Return the derivatives of an expression by all states."""
     return [derivatives(graph, (node,), {graph.leaf("state", i): graph.one})[0] for i in range(n)]
 
 
 def _change(graph: Graph, slopes: Sequence[Node], direction: Sequence[Node]) -> Node:
-    """Change of an expression along a direction of the states."""
+    """Return the derivative of an expression along a direction of the states, from its derivatives by the states."""
     return graph.add(graph.zero, *(graph.mul(a, b) for a, b in zip(slopes, direction, strict=True)))
 
 
 def _at_rest(graph: Graph, mode: Node, yes: Node, no: Node) -> Node:
-    """Return one expression while the mode says that the state rests, else another."""
+    """Return an expression with the value `yes` while the contact mode says that the state rests, else `no`."""
     return graph.where_less(mode, graph.number(0.5), yes, no)

@@ -1,4 +1,4 @@
-"""Hold the validated definition of a text model."""
+"""Hold the validated definition of a model given as text."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from magpend_core.models.text.writing import written
 
 @dataclass(frozen=True)
 class Impact:
-    """An instant at which states jump: where an expression passes zero.
+    """An impact: the states jump where an expression passes zero in a given direction.
 
     Attributes
     ----------
@@ -37,7 +37,7 @@ class Impact:
 
 @dataclass(frozen=True)
 class DrawingText:
-    """A drawing: places of points as expressions, see `magpend_core.models.model.Drawing`."""
+    """Drawing of a model given as text: positions of points as expressions, see `magpend_core.models.model.Drawing`."""
 
     points: Mapping[str, tuple[Tree, Tree]]
     fixed: Mapping[str, tuple[Tree, Tree]]
@@ -48,7 +48,7 @@ class DrawingText:
 
 @dataclass(frozen=True)
 class ClassifierText:
-    """Words for motions, each with a condition on the states that all kept sections must meet."""
+    """Classes of motion, each with a condition on the states that all stored sections of a motion must meet."""
 
     meaning: str
     words: Mapping[str, Tree]
@@ -56,7 +56,7 @@ class ClassifierText:
 
 @dataclass(frozen=True)
 class Definition:
-    """A text that holds together: every name is known, every expression is one.
+    """Validated definition of a model given as text: all names are known and all expressions are parsed.
 
     Attributes
     ----------
@@ -90,7 +90,9 @@ class Definition:
     table: Mapping[str, Any] = field(repr=False)
 
     def used(self, trees: Iterable[Tree]) -> tuple[str, ...]:
-        """All names that expressions need, through definitions; each definition after those that it needs."""
+        """Return all names that expressions need, also through definitions; each definition after those that it
+        needs.
+        """
         found: dict[str, None] = {}
         pending = [(name, False) for tree in trees for name, _ in names(tree)][::-1]
         while pending:
@@ -106,17 +108,17 @@ class Definition:
 
     @property
     def dynamics(self) -> list[Tree]:
-        """Expressions of the equations and the impacts."""
+        """All expressions of the equations and the impacts."""
         of_impacts = [tree for i in self.impacts for tree in (i.of, *i.set.values())]
         return [*self.equations.values(), *of_impacts]
 
     @property
     def autonomous(self) -> bool:
-        """Tell whether neither the equations nor the impacts need time or frequency."""
+        """Whether neither the equations nor the impacts depend on time or frequency."""
         return not {"t", "f", "phase"} & set(self.used(self.dynamics))
 
     def remarks(self) -> list[str]:
-        """Return a sentence for each parameter and definition that no expression uses."""
+        """Return a sentence for each parameter and each definition that no expression uses."""
         trees = [*self.dynamics, *self.quantities.values()]
         if self.drawing is not None:
             trees += [t for pair in (*self.drawing.points.values(), *self.drawing.fixed.values()) for t in pair]
@@ -131,8 +133,8 @@ class Definition:
         ]
 
     def meaning(self) -> str:
-        """Return the part of a text model that determines its numbers, in a standard form: equal for models that
-        differ only in layout or wording.
+        """Return a standard form of all that determines the model's numbers: equal for texts that differ in layout or
+        wording.
         """
         bounds = [[p.name, p.bound] for p in self.parameters]
         plain = {
@@ -155,7 +157,7 @@ class Definition:
 
 
 def _suggestion(name: str, table: str, used: Iterable[str]) -> str:
-    """Suggest a remedy for a name that nothing uses."""
+    """Return a remedy for a name that nothing uses, as the end of a sentence."""
     near = difflib.get_close_matches(name, sorted(used), n=1, cutoff=0.6)
     meant = f"did you mean it where an expression has {near[0]}? Else" if near else ""
     effect = " (to sweep it would change nothing)" if table == "parameters" else ""

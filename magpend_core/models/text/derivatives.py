@@ -1,4 +1,4 @@
-"""Differentiate expressions by the chain rule on the graph.
+"""Differentiate expressions by the chain rule on their graph.
 
 Each part's derivative is made once, so that the Jacobian of equations that share parts is about as large as
 the equations times the number of states, however deep definitions stand in one another.
@@ -12,7 +12,7 @@ from magpend_core.models.text.graph import Graph, Node, in_order
 
 
 def derivatives(graph: Graph, roots: tuple[Node, ...], seeds: Mapping[Node, Node]) -> list[Node]:
-    """Derivative of each root along a direction.
+    """Return the derivative of each expression along a direction, given by `seeds`.
 
     Parameters
     ----------
@@ -92,7 +92,9 @@ def _minimum(g: Graph, node: Node, d: list[Node]) -> Node:
 
 
 def _slope(slope: Callable[[Graph, Node, Node], Node]) -> Rule:
-    """Rule of a function of one argument, from its slope by argument and value."""
+    """Return the differentiation rule of a function of one argument, given its derivative in terms of argument and
+    value.
+    """
     return lambda g, node, d: g.mul(slope(g, node.args[0], node), d[0])
 
 

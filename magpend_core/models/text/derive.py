@@ -1,4 +1,4 @@
-"""Derive the expressions of the engine's functions from a definition."""
+"""Derive the expressions for the engine's functions from the definition of a model given as text."""
 
 from __future__ import annotations
 
@@ -27,7 +27,9 @@ SCANNED = 256
 
 @dataclass(frozen=True)
 class Layer:
-    """The expressions that `System.layers` returns for one layer."""
+    """Expressions that `System.layers` returns for one layer, a narrow region where the right-hand side changes
+    quickly.
+    """
 
     value: Node
     rate: Node
@@ -38,7 +40,7 @@ class Layer:
 
 @dataclass(frozen=True)
 class Wave:
-    """Edges of a smooth function of time: where an expression passes zero, `count` times in a period."""
+    """Edges of the forcing: the `count` instants in a drive period at which a smooth function of time passes zero."""
 
     value: Node
     slope: Node
@@ -50,7 +52,7 @@ class Wave:
 
 @dataclass(frozen=True)
 class Derived:
-    """The expressions derived from a text: rates, Jacobian, layers, edges.
+    """Expressions derived from a model given as text: rates, Jacobian, layers, edges, switches, impacts.
 
     Attributes
     ----------
@@ -93,18 +95,18 @@ class Derived:
 
     @property
     def timed_layers(self) -> bool:
-        """Tell whether layers need the time."""
+        """Whether the layers depend on time."""
         nodes = [n for la in self.layers for n in (la.value, la.rate, la.half_width, la.per_strength)]
         return any(n.op == "time" for n in in_order(nodes))
 
     @property
     def n_edges(self) -> int:
-        """Number of edges of a period."""
+        """Number of edges (instants at which the forcing changes quickly) in a drive period."""
         return len(self.instants) + sum(w.count for w in self.waves)
 
 
 def derive(definition: Definition) -> Derived:
-    """Derive the rates, the Jacobian, the layers and the edges of a text.
+    """Derive rates, Jacobian, layers, edges, switches and impacts of a model given as text.
 
     Raises
     ------
@@ -152,7 +154,7 @@ def derive(definition: Definition) -> Derived:
 
 
 def _breaks(graph: Graph, rates: tuple[Node, ...], presets: Sequence[Mapping[int, float]]) -> bool:
-    """Tell whether rates differ between begin and end of a period, at a generic state."""
+    """Return whether the rates at a generic state differ between begin and end of a drive period."""
     leaves = [n for n in in_order(rates) if n.op == "state"]
     states = {n.number: GENERIC[int(n.value) % len(GENERIC)] for n in leaves}
     time = graph.leaf("time").number
@@ -166,7 +168,9 @@ def _breaks(graph: Graph, rates: tuple[Node, ...], presets: Sequence[Mapping[int
 def _smoothed(
     graph: Graph, rates: tuple[Node, ...], scales: tuple[float, ...], values: Mapping[int, float]
 ) -> frozenset[int]:
-    """Corners that lie within a narrow layer of the same argument: steps are short there anyway."""
+    """Return the numbers of corner nodes that lie in a narrow layer of the same argument, where steps are short
+    anyway.
+    """
     cores = set()
     for node in in_order(rates):
         place = place_of(graph, node)
@@ -181,7 +185,7 @@ def _smoothed(
 
 
 def _is_layer(steep: Steep) -> bool:
-    """Whether it is a place on the state, and no clock's."""
+    """Return whether a steep place depends on the state, and not on a sign that changes with time alone."""
     return steep.value.kind == STATED and not any(n.op == "clock" for n in in_order([steep.value]))
 
 
@@ -200,7 +204,7 @@ def _wave(graph: Graph, steep: Steep, presets: Sequence[Mapping[int, float]]) ->
 
 
 def _zeros(graph: Graph, node: Node, values: Mapping[int, float]) -> int:
-    """Number of times an expression passes zero in a period of 1 s."""
+    """Return how often an expression of time changes its sign in a period of 1 s."""
     times = (np.arange(SCANNED + 1) - 0.37) / SCANNED
     (found,) = node_values([node], {**values, graph.leaf("time").number: times})
     return int(np.count_nonzero(np.diff(np.sign(np.broadcast_to(found, times.shape))) != 0.0))
@@ -226,7 +230,7 @@ MOST_LOOKED_AT = 100
 
 
 def forcing_of(graph: Graph, roots: tuple[Node, ...], preferred: Node | None) -> Node | None:
-    """The largest part that needs no state and through which alone time enters."""
+    """Return the largest expression without states through which alone time enters; None if time does not enter."""
     if preferred is not None and preferred.kind == TIMED and not _reaches_time(roots, preferred):
         return preferred
     order = in_order(roots)
@@ -255,7 +259,7 @@ def _reaches_time(roots: tuple[Node, ...], without: Node) -> bool:
 
 
 class Builder:
-    """Makes nodes of trees; each definition once."""
+    """Builder of a model's expression graph from parsed expressions; each definition becomes one node."""
 
     def __init__(self, definition: Definition) -> None:
         self.definition = definition
@@ -269,12 +273,12 @@ class Builder:
         graph.positive = frozenset(i for i, p in enumerate(definition.parameters) if p.bound == POSITIVE)
 
     def leaf_values(self, parameters: Mapping[str, float]) -> dict[int, float]:
-        """Values of leaves by number, at 1 Hz."""
+        """Return the values of parameters by the number of their graph node, with the drive frequency 1 Hz."""
         own = {self.names[name].number: value for name, value in parameters.items()}
         return {**own, self.graph.leaf("frequency").number: 1.0}
 
     def node(self, tree: Tree) -> Node:
-        """Return the node of an expression, after those of the definitions that it needs."""
+        """Return the graph node of a parsed expression; adds the definitions that it needs first."""
         for name in self.definition.used([tree]):
             if name not in self.names:
                 node = self._node(self.definition.define[name])

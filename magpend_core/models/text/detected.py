@@ -1,4 +1,4 @@
-"""Describe the steep places, corners and jumps that were detected in a text, by which steps are chosen."""
+"""Describe in sentences the steep places, corners and jumps found in a model's equations."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _LEAVES = {"time": "t", "frequency": "f"}
 def found_in(
     model: TextModel, parameters: Mapping[str, float], frequency_hz: float, state: Sequence[float]
 ) -> Iterator[str]:
-    """Sentences on layers, switches, impacts, and on steep places that are not followed.
+    """Yield a sentence on each layer, switch and impact, and on each steep place that the steps do not follow.
 
     Parameters
     ----------
@@ -60,7 +60,9 @@ def found_in(
 def _numbers(
     nodes: Sequence[Node], own: Definition, parameters: Mapping[str, float], frequency_hz: float, state: Sequence[float]
 ) -> list[float]:
-    """Compute the values of nodes at one point, with 1 for each possible side or mode."""
+    """Compute the values of expressions at one state at time 0, with 1 for the side of each switch and for each
+    mode.
+    """
     given = {"parameter": [parameters[p.name] for p in own.parameters], "state": list(state)}
     leaves: dict[int, Any] = {}
     pending = list(nodes)
@@ -77,7 +79,7 @@ def _numbers(
 
 
 def _text(node: Node, own: Definition, depth: int = 0) -> str:
-    """An expression of a graph, for people; parts that are deep within are left out."""
+    """Return an expression of the graph as readable text; parts nested deeper than `MAX_DEPTH` are written as "..."."""
     if node.op == "number":
         return f"{node.value:.6g}"
     if node.op in ("state", "parameter"):

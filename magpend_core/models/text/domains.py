@@ -1,4 +1,4 @@
-"""Find where an expression has no value: the part of the text, and the numbers that it met.
+"""Find the parts of an expression that have no finite value, and the numbers for which that happens.
 
 Looked for before anything is derived or compiled, by numpy on the text as it was written.
 """
@@ -21,7 +21,7 @@ MAX_FAULTS = 20
 
 @dataclass(frozen=True)
 class Fault:
-    """A part of a text that has no finite value.
+    """A part of a model's text that has no finite value, with the reason and the values at which it happens.
 
     Attributes
     ----------
@@ -51,7 +51,7 @@ class Fault:
 
 
 def domain_faults(definition: Definition, values: Mapping[str, Any]) -> list[Fault]:
-    """Find the subexpressions of a text's equations that have no finite value.
+    """Find the innermost parts of a model's equations that have no finite value.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ def domain_faults(definition: Definition, values: Mapping[str, Any]) -> list[Fau
 
 
 def _constant_faults(definition: Definition, values: Mapping[str, Any]) -> list[Fault]:
-    """Find parts of a text that need no state and no time, and have no finite value."""
+    """Find parts of a model's text that depend on neither state nor time and have no finite value."""
     places = {f"equations.{name}": tree for name, tree in definition.equations.items()}
     for i, impact in enumerate(definition.impacts):
         places[f"impacts[{i}].of"] = impact.of
@@ -101,7 +101,7 @@ def _is_constant(tree: Tree, known: Mapping[str, Any]) -> bool:
 def _look_at_constants(
     tree: Tree, place: str, known: Mapping[str, Any], rows: np.ndarray, found: list[Fault], *, guards: bool
 ) -> None:
-    """Add the faults of the parts in which known names stand alone.
+    """Append a fault for each part of an expression that has only known names and no finite value.
 
     With `guards` a branch of `where` counts where a condition of known names takes it.
     """
@@ -124,7 +124,7 @@ def _has_guards(tree: Tree) -> bool:
 
 
 def _start_faults(definition: Definition, values: Mapping[str, Any]) -> list[Fault]:
-    """Find parts of the equations that have no finite value at the starts."""
+    """Find parts of the equations that have no finite value at the initial states."""
     known: dict[str, Any] = {"pi": np.pi, **{name: np.asarray(v, np.float64) for name, v in values.items()}}
     n = max((v.size for v in known.values() if isinstance(v, np.ndarray)), default=1)
     equations = {f"equations.{name}": tree for name, tree in definition.equations.items()}
@@ -145,8 +145,8 @@ def _start_faults(definition: Definition, values: Mapping[str, Any]) -> list[Fau
 
 
 def _look(tree: Tree, place: str, known: Mapping[str, Any], rows: np.ndarray, found: list[Fault]) -> np.ndarray:
-    """Append a message for each part of an expression without a finite value, the innermost first; return where the
-    whole has none.
+    """Append a fault for each innermost part of an expression without a finite value; return where the expression has
+    none.
     """
     if tree.kind == "inverse":  # told with its product
         return _look(tree.args[0], place, known, rows, found)
@@ -169,7 +169,9 @@ def _look(tree: Tree, place: str, known: Mapping[str, Any], rows: np.ndarray, fo
 
 
 def _taken(tree: Tree, known: Mapping[str, Any], rows: np.ndarray) -> list[np.ndarray]:
-    """Return the sample points at which each argument's value matters."""
+    """Return for each argument the sample points at which its value matters: for `where`, those at which it is
+    chosen.
+    """
     if tree.kind == "call" and tree.value == "where":
         chosen = np.broadcast_to(value_of(tree.args[0], known), rows.shape).astype(bool)
         return [rows, rows & chosen, rows & ~chosen]
@@ -207,7 +209,7 @@ _BINDING = {"or": 0, "and": 1, "compare": 3, "sum": 4, "negative": 4, "product":
 
 
 def readable(tree: Tree) -> str:
-    """Write an expression for people: brackets where they are needed, numbers short."""
+    """Write an expression as readable text: brackets only where needed, numbers short."""
     return _readable(tree, 0)
 
 
@@ -228,7 +230,7 @@ def _readable(tree: Tree, least: int) -> str:
 
 
 def _joined(tree: Tree, own: int) -> str:
-    """Parts of an expression with the signs between them."""
+    """Return the text of an expression's operands with the operators between them."""
     if tree.kind == "negative":
         return f"-{_readable(tree.args[0], 5)}"
     if tree.kind == "power":

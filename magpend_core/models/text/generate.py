@@ -1,4 +1,4 @@
-"""Generate the source of the engine's functions from derived expressions.
+"""Generate Python source for the engine's functions from derived expressions.
 
 No name and no character of a model's text stands in it: states, parameters and constants are numbered.
 
@@ -21,7 +21,7 @@ _NAMES = {"less": "where_less", "square": "square_wave"}
 
 
 class Writer:
-    """Writes the lines of one function.
+    """Writer of the source lines of one generated function.
 
     Parameters
     ----------
@@ -35,7 +35,7 @@ class Writer:
         self.inverse_roots: set[int] = set()
 
     def write(self, roots: Iterable[Node]) -> list[str]:
-        """Write the lines that compute some nodes; return the names of their values."""
+        """Write the lines that compute some nodes; return the names of their values in the code."""
         roots = list(roots)
         wanted = self._wanted(roots)
         for node in in_order(wanted.values()):
@@ -44,7 +44,7 @@ class Writer:
         return [self.name(root) for root in roots]
 
     def _wanted(self, roots: list[Node]) -> dict[int, Node]:
-        """Nodes whose value is needed by itself; products within sums are not among them."""
+        """Return the nodes that need a variable of their own; products within sums do not."""
         wanted: dict[int, Node] = {}
         pending = list(roots)
         while pending:
@@ -66,7 +66,7 @@ class Writer:
         return wanted
 
     def name(self, node: Node) -> str:
-        """Return the name of a node."""
+        """Return the name of a node's value in the generated code."""
         if node.number in self.leaves:
             return self.leaves[node.number]
         if node.op == "number":
@@ -90,7 +90,9 @@ class Writer:
         self.lines.append(f"{target} = {self._value(node)}")
 
     def _by_root(self, above: Node, x: Node, n: int) -> str:
-        """Divide a number by the n-th power of a root without a division, and without a product that could be fused."""
+        """Return source for a number divided by the n-th power of a root, without a division and without a product that
+        could be fused.
+        """
         root = f"w{x.number}"
         if x.number not in self.inverse_roots:
             self.inverse_roots.add(x.number)
@@ -139,8 +141,8 @@ class Writer:
 
 
 def root_under(node: Node) -> tuple[Node, int] | None:
-    """Return x and the power 1, 3 or 5 of a quotient by sqrt(x), x sqrt(x) or x x sqrt(x) whose x changes with the
-    state.
+    """Return x and n = 1, 3 or 5 if a node is a quotient by sqrt(x), x sqrt(x) or x x sqrt(x) that varies with the
+    state, else None.
     """
     if node.op != "div" or node.args[1].kind != STATED:
         return None
@@ -160,7 +162,9 @@ def root_under(node: Node) -> tuple[Node, int] | None:
 
 
 def _twin(node: Node, wanted: Mapping[int, Node]) -> Node | None:
-    """Return the cosine of a sine's argument, or the sine of a cosine's, if the code needs both."""
+    """Return the node of the cosine (for a sine) or sine (for a cosine) of the same argument, if the code needs
+    both.
+    """
     other = "cos" if node.op == "sin" else "sin"
     for candidate in wanted.values():
         if candidate.op == other and candidate.args[0] is node.args[0]:
@@ -169,7 +173,7 @@ def _twin(node: Node, wanted: Mapping[int, Node]) -> Node | None:
 
 
 def constants_of(roots: Iterable[Node]) -> list[Node]:
-    """Return the expressions that change only with the cell and are used by others that change with time or state."""
+    """Return the subexpressions independent of time and state that are used in others: constants of a trajectory."""
     roots = list(roots)
     found = {root.number: root for root in roots if root.kind == CONSTANT}
     for node in in_order(roots):
@@ -180,7 +184,7 @@ def constants_of(roots: Iterable[Node]) -> list[Node]:
 
 @dataclass(frozen=True)
 class Source:
-    """Generated functions.
+    """Source of a system's functions, and the numbers of constants, modes and edges that they use.
 
     Attributes
     ----------
@@ -200,7 +204,7 @@ class Source:
 
 
 def source_of(derived: Derived) -> Source:
-    """Write all functions of a system that it has."""
+    """Generate the source of all functions of a system."""
     forcing = () if derived.forcing is None else (derived.forcing,)
     layers = [node for la in derived.layers for node in (la.value, la.rate, la.half_width, la.per_strength)]
     switches = [node for pair in derived.sliding.pairs for node in pair]
@@ -233,7 +237,7 @@ def source_of(derived: Derived) -> Source:
 
 
 def _entries(derived: Derived) -> tuple[int, ...] | None:
-    """Places of a large Jacobian's entries that are not 0 everywhere; None for all of a small one's."""
+    """Return the positions of the entries of a large Jacobian that are not always 0; None for a small Jacobian."""
     if len(derived.rates) <= WRITTEN_OUT:
         return None
     found = tuple(i for i, node in enumerate(derived.jacobian) if not node.is_number(0.0))
@@ -255,7 +259,7 @@ def _leaves(derived: Derived, constants: list[Node], n_constants: int, n_modes: 
 
 
 def _cell(roots: Iterable[Node]) -> dict[int, str]:
-    """Leaves of what changes with the cell alone."""
+    """Return the names in generated code of parameters, frequency, time and edge ranks, by node number."""
     names = {}
     for node in in_order(roots):
         if node.op == "parameter":
@@ -283,14 +287,16 @@ def _constants(constants: list[Node]) -> str:
 
 
 def _scalar(name: str, arguments: str, roots: list[Node]) -> str:
-    """A function of plain numbers of the cell, and of time if it is an argument."""
+    """Return source of a function of plain numbers: drive frequency, parameters, and time if it is an argument."""
     writer = Writer(_cell(roots))
     names = [f"{name} + 0.0" for name in writer.write(roots)]
     return _function(name, arguments, [*writer.lines, f"return {', '.join(names)}" + "," * (len(names) > 1)])
 
 
 def _edges(derived: Derived) -> list[str]:
-    """Write the functions of the edge times in a period: first of the jumps, then of the waves' zeros."""
+    """Return sources of the functions for the edge times in a period: of the jumps, then of the zeros of smooth
+    waves.
+    """
     n_instants, parts, names = len(derived.instants), [], []
     for i, instant in enumerate(derived.instants):
         parts.append(_scalar(f"instant{i}", "frequency, p", [instant.time]))
@@ -356,7 +362,9 @@ def _forcing(forcing: Node | None, leaves: Mapping[int, str]) -> str:
 
 
 def _tuple(name: str, arguments: str, roots: Iterable[Node], leaves: Mapping[int, str], group: int = 0) -> str:
-    """A function that returns a tuple of numbers per lane, or of groups of them."""
+    """Return source of a function that returns a tuple of numbers per SIMD lane, or a tuple of tuples of `group` such
+    numbers.
+    """
     roots = list(roots)
     writer = Writer(leaves)
     values = writer.write(roots)

@@ -1,4 +1,4 @@
-"""Parse arithmetic as text with a whitelist, without evaluating it.
+"""Parse arithmetic expressions given as text, with a whitelist and without evaluating them.
 
 Numbers, names, ``+ - * / **``, comparisons, ``and or not``, and calls of `FUNCTIONS`. There is nothing else:
 no attributes, no indices, no text, no assignment. Length, nesting, and what numbers may be are bounded, so
@@ -85,7 +85,7 @@ _BINDING = {
 
 
 class GrammarError(ValueError):
-    """A text is no expression.
+    """Error: a text is not a valid expression.
 
     Attributes
     ----------
@@ -103,7 +103,7 @@ class GrammarError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Tree:
-    """An expression as it was written.
+    """Syntax tree of a parsed expression, in the order in which it was written.
 
     Attributes
     ----------
@@ -125,12 +125,12 @@ class Tree:
 
     @property
     def is_condition(self) -> bool:
-        """Tell whether the value is true or false and not a number."""
+        """Whether the expression is a condition (true or false) and not a number."""
         return self.kind in ("compare", "and", "or", "not")
 
 
 def parse(text: object) -> Tree:
-    """Read an expression.
+    """Parse an arithmetic expression.
 
     Parameters
     ----------
@@ -153,7 +153,7 @@ def parse(text: object) -> Tree:
 
 
 def parse_condition(text: object) -> Tree:
-    """Read a condition, such as ``x < 0 and v > 1``.
+    """Parse a condition, such as ``x < 0 and v > 1``.
 
     Raises
     ------
@@ -190,7 +190,7 @@ def _parse(text: object) -> Tree:
 
 
 def _unknown_functions(tokens: list[_Token]) -> Iterator[str]:
-    """Yield a sentence for each call of an unknown function, where there is no tree."""
+    """Yield an error sentence for each call of an unknown function among the tokens of an unparsable text."""
     for token, after in itertools.pairwise(tokens):
         is_call = token.kind == "name" and after.text == "(" and token.text not in ("and", "or", "not")
         if is_call and token.text not in FUNCTIONS:
@@ -198,14 +198,14 @@ def _unknown_functions(tokens: list[_Token]) -> Iterator[str]:
 
 
 def _names_among(tokens: list[_Token]) -> Iterator[tuple[str, int]]:
-    """Each name with its place, where there is no tree; functions are not among them."""
+    """Yield each name among the tokens of an unparsable text with its character position, except names of functions."""
     for token, after in itertools.pairwise(tokens):
         if token.kind == "name" and after.text != "(" and token.text not in ("and", "or", "not"):
             yield token.text, token.at
 
 
 def names(tree: Tree) -> Iterator[tuple[str, int]]:
-    """Each name in an expression with its place; functions are not among them."""
+    """Yield each name in an expression with its character position; names of functions are left out."""
     if tree.kind == "name":
         yield str(tree.value), tree.at
     for arg in tree.args:
@@ -213,7 +213,7 @@ def names(tree: Tree) -> Iterator[tuple[str, int]]:
 
 
 def name_problem(name: object) -> str | None:
-    """Return the problem of a name given by the user, or None."""
+    """Return what is wrong with a name given by the user, or None."""
     if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
         return "must begin with a letter and go on with letters, digits and underscores"
     if len(name) > MAX_NAME:
@@ -259,7 +259,7 @@ def _tokens(text: str) -> tuple[list[_Token], list[str]]:
 
 
 class _Parser:
-    """Precedence climbing; two calls for each level of nesting."""
+    """Parser of expressions by precedence climbing; makes two nested calls for each level of nesting."""
 
     def __init__(self, tokens: list[_Token]) -> None:
         self.tokens = tokens
@@ -272,20 +272,20 @@ class _Parser:
         return self.tokens[self.next]
 
     def take(self) -> _Token:
-        """Return the next token and go on."""
+        """Return the current token and advance to the next."""
         token = self.token
         self.next += token.kind != "end"
         return token
 
     def whole(self) -> Tree:
-        """Read all of the text."""
+        """Parse the whole text as one expression; raise `GrammarError` if anything is left over."""
         tree = self.expression(_OR)
         if self.token.kind != "end":
             raise self.unexpected(self.token)
         return tree
 
     def unexpected(self, token: _Token) -> GrammarError:
-        """Return the sentence for a token that cannot follow here, with a remedy if one is known."""
+        """Return an error for a token that cannot follow here, with a remedy if one is known."""
         hints = {
             "==": "; compare with < or >",
             "!=": "; compare with < or >",
@@ -322,12 +322,12 @@ class _Parser:
         return left
 
     def lacks_sign(self, token: _Token) -> bool:
-        """Return whether an operand begins where a sign must stand."""
+        """Return whether an operand begins where an operator is expected."""
         is_operand = token.kind in ("number", "name") or token.text == "("
         return is_operand and token.text not in ("and", "or", "not")
 
     def joined(self, left: Tree, token: _Token, binding: int) -> Tree:
-        """Parse the operand after a sign."""
+        """Parse the right operand of a binary operator, and return the joined expression."""
         if binding == _POWER:
             begin = self.next
             right = self.expression(_SIGN)
@@ -364,7 +364,7 @@ class _Parser:
             )
 
     def prefix(self) -> Tree:
-        """Read the beginning of an expression: a sign, a number, a name or a bracket."""
+        """Parse the beginning of an expression: a sign, a number, a name, a call or a bracket."""
         token = self.take()
         if token.kind == "number":
             value = float(token.text)
@@ -393,7 +393,7 @@ class _Parser:
         )
 
     def close(self, opened: _Token) -> None:
-        """Read the ) that belongs to a (."""
+        """Read the closing bracket of an opening one; raise `GrammarError` if it is missing."""
         if self.token.text == ")":
             self.take()
         elif self.token.kind == "end":
@@ -402,7 +402,7 @@ class _Parser:
             raise self.unexpected(self.token)
 
     def call(self, name: _Token) -> Tree:
-        """Read the arguments of a function."""
+        """Parse the arguments of a function call."""
         opened = self.take()
         if name.text not in FUNCTIONS:
             self.problems.append(unknown(name.text, name.at, FUNCTIONS, "function"))
@@ -417,7 +417,7 @@ class _Parser:
         return Tree("call", name.at, name.text, tuple(args))
 
     def check_arguments(self, name: _Token, args: list[Tree]) -> None:
-        """Note a wrong number of arguments, and conditions in the place of numbers."""
+        """Report a wrong number of function arguments, and conditions given as arguments in place of numbers."""
         least, most = FUNCTIONS.get(name.text, (0, len(args)))
         if not least <= len(args) <= most:
             wanted = f"{least}" if least == most else f"{least} to {most}"
@@ -432,7 +432,7 @@ class _Parser:
             self.numbers(tuple(args), name)
 
     def numbers(self, parts: tuple[Tree, ...], token: _Token) -> tuple[Tree, ...]:
-        """Return parts, after noting those that are conditions."""
+        """Return the operands, after reporting those that are conditions where numbers are needed."""
         self.problems += [
             f"a condition stands at character {part.at} where {token.text!r} needs a number; use where(condition, a, b)"
             for part in parts
@@ -441,7 +441,7 @@ class _Parser:
         return parts
 
     def conditions(self, parts: tuple[Tree, ...], token: _Token) -> None:
-        """Note parts that are numbers."""
+        """Report operands that are numbers where conditions are needed."""
         self.problems += [
             f"a number stands at character {part.at} where {token.text!r} needs a condition (x < 0, say)"
             for part in parts
@@ -450,7 +450,7 @@ class _Parser:
 
 
 def unknown(name: str, at: int, known: Iterable[str], what: str) -> str:
-    """Sentence on an unknown name, with the nearest known ones."""
+    """Return an error sentence for an unknown name, with the nearest known ones."""
     if name in ELSEWHERE:
         return f"unknown {what} {name!r} at character {at}; here it is {ELSEWHERE[name]}"
     hint = near_names(name[:MAX_NAME], known, f"{what}s").rstrip(".")
@@ -464,6 +464,6 @@ def _name(token: _Token) -> Tree:
 
 
 def _flat(kind: str, left: Tree, right: Tree) -> Tree:
-    """Append a term to a joined sum, so that long sums do not nest deeply."""
+    """Append an operand to a sum, product, ``and`` or ``or`` of the same kind, so that long ones do not nest deeply."""
     args = left.args if left.kind == kind else (left,)
     return Tree(kind, left.at, "", (*args, right))

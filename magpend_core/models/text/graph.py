@@ -1,4 +1,4 @@
-"""Hold expressions as a graph in which equal parts are one node, simplified where that is exact or nearly so.
+"""Hold expressions as a graph in which equal parts are one node, with simplifications that are exact or nearly so.
 
 A graph belongs to one model and grows in an order that the model's meaning decides alone, so that the code
 generated from it is the same in every process. Sums and products are brought into a form in which what needs
@@ -21,11 +21,11 @@ MAX_POWER = 64
 
 
 class GraphError(ValueError):
-    """The equations are too large."""
+    """Error: the equations are too large, or have a form that the engine cannot use."""
 
 
 class Node:
-    """A part of an expression.
+    """Node of an expression graph: a number, a symbol, or an operation on other nodes.
 
     Attributes
     ----------
@@ -48,7 +48,7 @@ class Node:
         self.op, self.args, self.value, self.kind, self.number = op, args, value, kind, number
 
     def is_number(self, value: float) -> bool:
-        """Tell whether the node is this number."""
+        """Return whether the node is this number."""
         return self.op == "number" and self.value == value
 
 
@@ -85,7 +85,7 @@ _AT_ZERO = {
 
 
 def _finite(function: Callable[[float, float], float], a: float, b: float) -> float:
-    """Value of a function of two numbers; raises `GraphError` if it is too large."""
+    """Return the value of a function of two numbers; raise `GraphError` if it is too large."""
     try:
         value = function(a, b)
     except OverflowError:
@@ -96,7 +96,7 @@ def _finite(function: Callable[[float, float], float], a: float, b: float) -> fl
 
 
 class Graph:
-    """Makes nodes; asks for the same part again return the same node."""
+    """Expression graph of one model: makes nodes, and returns the same node for equal expressions."""
 
     def __init__(self) -> None:
         self.nodes: list[Node] = []
@@ -108,7 +108,7 @@ class Graph:
         self.zero, self.one = self.number(0.0), self.number(1.0)
 
     def node(self, op: str, *args: Node, value: float = 0.0) -> Node:
-        """Return a node as it is asked for, without simplification."""
+        """Return the node of an operation on given nodes, without simplification."""
         key = (op, repr(value), *(a.number for a in args))
         found = self._known.get(key)
         if found is None:
@@ -121,17 +121,17 @@ class Graph:
         return found
 
     def number(self, value: float) -> Node:
-        """A number; -0.0 is 0.0."""
+        """Return the node of a number; -0.0 becomes 0.0."""
         return self.node("number", value=value + 0.0)
 
     def leaf(self, op: str, position: int = 0) -> Node:
-        """A parameter, a state, a rate, a mode, the time or the frequency."""
+        """Return the leaf node of a parameter, a state, a state's rate, a mode, the time or the frequency."""
         return self.node(op, value=position)
 
     # ---- sums ------------------------------------------------------------------------------------
 
     def add(self, *terms: Node) -> Node:
-        """Sum; what needs no state becomes one term of it, in which what needs no time is one."""
+        """Add nodes: first the terms without state and time, then those that depend on time alone, then the rest."""
         groups: tuple[list[Node], ...] = ([], [], [])
         for term in self._collected(terms):
             groups[term.kind].append(term)
@@ -141,7 +141,9 @@ class Graph:
         return self._sum(groups[STATED]) if groups[STATED] else self.zero
 
     def _collected(self, terms: Iterable[Node]) -> list[Node]:
-        """Add up numbers, and the factors of terms that differ by a number alone."""
+        """Combine the terms of a sum: add up numbers, and the coefficients of terms that differ only by a numerical
+        factor.
+        """
         total, factors = 0.0, {}  # type: ignore[var-annotated]
         for term in terms:
             factor, core = 1.0, term
@@ -165,19 +167,21 @@ class Graph:
         return self.node("add", *terms)
 
     def neg(self, x: Node) -> Node:
-        """Negative."""
+        """Return the negative of a node."""
         if x.op == "number":
             return self.number(-x.value)
         return x.args[0] if x.op == "neg" else self.node("neg", x)
 
     def sub(self, a: Node, b: Node) -> Node:
-        """Difference."""
+        """Return the difference of two nodes."""
         return self.add(a, self.neg(b))
 
     # ---- products --------------------------------------------------------------------------------
 
     def mul(self, *factors: Node) -> Node:
-        """Multiply nodes: first the factors that depend on the cell alone, then those on time alone, then the rest."""
+        """Multiply nodes: first the factors without state and time, then those that depend on time alone, then the
+        rest.
+        """
         total, negative, groups = 1.0, False, ([], [], [])  # type: ignore[var-annotated]
         pending = list(factors)[::-1]
         while pending:
@@ -202,7 +206,9 @@ class Graph:
         return self.neg(found) if negative else found
 
     def _chain(self, factors: list[Node]) -> Node:
-        """Join from the left; the order within does not matter, so that x*y is y*x."""
+        """Return the product of factors, joined from the left; factors of one kind are sorted, so that x*y and y*x are
+        one node.
+        """
         if len({f.kind for f in factors}) == 1:
             factors = sorted(factors, key=lambda f: (f.op != "number", f.number))
         found = factors[0]
@@ -211,7 +217,7 @@ class Graph:
         return found
 
     def div(self, a: Node, b: Node) -> Node:
-        """Divide nodes; a divisor that depends on the cell alone becomes a factor, its inverse."""
+        """Divide nodes; a divisor that depends on neither state nor time becomes a factor, its inverse."""
         if a.is_number(0.0) or b.is_number(1.0):
             return a
         if a.op == "number" and b.op == "number" and b.value != 0.0 and math.isfinite(a.value / b.value):
@@ -229,7 +235,7 @@ class Graph:
         return self.node("div", a, b)
 
     def power(self, base: Node, exponent: Node) -> Node:
-        """Power; whole ones and halves as products and roots."""
+        """Return a node for a power; whole and half-integer exponents become products and square roots."""
         if exponent.op == "number":
             twice = 2.0 * exponent.value
             if twice == math.floor(twice) and abs(twice) <= 2 * MAX_POWER:
@@ -261,7 +267,7 @@ class Graph:
     # ---- functions -------------------------------------------------------------------------------
 
     def call(self, function: str, *args: Node) -> Node:
-        """A function of `engine.simd` or `engine.vecmath`."""
+        """Return a node for the call of a function of `engine.simd` or `engine.vecmath`, simplified where possible."""
         first = args[0]
         if len(args) == 1 and first.op == "number":
             if first.value == 0.0 and function in _AT_ZERO:
@@ -280,7 +286,7 @@ class Graph:
         return self.node(function, *args)
 
     def where_less(self, a: Node, b: Node, yes: Node, no: Node) -> Node:
-        """`yes` where ``a < b``, else `no`."""
+        """Return a node with the value `yes` where ``a < b``, else `no`."""
         if yes is no:
             return yes
         if a is b:
@@ -290,7 +296,9 @@ class Graph:
         return self.node("less", a, b, yes, no)
 
     def choice(self, side: Node, yes: Node, no: Node) -> Node:
-        """`yes` where `side` is 1, `no` where it is -1, and between the two what lies between them."""
+        """Return a node with the value `yes` where `side` is 1, `no` where it is -1, and linearly interpolated in
+        between.
+        """
         if yes is no or side.is_number(1.0):
             return yes
         if side.is_number(-1.0):
@@ -316,7 +324,7 @@ def in_order(roots: Iterable[Node]) -> list[Node]:
 
 
 def substituted(graph: Graph, roots: list[Node], values: Mapping[Node, Node]) -> list[Node]:
-    """Return nodes in which others stand for some."""
+    """Return expressions in which some nodes are replaced by others."""
     known = {node.number: value for node, value in values.items()}
     for node in in_order(roots):
         if node.number not in known:
@@ -327,7 +335,7 @@ def substituted(graph: Graph, roots: list[Node], values: Mapping[Node, Node]) ->
 
 
 def made_again(graph: Graph, node: Node, args: tuple[Node, ...]) -> Node:
-    """Make a node with other arguments."""
+    """Make a node with the operation of a given node and other arguments."""
     if node.op == "add":
         return graph.add(*args)
     if node.op == "mul":

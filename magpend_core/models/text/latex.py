@@ -64,7 +64,7 @@ _SIGNS = {"<": "<", "<=": r"\le", ">": ">", ">=": r"\ge"}
 
 
 def latex_of(tree: Tree, symbols: Mapping[str, str]) -> str:
-    """LaTeX of an expression, without dollar signs.
+    """Return the LaTeX of an expression, without dollar signs.
 
     Parameters
     ----------
@@ -77,7 +77,7 @@ def latex_of(tree: Tree, symbols: Mapping[str, str]) -> str:
 
 
 def equations_of(definition: Definition) -> list[str]:
-    """Lines of LaTeX: definitions in the order of their need, then the rate of each state."""
+    """Return lines of LaTeX: the definitions that the equations use, then the time derivative of each state."""
     symbols = {s.name: s.symbol for s in definition.states if s.symbol}
     symbols |= {p.name: p.symbol for p in definition.parameters if p.symbol}
     used = definition.used(definition.dynamics)
@@ -93,7 +93,7 @@ def equations_of(definition: Definition) -> list[str]:
 
 
 def symbol_of(name: str, symbols: Mapping[str, str]) -> str:
-    """LaTeX of a name: its own symbol, a Greek letter, one letter, or a word upright, with an index."""
+    """Return the LaTeX of a name: its own symbol, a Greek letter, one letter or an upright word, with an index."""
     if name in symbols:
         return symbols[name]
     head, _, index = name.partition("_")
@@ -104,12 +104,12 @@ def symbol_of(name: str, symbols: Mapping[str, str]) -> str:
 
 
 def _upright(word: str) -> str:
-    """A word of several letters upright; one letter stands as a variable."""
+    """Return the LaTeX of a word: several letters upright, one letter as a variable."""
     return word if len(word) == 1 else rf"\mathrm{{{word}}}"
 
 
 def _written(tree: Tree, symbols: Mapping[str, str]) -> tuple[str, int]:
-    """LaTeX, and how strongly its outermost sign binds."""
+    """Return the LaTeX of an expression, and how strongly its outermost operator binds."""
     if tree.kind == "number":
         return _number(float(tree.value))
     if tree.kind == "name":
@@ -135,7 +135,7 @@ def _written(tree: Tree, symbols: Mapping[str, str]) -> tuple[str, int]:
 
 
 def _in(tree: Tree, symbols: Mapping[str, str], least: int) -> str:
-    """LaTeX of a part, in brackets if it binds less than it must."""
+    """Return the LaTeX of a subexpression, in brackets if its outermost operator binds more weakly than `least`."""
     text, binds = _written(tree, symbols)
     return text if binds >= least else rf"\left({text}\right)"
 

@@ -1,4 +1,4 @@
-"""Find where equations are steep, with the nearest complex singularity and the jump.
+"""Find steep functions in a model's equations, with their nearest complex singularity and the jump across.
 
 A step that crosses such a place must be in proportion to the distance from the singularity (see
 `engine.lanes.choose_step`). Places on the state are *layers*, places in time alone are *edges*.
@@ -30,7 +30,7 @@ GENERIC = (0.37, -0.59, 0.83, -0.21, 0.67, -0.43)
 
 @dataclass(frozen=True)
 class Steep:
-    """A place at which equations are steep.
+    """A place at which a model's equations are steep, with its half-width and the jump of the rates across it.
 
     Attributes
     ----------
@@ -55,7 +55,9 @@ class Steep:
 
 @dataclass(frozen=True)
 class Place:
-    """A steep function before it is known what hangs on it: singularity and change in units of `argument`."""
+    """A steep function of `argument`: its singularity's distance from 0 in units of the argument, and its change
+    across.
+    """
 
     argument: Node
     distance: Node
@@ -64,7 +66,7 @@ class Place:
 
 
 def steep_places(graph: Graph, rates: tuple[Node, ...], scales: tuple[float, ...]) -> list[Steep]:
-    """Find all steep places of the rates; each function once.
+    """Find the steep functions in the rates, each once, with half-width and jump.
 
     Parameters
     ----------
@@ -92,7 +94,7 @@ def steep_places(graph: Graph, rates: tuple[Node, ...], scales: tuple[float, ...
 
 
 def place_of(graph: Graph, node: Node) -> Place | None:
-    """Recognise a steep function."""
+    """Return the singularity and change of a steep function, such as atan or tanh; None for any other node."""
     if node.op == "atan":
         return Place(node.args[0], graph.one, graph.number(math.pi), "atan")
     if node.op == "tanh":
@@ -103,7 +105,7 @@ def place_of(graph: Graph, node: Node) -> Place | None:
 
 
 def _logistic(graph: Graph, node: Node) -> Place | None:
-    """A quotient by 1 + exp(w)."""
+    """Return the singularity and change of a quotient by 1 + exp(w); None for another quotient."""
     above, below = node.args
     if below.op != "add" or len(below.args) != 2 or not any(a.is_number(1.0) for a in below.args):
         return None
@@ -112,7 +114,7 @@ def _logistic(graph: Graph, node: Node) -> Place | None:
 
 
 def _smoothed_sign(graph: Graph, node: Node) -> Place | None:
-    """The quotient u/sqrt(u**2 + e**2)."""
+    """Return the singularity and change of a quotient u/sqrt(u**2 + e**2); None for another quotient."""
     above, below = node.args
     if below.op != "sqrt" or below.args[0].op != "add" or len(below.args[0].args) != 2:
         return None
@@ -124,7 +126,7 @@ def _smoothed_sign(graph: Graph, node: Node) -> Place | None:
 
 
 def core_of(graph: Graph, node: Node) -> tuple[Node, Node]:
-    """Return the size of a constant factor of a product, and the rest."""
+    """Split a product into the absolute value of its constant factor, and the rest."""
     if node.op == "neg":
         node = node.args[0]
     if node.op == "mul" and node.args[0].kind == CONSTANT:
@@ -133,7 +135,7 @@ def core_of(graph: Graph, node: Node) -> tuple[Node, Node]:
 
 
 def _jump(graph: Graph, changes: list[Node], scales: tuple[float, ...]) -> Node | None:
-    """Size of the largest change; estimated at two states if its expression is a long one."""
+    """Return the size of the largest of some changes; long expressions are only evaluated at two states."""
     changes = [graph.call("absolute", c) for c in changes if not c.is_number(0.0)]
     if not changes:
         return None
@@ -151,7 +153,7 @@ def _jump(graph: Graph, changes: list[Node], scales: tuple[float, ...]) -> Node 
 
 
 def largest(graph: Graph, nodes: list[Node]) -> Node:
-    """Return the largest of some numbers; a NaN is ignored unless it is the last."""
+    """Return an expression for the largest of some expressions; a NaN is ignored unless it is the last."""
     found = nodes[0]
     for node in nodes[1:]:
         if not node.is_number(0.0):
@@ -168,7 +170,7 @@ def _scale(leaf: Node, scales: tuple[float, ...]) -> float:
 
 
 def keeps_sign(graph: Graph, node: Node) -> bool:
-    """Tell whether a number cannot pass zero, judged by its form."""
+    """Return whether an expression cannot pass zero, judged by its form alone."""
     return _above_zero(graph, node.args[0] if node.op == "neg" else node)
 
 

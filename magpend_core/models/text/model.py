@@ -1,4 +1,4 @@
-"""Define the models that are read from text."""
+"""Define the class of the models that are given as text."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ SOURCES = tuple(
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TextModel(Model):
-    """A model whose system is derived from its text when it is first needed.
+    """A model given as text; its system for the engine is derived when it is first needed.
 
     Attributes
     ----------
@@ -59,7 +59,7 @@ class TextModel(Model):
 
     @cached_property
     def remarks(self) -> tuple[str, ...]:
-        """Sentences on parameters and definitions that nothing uses."""
+        """Warnings about parameters and definitions that no expression uses."""
         return tuple(self.definition.remarks())
 
     @cached_property
@@ -78,12 +78,12 @@ class TextModel(Model):
 
     @cached_property
     def source(self) -> Source:
-        """The engine's functions, as text."""
+        """Generated source code of the engine's functions."""
         return source_of(self.derived)
 
     @cached_property
     def digest(self) -> str:
-        """Digest of the text's normal form and of the code that makes a system of it."""
+        """Digest of the text's normal form and of the code that makes the engine's system from it."""
         from magpend_core.source_digests import meaning_digest
 
         # the source, too: what is found at the default parameters, edges say, is in it
@@ -92,14 +92,14 @@ class TextModel(Model):
 
     @cached_property
     def system(self) -> System:
-        """Return the system for the engine; imports the compiler."""
+        """Return the system that the engine integrates; imports the compiler."""
         from magpend_core.models.text.compiled import system_of
 
         return system_of(self.definition, self.derived, self.source)
 
 
 def model_of(definition: Definition, shipped: bool = False) -> TextModel:
-    """Make a model from the definition of a text."""
+    """Make a model from the validated definition of a model's text."""
     section = "" if definition.autonomous else "the start of the drive's period"
     return TextModel(
         name=definition.name,

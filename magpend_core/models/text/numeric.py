@@ -1,4 +1,4 @@
-"""Evaluate expressions by numpy as they were written: no compiler, no derivation.
+"""Evaluate expressions with numpy, as they were written, without compiling or deriving anything.
 
 What opening and drawing a run need of a model; and what derived and compiled functions are checked against.
 """
@@ -73,7 +73,7 @@ _JOIN: dict[str, Callable[..., Any]] = {
 
 
 def value_of(tree: Tree, names: Mapping[str, Any]) -> Any:
-    """Value of an expression.
+    """Compute the value of a parsed expression for given values of its names.
 
     Parameters
     ----------
@@ -107,7 +107,7 @@ def _value(tree: Tree, names: Mapping[str, Any]) -> Any:
 
 
 def _product(tree: Tree, names: Mapping[str, Any]) -> Any:
-    """Multiply and divide in the order of the text."""
+    """Compute a product, with multiplications and divisions in the order of the text."""
     value = _value(tree.args[0], names)
     for part in tree.args[1:]:
         if part.kind == "inverse":
@@ -135,7 +135,7 @@ _NODES: dict[str, Callable[..., Any]] = {
 
 
 def node_values(roots: Sequence[Node], leaves: Mapping[int, Any]) -> list[Any]:
-    """Values of nodes of a graph.
+    """Compute the values of nodes of an expression graph.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Read the tables of a model: check names and expressions, and report all problems at once.
+"""Read the tables of a model given as text: check names and expressions, and report all problems at once.
 
 Needs nothing but numpy; takes milliseconds, whatever is given.
 """
@@ -58,7 +58,7 @@ _OF_RUNS = (
 
 
 def read_definition(table: Any, place: str = "model") -> tuple[Definition | None, list[str]]:
-    """Read the tables of a model.
+    """Read the tables of a model given as text; return its definition (None if there are problems) and the problems.
 
     Parameters
     ----------
@@ -86,7 +86,7 @@ def read_definition(table: Any, place: str = "model") -> tuple[Definition | None
 
 
 class _Reading(ViewsReader):
-    """One pass through the tables of a model."""
+    """Reader that goes once through the tables of a model given as text."""
 
     def definition(self, given: Any) -> Definition | None:
         table = self.table(given, self.place, len(KEYS) + 20, "keys")
@@ -144,7 +144,7 @@ class _Reading(ViewsReader):
         return True
 
     def _entry(self, value: Any, place: str, keys: tuple[str, ...], short: str) -> dict[str, Any]:
-        """Return a table; a plain value stands for its key `short`."""
+        """Return a table entry as a table; a plain value becomes the value of the key `short`."""
         if not isinstance(value, Mapping):
             return {short: value}
         entry = self.table(value, place, 20, "keys")
@@ -275,7 +275,7 @@ class _Reading(ViewsReader):
 
 
 def _circle(define: Mapping[str, Tree]) -> list[str]:
-    """Names of a definition that needs itself, from one to the next and back; empty if there is none."""
+    """Return the names along a circular definition, the first one again at the end; empty if there is none."""
     complete: set[str] = set()
     for first in define:
         path: list[str] = []
@@ -295,14 +295,14 @@ def _circle(define: Mapping[str, Tree]) -> list[str]:
 
 
 def _with_rate(state: State, tree: Tree | None, states: Iterable[str]) -> State:
-    """Note which state is the rate of another: its equation says nothing else."""
+    """Return a state with its `rate` set to another state, if its equation is the name of that state alone."""
     if tree is None or tree.kind != "name" or str(tree.value) not in states or tree.value == state.name:
         return state
     return State(**{**vars(state), "rate": str(tree.value)})
 
 
 def _plain(value: Any) -> Any:
-    """Return tables and lists with only texts and numbers, as in JSON."""
+    """Return nested tables and lists as plain dicts with text keys and lists, as in JSON."""
     if isinstance(value, Mapping):
         return {str(key): _plain(inner) for key, inner in value.items()}
     if isinstance(value, (list, tuple)):

@@ -1,4 +1,4 @@
-"""Sort the instants of a period, for generated functions. Plain numbers."""
+"""Sort the edge times of a drive period; functions of plain numbers that generated code calls."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from magpend_core.engine.jit import inline
 
 @inline
 def rank(at: Any, i: int) -> int:
-    """Place of instant number `i` among all, from 0; of two at the same time the first comes first."""
+    """Return the rank of instant number `i` among all, from 0; of two at the same time the first comes first."""
     place = 0
     for j in range(len(at)):
         if at[j] < at[i] or (at[j] == at[i] and j < i):
@@ -19,7 +19,7 @@ def rank(at: Any, i: int) -> int:
 
 @inline
 def set_times(at: Any, period: float, times: Any) -> None:
-    """Write instants in [0, period) in their order, each a little after the one before."""
+    """Write the instants of a period to `times` in rising order, each at least a little after the one before."""
     for i in range(len(at)):
         times[rank(at, i)] = at[i]
     gap = 1e-12 * period
@@ -33,6 +33,6 @@ def set_times(at: Any, period: float, times: Any) -> None:
 
 @inline
 def within(time: float, period: float) -> float:
-    """An instant brought into [0, period); what lies next to an end counts as 0."""
+    """Return an instant of a period unchanged, or 0 if it lies next to either end of the period."""
     near = 1e-9 * period
     return 0.0 if time < near or time > period - near else time

@@ -22,7 +22,7 @@ ROUGHLY = 0.05
 
 
 def values_of(definition: Definition, trees: Iterable[Tree], given: Mapping[str, Any]) -> list[Any]:
-    """Values of expressions through their definitions.
+    """Compute the values of expressions, and of the definitions that they use.
 
     Parameters
     ----------
@@ -44,14 +44,14 @@ def values_of(definition: Definition, trees: Iterable[Tree], given: Mapping[str,
 
 
 def by_name(definition: Definition, states: Any, parameters: Mapping[str, Any]) -> dict[str, Any]:
-    """States, shape (..., n_states), and parameters by name."""
+    """Return a dict with the values of the states, shape (..., n_states), and of the parameters by name."""
     states = np.asarray(states, np.float64)
     own = {s.name: states[..., i] for i, s in enumerate(definition.states)}
     return {**own, **{p.name: parameters[p.name] for p in definition.parameters if p.name in parameters}}
 
 
 def drawing_of(definition: Definition) -> Drawing | None:
-    """The drawing of a text."""
+    """Return a text's drawing as functions of states and parameters; None if the text has no drawing."""
     text = definition.drawing
     if text is None:
         return None
@@ -81,7 +81,7 @@ Classify = Callable[[np.ndarray, np.ndarray, np.ndarray, Mapping[str, Any]], np.
 
 
 def classifier_of(definition: Definition) -> Classifier | None:
-    """The classifier of a text: the first word whose condition all kept sections meet."""
+    """Return a text's classifier of motions: a motion gets the first word whose condition all stored sections meet."""
     text = definition.classifier
     if text is None:
         return None
@@ -103,7 +103,8 @@ def classifier_of(definition: Definition) -> Classifier | None:
 
 
 def mirror_problem(definition: Definition) -> str | None:
-    """Say which equation does not have the symmetry that a text claims, at the values of its parameters.
+    """Return a sentence on an equation that lacks the symmetry declared in the text, at the default parameters, or
+    None.
 
     Rates at a few states are compared with those at their images; a symmetry may hold nearly, as that of a
     square wave with a duty cycle next to one half does.
@@ -132,7 +133,7 @@ def mirror_problem(definition: Definition) -> str | None:
 
 
 def _rates(definition: Definition, states: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """Rates at states (n, n_states) and times in periods of 1 s, the shape of `states`."""
+    """Compute the rates at states (n, n_states) and times (n,), with drive periods of 1 s; returns (n, n_states)."""
     given = {**by_name(definition, states, definition.presets[0].values), "t": times, "f": 1.0}
     values = values_of(definition, definition.equations.values(), given)
     return np.stack([np.broadcast_to(np.asarray(v, np.float64), times.shape) for v in values], axis=1)

@@ -1,4 +1,4 @@
-"""Describe the side of a switching surface: the mode of the engine, or Filippov's equivalent on the surface.
+"""Derive sliding on switching surfaces: on a surface, Filippov's equivalent control replaces the sign of its side.
 
 Where the motions of both sides point to the surface, the state stays on it. What then stands for the side is
 the number sigma in [-1, 1] for which the surface's value does not change: with the rate of that value, r(s),
@@ -23,7 +23,7 @@ MAX_JOINT = 3
 
 @dataclass(frozen=True)
 class Sliding:
-    """The source code for sides in the engine's functions.
+    """Expressions that replace the sides of switching surfaces in the engine's functions, including sliding.
 
     Attributes
     ----------
@@ -42,12 +42,12 @@ class Sliding:
     pairs: tuple[tuple[Node, Node], ...]
 
     def lowered(self, roots: Iterable[Node]) -> list[Node]:
-        """Return nodes in which sides are written with modes."""
+        """Return expressions in which each side is replaced by its mode or its equivalent control."""
         return _spelled(self.graph, substituted(self.graph, list(roots), self.effective))
 
 
 def sliding_of(graph: Graph, rates: Sequence[Node], switches: Sequence[Switch]) -> Sliding:
-    """Find which surfaces a state can slide on, and what stands for their sides.
+    """Find the surfaces on which a state can slide, and the expression that replaces each side there.
 
     Parameters
     ----------
@@ -81,7 +81,7 @@ def sliding_of(graph: Graph, rates: Sequence[Node], switches: Sequence[Switch]) 
 
 
 def _spelled(graph: Graph, roots: list[Node]) -> list[Node]:
-    """Write choices as comparisons; in between only where a side can be that."""
+    """Write `choice` nodes as comparisons; interpolate only where a side can lie between -1 and 1."""
     known: dict[int, Node] = {}
     for node in in_order(roots):
         args = tuple(known[a.number] for a in node.args)
@@ -109,21 +109,21 @@ def _while_sliding(graph: Graph, mode: Node, sliding: Node, else_: Node) -> Node
 
 
 def _speed(graph: Graph, value: Node, rates: Sequence[Node]) -> Node:
-    """Return the rate of an expression along the motion."""
+    """Return the time derivative of an expression along the motion."""
     seeds = {n: rates[int(n.value)] for n in in_order([value]) if n.op == "state"}
     (found,) = derivatives(graph, (value,), {**seeds, graph.leaf("time"): graph.one})
     return found
 
 
 def _along(graph: Graph, value: Node) -> Node:
-    """Rate of an expression, with the states' rates as leaves."""
+    """Return the time derivative of an expression, in terms of the states' time derivatives as symbols."""
     seeds = {n: graph.leaf("rate", int(n.value)) for n in in_order([value]) if n.op == "state"}
     (found,) = derivatives(graph, (value,), {**seeds, graph.leaf("time"): graph.one})
     return found
 
 
 def _pull(graph: Graph, speed: Node, side: Node) -> Node:
-    """Half the difference that a side makes."""
+    """Return half the difference in `speed` between the two sides of a surface."""
     (slope,) = derivatives(graph, (speed,), {side: graph.one})
     if side not in in_order([slope]):
         return slope
@@ -139,7 +139,7 @@ def _solved(
     switches: Sequence[Switch],
     modes: Sequence[Node],
 ) -> list[Node]:
-    """Return the expression for each side on its surface; its mode for surfaces without sliding."""
+    """Return an expression for the equivalent control of each surface; for surfaces without sliding, their mode."""
     zeros = {s.side: graph.zero for s in switches}
     found = []
     for k in range(len(switches)):
@@ -161,7 +161,7 @@ def _solved(
 
 
 def _quotient(graph: Graph, top: Node, bottom: Node) -> Node:
-    """A quotient whose divisor is the difference that a side makes.
+    """Return a quotient, with 1 as divisor where the given divisor is 0.
 
     Where that is 0, as of friction without a coefficient, no state stays on the surface: any number will do.
     """
@@ -178,7 +178,9 @@ def _joint(
     modes: Sequence[Node],
     zeros: Mapping[Node, Node],
 ) -> Node:
-    """Return the equivalent of side k while the state may also slide on surface j, from two linear equations."""
+    """Return the equivalent control of surface k while the state may also slide on surface j, from two linear
+    equations.
+    """
     rest_k, rest_j, kk, kj, jk, jj = substituted(
         graph, [speeds[k], speeds[j], pulls[k][k], pulls[k][j], pulls[j][k], pulls[j][j]], zeros
     )

@@ -1,4 +1,4 @@
-"""Find corners and jumps of equations: ``sign``, ``abs``, ``min``, ``max``, ``where`` and ``square``.
+"""Find corners and jumps of a model's equations: ``sign``, ``abs``, ``min``, ``max``, ``where`` and ``square``.
 
 Each is smooth between the places at which an expression passes zero, so it is written with the *side* on
 which that expression is: +1 or -1, a number that changes at these places alone and is the same throughout a
@@ -34,7 +34,7 @@ MAX_WAVES = 16
 
 @dataclass
 class Switch:
-    """A surface on which equations have a corner or a jump.
+    """A switching surface, on which the equations have a corner or a jump.
 
     Attributes
     ----------
@@ -59,7 +59,7 @@ class Switch:
 
 @dataclass
 class Instant:
-    """An instant of each period at which something jumps.
+    """An instant of each drive period at which the right-hand side jumps.
 
     Attributes
     ----------
@@ -75,7 +75,7 @@ class Instant:
 
 @dataclass
 class Sides:
-    """A rewriter of expressions with sides, which collects the surfaces and modes that they use.
+    """Rewriter of expressions: it replaces corners and jumps by the sign of an expression, and collects the surfaces.
 
     Attributes
     ----------
@@ -96,7 +96,7 @@ class Sides:
     _surface: dict[int, Node] = field(default_factory=dict)
 
     def rewritten(self, roots: Iterable[Node], *, more: bool = True) -> list[Node]:
-        """Return nodes in which sides stand for corners and jumps.
+        """Return expressions in which the signs of other expressions replace corners and jumps.
 
         Parameters
         ----------
@@ -116,7 +116,7 @@ class Sides:
         return [known[root.number] for root in roots]
 
     def _as_surface(self, node: Node, rewritten: Node) -> Node:
-        """Return a node in the form for surface values: known edges put in, modes left out.
+        """Return a node in the form for the value of a surface: with known edges, but without modes.
 
         Engines find out on which sides a start is one after the other, so that none may need another.
         """
@@ -128,7 +128,9 @@ class Sides:
         return node if same else made_again(self.graph, node, args)
 
     def _smooth(self, node: Node, args: tuple[Node, ...], more: bool) -> Node:
-        """Return a node with arguments that have been rewritten; with a side, if it has a corner."""
+        """Return a node with rewritten arguments; a function with a corner or jump is written with the sign of an
+        expression.
+        """
         g = self.graph
         same = all(a is b for a, b in zip(args, node.args, strict=True))
         plain = node if same else made_again(g, node, args)
@@ -153,7 +155,7 @@ class Sides:
     def side(
         self, value: Node, rewritten: Node, jumps: bool, more: bool = True, written: Node | None = None
     ) -> Node | None:
-        """Return what stands for the sign of an expression; None if nothing can."""
+        """Return a node for the sign of an expression; None if there is none."""
         g = self.graph
         if value.op == "neg":
             inner = self.side(value.args[0], g.neg(rewritten), jumps, more, written)
@@ -184,7 +186,9 @@ class Sides:
         return switch.side if jumps else switch.mode
 
     def _in_time(self, value: Node) -> Node | None:
-        """The sign of a + b t with constant a and b: it changes once in a period, or not at all."""
+        """Return the sign of a + b t, with constant a and b, as a jump at a known instant; None for another
+        expression.
+        """
         g, time = self.graph, self.graph.leaf("time")
         if any(n.op in CORNERED or n.op == "segment" for n in in_order([value])):
             return None
@@ -207,7 +211,7 @@ class Sides:
         return self._after(instant, inside(g.neg(after), middle), inside(after, middle))
 
     def break_at_start(self) -> None:
-        """Let something jump where a period begins."""
+        """Add the start of the period to the instants at which the right-hand side may jump."""
         self._instant(self.graph.zero)
 
     def _instant(self, time: Node) -> Instant:
@@ -220,12 +224,12 @@ class Sides:
         return self.instants[-1]
 
     def _after(self, instant: Instant, before: Node, after: Node) -> Node:
-        """A number that changes at an instant."""
+        """Return an expression that changes from `before` to `after` at an instant of the period."""
         g = self.graph
         return g.where_less(g.leaf("segment"), g.sub(instant.rank, g.number(0.5)), before, after)
 
     def _square(self, node: Node, more: bool) -> Node | None:
-        """A square wave of n t f + a: its edges are known beforehand for a whole number n."""
+        """Return a square wave of n t f + a as jumps at known instants if n is a whole number, else None."""
         g = self.graph
         phase, duty = node.args
         (slope,) = derivatives(g, (phase,), {g.leaf("time"): g.one})
@@ -256,7 +260,7 @@ class Sides:
 
 
 def _moves(rewritten: Node) -> bool:
-    """Whether an expression changes between its jumps."""
+    """Return whether an expression changes between its jumps."""
     moves: dict[int, bool] = {}
     for node in in_order([rewritten]):
         if node.op in ("square", "sign", "floor"):
@@ -268,7 +272,7 @@ def _moves(rewritten: Node) -> bool:
 
 
 def _plain(value: Node, written: Node) -> Node | None:
-    """The expression as it was written, if that is not the value of the surface."""
+    """Return the expression as it was written if it differs from the value of the surface, else None."""
     return None if value is written else written
 
 
@@ -277,7 +281,7 @@ def _at_time_zero(graph: Graph, node: Node) -> list[Node]:
 
 
 def _multiple_of(slope: Node, frequency: Node) -> int | None:
-    """The whole number that a slope is times the frequency."""
+    """Return the whole number n if a slope is n times the drive frequency, else None."""
     if slope is frequency:
         return 1
     if slope.op == "mul" and slope.args[0].op == "number" and slope.args[1] is frequency:

@@ -1,4 +1,4 @@
-"""Read tables of text and numbers, and report all their problems at once, each with its place."""
+"""Read tables of text and numbers, and report all their problems at once, each with the path of its key."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SHOWN = 60
 
 
 def shown(value: object, around: int = 1) -> str:
-    """A value as a sentence repeats it: its part next to a character, if it is long."""
+    """Return a value as an error message quotes it: of a long one only the part around one character."""
     text = " ".join(value.split()) if isinstance(value, str) else repr(value)
     if len(text) > SHOWN:
         begin = max(0, min(around - 1 - SHOWN // 2, len(text) - SHOWN))
@@ -36,11 +36,11 @@ class Reader:
         self.problems: list[str] = []
 
     def report(self, place: str, sentence: str) -> None:
-        """Note a problem."""
+        """Append a problem to `problems`, with the path of its key."""
         self.problems.append(f"{place}: {sentence}")
 
     def table(self, value: Any, place: str, most: int, what: str = "entries") -> dict[str, Any]:
-        """Return a table; {} if it is none, without keys that are no text."""
+        """Return a value if it is a table, without keys that are not text; else report it and return {}."""
         if not isinstance(value, Mapping):
             self.report(place, f"{shown(value)} must be a table; write {place.rpartition('.')[2]} = {{ ... }}.")
             return {}
@@ -53,14 +53,14 @@ class Reader:
         return {key: value[key] for key in value if isinstance(key, str)}
 
     def keys(self, table: Mapping[str, Any], place: str, known: Iterable[str]) -> None:
-        """Report keys that do not belong there."""
+        """Report the keys of a table that are not among the known ones."""
         known = tuple(known)
         for key in table:
             if key not in known:
                 self.report(f"{place}.{key[:SHOWN]}", f"is no key here; {near_names(key[:SHOWN], known, 'keys')}")
 
     def text(self, table: Mapping[str, Any], key: str, place: str, default: str = "") -> str:
-        """Return a phrase."""
+        """Return a table's value if it is a text that is not too long; else report it and return `default`."""
         value = table.get(key, default)
         if not isinstance(value, str):
             self.report(f"{place}.{key}", f"{shown(value)} must be a text in quotes.")
@@ -71,14 +71,14 @@ class Reader:
         return value
 
     def flag(self, table: Mapping[str, Any], key: str, place: str) -> bool:
-        """Return true or false."""
+        """Return a table's value if it is true or false; else report it and return false."""
         value = table.get(key, False)
         if not isinstance(value, bool):
             self.report(f"{place}.{key}", f"{shown(value)} must be true or false.")
         return value is True
 
     def number(self, value: Any, place: str, default: float = 0.0) -> float:
-        """Return a finite number."""
+        """Return a value if it is a finite number; else report it and return `default`."""
         if isinstance(value, bool) or not isinstance(value, (int, float)):
             self.report(place, f"{shown(value)} must be a number.")
             return default
@@ -88,7 +88,7 @@ class Reader:
         return float(value)
 
     def positive(self, table: Mapping[str, Any], key: str, place: str, default: float) -> float:
-        """Return a number above 0, or infinity."""
+        """Return a table's value if it is a number above 0 or infinity; else report it and return `default`."""
         value = table.get(key, default)
         if isinstance(value, float) and value == math.inf:
             return value
@@ -99,7 +99,9 @@ class Reader:
         return number
 
     def name(self, value: Any, place: str, taken: Mapping[str, str]) -> bool:
-        """Check a name that is given here; `taken` says what each name means already."""
+        """Return whether a new name is allowed; report the problem if not. `taken` maps the names in use to their
+        meaning.
+        """
         problem = name_problem(value)
         if problem is None and value in taken:
             problem = f"is the name of a {taken[value]} already; choose another"
@@ -108,11 +110,11 @@ class Reader:
         return problem is None
 
     def expression(self, value: Any, place: str, known: Mapping[str, str]) -> Tree | None:
-        """Return an expression of known names, or None."""
+        """Parse an expression that uses only known names; report problems and return None for any other value."""
         return self._tree(value, place, known, parse)
 
     def condition(self, value: Any, place: str, known: Mapping[str, str]) -> Tree | None:
-        """Return a condition of known names, or None."""
+        """Parse a condition that uses only known names; report problems and return None for any other value."""
         return self._tree(value, place, known, parse_condition)
 
     def _tree(self, value: Any, place: str, known: Mapping[str, str], read: Callable[[Any], Tree]) -> Tree | None:

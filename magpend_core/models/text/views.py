@@ -1,4 +1,4 @@
-"""Read a text's other tables: drawing, mirror, motion labels, presets."""
+"""Read the optional tables of a model given as text: drawing, mirror symmetry, classes of motion, presets."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ DEFAULT_PRESET = "default"
 
 
 class ViewsReader(Reader):
-    """Reads tables below `place`; `known` says what each name means."""
+    """Reader of tables whose paths begin with `place`; `known` maps each name to its meaning."""
 
     def __init__(self, place: str) -> None:
         super().__init__()

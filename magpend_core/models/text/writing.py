@@ -1,4 +1,4 @@
-"""Write expression trees as text in one canonical way, so that texts which mean the same are spelled the same."""
+"""Write expression trees as text in one canonical form, the same for texts that differ only in spaces and brackets."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from magpend_core.models.text.grammar import Tree
 
 
 def written(tree: Tree) -> str:
-    """Write a tree as text in one way, which reads back to the same tree: spaces and brackets are gone."""
+    """Write an expression tree as text in one canonical form, which parses to the same tree."""
     return _WRITE[tree.kind](tree, [written(arg) for arg in tree.args])
 
 

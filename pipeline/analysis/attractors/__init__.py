@@ -1,1 +1,1 @@
-"""Find coexisting attractors, describe them, and follow them along the axes."""
+"""Find coexisting attractors, describe them, and follow them along the swept parameters."""

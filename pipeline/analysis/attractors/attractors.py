@@ -1,4 +1,5 @@
-"""Find the attractors at every parameter point, test whether they attract, and follow them along the sweep.
+"""Find the sets on which trajectories end at every parameter point, test whether they attract, and follow them along
+the sweep.
 
     ds = pipeline.open_run(directory)
     found = identify(ds)                 # integrates: Newton's method, and samples of what has not settled
@@ -143,7 +144,7 @@ def identify(
     block_bytes: int = BUDGET,
     **changes: Any,
 ) -> xr.Dataset:
-    """Find the attractors at each parameter point of a cube and assign the cells to them.
+    """Find the attractors at each parameter point of a cube and assign each trajectory (cell) to one of them.
 
     Parameters
     ----------
@@ -211,7 +212,7 @@ def _flags(words: str) -> dict[str, Any]:
 
 
 def _dataset(ds: xr.Dataset, found: Mapping[tuple[int, ...], Found], search: Search) -> xr.Dataset:
-    """Build the result of `identify` in the schema of this module."""
+    """Build the Dataset that `identify` returns; the text of this module lists its variables."""
     dims, start_dims = split_dims(ds["status"])
     shape = tuple(ds.sizes[d] for d in dims)
     table = _filled(ds, dims, shape, found, search)
@@ -249,7 +250,7 @@ def _filled(
     found: Mapping[tuple[int, ...], Found],
     search: Search,
 ) -> _Table:
-    """Fill the table of the attractors of all parameter points."""
+    """Build the output table and fill it with the attractors of all parameter points."""
     n = max((len(f.features) for f in found.values()), default=0)
     longest = max((len(x.points) for f in found.values() for x in f.features), default=0)
     n_states = ds.sizes["state"]
@@ -271,7 +272,7 @@ def _filled(
 
 
 def _with_exponents(result: xr.Dataset, ds: xr.Dataset) -> xr.Dataset:
-    """Copy the largest Lyapunov exponent from the cube, if it has one, to the sets that do not close."""
+    """Take the largest Lyapunov exponent of each non-periodic set from its trajectories, if the cube has exponents."""
     if "lyapunov" not in ds:
         return result
     dims, signs = result["attractor_id"].dims, ChaosOptions()
@@ -348,7 +349,7 @@ _ELSEWHERE = (
 
 
 def _names(dynamics: Dynamics) -> list[str]:
-    """Names of the variables, without those that the model cannot provide."""
+    """Return the names of the output variables, without those that the model cannot provide."""
     model = dynamics.model
     has_energy = model is not None and any(q.name == ENERGY for q in model.quantities)
     left_out = {
@@ -362,7 +363,7 @@ def _names(dynamics: Dynamics) -> list[str]:
 
 
 class _Table:
-    """Arrays of the variables per attractor."""
+    """Arrays of the output variables, with an entry per parameter point and attractor."""
 
     def __init__(
         self, dims: tuple[str, ...], shape: tuple[int, ...], n: int, sizes: Mapping[str, int], dynamics: Dynamics
@@ -376,7 +377,7 @@ class _Table:
             self.arrays[name] = np.full((*shape, n, *(sizes[d] for d in own)), fill, dtype)
 
     def fill(self, at: tuple[int, ...], x: Features, n_cells: int) -> None:
-        """Write the features of one set into the arrays."""
+        """Write the features of one attractor (or other set on which trajectories end) into the arrays."""
         arrays = self.arrays
         arrays["n_cells"][at] = n_cells
         if x.n_to is not None:
@@ -392,7 +393,9 @@ class _Table:
             arrays[name][at] = getattr(x, name)
 
     def share(self, index: tuple[int, ...], one: Found) -> None:
-        """Write the shares of a point's attractors among its cells that attract or diverge."""
+        """Write each attractor's share of the trajectories at a parameter point, among those that reach an attractor or
+        diverge.
+        """
         counts = np.array(one.counts, np.int64)
         attracts = np.array([x.stability == ATTRACTS for x in one.features], bool)
         total = int(counts[attracts].sum()) + self.n_diverged[index] + int((one.decision == DIVERGES).sum())

@@ -1,4 +1,4 @@
-"""Tabulate the jumps and loops of a hysteresis."""
+"""Tabulate hysteresis loops and the jumps between attractors."""
 
 from __future__ import annotations
 
@@ -10,7 +10,9 @@ from pipeline.products.product import Table
 
 
 def hysteresis_table(ds: xr.Dataset) -> Table:
-    """Return a row per kind of jump, with ids and path values before and after; lines also describe the loops."""
+    """Return a row per kind of jump: attractor ids and parameter values before and after; text lines also describe the
+    loops.
+    """
     names = ("jump_from", "jump_to", "jump_from_id", "jump_to_id", "jump_count")
     jumps = [ds.isel(jump=i) for i in range(ds.sizes["jump"])]
     rows = [
@@ -51,5 +53,5 @@ def _loop_words(loop: xr.Dataset, unit: str) -> Words:
 
 
 def _met(counts: np.ndarray) -> str:
-    """Format the attractors that were met, with the numbers of points."""
+    """Format the ids of the attractors that were met, each with the number of parameter points."""
     return ", ".join(f"{i} ({counted(counts[i], 'point')})" for i in np.flatnonzero(counts)) or "-"

@@ -16,7 +16,7 @@ def identified(run: Run, options: IdentifyOptions) -> xr.Dataset:
 
 
 def attractors(run: Run, options: AttractorOptions) -> xr.Dataset:
-    """Find the attractors of a run and give them ids that follow them along its axes."""
+    """Find the attractors of a run and give them ids that follow them along the swept parameters."""
     from pipeline.analysis.attractors.attractors import match
 
     found = run.derive("identified", **options.part(IdentifyOptions))

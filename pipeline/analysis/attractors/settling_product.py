@@ -1,4 +1,6 @@
-"""Select the settling data of a run's attractors, as an analysis (`pipeline.products.attractors`)."""
+"""Select the data that show whether a run's non-periodic sets are transient, as an analysis
+(`pipeline.products.attractors`).
+"""
 
 from __future__ import annotations
 
@@ -31,6 +33,6 @@ VARIABLES = (
 
 
 def settling(run: Run, options: AttractorOptions) -> xr.Dataset:
-    """Return the evidence on whether each set that does not close is transient or attracts."""
+    """Return the evidence on whether each non-periodic set is transient or attracts."""
     found: xr.Dataset = run.derive("attractors", **options.plain())
     return found[list(VARIABLES)]

@@ -1,4 +1,4 @@
-"""Tabulate the sets that do not close, with the evidence from their extended cells."""
+"""Tabulate the non-periodic sets, with the evidence from trajectories that were integrated further."""
 
 from __future__ import annotations
 
@@ -13,7 +13,9 @@ from pipeline.products.product import Table
 
 
 def settling_table(ds: xr.Dataset) -> Table:
-    """Return a row per parameter point and set that does not close, with the fate of its extended cells."""
+    """Return a row per parameter point and non-periodic set: how many of its extended cells stayed, left, and reached
+    other sets.
+    """
     dims = [str(d) for d in ds["kind"].dims if d != "attractor"]
     found = sets_of(ds, ds["kind"].isin(APERIODIC), dims)
     rows = [{**where, "attractor_id": int(one["attractor"]), **_row(one)} for where, one in found]

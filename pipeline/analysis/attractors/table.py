@@ -35,7 +35,7 @@ _NUMBERS = ("lyapunov_max", "lyapunov_low", "lyapunov_high", "mean_lifetime", "l
 
 
 def attractors_table(ds: xr.Dataset) -> Table:
-    """Return the table of attractors: lines per parameter point if there are few, otherwise per id."""
+    """Return the table of attractors: lines per parameter point if there are few points, otherwise per attractor id."""
     rows = _rows(ds)
     dims, _ = split_dims(ds["attractor_id"])
     n_points = int(np.prod([ds.sizes[d] for d in dims]))
@@ -80,7 +80,7 @@ def _rows(ds: xr.Dataset) -> list[Row]:
 
 
 def _attractor(one: xr.Dataset) -> Row:
-    """Return the columns of one attractor, without those that its model lacks."""
+    """Return the table columns of one attractor, without the quantities that its model lacks."""
     row: Row = {"attractor_id": int(one["attractor"])}
     row |= values(one, "kind", "stability", "evidence", "orbit_period", "period_s", "side")
     if "rotation" in one:
@@ -97,7 +97,9 @@ def _attractor(one: xr.Dataset) -> Row:
 
 
 def _remarks(ds: xr.Dataset, rows: Sequence[Row]) -> list[str]:
-    """Return remarks below the table: conservative flow, periods beyond the search limit, spent budgets."""
+    """Return the remarks below the table: conservative flow, periods beyond the search limit, exhausted integration
+    budgets.
+    """
     lines = []
     if any(row["evidence"] == "volume" for row in rows):
         lines.append("the flow preserves volume: a conservative system has no attractors")
@@ -162,7 +164,7 @@ _SHOWN_BY = {
 
 
 def _shown_by(row: Row) -> str:
-    """Format the evidence for the stability."""
+    """Format the evidence for the stability of a set."""
     low = number(row["lifetime_low"], ".0f")
     if row["evidence"] == "stayed":
         return f"{row['n_sampled']} stayed, lifetime above {low}"
@@ -201,12 +203,14 @@ def _id_summary(ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str]) -> Wor
 
 
 def _known(*ids: int) -> str:
-    """Format the distinct ids; a negative one stands for no set."""
+    """Format the distinct ids of sets, without negative ones; a dash if none is left."""
     return distinct(i for i in ids if i >= 0) or "-"
 
 
 def _evidence(bases: Sequence[str]) -> str:
-    """Summarise the evidence for an id: followed branches, doublings, or points matched by distance alone."""
+    """Summarise the evidence for an attractor's id: followed branches, period doublings, or points matched by distance
+    alone.
+    """
     evidence = [basis for basis in bases if basis != "first_appearance"]
     told = [name for name in ("branch", "doubling") if name in evidence]
     n = evidence.count("distance")

@@ -293,7 +293,9 @@ def _pool(values: npt.NDArray[np.generic], block: int) -> Floats:
 
 
 def _entropies(sums: Floats) -> Floats:
-    """Compute the mean entropy over all boxes and over boundary boxes, from their sums."""
+    """Compute the mean entropy over all boxes and over boundary boxes, from the summed entropy and the two numbers of
+    boxes.
+    """
     return _ratio(np.array([sums[0], sums[0]]), sums[1:])
 
 
@@ -306,7 +308,7 @@ def _ratio(hits: Floats, trials: Floats) -> Floats:
 
 
 class _Line(NamedTuple):
-    """A straight line fitted to ln f against ln eps."""
+    """Straight line fitted to ln f against ln eps; f is the uncertain fraction."""
 
     slope: float
     intercept: float
@@ -336,7 +338,8 @@ def _epsilons(epsilons: Sequence[int] | None, shape: tuple[int, ...], method: Sc
 
 
 def _perturbed(codes: Codes, eps: Ints) -> tuple[Floats, Floats]:
-    """Count the trials and the uncertain trials per epsilon and tile.
+    """Count per epsilon and tile the cells tested, and those of uncertain outcome: the label changes at a distance
+    epsilon.
 
     Every epsilon has the same trials: the cells that have room for the largest epsilon. Otherwise f would not
     be a straight line even for a straight boundary.
@@ -358,7 +361,9 @@ def _perturbed(codes: Codes, eps: Ints) -> tuple[Floats, Floats]:
 
 
 def _boxed(codes: Codes, eps: Ints, method: Scaling) -> tuple[Floats, Floats]:
-    """Count per epsilon and tile the boxes, and those with several labels (or sum their entropies)."""
+    """Count the boxes per side length (epsilon) and tile, and those with several labels (or sum the entropies of the
+    boxes).
+    """
     n_tiles = tiles_per_side(codes.shape) ** codes.ndim
     trials, hits = np.zeros((eps.size, n_tiles)), np.zeros((eps.size, n_tiles))
     for i, e in enumerate(eps):
@@ -370,12 +375,14 @@ def _boxed(codes: Codes, eps: Ints, method: Scaling) -> tuple[Floats, Floats]:
 
 
 def _window(codes: Codes, axis: int, start: int, stop: int) -> Codes:
-    """Return the part of the grid between two positions along an axis."""
+    """Return the slice of a label grid between two positions along one axis."""
     return codes[tuple(slice(start, stop) if k == axis else slice(None) for k in range(codes.ndim))]
 
 
 def _fit_line(eps: Ints, f: Floats) -> _Line:
-    """Fit a line to ln f against ln eps where f > 0, by least squares; NaN with fewer than three points."""
+    """Fit a line to ln f against ln eps (f: uncertain fraction) where f > 0, by least squares; NaN with fewer than
+    three points.
+    """
     use = f > 0.0
     if use.sum() < 3:
         return _Line(np.nan, np.nan, np.nan, np.nan)

@@ -23,7 +23,7 @@ UNFINISHED = (-1,)
 
 @dataclass(frozen=True)
 class LabelGrid:
-    """The labels of a grid or sample, numbered without gaps.
+    """Labels of a grid or sample of cells, as consecutive indices.
 
     Attributes
     ----------
@@ -38,14 +38,14 @@ class LabelGrid:
 
     @property
     def fraction_unfinished(self) -> float:
-        """Part of all cells whose outcome is not known."""
+        """Share of all cells whose outcome is not known."""
         return float((self.codes < 0).mean())
 
 
 def read_labels(
     labels: npt.ArrayLike, unfinished: Collection[int] = UNFINISHED, ids: Collection[int] = ()
 ) -> LabelGrid:
-    """Number the labels of an array without gaps and mark the unfinished cells.
+    """Replace the labels of an array by consecutive indices, and mark the unfinished cells (outcome not known).
 
     Parameters
     ----------
@@ -102,7 +102,9 @@ def bootstrap_weights(n: int, resamples: int, seed: int) -> Iterator[Floats]:
 
 
 def spread(resampled: Floats, confidence: float) -> tuple[Floats, Floats, Floats]:
-    """Compute the standard error and the percentile interval along the first axis; NaN if any is NaN."""
+    """Compute the standard error and the percentile interval of resampled values along the first axis; NaN if any is
+    NaN.
+    """
     tail = 50.0 * (1.0 - confidence)
     low, high = np.percentile(resampled, [tail, 100.0 - tail], axis=0)
     return np.asarray(resampled.std(axis=0, ddof=1)), np.asarray(low), np.asarray(high)

@@ -191,7 +191,7 @@ def tipping_probabilities(
 def _kept_dims(
     labels: npt.ArrayLike | xr.DataArray, dims: Sequence[str] | None
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the names of the dims that stay and of the dims to count over."""
+    """Return the names of the dims that stay in the result, and of the dims to count over."""
     if dims is None:
         over = tuple(str(dim) for dim in labels.dims) if isinstance(labels, xr.DataArray) else ()
         return (), over
@@ -204,7 +204,7 @@ def _kept_dims(
 
 
 def _count_rows(grid: LabelGrid, shape: tuple[int, ...]) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """Count the cells per label and the unfinished cells, for each element of the leading axes `shape`."""
+    """Count the cells per label and the unfinished cells, for each element of the leading axes of shape `shape`."""
     n_rows, width = int(np.prod(shape)), grid.ids.size + 1
     codes = grid.codes.reshape(n_rows, -1).astype(np.int64) + 1
     codes += width * np.arange(n_rows)[:, None]
@@ -215,7 +215,7 @@ def _count_rows(grid: LabelGrid, shape: tuple[int, ...]) -> tuple[npt.NDArray[np
 def _count_inferred(
     grid: LabelGrid, inferred: npt.NDArray[np.generic], shape: tuple[int, ...]
 ) -> npt.NDArray[np.int64]:
-    """Count the inferred cells per label."""
+    """Count per label the cells whose outcome was inferred from neighbouring cells."""
     if inferred.dtype != bool or inferred.shape != grid.codes.shape:
         raise ValueError(
             f"inferred is {inferred.dtype} of shape {inferred.shape}, the labels are of shape "
@@ -233,7 +233,9 @@ def _with_intervals(
     method: Interval,
     name: str = "fraction",
 ) -> dict[str, tuple[tuple[str, ...], npt.NDArray[np.generic]]]:
-    """Compute fractions, intervals and bounds due to unfinished cells, from counts (outcomes last)."""
+    """Compute outcome fractions, their intervals and the bounds due to unfinished cells, from counts (outcomes on the
+    last axis).
+    """
     cells, unknown = n_cells[..., None], n_unfinished[..., None]
     finished = cells - unknown
     low, high = binomial_interval(count, finished, confidence=confidence, method=method)
@@ -272,7 +274,7 @@ def _same_cells(before: xr.DataArray, after: xr.DataArray) -> xr.DataArray:
 
 
 def _provenance(unfinished: Collection[int], confidence: float, method: Interval) -> dict[str, object]:
-    """Return the attributes with the options and references of the numbers."""
+    """Return dataset attributes: the options and the references of the intervals."""
     return {
         "interval": method,
         "confidence": confidence,

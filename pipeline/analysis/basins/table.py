@@ -27,7 +27,7 @@ from pipeline.products.product import Table
 
 
 def basins_table(ds: xr.Dataset) -> Table:
-    """Return a row per outcome and parameter point: number of cells, and fraction with its intervals.
+    """Return a row per outcome and parameter point: number of cells, and basin fraction with its intervals.
 
     The lines have a table per point if there are few, otherwise ranges; the boundaries follow.
     """

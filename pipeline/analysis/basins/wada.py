@@ -38,7 +38,7 @@ def wada_merge_test(
     confidence: float = 0.95,
     seed: int = 0,
 ) -> xr.Dataset:
-    """Test by merging whether all basins share one boundary.
+    """Test whether all basins share one boundary: merge all basins but one in turn, and compare the boundaries.
 
     For each basin in turn, all others are merged. If the basins have the Wada property, the boundary is the
     same for every basin. On a grid, each boundary then lies within every other boundary fattened by a radius
@@ -147,7 +147,8 @@ def _boundary_cells(codes: Codes, code: int) -> Ints:
 
 
 def _distances(shape: tuple[int, ...], boundaries: list[Ints], radii: Ints, metric: Metric) -> tuple[Floats, Floats]:
-    """Compute each boundary's largest distance from every other, and count cells beyond each radius per tile.
+    """Compute each basin boundary's largest distance from every other boundary, and count its cells beyond each radius
+    per tile.
 
     There is one distance transform per label, which is read at the boundary cells of each pair.
     """

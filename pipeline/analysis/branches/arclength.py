@@ -1,4 +1,4 @@
-"""Trace the solutions of a problem by pseudo-arclength continuation (Keller 1977).
+"""Trace solution curves of a system of equations by pseudo-arclength continuation (Keller 1977).
 
 The predictor extends the cubic through the last two points by a step along the tangent. The corrector is
 Newton's method in the plane normal to the tangent, so that it also passes folds in the parameter.
@@ -18,7 +18,7 @@ from pipeline.analysis.branches.problems import Problem, Value
 
 @dataclass(frozen=True, eq=False)
 class Settings:
-    """The settings of a trace.
+    """Settings for tracing a solution curve: step lengths, tolerance and limits.
 
     Attributes
     ----------
@@ -45,7 +45,7 @@ class Settings:
 
 @dataclass(frozen=True, eq=False)
 class Point:
-    """A solution: unknowns, unit tangent, the problem's value, number of Newton steps."""
+    """Point of a solution curve: unknowns, unit tangent, value of the equations there, number of Newton steps."""
 
     u: np.ndarray
     tangent: np.ndarray
@@ -54,13 +54,13 @@ class Point:
 
     @property
     def residual(self) -> float:
-        """Largest scaled residual."""
+        """Largest scaled residual of the equations at this point."""
         return float(np.abs(self.value.residual).max())
 
 
 @dataclass(eq=False)
 class Trace:
-    """The points of a trace in order, and the reason for its end."""
+    """Points of a traced solution curve in order, and the reason for its end."""
 
     points: list[Point] = field(default_factory=list)
     end: str = ""
@@ -69,7 +69,7 @@ class Trace:
 def correct(
     problem: Problem, guess: np.ndarray, normal: np.ndarray, settings: Settings, along: np.ndarray | None = None
 ) -> Steps[Point | None]:
-    """Find the solution in the plane through `guess` with this normal; None if Newton's method fails.
+    """Correct a guess by Newton's method to a solution in the plane through it with this normal; None if that fails.
 
     The point's tangent goes along `along`, by default along the normal.
     """
@@ -99,7 +99,7 @@ def correct(
 
 
 def tangent_of(value: Value, along: np.ndarray) -> np.ndarray | None:
-    """Return the unit tangent of the solutions that points along `along`; None if it is not unique."""
+    """Return the unit tangent of the solution curve that points along `along`; None if the tangent is not unique."""
     matrix = np.vstack([value.derivative, along])
     right = np.zeros(len(matrix))
     right[-1] = 1.0
@@ -124,7 +124,7 @@ Stop = Callable[[list[Point]], str]
 
 
 def trace(problem: Problem, start: Point, settings: Settings, stop: Stop, between: Between) -> Steps[Trace]:
-    """Follow the solutions from a point along its tangent.
+    """Follow a solution curve from a start point along its tangent.
 
     `between` may refuse a step, which is then tried with half the length; `stop` is asked after every
     point. The start is the first of the points.
@@ -154,7 +154,9 @@ def trace(problem: Problem, start: Point, settings: Settings, stop: Stop, betwee
 
 
 def cubic(a: Point, b: Point, share: float) -> np.ndarray:
-    """Evaluate the cubic through two points and their tangents at a share of the chord (above 1: beyond)."""
+    """Evaluate the cubic through two points and their tangents at a share of the chord (above 1: beyond the second
+    point).
+    """
     length = float(np.linalg.norm(b.u - a.u))
     s, rest = share, 1.0 - share
     middle = rest**2 * (1.0 + 2.0 * s) * a.u + s**2 * (3.0 - 2.0 * s) * b.u
@@ -162,7 +164,7 @@ def cubic(a: Point, b: Point, share: float) -> np.ndarray:
 
 
 def _ahead(points: list[Point], step: float) -> np.ndarray:
-    """Predict the point a step ahead, in the plane normal to the tangent there."""
+    """Predict the next point of the curve a step ahead, in the plane normal to the present tangent."""
     here = points[-1]
     straight = here.u + step * here.tangent
     if len(points) < 2:
@@ -175,7 +177,7 @@ def _ahead(points: list[Point], step: float) -> np.ndarray:
 
 
 def _is_near(here: Point, there: Point, step: float, settings: Settings) -> bool:
-    """Return whether a step stayed on the curve: the tangent turned little, and the correction was small."""
+    """Return whether a step stayed on the solution curve: the tangent turned little, and the correction was small."""
     cosine = float(here.tangent @ there.tangent)
     moved = np.linalg.norm(there.u - here.u - step * here.tangent)
     return cosine >= np.cos(settings.largest_turn) and bool(moved <= 0.5 * step)

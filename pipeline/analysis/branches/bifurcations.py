@@ -74,7 +74,7 @@ and the tangent are dependent.
 
 @dataclass(eq=False)
 class Bifurcation:
-    """A located bifurcation.
+    """Bifurcation located on a branch of periodic orbits.
 
     Attributes
     ----------
@@ -134,7 +134,7 @@ _CHANGES = {FOLD: 1, DOUBLING: 1, TORUS: 2, BRANCHING: 1, HOPF: 2}
 
 @dataclass(eq=False)
 class Watch:
-    """A detector of bifurcations between neighbouring points of a trace, with those located so far."""
+    """Detector of bifurcations between neighbouring points of a traced branch; it stores those located so far."""
 
     problem: OneParameter
     settings: Settings
@@ -143,7 +143,7 @@ class Watch:
     n_steps: int = 0
 
     def between(self, a: Point, b: Point) -> Steps[bool]:
-        """Locate the bifurcations between two points; return False if they do not explain the stability."""
+        """Locate the bifurcations between two points; return False if they do not explain the change of stability."""
         if self.skip_first and self.n_steps == 0:
             self.n_steps += 1
             return True
@@ -165,7 +165,7 @@ class Watch:
 
 
 def _explains(kinds: list[str], change: int) -> bool:
-    """Return whether these bifurcations can change the number of unstable multipliers by `change`."""
+    """Return whether bifurcations of these kinds can change the number of unstable multipliers by `change`."""
     reachable = {0}
     for kind in kinds:
         step = _CHANGES[kind]
@@ -175,7 +175,9 @@ def _explains(kinds: list[str], change: int) -> bool:
 
 
 def locate(problem: OneParameter, a: Point, b: Point, kind: str, settings: Settings) -> Steps[Bifurcation | None]:
-    """Find where a test function vanishes between two points; None if an orbit between is not found."""
+    """Locate the bifurcation between two points where its test function vanishes; None if no orbit between them is
+    found.
+    """
     test = TESTS[kind]
 
     def tested(point: Point) -> Steps[float]:
@@ -240,14 +242,18 @@ def _root(known: list[tuple[float, float]]) -> float:
 
 
 def _between(a: Point, b: Point, share: float) -> np.ndarray:
-    """Guess the orbit at a share of the chord, in the plane normal to the chord."""
+    """Interpolate a guess of the orbit between two points, at a share of the chord and in the plane normal to the
+    chord.
+    """
     chord = b.u - a.u
     bent = cubic(a, b, share)
     return np.asarray(bent + (share - (bent - a.u) @ chord / (chord @ chord)) * chord)
 
 
 def tell_apart(located: list[Bifurcation], a: Point) -> list[Bifurcation]:
-    """Drop neutral saddles and folds that are branch points, and sort along the branch."""
+    """Drop neutral saddles and folds that are branch points from located bifurcations, and sort the rest along the
+    branch.
+    """
     branching = [one.point.u for one in located if one.kind == BRANCHING]
     kept = []
     for one in located:
@@ -260,7 +266,9 @@ def tell_apart(located: list[Bifurcation], a: Point) -> list[Bifurcation]:
 
 
 def _is_torus(one: Bifurcation) -> bool:
-    """Return whether the pair with product 1 is complex; a real pair is only a neutral saddle."""
+    """Return whether the multiplier pair with product 1 is complex (a torus bifurcation) and not real (a neutral
+    saddle).
+    """
     multipliers = multipliers_of(one.point)
     complex_pairs = multipliers[multipliers.imag > 0.0]
     return bool(len(complex_pairs)) and bool(np.abs(np.abs(complex_pairs) - 1.0).min() < 1e-4)

@@ -1,4 +1,4 @@
-"""Link the orbits found along a parameter that lie on one branch.
+"""Link periodic orbits that were found at different values of a parameter and lie on one branch.
 
 Orbits are given at several values of one parameter. Each is followed from value to value, stable or not,
 until it meets another one, at which moment the two are linked:
@@ -70,7 +70,9 @@ class Found:
         return self.family.period
 
     def distance(self, u: np.ndarray) -> tuple[float, int]:
-        """Euclidean scaled distance of unknowns from the nearest section point, and its index."""
+        """Return the Euclidean scaled distance of unknowns from the orbit's nearest section point, and this point's
+        index.
+        """
         away = [float(np.linalg.norm(self.family.mismatch(u, point))) for point in self.points]
         nearest = int(np.argmin(away))
         return away[nearest], nearest
@@ -78,7 +80,7 @@ class Found:
 
 @dataclass(frozen=True)
 class Link:
-    """Two orbits of one branch, by number, and the number of period doublings between them."""
+    """Link between two orbits of one branch, by number, with the number of period doublings between them."""
 
     first: int
     second: int
@@ -87,7 +89,7 @@ class Link:
 
 @dataclass(eq=False)
 class Links:
-    """The links along one line of orbits, and the outcome of following each orbit.
+    """Links between orbits along one parameter, and how following each orbit ended.
 
     Attributes
     ----------
@@ -103,7 +105,7 @@ class Links:
 
 
 def connect(lines: Sequence[Sequence[Found]], settings: Settings = CONNECT) -> list[Links]:
-    """Link the orbits of each line that lie on one branch.
+    """Link the orbits that lie on one branch, for each line of orbits along one parameter.
 
     Parameters
     ----------
@@ -150,7 +152,7 @@ def _tangent(one: Found, settings: Settings) -> Steps[Point | None]:
 
 
 def _neighbours(line: Sequence[Found], start: dict[int, Point | None]) -> Links:
-    """Link orbits at neighbouring values that a step along the tangent connects."""
+    """Link orbits at neighbouring parameter values that a step along the tangent connects."""
     result = Links()
     by_place: dict[tuple[int, int], list[Found]] = {}
     for one in line:
@@ -165,13 +167,15 @@ def _neighbours(line: Sequence[Found], start: dict[int, Point | None]) -> Links:
 
 
 def _is_one_step(a: Found, b: Found, start: dict[int, Point | None]) -> bool:
-    """Return whether the tangent at each orbit leads to the other orbit, at a consistent phase."""
+    """Return whether the tangent at each of two orbits leads to the other one, with consistent order of the section
+    points.
+    """
     phases = [_leads_to(start[a.number], b), _leads_to(start[b.number], a)]
     return all(p is not None for p in phases) and sum(p for p in phases if p is not None) % a.period == 0
 
 
 def _leads_to(point: Point | None, other: Found) -> int | None:
-    """Return the index of the section point that the tangent leads to on another orbit; None if elsewhere."""
+    """Return the index of another orbit's section point to which the tangent leads; None if it leads elsewhere."""
     if point is None or point.tangent[-1] == 0.0:
         return None
     change = other.value / other.family.scales[0] - point.u[-1]
@@ -185,7 +189,9 @@ def _leads_to(point: Point | None, other: Found) -> int | None:
 
 
 def _targets(one: Found, line: Sequence[Found], way: int, known: Links) -> list[Found]:
-    """Return the orbits that one can meet: upwards of its own period, both ways of half, quarter, ..."""
+    """Return the orbits that one orbit's branch can meet: of equal period only upwards, of half, quarter, ... in both
+    directions.
+    """
     if one.number in (known.up if way > 0 else known.down):
         return []
     halves = {one.period // 2**k for k in range(1, one.period.bit_length()) if one.period % 2**k == 0}
@@ -200,7 +206,7 @@ def _targets(one: Found, line: Sequence[Found], way: int, known: Links) -> list[
 
 @dataclass(eq=False)
 class _Meeting:
-    """A detector of the orbits that a trace meets."""
+    """Detector of the target orbits that a traced branch meets."""
 
     family: Family
     targets: Sequence[Found]
@@ -209,7 +215,9 @@ class _Meeting:
     met: Found | None = None
 
     def between(self, a: Point, b: Point) -> Steps[bool]:
-        """Correct the orbit at each parameter value that was passed, and compare it with the orbits there."""
+        """Compare the branch with each target orbit whose parameter value the last step passed; always accept the
+        step.
+        """
         chord = b.u - a.u
         for target in self.targets:
             value = target.value / self.family.scales[0]
@@ -228,7 +236,7 @@ class _Meeting:
         return True
 
     def stop(self, points: list[Point]) -> str:
-        """Return the reason to end the trace; empty if it continues."""
+        """Return the reason to end the trace; an empty text lets it continue."""
         here = points[-1]
         if self.met is not None:
             return LINKED
@@ -243,7 +251,9 @@ class _Meeting:
 def _follow(
     one: Found, point: Point, targets: Sequence[Found], way: int, settings: Settings
 ) -> Steps[tuple[str, Link | None]]:
-    """Follow an orbit one way until it meets a target; halve its period at period doublings."""
+    """Follow an orbit up or down in the parameter until it meets a target orbit; halve its period at period
+    doublings.
+    """
     family, here = one.family, point
     for n_doublings in range(one.period.bit_length()):
         meeting = _Meeting(family, targets, way, settings)
@@ -267,7 +277,7 @@ def _follow(
 
 
 def grouped(places: Sequence[Hashable], links: Iterable[Link]) -> tuple[np.ndarray, list[Link]]:
-    """Group linked orbits, links without doublings first; a group never has two orbits of one place.
+    """Group linked orbits, links without period doublings first; a group never has two orbits at one parameter point.
 
     Parameters
     ----------

@@ -84,7 +84,7 @@ class Curve:
 
     @property
     def values(self) -> np.ndarray:
-        """Both parameters at the points, shape (n, 2)."""
+        """Values of both parameters at the points of the curve, shape (n, 2)."""
         return np.array([self.family.values(p.u) for p in self.points])
 
 
@@ -96,7 +96,7 @@ def curves_from(
     max_period: int,
     settings: Settings = CURVE,
 ) -> list[Curve]:
-    """Continue the bifurcations located on branches in a second parameter.
+    """Continue the bifurcations located on branches as curves, with a second free parameter.
 
     Parameters
     ----------
@@ -133,7 +133,7 @@ Bounds = tuple[tuple[float, float], tuple[float, float]]
 def continue_curves(
     starts: Sequence[CurveStart], bounds: Bounds, settings: Settings = CURVE, max_period: int = 0
 ) -> list[Curve]:
-    """Follow each start both ways until a bound, its own start, or a resonance; see `curves_from`.
+    """Follow each bifurcation in both directions until a bound, its own start or a resonance; see `curves_from`.
 
     Curves that spring from the points of codimension two are followed as well, up to orbits of `max_period`.
     """
@@ -193,7 +193,7 @@ def _sprung(problem: BifurcationProblem, at: SpecialPoint) -> Steps[tuple[Bifurc
 
 
 def _starts(ds: xr.Dataset, parameters: Parameters, second: str, bounds: Bounds, max_period: int) -> list[CurveStart]:
-    """Return the located points with their two-parameter families and unknowns."""
+    """Return the located bifurcations to continue, each with its two-parameter family of orbits and its unknowns."""
     first = str(ds.attrs["parameter"])
     scales = tuple(high - low for low, high in bounds)
     found = []

@@ -1,4 +1,4 @@
-"""Convert branches into a labelled dataset."""
+"""Convert branches of periodic orbits into a labelled dataset."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def dataset_of(
 
 
 def _fixed(branches: Sequence[Branch], parameter: str, parameters: Parameters | None) -> dict[str, Any]:
-    """Return the variables of other parameters in which branches differ from the run's own values."""
+    """Return dataset variables for the fixed parameters whose values on the branches differ from the run's."""
     if parameters is None or not branches:
         return {}
     values = np.array([b.family.parameters for b in branches])
@@ -105,14 +105,16 @@ def _side_variables(
 
 
 def _settle_origin(counts: np.ndarray, branch: Branch) -> None:
-    """Copy the count of unstable multipliers to a branch's bifurcation from the next point, in place."""
+    """Replace, in place, the number of unstable multipliers at a branch's origin (a bifurcation) by that of the next
+    point.
+    """
     for j, point in enumerate(branch.points):
         if branch.origin is not None and point.u is branch.origin.point.u:
             counts[j] = counts[j + 1] if j + 1 < len(branch.points) else counts[j - 1]
 
 
 class _Arrays:
-    """The arrays of the variables per point of a branch."""
+    """Arrays of the output variables per branch and point."""
 
     def __init__(self, shape: tuple[int, int], longest: int, n_states: int) -> None:
         self.parameter = np.full(shape, np.nan)
@@ -125,7 +127,7 @@ class _Arrays:
         self.period_s = np.full(shape, np.nan)
 
     def put(self, i: int, j: int, branch: Branch, point: Any) -> None:
-        """Write point number `j` of branch number `i`."""
+        """Write the data of point `j` on branch `i` into the arrays."""
         self.parameter[i, j] = branch.family.values(point.u)[0]
         self.section[i, j, : max(branch.family.period, 1)] = _orbit(branch, point)
         self.multiplier[i, j] = multipliers_of(point)

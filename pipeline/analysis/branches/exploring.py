@@ -1,4 +1,4 @@
-"""Follow all branches that are connected with some orbits, each once."""
+"""Follow all branches that are connected with given orbits through bifurcations, each branch once."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class Start:
 
 @dataclass(frozen=True, eq=False)
 class Scope:
-    """The limits of an exploration.
+    """Limits of an exploration of branches: parameter interval, longest period, generations.
 
     Attributes
     ----------
@@ -74,7 +74,7 @@ class Scope:
 
 
 def explore(starts: Sequence[Start], scope: Scope) -> list[Branch]:
-    """Follow the branches of all starts, and the branches that bifurcate from them.
+    """Follow the branches of all starting orbits, and the branches that bifurcate from them.
 
     Returns
     -------
@@ -98,7 +98,7 @@ def explore(starts: Sequence[Start], scope: Scope) -> list[Branch]:
 
 
 def _follow_starts(starts: Sequence[Start], branches: list[Branch], scope: Scope) -> None:
-    """Append the branches of starts that lie on no branch yet, in the order of the parameter values.
+    """Append the branches of starting orbits that lie on no known branch yet, in the order of the parameter values.
 
     When a start is followed, so are the others at its value, and the first start of each other attractor, on
     lanes that would be idle. Most of these are needed later; one that turns out to lie on a known branch is
@@ -127,7 +127,9 @@ def _follow_starts(starts: Sequence[Start], branches: list[Branch], scope: Scope
 
 
 def _first_of_each(starts: Sequence[Start], followed: set[int]) -> list[int]:
-    """Return the first start of each pair of attractor and period, without pairs of which a start was followed."""
+    """Return the first starting orbit of each pair (attractor, period), without pairs of which an orbit was followed
+    already.
+    """
     kinds = [(start.attractor, start.family.period) for start in starts]
     done = {kinds[i] for i in followed}
     firsts = {kind: i for i, kind in reversed(list(enumerate(kinds))) if kind[0] >= 0 and kind not in done}
@@ -152,7 +154,7 @@ def _both_ways(starts: Sequence[Start], scope: Scope, what: str) -> list[Branch 
 
 
 def _lie_on(starts: Sequence[Start], branches: Sequence[Branch]) -> list[bool]:
-    """Return whether each start is an orbit of one of the branches."""
+    """Return for each starting orbit whether it lies on one of the branches."""
     asked = [(i, guess) for i, s in enumerate(starts) for b in branches for guess in _near(s, b)]
     settings = Settings()
     found = run_together([_at_value(starts[i].family, guess, settings) for i, guess in asked])
@@ -171,7 +173,7 @@ def _at_value(family: Family, guess: np.ndarray, settings: Settings) -> Steps[Po
 
 
 def _near(start: Start, branch: Branch) -> Iterator[np.ndarray]:
-    """Yield the interpolated points of a branch at the start's parameter value that are near its orbit."""
+    """Yield the points of a branch, interpolated at a starting orbit's parameter value, that are near this orbit."""
     family = branch.family
     if family.period != start.family.period or not _same_others(family, start.family):
         return
@@ -191,7 +193,7 @@ def _near(start: Start, branch: Branch) -> Iterator[np.ndarray]:
 
 
 def _same_others(a: Family, b: Family) -> bool:
-    """Return whether two families have equal parameters apart from the free one."""
+    """Return whether two families of orbits have equal parameters apart from the free one."""
     return a.free == b.free and np.array_equal(_fixed(a), _fixed(b))
 
 
@@ -202,7 +204,7 @@ def _fixed(family: Family) -> np.ndarray:
 
 
 def _distance(start: Start, point: Point) -> float:
-    """Return the scaled distance of a start from the nearest section point of an orbit."""
+    """Return the scaled distance of a starting orbit from the nearest section point of another orbit."""
     here = start.family.unknowns(start.state, [0.0])
     return min(float(np.abs(start.family.mismatch(here, x)).max()) for x in point.value.images)
 
@@ -211,7 +213,7 @@ def _distance(start: Start, point: Point) -> float:
 
 
 def _adopt(branches: Sequence[Branch]) -> list[Start]:
-    """Connect branches that end on orbits of half their period to the period doubling there.
+    """Connect each branch that ends on an orbit of half its period to the period doubling there.
 
     Return the orbits of half the period as starts, for ends without a known doubling.
     """
@@ -231,7 +233,7 @@ def _adopt(branches: Sequence[Branch]) -> list[Start]:
 
 
 def _doubling_at(branches: Sequence[Branch], branch: Branch, which: int) -> Bifurcation | None:
-    """Find the nearest period doubling of half the period, within a few steps of the branch's end."""
+    """Find the nearest period doubling on a branch of half the period, within a few steps of this branch's end."""
     end, inner = (branch.points[0], branch.points[1]) if which == 0 else branch.points[:-3:-1]
     reach = 3.0 * max(float(np.linalg.norm(end.u - inner.u)), 1e-3)
     best, nearest = None, reach
@@ -252,13 +254,15 @@ def _gap(family: Family, end: Point, one: Bifurcation) -> float:
 
 
 def _half_orbit(branch: Branch, which: int) -> Start:
-    """Make a start of half the period from the orbit at the end of a branch."""
+    """Make a starting orbit of half the period from the orbit at the end of a branch."""
     state, value = half_orbit(branch.family, branch.points[-which])
     return Start(replace(branch.family, period=branch.family.period // 2), state, value)
 
 
 def _criticality(at: Bifurcation, child: Branch, end: int) -> str:
-    """Decide criticality: supercritical if the child lies on the side where the parent is less stable."""
+    """Decide criticality of a period doubling: supercritical if the doubled branch lies where the parent branch is less
+    stable.
+    """
     rising = at.point.tangent[-1] > 0.0
     worse_above = (at.n_unstable_after > at.n_unstable_before) == rising
     inner = child.points[end + 3 if end == 0 else end - 3]
@@ -266,7 +270,7 @@ def _criticality(at: Bifurcation, child: Branch, end: int) -> str:
 
 
 def _switch(branches: list[Branch], scope: Scope, what: str) -> None:
-    """Follow the unknown branches at period doublings and branch points."""
+    """Follow the branches not yet known that start at period doublings and branch points."""
     open_ends = [
         (branch, one)
         for branch in branches
@@ -301,7 +305,7 @@ def _switch(branches: list[Branch], scope: Scope, what: str) -> None:
 
 
 def _cross(points: Sequence[tuple[Branch, Bifurcation]], branches: list[Branch], scope: Scope) -> None:
-    """Follow the other branch through each branch point, both ways."""
+    """Follow the other branch through each branch point, in both directions."""
     for parent, one in points:
         if _is_crossing(parent, one, branches):
             continue
@@ -326,7 +330,9 @@ def _direction(branch: Branch, at: Bifurcation) -> np.ndarray:
 
 
 def _is_crossing(parent: Branch, one: Bifurcation, branches: Sequence[Branch]) -> bool:
-    """Return whether the other branch is known: it has a branch point at the same orbit."""
+    """Return whether the other branch at a branch point is known: a known branch has a branch point at the same
+    orbit.
+    """
     for branch in branches:
         for other in branch.bifurcations if branch.family.period == parent.family.period else ():
             same = _gap(branch.family, one.point, other) < 1e-4 and abs(one.point.u[-1] - other.point.u[-1]) < 1e-4

@@ -1,4 +1,4 @@
-"""Follow one branch of periodic orbits from an orbit, both ways to its ends."""
+"""Follow one branch of periodic orbits from a given orbit to both of its ends."""
 
 from __future__ import annotations
 
@@ -58,13 +58,13 @@ class Branch:
 
     @property
     def values(self) -> np.ndarray:
-        """Parameter values of the points."""
+        """Parameter values at the points of the branch."""
         return np.array([self.family.values(p.u)[0] for p in self.points])
 
 
 @dataclass(eq=False)
 class Half:
-    """One direction of a branch from its start: the trace and its bifurcations."""
+    """One direction of a branch from its start: the traced points and the bifurcations."""
 
     trace: Trace
     bifurcations: list[Bifurcation] = field(default_factory=list)
@@ -72,7 +72,7 @@ class Half:
 
 @dataclass(frozen=True, eq=False)
 class _Stop:
-    """The rule that ends a trace."""
+    """Rule that ends the trace of a branch: at a bound, a closed branch, an equilibrium or a period halving."""
 
     family: Family
     low: float
@@ -89,7 +89,7 @@ class _Stop:
         return "period_halving" if len(points) > 2 and has_halved(self.family, points) else ""
 
     def _is_closed(self, points: list[Point]) -> bool:
-        """Whether the last step passed the start, at any phase of the orbit."""
+        """Return whether the last step passed the start of the branch, at any phase of the orbit."""
         if len(points) < 5:
             return False
         first, before, here = points[0], points[-2], points[-1]
@@ -105,7 +105,7 @@ class _Stop:
         return False
 
     def _difference(self, state: np.ndarray, parameter: float, u: np.ndarray) -> np.ndarray:
-        """Scaled unknowns of a state and parameter minus `u`."""
+        """Return the scaled unknowns of a state and a parameter value, minus `u`."""
         return np.append(self.family.mismatch(u, state), parameter - u[-1])
 
 
@@ -123,7 +123,9 @@ def _end_of_crossings(family: Family, point: Point) -> str:
 
 
 def has_halved(family: Family, points: list[Point]) -> bool:
-    """Return whether the trace passed an orbit of half the period: the orbit's halves changed places."""
+    """Return whether the trace passed an orbit of half the period: the two halves of the orbit's period changed
+    places.
+    """
     if not family.period or family.period % 2 or len(points) < 2:
         return False
     before, here = (_half_way(family, p) for p in points[-2:])
@@ -135,14 +137,16 @@ def _half_way(family: Family, point: Point) -> np.ndarray:
 
 
 def half_orbit(family: Family, point: Point) -> tuple[np.ndarray, float]:
-    """Return the mean of an orbit's halves, near the orbit of half the period, and the parameter value."""
+    """Return the mean of an orbit and itself half a period later, a guess of the orbit of half the period, and the
+    parameter value.
+    """
     u = point.u.copy()
     u[:-1] += 0.5 * _half_way(family, point)
     return family.state(u), float(family.values(u)[0])
 
 
 def first_point(problem: OneParameter, u: np.ndarray, settings: Settings) -> Steps[Point | None]:
-    """Correct an orbit at its parameter value; its tangent points to rising parameter values."""
+    """Correct an orbit at a fixed parameter value, and orient its tangent to rising parameter values."""
     normal = np.zeros(problem.size)
     normal[-1] = 1.0
     found = yield from correct(problem, u, normal, settings)
@@ -155,7 +159,9 @@ def first_point(problem: OneParameter, u: np.ndarray, settings: Settings) -> Ste
 def half_branch(
     family: Family, start: Point, low: float, high: float, settings: Settings, from_bifurcation: bool = False
 ) -> Steps[Half]:
-    """Follow orbits from a point along its tangent; the last point lies on the bound that was passed."""
+    """Follow a branch from a point along its tangent to one end; a point beyond a parameter bound is moved onto the
+    bound.
+    """
     problem = problem_of(family)
     watch = Watch(problem, settings, skip_first=from_bifurcation)
     found = yield from trace(problem, start, settings, _Stop(family, low, high), watch.between)
@@ -185,7 +191,7 @@ def _is_known(one: Bifurcation, found: list[Bifurcation]) -> bool:
 
 
 def _cut(problem: OneParameter, found: Trace, low: float, high: float, settings: Settings) -> Steps[None]:
-    """Replace the point beyond the bound by one on it."""
+    """Replace the last point, which lies beyond a parameter bound, by one on the bound."""
     family = problem.family
     before, beyond = found.points[-2:]
     values = [family.values(p.u)[0] for p in (before, beyond)]
@@ -202,7 +208,7 @@ def _cut(problem: OneParameter, found: Trace, low: float, high: float, settings:
 
 
 def joined(family: Family, backward: Half, forward: Half) -> Branch:
-    """Join two halves from the same start to a branch, the backward half first and reversed."""
+    """Join two traces from the same start to a branch: the backward trace reversed, then the forward one."""
     if forward.trace.end == "closed":
         return Branch(family, forward.trace.points, forward.bifurcations, ("closed", "closed"))
     back = [Point(p.u, -p.tangent, p.value, p.n_iterations) for p in reversed(backward.trace.points)]
@@ -231,7 +237,9 @@ def opposite(point: Point) -> Point:
 
 
 def doubled_start(family: Family, at: Bifurcation) -> Steps[Point | None]:
-    """Return a period doubling's orbit, taken twice, with the tangent of the doubled branch."""
+    """Return the start of the doubled branch at a period doubling: the orbit taken twice, with the tangent of the new
+    branch.
+    """
     double = Family(
         family.system, 2 * family.period, family.frequency_hz, family.parameters, family.free, family.scales
     )
@@ -248,7 +256,7 @@ def doubled_start(family: Family, at: Bifurcation) -> Steps[Point | None]:
 def crossing_half(
     family: Family, at: Bifurcation, own: np.ndarray, way: float, low: float, high: float, settings: Settings
 ) -> Steps[Half]:
-    """Follow the other branch through a branch point, one way.
+    """Follow the other branch through a branch point in one direction.
 
     At a branch point the derivative's kernel has two dimensions, and the other branch's tangent lies in it.
     The known branch does not meet a plane at a small distance along the kernel's normal to it, so Newton's

@@ -1,4 +1,4 @@
-"""Run many computations in step, so that their trajectories share the engine's lanes.
+"""Run many computations in step, so that their trajectories fill the engine's SIMD lanes together.
 
 A computation is a generator: it yields a `Query`, receives the `Value` of its problem, and returns its
 result. A single orbit would fill one lane of sixteen. One call serves all waiting computations, at little
@@ -24,7 +24,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Query:
-    """A request to evaluate a problem at the unknowns `u`."""
+    """Request to evaluate the equations of a problem at the unknowns `u`."""
 
     problem: Problem
     u: np.ndarray
@@ -35,7 +35,7 @@ Steps = Generator[Query, Value, T]
 
 
 def run_together(computations: Sequence[Steps[T]], what: str = "") -> list[T]:
-    """Run computations to their ends and return their results, in their order.
+    """Run computations in step to their ends and return their results, in their order.
 
     If the work has a name, progress is reported. The length of a trace is unknown before its end, so it
     counts by the part of the parameter's interval that it has covered, up to nine tenths.
@@ -64,7 +64,9 @@ def run_together(computations: Sequence[Steps[T]], what: str = "") -> list[T]:
 def _report(
     what: str, queries: Mapping[int, Query], waiting: Iterable[int], seen: dict[int, tuple[float, float]], n: int
 ) -> None:
-    """Report progress; `seen` has the range of the last unknown of each computation, updated in place."""
+    """Report the progress of computations; `seen` has the range covered by each one's last unknown, updated in
+    place.
+    """
     for i, query in queries.items():
         last = float(query.u[-1])
         low, high = seen.get(i, (last, last))
@@ -90,7 +92,7 @@ def _evaluate(queries: Sequence[Query]) -> list[Value]:
 
 
 def _calls(systems: Sequence[tuple[int, System]]) -> list[list[int]]:
-    """Group queries into calls, by system."""
+    """Group the indices of queries by the system that they integrate; each group is one call of the engine."""
     by_system: dict[str, list[int]] = {}
     for i, system in systems:
         by_system.setdefault(system.label, []).append(i)

@@ -85,7 +85,7 @@ def _values(parameters: Parameters) -> Mapping[str, Any]:
 
 
 def rotation_of(branch: Branch) -> np.ndarray:
-    """Compute the mean turns of each angle per drive period or return, from the branch's first orbit."""
+    """Compute the mean turns of each angle per drive period or return, on the branch's first orbit."""
     family = branch.family
     if not any(family.system.is_angle) or not family.period:
         return np.zeros(sum(family.system.is_angle))

@@ -50,7 +50,7 @@ WIDEST_GAP, MOST_TRIES = 0.05, 6
 
 @dataclass(frozen=True, eq=False)
 class Ends:
-    """The ends of the trajectories that a problem requested.
+    """End points of the trajectories that a problem requested, with their derivatives and durations.
 
     Attributes
     ----------
@@ -72,7 +72,7 @@ class Ends:
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """Requested trajectories: starts (m, n_states), frequencies (m,) [Hz], packed parameters (m, k)."""
+    """Trajectories to integrate: start states (m, n_states), frequencies (m,) [Hz], packed parameters (m, k)."""
 
     states: np.ndarray
     frequency_hz: np.ndarray
@@ -82,7 +82,7 @@ class Rows:
 
 @dataclass(frozen=True, eq=False)
 class Value:
-    """The value of a problem at `u`: F (m,), its derivative (m, m + 1), and the orbit's data.
+    """Value of F at `u`: residual (m,), derivative (m, m + 1), and data of the orbit.
 
     `images` are the orbit's sections, `monodromy` its monodromy matrix, `seconds` its period [s]. For an
     equilibrium (`is_rest`) they are its state, the Jacobian [1/s] and NaN.
@@ -97,12 +97,12 @@ class Value:
 
     @property
     def is_finite(self) -> bool:
-        """Whether all trajectories arrived."""
+        """Whether F and its derivative are finite."""
         return bool(np.isfinite(self.residual).all() and np.isfinite(self.derivative).all())
 
 
 class Problem(Protocol):
-    """``F(u) = 0`` in one unknown more than equations."""
+    """System of equations ``F(u) = 0`` with one unknown more than equations."""
 
     @property
     def size(self) -> int:
@@ -113,10 +113,10 @@ class Problem(Protocol):
         """System to integrate."""
 
     def rows(self, u: np.ndarray) -> Rows:
-        """Return the trajectories that the value at `u` needs."""
+        """Return the trajectories to integrate for the value of F at `u`."""
 
     def value(self, u: np.ndarray, ends: Ends) -> Value | None:
-        """Compute F and its derivative from the trajectories' ends; None to ask for other trajectories."""
+        """Compute F and its derivative from the ends of trajectories; None if other trajectories must be integrated."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,7 +147,7 @@ class Family:
 
     @property
     def unit(self) -> np.ndarray:
-        """Unit of each unknown: of the states, then of the free parameters."""
+        """Scale of each unknown: of the states, then of the free parameters."""
         return np.array([*self.system.scales, *self.scales])
 
     def unknowns(self, state: np.ndarray, values: Sequence[float]) -> np.ndarray:
@@ -155,16 +155,16 @@ class Family:
         return np.asarray(np.concatenate([state, values]) / self.unit)
 
     def state(self, u: np.ndarray) -> np.ndarray:
-        """Return the section point [the states' units], angles wrapped."""
+        """Return the section point in the unknowns `u` [the states' units], angles wrapped."""
         n = self.system.n_states
         return wrap_angles(np.asarray(u[:n] * np.asarray(self.system.scales)), self.system)
 
     def values(self, u: np.ndarray) -> np.ndarray:
-        """Return the values of the free parameters."""
+        """Return the values of the free parameters in the unknowns `u`."""
         return np.asarray(u[self.system.n_states :] * np.asarray(self.scales))
 
     def rows(self, many: np.ndarray) -> Rows:
-        """Return the trajectories of one period from many unknowns (m, size)."""
+        """Return the trajectories to integrate over one period of the orbit, from many unknowns (m, size)."""
         n = self.system.n_states
         frequency = np.full(len(many), self.frequency_hz)
         packed = np.tile(self.parameters, (len(many), 1))
@@ -177,7 +177,9 @@ class Family:
         return Rows(many[:, :n] * np.asarray(self.system.scales), frequency, packed, self.period)
 
     def mismatch(self, u: np.ndarray, image: np.ndarray) -> np.ndarray:
-        """Compute the scaled difference between the image and the point, angles on their circle."""
+        """Compute the scaled difference between the image of a section point and the point itself, angles on their
+        circle.
+        """
         scales = np.asarray(self.system.scales)
         start = u[: self.system.n_states] * scales
         return np.asarray(wrap_angles(image - start, self.system) / scales)
@@ -190,20 +192,22 @@ class Family:
 
 @dataclass(frozen=True, eq=False)
 class _Segments:
-    """Section points (period, n_states) of an orbit at `u`, scaled, and their derivatives by the unknowns."""
+    """Scaled section points (period, n_states) of an orbit at `u`, and their derivatives with respect to the
+    unknowns.
+    """
 
     u: np.ndarray
     points: np.ndarray
     slopes: np.ndarray
 
     def at(self, u: np.ndarray) -> np.ndarray:
-        """Return the points at other unknowns, to first order; the first one is exact."""
+        """Return the section points at other unknowns, to first order; the first point is exact."""
         return np.asarray(self.points + self.slopes @ (u - self.u))
 
 
 @dataclass(eq=False)
 class OrbitProblem:
-    """Fixed points of the p-fold stroboscopic or return map, with one free parameter.
+    """Equations for fixed points of the p-fold stroboscopic or return map, with one free parameter.
 
     An orbit of several periods is evaluated by multiple shooting: all its periods are integrated side by side,
     on lanes that would be idle, from the section points that the last evaluation predicts. Where these miss
@@ -226,7 +230,7 @@ class OrbitProblem:
         return self.family.system
 
     def rows(self, u: np.ndarray) -> Rows:
-        """Return the trajectories of the orbit, or of each of its periods, and of a neighbour in the parameter."""
+        """Return the trajectories to integrate: the orbit, or each of its periods, and a neighbour in the parameter."""
         step = np.zeros(self.size)
         step[-1] = ONE_SIDED_STEP
         if self._known is None:
@@ -236,7 +240,9 @@ class OrbitProblem:
         return replace(self.family.rows(np.concatenate([own, own + step])), period=1)
 
     def value(self, u: np.ndarray, ends: Ends) -> Value | None:
-        """Compute the mismatch after the period, and its derivative; None to ask for other trajectories."""
+        """Compute the orbit's mismatch after its period, and its derivative; None if other trajectories must be
+        integrated.
+        """
         is_whole = ends.images.shape[1] == self.family.period
         return self._of_whole(u, ends) if is_whole else self._of_segments(u, ends)
 
@@ -255,7 +261,7 @@ class OrbitProblem:
         return None
 
     def _of_segments(self, u: np.ndarray, ends: Ends) -> Value | None:
-        """Put the periods together: images, derivatives and the mismatch follow from period to period."""
+        """Combine the separately integrated periods of an orbit into its images, derivative and mismatch."""
         n, scales = self.size - 1, np.asarray(self.system.scales)
         starts = np.split(ends.starts / scales, 2)[0]
         images, beside = np.split(ends.images[:, 0], 2)
@@ -290,7 +296,8 @@ class OrbitProblem:
 
 
 def _is_joined(gap: float, residual: float) -> bool:
-    """Return whether the gaps between periods are small enough beside the residual.
+    """Return whether the gaps between the separately integrated periods of an orbit are small enough beside the
+    residual.
 
     F errs by the square of the gap, the derivative by the gap. Far from the solution Newton's method needs
     neither to be exact.
@@ -316,7 +323,7 @@ def doubling_test(monodromy: np.ndarray) -> float:
 
 
 def torus_test(monodromy: np.ndarray) -> float:
-    """Compute the product of mu_i mu_j - 1 over pairs, zero where two multipliers have the product 1.
+    """Compute the product of mu_i mu_j - 1 over pairs of multipliers, zero where two multipliers have the product 1.
 
     The determinant of the bialternate product of M with itself, minus 1 (Kuznetsov, Elements of Applied
     Bifurcation Theory, 3rd ed., 2004, Sect. 10.2.2).
@@ -336,7 +343,7 @@ TESTS: dict[str, Callable[[np.ndarray], float]] = {
 
 @dataclass(frozen=True, eq=False)
 class BifurcationProblem:
-    """Orbits at a bifurcation, with two free parameters: the orbit's equations and ``test = 0``."""
+    """Equations for orbits at a bifurcation, with two free parameters: the equations of the orbit and ``test = 0``."""
 
     family: Family
     kind: str
@@ -357,12 +364,12 @@ class BifurcationProblem:
         return np.array([STATE_STEP] * n + [PARAMETER_STEP] * 2)
 
     def rows(self, u: np.ndarray) -> Rows:
-        """Return the trajectories of the orbit and of two neighbours in every unknown."""
+        """Return the trajectories to integrate: the orbit, and two neighbours in every unknown."""
         shifts = np.diag(self._steps)
         return self.family.rows(np.concatenate([u[None], u + shifts, u - shifts]))
 
     def value(self, u: np.ndarray, ends: Ends) -> Value:
-        """Compute the mismatch and the test function, with their derivative."""
+        """Compute the orbit's mismatch after its period and the test function, with their derivative."""
         n, size = self.family.system.n_states, self.size
         test = TESTS[self.kind]
         tests = np.array([test(m) if np.isfinite(m).all() else np.nan for m in ends.monodromy])

@@ -1,4 +1,4 @@
-"""Compute branches and curves as analyses of a run (`pipeline.products.branches`)."""
+"""Compute branches of orbits and bifurcation curves as analyses of a run (`pipeline.products.branches`)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ LEAST_PERIOD = 4
 
 
 def settle_branches(run: Run, options: BranchOptions) -> BranchOptions:
-    """Complete the interval from the run's axis; raise SpecError if it is empty."""
+    """Complete the parameter interval from the run's axis; raise SpecError if it is empty."""
     parameter = options.parameter
     _refuse_frequency_of_flow(run, parameter)
     low, high = _interval(run, parameter, options.low, options.high)
@@ -57,7 +57,7 @@ def _ends(options: BranchOptions) -> tuple[float, float]:
 
 
 def settle_curves(run: Run, options: CurveOptions) -> CurveOptions:
-    """Complete the branches' interval; raise SpecError unless two different parameters span a plane."""
+    """Complete the parameter interval of the branches; raise SpecError unless two different parameters span a plane."""
     from pipeline.specification.problems import SpecError
 
     settled = options.model_copy(update=settle_branches(run, options).part(BranchOptions))
@@ -73,7 +73,7 @@ def settle_curves(run: Run, options: CurveOptions) -> CurveOptions:
 
 
 def curves(run: Run, options: CurveOptions) -> xr.Dataset:
-    """Continue the bifurcations located by `branches` in the plane of its parameter and a second one."""
+    """Continue the bifurcations located by `branches` in the plane of the branches' parameter and a second one."""
     from pipeline.analysis.branches import curves_dataset, curves_from
 
     located = run.derive("branches", **options.part(BranchOptions))
@@ -91,7 +91,7 @@ def _axis(run: Run, parameter: str) -> xr.DataArray | None:
 
 
 def _interval(run: Run, parameter: str, low: float | None, high: float | None) -> tuple[float, float]:
-    """Check the parameter and complete its interval from the run's axis."""
+    """Check the parameter of the branches, and complete its interval from the run's axis."""
     from pipeline.specification.problems import SpecError, unknown_name
 
     base = parameters_of(run.cube())

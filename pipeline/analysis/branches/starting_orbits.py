@@ -1,4 +1,4 @@
-"""Find starting orbits: those that attract cells of a cube, and those near recurrences in its chaos."""
+"""Find starting orbits for branches: attractors of a cube, and orbits near which its bounded trajectories recur."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Listed:
 
 
 def listed(attractors: xr.Dataset, parameters: Parameters, parameter: str, scale: float) -> Iterator[Listed]:
-    """Yield all attractors of a run, those with a polished closed orbit as starts.
+    """Yield all attractors of a run; those with a polished closed orbit have a starting orbit.
 
     Parameters
     ----------
@@ -63,7 +63,8 @@ def listed(attractors: xr.Dataset, parameters: Parameters, parameter: str, scale
 def attracting(
     attractors: xr.Dataset, parameters: Parameters, parameter: str, interval: tuple[float, float], max_period: int = 0
 ) -> tuple[list[Start], list[str]]:
-    """Return the polished closed orbits among the attractors of a run, and the attractors left out.
+    """Return starting orbits from the polished closed orbits among a run's attractors, and a line on each attractor
+    left out.
 
     Parameters
     ----------
@@ -99,7 +100,7 @@ def attracting(
 
 
 def _why_not(one: Listed, interval: tuple[float, float], max_period: int) -> str:
-    """Return the reason why an attractor is no start; empty if it is one."""
+    """Return the reason why no branch can start from an attractor; empty if one can."""
     if one.is_cycle:
         return "a limit cycle seen at even times; see it at crossings: [section] of a new run"
     if not one.period and not one.is_rest:
@@ -115,7 +116,7 @@ def _why_not(one: Listed, interval: tuple[float, float], max_period: int) -> str
 
 
 def _places(where: Sequence[Mapping[str, float]]) -> str:
-    """Describe the places of an attractor by the range of each axis."""
+    """Describe where an attractor occurs, by its range on each parameter axis."""
     if not where[0]:
         return ""
     ranges = []
@@ -129,7 +130,7 @@ def _places(where: Sequence[Mapping[str, float]]) -> str:
 def family_of(
     system: System, period: int, frequency_hz: float, packed: np.ndarray, parameter: str, scale: float
 ) -> Family:
-    """Make the family of orbits of a period with one free parameter."""
+    """Make the family of orbits with a given period and one free parameter."""
     return Family(system, period, frequency_hz, packed, (parameter,), (scale,))
 
 
@@ -147,7 +148,7 @@ def _dims(ds: xr.Dataset) -> list[str]:
 
 
 def _points(ds: xr.Dataset) -> list[xr.Dataset]:
-    """Return the parameter points of a dataset."""
+    """Split a dataset into its parameter points, a dataset each."""
     dims = _dims(ds)
     indices = np.ndindex(*(ds.sizes[d] for d in dims))
     return [ds.isel(dict(zip(dims, map(int, index), strict=True))) for index in indices]

@@ -1,4 +1,4 @@
-"""Tabulate branches and curves, for ``magpend analyse branches`` and ``curves``."""
+"""Tabulate branches and bifurcation curves, for ``magpend analyse branches`` and ``curves``."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from pipeline.products.product import Table
 
 
 def branches_table(ds: xr.Dataset) -> Table:
-    """Return the table of bifurcations, with lines on stable segments and attractors left out.
+    """Return the table of bifurcations, with lines on stable segments and on attractors from which no branch starts.
 
     Equilibria have the period 0, and eigenvalues [1/s] in place of multipliers. A Hopf point has the period of
     its small cycles. ``normal_form`` is the coefficient of the normal form (see
@@ -34,7 +34,7 @@ def branches_table(ds: xr.Dataset) -> Table:
 
 
 def _why_none(ds: xr.Dataset) -> str:
-    """Return why there is no branch: a line for each reason, with the number of attractors it holds for."""
+    """Return a text on why there is no branch: a line per reason, with the number of attractors that it concerns."""
     name = parameter_name(str(ds.attrs["parameter"]))
     lines = str(ds.attrs.get("left_out", "")).splitlines()
     reasons = Counter(line.partition(": ")[2] for line in lines)
@@ -44,7 +44,7 @@ def _why_none(ds: xr.Dataset) -> str:
 
 
 def table_of(ds: xr.Dataset) -> list[Row]:
-    """Return a row per located bifurcation, by rising parameter value; see `branches_table`.
+    """Return a table row per located bifurcation, by rising parameter value; see `branches_table`.
 
     The parameter's column has its name and, for the drive's frequency, its unit: ``frequency_hz``. Parameters
     that have other values than the run's own follow, and ``side`` where the model has words for motions.
@@ -79,7 +79,7 @@ def table_of(ds: xr.Dataset) -> list[Row]:
 
 
 def fixed_of(ds: xr.Dataset, branch: int) -> dict[str, float]:
-    """Return a branch's fixed parameters: the frequency, and those that differ from the run's values."""
+    """Return a branch's fixed parameters: the drive frequency, and those that differ from the run's values."""
     parameter = str(ds.attrs["parameter"])
     names = [FREQUENCY] if parameter != FREQUENCY and FREQUENCY in ds else []
     names += [str(n) for n in ds.data_vars if str(ds[n].attrs.get("long_name", "")) == f"value of {n}"]
@@ -87,7 +87,7 @@ def fixed_of(ds: xr.Dataset, branch: int) -> dict[str, float]:
 
 
 def _unstable(one: xr.Dataset, kind: str) -> tuple[str, str]:
-    """Return the numbers of unstable multipliers below and above in the parameter, as texts."""
+    """Return the numbers of unstable multipliers below and above a bifurcation's parameter value, as texts."""
     before, after = int(one["n_unstable_before"]), int(one["n_unstable_after"])
     rises = bool(one["rises_before"])
     if kind == FOLD:
@@ -153,7 +153,9 @@ def _left_out(ds: xr.Dataset) -> list[str]:
 
 
 def windows_of(ds: xr.Dataset) -> list[dict[str, Any]]:
-    """Return the stable segments of the branches with their bounds, sorted by period, side and parameter."""
+    """Return the stable segments of the branches with their bounds, sorted by period, classifier label and parameter
+    value.
+    """
     found = []
     for i in range(ds.sizes["branch"]):
         n = int(ds["n_points"][i])
@@ -176,7 +178,7 @@ def windows_of(ds: xr.Dataset) -> list[dict[str, Any]]:
 
 
 def _stable_runs(stable: np.ndarray, closed: bool) -> list[tuple[int, int]]:
-    """Return the first and last points of runs of stable points; on a closed branch a run may wrap."""
+    """Return the first and last index of each run of stable points; on a closed branch a run may wrap around."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], stable.astype(np.int8), [0]])))
     runs = [(int(a), int(b) - 1) for a, b in edges.reshape(-1, 2)]
     if closed and len(runs) > 1 and stable[0] and stable[-1]:
@@ -190,7 +192,7 @@ def _ends_of(ds: xr.Dataset, branch: int) -> tuple[str, str]:
 
 
 def _bound(ds: xr.Dataset, branch: int, point: int, after: int, end: int) -> tuple[float, str]:
-    """Return the value and name of a stable segment's bound: a bifurcation after `after`, or the end."""
+    """Return the parameter value and the name of a stable segment's bound: a bifurcation, or the branch's end."""
     here = np.flatnonzero((ds["of_branch"].values == branch) & (ds["after"].values == after))
     value = float(ds["parameter"][branch, point])
     if len(here):

@@ -57,7 +57,7 @@ def chaos(ds: xr.Dataset, attractors: xr.Dataset, options: ChaosOptions | None =
 
 
 def chaotic_cells(ds: xr.Dataset, options: ChaosOptions | None = None, **changes: Any) -> xr.Dataset:
-    """Compute the indicators of chaos of each cell.
+    """Compute the indicators of chaos (Lyapunov exponents, dimension, 0-1 test) of each cell (trajectory).
 
     Parameters
     ----------
@@ -103,7 +103,8 @@ def chaotic_cells(ds: xr.Dataset, options: ChaosOptions | None = None, **changes
 
 
 def check_chaos(ds: xr.Dataset, options: ChaosOptions) -> None:
-    """Check that the cube allows an indicator, or that orbits are polished and so have multipliers.
+    """Raise ValueError unless the cube allows Lyapunov exponents or the 0-1 test, or orbits are polished and have
+    multipliers.
 
     Raises
     ------
@@ -115,7 +116,7 @@ def check_chaos(ds: xr.Dataset, options: ChaosOptions) -> None:
 
 
 def reasons(ds: xr.Dataset, stride: int = 1) -> list[str]:
-    """Return the reasons why a cube does not allow the exponents or the 0-1 test, a sentence each."""
+    """Return a sentence for each reason why a cube does not allow Lyapunov exponents or the 0-1 test."""
     found = []
     if "lyapunov" not in ds:
         found.append(
@@ -137,7 +138,7 @@ def _of_exponents(ds: xr.Dataset, options: ChaosOptions) -> xr.Dataset:
 
 
 def _without_exponents(ds: xr.Dataset) -> xr.Dataset:
-    """Return the motion of cells without exponents: regular if closed, otherwise unknown."""
+    """Return the class of motion of cells without Lyapunov exponents: regular if closed, otherwise unknown."""
     closed = is_closed(ds)
     motion = xr.full_like(closed, Motion.UNKNOWN, dtype=np.int8)
     motion = motion.where(~closed, np.int8(Motion.REGULAR)).assign_attrs(motion_attrs())

@@ -1,4 +1,4 @@
-"""Compute the Kaplan-Yorke and the correlation dimension of the section.
+"""Compute the Kaplan-Yorke and the correlation dimension of attractors on the section.
 
 On the section a closed orbit is a few points, of dimension 0, and a quasi-periodic motion is a curve, of
 dimension 1. The attractor of the flow has one dimension more.
@@ -101,7 +101,7 @@ def kaplan_yorke_dimension(
 
 
 def _without_zero(values: np.ndarray, rates: np.ndarray) -> np.ndarray:
-    """Drop the value of the rate nearest to 0 from the last axis."""
+    """Drop from the last axis of `values` the entry whose rate is nearest to 0."""
     nearest = np.argmin(np.abs(np.nan_to_num(rates, nan=np.inf)), axis=-1)
     kept = np.arange(rates.shape[-1]) != nearest[..., None]
     return np.asarray(values[kept].reshape(*rates.shape[:-1], rates.shape[-1] - 1))
@@ -130,7 +130,8 @@ def correlation_dimension(
     floor: float = SAME_POINT,
     geometry: Geometry | None = None,
 ) -> xr.Dataset:
-    """Compute the correlation dimension of each cell's sections, with the curve and the range of the fit.
+    """Compute the correlation dimension of each cell's section points, with the correlation sum and the range of the
+    fit.
 
     The correlation sum C(r) is the share of pairs of points closer than r; the dimension is the
     slope of log C against log r (Grassberger and Procaccia, Phys. Rev. Lett. 50, 346 and Physica D 9,
@@ -217,7 +218,7 @@ def correlation_dimension(
 
 @dataclass(frozen=True)
 class _Curve:
-    """The correlation sum of one set, with the dimension and the range of its fit."""
+    """Correlation sum of one set, with the fitted dimension and the range of the fit."""
 
     log_radius: Floats
     log_sum: Floats
@@ -239,7 +240,7 @@ def _sample(section: Floats, n_max: int) -> Floats:
 
 
 def _dimension_of(section: Floats, theiler: int, floor: float, geometry: Geometry) -> _Curve:
-    """Compute the correlation dimension of the points of some cells, shape (cell, n, state)."""
+    """Compute the correlation dimension of the section points of some cells, shape (cell, n, state)."""
     n_radii = N_OCTAVES * PER_OCTAVE + 1
     nothing = _Curve(np.full(n_radii, np.nan), np.full(n_radii, np.nan))
     n_points = section.shape[0] * section.shape[1]
@@ -269,7 +270,9 @@ def _dimension_of(section: Floats, theiler: int, floor: float, geometry: Geometr
 
 
 def _extent(points: Floats, geometry: Geometry) -> float:
-    """Return the largest extent of a component, at most half its circle."""
+    """Return the largest scaled extent of the points over all state components; an angle counts at most half its
+    circle.
+    """
     extent = 0.0
     for i, length in enumerate(geometry.circumference):
         x = geometry.scaled(points)[:, i]
@@ -303,7 +306,7 @@ class _Pairs:
 
     @classmethod
     def of(cls, section: Floats, radii: Floats, theiler: int, geometry: Geometry) -> _Pairs:
-        """Count the pairs among the points of some cells, shape (cell, n, state)."""
+        """Count the pairs closer than each radius among the section points of some cells, shape (cell, n, state)."""
         m, n, _ = section.shape
         points = section.reshape(m * n, -1)
         everything = geometry.tree(points)
@@ -327,11 +330,11 @@ class _Pairs:
 
     @property
     def all(self) -> npt.NDArray[np.int64]:
-        """Pairs of all points, shape (radius,)."""
+        """Numbers of pairs among all points, shape (radius,)."""
         return np.asarray(self.by_part.sum(axis=0))
 
     def without(self, part: int) -> npt.NDArray[np.int64]:
-        """Return the pairs of points outside of a part, shape (radius,)."""
+        """Return the numbers of pairs among the points outside of one part of the sample, shape (radius,)."""
         return np.asarray(self.all - 2 * self.by_part[part] + self.within[part])
 
 
@@ -340,7 +343,9 @@ def _logarithm(values: npt.NDArray[Any]) -> Floats:
 
 
 def _slope(x: Floats, y: Floats, rows: npt.NDArray[np.int64]) -> float:
-    """Fit a slope through some rows by least squares, without radii that have no pair."""
+    """Fit the slope of y against x over some radii by least squares, without radii that no pair of points is closer
+    than.
+    """
     rows = rows[np.isfinite(y[rows])]
     x, y = x[rows] - x[rows].mean(), y[rows] - y[rows[0]]  # a flat curve has the slope 0 exactly
     return float((x * y).sum() / (x * x).sum())

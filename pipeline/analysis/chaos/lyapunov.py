@@ -26,7 +26,7 @@ FEWEST_BLOCKS = 12
 
 
 class Motion(IntEnum):
-    """Classes of motion by a cell's exponents."""
+    """Classes of a cell's motion by its Lyapunov exponents."""
 
     UNKNOWN = 0
     REGULAR = 1
@@ -36,7 +36,7 @@ class Motion(IntEnum):
 
 
 def summarise(ds: xr.Dataset, *, n_sigma: float = 3.0, least: float = 0.005) -> xr.Dataset:
-    """Classify the motion of each cell by its exponents, with errors, drift and consistency checks.
+    """Classify the motion of each cell by its Lyapunov exponents, with errors, drift and consistency checks.
 
     Parameters
     ----------
@@ -100,7 +100,7 @@ def summarise(ds: xr.Dataset, *, n_sigma: float = 3.0, least: float = 0.005) -> 
 
 
 def period_seconds(ds: xr.Dataset) -> xr.DataArray:
-    """Return the time between two sections [s]: a drive period, or the mean return of each cell."""
+    """Return the time between two section points [s]: a drive period, or the mean return time of each cell."""
     if "return_time" in ds:
         return ds["return_time"].mean("period_index")
     frequency = ds["frequency"] if "frequency" in ds.coords else xr.DataArray(float(ds.attrs["frequency_hz"]))
@@ -114,7 +114,7 @@ def _running(blocks: xr.DataArray) -> xr.DataArray:
 
 
 def is_closed(ds: xr.Dataset) -> xr.DataArray:
-    """Return which cells' sections closed."""
+    """Return for each cell whether its section points repeat with a period."""
     return (ds["status"] == PERIODIC) | (ds["orbit_period"] > 0)
 
 
@@ -143,7 +143,7 @@ def _motion(ds: xr.Dataset, n_sigma: float, least: float) -> dict[str, xr.DataAr
 
 
 def motion_attrs() -> dict[str, Any]:
-    """Return the attributes of an array of codes of `Motion`."""
+    """Return the xarray attributes of an array of `Motion` codes: unit, name, flag values and meanings."""
     return {
         "units": "1",
         "long_name": "kind of motion by its exponents",
@@ -153,7 +153,7 @@ def motion_attrs() -> dict[str, Any]:
 
 
 def transients(ds: xr.Dataset, *, n_sigma: float, least: float) -> xr.DataArray:
-    """Detect cells whose chaos ended within the blocks of their exponents.
+    """Detect cells with transient chaos: it ended within the time blocks over which their exponents are averaged.
 
     Returns
     -------
@@ -184,7 +184,7 @@ def transients(ds: xr.Dataset, *, n_sigma: float, least: float) -> xr.DataArray:
 
 
 def on_attractor(ds: xr.Dataset, *, n_sigma: float, least: float) -> xr.DataArray:
-    """Return which cells' largest exponent describes the set that they ended on.
+    """Return for each cell whether its largest exponent describes the set on which it ended.
 
     Their flag is good, or only the first exponent is resolved, and they are no transients.
     """

@@ -74,7 +74,7 @@ FEWEST_POINTS = 1000
 
 
 class Nature(IntEnum):
-    """Classes of attractors by their exponents or, without exponents, by the 0-1 test."""
+    """Classes of the motion on attractors by their exponents or, without exponents, by the 0-1 test."""
 
     UNKNOWN = 0
     REGULAR = 1
@@ -88,14 +88,14 @@ class Nature(IntEnum):
 
     @property
     def words(self) -> str:
-        """Label for tables."""
+        """Label of this class in tables."""
         by_test = self.name.endswith("_BY_TEST")
         name = self.name.removesuffix("_BY_TEST").lower().replace("quasi_", "quasi-")
         return name + (" (by the 0-1 test)" if by_test else "")
 
     @property
     def has_dimension(self) -> bool:
-        """Whether a correlation dimension of its sections is computed."""
+        """Whether a correlation dimension is computed for attractors of this class."""
         return self in (Nature.CHAOTIC, Nature.HYPERCHAOTIC, Nature.CHAOTIC_BY_TEST, Nature.UNDECIDED)
 
 
@@ -104,7 +104,7 @@ _FROM = ("none", "multipliers", "cells", "eigenvalues")
 
 @dataclass
 class _Cells:
-    """The cells of one parameter point as rows.
+    """Cells of one parameter point, as rows of arrays.
 
     Attributes
     ----------
@@ -131,7 +131,7 @@ class _Cells:
 
 
 def chaos_per_attractor(ds: xr.Dataset, cells: xr.Dataset, attractors: xr.Dataset, options: ChaosOptions) -> xr.Dataset:
-    """Add the variables per attractor to those of the cells; see the text of this module.
+    """Add variables per attractor to the chaos indicators of the cells; the text of this module lists them.
 
     Parameters
     ----------
@@ -197,7 +197,7 @@ def _flags(words: Sequence[str]) -> dict[str, Any]:
 
 
 def _of_attractor(one: xr.Dataset, cells: _Cells, number: int, n_states: int, options: ChaosOptions) -> dict[str, Any]:
-    """Compute the counts, exponents, 0-1 test and nature of one attractor."""
+    """Compute the cell counts, exponents, 0-1 test and class of motion of one attractor."""
     is_own = cells.values["attractor_id"] == number
     found: dict[str, Any] = {"kind_is_bounded": int(one["kind"]) in APERIODIC}
     found |= _counts(cells, is_own, options)
@@ -262,7 +262,9 @@ def _exponents(one: xr.Dataset, cells: _Cells, is_own: npt.NDArray[np.bool_], n_
 
 
 def _nature(one: xr.Dataset, found: dict[str, Any], options: ChaosOptions) -> Nature:
-    """Return the nature of a set by its kind and stability, else by its exponents or the 0-1 test."""
+    """Classify the motion on a set by the set's kind and stability or, if these do not decide, by exponents or the 0-1
+    test.
+    """
     kind, stability = int(one["kind"]), int(one["stability"])
     if kind in (PERIODIC_ORBIT, EQUILIBRIUM):
         return Nature.UNDECIDED if stability == UNSTABLE else Nature.REGULAR
@@ -288,13 +290,15 @@ def _nature(one: xr.Dataset, found: dict[str, Any], options: ChaosOptions) -> Na
 
 
 class _Curves:
-    """The correlation dimensions of attractors, from their cells' pooled sections."""
+    """Correlation dimensions of attractors, from the pooled section points of their cells."""
 
     def __init__(self, options: ChaosOptions) -> None:
         self._n_max = options.n_max
 
     def of(self, point: xr.Dataset, starts: Sequence[str], cells: _Cells, number: int) -> dict[str, float]:
-        """Compute the dimension of one attractor from its cells; empty if there are too few points."""
+        """Compute the correlation dimension of one attractor from its cells; return an empty dict if there are too few
+        points.
+        """
         lasting = (cells.values["attractor_id"] == number) & (cells.values["is_transient"] != 1)
         n_keep = point.sizes["period_index"]
         if min(int(lasting.sum()) * n_keep, self._n_max) < FEWEST_POINTS:
@@ -309,7 +313,7 @@ class _Curves:
 
 
 def pooled(point: xr.Dataset, starts: Sequence[str], which: npt.NDArray[np.bool_]) -> xr.Dataset:
-    """Return the sections and status of some cells of a parameter point, on the dim ``cell``."""
+    """Return the sections and status of some cells of a parameter point, stacked on the dim ``cell``."""
     own = point[["section", "status"]].reset_coords(drop=True)
     rows = own.stack(cell=list(starts), create_index=False) if starts else own.expand_dims("cell")
     return rows.isel(cell=np.flatnonzero(which)).assign_attrs(point.attrs)

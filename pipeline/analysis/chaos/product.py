@@ -10,28 +10,32 @@ from pipeline.products.chaos import ChaosOptions, DimensionOptions
 
 
 def needs_chaos(run: Run, options: ChaosOptions) -> None:
-    """Raise ValueError if the cube has neither exponents nor enough sections and orbits are not polished."""
+    """Raise ValueError if no indicator of chaos can be computed: no exponents, too few sections, and orbits not
+    polished.
+    """
     from pipeline.analysis.chaos.chaos import check_chaos
 
     check_chaos(run.cube(), options)
 
 
 def chaos(run: Run, options: ChaosOptions) -> xr.Dataset:
-    """Compute exponents, dimensions and 0-1 test of the cells and of each attractor."""
+    """Compute Lyapunov exponents, dimensions and 0-1 test of the cells and of each attractor."""
     from pipeline.analysis.chaos.chaos import chaos as compute
 
     return compute(run.cube(), run.derive("attractors", **options.part(AttractorOptions)), options)
 
 
 def needs_dimension(run: Run, options: DimensionOptions) -> None:
-    """Raise ValueError for an axis or a value that the cube does not have."""
+    """Raise ValueError if the options select an axis or a value that the cube does not have."""
     from pipeline.analysis.selection import select_points
 
     select_points(run.cube(), options.at)
 
 
 def settle_dimension(run: Run, options: DimensionOptions) -> DimensionOptions:
-    """Replace values by the exact axis values, so that every spelling of a point has the same kept result."""
+    """Replace selected parameter values by the exact axis values, so that rounded values find the same stored
+    result.
+    """
     from pipeline.analysis.selection import select_points
 
     part = select_points(run.cube(), options.at)
@@ -39,7 +43,7 @@ def settle_dimension(run: Run, options: DimensionOptions) -> DimensionOptions:
 
 
 def dimension(run: Run, options: DimensionOptions) -> xr.Dataset:
-    """Compute the correlation dimension of each attractor that does not close."""
+    """Compute the correlation dimension of each non-periodic attractor."""
     from pipeline.analysis.chaos.correlation import section_dimension
 
     return section_dimension(run.cube(), run.derive("attractors", **options.part(AttractorOptions)), options)

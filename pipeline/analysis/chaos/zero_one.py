@@ -131,7 +131,7 @@ def _number(ds: xr.Dataset, state: str) -> int:
 
 
 def _observable(section: Floats, state: int | None, geometry: Geometry) -> Floats:
-    """Return the observable without its mean, shape (cell, n); 0 where the sections are one point."""
+    """Return the observable of the 0-1 test without its mean, shape (cell, n); 0 where all section points coincide."""
     columns = range(section.shape[-1]) if state is None else [state]
     lines = []
     for i in columns:
@@ -167,7 +167,9 @@ def _zero_one(phi: Floats, c: Floats) -> Floats:
 
 
 def _growth(phi: Floats, c: Floats) -> Floats:
-    """Compute K_c of each observable and frequency, shape (cell, c); 0 where the observable is 0."""
+    """Compute the correlation K_c of the 0-1 test for each observable and frequency c, shape (cell, c); 0 for a zero
+    observable.
+    """
     n = phi.shape[1]
     n_cut = n // 10
     walk = np.cumsum(phi[:, None, :] * np.exp(1j * c[:, None] * np.arange(1, n + 1)), axis=-1)
@@ -180,7 +182,8 @@ def _growth(phi: Floats, c: Floats) -> Floats:
 
 
 def _displacement(walk: npt.NDArray[np.complex128], n_cut: int) -> Floats:
-    """Compute the mean of ``|z(j + lag) - z(j)|**2`` over the first n - n_cut j, for lags 1 to `n_cut`.
+    """Compute the mean square displacement ``|z(j + lag) - z(j)|**2`` of a walk z over the first n - n_cut j, lags 1 to
+    `n_cut`.
 
     The lags are on the last axis. The expanded square gives sums of squares and a correlation, which is
     computed by Fourier transform.

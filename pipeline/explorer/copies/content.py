@@ -1,4 +1,4 @@
-"""Collect the content of a copy: view, answers, planes, columns, layers."""
+"""Collect the data of an exported page: description of the run, diagrams, overlays, planes of initial states."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ Place = dict[str, int]
 
 @dataclass
 class Copied:
-    """The copied content of a run.
+    """Data and notes of an export, collected so far.
 
     Attributes
     ----------
@@ -63,7 +63,7 @@ class Copied:
 
     @property
     def x(self) -> str:
-        """Return the default horizontal axis."""
+        """Name of the default horizontal axis."""
         return str(self.view["axes"][0]["name"])
 
     def size(self) -> int:
@@ -72,7 +72,7 @@ class Copied:
 
 
 def gather(run: ExploredRun, quantities: Sequence[str] = ()) -> Copied:
-    """Return the content that both kinds of copies share; columns are added later.
+    """Collect the data that one-file and folder exports share; diagram data are added later.
 
     Parameters
     ----------
@@ -125,7 +125,7 @@ def gather(run: ExploredRun, quantities: Sequence[str] = ()) -> Copied:
 
 
 def _view(run: ExploredRun, quantities: Sequence[str]) -> tuple[dict[str, Any], int]:
-    """Return the view with these quantities only, and the number left out."""
+    """Return the description of a run with only these quantities, and the number of quantities omitted."""
     known = [q.name for q in run.model.quantities]
     if problems := [unknown_name("--quantity", name, known) for name in quantities if name not in known]:
         raise SpecError(problems)
@@ -137,20 +137,20 @@ def _view(run: ExploredRun, quantities: Sequence[str]) -> tuple[dict[str, Any], 
 
 
 def places(run: ExploredRun, but: str = "") -> Iterator[Place]:
-    """Yield every combination of indices on the swept axes but one."""
+    """Yield every combination of indices on the swept axes, except the axis `but`."""
     swept = [a for a in run.axes if a.swept and a.name != but]
     for indices in itertools.product(*(range(len(a.values)) for a in swept)):
         yield {a.name: i for a, i in zip(swept, indices, strict=True)}
 
 
 def place_key(run: ExploredRun, at: Mapping[str, int], x: str = "") -> str:
-    """Return the name of an answer for a place; the page builds the same name (`placeKey`)."""
+    """Return the key of an answer at given axis indices; the page's script builds the same key (`placeKey`)."""
     parts = [f"{a.name}={at.get(a.name, 0)}" for a in run.axes if a.name != x]
     return "&".join([*([f"x={x}"] if x else []), *parts])
 
 
 def _answers(copied: Copied, kind: str, asked: Iterable[tuple[str, Callable[[], Any]]], alike: bool = False) -> None:
-    """Put the answers of a kind into objects of about equal size; of too many, none.
+    """Pack the answers to all requests of a kind into objects of about equal size; pack none if there are too many.
 
     If they are all alike, the first stands for all.
     """
@@ -179,7 +179,7 @@ def _answers(copied: Copied, kind: str, asked: Iterable[tuple[str, Callable[[], 
 
 
 def add_planes(copied: Copied, most_bytes: float) -> None:
-    """Add the planes of initial states, up to a total size."""
+    """Add the labelled planes of initial states to an export, until a total size is reached."""
     run, size, none = copied.run, 0, None
     objects: dict[str, str] = {}
     found = list(itertools.islice(places(run), MOST_PLACES + 1))
@@ -208,7 +208,7 @@ def _product(run: ExploredRun) -> int:
 
 @dataclass(frozen=True)
 class Column:
-    """The points of one vertical axis, cell by cell.
+    """Diagram points of one vertical axis: values, and the number of points of each cell.
 
     Attributes
     ----------
@@ -243,14 +243,14 @@ def column(run: ExploredRun, x: str, y: str) -> tuple[Column, dict[str, np.ndarr
 
 
 def ranges(first: np.ndarray, count: np.ndarray) -> np.ndarray:
-    """Return ``first[0], first[0] + 1, ...``, `count[0]` of them, then likewise from ``first[1]`` on."""
+    """Concatenate the index ranges ``first[i], ..., first[i] + count[i] - 1`` for all i."""
     ends = np.cumsum(count, dtype=np.int64)
     total = int(ends[-1]) if len(ends) else 0
     return np.asarray(np.arange(total) + np.repeat(np.asarray(first, np.int64) - (ends - count), count))
 
 
 def place_of(run: ExploredRun, vertical: Vertical) -> tuple[str, list[int | None]]:
-    """Return where a vertical axis is stored: a variable, and an index on each of its own dims.
+    """Return where the cube stores a vertical axis: the variable, and an index for each dim that is not a cell dim.
 
     The index is None on the dim of sections.
     """

@@ -1,4 +1,4 @@
-"""Export a run for a browser without a server, as one file or as a folder.
+"""Export a run's interactive page for a browser without a server, as one file or as a folder.
 
 A copy computes nothing: its orbits were integrated when it was made, and it lists its gaps.
 """
@@ -37,7 +37,7 @@ RESERVE = 10_000
 
 @dataclass(frozen=True)
 class Exported:
-    """The result of an export.
+    """Result of an export: its path, size, number of orbits, and notes.
 
     Attributes
     ----------
@@ -64,7 +64,7 @@ def export_page(
     most_orbits: int = MOST_ORBITS,
     most_bytes: int = MOST_BYTES,
 ) -> Exported:
-    """Write a run as one HTML file that opens by a double click.
+    """Write a run's interactive page as one HTML file.
 
     Parameters
     ----------
@@ -117,7 +117,7 @@ def _html(copied: Copied) -> bytes:
 
 
 def _fitted(copied: Copied, columns: Mapping[str, Column], most_bytes: int) -> Fitted:
-    """Return the columns in as much detail as fits beside the rest of the page."""
+    """Return the diagram data in as much detail as fits into the file beside the rest of the page."""
     # base64 makes four of three
     room = (most_bytes - len(_html(copied)) - RESERVE) * 3 / 4
     found = fit(columns, periods(copied.run), room) if room > 0 else None
@@ -130,7 +130,7 @@ def _fitted(copied: Copied, columns: Mapping[str, Column], most_bytes: int) -> F
 
 
 def check_place(out: Path, force: bool) -> None:
-    """Raise `RefusedError` if a path is taken or not writable, before any computation.
+    """Raise `RefusedError` if a path exists or is not writable, before anything is computed.
 
     Raises
     ------
@@ -164,7 +164,7 @@ def periods(run: ExploredRun) -> np.ndarray:
 
 
 def add_all_orbits(copied: Copied, columns: Mapping[str, Column], layers: Mapping[str, np.ndarray], room: Room) -> int:
-    """Integrate the representative orbits and add them; return their number."""
+    """Integrate representative orbits and add them to an export; return their number."""
     run = copied.run
     count = columns[next(iter(columns))].count
     known = {**layers, "orbit_period": periods(run)}
@@ -172,13 +172,13 @@ def add_all_orbits(copied: Copied, columns: Mapping[str, Column], layers: Mappin
 
 
 def finished(copied: Copied) -> dict[str, bytes]:
-    """Return all objects, the copy's description first."""
+    """Return all packed objects of an export, the description of the run first."""
     about = {**copied.about, "notice": notice(copied)}
     return {"view": packed_json({"view": copied.view, "about": about}), **copied.objects}
 
 
 def notice(copied: Copied) -> str:
-    """Return the notes that a reader of a copy needs."""
+    """Return the notes shown to readers of an exported page."""
     view = copied.view
     first = (
         f"This is a copy of the run {view['name']} (digest {view['digest'][:12]}), made by "

@@ -1,4 +1,4 @@
-"""Export a run as a folder for any static host, read column by column on demand."""
+"""Export a run's interactive page as a folder for any static web host; the page loads its data on demand."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ MOST_BYTES = 500_000_000
 def export_folder(
     source: Run, out: Path, *, force: bool = False, quantities: Sequence[str] = (), most_orbits: int = MOST_ORBITS
 ) -> Exported:
-    """Write a run as a folder that any static host can serve.
+    """Write a run's interactive page and data as a folder that any static web host can serve.
 
     In it are the page, the cube with its metadata in one file and its chunks cut by columns, and
     ``objects.json`` with the sha256 of every object, whose own sha256 stands in the page.
@@ -136,7 +136,7 @@ def _write(run: ExploredRun, folder: Path, quantities: Sequence[str], most_orbit
 
 
 def _quantity(run: ExploredRun, name: str, column: Column) -> Layer:
-    """Return a quantity at the drawn sections, as an array of the cube; NaN where there are none."""
+    """Return a quantity at the section points of the diagram, in the shape of the cube; NaN elsewhere."""
     values = np.full((run.plan.n_cells, run.n_keep), np.nan)
     values[np.arange(run.n_keep) < column.count[:, None]] = column.y
     quantity = run.model.quantity(name)
@@ -145,7 +145,7 @@ def _quantity(run: ExploredRun, name: str, column: Column) -> Layer:
 
 
 def _layers_of(copied: Copied, layers: dict[str, np.ndarray]) -> dict[str, Layer]:
-    """Return colour codes in the shape of the cube, with the meaning of each code."""
+    """Return the colour codes of the cells as arrays in the shape of the cube, with the meaning of each code."""
     shape = copied.run.plan.shape
     titles = {f"colour_{c['name']}": c for c in copied.view["colours"]}
     return {

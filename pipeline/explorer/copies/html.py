@@ -1,4 +1,4 @@
-"""Write the HTML of copies: a single file, or a page with a data folder."""
+"""Write the HTML of exported pages, with the data inside or in a folder."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _DATA = '<script type="application/octet-stream;base64" id="data-{name}">{conten
 
 
 def static_text(name: str) -> str:
-    """Return a file of the built page."""
+    """Return the text of a file in ``static/``, where the built page lies."""
     return resources.files("pipeline.explorer").joinpath("static", name).read_text("utf-8")
 
 
@@ -44,7 +44,7 @@ def inline_html(title: str, generator: str, objects: Mapping[str, bytes]) -> str
 
 
 def folder_html(title: str, generator: str, list_sha256: str) -> str:
-    """Return the page of a folder; it holds the digest of the list of digests."""
+    """Return the HTML page of a folder export, with the digest of ``objects.json``, which lists the data's digests."""
     return _page("folder", title, generator, "explorer-folder.js", "'self'", f' data-objects="{list_sha256}"')
 
 
@@ -72,5 +72,5 @@ def _page(
 
 
 def _digest(text: str) -> str:
-    """Return a text's digest in the form of a content policy."""
+    """Return the SHA-256 of a text in the form that a content security policy (HTTP) needs."""
     return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"

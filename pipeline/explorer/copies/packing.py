@@ -1,4 +1,4 @@
-"""Pack a copy's data for its page: arrays or JSON in gzip.
+"""Pack the data of an exported page: arrays or JSON, compressed by gzip.
 
 Bytes of numbers lie apart, all first bytes before all second ones, which gzip makes a third smaller.
 `page/src/export-data.js` is the other end.
@@ -20,7 +20,7 @@ LEVEL = 6
 
 
 def packed(arrays: Mapping[str, np.ndarray], attrs: Mapping[str, Any] | None = None) -> bytes:
-    """Return arrays and attributes as a packed object.
+    """Return arrays and attributes as gzip bytes.
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ def packed(arrays: Mapping[str, np.ndarray], attrs: Mapping[str, Any] | None = N
 
 
 def packed_json(value: Any) -> bytes:
-    """Return a JSON value as a packed object; no NaN and no infinity."""
+    """Return a JSON value as gzip bytes; raise `ValueError` for NaN or infinity."""
     return _zipped(json.dumps(value, allow_nan=False, separators=(",", ":")).encode())
 
 

@@ -1,1 +1,1 @@
-"""Read a run for the page: diagrams, planes, orbits, overlays, tables."""
+"""Read from a run the data that the page shows: diagrams, planes, orbits, overlays, tables."""

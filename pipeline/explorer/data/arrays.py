@@ -58,7 +58,7 @@ def pack_arrays(arrays: Mapping[str, np.ndarray], attrs: Mapping[str, Any] | Non
 
 
 def unpack_arrays(data: bytes) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Return the arrays by name and the attributes given to `pack_arrays`."""
+    """Unpack a byte string of `pack_arrays` into arrays by name and attributes."""
     begin = 4 + int.from_bytes(data[:4], "little")
     header = json.loads(data[4:begin])
     arrays = {}

@@ -1,4 +1,4 @@
-"""Integrate the orbit behind a point of the diagram, from the section point in the cube."""
+"""Integrate the orbit behind a clicked point of the diagram, from its section point in the cube."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ MOST_SEEDS = 200
 
 @dataclass(frozen=True)
 class Cell:
-    """A cell of the cube, with its parameters and its start.
+    """A cell (trajectory) of the cube, with its parameters and initial state.
 
     Attributes
     ----------
@@ -60,23 +60,23 @@ class Cell:
 
     @property
     def status(self) -> Status:
-        """Return the cell's status."""
+        """Status of the cell's integration."""
         return Status(int(self.data["status"]))
 
     @property
     def section(self) -> np.ndarray:
-        """Return the kept sections, shape (n_keep, n_states); NaN where there are none."""
+        """Stored section points, shape (n_keep, n_states); NaN where there are none."""
         return np.asarray(self.data["section"].transpose("period_index", "state").values, np.float64)
 
     @property
     def period(self) -> int:
-        """Return the period in drive periods or returns, 0 if the kept sections do not close."""
+        """Period in drive periods or returns; 0 if the stored section points do not close."""
         closed = self.status in (Status.PERIODIC, Status.INFERRED)
         return int(self.data["orbit_period"]) if closed else 0
 
 
 def cell_of(run: ExploredRun, number: int) -> Cell:
-    """Read a cell; raise `ExplorerError` if it does not exist or has no section."""
+    """Read a cell; raise `ExplorerError` if it does not exist."""
     index = run.cell(number)
     cube = run.cube()
     names = [n for n in ("section", "turns", "status", "orbit_period", "lyapunov") if n in cube]
@@ -88,7 +88,7 @@ def cell_of(run: ExploredRun, number: int) -> Cell:
 
 
 def orbit(run: Run, cell: int, point: int, *, linearised: bool = True) -> bytes:
-    """Return the orbit behind a point in the page's form.
+    """Return the orbit behind a diagram point as arrays and attributes, packed for the page.
 
     Parameters
     ----------
@@ -139,7 +139,9 @@ def _no_point(cell: Cell, point: int, n_points: int) -> str:
 
 
 def _seconds(run: Run, cell: Cell, state: np.ndarray, n_periods: int) -> np.ndarray:
-    """Return the end time of each period from a section point [s]; integrate if there is no drive."""
+    """Return the end time of each period from a section point [s]; integrate to find the returns if there is no
+    drive.
+    """
     if run.model.crossing is None:
         return np.asarray(np.arange(1, n_periods + 1) / cell.clock_hz)
     from magpend_core.sections import run_branches
@@ -202,14 +204,14 @@ _TOLD = ("attractor", "share", "low", "high", "kind", "stability", "evidence")
 
 
 def _is_stable(stability: str | None, multipliers: np.ndarray | None) -> bool | None:
-    """Tell whether an orbit attracts: by the analysis, else by its multipliers; None if unknown."""
+    """Return whether an orbit attracts, by the stored analysis, else by its multipliers; None if unknown."""
     if stability is not None:
         return {STABILITIES[ATTRACTS]: True, STABILITIES[UNSTABLE]: False}.get(stability)
     return None if multipliers is None else bool(np.abs(multipliers).max() < 1.0)
 
 
 def shown(one: xr.Dataset) -> dict[str, str | None]:
-    """Return a set's kind and stability at a point, with the evidence for the stability (or None)."""
+    """Return kind and stability of an attractor or other limit set, with the evidence for its stability (or None)."""
     evidence = int(one["evidence"])
     return {
         "kind": KINDS[int(one["kind"])].replace("_", " "),
@@ -219,7 +221,7 @@ def shown(one: xr.Dataset) -> dict[str, str | None]:
 
 
 def _attractor(run: ExploredRun, cell: Cell) -> dict[str, Any]:
-    """Return the stored attractor data of a cell's set; empty if unknown.
+    """Return stored data on the attractor that a cell reaches: number, share, stability; None for unknown entries.
 
     A cell whose sections do not close may be on its way to a closed orbit all the same.
     """
@@ -273,7 +275,7 @@ def linearise(cell: Cell) -> tuple[np.ndarray | None, float | None]:
 def _exponents(
     cell: Cell, multipliers: np.ndarray | None, seconds: float | None
 ) -> tuple[list[float] | None, str | None]:
-    """Return Lyapunov exponents [1/s] from the cube, or from a closed orbit's multipliers."""
+    """Return Lyapunov exponents [1/s] from the cube, or from the multipliers of a closed orbit; and their source."""
     if "lyapunov" in cell.data:
         own = cell.data["lyapunov"].values
         if np.isfinite(own).all():
@@ -301,7 +303,7 @@ def _state(run: ExploredRun, values: np.ndarray) -> dict[str, float]:
 
 
 def seeds(run: ExploredRun, cell: Cell) -> list[dict[str, Any]]:
-    """Return the initial states at the cell's point that end on its attractor, its own first.
+    """Return the initial states at the cell's parameter point that end on its attractor, the cell's own first.
 
     Without attractors it is the cell's own alone. Each has a value of every state, and a ``label``.
     """
@@ -322,7 +324,7 @@ def seeds(run: ExploredRun, cell: Cell) -> list[dict[str, Any]]:
 
 
 def _starts_of(run: ExploredRun, name: str) -> np.ndarray:
-    """Return the initial values of a state, over the dims of the starts."""
+    """Return the initial values of a state, as an array over the dims of the initial conditions."""
     coordinate = run.cube().coords[name]
     sizes = [run.plan.shape[run.plan.dims.index(d)] for d in run.start_dims]
     shaped = [n if d in coordinate.dims else 1 for d, n in zip(run.start_dims, sizes, strict=True)]

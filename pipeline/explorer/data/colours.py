@@ -43,7 +43,7 @@ _STATUS = {
 
 @dataclass(frozen=True)
 class Category:
-    """One colour of a scheme, and its meaning."""
+    """One code of a colour scheme, with its meaning and colour."""
 
     number: int
     label: str
@@ -52,7 +52,7 @@ class Category:
 
 @dataclass(frozen=True)
 class Scheme:
-    """A way to colour cells.
+    """A scheme that colours cells: its codes, labels and colours.
 
     Attributes
     ----------
@@ -72,7 +72,7 @@ class Scheme:
     needs: tuple[str, ...] = ()
 
     def describe(self) -> dict[str, Any]:
-        """Return the scheme in the page's form."""
+        """Return the scheme as a dictionary for the page."""
         return {
             "name": self.name,
             "title": self.title,
@@ -126,7 +126,7 @@ def _schemes(run: ExploredRun) -> Iterator[Scheme]:
 
 
 def _seeds(run: ExploredRun) -> Iterator[Scheme]:
-    """Colour by the initial state, if there are few."""
+    """Yield the scheme that colours cells by their initial state, if there are few initial states."""
     cube, dims = run.cube(), run.start_dims
     sizes = [run.plan.shape[run.plan.dims.index(d)] for d in dims]
     walked = BRANCH in dims
@@ -148,7 +148,7 @@ def _seeds(run: ExploredRun) -> Iterator[Scheme]:
 
 
 def _ends(found: xr.Dataset) -> tuple[xr.DataArray, tuple[Category, ...]]:
-    """Return codes of the cells' ends: an attractor id, or a grey beyond all ids; and the greys.
+    """Return for each cell the code of its attractor, or of a grey category beyond all ids; and the grey categories.
 
     Cells that diverged, failed or are pending have none.
     """
@@ -165,7 +165,7 @@ def _ends(found: xr.Dataset) -> tuple[xr.DataArray, tuple[Category, ...]]:
 
 
 def _told(codes: xr.DataArray) -> xr.DataArray:
-    """Return motion codes, with none for cells that were not classified."""
+    """Return motion codes with -1 for cells that were not classified."""
     return codes.where(codes > 0, -1)
 
 

@@ -1,4 +1,4 @@
-"""Read the points of a bifurcation diagram: the kept sections at fixed values of the other axes.
+"""Read the points of a bifurcation diagram: the stored section points at fixed values of the other axes.
 
 The cube is read block by block in the chunks of the store, each compared with its sha256; what stays in
 memory is one number per point. A diagram of more than `MOST_POINTS` shows the last sections of each cell, as
@@ -59,7 +59,7 @@ class Points:
 
 
 def diagram(run: Run, x: str, y: str, at: Mapping[str, int]) -> bytes:
-    """Return a diagram in the page's form.
+    """Return the points of a bifurcation diagram as arrays and attributes, packed for the page.
 
     Parameters
     ----------
@@ -121,13 +121,13 @@ def points(run: ExploredRun, x: str, y: str, at: Mapping[str, int]) -> Points:
 
 
 def _numbered(run: ExploredRun) -> xr.Dataset:
-    """Return the cube with each cell's index along every dim, as ``_DIM``."""
+    """Return the cube with the indices along every dim as coordinates named ``_DIM``."""
     ds = run.cube()
     return ds.assign_coords({f"_{d}": (d, np.arange(n)) for d, n in zip(run.plan.dims, run.plan.shape, strict=True)})
 
 
 def _cell_numbers(run: ExploredRun, place: Mapping[str, int]) -> np.ndarray:
-    """Return the flat numbers of the selected cells, in the shape of the selection."""
+    """Return the flat cube indices of the selected cells, in the shape of the selection."""
     dims, shape = run.plan.dims, run.plan.shape
     chosen = [np.array([place[d]]) if d in place else np.arange(n) for d, n in zip(dims, shape, strict=True)]
     return np.asarray(np.ravel_multi_index(np.ix_(*chosen), shape)).astype(np.uint32)
@@ -146,7 +146,7 @@ class _Table:
         self.codes = {s.name: np.full(sizes, NONE, np.uint16) for s in self.schemes}
 
     def read(self, ds: xr.Dataset, selection: Mapping[str, slice]) -> None:
-        """Read a block of cells."""
+        """Read values, status and colour codes of a block of cells."""
         block = ds[self.names].isel(selection).load()
         where: Any = tuple(selection[d] for d in self.dims)
         status = block["status"].transpose(*self.dims)
@@ -160,7 +160,7 @@ class _Table:
             self.codes[scheme.name][where] = np.where(found.values < 0, NONE, found.values)
 
     def points(self, x: np.ndarray, cells: np.ndarray) -> Points:
-        """Return the drawable points read, sorted along the horizontal axis."""
+        """Return the points read so far that can be drawn, ordered along the horizontal axis."""
         n = self.status.size
 
         def ordered(array: np.ndarray) -> np.ndarray:

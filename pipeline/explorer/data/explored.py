@@ -1,4 +1,4 @@
-"""Open a run for the explorer: its cube and its stored results, each read once."""
+"""Open a run for the explorer; its cube and its stored analyses are each read once."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ MOST_LARGE = 2
 
 
 class ExplorerError(ValueError):
-    """A request for something that does not exist; the message is shown on the page."""
+    """Raised for a request for something that does not exist; the message is shown on the page."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class Axis:
 
 @dataclass(frozen=True)
 class ExploredRun(Run):
-    """A run whose cube is opened once, and whose kept results are read once.
+    """An opened run that reads its cube and the stored results of analyses only once.
 
     Reading never computes: what is not in the cube or in ``derived/`` is not there.
     """
@@ -68,14 +68,14 @@ class ExploredRun(Run):
 
     @classmethod
     def of(cls, source: str | Path | Run) -> ExploredRun:
-        """Return the current content of a run directory, or the cells of an opened run."""
+        """Open a run directory for the explorer, or wrap an opened run."""
         run = Run.open(source)
         if isinstance(run, cls):
             return run
         return cls(**{f.name: getattr(run, f.name) for f in fields(Run)})
 
     def cube(self, chunks: Any = None, *, check: bool | None = None) -> xr.Dataset:
-        """Return the cube, lazily; every chunk is checked when it is read."""
+        """Return the cube as a lazy dataset; each chunk is verified when it is read."""
         if chunks is not None or check is not None:
             return super().cube(chunks, check=check)
         with self._lock:
@@ -111,7 +111,7 @@ class ExploredRun(Run):
         return sorted(place.name for place in products_in(self.info.files.below(DERIVED)))
 
     def remembered(self, key: str, make: Callable[[], T]) -> T:
-        """Return a value made once per key, even under concurrent requests."""
+        """Return the value of a key, computed once, even under concurrent requests."""
         with self._lock:
             lock = self._opened.setdefault(f"lock {key}", threading.Lock())
         with lock:
@@ -121,7 +121,9 @@ class ExploredRun(Run):
             return found
 
     def large(self, key: str, make: Callable[[], T]) -> T:
-        """Return a large value by key: made one at a time, with only the last few kept."""
+        """Return the value of a key, computed at first use, one at a time; only the last few large values stay in
+        memory.
+        """
         with self._lock:
             last: list[str] = self._opened.setdefault("large", [])
             if key in last:
@@ -135,12 +137,12 @@ class ExploredRun(Run):
 
     @property
     def path(self) -> str | None:
-        """Return the axis that a continuation follows; None in a sweep."""
+        """Name of the axis along which a continuation runs; None for a sweep."""
         return None if self.plan.path is None else self.plan.dims[self.plan.path]
 
     @property
     def axes(self) -> tuple[Axis, ...]:
-        """Return the possible horizontal axes: swept parameters, or else the one shared value."""
+        """Possible horizontal axes: the swept parameters, or, if none is swept, the frequency or first parameter."""
         swept = tuple(Axis(a.dim, a.parameter, a.values) for a in parameter_axes(self.spec))
         if swept:
             return swept
@@ -158,23 +160,23 @@ class ExploredRun(Run):
 
     @property
     def start_dims(self) -> tuple[str, ...]:
-        """Return the dims that distinguish the cells of one parameter point."""
+        """Dims over initial conditions: they distinguish the cells at one parameter point."""
         return tuple(d for d in self.plan.dims if is_start_dim(d))
 
     @property
     def n_keep(self) -> int:
-        """Return the number of sections kept of each cell."""
+        """Number of section points stored for each cell."""
         return int(self.plan.sizes["period_index"])
 
     def check_axes(self, at: Mapping[str, int]) -> None:
-        """Raise `ExplorerError` for indices on axes that the run does not have."""
+        """Raise `ExplorerError` if an axis name does not exist in the run."""
         known = [a.name for a in self.axes]
         for name in at:
             if name not in known:
                 raise ExplorerError(unknown_name("axis", name, known or ["none"]))
 
     def place(self, at: Mapping[str, int], *, but: str = "") -> dict[str, int]:
-        """Return the index on every swept axis but one.
+        """Check the index on every swept axis except `but`, and return these indices by axis.
 
         Parameters
         ----------

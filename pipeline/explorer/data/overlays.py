@@ -1,4 +1,4 @@
-"""Read the curves, branches and attractors shown with a diagram.
+"""Read the curves, orbit branches and attractors that are drawn with a diagram.
 
 All of it is read from the cube and from ``derived/``; what no analysis has found is not there.
 """
@@ -39,7 +39,7 @@ MOST_SECTION = 2000
 
 
 def curves(run: Run, x: str, at: Mapping[str, int]) -> dict[str, Any]:
-    """Return exponents and basin fractions over the horizontal axis.
+    """Return curves of Lyapunov exponents and basin fractions along the horizontal axis.
 
     Parameters
     ----------
@@ -72,7 +72,7 @@ def curves(run: Run, x: str, at: Mapping[str, int]) -> dict[str, Any]:
 
 
 def _cube_exponents(run: ExploredRun, x: str, place: Mapping[str, int]) -> Iterator[dict[str, Any]]:
-    """Return the mean exponents over the starts, with the least and largest as a band."""
+    """Yield curves of the Lyapunov exponents: mean over the initial conditions, with minimum and maximum as a band."""
     cube = run.cube()
     if "lyapunov" not in cube:
         return
@@ -102,7 +102,9 @@ def _size(array: xr.DataArray, dims: list[Any]) -> int:
 
 
 def _attractor_curves(run: ExploredRun, x: str, place: Mapping[str, int]) -> Iterator[dict[str, Any]]:
-    """Return each attractor's largest exponent and share, with gaps where it does not attract."""
+    """Yield curves of each attractor's largest exponent and of its basin share; shares have gaps where it does not
+    attract.
+    """
     found = run.kept("attractors")
     if found is None:
         return
@@ -202,7 +204,7 @@ def branches(run: Run, x: str, y: str, at: Mapping[str, int]) -> dict[str, Any]:
 
 
 def _is_at(run: ExploredRun, found: xr.Dataset, branch: int, place: Mapping[str, int]) -> bool:
-    """Tell whether a branch was followed at given values of the other axes."""
+    """Return whether a branch was followed at the given values of the other axes."""
     for name, index in place.items():
         value = float(run.axis(name).values[index])
         there = float(found[name][branch]) if name in found else _base(run, name)
@@ -212,7 +214,7 @@ def _is_at(run: ExploredRun, found: xr.Dataset, branch: int, place: Mapping[str,
 
 
 def _base(run: ExploredRun, axis: str) -> float:
-    """Return the base value of a swept parameter in the specification."""
+    """Return the value of a swept parameter in the specification's base parameters."""
     if axis == FREQUENCY_DIM:
         own = run.spec.frequency_hz
         return math.nan if own is None else float(own)
@@ -228,7 +230,7 @@ def _segments(x: np.ndarray, y: np.ndarray, stable: bool) -> Iterator[dict[str, 
 
 
 def _motion(found: xr.Dataset, branch: int) -> str | None:
-    """Return the class of motion along a branch, as the model's label."""
+    """Return the model's label for the kind of motion along a branch; None if there is none."""
     classifier = model_of(found).classifier
     if classifier is None or "side" not in found:
         return None
@@ -237,7 +239,7 @@ def _motion(found: xr.Dataset, branch: int) -> str | None:
 
 
 def _event(found: xr.Dataset, k: int, y: str) -> dict[str, Any]:
-    """Return a located bifurcation in the page's form."""
+    """Return a located bifurcation as a dictionary for the page."""
     branch, kind = int(found["of_branch"][k]), KINDS[int(found["kind"][k])]
     period = int(found["orbit_period"][branch])
     criticality = CRITICALITIES[int(found["criticality"][k])]
@@ -259,7 +261,7 @@ def _event(found: xr.Dataset, k: int, y: str) -> dict[str, Any]:
 
 
 def attractors(run: Run, at: Mapping[str, int]) -> dict[str, Any]:
-    """Return the attractors that coexist at a parameter point, the largest share first, then its other sets.
+    """Return the limit sets at a parameter point, the one with the largest basin share first.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Label the plane of initial states at a parameter point by the known ends of the starts."""
+"""Label the initial states of a plane, at one parameter point, by the attractor that each reaches in the cube."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _DIVERGED = -2
 
 @dataclass(frozen=True)
 class Plane:
-    """Labels over a plane of initial states.
+    """Plane of initial states: two states across and upwards, and the label of each initial state.
 
     Attributes
     ----------
@@ -55,7 +55,7 @@ class Plane:
 
 
 def plane(run: Run, at: Mapping[str, int]) -> bytes:
-    """Return the plane of initial states at a parameter point in the page's form.
+    """Return the labelled plane of initial states at a parameter point, packed for the page.
 
     Parameters
     ----------
@@ -89,7 +89,7 @@ def plane(run: Run, at: Mapping[str, int]) -> bytes:
 
 
 def plane_of(run: ExploredRun, at: Mapping[str, int]) -> Plane:
-    """Read the plane; arguments as for `plane`.
+    """Read the labelled plane of initial states at a parameter point; arguments as for `plane`.
 
     Of a grid of more than two states the first two are shown, at the middle of the others.
     """
@@ -131,7 +131,7 @@ def _of_grid(run: ExploredRun, place: Mapping[str, int], scheme: Scheme, dims: l
 
 
 def _of_starts(run: ExploredRun, place: Mapping[str, int], scheme: Scheme) -> Plane:
-    """Return starts that form no grid, one by one; for a continuation the starts of its branches."""
+    """Return the plane for initial states that form no grid, with one label each."""
     from pipeline.explorer.data.view import planes
 
     pairs = planes(run)
@@ -156,7 +156,7 @@ def _of_starts(run: ExploredRun, place: Mapping[str, int], scheme: Scheme) -> Pl
 
 
 def _part(run: ExploredRun, scheme: Scheme, index: Mapping[str, int]) -> xr.Dataset:
-    """Load the cells at a parameter point, with their indices in the cube."""
+    """Load status and colour code of the cells at a parameter point."""
     cube = run.cube()
     names = [n for n in cube.data_vars if n in {"status", *scheme.needs}]
     numbered = cube[names].assign_coords(
@@ -172,7 +172,7 @@ def _part(run: ExploredRun, scheme: Scheme, index: Mapping[str, int]) -> xr.Data
 
 
 def _labels(part: xr.Dataset, scheme: Scheme) -> xr.DataArray:
-    """Return the label of each start."""
+    """Return the label of each initial state: a code of the scheme, diverged or none."""
     codes = part["_code"].values
     told = np.where(codes < 0, NONE, codes)
     if scheme.name != "status":
@@ -181,7 +181,7 @@ def _labels(part: xr.Dataset, scheme: Scheme) -> xr.DataArray:
 
 
 def _categories(scheme: Scheme, labels: np.ndarray) -> list[Category]:
-    """Return the meaning of each label that occurs."""
+    """Return the labels that occur, each with its meaning and colour."""
     present = set(np.unique(labels).tolist())
     found = [c for c in scheme.categories if c.number in present]
     if _DIVERGED in present:
@@ -194,7 +194,7 @@ def _state_of(run: ExploredRun, dim: str) -> str:
 
 
 def _fixed(run: ExploredRun, part: xr.Dataset, states: tuple[str, str]) -> dict[str, float]:
-    """Return the values of hidden states that all starts share."""
+    """Return the values of the states that are not shown and that all initial states share."""
     found = {}
     for state in run.model.states:
         values = np.unique(np.asarray(part.coords[grid_dim(state.name)].values, np.float64))
@@ -204,7 +204,7 @@ def _fixed(run: ExploredRun, part: xr.Dataset, states: tuple[str, str]) -> dict[
 
 
 def _spread(part: xr.Dataset, name: str, like: xr.DataArray) -> np.ndarray:
-    """Return a coordinate of the starts, one value for each cell."""
+    """Return the values of a coordinate of the initial states, one for each cell."""
     coordinate = part.coords[name]
     values = xr.DataArray(coordinate.values.astype(np.float64), dims=coordinate.dims)
     plain = xr.DataArray(np.zeros(like.shape), dims=like.dims)

@@ -42,7 +42,7 @@ def series(
     atol: float,
     with_quantities: bool = True,
 ) -> dict[str, np.ndarray]:
-    """Integrate the states over time from a section, with quantities and drawing.
+    """Integrate the states over time from a section point, and compute the quantities and the drawing's points.
 
     Parameters
     ----------

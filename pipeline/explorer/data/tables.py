@@ -1,4 +1,4 @@
-"""Export the numbers of a view as CSV or as NetCDF with provenance."""
+"""Export the numbers of a view (diagram, orbit, plane, ...) as CSV or as NetCDF with provenance."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ Asked = Mapping[str, Any]
 
 
 def table(run: Run, kind: str, asked: Asked, form: str = "csv") -> bytes:
-    """Return the numbers of a view.
+    """Return the numbers of a view (diagram, orbit, plane, ...) as the bytes of a CSV or NetCDF file.
 
     Parameters
     ----------
@@ -89,7 +89,7 @@ def _diagram(run: ExploredRun, asked: Asked) -> xr.Dataset:
 
 
 def _words(scheme: Scheme) -> np.ndarray:
-    """Return the label of each code of a scheme; empty for none."""
+    """Return an array with the label of each code of a colour scheme; empty for unused codes."""
     words = np.full(1 << 16, "", f"U{max((len(c.label) for c in scheme.categories), default=1)}")
     for category in scheme.categories:
         words[category.number] = category.label
@@ -200,7 +200,7 @@ def _unit(run: ExploredRun, axis: str) -> str:
 
 
 def _place(run: ExploredRun, x: str, at: Mapping[str, int]) -> dict[str, float]:
-    """Return the values of the axes that are not shown."""
+    """Return the values of the fixed axes, as attributes ``at_NAME``."""
     return {f"at_{n}": float(run.axis(n).values[i]) for n, i in run.place(at, but=x).items()}
 
 
@@ -238,7 +238,7 @@ def _heading(ds: xr.Dataset, name: str) -> str:
 
 
 def _rows(columns: list[np.ndarray]) -> Iterator[tuple[Any, ...]]:
-    """Return rows of plain values: shortest round-trip floats; NaN as empty."""
+    """Yield table rows as plain Python values; NaN becomes an empty text."""
     n = len(columns[0]) if columns else 0
     for first in range(0, n, _ROWS_AT_ONCE):  # as objects, numbers take ten times their room
         yield from zip(*(_plain(c[first : first + _ROWS_AT_ONCE]) for c in columns), strict=True)

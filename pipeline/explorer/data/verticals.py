@@ -1,4 +1,4 @@
-"""List the possible vertical axes of a diagram: states, quantities, kept extremes."""
+"""List the possible vertical axes of a diagram: states, quantities, stored extremes."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class Vertical:
 
 
 def verticals(run: ExploredRun) -> list[Vertical]:
-    """Return a run's vertical axes, first the model's first state that differs between sections."""
+    """Return a run's possible vertical axes; the first is a state that differs between section points."""
     return run.remembered("verticals", lambda: _verticals(run))
 
 
@@ -87,7 +87,7 @@ def _state(name: str) -> Callable[[xr.Dataset], xr.DataArray]:
 
 
 def _quantity(run: ExploredRun, name: str) -> Callable[[xr.Dataset], xr.DataArray]:
-    """Return a model quantity at the sections, from the kept states."""
+    """Return a function that evaluates a model quantity at the stored section points of a part of the cube."""
     model = run.model.flow
     column = [q.name for q in model.quantities].index(name)
 
@@ -115,7 +115,7 @@ def _quantity(run: ExploredRun, name: str) -> Callable[[xr.Dataset], xr.DataArra
 
 
 def _point(run: ExploredRun, values: Mapping[str, float]) -> tuple[np.ndarray, float]:
-    """Return packed flow parameters and frequency at values of the swept axes."""
+    """Return the packed parameters of the flow and the frequency [Hz] at given values of the swept axes."""
     changed = {parameter_name(d): v for d, v in values.items() if d != FREQUENCY_DIM}
     own = run.parameters
     packed = np.array([changed.get(n, own[n]) for n in run.model.flow.parameter_names], np.float64)

@@ -30,7 +30,7 @@ _LOWEST = {POSITIVE: 0.0, NON_NEGATIVE: 0.0, FRACTION: 0.0}
 
 
 def describe_view(run: Run, live: bool) -> dict[str, Any]:
-    """Describe a run: its content, with names, drawing and colours.
+    """Describe a run for the page: content, names, drawing and colours.
 
     Parameters
     ----------
@@ -148,13 +148,13 @@ def _state(state: Any) -> dict[str, Any]:
 
 
 def _section(model: Model) -> str:
-    """Describe the section in words."""
+    """Return the name of the section and where it lies, as a text."""
     where = model.section if model.crossing is None else model.crossing.sentence
     return f"{section_name(model)} at {where}"
 
 
 def _parameter(run: ExploredRun, parameter: Parameter) -> dict[str, Any]:
-    """Return a parameter, its value if all cells share one, and its range for dragging.
+    """Return a parameter with its value (None if swept) and the range in which the page lets users change it.
 
     That is the range of its axis; else from half to one and a half times its value, within its bound.
     """
@@ -221,7 +221,7 @@ def _axis(run: ExploredRun, axis: Axis) -> dict[str, Any]:
 
 
 def planes(run: ExploredRun) -> list[tuple[str, str]]:
-    """Return the state pairs worth showing as a plane of initial states.
+    """Return the pairs of states that are offered as a plane of initial states.
 
     First that of the run's own grid, then pairs of angles, then what phase portraits show.
     """
@@ -243,13 +243,13 @@ def _has(run: ExploredRun) -> dict[str, bool]:
 
 
 def commands(run: ExploredRun, directory: str) -> dict[str, str]:
-    """Return the command for each missing analysis that the run can have."""
+    """Return the command line of each analysis that is missing and that the run's data allow."""
     wanted = [name for name in ("attractors", "branches", "basins") if run.kept(name) is None]
     return {name: f"magpend analyse {name} {shlex.quote(directory)}" for name in wanted if _can_have(run, name)}
 
 
 def _can_have(run: ExploredRun, name: str) -> bool:
-    """Tell whether the run has the input of an analysis with default options."""
+    """Return whether the run has the input that an analysis with default options needs."""
     if run.spec.recorded is not None:
         return False
     analysis = ANALYSES[name]

@@ -1,1 +1,1 @@
-"""Compute while the user watches: starts, slices of basins, orbits that follow a parameter, runs of a region."""
+"""Compute while the user watches: trajectories, basin slices, orbits that follow a parameter, runs of a region."""

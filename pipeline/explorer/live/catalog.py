@@ -49,7 +49,7 @@ SAME_SECONDS = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Entry:
-    """An attractor, or a class of cells, on which trajectories end.
+    """Entry of a catalog: an attractor, or a class of cells that reached no known one.
 
     Attributes
     ----------
@@ -86,7 +86,7 @@ class Entry:
 
 @dataclass(frozen=True, eq=False)
 class Known:
-    """The stored analysis at a parameter point.
+    """Stored attractors and cells of the run at a parameter point, as far as they exist.
 
     Attributes
     ----------
@@ -103,7 +103,7 @@ class Known:
     index: tuple[int, ...] | None = None
 
     def here(self) -> xr.Dataset | None:
-        """Return the attractors at the point."""
+        """Return the stored attractors at the parameter point; None if there are none."""
         if self.attractors is None or self.index is None or self.cells is None:
             return None
         dims, _ = split_dims(self.attractors["attractor_id"])
@@ -111,7 +111,7 @@ class Known:
 
 
 class Catalog:
-    """Attractors of a parameter point; several threads may ask at once.
+    """Catalog of the attractors at a parameter point; safe for use by several threads.
 
     Parameters
     ----------
@@ -142,7 +142,7 @@ class Catalog:
     # ---- what the run knows ------------------------------------------------------------------
 
     def _take(self, here: xr.Dataset, cells: xr.Dataset) -> None:
-        """Add the run's attractors as entries."""
+        """Add the run's stored attractors at the parameter point to the catalog."""
         present = np.flatnonzero(here["kind"].values != ABSENT)
         points = {int(i): _finite(here["attractor_points"].values[i]) for i in present}
         periods = here["orbit_period"].values
@@ -166,7 +166,9 @@ class Catalog:
                     self._sets.append((entry, cloud))
 
     def _cloud_of(self, here: xr.Dataset, cells: xr.Dataset, number: int) -> Cloud | None:
-        """Return the cloud of the cube's cells on a set that does not close."""
+        """Return the section points of the cube's cells on an aperiodic set, as a `Cloud`; None if there are no such
+        cells.
+        """
         block = self._point(cells).whole()
         ids = here["attractor_id"].transpose(*split_dims(cells["status"])[1]).values.ravel()
         own = np.flatnonzero((ids == number) & block.is_bounded)
@@ -193,7 +195,7 @@ class Catalog:
     # ---- where trajectories are ----------------------------------------------------------------
 
     def on_orbits(self, block: Block) -> np.ndarray:
-        """Return the entry of the orbit that each cell has reached or is certain to reach, -1 for none."""
+        """Return the entry number of the orbit that each cell has reached or is certain to reach; -1 for none."""
         with self._lock:
             orbits, numbers = list(self._orbits), np.array([*self._orbit_entries, -1])
         if not orbits:
@@ -202,7 +204,7 @@ class Catalog:
         return np.asarray(numbers[label])
 
     def unsure(self, block: Block, numbers: np.ndarray) -> np.ndarray:
-        """Return the undecided cells worth integrating further, by the rule of the analysis."""
+        """Return which undecided cells come back so near that they are worth integrating further."""
         rows = np.flatnonzero(block.is_bounded & (numbers < 0))
         near = np.zeros(len(numbers), bool)
         longest = self.options.max_orbit_period
@@ -212,7 +214,7 @@ class Catalog:
         return near
 
     def conclude(self, block: Block, *, final: bool = True, strictly: bool = False) -> np.ndarray:
-        """Return the entry of each cell; an unknown closed orbit gets a new entry.
+        """Return the catalog entry of each cell's final motion; an unknown closed orbit gets a new entry.
 
         Parameters
         ----------
@@ -236,7 +238,9 @@ class Catalog:
         return numbers
 
     def _rest(self, block: Block, numbers: np.ndarray) -> Block:
-        """Assign cells at equilibria and on limit cycles of a flow, in place; return the other cells."""
+        """Assign cells at equilibria and on limit cycles of a flow, in `numbers`; return the block with these
+        marked.
+        """
         point = self._point(_dataset_of(block, self.model))
         tell_rest([point], self.tolerance, self._geometry)
         for k, found in enumerate(point.equilibria):
@@ -259,7 +263,9 @@ class Catalog:
         return Block(block.cells, block.section, status, block.orbit_period, block.turns, block.rest)
 
     def _learn(self, block: Block, numbers: np.ndarray) -> None:
-        """Polish closed orbits that match no known one, and add them, in place."""
+        """Refine new closed orbits by Newton's method, add them to the catalog, and assign cells to them; change
+        `numbers`.
+        """
         for row in np.flatnonzero(block.is_closed & (numbers < 0)):
             if numbers[row] >= 0 or self._n_new >= MOST_ENTRIES:
                 continue
@@ -280,7 +286,9 @@ class Catalog:
                 self._add_orbit(orbit, entry)
 
     def _in_sets(self, block: Block, numbers: np.ndarray) -> None:
-        """Assign the remaining bounded cells to the run's sets that do not close, in place."""
+        """Assign undecided bounded cells to the run's aperiodic attractors, by comparing section points; change
+        `numbers`.
+        """
         rows = np.flatnonzero(block.is_bounded & (numbers < 0))
         if not len(rows) or not self._sets:
             return
@@ -328,7 +336,9 @@ class Catalog:
         return None
 
     def _class_of(self, block: Block, row: int) -> Entry:
-        """Return the entry for a cell on no known attractor: one per status, period and motion."""
+        """Return the entry of the class of cells (status, period, motion) to which a cell without an attractor
+        belongs.
+        """
         status = int(block.status[row])
         alive = bool(block.is_bounded[row] or block.is_closed[row])
         period = int(block.orbit_period[row]) if alive else 0
@@ -344,7 +354,7 @@ class Catalog:
     # ---- motions -------------------------------------------------------------------------------
 
     def motions(self, block: Block) -> np.ndarray:
-        """Return the classifier's code for each cell."""
+        """Return the motion code of each cell by the model's classifier."""
         return features.sides_of(block.section, block.turns, self.place.frequency, self.place.parameters)
 
     def _motion_of(self, orbit: Orbit) -> int:
@@ -377,10 +387,10 @@ class Catalog:
 
 
 class _WholePoint(Point):
-    """A parameter point whose cells form one block."""
+    """A parameter point whose cells (initial conditions) are handled as one block."""
 
     def whole(self) -> Block:
-        """Return all cells."""
+        """Return all cells of the parameter point."""
         return next(self.blocks())
 
 
@@ -389,7 +399,7 @@ def _finite(points: np.ndarray) -> np.ndarray:
 
 
 def _options_of(here: xr.Dataset | None) -> IdentifyOptions:
-    """Return the options that found the run's attractors, else the defaults."""
+    """Return the options with which the run's attractors were found; without attractors the defaults."""
     attrs: Mapping[Any, Any] = {} if here is None else here.attrs
     given = {}
     for name, field in IdentifyOptions.model_fields.items():
@@ -400,7 +410,7 @@ def _options_of(here: xr.Dataset | None) -> IdentifyOptions:
 
 
 def _tolerance_of(here: xr.Dataset | None, closure_tolerance: float) -> float:
-    """Return the distance within which a closed cell belongs to an orbit, as in `identify`."""
+    """Return the largest distance between a closed cell and its orbit, the same as in `identify`."""
     found = 0.0 if here is None else float(here.attrs.get("identify_tolerance", 0.0))
     return found or max(1e-4, 10.0 * closure_tolerance)
 

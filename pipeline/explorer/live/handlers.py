@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def works(live: LiveRun) -> Mapping[str, Work]:
-    """Return the handler of each kind of job, with the state shared within a session."""
+    """Return the function that handles each kind of job of a session."""
     return {
         "start": partial(start, live),
         "slice": partial(slice_of, live),

@@ -29,7 +29,7 @@ Emit = Callable[[Answer], None]
 
 
 class Job:
-    """A request in progress.
+    """A live request in progress, with the functions that send its answers.
 
     Parameters
     ----------
@@ -44,7 +44,7 @@ class Job:
         self.began = time.perf_counter()
 
     def answers_to(self, emit: Emit) -> None:
-        """Set the receiver of answers."""
+        """Set the function that receives the job's answers."""
         self._emit = emit
 
     def cancel(self) -> None:
@@ -57,31 +57,31 @@ class Job:
             raise CancelledError
 
     def wait(self, seconds: float) -> None:
-        """Wait, and raise `CancelledError` as soon as the job is cancelled."""
+        """Wait for some seconds; raise `CancelledError` as soon as the job is cancelled."""
         self._cancelled.wait(seconds)
         self.check()
 
     def tell(self, kind: str, **fields: Any) -> None:
-        """Send a JSON answer."""
+        """Send a JSON object as an answer."""
         if kind != "done" or not fields.get("cancelled"):
             self.check()
         self._emit({"id": self.id, "kind": kind, **fields})
 
     def show(self, kind: str, arrays: Mapping[str, np.ndarray], **attrs: Any) -> None:
-        """Send an answer of arrays."""
+        """Send arrays as an answer."""
         self.check()
         self._emit(pack_arrays(arrays, {"id": self.id, "kind": kind, **attrs}))
 
 
 def _nowhere(answer: Answer) -> None:
-    """Discard an answer that has no receiver."""
+    """Ignore an answer; used until a job has a receiver."""
 
 
 Work = Callable[[Job], None]
 
 
 class Desk:
-    """The worker for jobs of one kind, one at a time, in a thread that runs only while there are jobs.
+    """Queue of jobs of one kind: one runs at a time, in a thread that exists only while there are jobs.
 
     Parameters
     ----------
@@ -100,7 +100,7 @@ class Desk:
         self._closed = False
 
     def put(self, job: Job) -> None:
-        """Accept a job; it replaces the waiting and the running one."""
+        """Queue a job; it cancels the running job and replaces the waiting one."""
         job.answers_to(self._emit)
         with self._lock:
             if self._closed:
@@ -115,7 +115,7 @@ class Desk:
             left.tell("done", cancelled=True)
 
     def cancel(self, number: int) -> None:
-        """Cancel the job with a given number, if it is here."""
+        """Cancel the waiting or running job with a given number, if there is one."""
         left = None
         with self._lock:
             if self._waiting is not None and self._waiting.id == number:
@@ -134,11 +134,11 @@ class Desk:
 
     @property
     def is_busy(self) -> bool:
-        """Tell whether a job is running or waiting."""
+        """Whether a job is running or waiting."""
         return self._thread is not None
 
     def join(self, timeout: float) -> None:
-        """Wait until no job is running."""
+        """Wait until no job is running, at most `timeout` seconds."""
         thread = self._thread
         if thread is not None:
             thread.join(timeout)

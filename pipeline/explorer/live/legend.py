@@ -1,4 +1,4 @@
-"""Name and colour the ends of live trajectories, like the run's figures where possible."""
+"""Name and colour the attractors that live trajectories reach, as in the run's figures where possible."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Legend:
         self._free = [colour for colour in COLOURS if colour not in taken] or [OTHERS]
 
     def lines(self) -> list[dict[str, Any]]:
-        """Return all entries: number, name, colour and the run's id, by number."""
+        """Return the legend: number, label, colour and attractor id of every catalog entry, by number."""
         new = 0
         found: list[dict[str, Any]] = []
         for entry in sorted(list(self._catalog.entries), key=lambda e: e.number):
@@ -61,11 +61,11 @@ class Legend:
         return found
 
     def line(self, entry: Entry) -> dict[str, Any]:
-        """Return one entry in the form of `lines`."""
+        """Return the legend line of one catalog entry; see `lines`."""
         return next(line for line in self.lines() if line["id"] == entry.number)
 
     def name(self, entry: Entry) -> str:
-        """Return the name of an entry."""
+        """Return the name of a catalog entry, such as ``period 3``."""
         if entry.attractor is not None:
             return self._names[entry.attractor]
         if entry.status:
@@ -83,7 +83,7 @@ class Legend:
         return f"not among the run's: {text}" if self._known and entry.kind != ABSENT else text
 
     def motion(self, code: int) -> str:
-        """Return the classifier's label; empty if it has none."""
+        """Return the classifier's label of a motion code; empty if there is none."""
         classifier = self._model.classifier
         if classifier is None or not code or code in classifier.neutral:
             return ""
@@ -110,7 +110,7 @@ def _status_word(status: int) -> str:
 
 
 def _shown(stability: int) -> str:
-    """Describe the stability shown for a set that does not attract; empty for an attractor."""
+    """Return the stability in words for a set that does not attract; empty for an attractor."""
     return "" if stability in (0, ATTRACTS) else STABILITIES[stability].replace("_", " ")
 
 

@@ -62,7 +62,7 @@ def live_problem(run: Run) -> str | None:
 
 
 class Session(Protocol):
-    """A live session as its run sees it; see `pipeline.explorer.live.session`."""
+    """Interface of a live session that its run uses; see `pipeline.explorer.live.session`."""
 
     @property
     def is_over(self) -> bool:
@@ -72,11 +72,11 @@ class Session(Protocol):
         """Cancel all jobs."""
 
     def join(self, timeout: float) -> None:
-        """Wait until no job is at work."""
+        """Wait until no job is running, at most `timeout` seconds."""
 
 
 class LiveRun:
-    """The state shared by all live sessions of a run.
+    """A run with the state that all its live sessions share.
 
     Parameters
     ----------
@@ -112,21 +112,21 @@ class LiveRun:
         self.pool.shutdown(wait=False, cancel_futures=True)
 
     def enter(self, session: Session) -> None:
-        """Register a session, so that it ends with the run."""
+        """Register a session, so that closing the run closes it."""
         with self._lock:
             self._sessions.add(session)
 
     def leave(self, session: Session) -> None:
-        """Forget a session once it is closed and its jobs have ended."""
+        """Remove a session, and all others that are closed and have no running job."""
         with self._lock:
             self._sessions = {s for s in self._sessions if s is not session and not s.is_over}
 
     def warm(self, tell: Callable[[int, int], None] | None = None) -> None:
-        """Compile and read in the background; `tell` receives the progress."""
+        """Compile the code for live jobs in a background thread; `tell` receives the progress."""
         self._warming.begin(tell)
 
     def is_warm(self, what: str) -> bool:
-        """Tell whether a step is compiled: ``series``, ``sections``, ``maps`` or ``attractors``."""
+        """Return whether a compilation step is done: ``series``, ``sections``, ``maps`` or ``attractors``."""
         return self._warming.has_done(what)
 
     # ---- parameter points --------------------------------------------------------------------
@@ -202,7 +202,7 @@ class LiveRun:
         return state
 
     def check_states(self, states: np.ndarray, place: Place) -> None:
-        """Raise `SpecError` for states at which the equations of a text model have no value."""
+        """Raise `SpecError` for states at which the model's equations are undefined."""
         point = {**place.parameters, FREQUENCY: place.frequency}
         check_states(self.model.flow, states, [point])
 
@@ -210,14 +210,14 @@ class LiveRun:
 
     @property
     def attractors(self) -> xr.Dataset | None:
-        """Return the run's attractors stored in ``derived/``, if any; compute nothing."""
+        """Attractors of the run stored in ``derived/``; None if they were not computed."""
         with self._lock:
             if self._attractors is None:
                 self._attractors = stored(self.run, "attractors")
             return self._attractors
 
     def catalog(self, place: Place) -> Catalog:
-        """Return the known attractors of a parameter point; the same object for the same point."""
+        """Return the catalog of known attractors at a parameter point; the same object for equal points."""
         known = self._known(place)
         key = (float(known.attractors is not None), *place.key)
         with self._lock:
@@ -241,18 +241,18 @@ class LiveRun:
 
     @property
     def cube(self) -> xr.Dataset:
-        """Return the run's cube, opened once."""
+        """Cube of the run, opened once."""
         with self._lock:
             if self._cube is None:
                 self._cube = self.run.cube()
             return self._cube
 
     def legend(self, catalog: Catalog) -> Legend:
-        """Return the names and colours of a point's attractors."""
+        """Return the names and colours of the attractors in a catalog."""
         return Legend(catalog, self.attractors)
 
     def first_start(self) -> tuple[Place, np.ndarray]:
-        """Return a parameter point of the run, and a start there."""
+        """Return the first parameter point of the run, and its first initial state."""
         cells = CellMap(self.spec)
         block = tuple(slice(0, 1) if i != cells.path else slice(0, n) for i, n in enumerate(cells.shape))
         inputs = cells.inputs(block)
@@ -266,7 +266,7 @@ def _same(a: float, b: float) -> bool:
 
 
 class Warming:
-    """A thread that compiles the code for jobs once, so that the first job does not wait for it."""
+    """Thread that compiles the code for live jobs once, so that the first job need not wait."""
 
     def __init__(self, live: LiveRun) -> None:
         self._live, self._lock = live, threading.Lock()
@@ -276,7 +276,7 @@ class Warming:
         self._steps = (self._series, self._sections, self._maps, self._attractors)
 
     def begin(self, tell: Callable[[int, int], None] | None) -> None:
-        """Begin unless already begun; `tell` receives every step from now on."""
+        """Start the compilation unless it has begun; call `tell` after every step."""
         with self._lock:
             if tell is not None and self._done < len(self._steps):
                 self._listeners.append(tell)
@@ -288,7 +288,7 @@ class Warming:
             tell(done, len(self._steps))
 
     def has_done(self, what: str) -> bool:
-        """Tell whether a step has ended, with or without success."""
+        """Return whether a step of the compilation has ended, with or without success."""
         with self._lock:
             return f"_{what}" in [step.__name__ for step in self._steps[: self._done]]
 

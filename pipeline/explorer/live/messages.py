@@ -1,4 +1,4 @@
-"""Read the page's live requests: check, bound, or refuse each with one sentence.
+"""Validate the live requests that the page sends; reject an invalid one with one sentence.
 
 A message is a JSON object with an ``id`` of the page's choice and ``do``, the name of a job; see the classes
 here. No field of a message names a file.
@@ -26,7 +26,7 @@ Pair = tuple[float, float]
 
 
 class RequestError(ValueError):
-    """A message that cannot be accepted.
+    """Raised for a message that is invalid or cannot be carried out.
 
     Attributes
     ----------
@@ -46,13 +46,13 @@ class Message(BaseModel):
 
 
 class Job(Message):
-    """A job with the page's number `id`."""
+    """Request for a job, with a number `id` chosen by the page."""
 
     id: int = Field(ge=0, le=2**53)
 
 
 class StartRequest(Job):
-    """A request to integrate a start and tell where it ends."""
+    """Request to integrate an initial state and report the attractor that it reaches."""
 
     do: Literal["start"]
     parameters: Values = {}
@@ -62,7 +62,7 @@ class StartRequest(Job):
 
 
 class SliceRequest(Job):
-    """A request for the ends of the starts of a plane."""
+    """Request to compute which attractors the initial states of a plane reach."""
 
     do: Literal["slice"]
     parameters: Values = {}
@@ -74,14 +74,14 @@ class SliceRequest(Job):
 
 
 class CellPoint(Message):
-    """A kept section of a cell of the cube."""
+    """Reference to a stored section point of a cell of the cube."""
 
     cell: int = Field(ge=0, le=2**53)
     point: int = Field(0, ge=0, le=2**53)
 
 
 class KeptOrbit(Message):
-    """An orbit named by an earlier answer."""
+    """Reference to an orbit of an earlier answer, by its number."""
 
     orbit: int = Field(ge=0, le=2**53)
 
@@ -96,7 +96,7 @@ class FollowRequest(Job):
 
 
 class Region(Message):
-    """A part of a run's parameters or starts.
+    """Region selected on the page: intervals of parameters or initial states.
 
     Attributes
     ----------
@@ -117,7 +117,7 @@ class Region(Message):
 
 
 class RunRequest(Job, Region):
-    """A request to run the specification of a region."""
+    """Request to compute the run of a region of parameters or initial states."""
 
     do: Literal["run"]
 
@@ -135,7 +135,7 @@ _READER: TypeAdapter[Request] = TypeAdapter(Annotated[Request, Field(discriminat
 
 
 def read_request(text: str | bytes) -> Request:
-    """Read a message.
+    """Parse and validate a message; raise `RequestError` if it is invalid.
 
     Raises
     ------
@@ -151,7 +151,7 @@ def read_request(text: str | bytes) -> Request:
 
 
 def sentence_of(error: ValidationError) -> str:
-    """Return one sentence on the first error."""
+    """Return one sentence about the first error of a validation."""
     first = error.errors(include_url=False, include_context=False, include_input=False)[0]
     jobs = {"start", "slice", "follow", "run", "cancel"}
     if str(first["type"]).startswith("union_tag"):
@@ -162,7 +162,7 @@ def sentence_of(error: ValidationError) -> str:
 
 
 def number_in(text: str | bytes) -> int | None:
-    """Return the ``id`` of a rejected message; None if it has none."""
+    """Return the ``id`` of an invalid message; None if it has no valid one."""
     try:
         number = json.loads(text)["id"]
     except (ValueError, KeyError, TypeError, RecursionError):

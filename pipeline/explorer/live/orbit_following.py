@@ -59,7 +59,7 @@ HALVED = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Held:
-    """An orbit at a parameter point.
+    """A periodic orbit: parameter point, period and one section point.
 
     Attributes
     ----------
@@ -77,7 +77,7 @@ class Held:
 
 @dataclass(frozen=True, eq=False)
 class Reached:
-    """The result of following an orbit.
+    """Result of following an orbit: the parameter value and orbit reached, and why it went no further.
 
     Attributes
     ----------
@@ -98,7 +98,7 @@ class Reached:
 
 
 class Follower:
-    """The worker that follows the orbits of a session.
+    """Handler of the requests of a session to follow orbits; it remembers the orbits found.
 
     Parameters
     ----------
@@ -112,7 +112,7 @@ class Follower:
         self._next = 0
 
     def follow(self, job: Job) -> None:
-        """Run a job."""
+        """Follow the orbit that a job names, and send the orbit that was reached."""
         request = job.request
         assert isinstance(request, FollowRequest)
         if self._live.model.autonomous and self._live.model.crossing is None:
@@ -197,7 +197,7 @@ def _value(place: Place, name: str) -> float:
 
 
 def cell_orbit(live: LiveRun, cell: int, point: int) -> Held:
-    """Return the closed orbit of a cell of the cube.
+    """Return a cell's closed orbit: its parameter point, its period and one of its section points.
 
     Parameters
     ----------
@@ -237,7 +237,7 @@ def cell_orbit(live: LiveRun, cell: int, point: int) -> Held:
 
 
 def _period_of_attractor(live: LiveRun, at: Mapping[str, int]) -> int:
-    """Return the period of the closed orbit on which a cell ends; 0 if there is none."""
+    """Return the period of the closed orbit that a cell reaches, by the stored attractors; 0 if there is none."""
     attractors = live.attractors
     if attractors is None:
         return 0
@@ -249,7 +249,7 @@ def _period_of_attractor(live: LiveRun, at: Mapping[str, int]) -> int:
 
 
 def _followed(family: Family, state: np.ndarray, begin: float, target: float, job: Job) -> Reached:
-    """Follow an orbit from one parameter value to another."""
+    """Follow a periodic orbit from one parameter value to another, as far as it exists and time allows."""
     problem, scale = OrbitProblem(family), family.scales[0]
     normal = np.zeros(problem.size)
     normal[-1] = 1.0
@@ -278,7 +278,7 @@ def _followed(family: Family, state: np.ndarray, begin: float, target: float, jo
 
 
 def _step(problem: OrbitProblem, here: Point, move: float, normal: np.ndarray) -> Point | None:
-    """Return the orbit after a parameter step; None if none is found nearby."""
+    """Return the orbit after one step of the parameter; None if Newton's method finds none nearby."""
     slope = here.tangent / here.tangent[-1] if abs(here.tangent[-1]) > 1e-6 else normal
     ahead = move * slope
     if np.abs(ahead[:-1]).max(initial=0.0) > LONGEST_MOVE:
@@ -294,7 +294,7 @@ def _step(problem: OrbitProblem, here: Point, move: float, normal: np.ndarray) -
 
 
 def _has_halved(family: Family, point: Point) -> bool:
-    """Tell whether an orbit of even period also closes after half of it."""
+    """Return whether an orbit of even period already closes after half of its period."""
     if family.period % 2:
         return False
     half = family.mismatch(point.u, point.value.images[family.period // 2 - 1])
@@ -318,7 +318,7 @@ def _why(point: Point, family: Family, target: float) -> str:
 def described(
     live: LiveRun, place: Place, family: Family, point: Point
 ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Return an orbit's arrays and attributes in the page's form."""
+    """Return the followed orbit as arrays and attributes, with multipliers, stability and exponents."""
     model, is_flow = live.model, live.model.crossing is not None
     seconds = point.value.seconds
     images = point.value.images

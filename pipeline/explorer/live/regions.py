@@ -1,4 +1,4 @@
-"""Turn a region drawn on the page into a specification, and run it beside this run."""
+"""Turn a region drawn on the page into a specification, and compute its run in a directory beside this one."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ _PACKAGES = Path(__file__).parents[3]
 
 
 def zoomed(run: Run, region: Region) -> tuple[Spec, list[str]]:
-    """Return the specification of a region, and notes on parts outside the run.
+    """Return the specification of a region, and notes on parts that lie outside the run's ranges.
 
     Raises
     ------
@@ -57,14 +57,14 @@ def zoomed(run: Run, region: Region) -> tuple[Spec, list[str]]:
 
 
 def zoom_toml(run: Run, region: Region) -> str:
-    """Return the specification of a region as TOML, with a line on its origin."""
+    """Return the specification of a region as TOML, with comments on its origin."""
     spec, notes = zoomed(run, region)
     head = [f"# Zoom into a run, digest {run.info.digest}.", *(f"# note: {_one_line(note)}" for note in notes)]
     return "\n".join([*head, to_toml(spec)])
 
 
 def changes_of(run: Run, region: Region) -> Changes:
-    """Return the changes to the specification for a region."""
+    """Return the changes to a run's specification that restrict it to a region."""
     swept = {axis.parameter: axis for axis in parameter_axes(run.spec)}
     first, second = _names(run, region, list(swept))
     ranges = {}
@@ -84,7 +84,9 @@ def changes_of(run: Run, region: Region) -> Changes:
 
 
 def _names(run: Run, region: Region, swept: list[str]) -> tuple[str, str | None]:
-    """Return the specification keys of the intervals; None for one that is neither axis nor start."""
+    """Return the specification keys of the region's intervals; None for an interval of neither parameter nor initial
+    state.
+    """
     walk = run.spec.continuation
     if region.axes is None:
         if not swept:
@@ -109,7 +111,7 @@ def _key(name: str) -> str:
 
 
 def _rounded(name: str, low: float, high: float) -> tuple[float, float]:
-    """Round the ends to digits that a mouse drag can resolve."""
+    """Round the ends of an interval to as many digits as a mouse drag can resolve."""
     if not low < high:
         raise RequestError(f"{name}: the interval {low:g} to {high:g} is empty; its end must be greater.")
     if not math.isfinite(high - low):
@@ -134,7 +136,7 @@ def region_name(run: Run, spec: Spec) -> str:
 
 
 class RegionRunner:
-    """The worker that runs regions, one at a time for all users.
+    """Handler of requests to run a region; only one region runs at a time, for all users.
 
     Parameters
     ----------
@@ -146,7 +148,7 @@ class RegionRunner:
         self._live, self._busy = live, live.region_lock
 
     def run(self, job: Job) -> None:
-        """Run a job."""
+        """Run the region that a job describes, and report its progress."""
         request = job.request
         assert isinstance(request, RunRequest)
         spec = self._checked(request)
@@ -182,7 +184,7 @@ class RegionRunner:
         return spec
 
     def _watch(self, job: Job, spec: Spec, path: Path, out: Path) -> None:
-        """Start the run, report its progress, and wait for its end."""
+        """Start the run of a region as a process, report its progress, and wait for its end."""
         plan = make_plan(spec)
         words = ["run", str(path), "--out", str(out), *(["--workers", "0"] if plan.n_tasks == 1 else [])]
         job.tell("progress", done=0, total=plan.n_cells, name=out.name)
@@ -204,7 +206,7 @@ class RegionRunner:
 
 
 def _committed(out: Path) -> int:
-    """Return the number of committed cells; 0 before there is a run."""
+    """Return the number of committed cells in a run directory; 0 if it holds no run yet."""
     with contextlib.suppress(StoreError, OSError):
         return state(out).n_committed
     return 0
@@ -212,7 +214,7 @@ def _committed(out: Path) -> int:
 
 @contextlib.contextmanager
 def _group(words: list[str], folder: Path, said: Any) -> Iterator[subprocess.Popen[bytes]]:
-    """Run the command line in its own process group, which ends with the block."""
+    """Run a magpend command in its own process group, which is ended with the block."""
     path = os.pathsep.join([str(_PACKAGES), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep)
     process = subprocess.Popen(
         [sys.executable, "-m", "pipeline.cli.main", *words],
@@ -230,7 +232,7 @@ def _group(words: list[str], folder: Path, said: Any) -> Iterator[subprocess.Pop
 
 
 def _end_group(process: subprocess.Popen[bytes]) -> None:
-    """End a process group: first politely, then by force."""
+    """End a process group by SIGTERM, and by SIGKILL if it does not exit in time."""
     if process.poll() == 0:
         return
     if process.poll() is None:

@@ -1,4 +1,4 @@
-"""Take a user's live requests and answer them: starts, slices, orbits that follow a parameter, runs of a region.
+"""Receive a user's live requests, run them as jobs, and send the answers.
 
 A session takes messages (see `messages`) and passes its answers to a callback: dictionaries for JSON, and bytes of
 `arrays.pack_arrays`. One job of each kind runs at a time, and a newer one replaces it. A session does not know how
@@ -20,7 +20,7 @@ LOG = logging.getLogger(__name__)
 
 
 class LiveSession:
-    """One user's live session.
+    """Live session of one user: the queues of jobs and the callback for answers.
 
     Parameters
     ----------
@@ -63,7 +63,7 @@ class LiveSession:
         self._desks[request.do].put(Job(request))
 
     def close(self) -> None:
-        """Cancel all jobs; emit nothing from now on."""
+        """Cancel all jobs of the session, and send no more answers."""
         self._closed.set()
         for desk in self._desks.values():
             desk.close()
@@ -72,10 +72,10 @@ class LiveSession:
 
     @property
     def is_over(self) -> bool:
-        """Tell whether the session is closed and no job is running."""
+        """Whether the session is closed and no job is running."""
         return self._closed.is_set() and not any(desk.is_busy for desk in self._desks.values())
 
     def join(self, timeout: float = 30.0) -> None:
-        """Wait until no job is at work."""
+        """Wait until no job is running."""
         for desk in self._desks.values():
             desk.join(timeout)

@@ -1,4 +1,4 @@
-"""Integrate trajectories at a parameter point in short legs, bit for bit like the run's cells."""
+"""Integrate trajectories at a parameter point a few periods at a time, bit for bit like the run's cells."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ LEG = 32
 
 
 class Ends(Protocol):
-    """The known ends of trajectories at a parameter point; see `pipeline.explorer.live.catalog.Catalog`."""
+    """Interface of the catalog of attractors at a parameter point; see `pipeline.explorer.live.catalog.Catalog`."""
 
     model: Model
 
@@ -41,14 +41,14 @@ class Ends(Protocol):
         """Return the entry of the orbit that each cell has reached, -1 for none."""
 
     def unsure(self, block: Block, numbers: np.ndarray) -> np.ndarray:
-        """Return the undecided cells worth integrating further."""
+        """Return which undecided cells are worth integrating further."""
 
     def conclude(self, block: Block, *, final: bool = True, strictly: bool = False) -> np.ndarray:
-        """Return the entry of each cell."""
+        """Return the catalog entry of each cell's final motion."""
 
 
 class CancelledError(Exception):
-    """The signal that a job is no longer wanted."""
+    """Raised in a job that has been cancelled."""
 
 
 Check = Callable[[], None]
@@ -57,7 +57,7 @@ Check = Callable[[], None]
 
 @dataclass(frozen=True, eq=False)
 class Place:
-    """A parameter point.
+    """Parameter point: parameters, frequency, and its index in the cube if it has one.
 
     Attributes
     ----------
@@ -74,17 +74,17 @@ class Place:
 
     @property
     def key(self) -> tuple[float, ...]:
-        """Return the point's key."""
+        """Frequency and parameter values, as a dictionary key."""
         return (self.frequency, *self.parameters.values())
 
 
 def system_at(place: Place, integration: Integration) -> System:
-    """Return the system to integrate at a point, with the run's method."""
+    """Return the system of a parameter point, with the run's integration method."""
     return replace(place.parameters.model.system, method=integration.method)
 
 
 class Flight:
-    """Trajectories under way at one parameter point.
+    """Trajectories at one parameter point that are integrated step by step.
 
     Parameters
     ----------
@@ -120,7 +120,7 @@ class Flight:
         self._seconds = 0.0
 
     def advance(self, rows: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
-        """Integrate some active cells for `n` periods, in calls short enough to allow cancelling.
+        """Integrate the trajectories `rows` for `n` periods, in calls so short that a job can be cancelled in between.
 
         Returns
         -------
@@ -156,7 +156,9 @@ class Flight:
         return found.section[:, 0], found.turns[:, 0]
 
     def closed(self, section: np.ndarray, integration: Integration) -> np.ndarray:
-        """Return the period on which each row of last sections closes, 0 if on none, by the run's rule."""
+        """Return the period on which each cell's last section points close, by the run's tolerance; 0 if they do
+        not.
+        """
         return orbit_periods(
             section,
             closure_tolerance=integration.closure_tolerance,
@@ -165,7 +167,7 @@ class Flight:
         )
 
     def block(self, rows: np.ndarray, section: np.ndarray, turns: np.ndarray, period: np.ndarray) -> Block:
-        """Return cells in the form of the analyses; ended cells have the cube's status."""
+        """Return cells as a block, the input of the analyses; ended cells have the status that the cube would give."""
         status = self.status[rows].copy()
         kept = status == Status.BOUNDED
         status[kept & (period > 0)] = Status.PERIODIC
@@ -180,7 +182,7 @@ Tell = Callable[[np.ndarray, int], None]
 
 
 def run_start(flight: Flight, integration: Integration, tell: Tell, periods: int | None = None) -> Block:
-    """Integrate one start like the run's cells; report its sections as they come.
+    """Integrate one initial state like the run's cells, and report its section points as they are computed.
 
     Parameters
     ----------
@@ -226,7 +228,7 @@ def run_start(flight: Flight, integration: Integration, tell: Tell, periods: int
 
 
 def taken(block: Block, rows: np.ndarray) -> Block:
-    """Return some cells of a block as a block."""
+    """Return the cells `rows` of a block as a new block."""
     rest = None if block.rest is None else block.rest[rows]
     return Block(
         slice(0, len(rows)), block.section[rows], block.status[rows], block.orbit_period[rows], block.turns[rows], rest
@@ -249,7 +251,7 @@ def run_on(
     check: Check,
     tell: Tell | None = None,
 ) -> np.ndarray:
-    """Extend the integration until cells reach an orbit; return their entries, -1 if undecided.
+    """Integrate undecided cells further until they reach an orbit; return their catalog entries, -1 if none is reached.
 
     As long, and as exactly, as the analysis of attractors runs its spirals on.
 
@@ -289,7 +291,7 @@ def run_on(
 def _look(
     flight: Flight, rows: np.ndarray, last: np.ndarray, integration: Integration, ends: Ends, *, strictly: bool = False
 ) -> np.ndarray:
-    """Return the entries of moving cells, -1 for those not yet on an orbit."""
+    """Return the catalog entry of each moving cell; -1 for cells not yet on a known orbit."""
     no_turns = np.zeros((len(rows), sum(ends.model.is_angle)), np.int64)
     period = np.zeros(len(rows), np.int16)
     alive = flight.status[rows] == Status.BOUNDED
@@ -301,7 +303,7 @@ def _look(
 
 
 def settle_cells(place: Place, integration: Integration, ends: Ends, starts: np.ndarray, check: Check) -> np.ndarray:
-    """Return the entry on which each start ends.
+    """Return the catalog entry (attractor or class of cells) that each initial state reaches.
 
     A cell is given up as soon as it is on an orbit that is known, or certain to end there; the others go on
     for as long as the run's own cells, and then on as the analysis of attractors runs them on.
@@ -356,7 +358,7 @@ def conclude(
     check: Check,
     tell: Tell | None = None,
 ) -> np.ndarray:
-    """Return each cell's entry at its end, after extending undecided cells that come back near."""
+    """Return the catalog entry of each cell, after integrating undecided cells further that come back near."""
     numbers = ends.conclude(block, final=False)
     unsure = np.flatnonzero(ends.unsure(block, numbers))
     if len(unsure):

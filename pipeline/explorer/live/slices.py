@@ -1,4 +1,4 @@
-"""Compute live where the starts of a plane end, on grids from coarse to fine.
+"""Compute live which attractors the initial states of a plane reach, on grids from coarse to fine.
 
 The cells of the finest grid are squares of the plane, and the starts their centres. A coarser grid takes
 every second, fourth, ... of these starts, so that a finer one computes only what lies between. What a start
@@ -33,7 +33,7 @@ NOT_YET = -1
 
 
 def slice_of(live: LiveRun, job: Job) -> None:
-    """Run a slice job."""
+    """Compute the slice (labelled plane of initial states) of a job, and send its grids."""
     request = job.request
     assert isinstance(request, SliceRequest)
     place = live.place(request.parameters, request.frequency)
@@ -50,7 +50,7 @@ def slice_of(live: LiveRun, job: Job) -> None:
 
 
 class _Grid:
-    """The starts of a plane, and their labels so far.
+    """Grid of initial states in a plane, and the labels (attractors) found so far.
 
     Attributes
     ----------
@@ -69,7 +69,7 @@ class _Grid:
 
     @classmethod
     def of(cls, live: LiveRun, request: SliceRequest, place: Place) -> _Grid:
-        """Grid that is asked for, its resolution raised to 16, 32, 64, ..."""
+        """Make the grid of a request; its resolution is raised to 16, 32, 64, ..."""
         names = live.model.state_names
         known = ", ".join(names)
         for name in request.plane:
@@ -92,27 +92,29 @@ class _Grid:
         return grid
 
     def levels(self) -> Iterator[int]:
-        """Return the cells along a side, from the coarsest grid to the finest."""
+        """Yield the number of cells along a side, from the coarsest grid to the finest."""
         n = LEAST_RESOLUTION
         while n <= self.n:
             yield n
             n *= 2
 
     def missing(self, n: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return rows and columns of a grid's starts that are not known yet."""
+        """Return rows and columns, in the finest grid, of those initial states of a coarser one that have no label
+        yet.
+        """
         step = self.n // n
         rows, columns = np.nonzero(self.labels[::step, ::step] == NOT_YET)
         return rows * step, columns * step
 
     def starts(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-        """Return initial states at rows and columns of the finest grid."""
+        """Return the initial states at given rows and columns of the finest grid."""
         states = np.tile(self._base, (len(rows), 1))
         states[:, self._columns[0]] = self.axes[0][columns]
         states[:, self._columns[1]] = self.axes[1][rows]
         return states
 
     def image(self, n: int) -> np.ndarray:
-        """Return a grid's labels; unknown ones take the label of the next coarser grid."""
+        """Return the labels of a grid of n x n cells; missing ones are taken from the next coarser grid."""
         step = self.n // n
         own = self.labels[::step, ::step].astype(np.int16)
         if n == LEAST_RESOLUTION:
@@ -122,13 +124,13 @@ class _Grid:
 
 
 class _Slice:
-    """The computation of a slice's grids, one after the other, in all threads."""
+    """Computation of a slice (labelled plane of initial states), one grid after the other, in several threads."""
 
     def __init__(self, live: LiveRun, job: Job, grid: _Grid, catalog: Catalog) -> None:
         self._live, self._job, self._grid, self._catalog = live, job, grid, catalog
 
     def compute(self, n: int) -> None:
-        """Compute a grid's missing labels, and show it now and then."""
+        """Compute a grid's missing labels, and send the unfinished grid at intervals."""
         rows, columns = self._grid.missing(n)
         total, done, shown = len(rows), 0, time.perf_counter()
         size = FIRST_BATCH if n == LEAST_RESOLUTION else BATCH
@@ -166,7 +168,7 @@ class _Slice:
         self._grid.labels[rows[part], columns[part]] = labels
 
     def show(self, n: int, share: float) -> None:
-        """Show a grid as it is."""
+        """Send the current labels of a grid to the page."""
         step = self._grid.n // n
         own: dict[str, Any] = {
             "label": self._grid.image(n),

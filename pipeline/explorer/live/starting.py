@@ -1,4 +1,4 @@
-"""Integrate a start live: its path, its sections as it settles, and its end."""
+"""Integrate an initial state live: send its path, its section points, and the attractor that it reaches."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ MOST_EVERY_S = 0.03
 
 
 def start(live: LiveRun, job: Job) -> None:
-    """Run a start job."""
+    """Integrate the initial state of a job; send its path, section points and attractor."""
     request = job.request
     assert isinstance(request, StartRequest)
     place = live.place(request.parameters, request.frequency)
@@ -52,7 +52,7 @@ def start(live: LiveRun, job: Job) -> None:
 
 
 def _end(live: LiveRun, job: Job, place: Place, block: Block, number: int, periods: int) -> None:
-    """Report where a start ended."""
+    """Send the name and colour of the attractor that an initial state has reached."""
     catalog = live.catalog(place)
     entry, legend = catalog.entry(number), live.legend(catalog)
     line = legend.line(entry)
@@ -72,7 +72,7 @@ def _end(live: LiveRun, job: Job, place: Place, block: Block, number: int, perio
 
 
 class _Path:
-    """The trajectory of a start over its first periods, shown piece by piece."""
+    """Trajectory of an initial state over its first periods, sent piece by piece."""
 
     def __init__(self, live: LiveRun, job: Job, place: Place, state: np.ndarray) -> None:
         self._live, self._job, self._place = live, job, place
@@ -80,7 +80,7 @@ class _Path:
         self._period = self._seconds()
 
     def _seconds(self) -> float:
-        """Return a drive period, or a flow's mean return time over its first returns [s]."""
+        """Return the drive period, or the mean of a flow's first return times [s]."""
         place = self._place
         if self._live.model.crossing is None:
             return 1.0 / place.frequency
@@ -100,7 +100,7 @@ class _Path:
         return float(times.mean()) if len(times) else 1.0 / place.frequency
 
     def show(self, n_periods: int) -> None:
-        """Integrate the next periods, and show them; nothing where the trajectory ends in them."""
+        """Integrate the next periods and send them; send nothing if the integration fails."""
         live, place = self._live, self._place
         times = self._period * np.arange(n_periods * SAMPLES + 1) / SAMPLES
         try:
@@ -122,7 +122,7 @@ class _Path:
 
 
 class _Sections:
-    """A buffer that sends sections in pieces of reasonable size."""
+    """Buffer that sends section points to the page in pieces of reasonable size."""
 
     def __init__(self, job: Job) -> None:
         self._job, self._told = job, time.perf_counter()
@@ -130,7 +130,7 @@ class _Sections:
         self.done = 0
 
     def take(self, section: np.ndarray, done: int) -> None:
-        """Add sections (k, n_states)."""
+        """Add section points, shape (k, n_states); send the buffer if enough time has passed."""
         self._kept.append(section[np.isfinite(section).all(axis=1)])
         self.done = done
         if time.perf_counter() - self._told >= MOST_EVERY_S:

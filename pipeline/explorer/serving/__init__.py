@@ -1,1 +1,1 @@
-"""Serve the page on loopback: requests for data, the websocket, the token."""
+"""Serve the explorer on this machine only: page, data requests, websocket, and access control by a token."""

@@ -1,4 +1,4 @@
-"""Define the answers that the page can request by name: their arguments and their content."""
+"""Define the data requests of the page: their names, arguments and answers."""
 
 from __future__ import annotations
 
@@ -60,14 +60,14 @@ class Query:
 
     @property
     def at(self) -> dict[str, int]:
-        """Return the index by axis: the arguments ``at.NAME``."""
+        """Index on each swept axis, from the arguments ``at.NAME``."""
         names = [name for name in self.words if name.startswith(_AT)]
         return {name.removeprefix(_AT): self.count(name) for name in names}
 
 
 @dataclass(frozen=True)
 class Reply:
-    """An answer: bytes, their type, and a file name if it is a download."""
+    """Reply to a request: bytes, their media type, and a file name if it is a download."""
 
     content: bytes
     kind: str
@@ -79,7 +79,7 @@ Give = Callable[[ExploredRun, Query, LiveRun | None], Reply]
 
 @dataclass(frozen=True)
 class Answer:
-    """A kind of request with the function that answers it.
+    """A kind of data request, with the function that answers it.
 
     Attributes
     ----------
@@ -101,7 +101,7 @@ class Answer:
 
 
 def json_reply(value: Any) -> Reply:
-    """Return JSON without NaN: a gap is null."""
+    """Return a value as a JSON reply; raise `ValueError` for NaN or infinity."""
     return Reply(json.dumps(value, allow_nan=False).encode(), JSON)
 
 
@@ -176,7 +176,7 @@ ANSWERS: dict[str, Answer] = {
 
 
 def first_answers(run: ExploredRun, live: LiveRun | None) -> None:
-    """Prepare the page's first requests: the view, and the diagram shown first."""
+    """Compute the answers to the page's first requests in advance: the run's description and the first diagram."""
     try:
         _view(run, Query({}), live)
         axis = next((a for a in run.axes if a.name == run.path), run.axes[0])

@@ -1,4 +1,4 @@
-"""Open the page in a browser without showing its address: process arguments are public."""
+"""Open the page in a browser by a private redirect file, since command lines of processes are public."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def redirect_file(folder: Path, address: str) -> Path:
 
 @contextlib.contextmanager
 def browser() -> Iterator[Callable[[str], None]]:
-    """Yield a function that opens an address in the user's browser, if there is one, without waiting.
+    """Yield a function that opens an address in the user's browser without waiting for it.
 
     The redirect file exists as long as the block runs.
     """

@@ -1,4 +1,4 @@
-"""Write the page's HTML; script and style come from `static/`."""
+"""Write the HTML of the served page; script and style come from `static/`."""
 
 from __future__ import annotations
 
@@ -42,5 +42,5 @@ def page(title: str, token: str) -> str:
 
 
 def note(sentence: str) -> str:
-    """Return a page with one sentence."""
+    """Return an HTML page that shows one sentence."""
     return _NOTE.format(sentence=escape(sentence))

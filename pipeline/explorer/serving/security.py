@@ -1,4 +1,4 @@
-"""Decide which requests the explorer answers: only this machine's page with the token.
+"""Decide which requests the explorer answers: those of its own page, with the secret token.
 
 A server on loopback can be reached by every process of the machine and, through a browser, by every page
 that is open in it. So there is a random token in the address that is printed, and every request but those
@@ -25,13 +25,13 @@ FROM_HERE = ("same-origin", "none")
 
 
 def new_token() -> str:
-    """Return a random token that cannot be guessed."""
+    """Return a random secret token for access to the page."""
     return secrets.token_urlsafe(TOKEN_BYTES)
 
 
 @dataclass(frozen=True)
 class Guard:
-    """The check of every request.
+    """Check of a request's origin and token.
 
     Attributes
     ----------
@@ -44,11 +44,13 @@ class Guard:
 
     @property
     def hosts(self) -> tuple[str, ...]:
-        """Return the host names of this server."""
+        """Host names, with port, under which this server may be addressed."""
         return f"127.0.0.1:{self.port}", f"localhost:{self.port}"
 
     def foreign(self, headers: Mapping[str, str]) -> str | None:
-        """Return why a request is from neither this page nor a user, or None."""
+        """Return the reason to reject a request as coming from another page or naming another host; None if there is
+        none.
+        """
         if headers.get("Host", "").lower() not in self.hosts:
             return "this server answers to its own address alone; use the one that it printed"
         origin = headers.get("Origin")
@@ -59,11 +61,11 @@ class Guard:
         return None
 
     def knows(self, given: str) -> bool:
-        """Tell whether this is the token, in constant time."""
+        """Return whether a text is the token, in a comparison of constant time."""
         return hmac.compare_digest(given.encode("utf-8", "replace"), self.token.encode())
 
     def authorised(self, headers: Mapping[str, str], argument: str = "") -> bool:
-        """Tell whether a request has the token: in a header, or as the argument ``token``."""
+        """Return whether a request carries the token, in a header or as the argument ``token``."""
         given = [headers.get(name, "") for name in TOKEN_HEADERS]
         bare = [g[len(_SCHEME) :] if g.lower().startswith(_SCHEME) else g for g in given]
         found = [self.knows(one) for one in (*bare, argument)]
@@ -71,7 +73,7 @@ class Guard:
 
 
 def content_policy(port: int) -> str:
-    """Return the page's content policy: its own script and style, and its workers."""
+    """Return the content security policy (HTTP header) of the page: its own script, style and connections."""
     sockets = f"ws://127.0.0.1:{port} ws://localhost:{port}"  # some browsers do not take 'self' for these
     return (
         "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; "
@@ -81,7 +83,7 @@ def content_policy(port: int) -> str:
 
 
 def headers_of(port: int) -> dict[str, str]:
-    """Return the headers of every answer."""
+    """Return the HTTP headers that every answer carries."""
     return {
         "Content-Security-Policy": content_policy(port),
         "X-Content-Type-Options": "nosniff",
@@ -108,7 +110,7 @@ class Rate:
         self._left, self._then = float(burst), time.monotonic()
 
     def allows(self) -> bool:
-        """Consume one allowance; return whether there was one."""
+        """Return whether another request is allowed now, and count it."""
         now = time.monotonic()
         self._left = min(self._burst, self._left + (now - self._then) * self._per_second)
         self._then = now

@@ -1,4 +1,4 @@
-"""Serve one read-only page of a run on loopback.
+"""Serve the interactive page of a run on this machine only.
 
 What takes long to import is imported once the address is known, while a browser starts.
 
@@ -146,17 +146,17 @@ class Service:
 
 
 class TooManyError(ValueError):
-    """More requests than the server handles at once."""
+    """Raised if the server has more waiting requests than it accepts."""
 
 
 class Handler(web.RequestHandler):
-    """The base of all handlers."""
+    """Base class of all HTTP handlers: it checks the token and the request rate, and sets headers."""
 
     needs_token = True
     service: Service
 
     def initialize(self, service: Service) -> None:
-        """Store the shared state."""
+        """Store the service (run, guard and threads) that all handlers share."""
         self.service = service
 
     def set_default_headers(self) -> None:
@@ -171,7 +171,7 @@ class Handler(web.RequestHandler):
         return None
 
     def prepare(self) -> None:
-        """Refuse invalid requests before any work."""
+        """Reject a request with a bad origin, a wrong token or too high a rate, before any work."""
         guard, headers = self.service.guard, self.request.headers
         if len(self.request.uri or "") > MOST_ADDRESS:
             self.refuse(414, "the address is too long")
@@ -189,7 +189,7 @@ class Handler(web.RequestHandler):
             self.refuse(403, "the token is missing or wrong; use the address that magpend explore printed")
 
     def refuse(self, status: int, sentence: str) -> None:
-        """Answer with one sentence as JSON, and end the request."""
+        """Send a sentence as JSON with an error status, and end the request."""
         self.set_status(status)
         self.set_header("Content-Type", "application/json; charset=utf-8")
         self.finish(json.dumps({"error": sentence}))
@@ -203,13 +203,13 @@ class PageHandler(Handler):
     """The handler of the page itself."""
 
     def refuse(self, status: int, sentence: str) -> None:
-        """Answer with a page that holds one sentence."""
+        """Send an HTML page that shows one sentence, with an error status."""
         self.set_status(status)
         self.set_header("Content-Type", "text/html; charset=utf-8")
         self.finish(page_html.note(sentence))
 
     async def get(self) -> None:
-        """The page of the run."""
+        """Send the HTML page of the run."""
         if "explorer.js" not in self.service.static:
             self.refuse(500, "the page's script is not installed: install magpend again")
             return
@@ -223,7 +223,7 @@ class StaticHandler(Handler):
     needs_token = False
 
     async def get(self, name: str) -> None:
-        """One of `STATIC`."""
+        """Send a script or style file by name."""
         if name not in self.service.static:
             self.refuse(404, "there is no such file")
             return
@@ -233,23 +233,23 @@ class StaticHandler(Handler):
 
 
 class ApiHandler(Handler):
-    """The handler of one kind of answer."""
+    """Handler of one kind of data request; see `answers`."""
 
     answer: Answer
 
     def initialize(self, service: Service, answer: Answer) -> None:  # type: ignore[override]
-        """Store the shared state and the kind of answer."""
+        """Store the service and the kind of data request."""
         self.service, self.answer = service, answer
 
     async def get(self) -> None:
-        """Answer from what the address says."""
+        """Answer a GET request from the arguments of its address."""
         if self.answer.method != "GET":
             self.refuse(405, f"api/{self.answer.name} takes {self.answer.method}")
             return
         await self._reply(b"")
 
     async def post(self) -> None:
-        """Answer from what the body says."""
+        """Answer a POST request from its body."""
         if self.answer.method != "POST":
             self.refuse(405, f"api/{self.answer.name} takes {self.answer.method}")
             return
@@ -289,10 +289,10 @@ class ApiHandler(Handler):
 
 
 class NothingHandler(Handler):
-    """The handler of all other addresses."""
+    """Handler of all addresses that do not exist."""
 
     def prepare(self) -> None:
-        """Refuse, and say no more than that there is nothing."""
+        """Check the request like every handler, then answer it with status 404."""
         super().prepare()
         if not self._finished:
             self.refuse(404, "there is no such page")
@@ -335,7 +335,7 @@ def _live_routes(service: Service) -> list[Any]:
 
 
 def listening(port: int) -> socket.socket:
-    """Return a socket on loopback.
+    """Return a listening socket on the loopback address.
 
     Raises
     ------

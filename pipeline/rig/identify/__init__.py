@@ -1,1 +1,1 @@
-"""Identify parameters of a model from recordings."""
+"""Identify unknown parameters of a model from recordings of a rig."""

@@ -1,4 +1,4 @@
-"""Build the fitting problem from a specification and its recordings."""
+"""Build the least-squares problem of an identification from its TOML specification and its recordings."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ LEAST_NOISE = 1e-6
 
 @dataclass(frozen=True)
 class Built:
-    """The pieces that are fitted, and the pieces that are held out.
+    """Least-squares problem of an identification, with the held-out pieces that only judge the fit.
 
     Attributes
     ----------
@@ -54,7 +54,7 @@ class Built:
 
 @dataclass(frozen=True)
 class Stretch:
-    """The samples of a recording that make a piece."""
+    """Range of samples of a recording that is to become one piece of the fit."""
 
     recording: int
     number: int
@@ -63,7 +63,7 @@ class Stretch:
 
 
 def read_all(spec: IdentificationSpec) -> list[xr.Dataset]:
-    """Read the recordings of a specification.
+    """Read all recordings that the specification of an identification names.
 
     Raises
     ------
@@ -83,7 +83,7 @@ def read_all(spec: IdentificationSpec) -> list[xr.Dataset]:
 
 
 def build(spec: IdentificationSpec, recordings: Sequence[xr.Dataset]) -> Built:
-    """Return the fitting problem of a specification and its recordings.
+    """Build the least-squares problem of a specification and its recordings, and set the held-out pieces apart.
 
     Raises
     ------
@@ -136,7 +136,8 @@ def build(spec: IdentificationSpec, recordings: Sequence[xr.Dataset]) -> Built:
 def channels_of(
     model: Model, wanted: Sequence[str], recordings: Sequence[xr.Dataset], problems: list[str]
 ) -> tuple[str, ...]:
-    """Return the channels that are compared: the given ones, by default those that all recordings measure.
+    """Return the names of the measured states (channels) to compare: those of the specification, else those in all
+    recordings.
 
     By default a rate is left out if its state is measured, since it adds no information.
     """
@@ -201,7 +202,7 @@ def _hold_out_problems(i: int, table: RecordingTable, n: int) -> list[str]:
 
 
 def free_of(spec: IdentificationSpec, channels: Sequence[str], n_recordings: int) -> tuple[Free, ...]:
-    """Return the unknowns: parameters in the order of the specification, then zeros of the sensors."""
+    """Return the unknowns of the fit: parameters in the order of the specification, then zero offsets of sensors."""
     found = []
     for u in spec.unknowns:
         p = spec.model.parameter(u.name)
@@ -220,7 +221,7 @@ def free_of(spec: IdentificationSpec, channels: Sequence[str], n_recordings: int
 def noise_of(
     model: Model, channels: Sequence[str], smoothed: Sequence[xr.Dataset], stated: Mapping[str, float]
 ) -> np.ndarray:
-    """Return the standard deviation that each channel is weighted with [SI].
+    """Return the standard deviation of each channel by which its residuals are divided [SI].
 
     The specification may state it. Otherwise the recordings give it, one value for all channels of a unit: in
     most rigs the model's error exceeds the sensors' noise and is not proportional to it.
@@ -247,7 +248,7 @@ def pieces_of(
     recording: int,
     decimate: int = 1,
 ) -> list[Piece]:
-    """Cut a recording into pieces.
+    """Cut a recording into the pieces that are fitted, each with samples, drive and a first guess of its initial state.
 
     Parameters
     ----------
@@ -304,7 +305,7 @@ def pieces_of(
 
 
 def stretches(ds: xr.Dataset, piece_s: float | None, recording: int) -> list[Stretch]:
-    """Return the stretches of a recording: its pieces, each cut into equal parts of about a given length.
+    """Cut each uninterrupted piece of a recording into equal stretches of about `piece_s`; return all stretches.
 
     Parameters
     ----------
@@ -333,7 +334,9 @@ def _runs(piece: np.ndarray) -> list[tuple[int, int]]:
 
 
 def _usable(ds: xr.Dataset, stretch: Stretch, channels: Sequence[str], drive: _Driven | None) -> slice:
-    """Return the samples of a stretch from the first with all channels, as far as the drive is known."""
+    """Return a stretch's usable samples: from the first with values of all channels to the last at which the drive is
+    known.
+    """
     begin, end = stretch.samples.start, stretch.samples.stop
     time = ds["time"].values[begin:end]
     good = np.all([np.isfinite(ds[name].values[begin:end]) for name in channels], axis=0)
@@ -345,7 +348,7 @@ def _usable(ds: xr.Dataset, stretch: Stretch, channels: Sequence[str], drive: _D
 
 
 def _start(model: Model, own: xr.Dataset) -> np.ndarray:
-    """Return a first guess of the state at the first sample: smoothed measurements, and 0 for the other states."""
+    """Return a first guess of the state at the first sample: smoothed measurements, and 0 for states not measured."""
     found = []
     for state in model.states:
         value = float(own[state.name].values[0]) if state.name in own else 0.0
@@ -355,14 +358,14 @@ def _start(model: Model, own: xr.Dataset) -> np.ndarray:
 
 @dataclass(frozen=True)
 class _Driven:
-    """A recording's drive, and the times that it covers [s]."""
+    """Drive of a recording, with the times that it covers [s]."""
 
     drive: Drive | None
     begin_s: float
     end_s: float
 
     def window(self, begin: float, end: float) -> Drive:
-        """Return the part of the drive that a piece needs."""
+        """Return the part of the drive between two times [s]; a drive of zero torque if no drive was recorded."""
         if self.drive is None:
             # no torque here, while other recordings have one
             return Drive.from_torque(np.array([0.0, end - begin]), np.zeros(2))
@@ -370,7 +373,7 @@ class _Driven:
 
 
 def _drive_of(table: RecordingTable, ds: xr.Dataset) -> _Driven | None:
-    """Return the drive of a recording; None for none."""
+    """Return the drive of a recording and the times that it covers; None if the drive was off."""
     time = ds["time"].values
     if table.drive == "none":
         return None
@@ -396,7 +399,8 @@ def _drive_of(table: RecordingTable, ds: xr.Dataset) -> _Driven | None:
 
 
 def _steadied(edges: Edges) -> Edges:
-    """Replace edges by their fitted line when their scatter is below the sampling resolution.
+    """Replace the edges of a drive by evenly spaced ones from a fitted line if they scatter by less than the sampling
+    interval.
 
     A single edge is known to half a sampling interval; a line through many edges is known far better.
     """
@@ -417,6 +421,6 @@ def _steadied(edges: Edges) -> Edges:
 
 
 def _rechained(pieces: list[Piece], offset: int) -> list[Piece]:
-    """Renumber the predecessors of pieces after some were taken out; -1 where the predecessor is gone."""
+    """Renumber the preceding piece of each piece (`Piece.follows`) after pieces were removed; -1 if it was removed."""
     numbers = {p.number: offset + k for k, p in enumerate(pieces)}
     return [replace(p, follows=numbers.get(p.number - 1, -1) if p.follows >= 0 else -1) for p in pieces]

@@ -1,4 +1,4 @@
-"""Judge an identification on another recording; only the starts of its pieces are fitted."""
+"""Test a finished identification on another recording, with only the initial states of its pieces fitted."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from pipeline.specification.problems import SpecError
 
 
 def check(directory: str | Path, recording: str | Path, *, like: int = 0) -> dict[str, Any]:
-    """Judge a finished identification on another recording.
+    """Test a finished identification on another recording; return the residuals' rms and the correlation by channel.
 
     The file's pieces stay whole, and each has a free start. Every sample counts. The criterion is least
     squares, whatever the loss of the fit. Sensors' zeros keep their identified values.

@@ -1,4 +1,4 @@
-"""Compare identifications by their held-out pieces, not by their fits."""
+"""Compare identifications by how well they predict the held-out pieces of the recordings."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pipeline.specification.problems import SpecError
 
 
 def compare(directories: Sequence[str | Path]) -> Table:
-    """Compare finished identifications; the one with the best prediction comes first.
+    """Compare finished identifications in a table, sorted by their residuals on held-out pieces.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Write and read the directory of an identification.
+"""Write and read the directory of an identification, which can be stopped and continued.
 
     identification.json   specification, mappings, digest, versions, host, time: written once
     outcomes/             a file for each local fit and each profile, written whole
@@ -54,7 +54,7 @@ _NOT_NUMBERS = ("check.py", "comparison.py", "directory.py", "figures.py", "repo
 
 @dataclass(frozen=True)
 class Source:
-    """A recording of an identification, with its mapping.
+    """Recording of an identification: its file name and sha256, with the text of its mapping file.
 
     Attributes
     ----------
@@ -72,7 +72,7 @@ class Source:
 
 @dataclass(frozen=True)
 class Info:
-    """The content of ``identification.json``.
+    """Content of ``identification.json``.
 
     Attributes
     ----------
@@ -104,7 +104,7 @@ class Info:
 
 
 def sources_of(spec: IdentificationSpec) -> list[Source]:
-    """Read the recordings and mappings of a specification, which also decide the numbers.
+    """Read the bytes of each recording and the text of its mapping; return file name, sha256 and mapping text.
 
     Raises
     ------
@@ -128,7 +128,9 @@ def sources_of(spec: IdentificationSpec) -> list[Source]:
 
 
 def _kept(path: Path) -> str:
-    """Return the text of a mapping file; the parsed mapping in full if its model is a file or an object."""
+    """Return the text of a mapping file; if its model is a file or an object, return the parsed mapping as TOML
+    instead.
+    """
     text = path.read_text("utf-8")
     model = tomllib.loads(text).get("model")
     is_whole = isinstance(model, str) and not is_model_file(model) and not is_object_path(model)
@@ -136,7 +138,9 @@ def _kept(path: Path) -> str:
 
 
 def identity_of(spec: IdentificationSpec, sources: Sequence[Source]) -> dict[str, Any]:
-    """Return everything that decides the numbers: specification, recordings, kernel, model, code."""
+    """Return all inputs that decide the numerical results: specification, recordings, kernel version, model and code
+    digests.
+    """
     tables = spec.as_dict()
     for table, source in zip(tables["recordings"], sources, strict=True):
         del table["file"], table["mapping"]
@@ -158,7 +162,7 @@ def is_identification(directory: str | Path) -> bool:
 
 
 def read_info(directory: str | Path) -> Info:
-    """Read and check ``identification.json``.
+    """Read ``identification.json``, and check its format and digest.
 
     Raises
     ------
@@ -191,7 +195,7 @@ def read_info(directory: str | Path) -> Info:
 
 
 def check(directory: Path, identity: Mapping[str, Any]) -> Info | None:
-    """Check whether an identification can be done in a directory; nothing is changed.
+    """Return the same identification if a directory holds it, None if it is free; raise if it holds anything else.
 
     Returns
     -------
@@ -229,13 +233,15 @@ def check(directory: Path, identity: Mapping[str, Any]) -> Info | None:
 
 
 def _short(line: str) -> str:
-    """Shorten a line that may hold the whole text of a mapping."""
+    """Shorten a line of a message to 400 characters."""
     flat = " ".join(line.split())
     return flat if len(flat) <= 400 else f"{flat[:197]} ... {flat[-197:]}"
 
 
 def establish(directory: Path, spec: IdentificationSpec, sources: Sequence[Source], spec_text: str) -> Info:
-    """Make the directory, or return the identification in it; call `check` first."""
+    """Create the directory of an identification and its ``identification.json``, or return the identification that it
+    holds.
+    """
     identity = identity_of(spec, sources)
     if check(directory, identity) is None:
         directory.mkdir(parents=True, exist_ok=True)
@@ -256,7 +262,7 @@ def establish(directory: Path, spec: IdentificationSpec, sources: Sequence[Sourc
 
 
 class Outcomes:
-    """Outcomes by name; each is computed once and kept in its own file.
+    """Files of the outcomes of local fits and profiles, one file per outcome; a later run reads them again.
 
     Parameters
     ----------
@@ -269,7 +275,7 @@ class Outcomes:
         self.recalled = 0
 
     def recall(self, name: str, unpack: Callable[[Mapping[str, np.ndarray]], T]) -> T | None:
-        """Return an outcome if its file exists and is whole; otherwise None."""
+        """Return a stored outcome; None if its file is missing or damaged."""
         path = self._folder / f"{name}.npz"
         if not is_there(path):
             return None
@@ -282,14 +288,16 @@ class Outcomes:
         return found
 
     def store(self, name: str, packed: Mapping[str, np.ndarray]) -> None:
-        """Write an outcome whole."""
+        """Write an outcome to its file atomically."""
         buffer = io.BytesIO()
         np.savez(buffer, **packed)  # type: ignore[arg-type]
         write_atomically(self._folder / f"{name}.npz", buffer.getvalue())
 
 
 def write_result(directory: Path, result: Mapping[str, Any], files: Sequence[str]) -> None:
-    """Write ``result.json`` with the digests of the other files; it marks the identification as finished."""
+    """Write ``result.json`` with the sha256 of the other result files; its existence marks the identification as
+    finished.
+    """
     entries = {name: entry_of((directory / name).read_bytes()) for name in sorted(files)}
     write_atomically(directory / RESULT, canonical({**result, "files": entries}))
 
@@ -317,7 +325,7 @@ def read_result(directory: str | Path) -> dict[str, Any]:
 
 
 def is_complete(directory: Path) -> bool:
-    """Return whether all results exist and have not changed."""
+    """Return whether ``result.json`` and all files that it lists exist unchanged."""
     if not is_there(directory / RESULT):
         return False
     try:

@@ -1,4 +1,6 @@
-"""Draw the figures of an identification: fit over data, residuals, profiles, correlations."""
+"""Draw the figures of an identification: computed over measured values, residuals, profile likelihoods,
+correlations.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +40,7 @@ FITTED, HELD = style.BLUE, style.VERMILLION
 
 
 def draw_all(folder: Path, residuals: xr.Dataset, result: Mapping[str, Any]) -> list[str]:
-    """Draw all figures of an identification, with the data drawn beside each.
+    """Draw all figures of an identification, and save each with the data that it shows.
 
     Parameters
     ----------
@@ -75,7 +77,7 @@ def _title(attrs: Mapping[Any, Any], what: str) -> str:
 
 
 def _finish(fig: style.DataFigure) -> None:
-    """Mark the figure if recordings are simulated, and finish it."""
+    """Write "simulated recording" on a figure if its data are simulated, and finish its layout."""
     if fig.data.attrs.get("simulated"):
         fig.text(0.012, 0.992, "simulated recording", ha="left", va="top", fontsize=fig.look.legend)
     style.finish(fig)
@@ -91,7 +93,7 @@ def _milli(ds: xr.Dataset, channel: str) -> tuple[str, float]:
 
 
 def plot_fit(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.DataFigure:
-    """Draw measured and computed values of some pieces, with their residuals.
+    """Draw measured and computed values of up to four pieces, with their residuals.
 
     Parameters
     ----------
@@ -176,7 +178,7 @@ def _share_range(row: list[Axes]) -> None:
 
 
 def plot_residuals(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.DataFigure:
-    """Draw the residuals of each channel: autocorrelation, by piece, against the rate, histogram.
+    """Draw the residuals of each channel: autocorrelation, rms by piece, residuals against the rate, histogram.
 
     Parameters
     ----------
@@ -299,7 +301,7 @@ def _draw_histogram(ax: Axes, views: xr.Dataset, channel: str, factor: float) ->
 def plot_profiles(
     attrs: Mapping[Any, Any], result: Mapping[str, Any], *, frame: style.Frame = style.WIDE
 ) -> style.DataFigure:
-    """Draw the profile of each unknown, with the parabola from its standard error.
+    """Draw the profile likelihood of each unknown, with the parabola that its standard error predicts.
 
     Parameters
     ----------
@@ -371,7 +373,9 @@ def _draw_profile(ax: Axes, data: xr.Dataset, name: str, estimate: Mapping[str, 
 
 
 def _engineering(size: float) -> tuple[float, int]:
-    """Return a factor and its power of ten that bring a very small or large number between 1 and 1000."""
+    """Return a power-of-ten factor and its exponent (a multiple of 3) that bring a very small or large number to 1 to
+    1000.
+    """
     if not size > 0 or 1e-2 <= size < 1e4:
         return 1.0, 0
     exponent = 3 * math.floor(math.log10(size) / 3)
@@ -381,7 +385,7 @@ def _engineering(size: float) -> tuple[float, int]:
 def plot_correlations(
     attrs: Mapping[Any, Any], result: Mapping[str, Any], *, frame: style.Frame = SQUARE
 ) -> style.DataFigure:
-    """Draw the correlations of the estimates as a matrix; undetermined entries stay empty.
+    """Draw the correlation matrix of the estimates; entries of parameters that the data do not determine stay empty.
 
     Parameters
     ----------

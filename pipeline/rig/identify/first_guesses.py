@@ -1,4 +1,4 @@
-"""Fit the pieces' starts for given parameters, or project them out of the problem."""
+"""Fit the initial states of the pieces for given parameters, or eliminate them from the least-squares problem."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ SETTLED = 1e-10
 
 
 class Starts(NamedTuple):
-    """The fitted starts, and which of them have converged."""
+    """Fitted initial states of the pieces, and whether each has converged."""
 
     starts: Array  # (n_piece, n_states)
     settled: NDArray[np.bool_]  # (n_piece,)
 
 
 def fit_starts(problem: Problem, theta: Array, starts: Array) -> Starts:
-    """Fit each piece's start by least squares with the unknowns held (Levenberg and Marquardt).
+    """Fit the initial state of each piece by least squares (Levenberg-Marquardt), with the unknown parameters fixed.
 
     The engine integrates all pieces together; each has its own damping. Gaps between stretches do not count.
 
@@ -70,7 +70,7 @@ def fit_starts(problem: Problem, theta: Array, starts: Array) -> Starts:
 
 
 def block_rows(problem: Problem) -> list[slice]:
-    """Return the rows of each piece in a compressed evaluation."""
+    """Return the range of rows that each piece has in the compressed residual vector."""
     n_own = len(problem.free) + len(problem.model.states)
     sizes = [min(int(np.isfinite(p.measured).sum()), n_own + 1) for p in problem.pieces]
     ends = np.cumsum([0, *sizes])
@@ -78,7 +78,7 @@ def block_rows(problem: Problem) -> list[slice]:
 
 
 class _Block(NamedTuple):
-    """The compressed rows of a piece, and their slopes by its start."""
+    """Compressed residuals of a piece, and their derivatives by its initial state."""
 
     jacobian: Array
     rows: Array
@@ -98,7 +98,7 @@ def _cost(block: _Block) -> float:
 
 
 def _step(jacobian: Array, rows: Array, damping: float) -> tuple[Array, float]:
-    """Return a damped Gauss-Newton step, and the decrease of the cost predicted without damping."""
+    """Return a damped Gauss-Newton step, and the decrease of the cost that an undamped step would give."""
     size = np.sqrt(damping) * np.linalg.norm(jacobian, axis=0)
     stacked = np.vstack([jacobian, np.diag(np.maximum(size, 1e-300))])
     right = np.concatenate([-rows, np.zeros(len(size))])
@@ -107,13 +107,13 @@ def _step(jacobian: Array, rows: Array, damping: float) -> tuple[Array, float]:
 
 
 def _own(problem: Problem, evaluation: Evaluation, k: int, here: slice) -> Array:
-    """Return the slopes of a piece's rows by its own start."""
+    """Return the derivatives of a piece's residuals by its own initial state."""
     n, n_free = len(problem.model.states), len(problem.free)
     return evaluation.jacobian[here, n_free + k * n : n_free + (k + 1) * n]
 
 
 def carry_starts(problem: Problem, evaluation: Evaluation, starts: Array, change: Array) -> Array:
-    """Return the starts after a change of the unknowns, to first order, (n_piece, n_states)."""
+    """Return the optimal initial states after a change of the unknowns, to first order, (n_piece, n_states)."""
     found, n_free = np.array(starts), len(problem.free)
     for k, here in enumerate(block_rows(problem)):
         wanted = evaluation.rows[here] + evaluation.jacobian[here, :n_free] @ change
@@ -122,7 +122,7 @@ def carry_starts(problem: Problem, evaluation: Evaluation, starts: Array, change
 
 
 def project_starts_out(problem: Problem, evaluation: Evaluation) -> tuple[Array, Array]:
-    """Return rows and slopes by the unknowns, with the directions of the starts projected out.
+    """Return residuals and their derivatives by the unknowns, with the directions of the initial states projected out.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Determine which parameters the data determine, and describe it in numbers and sentences."""
+"""Find out which parameters the data determine, and describe it in numbers and sentences."""
 
 from __future__ import annotations
 
@@ -27,7 +27,8 @@ NEVER = 1e-6
 
 @dataclass(frozen=True)
 class Direction:
-    """A direction in parameter space, each parameter in units of its size.
+    """Direction in parameter space with its singular value and standard error; each parameter is in units of its
+    typical size.
 
     Attributes
     ----------
@@ -46,14 +47,14 @@ class Direction:
 
     @property
     def is_loose(self) -> bool:
-        """Whether the data do not determine the direction."""
+        """Whether the standard error along the direction is so large that the data do not determine it."""
         return self.error > LOOSE
 
 
 def sizes_of(
     theta: np.ndarray, start: np.ndarray, lower: np.ndarray, upper: np.ndarray, sensed: np.ndarray
 ) -> np.ndarray:
-    """Return the size of each parameter, to which changes are compared.
+    """Return a typical size of each parameter, as the unit of its changes.
 
     Parameters
     ----------
@@ -74,7 +75,7 @@ def sizes_of(
 
 
 def directions_of(information: np.ndarray, scale: np.ndarray, inflation: float) -> list[Direction]:
-    """Return the directions of the scaled information matrix, the best determined one first.
+    """Return the eigenvectors of the scaled information matrix as directions, the best determined one first.
 
     Parameters
     ----------
@@ -97,7 +98,7 @@ def directions_of(information: np.ndarray, scale: np.ndarray, inflation: float) 
 
 
 def invisible(information: np.ndarray, names: Sequence[str]) -> list[str]:
-    """Return the names of the parameters that no residual depends on."""
+    """Return the names of the parameters that the residuals do not depend on."""
     own = np.diag(information)
     return [name for name, value in zip(names, own, strict=True) if not value > 0.0]
 
@@ -109,7 +110,8 @@ def warnings_of(
     prior_sd: np.ndarray,
     at_bound: Sequence[str],
 ) -> list[str]:
-    """Return sentences about what the data do not determine.
+    """Return warnings: parameters and combinations that the data do not determine, estimates at a bound or set by a
+    prior.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Run an identification from its specification, or complete one that was stopped."""
+"""Run an identification from its specification, or continue one that was stopped."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ SAME_MOTION = 1e-3
 
 
 class NotConvergedError(ArithmeticError):
-    """An error for an identification in which no start converged."""
+    """Error of an identification in which no local fit converged."""
 
 
 def identify(
@@ -133,7 +133,7 @@ def _write(
 
 
 def refuse_invisible(problem: Problem) -> None:
-    """Refuse unknowns that no residual depends on, by a first evaluation.
+    """Evaluate the residuals once, and raise `SpecError` if they do not depend on some of the unknowns.
 
     Raises
     ------
@@ -170,7 +170,9 @@ def refuse_invisible(problem: Problem) -> None:
 
 
 def _is_driven(problem: Problem) -> bool:
-    """Return whether trajectories without a drive depend on the drive's period."""
+    """Return whether the trajectory of an undriven piece changes with the drive period, so that the model is driven
+    after all.
+    """
     piece = problem.pieces[0]
     if piece.drive is not None:
         return False
@@ -186,7 +188,7 @@ def _is_driven(problem: Problem) -> bool:
 
 
 def find(spec: IdentificationSpec, built: Built, outcomes: Outcomes, echo: Echo) -> reports.Finding:
-    """Search for the best fit, judge it, and compute its errors.
+    """Search for the best fit, test it on the held-out pieces, and compute errors, profiles and warnings.
 
     Raises
     ------
@@ -238,7 +240,7 @@ def find(spec: IdentificationSpec, built: Built, outcomes: Outcomes, echo: Echo)
 
 
 def require_starts(fit: Fit, what: str) -> None:
-    """Raise `NotConvergedError` unless the starts of judged pieces were found."""
+    """Raise `NotConvergedError` unless the fit of the initial states of the pieces converged."""
     if not fit.converged:
         raise NotConvergedError(
             f"the starts of the {what} did not converge ({fit.message}), so there is nothing to judge by."
@@ -306,13 +308,13 @@ def _unpack_profile(name: str, data: Mapping[str, np.ndarray]) -> Profile:
 
 
 def _plain_errors(linear: Linearised, scale: np.ndarray) -> np.ndarray:
-    """Return standard errors for independent residuals as large as the noise."""
+    """Return the standard errors for independent residuals with the assumed noise."""
     inverse = np.linalg.pinv(linear.information * np.outer(scale, scale), rcond=1e-12, hermitian=True)
     return np.asarray(np.sqrt(np.diag(inverse)) * scale)
 
 
 class Kept:
-    """The kept outcomes of starts by number, as `pipeline.rig.identify.search.search` uses them.
+    """Store of finished local fits, by the number of their first guess, for `pipeline.rig.identify.search.search`.
 
     Parameters
     ----------
@@ -325,14 +327,14 @@ class Kept:
         self.fits: dict[int, Fit] = {}
 
     def recall(self, number: int) -> Fit | None:
-        """Return the outcome of a start if it is stored; otherwise None."""
+        """Return the local fit that began at first guess `number`, or None if it is not stored."""
         fit = self._outcomes.recall(_name(number), unpack_fit)
         if fit is not None:
             self.fits[number] = fit
         return fit
 
     def store(self, number: int, fit: Fit) -> None:
-        """Store the outcome of a start."""
+        """Store the local fit that began at first guess `number`."""
         self._outcomes.store(_name(number), pack_fit(fit))
         self.fits[number] = fit
 
@@ -342,7 +344,7 @@ def _name(number: int) -> str:
 
 
 def pack_fit(fit: Fit) -> dict[str, np.ndarray]:
-    """Return a fit as arrays."""
+    """Return all fields of a fit as named arrays, to be stored in a file."""
     lengths = np.array([len(r) for r in fit.residuals], np.int64)
     return {
         "theta": fit.theta,
@@ -359,7 +361,7 @@ def pack_fit(fit: Fit) -> dict[str, np.ndarray]:
 
 
 def unpack_fit(data: Mapping[str, np.ndarray]) -> Fit:
-    """Return the fit that `pack_fit` turned into arrays."""
+    """Rebuild a fit from the arrays of `pack_fit`."""
     residuals = np.split(data["residuals"], np.cumsum(data["lengths"])[:-1])
     return Fit(
         data["theta"],

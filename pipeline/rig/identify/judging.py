@@ -1,4 +1,4 @@
-"""Judge how well computed trajectories fit measured ones: root mean squares and correlations."""
+"""Judge how well computed trajectories fit measured ones, by root mean squares and correlations."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ The length is then doubled until it covers the piece: a long piece does not tole
 
 @dataclass(frozen=True)
 class Judgement:
-    """The residuals of measured pieces, with measures of the fit.
+    """Residuals of measured pieces, with root mean squares and correlations.
 
     Attributes
     ----------
@@ -44,7 +44,7 @@ class Judgement:
         return self._rms(self.residuals)
 
     def rms_of(self, k: int) -> dict[str, float]:
-        """Return the root mean square of each channel's residuals in one piece [SI]."""
+        """Return the root mean square of each channel's residuals in piece `k` [SI]."""
         return self._rms([self.residuals[k]])
 
     def _rms(self, residuals: Sequence[np.ndarray]) -> dict[str, float]:
@@ -56,13 +56,15 @@ class Judgement:
 
     @property
     def correlation(self) -> dict[str, float]:
-        """Pearson's correlation coefficient of measured and computed values of each channel."""
+        """Pearson's correlation coefficient between measured and computed values, by channel."""
         measured = np.concatenate([p.measured for p in self.pieces])
         computed = measured - np.concatenate(self.residuals)
         return {name: _pearson(measured[:, c], computed[:, c]) for c, name in enumerate(self.channels)}
 
     def as_dict(self) -> dict[str, Any]:
-        """Return plain data: rms and correlation, and the rms of each piece; None if undefined."""
+        """Return rms and correlation by channel, and the rms of each piece, as plain data; undefined values are
+        None.
+        """
         return {
             "rms": _known(self.rms),
             "correlation": _known(self.correlation),
@@ -87,14 +89,14 @@ def _pearson(x: np.ndarray, y: np.ndarray) -> float:
 
 
 def judge_fit(problem: Problem, fit: Fit) -> Judgement:
-    """Judge a fit on the pieces that it was fitted to."""
+    """Return the residuals of a fit on the pieces that it was fitted to, with their measures."""
     return Judgement(problem.channels, problem.pieces, fit.residuals)
 
 
 def known_problem(
     problem: Problem, values: Mapping[str, float], zeros: Mapping[str, float], pieces: Sequence[Piece]
 ) -> Problem:
-    """Return the problem in which only the starts of given pieces are unknown.
+    """Return the problem in which only the initial states of the given pieces are unknown.
 
     Parameters
     ----------
@@ -123,7 +125,7 @@ def known_problem(
 def judge(
     problem: Problem, values: Mapping[str, float], zeros: Mapping[str, float], pieces: Sequence[Piece]
 ) -> tuple[Judgement, Fit]:
-    """Judge known parameters on pieces that they were not fitted to; only the starts are fitted.
+    """Judge known parameters on pieces that they were not fitted to; only the initial states are fitted.
 
     Parameters
     ----------
@@ -148,7 +150,7 @@ def judge(
 
 
 def _beginning(problem: Problem, length_s: float) -> Problem:
-    """Return the problem over the first part of each piece."""
+    """Return the problem with each piece cut to its first `length_s` seconds."""
     fewest = 4 * len(problem.model.states)
     pieces = []
     for p in problem.pieces:

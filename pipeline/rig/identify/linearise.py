@@ -1,4 +1,4 @@
-"""Linearise a fit for its statistics: residuals and slopes by sample, with the starts eliminated."""
+"""Linearise a fit for its statistics: residuals and their derivatives at each sample, initial states eliminated."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ MAD = 1.4826
 
 
 def linearise(problem: Problem, fit: Fit) -> Linearised:
-    """Return residuals and slopes at a fit's optimum, with the starts eliminated.
+    """Return residuals and their derivatives by the parameters at a fit's optimum, with the initial states eliminated.
 
     The fit's own slopes are compressed piece by piece. Statistics of autocorrelated residuals need them along
     time.
@@ -63,7 +63,9 @@ def _information(
     prior: np.ndarray,
     scale: float,
 ) -> np.ndarray:
-    """Return the information matrix of the samples, or of the whole fit if pieces are continuous."""
+    """Return the information matrix of the unknowns, summed over samples, or from the whole Jacobian if pieces are
+    continuous.
+    """
     if problem.continuity is not None:
         return eliminate_starts(fit.jacobian, len(problem.free))[0]
     total = np.diag(prior)
@@ -76,7 +78,9 @@ def _information(
 
 
 def loss_scale_of(problem: Problem, fit: Fit) -> float:
-    """Return the residual above which the loss of a fit grows slower than the square; see `fit_local`."""
+    """Return the residual, in units of the noise, above which a robust loss grows slower than the square; see
+    `fit_local`.
+    """
     if problem.loss == "linear":
         return 1.0
     z = np.concatenate(fit.residuals) / problem.noise
@@ -84,7 +88,9 @@ def loss_scale_of(problem: Problem, fit: Fit) -> float:
 
 
 def groups_of(problem: Problem) -> tuple[int, ...]:
-    """Return the independent stretch of each piece; with continuity, joined pieces are one stretch."""
+    """Return the number of the independent group of each piece; with a continuity weight, successive pieces form one
+    group.
+    """
     found: list[int] = []
     for k, piece in enumerate(problem.pieces):
         joined = problem.continuity is not None and 0 <= piece.follows < k
@@ -93,7 +99,7 @@ def groups_of(problem: Problem) -> tuple[int, ...]:
 
 
 def sample_slopes(problem: Problem, fit: Fit) -> list[np.ndarray]:
-    """Return each piece's slopes in units of the noise, (n, n_channels, n_free + n_states).
+    """Return the derivatives of each piece's residuals in units of the noise, (n, n_channels, n_free + n_states).
 
     They are central differences from one call of the engine. The starts of all pieces are changed at once,
     since no piece depends on another's start. At a bound the differences are one-sided.

@@ -1,4 +1,4 @@
-"""Fit the unknowns and the pieces' starts by least squares, from one first guess."""
+"""Fit the unknowns and the initial states of the pieces by least squares, from one first guess."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ DENSE_COLUMNS = 600
 
 @dataclass(frozen=True)
 class Fit:
-    """The outcome of a local fit.
+    """Outcome of a local fit: estimates, cost, convergence and residuals.
 
     Attributes
     ----------
@@ -60,7 +60,7 @@ class Fit:
 
 
 class _Search:
-    """The function that `least_squares` minimises, with its last and its best point.
+    """Residual function that `least_squares` minimises; it stores its last and its best evaluation.
 
     The vector holds the unknowns in units of their sizes. With a weight on the gaps it also holds all starts.
     Without a weight each start depends on its own piece alone. It is then fitted for the unknowns of each
@@ -80,14 +80,18 @@ class _Search:
         self._base: _Point | None = None
 
     def split(self, x: Array) -> tuple[Array, Array]:
-        """Split the vector into the unknowns and the starts; return the given starts if they are not free."""
+        """Split a scaled vector into the unknowns and the initial states; if it holds no initial states, return the
+        first guesses.
+        """
         full = x * self.sizes
         if not self.joint:
             return full, self.starts
         return full[: self.n_free], full[self.n_free :].reshape(self.starts.shape)
 
     def at(self, x: Array) -> _Point:
-        """Evaluate a point, or recall the last evaluation."""
+        """Evaluate residuals and Jacobian at a scaled vector of unknowns; reuse the last evaluation if the vector is
+        the same.
+        """
         key = x.tobytes()
         if self._last is None or key != self._key:
             theta, starts = self.split(x)
@@ -107,7 +111,9 @@ class _Search:
         return self._last
 
     def _starts_for(self, theta: Array) -> Array:
-        """Return fitted starts for given unknowns; the guess extrapolates from the best point."""
+        """Return fitted initial states for given unknowns; their first guess is extrapolated from the best evaluation
+        so far.
+        """
         base = self._base
         if base is None:
             return fit_starts(self.problem, theta, self.starts).starts
@@ -198,7 +204,7 @@ def _solve(problem: Problem, theta0: Array, starts: Array, ending: _Ending, echo
 
 
 def _least_squares(walk: _Search, x: Array, ending: _Ending) -> tuple[Array, bool, str]:
-    """Return the point where `least_squares` ended, whether it converged, and its message."""
+    """Run `scipy.optimize.least_squares`; return its final point, whether it converged, and its message."""
     from scipy.optimize import least_squares
     from scipy.sparse import csr_array
 
@@ -223,7 +229,7 @@ def _least_squares(walk: _Search, x: Array, ending: _Ending) -> tuple[Array, boo
 
 
 def _starts_alone(walk: _Search) -> Fit:
-    """Fit the starts if nothing else is unknown."""
+    """Fit the initial states of the pieces if there are no other unknowns."""
     problem, nothing = walk.problem, np.zeros(0)
     starts, settled = fit_starts(problem, nothing, walk.starts)
     n = int(np.count_nonzero(~settled))
@@ -254,7 +260,7 @@ def _outcome(point: _Point, count: int, ended: bool, message: str) -> Fit:
 def _fit_others(
     problem: Problem, theta0: Array, starts: Array | None, fixed: Mapping[str, float], ending: _Ending
 ) -> Fit:
-    """Fit with some unknowns held; the outcome holds all unknowns."""
+    """Fit with some unknowns fixed at given values; the returned fit contains all unknowns."""
     held = np.array([name in fixed for name in problem.names], bool)
     part = fit_local(
         problem.without(fixed),

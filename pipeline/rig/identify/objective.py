@@ -1,4 +1,4 @@
-"""Compute residuals and slopes of a whole population of unknowns in one call of the engine."""
+"""Compute residuals and their derivatives for many sets of unknowns in one call of the engine."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ LOST = 1e6
 
 @dataclass(frozen=True)
 class Evaluation:
-    """The residuals and slopes of one member of a population.
+    """Residuals, and on request their derivatives, for one set of unknowns.
 
     Attributes
     ----------
@@ -58,7 +58,9 @@ class Evaluation:
 
 
 class _Motions(NamedTuple):
-    """The trajectories of a population, and their slopes; `columns` are the states that were written."""
+    """Computed trajectories of all pieces for many sets of unknowns, and their derivatives by the unknowns and initial
+    states.
+    """
 
     states: Array  # (member, piece, time, column)
     slopes: Array  # (member, change, piece, time, column): by the moving unknowns, then by the own start
@@ -66,7 +68,7 @@ class _Motions(NamedTuple):
 
 
 def evaluate(problem: Problem, thetas: Array, starts: Array, *, slopes: bool) -> list[Evaluation]:
-    """Compute residuals and slopes of every member of a population.
+    """Compute residuals, and on request their derivatives, for each row of a matrix of unknowns.
 
     Parameters
     ----------
@@ -109,7 +111,9 @@ def _without_slopes(problem: Problem, thetas: Array, starts: Array) -> _Motions:
 
 
 def _steps(problem: Problem, thetas: Array) -> Array:
-    """Return steps of the trajectory's unknowns for differences, (member, change), within the bounds."""
+    """Return the finite-difference steps of the unknowns that affect the trajectory, (member, change), within the
+    bounds.
+    """
     found = np.zeros((len(thetas), len(problem.moving)))
     for j, i in enumerate(problem.moving):
         f, values = problem.free[i], thetas[:, i]
@@ -120,7 +124,7 @@ def _steps(problem: Problem, thetas: Array) -> Array:
 
 
 def _changed(problem: Problem, thetas: Array, steps: Array) -> Array:
-    """Return packed parameters (member, change, n_parameters), each with one unknown changed."""
+    """Return the packed parameters after changing one unknown at a time, (member, change, n_parameters)."""
     members = []
     for theta, own in zip(thetas, steps, strict=True):
         rows = np.tile(theta, (len(own), 1))
@@ -130,7 +134,9 @@ def _changed(problem: Problem, thetas: Array, steps: Array) -> Array:
 
 
 def _by_differences(problem: Problem, thetas: Array, starts: Array) -> _Motions:
-    """Compute slopes as differences between lanes; each has one unknown or start state changed."""
+    """Compute derivatives by finite differences: each trajectory has one unknown or one component of the initial state
+    changed.
+    """
     steps, n = _steps(problem, thetas), len(problem.model.states)
     moves = STEP * np.diag(problem.model.scales)
     packed = problem.pack(thetas)[:, None]
@@ -146,7 +152,9 @@ def _by_differences(problem: Problem, thetas: Array, starts: Array) -> _Motions:
 
 
 def _by_tangents(problem: Problem, thetas: Array, starts: Array) -> _Motions:
-    """Compute slopes by variational equations: one tangent vector per unknown and per state of the starts."""
+    """Compute derivatives by variational equations, with one tangent vector per unknown and per component of the
+    initial state.
+    """
     system, steps = with_parameter_tangent(problem.system), _steps(problem, thetas)
     n, n_moving = len(problem.model.states), len(problem.moving)
     same = np.repeat(problem.pack(thetas)[:, None], n_moving + n, axis=1)
@@ -167,7 +175,9 @@ def _by_tangents(problem: Problem, thetas: Array, starts: Array) -> _Motions:
 def _integrate(
     problem: Problem, parameters: Array, starts: Array, tolerance: float, system: System | None = None
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Return states (member, change, piece, time, column), and which failed (member, change, piece)."""
+    """Integrate all pieces; return states (member, change, piece, time, column), and where it failed (member, change,
+    piece).
+    """
     shape, n = starts.shape[:3], len(problem.model.states)
     n_pieces = shape[2]
     columns = list(problem.columns) if problem.continuity is None else list(range(n))
@@ -190,7 +200,7 @@ def _integrate(
 
 
 def _thrice(drive: Drive | None) -> Drive | None:
-    """Return the drive for all three sets of parameters of `with_parameter_tangent`."""
+    """Return the drive with its values repeated for the three copies of the parameters in `with_parameter_tangent`."""
     if drive is None or not drive.names:
         return drive
     names = tuple(f"{name}{end}" for end in ("", PLUS, MINUS) for name in drive.names)
@@ -198,7 +208,7 @@ def _thrice(drive: Drive | None) -> Drive | None:
 
 
 def _grid(problem: Problem, k: int) -> Array:
-    """Return the times of a piece; with continuity, also the start of the piece that continues it."""
+    """Return the sample times of a piece; with continuity, also the time at which the next piece starts."""
     time = problem.pieces[k].time
     if problem.continuity is None or not any(p.follows == k for p in problem.pieces):
         return time
@@ -206,14 +216,16 @@ def _grid(problem: Problem, k: int) -> Array:
 
 
 def _read(problem: Problem, k: int, states: Array) -> Array:
-    """Return the channels among computed states at a piece's times, (..., n, n_channels)."""
+    """Select the measured states from computed states, at the sample times of a piece, (..., n, n_channels)."""
     n = len(problem.pieces[k].time)
     read = states if problem.continuity is None else states[..., list(problem.columns)]
     return np.asarray(read[..., :n, :])
 
 
 def _block(problem: Problem, k: int, theta: Array, member: _Motions, slopes: bool) -> tuple[int, Array, Array]:
-    """Return a piece's number, compressed rows, and slopes by the unknowns and its own start."""
+    """Return a piece's number, its compressed residuals, and their derivatives by the unknowns and its own initial
+    state.
+    """
     piece, n_free = problem.pieces[k], len(problem.free)
     n_own = n_free + len(problem.model.states)
     given = np.isfinite(piece.measured)
@@ -237,7 +249,7 @@ def _block(problem: Problem, k: int, theta: Array, member: _Motions, slopes: boo
 
 
 def _robust(z: Array, problem: Problem) -> tuple[Array, Array]:
-    """Return rows whose halved squares add up to the loss, and their slope by the residual `z`."""
+    """Return transformed residuals whose halved squares add up to the robust loss, and their derivative by `z`."""
     if problem.loss == "linear":
         return z, np.ones_like(z)
     scale = problem.loss_scale
@@ -256,7 +268,7 @@ def _robust(z: Array, problem: Problem) -> tuple[Array, Array]:
 
 
 def _gaps(problem: Problem, starts: Array, member: _Motions, slopes: bool) -> list[tuple[int, Array, Array]]:
-    """Return rows of the gaps between stretches, with slopes by the unknowns and by both starts."""
+    """Return the gaps between the end of a stretch and the start of the next as residuals, with their derivatives."""
     if problem.continuity is None:
         return []
     n_free, n_states = len(problem.free), len(problem.model.states)
@@ -280,7 +292,9 @@ def _gaps(problem: Problem, starts: Array, member: _Motions, slopes: bool) -> li
 def _with_priors(
     problem: Problem, theta: Array, blocks: list[tuple[int, Array, Array]], slopes: bool
 ) -> tuple[Array, Array]:
-    """Stack the blocks, each at its columns, with rows of the priors below."""
+    """Stack the residuals of all pieces and priors, and place their derivatives in the columns of the whole
+    Jacobian.
+    """
     priors = [(i, f) for i, f in enumerate(problem.free) if f.has_prior]
     last = np.array([(f.prior_mean - theta[i]) / f.prior_sd for i, f in priors])
     rows = np.concatenate([*(b[1] for b in blocks), last])

@@ -1,4 +1,6 @@
-"""Define the fitting problem: unknowns, pieces of recordings, and parameters as functions of unknowns."""
+"""Define the least-squares problem: unknowns, pieces of recordings, and model parameters as functions of the
+unknowns.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,7 @@ ZERO = "zero"
 
 @dataclass(frozen=True)
 class Free:
-    """An unknown: a parameter of the model or a sensor's zero.
+    """Unknown of the fit: a parameter of the model or the zero offset of a sensor.
 
     Attributes
     ----------
@@ -45,20 +47,20 @@ class Free:
 
     @property
     def size(self) -> float:
-        """Scale of the unknown; steps of differences and of the search are fractions of it."""
+        """Typical size of the unknown; steps of finite differences and of the search are fractions of it."""
         width = self.upper - self.lower
         least = 1e-2 * width if math.isfinite(width) else 0.0
         return max(abs(self.start), least) or 1.0
 
     @property
     def has_prior(self) -> bool:
-        """Whether an independent measurement is given."""
+        """Whether the unknown has a prior from an independent measurement."""
         return math.isfinite(self.prior_sd)
 
 
 @dataclass(frozen=True)
 class Piece:
-    """A stretch of a recording whose start is free.
+    """Stretch of a recording that is fitted as one trajectory with its own unknown initial state.
 
     Attributes
     ----------
@@ -87,7 +89,8 @@ class Piece:
 
 @dataclass(frozen=True)
 class Problem:
-    """A least-squares problem: measured states against parameters and the pieces' starts.
+    """Least-squares problem of an identification: the unknowns are parameters, sensor offsets and the pieces' initial
+    states.
 
     Attributes
     ----------
@@ -135,7 +138,7 @@ class Problem:
 
     @cached_property
     def system(self) -> System:
-        """System that is integrated."""
+        """System of equations that is integrated; it takes the measured torque as its drive if the problem has one."""
         return with_recorded_drive(self.model.system) if self.recorded else self.model.system
 
     @property
@@ -150,22 +153,22 @@ class Problem:
 
     @cached_property
     def lower(self) -> np.ndarray:
-        """Lower bounds."""
+        """Lower bounds of the unknowns."""
         return np.array([f.lower for f in self.free])
 
     @cached_property
     def upper(self) -> np.ndarray:
-        """Upper bounds."""
+        """Upper bounds of the unknowns."""
         return np.array([f.upper for f in self.free])
 
     @cached_property
     def starts(self) -> np.ndarray:
-        """First guesses of the pieces' starts, (n_piece, n_states)."""
+        """First guesses of the initial states of the pieces, (n_piece, n_states)."""
         return np.array([p.start for p in self.pieces])
 
     @cached_property
     def columns(self) -> tuple[int, ...]:
-        """Index of each channel's state."""
+        """Index of the state that each channel measures."""
         return tuple(self.model.state_names.index(name) for name in self.channels)
 
     @cached_property
@@ -175,7 +178,9 @@ class Problem:
 
     @cached_property
     def zeros(self) -> np.ndarray:
-        """Derivative of the sensors' readings by the unknowns, (recording, n_channels, n_free), 0 or 1."""
+        """Derivative of the sensor offset in each channel by the unknowns, (recording, n_channels, n_free); entries are
+        0 or 1.
+        """
         n = 1 + max((p.recording for p in self.pieces), default=0)
         found = np.zeros((n, len(self.channels), len(self.free)))
         for i, f in enumerate(self.free):
@@ -187,7 +192,7 @@ class Problem:
 
     @cached_property
     def state_noise(self) -> np.ndarray:
-        """Standard deviation that gaps in each state are divided by, (n_states,).
+        """Standard deviation of each state by which the gaps between stretches are divided, (n_states,).
 
         Channels have their noise. The values of other states are proportional to their spread over the
         starts.
@@ -199,7 +204,7 @@ class Problem:
         return np.asarray(noise)
 
     def values(self, theta: np.ndarray) -> dict[str, float]:
-        """Return the parameters by name for given unknowns."""
+        """Return the value of every model parameter by name, for given unknowns of the fit."""
         found = self.fixed.as_dict()
         found |= {self.free[i].name: float(theta[i]) for i in self.moving}
         for name, (factor, other) in self.tied.items():
@@ -218,7 +223,7 @@ class Problem:
         return np.hstack([packed, np.zeros((len(thetas), more))])
 
     def without(self, fixed: Mapping[str, float]) -> Problem:
-        """Return the problem with some unknowns held at given values.
+        """Return the problem with some unknowns fixed at given values.
 
         A sensor's zero that is held is subtracted from the measured values.
         """

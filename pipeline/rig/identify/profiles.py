@@ -1,4 +1,4 @@
-"""Compute profile likelihoods: the growth of the criterion as one parameter is held off its estimate.
+"""Compute profile likelihoods: the increase of the cost when one parameter is fixed away from its estimate.
 
 The growth is scaled by the covariance, autocorrelated residuals included. On a quadratic criterion the
 profile's interval therefore equals the interval of the standard error. On any other criterion the profile's
@@ -29,7 +29,8 @@ UNKNOWN_STEP = 0.1
 
 @dataclass(frozen=True)
 class Profile:
-    """The growth of the criterion away from an estimate.
+    """Profile likelihood of one parameter: the scaled increase of the cost away from the estimate, and its 95 %
+    interval.
 
     Attributes
     ----------
@@ -50,13 +51,13 @@ class Profile:
 
     @property
     def lowest(self) -> float:
-        """Least growth; below 0 if the profile found a better fit than the best."""
+        """Least increase of the cost; it is negative if the profile met a better fit than the best one."""
         return float(np.nanmin(self.growth))
 
 
 @dataclass(frozen=True)
 class Curvature:
-    """The curvature of the criterion along a parameter near its estimate.
+    """Quadratic approximation of the cost along one parameter near its estimate, with the step sizes for its profile.
 
     Attributes
     ----------
@@ -83,7 +84,7 @@ class Curvature:
 
 
 def profile(problem: Problem, best: Fit, name: str, about: Curvature, fit_local: Callable[..., Fit]) -> Profile:
-    """Compute the profile of one parameter; all others and all starts are fitted again at each value.
+    """Compute the profile likelihood of one parameter: at each of its values, all other unknowns are fitted again.
 
     Parameters
     ----------
@@ -122,7 +123,7 @@ def profile(problem: Problem, best: Fit, name: str, about: Curvature, fit_local:
 
 
 def following(information: np.ndarray, index: int) -> np.ndarray:
-    """Return the derivative of the best-fit parameters by one parameter that is held fixed, shape (n_free,)."""
+    """Return the derivative of the optimum of all parameters by one of them that is held fixed, shape (n_free,)."""
     others = np.delete(np.arange(len(information)), index)
     moves = np.ones(len(information))
     both = information[np.ix_(others, others)]
@@ -134,7 +135,7 @@ def following(information: np.ndarray, index: int) -> np.ndarray:
 
 
 def interval_of(values: np.ndarray, growth: np.ndarray, estimate: float, critical: float) -> tuple[float, float]:
-    """Return where the root of a profile's growth crosses the critical value, interpolated linearly.
+    """Return the two values at which the square root of a profile reaches the critical value, interpolated linearly.
 
     Parameters
     ----------

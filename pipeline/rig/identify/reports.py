@@ -1,4 +1,4 @@
-"""Report a finished identification: ``result.json``, the preset, the residuals, printed lines."""
+"""Report a finished identification: ``result.json``, a preset of the values, the residuals and printed lines."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ SAME = 1e-3
 
 @dataclass(frozen=True)
 class Finding:
-    """The results of an identification, before they are written to files.
+    """Results of an identification before they are written to files.
 
     Attributes
     ----------
@@ -68,21 +68,21 @@ class Finding:
 
     @property
     def zeros(self) -> dict[str, float]:
-        """Sensors' zeros by the names of their unknowns."""
+        """Zero offsets of the sensors, by the names of their unknowns."""
         return zeros_of(self.problem, self.best)
 
     @property
     def n_same(self) -> int:
-        """Number of starts that reached the best optimum."""
+        """Number of first guesses whose fits converged to the best optimum."""
         return sum(self.is_same(fit) for fit in self.starts.values())
 
     def is_same(self, fit: Fit) -> bool:
-        """Return whether a fit reached the best optimum."""
+        """Return whether a fit converged to the best optimum, up to a relative difference of 1e-3 in the cost."""
         return fit.converged and fit.cost <= (1 + SAME) * self.best.cost
 
 
 def zeros_of(problem: Problem, fit: Fit) -> dict[str, float]:
-    """Return the sensors' zeros of a fit by the names of their unknowns."""
+    """Return the zero offsets of the sensors that a fit found, by the names of their unknowns."""
     named = zip(problem.names, fit.theta, strict=True)
     return {name: float(value) for name, value in named if name.startswith(f"{ZERO}.")}
 
@@ -90,7 +90,7 @@ def zeros_of(problem: Problem, fit: Fit) -> dict[str, float]:
 def result_of(
     spec: IdentificationSpec, found: Finding, sources: Sequence[Source], digest: str, findings: Sequence[Sequence[str]]
 ) -> dict[str, Any]:
-    """Return ``result.json`` as plain data. It does not depend on time or speed."""
+    """Return the content of ``result.json`` as plain data. It does not depend on time or speed."""
     names = found.problem.names
     return {
         "title": spec.title,
@@ -130,7 +130,7 @@ def result_of(
 
 
 def _sureness(found: Finding) -> dict[str, Any]:
-    """Return covariance, correlations, singular values and profiles as plain data."""
+    """Return covariance, correlations, singular values and profiles of an identification as plain data."""
     names = found.problem.names
     return {
         "covariance": {
@@ -163,7 +163,7 @@ def _sureness(found: Finding) -> dict[str, Any]:
 
 
 def _errors(sources: Sequence[Source], findings: Sequence[Sequence[str]]) -> list[str]:
-    """Return the findings that make results from a recording wrong."""
+    """Return a warning for each recording's finding of severity "error"."""
     return [
         f"{s.file} has an {line}"
         for s, said in zip(sources, findings, strict=True)
@@ -194,7 +194,7 @@ def _estimate(found: Finding, i: int) -> dict[str, Any]:
 
 
 def interval_of(found: Finding, i: int) -> tuple[float, float]:
-    """Return the 95 % interval of an estimate by its standard error, within the bounds."""
+    """Return the 95 % interval of unknown `i` from its standard error, cut off at its bounds."""
     free, value = found.problem.free[i], float(found.best.theta[i])
     half = found.covariance.critical * float(found.covariance.errors[i])
     return max(value - half, free.lower), min(value + half, free.upper)
@@ -206,14 +206,14 @@ def _number(value: float) -> float | None:
 
 
 def _plain(values: Any) -> Any:
-    """Return nested lists of numbers that JSON can hold."""
+    """Return an array or sequence as nested lists for JSON; values that are not finite become None."""
     if isinstance(values, np.ndarray | list | tuple):
         return [_plain(v) for v in values]
     return _number(float(values))
 
 
 def write_values(path: Path, spec: IdentificationSpec, found: Finding, sources: Sequence[Source]) -> None:
-    """Write the preset: all parameters, each with its origin."""
+    """Write the identified, tied and fixed parameters as a preset, each with its origin."""
     files = ", ".join(f"{s.file} (sha256 {s.sha256[:12]})" for s in sources)
     phrases = {}
     for i, free in enumerate(found.problem.free):
@@ -259,7 +259,7 @@ def residuals_of(spec: IdentificationSpec, found: Finding) -> xr.Dataset:
 
 
 def lines_of(result: Mapping[str, Any]) -> list[str]:
-    """Return the result as lines to print."""
+    """Return the content of ``result.json`` as lines to print."""
     estimates = result["estimates"]
     width = max(map(len, estimates))
     lines = []
@@ -279,7 +279,7 @@ def lines_of(result: Mapping[str, Any]) -> list[str]:
 
 
 def judgement_lines(judged: Mapping[str, Any], units: Mapping[str, str]) -> list[str]:
-    """Return a line for each channel with its rms and correlation."""
+    """Return one printed line for each channel: root mean square of its residuals and correlation."""
     lines = []
     for name, rms in judged["rms"].items():
         shown = "-" if rms is None else f"{rms:.4g} {units[name]}"

@@ -1,4 +1,4 @@
-"""Compute views of residuals: by piece, along time, against the rate, and their distribution."""
+"""Arrange residuals for drawing: rms by piece, autocorrelation, mean against the rate, and histogram."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ BINS = 30
 
 @dataclass(frozen=True)
 class Series:
-    """The place of a piece in a dataset of residuals.
+    """Piece in a dataset of residuals: its numbers, its range of samples, and the size of its residuals.
 
     Attributes
     ----------
@@ -40,12 +40,12 @@ class Series:
     worst: float
 
     def of(self, ds: xr.Dataset) -> xr.Dataset:
-        """Return the piece's part of the dataset."""
+        """Return the samples of the piece from the dataset."""
         return ds.isel(sample=slice(*self.samples))
 
 
 def pieces_in(ds: xr.Dataset) -> list[Series]:
-    """Return the pieces of a dataset of residuals, in their order."""
+    """Return the pieces of a dataset of residuals in their order, each with its range of samples."""
     keys = np.stack([ds[name].values for name in ("held_out", "recording", "piece")])
     cuts = np.flatnonzero((np.diff(keys, axis=1) != 0).any(axis=0)) + 1
     bounds = [0, *cuts.tolist(), keys.shape[1]]
@@ -74,7 +74,7 @@ def per_piece(ds: xr.Dataset, channel: str) -> xr.Dataset:
 
 
 def rate_of(ds: xr.Dataset, channel: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return a channel's computed rates and its residuals at the same times, for all fitted pieces.
+    """Return a channel's computed rates of change and its residuals at the same times, over all fitted pieces.
 
     Computed values have no noise, so the rates are differences of neighbours.
     """
@@ -93,7 +93,7 @@ def rate_of(ds: xr.Dataset, channel: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def residual_views(ds: xr.Dataset, channels: list[str]) -> xr.Dataset:
-    """Return curves of the residuals: autocorrelation, mean against the rate, density.
+    """Return the data of the residual plots: autocorrelation, mean against the rate, and density.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Search globally: follow many first guesses to an optimum, over stretches of growing length.
+"""Search globally: fit from many first guesses, first over short stretches of the recordings, then over longer ones.
 
 Far from the true parameters a long piece is out of phase with its recording, and the cost is rugged. Short
 stretches from smoothed states are not, so a guess is first fitted to those, then to longer ones, and to the
@@ -36,13 +36,13 @@ POPULATION = 32
 
 
 class Keep(Protocol):
-    """A store of the outcomes of starts, by their numbers."""
+    """Protocol of a store for finished fits, by the number of their first guess."""
 
     def recall(self, number: int) -> Fit | None:
-        """Return the outcome of a start if it is stored; otherwise None."""
+        """Return the fit from first guess `number`, or None if it is not stored."""
 
     def store(self, number: int, fit: Fit) -> None:
-        """Store the outcome of a start."""
+        """Store the fit from first guess `number`."""
 
 
 def search(
@@ -56,7 +56,7 @@ def search(
     keep: Keep | None = None,
     tell: Callable[[str], None] = lambda line: None,
 ) -> list[Fit]:
-    """Fit from many first guesses; return the fits, best first.
+    """Fit from many first guesses; return the fits in the order of their cost, converged ones first.
 
     Parameters
     ----------
@@ -102,7 +102,7 @@ def _kept(
     keep: Keep | None,
     tell: Callable[[str], None],
 ) -> Fit:
-    """Return the outcome of a start: the stored one, or that of a new fit."""
+    """Return the fit from first guess `k`: the stored one, or a new one, which is then stored."""
     fit = keep.recall(k) if keep is not None else None
     if fit is None:
         fit = refine(
@@ -118,7 +118,7 @@ def _kept(
 def guess(
     problem: Problem, n_starts: int, seed: int, spread: float, method: str, n_samples: int, shortest: Problem
 ) -> list[Array]:
-    """Return first guesses; the problem's own comes first."""
+    """Return first guesses of the unknowns: the problem's own, then the best Sobol points or results of CMA-ES."""
     if n_starts == 1:
         return [problem.start]
     if method == "cma":
@@ -131,7 +131,7 @@ def guess(
 
 
 def sobol(problem: Problem, n: int, seed: int, spread: float) -> Array:
-    """Return points of a scrambled Sobol sequence around the problem's own guess, (n, n_free)."""
+    """Return scrambled Sobol points around the problem's first guess of the unknowns, (n, n_free)."""
     from scipy.stats import qmc
 
     if n < 1 or not problem.free:
@@ -143,7 +143,9 @@ def sobol(problem: Problem, n: int, seed: int, spread: float) -> Array:
 
 
 def costs(problem: Problem, thetas: Array) -> Array:
-    """Return the costs of a population with the starts as guessed; infinite if a trajectory diverges."""
+    """Return the cost of each row of unknowns, with initial states as first guessed; infinite if a trajectory
+    diverges.
+    """
     found = []
     for at in range(0, len(thetas), POPULATION):
         members = thetas[at : at + POPULATION]
@@ -153,7 +155,7 @@ def costs(problem: Problem, thetas: Array) -> Array:
 
 
 def _evolve(problem: Problem, start: Array, seed: int, spread: float) -> Array:
-    """Minimise the cost over short stretches by CMA-ES, one population per call of the engine."""
+    """Minimise the cost over short stretches by the evolution strategy CMA-ES, with one engine call per population."""
     import cma
 
     sizes = np.array([f.size for f in problem.free])
@@ -177,7 +179,7 @@ def _evolve(problem: Problem, start: Array, seed: int, spread: float) -> Array:
 
 
 def refine(problem: Problem, theta: Array, *, stages: Sequence[Problem] | None = None, echo: Echo | None = None) -> Fit:
-    """Fit from one first guess: over short stretches, longer ones, then whole pieces, with free starts.
+    """Fit from one first guess over short stretches, then longer ones, then whole pieces.
 
     Noise may lead short stretches to a wrong optimum from which longer ones do not return. The last fit
     therefore begins from the stage whose outcome has the least cost over whole pieces.
@@ -196,7 +198,9 @@ def refine(problem: Problem, theta: Array, *, stages: Sequence[Problem] | None =
 
 
 def _stages(problem: Problem) -> list[Problem]:
-    """Return the problem over stretches of growing lengths, with starts estimated from the recordings."""
+    """Return the problem over short, longer and still longer stretches, with initial states estimated from the
+    recordings.
+    """
     longest = max(p.time[-1] for p in problem.pieces)
     period = slowest_period(problem)
     lengths = [share * period for share in STRETCHES if share * period < 0.8 * longest]
@@ -204,7 +208,7 @@ def _stages(problem: Problem) -> list[Problem]:
 
 
 def slowest_period(problem: Problem) -> float:
-    """Return the longest period [s] of the channels' oscillations, from crossings of their mean.
+    """Return the longest oscillation period of the channels [s], estimated from the crossings of their mean.
 
     Without crossings, return the length of the longest piece.
     """
@@ -223,7 +227,8 @@ def slowest_period(problem: Problem) -> float:
 
 
 def cut(problem: Problem, length_s: float) -> Problem:
-    """Return the problem over thinned stretches of about a given length, with starts estimated from the data.
+    """Return the problem with pieces cut into stretches of about `length_s` and thinned; initial states come from the
+    data.
 
     Local cubic polynomials through a sixth of a stretch on either side give the rates at the starts.
     """
@@ -251,7 +256,9 @@ def _stretches(problem: Problem, piece: Piece, length_s: float) -> list[Piece]:
 
 
 def _read_off(problem: Problem, piece: Piece, at: int, half: int) -> Array:
-    """Estimate the state at a sample: channels and their rates, from a local cubic polynomial."""
+    """Estimate the state at a sample from local cubic polynomials through the channels: their values and
+    derivatives.
+    """
     window = slice(max(at - half, 0), at + half + 1)
     t = piece.time[window] - piece.time[at]
     state = np.array(piece.start)

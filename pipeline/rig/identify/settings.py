@@ -1,4 +1,4 @@
-"""Apply parameter values that were set in single recordings only."""
+"""Apply values of parameters that hold in single recordings only, such as a drive amplitude of 0."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pipeline.rig.identify.problem import Piece
 
 
 def setting_problems(model: Model, values: Mapping[str, float], where: str) -> list[str]:
-    """Return problems with settings: unknown parameters, values out of bounds."""
+    """Return problems with values set for one recording: unknown parameters, values out of bounds."""
     found = []
     for name, value in values.items():
         if name not in model.parameter_names:
@@ -28,7 +28,7 @@ def setting_problems(model: Model, values: Mapping[str, float], where: str) -> l
 
 
 def apply_settings(pieces: Sequence[Piece], settings: Mapping[int, Mapping[str, float]]) -> list[Piece]:
-    """Give each piece the settings of its recording, as parameter values of its drive.
+    """Give each piece the parameter values that hold in its recording only, as parameter values of its drive.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Parse and validate the specification of an identification as a whole."""
+"""Parse and validate the TOML specification of an identification."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from pipeline.specification.tables import Table
 
 
 class SensorsTable(Table):
-    """The table ``[sensors]``: unknowns of the sensors."""
+    """Table ``[sensors]``: channels whose zero offset is unknown."""
 
     zero: Annotated[tuple[str, ...], Field(strict=False)] = Field(
         (), description="Channels whose zero is unknown: one offset per recording"
@@ -34,7 +34,7 @@ class SensorsTable(Table):
 
 
 class RecordingTable(Table):
-    """A table ``[[recordings]]``: a recording, the kind of its drive, and the part that is used."""
+    """Table ``[[recordings]]``: file of a recording, its mapping, the kind of its drive, and the part that is used."""
 
     file: str = Field(description="Recording, relative to the specification")
     mapping: str = Field(description="Mapping file of the recording, relative to the specification")
@@ -57,7 +57,7 @@ class RecordingTable(Table):
 
 
 class FitTable(Table):
-    """The table ``[fit]``: the criterion of the fit."""
+    """Table ``[fit]``: channels, loss, weights and numerical method of the fit."""
 
     channels: Annotated[tuple[str, ...], Field(strict=False)] = Field(
         (),
@@ -86,7 +86,7 @@ class FitTable(Table):
 
 
 class SearchTable(Table):
-    """The table ``[search]``: the global search, and the profiles after it."""
+    """Table ``[search]``: first guesses of the global search, and whether to compute profile likelihoods."""
 
     n_starts: Annotated[int, Field(ge=1, le=10_000)] = Field(
         8, description="Number of first guesses that are refined; the first is the specification's"
@@ -106,7 +106,7 @@ class SearchTable(Table):
 
 @dataclass(frozen=True)
 class IdentificationSpec:
-    """A valid specification of an identification.
+    """Validated specification of an identification.
 
     Attributes
     ----------
@@ -145,7 +145,7 @@ class IdentificationSpec:
 
     @property
     def preset_found(self) -> str | Path | None:
-        """The preset as `Model.preset` takes it."""
+        """Name of the preset, or path of its file, as `Model.preset` expects it."""
         return _found(self.preset, self.folder)
 
     @cached_property
@@ -154,11 +154,13 @@ class IdentificationSpec:
         return tuple(u.name for u in self.unknowns)
 
     def path(self, name: str) -> Path:
-        """Return the path of a file that the specification names."""
+        """Return the path of a file named in the specification, relative to the specification's folder."""
         return self.folder / name
 
     def as_dict(self) -> dict[str, Any]:
-        """Return plain data with all defaults filled in, without title; equal for equal identifications."""
+        """Return the specification as plain data with all defaults and without title; equal data mean equal
+        identifications.
+        """
         return {
             "kind": IDENTIFICATION,
             "model": self.model.reference,
@@ -180,7 +182,7 @@ class IdentificationSpec:
 
 
 def _plain(bound: float) -> float | str:
-    """Return a bound that JSON can hold."""
+    """Return a finite bound as a number, an infinite one as text, for JSON."""
     return bound if math.isfinite(bound) else str(bound)
 
 
@@ -188,7 +190,7 @@ _KEYS = ("kind", "title", "model", "preset", "parameters", "identify", "tied", "
 
 
 def load_identification(path: str | Path) -> IdentificationSpec:
-    """Read and validate the specification of an identification.
+    """Read and validate the TOML file that specifies an identification.
 
     Raises
     ------
@@ -200,7 +202,7 @@ def load_identification(path: str | Path) -> IdentificationSpec:
 
 
 def parse_identification(data: Mapping[str, Any], folder: Path) -> IdentificationSpec:
-    """Validate the tables of a specification; paths of files are relative to `folder`.
+    """Validate the TOML tables of an identification; file paths in them are relative to `folder`.
 
     Raises
     ------
@@ -254,7 +256,7 @@ def _text(data: Mapping[str, Any], key: str, problems: list[str]) -> str | None:
 
 
 def _found(preset: str | None, folder: Path) -> str | Path | None:
-    """Return a preset's name, or the path of its file."""
+    """Return a preset's name unchanged, or the path of a preset file in the specification's folder."""
     return folder / preset if preset is not None and is_file(preset) else preset
 
 
@@ -270,7 +272,7 @@ def _table(data: Mapping[str, Any], key: str, model: type[Table], problems: list
 
 
 def _recordings(data: Mapping[str, Any], folder: Path, problems: list[str]) -> tuple[RecordingTable, ...]:
-    """Return the valid recordings."""
+    """Validate the tables ``[[recordings]]``, and return those that are valid."""
     tables = data.get("recordings")
     if not isinstance(tables, list) or not tables:
         problems.append("recordings: missing; add a table [[recordings]] with file and mapping for each.")

@@ -1,4 +1,4 @@
-"""Estimate the errors of a fit: covariance with starts eliminated, intervals, autocorrelation.
+"""Estimate the errors of a fit: covariance without the initial states, intervals, autocorrelation of residuals.
 
 Everything is in units of the noise that the fit was weighted with. Let J = (A, B) be the slopes of the
 residuals by the parameters and by the starts, ``H = J'J`` and ``X = H_ss^-1 H_sp``. With the starts
@@ -45,7 +45,7 @@ Estimator = Literal["white", "pieces", "newey-west"]
 
 @dataclass(frozen=True)
 class Linearised:
-    """A fit near its optimum with the starts eliminated, in units of the noise.
+    """Residuals and their derivatives at a fit's optimum, with the initial states eliminated, in units of the noise.
 
     Attributes
     ----------
@@ -81,18 +81,18 @@ class Linearised:
 
     @property
     def n_samples(self) -> int:
-        """Number of measured values."""
+        """Number of measured values in all pieces."""
         return int(sum(np.isfinite(r).sum() for r in self.residuals))
 
     @property
     def n_fitted(self) -> int:
-        """Number of fitted values: parameters without a prior, and starts."""
+        """Number of fitted values: parameters without a prior, and components of the initial states."""
         return int((self.prior == 0).sum()) + self.n_starts
 
 
 @dataclass(frozen=True)
 class Covariance:
-    """The covariance of the estimates, with the method that gave it.
+    """Covariance of the estimates, with the method that gave it and the half width of 95 % intervals.
 
     Attributes
     ----------
@@ -132,7 +132,7 @@ class Covariance:
 
 
 def eliminate_starts(jacobian: np.ndarray, n_free: int) -> tuple[np.ndarray, np.ndarray]:
-    """Eliminate the starts from a least squares problem.
+    """Eliminate the initial states from a least-squares problem; return the information matrix of the parameters.
 
     Parameters
     ----------
@@ -161,7 +161,8 @@ def pooled_autocorrelation(residuals: Sequence[np.ndarray], most: int) -> np.nda
 
 
 def pooled_pairs(residuals: Sequence[np.ndarray], most: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the autocorrelation about 0 of one channel's residuals over all pieces, and numbers of pairs.
+    """Return the autocorrelation (mean not subtracted) of one channel's residuals over all pieces, and the pairs per
+    lag.
 
     Parameters
     ----------
@@ -211,7 +212,7 @@ def is_autocorrelated(residuals: Sequence[np.ndarray]) -> bool:
 
 
 def memory_of(rho: np.ndarray, n: int) -> tuple[int, float]:
-    """Return the correlation length of residuals, and their number per independent one.
+    """Return the lag at which residuals have lost their correlation, and the number of residuals per independent one.
 
     Parameters
     ----------
@@ -237,7 +238,7 @@ def memory_of(rho: np.ndarray, n: int) -> tuple[int, float]:
 
 
 def n_effective(residuals: Sequence[np.ndarray]) -> list[float]:
-    """Return the number of independent residuals of each channel."""
+    """Return the effective number of independent residuals of each channel, given their autocorrelation."""
     most = max(1, max(len(r) for r in residuals) // 3)
     found = []
     for c in range(residuals[0].shape[1]):
@@ -248,7 +249,7 @@ def n_effective(residuals: Sequence[np.ndarray]) -> list[float]:
 
 
 def robust_weights(residuals: np.ndarray, loss: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return weight and curvature of residuals for a loss of `scipy.optimize.least_squares`.
+    """Return weight and curvature of each residual for a robust loss of `scipy.optimize.least_squares`.
 
     Returns
     -------
@@ -270,7 +271,7 @@ def robust_weights(residuals: np.ndarray, loss: str) -> tuple[np.ndarray, np.nda
 
 @dataclass(frozen=True)
 class _Scores:
-    """Scores along time, and information, of each piece."""
+    """Scores (gradients of the cost by the parameters) along time and information matrices, piece by piece."""
 
     scores: list[np.ndarray]
     information: list[np.ndarray]
@@ -292,7 +293,7 @@ def _scores(fit: Linearised) -> _Scores:
 
 
 def covariance_of(fit: Linearised, scale: np.ndarray, estimator: Estimator | None = None) -> Covariance:
-    """Estimate the covariance of the parameters.
+    """Estimate the covariance of the fitted parameters, with allowance for autocorrelated residuals.
 
     Parameters
     ----------
@@ -338,7 +339,7 @@ def covariance_of(fit: Linearised, scale: np.ndarray, estimator: Estimator | Non
 
 
 def _inverse(information: np.ndarray, scale: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the inverse on determined directions, and which parameters are not determined."""
+    """Return the pseudo-inverse of the information matrix, and which parameters are not determined."""
     values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
     good = values > SINGULAR * max(float(values.max(initial=0.0)), 1e-300)
     inverse = (vectors[:, good] / values[good]) @ vectors[:, good].T
@@ -411,7 +412,9 @@ def _newey_west(fit: Linearised, parts: _Scores, scale: np.ndarray) -> tuple[np.
 
 
 def _bartlett(scores: np.ndarray, bandwidth: int) -> np.ndarray:
-    """Return the long-run covariance of scores along time, times their number, with Bartlett's weights."""
+    """Return the Newey-West sum of the scores' autocovariances over time, with Bartlett weights up to lag
+    `bandwidth`.
+    """
     n, p = scores.shape
     window = 1.0 - np.abs(np.arange(-bandwidth, bandwidth + 1)) / (bandwidth + 1)
     smoothed = np.stack(

@@ -1,4 +1,6 @@
-"""Check which parameters are identified, tied or fixed, against the model and each other."""
+"""Check the parameters of a specification: which are identified, tied to others or fixed, and whether this is
+consistent.
+"""
 
 from __future__ import annotations
 
@@ -26,14 +28,14 @@ Pair = Annotated[tuple[float, float], Field(strict=False)]
 
 
 class Prior(Table):
-    """An independent measurement of a parameter: its value and standard deviation."""
+    """Prior of a parameter from an independent measurement: mean and standard deviation."""
 
     mean: float
     sd: Annotated[float, Field(gt=0)]
 
 
 class Identified(Table):
-    """A table ``[identify.NAME]``: a parameter that is identified."""
+    """Table ``[identify.NAME]``: first guess, bounds and prior of a parameter to be identified."""
 
     start: float | None = Field(None, description="First guess; by default the preset's value")
     bounds: Pair | None = Field(None, description="[low, high]; by default those of the model")
@@ -44,7 +46,7 @@ class Identified(Table):
 
 @dataclass(frozen=True)
 class Unknown:
-    """An identified parameter with all defaults filled in.
+    """Parameter to be identified, with first guess, bounds and prior filled in.
 
     Attributes
     ----------
@@ -62,7 +64,9 @@ class Unknown:
 
 
 def validate(model: type[BaseModel], value: Any, path: str, problems: list[str]) -> Any:
-    """Return a validated table; on problems, add them and return None."""
+    """Return a table validated by a pydantic model; if it is invalid, add the problems to `problems` and return
+    None.
+    """
     try:
         return model.model_validate(value)
     except ValidationError as error:
@@ -71,7 +75,7 @@ def validate(model: type[BaseModel], value: Any, path: str, problems: list[str])
 
 
 def table_at(data: Mapping[str, Any], key: str, problems: list[str]) -> Mapping[str, Any]:
-    """Return a table by its key; empty if it is missing, or after adding a problem if it is not a table."""
+    """Return the table under a TOML key; empty if it is missing, or if it is no table, which adds a problem."""
     table = data.get(key, {})
     if isinstance(table, dict):
         return table
@@ -83,7 +87,7 @@ _TIE = re.compile(r"\s*(?:([+-]?\s*[0-9.]+(?:[eE][+-]?[0-9]+)?)\s*\*\s*|(-)\s*)?
 
 
 class ParameterTables:
-    """The fixed values, unknowns and ties of a specification, checked together."""
+    """Fixed values, unknowns and ties (parameters proportional to others) of a specification, checked together."""
 
     def __init__(self, data: Mapping[str, Any], model: Model, preset: str | Path | None, problems: list[str]) -> None:
         self._model, self._problems = model, problems
@@ -145,7 +149,9 @@ class ParameterTables:
         return Unknown(name, start, max(low, least), min(high, most), one.prior)
 
     def _bounds(self, name: str, start: float) -> tuple[float, float]:
-        """Return the model's bounds; an open bound is approached up to a small margin."""
+        """Return the model's bounds on a parameter; a bound that is not allowed itself is replaced by one close to
+        it.
+        """
         return {
             POSITIVE: (_LEAST * start, math.inf),
             NON_NEGATIVE: (0.0, math.inf),
@@ -200,7 +206,7 @@ class ParameterTables:
 
 
 def _number(text: str | None) -> float:
-    """Return the factor of a tie; NaN if it is not a number."""
+    """Return the factor in a tie such as ``-1.0*NAME``; NaN if it is not a number."""
     try:
         return 1.0 if text is None else float(text.replace(" ", ""))
     except ValueError:

@@ -1,1 +1,1 @@
-"""Fit the magnet torque to measured curves, and write a preset."""
+"""Fit a law of the torque between magnets to measured curves, and write its parameters as a preset."""

@@ -46,7 +46,7 @@ _MODELS: dict[str, tuple[str, Any, str]] = {"fit": ("black", "-", "o"), "dipoles
 
 
 def draw_curves(outcome: Outcome, frame: style.Frame = style.WIDE) -> style.DataFigure:
-    """Draw measured torque curves of some locked angles, each with a fitted bump (Fig. 6).
+    """Draw the measured torque curves of some locked angles, each with its fitted bump (Fig. 6).
 
     Filled points are right of the fixed magnet, open ones left of it.
     """
@@ -79,7 +79,7 @@ def draw_curves(outcome: Outcome, frame: style.Frame = style.WIDE) -> style.Data
 
 
 def draw_numbers(outcome: Outcome, frame: style.Frame = style.WIDE) -> style.DataFigure:
-    """Draw height, position and width of the bumps over the locked angle, with their laws (Fig. 7).
+    """Draw height, position and width of the fitted bumps over the locked angle, with the laws fitted to them (Fig. 7).
 
     Bars are standard errors. Full lines are the laws through the points; dashed lines are the joint fit's.
     """
@@ -123,7 +123,7 @@ def draw_numbers(outcome: Outcome, frame: style.Frame = style.WIDE) -> style.Dat
 
 
 def draw_map(outcome: Outcome, frame: style.Frame = style.WIDE) -> style.DataFigure:
-    """Draw the fitted torque over both angles, with its zero line and the readings (Fig. 8)."""
+    """Draw the fitted torque as a map over both angles, with the line of zero torque and the readings (Fig. 8)."""
     m, values = outcome.measured, outcome.joint.values
     angle, locked = (np.linspace(a.min() - _EDGE, a.max() + _EDGE, FINE) for a in (m.angle, m.locked))
     torque = laws.magnet_moment(angle, locked[:, None], values)
@@ -150,7 +150,7 @@ def draw_map(outcome: Outcome, frame: style.Frame = style.WIDE) -> style.DataFig
 
 
 def draw_comparison(outcome: Outcome, frame: style.Frame = style.WIDE) -> style.DataFigure:
-    """Draw the joint fit and point dipoles against the readings, with their residuals (Fig. 9)."""
+    """Draw the torques of the joint fit and of point dipoles over the readings, with the residuals of both (Fig. 9)."""
     shown = _spread(outcome, COMPARED)
     figure = style.new_figure(4.4, _comparison(outcome, shown), frame)
     grid = figure.subplots(2, len(shown), sharex="col", sharey="row", height_ratios=[1.5, 1.0], squeeze=False)
@@ -198,7 +198,7 @@ FIGURES: dict[str, Callable[..., style.DataFigure]] = {
 
 
 def write_figures(outcome: Outcome, folder: Path) -> list[Path]:
-    """Draw all figures and write them with their data into an existing folder."""
+    """Draw all figures of a torque fit, and write them with their data into an existing folder."""
     written = []
     for name, draw in FIGURES.items():
         figure = draw(outcome)
@@ -213,14 +213,14 @@ def write_figures(outcome: Outcome, folder: Path) -> list[Path]:
 
 
 def _spread(outcome: Outcome, n: int) -> list[float]:
-    """Return up to n locked angles from the least to the largest, evenly spread over those measured."""
+    """Return up to `n` of the measured locked angles, evenly spread from the least to the largest."""
     every = sorted(fit.curve.locked for fit in outcome.curves)
     angles = [a for a, b in zip(every, [*every[1:], np.inf], strict=True) if b - a > SAME_ANGLE]
     return [angles[i] for i in np.unique(np.linspace(0, len(angles) - 1, n).round().astype(int))]
 
 
 def _place(shown: Sequence[float], locked: float) -> int | None:
-    """Return the index of a locked angle among those shown; None if it is not shown."""
+    """Return the index of a locked angle in `shown`, or None if it is not there."""
     near = np.flatnonzero(np.abs(np.array(shown) - locked) < SAME_ANGLE)
     return int(near[0]) if near.size else None
 
@@ -253,7 +253,9 @@ def _readings(outcome: Outcome, rows: np.ndarray) -> xr.Dataset:
 
 
 def _numbers(outcome: Outcome, fine: np.ndarray) -> xr.Dataset:
-    """Return the parameters of each curve, and both laws on a fine grid, by side."""
+    """Return height, position and width of each curve's bump, and the laws of the separate and the joint fit on a fine
+    grid.
+    """
     curves = outcome.curves
     variables: dict[str, Any] = {
         "curve_locked": ("curve", [np.degrees(f.curve.locked) for f in curves], {"units": "deg"}),
@@ -280,7 +282,7 @@ def _laws_at(locked: np.ndarray, values: dict[str, float], i: int) -> dict[str, 
 
 
 def _comparison(outcome: Outcome, shown: Sequence[float]) -> xr.Dataset:
-    """Return readings at some locked angles, and both models on a fine grid."""
+    """Return the readings at some locked angles, with the torque of both models on a fine grid of angles."""
     m = outcome.measured
     own = [np.flatnonzero(np.abs(m.locked - locked) < SAME_ANGLE) for locked in shown]
     fine = np.array([_fine(m.angle[rows]) for rows in own])
@@ -317,7 +319,7 @@ def _points(ax: Axes, angle: np.ndarray, torque: np.ndarray, place: int, side: i
 def _done(
     figure: style.DataFigure, ax: Axes, outcome: Outcome, handles: list[Any], *, short: bool = False
 ) -> style.DataFigure:
-    """Add the label and the legend, and finish the figure."""
+    """Add a figure's title and legend, and finish its layout."""
     text = outcome.measured.label
     if short:
         figure.suptitle(

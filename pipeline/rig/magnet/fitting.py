@@ -1,4 +1,4 @@
-"""Fit torque curves: single curves, laws over the locked angle, a joint fit, and point dipoles.
+"""Fit measured torque curves: each curve alone, laws over the locked angle, all readings jointly, and point dipoles.
 
 See Wojna et al., J. Sound Vib. 430 (2018), section 3, Eq. 16-19. Standard errors come from the residuals'
 variance. If the law is wrong, residuals of neighbouring readings are correlated and these errors are too
@@ -33,7 +33,7 @@ FARTHEST_DIPOLES = 3.0
 
 @dataclass(frozen=True)
 class CurveFit:
-    """A bump fitted to one curve (Eq. 17).
+    """Bump fitted to one torque curve (Eq. 17).
 
     Attributes
     ----------
@@ -51,7 +51,7 @@ class CurveFit:
 
 @dataclass(frozen=True)
 class Laws:
-    """The curves' parameters as functions of the locked angle (Eq. 18).
+    """Laws of the bumps' height, position and width over the locked angle (Eq. 18).
 
     Attributes
     ----------
@@ -68,7 +68,7 @@ class Laws:
 
 @dataclass(frozen=True)
 class JointFit:
-    """A fit to all readings at once (Eq. 18-19).
+    """Joint fit to all readings (Eq. 18-19), with standard errors and correlations of its parameters.
 
     Attributes
     ----------
@@ -103,7 +103,7 @@ class JointFit:
 
 @dataclass(frozen=True)
 class DipoleFit:
-    """A fit of point dipoles (Eq. 16).
+    """Fit of two point dipoles to the readings (Eq. 16).
 
     Attributes
     ----------
@@ -123,7 +123,7 @@ class DipoleFit:
 
 
 def fit_curve(angle: np.ndarray, torque: np.ndarray, curve: Curve) -> CurveFit:
-    """Fit Eq. 17 to one curve.
+    """Fit the bump of Eq. 17 to one torque curve.
 
     Parameters
     ----------
@@ -158,7 +158,7 @@ def fit_curve(angle: np.ndarray, torque: np.ndarray, curve: Curve) -> CurveFit:
 
 
 def fit_curves(measured: Measurement) -> tuple[CurveFit, ...]:
-    """Fit every curve on its own.
+    """Fit a bump to each torque curve separately.
 
     Raises
     ------
@@ -180,7 +180,7 @@ def fit_curves(measured: Measurement) -> tuple[CurveFit, ...]:
 
 
 def fit_laws(curves: Sequence[CurveFit]) -> Laws:
-    """Fit height, position and width over the locked angle: a Gaussian, a line, a constant (Eq. 18).
+    """Fit how the bumps' height, position and width depend on the locked angle: Gaussian, line, constant (Eq. 18).
 
     Each value is weighted by its standard error. The laws' own errors come from the scatter about them.
 
@@ -212,7 +212,7 @@ def fit_laws(curves: Sequence[CurveFit]) -> Laws:
 
 
 def _weights(errors: np.ndarray) -> np.ndarray:
-    """Return weights by standard errors; errors that are mere rounding are bounded from below."""
+    """Return weights inversely proportional to standard errors; errors below 1e-3 of the largest count as that."""
     largest = float(errors.max())
     return np.ones(len(errors)) if largest == 0.0 else largest / np.maximum(errors, 1e-3 * largest)
 
@@ -301,7 +301,7 @@ def fit_jointly(measured: Measurement, start: Mapping[str, float], hold: Mapping
 
 
 def _upright(values: dict[str, float]) -> dict[str, float]:
-    """Make widths positive; only their squares matter."""
+    """Make the fitted widths positive; the law contains only their squares."""
     return {n: abs(v) if n.startswith(("gamma", "c")) else v for n, v in values.items()}
 
 
@@ -326,7 +326,7 @@ def _judged(measured: Measurement, found: Solution, free: tuple[str, ...], value
 
 
 def _scale(name: str, values: Mapping[str, float]) -> float:
-    """Return the size of a parameter's change that changes the torque substantially."""
+    """Return the size of a change of one parameter that changes the torque substantially."""
     if name == "eps_mag":
         return values[name]
     kind, i = name[:-1], name[-1]
@@ -335,7 +335,7 @@ def _scale(name: str, values: Mapping[str, float]) -> float:
 
 
 def _neighbours(measured: Measurement, residuals: np.ndarray) -> float:
-    """Return the correlation of residuals of neighbouring readings, over all curves."""
+    """Return the correlation between the residuals of neighbouring readings of a curve, over all curves."""
     products = squares = 0.0
     for curve in measured.curves:
         own = residuals[curve.rows[np.argsort(measured.angle[curve.rows])]]
@@ -348,7 +348,7 @@ def _neighbours(measured: Measurement, residuals: np.ndarray) -> float:
 
 
 def fit_dipoles(measured: Measurement, *, place: bool = False) -> DipoleFit:
-    """Fit the strength of point dipoles (Eq. 16), and with `place` also the place of the fixed one.
+    """Fit the strength of two point dipoles (Eq. 16); with `place`, fit the position of the fixed dipole too.
 
     The torque is linear in the strength. The place is sought below the end of the stretched pendulum.
 
@@ -413,7 +413,7 @@ class Outcome:
 
 
 def fit_measurement(measured: Measurement) -> Outcome:
-    """Fit single curves, their laws over the locked angle, all readings at once, and point dipoles.
+    """Run all fits of a measurement: each curve alone, laws over the locked angle, all readings jointly, point dipoles.
 
     Raises
     ------

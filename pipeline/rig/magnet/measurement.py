@@ -1,4 +1,4 @@
-"""Read a measurement of the magnets' torque: a table of readings and its header.
+"""Read a measurement of the torque between magnets: a TOML header and a CSV table of readings.
 
 The header is a TOML file; ``workflows/magnet/discs.toml`` is an example, docs/magnet.md lists its keys. All
 problems with the header and the table are reported at once.
@@ -44,7 +44,7 @@ TORQUE_UNITS = {"N m": 1.0, "mN m": 1e-3, "N": 1.0}
 
 
 class AngleColumn(Table):
-    """A column of angles."""
+    """Column of the table with angles."""
 
     column: str = Field(description="Its name in the table's first row.")
     unit: Literal["deg", "rad"] = Field(description="Unit in the file.")
@@ -60,7 +60,7 @@ class AngleColumn(Table):
 
 
 class TorqueColumn(Table):
-    """A column of readings."""
+    """Column of the table with torque or force readings."""
 
     column: str = Field(description="Its name in the table's first row.")
     unit: Literal["N m", "mN m", "N"] = Field(description="Unit in the file; N: a force at the end of arm_m.")
@@ -75,12 +75,12 @@ class TorqueColumn(Table):
 
     @property
     def scale(self) -> float:
-        """Factor from the file's unit to N m."""
+        """Factor from the column's unit to N m, with sign and lever arm."""
         return self.sign * TORQUE_UNITS[self.unit] * (self.arm_m or 1.0)
 
 
 class SideColumn(Table):
-    """A column that tells on which side of the fixed magnet the pendulum was."""
+    """Column of the table that gives the side of the fixed magnet on which the pendulum was."""
 
     column: str = Field(description="Its name in the table's first row.")
     right: str = Field("right", description="Entry for the right side, where torques are positive.")
@@ -88,14 +88,14 @@ class SideColumn(Table):
 
 
 class Tie(Table):
-    """The tie that holds the upper link, with its weight."""
+    """Tie that holds the upper link during the measurement; its weight adds a torque to the readings."""
 
     mass_kg: float = Field(ge=0, description="Mass that hangs on the link [kg].")
     lever_m: float = Field(ge=0, description="Distance from the upper joint along the link to the mass [m].")
 
 
 class Correction(Table):
-    """The torques in the readings besides the magnets' torque."""
+    """Table of the header that lists the torques to subtract from the readings, besides the magnets' own."""
 
     weights: bool = Field(description="Whether the readings include the torque of the links' weights.")
     tie: Tie | None = Field(None, description="Weight of the tie, if the readings include it.")
@@ -120,7 +120,7 @@ Columns: Any = create_model("Columns", __base__=Table, **_COLUMNS)
 
 
 class Header(Table):
-    """The header of a measurement."""
+    """TOML header of a measurement: the table's file and columns, known parameters, corrections."""
 
     title: str = Field(description="Title of the measurement, one line.")
     synthetic: bool = Field(False, description="Whether the readings were computed; all results state this.")
@@ -147,7 +147,7 @@ class Header(Table):
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """The readings at one locked angle on one side.
+    """Torque curve: the readings at one locked angle on one side of the fixed magnet.
 
     Attributes
     ----------
@@ -169,7 +169,7 @@ class Curve:
 
 @dataclass(frozen=True, eq=False)
 class Measurement:
-    """The corrected readings in SI units.
+    """Measurement of the magnets' torque: readings in SI units, before and after subtracting all other torques.
 
     Attributes
     ----------
@@ -205,17 +205,19 @@ class Measurement:
 
     @cached_property
     def curves(self) -> tuple[Curve, ...]:
-        """Curves in the order of side (right first) and rising locked angle."""
+        """Torque curves of the measurement, sorted by side (right first) and rising locked angle."""
         return curves_of(self.locked, self.side)
 
     @property
     def label(self) -> str:
-        """Title for figures and presets; it marks synthetic readings."""
+        """Title of the measurement for figures and presets, beginning with "SYNTHETIC" if the readings were
+        computed.
+        """
         return ("SYNTHETIC: " if self.header.synthetic else "") + self.header.title
 
 
 def curves_of(locked: np.ndarray, side: np.ndarray) -> tuple[Curve, ...]:
-    """Group readings by side and locked angle."""
+    """Group readings into torque curves: one for each side and locked angle."""
     found = []
     for code in range(len(laws.SIDES)):
         rows = np.flatnonzero(side == code)
@@ -226,7 +228,7 @@ def curves_of(locked: np.ndarray, side: np.ndarray) -> tuple[Curve, ...]:
 
 
 def find_measurement(name: str | Path) -> Path:
-    """Return the path of a header, given as a path or as the name of a measurement that ships.
+    """Return the path of a measurement's header, given as a path or as the name of a measurement in the package.
 
     Raises
     ------
@@ -243,7 +245,7 @@ def find_measurement(name: str | Path) -> Path:
 
 
 def read_measurement(path: str | Path) -> Measurement:
-    """Read a header and its table.
+    """Read a measurement: its TOML header and its table of readings, corrected and in SI units.
 
     Parameters
     ----------
@@ -288,7 +290,7 @@ def _besides(
 
 
 def _known(header: Header, folder: Path) -> tuple[Parameters | None, list[str]]:
-    """Return the parameters before the fit, and problems with them."""
+    """Return the model parameters that are known before the fit, and the problems with them."""
     problems = [
         f"parameters.{name}: has no provenance; say in [provenance] where the value comes from."
         for name in header.parameters
@@ -316,7 +318,7 @@ def _known(header: Header, folder: Path) -> tuple[Parameters | None, list[str]]:
 
 
 def _table(path: Path, header: Header) -> tuple[dict[str, list[str]], bytes, list[str], list[str]]:
-    """Return the columns as they stand in the file, its bytes, and its problems and warnings."""
+    """Read the CSV table; return its columns as text, the file's bytes, problems and warnings."""
     try:
         content = path.read_bytes()
         lines = [line for line in content.decode("utf-8-sig").splitlines() if line.strip()]
@@ -344,7 +346,7 @@ def _table(path: Path, header: Header) -> tuple[dict[str, list[str]], bytes, lis
 
 
 def _wanted(header: Header) -> dict[str, str]:
-    """Return the names of the needed columns, by meaning (angle, torque, ...)."""
+    """Return the column name in the file for each quantity (angle, torque, ...)."""
     found = {name: getattr(header.columns, name).column for name in type(header.columns).model_fields}
     if header.correction.without is not None:
         found["without"] = header.correction.without
@@ -352,7 +354,7 @@ def _wanted(header: Header) -> dict[str, str]:
 
 
 def _but_for_units(wanted: dict[str, str], names: list[str], header: Header) -> tuple[dict[str, str], list[str]]:
-    """Accept columns whose names have a unit in brackets besides, for the header gives it; warn of them."""
+    """Accept columns whose names differ from the header's only by a unit in brackets, and warn of them."""
     found, warnings = dict(wanted), []
     for key, name in wanted.items():
         near = units.names_with_unit(name, names)
@@ -369,7 +371,7 @@ def _but_for_units(wanted: dict[str, str], names: list[str], header: Header) -> 
 
 
 def _numbers(header: Header, table: Mapping[str, list[str]], problems: list[str]) -> dict[str, np.ndarray]:
-    """Return the columns in SI units; on problems, add them and return nothing."""
+    """Convert the table's columns to arrays in SI units; if there are problems, add them and return an empty dict."""
     before, found = len(problems), {}
     where = header.file
     for key in (name for name in table if name != "side"):
@@ -406,7 +408,7 @@ def _number(text: str, decimal: str) -> float:
 
 
 def _places(rows: Any) -> str:
-    """Format row numbers of the table; the first reading is row 1."""
+    """Format row numbers of the table for a message, at most three; the first reading is row 1."""
     named = ", ".join(str(i) for i in rows[:MAX_NAMED])
     more = f" and {len(rows) - MAX_NAMED} more" if len(rows) > MAX_NAMED else ""
     return f"row{'s' if len(rows) > 1 else ''} {named}{more}"

@@ -1,4 +1,4 @@
-"""Write the results of a fit of torque curves: ``fit.json``, presets with provenance, a summary."""
+"""Write the results of a torque fit: ``fit.json``, presets with the origin of each value, a printed summary."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ ALIKE = 0.3
 
 
 def report_of(outcome: Outcome) -> dict[str, Any]:
-    """Return all numbers of a fit as plain data; SI units, or degrees where the key says so."""
+    """Return all numbers of a torque fit as plain data, in SI units, or in degrees where the key says so."""
     m = outcome.measured
     curves = [
         {
@@ -88,7 +88,7 @@ def _dipoles(fit: DipoleFit) -> dict[str, Any]:
 
 
 def write_results(outcome: Outcome, folder: Path) -> list[Path]:
-    """Write report and presets into an existing folder; return their paths."""
+    """Write ``fit.json`` and the presets into an existing folder; return the paths of all files."""
     report = folder / REPORT
     text = json.dumps(report_of(outcome), indent=1, allow_nan=False, ensure_ascii=False)
     write_atomically(report, text + "\n")
@@ -123,7 +123,9 @@ def write_presets(outcome: Outcome, folder: Path) -> list[Path]:
 
 
 def _base(measured: Measurement, model: str) -> str | Preset:
-    """Return the preset of the parameters that are not fitted; of a file, only the model's parameters are used."""
+    """Return the preset that supplies the parameters which are not fitted; a preset file is reduced to the model's
+    parameters.
+    """
     name = measured.header.preset
     if name is None:
         return load_model(model).presets[0].name
@@ -135,7 +137,7 @@ def _base(measured: Measurement, model: str) -> str | Preset:
 
 
 def _error(fit: JointFit, name: str, measured: Measurement) -> str:
-    """Format the standard error of a value, the larger of the two."""
+    """Format the standard error of a parameter: the larger of the residuals' and the jackknife's."""
     error, unit = np.fmax(fit.errors[name], fit.errors_by_curve[name]), _unit(name, measured)
     return f"standard error {error:.2g} {unit}".rstrip()
 
@@ -149,7 +151,7 @@ def _unit(name: str, measured: Measurement) -> str:
 
 
 def summary_of(outcome: Outcome) -> list[str]:
-    """Return the lines of a fit's printed summary."""
+    """Return the printed summary of a torque fit, line by line."""
     m, joint = outcome.measured, outcome.joint
     r2 = [fit.quality.r2 for fit in outcome.curves]
     line = laws.transition(joint.values)
@@ -183,7 +185,9 @@ def _table(joint: JointFit, m: Measurement) -> list[str]:
 
 
 def warnings_of(outcome: Outcome) -> list[str]:
-    """Return what whoever uses the numbers must know."""
+    """Return warnings for users of the fit: columns accepted by similar names, undetermined parameters, correlated
+    residuals.
+    """
     joint, found = outcome.joint, list(outcome.measured.warnings)
     for name, partner in joint.undetermined.items():
         found.append(

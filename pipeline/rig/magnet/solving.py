@@ -1,4 +1,4 @@
-"""Solve least squares to rounding, with standard errors of the estimates."""
+"""Solve nonlinear least squares to rounding error, with standard errors of the estimates."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ MAX_EVALUATIONS = 4000
 
 @dataclass(frozen=True)
 class Solution:
-    """A converged least-squares fit.
+    """Result of a converged least-squares fit: estimates, standard errors, Jacobian and residuals.
 
     Attributes
     ----------
@@ -36,7 +36,7 @@ class Solution:
 
     @property
     def correlation(self) -> np.ndarray:
-        """Correlation matrix of the estimates, for readings of equal noise."""
+        """Correlation matrix of the estimates, for readings with equal noise."""
         normal = _inverse(self.jacobian)
         size = np.sqrt(np.diag(normal))
         return np.asarray(normal / size[:, None] / size)
@@ -44,7 +44,7 @@ class Solution:
 
 @dataclass(frozen=True)
 class Quality:
-    """The quality of a fit: R squared and root mean square.
+    """Quality of a fit: R squared, and root mean square of the residuals.
 
     Attributes
     ----------
@@ -59,7 +59,7 @@ class Quality:
 
     @classmethod
     def of(cls, measured: np.ndarray, residuals: np.ndarray) -> Quality:
-        """Return the quality of a fit from readings and residuals."""
+        """Compute the quality of a fit from the readings and their residuals."""
         total = float(((measured - measured.mean()) ** 2).sum())
         left = float(residuals @ residuals)
         return cls(1.0 - left / total if total > 0.0 else math.nan, math.sqrt(left / len(residuals)))
@@ -71,7 +71,7 @@ def solve(
     start: Sequence[float],
     what: str,
 ) -> Solution:
-    """Solve least squares by Levenberg and Marquardt, to rounding.
+    """Solve a nonlinear least-squares problem by the Levenberg-Marquardt method, to rounding error.
 
     Parameters
     ----------
@@ -114,7 +114,7 @@ def solve(
 
 
 def _inverse(jacobian: np.ndarray) -> np.ndarray:
-    """Return the inverse of the fit's normal matrix; columns are scaled to equal size for accuracy."""
+    """Return the inverse of the normal matrix ``J.T @ J``; columns are scaled to equal size for accuracy."""
     size = np.linalg.norm(jacobian, axis=0)
     _, s, right = np.linalg.svd(jacobian / size, full_matrices=False)
     if not s[-1] > len(jacobian) * _EPS * s[0]:
@@ -124,7 +124,7 @@ def _inverse(jacobian: np.ndarray) -> np.ndarray:
 
 
 def errors_by_cluster(found: Solution, clusters: Sequence[np.ndarray]) -> np.ndarray:
-    """Return standard errors that allow for any correlation of residuals within a cluster.
+    """Return standard errors by a jackknife over clusters of readings; residuals may be correlated within a cluster.
 
     This is the jackknife over clusters about the fit to all readings (CR3): each cluster is left out in turn,
     to first order. Unlike the plain sandwich, its errors are not too small with few clusters: MacKinnon,

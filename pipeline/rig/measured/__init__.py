@@ -1,1 +1,1 @@
-"""Measure diagrams on a rig: sections at the edges of the drive, compared with computed ones."""
+"""Measure bifurcation diagrams on a rig from recorded sweeps, and compare them with computed ones."""

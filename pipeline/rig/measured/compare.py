@@ -1,4 +1,6 @@
-"""Compare measured with computed diagrams: distances of sections, regimes, shifts of window edges."""
+"""Compare a measured bifurcation diagram with a computed one: distances of section points, periods, edges of
+windows.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,7 @@ NOBODY = -1
 def compare(
     measured: xr.Dataset, run: AnalysedRun, *, at: Mapping[str, float] | None = None, seed: int = 0
 ) -> xr.Dataset:
-    """Compare a measured diagram with the attractors of a run.
+    """Compare a measured bifurcation diagram with the attractors of a computed run.
 
     Parameters
     ----------
@@ -60,7 +62,9 @@ def compare(
 
 
 def compare_with(measured: xr.Dataset, computed: Computed, *, seed: int = 0) -> xr.Dataset:
-    """Compare a measured diagram that has sides with computed attractors; see `compare`."""
+    """Compare a measured diagram with computed attractors; each frequency step already has its class of motion
+    (``side``).
+    """
     f = measured["frequency"].values
     if not any(computed.place(float(x)) >= 0 for x in f):
         own = computed.frequencies
@@ -102,7 +106,9 @@ def compare_with(measured: xr.Dataset, computed: Computed, *, seed: int = 0) -> 
 
 
 def _step(measured: xr.Dataset, step: int, computed: Computed, distances: np.ndarray, seed: int) -> dict[str, float]:
-    """Compare model and measurement at one step of the frequency; fill the step's row of `distances`."""
+    """Compare the model with the measurement at one drive frequency; write the distances from all attractors into
+    `distances`.
+    """
     states = [str(s) for s in measured["state"].values]
     geometry = geometry_of(states, computed.model.state_names, Geometry.of(computed.model))
     points, noise = measured["section"].values[step], measured["section_noise"].values[step]

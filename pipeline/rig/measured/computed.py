@@ -1,4 +1,4 @@
-"""Read a run's attractors at the frequencies of a rig: their points, periods and sides."""
+"""Read the attractors of a computed run at the drive frequencies of a rig: points, periods and classes of motion."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Floats = npt.NDArray[np.float64]
 def cube_and_parameters(
     run: AnalysedRun, model: str | Model, at: Mapping[str, float] | None = None
 ) -> tuple[xr.Dataset, Parameters]:
-    """Return a run's cells over the drive frequency, and its parameters there.
+    """Return a run's cube over the drive frequency, at one value of every other axis, and its parameters there.
 
     Raises
     ------
@@ -63,7 +63,7 @@ def cube_and_parameters(
 
 @dataclass(frozen=True)
 class Computed:
-    """The attractors of a run along its frequency axis, at one value of every other axis.
+    """Attractors of a run over the drive frequency, at one value of every other swept parameter.
 
     Attributes
     ----------
@@ -85,7 +85,7 @@ class Computed:
 
     @classmethod
     def of(cls, run: AnalysedRun, model: str | Model, at: Mapping[str, float] | None = None) -> Computed:
-        """Read a run and its attractors, which are computed if they are not kept.
+        """Read a run and its attractors; the attractors are computed if no stored result exists.
 
         Raises
         ------
@@ -102,16 +102,16 @@ class Computed:
 
     @property
     def model(self) -> Model:
-        """Model that was integrated."""
+        """Model of the run."""
         return self.parameters.model
 
     @property
     def frequencies(self) -> Floats:
-        """Frequencies in rising order [Hz]."""
+        """Drive frequencies of the run, in rising order [Hz]."""
         return np.asarray(self.attractors[FREQUENCY_DIM].values, np.float64)
 
     def place(self, frequency_hz: float) -> int:
-        """Return the index of the nearest frequency; -1 if it is outside the axis by over half a step."""
+        """Return the index of the nearest computed frequency, or -1 if the nearest is too far away."""
         f = self.frequencies
         i = int(np.abs(f - frequency_hz).argmin())
         near = np.abs(np.delete(f, i) - f[i])
@@ -119,7 +119,7 @@ class Computed:
         return i if abs(f[i] - frequency_hz) <= reach or f[0] < frequency_hz < f[-1] else -1
 
     def regime(self, place: int, attractor: int) -> tuple[int, int] | None:
-        """Return period and side of a set at a frequency; period 0 if it does not close.
+        """Return period and class of motion of an attractor at frequency index `place`; period 0 if it is aperiodic.
 
         None if the set does not exist there or is unstable, since a rig does not show unstable sets.
         """
@@ -131,7 +131,7 @@ class Computed:
         return period, int(one["side"]) if "side" in one else 0
 
     def candidates(self, frequency_hz: float, states: Sequence[str]) -> list[Candidate]:
-        """Return the attractors at a frequency, with their points in the chosen states.
+        """Return the attractors that the model has at a frequency, each with its section points in the given states.
 
         Points of a closed orbit are interpolated between neighbouring frequencies if the attractor has the
         same period there. Otherwise, and for sets that do not close, they are those at the nearest frequency.
@@ -159,7 +159,7 @@ class Computed:
         return np.asarray(points[np.isfinite(points).all(axis=1)], np.float64)
 
     def _set(self, place: int, attractor: int) -> Floats:
-        """Return the sections of all cells on a set that does not close."""
+        """Return the section points of all trajectories on an aperiodic attractor at one frequency."""
         frequency = self.frequencies[place]
         dims = start_dims(self.attractors)
         ids = self.attractors["attractor_id"].isel({FREQUENCY_DIM: place}).transpose(*dims).values

@@ -1,4 +1,4 @@
-"""Compute Wasserstein-1 distances between sets of section points, and their noise floor.
+"""Compute Wasserstein-1 distances between sets of section points, and the distance that noise alone gives.
 
 For two sets of equally many points, Wasserstein-1 is the mean distance in the cheapest pairing, found by
 `scipy.optimize.linear_sum_assignment` (a shortest augmenting path: Crouse, IEEE Trans. Aerosp. Electron.
@@ -27,7 +27,7 @@ _DRAWS = 8
 
 
 def wasserstein(a: Floats, b: Floats, geometry: Geometry) -> float:
-    """Return the Wasserstein-1 distance between two sets of section points.
+    """Return the Wasserstein-1 distance between two sets of section points with equal weights.
 
     Parameters
     ----------
@@ -65,7 +65,7 @@ def _transport(ways: Floats) -> float:
 
 @dataclass(frozen=True)
 class Candidate:
-    """An attractor of the model at one frequency.
+    """Attractor of the model at one frequency, with its section points.
 
     Attributes
     ----------
@@ -87,7 +87,7 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Cloud:
-    """The sections of one step, with their noise.
+    """Measured section points at one frequency step, with their noise.
 
     Attributes
     ----------
@@ -103,12 +103,12 @@ class Cloud:
 
     @property
     def cycle(self) -> int:
-        """Number of sections after which a closed motion repeats; 1 if it does not close."""
+        """Number of section points after which the motion repeats; 1 if it is aperiodic."""
         return max(self.orbit_period, 1)
 
     @property
     def size(self) -> int:
-        """Number of sections of a half, in whole cycles if the half is long enough.
+        """Number of section points in each half, in whole cycles of the orbit if the half is long enough.
 
         Otherwise the halves would hold the points of an orbit in unequal numbers, which adds a distance from
         one point of the orbit to another.
@@ -117,11 +117,11 @@ class Cloud:
         return half // self.cycle * self.cycle or half
 
     def halves(self) -> tuple[Floats, Floats]:
-        """Return the first and the second half."""
+        """Return the first and the second half of the section points."""
         return self.points[-2 * self.size : -self.size], self.points[-self.size :]
 
     def shuffled(self, rng: np.random.Generator) -> tuple[Floats, Floats]:
-        """Return two halves of randomly drawn cycles."""
+        """Divide the section points into two halves at random, in whole cycles of the orbit."""
         both = self.points[-2 * self.size :]
         length = self.cycle if self.size % self.cycle == 0 else 1
         cycles = both.reshape(-1, length, both.shape[-1])
@@ -131,7 +131,7 @@ class Cloud:
 
 
 def cloud_of(points: Floats, noise: Floats, orbit_period: int) -> Cloud:
-    """Return the sections of a step; cycles with a missing section (NaN) are left out."""
+    """Return the measured section points of one frequency step; cycles with a missing point (NaN) are left out."""
     known = np.asarray(np.isfinite(points).all(axis=1), np.bool_)
     last = int(np.flatnonzero(known)[-1]) + 1
     cycle = max(orbit_period, 1)
@@ -143,7 +143,7 @@ def cloud_of(points: Floats, noise: Floats, orbit_period: int) -> Cloud:
 
 
 def _scatter(points: Floats, noise: Floats, orbit_period: int) -> Floats:
-    """Return the noise of sections, or the observed scatter of a closed motion if that is larger."""
+    """Return the noise of section points, or the observed scatter of a periodic motion if that is larger."""
     k = orbit_period
     if not k or len(points) <= 2 * k:
         return noise
@@ -153,7 +153,7 @@ def _scatter(points: Floats, noise: Floats, orbit_period: int) -> Floats:
 
 
 def floor_of(cloud: Cloud, geometry: Geometry, rng: np.random.Generator) -> float:
-    """Return the noise floor of a recording: Wasserstein-1 between halves of its sections.
+    """Return the noise floor of a measurement: Wasserstein-1 distance between the halves of its section points.
 
     It is the mean over randomly drawn halves. If the first and the second half differ more, as in a recording
     that drifted, it is their distance.
@@ -163,7 +163,7 @@ def floor_of(cloud: Cloud, geometry: Geometry, rng: np.random.Generator) -> floa
 
 
 def distance_to(candidate: Candidate, cloud: Cloud, geometry: Geometry, rng: np.random.Generator) -> float:
-    """Return the mean Wasserstein-1 distance of the halves of a recording from an attractor.
+    """Return the mean Wasserstein-1 distance between an attractor and the two halves of the measured section points.
 
     Parameters
     ----------
@@ -187,7 +187,7 @@ def distance_to(candidate: Candidate, cloud: Cloud, geometry: Geometry, rng: np.
 
 
 def _drawn(candidate: Candidate, size: int, rng: np.random.Generator) -> Floats:
-    """Draw at least `size` points of an attractor; an orbit is repeated as a whole."""
+    """Draw at least `size` section points of an attractor; a periodic orbit is repeated as a whole."""
     points = candidate.points
     if candidate.orbit_period:
         return np.tile(points, (max(1, -(-size // len(points))), 1))
@@ -195,6 +195,6 @@ def _drawn(candidate: Candidate, size: int, rng: np.random.Generator) -> Floats:
 
 
 def geometry_of(names: Sequence[str], model_names: Sequence[str], whole: Geometry) -> Geometry:
-    """Return the geometry of the states that a recording has."""
+    """Return the scales and angle flags of the recorded states only, for distances between section points."""
     at = [list(model_names).index(n) for n in names]
     return Geometry(tuple(whole.is_angle[i] for i in at), tuple(whole.scales[i] for i in at))

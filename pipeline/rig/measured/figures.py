@@ -1,4 +1,4 @@
-"""Draw measured diagrams beside and over computed ones, and the distances between them."""
+"""Draw measured bifurcation diagrams beside or over computed ones, and the distances between them."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def plot_measured(
     layout: str = "side",
     frame: style.Frame = style.WIDE,
 ) -> style.DataFigure:
-    """Draw measured sections over the drive frequency: alone, beside or over a computed diagram.
+    """Draw measured section points over the drive frequency: alone, or beside or over a computed diagram.
 
     Parameters
     ----------
@@ -112,7 +112,7 @@ def _rig(measured: xr.Dataset) -> str:
 def _ranges(
     measured: xr.Dataset, values: np.ndarray, cube: xr.Dataset | None, frame: style.Frame
 ) -> tuple[tuple[float, float], tuple[float, float] | None]:
-    """Return ranges of the axes that hold both diagrams; None for heights that the computed one sets."""
+    """Return the axis ranges that contain both diagrams; the second is None if the computed diagram sets the y axis."""
     own = measured["frequency"].values
     f = own if cube is None else np.concatenate([own, np.atleast_1d(cube[FREQUENCY_DIM].values)])
     margin = 0.02 * float(np.ptp(f)) or 0.02 * float(f[0])
@@ -139,7 +139,7 @@ def _dress(ax: Axes, measured: xr.Dataset, measure: labels.Measure, ranges: Any)
 
 
 def _draw_steps(ax: Axes, measured: xr.Dataset, values: np.ndarray, over: bool) -> None:
-    """Draw the sections of all steps by direction and class of motion, upward sweeps on top."""
+    """Draw the measured section points by sweep direction and class of motion, with upward sweeps on top."""
     motions = motions_of(measured)
     codes = measured["side"].values if "side" in measured else np.zeros(measured.sizes["step"], int)
     f, ways = measured["frequency"].values, measured["direction"].values.astype(str)
@@ -188,7 +188,7 @@ def _handles(measured: xr.Dataset, motions: Motions, diagram: Diagram | None, ov
 def plot_comparison(
     compared: xr.Dataset, computed: Computed, *, state: str = "", degrees: bool = False, frame: style.Frame = style.WIDE
 ) -> style.DataFigure:
-    """Draw measured points over the attractors, their distances in units of noise, and both regimes.
+    """Draw measured points over the attractors, their distances in units of noise, and the periods of rig and model.
 
     Parameters
     ----------
@@ -248,7 +248,7 @@ def plot_comparison(
 
 @dataclass(frozen=True)
 class _Met:
-    """The attractors that were nearest to the rig at some step, with colours and names."""
+    """Attractors that were nearest to the measurement at some frequency step, with colours and names."""
 
     colours: dict[int, str]
     names: dict[int, str]
@@ -256,7 +256,9 @@ class _Met:
 
 
 def _met(compared: xr.Dataset, computed: Computed) -> _Met:
-    """Return the nearest attractors; the most frequent one of each side gets that side's colour."""
+    """Return the attractors nearest to the measurement at any step; the most frequent one of each class gets its
+    colour.
+    """
     cast, motions = palette.cast_of(computed.attractors), motions_of(compared)
     winners, sides = compared["winner"].values, compared["computed_side"].values
     ids = [int(i) for i in np.unique(winners) if i >= 0]
@@ -272,7 +274,7 @@ def _met(compared: xr.Dataset, computed: Computed) -> _Met:
 
 
 def _draw_attractors(ax: Axes, computed: Computed, measure: labels.Measure, met: _Met) -> None:
-    """Draw the points of all attractors; grey ones were nowhere nearest to the rig."""
+    """Draw the section points of all attractors; an attractor that was never nearest to the measurement is grey."""
     found = computed.attractors
     points = found["attractor_points"].sel(state=measure.name).transpose(FREQUENCY_DIM, "attractor", "point")
     values = measure.shown(points.values, wrap=True)
@@ -322,7 +324,9 @@ def _draw_distances(ax: Axes, compared: xr.Dataset, met: _Met) -> None:
 
 
 def _draw_regimes(ax: Axes, compared: xr.Dataset, motions: Motions, ways: Sequence[str]) -> None:
-    """Draw strips of the regimes of rig and model, two for each direction."""
+    """Draw period and class of motion over the frequency as coloured strips: one for the rig, one for the model, per
+    direction.
+    """
     rows: list[str] = []
     for way in ways:
         chosen = np.flatnonzero(compared["direction"].values == way)

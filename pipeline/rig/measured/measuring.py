@@ -1,4 +1,4 @@
-"""Measure a diagram: sections, period and class of motion at each step of recorded sweeps."""
+"""Measure a bifurcation diagram: section points, period and class of motion at each frequency of recorded sweeps."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ DIRECTIONS = {1: "up", -1: "down", 0: "none"}
 
 @dataclass(frozen=True)
 class _Step:
-    """A row of a measured diagram."""
+    """Frequency step of a measured diagram: its section points, their noise, and the period of the motion."""
 
     stretch: Stretch
     recording: int
@@ -41,7 +41,7 @@ class _Step:
 def measure(
     recordings: Sequence[xr.Dataset], options: SweepOptions | None = None, *, parameters: Parameters | None = None
 ) -> xr.Dataset:
-    """Return sections and regimes at each step of one or more recorded sweeps.
+    """Return section points, period and class of motion at each frequency step of one or more recorded sweeps.
 
     Parameters
     ----------
@@ -114,7 +114,7 @@ def _steps(recording: xr.Dataset, number: int, options: SweepOptions, parameters
 
 
 def _instants(edges: Edges, stretches: Sequence[Stretch], phase: float) -> Edges:
-    """Return the times of the sections of all stretches: rising edges, or a fixed phase later."""
+    """Return the times at which section points are taken: rising edges of the drive, or a fixed phase after them."""
     later = [s.edges.rising + phase / s.timing.frequency_hz for s in stretches]
     # windows end at the other edges of the drive; for sections at another phase, at all edges
     others = np.sort(np.concatenate([edges.rising, edges.falling])) if phase else edges.falling
@@ -122,7 +122,7 @@ def _instants(edges: Edges, stretches: Sequence[Stretch], phase: float) -> Edges
 
 
 def _in_place(sections: xr.Dataset, name: str, n: int) -> np.ndarray:
-    """Return sections at the indices of their edges, NaN for edges without one: later code counts periods."""
+    """Place section points at the indices of their drive edges; edges without a point become NaN."""
     values = np.full((n, sections.sizes["state"]), np.nan)
     values[sections["number"].values] = sections[name].values
     return values
@@ -131,7 +131,7 @@ def _in_place(sections: xr.Dataset, name: str, n: int) -> np.ndarray:
 def _with_instants(
     points: np.ndarray, noise: np.ndarray, names: tuple[str, ...], model: Model, scatter_s: float
 ) -> np.ndarray:
-    """Return the noise of sections, with the scatter of their times where the rate is known."""
+    """Return the noise of section points, with the scatter of their times added for states whose rate is measured."""
     both = noise.copy()
     for i, name in enumerate(names):
         rate = model.state(name).rate
@@ -143,7 +143,7 @@ def _with_instants(
 def _shaken(
     points: np.ndarray, noise: np.ndarray, kink: np.ndarray, names: tuple[str, ...], model: Model, shake_s: float
 ) -> np.ndarray:
-    """Return the expected scatter of a closed motion whose drive itself jitters.
+    """Return the expected scatter of a periodic motion whose drive jitters: sensor noise and the effect of late edges.
 
     A late edge lets an angle advance by its rate times the delay. It changes a rate by the jump of the rate's
     derivative times the delay.
@@ -159,7 +159,7 @@ def _shaken(
 
 
 def _check(steps: Sequence[_Step], recordings: Sequence[xr.Dataset]) -> None:
-    """Refuse recordings without sections, or with different states."""
+    """Raise `SpecError` if the recordings give no section points, or have different states."""
     if not steps:
         names = ", ".join(name_of(r) for r in recordings)
         raise SpecError(
@@ -228,7 +228,7 @@ def _about(units: str, text: str) -> dict[str, str]:
 
 
 def with_sides(measured: xr.Dataset, parameters: Parameters) -> xr.Dataset:
-    """Add the class of motion of each step, by the model's classifier with given parameters.
+    """Add the class of motion (``side``) of each frequency step, by the model's classifier with given parameters.
 
     Without a classifier, or with a state unknown, nothing is added.
     """

@@ -1,4 +1,4 @@
-"""Draw a recording and the model from the same state: time series and phase portraits."""
+"""Draw a recording and a computed trajectory from the same initial state: time series and phase portraits."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SUFFIX = "_computed"
 
 
 def plot_series(ds: xr.Dataset, *, degrees: bool = False, frame: style.Frame = style.WIDE) -> style.DataFigure:
-    """Draw the series of `pipeline.rig.measured.series.series_of` over each other, and phase portraits.
+    """Draw measured over computed time series from `pipeline.rig.measured.series.series_of`, and phase portraits.
 
     Parameters
     ----------
@@ -108,7 +108,9 @@ def _draw_portrait(ax: Axes, ds: xr.Dataset, pair: list[labels.Measure]) -> None
 
 
 def _looks(name: str) -> tuple[tuple[str, dict[str, Any]], ...]:
-    """Return the looks of the measured line and of the computed one, which is thinner and on top."""
+    """Return variable names and line styles of a measured and a computed state; the computed line is thinner and on
+    top.
+    """
     return (
         (name, {"color": RIG, "linewidth": 1.3, "zorder": 2.0}),
         (name + SUFFIX, {"color": MODEL, "linewidth": 0.8, "zorder": 3.0}),

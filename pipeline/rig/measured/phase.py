@@ -1,4 +1,4 @@
-"""Find the phase of a model's sections in the drive period, from the rising edge."""
+"""Find the phase of the drive period at which a model takes its stroboscopic section, counted from the rising edge."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _SNAP = 2e-3
 
 
 def section_phase(parameters: Parameters, frequency_hz: float) -> float:
-    """Return the phase of the model's section after the drive's rising edge, as a fraction of the period.
+    """Return the phase of the model's stroboscopic section after the drive's rising edge, as a fraction of the period.
 
     Parameters
     ----------

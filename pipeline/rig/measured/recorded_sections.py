@@ -1,4 +1,4 @@
-"""Compute sections of a recording: states and rates at the times when the drive rises.
+"""Compute stroboscopic section points of a recording: states and rates at the rising edges of the drive.
 
 A recording has noisy angles, and its samples are not synchronous with the drive. A polynomial is fitted on
 either side of each edge, with the continuous quantities in common. When the torque jumps, an angle and its
@@ -32,7 +32,7 @@ _LEAST_SPARE = 3
 
 @dataclass(frozen=True)
 class Channel:
-    """A measured state, and the state that its slope gives if that is not measured.
+    """Measured state of a recording, with the rate that its slope gives if that is not measured itself.
 
     Attributes
     ----------
@@ -53,7 +53,7 @@ class Channel:
 
 
 def channels_of(recording: xr.Dataset, model: Model) -> list[Channel]:
-    """Return the states that a recording holds, each with the rate that its slope gives.
+    """Return the measured states of a recording, each with the rate that its slope gives if that is not measured.
 
     Raises
     ------
@@ -78,12 +78,12 @@ def channels_of(recording: xr.Dataset, model: Model) -> list[Channel]:
 
 
 def name_of(recording: xr.Dataset) -> str:
-    """Return the file's name, for messages."""
+    """Return the file name of a recording, for messages."""
     return str(recording.attrs.get("file") or "the recording")
 
 
 def find_sections(recording: xr.Dataset, edges: Edges, *, window_s: float = WINDOW_S, order: int = ORDER) -> xr.Dataset:
-    """Return states at the rising edges, by local polynomials with a kink at the edge.
+    """Return the states at the rising edges of the drive, from local polynomials with a kink at the edge.
 
     Parameters
     ----------
@@ -157,7 +157,7 @@ def find_sections(recording: xr.Dataset, edges: Edges, *, window_s: float = WIND
 
 
 def _check(recording: xr.Dataset, window_s: float, order: int) -> None:
-    """Refuse a window that cannot hold the polynomial."""
+    """Raise `SpecError` if the window has too few samples for the polynomial, or the polynomial's order is below 2."""
     if order < 2:
         raise SpecError([f"order = {order}: must be at least 2, so that the curvature can differ."])
     step = float(np.median(np.diff(recording["time"].values)))
@@ -174,7 +174,9 @@ def _check(recording: xr.Dataset, window_s: float, order: int) -> None:
 def _fits(
     recording: xr.Dataset, edges: Edges, channels: list[Channel], window_s: float, order: int
 ) -> list[tuple[int, Floats, Floats, Floats, Floats]]:
-    """Return index and fit of each edge with enough samples; see `_fit`."""
+    """Fit the channels about each rising edge that has enough samples; return the edge's number and the results of
+    `_fit`.
+    """
     time = recording["time"].values
     piece = recording["piece"].values if "piece" in recording.coords else np.zeros(time.size, np.int64)
     data = np.stack([recording[c.name].values for c in channels], axis=1)
@@ -192,7 +194,7 @@ def _fits(
 
 
 def _nearest(instants: Floats, at: float, beyond: float) -> float:
-    """Return the distance of the nearest edge that is more than `beyond` away; infinite if there is none.
+    """Return the distance from time `at` to the nearest edge more than `beyond` away; infinite if there is none.
 
     An edge placed by a fitted line differs slightly from the detected one.
     """
@@ -205,7 +207,9 @@ def _nearest(instants: Floats, at: float, beyond: float) -> float:
 def _fit(
     t: Floats, data: Floats, channels: list[Channel], half: float, order: int
 ) -> tuple[Floats, Floats, Floats, Floats] | None:
-    """Return value and slope (channel, 2) at t = 0, spread per unit noise, variance and kink (channel,)."""
+    """Fit each channel about one edge; return value and slope (channel, 2) at t = 0, spread per unit noise, variance
+    and kink (channel,).
+    """
     if min((t < 0).sum(), (t >= 0).sum()) < order + _LEAST_SPARE or not np.isfinite(data).all():
         return None
     values, spread = np.empty((len(channels), 2)), np.empty((len(channels), 2))
@@ -227,7 +231,9 @@ def _fit(
 
 
 def _basis(x: Floats, order: int, smooth: bool) -> Floats:
-    """Return columns of the fit: value, slope, then terms of each side."""
+    """Return the design matrix of the polynomial fit: terms that both sides of the edge share, then those of each
+    side.
+    """
     left, right = np.where(x < 0, x, 0.0), np.where(x < 0, 0.0, x)
     first = 2 if smooth else 1
     shared = [np.ones_like(x), x] if smooth else [np.ones_like(x)]

@@ -1,4 +1,4 @@
-"""Estimate the periods of measured motions from noisy sections, with a confidence.
+"""Estimate the periods of measured motions from noisy section points, each with a confidence.
 
 A motion of period k repeats every k sections, up to noise and the rest of a transient. Second differences at
 lag k, x[n + 2k] - 2 x[n + k] + x[n], suppress a transient: if it decays by a factor m per k sections, they
@@ -56,7 +56,7 @@ class Regime:
 def find_period(
     points: Floats, noise: Floats, *, limit: float = LIMIT, max_period: int = MAX_PERIOD, seed: int = 0
 ) -> Regime:
-    """Estimate the period of a motion from its sections.
+    """Estimate the period of a motion from its noisy section points.
 
     Parameters
     ----------
@@ -96,14 +96,18 @@ def find_period(
 
 
 def _second(points: Floats, noise: Floats, k: int) -> Floats:
-    """Return mean squares over components of the second differences at lag k, in units of their noise."""
+    """Return the second differences of section points at lag k: their mean squares over the states, in units of their
+    noise.
+    """
     difference = points[2 * k :] - 2 * points[k:-k] + points[: -2 * k]
     variance = noise[2 * k :] ** 2 + 4 * noise[k:-k] ** 2 + noise[: -2 * k] ** 2
     return np.asarray((difference**2 / variance).mean(axis=1))
 
 
 def _closure(squares: Floats) -> Floats:
-    """Return root mean squares by lag, over all sections or the later half, whichever is less."""
+    """Return the rms of the second differences for each period, over all section points or the later half, whichever is
+    less.
+    """
     known = np.isfinite(squares)
     values = np.where(known, squares, 0.0)
     later = np.zeros(squares.shape[1], bool)
@@ -118,13 +122,13 @@ def _closure(squares: Floats) -> Floats:
 
 
 def _least(closure: Floats, limit: float) -> int:
-    """Return the row of the least period that closes; -1 if none does."""
+    """Return the row of the least period at which the motion closes, or -1 if there is none."""
     closed = np.flatnonzero(closure <= limit)
     return int(closed[0]) if closed.size else -1
 
 
 def _share(squares: Floats, found: int, limit: float, rng: np.random.Generator) -> float:
-    """Return the fraction of resamples that give the same row.
+    """Return the fraction of bootstrap resamples that give the same period.
 
     Sections are drawn in blocks as long as second differences overlap, for all lags together. The limit is
     drawn log-uniformly between half and twice the chosen one, since the noise is known only to about a factor

@@ -1,4 +1,4 @@
-"""Compare time series: a recording, and the model from the same state at a rising edge."""
+"""Compare time series: a recording, and a computed trajectory from the same state at a rising edge of the drive."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def series_of(
     order: int = ORDER,
     hysteresis: float | None = None,
 ) -> xr.Dataset:
-    """Return a part of a recording from a rising edge on, and the model's trajectory from the same state.
+    """Return part of a recording from a rising edge on, with the model's trajectory from the same state.
 
     Local polynomials give the model's initial state at the edge. The drive frequency is that of a line
     through the edges of the stretch of constant frequency.
@@ -103,7 +103,7 @@ def series_of(
 def _part(
     recording: xr.Dataset, edges: Edges, sections: xr.Dataset, start_s: float | None, n_periods: int
 ) -> tuple[int, int]:
-    """Return the first and the last edge of the part."""
+    """Return the first and the last rising edge of the part to compare, within one stretch of constant frequency."""
     begin = -math.inf if start_s is None else start_s
     known = [int(n) for n in sections["number"].values if edges.rising[int(n)] >= begin]
     for first in known:
@@ -121,14 +121,16 @@ def _part(
 
 
 def _first_timing(edges: Edges) -> float:
-    """Return a rough frequency of the drive [Hz]."""
+    """Return a rough drive frequency from the median distance of rising edges [Hz]."""
     if edges.rising.size < _LEAST:
         raise SpecError([f"drive: {edges.rising.size} rising edges; a series needs {_LEAST} of them."])
     return 1 / float(np.median(np.diff(edges.rising)))
 
 
 def _fitted(edges: Edges, first: int, last: int) -> np.ndarray:
-    """Return the part's edges, placed on the line through all edges of its stretch."""
+    """Return the times of edges `first` to `last` on a line fitted to all edges of their stretch of constant
+    frequency.
+    """
     a, b = next((a, b) for a, b in constant_spans(edges) if a <= first < b)
     rising = edges.rising[a : b + 1]
     n = np.arange(rising.size, dtype=np.float64)

@@ -31,7 +31,7 @@ _AROUND = 16
 
 @dataclass(frozen=True)
 class Stretch:
-    """Consecutive drive periods of one frequency.
+    """Consecutive drive periods with the same frequency: the edges at which section points are taken, and their timing.
 
     Attributes
     ----------
@@ -59,13 +59,13 @@ class Stretch:
 
     @property
     def shake_s(self) -> float:
-        """Jitter of the drive itself [s]; 0 if the error of measuring explains the scatter."""
+        """Jitter of the drive itself [s]; 0 if measurement error explains the scatter of the edges."""
         own = self.timing.jitter_s**2 - self.edges.error_s**2
         return math.sqrt(own) if self.timing.jitter_s > _TRUE_JITTER * self.edges.error_s else 0.0
 
 
 def cut(edges: Edges, *, transient: int = TRANSIENT, window: int | None = None) -> list[Stretch]:
-    """Cut a sweep into stretches of constant frequency, or a slow sweep into windows.
+    """Cut a stepped sweep into stretches of constant frequency, or a slow continuous sweep into windows.
 
     Parameters
     ----------
@@ -121,7 +121,9 @@ def cut(edges: Edges, *, transient: int = TRANSIENT, window: int | None = None) 
 
 
 def _is_swept(edges: Edges, spans: list[tuple[int, int]]) -> bool:
-    """Return whether the frequency changes all the time: short stretches, or most curved the same way."""
+    """Return whether the frequency changes all the time: stretches are short, or most are curved in the same
+    direction.
+    """
     if len(spans) > 3 and np.median([b - a for a, b in spans]) < LEAST:
         return True
     bends = np.array([_bend(edges.rising[a : b + 1], _noise(edges)) for a, b in spans if b - a >= LEAST])
@@ -137,7 +139,9 @@ def _bend(rising: Floats, noise: float) -> float:
 
 
 def constant_spans(edges: Edges) -> list[tuple[int, int]]:
-    """Return first and last rising edge of each stretch of constant frequency; neighbours share an edge."""
+    """Return the first and last rising edge of each stretch of constant frequency; neighbouring stretches share an
+    edge.
+    """
     t = edges.rising
     noise = _noise(edges)
     spans, first = [], 0
@@ -152,7 +156,9 @@ def constant_spans(edges: Edges) -> list[tuple[int, int]]:
 
 
 def _noise(edges: Edges) -> float:
-    """Estimate the standard deviation of an edge [s] from second differences, which steps rarely affect."""
+    """Estimate the standard deviation of an edge time [s] from second differences, which frequency steps hardly
+    affect.
+    """
     second = np.diff(edges.rising, 2)
     own = 1.4826 * float(np.median(np.abs(second))) / math.sqrt(6) if second.size else 0.0
     period = float(np.median(np.diff(edges.rising)))
@@ -160,7 +166,7 @@ def _noise(edges: Edges) -> float:
 
 
 def _reach(t: Floats, first: int, noise: float) -> int:
-    """Return the last edge that lies on the line through the edges before it."""
+    """Return the last edge up to which the drive frequency is constant, so that all edges lie on a line."""
     if first + 2 >= t.size:
         return int(t.size - 1)
     period = t[first + 1] - t[first]
@@ -186,7 +192,7 @@ def _reach(t: Floats, first: int, noise: float) -> int:
 
 
 def _placed(t: Floats, first: int, last: int) -> int:
-    """Return the edge of a step: where two lines, through the edges before and after, fit best."""
+    """Return the edge at which the frequency steps: there, two lines through the edges before and after fit best."""
     low, high = max(first, last - _AROUND), min(t.size - 1, last + _AROUND)
     choices = range(max(low + 2, first + 1), min(last + 2, high - 1))
     costs = {k: _misfit(t[low : k + 1]) + _misfit(t[k : high + 1]) for k in choices}
@@ -194,21 +200,21 @@ def _placed(t: Floats, first: int, last: int) -> int:
 
 
 def _misfit(t: Floats) -> float:
-    """Return the sum of squares about the line through times."""
+    """Return the sum of squared residuals of a line through edge times."""
     n = np.arange(t.size) - 0.5 * (t.size - 1)
     x = t - t.mean()
     return float(((x - n * (n @ x) / (n @ n)) ** 2).sum())
 
 
 def _constant(edges: Edges, first: int, last: int, transient: int) -> Stretch:
-    """Return the stretch between two edges, with sections after the transient."""
+    """Return the stretch of constant frequency between two edges, without its transient."""
     rising = edges.rising[first : last + 1]
     own = edges.between(rising[0], math.nextafter(rising[-1], math.inf))
     return _stretch(own, np.zeros(rising.size), transient)
 
 
 def _windows(edges: Edges, window: int) -> list[Stretch]:
-    """Return windows of a slow sweep; the frequency is that of their middle, with curvature removed."""
+    """Cut a slow sweep into windows; the frequency of a window is that at its middle."""
     found = []
     for first in range(0, edges.rising.size - window, window):
         rising = edges.rising[first : first + window + 1]
@@ -230,7 +236,9 @@ def _windows(edges: Edges, window: int) -> list[Stretch]:
 
 
 def _stretch(own: Edges, curve: Floats, transient: int) -> Stretch:
-    """Return a stretch from its edges, with the times `curve` [s] subtracted for the fit."""
+    """Return a stretch with its timing; the times `curve` [s] are subtracted from the edges before the line is
+    fitted.
+    """
     rising = own.rising
     # a falling edge is shifted by interpolation between its rising ones
     falling = own.falling - np.interp(own.falling, rising, curve)
@@ -246,8 +254,8 @@ def _stretch(own: Edges, curve: Floats, transient: int) -> Stretch:
 
 
 def _line(rising: Floats) -> Floats:
-    """Fit edge times by a line over the edge number, and return the times on it; a missing edge does not renumber
-    later ones.
+    """Return the times on a line fitted to edge times over the edge number; a missing edge does not shift later
+    numbers.
     """
     gaps = np.diff(rising)
     n = np.concatenate([[0.0], np.cumsum(np.maximum(np.rint(gaps / np.median(gaps)), 1.0))])
@@ -257,7 +265,9 @@ def _line(rising: Floats) -> Floats:
 
 
 def _directed(stretches: list[Stretch]) -> list[Stretch]:
-    """Set the direction of each stretch from the change of frequency; the first follows the second."""
+    """Set the sweep direction of each stretch from the change of frequency; the first stretch takes that of the
+    second.
+    """
     f = np.array([s.timing.frequency_hz for s in stretches])
     error = np.array([s.timing.frequency_error_hz for s in stretches])
     signs = [0] * len(stretches)

@@ -1,4 +1,4 @@
-"""Make tables of measured diagrams: a row per step, and a row per window edge."""
+"""Make tables of a measured diagram: one row per frequency step, and one per window edge."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ FAR = 5.0
 
 
 def steps_table(measured: xr.Dataset) -> Table:
-    """Return the table of steps: frequency, jitter, duty cycle, period, confidence, and any comparison."""
+    """Return a table of the frequency steps: frequency, jitter, duty cycle, period, confidence, and any comparison."""
     rows = [_row(measured.isel(step=i)) for i in range(measured.sizes["step"])]
     return Table(rows, [counted(len(rows), "step"), *aligned([_words(r) for r in rows])])
 
@@ -35,7 +35,7 @@ def _row(one: xr.Dataset) -> Row:
 
 
 def words_of(measured: xr.Dataset) -> tuple[str, ...]:
-    """Return the labels of the model's classifier; empty without one."""
+    """Return the labels of the model's motion classifier; empty if it has none."""
     classifier = model_of(measured).classifier
     return classifier.words if classifier is not None else ()
 
@@ -67,7 +67,7 @@ def _words(row: Row) -> Words:
 
 
 def edges_table(compared: xr.Dataset) -> Table:
-    """Return the table of window edges on the rig and in the model."""
+    """Return a table of the frequencies at which regimes end on the rig and in the model."""
     words = words_of(compared)
     rows: list[Row] = []
     for k in range(compared.sizes.get("edge", 0)):
@@ -99,7 +99,7 @@ def _between(row: Row, name: str) -> str:
 
 
 def summary_lines(compared: xr.Dataset) -> list[str]:
-    """Return a summary of the comparison in a few lines."""
+    """Return a printed summary of the comparison of a measured with a computed diagram."""
     covered = compared["winner"].values >= 0
     sure = covered & (compared["confidence"].values >= CONFIDENT)
     d = compared["distance_in_noise"].values[covered]

@@ -1,4 +1,6 @@
-"""Find windows of a sweep, and compare where their regimes end on the rig and in the model."""
+"""Find windows (frequency ranges with one regime) of a sweep, and compare where they end on the rig and in the
+model.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,7 @@ Regime = tuple[int, int]
 
 @dataclass(frozen=True)
 class Window:
-    """Successive frequency steps of one recording, swept in one direction, with the same regime."""
+    """Window: successive frequency steps of one recording, swept in one direction, with the same regime."""
 
     regime: Regime
     steps: tuple[int, ...]
@@ -32,7 +34,7 @@ class Window:
 
 @dataclass(frozen=True)
 class WindowEdge:
-    """The end of a window on the rig, and of the same regime in the model.
+    """End of a measured window, with the frequency at which the same regime ends in the model.
 
     Attributes
     ----------
@@ -70,19 +72,21 @@ class WindowEdge:
 
 
 def regime_of(measured: xr.Dataset, step: int) -> Regime:
-    """Return period and side of a step."""
+    """Return the regime of a frequency step: period and class of motion."""
     side = int(measured["side"].values[step]) if "side" in measured else 0
     return int(measured["orbit_period"].values[step]), side
 
 
 def words_for(regime: Regime, words: tuple[str, ...]) -> str:
-    """Return a regime in words."""
+    """Return a regime (period and class of motion) in words."""
     period = f"period {regime[0]}" if regime[0] else "unclosed"
     return f"{period}, {words[regime[1]]}" if regime[1] and words else period
 
 
 def windows_of(measured: xr.Dataset, *, confident: float = CONFIDENT) -> list[Window]:
-    """Return the windows of all recordings; steps with an uncertain period are skipped."""
+    """Return the windows (runs of steps with the same regime) of all recordings; steps with an uncertain period are
+    skipped.
+    """
     keys = list(zip(measured["recording"].values.tolist(), measured["direction"].values.tolist(), strict=True))
     sure = [i for i in range(len(keys)) if measured["confidence"].values[i] >= confident]
     labelled = itertools.groupby(sure, key=lambda i: (keys[i], regime_of(measured, i)))
@@ -92,7 +96,7 @@ def windows_of(measured: xr.Dataset, *, confident: float = CONFIDENT) -> list[Wi
 def window_edges(
     measured: xr.Dataset, winners: np.ndarray, computed: Computed, *, confident: float = CONFIDENT
 ) -> list[WindowEdge]:
-    """Return the edges of the measured windows, each with the end of the same regime in the model.
+    """Return the ends of the measured windows, each with the frequency at which the same regime ends in the model.
 
     Parameters
     ----------
@@ -133,7 +137,9 @@ def window_edges(
 def _computed_end(
     window: Window, measured: xr.Dataset, winners: np.ndarray, computed: Computed
 ) -> tuple[float, float, str]:
-    """Return where a measured window's regime ends in the model, in the direction of the sweep."""
+    """Return the frequency at which the regime of a measured window ends in the model, in the direction of the
+    sweep.
+    """
     f = measured["frequency"].values
     with_side = "side" in measured
     chosen = {}
@@ -152,7 +158,9 @@ def _computed_end(
 
 
 def _walk(place: int, sign: int, computed: Computed, holds: Callable[[int], bool]) -> tuple[float, float, str]:
-    """Follow the run's axis while a condition holds; return where it ends, half a step, and a note."""
+    """Follow the computed frequencies from index `place` while a condition holds; return the end [Hz], half a step, and
+    a note.
+    """
     f = computed.frequencies
     while 0 <= place + sign < f.size:
         if not holds(place + sign):

@@ -1,4 +1,4 @@
-"""Write a comparison as files: figures, tables, data."""
+"""Write the comparison of a measured with a computed diagram to files: figures, tables, data."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def write_comparison(
     degrees: bool = False,
     frame: Frame = WIDE,
 ) -> list[Path]:
-    """Write the figures, the tables and the numbers of a comparison.
+    """Write the figures and tables of the comparison of a measured with a computed diagram; return their paths.
 
     Parameters
     ----------

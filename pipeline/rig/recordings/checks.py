@@ -1,4 +1,4 @@
-"""Check the readings of one channel, in the file's own units."""
+"""Check the readings of one channel for faults, in the file's own units."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ LEAP_AROUND = 9
 
 
 class Signal:
-    """A channel on the recording's clock.
+    """Readings of one channel, with the recording's times and pieces.
 
     Parameters
     ----------
@@ -44,13 +44,13 @@ class Signal:
         self.name, self.raw, self.time, self.piece = name, raw, time, piece
 
     def found(self, kind: str, start: int, end: int, severity: str, text: str) -> Finding:
-        """Return a finding on the samples from `start` to before `end`."""
+        """Return a finding about the samples from index `start` up to, not including, `end`."""
         first, last = float(self.time[start]), float(self.time[end - 1])
         return Finding(kind, self.name, first, last, severity, text)  # type: ignore[arg-type]
 
 
 def missing(signal: Signal) -> list[Finding]:
-    """Find samples that are not numbers."""
+    """Report samples that are not numbers."""
     return [
         signal.found("missing", i, k, "warning", f"{k - i} samples are no numbers.")
         for i, k in runs(~np.isfinite(signal.raw), signal.piece)
@@ -58,7 +58,7 @@ def missing(signal: Signal) -> list[Finding]:
 
 
 def constant(signal: Signal, severity: str = "warning") -> list[Finding]:
-    """Return a finding if a channel never changes."""
+    """Report a channel whose readings never change."""
     known = signal.raw[np.isfinite(signal.raw)]
     if known.size and np.ptp(known) > 0.0:
         return []
@@ -67,7 +67,7 @@ def constant(signal: Signal, severity: str = "warning") -> list[Finding]:
 
 
 def saturated(signal: Signal, entry: ChannelMap) -> list[Finding]:
-    """Find samples at the ends of the sensor's range; without a range, peaks that look clipped.
+    """Find samples at the ends of the sensor's range, or, if the range is not stated, peaks that look clipped.
 
     Samples in a dead band at the end of the range are not saturated; `in_dead_band` finds them.
     """
@@ -92,7 +92,7 @@ def saturated(signal: Signal, entry: ChannelMap) -> list[Finding]:
 
 
 def _beside_wraps(signal: Signal, least: float) -> np.ndarray:
-    """Return the samples next to a jump of at least a given size."""
+    """Return a mask of the samples next to a jump of at least `least`."""
     jump = np.abs(np.diff(signal.raw)) > least
     beside = np.zeros(len(signal.raw), dtype=bool)
     beside[1:] |= jump
@@ -101,7 +101,7 @@ def _beside_wraps(signal: Signal, least: float) -> np.ndarray:
 
 
 def _cut_off(signal: Signal) -> list[Finding]:
-    """Find equal readings at the extremes that last longer than a turning point can.
+    """Find peaks that look clipped: equal extreme readings for longer than a turning point can last.
 
     Near a turning point with acceleration a, a reading of grain q stays constant for about 2*sqrt(2*q/a). The
     slope before it, times half that time, is a few grains. If it is many grains, the peak is clipped.
@@ -139,7 +139,7 @@ def _within(raw: np.ndarray, band: tuple[float, float]) -> np.ndarray:
 
 
 def in_dead_band(signal: Signal, entry: ChannelMap) -> tuple[np.ndarray, list[Finding]]:
-    """Return the samples in the dead band, and the findings."""
+    """Return a mask of the samples in the sensor's dead band, and findings that report them."""
     if entry.dead_band is None:
         return np.zeros(len(signal.raw), dtype=bool), []
     mask = _within(signal.raw, entry.dead_band)
@@ -157,7 +157,7 @@ def in_dead_band(signal: Signal, entry: ChannelMap) -> tuple[np.ndarray, list[Fi
 
 
 def unwrapped(signal: Signal, angle: np.ndarray, wraps: bool) -> tuple[np.ndarray, list[Finding]]:
-    """Unwrap an angle within its pieces if the mapping asks for it; otherwise find jumps of a turn.
+    """Unwrap an angle within each piece if the mapping says that it wraps; otherwise report jumps by a full turn.
 
     Parameters
     ----------
@@ -198,7 +198,7 @@ def unwrapped(signal: Signal, angle: np.ndarray, wraps: bool) -> tuple[np.ndarra
 
 
 def leaps(signal: Signal, angle: np.ndarray) -> list[Finding]:
-    """Find steps of an angle that are neither a motion nor a wrap.
+    """Find steps of an angle between samples that are too large for a motion and too small for a wrap by a full turn.
 
     An example is a wrap whose flank was sampled: it looks like a motion, and a turn is lost.
 

@@ -1,4 +1,4 @@
-"""Put the channels of a file on one uniform clock, in pieces between gaps."""
+"""Give all channels of a file the same uniform sample times, in pieces between gaps."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ UNEVEN = 0.5
 
 @dataclass(eq=False)
 class Clock:
-    """The times of a recording's samples, and the samples that are used of each channel.
+    """Uniform sample times of a recording, and the range of samples that is used of each channel.
 
     Attributes
     ----------
@@ -67,7 +67,7 @@ def clock_of(
     numbers: np.ndarray | None = None,
     apart: bool = False,
 ) -> Clock:
-    """Put the channels of all stretches on one clock.
+    """Give the channels of all stretches of a file the same uniform sample times.
 
     Parameters
     ----------
@@ -118,7 +118,7 @@ def clock_of(
 def _changes(
     numbers: np.ndarray, stretches: Sequence[Mapping[str, Channel]], taken: Sequence[Mapping[str, tuple[int, int]]]
 ) -> np.ndarray:
-    """Return the samples at which the file's piece number changes."""
+    """Return a mask of the samples at which the piece number in the file changes."""
     parts, first = [], 0
     for channels, where in zip(stretches, taken, strict=True):
         name, channel = next(iter(channels.items()))
@@ -130,7 +130,7 @@ def _changes(
 
 
 def _stamps(channel: Channel, stated: float | None) -> np.ndarray:
-    """Return the times of a channel's samples [s]; NaN if the file states no start."""
+    """Return the sample times of a channel [s]; they are NaN if the file does not state the start."""
     if channel.time is not None and stated is None:
         return channel.time
     step = channel.step_s if stated is None else stated
@@ -138,7 +138,7 @@ def _stamps(channel: Channel, stated: float | None) -> np.ndarray:
 
 
 def step_of(channel: Channel) -> float:
-    """Return the sampling interval of one channel [s]: from its time stamps, or as stated."""
+    """Return the sampling interval of one channel [s], from its time stamps or as the file states it."""
     if channel.time is None or len(channel.time) < 2:
         return channel.step_s
     steps = np.diff(channel.time)
@@ -182,7 +182,7 @@ def _refuse_mixed(steps: Mapping[str, float], source: str) -> None:
 
 
 def _rate_findings(stretches: Sequence[Mapping[str, Channel]], stated: float | None) -> list[Finding]:
-    """Return findings if the file states another rate than the mapping."""
+    """Report channels whose sampling rate in the file differs from that of the mapping."""
     if stated is None:
         return []
     findings = []
@@ -201,7 +201,9 @@ def _rate_findings(stretches: Sequence[Mapping[str, Channel]], stated: float | N
 def _aligned(
     channels: Mapping[str, Channel], step: float, source: str
 ) -> tuple[dict[str, tuple[int, int]], list[Finding]]:
-    """Align the channels of a stretch: from the latest start to the earliest end."""
+    """Return the range of samples of each channel from the latest start to the earliest end in a stretch, and
+    findings.
+    """
     starts = {n: float(c.time[0]) if c.time is not None and len(c) else c.start_s for n, c in channels.items()}
     known = [s for s in starts.values() if math.isfinite(s)]
     first = max(known, default=0.0)
@@ -270,7 +272,7 @@ def _length_findings(lengths: Mapping[str, int], n_common: int, step: float) -> 
 
 
 def _checked_stamps(stamps: list[np.ndarray], step: float, source: str) -> list[np.ndarray]:
-    """Return time stamps that are numbers and rise; count from 0 if the file states no start."""
+    """Check that time stamps are finite and do not decrease; count from 0 if the file states no start."""
     if all(np.isnan(s).all() for s in stamps):
         return [step * np.arange(len(s)) for s in stamps]
     for s in stamps:
@@ -284,7 +286,7 @@ def _checked_stamps(stamps: list[np.ndarray], step: float, source: str) -> list[
 def _cut(
     time: np.ndarray, forced: np.ndarray, step: float, stated: float | None
 ) -> tuple[np.ndarray, np.ndarray, float, list[Finding]]:
-    """Cut the samples at gaps and at given places, and make time even within each piece."""
+    """Divide the samples into pieces at gaps and at forced cuts, and make the times even within each piece."""
     is_gap = _missing(time, step) > 0
     piece = np.cumsum(is_gap | np.concatenate([[False], forced[1:]])).astype(np.int64)
     even, own_step, residual = _even(time, piece, step, stated)
@@ -303,7 +305,7 @@ def _cut(
 
 
 def _missing(time: np.ndarray, step: float) -> np.ndarray:
-    """Return the number of samples that are missing before each sample.
+    """Return the number of samples missing before each sample, from its time stamp.
 
     With jitter, a late stamp is no gap if the stamps after it are in time again, by their mean phase.
     """
@@ -323,7 +325,7 @@ def _missing(time: np.ndarray, step: float) -> np.ndarray:
 
 
 def _skipped(time: np.ndarray, step: float, late: np.ndarray, is_sure: np.ndarray) -> np.ndarray:
-    """Return the number of samples missing at each late stamp, from the delay of the stamps behind it.
+    """Return the number of samples missing before each late time stamp, from the delay of the stamps after it.
 
     Stamps beyond another gap are not used. Of neighbouring doubtful stamps the one with the largest shift
     counts.
@@ -358,7 +360,7 @@ def _refuse_backwards(stamps: list[np.ndarray], source: str) -> None:
 
 
 def _one_after_another(stamps: list[np.ndarray], step: float, findings: list[Finding]) -> tuple[list[np.ndarray], bool]:
-    """Shift stretches whose clock restarts behind the stretch before; return whether any was shifted."""
+    """Shift stretches whose time restarts so that they follow the stretch before; return whether any was shifted."""
     placed = [stamps[0]]
     moved = 0
     for s in stamps[1:]:
@@ -384,7 +386,9 @@ def _one_after_another(stamps: list[np.ndarray], step: float, findings: list[Fin
 def _even(
     time: np.ndarray, piece: np.ndarray, step: float, stated: float | None
 ) -> tuple[np.ndarray, float, np.ndarray]:
-    """Fit lines of one slope through the stamps of all pieces; return lines, slope and residuals."""
+    """Fit one line per piece, all of the same slope, to the time stamps; return times on the lines, slope and
+    residuals.
+    """
     count = np.bincount(piece)
     first = np.concatenate([[0], np.cumsum(count)[:-1]])
     index = np.arange(len(time)) - first[piece]
@@ -404,7 +408,7 @@ def _even(
 
 
 def _jitter_findings(time: np.ndarray, residual: np.ndarray, step: float) -> list[Finding]:
-    """Return a finding on stamps that deviate from even steps, with a warning if samples are misplaced."""
+    """Report time stamps that deviate from even steps; as a warning if they deviate by half a step or more."""
     worst, spread = float(np.abs(residual).max()), float(residual.std())
     if worst <= EVEN * step:
         return []

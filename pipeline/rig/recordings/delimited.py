@@ -1,4 +1,4 @@
-"""Read CSV files; delimiter, header and decimal comma are stated or detected."""
+"""Read CSV files; delimiter, header and decimal sign are stated or detected."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _BRACKETS = re.compile(r"[\[(]([^\])]*)[\])]\s*$")
 
 @dataclass(frozen=True)
 class _Form:
-    """The delimiter, decimal sign, header and columns of a CSV text.
+    """Form of a CSV text: delimiter, decimal sign, number of header rows, and columns.
 
     Attributes
     ----------
@@ -98,7 +98,7 @@ def read_csv(path: Path, stated: CsvMap) -> Raw:
 
 
 def _columns(body: list[str], form: _Form) -> dict[int, np.ndarray]:
-    """Return columns of numbers, and of dates or times of day [s since the first]."""
+    """Return the numeric columns, and the columns of dates or times of day [s since the first]."""
     numbers = [j for j in range(form.n_columns) if j not in form.texts]
     values = table(body, numbers, form.delimiter, form.decimal)
     found = {j: values[:, k] for k, j in enumerate(numbers)}
@@ -112,7 +112,7 @@ def _columns(body: list[str], form: _Form) -> dict[int, np.ndarray]:
 
 
 def _form(path: Path, rows: list[str], stated: CsvMap) -> _Form:
-    """Detect the form in which the rows are numbers."""
+    """Detect delimiter, decimal sign and header of a CSV text."""
     delimiters = (stated.delimiter,) if stated.delimiter else DELIMITERS
     decimals = (stated.decimal,) if stated.decimal else (".", ",")
     found = []
@@ -146,7 +146,9 @@ def _form(path: Path, rows: list[str], stated: CsvMap) -> _Form:
 
 
 def _try(rows: list[str], delimiter: str, decimal: str, header: bool | None) -> _Form | None:
-    """Return the form with a given delimiter and decimal sign; None if it does not fit."""
+    """Try to read the rows with one delimiter and decimal sign; return the form of the text, or None if they do not
+    fit.
+    """
     sample = rows[:LOOKED_AT]
     parsed = [[number(part, decimal) for part in split(row, delimiter)] for row in sample]
     late = parsed[len(parsed) // 2 :]
@@ -175,7 +177,7 @@ def _try(rows: list[str], delimiter: str, decimal: str, header: bool | None) -> 
 
 
 def _names(head: list[list[str]], n_columns: int) -> tuple[list[str], list[str]]:
-    """Return names and units of the columns from the rows before the numbers."""
+    """Return names and units of the columns from the header rows."""
     whole = [[part.strip().strip('"').strip() for part in row] for row in head if len(row) == n_columns]
     if not whole:
         return [str(j + 1) for j in range(n_columns)], [""] * n_columns

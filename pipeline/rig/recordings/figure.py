@@ -1,4 +1,4 @@
-"""Draw a recording: its quantities over time, with the findings marked."""
+"""Draw the measured quantities of a recording over time, and mark the faults found in it."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ LEAST_MARK = 0.003
 
 
 def plot_recording(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.DataFigure:
-    """Draw the measured quantities of a recording over time, with the findings marked.
+    """Draw the measured quantities of a recording over time, and mark the faults found in it.
 
     Parameters
     ----------
@@ -114,7 +114,9 @@ def _draw(ax: Axes, ds: xr.Dataset, name: str, span: tuple[float, float], colour
 
 
 def _envelope(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return minimum and maximum of neighbouring samples, in their order; NaN if none is known."""
+    """Return the minimum and maximum of each block of samples, in the order of time; NaN if a block has no known
+    sample.
+    """
     n = len(time) // (MOST_DOTS // 2) + 1
     whole = len(time) // n * n
     blocks = values[:whole].reshape(-1, n)
@@ -129,7 +131,7 @@ def _envelope(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def _mark(axes: Sequence[Axes], rows: Sequence[Sequence[str]], ds: xr.Dataset, span: tuple[float, float]) -> list[str]:
-    """Shade the findings and draw the ends of pieces; return the kinds that are marked."""
+    """Shade the times of the faults and draw the ends of pieces; return the kinds of faults that are marked."""
     least = LEAST_MARK * (span[1] - span[0])
     kinds: dict[str, None] = {}
     for f in findings_of(ds):
@@ -157,7 +159,7 @@ def _mark_handle(kind: str) -> Any:
 
 
 def _line_handles(ds: xr.Dataset, rows: Sequence[Sequence[str]]) -> list[Any]:
-    """Return the legend of panels with more than one line; colours are the same in all panels."""
+    """Return the legend entries of panels with more than one line."""
     return [
         Line2D([], [], color=colour, linewidth=1.2, label=_symbol(ds, name))
         for names in rows
@@ -167,7 +169,7 @@ def _line_handles(ds: xr.Dataset, rows: Sequence[Sequence[str]]) -> list[Any]:
 
 
 def _caption(ds: xr.Dataset) -> str:
-    """Return the caption: file, rate, pieces, and findings without a place in time."""
+    """Return the caption of the figure: file, sampling rate, number of pieces, and faults without a known time."""
     n_pieces = len(np.unique(ds["piece"].values))
     parts = [
         Path(str(ds.attrs.get("file", ""))).name,

@@ -1,4 +1,4 @@
-"""Define the findings of a recording: faults and corrections that are always reported."""
+"""Define findings: reports of faults in a recording and of corrections made to it."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ SEVERITIES: tuple[Severity, ...] = ("note", "warning", "error")
 
 @dataclass(frozen=True)
 class Finding:
-    """A fault of a recording, or a correction that was made.
+    """Finding: a fault in a recording, or a correction made to it, with its time, severity and description.
 
     Attributes
     ----------
@@ -63,7 +63,7 @@ KINDS = {
 
 
 def findings_of(ds: xr.Dataset) -> list[Finding]:
-    """Return the findings of a recording, from its attribute ``findings``."""
+    """Return the findings stored in a recording's attribute ``findings``."""
     rows = json.loads(ds.attrs.get("findings", "[]"))
     return [
         Finding(**{**row, **{k: math.nan if row[k] is None else row[k] for k in ("start_s", "end_s")}}) for row in rows
@@ -77,7 +77,7 @@ def to_json(findings: Iterable[Finding]) -> str:
 
 
 def summary(findings: Iterable[Finding]) -> list[str]:
-    """Return lines about findings, the most severe first; each kind and channel has one line.
+    """Return findings as printed lines, the most severe first; findings of the same kind and channel share one line.
 
     Returns
     -------
@@ -91,7 +91,9 @@ def summary(findings: Iterable[Finding]) -> list[str]:
 
 
 def _group_line(severity: str, kind: str, channel: str, own: Sequence[Finding]) -> str:
-    """Return the line of a group: number, place and text of the first finding."""
+    """Return one printed line for findings of the same kind and channel: their number, and time and text of the
+    first.
+    """
     first = own[0]
     where = "" if math.isnan(first.start_s) else f" at {first.start_s:.6g} s"
     often = f" ({len(own)} times, first{where})" if len(own) > 1 else where
@@ -99,7 +101,7 @@ def _group_line(severity: str, kind: str, channel: str, own: Sequence[Finding]) 
 
 
 def runs(mask: np.ndarray, piece: np.ndarray | None = None) -> np.ndarray:
-    """Return the stretches of true entries.
+    """Return the first and last-plus-one index of each stretch of true entries in a mask.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Select the reader of a recording by its format or suffix."""
+"""Choose the reader for a recording by the stated format or the file's suffix."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ SUFFIXES = {
 
 
 def format_of(path: Path, stated: str | None = None) -> str:
-    """Return the name of a file's format.
+    """Return the format of a file: the stated one, otherwise that of its suffix.
 
     Raises
     ------
@@ -42,7 +42,7 @@ def format_of(path: Path, stated: str | None = None) -> str:
 
 
 def read_raw(path: Path, stated: str | None = None, csv: CsvMap | None = None) -> Raw:
-    """Read all channels of a file.
+    """Read all channels of a recording's file with the reader for its format.
 
     Parameters
     ----------

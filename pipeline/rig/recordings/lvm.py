@@ -1,4 +1,4 @@
-"""Read LVM files, LabVIEW's text format: a header of the file, and a header of each segment.
+"""Read LVM files, the text format of LabVIEW: one file header, then segments that each have a header.
 
 Written from National Instruments' description "Specification for the LabVIEW Measurement File (.lvm)".
 No text in a file is evaluated. Fields that are not numbers are NaN.
@@ -27,7 +27,7 @@ SEPARATORS = {"Tab": "\t", "Comma": ",", "Space": " ", "Semicolon": ";"}
 
 @dataclass
 class _Style:
-    """Settings from the file's header that hold for all segments."""
+    """Settings of an LVM file for all its segments: field separator, decimal sign, X columns."""
 
     separator: str
     decimal: str
@@ -36,7 +36,7 @@ class _Style:
 
 @dataclass
 class _Segment:
-    """Keys of a segment's header, the names of its columns, and its lines."""
+    """Segment of an LVM file: header keys, column names, and lines of data."""
 
     keys: dict[str, list[str]]
     names: list[str]
@@ -45,7 +45,7 @@ class _Segment:
 
 
 def read_lvm(path: Path) -> Raw:
-    """Read all channels of all segments.
+    """Read all channels of all segments of an LVM file.
 
     Segments with successive times are one recording. The times come from their headers (``Date``, ``Time``,
     ``X0``, ``Delta_X``) and the X columns. Comments are left out.
@@ -70,7 +70,7 @@ def read_lvm(path: Path) -> Raw:
 
 
 def _file_header(path: Path, lines: list[str]) -> tuple[_Style, int]:
-    """Read the file's header; return its settings and the next line."""
+    """Read the file header; return its settings and the index of the line after it."""
     keys: dict[str, str] = {}
     for i, line in enumerate(lines[1:], 1):
         if line.strip().startswith(END):
@@ -113,7 +113,7 @@ def _segments(path: Path, lines: list[str], at: int, style: _Style) -> list[_Seg
 
 
 def _skip(lines: list[str], i: int) -> int:
-    """Return the index of the line after empty lines and special blocks."""
+    """Return the index of the next line after empty lines and special blocks."""
     while i < len(lines):
         if lines[i].startswith(SPECIAL):
             while i < len(lines) and not lines[i].startswith(END_SPECIAL):
@@ -125,7 +125,7 @@ def _skip(lines: list[str], i: int) -> int:
 
 
 def _columns(segment: _Segment) -> dict[int, int | None]:
-    """Return the columns of channels, each with its X column if it has one."""
+    """Return the index of each channel column with that of its X column, or None without one."""
     last_x: int | None = None
     found: dict[int, int | None] = {}
     for j, name in enumerate(segment.names):
@@ -137,7 +137,7 @@ def _columns(segment: _Segment) -> dict[int, int | None]:
 
 
 def _key(segment: _Segment, name: str, column: int) -> str:
-    """Return a header key's value for a column; the key's label stands in the first X column."""
+    """Return the value of a header key for one channel column."""
     values = segment.keys.get(name, [])
     place = column - 1 if segment.names[0] == X_NAME else column
     return values[place] if 0 <= place < len(values) else ""
@@ -149,7 +149,7 @@ def _number(segment: _Segment, name: str, column: int, style: _Style) -> float:
 
 
 def _instants(segment: _Segment, style: _Style) -> dict[int, float]:
-    """Return the segment's start by column [s since year 1], if it is stated."""
+    """Return the start time of each channel column [s since year 1], where the segment's header states it."""
     found = {}
     for j in _columns(segment):
         try:
@@ -189,7 +189,7 @@ def _channels(segment: _Segment, style: _Style, zero: float) -> dict[str, Channe
 
 
 def _truncations(segment: _Segment, channels: dict[str, Channel], style: _Style) -> list[Finding]:
-    """Return findings on segments with fewer samples than their header states."""
+    """Report segments that have fewer samples than their header states."""
     findings = []
     for j, channel in zip(_columns(segment), channels.values(), strict=True):
         stated = _number(segment, "Samples", j, style)

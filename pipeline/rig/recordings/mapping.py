@@ -1,4 +1,4 @@
-"""Define the mapping of a recording: the quantity and the scaling of each channel."""
+"""Define the mapping of a recording: which channel holds which quantity, and how it is converted to SI units."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ Positive = Annotated[float, Field(gt=0)]
 
 
 class Scaled(Table):
-    """A channel and its conversion to SI units: ``sign*scale*unit*(raw - zero) + offset``."""
+    """Channel with its conversion to SI units: ``sign*scale*unit*(raw - zero) + offset``."""
 
     channel: Name = Field(description="Name in the file, or the number of its column, from 1.")
     unit: str = Field(default="", description="Unit in the file; by default the quantity's.")
@@ -41,7 +41,7 @@ class Scaled(Table):
 
 
 class ChannelMap(Scaled):
-    """A table ``[channels.NAME]``: a measured quantity, under the name of the model's state."""
+    """Table ``[channels.NAME]``: channel of a measured quantity; NAME is a quantity of the model, such as a state."""
 
     range: Pair | None = Field(default=None, description="Ends of the sensor's range [the file's unit].")
     wraps: bool = Field(default=False, description="Whether the reading jumps back once a turn.")
@@ -62,26 +62,26 @@ class ChannelMap(Scaled):
 
 
 class DriveMap(Scaled):
-    """The table ``[drive]``: a torque, or a signal that switches with it."""
+    """Table ``[drive]``: channel of the drive torque, or of a signal that switches with the drive."""
 
     kind: Literal["torque", "signal"] = Field(description="A torque [N m], or the level of a signal.")
 
 
 class TimeMap(Table):
-    """The key ``time``: the channel with a time stamp for each sample."""
+    """Key ``time``: channel with the time stamp of each sample."""
 
     channel: Name = Field(description="Name in the file, or the number of its column, from 1.")
     unit: str = Field(default="s", description="Unit in the file.")
 
 
 class PieceMap(Table):
-    """The key ``piece``: a channel that changes where a new piece begins."""
+    """Key ``piece``: channel whose value changes where a new piece of the recording begins."""
 
     channel: Name = Field(description="Name in the file, or the number of its column, from 1.")
 
 
 class CsvMap(Table):
-    """The table ``[csv]``: the form of a text, where it should not be detected."""
+    """Table ``[csv]``: delimiter, decimal sign and header of a CSV file, where they should not be detected."""
 
     delimiter: Annotated[str, Field(min_length=1, max_length=1)] | None = Field(
         default=None, description="Separator of fields."
@@ -92,7 +92,7 @@ class CsvMap(Table):
 
 
 class Mapping(Table):
-    """The meaning of a recording's channels.
+    """Mapping of a recording: the model's quantity, unit and scale of each channel, as in its TOML file.
 
     The keys are those of the TOML file; `load_mapping` reads and checks one.
     """
@@ -122,7 +122,7 @@ class Mapping(Table):
 
     @property
     def drive_map(self) -> DriveMap | None:
-        """Mapping of the drive's channel; None if no drive was recorded."""
+        """Mapping of the drive's channel; None if the recording has none."""
         return None if isinstance(self.drive, str) else self.drive
 
     def unit_of(self, name: str) -> str:
@@ -132,13 +132,13 @@ class Mapping(Table):
         return _units(self.system)[name]
 
     def factor_of(self, name: str) -> float:
-        """Return the factor from the file's numbers to SI units, with its sign."""
+        """Return the factor from the numbers of a quantity in the file to SI units, with its sign."""
         entry: Scaled = self.drive_map if name == DRIVE and self.drive_map else self.channels[name]
         known = units.factor(entry.unit, self.unit_of(name))
         return entry.sign * (1.0 if entry.scale is None else entry.scale) * (1.0 if known is None else known)
 
     def toml(self) -> str:
-        """Return the text of a file that `load_mapping` reads as this mapping."""
+        """Return the mapping as the text of a TOML file."""
         plain = self.model_dump(mode="json", exclude_none=True, exclude_defaults=True)
         tables = {key: plain.pop(key) for key in ("csv", "channels", "drive") if isinstance(plain.get(key), dict)}
         model = model_toml(plain.pop("model")).rstrip("\n")
@@ -153,7 +153,7 @@ class Mapping(Table):
 
 
 def load_mapping(path: str | Path) -> Mapping:
-    """Read and check a mapping.
+    """Read and validate the mapping of a recording from a TOML file.
 
     Parameters
     ----------
@@ -169,7 +169,7 @@ def load_mapping(path: str | Path) -> Mapping:
 
 
 def parse_mapping(data: AnyMapping[str, Any] | str, source: str = "", folder: str | Path | None = KEPT) -> Mapping:
-    """Validate a mapping given as plain data, or as the text of a TOML file.
+    """Validate a mapping given as tables or as the text of a TOML file.
 
     Parameters
     ----------
@@ -205,7 +205,9 @@ def parse_mapping(data: AnyMapping[str, Any] | str, source: str = "", folder: st
 
 
 def _rest(rest: dict[str, Any], problems: list[str]) -> dict[str, Any]:
-    """Validate the other keys one by one, so that none hides another's problems."""
+    """Validate the keys of a mapping other than model, channels and drive, one by one so that all problems are
+    reported.
+    """
     found = {}
     for key, value in rest.items():
         if key not in Mapping.model_fields:
@@ -262,7 +264,7 @@ def _units(model: Model) -> dict[str, str]:
 
 
 def _quantity_problems(model: Model, channels: dict[str, ChannelMap], drive: DriveMap | None) -> list[str]:
-    """Return problems with names and units of quantities."""
+    """Return problems with the mapped channels: unknown quantities, unsuitable units or scales."""
     problems = []
     known = _units(model)
     for name, entry in channels.items():

@@ -1,4 +1,4 @@
-"""Read MATLAB files, version 7 and older: numeric arrays, cells, structures."""
+"""Read MATLAB files up to version 7: numeric arrays, cells, structures."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _PRIVATE = "__"
 
 
 def read_matlab(path: Path) -> Raw:
-    """Read all real arrays of a MATLAB file.
+    """Read all real arrays of a MATLAB file as channels.
 
     A variable of one row or column is the channel ``NAME``. The rows of others are ``NAME[0]``, ``NAME[1]``,
     ...; samples lie along the longer side. Fields of a structure are ``STRUCTURE.FIELD``. The elements of
@@ -61,7 +61,9 @@ def _refuse_hdf5(path: Path) -> None:
 
 
 def _gather(name: str, value: Any, leaves: dict[str, list[np.ndarray]]) -> None:
-    """Add the numeric arrays of a variable: one, or one for each of its cells."""
+    """Add the numeric arrays of a MATLAB variable to `leaves`: one array, or one per cell; fields of structures
+    separately.
+    """
     if not isinstance(value, np.ndarray):
         return
     if value.dtype.names:
@@ -83,7 +85,7 @@ def _gather(name: str, value: Any, leaves: dict[str, list[np.ndarray]]) -> None:
 
 
 def _cell(value: Any) -> Any:
-    """Return the content of a cell; cells of one element are opened."""
+    """Return the content of a MATLAB cell; cells of one element are unpacked repeatedly."""
     while isinstance(value, np.ndarray) and value.dtype == object and value.size == 1:
         value = value.flat[0]
     return value
@@ -98,7 +100,7 @@ def _plain(value: np.ndarray) -> np.ndarray:
 
 
 def _step(leaves: dict[str, list[np.ndarray]]) -> float:
-    """Return the sampling interval that the file states [s]; NaN if it does not."""
+    """Return the sampling interval from the variable ``dt`` of the file [s]; NaN without one."""
     for name, arrays in leaves.items():
         if name.rpartition(".")[2] == STEP and all(a.size == 1 for a in arrays):
             return float(arrays[0].flat[0])
@@ -122,7 +124,7 @@ def _stretches(path: Path, leaves: dict[str, list[np.ndarray]], step: float) -> 
 
 
 def _channels(name: str, array: np.ndarray, step: float) -> list[Channel]:
-    """Return the rows of an array along its longer side as channels."""
+    """Return an array as channels with their samples along its longer side."""
     rows = array if array.shape[1] >= array.shape[0] else array.T
     if rows.shape[1] == 1:
         return []

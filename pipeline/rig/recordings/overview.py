@@ -1,4 +1,4 @@
-"""Describe a file or a recording by tables."""
+"""Describe the channels of a file, or the quantities of a recording, by tables."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from pipeline.rig.recordings.raw import Raw
 
 
 def describe_file(raw: Raw) -> Table:
-    """Return a row for each channel of a file, before any mapping.
+    """Return a table with one row for each channel of a file, before any mapping to quantities.
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ def _channel_row(raw: Raw, name: str) -> dict[str, Any]:
 
 
 def describe_recording(ds: xr.Dataset) -> tuple[Table, Table]:
-    """Return a row for each quantity of a recording, and one for each finding.
+    """Return two tables of a recording: one row per measured quantity, and one row per finding.
 
     Parameters
     ----------

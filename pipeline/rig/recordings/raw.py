@@ -1,4 +1,4 @@
-"""Define the result of all readers: named channels, each with its own clock, before any mapping."""
+"""Define what all readers return: named channels as in the file, each with its own sample times."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from pipeline.rig.recordings.findings import Finding
 
 @dataclass(frozen=True, eq=False)
 class Channel:
-    """A channel in one stretch of a file.
+    """Channel of a file: readings with unit and sample times, in one stretch.
 
     Attributes
     ----------
@@ -46,7 +46,7 @@ class Channel:
 
 @dataclass(frozen=True, eq=False)
 class Raw:
-    """The content of a file before any mapping.
+    """Content of a recording's file before any mapping: its channels, in one or more stretches.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Read a file through its mapping into one labelled dataset, which the rest of the rig works with."""
+"""Read a recording's file through its mapping into a dataset with names and SI units."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ DIM = "sample"
 def read_recording(
     path: str | Path, mapping: Mapping | str | Path, *, window_s: tuple[float, float] | None = None
 ) -> xr.Dataset:
-    """Read a recording and check it.
+    """Read a recording through its mapping, and check its channels for faults.
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ def read_recording(
 
 
 def recording_of(raw: Raw, mapping: Mapping, *, window_s: tuple[float, float] | None = None) -> xr.Dataset:
-    """Return the recording from a file that was already read; see `read_recording`.
+    """Convert a file that was already read into a recording; see `read_recording`.
 
     Parameters
     ----------
@@ -101,7 +101,8 @@ def recording_of(raw: Raw, mapping: Mapping, *, window_s: tuple[float, float] | 
 
 
 def window(ds: xr.Dataset, window_s: tuple[float, float]) -> xr.Dataset:
-    """Return a part of a recording with its findings; times still count from the recording's first sample.
+    """Return the part of a recording in a time window, with its findings; times still count from the first sample of
+    the whole.
 
     Parameters
     ----------
@@ -136,7 +137,7 @@ def _entries(mapping: Mapping) -> dict[str, Scaled]:
 
 
 def _resolved(raw: Raw, mapping: Mapping) -> dict[str, str]:
-    """Return the name in the file of each mapped channel, and of ``time`` and ``piece``."""
+    """Return the name in the file of each mapped channel, and of the channels for ``time`` and ``piece``."""
     wanted: dict[str, Scaled | TimeMap | PieceMap] = dict(_entries(mapping))
     for name, axis in (("time", mapping.time), ("piece", mapping.piece)):
         if axis is not None:
@@ -168,7 +169,7 @@ def _name_of(channel: str | int, names: Sequence[str]) -> str | None:
 
 
 def _name_but_for_unit(entry: Scaled | TimeMap | PieceMap, names: Sequence[str]) -> str | None:
-    """Return the only name that equals the mapping's plus a unit in brackets, if the mapping has a unit."""
+    """Return the only channel in the file whose name is that of the mapping plus a unit in brackets; None otherwise."""
     near = _names_with_unit(entry.channel, names)
     if len(near) != 1 or isinstance(entry, PieceMap) or not entry.unit:
         return None
@@ -180,12 +181,14 @@ def _name_but_for_unit(entry: Scaled | TimeMap | PieceMap, names: Sequence[str])
 
 
 def _names_with_unit(channel: str | int, names: Sequence[str]) -> list[tuple[str, str]]:
-    """Return names that are a channel's and a unit in brackets, each with the unit."""
+    """Return the channel names that consist of the given name and a unit in brackets, each with the unit."""
     return units.names_with_unit(channel, names) if isinstance(channel, str) else []
 
 
 def _unit_hint(entry: Scaled | TimeMap | PieceMap, names: Sequence[str]) -> str:
-    """Return a hint to add the unit to the mapping, if the name lacks one."""
+    """Return a hint for an error message if a channel in the file differs from the mapping's only by a unit in
+    brackets.
+    """
     near = _names_with_unit(entry.channel, names)
     if len(near) != 1 or isinstance(entry, PieceMap):
         return ""
@@ -193,7 +196,7 @@ def _unit_hint(entry: Scaled | TimeMap | PieceMap, names: Sequence[str]) -> str:
 
 
 def _name_findings(mapping: Mapping, columns: dict[str, str]) -> list[Finding]:
-    """Return findings on channels whose names in the file have a unit that the mapping's lack."""
+    """Report channels that were accepted although their name in the file has an additional unit."""
     given: dict[str, str | int] = {name: entry.channel for name, entry in _entries(mapping).items()}
     if mapping.time is not None:
         given["time"] = mapping.time.channel
@@ -214,7 +217,8 @@ def _name_findings(mapping: Mapping, columns: dict[str, str]) -> list[Finding]:
 def _timed(
     stretch: AnyMapping[str, Channel], mapping: Mapping, columns: dict[str, str], findings: list[Finding]
 ) -> tuple[dict[str, Channel], np.ndarray]:
-    """Return a stretch's channels by their names in the dataset, with time stamps, and piece numbers.
+    """Return the mapped channels of a stretch under the model's names, with time stamps, and the piece numbers of the
+    samples.
 
     Channels longer than the time stamps or the piece numbers are cut, with a finding.
     """
@@ -238,14 +242,14 @@ def _timed(
 
 
 def _joined(stretches: Sequence[AnyMapping[str, Channel]], name: str, clock: Clock) -> np.ndarray:
-    """Return the readings of a channel on the clock."""
+    """Return the used readings of a channel, joined over all stretches."""
     return np.concatenate(
         [s[name].values[slice(*taken[name])] for s, taken in zip(stretches, clock.taken, strict=True)]
     )
 
 
 def _converted(signal: checks.Signal, mapping: Mapping) -> tuple[np.ndarray, list[Finding]]:
-    """Check a channel and convert it to SI units."""
+    """Check the readings of a channel for faults and convert them to SI units; return values and findings."""
     entry = _entries(mapping)[signal.name]
     found = checks.missing(signal)
     raw = np.where(np.isfinite(signal.raw), signal.raw, np.nan)
@@ -263,7 +267,7 @@ def _converted(signal: checks.Signal, mapping: Mapping) -> tuple[np.ndarray, lis
 
 
 def _make_absolute(variables: dict[str, np.ndarray], mapping: Mapping) -> None:
-    """Add to each relative angle the angle that it is relative to."""
+    """Add to each relative angle the angle to which it is relative, so that it becomes absolute."""
     own = dict(variables)
     for name, entry in mapping.channels.items():
         if entry.relative_to is not None:
@@ -271,7 +275,7 @@ def _make_absolute(variables: dict[str, np.ndarray], mapping: Mapping) -> None:
 
 
 def _unit_findings(raw: Raw, mapping: Mapping, columns: dict[str, str]) -> list[Finding]:
-    """Return findings on channels whose unit in the file differs from the mapping's."""
+    """Report channels whose unit in the file differs from that in the mapping."""
     findings = []
     for name, entry in _entries(mapping).items():
         stated = units.spelled(raw.stretches[0][columns[name]].unit)
@@ -293,7 +297,7 @@ def _unit_findings(raw: Raw, mapping: Mapping, columns: dict[str, str]) -> list[
 def _labelled(
     variables: AnyMapping[str, np.ndarray], clock: Clock, raw: Raw, mapping: Mapping, findings: list[Finding]
 ) -> xr.Dataset:
-    """Return the dataset with names, units and provenance."""
+    """Return the dataset of a recording with names, units and provenance."""
     model = mapping.system
     meanings = {s.name: s.meaning for s in model.states} | {q.name: q.meaning for q in model.quantities}
     data: dict[str, Any] = {}

@@ -1,4 +1,4 @@
-"""Smooth states and estimate rates by local polynomials without lag, with their noise.
+"""Smooth measured states and estimate their rates by local polynomials without phase shift, with the noise of both.
 
 A polynomial of low order is fitted by least squares to the samples of a window (Savitzky and Golay, Anal.
 Chem. 36, 1964, 1627). In the middle of a stretch the window is centred, so the phase is not shifted. At the
@@ -54,7 +54,7 @@ def smooth(
     order: int = 3,
     edges_s: Sequence[float] | np.ndarray | None = None,
 ) -> xr.Dataset:
-    """Smooth the measured quantities, and add the rates that are not measured.
+    """Smooth the measured quantities of a recording, and add the rates that are not measured.
 
     Parameters
     ----------
@@ -100,12 +100,14 @@ def smooth(
 
 
 def _least(order: int) -> int:
-    """Return the samples of the shortest window: odd, and more than a polynomial has coefficients."""
+    """Return the least window length for polynomials of a given order, an odd number of samples."""
     return order + 2 + (order + 1) % 2
 
 
 def _checked(window_s: float | None, order: int, step: float) -> int | None:
-    """Return the samples of a requested window, an odd number."""
+    """Return the requested window length as an odd number of samples; raise `SpecError` if it or the order is too
+    small.
+    """
     problems = []
     if order < 1:
         problems.append(f"order = {order}: must be 1 or more, so that there is a rate.")
@@ -121,7 +123,7 @@ def _checked(window_s: float | None, order: int, step: float) -> int | None:
 
 
 def _switches(ds: xr.Dataset) -> np.ndarray:
-    """Return the times at which the drive jumps between any of its levels [s].
+    """Return the times at which the drive jumps from one of its levels to another [s].
 
     A drive that is switched off has three levels, so edges about one middle, as in `pipeline.rig.edges`, do
     not suffice.
@@ -143,7 +145,9 @@ def _switches(ds: xr.Dataset) -> np.ndarray:
 
 
 def _parts(ds: xr.Dataset, name: str, edges: np.ndarray) -> np.ndarray:
-    """Return first and last-plus-one sample of each stretch that polynomials may span, (n, 2)."""
+    """Return the first and last-plus-one sample of each stretch without gap, missing value or switch of the drive, (n,
+    2).
+    """
     values, piece, time = ds[name].values, ds["piece"].values, ds["time"].values
     known = np.isfinite(values)
     number = piece + 0.0
@@ -157,7 +161,7 @@ def _parts(ds: xr.Dataset, name: str, edges: np.ndarray) -> np.ndarray:
 
 
 class _Basis(NamedTuple):
-    """Polynomials on a window, orthonormal on its samples.
+    """Polynomials on a window, orthonormal over its samples, with their slopes.
 
     Attributes
     ----------
@@ -184,20 +188,20 @@ def _basis(width: int, order: int) -> _Basis:
 
 
 class _Fit:
-    """The smoothed values, rates and noise of one quantity with one window."""
+    """Smoothed values and rates of one quantity, with its noise and the window length."""
 
     def __init__(self, values: np.ndarray, rates: np.ndarray, noise: float, width: int, score: float) -> None:
         self.values, self.rates, self.noise, self.width, self.score = values, rates, noise, width, score
 
     def attrs(self, order: int, step: float, derivative: int) -> dict[str, Any]:
-        """Return the dataset's attributes of the values, or of the rates."""
+        """Return the attributes of the smoothed values or rates: noise and window length."""
         gain = _gain(self.width, order, derivative, step)
         raw = {"noise": self.noise} if derivative == 0 else {}
         return {**raw, "noise_smoothed": self.noise * gain, "window_s": self.width * step}
 
 
 def _gain(width: int, order: int, derivative: int, step: float) -> float:
-    """Return the noise of a smoothed value or rate, in the middle of a window, over that of a sample."""
+    """Return the ratio of the noise of a smoothed value or rate in the middle of a window to that of a raw sample."""
     basis = _basis(width, order)
     rows = basis.slopes / step if derivative else basis.values
     return float(np.linalg.norm(rows[width // 2]))
@@ -210,7 +214,7 @@ def _fit(values: np.ndarray, parts: np.ndarray, width: int | None, order: int, s
 
 
 def _first_samples(parts: np.ndarray, count: int) -> np.ndarray:
-    """Return stretches with a given number of samples in total; the last one is cut."""
+    """Return the first stretches, cut so that together they have at most `count` samples."""
     if not len(parts):
         return parts
     lengths = np.diff(parts, axis=1).ravel()
@@ -221,7 +225,7 @@ def _first_samples(parts: np.ndarray, count: int) -> np.ndarray:
 
 
 def _best_width(values: np.ndarray, parts: np.ndarray, order: int) -> int:
-    """Return the window with the least error of prediction."""
+    """Return the window length [samples] with the least error in leave-one-out cross-validation."""
     first = _least(order)
     used = _first_samples(parts, MOST_SAMPLES)
     if len(used):
@@ -239,7 +243,7 @@ def _best_width(values: np.ndarray, parts: np.ndarray, order: int) -> int:
 
 
 def _smoothed(values: np.ndarray, parts: np.ndarray, width: int, order: int, step: float) -> _Fit:
-    """Fit all stretches with one window; short stretches get a shorter one."""
+    """Smooth all stretches with one window length; stretches shorter than the window use a shorter one."""
     fitted, slopes, leverage = (np.full(len(values), np.nan) for _ in range(3))
     lengths = np.diff(parts, axis=1).ravel()
     own = np.minimum(width, lengths - 1 + lengths % 2)
@@ -258,12 +262,14 @@ def _smoothed(values: np.ndarray, parts: np.ndarray, width: int, order: int, ste
 
 
 def _order_of(own: int, width: int, order: int) -> int:
-    """Return the order for a short window, lower since noise outweighs curvature there."""
+    """Return the polynomial order for a stretch shorter than the window; it is lower for short stretches."""
     return max(order - sum(own < share * width for share in SHORT), 1)
 
 
 def _fit_ends(values: np.ndarray, parts: np.ndarray, width: int, order: int, out: tuple[np.ndarray, ...]) -> None:
-    """Fill in the first and the last half of each stretch from the window at its end."""
+    """Smooth the samples within half a window of the start or end of each stretch, with the first or last whole
+    window.
+    """
     basis, half = _basis(width, order), width // 2
     for begins, rows in ((parts[:, 0], slice(0, half + 1)), (parts[:, 1] - width, slice(half, width))):
         window = values[begins[:, None] + np.arange(width)]
@@ -276,7 +282,7 @@ def _fit_ends(values: np.ndarray, parts: np.ndarray, width: int, order: int, out
 
 
 def _fit_middles(values: np.ndarray, parts: np.ndarray, width: int, order: int, out: tuple[np.ndarray, ...]) -> None:
-    """Fill in samples with half a window on either side, by convolution."""
+    """Smooth by convolution the samples that have half a window of samples on either side."""
     half = width // 2
     long = parts[np.diff(parts, axis=1).ravel() > width + 1]
     if not len(long):
@@ -295,7 +301,7 @@ def _fit_middles(values: np.ndarray, parts: np.ndarray, width: int, order: int, 
 
 
 def _convolved(y: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Return weighted sums about each sample; long windows use Fourier transforms, which are faster."""
+    """Return the weighted sum of samples about each sample; long windows use Fourier transforms."""
     from scipy.ndimage import correlate1d
     from scipy.signal import oaconvolve
 

@@ -1,4 +1,4 @@
-"""Read TDMS files of LabVIEW through npTDMS."""
+"""Read TDMS files of LabVIEW with the package npTDMS."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _UNITS = ("unit_string", "NI_UnitDescription", "unit")
 
 
 def read_tdms(path: Path) -> Raw:
-    """Read all channels of numbers and of times; their names are ``GROUP/CHANNEL``.
+    """Read all channels of numbers or times in a TDMS file, under the names ``GROUP/CHANNEL``.
 
     Waveforms state their sampling interval and start. The start is read with all its digits, while npTDMS by
     default rounds it to microseconds. A last segment shorter than stated, for which npTDMS only warns, is a
@@ -73,7 +73,7 @@ def _channel(name: str, values: np.ndarray, properties: Mapping[str, Any], zero:
 
 
 def _numbers(data: Any, zero: int) -> np.ndarray | None:
-    """Return readings as floats and times in seconds; None for any other type."""
+    """Return a channel's data as floats, time stamps as seconds since `zero`; None for data of other types."""
     array = np.asarray(data)
     names = array.dtype.names or ()
     if "second_fractions" in names:
@@ -83,7 +83,7 @@ def _numbers(data: Any, zero: int) -> np.ndarray | None:
 
 
 def _earliest(file: Any) -> int:
-    """Return a whole second before the start of all channels; times counted from it lose no digits."""
+    """Return a whole second before the start of all channels, from which times are counted without loss of digits."""
     starts = [c.properties.get("wf_start_time") for g in file.groups() for c in g.channels()]
     return min((int(s.seconds) for s in starts if s is not None), default=0)
 
@@ -93,7 +93,7 @@ def _seconds(stamp: Any, zero: int) -> float:
 
 
 def _truncations(path: Path, file: Any, warnings: list[str]) -> list[Finding]:
-    """Return findings from npTDMS's warnings, with the numbers of samples if it knows them."""
+    """Report data that the file states but does not hold, from the warnings of npTDMS."""
     status = file.file_status
     remedy = "copy the file again, or take care that the writing program closes it"
     if status.channel_statuses:
@@ -116,7 +116,7 @@ def _truncations(path: Path, file: Any, warnings: list[str]) -> list[Finding]:
 
 
 def _bytes_after_last_segment(path: Path) -> int:
-    """Return the bytes of a last segment with an incomplete lead-in, which npTDMS silently skips.
+    """Return the number of bytes after the last segment with a complete lead-in; npTDMS silently skips them.
 
     The lead-in of a segment has 28 bytes: tag, table of contents, version, and the lengths of the parts that
     follow (National Instruments, "TDMS File Format Internal Structure").
@@ -137,7 +137,7 @@ def _truncated(text: str) -> Finding:
 
 @contextlib.contextmanager
 def _listening() -> Iterator[list[str]]:
-    """Collect npTDMS's log messages and keep them from other handlers."""
+    """Collect the log messages of npTDMS in a list and keep them from other handlers, as a context manager."""
     heard: list[str] = []
 
     def keep(record: logging.LogRecord) -> bool:

@@ -1,4 +1,4 @@
-"""Read numbers in texts: encodings, decimal commas, empty fields."""
+"""Read numbers from text files: encodings, decimal commas, empty fields, dates."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _INSTANT = re.compile(
 
 
 def read_text(path: Path) -> str:
-    """Return a text in UTF-8, or in the Western encoding of Windows (cp1252) that LabVIEW writes.
+    """Return the text of a file, decoded as UTF-8 or else as cp1252, which LabVIEW on Windows writes.
 
     Raises
     ------
@@ -34,7 +34,7 @@ def read_text(path: Path) -> str:
 
 
 def number(field: str, decimal: str) -> float | None:
-    """Return the number in a field; NaN for an empty field, None for any other text."""
+    """Return the number in a text field; NaN for an empty field, None for any other text."""
     text = field.strip().strip('"').strip()
     if not text:
         return float("nan")
@@ -51,7 +51,7 @@ def number(field: str, decimal: str) -> float | None:
 
 
 def split(line: str, delimiter: str) -> list[str]:
-    """Return the fields of a line; a blank as delimiter stands for any number of blanks."""
+    """Split a line into its fields; a blank as delimiter also matches several blanks."""
     if delimiter == " ":
         return line.split()
     if '"' in line:
@@ -62,7 +62,8 @@ def split(line: str, delimiter: str) -> list[str]:
 
 
 def table(lines: Sequence[str], columns: Sequence[int], delimiter: str, decimal: str) -> np.ndarray:
-    """Return rows of numbers; NaN for fields that are empty, missing or texts.
+    """Convert chosen columns of text lines to an array of numbers; fields that are empty, missing or not numbers become
+    NaN.
 
     Parameters
     ----------
@@ -104,7 +105,7 @@ def table(lines: Sequence[str], columns: Sequence[int], delimiter: str, decimal:
 
 
 def instants(fields: Sequence[str]) -> np.ndarray | None:
-    """Return dates or times of day as seconds since the first; None for other texts.
+    """Convert dates or times of day to seconds since the first; return None if a field is anything else.
 
     Parameters
     ----------
@@ -134,6 +135,6 @@ def unique(names: Sequence[str]) -> list[str]:
 
 
 def without_end(values: np.ndarray) -> np.ndarray:
-    """Drop the empty fields after a column's last number."""
+    """Drop the values of a column after its last finite number."""
     known = np.flatnonzero(np.isfinite(values))
     return values[: known[-1] + 1] if known.size else values[:0]

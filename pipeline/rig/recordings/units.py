@@ -52,12 +52,12 @@ _SPELLINGS = {
 
 
 def spelled(unit: str) -> str:
-    """Return a unit in its usual spelling; LabVIEW writes ``Volts``."""
+    """Return the symbol of a unit that is spelled out, such as V for ``Volts``."""
     return _SPELLINGS.get(unit.strip().lower(), unit.strip())
 
 
 def factor(unit: str, wanted: str) -> float | None:
-    """Return the factor from a unit to another; None if it is a unit of another quantity.
+    """Return the factor from a unit to an SI unit; None if they measure different quantities or the unit is unknown.
 
     Parameters
     ----------
@@ -70,12 +70,12 @@ def factor(unit: str, wanted: str) -> float | None:
 
 
 def kind_of(unit: str) -> str | None:
-    """Return the SI unit of the quantity that a unit measures; None if the unit is unknown."""
+    """Return the SI unit that a unit can be converted to; None if the unit is unknown."""
     return next((si for si, known in UNITS.items() if unit in known), None)
 
 
 def same(one: str, other: str) -> bool:
-    """Whether two units are one, however they are spelled."""
+    """Return whether two spellings mean the same unit."""
     one, other = spelled(one), spelled(other)
     kind = kind_of(one)
     alike = kind is not None and kind == kind_of(other) and factor(one, kind) == factor(other, kind)
@@ -83,7 +83,7 @@ def same(one: str, other: str) -> bool:
 
 
 def names_with_unit(wanted: str, names: Sequence[str]) -> list[tuple[str, str]]:
-    """Return the names that are the wanted one and a unit in brackets, each with the unit.
+    """Return the column names that consist of `wanted` and a unit in brackets, each with the unit.
 
     Parameters
     ----------

@@ -26,7 +26,7 @@ GROUP = "recording"
 
 
 def write_recording(ds: xr.Dataset, path: str | Path) -> Path:
-    """Write a recording with its quantities in SI units.
+    """Write a recording in SI units to a TDMS, CSV or NetCDF file.
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ def write_recording(ds: xr.Dataset, path: str | Path) -> Path:
 
 
 def mapping_for(ds: xr.Dataset, path: str | Path) -> Mapping:
-    """Return the mapping of a file that `write_recording` wrote."""
+    """Return the mapping for reading a file that `write_recording` wrote."""
     is_tdms = Path(path).suffix.lower() == ".tdms"
 
     def own(name: str) -> str:
@@ -75,12 +75,12 @@ def mapping_for(ds: xr.Dataset, path: str | Path) -> Mapping:
 
 
 def _is_one_waveform(ds: xr.Dataset) -> bool:
-    """Return whether start and sampling interval describe all times."""
+    """Return whether a recording is one piece from time 0, so that the sampling interval gives all times."""
     return ds["piece"].size == 0 or (int(ds["piece"][0]) == int(ds["piece"][-1]) and float(ds["time"][0]) == 0.0)
 
 
 def write_raw(raw: Raw, path: str | Path) -> Path:
-    """Write channels unchanged, as TDMS or CSV.
+    """Write the channels of a file unchanged to a TDMS or CSV file.
 
     Parameters
     ----------
@@ -102,7 +102,9 @@ def write_raw(raw: Raw, path: str | Path) -> Path:
 
 
 def check_target(path: str | Path, suffixes: Sequence[str] = SUFFIXES) -> Path:
-    """Refuse a path that a recording cannot be written to."""
+    """Return the path of a file to write; raise `SpecError` if its suffix is not supported or its folder does not
+    exist.
+    """
     target = Path(path)
     if target.suffix.lower() not in suffixes:
         raise SpecError([f"{path}: the suffix must be one of {', '.join(suffixes)}."])
@@ -132,7 +134,7 @@ def _write_tdms(channels: Sequence[Channel], path: Path, is_simulated: bool) -> 
 
 
 def _write_csv(channels: Sequence[Channel], path: Path, is_simulated: bool) -> None:
-    """Write a column for each channel, with all digits."""
+    """Write a CSV file with one column for each channel, with all digits."""
     columns = [(c.name, c.values) for c in channels]
     step = channels[0].step_s
     if not any(name == "time" for name, _ in columns) and math.isfinite(step):

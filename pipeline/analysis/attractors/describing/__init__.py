@@ -1,1 +1,1 @@
-"""Label the cells of a parameter point, and compute the features of its attractors."""
+"""Assign the trajectories of a parameter point to attractors, and compute the features of the attractors."""

@@ -1,4 +1,4 @@
-"""Compute the features of an attractor: ranges, rotation, side, energy, mirror partner.
+"""Compute the features of an attractor: ranges, rotation, classifier code, energy, mirror image.
 
 Half a drive period
 -------------------
@@ -39,7 +39,7 @@ SAMPLES = 256
 
 @dataclass
 class Cells:
-    """Statistics of one attractor's cells, accumulated block by block in any order.
+    """Statistics of the trajectories (cells) on one attractor, accumulated block by block in any order.
 
     Attributes
     ----------
@@ -70,7 +70,7 @@ class Cells:
     seconds: list[np.ndarray] = field(default_factory=list)
 
     def add(self, block: Block, cells: np.ndarray, labels: np.ndarray, geometry: Geometry) -> None:
-        """Add some cells of a block; `labels` has the classifier's code of every cell of the block."""
+        """Add some cells of a block; `labels` has the classifier code of every cell of the block."""
         section = block.section[cells]
         self.n += len(cells)
         flat = section.reshape(-1, section.shape[-1])
@@ -88,16 +88,19 @@ class Cells:
 
     @property
     def mean_rotation(self) -> np.ndarray:
-        """Mean over cells, summed in rising order so that the order of cells does not change the last bit."""
+        """Mean rotation of the cells, summed in rising order so that the order of cells does not change the last
+        bit.
+        """
         return np.asarray(np.sort(np.concatenate(self.rotations), axis=0).mean(axis=0))
 
     @property
     def mean_seconds(self) -> float:
-        """Mean time between two sections [s]; NaN if it is not known."""
+        """Mean time between two successive section points of the cells [s]; NaN if it is not known."""
         return float(np.sort(np.concatenate(self.seconds)).mean()) if self.seconds else np.nan
 
     def side(self, parameters: Parameters, frequency: float) -> int:
-        """Return the set's code: the common code of its cells, or else the code of their pooled points.
+        """Return the attractor's classifier code: the common code of its cells, or else the code of their pooled
+        section points.
 
         The pooled points are classified with the median of the cells' turns.
         """
@@ -111,7 +114,7 @@ class Cells:
 
 @dataclass
 class Features:
-    """One attractor at one parameter point; ``None`` and NaN mean not known.
+    """Features of one attractor at one parameter point; ``None`` and NaN mean not known.
 
     The attributes become variables of the same name; see `pipeline.analysis.attractors.attractors`.
     """
@@ -151,7 +154,9 @@ class Features:
 
 
 def mean_rotation(section: np.ndarray, turns: np.ndarray, geometry: Geometry) -> np.ndarray:
-    """Compute the mean rotation over the kept sections [turns per drive period], shape (cell, angle)."""
+    """Compute the mean rotation of each angle over the stored section points [turns per drive period], shape (cell,
+    angle).
+    """
     angles = np.asarray(geometry.is_angle)
     change = section[:, -1, angles] - section[:, 0, angles]
     n = max(section.shape[1] - 1, 1)
@@ -159,7 +164,9 @@ def mean_rotation(section: np.ndarray, turns: np.ndarray, geometry: Geometry) ->
 
 
 def sides_of(section: np.ndarray, turns: np.ndarray, frequency: float, parameters: Parameters | None) -> np.ndarray:
-    """Classify rows of sections by the model's classifier; unknown without a classifier or with a NaN."""
+    """Classify trajectories by the model's classifier, from their section points; `UNKNOWN` without a classifier or
+    with a NaN.
+    """
     classifier = parameters.model.classifier if parameters is not None else None
     if classifier is None or parameters is None:
         return np.full(len(section), UNKNOWN, np.int64)
@@ -168,7 +175,7 @@ def sides_of(section: np.ndarray, turns: np.ndarray, frequency: float, parameter
 
 
 def follow_orbit(found: Features, parameters: Parameters, frequency: float, geometry: Geometry) -> None:
-    """Integrate a polished orbit over its period and fill in ranges, exact rotation, energy and image.
+    """Integrate a periodic orbit over its period and fill in its ranges, exact rotation, energy range and mirror image.
 
     `frequency` is the drive frequency, or the mean frequency of the returns [Hz].
     """
@@ -188,7 +195,7 @@ def follow_orbit(found: Features, parameters: Parameters, frequency: float, geom
 
 
 def fill_cycle(found: Features, cycle: Cycle) -> None:
-    """Fill in the features of a limit cycle of a flow sampled at equal times."""
+    """Fill in the features of a limit cycle of an autonomous flow that is sampled at equal times."""
     found.kind, found.period_s, found.residual = PERIODIC_ORBIT, cycle.seconds, cycle.residual
     found.stability, found.evidence = ATTRACTS, BY_MULTIPLIERS
     found.multipliers, found.lyapunov_max = cycle.multipliers, 0.0
@@ -196,7 +203,9 @@ def fill_cycle(found: Features, cycle: Cycle) -> None:
 
 
 def of_equilibrium(found: Equilibrium, parameters: Parameters | None, n_angles: int) -> Features:
-    """Return the features of an equilibrium; its largest exponent is an eigenvalue's real part."""
+    """Return the features of an equilibrium; its largest Lyapunov exponent is the largest real part of the
+    eigenvalues.
+    """
     x = Features(
         found.state[None],
         EQUILIBRIUM,
@@ -220,7 +229,7 @@ def of_equilibrium(found: Equilibrium, parameters: Parameters | None, n_angles: 
 
 
 def follow_points(found: Features, parameters: Parameters, frequency: float) -> None:
-    """Fill in the energy range and the mirror image of a set, from its stored points."""
+    """Fill in the energy range and the mirror image of an attractor or other set, from its stored section points."""
     _fill_energy(found, np.zeros(len(found.points)), found.points, of_flow(parameters), frequency)
     mirror = parameters.model.mirror
     if mirror is None:
@@ -257,7 +266,9 @@ def _fill_energy(
 
 
 def pair_mirrors(found: list[Features], mirror: Mirror, threshold: float, geometry: Geometry) -> None:
-    """Fill in each attractor's mirror partner: the one nearest to its image, if within `threshold`."""
+    """Find each attractor's mirror partner: the attractor nearest to its image under the model's symmetry, if within
+    `threshold`.
+    """
     turned = np.array(mirror.signs)[list(geometry.is_angle)]
     for a in found:
         if a.image is None:

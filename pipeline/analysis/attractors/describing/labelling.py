@@ -1,4 +1,4 @@
-"""Label the cells of one parameter point, and describe its sets with their evidence."""
+"""Assign the cells (trajectories) of one parameter point to attractors and other sets, and describe these sets."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ MOST_PROBES = 8
 
 @dataclass
 class Found:
-    """Sets of one parameter point, and the set of each cell.
+    """Result of one parameter point: the sets on which its cells end, and the set of each cell.
 
     Attributes
     ----------
@@ -72,8 +72,8 @@ class Found:
 
 @dataclass
 class _Labels:
-    """Provisional set numbers of the cells: first polished orbits, then raw orbits, bounded sets, equilibria, limit
-    cycles.
+    """Provisional number of each cell's set; the numbers run over polished orbits, unpolished orbits, bounded sets,
+    equilibria, limit cycles.
     """
 
     label: np.ndarray
@@ -88,7 +88,7 @@ class _Labels:
 
 
 def analyse(point: Point, search: Search) -> Work[Found]:
-    """Find the sets that the cells of a parameter point are on, with their kind, stability and evidence."""
+    """Find the sets on which the cells of a parameter point end, with their kind, stability and evidence."""
     labels = _Labels.of(point.n_cells)
     if search.options.polish and (yield from _preserves_volume(point, search)):
         return _describe(point, [], [_conservative(point, labels)], labels, search)
@@ -110,7 +110,7 @@ def analyse(point: Point, search: Search) -> Work[Found]:
 
 
 def _is_elsewhere(point: Point) -> np.ndarray:
-    """Return which cells are at an equilibrium, or on a limit cycle of a flow sampled at equal times."""
+    """Return for each cell whether it is at an equilibrium, or on a limit cycle of a flow sampled at equal times."""
     found = np.zeros(point.n_cells, bool)
     for told in (point.at_rest, point.on_cycle):
         if told is not None:
@@ -134,7 +134,9 @@ def _preserves_volume(point: Point, search: Search) -> Work[bool]:
 
 
 def _some_points(point: Point, n: int = 16) -> np.ndarray:
-    """Return the last section points of the `n` bounded cells with the least hashes, shape (n, state)."""
+    """Return the last section points of `n` arbitrary but reproducible bounded cells (those of least hash), shape (n,
+    state).
+    """
     found = np.zeros((0, 1, point.n_states))
     for block in point.blocks():
         more = np.concatenate([found, block.section[block.is_closed | block.is_bounded, -1:]])
@@ -143,7 +145,7 @@ def _some_points(point: Point, n: int = 16) -> np.ndarray:
 
 
 def _conservative(point: Point, labels: _Labels) -> BoundedSet:
-    """Label all cells of a flow that preserves volume as one neutral set."""
+    """Label all cells of a volume-preserving flow as one neutral set."""
     for block in point.blocks():
         own = np.flatnonzero(block.is_closed | block.is_bounded)
         labels.put(own + block.cells.start, 0, SAME_SET)
@@ -154,7 +156,7 @@ def _conservative(point: Point, labels: _Labels) -> BoundedSet:
 
 
 def _label_orbits(point: Point, state: State, labels: _Labels, search: Search) -> np.ndarray:
-    """Label the cells on orbits; return the group of each closed cell without an orbit, -1 for all others."""
+    """Label the cells on orbits; return the group of each closed cell that is on no orbit, -1 for all other cells."""
     groups = np.full(point.n_cells, -1, np.int64)
     for block in point.blocks():
         own = block.cells
@@ -168,7 +170,9 @@ def _label_orbits(point: Point, state: State, labels: _Labels, search: Search) -
 
 
 def _probe(point: Point, state: State, labels: _Labels, search: Search) -> Work[None]:
-    """Probe degenerate orbits and equilibria by nearby trajectories, and label the cells that approach."""
+    """Test whether degenerate orbits and equilibria attract nearby trajectories, and label the cells that approach
+    them.
+    """
     neutral = [i for i, orbit in enumerate(state.orbits) if orbit.is_polished and orbit.stability == NEUTRAL]
     for i in neutral[:MOST_PROBES]:
         within = yield from probe_orbit(state.orbits[i], search.geometry)
@@ -188,7 +192,9 @@ def _probe(point: Point, state: State, labels: _Labels, search: Search) -> Work[
 
 
 def _label_courses(point: Point, found: Outcome, labels: _Labels, groups: np.ndarray, search: Search) -> None:
-    """Label the sampled cells that reached an end, and all cells in their boxes or groups, by this end."""
+    """Label cells by the attractor, or other end, that a sampled cell of the same box or group reached when integrated
+    further.
+    """
     ends = {course.key: course.end for course in found.courses if not course.goes_on}
     if not ends:
         return
@@ -210,7 +216,9 @@ def _label_courses(point: Point, found: Outcome, labels: _Labels, groups: np.nda
 
 
 def _label_raw(point: Point, state: State, groups: np.ndarray, labels: _Labels, search: Search) -> list[Orbit]:
-    """Label the closed cells without a polished orbit, one raw orbit per group."""
+    """Group the closed cells that are on no polished orbit, and make an unpolished orbit of each group from its section
+    points.
+    """
     left = np.where((labels.label < 0) & (labels.decision != DIVERGES) & ~_is_elsewhere(point), groups, -1)
     best: dict[int, tuple[float, int, np.ndarray]] = {}
     for block in point.blocks():
@@ -223,7 +231,7 @@ def _label_raw(point: Point, state: State, groups: np.ndarray, labels: _Labels, 
 def _label_sets(
     point: Point, first: int, sets: Sequence[BoundedSet], labels: _Labels, groups: np.ndarray, search: Search
 ) -> None:
-    """Label the sampled cells of each set, and all other cells whose section points lie on the set."""
+    """Label the cells of each non-periodic set: its sampled cells, and all others whose section points lie on it."""
     for i, one in enumerate(sets):
         own = one.cells[labels.label[one.cells] < 0]
         labels.put(own, first + i, SAME_SET)
@@ -238,7 +246,7 @@ def _label_sets(
 
 
 def _label_ends(block: Block, ends: Mapping[int, int], label: np.ndarray, decision: np.ndarray) -> None:
-    """Label the closed cells that were integrated further by their ends, in place."""
+    """Label closed cells in place by the orbits that they reached when they were integrated further."""
     rest = np.flatnonzero(block.is_closed & (label[block.cells] < 0))
     for row, mark in zip(rest, marks_of(block.section[rest]), strict=True):
         if int(mark) in ends:
@@ -248,7 +256,9 @@ def _label_ends(block: Block, ends: Mapping[int, int], label: np.ndarray, decisi
 def _representatives(
     block: Block, group: np.ndarray, best: dict[int, tuple[float, int, np.ndarray]], geometry: Geometry
 ) -> None:
-    """Keep the last period of the best closed cell of each group, among those not on a polished orbit."""
+    """Store for each group of closed cells the last period of the cell that closes best, among those not on a polished
+    orbit.
+    """
     rows = np.flatnonzero(group >= 0)
     if not len(rows):
         return
@@ -269,7 +279,7 @@ def _representatives(
 def _describe(
     point: Point, orbits: Sequence[Orbit], sets: Sequence[BoundedSet], labels: _Labels, search: Search
 ) -> Found:
-    """Compute the features of all sets that have cells, and renumber the labels in canonical order."""
+    """Compute the features of all sets that have cells, and renumber the sets in canonical order."""
     resting = len(orbits) + len(sets)
     _label_elsewhere(point, resting, labels)
     cells: dict[int, Cells] = {}
@@ -315,7 +325,7 @@ def _number_ends(
     resting: int,
     table: np.ndarray,
 ) -> None:
-    """Fill `n_to`: count the cells that left each set by the final number of the set they reached."""
+    """Fill `n_to`: for each set, count the cells that left it by the number of the set on which they ended."""
     for features, number in zip(ranked, order, strict=True):
         if first <= number < resting:
             ended = np.zeros(len(order), np.int64)
@@ -330,7 +340,7 @@ def _number_ends(
 def _features_of(
     number: int, cells: Cells, orbits: Sequence[Orbit], sets: Sequence[BoundedSet], point: Point, search: Search
 ) -> Features:
-    """Return the features of the set with a provisional number, from its cells."""
+    """Return the features of the orbit, bounded set, equilibrium or limit cycle with this provisional number."""
     resting = len(orbits) + len(sets)
     if number < len(orbits):
         return _of_orbit(cells, orbits[number], point, search)
@@ -345,7 +355,7 @@ def _features_of(
 
 
 def _of_points(cells: Cells, kind: int, period: int, point: Point, search: Search) -> Features:
-    """Return the features that the section points of a set's cells show."""
+    """Return the features of a set that follow from the section points of its cells."""
     assert cells.points is not None
     points = feature.sorted_points(cells.points, search.geometry)
     found = Features(points, kind, period, cells.mean_rotation, UNKNOWN, cells.low, cells.high)

@@ -25,7 +25,7 @@ def portraits(
     n_samples: int = 256,
     n_periods: int = 20,
 ) -> xr.Dataset:
-    """Integrate each set of a parameter point: an orbit for one period, any other set for `n_periods`.
+    """Integrate a trajectory on each set of a parameter point: one period of an orbit, `n_periods` of any other set.
 
     Parameters
     ----------
@@ -92,7 +92,7 @@ def _step(here: xr.Dataset, parameters: Parameters, frequency: float, n_samples:
 
 
 def _mean_return(starts: np.ndarray, parameters: Parameters, frequency: float) -> float:
-    """Integrate 16 crossings and return the mean time between them [s]."""
+    """Integrate 16 returns to the Poincare section and return the mean time between them [s]."""
     result = run_branches(
         parameters.pack()[None, None],
         np.full((1, 1), frequency),
@@ -142,7 +142,7 @@ def _dataset(here: xr.Dataset, orbits: list[np.ndarray], parameters: Parameters,
 
 
 def _drawn(result: xr.Dataset, table: np.ndarray, parameters: Parameters) -> xr.Dataset:
-    """Add the positions of the points of the model's drawing, if it has one."""
+    """Add the positions along each motion of the points in the model's drawing, if the model has a drawing."""
     drawing = parameters.model.drawing
     if drawing is None:
         return result

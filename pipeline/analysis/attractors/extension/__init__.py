@@ -1,1 +1,1 @@
-"""Extend cells that are on no known orbit, and describe the sets that they stay on."""
+"""Integrate trajectories further whose attractor is not known yet, and describe the sets on which they stay."""

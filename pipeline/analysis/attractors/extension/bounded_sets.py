@@ -1,4 +1,4 @@
-"""Describe sets that do not close, from the extended trajectories of their cells."""
+"""Describe non-periodic sets from trajectories on them that were integrated further."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ MOST_SHAPED = 1024
 
 @dataclass(frozen=True, eq=False)
 class BoundedSet:
-    """A set that does not close: its kind, stability and evidence.
+    """Non-periodic set: its kind (chaotic, torus or other bounded set), stability and evidence.
 
     Attributes
     ----------
@@ -64,7 +64,7 @@ class BoundedSet:
 
     @classmethod
     def neutral(cls) -> BoundedSet:
-        """Return the set of all cells of a flow that preserves volume."""
+        """Return the neutral set that holds all cells of a volume-preserving flow."""
         none = np.zeros(0, np.int64)
         evidence = stability.BY_VOLUME
         return cls(none, None, none, BOUNDED_SET, NEUTRAL, evidence, None, 0, 0, 0, 0.0, {})
@@ -73,7 +73,7 @@ class BoundedSet:
 def describe(
     own: Sequence[Course], left: Sequence[Course], point: Point, settings: Settings, has_stayed: bool
 ) -> Work[BoundedSet]:
-    """Return the kind, stability and lifetimes of a set, from the cells that stayed and those that left.
+    """Return the kind, stability and lifetimes of a non-periodic set, from the cells that stayed and those that left.
 
     Parameters
     ----------
@@ -117,7 +117,7 @@ def describe(
 
 
 def left_behind(left: Sequence[Course], settings: Settings) -> BoundedSet:
-    """Return the transient set that cells were on before they left, when no sampled cell stayed."""
+    """Return the transient set on which cells were before they left it, for the case that no sampled cell stayed."""
     paths = [course.stayed for course in left]
     return BoundedSet(
         np.zeros(0, np.int64),
@@ -136,7 +136,7 @@ def left_behind(left: Sequence[Course], settings: Settings) -> BoundedSet:
 
 
 def ends_of(left: Iterable[Course]) -> dict[int, int]:
-    """Count cells by their end."""
+    """Count trajectories by the orbit, equilibrium or failure in which each of them ended."""
     ended: dict[int, int] = {}
     for course in left:
         ended[course.end] = ended.get(course.end, 0) + 1
@@ -144,7 +144,7 @@ def ends_of(left: Iterable[Course]) -> dict[int, int]:
 
 
 def were_on(course: Course, own: Sequence[Course], settings: Settings) -> bool:
-    """Return whether a cell was on the set of the cells `own` before it left."""
+    """Return whether a trajectory was on the same set as the trajectories `own` before it left."""
     points = np.concatenate([other.stayed for other in own])
     return bool(mixing(course.stayed, points, settings.geometry, settings.closure) >= OTHER)
 
@@ -152,7 +152,7 @@ def were_on(course: Course, own: Sequence[Course], settings: Settings) -> bool:
 def _verdict(
     own: Sequence[Course], left: Sequence[Course], growth: Growth | None, has_stayed: bool, settings: Settings
 ) -> tuple[int, int]:
-    """Stability and evidence."""
+    """Return the stability code of a set and the code of the evidence for it."""
     if growth is not None and growth.preserves_volume:
         return NEUTRAL, stability.BY_VOLUME
     if left:
@@ -165,7 +165,9 @@ def _verdict(
 
 
 def _growth(own: Sequence[Course], point: Point, settings: Settings, most: int) -> Work[Growth | None]:
-    """Compute the exponents of the section map along extended cells; None if there are too few sections."""
+    """Compute the Lyapunov exponents of the section map along trajectories of a set; None if there are too few section
+    points.
+    """
     n = min(course.length for course in own)
     if n < LEG:
         return None
@@ -187,7 +189,9 @@ def _growth(own: Sequence[Course], point: Point, settings: Settings, most: int) 
 
 
 def _closes_above(own: Sequence[Course], growth: Growth | None, settings: Settings) -> int:
-    """Return the least period beyond the search limit with which a contracting set recurs; 0 if none."""
+    """Return the least period beyond the search limit with which a contracting set recurs; 0 if no such period is
+    seen.
+    """
     if growth is None or not growth.contracts:
         return 0
     path = min((c.extension for c in own), key=len)

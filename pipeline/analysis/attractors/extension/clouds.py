@@ -1,4 +1,4 @@
-"""Decide by nearest neighbours whether two samples show one set, and which set a cell is on.
+"""Decide by nearest neighbours whether two samples of section points lie on one set, and on which set a trajectory is.
 
 Two trajectories on one ergodic set visit the same points equally often; two attractors are a distance
 apart. So each point of the later half of a sample looks for its nearest neighbour among equally many points
@@ -33,7 +33,7 @@ INSIDE, REACHED = 0.9, 3.0
 
 
 def thinned(points: np.ndarray, n: int) -> np.ndarray:
-    """Return at most `n` points of a sample (m, state), in the order of time.
+    """Return at most `n` randomly drawn points of a sample (m, state), in the order of time.
 
     Points are drawn at random with a fixed seed. A regular stride would be wrong: on a set of two pieces that
     alternate, every second point lies on one piece.
@@ -45,7 +45,7 @@ def thinned(points: np.ndarray, n: int) -> np.ndarray:
 
 
 def mixing(a: np.ndarray, b: np.ndarray, geometry: Geometry, least: float = 0.0) -> float:
-    """Compute the share of nearest neighbours in the other sample, the smaller of both directions.
+    """Compute the share of points whose nearest neighbour lies in the other sample, the smaller of both directions.
 
     Parameters
     ----------
@@ -78,14 +78,14 @@ def _crossing(own: np.ndarray, other: np.ndarray, n: int, geometry: Geometry, le
 
 
 def is_stationary(path: np.ndarray, geometry: Geometry, least: float = 0.0) -> bool:
-    """Return whether the early and the late half of a trajectory show the same set."""
+    """Return whether the first and the second half of a trajectory visit the same set."""
     half = len(path) // 2
     share = mixing(path[:half], path[half:], geometry, least)
     return bool(share >= OTHER)
 
 
 def group(samples: Sequence[np.ndarray], geometry: Geometry, least: float = 0.0) -> tuple[np.ndarray, bool]:
-    """Group samples of section points into sets.
+    """Group samples of section points by the set on which they lie.
 
     Parameters
     ----------
@@ -123,7 +123,7 @@ def group(samples: Sequence[np.ndarray], geometry: Geometry, least: float = 0.0)
 
 
 def _pooled(samples: Sequence[np.ndarray]) -> np.ndarray:
-    """Merge samples into one: equally many points of each, interleaved in time."""
+    """Merge samples of section points into one sample: equally many points of each, interleaved in time."""
     each = max(4, MOST_POINTS // len(samples))
     parts = [thinned(sample, each) for sample in samples]
     n = min(len(part) for part in parts)
@@ -132,7 +132,7 @@ def _pooled(samples: Sequence[np.ndarray]) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Cloud:
-    """Section points of one set, to compare other cells with.
+    """Section points of one set in a search tree, to test whether other trajectories lie on this set.
 
     Attributes
     ----------
@@ -147,7 +147,7 @@ class Cloud:
 
     @classmethod
     def of(cls, samples: Sequence[np.ndarray], geometry: Geometry, least: float) -> Cloud:
-        """Build the cloud of some cells' points, with a spacing of at least `least`."""
+        """Build the cloud from section points of some cells; its point spacing is at least `least`."""
         points = _pooled(samples)
         # distances from one half to the other: a safe spacing, since the whole is twice as dense
         order = np.random.default_rng(0).permutation(len(points))
@@ -156,13 +156,13 @@ class Cloud:
         return cls(geometry.tree(points), max(float(np.quantile(away, 0.99)), least))
 
     def distances(self, section: np.ndarray, geometry: Geometry) -> np.ndarray:
-        """Return the distance of each section point (..., state) from the set, in units of its spacing."""
+        """Return the distance of each section point (..., state) from the set, in units of the set's point spacing."""
         away = self.tree.query(geometry.scaled(section), p=np.inf)[0]
         return np.asarray(away / self.spacing)
 
 
 def members(section: np.ndarray, clouds: Sequence[Cloud], geometry: Geometry) -> np.ndarray:
-    """Return the set that each cell is on by its sections (cell, period_index, state); -1 for none."""
+    """Return the number of the set on which each cell's section points (cell, period_index, state) lie; -1 for none."""
     if not clouds or not len(section):
         return np.full(len(section), -1, np.int64)
     away = np.stack([cloud.distances(section, geometry) for cloud in clouds])

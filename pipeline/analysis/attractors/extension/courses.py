@@ -1,4 +1,4 @@
-"""Follow sampled cells from the last section that a run kept to where they end."""
+"""Record how sampled trajectories go on after the last section point of the run, until they end."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ ON_SET, FAILED, DIVERGED, AT_REST = -1, -2, -3, -4
 
 @dataclass
 class Course:
-    """A sampled cell and its extension.
+    """Sampled trajectory of the run and its extension by further integration.
 
     Attributes
     ----------
@@ -49,32 +49,32 @@ class Course:
 
     @property
     def goes_on(self) -> bool:
-        """Whether it has not ended."""
+        """Whether the trajectory has not ended yet (on an orbit, at an equilibrium, diverged or failed)."""
         return self.end == ON_SET
 
     @property
     def extension(self) -> np.ndarray:
-        """All sections of the extension, shape (n, state)."""
+        """All section points of the extension, shape (n, state)."""
         return np.concatenate([self.kept[:0], *self.legs])
 
     @property
     def stayed(self) -> np.ndarray:
-        """Section points on the set: the whole extension, or the part before the cell left."""
+        """Section points on the set: the whole extension, or the part before the trajectory left."""
         if self.goes_on:
             return self.extension if self.legs else self.kept
         return np.asarray(self.extension[: int(self.periods)])
 
     @property
     def has_left(self) -> bool:
-        """Whether it ended after at least `LEAST_SEEN` sections elsewhere."""
+        """Whether the trajectory ended after at least `LEAST_SEEN` section points on another set."""
         return not self.goes_on and not self.is_leaving and len(self.stayed) >= LEAST_SEEN
 
     @property
     def length(self) -> int:
-        """Number of sections of the extension."""
+        """Number of section points in the extension."""
         return sum(len(leg) for leg in self.legs)
 
 
 def rest_number(end: int) -> int | None:
-    """Return the number of the equilibrium that an end code stands for; None for other ends."""
+    """Return the number of the equilibrium that an end code means; None if the code means another end."""
     return AT_REST - end if end <= AT_REST else None

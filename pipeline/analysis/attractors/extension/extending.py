@@ -1,4 +1,4 @@
-"""Extend cells that are on no known orbit or equilibrium, until their set is known.
+"""Integrate trajectories further that are on no known orbit or equilibrium, until the set on which they end is known.
 
 A sample of these cells is integrated further from the last section, leg by leg. After each leg, cells that
 reached an orbit or an equilibrium, known or new, leave the sample. The others are grouped into sets
@@ -57,7 +57,7 @@ LOOK_BACK = 4
 
 @dataclass
 class Outcome:
-    """Result of the extension of a parameter point.
+    """Result of integrating the trajectories of one parameter point further.
 
     Attributes
     ----------
@@ -83,7 +83,7 @@ class Outcome:
 def extend(
     point: Point, orbits: Sequence[Orbit], label: np.ndarray, settings: Settings, budget: float, n_sample: int
 ) -> Work[Outcome]:
-    """Extend samples of a point's cells with label -1 until their sets are known.
+    """Integrate samples of the cells with label -1 further, until the sets on which they end are known.
 
     Parameters
     ----------
@@ -121,7 +121,7 @@ def extend(
 
 
 class _Extension:
-    """The state of the extension at one parameter point: the sampled cells, the orbits and the sets found so far."""
+    """State of the further integration at one parameter point: sampled trajectories, orbits and sets found so far."""
 
     def __init__(self, point: Point, orbits: list[Orbit], settings: Settings, budget: float) -> None:
         self.point, self.orbits, self.settings = point, orbits, settings
@@ -135,13 +135,13 @@ class _Extension:
 
     @property
     def has_budget(self) -> bool:
-        """Whether some of the budget is left."""
+        """Whether periods are left in the integration budget."""
         return self.spent < self.budget
 
     # ---- samples -------------------------------------------------------------------------------
 
     def sample(self, loose: np.ndarray, n: int) -> list[Course]:
-        """Return the next `n` cells by rising hash of their sections, one per box of last sections."""
+        """Choose the next `n` cells to integrate further: one per box of last section points, by rising hash."""
         known = {course.key for course in self.courses}
         best: dict[int, tuple[int, int, np.ndarray, float]] = {}
         is_loose = np.zeros(self.point.n_cells, bool)
@@ -160,14 +160,14 @@ class _Extension:
         return [Course(cell, key, kept, kept[-1], step) for key, (_, cell, kept, step) in chosen]
 
     def left_of(self, loose: np.ndarray) -> np.ndarray:
-        """Return the loose cells that were not sampled and lie on no final set."""
+        """Return the unassigned cells that were not sampled and lie on no set with a final verdict."""
         done = np.zeros(self.point.n_cells, bool)
         done[self.told(loose)[0]] = True
         done[[course.cell for course in self.courses]] = True
         return np.asarray(loose[~done[loose]])
 
     def told(self, loose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the loose cells on sets whose verdict is final, and the sets' numbers."""
+        """Return the unassigned cells that lie on sets with a final verdict, and the numbers of these sets."""
         final = [i for i, one in enumerate(self.sets) if one.stability in (ATTRACTS, NEUTRAL) or not self.budget]
         clouds = [one for i in final if (one := self.sets[i].cloud) is not None]
         is_loose = np.zeros(self.point.n_cells, bool)
@@ -181,7 +181,7 @@ class _Extension:
         return np.concatenate(cells), np.concatenate(numbers)
 
     def add_transient(self) -> None:
-        """Add the set that cells have left, unless it is a set on which other cells stayed."""
+        """Add the transient set that trajectories have left, unless other trajectories stayed on it."""
         left = [course for course in self.courses if course.has_left]
         if left and not any(one.n_left for one in self.sets):
             self.sets.append(left_behind(left, self.settings))
@@ -189,7 +189,9 @@ class _Extension:
     # ---- legs ----------------------------------------------------------------------------------
 
     def run(self) -> Work[None]:
-        """Extend unfinished cells until the sample has stayed, and longer while a set is in doubt."""
+        """Integrate unfinished trajectories further until they have stayed long enough, and longer while a set is in
+        doubt.
+        """
         target = LEAST_STAY
         for _ in range(DOUBLINGS + 1):
             yield from self._extend(target)
@@ -202,7 +204,9 @@ class _Extension:
             target = 2 * max(c.length for c in self.courses if c.goes_on)
 
     def conclude(self) -> Work[None]:
-        """Describe the sets of unfinished cells without extending them, unless they were told as they are."""
+        """Describe the sets of unfinished trajectories without integrating further, unless their description is up to
+        date.
+        """
         if self._told != self._lengths():
             yield from self._tell_sets()
 
@@ -225,7 +229,7 @@ class _Extension:
             yield from self._take(going, leg)
 
     def _has_stayed(self, going: Sequence[Course], target: int) -> bool:
-        """Whether the unfinished cells have stayed long enough for a verdict."""
+        """Return whether the unfinished trajectories have stayed long enough to decide that their set attracts."""
         least = min(course.length for course in going)
         if least < target:
             return False
@@ -234,12 +238,12 @@ class _Extension:
         return least >= longest or lifetime_interval(0, at_risk)[0] >= longest
 
     def _longest_transient(self) -> float:
-        """Return the longest time that a cell of the point was seen away from its end."""
+        """Return the longest transient seen at the parameter point [drive periods or returns]."""
         left = [c.periods for c in self.courses if not c.goes_on and not c.is_leaving]
         return self.settings.seen + max(left, default=0.0)
 
     def _take(self, going: Sequence[Course], leg: Extended) -> Work[None]:
-        """Record the results of a leg, and end the cells that reached an orbit or an equilibrium."""
+        """Record `LEG` more sections of each trajectory, and end those that reached an orbit or an equilibrium."""
         computed = np.isin(leg.status, (Status.PERIODIC, Status.BOUNDED))
         for course, state, step, section, ok in zip(going, leg.state, leg.step, leg.section, computed, strict=True):
             course.state, course.step = state, float(step)
@@ -263,7 +267,7 @@ class _Extension:
         self._leap(own, leg.section[rows])
 
     def _fail(self, course: Course, status: int) -> None:
-        """End a cell that did not finish its leg: at rest, diverged, or failed."""
+        """End the extension of a trajectory whose integration stopped early: at rest, diverged or failed."""
         course.periods = float(course.length)
         course.is_leaving = not course.length
         course.end = DIVERGED if status == Status.DIVERGED else FAILED
@@ -273,7 +277,7 @@ class _Extension:
                 course.end = AT_REST - number
 
     def _search(self, own: Sequence[Course], block: Block) -> Work[None]:
-        """Find orbits by Newton's method, from cells that close or nearly close."""
+        """Find closed orbits by Newton's method, from trajectories that close or nearly close."""
         label, _ = decide(block, self.orbits, 10.0 * self.settings.closure, self.geometry)
         rest = np.flatnonzero(label < 0).tolist()
         closed = ClosedCells(self.geometry, 10.0 * self.settings.closure, Guesses.none(block.section.shape[2]))
@@ -297,11 +301,11 @@ class _Extension:
                 self.orbits.append(orbit)
 
     def _rests(self, orbit: Orbit) -> bool:
-        """Whether an orbit is an equilibrium that lies on the section."""
+        """Return whether a closed orbit is in fact an equilibrium that lies on the section."""
         return self.point.can_rest and rest_of_orbit(self.point, orbit.points[0], self.geometry) is not None
 
     def _leave(self, course: Course, number: int) -> None:
-        """End a cell on an orbit, and record when it came near the orbit for good."""
+        """End the extension of a trajectory on an orbit, and record when it came near the orbit for good."""
         orbit, states = self.orbits[number], np.concatenate([course.kept, course.extension])
         phase = int(np.argmin(self.geometry.distance(orbit.points, states[-1])))
         back = np.arange(len(states))
@@ -312,7 +316,7 @@ class _Extension:
         course.is_leaving = entered <= len(course.kept)
 
     def _rest(self, own: Sequence[Course], section: np.ndarray, seconds: np.ndarray) -> None:
-        """End the cells that approach a stable equilibrium."""
+        """End the extension of trajectories that approach a stable equilibrium."""
         if not self.point.can_rest:
             return
         going = [i for i, course in enumerate(own) if course.goes_on]
@@ -325,7 +329,7 @@ class _Extension:
                 own[i].is_leaving = len(own[i].legs) <= 1
 
     def _leap(self, own: Sequence[Course], section: np.ndarray) -> None:
-        """Move cells that leave an unstable orbit slowly farther from it along their way."""
+        """Move trajectories that slowly leave an unstable orbit farther out along their predicted path."""
         rows = [i for i, course in enumerate(own) if course.goes_on]
         if not rows:
             return
@@ -337,7 +341,7 @@ class _Extension:
     # ---- sets ----------------------------------------------------------------------------------
 
     def _tell_sets(self) -> Work[bool]:
-        """Group the unfinished cells into sets and describe them; return whether a set is in doubt."""
+        """Group the unfinished trajectories into sets and describe them; return whether a set is in doubt."""
         going = [course for course in self.courses if course.goes_on]
         has_stayed = bool(going[0].legs) and self._has_stayed(going, LEAST_STAY)
         numbers, is_sure = group([c.stayed for c in going], self.geometry, self.settings.closure)
@@ -355,7 +359,9 @@ class _Extension:
     def _with_those_left(
         self, groups: Sequence[list[Course]], gone: Sequence[Course]
     ) -> list[tuple[list[Course], list[Course]]]:
-        """Pair each group with the cells that left it; merge all groups that cells left into one set."""
+        """Pair each group of trajectories with those that left its set; merge all groups whose set was left into
+        one.
+        """
         left = [[course for course in gone if were_on(course, own, self.settings)] for own in groups]
         joined = [course for own, some in zip(groups, left, strict=True) if some for course in own]
         found = [(own, some) for own, some in zip(groups, left, strict=True) if not some]

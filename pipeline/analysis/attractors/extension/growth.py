@@ -1,4 +1,4 @@
-"""Classify a set that does not close as chaotic, torus or neither, by the growth of small distances.
+"""Classify a non-periodic set as chaotic, as a torus or as neither, by the growth of small distances.
 
 The derivatives of the section map along extended cells give the exponents per section (Eckmann and
 Ruelle, Rev. Mod. Phys. 57, 617, 1985, sec. V). These exponents exclude the phase of the drive, and the
@@ -50,7 +50,7 @@ an interval around 0 counts as 0."""
 
 @dataclass(frozen=True)
 class Growth:
-    """Exponents of the section map on a set, per section.
+    """Lyapunov exponents of the section map on a set, per section.
 
     Attributes
     ----------
@@ -77,7 +77,7 @@ class Growth:
 
     @property
     def is_chaotic(self) -> bool:
-        """Whether small distances grow: the interval lies above 0 and the growth reaches `GROWN`."""
+        """Whether small distances grow: the exponent's interval lies above 0 and the growth reaches `GROWN`."""
         return bool(self.low > 0.0 and self.rate * self.length >= GROWN)
 
     @property
@@ -88,18 +88,18 @@ class Growth:
 
     @property
     def is_zero(self) -> bool:
-        """Whether the weighted average is 0 within `ZERO`."""
+        """Whether the weighted average of the largest exponent is 0 within `ZERO`."""
         return bool(abs(self.weighted) <= ZERO and self.weighted_error <= 3.0 * ZERO)
 
     @property
     def preserves_volume(self) -> bool:
-        """Whether the mean change of volumes is 0 within its error."""
+        """Whether the mean change of phase volumes is 0 within its error."""
         near = abs(self.volume) <= N_SIGMA * self.volume_error and self.volume_error <= LOST_ERROR
         return bool(near or abs(self.volume) <= LOST)
 
 
 def growth_of(derivatives: np.ndarray, n_known: int, volumes: np.ndarray) -> Growth:
-    """Compute the exponents of the section map from its derivatives along some cells.
+    """Compute the Lyapunov exponents of the section map from its derivatives along some trajectories.
 
     Parameters
     ----------
@@ -152,7 +152,7 @@ def _mean(values: np.ndarray) -> tuple[float, float]:
 def volumes_of(
     derivatives: np.ndarray, before: np.ndarray, after: np.ndarray, crossed: int | None, flow: Rates
 ) -> np.ndarray:
-    """Compute the logarithm of the change of a volume along the flow over a period or return, shape (n,).
+    """Compute the logarithm of a phase volume's change along the flow over one period or return, shape (n,).
 
     On a section of crossings the map's change of areas differs from the flow's change of volumes by the ratio
     of the crossing speeds.
@@ -177,7 +177,9 @@ def volumes_of(
 
 
 def _logarithms(derivatives: np.ndarray) -> np.ndarray:
-    """Compute the log growth of orthonormal directions at each section by QR; `GONE` where one vanishes."""
+    """Compute the logarithmic growth of orthonormal directions at each section by QR; `GONE` for a direction that
+    vanishes.
+    """
     basis = np.broadcast_to(np.eye(derivatives.shape[-1]), derivatives[:, 0].shape)
     grown = np.empty(derivatives.shape[:-1])
     for i in range(derivatives.shape[1]):
@@ -219,7 +221,9 @@ def on_closed_curves(points: np.ndarray, geometry: Geometry) -> bool:
 
 
 def kind_of(growth: Growth, points: np.ndarray, geometry: Geometry) -> int:
-    """Return the kind of a set from its exponents and its section points (n, state)."""
+    """Return the kind of a set (chaotic, torus or other) from its Lyapunov exponents and its section points (n,
+    state).
+    """
     if growth.is_chaotic:
         return CHAOTIC_SET
     if growth.is_zero and on_closed_curves(points, geometry):

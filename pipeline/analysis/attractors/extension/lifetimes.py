@@ -1,4 +1,4 @@
-"""Estimate the mean lifetime on a set that motions leave, with its confidence interval.
+"""Estimate the mean lifetime of trajectories on a transient set, with its confidence interval.
 
 Escape from a chaotic saddle forgets the past, so lifetimes beyond the first few periods are exponential
 (Kantz and Grassberger, Physica D 17 (1985) 75; Lai and Tel, Transient Chaos, 2011, ch. 1). Let r be the
@@ -15,7 +15,7 @@ from scipy.stats import chi2
 
 
 def lifetime_interval(n_left: int, time_at_risk: float, confidence: float = 0.95) -> tuple[float, float]:
-    """Compute the confidence interval of the mean lifetime from escapes and the total time at risk.
+    """Compute the confidence interval of the mean lifetime from the number of escapes and the total time at risk.
 
     Parameters
     ----------

@@ -1,1 +1,1 @@
-"""Find the attractors of a parameter point: orbits, limit cycles and equilibria that its cells are on."""
+"""Find the closed orbits, limit cycles and equilibria on which the trajectories of a parameter point end."""

@@ -1,4 +1,4 @@
-"""Decide which orbit a cell has reached or approaches."""
+"""Decide which closed orbit each trajectory has reached or approaches."""
 
 from __future__ import annotations
 
@@ -25,7 +25,9 @@ class _Metric:
 
     @classmethod
     def of(cls, orbit: Orbit, geometry: Geometry) -> _Metric | None:
-        """Return the norm of an orbit; None if the orbit attracts too weakly, or not at all."""
+        """Return a norm in which the return map of an orbit contracts; None if the orbit attracts too weakly, or not at
+        all.
+        """
         matrix = scaled_derivative(orbit, geometry)
         slow = 0.5 * (1.0 + float(np.abs(orbit.multipliers).max()))
         try:
@@ -41,7 +43,7 @@ class _Metric:
 
     @property
     def factor(self) -> float:
-        """Largest norm of a state at scaled distance 1."""
+        """Upper bound of the norm of a state at scaled distance 1."""
         return float(np.linalg.norm(self.root, 2) * np.sqrt(len(self.root)))
 
 
@@ -98,7 +100,9 @@ def decide(
 def _nearest(
     section: np.ndarray, cells: np.ndarray, orbits: Sequence[Orbit], geometry: Geometry
 ) -> Iterator[tuple[np.ndarray, int, int]]:
-    """Yield the cells whose last section is within `REACH` of an orbit point, with orbit and phase."""
+    """Yield groups of cells whose last section points are within `REACH` of the same orbit point, with orbit and
+    phase.
+    """
     if not orbits or not len(cells):
         return
     owner = np.repeat(np.arange(len(orbits)), [o.period for o in orbits])
@@ -116,7 +120,9 @@ def _on_orbit(section: np.ndarray, orbit: Orbit, phase: int, tolerance: float, g
 
 
 def _approach(section: np.ndarray, orbit: Orbit, phase: int, tolerance: float, geometry: Geometry) -> np.ndarray:
-    """Return ``CERTAIN``, ``APPROACHING`` or ``UNDECIDED`` for cells whose last section has this phase."""
+    """Return ``CERTAIN``, ``APPROACHING`` or ``UNDECIDED`` for each cell whose last section point is nearest to this
+    phase of an orbit.
+    """
     code = np.zeros(len(section), np.int8)
     last = section.shape[1] - 1 - phase
     if not orbit.is_stable or last < 2 * orbit.period:

@@ -1,4 +1,4 @@
-"""Hold the cells of one parameter point in blocks, and collect guesses of closed orbits from them."""
+"""Hold the trajectories (cells) of one parameter point in blocks, and collect guesses of closed orbits from them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pipeline.analysis.sets import Geometry, groups, hashes
 
 @dataclass(frozen=True)
 class Block:
-    """Some cells of one parameter point.
+    """Some cells (trajectories) of one parameter point, with their section points and status.
 
     Attributes
     ----------
@@ -40,18 +40,22 @@ class Block:
     step: np.ndarray | None = None
 
     def take(self, rows: np.ndarray) -> Block:
-        """Return the cells of some rows; `cells` no longer gives their places."""
+        """Return a block with the given rows of cells; its `cells` no longer gives their indices at the parameter
+        point.
+        """
         return Block(self.cells, self.section[rows], self.status[rows], self.orbit_period[rows], self.turns[rows])
 
     @cached_property
     def is_closed(self) -> np.ndarray:
-        """Whether each cell's sections close, or its period was inferred from its neighbours."""
+        """Whether each cell's section points repeat with a period, or its period was inferred from neighbouring
+        cells.
+        """
         closed = np.isin(self.status, (Status.PERIODIC, Status.INFERRED))
         return np.asarray(closed & (self.orbit_period > 0) & self._finite)
 
     @cached_property
     def is_bounded(self) -> np.ndarray:
-        """Whether each cell was computed to the end and closes on no periodic orbit."""
+        """Whether each cell was integrated to the end without closing on a periodic orbit."""
         computed = np.isin(self.status, (Status.PERIODIC, Status.BOUNDED))
         return np.asarray(computed & self._finite & ~self.is_closed)
 
@@ -62,7 +66,7 @@ class Block:
 
 @dataclass(frozen=True)
 class Guesses:
-    """Guesses for closed orbits: the best cell of each box.
+    """Starting guesses for closed orbits: the best cell of each box of section points.
 
     Attributes
     ----------
@@ -86,17 +90,17 @@ class Guesses:
 
     @classmethod
     def none(cls, n_states: int) -> Guesses:
-        """Return an empty collection."""
+        """Return an empty collection of guesses."""
         empty = np.zeros(0)
         whole = np.zeros(0, np.uint64)
         return cls(whole, empty, whole, np.zeros((0, n_states)), np.zeros(0, np.int64))
 
     def take(self, rows: np.ndarray) -> Guesses:
-        """Return the guesses of some rows."""
+        """Return the guesses in the given rows."""
         return Guesses(self.key[rows], self.score[rows], self.mark[rows], self.point[rows], self.period[rows])
 
     def best(self, key: np.ndarray | None = None) -> Guesses:
-        """Keep the best per key, in rising order of the keys."""
+        """Return the best guess per key, in rising order of the keys."""
         keys = self.key if key is None else key
         order = np.lexsort((self.mark, self.score, keys))
         first = np.ones(len(order), bool)
@@ -104,7 +108,7 @@ class Guesses:
         return self.take(order[first])
 
     def least(self, n: int) -> Guesses:
-        """Return the `n` guesses of least score, in the order of their marks."""
+        """Return the `n` guesses of least score, sorted by the hashes of their cells."""
         least = np.lexsort((self.mark, self.score))[:n]
         return self.take(least[np.argsort(self.mark[least], kind="stable")])
 
@@ -113,18 +117,18 @@ class Guesses:
         return Guesses(self.key, self.score, self.mark, self.point, np.zeros_like(self.period))
 
     def joined(self, other: Guesses) -> Guesses:
-        """Return the best guess per key of this collection and another."""
+        """Return the best guess per box from this collection and another."""
         return self.followed_by(other).best()
 
     def followed_by(self, other: Guesses) -> Guesses:
-        """Return this collection followed by another."""
+        """Return these guesses followed by those of another collection."""
         names = ("key", "score", "mark", "point", "period")
         return Guesses(*(np.concatenate([getattr(self, n), getattr(other, n)]) for n in names))
 
 
 @dataclass
 class ClosedCells:
-    """Groups of closed cells, by the boxes that their last sections fall into.
+    """Groups of closed (periodic) cells, by the boxes into which their last section points fall.
 
     A cell of period p contributes the boxes of its last p sections, whose order does not matter.
     Boxes of side `tolerance` that touch are connected, and so are all boxes of one cell. Cells of
@@ -140,7 +144,7 @@ class ClosedCells:
     _edges: list[np.ndarray] = field(default_factory=list)
 
     def add(self, block: Block) -> None:
-        """Add the closed cells of a block."""
+        """Add the closed (periodic) cells of a block to the groups."""
         for p in np.unique(block.orbit_period[block.is_closed]):
             cells = np.flatnonzero(block.is_closed & (block.orbit_period == p))
             section = block.section[cells]
@@ -166,7 +170,7 @@ class ClosedCells:
         self._keys.append(unique)
 
     def close(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the keys of all boxes in rising order, and the group of each box."""
+        """Return the keys of all occupied boxes in rising order, and the number of each box's group."""
         if not self._keys:
             return np.zeros(0, np.uint64), np.zeros(0, np.int64)
         keys, first = np.unique(np.concatenate(self._keys), return_index=True)
@@ -188,12 +192,12 @@ class ClosedCells:
 
 
 def _rows_of(points: np.ndarray, p: int, geometry: Geometry, side: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the period and box of each point, as rows of integers and as hashed keys."""
+    """Return the orbit period and the box of each section point, as rows of integers and as hashed keys."""
     boxes = geometry.boxes(points, side)
     rows = np.concatenate([np.full((*boxes.shape[:-1], 1), p, np.int64), boxes], axis=-1)
     return rows, hashes(rows)
 
 
 def marks_of(section: np.ndarray) -> np.ndarray:
-    """Return a hash of each cell's sections (cell, period_index, state)."""
+    """Hash the section points (cell, period_index, state) of each cell to one number."""
     return hashes(section.reshape(len(section), section.shape[1] * section.shape[2]))

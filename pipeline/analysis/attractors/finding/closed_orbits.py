@@ -1,4 +1,4 @@
-"""Polish closed orbits by Newton's method, integrate guesses until they close, and compare orbits.
+"""Polish (refine) closed orbits by Newton's method, integrate guesses until they close, and compare orbits.
 
 `polish` runs Newton's method of the core, and `run_on` runs the engine. Both take one section point per
 guess.
@@ -65,12 +65,12 @@ class Orbit:
 
     @property
     def period(self) -> int:
-        """Number of drive periods, or returns, until the orbit closes."""
+        """Number of drive periods, or of returns to the section, until the orbit closes."""
         return len(self.points)
 
     @property
     def is_polished(self) -> bool:
-        """Whether Newton's method converged on it."""
+        """Whether Newton's method converged on the orbit."""
         return bool(np.isfinite(self.residual))
 
     @cached_property
@@ -85,7 +85,9 @@ class Orbit:
 
     @cached_property
     def stability(self) -> int:
-        """Stability by the multipliers and their error, or by trajectories on both sides."""
+        """Stability from the multipliers and their error or, if these do not decide, from trajectories on both
+        sides.
+        """
         if not self.is_polished:
             return NOT_SETTLED
         found = by_margin(float(np.abs(self.multipliers).max()), 1.0, self.multiplier_error)
@@ -93,7 +95,7 @@ class Orbit:
 
     @property
     def is_stable(self) -> bool:
-        """Whether it is shown to attract."""
+        """Whether the orbit is shown to attract."""
         return self.stability == ATTRACTS
 
     @property
@@ -103,13 +105,13 @@ class Orbit:
 
 
 def scaled_derivative(orbit: Orbit, geometry: Geometry) -> np.ndarray:
-    """Return the monodromy matrix for states in units of their scales."""
+    """Return the orbit's monodromy matrix for states in units of their scales."""
     scales = np.asarray(geometry.scales)
     return np.asarray(orbit.derivative * scales[None, :] / scales[:, None])
 
 
 def raw_orbit(points: np.ndarray, geometry: Geometry) -> Orbit:
-    """Make an unpolished orbit of section points (period, state)."""
+    """Make an orbit from its section points (period, state), without polishing it by Newton's method."""
     n = points.shape[1]
     return Orbit(_rolled(points, geometry), np.full(n, np.nan + 0j), np.nan, np.full((n, n), np.nan))
 
@@ -129,7 +131,7 @@ def polish(
     system: System,
     tolerance: float,
 ) -> list[Orbit | None]:
-    """Polish guesses at any parameter points in one call.
+    """Polish guesses of closed orbits, at any parameter points, by Newton's method in one call.
 
     Parameters
     ----------
@@ -193,7 +195,9 @@ def _polished(
     system: System,
     tolerance: float,
 ) -> list[Orbit | None]:
-    """Polish guesses to a residual, and those again whose least point is another one, from this point."""
+    """Polish guesses by Newton's method to a residual, and once more from an orbit's least section point if that
+    differs.
+    """
     found = polish_orbits(packed, frequency, points, period, tolerance=tolerance, system=system)
     orbits = [_orbit_of(found, row) if found.converged[row] else None for row in range(len(points))]
     least = {row: _rolled(one.points, geometry)[0] for row, one in enumerate(orbits) if one is not None}
@@ -221,7 +225,7 @@ def _orbit_of(found: PeriodicOrbits, row: int) -> Orbit:
 def run_on(
     packed: np.ndarray, frequency: np.ndarray, points: np.ndarray, max_orbit_period: int, system: System
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Integrate section points (n, state) until they close within `EXTEND_CLOSURE`.
+    """Integrate from section points (n, state) until the trajectories close within `EXTEND_CLOSURE`.
 
     Returns
     -------
@@ -249,7 +253,7 @@ def run_on(
 
 
 def distinct(orbits: Sequence[Orbit], geometry: Geometry) -> list[Orbit]:
-    """Merge orbits that coincide; return them sorted, whatever their order was."""
+    """Merge orbits that coincide and return them sorted, independent of the order in which they were given."""
 
     def key(orbit: Orbit) -> tuple[int, tuple[float, ...], bytes]:
         least = rounded_points(orbit.points[:1], geometry)[0]

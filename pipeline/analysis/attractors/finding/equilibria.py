@@ -1,4 +1,4 @@
-"""Find the equilibria of flows, and the cells that are at an equilibrium or approach one.
+"""Find the equilibria of flows, and the trajectories (cells) that are at an equilibrium or approach one.
 
 Newton's method on the rates starts from the last states of cells, near or far. A cell belongs to a stable
 equilibrium in three cases: it had no return and stopped near the equilibrium; it lies on it within the
@@ -36,7 +36,7 @@ GUESSES, GUESS_BOX = 64, 0.1
 
 
 def tell_rest(points: Iterable[Point], tolerance: float, geometry: Geometry) -> None:
-    """Find the equilibria that cells of some parameter points are at, in place.
+    """Find the equilibria of some parameter points and the cells that are at them; store both in the points.
 
     Parameters
     ----------
@@ -56,7 +56,9 @@ def tell_rest(points: Iterable[Point], tolerance: float, geometry: Geometry) -> 
 
 
 def _ends(point: Point, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return each cell's last state, NaN if it has none, and the largest distance that counts as at rest."""
+    """Return each cell's last state (NaN if it has none) and the distance within which it counts as at an
+    equilibrium.
+    """
     states = np.full((point.n_cells, point.n_states), np.nan)
     reach = np.full(point.n_cells, tolerance)
     for block in point.blocks():
@@ -70,7 +72,9 @@ def _ends(point: Point, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _waited(point: Point, states: np.ndarray) -> np.ndarray:
-    """Integrate cells without a return until they are near an equilibrium; NaN for those that do return."""
+    """Integrate trajectories that have not returned to the section until they are near an equilibrium; NaN for those
+    that return.
+    """
     states, system = states.copy(), point.integrates
     far = np.flatnonzero(np.isfinite(states).all(axis=1))
     for _ in range(WAITS):
@@ -96,7 +100,9 @@ def _waited(point: Point, states: np.ndarray) -> np.ndarray:
 
 
 def _found(point: Point, states: np.ndarray, reach: np.ndarray, geometry: Geometry) -> list[Equilibrium]:
-    """Find equilibria by Newton's method from near states and a sample of far ones, in canonical order."""
+    """Find equilibria by Newton's method from last states close to them and a sample of other states, in canonical
+    order.
+    """
     if not len(states):
         return []
     steps, _ = newton_steps(point.integrates, states, point.packed)
@@ -127,7 +133,7 @@ def equilibria_near(point: Point, states: np.ndarray, geometry: Geometry) -> lis
 
 
 def _settled(point: Point, states: np.ndarray, reach: np.ndarray, geometry: Geometry) -> np.ndarray:
-    """Return the equilibrium that each cell is at; -1 for none."""
+    """Return the index of the equilibrium that each cell is at; -1 for none."""
     at_rest = np.full(len(states), -1, np.int64)
     rows = np.flatnonzero(np.isfinite(states).all(axis=1))
     for k, one in enumerate(point.equilibria):
@@ -137,7 +143,7 @@ def _settled(point: Point, states: np.ndarray, reach: np.ndarray, geometry: Geom
 
 
 def put_at_rest(point: Point, tolerance: float, geometry: Geometry) -> None:
-    """Label the cells near degenerate equilibria that were seen to attract, in place."""
+    """Label in place the cells near degenerate equilibria that nearby trajectories were seen to approach."""
     states, _ = _ends(point, tolerance)
     assert point.at_rest is not None
     for k, one in enumerate(point.equilibria):
@@ -160,7 +166,7 @@ def _label_approaching(point: Point, tolerance: float, geometry: Geometry) -> No
 def approaching(
     point: Point, section: np.ndarray, seconds: np.ndarray, tolerance: float, geometry: Geometry
 ) -> np.ndarray:
-    """Return the stable equilibrium that each trajectory approaches; -1 for none.
+    """Return the index of the stable equilibrium that each trajectory approaches; -1 for none.
 
     Parameters
     ----------
@@ -183,7 +189,9 @@ def approaching(
 
 
 def rest_near(point: Point, state: np.ndarray, geometry: Geometry) -> int | None:
-    """Return the stable equilibrium near the last state of a cell without a return; add it if it is new."""
+    """Return the index of the stable equilibrium near the last state of a trajectory that does not return; append it if
+    new.
+    """
     if not np.isfinite(state).all():
         return None
     state = _waited(point, state[None])[0]
@@ -194,7 +202,7 @@ def rest_near(point: Point, state: np.ndarray, geometry: Geometry) -> int | None
 
 
 def number_of(one: Equilibrium, point: Point, geometry: Geometry) -> int:
-    """Return the index of an equilibrium among those of a point; append it if it is new."""
+    """Return the index of an equilibrium among those of a parameter point; append it if it is new."""
     for k, other in enumerate(point.equilibria):
         if geometry.distance(one.state, other.state) <= SAME_EQUILIBRIUM:
             return k
@@ -203,7 +211,7 @@ def number_of(one: Equilibrium, point: Point, geometry: Geometry) -> int:
 
 
 def rest_of_orbit(point: Point, state: np.ndarray, geometry: Geometry) -> int | None:
-    """Return the number of the equilibrium that a polished orbit degenerates to; None if the orbit moves."""
+    """Return the index of the equilibrium to which a polished orbit has shrunk; None if the orbit is no equilibrium."""
     steps, _ = newton_steps(point.integrates, state[None], point.packed)
     if not np.abs(steps / np.asarray(geometry.scales)).max() <= 10.0 * SAME_EQUILIBRIUM:
         return None

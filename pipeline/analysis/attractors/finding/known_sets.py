@@ -46,18 +46,22 @@ class Equilibrium:
 
     @cached_property
     def stability(self) -> int:
-        """Stability by the real parts of the eigenvalues and their error, or by trajectories beside it."""
+        """Stability from the real parts of the eigenvalues and their error or, if these do not decide, from nearby
+        trajectories.
+        """
         found = by_margin(float(self.eigenvalues.real[0]), 0.0, self.eigenvalue_error)
         return ATTRACTS if found == NEUTRAL and self.approached_within > 0.0 else found
 
     @property
     def is_stable(self) -> bool:
-        """Whether it is shown to attract."""
+        """Whether the equilibrium is shown to attract."""
         return self.stability == ATTRACTS
 
     @cached_property
     def _norm(self) -> tuple[np.ndarray, float] | None:
-        """Root S of a norm |S x| that falls at least as exp(-rate t), and the rate; None if there is none."""
+        """Matrix S and rate such that |S x| falls at least as exp(-rate t) along the linear flow; None if there are
+        none.
+        """
         rate = -0.5 * float(self.eigenvalues.real[0])
         shifted = self.jacobian + rate * np.eye(len(self.jacobian))
         try:
@@ -67,7 +71,7 @@ class Equilibrium:
             return None
 
     def is_approached(self, section: np.ndarray, seconds: np.ndarray, noise: float, geometry: Geometry) -> np.ndarray:
-        """Return which trajectories follow the linear flow towards it, shape (n,).
+        """Return for each trajectory whether it follows the linear flow towards the equilibrium, shape (n,).
 
         With A the Jacobian, t the time between two sections and r = exp(-rate t) the bound on the linear
         flow in its norm, let d be the distances and e = ``|d' - exp(A t) d|`` the error of the linear flow.
@@ -99,7 +103,7 @@ class Equilibrium:
         return np.asarray((error <= allowed + known).all(axis=1) & (size[:, -1] <= size[:, 0] + known))
 
     def _flow(self, times: np.ndarray) -> np.ndarray:
-        """Return the linear flow over each time, shape (..., state, state)."""
+        """Return the matrix exponential of the Jacobian over each time, shape (..., state, state)."""
         values, vectors = np.linalg.eig(self.jacobian)
         if np.linalg.cond(vectors) > 1e8:  # nearly defective: the eigenvectors are no basis
             return np.asarray(expm(self.jacobian * times[..., None, None]))

@@ -30,7 +30,7 @@ TRIES = 3
 
 
 class _Crossings:
-    """The crossings of a level by one state, upwards, for cells of a parameter point.
+    """Upward crossings of a fixed level by one state variable, for cells of a parameter point.
 
     Parameters
     ----------
@@ -48,7 +48,9 @@ class _Crossings:
         self.state = state
 
     def of(self, states: np.ndarray, level: float) -> np.ndarray:
-        """Return successive crossings, shape (cell, RETURNS, state), padded with NaN."""
+        """Return successive crossings of the level from each start state, shape (cell, RETURNS, state), padded with
+        NaN.
+        """
         n = len(states)
         found = run_branches(
             np.tile(np.append(self._packed, level), (n, 1, 1)),
@@ -63,7 +65,9 @@ class _Crossings:
         return np.asarray(found.section[:, 0])
 
     def cycle_of(self, start: np.ndarray, geometry: Geometry, residual: float) -> tuple[Cycle, np.ndarray] | None:
-        """Return the stable cycle that a state is on and the cycle's crossings of the level, or None."""
+        """Return the stable limit cycle that a state lies on, with the cycle's crossings of the level; None if there is
+        none.
+        """
         level = float(start[self.state])
         path = self.of(start[None], level)[0]
         # a state almost tangent to the level may start with a crossing that is not the cycle's
@@ -80,7 +84,7 @@ class _Crossings:
 
 
 def tell_cycles(points: Iterable[Point], tolerance: float, longest: int, residual: float, geometry: Geometry) -> None:
-    """Find the limit cycles that cells of some parameter points are on, in place.
+    """Find the limit cycles that cells of some parameter points are on; store both in the points.
 
     Parameters
     ----------
@@ -130,7 +134,7 @@ def _tell(point: Point, tolerance: float, longest: int, residual: float, geometr
 
 
 def _ends(point: Point) -> tuple[np.ndarray, np.ndarray]:
-    """Return the last state of each cell, NaN unless bounded, and whether the cell is closed."""
+    """Return the last state of each cell (NaN if the cell is not bounded), and whether the cell is closed."""
     states = np.full((point.n_cells, point.n_states), np.nan)
     is_closed = np.zeros(point.n_cells, bool)
     for block in point.blocks():

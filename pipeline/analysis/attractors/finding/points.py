@@ -59,7 +59,7 @@ class Dynamics:
         *,
         needed: bool = True,
     ) -> Dynamics:
-        """Collect the parameters and the system that are given, or else those of the run.
+        """Collect the given parameters and system or, where they are missing, those of the run.
 
         Raises
         ------
@@ -75,23 +75,23 @@ class Dynamics:
 
     @property
     def integrates(self) -> System:
-        """System to integrate; there must be one."""
+        """System of equations to integrate; it must have been given."""
         assert self.system is not None
         return self.system
 
     @property
     def can_rest(self) -> bool:
-        """Whether equilibria are searched: only for autonomous models whose equations are integrated."""
+        """Whether equilibria are searched for: only for autonomous models whose equations are integrated."""
         return self.model is not None and self.model.autonomous and self.system is not None
 
     @property
     def is_flow(self) -> bool:
-        """Whether sections are crossings of a flow."""
+        """Whether the section points are crossings of a Poincare section by an autonomous flow."""
         return self.model is not None and self.model.crossing is not None
 
     @property
     def n_angles(self) -> int:
-        """Number of states on circles."""
+        """Number of states that are angles."""
         return sum(self.geometry.is_angle)
 
 
@@ -146,11 +146,15 @@ class Point:
 
     @property
     def n_neutral(self) -> int:
-        """Number of the section map's exponents that are 0 by construction: 1 for a flow at equal times."""
+        """Number of Lyapunov exponents of the section map that are 0 by construction: 1 for a flow sampled at equal
+        times, else 0.
+        """
         return int(self.can_rest and not self.is_flow)
 
     def volumes(self, derivatives: np.ndarray, before: np.ndarray, after: np.ndarray) -> np.ndarray:
-        """Compute the log change of a volume along the flow over each step of the section map, shape (n,)."""
+        """Compute the logarithm of a phase volume's change along the flow over each step of the section map, shape
+        (n,).
+        """
 
         def flow(states: np.ndarray) -> np.ndarray:
             return rates_at(self.integrates, states, self.packed)
@@ -159,7 +163,7 @@ class Point:
 
     @property
     def integrates(self) -> System:
-        """System to integrate; there must be one."""
+        """System of equations to integrate; it must have been given."""
         assert self.system is not None
         return self.system
 
@@ -174,7 +178,7 @@ class Point:
         return int(self.cube.sizes["state"])
 
     def blocks(self) -> Iterator[Block]:
-        """Yield all cells in blocks, in the order of the start dims."""
+        """Yield all cells in blocks, in the order of the dims of their starts (initial conditions or branches)."""
         first = self.start_dims[0] if self.start_dims else None
         length = self.cube.sizes[first] if first else 1
         inner = self.n_cells // max(length, 1)
@@ -189,7 +193,7 @@ class Point:
             yield self._known(self._read(part, slice(begin * inner, begin * inner + n), n))
 
     def _known(self, block: Block) -> Block:
-        """Return a block in which cells at rest or on a limit cycle count as neither closed nor bounded."""
+        """Return the block with cells at an equilibrium or on a limit cycle marked as neither closed nor bounded."""
         for told in (self.at_rest, self.on_cycle):
             if told is not None:
                 status = np.where(told[block.cells] >= 0, np.int8(Status.NO_RETURN), block.status)
@@ -213,7 +217,9 @@ class Point:
 
 
 def slabs(ds: xr.Dataset, dynamics: Dynamics, budget: int) -> Iterator[dict[tuple[int, ...], Point]]:
-    """Yield groups of parameter points by index; a group that fits the budget is loaded in one read."""
+    """Yield groups of parameter points, by index in the cube; a group that fits the memory budget is loaded in one
+    read.
+    """
     names = [name for name in _READ if name in ds]
     cube = ds[names].reset_coords(drop=True) if FREQUENCY_DIM in ds.dims else ds[names]
     dims, start_dims = split_dims(ds["status"])
@@ -236,7 +242,7 @@ def slabs(ds: xr.Dataset, dynamics: Dynamics, budget: int) -> Iterator[dict[tupl
 
 
 def _fixed(ds: xr.Dataset) -> dict[str, float]:
-    """Return the parameters that are scalar coordinates."""
+    """Return the dataset's scalar coordinates: parameters that are not swept, by name."""
     return {str(name): float(c) for name, c in ds.coords.items() if not c.ndim and c.dtype.kind in "fiu"}
 
 

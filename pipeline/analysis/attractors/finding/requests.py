@@ -1,4 +1,5 @@
-"""Collect the engine requests of all parameter points, and answer them in common calls.
+"""Collect the integrations that the analyses of all parameter points request, and run them in common calls of the
+engine.
 
 The work on a point is a generator: it yields a request and receives the answer. All points advance in step,
 so that their trajectories fill the engine's lanes together.
@@ -30,7 +31,7 @@ LEG = 64
 
 @dataclass(frozen=True)
 class Leg:
-    """A request to extend trajectories by `LEG` sections, from states (n, state) and step sizes (n,).
+    """Request to integrate trajectories over `LEG` further sections, from states (n, state) with step sizes (n,).
 
     With a step size of 0 the engine chooses the step.
     """
@@ -41,7 +42,7 @@ class Leg:
 
 @dataclass(frozen=True)
 class Extended:
-    """The answer to a `Leg`.
+    """Answer to a `Leg` request: section points, status and final states of the trajectories.
 
     Attributes
     ----------
@@ -65,7 +66,7 @@ class Extended:
 
 @dataclass(frozen=True)
 class Polish:
-    """A request to polish guesses; the answer is a list of `Orbit` or None, one per guess.
+    """Request to polish guesses of closed orbits; the answer is a list of `Orbit` or None, one per guess.
 
     Guesses without a period are first integrated until they close.
     """
@@ -92,7 +93,7 @@ Work = Generator[Request, Any, T]
 
 @dataclass(frozen=True)
 class Settings:
-    """The settings by which trajectories of a run are extended.
+    """Settings for integrating trajectories of a run further: tolerances, limits, system and method.
 
     Attributes
     ----------
@@ -148,7 +149,7 @@ class Settings:
 def answer_all(
     works: Mapping[tuple[int, ...], Work[T]], points: Mapping[tuple[int, ...], Point], settings: Settings, what: str
 ) -> dict[tuple[int, ...], T]:
-    """Carry out the work on all points in step, and return the result of each point."""
+    """Run the analyses (generators) of all parameter points in step, and return the result of each point."""
     answers: dict[tuple[int, ...], Any] = dict.fromkeys(works)
     results: dict[tuple[int, ...], T] = {}
     while answers:
@@ -172,7 +173,9 @@ def answer_all(
 def _gathered(
     sizes: Sequence[int], asked: Mapping[tuple[int, ...], Any], points: Mapping[tuple[int, ...], Point]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the packed parameters and the frequency of each row, and the end of each point's rows."""
+    """Return packed parameters and frequency of each requested trajectory, and the end index of each parameter point's
+    rows.
+    """
     packed = np.repeat([points[i].packed for i in asked], sizes, axis=0)
     frequency = np.repeat([points[i].frequency for i in asked], sizes)
     return packed, frequency, np.cumsum(sizes)
@@ -252,7 +255,8 @@ def _polished(
 def _each_once(
     search: np.ndarray, start: np.ndarray, period: np.ndarray, mark: np.ndarray, ended: np.ndarray, geometry: Geometry
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Choose the rows to polish; return them, and for each row the index of its representative (-1: none).
+    """Choose the guesses to polish, without duplicates; return them and the index of each guess's representative (-1:
+    none).
 
     Rows that were integrated further and ended in one box are on one orbit; the row of least hash represents
     them. Rows without a period have no representative.

@@ -28,7 +28,7 @@ ROUNDS, ROUNDS_LOOSE = 3, 6
 
 @dataclass(frozen=True)
 class Search:
-    """The options of a search, with the run's dynamics and settings.
+    """Options of the search for attractors, with the run's dynamics and settings.
 
     Attributes
     ----------
@@ -49,12 +49,12 @@ class Search:
 
     @property
     def geometry(self) -> Geometry:
-        """Geometry of the states."""
+        """Geometry of the states: which of them are angles, and their scales."""
         return self.dynamics.geometry
 
     @property
     def longest(self) -> int:
-        """Longest orbit period in the search."""
+        """Longest orbit period that the search looks for."""
         return self.options.max_orbit_period
 
     @property
@@ -64,13 +64,13 @@ class Search:
 
     @property
     def box(self) -> float:
-        """Side of the boxes that group closed cells."""
+        """Side length of the boxes by which closed cells are grouped."""
         return LOOSE_SHARE * self.tolerance if self.is_loose else self.tolerance
 
 
 @dataclass
 class State:
-    """The result of the search at one point, before its cells are labelled.
+    """Result of the search for orbits at one parameter point, before its cells are labelled.
 
     Attributes
     ----------
@@ -92,7 +92,7 @@ class State:
 
 
 def search_orbits(point: Point, search: Search) -> Work[State]:
-    """Find the orbits that cells of a point have closed on or approach."""
+    """Find the closed orbits that the cells of a parameter point have reached or approach."""
     n_states = len(search.geometry.scales)
     closed = ClosedCells(search.geometry, search.box, Guesses.none(n_states))
     for block in point.blocks():
@@ -128,14 +128,14 @@ def search_orbits(point: Point, search: Search) -> Work[State]:
 
 
 def moving(orbits: Sequence[Orbit | None], point: Point, geometry: Geometry) -> list[Orbit | None]:
-    """Replace orbits that are equilibria by None, and add these equilibria to the point, in place."""
+    """Replace orbits that are in fact equilibria by None, and add these equilibria to the parameter point, in place."""
     if not point.can_rest:
         return list(orbits)
     return [None if o is None or rest_of_orbit(point, o.points[0], geometry) is not None else o for o in orbits]
 
 
 def _closed_undecided(point: Point, orbits: Sequence[Orbit], search: Search) -> Guesses:
-    """Return the last points of closed cells that are on no known orbit, as guesses of orbits of unknown period."""
+    """Return the last section points of closed cells on no known orbit, as guesses of orbits of unknown period."""
     found = Guesses.none(len(search.geometry.scales))
     for block in point.blocks():
         label, _ = decide(block, orbits, search.tolerance, search.geometry)
@@ -149,7 +149,7 @@ def _closed_undecided(point: Point, orbits: Sequence[Orbit], search: Search) -> 
 
 
 def _undecided(point: Point, orbits: Sequence[Orbit], search: Search) -> Guesses:
-    """Make guesses from the cells that are on no known orbit."""
+    """Make guesses of closed orbits from the cells that are on no known orbit."""
     closed = ClosedCells(search.geometry, search.box, Guesses.none(len(search.geometry.scales)))
     near = Guesses.none(len(search.geometry.scales))
     for block in point.blocks():

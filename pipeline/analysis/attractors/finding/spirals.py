@@ -52,7 +52,7 @@ map that allows it, in units of the growth."""
 
 @dataclass(frozen=True)
 class Recurrence:
-    """The recurrence of cells' sections.
+    """Recurrence of the section points of cells: period, distance and centre.
 
     Attributes
     ----------
@@ -73,7 +73,7 @@ class Recurrence:
 
     @classmethod
     def of(cls, section: np.ndarray, max_period: int, geometry: Geometry) -> Recurrence:
-        """Compute the recurrence of sections (cell, period_index, state)."""
+        """Compute the recurrence of section points (cell, period_index, state)."""
         period, lag = _recurring(section, max_period, geometry)
         centred, centre = _contracting(section, max_period, geometry)
         return cls(period, lag, centred, centre)
@@ -117,7 +117,8 @@ def _contracting(section: np.ndarray, max_period: int, geometry: Geometry) -> tu
 
 
 def near_closed(section: np.ndarray, max_period: int, geometry: Geometry, closing_only: bool = False) -> Guesses:
-    """Return guesses from cells that are not closed but recur, the best one of each box.
+    """Return guesses of orbits from cells that are not closed but whose section points recur, the best guess of each
+    box.
 
     Each cell gives its last section with the period of recurrence and, if its sections contract, the mean of
     the last section's phase. Cells whose sections recur at falling distances guess at every period, unlike
@@ -137,7 +138,7 @@ def near_closed(section: np.ndarray, max_period: int, geometry: Geometry, closin
 
 
 def _closes_in(section: np.ndarray, found: Recurrence, geometry: Geometry) -> np.ndarray:
-    """Return which cells recur at falling distances."""
+    """Return for each cell whether its section points recur at falling distances."""
     closes = found.centred > 0
     half = section.shape[1] // 2
     for p in np.unique(found.period[found.period > 0]).tolist():
@@ -180,12 +181,12 @@ def beside(orbits: Sequence[Orbit], max_period: int, geometry: Geometry) -> Gues
 
 
 def keys_of(section: np.ndarray, side: float, geometry: Geometry) -> np.ndarray:
-    """Return a hash of the box that the last section of each cell lies in."""
+    """Return a hash of the box that holds the last section point of each cell."""
     return hashes(geometry.boxes(section[:, -1], side))
 
 
 def leap(section: np.ndarray, orbits: Sequence[Orbit], geometry: Geometry) -> np.ndarray:
-    """Move cells that leave an unstable orbit slowly to about `LEAP` times their distance from it.
+    """Move trajectories that slowly leave an unstable orbit to about `LEAP` times their distance from it.
 
     Near a bifurcation leaving takes thousands of periods, in which the motion follows the orbit's monodromy
     matrix. Let u be the components of a cell's distance along the unstable eigenvectors, at the sections that

@@ -63,7 +63,7 @@ def largest_error(matrix: np.ndarray, size: float, *, real: bool = False) -> flo
 
 
 def by_margin(leading: float, bound: float, error: float) -> int:
-    """Return `ATTRACTS` if a leading modulus or real part is below its bound, and `UNSTABLE` if above.
+    """Decide stability from the leading modulus or real part: `ATTRACTS` below its bound, `UNSTABLE` above it.
 
     Within the error of the bound, return `NEUTRAL`.
     """

@@ -19,7 +19,7 @@ Place = tuple[tuple[int, ...], int]
 
 @dataclass(frozen=True, eq=False)
 class Connections:
-    """Connections between appearances of attractors, numbered by their index in a list.
+    """Connections between attractors at different parameter points, numbered by their index in a list.
 
     Attributes
     ----------
@@ -41,11 +41,12 @@ class Connections:
 
     @classmethod
     def none(cls, n: int) -> Connections:
-        """Return `n` appearances that were not followed and are not connected."""
+        """Return the connections of `n` attractors that were not followed: none is connected to another."""
         return cls(np.arange(n), np.arange(n), np.zeros(n, bool))
 
     def may_be_one(self, axis: int, first: tuple[int, int], second: tuple[int, int]) -> bool:
-        """Return whether distance may match two appearances, the first at the lower value of an axis.
+        """Return whether attractors at two parameter points may be matched by distance; the first is at the lower value
+        of an axis.
 
         Parameters
         ----------
@@ -62,7 +63,7 @@ class Connections:
 
 
 def followable(attractors: xr.Dataset, at: Place) -> bool:
-    """Return whether an appearance is a closed orbit on which Newton's method converged."""
+    """Return whether an attractor at one parameter point is a closed orbit on which Newton's method converged."""
     index, row = at
     if "is_polished" not in attractors:
         return False
@@ -78,7 +79,7 @@ def connections(
     frequency: float,
     system: System,
 ) -> Connections:
-    """Follow all closed orbits along every axis.
+    """Follow all closed orbits along every swept parameter.
 
     Parameters
     ----------

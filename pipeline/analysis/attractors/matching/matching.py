@@ -44,7 +44,7 @@ _, _FIRST, _BRANCH, _DOUBLING, _DISTANCE = range(len(BASES))
 
 @dataclass(frozen=True, eq=False)
 class _Seen:
-    """An appearance: an attractor at one parameter point, from one row of the stored features."""
+    """Attractor at one parameter point, from one row of the stored features."""
 
     number: int
     kind: int
@@ -61,7 +61,7 @@ class _Seen:
 
 @dataclass(frozen=True, eq=False)
 class _Rule:
-    """The rule for matching by distance: which appearances may match, and up to which distance."""
+    """Rule for matching attractors by distance: which of them may match, and up to which distance."""
 
     threshold: float
     geometry: Geometry
@@ -69,7 +69,7 @@ class _Rule:
     known: Connections
 
     def distance(self, axis: int, before: _Seen, here: _Seen) -> float:
-        """Return the distance from an earlier appearance along an axis; infinite if they may not match."""
+        """Return the distance of an attractor from an earlier one along an axis; infinite if they may not match."""
         ends = (before.number, before.period), (here.number, here.period)
         if not self._alike(before, here) or not self.known.may_be_one(axis, *ends):
             return np.inf
@@ -90,7 +90,7 @@ def match(
     parameters: Parameters | np.ndarray | None = None,
     system: System | None = None,
 ) -> xr.Dataset:
-    """Give attractors ids that follow them along the sweep; the text of this module defines an id.
+    """Give each attractor an id that stays the same along the sweep; the text of this module defines an id.
 
     Closed orbits are first connected by continuation (`pipeline.analysis.branches.connecting`). Then the
     parameter points are visited in the order of their axes. An appearance that is connected with an earlier
@@ -167,7 +167,7 @@ def _connections(
     parameters: Parameters | np.ndarray | None,
     system: System | None,
 ) -> Connections:
-    """Follow the closed orbits along the axes, if at least two can be followed."""
+    """Follow the closed orbits along the parameter axes, if at least two can be followed."""
     if not dims or sum(followable(attractors, place) for place in places) < 2:
         return Connections.none(len(places))
     base = parameters_of(attractors) if parameters is None else parameters
@@ -182,19 +182,19 @@ def _connections(
 
 
 def _geometry(attractors: xr.Dataset, system: System | None) -> Geometry:
-    """Return the geometry of the states of the given system, or else of the model."""
+    """Return the geometry of the states, from the given system or else from the model."""
     told: Any = system or model_of(attractors)
     return Geometry(told.is_angle, told.scales)
 
 
 def _neutral(attractors: xr.Dataset) -> frozenset[int]:
-    """Return the codes of `side` that are compatible with every other code."""
+    """Return the classifier codes that are compatible with every other code."""
     classifier = model_of(attractors).classifier
     return frozenset(classifier.neutral if classifier else ())
 
 
 class _Ids:
-    """The ids given so far, parameter point by parameter point.
+    """Attractor ids given so far, parameter point by parameter point.
 
     Attributes
     ----------
@@ -218,7 +218,7 @@ class _Ids:
         self._met: set[int] = set()
 
     def at(self, here: Sequence[_Seen], known: Mapping[int, list[tuple[int, _Seen]]]) -> dict[int, _Seen]:
-        """Give ids to the appearances at the next parameter point; return the appearances by id."""
+        """Give ids to the attractors at the next parameter point; return the attractors by id."""
         free = [one for one in here if self._group[one.number] not in self._by_group]
         for one in here:
             if one not in free:
@@ -236,7 +236,9 @@ class _Ids:
         return {self._by_group[self._group[one.number]]: one for one in here}
 
     def _has_room(self, one: _Seen, identity: int) -> bool:
-        """Whether an id is free at every parameter point where the appearance's group is listed."""
+        """Return whether an id is free at every parameter point at which the attractor's group of connected orbits
+        occurs.
+        """
         return not self._where[self._group[one.number]] & self.taken[identity]
 
     def _give(self, one: _Seen, identity: int) -> None:
@@ -264,7 +266,7 @@ def _seen(attractors: xr.Dataset, number: int, place: Place) -> _Seen:
 def _known(
     seen: dict[tuple[int, ...], dict[int, _Seen]], index: tuple[int, ...], look_back: int
 ) -> dict[int, list[tuple[int, _Seen]]]:
-    """Return the appearances to compare with: for each id, the axis and the nearest appearance along it."""
+    """Return for each id the axes and, along each, the nearest earlier attractor with this id."""
     known: dict[int, list[tuple[int, _Seen]]] = {}
     for axis in range(len(index)):
         along: dict[int, _Seen] = {}
@@ -283,7 +285,7 @@ def _assign(
     rule: _Rule,
     is_free: Callable[[_Seen, int], bool],
 ) -> list[int | None]:
-    """Assign each attractor to an id by distance; None for a new attractor."""
+    """Assign each attractor of a parameter point to an existing id by distance; None for a new attractor."""
     given: list[int | None] = [None] * len(here)
     if not here or not known:
         return given
@@ -303,7 +305,7 @@ def _assign(
 
 
 def _renumbered(attractors: xr.Dataset, ids: np.ndarray, n_ids: int, dims: tuple[str, ...]) -> xr.Dataset:
-    """Move every attractor to the row of its id, and write the ids into the cells."""
+    """Move every attractor to the row of its id, and write the ids into the array of cells."""
     present = np.nonzero(ids >= 0)
     target = (*present[:-1], ids[present])
     variables: dict[str, Any] = {}
@@ -336,13 +338,13 @@ def _fill(name: str, dtype: np.dtype[Any]) -> float:
 
 
 def _lookup(ids: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Return the ids of row numbers at one parameter point; -1 for no row."""
+    """Return the ids of the attractors in some rows at one parameter point; -1 for the row -1."""
     table = np.append(ids, -1)
     return np.asarray(table[rows])
 
 
 def _destinations(values: np.ndarray, ids: np.ndarray, n_ids: int) -> np.ndarray:
-    """Convert the counts of cells that left a set, by the row of their destination, into counts by its id."""
+    """Convert counts of cells that left a set: from the row of the set that they reached to the id of this set."""
     moved = np.zeros((*values.shape[:-1], n_ids), values.dtype)
     for *index, row in np.argwhere(ids >= 0).tolist():
         point = tuple(index)
