@@ -74,6 +74,7 @@ ANALYSES = {
     "dimension": ("sweep", ["--n-max", "2000"]),
     "branches": ("walk", ["--period", "1"]),
     "curves": ("walk", ["--period", "1", "--second", "amplitude", "--second-from", "0.25", "--second-to", "0.35"]),
+    "orbits": ("sweep", [*AT["point"], "--period", "1", "--starts", "40"]),
 }
 
 FIGURES_OF = {

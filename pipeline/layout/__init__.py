@@ -1,1 +1,1 @@
-"""Turn a specification into cells, tasks, chunks, names and an identity. Pure: nothing is created."""
+"""Turn a run's specification into cells, tasks, chunks, names and an identity, without creating any file."""

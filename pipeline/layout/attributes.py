@@ -1,4 +1,4 @@
-"""Convert attributes to the types that every file format accepts: numbers, lists of numbers, texts."""
+"""Convert dataset attributes to types that every file format accepts: numbers, lists of numbers, texts."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 def netcdf_safe(ds: xr.Dataset) -> xr.Dataset:
-    """Return a dataset whose attributes can be written as NetCDF: see `safe_attributes`."""
+    """Return a copy of a dataset with all attributes converted to the types that NetCDF accepts."""
     safe = ds.copy(deep=False)
     safe.attrs = safe_attributes(ds.attrs)
     for variable in safe.variables.values():
@@ -22,7 +22,7 @@ def netcdf_safe(ds: xr.Dataset) -> xr.Dataset:
 
 
 def safe_attributes(attrs: Mapping[Any, Any]) -> dict[str, Any]:
-    """Return attributes in the types that NetCDF accepts.
+    """Return dataset attributes converted to the types that NetCDF accepts.
 
     Truth values become 0 and 1. A list of texts becomes one text, joined by spaces. Other lists and tables
     become JSON. None is left out.

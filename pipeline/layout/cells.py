@@ -1,4 +1,4 @@
-"""Turn a specification into numbers: dims and coordinates of the cube, and a task's input arrays."""
+"""Turn a run's specification into numbers: dims and coordinates of the cube, and input arrays of each task."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ DIRECTION_CODES = {"up": 1, "down": -1}
 
 @dataclass(frozen=True)
 class Coordinate:
-    """A coordinate of the cube."""
+    """A coordinate of the cube: name, dims, values and attributes."""
 
     name: str
     dims: tuple[str, ...]
@@ -30,7 +30,7 @@ class Coordinate:
 
 @dataclass(frozen=True)
 class ParameterAxis:
-    """A swept parameter and the cube's dim that it becomes."""
+    """A swept parameter: its name, its values, and its dim in the cube."""
 
     dim: str
     parameter: str
@@ -39,7 +39,7 @@ class ParameterAxis:
 
 @dataclass(frozen=True)
 class InitialStates:
-    """Initial states in a flat order. A grid is not expanded to a table.
+    """Initial states numbered by one flat index; a grid is stored as its axes, not as a table of all states.
 
     Attributes
     ----------
@@ -61,7 +61,7 @@ class InitialStates:
         return math.prod(self.shape)
 
     def at(self, flat: np.ndarray) -> np.ndarray:
-        """Return the initial states with given flat indices, shape (n, n_states), in the model's units."""
+        """Return the initial states at given flat indices, shape (n, n_states), in the model's units."""
         out = np.empty((len(flat), len(self.columns)))
         steps = np.unravel_index(flat, self.shape) if self.shape else ()
         for i, column in enumerate(self.columns):
@@ -83,7 +83,7 @@ def parameter_axes(spec: Spec) -> tuple[ParameterAxis, ...]:
 
 
 def _state_value(table: Any, state: str) -> tuple[Any, float]:
-    """Return a state's value from the table, and the factor that converts it to SI units."""
+    """Return a state's value in a table of initial states, and the factor that converts it to SI units."""
     in_degrees = table.of(degrees_key(state))
     if in_degrees is not None:
         return in_degrees, math.pi / 180
@@ -92,7 +92,7 @@ def _state_value(table: Any, state: str) -> tuple[Any, float]:
 
 
 def initial_states(starts: Starts) -> InitialStates:
-    """Return the initial states of a specification."""
+    """Return the initial states that a specification lists, samples or spans as a grid."""
     if isinstance(starts, GridStarts):
         return _grid(starts)
     columns = _rows(starts) if isinstance(starts, ListStarts) else _samples(starts)
@@ -139,7 +139,7 @@ def _samples(starts: RandomStarts) -> list[np.ndarray]:
 
 
 def coordinates(spec: Spec) -> tuple[Coordinate, ...]:
-    """Return the cube's coordinates, numbers only.
+    """Return the cube's coordinates, with numeric values only.
 
     ``direction`` is +1 (up) or -1 (down) here; `open_run` returns it as text.
     """
@@ -200,7 +200,7 @@ def _branch_coords(spec: Spec, states: InitialStates) -> list[Coordinate]:
 
 @dataclass(frozen=True)
 class Inputs:
-    """A task's arguments for `run_branches`: branches times points.
+    """Input arrays of `run_branches` for one task: parameters, frequencies and initial states of its branches.
 
     Attributes
     ----------
@@ -218,13 +218,13 @@ class Inputs:
     step_size: np.ndarray | None = None
 
     def take(self, branches: Any) -> Inputs:
-        """Return some of the branches."""
+        """Return the inputs of selected branches."""
         step = None if self.step_size is None else self.step_size[branches]
         return Inputs(self.parameters[branches], self.frequency_hz[branches], self.initial_states[branches], step)
 
 
 class CellMap:
-    """A map between the cells of a block of the cube and the branches and points of the kernel.
+    """Map between a block of cells of the cube and the kernel's arrays over branches and their parameter points.
 
     In a sweep each cell is a branch with one point. In a continuation the branches of a block walk the
     block's part of the path: upward ones from its first point, downward ones from its last.
@@ -249,7 +249,7 @@ class CellMap:
             self.path = [a.parameter for a in self._axes].index(self._walk.path)
 
     def inputs(self, block: tuple[slice, ...]) -> Inputs:
-        """Return the kernel's arguments for a block of cells."""
+        """Return the kernel's input arrays for a block of cells."""
         sizes = [s.stop - s.start for s in block]
         index = self._branch_first(np.indices(sizes).reshape(len(block), math.prod(sizes)), block)
         values = {a.parameter: a.values[index[i]] for i, a in enumerate(self._axes)}
@@ -262,7 +262,7 @@ class CellMap:
         return Inputs(parameters, values.get(FREQUENCY, fixed), self._states.at(self._start_of(index[:, :, 0])))
 
     def last_cells(self, block: tuple[slice, ...]) -> tuple[slice, ...]:
-        """Return the cells of a block where its branches end. All its branches walk in one direction."""
+        """Return the last cell of each branch in a block whose branches all run in one direction."""
         assert self.path is not None
         part = block[self.path]
         down = self._down(np.array([block[-1].start]))[0]
@@ -279,7 +279,9 @@ class CellMap:
         return np.asarray(np.ravel_multi_index(tuple(own), self._states.shape))
 
     def _branch_first(self, cells: np.ndarray, block: tuple[slice, ...]) -> np.ndarray:
-        """Return cell indices, shape (dim, branch, point), with points in the order of the walk."""
+        """Return cell indices, shape (dim, branch, point), with the points in the order in which each branch visits
+        them.
+        """
         sizes = [s.stop - s.start for s in block]
         index = cells + np.array([s.start for s in block], dtype=np.int64).reshape(-1, 1)
         if self.path is None:
@@ -291,13 +293,13 @@ class CellMap:
         return walked
 
     def _down(self, branches: np.ndarray) -> np.ndarray:
-        """Return which branches walk down."""
+        """Return a mask of the branches that are continued towards falling parameter values."""
         assert self._walk is not None
         directions = np.array([d == "down" for d in self._walk.directions])
         return np.asarray(directions[branches // len(self._states)])
 
     def outputs(self, block: tuple[slice, ...], values: np.ndarray) -> np.ndarray:
-        """Reshape a kernel's result, shape (branch, point, ...), to the block's shape."""
+        """Reshape a kernel result of shape (branch, point, ...) to the shape of its block of cells."""
         sizes = [s.stop - s.start for s in block]
         own = values.shape[2:]
         if self.path is None:

@@ -1,4 +1,4 @@
-"""Check that the equations have values at the initial states of a run, before anything is computed."""
+"""Check that the model's equations can be evaluated at a run's initial states, before anything is computed."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ MOST_CORNERS = 64
 
 
 def check_starts(spec: Spec) -> None:
-    """Refuse a run of a text model whose equations have no value at the initial conditions.
+    """Refuse a run if its model's equations, written as text, cannot be evaluated at the initial conditions.
 
     They are evaluated at time 0 at all starts (at most `MOST_STARTS`), at both ends of every axis. If they
     have values at some of the ends, the run is not refused: the status of its cells shows where they have
@@ -50,7 +50,7 @@ def check_starts(spec: Spec) -> None:
 
 
 def check_states(model: Model, states: np.ndarray, points: Sequence[Mapping[str, Any]]) -> None:
-    """Refuse states at which the equations of a model as text have no value.
+    """Refuse states at which the equations of a model written as text cannot be evaluated.
 
     Parameters
     ----------

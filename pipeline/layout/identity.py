@@ -1,4 +1,4 @@
-"""Define when two runs are the same run: by a digest, and by the keys in which they differ."""
+"""Define when two runs are the same: by a digest of their identity, and by the keys in which identities differ."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ have their own versions.
 
 
 def identity_of(spec: Spec, plan: Plan, kernel_version: str) -> dict[str, Any]:
-    """Return everything that decides the store's bytes: specification, parameters, layout, kernel, code.
+    """Return all data that determine the bytes of a run's store: specification, parameters, layout, kernel, code.
 
     The title and ``[execution]`` are left out; the chunks that follow from ``[execution]`` are included. So
     is a digest of the coordinates, the numbers that ranges and seeds stand for.
@@ -51,7 +51,7 @@ def identity_of(spec: Spec, plan: Plan, kernel_version: str) -> dict[str, Any]:
 
 
 def _coordinates_digest(spec: Spec) -> str:
-    """Return a digest of the coordinates' names, dims, types and bytes."""
+    """Return a digest of the names, dims, types and bytes of the cube's coordinates."""
     digest = hashlib.sha256()
     for coordinate in coordinates(spec):
         values = np.asarray(coordinate.values)
@@ -62,7 +62,7 @@ def _coordinates_digest(spec: Spec) -> str:
 
 
 def code_of(spec: Spec) -> list[str]:
-    """Return the modules of the pipeline that decide the numbers of a run's tasks."""
+    """Return the pipeline modules whose code determines the numbers that a run's tasks compute."""
     products = [CELL_PRODUCTS[name].compute.partition(":")[0] for name in spec.products]
     refined = ["compute.refinement"] if spec.refine is not None else []
     walked = ["compute.continuation"] if spec.continuation is not None else []
@@ -72,22 +72,22 @@ def code_of(spec: Spec) -> list[str]:
 
 @lru_cache
 def code_version(module: str) -> str:
-    """Return a digest of a module's meaning; see `magpend_core.source_digests`."""
+    """Return a digest of a module's code that ignores comments and docstrings; see `magpend_core.source_digests`."""
     return meaning_digest([_PIPELINE / f"{module.replace('.', '/')}.py"])
 
 
 def canonical(data: Any) -> str:
-    """Return JSON that is equal for equal data: sorted keys, shortest round-trip numbers."""
+    """Return canonical JSON, the same text for equal data: sorted keys, shortest round-trip numbers."""
     return json.dumps(data, sort_keys=True, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
 
 
 def digest_of(identity: Mapping[str, Any]) -> str:
-    """Return the digest of an identity, 32 hexadecimal digits."""
+    """Return the digest of a run's identity, 32 hexadecimal digits."""
     return hashlib.sha256(canonical(_numbers(identity)).encode()).hexdigest()[:32]
 
 
 def _numbers(data: Any) -> Any:
-    """Convert whole floats to int, so that ``2`` and ``2.0`` give one digest; -0.0 stays."""
+    """Convert whole-number floats to int, so that ``2`` and ``2.0`` give one digest; -0.0 stays a float."""
     if isinstance(data, Mapping):
         return {k: _numbers(v) for k, v in data.items()}
     if isinstance(data, (list, tuple)):
@@ -98,7 +98,7 @@ def _numbers(data: Any) -> Any:
 
 
 def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
-    """Return a line per key that differs: dotted path, value in the directory, value now."""
+    """Return a line of text per key that differs between two identities: dotted key, old value, new value."""
     left, right = dict(_leaves(_numbers(old))), dict(_leaves(_numbers(new)))
     absent = "(absent)"
     return [

@@ -1,4 +1,4 @@
-"""Find the cells of one run in another: cells with bitwise equal inputs. Pure numpy.
+"""Find cells with bitwise equal inputs in two runs, so that one run can take over the other's results.
 
 A cell's result depends on its inputs alone: parameters, initial state, and how it is integrated. A run can
 therefore take over another run's cells, even if their axes, starts and tasks differ.
@@ -25,7 +25,7 @@ _CODE = (*CODE, "compute.continuation", "compute.recorded_drive", "specification
 
 
 def deciding(identity: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the part of a run's identity that decides how any cell is integrated.
+    """Return the part of a run's identity that determines how each cell is integrated.
 
     It leaves out the cells themselves (axes, starts, parameters), their layout, the rules of inference
     between them, the number of kept sections, and the products, which have their own conditions.
@@ -42,13 +42,13 @@ def deciding(identity: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def unlike(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
-    """Return the differences that keep cells of two runs from being the same, a line for each."""
+    """Return a line of text per difference in integration settings that keeps two runs from sharing cells."""
     return differences(deciding(old), deciding(new))
 
 
 @dataclass(frozen=True)
 class Way:
-    """The order in which a continuation visits the values of its path, and the part of it that a block covers.
+    """Order in which a continuation visits its parameter values, and the position of a block of cells in it.
 
     Attributes
     ----------
@@ -66,7 +66,7 @@ class Way:
 
 
 def way_of(spec: Spec, block: tuple[slice, ...]) -> Way | None:
-    """Return the path of a block's branches, which walk in one direction; None in a sweep."""
+    """Return the order in which a block's branches visit the continuation parameter's values; None in a sweep."""
     if spec.continuation is None:
         return None
     path, values = _path_of(spec)
@@ -78,7 +78,7 @@ def way_of(spec: Spec, block: tuple[slice, ...]) -> Way | None:
 
 
 def _path_of(spec: Spec) -> tuple[int, np.ndarray]:
-    """Return index and values of the axis along which branches walk."""
+    """Return the continuation parameter's axis: its index among the cube's parameter axes, and its values."""
     assert spec.continuation is not None
     axes = parameter_axes(spec)
     path = [a.parameter for a in axes].index(spec.continuation.path)
@@ -86,7 +86,7 @@ def _path_of(spec: Spec) -> tuple[int, np.ndarray]:
 
 
 class Finder:
-    """A search for cells of a run by their inputs.
+    """Search for cells of a run by their inputs: parameter values and initial state.
 
     A cell of a continuation depends on all cells before it. Two continuations from one initial state
     therefore agree up to the first parameter value that differs, and nowhere beyond.
@@ -113,7 +113,7 @@ class Finder:
         self.shape = (*(len(a.values) for a in self._axes), *n_last)
 
     def find(self, inputs: Inputs, way: Way | None = None) -> np.ndarray:
-        """Return each cell's flat index in this run, shape (branch, point), or `NOWHERE`.
+        """Return the flat index in this run of each given cell, shape (branch, point); `NOWHERE` if this run lacks it.
 
         Parameters
         ----------
@@ -151,7 +151,7 @@ class Finder:
         return np.where(here, place * n_starts + start[:, None], NOWHERE)
 
     def _fixed(self, inputs: Inputs) -> np.ndarray:
-        """Return which branches have this run's values of all parameters that it does not sweep."""
+        """Return a mask of the branches that agree with this run in every parameter that this run does not sweep."""
         swept = {a.parameter for a in self._axes}
         fixed = [i for i, name in enumerate(self._names) if name not in swept]
         here = (_bits(inputs.parameters[:, 0, fixed]) == _bits(self._packed[fixed])).all(axis=1)
@@ -166,14 +166,14 @@ class Finder:
 
 
 def _n_alike(old: np.ndarray, new: np.ndarray) -> int:
-    """Return the number of leading points that two paths share."""
+    """Return the number of leading parameter values that two continuation paths have in common."""
     n = min(len(old), len(new))
     differ = np.flatnonzero(_bits(old[:n]) != _bits(new[:n]))
     return int(differ[0]) if len(differ) else n
 
 
 class _Grid:
-    """The initial states of a grid, searchable."""
+    """Search index over the initial states of a grid."""
 
     def __init__(self, states: InitialStates) -> None:
         self._states = states
@@ -182,7 +182,7 @@ class _Grid:
         return len(self._states)
 
     def find(self, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the flat index of each state, and whether the grid contains it."""
+        """Return the flat index of each state in the grid, and whether the grid contains the state."""
         assert self._states.grid is not None
         here = np.ones(len(wanted), bool)
         place = np.zeros(len(wanted), np.int64)
@@ -197,7 +197,7 @@ class _Grid:
 
 
 class _Rows:
-    """The initial states of a list or of samples, searchable."""
+    """Search index over the initial states of a list or of samples."""
 
     def __init__(self, states: InitialStates) -> None:
         self._table = states.at(np.arange(len(states)))
@@ -209,7 +209,7 @@ class _Rows:
         return len(self._table)
 
     def find(self, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the index of each state's first equal row, and whether there is one."""
+        """Return the index of the first row equal to each state, and whether such a row exists."""
         place = np.searchsorted(self._marks, _marks(wanted))
         row = self._order[np.minimum(place, len(self._order) - 1)]
         # if two different states share a mark, the second one is not found; a wrong one is never returned
@@ -217,18 +217,18 @@ class _Rows:
 
 
 def _bits(values: Any) -> np.ndarray:
-    """Return the bit patterns of numbers: 0.0 and -0.0 differ, equal NaN patterns agree."""
+    """Return the bit patterns of floats as integers: 0.0 and -0.0 differ, equal NaN patterns agree."""
     return np.asarray(np.ascontiguousarray(values, np.float64).view(np.int64)).reshape(np.shape(values))
 
 
 def _on_axis(axis: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the index of each value on a rising axis, and whether it is there."""
+    """Return the index of each value on an increasing axis, and whether the axis contains the value."""
     step = np.minimum(np.searchsorted(axis, values), len(axis) - 1)
     return step, _bits(axis[step]) == _bits(values)
 
 
 def _marks(rows: np.ndarray) -> np.ndarray:
-    """Return a hash for each row, equal for equal rows."""
+    """Return a hash of each row of an array; equal rows have equal hashes."""
     mark = np.zeros(len(rows), np.uint64)
     for column in _bits(rows).view(np.uint64).T:
         mark = (mark ^ column) * np.uint64(0x9E3779B97F4A7C15)
@@ -237,7 +237,7 @@ def _marks(rows: np.ndarray) -> np.ndarray:
 
 
 def apart(old: Spec, new: Spec) -> list[str]:
-    """Explain why two runs that are integrated alike have no cell in common.
+    """Return a line of text per reason why two runs with equal integration settings have no cell in common.
 
     Returns
     -------
@@ -258,7 +258,7 @@ def apart(old: Spec, new: Spec) -> list[str]:
 
 
 def _swept(spec: Spec) -> dict[str, np.ndarray]:
-    """Return all values of each parameter and of the frequency."""
+    """Return all values of each parameter and of the drive frequency in a run, by name."""
     hz = np.nan if spec.frequency_hz is None else spec.frequency_hz
     values = {FREQUENCY: np.array([hz]), **dict(zip(spec.values.names, spec.values.pack()[:, None], strict=True))}
     return values | {axis.parameter: axis.values for axis in parameter_axes(spec)}

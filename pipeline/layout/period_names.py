@@ -1,4 +1,4 @@
-"""Name the periods and sections of a model, the same in cubes, tables and figures."""
+"""Name a model's periods and sections (stroboscopic or Poincare) alike in cubes, tables and figures."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from magpend_core.models.model import Model
 
 
 def period_of(model: Model | None) -> str:
-    """Return the word for the time between two sections: drive period, return or strobe period."""
+    """Return the word for the time between two section points: drive period, return or strobe period."""
     if model is None:
         return "drive period"
     if model.crossing is not None:
@@ -15,7 +15,7 @@ def period_of(model: Model | None) -> str:
 
 
 def periods_of(model: Model | None) -> str:
-    """Return the plural of `period_of`."""
+    """Return the plural of the word that `period_of` returns."""
     return f"{period_of(model)}s"
 
 
@@ -25,7 +25,7 @@ def section_name(model: Model | None) -> str:
 
 
 def once(model: Model | None) -> str:
-    """Return the meaning of a dot of the section, such as "once per drive period"."""
+    """Return the words for when a section point is recorded, such as "once per drive period"."""
     if model is None or model.crossing is None:
         return f"once per {period_of(model)}"
     return f"crossing of {model.crossing.sentence}"

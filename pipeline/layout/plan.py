@@ -1,4 +1,4 @@
-"""Turn a specification into a plan: cells, tasks, chunks, bytes, time. Pure: nothing is created.
+"""Turn a run's specification into a plan: cells, tasks, chunks, bytes and time, without creating any file.
 
 A task computes a block of cells and owns whole chunks of every variable. The layout follows from the
 specification alone, never from the number of workers. A run can therefore be resumed anywhere, with the same
@@ -102,7 +102,7 @@ class Plan:
 
     @property
     def n_points(self) -> int:
-        """Number of points per branch; 1 in a sweep."""
+        """Number of parameter points per branch; 1 in a sweep."""
         return 1 if self.path is None else self.shape[self.path]
 
     @property
@@ -122,23 +122,23 @@ class Plan:
 
     @property
     def core_seconds(self) -> float:
-        """Estimated time on one core [s]."""
+        """Estimated computing time of the run on one core [s]."""
         return self.n_cells * self.seconds_per_cell
 
     def seconds(self, index: int) -> float:
-        """Estimate the time of a task on one core [s]."""
+        """Estimate the computing time of a task on one core [s]."""
         seconds = self.seconds_per_cell
         if self.seconds_at is not None:
             seconds = float(self.seconds_at[self.task(index)[self.dims.index(FREQUENCY_DIM)]].mean())
         return seconds * self.cells_in(index)
 
     def task(self, index: int) -> tuple[slice, ...]:
-        """Return the block of cells of a task."""
+        """Return the block of cells of a task, as slices of the cube."""
         places = zip(self._place(index), self.block, self.shape, strict=True)
         return tuple(slice(p * b, min((p + 1) * b, n)) for p, b, n in places)
 
     def _place(self, index: int) -> tuple[int, ...]:
-        """Return the place of a task in the grid of tasks."""
+        """Return the indices of a task in the grid of tasks."""
         if not 0 <= index < self.n_tasks:
             raise IndexError(f"task {index} does not exist; there are {self.n_tasks}.")
         places = []
@@ -148,28 +148,28 @@ class Plan:
         return tuple(reversed(places))
 
     def walks_down(self, index: int) -> bool:
-        """Return whether the branches of a task walk down."""
+        """Return whether the branches of a task are continued towards falling parameter values."""
         if self.path is None or not self.directions:
             return False
         first = self._place(index)[-1] * self.block[-1]
         return self.directions[first * len(self.directions) // self.shape[-1]] == "down"
 
     def depth(self, index: int) -> int:
-        """Return the number of tasks before a task on its walk; 0 in a sweep."""
+        """Return the number of tasks that precede a task along its branches; 0 in a sweep."""
         if self.path is None:
             return 0
         place = self._place(index)[self.path]
         return self.task_grid[self.path] - 1 - place if self.walks_down(index) else place
 
     def predecessor(self, index: int) -> int | None:
-        """Return the task whose last states this task starts from; None if its branches begin here."""
+        """Return the index of the task whose last states this task continues from; None if its branches start here."""
         if self.path is None or self.depth(index) == 0:
             return None
         stride = math.prod(self.task_grid[self.path + 1 :])
         return index + stride if self.walks_down(index) else index - stride
 
     def tasks(self) -> Iterator[tuple[slice, ...]]:
-        """Return the blocks of all tasks in order."""
+        """Return the blocks of cells of all tasks in order."""
         return (self.task(i) for i in range(self.n_tasks))
 
     def cells_in(self, index: int) -> int:
@@ -177,7 +177,7 @@ class Plan:
         return math.prod(s.stop - s.start for s in self.task(index))
 
     def chunks(self, variable: Variable) -> tuple[int, ...]:
-        """Return the chunk shape of a variable: the task's block, cut along the path if it is too large."""
+        """Return the chunk shape of a variable: the task's block, cut along the continuation dim if it is too large."""
         sizes = self.sizes
         chunk = list(self.block)
         if self.path is not None:
@@ -191,7 +191,7 @@ class Plan:
 
 
 def make_plan(spec: Spec) -> Plan:
-    """Plan a run: choose the block of a task, and estimate size and time.
+    """Plan a run: choose the block of cells per task, and estimate size and time.
 
     A task takes a thirty-second part of the run, but between 2 and 20 s of one core by the rule of thumb, and
     at most 8 MB in a sweep. It has a multiple of 16 trajectories, unless ``execution.trajectories_per_task``
@@ -231,25 +231,25 @@ def make_plan(spec: Spec) -> Plan:
 
 
 def seconds_per_period(frequency_hz: np.ndarray, rtol: float) -> np.ndarray:
-    """Estimate the time of a drive period of one trajectory on one core [s], by the rule of thumb."""
+    """Estimate the computing time per drive period of one trajectory on one core [s], by a rule of thumb."""
     microseconds = MICROSECONDS_PER_PERIOD + MICROSECONDS_PER_SECOND / np.asarray(frequency_hz)
     return np.asarray(microseconds * 1e-6 * (RTOL_OF_RULE / rtol) ** (1 / ROOT))
 
 
 def mean_seconds_per_period(spec: Spec) -> float:
-    """Return the mean of `seconds_per_period` over the run's frequencies [s]."""
+    """Return the mean computing time per drive period over the run's frequencies [s]."""
     frequency = spec.axes[FREQUENCY].array() if FREQUENCY in spec.axes else spec.frequency_hz
     return float(np.mean(seconds_per_period(np.asarray(frequency), spec.integration.rtol)))
 
 
 def periods_per_cell(spec: Spec) -> tuple[float, float]:
-    """Return the most drive periods of a cell's sections, and the cost of its products in periods."""
+    """Return the most drive periods integrated per cell, and the cost of the cell's products in drive periods."""
     products = sum(CELL_PRODUCTS[name].cost(options) for name, options in spec.products.items())
     return float(spec.integration.n_transient + spec.integration.n_keep), float(products)
 
 
 def _seconds_at(spec: Spec) -> np.ndarray | None:
-    """Return the time of a cell at each swept frequency [s]; None if the frequency is not swept."""
+    """Return the estimated computing time of a cell at each swept frequency [s]; None if frequency is not swept."""
     if FREQUENCY not in spec.axes:
         return None
     frequency = spec.axes[FREQUENCY].array()
@@ -257,7 +257,7 @@ def _seconds_at(spec: Spec) -> np.ndarray | None:
 
 
 def _seconds_per_cell(spec: Spec) -> float:
-    """Return the mean time of a cell [s]."""
+    """Return the estimated mean computing time of a cell [s]."""
     periods = sum(periods_per_cell(spec))
     seconds = periods * mean_seconds_per_period(spec)
     if spec.recorded is not None and spec.recorded.kind == TORQUE:
@@ -278,12 +278,14 @@ def _trajectories(spec: Spec, n_cells: int, n_points: int, seconds_per_cell: flo
 
 
 def _wanted_seconds(core_seconds: float) -> float:
-    """Return the wanted time of a task for a run of given time on one core [s]."""
+    """Return the time that one task should take [s], given the run's total time on one core."""
     return min(max(core_seconds / WANTED_TASKS, LEAST_SECONDS), MOST_SECONDS)
 
 
 def _walk_block(spec: Spec, cells: CellMap, wanted: int, seconds_per_cell: float) -> tuple[int, ...]:
-    """Return the cells of a continuation's task: branches of one direction, over a part of the path."""
+    """Return the block shape of a continuation's task: branches of one direction, over a stretch of the parameter
+    axis.
+    """
     assert spec.continuation is not None
     assert cells.path is not None
     n_points, directions = cells.shape[cells.path], spec.continuation.directions
@@ -308,7 +310,9 @@ def _walk_block(spec: Spec, cells: CellMap, wanted: int, seconds_per_cell: float
 
 
 def _group(n_seeds: int, wanted: int, most: int) -> int:
-    """Return the number of seeds per task: a divisor, so that no task has branches of both directions."""
+    """Return the number of initial states per task, a divisor of `n_seeds`, so that no task mixes up and down
+    branches.
+    """
     divisors = [d for d in range(1, min(n_seeds, max(most, 1)) + 1) if n_seeds % d == 0]
     return min(divisors, key=lambda d: (max(d / wanted, wanted / d), -d))
 
@@ -324,13 +328,15 @@ def _part(n: int, most: int) -> int:
 
 
 def _bytes_per_cell(spec: Spec) -> int:
-    """Return the uncompressed bytes of a cell's variables."""
+    """Return the uncompressed size of a cell's variables [bytes]."""
     sizes = sizes_of(spec.model, spec.products, spec.integration.n_keep)
     return sum(v.itemsize(sizes) for v in variables_of(spec.model, spec.products))
 
 
 def _block(shape: tuple[int, ...], path: int | None, wanted: int) -> tuple[int, ...]:
-    """Fill a block from the last dim on; the path's dim is taken whole."""
+    """Return the shape of a block of about `wanted` cells, filled from the last dim; the continuation dim is taken
+    whole.
+    """
     block = [1] * len(shape)
     for i in reversed(range(len(shape))):
         if i == path:
@@ -342,7 +348,7 @@ def _block(shape: tuple[int, ...], path: int | None, wanted: int) -> tuple[int, 
 
 
 def _tile(shape: tuple[int, ...], stride: int, wanted: int) -> tuple[int, ...]:
-    """Return the sides of a tile of at most `wanted` cells if possible: multiples of the stride.
+    """Return the side lengths of a tile of at most `wanted` cells if possible, as multiples of the stride.
 
     A side may also be a whole axis. The shortest side that can grow is enlarged first. Then the tiles along
     an axis are made about equal.

@@ -1,4 +1,4 @@
-"""Define the variables of a cube: those of every cube, and those of its products.
+"""Define the variables of a cube: those of every cube, and those that its products add.
 
 Every variable has the cell dims of the run first (swept parameters, initial conditions or branches), then its
 own dims. `pipeline.products` declares the variables of products.
@@ -44,7 +44,7 @@ REST_STATE = Variable(
 
 
 def _counts(periods: str) -> tuple[Variable, ...]:
-    """Return the variables of a cell's status and counts, with the model's word for its periods."""
+    """Return the variables for a cell's status, period and counts; `periods` is the model's word for periods."""
     codes = flag_attrs(Status)
     return (
         Variable("status", (), "int8", int(Status.PENDING), "1", "what became of the cell", codes),
@@ -57,13 +57,13 @@ def _counts(periods: str) -> tuple[Variable, ...]:
 
 
 def variables_of(model: Model, products: Mapping[str, Options]) -> tuple[Variable, ...]:
-    """Return the variables of a cube with these products."""
+    """Return the variables of a cube with given products."""
     own = (CELL_PRODUCTS[name].variables(options, model) for name, options in products.items())
     return (*base_variables(model), *(variable for variables in own for variable in variables))
 
 
 def sizes_of(model: Model, products: Mapping[str, Options], n_keep: int) -> dict[str, int]:
-    """Return the sizes of the dims that are not cell dims."""
+    """Return the sizes of the dims that variables have besides the dims of the cells."""
     sizes = {"period_index": n_keep, "state": len(model.states), model.angle_dim: len(model.angles)}
     for name, options in products.items():
         sizes |= CELL_PRODUCTS[name].sizes(options, model)

@@ -1,4 +1,4 @@
-"""Define names and codes that runs, analyses, tables and figures share, and find a dataset's model.
+"""Define the names and codes shared by runs, analyses, tables and figures; look up the model of a dataset.
 
 This module imports no kernel, so that figures need no compiler.
 """
@@ -56,7 +56,7 @@ _GRID_SUFFIX = "_0"
 
 
 def grid_dim(state: str) -> str:
-    """Return the dim of a grid of initial values of a state."""
+    """Return the name of the dim for a grid of initial values of a state."""
     return f"{state}{_GRID_SUFFIX}"
 
 
@@ -66,28 +66,28 @@ def is_grid_dim(dim: str) -> bool:
 
 
 def is_start_dim(dim: str) -> bool:
-    """Return whether a cube's dim numbers the cells at one parameter point."""
+    """Return whether a cube's dim runs over initial conditions or branches, not over a parameter."""
     return dim in (BRANCH, START) or is_grid_dim(dim)
 
 
 def start_dims(dims: Iterable[object]) -> tuple[str, ...]:
-    """Return the dims of a cube that number the cells at one parameter point."""
+    """Return the dims of a cube that run over initial conditions or branches, not over parameters."""
     return tuple(str(d) for d in dims if is_start_dim(str(d)))
 
 
 def split_dims(cells: xr.DataArray) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the parameter dims and the start dims of an array over the cells."""
+    """Split the dims of an array over cells into parameter dims and initial-condition or branch dims."""
     dims = [str(dim) for dim in cells.dims]
     return tuple(d for d in dims if not is_start_dim(d)), start_dims(dims)
 
 
 def axis_name(parameter: str) -> str:
-    """Return the dim of a parameter in a cube; both names of the frequency are accepted."""
+    """Return the name of a parameter's dim in the cube; accept both names of the drive frequency."""
     return FREQUENCY_DIM if parameter in (FREQUENCY, FREQUENCY_DIM) else parameter
 
 
 def parameter_name(axis: str) -> str:
-    """Return the specification's name of the parameter that a cube's axis sweeps."""
+    """Return the name that the specification uses for the parameter of a cube's axis."""
     return FREQUENCY if axis in (FREQUENCY, FREQUENCY_DIM) else axis
 
 
@@ -120,14 +120,14 @@ _SECTION = "section_"
 
 
 def section_attributes(crossing: Crossing | None) -> dict[str, Any]:
-    """Return the attributes that describe a dataset's section; `model_of` reads them."""
+    """Return the dataset attributes that describe a Poincare section; `model_of` reads them."""
     if crossing is None:
         return {}
     return {f"{_SECTION}{key}": value for key, value in asdict(crossing).items()}
 
 
 def told_by(attrs: Mapping[Any, Any]) -> dict[str, Any]:
-    """Return the attributes of a dataset that describe the integration: model, parameters, section."""
+    """Select the dataset attributes that describe the integration: model, parameters, section."""
     return {
         str(key): value
         for key, value in attrs.items()
@@ -153,7 +153,7 @@ def frequency_of(model: Model | None, values: Mapping[str, Any]) -> float:
 
 
 def parameters_of(ds: xr.Dataset) -> Parameters:
-    """Return the parameters of a run by its attribute ``parameters``: a line ``name = value`` for each.
+    """Read a run's parameters from the dataset attribute ``parameters``, one line ``name = value`` for each.
 
     Raises
     ------
@@ -168,5 +168,5 @@ def parameters_of(ds: xr.Dataset) -> Parameters:
 
 
 def system_of(ds: xr.Dataset) -> System:
-    """Return the system that the engine integrated; this imports the compiler."""
+    """Return the dynamical system that the engine integrated for a dataset; this imports the compiler."""
     return model_of(ds).system

@@ -1,4 +1,4 @@
-"""Write files whole. No link is followed, and an error names the file and the remedy."""
+"""Write files atomically, without following links; errors name the file and the remedy."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ _REMEDIES = {
 
 
 class NoFileError(FileNotFoundError):
-    """An error for anything but a plain file where a file should be; the message says why."""
+    """Error for a path that is not a regular file; the message says why."""
 
 
 class LinkError(NoFileError):
-    """An error for a link where a file should be."""
+    """Error for a link where a regular file is expected."""
 
 
 class WritingError(OSError):
@@ -54,7 +54,7 @@ class WritingError(OSError):
 
 @contextlib.contextmanager
 def writing(path: Path | str) -> Iterator[None]:
-    """Turn a file system error into one that names the file and the remedy.
+    """Convert an `OSError` raised in the block into a `WritingError` that names the file and the remedy.
 
     Raises
     ------
@@ -79,7 +79,7 @@ def writing(path: Path | str) -> Iterator[None]:
 
 
 def open_plain(path: Path, mode: str, **options: Any) -> IO[Any]:
-    """Open a plain file. Links are not followed; folders, pipes and devices are refused.
+    """Open a regular file; refuse links, folders, pipes and devices.
 
     Parameters
     ----------
@@ -118,7 +118,7 @@ def _open_plain(path: str, flags: int) -> int:
 
 
 def write_atomically(path: Path, content: str | bytes) -> None:
-    """Write a file that is whole or absent after a crash; a link at its place is replaced.
+    """Write a file atomically, so that a crash never leaves it incomplete; replace a link at its path.
 
     Raises
     ------
@@ -141,12 +141,12 @@ def write_atomically(path: Path, content: str | bytes) -> None:
 
 
 def temporary_beside(path: Path) -> Path:
-    """Return a unique temporary name in the same folder."""
+    """Return a unique name for a temporary file in the folder of a given file."""
     return path.with_name(f".{path.name}.{uuid.uuid4().hex}{TEMPORARY}")
 
 
 def sync_folder(path: Path) -> None:
-    """Make a folder's entries durable."""
+    """Flush a folder's entries to disk, so that they survive a crash."""
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)
@@ -155,7 +155,7 @@ def sync_folder(path: Path) -> None:
 
 
 def write_netcdf(path: Path, ds: xr.Dataset) -> None:
-    """Write a dataset as NetCDF, whole or not at all."""
+    """Write a dataset as a NetCDF file atomically: complete or not at all."""
     write_atomically(path, netcdf_bytes(ds))
 
 

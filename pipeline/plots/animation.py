@@ -1,4 +1,4 @@
-"""Draw films of motions: the model's own drawing beside its phase portraits.
+"""Draw films of motions: the model's mechanical drawing beside its phase portraits.
 
 The background is drawn once, and only the moving artists are drawn anew. So a frame takes a few milliseconds.
 """
@@ -66,7 +66,9 @@ class Animation:
 
     @property
     def summary(self) -> str:
-        """Describe the film: frames, length [s], model time shown [s, drive periods], slow-down."""
+        """Describe the film in text: frames, length [s], model time covered [s, drive periods], speed relative to real
+        time.
+        """
         data = self.figure.data
         shown, frequencies = float(data["time"][-1]), np.unique(data["drive_frequency"].values)
         told = f"{shown:.4g} s of the model"
@@ -92,7 +94,7 @@ class Animation:
 
 
 def plot_animation(ds: xr.Dataset, *, degrees: bool = False, portrait: str = "", size: int = 800) -> Animation:
-    """Lay out a film of motions beside one another.
+    """Lay out an animation that shows one or more motions side by side.
 
     Parameters
     ----------
@@ -147,7 +149,9 @@ def plot_animation(ds: xr.Dataset, *, degrees: bool = False, portrait: str = "",
 
 
 def portraits_of(model: Model, portrait: str, n: int, degrees: bool = False) -> tuple[tuple[str, str], ...]:
-    """Return the state pairs that `plot_animation` shows for each of `n` motions; raise as it does."""
+    """Return the state pairs whose phase portraits are drawn for each of `n` motions; raise ValueError on invalid
+    options.
+    """
     labels.some_angle(model, degrees, "animations")
     if portrait:
         found = tuple(pair for pair in model.portraits if portrait in pair)
@@ -165,7 +169,7 @@ Box = tuple[float, float, float, float]
 
 @dataclass(frozen=True)
 class _Plan:
-    """Panel places [in]: several motions in columns, or the panels of one motion side by side."""
+    """Panel positions [in] of a film frame: several motions in columns, or the panels of one motion side by side."""
 
     n: int
     n_pairs: int
@@ -210,24 +214,24 @@ class _Plan:
 
     @property
     def row(self) -> float:
-        """Return the height of a row of motions."""
+        """Return the height of a row of motions [in]."""
         if self.n == 1:
             return self.drawing + self.above
         return self.above + self.drawing + self.n_pairs * (self.portrait + self.below)
 
     @property
     def foot(self) -> float:
-        """Return the height of the line below."""
+        """Return the height of the text line at the foot of a frame [in]."""
         return self.below if self.n == 1 else 0.5 * self.below
 
     @property
     def height(self) -> float:
-        """Return the height of the frame; an even number of pixels."""
+        """Return the height of a frame [in], rounded to an even number of pixels."""
         whole = self.foot + self.row * math.ceil(self.n / self.columns)
         return 2 * round(whole * SCREEN_DPI / 2) / SCREEN_DPI
 
     def boxes(self, k: int) -> list[Box]:
-        """Return the panels of a motion: its drawing if there is one, then its portraits."""
+        """Return the panel rectangles of a motion: its mechanical drawing if it has one, then its phase portraits."""
         return [self._box(*inches) for inches in (self._single() if self.n == 1 else self._column(k))]
 
     def _single(self) -> list[Box]:
@@ -259,7 +263,7 @@ class _Plan:
 
 
 def _title(fig: style.DataFigure, plan: _Plan, box: Box, text: str) -> None:
-    """Write a motion's name above its panels, shortened to the room there."""
+    """Write a motion's name above its panels, shortened to fit the panels' width."""
     room = plan.width / plan.columns - 0.2
     lines = style.folded(text, room, fig.look.legend).split("\n")
     short = lines[0] if len(lines) == 1 else lines[0].rstrip(",:") + " \N{HORIZONTAL ELLIPSIS}"

@@ -1,4 +1,4 @@
-"""Draw basins of attraction: which attractor each initial state of a grid ends on."""
+"""Draw basins of attraction: colour each initial state of a grid by the attractor that it ends on."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def plot_basins(
 
 
 def _write_letters(ax: Axes, codes: np.ndarray, cast: palette.Cast) -> None:
-    """Write the attractors' letters into the visible part of the image."""
+    """Write the letter of each attractor into the visible part of its basin."""
     left, right, bottom, top = ax.get_images()[0].get_extent()
     row, column = (
         np.clip(((np.arange(400) + 0.5) / 400 * (b - a) + a - low) / (high - low) * n, 0, n - 1).astype(int)
@@ -104,7 +104,7 @@ def _write_letters(ax: Axes, codes: np.ndarray, cast: palette.Cast) -> None:
 
 
 def _axes(attractors: xr.Dataset, at: Mapping[str, float] | None) -> tuple[str, str]:
-    """Return the names of the two axes of the image: horizontal, vertical."""
+    """Return the dims of the two axes of the image: horizontal, vertical."""
     dims = start_dims(attractors)
     grid = [grid_dim(name) for name in model_of(attractors).state_names if grid_dim(name) in dims]
     if len(grid) < 2:
@@ -128,7 +128,9 @@ def _axes(attractors: xr.Dataset, at: Mapping[str, float] | None) -> tuple[str, 
 def _codes(
     data: xr.Dataset, part: xr.Dataset, axes: tuple[str, str], cast: palette.Cast
 ) -> tuple[np.ndarray, dict[int, int]]:
-    """Return each cell's code (id, `_OTHERS`, or a grey from `_FIRST_GREY` down), and the cells per code."""
+    """Return the colour code of each cell (attractor id, `_OTHERS`, or a grey from `_FIRST_GREY` down), and cells per
+    code.
+    """
     ids, dims = np.maximum(data["outcome"].values, -1), part["attractor_id"].dims
     table = np.full(len(cast.names) + 1, _OTHERS, np.int32)
     table[list(cast.main)] = cast.main
@@ -143,7 +145,7 @@ def _codes(
 
 
 def _colour_table(cast: palette.Cast) -> np.ndarray:
-    """Return RGB by code, shape (codes, 3): ids first, so that negative codes index from the end."""
+    """Return RGB colours by code, shape (codes, 3): attractor ids first, so that negative codes index from the end."""
     greys = list(reversed(palette.GREYS.values()))
     colours = [*(cast.colours[i] for i in range(len(cast.names))), *greys, palette.OTHERS]
     return np.array([to_rgb(c) for c in colours], dtype=np.float32)
@@ -163,14 +165,14 @@ def _painted(
 
 
 def _timed(data: xr.Dataset, part: xr.Dataset) -> np.ndarray:
-    """Select integrated cells on closed orbits; for other cells the time is no convergence time."""
+    """Return a mask of the cells that were integrated and ended on a periodic orbit."""
     closed = np.append(part["kind"].values == PERIODIC_ORBIT, False)
     ids = np.maximum(data["outcome"].values, -1)
     return np.asarray(closed[ids] & (data["status"].values != INFERRED))
 
 
 def _scale(data: xr.Dataset, part: xr.Dataset) -> LogNorm | None:
-    """Return the scale of the shading, from the times of cells on closed orbits without the extremes."""
+    """Return the shading scale: the 1st to 99th percentile of convergence times of cells on periodic orbits."""
     if "n_periods" not in data:
         return None
     times = data["n_periods"].values[_timed(data, part)]
@@ -183,7 +185,7 @@ def _scale(data: xr.Dataset, part: xr.Dataset) -> LogNorm | None:
 def _extent(
     data: xr.Dataset, attractors: xr.Dataset, axes: tuple[str, str], degrees: bool
 ) -> tuple[float, float, float, float]:
-    """Return the limits of the image: the outer edges of the outer cells."""
+    """Return the limits of the image: the outer edges of the outermost cells."""
     x, y = (
         labels.start_measure(attractors, d, degrees).shown(style.edges(data[d].values.astype(np.float64))) for d in axes
     )
@@ -191,7 +193,7 @@ def _extent(
 
 
 def _is_square(data: xr.Dataset, attractors: xr.Dataset, axes: tuple[str, str]) -> bool:
-    """Tell whether both axes have the same unit and the same range."""
+    """Return whether both axes have the same unit and equally long ranges."""
     left, right, bottom, top = _extent(data, attractors, axes, False)
     units = {labels.start_measure(attractors, d).unit for d in axes}
     return len(units) == 1 and bool(np.isclose(right - left, top - bottom, rtol=0.02))
@@ -206,7 +208,9 @@ def _dress(ax: Axes, attractors: xr.Dataset, axes: tuple[str, str], degrees: boo
 
 
 def _entries(cast: palette.Cast, counts: Mapping[int, int], total: int) -> list[tuple[str, str]]:
-    """Return the legend: attractors by falling share, then the others, then cells without one."""
+    """Return the legend entries: attractors by falling share, then minor attractors, then cells without an
+    attractor.
+    """
     own = sorted((i for i in counts if i >= 0), key=lambda i: (-counts[i], i))
     entries = [(f"{cast.names[i]}, {palette.percent(counts[i] / total)}", cast.colours[i]) for i in own]
     if _OTHERS in counts:
@@ -219,7 +223,7 @@ def _entries(cast: palette.Cast, counts: Mapping[int, int], total: int) -> list[
 
 
 def _draw_scale(fig: style.DataFigure, ax: Axes, scale: LogNorm, periods: str) -> None:
-    """Draw the scale below the image: the shade of each convergence time."""
+    """Draw a colour bar below the image: the shade of each convergence time."""
     ramp = LinearSegmentedColormap.from_list("time", [(0.85,) * 3, (0.85 * (1.0 - _DARKEST),) * 3])
     bar = fig.colorbar(ScalarMappable(scale, ramp), ax=ax, orientation="horizontal", shrink=0.6, aspect=24, pad=0.02)
     bar.outline.set_linewidth(style.LINE_PT)
@@ -232,7 +236,7 @@ def _draw_scale(fig: style.DataFigure, ax: Axes, scale: LogNorm, periods: str) -
 
 
 def _stored(data: xr.Dataset, part: xr.Dataset, cast: palette.Cast) -> xr.Dataset:
-    """Return the data kept with the figure: the cells drawn, and the names of the attractors."""
+    """Return the data to store with the figure: the cells drawn, and the names of the attractors."""
     stored = data.reset_coords(drop=True).assign(share=part["share"].variable)
     stored = stored.assign_coords(attractor=part["attractor"].variable, name=("attractor", list(cast.names.values())))
     scalars = {k: v for k, v in part.coords.items() if v.ndim == 0 and v.dtype.kind == "f"}

@@ -1,4 +1,4 @@
-"""Draw bifurcation diagrams: kept sections over the swept parameter, coloured by class of motion.
+"""Draw bifurcation diagrams: stored section points over the swept parameter, coloured by class of motion.
 
 The cube is read block by block, twice: first for the range of the points and the shares of absent cells,
 then for the points. So memory does not grow with the cube.
@@ -37,7 +37,7 @@ def plot_bifurcation(
     at: Mapping[str, float] | None = None,
     frame: style.Frame = style.WIDE,
 ) -> style.DataFigure:
-    """Draw kept sections over the swept parameter, coloured by class of motion.
+    """Draw stored section points over the swept parameter, coloured by class of motion.
 
     Everything is read from the cube; nothing is integrated. The model's classifier defines the classes of
     motion; without a classifier, all points have one colour. Where cells are pending, diverged, failed or
@@ -115,7 +115,9 @@ class Diagram:
         at: Mapping[str, float] | None = None,
         frame: style.Frame = style.WIDE,
     ) -> Diagram:
-        """Survey a cube for its diagram; arguments as for `plot_bifurcation`."""
+        """Make the bifurcation diagram of a cube, after reading the cube once for ranges; arguments as for
+        `plot_bifurcation`.
+        """
         if quantity and state:
             raise ValueError(f"a diagram is drawn of a state or of a quantity; drop {state!r} or {quantity!r}")
         part = at_points(ds, at)
@@ -141,21 +143,21 @@ class Diagram:
 
     @property
     def layers(self) -> tuple[int, ...]:
-        """Return the indices of all directions."""
+        """Return the indices of all layers: one layer per direction of continuation."""
         return tuple(range(len(self.view.layers)))
 
     @property
     def caption(self) -> str:
-        """Return the fixed values of the other axes."""
+        """Return the caption: the fixed values of all axes except the swept parameter."""
         return labels.caption(self.view.ds, drop=[self.parameter])
 
     @property
     def with_strip(self) -> bool:
-        """Tell whether there are absent cells."""
+        """Return whether there are absent cells, which need a strip below the diagram."""
         return any(counts.any() for counts in self.survey.absent.values())
 
     def dress(self, ax: Axes) -> None:
-        """Give axes the limits, ticks and vertical label of the diagram."""
+        """Set limits, ticks and vertical label of the diagram on given axes."""
         style.style_axes(ax)
         style.limits(ax, self.frame, style.span(self.x), self._heights())
         labels.angle_ticks(ax, self.measure)
@@ -176,7 +178,7 @@ class Diagram:
         return low - margin, high + margin
 
     def handles(self, *, layers: bool = True, absent: bool = True) -> list[Any]:
-        """Return legend handles: motions, directions, absent cells."""
+        """Return legend handles for classes of motion, directions of continuation and absent cells."""
         motions, kinds = self.view.motions, {code for _, code in self.survey.classes}
         found: list[Any] = []
         if motions.told:
@@ -187,7 +189,7 @@ class Diagram:
         return found + (absent_handles(self.survey) if absent else [])
 
     def draw(self, panels: Sequence[pixels.Panel]) -> xr.Dataset:
-        """Draw the points into axes whose places are final, and return what was drawn."""
+        """Draw the points into axes whose positions are final, and return the data drawn."""
         width = 72.0 * self.frame.width_in * 0.88 / len(panels)
         left, right = panels[0].ax.get_xlim()
         shown = int(np.count_nonzero((self.x >= min(left, right)) & (self.x <= max(left, right))))
@@ -206,14 +208,14 @@ class Diagram:
 
 
 def with_diagram(data: xr.Dataset, drawn: xr.Dataset) -> xr.Dataset:
-    """Add a diagram's data to the data of a figure, under names that end in ``_diagram``."""
+    """Add the data of a bifurcation diagram to those of a figure, under names that end in ``_diagram``."""
     drawn = drawn.drop_vars([c for c in drawn.coords if c in data.variables or c in data.dims])
     renamed = drawn.rename({str(n): f"{n}_diagram" for n in (*drawn.data_vars, *drawn.dims)})
     return data.merge(renamed).assign_attrs(data.attrs)
 
 
 def fixed_of(ds: xr.Dataset) -> dict[str, Any]:
-    """Return the coordinates that are fixed for the whole dataset."""
+    """Return the scalar coordinates of a dataset, which are fixed for all its data."""
     return {str(k): v.variable for k, v in ds.coords.items() if not v.ndim and v.dtype.kind == "f"}
 
 
@@ -223,7 +225,9 @@ def _section(ds: xr.Dataset, state: str, degrees: bool) -> tuple[Measure, Any]:
 
 
 def _extreme(ds: xr.Dataset, quantity: str, degrees: bool) -> tuple[Measure, Any]:
-    """Return the measure of an extreme, and the function that takes its values from a block."""
+    """Return the axis measure of a quantity's extreme, and the function that reads its values from a block of the
+    cube.
+    """
     if "extremes" not in ds:
         wanted = quantity.rpartition(".")[0] or quantity
         raise ValueError(
@@ -262,7 +266,9 @@ def swept_parameter(ds: xr.Dataset) -> str:
 
 
 def _layers(names: Sequence[str], layout: str) -> list[tuple[int, ...]]:
-    """Return the layers of each panel; raise ValueError if layout ``side`` lacks a direction."""
+    """Return the layers (directions of continuation) of each panel; raise ValueError if layout ``side`` lacks a
+    direction.
+    """
     if layout == "overlay":
         return [tuple(range(len(names)))]
     if len(names) < 2:
@@ -274,7 +280,7 @@ def _layers(names: Sequence[str], layout: str) -> list[tuple[int, ...]]:
 
 
 def _panels(fig: style.DataFigure, diagram: Diagram, layers: Sequence[tuple[int, ...]]) -> list[pixels.Panel]:
-    """Make the axes of a figure: a diagram for each set of layers, with its strip of absent cells."""
+    """Make one panel per group of layers: axes for the diagram, and a strip for the share of absent cells."""
     strip = diagram.with_strip
     grid = fig.add_gridspec(2 if strip else 1, len(layers), height_ratios=[1.0, 0.08] if strip else None)
     panels: list[pixels.Panel] = []

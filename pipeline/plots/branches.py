@@ -1,4 +1,4 @@
-"""Draw branches of periodic orbits over the brute-force diagram."""
+"""Draw branches of periodic orbits over the bifurcation diagram of a run."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def plot_branches(
     at: Mapping[str, float] | None = None,
     frame: style.Frame = style.WIDE,
 ) -> style.DataFigure:
-    """Draw section points of periodic orbits over the parameter: solid stable, dashed unstable.
+    """Draw the section points of periodic orbits over a parameter: stable orbits solid, unstable ones dashed.
 
     All bifurcations are marked. Where a stable orbit appears or disappears, the name and period (for example
     PD1) stand beside the curves if there is room.
@@ -98,14 +98,14 @@ def plot_branches(
 def _below(
     cube: xr.Dataset | None, measure: Measure, degrees: bool, at: Mapping[str, float] | None, frame: style.Frame
 ) -> Diagram | None:
-    """Return the diagram under the branches, if a cube is given."""
+    """Return the bifurcation diagram to draw under the branches, or None without a cube."""
     if cube is None:
         return None
     return Diagram.of(cube, state=measure.name, degrees=degrees, at=at, frame=frame)
 
 
 def _dress(ax: Axes, frame: style.Frame, measure: Measure) -> None:
-    """Set look, limits and ticks for a figure without a diagram."""
+    """Set style, limits and ticks of the axes for a figure without a bifurcation diagram."""
     style.style_axes(ax)
     ax.margins(y=0.08)
     style.limits(ax, frame)
@@ -113,13 +113,13 @@ def _dress(ax: Axes, frame: style.Frame, measure: Measure) -> None:
 
 
 def _chosen(ds: xr.Dataset, max_period: int | None) -> list[int]:
-    """Select branches whose period is short enough."""
+    """Return the indices of the branches whose orbit period is at most `max_period`."""
     periods = ds["orbit_period"].values.tolist()
     return [i for i, period in enumerate(periods) if max_period is None or period <= max_period]
 
 
 def _draw_lines(ax: Axes, ds: xr.Dataset, chosen: list[int], measure: Measure, scale: bool) -> list[_Name]:
-    """Draw branches and mark their bifurcations; return the bifurcations' names."""
+    """Draw branches and mark their bifurcations; return the bifurcations' labels."""
     for i in chosen:
         for x, y, stable in pieces(ds, i, measure):
             ax.plot(x, y, scalex=scale, scaley=scale, **(_STABLE if stable else _UNSTABLE))
@@ -127,7 +127,7 @@ def _draw_lines(ax: Axes, ds: xr.Dataset, chosen: list[int], measure: Measure, s
 
 
 def _stored(ds: xr.Dataset) -> xr.Dataset:
-    """Return the branches without the types that NetCDF cannot store."""
+    """Return the branch data without variables and attributes of types that NetCDF cannot store."""
     plain = {k: v for k, v in ds.attrs.items() if isinstance(v, str | int | float | np.ndarray)}
     return ds.drop_vars([k for k, v in ds.variables.items() if v.dtype == object]).assign_attrs(
         {**plain, "title": "branches of periodic orbits"}
@@ -135,7 +135,7 @@ def _stored(ds: xr.Dataset) -> xr.Dataset:
 
 
 def pieces(ds: xr.Dataset, branch: int, measure: Measure) -> Iterator[tuple[np.ndarray, np.ndarray, bool]]:
-    """Return polylines of one stability of a branch, one per orbit point, cut where an angle wraps."""
+    """Yield polylines of a branch: one per section point and stretch of equal stability, cut where an angle wraps."""
     n = int(ds["n_points"][branch])
     period = max(int(ds["orbit_period"][branch]), 1)
     x = ds["parameter"].values[branch, :n]
@@ -163,7 +163,7 @@ def pieces(ds: xr.Dataset, branch: int, measure: Measure) -> Iterator[tuple[np.n
 
 @dataclass(frozen=True)
 class _Name:
-    """A label at a bifurcation: its text, its position, and the range of the orbit's points there."""
+    """A label at a bifurcation: its text, its position, and the range of the orbit's section points there."""
 
     period: int
     x: float
@@ -173,7 +173,9 @@ class _Name:
 
 
 def _mark(ax: Axes, ds: xr.Dataset, chosen: list[int], measure: Measure, scale: bool) -> list[_Name]:
-    """Draw markers on bifurcations; return labels where a stable orbit appears or disappears."""
+    """Draw markers at the bifurcations of chosen branches; return labels for those where a stable orbit appears or
+    disappears.
+    """
     names = []
     size = 3.4 if style.figure_of(ax).frame.compact else 4.5
     for k in range(ds.sizes["bifurcation"]):
@@ -204,7 +206,7 @@ def _mark(ax: Axes, ds: xr.Dataset, chosen: list[int], measure: Measure, scale: 
 
 
 def _name(ax: Axes, names: list[_Name]) -> None:
-    """Write labels where they cover neither lines nor other labels, joined to their point by a thin line.
+    """Write labels where they cover neither lines nor other labels, each joined by a thin line to its bifurcation.
 
     Short periods come first. A label without room nearby is left out; its marker remains.
     """
@@ -240,7 +242,7 @@ def _name(ax: Axes, names: list[_Name]) -> None:
 
 
 def _ink(drawn: Line2D, points: float) -> np.ndarray:
-    """Return points [pt] covered by lines (sampled every 3 pt) and markers."""
+    """Return points [pt] covered by a plotted line, sampled about every 3 pt, or by its markers."""
     line = drawn.get_transform().transform(np.asarray(drawn.get_xydata(), dtype=np.float64)) * points
     line = line[np.isfinite(line).all(axis=1)]
     if len(line) < 2 or drawn.get_linestyle() == "None":
@@ -261,7 +263,7 @@ def _free(
     taken: list[np.ndarray],
     bounds: np.ndarray,
 ) -> np.ndarray | None:
-    """Return the nearest free place for a text of a given size about an anchor [pt], or None."""
+    """Return the free position [pt] nearest to an anchor for a text of a given size; None if there is no room."""
     half = 0.5 * np.asarray(size)
     for distance in (9.0, 14.0, 20.0, 28.0, 38.0):
         for angle in (0.0, 0.6, -0.6, 1.1, -1.1):
@@ -299,7 +301,7 @@ def _handles(ds: xr.Dataset, chosen: list[int]) -> list[Any]:
 
 
 def draw(run: Run, options: BranchFigureOptions) -> style.DataFigure:
-    """Draw the figure ``branches`` of a run, over its own diagram or that of another one."""
+    """Draw the figure ``branches`` of a run, over its own bifurcation diagram or that of another run."""
     other = run.of(options.over) if options.over else run
     at, notes = values_of(other, options)
     found = run.derive("branches", **options.part(BranchOptions))

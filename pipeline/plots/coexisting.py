@@ -1,4 +1,4 @@
-"""Draw the diagram of all coexisting attractors: each id in its colour over the swept parameter."""
+"""Draw the section points of all coexisting attractors over the swept parameter, a colour per attractor."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def plot_coexisting(
 
 
 def _points(part: xr.Dataset, parameter: str, measure: labels.Measure) -> xr.Dataset:
-    """Return the values to draw, with the variables that set their look."""
+    """Return the section values to draw, with each attractor's basin share and stability."""
     values = part["attractor_points"].sel(state=measure.name, drop=True)
     values = values.transpose(parameter, "attractor", "point")
     shown = values.copy(data=measure.shown(values.values, wrap=True))
@@ -119,7 +119,9 @@ def _points(part: xr.Dataset, parameter: str, measure: labels.Measure) -> xr.Dat
 
 
 def _loops(found: xr.Dataset, part: xr.Dataset, parameter: str) -> list[tuple[float, float]]:
-    """Return the limits of the loops at the chosen other parameters, widened by half a step."""
+    """Return the parameter limits of hysteresis loops at the values chosen for other parameters, widened by half a
+    step.
+    """
     axis = part[parameter].values.astype(np.float64)
     edges = style.edges(axis)
     here = np.ones(found.sizes["loop"], bool)
@@ -135,7 +137,7 @@ def _loops(found: xr.Dataset, part: xr.Dataset, parameter: str) -> list[tuple[fl
 
 
 def _spread(one: xr.Dataset, parameter: str, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return position, value and parameter index of an attractor's chosen points."""
+    """Return parameter value, plotted value and parameter index of an attractor's points at chosen parameters."""
     values = one["value"].transpose(parameter, "point").values
     row, column = np.nonzero(np.isfinite(values) & chosen[:, None])
     return one[parameter].values[row].astype(np.float64), values[row, column], row
@@ -150,7 +152,7 @@ def _draw_weighted(ax: Axes, one: xr.Dataset, parameter: str, cast: palette.Cast
 
 
 def _draw_others(ax: Axes, data: xr.Dataset, parameter: str) -> None:
-    """Draw sets where they do not attract, in the grey of their stability."""
+    """Draw the section points of invariant sets where they do not attract, in the grey of their stability."""
     for code, grey in palette.GREY_OF.items():
         chosen = (data["stability"].values == code)[..., None] & np.isfinite(data["value"].values)
         row, *_ = np.nonzero(chosen)
@@ -175,12 +177,14 @@ def _word(stability: int) -> str:
 
 
 def _diameter(share: Any) -> Any:
-    """Return the diameter of a point [pt]: its area grows with its share of the basin fraction."""
+    """Return the diameter of a point [pt]; its area grows with the basin fraction that the point stands for."""
     return np.sqrt(_LEAST_PT**2 + _GROWTH_PT**2 * np.asarray(share))
 
 
 def _draw_directions(ax: Axes, one: xr.Dataset, parameter: str, cast: palette.Cast) -> None:
-    """Draw large light points below small dark ones, so that both show where they coincide."""
+    """Draw an attractor's points of both directions: large light points below small dark ones, so that both stay
+    visible.
+    """
     number = int(one["attractor"])
     for word in one["direction"].values[::-1]:
         chosen = (one["present"].sel(direction=word).values > 0) & (one["stability"].values == ATTRACTS)
@@ -220,7 +224,7 @@ def _entries(data: xr.Dataset, cast: palette.Cast, both: bool, loops: bool) -> l
 
 
 def draw(run: Run, options: CoexistingOptions) -> style.DataFigure:
-    """Draw the figure ``attractors`` of a run, with its hysteresis if it was continued in both directions."""
+    """Draw the figure ``attractors`` of a run, with hysteresis loops if it was continued in both directions."""
     at, notes = values_of(run, options)
     found = attractors_of(run, options)
     both = "direction" in found.coords and {"up", "down"} == set(found["direction"].values.astype(str).tolist())

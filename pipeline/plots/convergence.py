@@ -1,4 +1,4 @@
-"""Draw the convergence of Lyapunov exponents: few cells as lines, many as bands."""
+"""Draw the convergence of Lyapunov exponents: a few cells as lines, many as quantile bands."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def plot_convergence(
     at: Mapping[str, float] | None = None,
     frame: style.Frame = style.WIDE,
 ) -> style.DataFigure:
-    """Draw how the exponents of the cells of one parameter point converge.
+    """Draw the convergence of the Lyapunov exponents of all cells at one parameter point.
 
     Parameters
     ----------
@@ -102,7 +102,7 @@ def plot_convergence(
 
 
 def _convergence(ds: xr.Dataset, exponent: int, per: str, at: Mapping[str, float] | None) -> xr.Dataset:
-    """Return the data to draw, with the dims `cell` and `period`."""
+    """Return the exponents to draw over time at one parameter point, with the dims `cell` and `period`."""
     part = select_points(ds, at, purpose="convergence is drawn at one parameter point")
     dims, starts = split_dims(part["status"])
     summary = summarise(part)
@@ -135,7 +135,7 @@ def _convergence(ds: xr.Dataset, exponent: int, per: str, at: Mapping[str, float
 
 
 def _own(data: xr.Dataset, kind: Motion) -> np.ndarray:
-    """Return the indices of the cells of one class of motion."""
+    """Return the indices of the cells that have one class of motion and an exponent."""
     return np.flatnonzero((data["motion"].values == kind) & np.isfinite(data["exponent_value"].values))
 
 
@@ -175,7 +175,7 @@ def _draw_running(ax: Axes, final: Axes, data: xr.Dataset) -> list[Any]:
 
 
 def _draw_final(final: Axes, data: xr.Dataset, own: np.ndarray, rank: np.ndarray, colour: str) -> None:
-    """Draw stored exponents with errors by their rank; omit the errors where there are many cells."""
+    """Draw the final exponents with errors over their rank; omit the errors if there are many cells."""
     value, error = data["exponent_value"].values, data["exponent_stderr"].values
     flagged = data["lyapunov_flag"].values[own] > GOOD
     many = data.sizes["cell"] > 4 * MOST_LINES
@@ -208,7 +208,7 @@ def _draw_final(final: Axes, data: xr.Dataset, own: np.ndarray, rank: np.ndarray
 
 
 def _draw_cells(ax: Axes, data: xr.Dataset, variable: str, kind: Motion, colour: str) -> None:
-    """Draw the cells of one class of motion: lines, or bands of quantiles about the median."""
+    """Draw the exponents of cells of one class of motion over time, as lines or as quantile bands about the median."""
     own = _own(data, kind)
     if not own.size:
         return

@@ -1,4 +1,4 @@
-"""Draw the correlation sum that a correlation dimension is fitted to."""
+"""Draw the correlation sum from which a correlation dimension is fitted."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def _of_one_attractor(ds: xr.Dataset) -> xr.Dataset:
 
 
 def _scales(ds: xr.Dataset) -> str:
-    """Return the unit lengths as text, for example ``1 for 1 rad, 10 rad/s``."""
+    """Return the length that counts as 1 for each state unit as text, for example ``1 for 1 rad, 10 rad/s``."""
     model = model_of(ds)
     units = {s.unit: s.scale for s in model.states}
     return "1 for " + ", ".join(f"{scale:g}" + (f" {unit}" if unit != "1" else "") for unit, scale in units.items())
@@ -127,7 +127,7 @@ def _draw_fit(top: Axes, bottom: Axes, data: xr.Dataset) -> None:
 
 
 def _correlation(ds: xr.Dataset) -> xr.Dataset:
-    """Return the data to draw: radii with pairs, the share of pairs, the slope between neighbouring radii."""
+    """Return the radii, the share of point pairs within each radius, and the slope between neighbouring radii."""
     dims = [str(d) for d in ds["correlation_dimension"].dims]
     one = ds.isel(dict.fromkeys(dims, 0))
     x, y = one["log_radius"].values, one["log_correlation_sum"].values

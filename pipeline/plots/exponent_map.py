@@ -25,7 +25,7 @@ _SHOWN = 0.98
 def plot_lyapunov_map(
     ds: xr.Dataset, *, per: str = "s", at: Mapping[str, float] | None = None, frame: style.Frame = style.WIDE
 ) -> style.DataFigure:
-    """Draw the largest exponent over two parameters.
+    """Draw the largest Lyapunov exponent over two swept parameters as a map.
 
     Parameters
     ----------
@@ -97,7 +97,7 @@ def _draw_map(fig: style.DataFigure, ax: Axes, data: xr.Dataset, part: xr.Datase
 
 
 def _scale(grid: np.ndarray) -> tuple[Normalize, str]:
-    """Return a colour scale symmetric about 0, and the ends that values exceed."""
+    """Return a colour scale symmetric about 0, and which ends of the scale are exceeded by values."""
     known = grid[np.isfinite(grid)]
     most = float(np.abs(known).max(initial=0.0))
     half = float(np.quantile(np.abs(known), _SHOWN)) if known.size else 1.0

@@ -22,7 +22,7 @@ from pipeline.products.registry import FIGURES
 
 
 class Run(Protocol):
-    """The parts of a run that figures use; see `pipeline.runs.derive.AnalysedRun`."""
+    """Protocol for the parts of a run that figures use; see `pipeline.runs.derive.AnalysedRun`."""
 
     @property
     def info(self) -> Any:
@@ -30,24 +30,24 @@ class Run(Protocol):
 
     @property
     def digest(self) -> str:
-        """Return the digest of the committed cells."""
+        """Return the digest of the run's stored cells."""
 
     @property
     def echo(self) -> Callable[[str], None]:
-        """Return the function that prints a line."""
+        """Return the function that prints a line of text for the user."""
 
     def of(self, source: str) -> Run:
-        """Open another run."""
+        """Open another run by its source, such as a run directory."""
 
     def cube(self, chunks: Any = None) -> xr.Dataset:
-        """Return the cells of the run."""
+        """Return the cube of the run's cells as a dataset."""
 
     def derive(self, name: str, **options: Any) -> xr.Dataset:
-        """Return the result of an analysis."""
+        """Return the result of a named analysis of the run."""
 
 
 def draw_figure(run: Run, name: str, options: FigureOptions) -> DataFigure:
-    """Draw a figure of a run, with its provenance.
+    """Draw a figure of a run by name, and add its provenance to the figure's data.
 
     Parameters
     ----------
@@ -78,13 +78,13 @@ def draw_figure(run: Run, name: str, options: FigureOptions) -> DataFigure:
 
 
 def request(name: str, options: Options) -> dict[str, Any]:
-    """Return the request: the figure, and its options that differ from the defaults."""
+    """Return the name of a figure and those of its options that differ from the defaults."""
     wanted = {key: value for key, value in options.changed().items() if key not in ("out", "format")}
     return {"figure": name, "options": wanted}
 
 
 def run_provenance(run: Run) -> dict[str, Any]:
-    """Return the provenance of a run's numbers."""
+    """Return the provenance of a run's data: source, title, digests, versions."""
     info, attrs = run.info, run.cube().attrs
     found: dict[str, Any] = {
         "source": str(attrs.get("source", "magpend")),
@@ -98,12 +98,12 @@ def run_provenance(run: Run) -> dict[str, Any]:
 
 
 def frame_of(options: FigureOptions) -> Frame:
-    """Return the size and the ranges from the options."""
+    """Return the figure's width and axis ranges from the options."""
     return Frame(options.width, options.xlim, options.ylim)
 
 
 def values_of(run: Run, options: FigureOptions | AnimationOptions) -> tuple[dict[str, float], list[str]]:
-    """Return the axis values that are drawn, and notes where they differ from the request.
+    """Return the axis values to draw at, and notes where they differ from the requested values.
 
     Raises
     ------
@@ -130,13 +130,13 @@ def values_of(run: Run, options: FigureOptions | AnimationOptions) -> tuple[dict
 
 
 def noted(figure: DataFigure, notes: list[str]) -> DataFigure:
-    """Add notes to a figure, to be shown to the user."""
+    """Add notes for the user to a figure, and return the figure."""
     figure.notes.extend(notes)
     return figure
 
 
 def attractors_of(run: Run, options: Options) -> xr.Dataset:
-    """Return the attractors of a run, matched with the options that concern matching."""
+    """Return the attractors of a run, matched along its axes with the options for matching."""
     from pipeline.products.attractors import AttractorOptions
 
     return run.derive("attractors", **options.part(AttractorOptions))

@@ -1,4 +1,4 @@
-"""Draw basin fractions over the swept parameter, as bands."""
+"""Draw the basin fractions of attractors over the swept parameter, as stacked bands."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def plot_fractions(
 
 
 def swept_parameter(attractors: xr.Dataset, at: Mapping[str, float] | None, what: str) -> str:
-    """Return the one swept parameter that `at` leaves."""
+    """Return the one swept parameter that `at` does not fix; raise ValueError unless there is exactly one."""
     dims = parameter_dims(attractors)
     left = [d for d in dims if d not in (at or {})]
     long = [d for d in left if attractors.sizes[d] > 1]
@@ -94,7 +94,7 @@ def swept_parameter(attractors: xr.Dataset, at: Mapping[str, float] | None, what
 
 
 def _fractions(part: xr.Dataset, parameter: str, cast: palette.Cast) -> xr.Dataset:
-    """Return the share of each attractor and of each kind of grey cell, per parameter value."""
+    """Return the share of cells per parameter value on each attractor, and of each kind without an attractor."""
     n = part.sizes[parameter]
     ids = outcomes(part).transpose(parameter, ...).values.reshape(n, -1)
     kinds, others = list(palette.GREYS), palette.other_cells(part)
@@ -126,7 +126,7 @@ def _fractions(part: xr.Dataset, parameter: str, cast: palette.Cast) -> xr.Datas
 
 
 def _about(data: xr.Dataset) -> str:
-    """Describe the number of cells and the width of the intervals."""
+    """Describe the number of cells per parameter value and the width of the confidence intervals in text."""
     n = int(data["n_cells"].max())
     if "low" not in data:
         return f"{n} branches each"
@@ -137,7 +137,7 @@ def _about(data: xr.Dataset) -> str:
 
 @dataclass(frozen=True)
 class _Band:
-    """A band: its name, colour, height at each parameter value, and id (-1 for none)."""
+    """A stacked band: name, colour, height at each parameter value, and attractor id (-1 for none)."""
 
     name: str
     colour: str
@@ -146,7 +146,9 @@ class _Band:
 
 
 def _bands(data: xr.Dataset, cast: palette.Cast) -> list[_Band]:
-    """Return bands from below: attractors by falling share, the others, cells without an attractor."""
+    """Return the bands from the bottom up: attractors by falling share, minor attractors, cells without an
+    attractor.
+    """
     share = data["fraction"].values
     n = len(cast.names)
     total = share[:, :n].sum(axis=0)
@@ -185,7 +187,7 @@ def _write_letters(ax: Axes, data: xr.Dataset, parameter: str, bands: Sequence[_
 
 
 def _draw_intervals(ax: Axes, data: xr.Dataset, parameter: str, bands: Sequence[_Band]) -> None:
-    """Draw the interval of the summed share below each band edge, side by side in a column."""
+    """Draw the binomial interval of each upper band edge (a summed share), side by side within a parameter column."""
     limits = style.edges(data[parameter].values.astype(np.float64))
     n = data["n_cells"].values
     floor = np.zeros(n.size)
@@ -203,7 +205,7 @@ def _draw_intervals(ax: Axes, data: xr.Dataset, parameter: str, bands: Sequence[
 def _raster(
     edges: np.ndarray, codes: np.ndarray, heights: np.ndarray, xlim: tuple[float, float], ylim: tuple[float, float]
 ) -> np.ndarray:
-    """Return the band's code at each raster point, 300 x 300 from below; -1 for none."""
+    """Return the code of the band at each pixel of a 300 x 300 raster, from the bottom row up; -1 for none."""
     place = (np.arange(300) + 0.5) / 300
     x, y = (low + place * (high - low) for low, high in (xlim, ylim))
     column = np.clip(np.searchsorted(edges, x) - 1, 0, heights.shape[1] - 1)

@@ -1,4 +1,4 @@
-"""Draw the gallery of attractors: phase portraits of each, and the path of a point of the model's drawing."""
+"""Draw all attractors of one parameter point: phase portraits, and the path of a point of the mechanical drawing."""
 
 from __future__ import annotations
 
@@ -31,7 +31,8 @@ _PATH_IN = 0.14
 def plot_gallery(
     attractors: xr.Dataset, portraits: xr.Dataset, *, degrees: bool = False, frame: style.Frame = style.WIDE
 ) -> style.DataFigure:
-    """Draw each attractor of one parameter point: its phase portraits, and the path of a point of the model.
+    """Draw each attractor of one parameter point: its phase portraits, and the path of a point of the mechanical
+    drawing.
 
     Parameters
     ----------
@@ -85,7 +86,7 @@ def plot_gallery(
 
 @dataclass(frozen=True)
 class _Layout:
-    """Panel places [in] for a number of attractors side by side, each with its panels.
+    """Panel positions [in] of a gallery: attractors side by side in rows, several panels for each.
 
     The last panel of each attractor is a path if the model has a `drawing`. Above all panels stand
     `lines` lines of text and a legend.
@@ -147,7 +148,7 @@ def _described(attractors: xr.Dataset, portraits: xr.Dataset) -> xr.Dataset:
 
 
 def _title(one: xr.Dataset, cast: palette.Cast, layout: _Layout) -> str:
-    """Return name and share of an attractor, broken into as many lines as there is room for."""
+    """Return the name and basin share of an attractor, broken into lines that fit its panels."""
     attracts = int(one["stability"]) == ATTRACTS
     share = f", share {palette.percent(float(one['share']))}" if attracts else ""
     room, size = layout.each * layout.pitch - layout.left, style.look_at(layout.frame).legend
@@ -181,13 +182,13 @@ def _draw_one(
 
 
 def _parameters(one: xr.Dataset) -> dict[str, float]:
-    """Return the parameter values at which a portrait is drawn."""
+    """Return the parameter values at which a phase portrait was computed."""
     values = parameters_of(one).as_dict()
     return {name: float(one[name]) if name in one.coords else value for name, value in values.items()}
 
 
 def _told(data: xr.Dataset, portraits: xr.Dataset, here: xr.Dataset) -> str:
-    """Describe the parameter point, and the attractors that are not drawn, with the reason."""
+    """Describe the parameter point in text, with the number of attractors and cells that are not drawn."""
     text = labels.caption(portraits.assign_attrs(data.attrs), with_start=False)
     if (rest := portraits.sizes["attractor"] - data.sizes["attractor"]) > 0:
         share = palette.percent(float(portraits["share"].sum() - data["share"].sum()))
@@ -221,7 +222,7 @@ def _fixed_handles(data: xr.Dataset, shown: set[str]) -> list[Any]:
 
 
 def draw(run: Run, options: AttractorFigureOptions) -> style.DataFigure:
-    """Draw the figure ``gallery`` of a run; integrates the portraits."""
+    """Draw the figure ``gallery`` of a run; this integrates the motions for the portraits."""
     from pipeline.analysis.attractors.describing.portraits import portraits
 
     at, notes = values_of(run, options)

@@ -28,7 +28,8 @@ _PI_STEPS = tuple(0.125 * 2**k for k in range(24))
 
 @dataclass(frozen=True)
 class Measure:
-    """A drawn state or quantity: its symbol, its unit, and the factor to that unit.
+    """Axis measure of a state or quantity: its symbol, its drawn unit, and the factor that converts values to this
+    unit.
 
     Attributes
     ----------
@@ -51,22 +52,22 @@ class Measure:
 
     @property
     def label(self) -> str:
-        """Return symbol and unit for an axis."""
+        """Return the axis label: symbol and unit."""
         return with_unit(self.symbol, self.unit)
 
     @property
     def half_turn(self) -> float:
-        """Return half a turn in the unit drawn."""
+        """Return half a turn in the drawn unit."""
         return math.pi * self.factor
 
     def shown(self, values: np.ndarray, *, wrap: bool = False) -> np.ndarray:
-        """Convert values to the unit drawn; wrap angles to half a turn about 0 if `wrap` is set."""
+        """Convert values to the drawn unit; if `wrap` is set, wrap angles to half a turn about 0."""
         folded = wrapped(values) if wrap and self.on_circle else values
         return np.asarray(folded * self.factor if self.factor != 1.0 else folded)
 
 
 def with_unit(name: str, unit: str) -> str:
-    """Return name and unit of an axis; no unit for pure numbers."""
+    """Return an axis label of name and unit, without a unit for dimensionless numbers."""
     return name if unit in ("", "1") else f"{name} [{raised(unit)}]"
 
 
@@ -76,7 +77,7 @@ def raised(unit: str) -> str:
 
 
 def state_measure(ds: xr.Dataset, state: str = "", degrees: bool = False) -> Measure:
-    """Return the measure of a state of a dataset.
+    """Return the axis measure (symbol, unit, factor) of a state of a dataset.
 
     Parameters
     ----------
@@ -100,7 +101,9 @@ def state_measure(ds: xr.Dataset, state: str = "", degrees: bool = False) -> Mea
 
 
 def quantity_measure(ds: xr.Dataset, name: str, degrees: bool = False) -> Measure:
-    """Return the measure of a quantity or state of the model; raise ValueError if there is none."""
+    """Return the axis measure (symbol, unit, factor) of a model's quantity or state; raise ValueError if it is
+    unknown.
+    """
     model = model_of(ds)
     if name in model.state_names:
         return state_measure(ds, name, degrees)
@@ -120,7 +123,7 @@ def _measure(name: str, symbol: str, unit: str, degrees: bool, on_circle: bool) 
 
 
 def start_measure(ds: xr.Dataset, dim: str, degrees: bool = False) -> Measure:
-    """Return the measure of a state's initial values; `degrees` counts for angles alone."""
+    """Return the axis measure (symbol, unit, factor) of a state's initial values; `degrees` affects angles only."""
     model = model_of(ds)
     one = model.state(dim.removesuffix("_0"))
     return _measure(
@@ -139,19 +142,19 @@ def some_angle(model: Model, degrees: bool, what: str) -> None:
 
 
 def wrapped(angle: np.ndarray) -> np.ndarray:
-    """Bring angles to [-pi, pi)."""
+    """Wrap angles to [-pi, pi)."""
     return np.asarray((angle + math.pi) % (2.0 * math.pi) - math.pi)
 
 
 def on_circle(angle: np.ndarray, *others: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Wrap an angle and break lines over it where it leaves one edge and enters at the other."""
+    """Wrap an angle to [-pi, pi), and insert NaN into it and other arrays where it jumps across the edge."""
     folded = wrapped(angle)
     jumps = np.flatnonzero(np.abs(np.diff(folded)) > math.pi) + 1
     return tuple(np.insert(values, jumps, np.nan) for values in (folded, *others))
 
 
 def angle_ticks(ax: Axes, measure: Measure, axis: str = "y", most: float | None = None) -> None:
-    """Set round ticks on an angle's axis: multiples of pi in wide ranges, of 15, 30 ... degrees."""
+    """Set round ticks on an angle axis: multiples of pi for wide ranges in radians, of 15, 30 ... for degrees."""
     if not measure.on_circle:
         return
     low, high = ax.get_ylim() if axis == "y" else ax.get_xlim()
@@ -164,7 +167,7 @@ def angle_ticks(ax: Axes, measure: Measure, axis: str = "y", most: float | None 
 
 
 def _step(span: float, most: float, steps: Sequence[float]) -> float:
-    """Smallest step that gives at most so many intervals, or the largest one on offer."""
+    """Return the smallest of the given steps that divides a span into at most `most` intervals, else the last step."""
     return next((step for step in steps if span / step <= most), steps[-1])
 
 
@@ -188,7 +191,7 @@ def pi_fraction(value: float, _position: int | None = None) -> str:
 
 
 def parameter_label(coordinate: xr.DataArray) -> str:
-    """Return the axis label of a parameter: its meaning and its unit."""
+    """Return the axis label of a parameter: its long name and its unit."""
     name = str(coordinate.attrs.get("long_name", coordinate.name))
     if coordinate.name == "frequency":
         name = "drive frequency"
@@ -196,12 +199,12 @@ def parameter_label(coordinate: xr.DataArray) -> str:
 
 
 def swept_label(name: str, units: str) -> str:
-    """Return the axis label of the continuation parameter of branches."""
+    """Return the axis label of the parameter along which branches are continued."""
     return "drive frequency [Hz]" if name in ("frequency", "frequency_hz") else with_unit(name, units)
 
 
 def caption(ds: xr.Dataset, *, drop: Iterable[str] = (), with_start: bool = True) -> str:
-    """Name the fixed values of a figure: parameters first, then the initial state.
+    """Return a caption that names the fixed values of a figure: parameters first, then the initial state.
 
     Parameters
     ----------

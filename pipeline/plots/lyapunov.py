@@ -98,7 +98,7 @@ def plot_lyapunov(
 
 
 def _lost(diagram: Diagram, data: xr.Dataset) -> Survey:
-    """Return the diagram's absent cells, and the cells with points but no exponent."""
+    """Return the cell counts of the diagram's survey, with added counts of cells that have points but no exponent."""
     found = diagram.survey
     value = data["exponent_value"].isel(exponent=0)
     others = [d for d in value.dims if d != diagram.parameter]
@@ -109,7 +109,7 @@ def _lost(diagram: Diagram, data: xr.Dataset) -> Survey:
 
 
 def _draw_lost(top: Axes, bottom: Axes, strip: Axes, diagram: Diagram, lost: Survey) -> None:
-    """Draw the share of lost cells in a strip, and shade both panels where all cells are lost."""
+    """Draw the share of cells without an exponent in a strip, and shade both panels where no cell has one."""
     style.style_axes(strip, minor=False)
     shade_blank(top, diagram.x, diagram.survey, diagram.layers)
     draw_absent(bottom, strip, diagram.x, lost, diagram.layers)
@@ -146,7 +146,7 @@ def _draw_exponents(ax: Axes, data: xr.Dataset, parameter: str, spectrum: bool, 
 def _draw_class(
     ax: Axes, x: np.ndarray, value: np.ndarray, error: np.ndarray, flag: np.ndarray, colour: str, gid: str
 ) -> None:
-    """Draw the points and the error band of one colour; the arrays have shape (x, cell)."""
+    """Draw the points and the error band of one class of motion in its colour; the arrays have shape (x, cell)."""
     there = np.isfinite(value)
     if not there.any():
         return

@@ -1,4 +1,4 @@
-"""Show the share of cells without points below a diagram, and explain an empty diagram."""
+"""Show the share of cells without points in a strip below a diagram, and explain an empty diagram."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ LOOKS: dict[str, dict[str, Any]] = {
 
 
 def draw_absent(ax: Axes, strip: Axes, x: np.ndarray, survey: Survey, layers: Sequence[int]) -> None:
-    """Draw the share of absent cells in the strip, and shade the diagram where no cell is left.
+    """Draw the share of absent cells in the strip, and shade the diagram at parameter values where all are absent.
 
     Parameters
     ----------
@@ -54,7 +54,7 @@ def draw_absent(ax: Axes, strip: Axes, x: np.ndarray, survey: Survey, layers: Se
 
 
 def shade_blank(ax: Axes, x: np.ndarray, survey: Survey, layers: Sequence[int]) -> None:
-    """Shade a diagram where no cell is left to draw; arguments as for `draw_absent`."""
+    """Shade a diagram at parameter values where all cells are absent; arguments as for `draw_absent`."""
     shown = list(layers)
     absent = sum((counts[shown].sum(0) for counts in survey.absent.values()), np.zeros(x.size, np.int64))
     blank = (absent >= np.maximum(survey.cells[shown].sum(0), 1)).astype(float)
@@ -65,7 +65,7 @@ def shade_blank(ax: Axes, x: np.ndarray, survey: Survey, layers: Sequence[int]) 
 
 
 def absent_handles(survey: Survey) -> list[Patch]:
-    """Return legend handles for cells that are left out: the reason and the number of each kind."""
+    """Return legend handles for cells that are not drawn: the reason and the number of cells of each kind."""
     total = int(survey.cells.sum())
     return [
         Patch(label=f"{name}: {int(counts.sum())} of {total} cells", **LOOKS[name])
@@ -75,7 +75,7 @@ def absent_handles(survey: Survey) -> list[Patch]:
 
 
 def say_empty(ax: Axes, survey: Survey, shown: str = "") -> None:
-    """Write into empty axes why there is nothing to draw."""
+    """Write the reason why there is nothing to draw into empty axes."""
     n_cells = int(survey.cells.sum())
     absent = {name: int(counts.sum()) for name, counts in survey.absent.items() if counts.any()}
     text = f"nothing to draw: of {n_cells} cells, " + style.join(f"{n} {name}" for name, n in absent.items())

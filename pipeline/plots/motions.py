@@ -20,7 +20,7 @@ PLAIN = "#1A3A5C"
 
 @dataclass(frozen=True)
 class Motions:
-    """The classes of motion of a dataset: labels and colours by code.
+    """Labels and colours of the classes of motion of a dataset, by code.
 
     Attributes
     ----------
@@ -35,12 +35,12 @@ class Motions:
 
     @property
     def told(self) -> bool:
-        """Tell whether the model distinguishes classes of motion."""
+        """Return whether the model distinguishes classes of motion."""
         return len(self.words) > 1
 
 
 def motions_of(ds: xr.Dataset) -> Motions:
-    """Return labels and colours of a dataset's model; a single class without a classifier."""
+    """Return the labels and colours of a model's classes of motion; a single class if the model has no classifier."""
     classifier = model_of(ds).classifier
     if classifier is None:
         return Motions(("motion",), (PLAIN,), (0,))
@@ -53,6 +53,6 @@ def motions_of(ds: xr.Dataset) -> Motions:
 
 
 def motion_codes(cells: xr.Dataset) -> xr.DataArray:
-    """Return the motion code of each cell of a part of the cube, on the dims of ``status``."""
+    """Return the code of the class of motion of each cell, on the dims of ``status``."""
     found = classify(cells)
     return xr.zeros_like(cells["status"], dtype=np.int8) if found is None else found

@@ -29,7 +29,7 @@ Floats = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Trail:
-    """The samples of a trail; in a repeating film it runs across the film's end.
+    """Samples of the fading trail behind a moving point; in a repeating film the trail continues across the film's end.
 
     Attributes
     ----------
@@ -48,7 +48,7 @@ class Trail:
 
     @classmethod
     def of(cls, one: xr.Dataset) -> Trail:
-        """Return that of a motion."""
+        """Return the trail of a motion in a film."""
         samples, times = one.sizes["sample"] - 1, one["time"].values
         length = int(TRAIL_S * one.attrs["fps"] * one.attrs["substeps"])
         period = float(one["period"])
@@ -56,7 +56,7 @@ class Trail:
         return cls(samples, min(length, samples), bool(one.attrs["repeats"]), min(closed, samples))
 
     def before(self, i: int) -> npt.NDArray[np.intp]:
-        """Return the samples from the trail's end to `i`."""
+        """Return the indices of the trail's samples up to sample `i`."""
         if self.repeats:
             return np.arange(i - self.length, i + 1) % self.n
         return np.arange(max(0, i - self.length), i + 1)
@@ -64,7 +64,9 @@ class Trail:
 
 @dataclass(frozen=True)
 class Point:
-    """A point that moves along a line, with its trail; behind what does not repeat the way that it came."""
+    """A point that moves along a path with a fading trail; for a motion that does not repeat, the path so far stays
+    visible.
+    """
 
     path: Floats
     jumps: float
@@ -75,7 +77,7 @@ class Point:
     dot: Any
 
     def at(self, i: int) -> list[Artist]:
-        """Artists at a sample."""
+        """Move the point to a sample, and return its artists."""
         samples = self.trail.before(i)
         segments, there = self._segments(samples)
         self.comet.set_segments(list(segments[there]))
@@ -97,7 +99,9 @@ class Point:
 
 
 def _point(ax: Axes, path: Floats, colour: str, trail: Trail, *, jumps: float, size: float, thick: float) -> Point:
-    """Make the artists of a moving point."""
+    """Make the artists of a point that moves along a path: dot, fading trail and, if the motion does not repeat, its
+    path.
+    """
     colours = np.empty((max(trail.length, 1), 4))
     colours[:, :3], colours[:, 3] = to_rgb(colour), np.linspace(0.0, 1.0, len(colours)) ** 1.5
     comet = LineCollection([], linewidths=thick, animated=True, capstyle="butt")
@@ -111,7 +115,6 @@ def _point(ax: Axes, path: Floats, colour: str, trail: Trail, *, jumps: float, s
 
 
 def _dots(ax: Axes, size: float, colour: str, edge: str, thick: float) -> Any:
-    """Make the artist of moving dots."""
     look: dict[str, Any] = {"markersize": size, "color": colour, "markeredgecolor": edge, "markeredgewidth": thick}
     (dots,) = ax.plot([], [], linestyle="none", marker="o", animated=True, **look)
     return dots
@@ -138,7 +141,7 @@ def moving_portrait(ax: Axes, one: xr.Dataset, pair: tuple[str, str], trail: Tra
 
 
 def _path(measures: Sequence[Measure], values: Sequence[Floats]) -> tuple[Floats, float]:
-    """Line of a portrait in its units, and how far apart two of its samples are only where it is cut."""
+    """Return the polyline of a phase portrait in drawn units, and the distance that marks a jump of a wrapped angle."""
     columns, jumps = [], math.inf
     for measure, column in zip(measures, values, strict=True):
         turning = measure.on_circle and np.ptp(column) >= 2.0 * np.pi
@@ -152,7 +155,7 @@ def _path(measures: Sequence[Measure], values: Sequence[Floats]) -> tuple[Floats
 
 @dataclass(frozen=True)
 class Scene:
-    """The plane that all drawings of a film share.
+    """The plane that the mechanical drawings of all motions in a film share.
 
     Attributes
     ----------
@@ -167,14 +170,14 @@ class Scene:
 
     @classmethod
     def of(cls, ds: xr.Dataset, drawing: Drawing) -> Scene:
-        """Return that of a film."""
+        """Return the plane that contains all points of a film's mechanical drawings."""
         places = ds["points"].values.reshape(-1, 2)
         if "fixed" in ds:
             places = np.concatenate([places, ds["fixed"].values.reshape(-1, 2)])
         return cls(drawing, np.nanmin(places, axis=0), np.nanmax(places, axis=0))
 
     def limit(self, ax: Axes) -> float:
-        """Set equal-scale limits that hold everything; return the width."""
+        """Set axis limits of equal scale that contain everything at all times; return the width in model units."""
         box = ax.get_window_extent()
         shape = np.array([box.width, box.height])
         scale = 1.22 * max(*((self.high - self.low) / shape), 1e-12)
@@ -186,7 +189,7 @@ class Scene:
 
 @dataclass(frozen=True)
 class Machine:
-    """The moving parts of a model's drawing: lines, points, and the traced path."""
+    """Moving parts of a model's mechanical drawing: lines, joints, and the traced path."""
 
     lines: tuple[Any, ...]
     corners: tuple[Floats, ...]
@@ -195,7 +198,7 @@ class Machine:
     traced: Point
 
     def at(self, i: int) -> list[Artist]:
-        """Artists at a sample."""
+        """Move the parts to a sample, and return them as a list of artists."""
         for line, corners in zip(self.lines, self.corners, strict=True):
             line.set_data(*corners[i].T)
         self.joints.set_data(*self.places[i].T)
@@ -204,7 +207,7 @@ class Machine:
 
 
 def moving_machine(ax: Axes, scene: Scene, one: xr.Dataset, trail: Trail, *, named: bool) -> Machine:
-    """Draw the fixed parts of a model's drawing, and return its moving parts."""
+    """Draw the fixed parts of a model's mechanical drawing, and return its moving parts."""
     drawing, colour = scene.drawing, str(one["colour"].values)
     ax.set_axis_off()
     width = scene.limit(ax)
@@ -232,7 +235,7 @@ def moving_machine(ax: Axes, scene: Scene, one: xr.Dataset, trail: Trail, *, nam
 
 
 def _fix(ax: Axes, still: dict[str, Floats], scene: Scene, named: bool) -> None:
-    """Draw the fixed points, with names beside them if `named` is set."""
+    """Draw the fixed points of a mechanical drawing, with names beside them if `named` is set."""
     ends = {name for names in scene.drawing.lines for name in names}
     for name, place in still.items():
         held = name in ends
@@ -259,7 +262,7 @@ def _fix(ax: Axes, still: dict[str, Floats], scene: Scene, named: bool) -> None:
 
 
 def _scale_bar(ax: Axes, width: float, unit: str) -> None:
-    """Draw a scale bar of round length, since there are no axes."""
+    """Draw a scale bar of round length, in place of axes."""
     power = 10.0 ** math.floor(math.log10(0.25 * width))
     length = max(f * power for f in (1.0, 2.0, 5.0) if f * power <= 0.25 * width)
     share = length / width
@@ -277,14 +280,14 @@ def _scale_bar(ax: Axes, width: float, unit: str) -> None:
 
 @dataclass(frozen=True)
 class Clock:
-    """The time shown, in drive periods if all motions have the same period."""
+    """Moving text that shows the model time, in drive periods if all motions have the same period."""
 
     text: Any
     time: Floats
     period: float
 
     def at(self, i: int) -> list[Artist]:
-        """Artists at a sample."""
+        """Set the time text to a sample, and return it as a list of artists."""
         if self.period:
             self.text.set_text(f"{self.time[i] / self.period:.2f} drive periods")
         else:
@@ -293,7 +296,7 @@ class Clock:
 
 
 def moving_clock(fig: style.DataFigure, ds: xr.Dataset) -> Clock:
-    """Write the playback speed, and return the part that shows the time."""
+    """Write the playback speed into a figure, and return the moving text that shows the time."""
     frequencies = ds["drive_frequency"].values
     forced = not model_of(ds).autonomous and np.ptp(frequencies) == 0.0
     width, height = fig.get_size_inches()

@@ -87,7 +87,7 @@ _FAILED = ("step limit", "step underflow", "unreached")
 
 
 def other_cells(part: xr.Dataset) -> dict[str, np.ndarray]:
-    """Count the cells without an attractor by the names of `GREYS`, on parameter dims, then start dims."""
+    """Return masks of the cells without an attractor by the names of `GREYS`; parameter dims first, then the others."""
     found: dict[str, np.ndarray] = {}
     for name, which in outcomes.other_cells(part).items():
         own = "failed" if name in _FAILED else name
@@ -97,7 +97,7 @@ def other_cells(part: xr.Dataset) -> dict[str, np.ndarray]:
 
 @dataclass(frozen=True)
 class Cast:
-    """The colours and names of the sets of a dataset.
+    """Colours and names of the attractors and other invariant sets of a dataset.
 
     Attributes
     ----------
@@ -115,7 +115,7 @@ class Cast:
 
 
 def cast_of(attractors: xr.Dataset, part: xr.Dataset | None = None) -> Cast:
-    """Assign colours and names to the sets of a dataset.
+    """Assign colours and names to the attractors and other invariant sets of a dataset.
 
     Parameters
     ----------
@@ -138,13 +138,13 @@ def cast_of(attractors: xr.Dataset, part: xr.Dataset | None = None) -> Cast:
 
 
 def _grey_of(stability: xr.DataArray) -> str:
-    """Return the grey of a set that attracts nowhere, by its most frequent stability."""
+    """Return the grey for an invariant set that attracts nowhere, by its most frequent stability."""
     codes = stability.values[np.isin(stability.values, list(GREY_OF))]
     return GREY_OF[int(np.bincount(codes).argmax())] if codes.size else OTHERS
 
 
 def describe(one: xr.Dataset) -> str:
-    """Describe a set: periods or kinds, motions, turns if it rotates, and its stability unless it attracts.
+    """Describe an attractor or other invariant set in words: period or kind, class of motion, turns, stability.
 
     Only points where the set is present count.
     """
@@ -158,7 +158,7 @@ def describe(one: xr.Dataset) -> str:
 
 
 def _stability(one: xr.Dataset) -> str:
-    """Describe the stability shown for a set that does not attract everywhere."""
+    """Return the stabilities of an invariant set where it does not attract, as text."""
     found = sorted({int(code) for code in one["stability"].values.ravel()} - {ABSENT, ATTRACTS})
     words = " or ".join(STABILITIES[code].replace("_", " ") for code in found)
     return f"{words} in parts" if words and (one["stability"].values == ATTRACTS).any() else words
@@ -202,7 +202,7 @@ def _words(one: xr.Dataset, codes: np.ndarray) -> str:
 
 
 def _turns(one: xr.Dataset, present: np.ndarray) -> str:
-    """Return mean turns per period, if the motion rotates everywhere in the same way."""
+    """Return the mean turns per period as text; empty unless the motion rotates equally at all parameter points."""
     dim = model_of(one).angle_dim
     if "rotation" not in one or dim not in one["rotation"].dims:
         return ""
@@ -228,7 +228,7 @@ Entry = tuple[str, str] | Artist
 def new_panel(
     data: xr.Dataset, entries: Sequence[Entry], frame: style.Frame, height: float = 4.3
 ) -> tuple[style.DataFigure, Axes]:
-    """Make a figure with one panel and a legend: beside it, or below in a narrow figure.
+    """Make a figure with one panel, and a legend beside it or, in a narrow figure, below it.
 
     Parameters
     ----------
@@ -290,7 +290,7 @@ def percent(share: float) -> str:
 
 
 def write_letters(ax: Axes, codes: np.ndarray, attractors: Iterable[int]) -> None:
-    """Write each attractor's letter into the widest place of its area, if one is wide enough.
+    """Write each attractor's letter into the widest part of its area in an image, if the letter fits.
 
     Parameters
     ----------

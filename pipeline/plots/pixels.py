@@ -1,4 +1,4 @@
-"""Draw points: few as markers, many counted on the pixels of an image.
+"""Draw points of a cube: a few as markers, many as an image whose pixels count them.
 
 In an image a pixel takes the colour of the motion that has most points in it, and is the darker the more
 there are; all panels of a figure share one scale of darkness.
@@ -27,7 +27,7 @@ TINT = 0.5
 
 @dataclass(frozen=True)
 class Look:
-    """Marker of one layer.
+    """Marker style of one layer.
 
     Attributes
     ----------
@@ -45,7 +45,7 @@ class Look:
 
 
 def looks(diameter: float, shown: Sequence[int]) -> dict[int, Look]:
-    """Return the markers of the layers: small dark over large light, so that both stay visible."""
+    """Return the marker styles of the layers: small dark markers over large light ones, so that both stay visible."""
     if len(shown) < 2:
         return {i: Look(diameter) for i in shown}
     dark = max(diameter, 0.95)
@@ -54,14 +54,14 @@ def looks(diameter: float, shown: Sequence[int]) -> dict[int, Look]:
 
 @dataclass(frozen=True)
 class Panel:
-    """Axes and the layers that they show."""
+    """Axes of a panel, and the layers (directions of continuation) drawn in it."""
 
     ax: Axes
     layers: tuple[int, ...]
 
 
 def draw_points(panels: Sequence[Panel], view: View, diameter: float) -> xr.Dataset:
-    """Draw the points of a view into axes whose places and limits are final.
+    """Draw the points of a `View` into axes whose positions and limits are final.
 
     Parameters
     ----------
@@ -123,7 +123,7 @@ def _draw_markers(panel: Panel, points: Points, view: View, diameter: float, x: 
 
 
 def distinct(x: np.ndarray, y: np.ndarray, xlim: Range, ylim: Range) -> tuple[np.ndarray, np.ndarray]:
-    """Drop points that would be drawn on the same spot as another.
+    """Drop points that would be drawn at the same position as another point.
 
     Many markers on one spot would darken their smoothed rims, and dots would become squares.
     """
@@ -158,7 +158,7 @@ Counts = Mapping[tuple[int, int], np.ndarray]
 
 
 def _pixels(ax: Axes) -> tuple[int, int]:
-    """Height and width of the image that fills the axes, finer than the page."""
+    """Return height and width [pixels] of the image that fills the axes; it is finer than the figure's resolution."""
     box = ax.get_window_extent()
     return max(1, round(box.height * SUPERSAMPLING)), max(1, round(box.width * SUPERSAMPLING))
 
@@ -204,7 +204,7 @@ def _draw_images(
 
 
 def _spread(counts: Counts, looks: Mapping[int, Look]) -> dict[int, dict[int, np.ndarray]]:
-    """Return the largest count within a dot around each pixel, by layer and motion."""
+    """Return the largest count of points within a dot around each pixel, by layer and class of motion."""
     return {
         i: {
             code: _dilate(grid, _disc(look.diameter / 72.0 * style.DPI * SUPERSAMPLING))
@@ -218,7 +218,7 @@ def _spread(counts: Counts, looks: Mapping[int, Look]) -> dict[int, dict[int, np
 def paint(
     picture: np.ndarray, spread: Mapping[int, np.ndarray], look: Look, colours: Sequence[str], reference: float
 ) -> None:
-    """Paint the points of one layer over the picture, each pixel by the motion with most points.
+    """Paint the points of one layer into an image; each pixel takes the colour of the class of motion with most points.
 
     Parameters
     ----------
@@ -249,7 +249,9 @@ def paint(
 
 
 def _opacity(counts: np.ndarray, faintest: float, reference: float) -> np.ndarray:
-    """Opacity from `faintest` for single points to 1 for the reference, logarithmic."""
+    """Return opacities that grow with the logarithm of the counts: `faintest` for one point, 1 for `reference`
+    points.
+    """
     if reference <= 1.0:
         return np.ones(counts.size, dtype=np.float32)
     depth = np.log(counts.astype(np.float32)) / np.float32(math.log(reference))
@@ -257,7 +259,7 @@ def _opacity(counts: np.ndarray, faintest: float, reference: float) -> np.ndarra
 
 
 def _disc(diameter: float) -> list[tuple[int, int]]:
-    """Return the offsets (row, column) of the pixels of a round dot from its centre."""
+    """Return the (row, column) offsets of the pixels that lie within a round dot from its centre."""
     radius = max(0.5, 0.5 * diameter)
     reach = math.ceil(radius)
     around = range(-reach, reach + 1)
@@ -275,7 +277,7 @@ def _dilate(grid: np.ndarray, dot: Sequence[tuple[int, int]]) -> np.ndarray:
 
 
 def _pixel_table(counts: Counts, x: Range, y: Range, view: View) -> xr.Dataset:
-    """Return the centres of the non-empty pixels, with their counts."""
+    """Return a dataset of the non-empty pixels: centre, count of points, class of motion and layer."""
     parts = []
     for (own_layer, code), grid in counts.items():
         rows, columns = np.nonzero(grid)

@@ -1,4 +1,4 @@
-"""Draw panels of one motion: a phase portrait of two states, and the path of a point of the model."""
+"""Draw panels of one motion: a phase portrait of two states, and the path of a point of the mechanical drawing."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _AIR = 1.16
 
 @dataclass(frozen=True)
 class Motion:
-    """One motion to draw in several panels.
+    """One motion to draw in several panels: its orbit, its section points and its colour.
 
     Attributes
     ----------
@@ -40,7 +40,7 @@ class Motion:
 
 
 def draw_portrait(ax: Axes, ds: xr.Dataset, pair: tuple[str, str], motion: Motion, *, degrees: bool = False) -> None:
-    """Draw a phase portrait: the motion as a line, its section as dots; on the circle where an angle turns.
+    """Draw a phase portrait: the motion as a line, its section points as dots; angles that make full turns are wrapped.
 
     Parameters
     ----------
@@ -104,7 +104,7 @@ def _dress(ax: Axes, measures: list[Measure], turning: list[bool]) -> None:
 
 
 def draw_path(ax: Axes, drawing: Drawing, parameters: Mapping[str, float], motion: Motion) -> list[str]:
-    """Draw the path of the point that a model's drawing traces, with the fixed points.
+    """Draw the path of the point that a model's mechanical drawing traces, with the fixed points nearby.
 
     Parameters
     ----------
@@ -154,13 +154,13 @@ def _marker(fixed: Mapping[str, np.ndarray], name: str) -> str:
 
 
 def fixed_handles(drawing: Drawing, parameters: Mapping[str, float], shown: Collection[str]) -> list[Any]:
-    """Return legend handles for the fixed points shown."""
+    """Return legend handles for those fixed points of a mechanical drawing that are shown."""
     fixed = drawing.fixed(parameters)
     return [style.dot(n, "0.2", 4.0, marker=_marker(fixed, n)) for n in fixed if n in shown]
 
 
 def _near(fixed: Mapping[str, np.ndarray], place: np.ndarray) -> list[str]:
-    """Return the fixed points to draw: those so near to the path that it is not shrunk by the axis limits."""
+    """Return the names of the fixed points that are near enough to a path to be drawn with it."""
     if not place.size:
         return list(fixed)
     size = max(float(np.ptp(place, axis=0).max()), 1e-12)
@@ -171,7 +171,7 @@ def _near(fixed: Mapping[str, np.ndarray], place: np.ndarray) -> list[str]:
 
 
 def equalise(ax: Axes) -> None:
-    """Set limits that hold all artists at equal scale; call it when the axes have their final place."""
+    """Set axis limits of equal scale that contain all lines; call it when the axes have their final position."""
     points = np.concatenate([line.get_xydata() for line in ax.get_lines()])
     box = ax.get_window_extent()
     low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)

@@ -1,4 +1,4 @@
-"""Draw regime maps: attractors, periods, or their number, over two swept parameters."""
+"""Draw regime maps over two swept parameters: the coexisting attractors, their periods, or their number."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def plot_regimes(
     curves: xr.Dataset | None = None,
     frame: style.Frame = style.WIDE,
 ) -> style.DataFigure:
-    """Draw the coexisting attractors or periods at each point of two swept parameters.
+    """Draw a map of the coexisting attractors, or of their orbit periods, over two swept parameters.
 
     Parameters
     ----------
@@ -112,7 +112,7 @@ def _with_curves(data: xr.Dataset, curves: xr.Dataset, x: str, y: str) -> xr.Dat
 
 
 def _draw_one(data: xr.Dataset, x: str, y: str, show: str, text: str, frame: style.Frame) -> style.DataFigure:
-    """Draw one map with a colour for each regime."""
+    """Draw one map over two parameters, with a colour for each regime."""
     colours, entries = _looks(data, show)
     if (data["share_without"] > SHARE_LIMIT).any():
         label = f"over {100 * SHARE_LIMIT:g} % of the cells\nwithout an attractor"
@@ -137,7 +137,7 @@ def _draw_one(data: xr.Dataset, x: str, y: str, show: str, text: str, frame: sty
 def _draw_multiples(
     data: xr.Dataset, x: str, y: str, show: str, text: str, frame: style.Frame, cast: palette.Cast
 ) -> style.DataFigure:
-    """Draw one map per member of the regimes, shaded by its share of the cells."""
+    """Draw one map per attractor or period, shaded by its share of the cells."""
     most = len(palette.COLOURS)
     total = data["share_of"].sum([x, y]).values
     chosen = np.sort(np.argsort(-total, kind="stable")[:most])
@@ -185,7 +185,7 @@ def _member_colour(member: str, show: str, cast: palette.Cast) -> str:
 
 
 def _dress(ax: Axes, data: xr.Dataset, x: str, y: str, frame: style.Frame) -> None:
-    """Mark points where an attractor may be missing, and set the ranges."""
+    """Mark parameter points with many cells without an attractor, and set the axis ranges."""
     row, column = np.nonzero(data["share_without"].values > SHARE_LIMIT)
     if row.size:
         ax.plot(data[x].values[column], data[y].values[row], gid="without", **_CROSS)
@@ -208,7 +208,7 @@ def _axes(attractors: xr.Dataset, at: Mapping[str, float] | None) -> tuple[str, 
 
 
 def _regimes(part: xr.Dataset, x: str, y: str, show: str) -> xr.Dataset:
-    """Return the regime of each point; regimes are numbered by falling frequency."""
+    """Return the regime of each parameter point; regimes are numbered from the most frequent one."""
     present = part["stability"].transpose(y, x, "attractor").values == ATTRACTS
     periods = part["orbit_period"].transpose(y, x, "attractor").values
     values = np.empty(present.shape[:2], object)
@@ -236,7 +236,7 @@ def _regimes(part: xr.Dataset, x: str, y: str, show: str) -> xr.Dataset:
 
 
 def _members(present: np.ndarray, periods: np.ndarray, share: np.ndarray, x: str, y: str, show: str) -> xr.Dataset:
-    """Return the share of cells on each attractor, or on all attractors of each period."""
+    """Return the share of cells on each attractor, or summed over the attractors of each period."""
     if show == "attractors":
         kinds = np.broadcast_to(np.arange(present.shape[-1]), present.shape)
         names = {i: letter(i) for i in range(present.shape[-1])}
@@ -253,7 +253,7 @@ def _members(present: np.ndarray, periods: np.ndarray, share: np.ndarray, x: str
 
 
 def _numbers(part: xr.Dataset, x: str, y: str) -> dict[str, Any]:
-    """Return each attractor's share, its interval, and the bound on unseen basins."""
+    """Return each attractor's basin share, its 95 % interval, and the bound on the share of an unseen basin."""
     dims = (y, x, "attractor")
     share = part["share"].transpose(*dims).values
     numbers: dict[str, Any] = {
@@ -291,7 +291,7 @@ def _label(present: np.ndarray, periods: np.ndarray, show: str) -> str:
 
 
 def _looks(data: xr.Dataset, show: str) -> tuple[list[str], list[palette.Entry]]:
-    """Return the colour of each regime, and the legend."""
+    """Return the colour of each regime, and the legend entries."""
     names = [str(v) for v in data["label"].values]
     if show == "number":
         ramp = matplotlib.colormaps["cividis"]

@@ -35,7 +35,7 @@ def plot_section(
     degrees: bool = False,
     frame: style.Frame = style.WIDE,
 ) -> style.DataFigure:
-    """Draw the kept sections of all cells of one parameter point in the plane of two states.
+    """Draw the stored section points of all cells at one parameter point, in the plane of two states.
 
     Parameters
     ----------
@@ -89,7 +89,7 @@ def plot_section(
 
 
 def _measures(part: xr.Dataset, states: tuple[str, str] | None, degrees: bool) -> list[labels.Measure]:
-    """Return the measures of the horizontal and vertical states."""
+    """Return the axis measures (symbol, unit, factor) of the horizontal and vertical states."""
     model = model_of(part)
     names = states or section_pair(model)
     for name in names:
@@ -101,7 +101,7 @@ def _measures(part: xr.Dataset, states: tuple[str, str] | None, degrees: bool) -
 
 
 def section_pair(model: Model, first: str = "") -> tuple[str, str]:
-    """Return the horizontal and vertical states: if possible a portrait pair that varies between sections."""
+    """Return the states of the horizontal and vertical axes, if possible those of a phase portrait."""
     states = model.section_states
     pairs = [p for p in model.portraits if set(p) <= set(states) and p[0] == (first or p[0])]
     if pairs:
@@ -112,7 +112,9 @@ def section_pair(model: Model, first: str = "") -> tuple[str, str]:
 
 
 def _view(part: xr.Dataset, measures: list[labels.Measure], attractors: xr.Dataset | None) -> View:
-    """Return the view, coloured by motion or attractor; directions share one layer."""
+    """Return a `View` of the section points, coloured by class of motion or by attractor, with all directions in one
+    layer.
+    """
 
     def coordinates(block: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
         section = block["section"].transpose(*block["status"].dims, "period_index", "state")
@@ -151,7 +153,7 @@ def _handles(view: View, found: set[int]) -> list[Any]:
 
 
 def _by_attractor(view: View, part: xr.Dataset, attractors: xr.Dataset) -> View:
-    """Colour points by their cell's attractor; other cells have the grey of their status."""
+    """Colour points by their cell's attractor, or by a grey for the status of cells without one."""
     chosen = attractors
     for dim in split_dims(attractors["attractor_id"])[0]:
         chosen = chosen.sel({dim: float(part[dim])})

@@ -1,4 +1,4 @@
-"""Set the common look of the figures: sizes, fonts, colours, shared parts.
+"""Set the common look of all figures: sizes, fonts, colours, axes, legends and captions.
 
 The look is set on each object, never through `matplotlib.rcParams`: these are shared by all threads.
 """
@@ -62,12 +62,12 @@ class Frame:
 
     @property
     def compact(self) -> bool:
-        """Tell whether the figure is too narrow for a legend beside the axes."""
+        """Return whether the figure is too narrow for a legend beside the axes."""
         return self.width < COMPACT_MM
 
     @property
     def width_in(self) -> float:
-        """Return the width [in]."""
+        """Return the figure's width [in]."""
         return self.width * MM
 
 
@@ -76,7 +76,7 @@ WIDE = Frame()
 
 @dataclass(frozen=True)
 class Look:
-    """The font sizes [pt] of a figure."""
+    """Font sizes [pt] of a figure: axis labels, ticks and legend."""
 
     label: float
     tick: float
@@ -87,7 +87,7 @@ _LOOKS = {False: Look(10.0, 9.0, 9.0), True: Look(8.0, 7.0, 7.0)}
 
 
 class DataFigure(Figure):
-    """A figure that carries the data it shows.
+    """A matplotlib figure that carries the data it shows.
 
     Attributes
     ----------
@@ -138,24 +138,24 @@ def new_figure(
 
 
 def look_at(frame: Frame) -> Look:
-    """Return the font sizes for a figure of this width."""
+    """Return the font sizes for a figure of a given width."""
     return _LOOKS[frame.compact]
 
 
 def figure_of(ax: Axes) -> DataFigure:
-    """Return the figure that axes are in."""
+    """Return the figure that contains the axes."""
     figure = ax.figure
     assert isinstance(figure, DataFigure)
     return figure
 
 
 def look_of(ax: Axes) -> Look:
-    """Return the font sizes of the figure that holds the axes."""
+    """Return the font sizes of the figure that contains the axes."""
     return figure_of(ax).look
 
 
 def finish(figure: DataFigure) -> None:
-    """Set the common font on every text, compute the layout, and fix it."""
+    """Set the common font on all texts of a figure, compute its layout, and keep it fixed."""
     for text in figure.findobj(Text):
         assert isinstance(text, Text)
         text.set_fontfamily(FONT)
@@ -168,7 +168,7 @@ def finish(figure: DataFigure) -> None:
 
 
 def style_axes(ax: Axes, *, inside: bool = True, minor: bool = True) -> None:
-    """Give axes the common lines, ticks and fonts.
+    """Set the common style of lines, ticks and fonts on axes.
 
     Parameters
     ----------
@@ -199,7 +199,7 @@ def style_axes(ax: Axes, *, inside: bool = True, minor: bool = True) -> None:
 
 
 def few_ticks(ax: Axes, x: int = 4, y: int = 4) -> None:
-    """Put at most so many ticks on small axes."""
+    """Set at most `x` and `y` ticks on the two axes of a small panel."""
     ax.xaxis.set_major_locator(MaxNLocator(x))
     ax.yaxis.set_major_locator(MaxNLocator(y))
 
@@ -221,7 +221,7 @@ def label_axes(ax: Axes, x: str | None = None, y: str | None = None) -> None:
 
 
 def caption(ax: Axes, text: str) -> None:
-    """Write a line above the axes, wrapped at the figure's edge."""
+    """Write a caption above the axes, wrapped at the figure's edge."""
     if text:
         look = look_of(ax)
         width = figure_of(ax).frame.width_in - 0.6
@@ -229,7 +229,7 @@ def caption(ax: Axes, text: str) -> None:
 
 
 def folded(text: str, width: float, size: float, indent: str = "") -> str:
-    """Break a text into lines of a width [in] between its words; letters of mathematics count as one each."""
+    """Break a text between words into lines of at most a given width [in]."""
     lines: list[str] = []
     for word in text.split(" "):
         if lines and _width(lines[-1] + " " + word, size) <= width:
@@ -246,7 +246,7 @@ def _width(text: str, size: float) -> float:
 
 
 def legend_above(figure: DataFigure, handles: Sequence[Any], *, size: float | None = None) -> None:
-    """Put a legend above everything, on the right, in as few rows as its width allows."""
+    """Place a legend above all axes of a figure, on the right, in as few rows as fit."""
     if not handles:
         return
     size = figure.look.legend if size is None else size
@@ -266,14 +266,14 @@ def legend_above(figure: DataFigure, handles: Sequence[Any], *, size: float | No
 
 
 def complete(figure: DataFigure, ax: Axes, text: str, handles: Sequence[Any] = ()) -> None:
-    """Write the caption and a legend above the axes, and `finish`."""
+    """Write the caption and a legend above the axes, then compute and fix the figure's layout."""
     caption(ax, text)
     legend_above(figure, handles)
     finish(figure)
 
 
 def legend_below(figure: DataFigure, handles: Sequence[Any]) -> None:
-    """Put a legend below everything, on the left."""
+    """Place a legend below all axes of a figure, on the left."""
     if handles:
         size = figure.look.legend
         texts = [str(h.get_label()) for h in handles]
@@ -292,7 +292,7 @@ def legend_below(figure: DataFigure, handles: Sequence[Any]) -> None:
 
 
 def columns(frame: Frame, texts: Sequence[str], size: float) -> int:
-    """Return how many legend columns fit the figure's width; each is as wide as its widest text."""
+    """Return the number of legend columns that fit the figure's width."""
     width = frame.width_in - 0.15
     for rows in range(1, len(texts)):
         n = math.ceil(len(texts) / rows)
@@ -303,7 +303,7 @@ def columns(frame: Frame, texts: Sequence[str], size: float) -> int:
 
 
 def dot(label: str, colour: Any, size: float = 5.0, *, face: Any = None, marker: str = "o") -> Line2D:
-    """Return a legend handle for points."""
+    """Return a legend handle that shows one marker."""
     return Line2D(
         [],
         [],
@@ -318,7 +318,7 @@ def dot(label: str, colour: Any, size: float = 5.0, *, face: Any = None, marker:
 
 
 def tinted(colour: str, tint: float) -> tuple[float, float, float]:
-    """Mix a colour with a share of white."""
+    """Mix a colour with white; `tint` is the share of white."""
     red, green, blue = (float(c) + (1.0 - float(c)) * tint for c in to_rgb(colour))
     return red, green, blue
 
@@ -339,7 +339,7 @@ def check_choice(what: str, value: str, allowed: Sequence[str]) -> None:
 
 
 def limits(ax: Axes, frame: Frame, x: tuple[float, float] | None = None, y: tuple[float, float] | None = None) -> None:
-    """Set axis ranges: from the frame, else the given ones, else unchanged.
+    """Set the axis ranges: those of the `Frame`, else the given ones, else unchanged.
 
     Raises
     ------
@@ -353,7 +353,7 @@ def limits(ax: Axes, frame: Frame, x: tuple[float, float] | None = None, y: tupl
 
 
 def check_range(name: Literal["xlim", "ylim"] | str, range_: tuple[float, float]) -> tuple[float, float]:
-    """Return a range of two different finite numbers; raises ValueError if it is none."""
+    """Return a range as two different finite numbers; raise ValueError if it is invalid."""
     low, high = (float(v) for v in range_)
     if not (math.isfinite(low) and math.isfinite(high) and low != high):
         raise ValueError(f"{name} = {low:g}, {high:g}: must be two different finite numbers")
@@ -361,7 +361,7 @@ def check_range(name: Literal["xlim", "ylim"] | str, range_: tuple[float, float]
 
 
 def edges(x: np.ndarray) -> np.ndarray:
-    """Return the limits between neighbouring parameter values."""
+    """Return the edges of columns centred on the parameter values: one more edge than values."""
     if x.size == 1:
         width = 0.05 * abs(float(x[0])) or 0.5
         return np.array([x[0] - width, x[0] + width])
@@ -370,7 +370,7 @@ def edges(x: np.ndarray) -> np.ndarray:
 
 
 def span(x: np.ndarray) -> tuple[float, float]:
-    """Return the range covered by the columns of the parameter values."""
+    """Return the range that columns centred on the parameter values cover."""
     limits = edges(np.asarray(x, dtype=np.float64))
     return float(limits.min()), float(limits.max())
 
@@ -378,7 +378,7 @@ def span(x: np.ndarray) -> tuple[float, float]:
 def fill_columns(
     ax: Axes, edges: np.ndarray, low: np.ndarray, high: np.ndarray, looks: Mapping[str, Any], gid: str
 ) -> PolyCollection:
-    """Fill columns from `low` to `high`: one rectangle for each run of equal columns."""
+    """Fill each column of a plot from `low` to `high`, with one rectangle per run of equal neighbouring columns."""
     levels = np.column_stack([low, high])
     starts = np.flatnonzero(np.r_[True, (np.diff(levels, axis=0) != 0).any(1)])
     ends = np.r_[starts[1:], len(levels)]
@@ -391,5 +391,5 @@ def fill_columns(
 
 
 def join(parts: Iterable[str]) -> str:
-    """Join the non-empty parts with commas."""
+    """Join the non-empty texts with commas."""
     return ", ".join(part for part in parts if part)

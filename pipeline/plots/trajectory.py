@@ -1,4 +1,4 @@
-"""Draw one trajectory: time series, phase portraits, and the path of a point of the model."""
+"""Draw one trajectory: time series, phase portraits, and the path of a point of the mechanical drawing."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ COLOURS = (style.BLUE, style.VERMILLION, style.GREEN, style.PURPLE, style.ORANGE
 
 
 def plot_trajectory(ds: xr.Dataset, *, degrees: bool = False, frame: style.Frame = style.WIDE) -> style.DataFigure:
-    """Draw the time series of a trajectory, a phase portrait of each pair of states, and a path.
+    """Draw a trajectory: its time series, a phase portrait per pair of states, and the path of a traced point.
 
     Parameters
     ----------
@@ -87,7 +87,7 @@ def plot_trajectory(ds: xr.Dataset, *, degrees: bool = False, frame: style.Frame
 
 
 def _draw_path(ax: Axes, ds: xr.Dataset, drawing: Drawing, motion: Motion) -> list[Any]:
-    """Draw the path of the traced point; return handles for a legend."""
+    """Draw the path of the point that the model's mechanical drawing traces; return legend handles."""
     style.style_axes(ax)
     parameters = parameters_of(ds).as_dict()
     shown = draw_path(ax, drawing, parameters, motion)
@@ -104,7 +104,9 @@ def _place(ds: xr.Dataset) -> str:
 
 
 def _grids(fig: style.DataFigure, n_rows: int, n_panels: int) -> tuple[list[SubplotSpec], list[SubplotSpec]]:
-    """Return the layout grids of the series and of the portraits (beside them, or below if narrow)."""
+    """Return the layout grids of the time series and of the phase portraits: side by side, or stacked in a narrow
+    figure.
+    """
     if not fig.frame.compact:
         outer = fig.add_gridspec(1, 2, width_ratios=[1.35, 1.0])
         left, right = outer[0].subgridspec(n_rows, 1), outer[1].subgridspec(n_panels, 1)
@@ -143,7 +145,7 @@ def _data(ds: xr.Dataset, series: dict[str, np.ndarray], drawing: Drawing | None
 
 
 def _section_times(ds: xr.Dataset, time: np.ndarray) -> np.ndarray:
-    """Return the times of the stroboscopic section within the time series [s]."""
+    """Return the times of the section points within the time series [s]."""
     if "section_times" in ds:
         times = np.asarray(ds["section_times"].values, dtype=np.float64)
     elif "frequency_hz" in ds.attrs:
@@ -158,7 +160,7 @@ def _section_times(ds: xr.Dataset, time: np.ndarray) -> np.ndarray:
 
 
 def _units(model: Model) -> list[tuple[str, ...]]:
-    """Group states by panel: one per unit, with angles apart."""
+    """Group the states into panels: one panel per unit, with angles apart."""
     kinds: dict[tuple[str, bool], tuple[str, ...]] = {}
     for s in model.states:
         key = (s.unit, s.on_circle) if s.unit != "1" else (s.name, False)
@@ -167,7 +169,9 @@ def _units(model: Model) -> list[tuple[str, ...]]:
 
 
 def _others(ds: xr.Dataset, model: Model) -> list[tuple[str, ...]]:
-    """Group further variables by unit: the first few of each of the first few units."""
+    """Group variables that are not states by unit; keep only the first few units and the first few variables of
+    each.
+    """
     found: dict[str, tuple[str, ...]] = {}
     for name, values in ds.data_vars.items():
         if values.dims == ("time",) and str(name) not in (*model.state_names, "section_times"):
@@ -181,7 +185,7 @@ def _colour(pair: int) -> str:
 
 
 def _colours(model: Model) -> dict[str, str]:
-    """Return the colour of each state, by the first portrait that contains it."""
+    """Return the colour of each state: that of the first phase portrait that contains the state."""
     found: dict[str, str] = {}
     for k, pair in enumerate(model.portraits):
         for name in pair:
@@ -221,7 +225,7 @@ def _draw_series(
 
 
 def _draw_others(ax: Axes, ds: xr.Dataset, time: np.ndarray, names: Sequence[str]) -> None:
-    """Draw variables that are not states, with a legend if there are several."""
+    """Draw the time series of variables that are not states in one panel, with a legend if there are several."""
     quantities = {q.name: q.symbol for q in model_of(ds).quantities}
     symbols = [f"${quantities[n]}$" if quantities.get(n) else n.replace("_", " ") for n in names]
     for name, symbol, look in zip(names, symbols, ("0.15", style.ORANGE), strict=False):

@@ -1,1 +1,1 @@
-"""Declare what a run computes of its cells, and what analyses and figures compute from a cube."""
+"""Declare the products of a run: results computed per cell, and the analyses and figures of its cube."""

@@ -1,4 +1,4 @@
-"""Declare the analyses of attractors, hysteresis, and sets that do not close."""
+"""Declare the analyses of attractors, of hysteresis, and of invariant sets that are not periodic orbits."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ class IdentifyOptions(Options):
 
     @property
     def effort(self) -> tuple[float, int]:
-        """Budget and sample of the extension, zeros without it; the larger of two efforts knows more."""
+        """Time budget and sample size for integrating unassigned cells further; zeros if they are not integrated."""
         return (self.budget, self.n_sample) if self.extend and self.budget else (0.0, 0)
 
     def with_effort(self, effort: tuple[float, int]) -> Self:
-        """Return the same options with another budget and sample of the extension."""
+        """Return the same options with another time budget and sample size for integrating unassigned cells further."""
         budget, n_sample = effort
         if not budget:
             return self.model_copy(update={"extend": False})
@@ -48,7 +48,7 @@ class IdentifyOptions(Options):
 
 
 class AttractorOptions(IdentifyOptions):
-    """Options for finding attractors, and for matching their ids along the axes."""
+    """Options for finding attractors, and for matching attractor ids along the swept parameters."""
 
     threshold: float = option(0.3, "Matching: largest distance between sets with one id.", gt=0.0)
     look_back: int = option(3, "Matching: steps over which an id is remembered.", ge=1)

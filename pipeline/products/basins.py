@@ -11,7 +11,7 @@ _ROOM = "pipeline.analysis.basins.product"
 
 
 class BasinOptions(AttractorOptions):
-    """Options for measuring basins."""
+    """Options for measuring basins of attraction: fractions, basin entropy, uncertainty exponent."""
 
     interval: Literal["wilson", "clopper-pearson"] = option("wilson", "Confidence interval of the fractions.")
     confidence: float = option(0.95, "Level of all intervals.", gt=0.0, lt=1.0)

@@ -8,7 +8,7 @@ _ROOM = "pipeline.analysis.branches.product"
 
 
 class BranchOptions(Options):
-    """Options for following branches of periodic orbits."""
+    """Options for continuing branches of periodic orbits."""
 
     parameter: str = option("", "Continuation parameter: a parameter, or frequency_hz; by default the swept one.")
     low: float | None = option(None, "Least value; by default the run's.", unit="SI", flag="--from")
@@ -28,7 +28,7 @@ class BranchOptions(Options):
 
 
 class CurveOptions(BranchOptions):
-    """Options for continuing bifurcations in a plane of two parameters."""
+    """Options for continuing bifurcations as curves in a plane of two parameters."""
 
     second: str = option(..., "Second parameter: its name, such as q, or frequency_hz.")
     second_low: float = option(..., "Least value of the second parameter.", unit="SI", flag="--second-from")

@@ -1,4 +1,4 @@
-"""Declare the analyses of chaos: exponents, dimensions, 0-1 test."""
+"""Declare the analyses of chaos: Lyapunov exponents, dimensions, 0-1 test."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Declare the product ``extremes``: minimum, maximum and mean of quantities over each kept drive period."""
+"""Declare the product ``extremes``: minimum, maximum and mean of quantities over each stored drive period."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ KINDS = ("min", "max", "mean")
 
 
 class ExtremesOptions(Options):
-    """Options of ``[products] extremes``."""
+    """Options of the product ``extremes`` in a specification's table ``[products]``."""
 
     quantities: tuple[str, ...] = option(
         help="Names of quantities and states of the model, such as an energy.", min_length=1, strict=False

@@ -13,7 +13,7 @@ Per = Literal["s", "period"]
 
 
 def _without(options: FigureOptions, name: str) -> str:
-    """Return the label of options with one of them at its default."""
+    """Return the part of a figure's file name made from options, as if one option had its default."""
     return FigureOptions.label(options.model_copy(update={name: ""}))
 
 
@@ -28,7 +28,9 @@ class BifurcationOptions(StateOptions):
     layout: Literal["overlay", "side"] = option("overlay", "Both directions in one panel, or one panel each.")
 
     def label(self) -> str:
-        """Return the label for the file's name; without the state if a quantity is drawn."""
+        """Return the part of the figure's file name made from options; the state is not named if a quantity is
+        drawn.
+        """
         return super().label() if not self.quantity else _without(self, "state")
 
 
@@ -46,36 +48,36 @@ class AttractorFigureOptions(AttractorOptions, FigureOptions):
 
 
 class BasinFigureOptions(AttractorFigureOptions):
-    """Options of a figure of basins."""
+    """Options of a figure of basins of attraction."""
 
     shade: bool = option(False, "Darken cells that took longer to converge.")
 
 
 class CoexistingOptions(AttractorOptions, StateOptions):
-    """Options of a figure of all attractors over a parameter."""
+    """Options of a figure of all coexisting attractors over a parameter."""
 
 
 class RegimeOptions(AttractorFigureOptions):
-    """Options of a map over two parameters."""
+    """Options of a regime map over two parameters."""
 
     show: Literal["periods", "attractors", "number"] = option("periods", "Property that is coloured.")
     curves: str = option("", "Run along one axis whose bifurcation curves are drawn over the map.")
 
 
 class LyapunovFigureOptions(StateOptions):
-    """Options of a figure of exponents over a parameter, or as a map."""
+    """Options of a figure of Lyapunov exponents over one parameter, or as a map over two."""
 
     spectrum: bool = option(False, "Draw all stored exponents, not only the largest.")
     as_map: bool = option(False, "Draw a map over two parameters instead of a diagram over one.", flag="--map")
     per: Per = option("s", "Exponents per second, or per drive period or return.")
 
     def label(self) -> str:
-        """Return the label for the file's name; without the state on a map."""
+        """Return the part of the figure's file name made from options; a map does not name the state."""
         return _without(self, "state") if self.as_map else super().label()
 
 
 class ConvergenceOptions(FigureOptions):
-    """Options of a figure of the convergence of exponents."""
+    """Options of a figure of the convergence of Lyapunov exponents."""
 
     exponent: int = option(1, "Index of the exponent; 1 is the largest.", ge=1)
     per: Per = option("s", "Exponents per second, or per drive period or return.")
@@ -86,22 +88,24 @@ class DimensionFigureOptions(DimensionOptions, FigureOptions):
 
 
 class _AlongOptions(BranchOptions, FigureOptions):
-    """Options of a figure along a parameter."""
+    """Options of a figure of branches along a continuation parameter."""
 
     def label(self) -> str:
-        """Return the label for the file's name; without the parameter if it is the frequency."""
+        """Return the part of the figure's file name made from options; the drive frequency is not named as the
+        parameter.
+        """
         return _without(self, "parameter") if self.parameter == "frequency_hz" else super().label()
 
 
 class BranchFigureOptions(_AlongOptions, StateOptions):
-    """Options of a figure of branches over a diagram."""
+    """Options of a figure of branches of periodic orbits over a bifurcation diagram."""
 
     over: str = option("", "Run whose diagram is drawn below; it must sweep the same parameter. By default DIR.")
     shown: int | None = option(None, "Longest orbit period that is drawn.", unit="drive periods or returns", ge=1)
 
 
 class MultiplierOptions(_AlongOptions):
-    """Options of a figure of multipliers along a branch."""
+    """Options of a figure of Floquet multipliers along a branch."""
 
     branch: int = option(0, "Index of the branch, as in the table.", ge=0)
 

@@ -1,4 +1,4 @@
-"""Declare the product ``lyapunov``: exponents along each cell's attractor, from its last kept section."""
+"""Declare the product ``lyapunov``: Lyapunov exponents of each cell, integrated on from its last section point."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Measured with the pendulum (1.6 for one vector, 2 for all four) and with Lorenz-
 
 
 class LyapunovOptions(Options):
-    """Options of ``[products] lyapunov``."""
+    """Options of the product ``lyapunov`` in a specification's table ``[products]``."""
 
     n_exponents: int | None = option(
         None, "Number of exponents, from the largest on; by default one for each state.", ge=1
@@ -43,7 +43,7 @@ class LyapunovOptions(Options):
 
 
 class LyapunovFlag(IntEnum):
-    """The trust in a cell's Lyapunov exponents."""
+    """Flag for the reliability of a cell's Lyapunov exponents."""
 
     ABSENT = 0
     GOOD = 1
@@ -53,7 +53,7 @@ class LyapunovFlag(IntEnum):
 
     @property
     def sentence(self) -> str:
-        """Meaning of the flag."""
+        """Meaning of the flag, as text."""
         return _FLAG_SENTENCES[self]
 
 

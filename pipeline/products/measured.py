@@ -1,4 +1,4 @@
-"""Define the options of measured diagrams: how recorded sweeps are cut, sectioned, judged and drawn."""
+"""Define the options for analysing recorded frequency sweeps and for drawing their measured diagrams."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ TRANSIENT, WINDOW_S, MAX_PERIOD = 20, 0.08, 16
 
 
 class SweepOptions(Options):
-    """Options for cutting, sectioning and judging recorded sweeps."""
+    """Options for analysing recorded frequency sweeps: windows, drive edges, orbit periods."""
 
     transient: int = option(TRANSIENT, "Drive periods dropped after each step of the frequency.", ge=0)
     window: int | None = option(
@@ -24,7 +24,7 @@ class SweepOptions(Options):
 
 
 class ComparisonOptions(SweepOptions):
-    """Options of the comparison of a measured sweep with a run, and of its figures."""
+    """Options for comparing a recorded frequency sweep with a run, and for the figures of the comparison."""
 
     state: str = option("", "State to draw; by default the first measured one.")
     degrees: bool = option(False, "Use degrees instead of radians.")
@@ -33,13 +33,13 @@ class ComparisonOptions(SweepOptions):
 
 
 class DiagramOptions(ComparisonOptions):
-    """Options of the measured diagram, alone or with a computed one."""
+    """Options of a measured bifurcation diagram, drawn alone or with a computed one."""
 
     layout: Literal["side", "over"] = option("side", "Draw the computed diagram beside the measured one, or under it.")
 
 
 class SeriesOptions(Options):
-    """Options of a recording beside the model's motion from the same state."""
+    """Options for drawing a recording beside the model's motion from the same state."""
 
     start_s: float | None = option(None, "Start at the first rising edge from this time on.", unit="s")
     periods: int = option(10, "Number of drive periods.", ge=1)

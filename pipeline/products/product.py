@@ -1,4 +1,4 @@
-"""Define products: what a run can compute of its cells, find in its cube, or draw.
+"""Define products of a run: results per cell, analyses of its cube, and figures.
 
 A product is a declaration: a model of its options, a line of help, and the names of its functions as
 ``"module:function"``. A function is imported when it is called. The command line, the specification and the
@@ -27,7 +27,7 @@ COLUMN_MM = 85.0
 
 
 def option(default: Any = ..., help: str = "", *, unit: str = "", flag: str = "", **bounds: Any) -> Any:
-    """Return a field of an `Options` model.
+    """Return a pydantic field for an `Options` model, with help, unit and bounds.
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ def option(default: Any = ..., help: str = "", *, unit: str = "", flag: str = ""
 
 
 class Options(BaseModel):
-    """The options of a product: types, defaults, bounds and help."""
+    """Base class of the options of a product: types, defaults, bounds and help."""
 
     model_config = ConfigDict(strict=True, frozen=True, extra="forbid", allow_inf_nan=False)
 
@@ -64,7 +64,7 @@ class Options(BaseModel):
         }
 
     def part(self, model: type[Options]) -> dict[str, Any]:
-        """Return the options that another model also has, for the analysis with that model."""
+        """Return the values of those options that another `Options` model declares."""
         return {name: getattr(self, name) for name in model.model_fields}
 
 
@@ -79,7 +79,7 @@ def default_of(model: type[Options], name: str) -> Any:
 
 @dataclass(frozen=True)
 class Table:
-    """The result of an analysis as a table.
+    """Result of an analysis as a table: rows for CSV and JSON, and lines to print.
 
     Attributes
     ----------
@@ -96,7 +96,7 @@ class Table:
     nothing: str = ""
 
     def csv(self) -> str:
-        """Return the rows as CSV, NaN as empty fields."""
+        """Return the table's rows as CSV text, with NaN as empty fields."""
         text = io.StringIO()
         writer = csv.DictWriter(text, dict.fromkeys(name for row in self.rows for name in row), lineterminator="\n")
         writer.writeheader()
@@ -105,7 +105,7 @@ class Table:
 
 
 def padded(table: Sequence[Sequence[str]], indent: str = "  ", right: bool = False) -> list[str]:
-    """Return the lines of a table of texts with columns of even width."""
+    """Format a table of texts as lines whose columns are padded to equal width."""
     widths = [max(map(len, column)) for column in zip(*table, strict=True)]
     lines = ([(t.rjust if right and k else t.ljust)(widths[k]) for k, t in enumerate(line)] for line in table)
     return [indent + "  ".join(line).rstrip() for line in lines]
@@ -113,7 +113,7 @@ def padded(table: Sequence[Sequence[str]], indent: str = "  ", right: bool = Fal
 
 @dataclass(frozen=True)
 class CellProduct:
-    """A product that a run computes of every cell, requested by ``[products] NAME = {...}``.
+    """Declaration of a product that a run computes for every cell, requested by ``[products] NAME = {...}``.
 
     Attributes
     ----------
@@ -158,7 +158,7 @@ class CellProduct:
 
 @dataclass(frozen=True)
 class Analysis:
-    """An analysis of a stored cube: ``magpend analyse NAME DIR``, kept in ``DIR/derived``.
+    """Declaration of an analysis of a cube: ``magpend analyse NAME DIR``; results are stored in ``DIR/derived``.
 
     Attributes
     ----------
@@ -214,7 +214,7 @@ class FigureOptions(Options):
     format: Literal["", "png", "pdf", "svg"] = option("", "File format; by default png, or that of --out.")
 
     def label(self) -> str:
-        """Return the part of the file's name for options that differ from their defaults."""
+        """Return the part of the figure's file name that lists the options with non-default values."""
         given = {name: value for name, value in self.changed().items() if name not in ("out", "format")}
         first = [name for name in _SPEAKS_FOR_ITSELF if name in given]
         order = [*first, *(name for name in given if name not in first)]
@@ -222,7 +222,7 @@ class FigureOptions(Options):
 
 
 class StateOptions(FigureOptions):
-    """Options of a figure of one state; the file's name always holds the state."""
+    """Options of a figure of one state; the figure's file name always contains the state."""
 
     state: str = option("", "State to draw; by default the model's first.")
 
@@ -247,7 +247,7 @@ def _word(value: Any) -> str:
 
 @dataclass(frozen=True)
 class Figure:
-    """A figure of a run: ``magpend plot NAME DIR``.
+    """Declaration of a figure of a run, drawn by ``magpend plot NAME DIR``.
 
     Attributes
     ----------

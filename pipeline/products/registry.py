@@ -1,4 +1,4 @@
-"""List all products by name. A new product is a new file and a line here."""
+"""List all products by name, with the modules that declare them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ P = TypeVar("P", CellProduct, Analysis, Figure)
 
 
 class Registry(Mapping[str, P], Generic[P]):
-    """Products by name; each is imported when it is first used.
+    """Mapping from names to products; each product is imported when it is first used.
 
     Parameters
     ----------

@@ -22,10 +22,10 @@ T = TypeVar("T")
 
 
 class Listener(Protocol):
-    """A function that shows progress."""
+    """Protocol of a function that shows progress reports."""
 
     def __call__(self, what: str, done: float, total: float, expected_s: float = 0.0) -> None:
-        """Take a report that `done` of `total` parts of a piece of work are finished; see `report`."""
+        """Show that `done` of `total` parts of a piece of work are finished; see `report`."""
 
 
 _listener: ContextVar[Listener | None] = ContextVar("listener", default=None)
@@ -35,7 +35,7 @@ COMPILING = "compiling"
 
 
 def report(what: str, done: float, total: float, expected_s: float = 0.0) -> None:
-    """Report that `done` of `total` parts of a piece of work are finished.
+    """Report to the listener that `done` of `total` parts of a piece of work are finished.
 
     Parameters
     ----------
@@ -52,12 +52,12 @@ def report(what: str, done: float, total: float, expected_s: float = 0.0) -> Non
 
 
 def is_heard() -> bool:
-    """Return whether there is a listener."""
+    """Return whether there is a listener for progress reports."""
     return _listener.get() is not None
 
 
 def track(items: Iterable[T], what: str, total: int | None = None) -> Iterator[T]:
-    """Yield items, and report the number of finished ones.
+    """Yield items, and report the number of finished items as progress.
 
     Parameters
     ----------
@@ -77,7 +77,7 @@ def track(items: Iterable[T], what: str, total: int | None = None) -> Iterator[T
 
 @contextlib.contextmanager
 def reporting(listener: Listener) -> Iterator[None]:
-    """Send all reports from inside this context to a listener, and say when the compiler runs."""
+    """Send all progress reports from inside this context to a listener, and report when the compiler runs."""
     last: tuple[str, float, float, float] = ("", 0.0, 0.0, 0.0)
 
     def heard(what: str, done: float, total: float, expected_s: float = 0.0) -> None:

@@ -1,4 +1,4 @@
-"""Define a variable of a cube; `pipeline.layout.schema` lists those of every cube."""
+"""Define the class for a variable of a cube; `pipeline.layout.schema` lists the variables of every cube."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Variable:
-    """A variable of a cube.
+    """Declaration of a variable of a cube: name, dims, data type, fill value, units.
 
     Attributes
     ----------
@@ -39,19 +39,19 @@ class Variable:
     attrs: Mapping[str, Any] = field(default_factory=dict)
 
     def attributes(self) -> dict[str, Any]:
-        """Return all attributes as written to the store."""
+        """Return all attributes of the variable as written to the store."""
         units = {"units": self.units} if self.units else {}
         return {**units, "long_name": self.long_name, **self.attrs}
 
     def itemsize(self, sizes: Mapping[str, int]) -> int:
-        """Return the uncompressed bytes per cell."""
+        """Return the uncompressed size of the variable per cell [bytes]."""
         import numpy as np
 
         return int(np.dtype(self.dtype).itemsize) * math.prod(sizes[d] for d in self.own_dims)
 
 
 def flag_attrs(codes: Any) -> dict[str, Any]:
-    """Return CF attributes of a variable of codes, from an `IntEnum` whose members have a `sentence`."""
+    """Return CF attributes of a variable that holds codes of an `IntEnum` whose members have a `sentence`."""
     return {
         "flag_values": [int(s) for s in codes],
         "flag_meanings": " ".join(s.name.lower() for s in codes),

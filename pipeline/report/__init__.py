@@ -1,1 +1,1 @@
-"""Report the results of runs and studies as HTML pages, with the paper's figures and claims judged."""
+"""Report runs and studies (reproductions of a paper) as HTML pages, with figures and judged claims."""

@@ -1,4 +1,4 @@
-"""Define the estimate that a measure of a study returns, and the results that it reads."""
+"""Define the `Estimate` that every measure of a study returns, and the protocol for the results that measures read."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ NOWHERE = math.nan
 
 @dataclass(frozen=True)
 class Estimate:
-    """A measured value with its interval.
+    """A measured value with its 95 % interval.
 
     Attributes
     ----------
@@ -44,18 +44,18 @@ class Estimate:
 
 
 def absent(why: str, step: float | None = None) -> Estimate:
-    """Return the estimate for a missing measurement, with the reason."""
+    """Return the estimate that stands for a missing measurement, with the reason."""
     return Estimate(NOWHERE, NOWHERE, NOWHERE, step=step, missing=why)
 
 
 class Results(Protocol):
-    """The results of a study by name; see `pipeline.report.results.Results`."""
+    """Protocol for the results of a study, read by name; see `pipeline.report.results.Results`."""
 
     def run(self, name: str) -> AnalysedRun:
-        """Return a run."""
+        """Return a run of the study by name."""
 
     def recording(self, name: str) -> xr.Dataset:
-        """Return the recording of a virtual rig."""
+        """Return a recording of a simulated test rig by name."""
 
     def torques(self, name: str) -> Any:
-        """Return the fit of torque readings."""
+        """Return the fit of a study's torque readings by name."""

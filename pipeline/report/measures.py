@@ -1,4 +1,4 @@
-"""Measure a study's results: estimates with 95 % intervals.
+"""Measure quantities in a study's results: estimates with 95 % intervals.
 
 A measure is a function of results and options that returns an `Estimate`. No measure depends on a model:
 classes of motion are the labels of the run's own classifier; axes and quantities are given by name. All
@@ -30,7 +30,7 @@ Measure = Callable[[Results, Sequence[str], Options], Estimate]
 
 
 def _cells(results: Results, name: str) -> tuple[xr.Dataset, str]:
-    """Return the cells of a run over its only axis, as (axis, cell), and the axis' name."""
+    """Return the cells of a run with one swept axis, with dims (axis, cell), and the name of the axis."""
     cube = results.run(name).cube()
     axes, starts = split_dims(cube["status"])
     wide = [d for d in axes if cube.sizes[d] > 1] or list(axes[:1])
@@ -47,7 +47,7 @@ def _cells(results: Results, name: str) -> tuple[xr.Dataset, str]:
 
 
 def _within(ds: xr.Dataset, axis: str, options: Options) -> xr.Dataset:
-    """Return the cells at the requested values of the axis: ``at`` one, or from ``low`` to ``high``."""
+    """Select the cells at one axis value, ``at``, or between the axis values ``low`` and ``high``."""
     values = ds[axis].values
     if "at" in options:
         at = _index(ds, axis, float(options["at"]))
@@ -58,7 +58,7 @@ def _within(ds: xr.Dataset, axis: str, options: Options) -> xr.Dataset:
 
 
 def _index(ds: xr.Dataset, axis: str, value: float) -> int | None:
-    """Return the index of a value on an axis; None if the axis does not have it."""
+    """Return the index of a value on an axis; None if the axis lacks the value."""
     try:
         return place(ds[axis], value)
     except ValueError:
@@ -70,7 +70,7 @@ def _step(values: np.ndarray) -> float | None:
 
 
 def _matches(ds: xr.Dataset, options: Options) -> np.ndarray:
-    """Return which cells have the wanted ``period`` (one or several; 0: not closed) and ``motion``."""
+    """Return a mask of the cells with a wanted orbit period (one or several; 0: not closed) and class of motion."""
     wanted = options.get("period")
     periods = ds["orbit_period"].values
     found = np.ones(periods.shape, bool)
@@ -92,7 +92,7 @@ def _share(count: int, n: int, confidence: float = 0.95) -> tuple[float, float]:
 
 
 def least_share(results: Results, of: Sequence[str], options: Options) -> Estimate:
-    """Return the fraction of cells with a period or motion, at the axis value where it is least.
+    """Return the smallest fraction of cells with an orbit period or class of motion, over all axis values.
 
     Options: ``at``, or ``low`` and ``high``; ``period``, ``motion``. The interval is Clopper and Pearson's.
     Its level is corrected for the number of axis values (Bonferroni), since the least of many fractions is
@@ -112,7 +112,7 @@ def least_share(results: Results, of: Sequence[str], options: Options) -> Estima
 
 
 def largest_share(results: Results, of: Sequence[str], options: Options) -> Estimate:
-    """Return the fraction of cells with a period or motion, at the axis value where it is largest.
+    """Return the largest fraction of cells with an orbit period or class of motion, over all axis values.
 
     Options and interval: see `least_share`.
     """
@@ -135,7 +135,9 @@ def _asked(options: Options) -> str:
 
 
 def window(results: Results, of: Sequence[str], options: Options) -> tuple[Estimate, int, int, xr.Dataset, str]:
-    """Return the width of the interval about a value in which all cells have a period, with its places."""
+    """Return the width of a periodic window about an axis value, its first and last index, the cells, and the axis
+    name.
+    """
     ds, axis = _cells(results, of[0])
     here = _within(ds, axis, {k: v for k, v in options.items() if k in ("low", "high")})
     values, n = here[axis].values, here.sizes["cell"]
@@ -163,7 +165,7 @@ def window(results: Results, of: Sequence[str], options: Options) -> tuple[Estim
 
 
 def window_width(results: Results, of: Sequence[str], options: Options) -> Estimate:
-    """Return the width of the unbroken interval about a value in which every cell has a period.
+    """Return the width of the interval about an axis value in which every cell has a given orbit period.
 
     Options: ``contains``, ``period`` (and ``motion``), ``low`` and ``high``. Each end lies between
     neighbouring values of the axis, which gives the interval of the estimate.
@@ -172,7 +174,8 @@ def window_width(results: Results, of: Sequence[str], options: Options) -> Estim
 
 
 def beside_window(results: Results, of: Sequence[str], options: Options) -> Estimate:
-    """Return the fraction of cells next to a window, on both sides, that have another period.
+    """Return the fraction of cells just outside both ends of a periodic window that have one of the given other
+    periods.
 
     Options: those of `window_width`; ``other``, the periods that count; ``within``, the largest distance from
     the window's ends.
@@ -192,7 +195,7 @@ def beside_window(results: Results, of: Sequence[str], options: Options) -> Esti
 
 
 def change_of_period(results: Results, of: Sequence[str], options: Options) -> Estimate:
-    """Return the axis value at which the period of most cells changes.
+    """Return the axis value at which the orbit period of most cells changes.
 
     Options: ``below`` and ``above``, the periods on the two sides; ``low`` and ``high``. The interval reaches
     from the last value with the period ``below`` to the next with the period ``above``. Between them, near a
@@ -218,7 +221,7 @@ def change_of_period(results: Results, of: Sequence[str], options: Options) -> E
 
 
 def located_bifurcation(results: Results, of: Sequence[str], options: Options) -> Estimate:
-    """Return the place of bifurcations of a type, by continuation of orbits from the run's cells.
+    """Return the parameter value of bifurcations of a type, located by continuation of orbits from the run's cells.
 
     Options: ``type``, as `magpend analyse branches` names it; ``low`` and ``high``; ``max_period``, the
     longest period of continued orbits. The interval spans all bifurcations found. Each is located exactly,
@@ -240,7 +243,8 @@ def located_bifurcation(results: Results, of: Sequence[str], options: Options) -
 
 
 def rarest_motion(results: Results, of: Sequence[str], options: Options) -> Estimate:
-    """Return the fraction of cells on the rarest of some motions at one value; above 0, all coexist.
+    """Return the smallest fraction of cells on any of the given motions at one axis value; above 0, all of them
+    coexist.
 
     Options: ``at``, ``motions``, ``period``.
     """
@@ -256,7 +260,8 @@ def rarest_motion(results: Results, of: Sequence[str], options: Options) -> Esti
 
 
 def largest_exponent(results: Results, of: Sequence[str], options: Options) -> Estimate:
-    """Return the largest Lyapunov exponent at one value [1/s], averaged over cells that are not closed.
+    """Return the largest Lyapunov exponent [1/s] at one axis value, averaged over cells that are not on a periodic
+    orbit.
 
     Options: ``at``. The interval is that of the mean over cells (Student's t). The cells are on one set, so
     their exponents differ only because of finite time.
@@ -279,7 +284,7 @@ def largest_exponent(results: Results, of: Sequence[str], options: Options) -> E
 
 
 def agreement(results: Results, of: Sequence[str], options: Options) -> Estimate:
-    """Return the fraction of common axis values at which most cells of two runs have the same period.
+    """Return the fraction of axis values common to two runs at which most of their cells have the same orbit period.
 
     Options: ``low``, ``high``. Periods above 16 count as one outcome, and so do cells that are not closed.
     """
@@ -300,7 +305,8 @@ def agreement(results: Results, of: Sequence[str], options: Options) -> Estimate
 
 
 def share_above(results: Results, of: Sequence[str], options: Options) -> Estimate:
-    """Return the fraction of a drive period, from its start, during which a quantity at rest is positive.
+    """Return the fraction of a drive period, from its start, in which a model quantity is positive for the state at
+    rest.
 
     Options: ``quantity``, ``frequency_hz``. The time of the sign change is found by bisection. The quantity
     must be positive at the start and change sign once.

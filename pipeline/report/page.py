@@ -33,7 +33,7 @@ MOST_ROWS = 60
 
 @dataclass(frozen=True)
 class Picture:
-    """A picture with its caption.
+    """A picture of a page, with its caption.
 
     Attributes
     ----------
@@ -65,7 +65,7 @@ class Picture:
 
 @dataclass(frozen=True)
 class Grid:
-    """A table.
+    """A table of a page.
 
     Attributes
     ----------
@@ -94,7 +94,7 @@ class Grid:
 
 @dataclass(frozen=True)
 class Text:
-    """A paragraph."""
+    """A paragraph of a page."""
 
     text: str
     kind: str = "text"
@@ -102,7 +102,7 @@ class Text:
 
 @dataclass(frozen=True)
 class Note:
-    """A sentence, with a command for the missing or additional result."""
+    """A block of a page with a sentence, and a command that computes a missing or additional result."""
 
     text: str
     command: str = ""
@@ -111,7 +111,7 @@ class Note:
 
 @dataclass(frozen=True)
 class Facts:
-    """Names and values, such as digests and versions."""
+    """A block of a page that lists names with values, such as digests and versions."""
 
     items: Mapping[str, str]
     kind: str = "facts"
@@ -119,7 +119,7 @@ class Facts:
 
 @dataclass(frozen=True)
 class Source:
-    """A text that is shown unchanged and folded, such as a specification."""
+    """A block of a page with unchanged text, collapsed at first, such as a specification."""
 
     title: str
     text: str
@@ -128,7 +128,7 @@ class Source:
 
 @dataclass(frozen=True)
 class Outcome:
-    """A claim, the measured result, and the verdict.
+    """A block of a page that shows a claim, the measured result, and the verdict.
 
     Attributes
     ----------
@@ -163,7 +163,7 @@ Block = Picture | Grid | Text | Note | Facts | Source | Outcome
 
 @dataclass(frozen=True)
 class Part:
-    """A section of a page."""
+    """A section of a report page: title, blocks and subsections."""
 
     title: str
     blocks: Sequence[Block]
@@ -172,7 +172,7 @@ class Part:
 
 @dataclass(frozen=True)
 class Page:
-    """A report as data.
+    """Content of a report page: title, summary and sections.
 
     Attributes
     ----------
@@ -193,20 +193,20 @@ class Page:
 
 
 def render(page: Page) -> str:
-    """Return a page as HTML; equal pages give equal bytes."""
+    """Render a page as HTML text; equal pages give equal bytes."""
     style = (_TEMPLATES / "page.css").read_text("utf-8")
     return _environment().get_template("page.html.j2").render(page=page, style=style, parts=anchored(page.parts))
 
 
 def write(page: Page, path: Path) -> None:
-    """Write a page as HTML, whole or not at all."""
+    """Write a page as an HTML file atomically: complete or not at all."""
     from pipeline.layout.writing import write_atomically
 
     write_atomically(path, render(page))
 
 
 def anchored(parts: Sequence[Part], prefix: str = "part") -> list[dict[str, Any]]:
-    """Return the sections, each with an anchor for the table of contents."""
+    """Return the page's sections as nested dictionaries, each with an anchor for the table of contents."""
     return [
         {"title": part.title, "blocks": part.blocks, "anchor": name, "parts": anchored(part.parts, name)}
         for name, part in ((f"{prefix}-{i}", part) for i, part in enumerate(parts, 1))
@@ -228,7 +228,7 @@ def _environment() -> Environment:
 
 
 def picture_of(figure: Figure, alt: str, caption: str = "", command: str = "") -> Picture:
-    """Return a figure as a picture block."""
+    """Return a matplotlib figure as a picture block of the page."""
     from pipeline.plots.style import TEXT_LOCK
 
     buffer = io.BytesIO()
@@ -239,7 +239,7 @@ def picture_of(figure: Figure, alt: str, caption: str = "", command: str = "") -
 
 
 def grid_of(rows: Sequence[Mapping[str, Any]], caption: str = "", command: str = "", most: int = MOST_ROWS) -> Grid:
-    """Return rows of numbers and texts as a table block; empty columns are left out."""
+    """Return rows of values as a table block of the page, without empty columns."""
     names = list(dict.fromkeys(name for row in rows for name in row))
     cells = [[text_of(row.get(name)) for name in names] for row in rows[:most]]
     kept = [k for k in range(len(names)) if any(line[k] not in ("", "-") for line in cells)]
@@ -249,7 +249,7 @@ def grid_of(rows: Sequence[Mapping[str, Any]], caption: str = "", command: str =
 
 
 def text_of(value: Any) -> str:
-    """Format a value of a table: six digits, a dash for a number that is not finite."""
+    """Format a value for a table: six digits, a dash for a number that is not finite."""
     if value is None:
         return ""
     if isinstance(value, bool):

@@ -1,4 +1,4 @@
-"""Make a page on one or several runs: ``magpend report``."""
+"""Make a report page on one or several runs: ``magpend report``."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def report(
     only_stored: bool = False,
     echo: Echo = print,
 ) -> Page:
-    """Return the page on one or several runs.
+    """Return the report page on one or several runs.
 
     Parameters
     ----------
@@ -55,12 +55,12 @@ def report(
 
 
 def made_by() -> str:
-    """Return program and version."""
+    """Return the program's name and version."""
     return f"magpend {metadata.version('magpend')}"
 
 
 def _summary(runs: Sequence[AnalysedRun]) -> Grid:
-    """Return the table of runs for a page with several runs."""
+    """Return a table that lists the runs of a page with several runs."""
     rows = [
         (run.info.title or run.name, run.name, run.model.name, run.spec.kind, str(run.plan.n_cells), run.digest[:12])
         for run in runs

@@ -1,4 +1,4 @@
-"""Carry out a study and judge its claims: ``magpend reproduce``."""
+"""Reproduce a study: compute its runs and judge its claims; ``magpend reproduce``."""
 
 from __future__ import annotations
 
@@ -57,13 +57,13 @@ class Judgement:
 
     @property
     def fails(self) -> bool:
-        """Whether a required claim is contradicted, calibrated or not."""
+        """Whether a required claim is contradicted, even if parameters were calibrated on it."""
         return self.claim.required and self.plain is Verdict.NOT_MET
 
 
 @dataclass(frozen=True)
 class Reproduced:
-    """The results of a study.
+    """Result of reproducing a study: folder, report page and judged claims.
 
     Attributes
     ----------
@@ -81,7 +81,7 @@ class Reproduced:
 
     @property
     def failed(self) -> list[Judgement]:
-        """Required claims that are contradicted."""
+        """Judged claims that are required and contradicted."""
         return [judgement for judgement in self.judgements if judgement.fails]
 
 
@@ -94,7 +94,7 @@ def reproduce(
     workers: int | None = None,
     echo: Echo = print,
 ) -> Reproduced:
-    """Compute the missing runs of a study, judge its claims and write its page.
+    """Compute the missing runs of a study, judge its claims and write its report page.
 
     Parameters
     ----------
@@ -146,7 +146,7 @@ def _chosen(study: Study, figures: Sequence[str]) -> list[FigureTable]:
 
 
 def judge(results: Results, figure: str, claim: ClaimTable) -> Judgement:
-    """Measure the quantity of a claim, and judge the claim.
+    """Measure the quantity of a claim, and judge the claim by it.
 
     The verdict is undecided if the axis is coarser, or the sample smaller, than the claim requires.
     """
@@ -171,7 +171,7 @@ def judge(results: Results, figure: str, claim: ClaimTable) -> Judgement:
 
 
 def _decides(claim: ClaimTable) -> str:
-    """Return a sentence on the size of a run that would decide an unmeasured claim."""
+    """Return a sentence on the axis step and number of cells that a claim needs to be decided."""
     steps = f"steps of at most {claim.step:g}" if claim.step else ""
     cells = f"at least {claim.n} cells" if claim.n else ""
     both = " and ".join(part for part in (steps, cells) if part)
@@ -179,7 +179,7 @@ def _decides(claim: ClaimTable) -> str:
 
 
 def _part(results: Results, figure: FigureTable, judgements: Sequence[Judgement]) -> Part:
-    """Return the section of a figure: the paper's text, pictures, verdicts, command."""
+    """Return the page section on a figure of the paper: the paper's statement, pictures, verdicts, command."""
     many = len(figure.numbers) > 1
     blocks: list[Block] = []
     if figure.says:
@@ -213,7 +213,7 @@ def _outcome(judgement: Judgement) -> Outcome:
 
 
 def spelled(judgement: Judgement) -> str:
-    """Return the result of a judgement with its interval, and the claimed range."""
+    """Return the measured result of a judged claim with its interval, and the claimed range, as text."""
     found, claim = judgement.estimate, judgement.claim
     if found.missing:
         return "not measured."
@@ -225,7 +225,7 @@ def spelled(judgement: Judgement) -> str:
 
 
 def _digits(width: float) -> str:
-    """Return a number format that shows two digits of an interval's width."""
+    """Return a format string with enough decimals to show two digits of an interval's width."""
     if not (math.isfinite(width) and width > 1e-8):
         return "{:.7g}"
     return f"{{:.{min(max(0, 1 - math.floor(math.log10(width))), 9)}f}}"
@@ -239,7 +239,7 @@ def _range(claim: ClaimTable) -> str:
 
 
 def _summary(results: Results, judgements: Sequence[Judgement]) -> list[Block]:
-    """Return the blocks above the figures: counts of verdicts, source, all claims, versions."""
+    """Return the blocks of the page above its figures: counts of verdicts, source, all claims, versions."""
     table = results.study.table
     counts = {verdict: sum(j.verdict is verdict for j in judgements) for verdict in Verdict}
     failed = sum(j.fails for j in judgements)
@@ -269,7 +269,7 @@ def _summary(results: Results, judgements: Sequence[Judgement]) -> list[Block]:
 
 
 def headline(judgements: Sequence[Judgement], smoke: bool) -> str:
-    """Return a sentence on how many claims are met, not met or undecided."""
+    """Return a sentence with the numbers of claims that are met, not met or undecided."""
     tests = decided_first(judgements)
     met, failed, left = (sum(j.verdict is v for j in tests) for v in (Verdict.MET, Verdict.NOT_MET, Verdict.UNDECIDED))
     text = f"Of {len(tests)} claims that are tests, {met} are met, {failed} not met, {left} undecided."
@@ -278,13 +278,13 @@ def headline(judgements: Sequence[Judgement], smoke: bool) -> str:
 
 
 def decided_first(judgements: Sequence[Judgement]) -> list[Judgement]:
-    """Return the claims that are tests, decided ones first."""
+    """Return the claims that test the model (no parameter was calibrated on them), decided claims first."""
     tests = [j for j in judgements if j.verdict is not Verdict.CALIBRATED]
     return sorted(tests, key=lambda j: j.verdict is Verdict.UNDECIDED)
 
 
 def calibrated_on(judgements: Sequence[Judgement]) -> str:
-    """Return a paragraph that lists the claims used for calibration; empty if there are none."""
+    """Return a paragraph that lists the claims on which parameters were calibrated; empty if there are none."""
     own = [j for j in judgements if j.verdict is Verdict.CALIBRATED]
     if not own:
         return ""
@@ -301,7 +301,7 @@ def calibrated_on(judgements: Sequence[Judgement]) -> str:
 
 
 def _provenance(results: Results) -> list[Part]:
-    """Return the section on the runs behind the figures: digests, versions, specifications."""
+    """Return the page section on the runs behind the figures: digests, versions, specifications."""
     runs = results.computed()
     if not runs:
         return []
@@ -316,7 +316,7 @@ def _provenance(results: Results) -> list[Part]:
 
 
 def _rows(judgements: Sequence[Judgement]) -> str:
-    """Return all judgements as JSON."""
+    """Return all judged claims as JSON text."""
     rows = [
         {
             "figure": j.figure,

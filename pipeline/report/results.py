@@ -1,4 +1,4 @@
-"""Compute the results of a study once: runs, recordings of virtual rigs, fits of torque readings."""
+"""Compute the results of a study once: runs, recordings of simulated test rigs, fits of torque readings."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Echo = Callable[[str], None]
 
 
 class Results:
-    """The results of a study in a folder.
+    """Results of a study in a folder: each is computed when it is first needed.
 
     Runs lie in ``runs/`` and are completed, not repeated. Recordings and fits take seconds and are computed
     again, with the same numbers.
@@ -50,7 +50,7 @@ class Results:
         self._torques: dict[str, Any] = {}
 
     def prepare(self, names: set[str]) -> None:
-        """Check all inputs with the given names, then compute the runs among them.
+        """Check all inputs that the named results need, then compute the runs among these results.
 
         Raises
         ------
@@ -63,7 +63,7 @@ class Results:
                 self.run(name)
 
     def _check(self, names: set[str]) -> None:
-        """Read all specifications, rigs and headers that are needed."""
+        """Read all needed specifications, simulated rigs and torque headers; raise SpecError with all problems."""
         table, problems = self.study.table, []
         checks: list[tuple[str, Callable[[str], Any]]] = [
             *((name, lambda name: load_spec(self.spec(name), smoke=self.smoke)) for name in table.runs),
@@ -80,7 +80,9 @@ class Results:
             raise SpecError(problems)
 
     def spec(self, name: str) -> Path:
-        """Return the specification of a run: a file of the study, or one that ships."""
+        """Return the path of a run's specification: a file of the study, or a specification shipped with the
+        package.
+        """
         given = self.study.table.runs[name].spec
         return self.study.file(given) if given.endswith(".toml") else find_spec(given)
 
@@ -90,7 +92,7 @@ class Results:
         return measured(self.study.table.torques[name].header, self.study.path.parent)
 
     def run(self, name: str) -> AnalysedRun:
-        """Return a run; compute or complete it first."""
+        """Return a run of the study by name, after computing its missing cells."""
         if name not in self._runs:
             place = self.folder / "runs" / name
             place.parent.mkdir(parents=True, exist_ok=True)
@@ -100,17 +102,17 @@ class Results:
         return self._runs[name]
 
     def computed(self) -> dict[str, AnalysedRun]:
-        """Return the runs that have been computed so far."""
+        """Return the runs computed or opened so far, by name."""
         return dict(self._runs)
 
     def rig(self, name: str) -> Rig:
-        """Return a virtual rig."""
+        """Return the simulated test rig of a recording."""
         from pipeline.rig.simulation import load_rig
 
         return load_rig(self.study.file(self.study.table.recordings[name].rig))
 
     def recording(self, name: str) -> xr.Dataset:
-        """Return the recording of a virtual rig, marked as simulated."""
+        """Return a recording of a simulated test rig by name, marked as simulated; compute it at the first call."""
         if name not in self._recordings:
             from pipeline.rig.recordings import read_recording
             from pipeline.rig.recordings.writing import write_raw
@@ -126,13 +128,13 @@ class Results:
         return self._recordings[name]
 
     def series(self, name: str, n_periods: int) -> xr.Dataset:
-        """Return a recording, and the model from the same state."""
+        """Return the time series of a recording, and of the model integrated from the same state."""
         from pipeline.rig.measured.series import series_of
 
         return series_of(self.recording(name), self.rig(name).parameters, n_periods=n_periods)
 
     def torques(self, name: str) -> Any:
-        """Return the fit of torque readings."""
+        """Return the fit of a study's torque readings by name; compute it at the first call."""
         if name not in self._torques:
             from pipeline.report.torque_curves import fitted
 

@@ -58,7 +58,7 @@ _CAPTIONS = {
 
 
 class Shown:
-    """A run that is reported on, with its cube.
+    """A run shown in a report, with its cube.
 
     Parameters
     ----------
@@ -75,11 +75,13 @@ class Shown:
 
     @property
     def directory(self) -> str:
-        """Run directory, quoted for a command."""
+        """Run directory, quoted for a shell command."""
         return shlex.quote(self.run.name)
 
     def options_of(self, name: str) -> list[dict[str, Any]]:
-        """Return the options with which an analysis can be shown: those stored, or the defaults."""
+        """Return the options with which an analysis is shown: those of stored results, else the defaults if it may be
+        computed.
+        """
         known = stored_options(self.run, name)
         return known or ([{}] if name in self.computed else [])
 
@@ -115,7 +117,7 @@ def part_of(source: str | AnalysedRun, echo: Callable[[str], None], computed: tu
 
 
 def _state(shown: Shown) -> Iterator[Block]:
-    """Yield facts about the run and its progress."""
+    """Yield the block with facts about the run and its progress."""
     run, found = shown.run, state(shown.run)
     swept = ", ".join(f"{name} {_span(shown.cube, name)}" for name in shown.axes) or "nothing"
     model = run.model
@@ -137,7 +139,7 @@ def _state(shown: Shown) -> Iterator[Block]:
 
 
 def _span(cube: xr.Dataset, name: str) -> str:
-    """Return the range of an axis, its unit and its number of values."""
+    """Return the range of an axis, its unit and its number of values as text."""
     values, unit = cube[name].values, str(cube[name].attrs.get("units", "1"))
     if values.size == 1:
         return f"{values[0]:g}{'' if unit == '1' else ' ' + unit}"
@@ -145,7 +147,7 @@ def _span(cube: xr.Dataset, name: str) -> str:
 
 
 def _parameters(shown: Shown) -> Iterator[Block]:
-    """Yield the table of parameters with values, units and sources."""
+    """Yield the table of the run's parameters with values, units and sources."""
     run = shown.run
     chosen = run.model.preset(run.spec.parameters.chosen)
     over, swept = run.spec.parameters.overrides, {parameter_name(name): name for name in shown.axes}
@@ -166,7 +168,7 @@ def _parameters(shown: Shown) -> Iterator[Block]:
 
 
 def _diagram(shown: Shown) -> Iterator[Block]:
-    """Yield the bifurcation diagram, or the section points if nothing is swept."""
+    """Yield the figure of the bifurcation diagram, or of the section points if nothing is swept."""
     if len(shown.axes) > 1:
         at = _first_of_others(shown)
         yield from _drawn(shown, "bifurcation", "Bifurcation diagram at the first values of the other axes", at=at)
@@ -177,14 +179,16 @@ def _diagram(shown: Shown) -> Iterator[Block]:
 
 
 def _first_of_others(shown: Shown) -> dict[str, float]:
-    """Return the first values of the axes that a diagram does not show."""
+    """Return the first value of each axis that a bifurcation diagram does not show."""
     continuation = shown.run.spec.continuation
     path = next((d for d in shown.axes if continuation and parameter_name(d) == continuation.path), shown.axes[0])
     return {d: float(shown.cube[d].values[0]) for d in shown.axes if d != path}
 
 
 def _attractors(shown: Shown) -> Iterator[Block]:
-    """Yield the attractors with periods, motions, ranges and basin fractions, and figures of them."""
+    """Yield the table of attractors with periods, motions, ranges and basin fractions, and figures of the
+    attractors.
+    """
     known = shown.options_of("attractors")
     if not known:
         yield _missing(shown, "attractors")
@@ -221,7 +225,9 @@ def _attractors(shown: Shown) -> Iterator[Block]:
 
 
 def _counted(rows: list[dict[str, Any]], told: str) -> str:
-    """Return the numbers of attractors and of other sets, and the sentence on the cells' ends."""
+    """Return a text with the numbers of attractors and of other invariant sets, and a sentence on the outcomes of
+    cells.
+    """
     attract = {r["attractor_id"] for r in rows if r["stability"] == "attracts"}
     others = {r["attractor_id"] for r in rows} - attract
     more = f", {counted(len(others), 'other set')}" if others else ""
@@ -229,7 +235,7 @@ def _counted(rows: list[dict[str, Any]], told: str) -> str:
 
 
 def _richest(rows: list[dict[str, Any]], axes: tuple[str, ...]) -> dict[str, float]:
-    """Return the axis values at which most attractors coexist, the first of equals."""
+    """Return the axis values at which most attractors coexist; the first such values in a tie."""
     counts: dict[tuple[float, ...], int] = {}
     for row in rows:
         place: tuple[float, ...] = tuple(row[name] for name in axes)
@@ -241,7 +247,9 @@ def _richest(rows: list[dict[str, Any]], axes: tuple[str, ...]) -> dict[str, flo
 def _attractor_grid(
     ds: xr.Dataset, rows: list[dict[str, Any]], axes: tuple[str, ...]
 ) -> tuple[list[str], list[list[str]]]:
-    """Return a row per attractor: kind, period, motion, ranges, largest fraction with its interval."""
+    """Return a table with a row per attractor: kind, period, motion, ranges, largest basin fraction with its
+    interval.
+    """
     motion, sampled = any("side" in r for r in rows), any("fraction" in r for r in rows)
     names = ["", "kind", "stability", "shown by", "period", *(["motion"] if motion else []), *axes, "cells"]
     names += ["basin fraction (95 % interval)"] if sampled else []
@@ -261,7 +269,7 @@ def _attractor_grid(
 
 
 def _share(rows: list[dict[str, Any]], axes: tuple[str, ...]) -> str:
-    """Return the largest basin fraction of an attractor, with its interval and place."""
+    """Return the largest basin fraction of an attractor, its interval and its parameter values, as text."""
     best = max(rows, key=lambda row: float(np.nan_to_num(row["fraction"], nan=-1.0)))
     if not np.isfinite(best["fraction"]):  # it attracts nowhere
         return "-"
@@ -271,7 +279,7 @@ def _share(rows: list[dict[str, Any]], axes: tuple[str, ...]) -> str:
 
 
 def _analyses(shown: Shown) -> Iterator[Part]:
-    """Yield a section for every other analysis: table and figure, or the command that computes it."""
+    """Yield a section for each further analysis: its table and figure, or the command that computes it."""
     for name in SHOWN[1:]:
         if not _suits(shown, name):
             continue
@@ -283,7 +291,7 @@ def _analyses(shown: Shown) -> Iterator[Part]:
 
 
 def _suits(shown: Shown, name: str) -> bool:
-    """Return whether an analysis applies to a run of this kind."""
+    """Return whether an analysis applies to the run that is shown."""
     if shown.run.spec.recorded is not None:  # the recording ends, so no cell can be integrated further
         return False
     if name == "hysteresis":
@@ -326,7 +334,7 @@ _OF_ATTRACTORS = {
 
 
 def _with_letters(row: Mapping[str, Any], path: str) -> dict[str, Any]:
-    """Return a row with letters for attractors and the axis' name for ends of a range."""
+    """Return a table row with letters instead of attractor ids, and with the axis name added to ends of a range."""
     found: dict[str, Any] = {}
     for name, value in row.items():
         if name in _OF_ATTRACTORS:
@@ -337,7 +345,7 @@ def _with_letters(row: Mapping[str, Any], path: str) -> dict[str, Any]:
 
 
 def _exponents(shown: Shown) -> Iterator[Block]:
-    """Yield the Lyapunov exponents of the cube, if it has them."""
+    """Yield the figure of the cube's Lyapunov exponents, or a note on how to compute them."""
     if shown.run.spec.recorded is not None:
         return
     if "lyapunov" not in shown.run.spec.products:
@@ -355,7 +363,7 @@ def _exponents(shown: Shown) -> Iterator[Block]:
 
 
 def provenance_of(run: AnalysedRun, spec: str = "SPEC") -> Iterator[Block]:
-    """Yield command, digests, versions and specification of a run, without host and home path."""
+    """Yield the blocks on a run's provenance: command, digests, versions and specification."""
     info = run.info
     made = dict(info.versions)
     facts = {
@@ -371,7 +379,7 @@ def provenance_of(run: AnalysedRun, spec: str = "SPEC") -> Iterator[Block]:
 
 
 def _drawn(shown: Shown, name: str, caption: str, **options: Any) -> Iterator[Block]:
-    """Yield a figure, or a note with the reason why it was not drawn."""
+    """Yield a figure as a picture block, or a note with the reason why it was not drawn."""
     try:
         drawn = figure(shown.run, name, options)
     except SpecError as error:
@@ -388,7 +396,7 @@ def _missing(shown: Shown, name: str) -> Note:
 
 
 def command_of(words: str, options: Mapping[str, Any], place: str) -> str:
-    """Return the command for one analysis or figure."""
+    """Return the shell command for one analysis or figure with given options."""
     verb, _, name = words.partition(" ")
     model = (ANALYSES if verb == "analyse" else FIGURES)[name].options
     parts = []

@@ -1,4 +1,4 @@
-"""Find the stored results of a run that belong to its present cells."""
+"""Find the stored analysis results of a run that belong to its present cells."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from pipeline.store.run import Run
 
 
 def stored_options(run: Run, name: str) -> list[dict[str, Any]]:
-    """Return the options of every stored result that `pipeline.runs.derive.derive` would use.
+    """Return the options of each stored result of an analysis that `pipeline.runs.derive.derive` would use.
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ def stored_options(run: Run, name: str) -> list[dict[str, Any]]:
 
 
 def settled_options(name: str, attrs: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the options of a stored result that differ from the defaults.
+    """Return the non-default options of a stored analysis result, with open defaults filled in.
 
     Options that were left open are filled in, such as a range that defaults to the axis'.
     """
@@ -57,7 +57,7 @@ def settled_options(name: str, attrs: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _tuples(value: Any) -> Any:
-    """Convert the lists of JSON to the tuples that options hold."""
+    """Convert lists from JSON to tuples, also inside dictionaries and lists."""
     if isinstance(value, dict):
         return {name: _tuples(part) for name, part in value.items()}
     return tuple(_tuples(part) for part in value) if isinstance(value, list) else value

@@ -1,4 +1,4 @@
-"""Read a study from TOML: its runs, its figures, and its claims."""
+"""Read a study (reproduction of a paper) from TOML: its runs, its figures, and its claims."""
 
 from __future__ import annotations
 
@@ -19,25 +19,25 @@ STUDY = "study.toml"
 
 
 class RunTable(Table):
-    """A table ``[runs.NAME]``: a run of the study."""
+    """A table ``[runs.NAME]`` of a study's file: a run of the study."""
 
     spec: str = Field(description="Specification: a file, relative to the study, or the name of one that ships.")
 
 
 class RecordingTable(Table):
-    """A table ``[recordings.NAME]``: a recording of a virtual rig."""
+    """A table ``[recordings.NAME]`` of a study's file: a recording of a simulated test rig."""
 
     rig: str = Field(description="Virtual rig: a file, relative to the study.")
 
 
 class TorqueTable(Table):
-    """A table ``[torques.NAME]``: torque readings that are fitted."""
+    """A table ``[torques.NAME]`` of a study's file: torque readings to fit."""
 
     header: str = Field(description="Header of torque readings: a file, or the name of one that ships.")
 
 
 class PictureTable(Table):
-    """A table ``[[figures.pictures]]``: a picture of a figure."""
+    """A table ``[[figures.pictures]]`` of a study's file: a picture of a figure."""
 
     kind: Literal["plot", "quantities", "recording", "series", "torques"] = Field(
         description="plot: a figure of a run, by the name of its command; quantities: quantities of the "
@@ -53,7 +53,7 @@ class PictureTable(Table):
 
 
 class ClaimTable(Table):
-    """A table ``[[figures.claims]]``: a claim with the measure that decides it."""
+    """A table ``[[figures.claims]]`` of a study's file: a claim with the measure that decides it."""
 
     statement: str = Field(description="The claim, paraphrased.")
     source: str = Field(description="Author and place of the claim.")
@@ -78,7 +78,7 @@ class ClaimTable(Table):
 
 
 class FigureTable(Table):
-    """A table ``[[figures]]``: one or several figures of the paper."""
+    """A table ``[[figures]]`` of a study's file: one or several figures of the paper, with pictures and claims."""
 
     number: str = Field(description="Number of the figure, or several numbers.")
     title: str = Field(description="Title of the figure.")
@@ -91,17 +91,17 @@ class FigureTable(Table):
 
     @property
     def numbers(self) -> list[str]:
-        """Numbers of the paper's figures in this section."""
+        """Numbers of the paper's figures that this table covers."""
         return self.number.replace(",", " ").split()
 
     @property
     def needs(self) -> set[str]:
-        """Names of all runs, recordings and torque readings that the figure needs."""
+        """Names of all runs, recordings and torque readings that the figure's pictures and claims use."""
         return {p.of for p in self.pictures} | {name for claim in self.claims for name in claim.of}
 
 
 class StudyTable(Table):
-    """The whole study."""
+    """Content of a study's TOML file."""
 
     title: str = Field(description="Title of the report.")
     source: str = Field(description="Citation of the reproduced paper.")
@@ -117,7 +117,7 @@ class StudyTable(Table):
 
 
 class Study:
-    """A study with its name and its file.
+    """A study: its name, the path of its TOML file, and the file's content.
 
     Parameters
     ----------
@@ -133,12 +133,12 @@ class Study:
         self.name, self.path, self.table = name, path, table
 
     def file(self, name: str) -> Path:
-        """Return the path of a file that the study names."""
+        """Return the path of a file given relative to the study's file."""
         return self.path.parent / name
 
 
 def shipped_studies() -> dict[str, Path]:
-    """Return the paths of the studies that ship, by name."""
+    """Return the paths of the studies shipped with the package, by name."""
     try:
         folder = Path(str(resources.files("workflows")))
     except ModuleNotFoundError:
@@ -147,7 +147,7 @@ def shipped_studies() -> dict[str, Path]:
 
 
 def load_study(name: str | Path) -> Study:
-    """Read a study: a file, or the name of a study that ships.
+    """Read a study from a file, or by the name of a study shipped with the package.
 
     Raises
     ------
@@ -170,7 +170,7 @@ def load_study(name: str | Path) -> Study:
 
 
 def _problems(table: StudyTable) -> list[str]:
-    """Return problems with names that do not exist."""
+    """Return the problems of a study's names: duplicates, and unknown inputs, figures or measures."""
     from pipeline.report.measures import MEASURES
 
     known = [*table.runs, *table.recordings, *table.torques]
@@ -193,7 +193,7 @@ def _problems(table: StudyTable) -> list[str]:
 
 
 def _plot_problems(at: str, picture: PictureTable) -> list[str]:
-    """Return problems with the figure of a run: an unknown name, or unknown options."""
+    """Return the problems of a picture's entry in the study: an unknown figure name, or wrong options."""
     if picture.figure not in FIGURES:
         return [f"{at}.figure: {unknown_name('figure', picture.figure, FIGURES)}"]
     try:

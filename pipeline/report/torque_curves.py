@@ -1,4 +1,4 @@
-"""Measure and draw fits of torque curves for a study."""
+"""Measure and draw the fits of magnet torque curves for a study."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _DRAWS, _SEED = 2000, 2018
 
 
 def measured(header: str, folder: Path) -> Measurement:
-    """Read torque readings by the path of their header, relative to a folder, or by a shipped name."""
+    """Read torque readings, given by the path of their header file or by the name of a shipped measurement."""
     from pipeline.rig.magnet.measurement import find_measurement, read_measurement
 
     own = folder / header
@@ -28,14 +28,14 @@ def measured(header: str, folder: Path) -> Measurement:
 
 
 def fitted(readings: Measurement) -> Outcome:
-    """Fit torque readings."""
+    """Fit models of the magnet torque to torque readings."""
     from pipeline.rig.magnet.fitting import fit_measurement
 
     return fit_measurement(readings)
 
 
 def drawn(outcome: Outcome, name: str) -> DataFigure:
-    """Draw a figure of `pipeline.rig.magnet.figures.FIGURES`."""
+    """Draw a named figure of torque readings from `pipeline.rig.magnet.figures.FIGURES`."""
     from pipeline.rig.magnet.figures import FIGURES
 
     if name not in FIGURES:
@@ -44,7 +44,7 @@ def drawn(outcome: Outcome, name: str) -> DataFigure:
 
 
 def curves_described(outcome: Outcome, options: Mapping[str, Any]) -> Estimate:
-    """Return the fraction of curves whose own bump fits with at least ``r2``."""
+    """Return the fraction of torque curves whose single-curve fit reaches a coefficient of determination of ``r2``."""
     from pipeline.analysis.intervals import binomial_interval
 
     r2 = np.array([fit.quality.r2 for fit in outcome.curves])
@@ -55,7 +55,7 @@ def curves_described(outcome: Outcome, options: Mapping[str, Any]) -> Estimate:
 
 
 def gain_over_dipoles(outcome: Outcome, options: Mapping[str, Any]) -> Estimate:
-    """Return the fraction of the point dipoles' squared residuals that the joint fit removes.
+    """Return the fraction by which the joint fit reduces the squared residuals of the point-dipole fit.
 
     The interval is a bootstrap over whole curves, so residuals within a curve may be correlated.
     """
@@ -74,7 +74,7 @@ def _squares(outcome: Outcome, residuals: np.ndarray) -> np.ndarray:
 
 
 def width_spread(outcome: Outcome, options: Mapping[str, Any]) -> Estimate:
-    """Return the change of the bumps' widths over the locked angle, relative to their mean.
+    """Return the change of the torque bumps' widths over the locked angle, relative to the mean width.
 
     A parabola in the locked angle is fitted to the widths. Its range over the measured angles is divided by
     its mean. The interval is a bootstrap over the curves.
@@ -102,7 +102,7 @@ def _width(values: Mapping[str, float]) -> float:
 
 
 def signs_apart(outcome: Outcome, options: Mapping[str, Any]) -> Estimate:
-    """Return the fraction of readings whose torque has the sign of their side of the transition line."""
+    """Return the fraction of readings whose torque has the sign of the angle's distance from the transition line."""
     from magpend_core.models.pendulum import magnet_torque as laws
     from pipeline.analysis.intervals import binomial_interval
 

@@ -1,4 +1,4 @@
-"""Judge claims: compare an interval with a claimed range."""
+"""Judge claims: compare a measured interval with a claimed range."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from enum import Enum
 
 
 class Verdict(Enum):
-    """A verdict on a claim.
+    """Verdict on a claim: met, not met, undecided, or used for calibration.
 
     A claim on which parameters were calibrated tests nothing. It has its own verdict, whatever the result.
     """
@@ -23,7 +23,7 @@ class Verdict(Enum):
 
     @property
     def css(self) -> str:
-        """CSS class of the block on a page."""
+        """CSS class of the block that shows the verdict on a page."""
         return self.name.lower().replace("_", "-")
 
     def __str__(self) -> str:
@@ -31,7 +31,7 @@ class Verdict(Enum):
 
 
 def judged(low: float, high: float, least: float, most: float) -> Verdict:
-    """Judge an interval against a claimed range.
+    """Judge a claim: compare the confidence interval of a measured number with the claimed range.
 
     Parameters
     ----------

@@ -1,1 +1,1 @@
-"""Work with a test rig: recordings, magnet torque, identification, measured diagrams."""
+"""Analyse data of a test rig: recordings, magnet torque, identification, measured bifurcation diagrams."""

@@ -1,4 +1,4 @@
-"""Make a drive file from a recording, in the format that `pipeline.specification.drive_files` reads."""
+"""Make a drive file from a recording, readable by `pipeline.specification.drive_files`."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ LONG = 1.5
 
 @dataclass(frozen=True)
 class DriveFile:
-    """The text of a drive file, with a summary of it.
+    """The text of a drive file, with a summary: timing, row and sample counts, interpolation error.
 
     Attributes
     ----------
@@ -47,7 +47,7 @@ class DriveFile:
 
 
 def drive_file(recording: xr.Dataset, kind: str, *, tolerance: float = 0.0) -> DriveFile:
-    """Make a drive file from a recording.
+    """Make a drive file from a recording: switching times, or values of the torque.
 
     Parameters
     ----------
@@ -99,7 +99,7 @@ def _problems(recording: xr.Dataset, kind: str, tolerance: float) -> list[str]:
 
 
 def _head(recording: xr.Dataset, what: str, kind: str) -> list[str]:
-    """Return a comment that names the recording, and the header of the table."""
+    """Return the first lines of a drive file: a comment that names the recording, and the table's header."""
     attrs = recording.attrs
     simulated = " (simulated)" if attrs.get("simulated") else ""
     source = f"{attrs.get('file', 'a recording')}{simulated}, sha256 {attrs.get('sha256', 'not known')}"
@@ -156,7 +156,7 @@ def _torque(recording: xr.Dataset, tolerance: float) -> DriveFile:
 
 
 def thinned(time: Floats, level: Floats, tolerance: float) -> npt.NDArray[np.int64]:
-    """Select samples so that linear interpolation between them meets all others within a tolerance.
+    """Select samples such that linear interpolation between them reproduces all others within a tolerance.
 
     Parameters
     ----------

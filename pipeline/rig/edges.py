@@ -137,7 +137,7 @@ class Edges:
         return mean / period, math.hypot(*errors) / period
 
     def common_error(self, fitted: Floats, scatter: float) -> float:
-        """Return the standard error [s] that all times on a line through the edges share.
+        """Return the standard error [s] that is common to all times on a line fitted through the edges.
 
         Parameters
         ----------
@@ -202,7 +202,7 @@ def find_edges(time: npt.ArrayLike, drive: npt.ArrayLike, *, hysteresis: float |
 
 
 def edges_of(recording: xr.Dataset, *, hysteresis: float | None = None) -> Edges:
-    """Return the edges of all pieces of a recording. No edge lies in a gap between pieces.
+    """Return the drive edges in all pieces of a recording; no edge lies in a gap between pieces.
 
     Parameters
     ----------
@@ -233,7 +233,7 @@ def edges_of(recording: xr.Dataset, *, hysteresis: float | None = None) -> Edges
 
 @dataclass(frozen=True)
 class _Switch:
-    """Middle and distance of the two levels, width of the band about the middle, noise of a sample."""
+    """A two-level signal: middle and distance of its levels, width of the band about the middle, noise of a sample."""
 
     middle: float
     span: float
@@ -242,7 +242,7 @@ class _Switch:
 
 
 def _switch(x: Floats, hysteresis: float | None) -> _Switch:
-    """Estimate the levels of a signal; raise unless it has two."""
+    """Estimate the two levels of a drive signal and its noise; raise SpecError if they are not distinct."""
     low, high, noise = _levels(x)
     span = high - low
     if span <= _LEAST_CONTRAST * noise or span <= 0:
@@ -261,7 +261,7 @@ def _switch(x: Floats, hysteresis: float | None) -> _Switch:
 
 
 def _found(parts: Sequence[tuple[Floats, Floats]], switch: _Switch) -> Edges:
-    """Return the edges of stretches of samples, in their order."""
+    """Return the edges in a sequence of sample stretches (times, signal), in order."""
     instants, rises, sharp, slopes, steps = [], [], [], [], [0.0]
     for t, x in parts:
         above = x - switch.middle
@@ -298,7 +298,7 @@ def _checked(time: npt.ArrayLike, drive: npt.ArrayLike) -> tuple[Floats, Floats]
 
 
 def _levels(x: Floats) -> tuple[float, float, float]:
-    """Return lower level, upper level and noise; the noise is estimated from second differences."""
+    """Return the signal's lower level, upper level and noise; the noise is estimated from second differences."""
     ends = np.percentile(x, [2, 98])
     middle = ends.mean()
     if ends[0] == ends[1]:
@@ -309,21 +309,21 @@ def _levels(x: Floats) -> tuple[float, float, float]:
 
 
 def _crossing(t: Floats, above: Floats) -> float:
-    """Return the time of the sign change; the mean of the first and the last if there are several."""
+    """Return the time of a sign change by linear interpolation; the mean of the first and last if there are several."""
     at = np.flatnonzero((above[:-1] > 0) != (above[1:] > 0))[[0, -1]]
     share = above[at] / (above[at] - above[at + 1])
     return float((t[at] + share * (t[at + 1] - t[at])).mean())
 
 
 def _numbers(rising: Floats) -> Floats:
-    """Return the number of each edge, in periods from the first; missing edges are counted."""
+    """Return the number of each rising edge, counted in drive periods from the first; missing edges are counted too."""
     gaps = np.diff(rising)
     steps = np.maximum(np.rint(gaps / np.median(gaps)), 1.0)
     return np.concatenate([[0.0], np.cumsum(steps)])
 
 
 def _line(number: Floats, rising: Floats) -> tuple[float, float]:
-    """Return intercept and slope by least squares, centred so that nothing cancels far from time 0."""
+    """Fit a line by centred least squares; return intercept and slope."""
     centred = number - number.mean()
     slope = float(centred @ (rising - rising.mean()) / (centred @ centred))
     return float(rising.mean() - slope * number.mean()), slope

@@ -67,13 +67,13 @@ STATIC = {
 
 
 def static_files() -> dict[str, tuple[bytes, str]]:
-    """Return content and type of the page's files, read once."""
+    """Read the page's static files; return content and MIME type by file name."""
     folder = resources.files("pipeline.explorer") / "static"
     return {name: ((folder / name).read_bytes(), kind) for name, kind in STATIC.items() if (folder / name).is_file()}
 
 
 class Service:
-    """The state shared by the request handlers.
+    """State shared by the HTTP request handlers: the run, its live computing, worker threads and rate limits.
 
     Parameters
     ----------
@@ -99,11 +99,11 @@ class Service:
         self.compiled: asyncio.Event | None = None
 
     def refresh(self) -> None:
-        """Read the directory again, for new cells and analyses."""
+        """Read the run directory again, for new cells and analyses."""
         self.run = self.run.refreshed()
 
     def warm(self) -> None:
-        """Prepare the page's first requests while the browser starts.
+        """Compute the answers to the page's first requests while the browser starts, then compile the live kernels.
 
         Called in the loop that answers: those who wait for something to be compiled wait there.
         """
@@ -139,7 +139,7 @@ class Service:
             self.waiting -= 1
 
     def close(self) -> None:
-        """Drop the waiting requests."""
+        """Cancel the waiting requests and close live computing."""
         self.pool.shutdown(wait=False, cancel_futures=True)
         if self.live is not None:
             self.live.close()

@@ -51,17 +51,17 @@ def socket_routes(live: LiveRun, authorised: Authorised, path: str = r"/ws") -> 
 
 
 class LiveSocket(WebSocketHandler):
-    """The live connection of one page."""
+    """Websocket connection of one browser page for live computing."""
 
     def initialize(self, live: LiveRun, authorised: Authorised, others: set[LiveSocket]) -> None:
-        """Store the arguments of the route."""
+        """Store the live run, the function that authorises requests, and the set of open connections."""
         self._live, self._authorised, self._others = live, authorised, others
         self._session: LiveSession | None = None
         self._allowance, self._heard = MOST_AT_ONCE, time.monotonic()
         self._waiting = 0
 
     async def prepare(self) -> None:
-        """Refuse whoever may not connect, and whoever is too many, before the connection is made."""
+        """Refuse a connection that is not authorised, or that exceeds the largest number of open connections."""
         if not self._authorised(self):
             self.set_status(403)
             await self.finish({"error": "this address has no valid token, or another page asks."})
@@ -70,7 +70,7 @@ class LiveSocket(WebSocketHandler):
             await self.finish({"error": f"{MOST_CONNECTIONS} pages watch already; close one."})
 
     def open(self, *args: str, **kwargs: str) -> None:
-        """Begin a session."""
+        """Start a live session for a new connection."""
         self._others.add(self)
         self.set_nodelay(True)
         loop = IOLoop.current()
@@ -82,7 +82,7 @@ class LiveSocket(WebSocketHandler):
         self._session = LiveSession(self._live, emit)
 
     def on_message(self, message: str | bytes) -> None:
-        """Handle a message; beyond the limit it is refused unread."""
+        """Handle a websocket message; answer with an error if messages arrive too fast."""
         now = time.monotonic()
         self._allowance = min(MOST_AT_ONCE, self._allowance + MOST_PER_SECOND * (now - self._heard)) - 1.0
         self._heard = now

@@ -59,7 +59,7 @@ _HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
 
 
 def _analysis(name: str) -> Callable[..., Any]:
-    """Function of an analysis, with its options in the docstring."""
+    """Return the function that runs a named analysis, with the analysis's options in its docstring."""
     from pipeline.products.product import default_of
     from pipeline.products.registry import ANALYSES
     from pipeline.runs.derive import derive
