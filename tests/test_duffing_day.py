@@ -73,6 +73,23 @@ ANALYSES = {
     "chaos": ("sweep", []),
     "dimension": ("sweep", ["--n-max", "2000"]),
     "branches": ("walk", ["--period", "1"]),
+    "manifolds": ("sweep", [*AT["point"], "--starts", "100", "--length", "0.5", "--chord", "0.1"]),
+    "tangency": (
+        "sweep",
+        [
+            *AT["point"],
+            "--starts",
+            "100",
+            "--parameter",
+            "amplitude",
+            "--from",
+            "0.3",
+            "--to",
+            "0.31",
+            "--length",
+            "0.5",
+        ],
+    ),
     "curves": ("walk", ["--period", "1", "--second", "amplitude", "--second-from", "0.25", "--second-to", "0.35"]),
     "orbits": ("sweep", [*AT["point"], "--period", "1", "--starts", "40"]),
 }
@@ -90,6 +107,7 @@ FIGURES_OF = {
     "branches": ("walk", ["--period", "1"]),
     "multipliers": ("walk", ["--period", "1"]),
     "curves": ("walk", ANALYSES["curves"][1]),
+    "manifolds": ANALYSES["manifolds"],
     "section": ("sweep", AT["point"]),
 }
 

@@ -18,6 +18,7 @@ from pipeline.plots.files import save_data, save_figure
 from pipeline.plots.fractions import plot_fractions
 from pipeline.plots.gallery import plot_gallery
 from pipeline.plots.lyapunov import plot_lyapunov
+from pipeline.plots.manifolds import plot_manifolds
 from pipeline.plots.multipliers import plot_multipliers
 from pipeline.plots.regimes import plot_regimes
 from pipeline.plots.section import plot_section
@@ -39,6 +40,7 @@ __all__ = [
     "plot_gallery",
     "plot_lyapunov",
     "plot_lyapunov_map",
+    "plot_manifolds",
     "plot_multipliers",
     "plot_regimes",
     "plot_section",

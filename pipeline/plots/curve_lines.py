@@ -7,7 +7,6 @@ from typing import Any
 
 import xarray as xr
 from matplotlib.axes import Axes
-from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
 
 from pipeline.plots import style
@@ -17,6 +16,7 @@ DASHES: tuple[Any, ...] = ("-", (0, (6, 2)), (0, (1, 1.2)), (0, (5, 1.5, 1, 1.5)
 """Line styles that can be told apart."""
 
 _ON_MAP = dict(zip(KINDS[:3], DASHES[:3], strict=True))
+_STYLE_NAMES = dict(zip(KINDS[:3], ("solid:", "dashed:", "dotted:"), strict=True))
 
 POINT_NAMES = {
     "cusp": "CP",
@@ -35,33 +35,46 @@ POINT_NAMES = {
 
 
 def draw_over(fig: style.DataFigure, axes: Sequence[Axes], ds: xr.Dataset, x: str) -> None:
-    """Draw curves in black over the panels of a map whose horizontal axis is the parameter `x`, with a legend."""
+    """Draw curves in black over the panels of a map whose horizontal axis is the parameter `x`.
+
+    Points of codimension two have their names if there is one panel; several are too small.
+    """
     along, across = ("first", "second") if str(ds.attrs["first_parameter"]) == x else ("second", "first")
-    halo = [withStroke(linewidth=2.4, foreground="white")]
-    seen: dict[str, Line2D] = {}
+    halo = [withStroke(linewidth=2.2, foreground="white")]
     for ax in axes:
         low, high = ax.get_xlim(), ax.get_ylim()
         for i in range(ds.sizes["curve"]):
             n, kind = int(ds["n_points"][i]), KINDS[int(ds["kind"][i])]
-            look: dict[str, Any] = {"color": "black", "linewidth": 1.1, "linestyle": _ON_MAP[kind]}
-            values = ds[along].values[i, :n], ds[across].values[i, :n]
-            ax.plot(*values, path_effects=halo, gid=f"curve:{i}", zorder=4.0, **look)
-            seen.setdefault(kind, Line2D([], [], label=NAMES[kind], **look))
+            ax.plot(
+                ds[along].values[i, :n],
+                ds[across].values[i, :n],
+                color="black",
+                linewidth=1.0 if len(axes) == 1 else 0.7,
+                linestyle=_ON_MAP[kind],
+                path_effects=halo if len(axes) == 1 else None,
+                gid=f"curve:{i}",
+                zorder=4.0,
+            )
         ax.set_xlim(low)
         ax.set_ylim(high)
-        mark_points(ax, ds, along, across, fig.look.tick)
-    handles = [seen[kind] for kind in _ON_MAP if kind in seen]
-    if handles:
-        fig.legend(handles=handles, loc="outside lower right", ncols=3, frameon=False, fontsize=fig.look.tick)
+        mark_points(ax, ds, along, across, fig.look.tick, named=len(axes) == 1)
 
 
-def mark_points(ax: Axes, ds: xr.Dataset, along: str, across: str, size: float) -> None:
-    """Mark the points of codimension two with their short names."""
+def line_note(ds: xr.Dataset) -> str:
+    """Return a text that says which line style stands for which bifurcation, for the kinds that occur."""
+    present = {KINDS[int(kind)] for kind in ds["kind"].values}
+    return ", ".join(f"{_STYLE_NAMES[kind]} {NAMES[kind]}" for kind in _ON_MAP if kind in present)
+
+
+def mark_points(ax: Axes, ds: xr.Dataset, along: str, across: str, size: float, named: bool = True) -> None:
+    """Mark the points of codimension two, with their short names if they are to be named."""
     names = str(ds["special_kind"].attrs["flag_meanings"]).split()
     halo = [withStroke(linewidth=2.0, foreground="white")]
     for k in range(ds.sizes["special"]):
         at = float(ds[f"special_{along}"][k]), float(ds[f"special_{across}"][k])
         ax.plot(*at, marker="o", markersize=3.2, color="black", markeredgecolor="white", markeredgewidth=0.5, zorder=6)
+        if not named:
+            continue
         ax.annotate(
             POINT_NAMES[names[int(ds["special_kind"][k])]],
             at,

@@ -20,7 +20,7 @@ from pipeline.analysis.selection import choose, parameter_dims, start_dims
 from pipeline.layout.attractor_letters import letter
 from pipeline.layout.vocabulary import ATTRACTS, parameter_name
 from pipeline.plots import labels, palette, style
-from pipeline.plots.curve_lines import draw_over
+from pipeline.plots.curve_lines import draw_over, line_note
 from pipeline.plots.figure import Run, attractors_of, frame_of, noted, values_of
 from pipeline.products.figures import RegimeOptions
 
@@ -87,7 +87,8 @@ def plot_regimes(
     data = _regimes(part, x, y, show)
     titles = {"periods": "periods of the coexisting attractors", "attractors": "coexisting attractors"}
     fixed = labels.caption(part, drop=[x, y])
-    text = style.join([titles.get(show, "number of attractors"), fixed, _about(data), left_out(part)])
+    lines = line_note(curves) if curves is not None else ""
+    text = style.join([titles.get(show, "number of attractors"), lines, fixed, _about(data), left_out(part)])
     several = show != "number" and np.unique(data["regime"]).size > len(palette.COLOURS)
     if curves is not None:
         data = _with_curves(data, curves, x, y)

@@ -7,6 +7,7 @@ from typing import Literal
 from pipeline.products.attractors import AttractorOptions
 from pipeline.products.branches import BranchOptions, CurveOptions
 from pipeline.products.chaos import DimensionOptions
+from pipeline.products.manifolds import ManifoldOptions
 from pipeline.products.product import Figure, FigureOptions, StateOptions, option
 
 Per = Literal["s", "period"]
@@ -116,6 +117,10 @@ class CurveFigureOptions(CurveOptions, _AlongOptions):
     over: str = option("", "Run over both parameters whose map of regimes is drawn below.")
 
 
+class ManifoldFigureOptions(ManifoldOptions, FigureOptions):
+    """Options of a figure of manifolds."""
+
+
 BIFURCATION = Figure(
     "bifurcation",
     "Draw a bifurcation diagram: section points over the swept parameter, coloured by class of motion.",
@@ -209,4 +214,11 @@ CURVES = Figure(
     "Draw curves of folds, period doublings and Neimark-Sacker points in the plane of two parameters.",
     CurveFigureOptions,
     "pipeline.plots.curves:draw",
+)
+
+MANIFOLDS = Figure(
+    "manifolds",
+    "Draw the stable and unstable manifolds of saddle orbits, over the basins of a run on a grid of two states.",
+    ManifoldFigureOptions,
+    "pipeline.plots.manifolds:draw",
 )

@@ -53,6 +53,8 @@ ANALYSES: Registry[Analysis] = Registry(
         "branches": "pipeline.products.branches:BRANCHES",
         "curves": "pipeline.products.branches:CURVES",
         "orbits": "pipeline.products.branches:ORBITS",
+        "manifolds": "pipeline.products.manifolds:MANIFOLDS",
+        "tangency": "pipeline.products.manifolds:TANGENCY",
     },
 )
 
@@ -77,6 +79,7 @@ FIGURES: Registry[Figure] = Registry(
             "branches",
             "multipliers",
             "curves",
+            "manifolds",
         )
     },
 )

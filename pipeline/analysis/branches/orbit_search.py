@@ -25,10 +25,11 @@ WIDER = 1.5
 
 def needs_point(run: Run, options: OrbitOptions) -> None:
     """Raise ValueError unless the values choose one parameter point."""
-    _point(run.cube(), options)
+    point_of(run.cube(), options)
 
 
-def _point(cube: xr.Dataset, options: OrbitOptions) -> xr.Dataset:
+def point_of(cube: xr.Dataset, options: OrbitOptions) -> xr.Dataset:
+    """Return the part of a cube at the parameter point of the options, without the parameters' dims."""
     part = select_points(cube, options.at, purpose="orbits are searched at one parameter point")
     return part.isel(dict.fromkeys(split_dims(part["status"])[0], 0))
 
@@ -36,7 +37,7 @@ def _point(cube: xr.Dataset, options: OrbitOptions) -> xr.Dataset:
 def orbits(run: Run, options: OrbitOptions) -> xr.Dataset:
     """Search the periodic orbits up to a period, stable or not."""
     cube = run.cube()
-    point, base = _point(cube, options), parameters_of(cube)
+    point, base = point_of(cube, options), parameters_of(cube)
     frequency, packed = parameters_at(point, base)
     system = base.model.system
     starts = _starts(point, system, options)

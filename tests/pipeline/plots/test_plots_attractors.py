@@ -558,7 +558,7 @@ def test_plot_regimes__curves_over_the_map(map_of_two, curves_of_two):
     np.testing.assert_allclose(line.get_xdata(), [2.1, 2.15, 2.2])
     np.testing.assert_allclose(line.get_ydata(), [1.0, 1.5, 2.0])
     assert [text.get_text() for text in fig.axes[0].texts] == ["CP"]
-    assert "fold" in [text.get_text() for legend in fig.legends for text in legend.get_texts()]
+    assert "solid: fold" in caption_of(fig)
     np.testing.assert_allclose(fig.data["special_first_curves"], [1.5])
     with pytest.raises(ValueError, match="plane of q and damping"):
         plot_regimes(map_of_two, curves=curves_of_two.assign_attrs(second_parameter="damping"))

@@ -1,0 +1,227 @@
+"""Compute manifolds and homoclinic tangencies as analyses of a run (`pipeline.products.manifolds`)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import product
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from magpend_core.models.model import Parameters
+from magpend_core.orbits import polish_orbits
+from pipeline.analysis.branches.orbit_search import needs_point, point_of
+from pipeline.analysis.branches.starting_orbits import parameters_at
+from pipeline.analysis.branches.units import parameter_units, state_units
+from pipeline.analysis.manifolds.growing import Manifold, Resolution, Saddle, stable_manifold, unstable_manifold
+from pipeline.analysis.manifolds.tangency import first_tangency
+from pipeline.analysis.run import Run
+from pipeline.analysis.tabular import Row, aligned, counted
+from pipeline.layout.vocabulary import (
+    FREQUENCY_DIM,
+    axis_name,
+    model_attribute,
+    parameter_name,
+    parameters_of,
+    section_attributes,
+)
+from pipeline.products.branches import OrbitOptions
+from pipeline.products.manifolds import ManifoldOptions, TangencyOptions
+from pipeline.products.product import Table
+from pipeline.products.reporting import track
+
+ENDS = ("length", "most", "generations", "lost")
+
+SIDES = (1.0, -1.0)
+
+
+def manifolds(run: Run, options: ManifoldOptions) -> xr.Dataset:
+    """Grow the manifolds of the saddle orbits that `orbits` finds."""
+    base, found = parameters_of(run.cube()), run.derive("orbits", **options.part(OrbitOptions))
+    resolution = Resolution(options.chord, options.length, options.most)
+    asked = [
+        (number, saddle, side, stable)
+        for number, saddle in _saddles(found, *parameters_at(point_of(run.cube(), options), base), base)
+        for stable in (False, True)
+        if _is_curve(saddle, stable)
+        for side in SIDES
+    ]
+    curves = [
+        (number, saddle, side, (stable_manifold if stable else unstable_manifold)(saddle, side, resolution))
+        for number, saddle, side, stable in track(asked, "growing manifolds")
+    ]
+    return _dataset(curves, base)
+
+
+def _saddles(found: xr.Dataset, frequency_hz: float, packed: np.ndarray, base: Parameters) -> list[tuple[int, Saddle]]:
+    """Return the saddle orbits and their numbers."""
+    saddles = []
+    for number in range(found.sizes["orbit"]):
+        one = found.isel(orbit=number)
+        multipliers = np.hypot(one["multiplier_real"].values, one["multiplier_imag"].values)
+        if not (multipliers > 1.0).any() or not ((multipliers < 1.0) & (multipliers > 0.0)).any():
+            continue
+        saddle = _saddle(base, frequency_hz, packed, one["section"].values[0], int(one["orbit_period"]))
+        if saddle is not None:
+            saddles.append((number, saddle))
+    return saddles
+
+
+def _saddle(base: Parameters, frequency_hz: float, packed: np.ndarray, state: np.ndarray, period: int) -> Saddle | None:
+    """Return the orbit near a section point; None if Newton's method finds none of this period."""
+    system = base.model.system
+    orbit = polish_orbits(packed[None], np.array([frequency_hz]), state[None], np.array([period]), system=system)
+    if not orbit.converged[0] or orbit.orbit_period[0] != period:
+        return None
+    return Saddle(system, frequency_hz, packed, orbit.section[0], period, orbit.derivative[0])
+
+
+def _is_curve(saddle: Saddle, stable: bool) -> bool:
+    try:
+        saddle.direction(stable)
+    except ValueError:
+        return False
+    return True
+
+
+def _dataset(curves: list[tuple[int, Saddle, float, Manifold]], base: Parameters) -> xr.Dataset:
+    system, model = base.model.system, base.model
+    n = max((len(curve.points) for *_, curve in curves), default=0)
+    points, times = np.full((len(curves), n, system.n_states), np.nan), np.full((len(curves), n), np.nan)
+    for i, (*_, curve) in enumerate(curves):
+        points[i, : len(curve.points)], times[i, : len(curve.points)] = curve.points, curve.time
+    flags = {"flag_values": np.arange(len(ENDS), dtype=np.int8), "flag_meanings": " ".join(ENDS)}
+
+    def column(values: list[Any], dtype: str, long_name: str, **attrs: Any) -> tuple[str, Any, dict[str, Any]]:
+        return "curve", np.array(values, dtype), {"units": "1", "long_name": long_name, **attrs}
+
+    return xr.Dataset(
+        {
+            "section": (("curve", "point", "state"), points, {"units": state_units(model)}),
+            "generation": (("curve", "point"), times, {"units": "1", "long_name": "generation and place within it"}),
+            "n_points": column([len(c.points) for *_, c in curves], "int32", "points of the curve"),
+            "stable": column([c.stable for *_, c in curves], "int8", "1 for a stable manifold"),
+            "direction": column([side for _, _, side, _ in curves], "int8", "side of the orbit on which it begins, 1 or -1"),
+            "orbit": column([number for number, *_ in curves], "int32", "number of the orbit"),
+            "orbit_period": column([saddle.period for _, saddle, *_ in curves], "int32", "its period"),
+            "end": column([ENDS.index(c.end) for *_, c in curves], "int8", "why the curve ends", **flags),
+        },
+        coords={"state": list(system.state_names)},
+        attrs={"model": model_attribute(model), **section_attributes(model.crossing)},
+    )
+
+
+def manifolds_table(ds: xr.Dataset) -> Table:
+    """Return a row per curve."""
+    rows: list[Row] = [
+        {
+            "orbit": int(one["orbit"]),
+            "period": int(one["orbit_period"]),
+            "manifold": "stable" if int(one["stable"]) else "unstable",
+            "direction": int(one["direction"]),
+            "n_points": int(one["n_points"]),
+            "generations": float(np.nanmax(one["generation"].values)),
+            "end": ENDS[int(one["end"])],
+        }
+        for one in (ds.isel(curve=i) for i in range(ds.sizes["curve"]))
+    ]
+    words = [{k: f"{v:.2f}" if isinstance(v, float) else str(v) for k, v in row.items()} for row in rows]
+    nothing = "" if rows else "no saddle orbit with a manifold that is a curve; see `magpend analyse orbits`."
+    return Table(rows, [counted(len(rows), "curve"), "", *aligned(words, "")], nothing)
+
+
+# ---- tangencies --------------------------------------------------------------------------------
+
+
+def needs_tangency(run: Run, options: TangencyOptions) -> None:
+    """Raise ValueError for a point, a parameter, or an interval that does not suit."""
+    from pipeline.specification.problems import unknown_name
+
+    needs_point(run, options)
+    base = parameters_of(run.cube())
+    if axis_name(options.parameter) != FREQUENCY_DIM and options.parameter not in base.names:
+        raise ValueError(unknown_name("parameter", options.parameter, (*base.names, FREQUENCY_DIM)))
+    if not options.low < options.high:
+        raise ValueError(f"the interval {options.low:g} to {options.high:g} is empty; --from must be less than --to.")
+    n_states = base.model.system.n_states
+    if n_states != 2:
+        raise ValueError(f"{base.model.name} has {n_states} states; tangencies are located for two.")
+
+
+def tangency(run: Run, options: TangencyOptions) -> xr.Dataset:
+    """Locate the first tangency of each pair of sides of each saddle's manifolds along a parameter."""
+    cube = run.cube()
+    base, found = parameters_of(cube), run.derive("orbits", **options.part(OrbitOptions))
+    frequency, packed = parameters_at(point_of(cube, options), base)
+    resolution = Resolution(options.chord, options.length)
+    rows = []
+    pairs = list(product(_saddles(found, frequency, packed, base), SIDES, SIDES))
+    for (number, saddle), one, other in track(pairs, "locating tangencies"):
+        if not (_is_curve(saddle, True) and _is_curve(saddle, False)):
+            continue
+        at = _followed(saddle, base, axis_name(options.parameter), options)
+        try:
+            value = first_tangency(at, options.low, options.high, (one, other), resolution)
+        except ValueError as problem:
+            rows.append((number, saddle.period, one, other, np.nan, str(problem)))
+        else:
+            rows.append((number, saddle.period, one, other, value, ""))
+    names = ("orbit", "orbit_period", "unstable_side", "stable_side", "value", "why_not")
+    columns = zip(*rows, strict=True) if rows else ([] for _ in names)
+    units = {"value": {"units": parameter_units(axis_name(options.parameter), base.model)}}
+    return xr.Dataset(
+        {
+            name: ("tangency", np.array(list(values)), units.get(name, {"units": "1"}))
+            for name, values in zip(names, columns, strict=True)
+        },
+        attrs={"parameter": axis_name(options.parameter), "model": model_attribute(base.model)},
+    )
+
+
+def _followed(saddle: Saddle, base: Parameters, parameter: str, options: TangencyOptions) -> Callable[[float], Saddle]:
+    """Return the function that gives the saddle at a value of the parameter, from the nearest value known."""
+    here = saddle.frequency_hz if parameter == FREQUENCY_DIM else saddle.packed[base.names.index(parameter)]
+    known = {float(here): saddle}
+    step = (options.high - options.low) / 8.0
+
+    def at(value: float) -> Saddle:
+        while value not in known:
+            nearest = min(known, key=lambda other: abs(other - value))
+            target = value if abs(value - nearest) <= step else nearest + np.sign(value - nearest) * step
+            packed, frequency = saddle.packed.copy(), saddle.frequency_hz
+            if parameter == FREQUENCY_DIM:
+                frequency = target
+            else:
+                packed[base.names.index(parameter)] = target
+            found = _saddle(base, frequency, packed, known[nearest].state, saddle.period)
+            if found is None:
+                raise ValueError(f"the orbit cannot be followed to {parameter_name(parameter)} = {target:g}.")
+            known[float(target)] = found
+        return known[value]
+
+    return at
+
+
+def tangency_table(ds: xr.Dataset) -> Table:
+    """Return a row per located tangency, and lines on the pairs of sides without one."""
+    name = parameter_name(str(ds.attrs["parameter"]))
+    every = [
+        {
+            "orbit": int(one["orbit"]),
+            "period": int(one["orbit_period"]),
+            "unstable_side": int(one["unstable_side"]),
+            "stable_side": int(one["stable_side"]),
+            name: float(one["value"]),
+            "why_not": str(one["why_not"].values),
+        }
+        for one in (ds.isel(tangency=i) for i in range(ds.sizes["tangency"]))
+    ]
+    rows = [{k: v for k, v in row.items() if k != "why_not"} for row in every if not row["why_not"]]
+    words = [{k: f"{v:.8f}" if isinstance(v, float) else str(v) for k, v in row.items()} for row in rows]
+    lines = [f"{len(rows)} first homoclinic tangencies along {name}", "", *aligned(words, "")]
+    for row in every:
+        if row["why_not"]:
+            sides = f"sides {row['unstable_side']:+d}, {row['stable_side']:+d}"
+            lines.append(f"orbit {row['orbit']}, {sides}: none, {row['why_not']}")
+    return Table(rows, lines, "" if every else "no saddle orbit with two manifolds that are curves.")
