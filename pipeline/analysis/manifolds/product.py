@@ -102,7 +102,7 @@ def _dataset(curves: list[tuple[int, Saddle, float, Manifold]], base: Parameters
             "generation": (("curve", "point"), times, {"units": "1", "long_name": "generation and place within it"}),
             "n_points": column([len(c.points) for *_, c in curves], "int32", "points of the curve"),
             "stable": column([c.stable for *_, c in curves], "int8", "1 for a stable manifold"),
-            "direction": column([side for _, _, side, _ in curves], "int8", "side of the orbit on which it begins, 1 or -1"),
+            "direction": column([side for _, _, side, _ in curves], "int8", "side of the orbit, 1 or -1"),
             "orbit": column([number for number, *_ in curves], "int32", "number of the orbit"),
             "orbit_period": column([saddle.period for _, saddle, *_ in curves], "int32", "its period"),
             "end": column([ENDS.index(c.end) for *_, c in curves], "int8", "why the curve ends", **flags),
