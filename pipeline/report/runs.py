@@ -33,7 +33,19 @@ if TYPE_CHECKING:
 CHEAP = ("attractors", "hysteresis", "basins")
 """Analyses that a report computes by default."""
 
-SHOWN = ("attractors", "hysteresis", "basins", "branches", "curves", "chaos", "dimension", "settling")
+SHOWN = (
+    "attractors",
+    "hysteresis",
+    "basins",
+    "branches",
+    "curves",
+    "orbits",
+    "manifolds",
+    "tangency",
+    "chaos",
+    "dimension",
+    "settling",
+)
 """Analyses in the order of a report."""
 
 _HEADINGS = {
@@ -41,6 +53,9 @@ _HEADINGS = {
     "basins": "Basins",
     "branches": "Bifurcations",
     "curves": "Curves of bifurcations",
+    "orbits": "Periodic orbits",
+    "manifolds": "Stable and unstable manifolds",
+    "tangency": "Homoclinic tangencies",
     "chaos": "Regular and chaotic",
     "dimension": "Dimensions",
     "settling": "Transient or attractor",
@@ -50,7 +65,10 @@ _CAPTIONS = {
     "hysteresis": "Jumps of the branches: the parameter values, and the attractors before and after",
     "basins": "Attractors on which the initial states of the grid end",
     "branches": "Located bifurcations",
-    "curves": "Curves of bifurcations",
+    "curves": "Points of codimension two on the curves of bifurcations",
+    "orbits": "All periodic orbits found at a parameter point, stable or not",
+    "manifolds": "Manifolds of the saddle orbits",
+    "tangency": "Parameter values at which manifolds of a saddle orbit first touch",
     "chaos": "Kind of motion of each attractor",
     "dimension": "Correlation dimensions of the attractors that do not close",
     "settling": "Sets that do not close, and the results of extending their cells",
