@@ -67,4 +67,5 @@ def draw(run: Run, options: CurveFigureOptions) -> style.DataFigure:
     found = run.derive("curves", **options.part(CurveOptions))
     if not options.over:
         return plot_curves(found, frame=frame_of(options))
-    return plot_regimes(attractors_of(run.of(options.over), RegimeOptions()), curves=found, frame=frame_of(options))
+    below = attractors_of(run.of(options.over), RegimeOptions())
+    return plot_regimes(below, show=options.show, curves=found, frame=frame_of(options))

@@ -26,7 +26,7 @@ its direction instead: ``turn`` in `_torus_tests`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
 
@@ -91,13 +91,16 @@ class SpecialPoint:
 class Detector:
     """A detector of points of codimension two between neighbouring points of a curve, with those located so far.
 
+    `settings` are tried in turn for locating one. `n_missed` counts sign changes that none of them leads to.
+
     Eigenvectors and planes of the pair are turned to those at the point before, so that test functions with
     a sign of theirs are continuous.
     """
 
     problem: BifurcationProblem
-    settings: Settings
+    settings: Sequence[Settings]
     found: list[SpecialPoint] = field(default_factory=list)
+    n_missed: int = 0
     _level: int | None = None
     _last: tuple[Point, _Frame, dict[str, float]] | None = None
 
@@ -110,9 +113,7 @@ class Detector:
         turned, after = yield from self._tests(b, frame)
         for kind, value in before.items():
             if value * after[kind] < 0.0:
-                one = yield from self._locate(kind, (a, value), (b, after[kind]), frame)
-                if one is not None and not any(_is_same(one, other) for other in self.found):
-                    self.found.append(one)
+                yield from self._locate(kind, (a, value), (b, after[kind]), frame)
         self._last = b, turned, after
         return True
 
@@ -138,7 +139,9 @@ class Detector:
         value = yield Query(CoefficientProblem(case), case.u)
         return float(value.residual[0])
 
-    def _locate(self, kind: str, a: Tested, b: Tested, frame: _Frame) -> Steps[SpecialPoint | None]:
+    def _locate(self, kind: str, a: Tested, b: Tested, frame: _Frame) -> Steps[None]:
+        """Add the zero of a test function between two points, or count it if no settings lead to it."""
+
         def test(point: Point) -> Steps[float]:
             if kind == OF_COEFFICIENT[self.problem.kind]:
                 _, values = yield from self._tests(point, frame)
@@ -146,20 +149,27 @@ class Detector:
             case = Case(self.problem.family, self.problem.kind, point.u, point.value.monodromy)
             return _matrix_tests(self.problem.kind, case.matrix, _Frame.of(case, frame))[kind]
 
-        ends = yield from find_root(self.problem, a, b, test, self.settings)
+        ends = None
+        for settings in self.settings:
+            ends = yield from find_root(self.problem, a, b, test, settings)
+            if ends is not None:
+                break
         if ends is None:
-            return None
+            self.n_missed += 1
+            return
         (low, at_low), (high, at_high) = ends
         if not min(abs(at_low), abs(at_high)) <= VANISHES * max(abs(a[1]), abs(b[1])):
-            return None
+            return
         nearest = low if abs(at_low) <= abs(at_high) else high
         if kind == TURN:
             cosine = _cosine(np.linalg.eigvals(nearest.value.monodromy))
             if abs(cosine) < 1.0 - ON_AXIS:
-                return None
+                return
             kind = R1 if cosine > 0.0 else R2
         bracket = np.abs(self.problem.family.values(high.u) - self.problem.family.values(low.u))
-        return SpecialPoint(kind, self.problem.family, nearest, bracket)
+        one = SpecialPoint(kind, self.problem.family, nearest, bracket)
+        if not any(_is_same(one, other) for other in self.found):
+            self.found.append(one)
 
 
 def _is_same(one: SpecialPoint, other: SpecialPoint) -> bool:

@@ -73,6 +73,8 @@ class Curve:
         Number of the located bifurcation it started from; -1 if it springs from a point of codimension two.
     special : list of SpecialPoint
         Points of codimension two on it.
+    n_missed : int
+        Sign changes of their test functions that could not be located.
     """
 
     family: Family
@@ -81,6 +83,7 @@ class Curve:
     ends: tuple[str, str]
     start: int
     special: list[SpecialPoint] = field(default_factory=list)
+    n_missed: int = 0
 
     @property
     def values(self) -> np.ndarray:
@@ -170,12 +173,13 @@ def _follow_all(ready: Sequence[Ready], curves: list[Curve], bounds: Bounds, set
         [_follow(p, way, bounds, settings) for _, p, f in ready for way in (opposite(f), f)], "following curves"
     )
     for i, (number, problem, first) in enumerate(ready):
-        (back, before), (ahead, after) = traces[2 * i : 2 * i + 2]
+        (back, before, missed_before), (ahead, after, missed_after) = traces[2 * i : 2 * i + 2]
         points = [opposite(p) for p in reversed(back.points)] + ahead.points[1:]
         is_known = any(_passes(curve, problem.kind, problem.family, first) for curve in curves)
         if not is_known and (number >= 0 or len(points) > 2):
             ends = back.end, ahead.end
-            curves.append(Curve(problem.family, problem.kind, points, ends, number, before + after))
+            n_missed = missed_before + missed_after
+            curves.append(Curve(problem.family, problem.kind, points, ends, number, before + after, n_missed))
 
 
 def _sprung(problem: BifurcationProblem, at: SpecialPoint) -> Steps[tuple[BifurcationProblem, Point] | None]:
@@ -222,7 +226,7 @@ def _first(problem: BifurcationProblem, u: np.ndarray, settings: Settings) -> St
 
 def _follow(
     problem: BifurcationProblem, start: Point, bounds: Bounds, settings: Settings
-) -> Steps[tuple[Trace, list[SpecialPoint]]]:
+) -> Steps[tuple[Trace, list[SpecialPoint], int]]:
     """Follow a curve one way, locate its points of codimension two, and drop the point beyond a bound.
 
     A Neimark-Sacker curve ends at the resonance R1 or R2 where its pair of multipliers becomes real.
@@ -245,7 +249,7 @@ def _follow(
             return "closed"
         return ""
 
-    detector = Detector(problem, LOCATE)
+    detector = Detector(problem, (LOCATE, CURVE))
     found = yield from trace(problem, start, settings, stop, detector.between)
     special = [one for one in detector.found if is_inside(one.point.u)]
     if found.end == "period_halving":  # coefficients of twice the period vanish where the orbit is that of one
@@ -255,7 +259,7 @@ def _follow(
         found.points.pop()
     if found.end == "resonance":
         found.points += [one.point for one in special if one.kind in (R1, R2)][-1:]
-    return found, special
+    return found, special, detector.n_missed
 
 
 def _has_torus(point: Point) -> bool:

@@ -58,6 +58,11 @@ def curves_dataset(curves: Sequence[Curve], first: str, second: str, model: Mode
             "kind": ("curve", np.array([KINDS.index(c.kind) for c in curves], np.int8), {**one, **kinds}),
             "orbit_period": ("curve", numbers([c.family.period for c in curves]), one),
             "start": ("curve", numbers([c.start for c in curves]), {**one, "long_name": "located point"}),
+            "n_missed": (
+                "curve",
+                numbers([c.n_missed for c in curves]),
+                {**one, "long_name": "sign changes that could not be located"},
+            ),
             "n_points": ("curve", numbers([len(c.points) for c in curves]), one),
             "first_end": ("curve", codes(0), {**one, **ends}),
             "last_end": ("curve", codes(1), {**one, **ends}),

@@ -228,6 +228,9 @@ def curves_table(ds: xr.Dataset) -> Table:
     rows.sort(key=lambda row: (row["type"], row[names[0]]))
     lines = [f"{counted(ds.sizes['curve'], 'curve')} in the plane of {' and '.join(names)}"]
     lines += [_curve_line(ds.isel(curve=i), i, names) for i in range(ds.sizes["curve"])]
+    missed = int(ds["n_missed"].sum())
+    if missed:
+        lines += ["", f"{counted(missed, 'sign change')} of test functions could not be located: points may be missing"]
     if rows:
         lines += ["", f"{counted(len(rows), 'point')} of codimension two", *aligned([_special_words(r) for r in rows])]
     return Table(rows, lines)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from magpend_core.models import load_model
-from pipeline.analysis.branches import Scope, Start, curves_dataset, explore
+from pipeline.analysis.branches import Scope, Start, codimension_two, curves_dataset, explore
 from pipeline.analysis.branches.curves import continue_curves
 from pipeline.analysis.branches.problems import Family
 from pipeline.analysis.branches.table import curves_table
@@ -194,3 +194,18 @@ def test_two_bifurcations_at_once(kind, free, bifurcations):
     assert {name for name, _ in located(curves)} == {kind}
     for _, value in located(curves):
         np.testing.assert_allclose(value, 0.0, atol=1e-7)
+
+
+def test_continue_curves__counts_what_it_cannot_locate(monkeypatch):
+    """A sign change without a located zero is told, not dropped."""
+
+    def nothing(*words):
+        return None
+        yield
+
+    monkeypatch.setattr(codimension_two, "find_root", nothing)
+    bounds = ((-0.5, 0.5), (-1.0, 1.0))
+    curves = curves_through("neimark_sacker", [0, 0, 0, 0, np.sqrt(0.3)], ("nu", "b"), [0.0, -0.4], bounds)
+    ds = curves_dataset(curves, "nu", "b", load_model(tomllib.loads(UNCOUPLED)))
+    assert ds["n_missed"].values.tolist() == [1]
+    assert any("1 sign change of test functions could not be located" in line for line in curves_table(ds).lines)
