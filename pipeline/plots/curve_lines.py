@@ -61,13 +61,13 @@ def draw_over(fig: style.DataFigure, axes: Sequence[Axes], ds: xr.Dataset, x: st
 
 
 def line_note(ds: xr.Dataset) -> str:
-    """Return a text that says which line style stands for which bifurcation, for the kinds that occur."""
+    """Return a text that says which line style stands for which kind of bifurcation."""
     present = {KINDS[int(kind)] for kind in ds["kind"].values}
     return ", ".join(f"{_STYLE_NAMES[kind]} {NAMES[kind]}" for kind in _ON_MAP if kind in present)
 
 
 def mark_points(ax: Axes, ds: xr.Dataset, along: str, across: str, size: float, named: bool = True) -> None:
-    """Mark the points of codimension two, with their short names if they are to be named."""
+    """Mark the points of codimension two on axes with dots and, if `named`, with short names such as CP and R1."""
     names = str(ds["special_kind"].attrs["flag_meanings"]).split()
     halo = [withStroke(linewidth=2.0, foreground="white")]
     for k in range(ds.sizes["special"]):

@@ -23,7 +23,7 @@ _NAMES = {0: "unstable manifold", 1: "stable manifold"}
 def plot_manifolds(
     ds: xr.Dataset, basins: style.DataFigure | None = None, *, degrees: bool = False, frame: style.Frame = style.WIDE
 ) -> style.DataFigure:
-    """Draw manifolds over the first two states.
+    """Draw manifolds in the plane of the first two states, alone or on a figure of basins.
 
     Parameters
     ----------
@@ -60,7 +60,7 @@ def plot_manifolds(
 
 
 def _shade(colour: str) -> str:
-    """Return a colour for the legend, where white lines would be lost."""
+    """Return the legend's colour of a line: grey for white lines, which would be invisible."""
     return "0.75" if colour == "white" else colour
 
 

@@ -59,7 +59,7 @@ ON_AXIS = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class SpecialPoint:
-    """A located point of codimension two.
+    """A located point of codimension two, such as a cusp: its kind, orbit, both parameter values and their errors.
 
     Attributes
     ----------
@@ -83,13 +83,13 @@ class SpecialPoint:
 
     @property
     def values(self) -> np.ndarray:
-        """Values of both parameters."""
+        """Values of both parameters at the point."""
         return self.family.values(self.point.u)
 
 
 @dataclass(eq=False)
 class Detector:
-    """A detector of points of codimension two between neighbouring points of a curve, with those located so far.
+    """Detector of points of codimension two along a bifurcation curve; it keeps those that it has located.
 
     `settings` are tried in turn for locating one. `n_missed` counts sign changes that none of them leads to.
 
@@ -105,7 +105,7 @@ class Detector:
     _last: tuple[Point, _Frame, dict[str, float]] | None = None
 
     def between(self, a: Point, b: Point) -> Steps[bool]:
-        """Locate the points between two points of the curve; True."""
+        """Locate the points of codimension two between two neighbouring points of the curve; always return True."""
         if self._last is None or self._last[0] is not a:
             first = yield from self._tests(a, None)
             self._last = a, *first
@@ -118,7 +118,7 @@ class Detector:
         return True
 
     def _tests(self, point: Point, frame: _Frame | None) -> Steps[tuple[_Frame, dict[str, float]]]:
-        """Compute all test functions at a point of the curve."""
+        """Compute all test functions of codimension two at a point of the curve."""
         family, kind = self.problem.family, self.problem.kind
         case = Case(family, kind, point.u, point.value.monodromy, STEPS, frame.vector if frame else None)
         turned = _Frame.of(case, frame)
@@ -127,7 +127,9 @@ class Detector:
         return turned, values
 
     def _coefficient(self, case: Case) -> Steps[float]:
-        """Compute the normal form coefficient with the size of the step that is best at the curve's first point."""
+        """Compute the normal form coefficient at a point of the curve, with the step of differences chosen at the first
+        point.
+        """
         if case.kind == TORUS and case.critical.imag == 0.0:  # beyond R1 or R2
             return float("nan")
         if self._level is None:
@@ -140,7 +142,9 @@ class Detector:
         return float(value.residual[0])
 
     def _locate(self, kind: str, a: Tested, b: Tested, frame: _Frame) -> Steps[None]:
-        """Add the zero of a test function between two points, or count it if no settings lead to it."""
+        """Locate the zero of a test function between two points of the curve, and keep it; count it as missed if that
+        fails.
+        """
 
         def test(point: Point) -> Steps[float]:
             if kind == OF_COEFFICIENT[self.problem.kind]:
@@ -181,14 +185,16 @@ def _is_same(one: SpecialPoint, other: SpecialPoint) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class _Frame:
-    """The critical eigenvector at a point of a curve, and an orthonormal basis (n, 2) of the plane of a pair."""
+    """Critical eigenvector at a point of a curve, and an orthonormal basis (n, 2) of the plane of a complex pair."""
 
     vector: np.ndarray
     plane: np.ndarray | None
 
     @classmethod
     def of(cls, case: Case, before: _Frame | None) -> _Frame:
-        """Return the frame at a point, turned to that of the point before."""
+        """Return the critical eigenvector and plane at a point of a curve, with the signs and the basis nearest to
+        those before.
+        """
         if case.kind != TORUS:
             return cls(case.q, None)
         values, vectors = np.linalg.eig(case.matrix)
@@ -202,7 +208,9 @@ class _Frame:
 
 
 def _matrix_tests(kind: str, matrix: np.ndarray, frame: _Frame) -> dict[str, float]:
-    """Compute the test functions of a monodromy matrix on a curve of a kind."""
+    """Compute the test functions of codimension two that depend on the monodromy matrix, for one kind of bifurcation
+    curve.
+    """
     if kind == TORUS:
         return _torus_tests(matrix, frame)
     critical = 1.0 if kind == FOLD else -1.0
@@ -234,29 +242,31 @@ def _torus_tests(matrix: np.ndarray, frame: _Frame) -> dict[str, float]:
 
 
 def _slope(matrix: np.ndarray, at: float) -> float:
-    """Compute the derivative of the characteristic polynomial."""
+    """Compute the derivative of a matrix's characteristic polynomial at a number."""
     return float(np.polyval(np.polyder(np.poly(matrix)), at).real)
 
 
 def _pairs(values: np.ndarray) -> float:
-    """Compute the product of mu_i mu_j - 1 over pairs."""
+    """Compute the product of mu_i mu_j - 1 over all pairs of multipliers."""
     return float(np.prod([a * b - 1.0 for a, b in combinations(values, 2)]).real)
 
 
 def _pair(values: np.ndarray) -> list[int]:
-    """Return the places of the two multipliers with product 1."""
+    """Return the indices of the two multipliers whose product is nearest to 1."""
     i, j = np.triu_indices(len(values), 1)
     k = int(np.argmin(np.abs(values[i] * values[j] - 1.0)))
     return [int(i[k]), int(j[k])]
 
 
 def _cosine(values: np.ndarray) -> float:
-    """Return half the sum of the two multipliers with product 1: the cosine of their angle on the circle."""
+    """Return the cosine of the angle of a Neimark-Sacker pair: half the sum of the two multipliers with product 1."""
     return float(0.5 * values[_pair(values)].sum().real)
 
 
 def merged(points: Mapping[int, list[SpecialPoint]]) -> list[SpecialPoint]:
-    """Return the points of all curves, each once; `points` has them by the number of the curve."""
+    """Collect the points of codimension two of all curves, each point once; `points` maps the number of a curve to its
+    points.
+    """
     found: list[SpecialPoint] = []
     for number, ones in points.items():
         for one in ones:
@@ -266,7 +276,7 @@ def merged(points: Mapping[int, list[SpecialPoint]]) -> list[SpecialPoint]:
 
 
 def _is_known(one: SpecialPoint, other: SpecialPoint) -> bool:
-    """Return whether two points are the same orbit, at any phase."""
+    """Return whether two located points are the same orbit: at equal parameter values, from whichever section point."""
     if one.kind != other.kind or one.family.period != other.family.period:
         return False
     if np.abs(one.point.u[-2:] - other.point.u[-2:]).max() > SAME_POINT:

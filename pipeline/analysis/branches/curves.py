@@ -57,7 +57,7 @@ AMPLITUDES = (0.02, 0.05, 0.1)
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """A curve of bifurcations.
+    """Curve of bifurcations in the plane of two parameters: its orbits and the reasons for both ends.
 
     Attributes
     ----------
@@ -167,7 +167,7 @@ Ready = tuple[int, BifurcationProblem, Point]
 
 
 def _follow_all(ready: Sequence[Ready], curves: list[Curve], bounds: Bounds, settings: Settings) -> None:
-    """Append the curves through some points, each once and unless it is known."""
+    """Follow bifurcation curves from their first orbits in both directions, and append those that are not known yet."""
     ready = [r for r in ready if not any(_passes(curve, r[1].kind, r[1].family, r[2]) for curve in curves)]
     traces = run_together(
         [_follow(p, way, bounds, settings) for _, p, f in ready for way in (opposite(f), f)], "following curves"
@@ -183,7 +183,7 @@ def _follow_all(ready: Sequence[Ready], curves: list[Curve], bounds: Bounds, set
 
 
 def _sprung(problem: BifurcationProblem, at: SpecialPoint) -> Steps[tuple[BifurcationProblem, Point] | None]:
-    """Find the first point of a curve that springs from a point of codimension two; None if there is none."""
+    """Find the first orbit of a curve that starts at a point of codimension two; None if there is no such curve."""
     if problem.family.period == at.family.period:
         found = yield from _first(problem, at.point.u, CURVE)
         return None if found is None else (problem, found)
@@ -269,7 +269,7 @@ def _has_torus(point: Point) -> bool:
 
 
 def _passes(curve: Curve, kind: str, family: Family, start: Point) -> bool:
-    """Return whether a curve passes through a start, at any phase, within the accuracy of its chords."""
+    """Return whether a bifurcation curve passes through an orbit, starting at any of the orbit's section points."""
     if curve.kind != kind or curve.family.period != family.period:
         return False
     for a, b in pairwise(np.array([p.u for p in curve.points])):

@@ -76,7 +76,7 @@ def curves_dataset(curves: Sequence[Curve], first: str, second: str, model: Mode
 def _special_points(
     curves: Sequence[Curve], first: str, second: str, model: Model | None, n_states: int
 ) -> dict[str, tuple[object, ...]]:
-    """Return the variables of the points of codimension two, each point once."""
+    """Return the dataset variables of the points of codimension two on all curves, each point once."""
     found = merged({i: curve.special for i, curve in enumerate(curves)})
     values = np.array([one.values for one in found]).reshape(-1, 2)
     brackets = np.array([one.bracket for one in found]).reshape(-1, 2)

@@ -31,7 +31,8 @@ SAME_TIME = 1e-6
 
 
 def cycle_family(equilibria: Family, at: Bifurcation) -> Family | None:
-    """Return the family of cycles of one return through a Hopf point; None if they do not cross its level.
+    """Return the family of limit cycles around a Hopf point, with a section through it; None if cycles do not cross
+    that.
 
     That is so for a system without a section by crossing, and if the crossing state does not oscillate.
     """
@@ -48,7 +49,7 @@ def cycle_family(equilibria: Family, at: Bifurcation) -> Family | None:
 
 
 def cycles_from(family: Family, at: Bifurcation, low: float, high: float, settings: Settings) -> Steps[Half | None]:
-    """Follow the cycles of a family from a Hopf point; None if no small cycle is found."""
+    """Follow the limit cycles that leave a Hopf point along the parameter; None if no small cycle is found."""
     direction = _direction(family, at)
     assert direction is not None
     normal = np.append(direction / np.linalg.norm(direction), 0.0)
@@ -61,7 +62,8 @@ def cycles_from(family: Family, at: Bifurcation, low: float, high: float, settin
 
 
 def _direction(family: Family, at: Bifurcation) -> np.ndarray | None:
-    """Return the scaled direction from the equilibrium to where small cycles cross the section; None if none does.
+    """Return the scaled direction from an equilibrium to where small cycles around it cross the section; None if they
+    do not.
 
     It is the real part of the critical eigenvector at the phase at which the crossing state passes its level in
     the section's direction; its largest component is 1.

@@ -42,7 +42,7 @@ CLOSE = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class FoundOrbit:
-    """A periodic orbit and how it was found.
+    """A periodic orbit found by the search: its points, monodromy matrix and number of hits.
 
     Attributes
     ----------
@@ -73,7 +73,7 @@ class FoundOrbit:
         return found[np.argsort(-np.abs(found), kind="stable")]
 
     def index(self, times: int = 1) -> int:
-        """Return the sign of det(1 - M) of the orbit run through some times."""
+        """Return the index of the orbit, the sign of det(1 - M^times), for the orbit repeated `times` times."""
         power = np.linalg.matrix_power(self.monodromy, times)
         return int(np.sign(np.linalg.det(np.eye(len(power)) - power)))
 
@@ -87,7 +87,7 @@ def search_orbits(
     *,
     rounds: int = ROUNDS,
 ) -> list[FoundOrbit]:
-    """Find periodic orbits from many starts, each orbit once.
+    """Find the periodic orbits near many starts by plain and deflated Newton iterations, each orbit once.
 
     Parameters
     ----------
@@ -130,7 +130,7 @@ def _iterate(
     system: System,
     known: Sequence[FoundOrbit],
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the section points at which iterations converged to no known orbit, and their periods."""
+    """Iterate Newton's method from all starts; return the section points that it converged to, and their periods."""
     state, scales = starts.astype(np.float64), np.asarray(system.scales)
     rows, done = np.arange(len(state)), []
     for _ in range(ITERATIONS):
@@ -162,14 +162,16 @@ def _iterate(
 
 
 def _newton(matrices: np.ndarray, mismatch: np.ndarray) -> np.ndarray:
-    """Solve for the steps; least squares where a matrix is singular."""
+    """Solve for the Newton steps of many starts; by least squares where a matrix is singular."""
     return np.array([np.linalg.lstsq(a, -b, rcond=None)[0] for a, b in zip(matrices, mismatch, strict=True)])
 
 
 def _stretch(
     states: np.ndarray, periods: np.ndarray, steps: np.ndarray, known: Sequence[FoundOrbit], system: System
 ) -> np.ndarray:
-    """Return the factors of the steps by deflation: 1/(1 - grad(log m) . step), m the product of 1 + 1/d^2."""
+    """Return the factors by which deflation changes Newton steps: 1/(1 - grad(log m) . step), m the product of 1 +
+    1/d^2.
+    """
     scales, along = np.asarray(system.scales), np.zeros(len(states))
     for one in known:
         own = np.flatnonzero(periods % one.period == 0)
@@ -190,7 +192,9 @@ def _add(
     packed: np.ndarray,
     system: System,
 ) -> None:
-    """Append the orbits at some section points that are not known yet, and count the hits of the first round."""
+    """Add the orbits through some section points that are not known yet, and count how often the first round met
+    each.
+    """
     if not len(states):
         return
     n = len(states)
@@ -212,13 +216,13 @@ def _is_same(one: FoundOrbit, points: np.ndarray, system: System) -> bool:
 
 
 def coverage(found: Sequence[FoundOrbit]) -> float:
-    """Estimate the probability that one more start leads to a known orbit; NaN without any hit."""
+    """Estimate the probability that one more random start leads to an orbit already found; NaN if none was found."""
     hits = np.array([one.n_hits for one in found])
     return float(1.0 - (hits == 1).sum() / hits.sum()) if hits.sum() else float("nan")
 
 
 def index_sums(found: Sequence[FoundOrbit], longest: int) -> dict[int, int]:
-    """Return the sum of the indices of all fixed points of the p-fold section map, for p up to `longest`."""
+    """Compute the sum of the indices of all fixed points of the p-fold section map, for p from 1 to `longest`."""
     return {
         p: sum(one.period * one.index(p // one.period) for one in found if p % one.period == 0)
         for p in range(1, longest + 1)
@@ -226,5 +230,5 @@ def index_sums(found: Sequence[FoundOrbit], longest: int) -> dict[int, int]:
 
 
 def expected_index(system: System) -> int:
-    """Return the Euler characteristic of the state space: 0 if a state is an angle, else 1."""
+    """Return the sum that the indices of all fixed points should have: 0 if a state is an angle, else 1."""
     return 0 if any(system.is_angle) else 1

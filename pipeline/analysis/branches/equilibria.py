@@ -13,7 +13,7 @@ from pipeline.analysis.branches.problems import PARAMETER_STEP, Ends, Family, Or
 
 @dataclass(eq=False)
 class EquilibriumProblem:
-    """Equilibria of a flow, with one free parameter. Nothing is integrated."""
+    """Equations for the equilibria of a flow along one free parameter; they need no integration."""
 
     family: Family
     _unit: float = field(default=0.0, init=False, repr=False)
@@ -25,15 +25,15 @@ class EquilibriumProblem:
 
     @property
     def system(self) -> System:
-        """System whose rates vanish."""
+        """System whose equilibria are followed."""
         return self.family.system
 
     def rows(self, u: np.ndarray) -> Rows:
-        """Return no trajectory."""
+        """Return an empty request: equilibria need no trajectories."""
         return self.family.rows(u[None][:0])
 
     def value(self, u: np.ndarray, ends: Ends) -> Value:
-        """Compute the scaled rates and their derivative."""
+        """Compute the scaled rates at a state and their derivatives by the state and the parameter."""
         step = np.zeros(self.size)
         step[-1] = PARAMETER_STEP
         rows, scales = self.family.rows(np.stack([u, u + step, u - step])), np.asarray(self.system.scales)
@@ -45,7 +45,7 @@ class EquilibriumProblem:
         return Value(rates[0] * unit, derivative, rows.states[:1], jacobian, is_rest=True)
 
     def _unit_of(self, jacobian: np.ndarray) -> float:
-        """Return the unit of time [s], which the first evaluation chooses: the inverse of the Jacobian's norm."""
+        """Return the unit of time of the equations [s]: the inverse of the Jacobian's norm at the first evaluation."""
         if not self._unit:
             norm = float(np.linalg.norm(self.family.scaled(jacobian)))
             self._unit = 1.0 / norm if norm > 0.0 and np.isfinite(norm) else 1.0

@@ -346,7 +346,7 @@ def _is_crossing(parent: Branch, one: Bifurcation, branches: Sequence[Branch]) -
 
 
 def _adopt_cycles(branches: Sequence[Branch]) -> None:
-    """Connect branches of cycles that end at an equilibrium to the Hopf point there."""
+    """Connect each branch of limit cycles that shrinks to an equilibrium to the Hopf point there."""
     for branch in branches:
         for which in (0, 1):
             if branch.ends[which] == "equilibrium":
@@ -357,7 +357,7 @@ def _adopt_cycles(branches: Sequence[Branch]) -> None:
 
 
 def _hopf_at(branches: Sequence[Branch], cycles: Branch, end: Point) -> Bifurcation | None:
-    """Return the nearest Hopf point to the last cycle of a branch, if it is within `AT_HOPF`."""
+    """Return the Hopf point nearest to the last limit cycle of a branch; None if it is farther than `AT_HOPF`."""
     near = [
         (max(_gap(cycles.family, end, one), abs(end.u[-1] - one.point.u[-1])), one)
         for other in branches
@@ -370,7 +370,7 @@ def _hopf_at(branches: Sequence[Branch], cycles: Branch, end: Point) -> Bifurcat
 
 
 def _leave_equilibria(branches: list[Branch], scope: Scope) -> None:
-    """Follow the cycles that leave the Hopf points at which no known branch of cycles ends."""
+    """Follow the limit cycles that leave the Hopf points at which no known branch of limit cycles ends."""
     _adopt_cycles(branches)
     points = [
         (branch, one) for branch in branches for one in branch.bifurcations if one.kind == HOPF and one.child is None
@@ -389,7 +389,8 @@ def _leave_equilibria(branches: list[Branch], scope: Scope) -> None:
 
 
 def _without_known(cycles: Branch, own: Family, branches: list[Branch], scope: Scope) -> list[Branch]:
-    """Return the parts of a branch from a Hopf point whose cycles are on no branch on another section.
+    """Return the parts of a branch of cycles from a Hopf point that are not on a known branch on another Poincare
+    section.
 
     Diagrams show the section of the run, `own`. So cycles that cross it are followed there, unless they have
     been, and are left out here.
@@ -410,13 +411,15 @@ def _without_known(cycles: Branch, own: Family, branches: list[Branch], scope: S
 
 
 def _equal_runs(periods: np.ndarray) -> list[tuple[int, int]]:
-    """Return the first and last places of runs of equal numbers above 0."""
+    """Return the first and last index of each run of equal numbers above 0."""
     bounds = np.flatnonzero(np.diff(periods, prepend=-1, append=-1))
     return [(a, b - 1) for a, b in itertools.pairwise(map(int, bounds)) if periods[a] > 0]
 
 
 def _other_sections(cycles: Branch, own: Family, branches: Sequence[Branch]) -> list[Family]:
-    """Return a family on each section other than that of the cycles, the run's own first."""
+    """Return a family of orbits for each Poincare section of the known branches but that of `cycles`, the run's own
+    first.
+    """
     families = [own, *(b.family for b in branches if b.family.period and b.family.free == own.free)]
     by_section = {_fixed(family).tobytes(): family for family in reversed(families)}
     by_section.pop(_fixed(cycles.family).tobytes(), None)
@@ -424,7 +427,7 @@ def _other_sections(cycles: Branch, own: Family, branches: Sequence[Branch]) -> 
 
 
 def _parts(cycles: Branch, wanted: np.ndarray) -> list[Branch]:
-    """Return the parts of a branch whose points are wanted, each with one more point on both sides."""
+    """Return the parts of a branch at the wanted points, as branches; each has one more point at both sides."""
     n, parts = len(wanted), []
     for first, last in [(max(a - 1, 0), min(b + 1, n - 1)) for a, b in _equal_runs(wanted.astype(int))]:
         ends = cycles.ends[0] if first == 0 else "other_section", cycles.ends[1] if last == n - 1 else "other_section"

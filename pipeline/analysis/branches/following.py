@@ -28,7 +28,7 @@ REST = 0.5
 
 
 def problem_of(family: Family) -> OneParameter:
-    """Return the equations of a family, for one computation."""
+    """Return the equations of a family of orbits or equilibria, as an object for one computation."""
     return OrbitProblem(family) if family.period else EquilibriumProblem(family)
 
 
@@ -110,7 +110,7 @@ class _Stop:
 
 
 def _end_of_crossings(family: Family, point: Point) -> str:
-    """Return ``tangent`` or ``equilibrium`` where a cycle hardly crosses its section; empty elsewhere."""
+    """Return ``tangent`` or ``equilibrium`` if a limit cycle hardly crosses its section, else an empty text."""
     crossed = crossed_state(family.system)
     if crossed is None:
         return ""

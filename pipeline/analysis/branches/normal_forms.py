@@ -53,14 +53,14 @@ SAME = 1e-5
 
 @dataclass(frozen=True, eq=False)
 class Bend:
-    """First and second derivatives of the matrix A along a direction, (n, n)."""
+    """First and second derivatives (n, n) of the monodromy matrix or Jacobian along a direction."""
 
     first: np.ndarray
     second: np.ndarray
 
 
 class Case:
-    """An orbit or equilibrium at a bifurcation, with its critical eigenvectors.
+    """An orbit or equilibrium at a bifurcation: its monodromy matrix or Jacobian, and the critical eigenvectors.
 
     Parameters
     ----------
@@ -90,13 +90,15 @@ class Case:
             self.q, self.p = -self.q, -self.p
 
     def neighbours(self) -> np.ndarray:
-        """Return the scaled unknowns of the orbit's neighbours along the eigenvector's real and imaginary parts."""
+        """Return the scaled unknowns of states displaced from the orbit along the critical eigenvector, for the
+        differences.
+        """
         parts = [self.q.real, self.q.imag] if self.kind in (TORUS, HOPF) else [self.q.real]
         shifts = np.concatenate([np.outer(sign * self.steps, part) for part in parts for sign in (1.0, -1.0)])
         return np.asarray(self.u + np.pad(shifts, ((0, 0), (0, len(self.u) - len(self.q)))))
 
     def coefficients(self, form: Form, neighbours: np.ndarray) -> np.ndarray:
-        """Compute a coefficient with each size of the step but the largest.
+        """Compute a normal form coefficient with each step size but the largest.
 
         `neighbours` are the derivatives of the map, or Jacobians, at `self.neighbours()`, unscaled.
         """
@@ -108,7 +110,9 @@ class Case:
 
 
 def judge(bifurcations: Sequence[tuple[Family, Bifurcation]]) -> None:
-    """Set the coefficient, its error and the criticality of bifurcations, and tell branch points apart, in place."""
+    """Compute the normal form coefficients of bifurcations, and from them criticality and kinds of branch points; in
+    place.
+    """
     cases = [Case(family, one.kind, one.point.u, one.point.value.monodromy) for family, one in bifurcations]
     for (_, one), case, matrices in zip(bifurcations, cases, _matrices(cases), strict=True):
         if one.kind == BRANCHING:
@@ -140,7 +144,9 @@ def _tell_branch_point(one: Bifurcation, case: Case, matrices: np.ndarray) -> No
 
 
 def _matrices(cases: Sequence[Case]) -> list[np.ndarray]:
-    """Return the derivatives of the map, or Jacobians, at the neighbours of each case."""
+    """Compute for each bifurcation the first derivatives of the section map (or the Jacobians) at states near the
+    orbit.
+    """
     found: dict[int, np.ndarray] = {}
     by_system: dict[str, list[int]] = {}
     for i, case in enumerate(cases):
@@ -157,7 +163,7 @@ def _matrices(cases: Sequence[Case]) -> list[np.ndarray]:
 
 @dataclass(frozen=True, eq=False)
 class CoefficientProblem:
-    """The coefficient of a bifurcation of orbits as a request for trajectories; there is nothing to solve.
+    """Request for the trajectories from which a normal form coefficient is computed; there are no equations to solve.
 
     The residual of its value has the coefficient for each size of the step but the largest.
     """
@@ -175,11 +181,11 @@ class CoefficientProblem:
         return self.case.family.system
 
     def rows(self, u: np.ndarray) -> Rows:
-        """Return the neighbours of the orbit."""
+        """Return the trajectories from the states near the orbit that the differences need."""
         return self.case.family.rows(self.case.neighbours())
 
     def value(self, u: np.ndarray, ends: Ends) -> Value:
-        """Compute the coefficient."""
+        """Compute the normal form coefficient from the ends of the trajectories, for each step size."""
         found = self.case.coefficients(FORMS[self.case.kind], ends.monodromy)
         return Value(found, np.zeros((len(found), self.size)), ends.images[0], ends.monodromy[0])
 
@@ -204,7 +210,9 @@ def critical_vectors(matrix: np.ndarray, kind: str) -> tuple[complex, np.ndarray
 
 
 def _bend(middle: np.ndarray, ahead: np.ndarray, behind: np.ndarray, steps: np.ndarray) -> list[Bend]:
-    """Compute derivatives of fourth order from matrices at steps ahead and behind, for each step but the largest."""
+    """Compute first and second derivatives of a matrix along a direction by differences of fourth order, for each step
+    size.
+    """
     h = steps[1:, None, None]
     odd, even = ahead - behind, ahead + behind
     first = (8.0 * odd[1:] - odd[:-1]) / (12.0 * h)
@@ -213,7 +221,7 @@ def _bend(middle: np.ndarray, ahead: np.ndarray, behind: np.ndarray, steps: np.n
 
 
 def settled(values: np.ndarray) -> tuple[float, float, int]:
-    """Return the value that differs least from those of the next sizes, the larger difference, and its place."""
+    """Return the value that changes least between neighbouring step sizes, its change as error, and its index."""
     changes = np.abs(np.diff(values))
     errors = np.maximum(changes[:-1], changes[1:])
     if np.isnan(errors).all():
@@ -229,7 +237,7 @@ Form = Callable[[Case, Sequence[Bend]], float]
 
 
 def _solved(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Solve linear equations; NaN if the matrix is singular, as where two bifurcations meet."""
+    """Solve linear equations; return NaN if the matrix is singular, as where two bifurcations coincide."""
     try:
         return np.asarray(np.linalg.solve(matrix, right))
     except np.linalg.LinAlgError:
@@ -242,7 +250,7 @@ def _quadratic(case: Case, bends: Sequence[Bend]) -> float:
 
 
 def _size(case: Case, bends: Sequence[Bend]) -> float:
-    """Compute how large the quadratic coefficient could be."""
+    """Compute an upper bound of the quadratic coefficient, to compare the coefficient with."""
     (bend,) = bends
     return float(0.5 * np.linalg.norm(case.p) * np.linalg.norm(bend.first))
 
@@ -262,7 +270,7 @@ def _cubic(case: Case, bends: Sequence[Bend]) -> float:
 
 
 def _complex_parts(case: Case, bends: Sequence[Bend]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the matrices of B(q, .) and B(q', .), and C(q, q, q')."""
+    """Return the matrices B(q, .) and B(conj(q), .), and the vector C(q, q, conj(q)), from the derivatives along q."""
     real, imag = bends
     along, against = real.first + 1j * imag.first, real.first - 1j * imag.first
     return along, against, (real.second + imag.second) @ case.q

@@ -24,18 +24,18 @@ WIDER = 1.5
 
 
 def needs_point(run: Run, options: OrbitOptions) -> None:
-    """Raise ValueError unless the values choose one parameter point."""
+    """Raise ValueError unless the options choose exactly one parameter point."""
     point_of(run.cube(), options)
 
 
 def point_of(cube: xr.Dataset, options: OrbitOptions) -> xr.Dataset:
-    """Return the part of a cube at the parameter point of the options, without the parameters' dims."""
+    """Return the part of a cube at the one parameter point that the options choose."""
     part = select_points(cube, options.at, purpose="orbits are searched at one parameter point")
     return part.isel(dict.fromkeys(split_dims(part["status"])[0], 0))
 
 
 def orbits(run: Run, options: OrbitOptions) -> xr.Dataset:
-    """Search the periodic orbits up to a period, stable or not."""
+    """Search all periodic orbits up to a period at a parameter point, stable or not."""
     cube = run.cube()
     point, base = point_of(cube, options), parameters_of(cube)
     frequency, packed = parameters_at(point, base)
@@ -54,7 +54,9 @@ def orbits(run: Run, options: OrbitOptions) -> xr.Dataset:
 
 
 def _starts(point: xr.Dataset, system: System, options: OrbitOptions) -> np.ndarray:
-    """Return the starts: half of them sections of the cells, half random in a wider box."""
+    """Return the initial states of the search: half drawn from the cells' section points, half random in a wider
+    box.
+    """
     generator = np.random.default_rng(options.seed)
     section = point["section"].transpose(..., "state").values.reshape(-1, system.n_states)
     section = section[np.isfinite(section).all(axis=1)]
@@ -108,7 +110,7 @@ def _dataset(found: list[FoundOrbit], system: System, options: OrbitOptions, poi
 
 
 def orbits_table(ds: xr.Dataset) -> Table:
-    """Return the table of the orbits, with lines on how complete it is."""
+    """Return the table of the orbits found, with lines on whether orbits may be missing."""
     rows = [_row(ds.isel(orbit=i)) for i in range(ds.sizes["orbit"])]
     lines = [f"{counted(len(rows), 'orbit')} from {counted(int(ds.attrs['n_starts']), 'start')} per period", ""]
     lines += [*aligned([_words(row) for row in rows], ""), ""]
@@ -120,7 +122,7 @@ def orbits_table(ds: xr.Dataset) -> Table:
 
 
 def _index_lines(ds: xr.Dataset, expected: int) -> list[str]:
-    """Return lines on the periods whose indices do not add up."""
+    """Return table lines on the periods for which the indices of the orbits do not have the expected sum."""
     sums = {int(p): int(total) for p, total in zip(ds["times"].values, ds["index_sum"].values, strict=True)}
     wrong = [f"{p}: {total}" for p, total in sums.items() if total != expected]
     if not wrong:

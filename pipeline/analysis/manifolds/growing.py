@@ -46,7 +46,7 @@ MOST_GENERATIONS = 60
 
 @dataclass(frozen=True, eq=False)
 class Saddle:
-    """A saddle orbit of the section map with its parameters.
+    """A saddle orbit of the section map: system, parameters, a section point and the monodromy matrix.
 
     Attributes
     ----------
@@ -77,7 +77,7 @@ class Saddle:
         return np.asarray(self.system.scales)
 
     def direction(self, stable: bool) -> tuple[float, np.ndarray]:
-        """Return the multiplier and the scaled unit eigenvector of the only stable or unstable direction.
+        """Return multiplier and unit eigenvector (scaled states) of the one stable or unstable direction of the orbit.
 
         Raises
         ------
@@ -96,7 +96,7 @@ class Saddle:
         return float(values[chosen[0]].real), vector / np.linalg.norm(vector)
 
     def images(self, states: np.ndarray, n_periods: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the images of section points and the derivatives after some periods."""
+        """Return the images of section points after some periods, and the derivatives of the section map there."""
         n = len(states)
         ends = section_map(
             np.tile(self.packed, (n, 1)),
@@ -109,7 +109,7 @@ class Saddle:
         return ends.images[:, -1], ends.derivatives
 
     def scaled(self, difference: np.ndarray) -> np.ndarray:
-        """Return a difference of states in units of the scales, angles on their circle."""
+        """Return a difference of states in units of the states' scales, with angles between -pi and pi."""
         return np.asarray(wrap_angles(difference, self.system) / self.scales)
 
 
@@ -124,7 +124,7 @@ class Resolution:
 
 @dataclass(eq=False)
 class Manifold:
-    """One side of a manifold, from the orbit outwards.
+    """One side of a manifold of a saddle orbit: its points from the orbit outwards, and why it ends.
 
     Attributes
     ----------
@@ -192,7 +192,9 @@ def _grow(saddle: Saddle, side: float, stable: bool, resolution: Resolution) -> 
 
 @dataclass(eq=False)
 class _Curve:
-    """A manifold while it grows: the places on the first segment, and the points of all generations there."""
+    """A manifold under construction: positions on its first segment, and their images (or preimages) in each
+    generation.
+    """
 
     saddle: Saddle
     resolution: Resolution
@@ -202,12 +204,12 @@ class _Curve:
     n_periods: int
 
     def __post_init__(self) -> None:
-        """Begin with a coarse first segment."""
+        """Set the first segment with nine positions."""
         self.places = np.linspace(0.0, 1.0, 9)
         self.generations = [self.first(self.places)]
 
     def grow(self) -> Manifold:
-        """Add generations until the manifold is long enough."""
+        """Add generations until the manifold has the requested length."""
         points, times, length, end = [self.generations[0][:1]], [np.zeros(1)], 0.0, "generations"
         for number in range(MOST_GENERATIONS):
             if number:
@@ -231,7 +233,7 @@ class _Curve:
         return self._cut(np.concatenate(points), np.concatenate(times), end)
 
     def _cut(self, points: np.ndarray, times: np.ndarray, end: str) -> Manifold:
-        """Cut a manifold at the length and the number of points that were asked for."""
+        """Cut the manifold at the length and at the number of points that were requested."""
         away = np.linalg.norm(self.saddle.scaled(np.diff(points, axis=0)), axis=1)
         far = np.flatnonzero(np.cumsum(away) > self.resolution.length)
         n = min(int(far[0]) + 2 if len(far) else len(points), self.resolution.most)
@@ -241,7 +243,8 @@ class _Curve:
         self.generations.append(self.step(self.generations[-1], self.generations[-1]))
 
     def _add_preimages(self) -> None:
-        """Add the preimages of the last generation, one after the other, each from that of its neighbour.
+        """Add the next generation of a stable manifold: preimages one after the other, each from its neighbour's
+        preimage.
 
         Where the step to the next one is long, or Newton's method fails, a place is inserted between them.
         """
@@ -272,7 +275,7 @@ class _Curve:
         self.generations.append(np.concatenate([np.array(found), rest]))
 
     def _refine(self) -> None:
-        """Insert places where the last generation is too coarse."""
+        """Insert positions on the first segment until the last generation's points are close enough together."""
         while len(self.places) < self.resolution.most:
             coarse = self._coarse(self.generations[-1]) & (np.diff(self.places) > SHORTEST)
             if not coarse.any():
@@ -280,7 +283,9 @@ class _Curve:
             self._insert(np.flatnonzero(coarse))
 
     def _insert(self, at: np.ndarray, share: float = 0.5) -> None:
-        """Insert a place after each of some places, at a share of the way to the next, and its points."""
+        """Insert a new position after each of some positions on the first segment, and its point in every
+        generation.
+        """
         middle = self.places[at] + share * (self.places[at + 1] - self.places[at])
         new = [self.first(middle)]
         for points in self.generations[1:]:
@@ -290,7 +295,9 @@ class _Curve:
         self.generations = [np.insert(points, at + 1, inserted, axis=0) for points, inserted in pairs]
 
     def _between(self, points: np.ndarray, at: np.ndarray, middle: np.ndarray) -> np.ndarray:
-        """Interpolate points at new places: by the cubic through four neighbours, by a line at the ends."""
+        """Interpolate a generation's points at new positions: by the cubic through four neighbours, at the ends by a
+        line.
+        """
         last = len(points) - 1
         result = np.empty((len(at), points.shape[1]))
         for row, (k, place) in enumerate(zip(at, middle, strict=True)):
@@ -303,7 +310,7 @@ class _Curve:
         return result
 
     def _coarse(self, points: np.ndarray) -> np.ndarray:
-        """Return which chords are too long, or turn too much at one of their ends."""
+        """Return for each chord of a curve whether it is too long, or the curve turns too much at one of its ends."""
         chords = self.saddle.scaled(np.diff(points, axis=0))
         lengths = np.linalg.norm(chords, axis=1)
         inner = (chords[1:] * chords[:-1]).sum(axis=1) / np.maximum(lengths[1:] * lengths[:-1], 1e-300)

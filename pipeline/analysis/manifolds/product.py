@@ -37,7 +37,7 @@ SIDES = (1.0, -1.0)
 
 
 def manifolds(run: Run, options: ManifoldOptions) -> xr.Dataset:
-    """Grow the manifolds of the saddle orbits that `orbits` finds."""
+    """Grow the manifolds of the saddle orbits that the analysis `orbits` finds."""
     base, found = parameters_of(run.cube()), run.derive("orbits", **options.part(OrbitOptions))
     resolution = Resolution(options.chord, options.length, options.most)
     asked = [
@@ -55,7 +55,7 @@ def manifolds(run: Run, options: ManifoldOptions) -> xr.Dataset:
 
 
 def _saddles(found: xr.Dataset, frequency_hz: float, packed: np.ndarray, base: Parameters) -> list[tuple[int, Saddle]]:
-    """Return the saddle orbits and their numbers."""
+    """Return the saddle orbits among the orbits found, each with its number."""
     saddles = []
     for number in range(found.sizes["orbit"]):
         one = found.isel(orbit=number)
@@ -69,7 +69,7 @@ def _saddles(found: xr.Dataset, frequency_hz: float, packed: np.ndarray, base: P
 
 
 def _saddle(base: Parameters, frequency_hz: float, packed: np.ndarray, state: np.ndarray, period: int) -> Saddle | None:
-    """Return the orbit near a section point; None if Newton's method finds none of this period."""
+    """Return the saddle orbit near a section point; None if Newton's method finds no orbit of this period."""
     system = base.model.system
     orbit = polish_orbits(packed[None], np.array([frequency_hz]), state[None], np.array([period]), system=system)
     if not orbit.converged[0] or orbit.orbit_period[0] != period:
@@ -113,7 +113,7 @@ def _dataset(curves: list[tuple[int, Saddle, float, Manifold]], base: Parameters
 
 
 def manifolds_table(ds: xr.Dataset) -> Table:
-    """Return a row per curve."""
+    """Return a row per manifold: orbit, kind, side, number of points and reason for its end."""
     rows: list[Row] = [
         {
             "orbit": int(one["orbit"]),
@@ -135,7 +135,7 @@ def manifolds_table(ds: xr.Dataset) -> Table:
 
 
 def needs_tangency(run: Run, options: TangencyOptions) -> None:
-    """Raise ValueError for a point, a parameter, or an interval that does not suit."""
+    """Raise ValueError if the parameter point, the parameter or its interval does not suit a search for tangencies."""
     from pipeline.specification.problems import unknown_name
 
     needs_point(run, options)
@@ -150,7 +150,9 @@ def needs_tangency(run: Run, options: TangencyOptions) -> None:
 
 
 def tangency(run: Run, options: TangencyOptions) -> xr.Dataset:
-    """Locate the first tangency of each pair of sides of each saddle's manifolds along a parameter."""
+    """Locate where unstable and stable manifolds of each saddle orbit first touch along a parameter, for all pairs of
+    sides.
+    """
     cube = run.cube()
     base, found = parameters_of(cube), run.derive("orbits", **options.part(OrbitOptions))
     frequency, packed = parameters_at(point_of(cube, options), base)
@@ -180,7 +182,9 @@ def tangency(run: Run, options: TangencyOptions) -> xr.Dataset:
 
 
 def _followed(saddle: Saddle, base: Parameters, parameter: str, options: TangencyOptions) -> Callable[[float], Saddle]:
-    """Return the function that gives the saddle at a value of the parameter, from the nearest value known."""
+    """Return a function that computes the saddle orbit at any value of the parameter, starting from the nearest known
+    value.
+    """
     here = saddle.frequency_hz if parameter == FREQUENCY_DIM else saddle.packed[base.names.index(parameter)]
     known = {float(here): saddle}
     step = (options.high - options.low) / 8.0
@@ -204,7 +208,7 @@ def _followed(saddle: Saddle, base: Parameters, parameter: str, options: Tangenc
 
 
 def tangency_table(ds: xr.Dataset) -> Table:
-    """Return a row per located tangency, and lines on the pairs of sides without one."""
+    """Return a row per located tangency, and for each pair of manifold sides without one a line that says why."""
     name = parameter_name(str(ds.attrs["parameter"]))
     every = [
         {

@@ -65,7 +65,8 @@ def first_tangency(
 
 
 def gap(saddle: Saddle, sides: tuple[float, float], resolution: Resolution = FINE) -> tuple[float, float]:
-    """Compute the least and the largest signed distance of one generation of the unstable from the stable manifold.
+    """Compute the least and largest signed distance of one generation of the unstable manifold from the stable
+    manifold.
 
     Both have one sign if the manifolds are apart, and two if they cross.
     """
@@ -77,7 +78,7 @@ def gap(saddle: Saddle, sides: tuple[float, float], resolution: Resolution = FIN
 
 
 def _oriented(saddle: Saddle, side: float, stable: bool) -> float:
-    """Return the side with the sign of the eigenvector's first component."""
+    """Return the sign to use with the eigenvector, so that a side is named by the sign of its first component."""
     _, vector = saddle.direction(stable)
     return side * float(np.sign(vector[0]))
 
@@ -102,7 +103,7 @@ def _extremes(unstable: Manifold, stable: Manifold, saddle: Saddle) -> tuple[flo
 
 
 def _first_maximum(values: np.ndarray) -> int:
-    """Return the place of the first maximum: where the manifold turns back for the first time."""
+    """Return the index of the first maximum of a list: where the manifold first turns back to the saddle."""
     falling = np.flatnonzero(np.diff(values) < 0.0)
     if not len(falling):
         raise ValueError("the unstable manifold does not turn back; it needs a greater length.")
@@ -110,7 +111,7 @@ def _first_maximum(values: np.ndarray) -> int:
 
 
 class _Line:
-    """A spline through points (n, 2) over the length of their chords."""
+    """A cubic spline through points (n, 2), as a function of the length along their chords."""
 
     def __init__(self, points: np.ndarray) -> None:
         steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
@@ -121,7 +122,7 @@ class _Line:
         self.slope = self.spline.derivative()
 
     def signed_distance(self, point: np.ndarray) -> float:
-        """Return the distance from the curve, positive on the left of its direction."""
+        """Return the distance of a point from the spline, positive on the left of its direction."""
         k = int(np.argmin(((self.points - point) ** 2).sum(axis=1)))
         place = self.places[k]
         for _ in range(20):
