@@ -7,12 +7,14 @@ import tomllib
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from scipy.optimize import fsolve
 
 from magpend_core.crossing import Crossing
 from magpend_core.models import load_model
 from magpend_core.models.sectioned import sectioned
 from pipeline.analysis.branches import Scope, Start, dataset_of, explore
 from pipeline.analysis.branches.arclength import Settings
+from pipeline.analysis.branches.bifurcations import n_unstable
 from pipeline.analysis.branches.equilibria import EquilibriumProblem
 from pipeline.analysis.branches.problems import Family
 from pipeline.analysis.branches.table import branches_table
@@ -159,8 +161,8 @@ FLUTTER = {"b": 0.15, "a": -0.5, "rho": 1.204, "mw": 5.3, "mT": 16.9, "c1": 0.16
 RIG = {"Ia": 0.1724, "ca": 0.5628, "ch": 14.5756, "ka": 54.1162, "k2": 751.6, "k3": 5006.7, "kh": 3529.4, "xa": 0.24}
 
 
-def flutter():
-    """The flutter rig of Lee, Barton and Renson as text: heave, pitch, lag and their rates."""
+def flutter_matrices():
+    """Inverse mass matrix, and damping and stiffness matrices by powers of U (Lee, Barton and Renson's rig)."""
     p = type("P", (), FLUTTER | RIG)
     pi, s = np.pi, 1.0 - p.c1 - p.c3
     mass = np.array(
@@ -189,7 +191,13 @@ def flutter():
     stiffness[2, 2, 2] = p.c2 * p.c4 / p.b**2
     stiffness[3, 0, 2] = 2.0 * pi * p.rho * p.c2 * p.c4 * (p.c1 + p.c3)
     stiffness[3, 1, 2] = -2.0 * pi * p.rho * p.b * half * p.c2 * p.c4 * (p.c1 + p.c3)
-    inverse = np.linalg.inv(mass)
+    return np.linalg.inv(mass), damping, stiffness
+
+
+def flutter():
+    """The flutter rig as text: heave, pitch, lag and their rates."""
+    p = type("P", (), FLUTTER | RIG)
+    inverse, damping, stiffness = flutter_matrices()
     terms = [("", 1.0), ("*U", 1.0), ("*U^2", 1.0), ("*U^3", 1.0)]
     equations = {"h": "vh", "al": "va", "w": "vw"}
     for i, name in enumerate(("vh", "va", "vw")):
@@ -214,3 +222,29 @@ def test_equilibria__flutter_rig():
     assert cycles is not None
     _, fold = only(cycles, "fold")
     assert fold == pytest.approx(14.6601239, abs=1e-6)
+    unstable = [p for p in cycles.points if 16.0 < cycles.family.values(p.u)[0] < 16.1 and n_unstable(p) == 1]
+    assert unstable
+    state, seconds = shooting(cycles.family, unstable[0])
+    np.testing.assert_allclose(cycles.family.state(unstable[0].u), state, atol=1e-8)
+    assert unstable[0].value.seconds == pytest.approx(seconds, rel=1e-8)
+
+
+def shooting(family, point):
+    """Find the same cycle from the matrices by scipy: its state where heave rises through 0, and its period."""
+    inverse, damping, stiffness = flutter_matrices()
+    powers = float(family.values(point.u)[0]) ** np.arange(4)
+    d, k = np.tensordot(powers, damping, 1), np.tensordot(powers, stiffness, 1)
+
+    def rates(t, z):
+        spring = np.array([0.0, RIG["k2"] * z[1] ** 2 + RIG["k3"] * z[1] ** 3, 0.0])
+        return np.concatenate([z[3:], -inverse @ (d @ z[3:] + k @ z[:3] + spring)])
+
+    def mismatch(unknowns):
+        start = np.array([0.0, *unknowns[:5]])
+        end = solve_ivp(rates, (0.0, unknowns[5]), start, method="DOP853", rtol=1e-12, atol=1e-13).y[:, -1]
+        return end - start
+
+    guess = np.array([*family.state(point.u)[1:], point.value.seconds]) * (1.0 + 1e-4)
+    found, _, good, _ = fsolve(mismatch, guess, xtol=1e-13, full_output=True)
+    assert good == 1
+    return np.array([0.0, *found[:5]]), found[5]
