@@ -245,7 +245,7 @@ def _special(ds: xr.Dataset, names: list[str], k: int) -> Row:
         names[0]: float(one["special_first"]),
         names[1]: float(one["special_second"]),
         "period": int(one["special_period"]),
-        "error": max(e / r for e, r in zip(errors, ranges, strict=True) if r > 0.0),
+        "error": max((e / r for e, r in zip(errors, ranges, strict=True) if r > 0.0), default=np.nan),
         "curve": int(one["special_curve"]),
     }
 
