@@ -187,7 +187,7 @@ def margin(w: Any, base: int, k: int, near: Any, far: Any) -> Any:
 
 
 def pair(w: Any, row: int, k: int) -> Any:
-    """Return value and time derivative of event function `k` from the rows that begin at `row`."""
+    """Return the value and the time derivative of event function `k`, stored in the work array from `row` on."""
     return load(w, row + 2 * k * WIDTH), load(w, row + (2 * k + 1) * WIDTH)
 
 

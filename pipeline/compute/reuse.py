@@ -102,7 +102,9 @@ class Source:
         return taken, {name: array[taken] for name, array in values.items()}
 
     def _task(self, place: np.ndarray) -> np.ndarray:
-        """Return the task that contains each cell; the number of tasks for cells that are `NOWHERE`."""
+        """Return the number of the task that contains each cell, or the number of tasks for a cell that is not in the
+        run.
+        """
         plan = self.run.plan
         steps = np.unravel_index(np.maximum(place, 0), plan.shape)
         places = tuple(step // b for step, b in zip(steps, plan.block, strict=True))

@@ -375,7 +375,7 @@ def _exchange(directory: Path, built: Path, echo: Echo) -> None:
 
 
 def _finish_exchange(directory: Path, echo: Echo) -> None:
-    """Rename the wider run to its final name if the process was killed after the old run was renamed."""
+    """Complete an interrupted `extend`: rename the widened run to the run's name if that was still to be done."""
     built = _beside(directory)
     if directory.exists() or not is_run(open_files(built)):
         return

@@ -73,7 +73,9 @@ class Spec:
 
     @property
     def refine(self) -> int | None:
-        """Stride of the cells computed first on a refined grid of initial conditions; None without refinement."""
+        """Refinement of the grid of initial conditions: every how many-th cell is integrated first; None without
+        refinement.
+        """
         starts = self.initial_conditions
         return starts.refine if isinstance(starts, GridStarts) else None
 

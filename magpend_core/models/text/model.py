@@ -83,7 +83,9 @@ class TextModel(Model):
 
     @cached_property
     def digest(self) -> str:
-        """Digest of the text's normal form and of the code that makes the engine's system from it."""
+        """Digest of a text model: of its equations in normal form, and of the code that translates them for the
+        engine.
+        """
         from magpend_core.source_digests import meaning_digest
 
         # the source, too: what is found at the default parameters, edges say, is in it

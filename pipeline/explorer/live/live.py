@@ -62,7 +62,7 @@ def live_problem(run: Run) -> str | None:
 
 
 class Session(Protocol):
-    """Interface of a live session that its run uses; see `pipeline.explorer.live.session`."""
+    """Methods of a live session (an open explorer page that computes) that the run behind it calls."""
 
     @property
     def is_over(self) -> bool:

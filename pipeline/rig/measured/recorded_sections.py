@@ -231,8 +231,8 @@ def _fit(
 
 
 def _basis(x: Floats, order: int, smooth: bool) -> Floats:
-    """Return the design matrix of the polynomial fit: terms that both sides of the edge share, then those of each
-    side.
+    """Return the design matrix of a polynomial fit around a switching edge of the drive, with separate terms on its two
+    sides.
     """
     left, right = np.where(x < 0, x, 0.0), np.where(x < 0, 0.0, x)
     first = 2 if smooth else 1

@@ -84,8 +84,8 @@ def words_for(regime: Regime, words: tuple[str, ...]) -> str:
 
 
 def windows_of(measured: xr.Dataset, *, confident: float = CONFIDENT) -> list[Window]:
-    """Return the windows (runs of steps with the same regime) of all recordings; steps with an uncertain period are
-    skipped.
+    """Return the parameter windows of all recordings: runs of consecutive frequency steps with the same kind of
+    motion.
     """
     keys = list(zip(measured["recording"].values.tolist(), measured["direction"].values.tolist(), strict=True))
     sure = [i for i in range(len(keys)) if measured["confidence"].values[i] >= confident]

@@ -189,8 +189,8 @@ class _Extension:
     # ---- legs ----------------------------------------------------------------------------------
 
     def run(self) -> Work[None]:
-        """Integrate unfinished trajectories further until they have stayed long enough, and longer while a set is in
-        doubt.
+        """Integrate trajectories without a known attractor further, until it is decided for each whether its set
+        attracts.
         """
         target = LEAST_STAY
         for _ in range(DOUBLINGS + 1):

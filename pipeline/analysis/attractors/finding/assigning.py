@@ -120,9 +120,7 @@ def _on_orbit(section: np.ndarray, orbit: Orbit, phase: int, tolerance: float, g
 
 
 def _approach(section: np.ndarray, orbit: Orbit, phase: int, tolerance: float, geometry: Geometry) -> np.ndarray:
-    """Return ``CERTAIN``, ``APPROACHING`` or ``UNDECIDED`` for each cell whose last section point is nearest to this
-    phase of an orbit.
-    """
+    """Return for each cell near an orbit point whether it has reached the orbit: certain, approaching or undecided."""
     code = np.zeros(len(section), np.int8)
     last = section.shape[1] - 1 - phase
     if not orbit.is_stable or last < 2 * orbit.period:
