@@ -70,8 +70,8 @@ class Crossing:
         return f"{self.of} = {self.value:g} going {self.direction}"
 
     def applied(self, parameters: np.ndarray, system: System) -> tuple[System, np.ndarray, np.ndarray]:
-        """Return the system with this Poincare section, its packed parameters with the level added, and the frequency
-        to integrate with.
+        """Return the system with this Poincare section, its parameters with the level appended, and the frequency to
+        pass to the engine.
 
         Parameters
         ----------

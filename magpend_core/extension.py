@@ -85,7 +85,7 @@ def more_sections(
 def orbit_periods(
     sections: np.ndarray, *, closure_tolerance: float, max_orbit_period: int, system: System
 ) -> np.ndarray:
-    """Return for each trajectory the period of the orbit on which its sections close, 0 if none, by the rule of
+    """Return the orbit period that each trajectory's section points show, or 0 where they show none, by the rule of
     `run_branches`.
 
     Parameters
@@ -113,7 +113,7 @@ def orbit_periods(
 
 
 def judge(rings: Any, last: int, settings: Settings, found: Any) -> None:
-    """Write to `found`, for each trajectory, the period of the orbit on which its last sections close, or 0."""
+    """Write to `found` the orbit period that each trajectory's last section points show, or 0 where they show none."""
     for i in range(len(rings)):
         found[i] = closed_period(rings[i], last, settings)
 

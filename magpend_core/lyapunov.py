@@ -130,7 +130,9 @@ def _orthonormalise(state: Any, memory: Any, settings: Any) -> None:
 
 
 def _average(section: Any, turns: Any, i_period: int, memory: Any, record: Any, measures: Any, settings: Any) -> int:
-    """Add the growth rates of a period to its block (a row of the record), and weighted to the measures."""
+    """Add the growth rates of a drive period to the sums of its block of periods, and to the weighted sums over all
+    periods.
+    """
     n_vectors = N_TANGENTS // N_BASE
     i = i_period - settings.n_transient
     n_periods = settings.n_blocks * settings.periods_per_block
@@ -288,7 +290,7 @@ def lyapunov_exponents(
 
 
 def _parts(n_cells: int, per_cell: int, n_lanes: int) -> list[slice]:
-    """Split trajectories into slices of limited size that are integrated one after the other."""
+    """Return slices that split many trajectories into parts of limited memory, to be integrated one after the other."""
     most = max(n_lanes, MOST_NUMBERS // per_cell // n_lanes * n_lanes)
     return [slice(i, i + most) for i in range(0, max(n_cells, 1), most)]
 

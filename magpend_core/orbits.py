@@ -330,7 +330,8 @@ def polish_orbits(
 def _take(
     found: PeriodicOrbits, rows: np.ndarray, ends: Returns, tolerance: float, least_period: bool, system: System
 ) -> np.ndarray:
-    """Store the residuals of some rows, and those orbits that have converged; return which rows need more iterations.
+    """Store the residuals of some guesses and the orbits that have converged; return which guesses need more
+    iterations.
 
     A row that closes after a divisor of its period gets this period, and -1 iterations.
     """

@@ -71,7 +71,9 @@ def _desk_for(system: System, n_out: int) -> _Desk:
 
 
 def _evaluate(desk: _Desk, t: Any, states: Any, frequency: float, p: Any, out: Any) -> None:
-    """Fill `out` (n, n_out) with the values of the bound function at times `t` (n,) and `states` (n, N)."""
+    """Fill `out` (n, n_out) with the rates, Jacobian or quantities at times `t` (n,) and `states` (n, N); which of them
+    is fixed at compilation.
+    """
     c, rows, time, y, values, edge_table = desk
     constants(frequency, p, c)
     for i in range(N_OWN):
@@ -258,7 +260,7 @@ def rates(t: Any, state: Any, parameters: Parameters, frequency_hz: float) -> np
 
 
 def drive_level(t: Any, parameters: Parameters, frequency_hz: float) -> np.ndarray:
-    """Return the forcing at given times, in the model's unit.
+    """Return the model's forcing at given times, in its unit.
 
     Parameters
     ----------

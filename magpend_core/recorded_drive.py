@@ -150,14 +150,16 @@ def _check_marks(marks: np.ndarray, total: int, n_intervals: int, start_s: float
 
 
 def _chunks(first_kept: int, last: int, most: int) -> Iterator[tuple[int, int]]:
-    """Yield ranges of drive intervals of limited length; one range ends with the first section that is stored."""
+    """Split a drive's intervals into ranges of limited length; one range ends at the first section point to be
+    stored.
+    """
     for begin, end in ((0, first_kept), (first_kept, last)):
         for first in range(begin, end, most):
             yield first, min(first + most, end)
 
 
 def _points(system: System, drive: Drive, packed: np.ndarray, part: slice) -> tuple[np.ndarray, np.ndarray]:
-    """Return parameters and frequency in each drive interval, for each trajectory."""
+    """Return the parameter vector and frequency that each trajectory has in each interval of the drive."""
     durations = drive.durations_s[part]
     shape = (len(packed), len(durations))
     points = np.repeat(packed[:, None], len(durations), axis=1)

@@ -250,8 +250,8 @@ def _offsets(parts: Sequence[np.ndarray]) -> np.ndarray:
 def _drive_table(
     system: System, grids: list[np.ndarray], drives: Sequence[Drive | None] | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return arrays of the drives for the engine: durations, values, first intervals, changed parameters, and
-    starts.
+    """Return the drives as arrays for the engine: durations, values, each drive's first interval, the parameters
+    changed, and start times.
     """
     given = [None] * len(grids) if drives is None else list(drives)
     if len(given) != len(grids):
@@ -278,7 +278,7 @@ def _drive_table(
 
 
 def _check_drive(number: int, drive: Drive, names: tuple[str, ...], end_s: float) -> np.ndarray:
-    """Return the interval durations of a drive, after checking that it covers its piece of the recording."""
+    """Return the durations of a drive's intervals, after checking that the drive lasts until the last sample."""
     durations = check_array(f"drives[{number}].durations_s", drive.durations_s, 1)
     if drive.names != names or (names and np.shape(drive.values) != (len(durations), len(names))):
         raise ValueError(

@@ -179,7 +179,9 @@ def _declaration(system: System, linearised: bool) -> Iterator[str]:
 
 
 def _extremes(packed: np.ndarray, frequency: np.ndarray, checked: _Checked | None) -> list[int]:
-    """Return the indices of the cells at which a parameter is least or greatest, beyond the ranges checked before."""
+    """Return the indices of the parameter sets in which a parameter or the frequency is extreme and outside the ranges
+    already checked.
+    """
     cells = {0} if checked is None else set()
     for i, column in enumerate((*packed.T, frequency)):
         for cell in (int(column.argmin()), int(column.argmax())):
@@ -207,8 +209,8 @@ class _Functions:
             return _NOT_RUN
 
     def numbers(self, name: str, wanted: int, what: str, *arguments: Any) -> tuple[np.ndarray, ...] | None:
-        """Call a function that must return a tuple of `wanted` numbers; return None, and report a problem, if it does
-        not.
+        """Call a function of the system that must return a tuple of `wanted` numbers; if it does not, report a problem
+        and return None.
         """
         values = self.call(name, *arguments)
         if values is _NOT_RUN:
@@ -227,8 +229,8 @@ class _Functions:
         return tuple(out)
 
     def has_values(self, frequency: np.float64, p: np.ndarray) -> bool:
-        """Return whether the constants are finite at one frequency and parameter vector; True for a system without
-        poles.
+        """Return whether the constants are finite at one frequency and parameter vector; always True if the system
+        declares no poles.
         """
         return not self.system.has_poles or bool(np.isfinite(self.constants(frequency, p)).all())
 
@@ -295,8 +297,8 @@ class _Motion:
         self.u: Any = 0.0
 
     def _constants_at(self, times: np.ndarray) -> tuple[Any, ...]:
-        """Return the constants of the system, then the modes of its switches, contacts and segments at the given
-        times.
+        """Return the arguments of a check at given times: the system's constants, then the modes of its switches,
+        contacts and time segments.
         """
         return (*self.own, *event_checks.modes_at(self.system, times, self.edges))
 
@@ -361,9 +363,7 @@ class _Motion:
             )
 
     def _check_period(self) -> None:
-        """Check that the rates are equal at the start and the end of a drive period, for a forcing that is the time
-        itself.
-        """
+        """Check that the rates are equal at both ends of a drive period, with time itself passed as the forcing."""
         ends = []
         for time in (0.0, self.period):
             self.u = np.full(N_SAMPLES, time)
@@ -403,7 +403,9 @@ class _Motion:
                 )
 
     def _check_jacobian(self, rates: np.ndarray) -> None:
-        """Compare the Jacobian with finite differences of the rates, whose error is bounded by two step sizes."""
+        """Compare the Jacobian with finite differences of the rates; two step sizes give a bound of the differences'
+        own error.
+        """
         n, names = self.system.n_states, self.system.state_names
         what = "the derivatives of each rate by each state, row by row"
         if self.system.jacobian_entries is not None:

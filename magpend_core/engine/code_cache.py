@@ -77,8 +77,8 @@ def keep(dispatcher: Any, home: Path, folder: Path) -> Any:
 
 @cache
 def _made(home: Path, folder: Path) -> str:
-    """Create a folder for its owner alone, and its parents up to `home`; return why it cannot be used, or an empty
-    text.
+    """Create a cache folder that only its owner can write to; return why it cannot be used, or an empty text if it
+    can.
     """
     try:
         home.parent.mkdir(parents=True, exist_ok=True)

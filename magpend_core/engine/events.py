@@ -105,7 +105,9 @@ def _middle_of(n: int) -> Callable[..., Any]:
 
 
 def event_bindings(system: System) -> dict[str, Any]:
-    """Return the values of the free names in the templates of events, for a system."""
+    """Return the values, for a given system, of the global names that the function templates of this module leave
+    open.
+    """
     of, direction = system.section or (0, 0)
     directions = [0.0] * system.n_switches + [float(d) for d in system.impact_directions]
     starts = [1.0] * system.n_switches + [-float(d) for d in system.impact_directions]
@@ -145,7 +147,7 @@ def cubic_dip(a: Any, da: Any, b: Any, db: Any) -> Any:
 
 
 def may_dip(a: Any, da: Any, b: Any, db: Any) -> Any:
-    """Return 1 where the cubic of `cubic_dip` may fall below 0 between its ends, judged by its control polygon; else
+    """Return 1 where a quick bound on a cubic (see `cubic_dip`) does not exclude a value below 0 between its ends, else
     0.
     """
     least = minimum(multiply_add(1.0 / 3.0, da, a), multiply_add(-1.0 / 3.0, db, b))
@@ -174,8 +176,8 @@ def cubic_root(a: Any, da: Any, b: Any, db: Any, right: Any) -> Any:
 
 
 def margin(w: Any, base: int, k: int, near: Any, far: Any) -> Any:
-    """Return values and rates of event function `k` at both ends of a step, signed so that its present side is
-    positive.
+    """Return value and rate of event function `k` at both ends of a step, with the sign chosen so that it is positive
+    before the event.
 
     `near` and `far` are pairs of value and rate. A value at the near end that is beyond zero, by rounding
     or after an event, counts as zero.
@@ -225,8 +227,8 @@ def hides_events(w: Any, base: int) -> Any:
 
 
 def judge_events(w: Any, base: int, failed: Any) -> Any:
-    """Return for each lane whether a step is accepted, taken back or ends on an event; `failed` is 1 where error
-    control rejects it.
+    """Return for each SIMD lane whether a step is accepted, taken back or ends on an event; `failed` is 1 where its
+    error is too large.
 
     ACCEPT, TAKE_BACK or LANDED; in the last case `fired` tells on which.
     """

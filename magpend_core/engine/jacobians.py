@@ -15,8 +15,8 @@ def places_of(system: System) -> Sequence[int]:
 
 
 def rows_of_entries(system: System) -> list[dict[int, int]]:
-    """Return for each row of the Jacobian the index in the tuple of `system.jacobian` of each returned entry, by
-    column.
+    """Return for each row of the Jacobian a dict: from the column of an entry to its index in the tuple of
+    `system.jacobian`.
     """
     n = system.n_states
     rows: list[dict[int, int]] = [{} for _ in range(n)]

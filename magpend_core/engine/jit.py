@@ -201,7 +201,7 @@ def _part(template: Callable[..., Any], used: Mapping[str, Any], dissolves: bool
 
 
 def _without_size(name: str, value: Any, names: set[str], sizes: dict[str, Any]) -> Any:
-    """Return a placeholder for a system size (such as the number of states) and store the size; return other values
+    """Replace a system size, such as the number of states, by a placeholder and note it in `sizes`; return other values
     unchanged.
     """
     if type(value) is int and value > 0 and name in _SIZES:

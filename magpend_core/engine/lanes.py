@@ -160,7 +160,8 @@ def rows_of(system: System, n_watched: int = 0) -> Rows:
 
 
 def step_ratio(room: Any) -> Any:
-    """Return the largest step near a layer or forcing edge, as a multiple of the distance from its complex singularity.
+    """Return the largest step near a layer or forcing edge, relative to the distance from the singularity in the
+    complex plane.
 
     The right-hand side near a layer behaves like (J/pi) atan(t/d), whose derivatives at a distance R
     from the poles at +-i d grow like J d n!/R^(n+1): a step h = c R leaves an error in proportion to
@@ -456,8 +457,8 @@ def begin_period(w: Any, base: int, lane: int, edge_table: Any) -> int:
 
 
 def set_target(w: Any, base: int, lane: int, time: float, edge_table: Any, edge: int) -> None:
-    """Let a lane's present time segment end at `time`, with the width of the forcing edge number `edge` (none for
-    n_edges).
+    """Let a SIMD lane's time segment end at `time`, at the forcing edge number `edge`; ``edge = n_edges`` stands for no
+    edge.
     """
     w[base + ROWS.target + lane] = time
     w[base + ROWS.target_width + lane] = edge_table[1, edge] if edge < NE else np.inf
@@ -467,7 +468,9 @@ def set_target(w: Any, base: int, lane: int, time: float, edge_table: Any, edge:
 
 
 def begin_segment(w: Any, base: int, lane: int, edge_table: Any, edge: int) -> int:
-    """Let a lane integrate from its last target time to the forcing edge number `edge`, or to the period's end."""
+    """Let a SIMD lane integrate on, from the end of its last time segment to forcing edge number `edge` or to the end
+    of the period.
+    """
     w[base + ROWS.start + lane] = w[base + ROWS.target + lane]
     w[base + ROWS.start_width + lane] = w[base + ROWS.target_width + lane]
     w[base + ROWS.start_ratio + lane] = w[base + ROWS.target_ratio + lane]
@@ -525,7 +528,7 @@ def move_lane(w: Any, source: int, target: int) -> None:
 
 
 def renew_state(w: Any, base: int, lane: int, state: Any, memory: Any, settings: Any) -> None:
-    """Let the observer's function `renew` rewrite the state in a SIMD lane."""
+    """Let the observer's function `renew` change the state of the trajectory in a SIMD lane."""
     for i in range(N):
         state[i] = w[base + ROWS.state + i * WIDTH + lane]
     renew(state, memory, settings)
@@ -656,7 +659,9 @@ def end_branch(cells: Cells, work: Work, lane: int, status: int) -> None:
 
 
 def serve(cells: Cells, work: Work, lane: int, settings: Any, section: Any, scratch: Any) -> bool:
-    """Handle a SIMD lane's event (end of a segment or period, or a failure); return True when its branch has ended."""
+    """Handle what ended a SIMD lane's integration (end of a segment or period, or a failure); return whether its branch
+    has ended.
+    """
     w, base, column = work.lanes, (lane // WIDTH) * ROWS.size, lane % WIDTH
     event = w[base + ROWS.event + column]
     w[base + ROWS.event + column] = NOTHING
@@ -720,7 +725,9 @@ def serve(cells: Cells, work: Work, lane: int, settings: Any, section: Any, scra
 
 
 def keep_time(w: Any, base: int, lane: int, memory: Any, out: Any) -> None:
-    """Write the time since the last section to the observer's memory and to the next output row."""
+    """Store the time since the previous section point in the observer's memory and, while room is left, in the output
+    array.
+    """
     time = w[base + ROWS.time + lane]
     memory[len(memory) - 1] = time
     if n_kept(memory) < len(out):
@@ -754,7 +761,9 @@ def work_for(system: System, observer: Observer, cells: Cells, n_lanes: int, set
 def advance(
     cells: Cells, work: Work, active: int, rtol: float, atol: float, max_attempts: float, settings: Any
 ) -> None:
-    """Integrate all branches, `active` at a time in SIMD lanes, and fill the output arrays of `cells`."""
+    """Integrate all branches in SIMD lanes, at most `active` branches at the same time, and fill the output arrays of
+    `cells`.
+    """
     n_branches = cells.frequency.shape[0]
     # a field of a tuple is counted by an atomic operation at every use: too slow per lane
     rows, events, scratch, section = work.lanes, work.events, work.scratch, work.section
@@ -854,7 +863,9 @@ def _layers_at(system: System) -> Callable[..., Any]:
 
 
 def engine_bindings(system: System, observer: Observer, watched: tuple[int, ...] = ()) -> dict[str, Any]:
-    """Return the values of the free names in the templates of this module, for a system and an observer."""
+    """Return the values, for a given system and observer, of the global names that the function templates of this
+    module leave open.
+    """
     bindings: dict[str, Any] = {
         "ROWS": rows_of(system, len(watched)),
         "WATCHES": len(watched) > 0,

@@ -200,8 +200,8 @@ def sizes_as_loads(module: ir.Module) -> None:
 
 
 def _arrays_by_name(text: str) -> str:
-    """Replace placeholder arrays in LLVM text by named constants without a value, as `sizes_as_loads` does with
-    numbers.
+    """Replace the arrays that serve as placeholders in LLVM text by references to named constants, defined when the
+    code is linked.
     """
     names = {number: name for name, number in _NAMES.items()}
     used: set[str] = set()

@@ -73,7 +73,9 @@ def _reset_along(system: System, n: int) -> Callable[..., Any]:
 
 
 def mode_bindings(system: System) -> dict[str, Any]:
-    """Return the values of the free names in these function templates, for a system."""
+    """Return the values, for a given system, of the global names that the function templates of this module leave
+    open.
+    """
     base = system.tangents_of or system
     has_divergence = system.tangents_of is not None and system.state_names[-1] == DIVERGENCE
     n_vectors = (system.n_states - has_divergence) // base.n_states - 1
@@ -105,7 +107,7 @@ def mode_bindings(system: System) -> dict[str, Any]:
 
 
 def lane_pairs(w: Any, base: int, lane: int, dy: Any) -> Any:
-    """Return the value and time derivative of each event function in a SIMD lane, for any time derivatives `dy` of its
+    """Return value and time derivative of each event function in a SIMD lane; `dy` are the time derivatives of the
     states.
     """
     y = lane_states(w, base + ROWS.state + lane)
@@ -122,8 +124,8 @@ def lane_rates(w: Any, base: int, lane: int) -> Any:
 
 
 def seat_switches(w: Any, base: int, lane: int, given: bool) -> None:
-    """Set the switch modes from the side on which the state lies; on a surface to 1, or with `given` to the present
-    mode.
+    """Set each switch mode by the side of the surface on which the state lies; on the surface itself it becomes 1, or
+    stays if `given`.
     """
     for k in range(N_SWITCHES):
         mode = base + ROWS.constants + (N_OWN + k) * WIDTH + lane
@@ -319,15 +321,17 @@ def turn_switch(w: Any, base: int, lane: int, k: int) -> None:
 
 
 def vector_row(base: int, lane: int, j: int) -> int:
-    """Return the first row of vector `j` among those mapped at an impact: tangent vectors first, then unit vectors."""
+    """Return the work array's first row of vector `j` of those mapped at an impact: tangent vectors first, then unit
+    vectors.
+    """
     if j < N_VECTORS:
         return base + ROWS.state + N_BASE * (1 + j) * WIDTH + lane
     return base + ROWS.slopes + N_BASE * (j - N_VECTORS) * WIDTH + lane
 
 
 def map_vector(w: Any, base: int, lane: int, k: int, at: int, shift: float, t: float, y: Any) -> None:
-    """Replace the vector stored from row `at` by the derivative of map `k` along it, with the time changing by
-    `shift`.
+    """Replace the vector stored from row `at` by its image under the linearised map `k` (an impact, or coming to rest);
+    `shift` is its time shift.
     """
     c, size = lane_constants(w, base + ROWS.constants + lane), 0.0
     for i in range(N_BASE):
@@ -341,7 +345,7 @@ def map_vector(w: Any, base: int, lane: int, k: int, at: int, shift: float, t: f
 
 
 def jump_vectors(w: Any, base: int, lane: int, k: int) -> None:
-    """Map all vectors through impact `k`, and store for each the shift of the impact time in `trial`."""
+    """Map all tangent and unit vectors through impact `k`, and store how much each shifts the time of the impact."""
     t, y = w[base + ROWS.time + lane], lane_base(w, base + ROWS.state + lane)
     before = lane_rates(w, base, lane)
     rate = lane_pairs(w, base, lane, before)[2 * (N_SWITCHES + k) + 1]
@@ -356,14 +360,18 @@ def jump_vectors(w: Any, base: int, lane: int, k: int) -> None:
 
 
 def set_units(w: Any, base: int, lane: int) -> None:
-    """Write unit vectors into the rows after the tangent vectors (see `vector_row`), over slopes no longer needed."""
+    """Write unit vectors to the work array; mapped at an impact together with the tangent vectors, they give the change
+    of volume.
+    """
     for j in range(N_VECTORS, N_THROUGH):
         for i in range(N_BASE):
             w[vector_row(base, lane, j) + i * WIDTH] = 1.0 if i == j - N_VECTORS else 0.0
 
 
 def log_volume(w: Any, at: int) -> float:
-    """Return log |det| of the N_BASE vectors stored from row `at` on; overwrites the vectors."""
+    """Return log |det| of the matrix whose vectors are stored in the work array from row `at` on; the matrix is
+    overwritten.
+    """
     total, n = 0.0, N_BASE
     for j in range(n):
         best = j

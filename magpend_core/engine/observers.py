@@ -178,7 +178,9 @@ def closed_period(ring: Any, last: int, settings: Settings) -> int:
 
 
 def _largest_lag(ring: Any, first: int, last: int, p: int, settings: Settings) -> float:
-    """Return the largest distance between section points `i` and ``i - p``, for first < i <= last."""
+    """Return the largest distance of a section point from that `p` periods before, for the points after number `first`
+    up to `last`.
+    """
     largest = 0.0
     for i in range(first + 1, last + 1):
         largest = max(largest, _lag_distance(ring, i, i - p, settings.window))

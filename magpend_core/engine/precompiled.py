@@ -371,4 +371,6 @@ class PartCache:
 
 
 class _Key:
-    """Entry point of cached code that Python cannot call; numba uses it only as a key to find the code."""
+    """Stand-in for the entry point from Python that cached code lacks; numba needs an object as key to find the
+    code.
+    """

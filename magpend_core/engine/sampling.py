@@ -47,7 +47,9 @@ COINCIDENT_S = 1e-9
 
 
 class Samples(NamedTuple):
-    """Input and output arrays of `follow_all`; the recording's pieces are concatenated."""
+    """Input and output arrays of `follow_all`; the time grids and drives of all recordings stand one after the
+    other.
+    """
 
     parameters: Any  # (trajectory, n_parameters)
     initial: Any  # (trajectory, n_states)
@@ -177,7 +179,9 @@ def write_due(samples: Samples, seats: Seats, lane: int, until: float) -> None:
 
 
 def go_on(samples: Samples, seats: Seats, lane: int, scratch: Any) -> int:
-    """Handle the step that a SIMD lane has attempted; return PENDING, or the status with which its trajectory ended."""
+    """Handle the step that a SIMD lane has attempted; return the trajectory's final status, or PENDING while it goes
+    on.
+    """
     base, column = (lane // WIDTH) * ROWS.size, lane % WIDTH
     w = seats.lanes
     event = w[base + ROWS.event + column]
@@ -244,7 +248,7 @@ def copy_seat(seats: Seats, source: int, target: int) -> None:
 
 
 def seats_for(system: System, samples: Samples, n_lanes: int) -> Seats:
-    """Allocate the arrays for a number of SIMD lanes."""
+    """Allocate the arrays of the sampling loop for a number of SIMD lanes."""
     n_groups = -(-min(n_lanes, len(samples.piece)) // WIDTH)
     size, n = n_groups * WIDTH, system.n_states
     return Seats(

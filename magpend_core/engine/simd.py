@@ -217,19 +217,19 @@ def maximum(a: Any, b: Any) -> Any:
 
 
 def times_power_of_two(x: Any, shifted: Any) -> Any:
-    """Multiply `x` by 2**k, with k in the low bits of `shifted` (see `vecmath`)."""
+    """Multiply `x` by 2**k, with the integer k held in the low bits of the float `shifted` (see `vecmath`)."""
     low = np.asarray(shifted, np.float64).view(np.int64) << np.int64(52)
     return (np.asarray(x, np.float64).view(np.int64) + low).view(np.float64)[()]
 
 
 def negate_if_bit(x: Any, shifted: Any, bit: int) -> Any:
-    """Negate `x` where bit number `bit` of the integer in the low bits of `shifted` is set."""
+    """Negate `x` where bit number `bit` of the integer held in the low bits of the float `shifted` is set."""
     flip = (np.asarray(shifted, np.float64).view(np.int64) >> np.int64(bit)) & np.int64(1)
     return np.where(flip == 1, -x, x)[()]
 
 
 def where_odd(shifted: Any, odd: Any, even: Any) -> Any:
-    """Return `odd` where the integer in the low bits of `shifted` is odd, else `even`."""
+    """Return `odd` where the integer held in the low bits of the float `shifted` is odd, else `even`."""
     low = np.asarray(shifted, np.float64).view(np.int64) & np.int64(1)
     return np.where(low == 1, odd, even)[()]
 

@@ -333,8 +333,8 @@ class System:
 
     @property
     def known(self) -> int:
-        """Number of states that the system's functions take; tangent vectors that the engine itself carries are not
-        counted.
+        """Number of states that the system's own functions take, without tangent vectors that the engine integrates by
+        itself.
         """
         return self.n_states if self.n_known is None else self.n_known
 

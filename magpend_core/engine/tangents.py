@@ -40,8 +40,8 @@ def trace_of(rows: list[dict[int, int]], name: str) -> str:
 
 
 def n_entries(system: System) -> int:
-    """Return how many numbers each stage of a step stores for the Jacobian; 0 if the engine carries no tangent
-    vectors.
+    """Return how many numbers of the Jacobian are stored at each Runge-Kutta stage; 0 if the engine integrates no
+    tangent vectors.
     """
     if system.known == system.n_states or system.tangents_of is None:
         return 0
@@ -54,7 +54,9 @@ def _has_trace(system: System) -> bool:
 
 
 def tangent_bindings(system: System) -> dict[str, Any]:
-    """Return the values of the free names in these function templates, for a system."""
+    """Return the values, for a given system, of the global names that the function templates of this module leave
+    open.
+    """
     known, base = system.known, system.tangents_of
     names = {"N_KNOWN": known, "N_ENTRIES": n_entries(system), "CARRIES": n_entries(system) > 0}
     if base is None or not names["CARRIES"]:
@@ -76,8 +78,8 @@ def tangent_bindings(system: System) -> dict[str, Any]:
 
 
 def _tangent_entries(base: System, order: list[int], has_trace: bool) -> Callable[..., Any]:
-    """Return a function that evaluates the entries of the Jacobian, in the order in which they are summed, and its
-    trace.
+    """Return a function that computes the Jacobian's entries, in the order in which products with vectors sum them, and
+    the trace.
     """
     parts = [f"entries[{k}]" for k in order]
     if has_trace:

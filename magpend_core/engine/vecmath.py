@@ -150,8 +150,8 @@ def exp2_falling(x: Any) -> Any:
 
 @inline
 def _quarter_turns(x: Any) -> Any:
-    """Compute sine and cosine of the remainder of `x` after whole quarter turns, and the (shifted) number of these
-    turns.
+    """Return sine and cosine of what is left of `x` after whole quarter turns, and the number of these turns in the low
+    bits of a float.
     """
     shifted = x * TWO_OVER_PI + _ROUND
     n = shifted - _ROUND

@@ -90,7 +90,7 @@ def load_model(reference: str | Mapping[str, Any] | Model = DEFAULT) -> Model:
 
 
 def _of_table(table: Mapping[str, Any]) -> Model:
-    """Return the model that a table defines; tables that differ only in their writing give the same object."""
+    """Return the model that a table defines; tables with the same meaning give the same object."""
     try:
         # not sorted: the order of the states is the model's
         text = json.dumps(table)
@@ -171,7 +171,7 @@ def _reduced(parameters: Parameters) -> tuple[Any, ...]:
 def _again(
     reference: str | Mapping[str, Any], values: dict[str, float], crossing: Crossing | None = None
 ) -> Parameters:
-    """Unpickle parameters, given the model's reference, the values, and the Poincare section if it has one."""
+    """Restore pickled parameters from the model's reference, the values, and the Poincare section if there is one."""
     found = load_model(reference)
     return Parameters(found if crossing is None else sectioned(found, crossing), values)
 

@@ -89,7 +89,7 @@ def _labels(spec: Spec) -> list[Coordinate]:
 
 
 def _values(labels: Iterable[Any]) -> np.ndarray:
-    """Return labels as an array of texts or of whole numbers."""
+    """Convert coordinate labels to a numpy array: of objects for texts, of int32 for numbers."""
     values = list(labels)
     return np.array(values, dtype=object if isinstance(values[0], str) else np.int32)
 

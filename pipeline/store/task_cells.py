@@ -56,8 +56,8 @@ def read_cells(
 
 
 def read_block(run: Run, index: int, names: Iterable[str]) -> dict[str, np.ndarray]:
-    """Read variables of a committed task of an opened run; their shape is that of the task's block, then their own
-    dims.
+    """Read variables of one committed task of an open run; the dims of the task's block of cells come first, then those
+    of the variable.
 
     Raises
     ------

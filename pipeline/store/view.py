@@ -91,7 +91,7 @@ class CommittedStore(WrapperStore[Store]):
         return type(self)(store, self._files, self._shown, self._checks)
 
     async def get(self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None) -> Buffer | None:
-        """Return the content of a key for zarr; None if it is not committed.
+        """Return the content of a file of the cube for zarr; None if readers must not see the file.
 
         Raises
         ------
@@ -130,7 +130,9 @@ class CommittedStore(WrapperStore[Store]):
         return content
 
     def _read(self, key: str, entry: Mapping[str, Any]) -> bytes:
-        """Read a local file and compare it with its recorded size and sha256, unless that is turned off."""
+        """Read a local file and compare it with its recorded size and sha256, unless MAGPEND_VERIFY=0 turns this
+        off.
+        """
         try:
             content: bytes | None = self._files.read(f"{CUBE}/{key}")
         except FileNotFoundError:
@@ -169,7 +171,7 @@ class CommittedStore(WrapperStore[Store]):
     async def get_partial_values(
         self, prototype: BufferPrototype, key_ranges: Iterable[tuple[str, ByteRequest | None]]
     ) -> list[Buffer | None]:
-        """Return parts (byte ranges) of the contents of keys, for zarr."""
+        """Return the requested byte ranges of several files of the cube, for zarr."""
         return [await self.get(key, prototype, byte_range) for key, byte_range in key_ranges]
 
     async def _get_many(

@@ -77,7 +77,9 @@ def _forcing(t: Any, c: Any) -> Any:
 
 @inline
 def _dry(v: Any, c: Any) -> Any:
-    """Compute the factor of the dry friction at the relative velocity `v`, and its derivative by `v`."""
+    """Compute the dry friction at relative velocity `v`, as a multiple of its amplitude, and the derivative of this
+    factor by `v`.
+    """
     fading = c[C.drop] * exp2_falling(-(c[C.c0] * absolute(v)))
     size = fading + c[C.floor]
     u = c[C.eps] * v
@@ -90,7 +92,9 @@ def _dry(v: Any, c: Any) -> Any:
 
 @inline
 def _air(c12: Any, w1: Any, w2: Any, c: Any) -> Any:
-    """Sum over the Gauss points of link 2: drag, its moment, and twice |v| with weights 1, s, s**2."""
+    """Return the air drag force on link 2 and its moment by Gauss quadrature, with three sums from which their
+    derivatives follow.
+    """
     across = c[C.l1] * (w1 * c12)
     near, middle, far = c[C.near], c[C.middle], c[C.far]
     v1 = multiply_add(near, w2, across)

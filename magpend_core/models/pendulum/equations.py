@@ -158,17 +158,15 @@ def link_constants(frequency: Any, p: Any) -> Any:
 
 
 def square_wave_constants(p: Any) -> Any:
-    """Return the constants of a square-wave drive: phase, offset (Eq. 13, 14, corrected), amplitude over pi/2,
-    steepness. A template.
+    """Return the constants of a square-wave drive: phase and offset (Eq. 13, 14, corrected), amplitude over pi/2, and
+    steepness.
     """
     phase = (math.pi - TWO_PI * p[AT.duty_cycle]) / 2.0
     return phase, -sin(phase), TWO_OVER_PI * p[AT.q], p[AT.eps_drive]
 
 
 def sine_constants(p: Any) -> Any:
-    """Return the constants of a sine drive: phase 0, offset 0, amplitude q, and steepness 1, which is not used. A
-    template.
-    """
+    """Return a sine drive's constants: phase 0, offset 0, its amplitude, and a steepness of 1, which is not used."""
     return 0.0, 0.0, p[AT.q], 1.0
 
 

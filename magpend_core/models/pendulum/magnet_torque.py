@@ -38,7 +38,9 @@ _VACUUM_PERMEABILITY = 1.25663706212e-6  # N/A2, CODATA 2018
 
 
 class Line(NamedTuple):
-    """Line ``psi1 = slope*psi_rel + offset`` on which the torque changes sign, midway between the peaks."""
+    """Straight line ``psi1 = slope*psi_rel + offset`` on which the magnets' torque changes sign, midway between its
+    peaks.
+    """
 
     slope: float
     offset: float  # rad

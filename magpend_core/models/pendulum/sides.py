@@ -101,7 +101,8 @@ def slowest_hz(parameters: Mapping[str, Any]) -> np.ndarray:
 def classify(
     section: np.ndarray, turns: np.ndarray, frequency_hz: np.ndarray, parameters: Mapping[str, Any]
 ) -> np.ndarray:
-    """Label motions by the side of the fixed magnet on which they stay (rule: see the module's text).
+    """Label motions by the side of the fixed magnet on which they stay, from their stored section points and full
+    turns.
 
     Parameters
     ----------

@@ -33,7 +33,7 @@ from magpend_core.models.pendulum.models import DIPOLE, DIPOLE_SINE, FITTED, FIT
 
 
 def _fitted_magnet(p: Any, values: Any, out: Any) -> None:
-    """Fill `out` with `FittedConstants`. A template."""
+    """Fill `out` with the constants of the fitted magnet torque, `FittedConstants`."""
     alpha1, alpha2, eps_mag = p[AT.alpha1], p[AT.alpha2], p[AT.eps_mag]
     p1, p2, r1, r2, l1, l2, h = p[AT.p1], p[AT.p2], p[AT.r1], p[AT.r2], p[AT.l1], p[AT.l2], p[AT.h]
     jump = (abs(alpha1) + abs(alpha2)) * values.compliance1
@@ -70,7 +70,7 @@ def _fitted_magnet(p: Any, values: Any, out: Any) -> None:
 
 
 def _dipole_magnet(p: Any, values: Any, out: Any) -> None:
-    """Fill `out` with `DipoleConstants`. A template."""
+    """Fill `out` with the constants of the point dipoles, `DipoleConstants`."""
     out[N_LINK] = VACUUM_PERMEABILITY * p[AT.pole1] * p[AT.pole2] / (4.0 * math.pi)
     out[N_LINK + 1] = p[AT.l1]
     out[N_LINK + 2] = p[AT.l2]
@@ -178,8 +178,8 @@ def _jacobian(y: Any, u: Any, c: Any) -> Any:
 
 
 def _square_wave_edges(frequency: Any, p: Any, times: Any, half_widths: Any, jumps: Any) -> None:
-    """Fill in the rising edge at 0 and the falling edge at d/f; sin(omega t + phase) + a has slope omega cos(phase)
-    there.
+    """Fill in times, half-widths and jumps of a square wave's two edges: rising at the period's start, falling after
+    the fraction `duty_cycle`.
     """
     k = all_link_constants(frequency, p)
     width = 1.0 / (k.eps_drive * k.omega * sincos(k.phase)[1])

@@ -99,9 +99,7 @@ def with_contacts(
 
 
 def along(graph: Graph, nodes: tuple[Node, ...]) -> list[Node]:
-    """Return the time derivatives of expressions of time and state; the states' time derivatives are symbols in
-    them.
-    """
+    """Return the time derivatives of expressions along a motion; symbols stand for the rates of the states."""
     states = {n: graph.leaf("rate", int(n.value)) for n in in_order(nodes) if n.op == "state"}
     return derivatives(graph, nodes, {**states, graph.leaf("time"): graph.one})
 
@@ -122,8 +120,8 @@ def _contact(graph: Graph, free: tuple[Node, ...], jump: Jump, place: str) -> _C
 
 
 def _pushed(graph: Graph, states: Sequence[Node], slopes: Sequence[Node]) -> tuple[Node, ...] | None:
-    """Return the direction in which an impact changes the states: the derivative of its map by a state that it
-    changes.
+    """Return the direction in which an impact changes the states, from the derivative of its map; None if none is
+    found.
     """
     own = [graph.leaf("state", i) for i in range(len(states))]
     changes = tuple(graph.sub(new, old) for new, old in zip(states, own, strict=True))
@@ -136,8 +134,8 @@ def _pushed(graph: Graph, states: Sequence[Node], slopes: Sequence[Node]) -> tup
 
 
 def _resting(graph: Graph, free: tuple[Node, ...], jump: Jump, contact: _Contact) -> tuple[Node, ...]:
-    """Return the states projected to rest on the surface of an impact, moved along the directions in which impacts move
-    them.
+    """Return expressions for the state moved onto the surface of an impact and brought to rest there, as an impact
+    would move it.
     """
     own = [graph.leaf("state", i) for i in range(len(free))]
     moved = derivatives(graph, free, dict(zip(own, contact.direction, strict=True)))
@@ -149,7 +147,9 @@ def _resting(graph: Graph, free: tuple[Node, ...], jump: Jump, contact: _Contact
 
 
 def _of_motion(graph: Graph, node: Node, free: tuple[Node, ...]) -> Node:
-    """Replace the time derivatives of the states in an expression by the equations of motion without contact."""
+    """Return an expression in which the equations of motion without contact replace the symbols for the states'
+    rates.
+    """
     (found,) = substituted(graph, [node], {graph.leaf("rate", i): rate for i, rate in enumerate(free)})
     return found
 
@@ -160,10 +160,12 @@ def _slopes(graph: Graph, node: Node, n: int) -> list[Node]:
 
 
 def _change(graph: Graph, slopes: Sequence[Node], direction: Sequence[Node]) -> Node:
-    """Return the derivative of an expression along a direction of the states, from its derivatives by the states."""
+    """Return an expression's directional derivative, given its derivatives by the states and a direction of the
+    states.
+    """
     return graph.add(graph.zero, *(graph.mul(a, b) for a, b in zip(slopes, direction, strict=True)))
 
 
 def _at_rest(graph: Graph, mode: Node, yes: Node, no: Node) -> Node:
-    """Return an expression with the value `yes` while the contact mode says that the state rests, else `no`."""
+    """Return an expression that equals `yes` while the state rests on the surface of an impact, else `no`."""
     return graph.where_less(mode, graph.number(0.5), yes, no)

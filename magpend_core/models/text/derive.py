@@ -154,7 +154,7 @@ def derive(definition: Definition) -> Derived:
 
 
 def _breaks(graph: Graph, rates: tuple[Node, ...], presets: Sequence[Mapping[int, float]]) -> bool:
-    """Return whether the rates at a generic state differ between begin and end of a drive period."""
+    """Return whether the rates at one sample state differ between the start and the end of a drive period."""
     leaves = [n for n in in_order(rates) if n.op == "state"]
     states = {n.number: GENERIC[int(n.value) % len(GENERIC)] for n in leaves}
     time = graph.leaf("time").number
@@ -168,8 +168,8 @@ def _breaks(graph: Graph, rates: tuple[Node, ...], presets: Sequence[Mapping[int
 def _smoothed(
     graph: Graph, rates: tuple[Node, ...], scales: tuple[float, ...], values: Mapping[int, float]
 ) -> frozenset[int]:
-    """Return the numbers of corner nodes that lie in a narrow layer of the same argument, where steps are short
-    anyway.
+    """Return the node numbers of those corners (of ``abs``) that coincide with a narrow steep layer, where steps are
+    short anyway.
     """
     cores = set()
     for node in in_order(rates):
@@ -185,7 +185,7 @@ def _smoothed(
 
 
 def _is_layer(steep: Steep) -> bool:
-    """Return whether a steep place depends on the state, and not on a sign that changes with time alone."""
+    """Return whether a steep place of the equations depends on the state, and on no sign that only time changes."""
     return steep.value.kind == STATED and not any(n.op == "clock" for n in in_order([steep.value]))
 
 

@@ -60,9 +60,7 @@ def found_in(
 def _numbers(
     nodes: Sequence[Node], own: Definition, parameters: Mapping[str, float], frequency_hz: float, state: Sequence[float]
 ) -> list[float]:
-    """Compute the values of expressions at one state at time 0, with 1 for the side of each switch and for each
-    mode.
-    """
+    """Compute the values of expressions at one state and time 0, with all switches on their positive side."""
     given = {"parameter": [parameters[p.name] for p in own.parameters], "state": list(state)}
     leaves: dict[int, Any] = {}
     pending = list(nodes)

@@ -145,8 +145,8 @@ def _start_faults(definition: Definition, values: Mapping[str, Any]) -> list[Fau
 
 
 def _look(tree: Tree, place: str, known: Mapping[str, Any], rows: np.ndarray, found: list[Fault]) -> np.ndarray:
-    """Append a fault for each innermost part of an expression without a finite value; return where the expression has
-    none.
+    """Append a `Fault` for each innermost part of an expression without a finite value; return at which sample points
+    it has none.
     """
     if tree.kind == "inverse":  # told with its product
         return _look(tree.args[0], place, known, rows, found)
@@ -169,8 +169,8 @@ def _look(tree: Tree, place: str, known: Mapping[str, Any], rows: np.ndarray, fo
 
 
 def _taken(tree: Tree, known: Mapping[str, Any], rows: np.ndarray) -> list[np.ndarray]:
-    """Return for each argument the sample points at which its value matters: for `where`, those at which it is
-    chosen.
+    """Return for each argument of an expression the sample points at which its value is used; ``where`` uses only the
+    one that it chooses.
     """
     if tree.kind == "call" and tree.value == "where":
         chosen = np.broadcast_to(value_of(tree.args[0], known), rows.shape).astype(bool)

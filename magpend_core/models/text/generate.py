@@ -90,8 +90,8 @@ class Writer:
         self.lines.append(f"{target} = {self._value(node)}")
 
     def _by_root(self, above: Node, x: Node, n: int) -> str:
-        """Return source for a number divided by the n-th power of a root, without a division and without a product that
-        could be fused.
+        """Return source code for a number divided by x**(n/2), by an inverse square root and products that the compiler
+        cannot fuse with sums.
         """
         root = f"w{x.number}"
         if x.number not in self.inverse_roots:
@@ -141,9 +141,7 @@ class Writer:
 
 
 def root_under(node: Node) -> tuple[Node, int] | None:
-    """Return x and n = 1, 3 or 5 if a node is a quotient by sqrt(x), x sqrt(x) or x x sqrt(x) that varies with the
-    state, else None.
-    """
+    """Return x and n if a node is a quotient by x**(n/2) with n = 1, 3 or 5 that depends on the state, else None."""
     if node.op != "div" or node.args[1].kind != STATED:
         return None
     below = node.args[1]
@@ -173,7 +171,7 @@ def _twin(node: Node, wanted: Mapping[int, Node]) -> Node | None:
 
 
 def constants_of(roots: Iterable[Node]) -> list[Node]:
-    """Return the subexpressions independent of time and state that are used in others: constants of a trajectory."""
+    """Return the subexpressions without time and state that the others use: they are computed once per trajectory."""
     roots = list(roots)
     found = {root.number: root for root in roots if root.kind == CONSTANT}
     for node in in_order(roots):
@@ -259,7 +257,9 @@ def _leaves(derived: Derived, constants: list[Node], n_constants: int, n_modes: 
 
 
 def _cell(roots: Iterable[Node]) -> dict[int, str]:
-    """Return the names in generated code of parameters, frequency, time and edge ranks, by node number."""
+    """Return what parameters, frequency, time and the ranks of edges are called in generated code, by the number of
+    their node.
+    """
     names = {}
     for node in in_order(roots):
         if node.op == "parameter":
@@ -287,15 +287,17 @@ def _constants(constants: list[Node]) -> str:
 
 
 def _scalar(name: str, arguments: str, roots: list[Node]) -> str:
-    """Return source of a function of plain numbers: drive frequency, parameters, and time if it is an argument."""
+    """Return source code of a function of plain numbers (frequency, parameters and perhaps time) that returns
+    expressions' values.
+    """
     writer = Writer(_cell(roots))
     names = [f"{name} + 0.0" for name in writer.write(roots)]
     return _function(name, arguments, [*writer.lines, f"return {', '.join(names)}" + "," * (len(names) > 1)])
 
 
 def _edges(derived: Derived) -> list[str]:
-    """Return sources of the functions for the edge times in a period: of the jumps, then of the zeros of smooth
-    waves.
+    """Return source code of the functions that compute the times, half-widths and jumps of the forcing's edges in a
+    period.
     """
     n_instants, parts, names = len(derived.instants), [], []
     for i, instant in enumerate(derived.instants):
@@ -362,8 +364,8 @@ def _forcing(forcing: Node | None, leaves: Mapping[int, str]) -> str:
 
 
 def _tuple(name: str, arguments: str, roots: Iterable[Node], leaves: Mapping[int, str], group: int = 0) -> str:
-    """Return source of a function that returns a tuple of numbers per SIMD lane, or a tuple of tuples of `group` such
-    numbers.
+    """Return source code of a function that returns the values of expressions as a tuple, or as a tuple of tuples of
+    length `group`.
     """
     roots = list(roots)
     writer = Writer(leaves)

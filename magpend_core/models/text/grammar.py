@@ -432,7 +432,7 @@ class _Parser:
             self.numbers(tuple(args), name)
 
     def numbers(self, parts: tuple[Tree, ...], token: _Token) -> tuple[Tree, ...]:
-        """Return the operands, after reporting those that are conditions where numbers are needed."""
+        """Return the operands of an arithmetic operation; report those that are conditions instead of numbers."""
         self.problems += [
             f"a condition stands at character {part.at} where {token.text!r} needs a number; use where(condition, a, b)"
             for part in parts

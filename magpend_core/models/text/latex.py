@@ -135,7 +135,9 @@ def _written(tree: Tree, symbols: Mapping[str, str]) -> tuple[str, int]:
 
 
 def _in(tree: Tree, symbols: Mapping[str, str], least: int) -> str:
-    """Return the LaTeX of a subexpression, in brackets if its outermost operator binds more weakly than `least`."""
+    """Return a subexpression's LaTeX, in brackets if its operator binds less tightly than the surrounding one requires
+    (`least`).
+    """
     text, binds = _written(tree, symbols)
     return text if binds >= least else rf"\left({text}\right)"
 

@@ -55,8 +55,8 @@ class Steep:
 
 @dataclass(frozen=True)
 class Place:
-    """A steep function of `argument`: its singularity's distance from 0 in units of the argument, and its change
-    across.
+    """A steep function: its argument, the distance of its nearest complex singularity, and its change across the steep
+    part.
     """
 
     argument: Node
@@ -94,7 +94,9 @@ def steep_places(graph: Graph, rates: tuple[Node, ...], scales: tuple[float, ...
 
 
 def place_of(graph: Graph, node: Node) -> Place | None:
-    """Return the singularity and change of a steep function, such as atan or tanh; None for any other node."""
+    """Return the `Place` (nearest singularity and change) of a steep function, such as atan or tanh; None for another
+    node.
+    """
     if node.op == "atan":
         return Place(node.args[0], graph.one, graph.number(math.pi), "atan")
     if node.op == "tanh":
@@ -105,7 +107,7 @@ def place_of(graph: Graph, node: Node) -> Place | None:
 
 
 def _logistic(graph: Graph, node: Node) -> Place | None:
-    """Return the singularity and change of a quotient by 1 + exp(w); None for another quotient."""
+    """Return the `Place` (nearest singularity and change) of a quotient by 1 + exp(w); None for another quotient."""
     above, below = node.args
     if below.op != "add" or len(below.args) != 2 or not any(a.is_number(1.0) for a in below.args):
         return None
@@ -114,7 +116,9 @@ def _logistic(graph: Graph, node: Node) -> Place | None:
 
 
 def _smoothed_sign(graph: Graph, node: Node) -> Place | None:
-    """Return the singularity and change of a quotient u/sqrt(u**2 + e**2); None for another quotient."""
+    """Return the `Place` (nearest singularity and change) of a quotient u/sqrt(u**2 + e**2); None for another
+    quotient.
+    """
     above, below = node.args
     if below.op != "sqrt" or below.args[0].op != "add" or len(below.args[0].args) != 2:
         return None
@@ -135,7 +139,9 @@ def core_of(graph: Graph, node: Node) -> tuple[Node, Node]:
 
 
 def _jump(graph: Graph, changes: list[Node], scales: tuple[float, ...]) -> Node | None:
-    """Return the size of the largest of some changes; long expressions are only evaluated at two states."""
+    """Return an expression for the largest absolute value of given changes; long ones are replaced by their values at
+    two sample states.
+    """
     changes = [graph.call("absolute", c) for c in changes if not c.is_number(0.0)]
     if not changes:
         return None
@@ -153,7 +159,9 @@ def _jump(graph: Graph, changes: list[Node], scales: tuple[float, ...]) -> Node 
 
 
 def largest(graph: Graph, nodes: list[Node]) -> Node:
-    """Return an expression for the largest of some expressions; a NaN is ignored unless it is the last."""
+    """Return an expression for the maximum of given expressions; of their values a NaN is ignored unless it is the
+    last.
+    """
     found = nodes[0]
     for node in nodes[1:]:
         if not node.is_number(0.0):

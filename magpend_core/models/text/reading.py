@@ -144,7 +144,9 @@ class _Reading(ViewsReader):
         return True
 
     def _entry(self, value: Any, place: str, keys: tuple[str, ...], short: str) -> dict[str, Any]:
-        """Return a table entry as a table; a plain value becomes the value of the key `short`."""
+        """Return an entry as a table; an entry that is a plain value becomes a table with this value under the key
+        `short`.
+        """
         if not isinstance(value, Mapping):
             return {short: value}
         entry = self.table(value, place, 20, "keys")
@@ -295,7 +297,7 @@ def _circle(define: Mapping[str, Tree]) -> list[str]:
 
 
 def _with_rate(state: State, tree: Tree | None, states: Iterable[str]) -> State:
-    """Return a state with its `rate` set to another state, if its equation is the name of that state alone."""
+    """Return a state; if its equation is just the name of another state, that state is noted as its `rate`."""
     if tree is None or tree.kind != "name" or str(tree.value) not in states or tree.value == state.name:
         return state
     return State(**{**vars(state), "rate": str(tree.value)})

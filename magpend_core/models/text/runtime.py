@@ -9,7 +9,9 @@ from magpend_core.engine.jit import inline
 
 @inline
 def rank(at: Any, i: int) -> int:
-    """Return the rank of instant number `i` among all, from 0; of two at the same time the first comes first."""
+    """Return the rank in time, from 0, of instant number `i` among all instants of a period; of two equal ones the
+    first comes first.
+    """
     place = 0
     for j in range(len(at)):
         if at[j] < at[i] or (at[j] == at[i] and j < i):
@@ -33,6 +35,6 @@ def set_times(at: Any, period: float, times: Any) -> None:
 
 @inline
 def within(time: float, period: float) -> float:
-    """Return an instant of a period unchanged, or 0 if it lies next to either end of the period."""
+    """Return an instant of a drive period unchanged, or 0 if it coincides with the start or the end of the period."""
     near = 1e-9 * period
     return 0.0 if time < near or time > period - near else time

@@ -42,12 +42,14 @@ class Sliding:
     pairs: tuple[tuple[Node, Node], ...]
 
     def lowered(self, roots: Iterable[Node]) -> list[Node]:
-        """Return expressions in which each side is replaced by its mode or its equivalent control."""
+        """Return expressions in which the sign of each surface's side is replaced by the switch mode or, while sliding,
+        the equivalent control.
+        """
         return _spelled(self.graph, substituted(self.graph, list(roots), self.effective))
 
 
 def sliding_of(graph: Graph, rates: Sequence[Node], switches: Sequence[Switch]) -> Sliding:
-    """Find the surfaces on which a state can slide, and the expression that replaces each side there.
+    """Find the switching surfaces on which a state can slide, and what replaces the sign of the side while it does.
 
     Parameters
     ----------
@@ -81,7 +83,9 @@ def sliding_of(graph: Graph, rates: Sequence[Node], switches: Sequence[Switch]) 
 
 
 def _spelled(graph: Graph, roots: list[Node]) -> list[Node]:
-    """Write `choice` nodes as comparisons; interpolate only where a side can lie between -1 and 1."""
+    """Rewrite `choice` nodes as comparisons of their side with 0; keep the interpolation only where sliding puts the
+    side between -1 and 1.
+    """
     known: dict[int, Node] = {}
     for node in in_order(roots):
         args = tuple(known[a.number] for a in node.args)
@@ -123,7 +127,7 @@ def _along(graph: Graph, value: Node) -> Node:
 
 
 def _pull(graph: Graph, speed: Node, side: Node) -> Node:
-    """Return half the difference in `speed` between the two sides of a surface."""
+    """Return half the difference of `speed`, the rate of a surface's value, between the two sides of a surface."""
     (slope,) = derivatives(graph, (speed,), {side: graph.one})
     if side not in in_order([slope]):
         return slope
@@ -139,7 +143,7 @@ def _solved(
     switches: Sequence[Switch],
     modes: Sequence[Node],
 ) -> list[Node]:
-    """Return an expression for the equivalent control of each surface; for surfaces without sliding, their mode."""
+    """Return for each switching surface its equivalent control, or its mode if no state can slide on it."""
     zeros = {s.side: graph.zero for s in switches}
     found = []
     for k in range(len(switches)):

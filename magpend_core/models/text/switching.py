@@ -75,7 +75,8 @@ class Instant:
 
 @dataclass
 class Sides:
-    """Rewriter of expressions: it replaces corners and jumps by the sign of an expression, and collects the surfaces.
+    """Rewriter that replaces corners and jumps in expressions by signs of smooth expressions, and collects the
+    switching surfaces.
 
     Attributes
     ----------
@@ -116,7 +117,8 @@ class Sides:
         return [known[root.number] for root in roots]
 
     def _as_surface(self, node: Node, rewritten: Node) -> Node:
-        """Return a node in the form for the value of a surface: with known edges, but without modes.
+        """Return an expression in the form that defines a switching surface: it must not depend on the modes of other
+        switches.
 
         Engines find out on which sides a start is one after the other, so that none may need another.
         """
@@ -128,8 +130,8 @@ class Sides:
         return node if same else made_again(self.graph, node, args)
 
     def _smooth(self, node: Node, args: tuple[Node, ...], more: bool) -> Node:
-        """Return a node with rewritten arguments; a function with a corner or jump is written with the sign of an
-        expression.
+        """Return a node with rewritten arguments; if it has a corner or a jump, write it with the sign of a switching
+        surface.
         """
         g = self.graph
         same = all(a is b for a, b in zip(args, node.args, strict=True))
@@ -155,7 +157,9 @@ class Sides:
     def side(
         self, value: Node, rewritten: Node, jumps: bool, more: bool = True, written: Node | None = None
     ) -> Node | None:
-        """Return a node for the sign of an expression; None if there is none."""
+        """Return a node for the sign of an expression, of a new switch if need be; None if the sign is to be computed
+        as it stands.
+        """
         g = self.graph
         if value.op == "neg":
             inner = self.side(value.args[0], g.neg(rewritten), jumps, more, written)
@@ -224,12 +228,16 @@ class Sides:
         return self.instants[-1]
 
     def _after(self, instant: Instant, before: Node, after: Node) -> Node:
-        """Return an expression that changes from `before` to `after` at an instant of the period."""
+        """Return an expression that equals `before` until a given instant of each drive period and `after` from then
+        on.
+        """
         g = self.graph
         return g.where_less(g.leaf("segment"), g.sub(instant.rank, g.number(0.5)), before, after)
 
     def _square(self, node: Node, more: bool) -> Node | None:
-        """Return a square wave of n t f + a as jumps at known instants if n is a whole number, else None."""
+        """Return a square wave whose phase is n t f + a (n whole) as jumps at known instants of the drive period; None
+        if it has another form.
+        """
         g = self.graph
         phase, duty = node.args
         (slope,) = derivatives(g, (phase,), {g.leaf("time"): g.one})
@@ -260,7 +268,7 @@ class Sides:
 
 
 def _moves(rewritten: Node) -> bool:
-    """Return whether an expression changes between its jumps."""
+    """Return whether an expression varies with state or time other than by jumps."""
     moves: dict[int, bool] = {}
     for node in in_order([rewritten]):
         if node.op in ("square", "sign", "floor"):
@@ -272,7 +280,9 @@ def _moves(rewritten: Node) -> bool:
 
 
 def _plain(value: Node, written: Node) -> Node | None:
-    """Return the expression as it was written if it differs from the value of the surface, else None."""
+    """Return the expression as the user wrote it if the expression of the switching surface differs from it, else
+    None.
+    """
     return None if value is written else written
 
 
@@ -281,7 +291,7 @@ def _at_time_zero(graph: Graph, node: Node) -> list[Node]:
 
 
 def _multiple_of(slope: Node, frequency: Node) -> int | None:
-    """Return the whole number n if a slope is n times the drive frequency, else None."""
+    """Return the whole number n if the slope of a square wave's phase is n times the drive frequency, else None."""
     if slope is frequency:
         return 1
     if slope.op == "mul" and slope.args[0].op == "number" and slope.args[1] is frequency:

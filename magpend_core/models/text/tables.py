@@ -40,7 +40,9 @@ class Reader:
         self.problems.append(f"{place}: {sentence}")
 
     def table(self, value: Any, place: str, most: int, what: str = "entries") -> dict[str, Any]:
-        """Return a value if it is a table, without keys that are not text; else report it and return {}."""
+        """Return a value that is a table, without those keys that are not text; report any other value and return
+        {}.
+        """
         if not isinstance(value, Mapping):
             self.report(place, f"{shown(value)} must be a table; write {place.rpartition('.')[2]} = {{ ... }}.")
             return {}

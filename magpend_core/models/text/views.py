@@ -17,7 +17,9 @@ DEFAULT_PRESET = "default"
 
 
 class ViewsReader(Reader):
-    """Reader of tables whose paths begin with `place`; `known` maps each name to its meaning."""
+    """Reader of the optional tables; `place` is the path at which they begin, `known` says what each name in use stands
+    for.
+    """
 
     def __init__(self, place: str) -> None:
         super().__init__()
@@ -25,11 +27,13 @@ class ViewsReader(Reader):
         self.known: dict[str, str] = dict.fromkeys(BUILT_IN, "built-in name")
 
     def at(self, *keys: str) -> str:
-        """Return the path of a key below the model's path."""
+        """Return the full path of a key within the model's tables, for messages."""
         return ".".join((self.place, *(k[:60] for k in keys)))
 
     def _timeless(self, tree: Tree | None, place: str, define: dict[str, Tree], only: set[str] | None = None) -> bool:
-        """Return whether an expression uses neither time nor states other than `only`; report those that it uses."""
+        """Return whether an expression uses no time and, if `only` is given, no state outside it; report a name that it
+        must not use.
+        """
         if tree is None:
             return False
         wanted = list(needed(tree, define))
