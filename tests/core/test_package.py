@@ -117,7 +117,7 @@ def version_after(run_python, copied, name, old, new):
 def test_kernel_version__follows_the_engines_meaning(run_python, copied):
     edited = version_after(run_python, copied, "engine/lanes.py", "# accepted in this cell", "# so far")
     assert edited == kernel_version()
-    edited = version_after(run_python, copied, "status.py", '"""Outcome of one cell', '"""What one cell gave')
+    edited = version_after(run_python, copied, "status.py", '"""Define the status codes', '"""List the status codes')
     assert edited == kernel_version()
     edited = version_after(run_python, copied, "engine/lanes.py", "SAFETY = 0.85", "SAFETY = 0.84")
     assert edited != kernel_version()
