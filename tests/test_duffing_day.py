@@ -36,6 +36,7 @@ n_keep = 220
 [products]
 lyapunov = { n_transient = 40, n_periods = 64, n_blocks = 4 }
 extremes = { quantities = ["energy", "v"] }
+rotation = { n_periods = 40 }
 [smoke]
 axes.frequency_hz.values = [0.155]
 """
@@ -90,6 +91,10 @@ ANALYSES = {
             "0.5",
         ],
     ),
+    "tongues": (
+        "sweep",
+        [*AT["line"], "--second", "damping", "--second-from", "0.2", "--second-to", "0.3", "--denominator", "1"],
+    ),
     "curves": ("walk", ["--period", "1", "--second", "amplitude", "--second-from", "0.25", "--second-to", "0.35"]),
     "orbits": ("sweep", [*AT["point"], "--period", "1", "--starts", "40"]),
 }
@@ -108,6 +113,8 @@ FIGURES_OF = {
     "multipliers": ("walk", ["--period", "1"]),
     "curves": ("walk", ANALYSES["curves"][1]),
     "manifolds": ANALYSES["manifolds"],
+    "rotation": ("sweep", []),
+    "tongues": ANALYSES["tongues"],
     "section": ("sweep", AT["point"]),
 }
 

@@ -308,7 +308,8 @@ def variables() -> str:
     from pipeline.layout.schema import REST_STATE, RETURN_TIME, base_variables
     from pipeline.products.registry import CELL_PRODUCTS
 
-    model, examples = load_model(), {"extremes": {"quantities": ("energy",)}}
+    model = load_model()
+    examples = {"extremes": {"quantities": ("energy",)}, "rotation": {"of": model.state_names[:1]}}
     found = [("", variable) for variable in base_variables(model)]
     found += [("`[section]`", variable) for variable in (RETURN_TIME, REST_STATE)]
     for name, product in CELL_PRODUCTS.items():

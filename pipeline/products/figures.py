@@ -9,6 +9,7 @@ from pipeline.products.branches import BranchOptions, CurveOptions
 from pipeline.products.chaos import DimensionOptions
 from pipeline.products.manifolds import ManifoldOptions
 from pipeline.products.product import Figure, FigureOptions, StateOptions, option
+from pipeline.products.tongues import TongueOptions
 
 Per = Literal["s", "period"]
 
@@ -118,6 +119,18 @@ class CurveFigureOptions(CurveOptions, _AlongOptions):
     show: Literal["periods", "attractors", "number"] = option("periods", "Property of the map that is coloured.")
 
 
+class RotationFigureOptions(FigureOptions):
+    """Options of a figure of rotation numbers over one parameter, or as a map over two."""
+
+
+class TongueFigureOptions(TongueOptions, FigureOptions):
+    """Options of a figure of Arnold tongues."""
+
+    def label(self) -> str:
+        """Return the part of the figure's file name made from options; the drive frequency is not named."""
+        return _without(self, "parameter") if self.parameter == "frequency_hz" else super().label()
+
+
 class ManifoldFigureOptions(ManifoldOptions, FigureOptions):
     """Options of a figure of manifolds."""
 
@@ -215,6 +228,21 @@ CURVES = Figure(
     "Draw curves of folds, period doublings and Neimark-Sacker points in the plane of two parameters.",
     CurveFigureOptions,
     "pipeline.plots.curves:draw",
+)
+
+ROTATION = Figure(
+    "rotation",
+    "Draw rotation numbers over a parameter, with the steps p/q (the devil's staircase), or as a map over two.",
+    RotationFigureOptions,
+    "pipeline.plots.rotation:draw",
+)
+
+TONGUES = Figure(
+    "tongues",
+    "Draw the edges of the Arnold tongues p/q in a plane, over the map of rotation numbers if the run spans it.",
+    TongueFigureOptions,
+    "pipeline.plots.tongues:draw",
+    needs="pipeline.analysis.branches.tongues_product:needs_rotation",
 )
 
 MANIFOLDS = Figure(

@@ -37,7 +37,12 @@ class Registry(Mapping[str, P], Generic[P]):
 
 
 CELL_PRODUCTS: Registry[CellProduct] = Registry(
-    "product", {"lyapunov": "pipeline.products.lyapunov:LYAPUNOV", "extremes": "pipeline.products.extremes:EXTREMES"}
+    "product",
+    {
+        "lyapunov": "pipeline.products.lyapunov:LYAPUNOV",
+        "extremes": "pipeline.products.extremes:EXTREMES",
+        "rotation": "pipeline.products.rotation:ROTATION",
+    },
 )
 
 ANALYSES: Registry[Analysis] = Registry(
@@ -53,6 +58,7 @@ ANALYSES: Registry[Analysis] = Registry(
         "branches": "pipeline.products.branches:BRANCHES",
         "curves": "pipeline.products.branches:CURVES",
         "orbits": "pipeline.products.branches:ORBITS",
+        "tongues": "pipeline.products.tongues:TONGUES",
         "manifolds": "pipeline.products.manifolds:MANIFOLDS",
         "tangency": "pipeline.products.manifolds:TANGENCY",
     },
@@ -79,6 +85,8 @@ FIGURES: Registry[Figure] = Registry(
             "branches",
             "multipliers",
             "curves",
+            "rotation",
+            "tongues",
             "manifolds",
         )
     },

@@ -47,7 +47,7 @@ def named(run: Run, options: Options) -> Options:
     model = run.model
     if {"parameter", "second", "state"} & fields.keys():
         if given.get("parameter") == "":
-            given["parameter"] = _swept(run)
+            given["parameter"] = _swept(run, [given.get("second", ""), *given.get("at", {})])
         for role in {"parameter", "second"} & fields.keys():
             changes[role] = parameter_name(given[role])
             problems += _unknown("parameter", given[role], changes[role], (*model.parameter_names, FREQUENCY))
@@ -59,8 +59,8 @@ def named(run: Run, options: Options) -> Options:
     return options.model_copy(update=changes)
 
 
-def _swept(run: Run) -> str:
-    """Return the name of the parameter that a run sweeps, or of the drive frequency if it sweeps none.
+def _swept(run: Run, others: Iterable[str]) -> str:
+    """Return the name of the parameter that a run sweeps besides `others`, or of the drive frequency if it sweeps none.
 
     Raises
     ------
@@ -69,6 +69,7 @@ def _swept(run: Run) -> str:
     """
     cube = run.cube()
     swept = [name for name in run.spec.axes if cube.sizes.get(axis_name(name), 1) > 1]
+    swept = [name for name in swept if axis_name(name) not in map(axis_name, others)]
     if len(swept) > 1:
         raise SpecError(
             [

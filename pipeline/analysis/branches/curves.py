@@ -98,6 +98,7 @@ def curves_from(
     bounds: Bounds,
     max_period: int,
     settings: Settings = CURVE,
+    generations: int = GENERATIONS,
 ) -> list[Curve]:
     """Continue the bifurcations located on branches as curves, with a second free parameter.
 
@@ -115,6 +116,8 @@ def curves_from(
         Longest period of the orbits; 0 takes the longest of the branches.
     settings
         Settings of the traces; arclengths are in units of the intervals.
+    generations
+        Number of generations of curves that spring from points of codimension two.
 
     Returns
     -------
@@ -123,7 +126,7 @@ def curves_from(
     """
     longest = max_period or int(branches["orbit_period"].values.max(initial=0))
     starts = _starts(branches, parameters, second, bounds, longest)
-    return continue_curves(starts, bounds, settings, longest)
+    return continue_curves(starts, bounds, settings, longest, generations)
 
 
 CurveStart = tuple[int, Family, str, np.ndarray]
@@ -134,7 +137,11 @@ Bounds = tuple[tuple[float, float], tuple[float, float]]
 
 
 def continue_curves(
-    starts: Sequence[CurveStart], bounds: Bounds, settings: Settings = CURVE, max_period: int = 0
+    starts: Sequence[CurveStart],
+    bounds: Bounds,
+    settings: Settings = CURVE,
+    max_period: int = 0,
+    generations: int = GENERATIONS,
 ) -> list[Curve]:
     """Follow each bifurcation in both directions until a bound, its own start or a resonance; see `curves_from`.
 
@@ -145,7 +152,7 @@ def continue_curves(
     ready = [(s[0], p, f) for s, p, f in zip(starts, problems, firsts, strict=True) if f is not None]
     curves: list[Curve] = []
     seen: list[SpecialPoint] = []
-    for _ in range(1 + GENERATIONS):
+    for _ in range(1 + generations):
         _follow_all(ready, curves, bounds, settings)
         points = merged({i: curve.special for i, curve in enumerate(curves)})
         fresh = [one for one in points if not any(one.point is other.point for other in seen)]

@@ -16,7 +16,7 @@ def settle_branches(run: Run, options: BranchOptions) -> BranchOptions:
     """Complete the parameter interval from the run's axis; raise SpecError if it is empty."""
     parameter = options.parameter
     _refuse_frequency_of_flow(run, parameter)
-    low, high = _interval(run, parameter, options.low, options.high)
+    low, high = interval_of(run, parameter, options.low, options.high)
     return options.model_copy(update={"parameter": parameter, "low": low, "high": high})
 
 
@@ -25,7 +25,7 @@ def _refuse_frequency_of_flow(run: Run, parameter: str) -> None:
     from pipeline.specification.problems import SpecError
 
     if axis_name(parameter) == FREQUENCY_DIM and run.model.crossing is not None:
-        swept = [name for name in run.spec.axes if _axis(run, name) is not None]
+        swept = [name for name in run.spec.axes if swept_axis(run, name) is not None]
         known = ", ".join(swept or run.model.parameter_names)
         raise SpecError([f"{run.model.name} has no drive frequency to follow; give --parameter: {known}."])
 
@@ -64,11 +64,11 @@ def settle_curves(run: Run, options: CurveOptions) -> CurveOptions:
     second = options.second
     if axis_name(second) == axis_name(settled.parameter):
         raise SpecError([f"{second} is the branches' own parameter; give another one."])
-    if _axis(run, second) is not None:
+    if swept_axis(run, second) is not None:
         raise SpecError(
             [f"the run sweeps {second}, so that its branches lie at several values; use a run that does not."]
         )
-    _interval(run, second, options.second_low, options.second_high)
+    interval_of(run, second, options.second_low, options.second_high)
     return settled
 
 
@@ -84,13 +84,13 @@ def curves(run: Run, options: CurveOptions) -> xr.Dataset:
     return curves_dataset(found, axis_name(options.parameter), second, base.model)
 
 
-def _axis(run: Run, parameter: str) -> xr.DataArray | None:
+def swept_axis(run: Run, parameter: str) -> xr.DataArray | None:
     """Return the axis of a parameter; None if the run does not sweep it."""
     axis = run.cube().coords.get(axis_name(parameter))
     return axis if axis is not None and axis.ndim > 0 and axis.size > 1 else None
 
 
-def _interval(run: Run, parameter: str, low: float | None, high: float | None) -> tuple[float, float]:
+def interval_of(run: Run, parameter: str, low: float | None, high: float | None) -> tuple[float, float]:
     """Check the parameter of the branches, and complete its interval from the run's axis."""
     from pipeline.specification.problems import SpecError, unknown_name
 
@@ -98,7 +98,7 @@ def _interval(run: Run, parameter: str, low: float | None, high: float | None) -
     is_frequency = axis_name(parameter) == FREQUENCY_DIM
     if not is_frequency and parameter not in base.names:
         raise SpecError([unknown_name("parameter", parameter, (*base.names, FREQUENCY_DIM))])
-    axis = _axis(run, parameter)
+    axis = swept_axis(run, parameter)
     if axis is not None:
         ends = float(axis.min()), float(axis.max())
     elif low is None or high is None:

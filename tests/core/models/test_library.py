@@ -63,6 +63,11 @@ def _van_der_pol(t, y, p):
     return v, p["mu"] * (1.0 - x * x) * v - x
 
 
+def _forced_van_der_pol(t, y, p):
+    x, v = y
+    return v, p["mu"] * (1.0 - x * x) * v - x + p["A"] * np.cos(t)
+
+
 def _rossler(t, y, p):
     x, y, z = y
     return -y - z, x + p["a"] * y, p["b"] + z * (x - p["c"])
@@ -81,6 +86,7 @@ EQUATIONS = {
     "belt-stick": (_belt, {"belt": 1.5, "zeta": 0.05, "mu": 0.5, "ratio": 2.0, "v0": 0.5}),
     "impact": (_impact, {"zeta": 0.1, "A": 0.3, "gap": 1.0, "r": 0.7}),
     "van-der-pol": (_van_der_pol, {"mu": 1.0}),
+    "forced-van-der-pol": (_forced_van_der_pol, {"mu": 1.0, "A": 0.4}),
     "rossler": (_rossler, {"a": 0.2, "b": 0.2, "c": 5.7}),
     "lorenz": (_lorenz, {"sigma": 10.0, "rho": 28.0, "beta": 8.0 / 3.0}),
 }
