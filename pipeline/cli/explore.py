@@ -16,6 +16,9 @@ def explore(
     no_browser: Annotated[
         bool, typer.Option("--no-browser", help="Print the address of the page; open no browser.")
     ] = False,
+    curves: Annotated[
+        str, typer.Option(help="Run whose bifurcation curves are drawn over the map of this run's two parameters.")
+    ] = "",
 ) -> None:
     """Explore a run in a browser: its diagram, the orbit behind each point, planes of initial states.
 
@@ -33,4 +36,4 @@ def explore(
         console.note("open this address in a browser on this machine; Ctrl-C ends the server")
 
     with contextlib.nullcontext() if no_browser else browser() as opened:
-        serve(directory, port, echo=serving, opened=opened)
+        serve(directory, port, echo=serving, opened=opened, curves=curves or None)

@@ -309,7 +309,10 @@ def variables() -> str:
     from pipeline.products.registry import CELL_PRODUCTS
 
     model = load_model()
-    examples = {"extremes": {"quantities": ("energy",)}, "rotation": {"of": model.state_names[:1]}}
+    examples: dict[str, dict[str, Any]] = {
+        "extremes": {"quantities": ("energy",)},
+        "rotation": {"of": model.state_names[:1]},
+    }
     found = [("", variable) for variable in base_variables(model)]
     found += [("`[section]`", variable) for variable in (RETURN_TIME, REST_STATE)]
     for name, product in CELL_PRODUCTS.items():

@@ -61,7 +61,14 @@ class ExploredRun(Run):
     """An opened run that reads its cube and the stored results of analyses only once.
 
     Reading never computes: what is not in the cube or in ``derived/`` is not there.
+
+    Attributes
+    ----------
+    curves : Run or None
+        Run whose bifurcation curves are shown; None for those of the run itself.
     """
+
+    curves: Run | None = None
 
     _opened: dict[str, Any] = field(default_factory=dict, compare=False, repr=False)
     _lock: Any = field(default_factory=threading.RLock, compare=False, repr=False)
@@ -95,10 +102,14 @@ class ExploredRun(Run):
             found: xr.Dataset | None = self._opened[key]
             return found
 
+    def bifurcation_curves(self) -> xr.Dataset | None:
+        """Return the stored curves of `curves`, or of the run itself; None if there are none."""
+        return self.kept("curves") if self.curves is None else ExploredRun.of(self.curves).kept("curves")
+
     def refreshed(self) -> ExploredRun:
         """Return the run with cells and results added since it was opened."""
         if not self.complete:
-            return ExploredRun.of(Run.open(self.info.files))
+            return replace(ExploredRun.of(Run.open(self.info.files)), curves=self.curves)
         if self._derived_names() == self.remembered("derived names", self._derived_names):
             return self
         # the cells of a complete run stay as they are

@@ -14,6 +14,7 @@ from pipeline.explorer.data.clicked_orbit import orbit
 from pipeline.explorer.data.diagram import diagram
 from pipeline.explorer.data.explored import ExploredRun, ExplorerError
 from pipeline.explorer.data.overlays import attractors, branches, curves
+from pipeline.explorer.data.parameter_plane import curve_orbit, parameter_plane
 from pipeline.explorer.data.planes import plane
 from pipeline.explorer.data.tables import FORMATS, table
 from pipeline.explorer.data.verticals import verticals
@@ -141,6 +142,14 @@ def _plane(run: ExploredRun, query: Query, live: LiveRun | None) -> Reply:
     return Reply(plane(run, query.at), BINARY)
 
 
+def _parameter_plane(run: ExploredRun, query: Query, live: LiveRun | None) -> Reply:
+    return json_reply(parameter_plane(run))
+
+
+def _curve_orbit(run: ExploredRun, query: Query, live: LiveRun | None) -> Reply:
+    return Reply(curve_orbit(run, query.count("curve"), query.count("point")), BINARY)
+
+
 def _table(run: ExploredRun, query: Query, live: LiveRun | None) -> Reply:
     kind, form = query.text("view"), query.text("format", "csv")
     words = {name: query.count(name) for name in ("cell", "point") if name in query.words}
@@ -169,6 +178,8 @@ ANSWERS: dict[str, Answer] = {
         Answer("attractors", _attractors),
         Answer("orbit", _orbit, integrates=True),
         Answer("plane", _plane),
+        Answer("parameter-plane", _parameter_plane),
+        Answer("curve-orbit", _curve_orbit, integrates=True),
         Answer("table", _table),
         Answer("zoom", _zoom, method="POST"),
     )

@@ -16,6 +16,7 @@ import logging
 import socket
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -358,7 +359,12 @@ def listening(port: int) -> socket.socket:
 
 
 def serve(
-    source: str | Path | Run, port: int = 0, *, echo: Callable[[str], None], opened: Callable[[str], None] | None = None
+    source: str | Path | Run,
+    port: int = 0,
+    *,
+    echo: Callable[[str], None],
+    opened: Callable[[str], None] | None = None,
+    curves: str | Path | Run | None = None,
 ) -> None:
     """Serve the page of a run until the process is stopped.
 
@@ -372,6 +378,8 @@ def serve(
         Prints a line.
     opened
         Called with the address once it can be asked, such as to open a browser.
+    curves
+        Run whose bifurcation curves are shown over the map of two parameters; by default those of the run.
 
     Raises
     ------
@@ -380,7 +388,11 @@ def serve(
     RefusedError, DamagedError, UnreadableError
         As `Run.open`.
     """
-    run = Run.open(source)
+    from pipeline.explorer.data.explored import ExploredRun
+
+    run: Run = Run.open(source)
+    if curves is not None:
+        run = replace(ExploredRun.of(run), curves=Run.open(curves))
     taken = listening(port)
     guard = Guard(new_token(), taken.getsockname()[1])
     address = f"http://{HOST}:{guard.port}/?token={guard.token}"

@@ -19,7 +19,7 @@ export function defaults(view) {
   const path = view.axes.find((axis) => axis.path) ?? view.axes[0];
   return {
     x: path?.name ?? null, y: view.verticals[0].name, at: atFor(view, path?.name, {}), colour: firstColour(view),
-    window: null, selected: null, plane: null, panel: null, hidden: {},
+    window: null, selected: null, curvePoint: null, plane: null, panel: null, hidden: {},
     overlays: { branches: view.has.branches, exponents: view.has.lyapunov, fractions: view.has.attractors }, dark: null,
   };
 }

@@ -9,6 +9,7 @@ import { scaled } from "./gestures.js";
 import { Legend } from "./legend.js";
 import { Messages } from "./messages.js";
 import { mountPanels } from "./panels.js";
+import { ParameterPlane } from "./parameter-plane.js";
 import { download } from "./picture.js";
 import { pictureOfView } from "./view-picture.js";
 import { createState } from "./state.js";
@@ -61,7 +62,8 @@ function build(source, root, view, messages) {
   curves.onLoaded = () => toolbar.showToggles();
   if (source.notice) messages.note(source.notice);
   else if (view.cells.pending) messages.note(pendingOf(view), () => location.reload());
-  const left = el("div", { class: "main-column" }, toolbar.element, legend.element, diagram.element, curves.element, messages.facts);
+  const left = el("div", { class: "main-column" }, toolbar.element, legend.element, diagram.element, curves.element,
+    new ParameterPlane(state, source, view).element, messages.facts);
   const right = el("div", { class: "side-column" });
   const layout = el("div", { class: "layout" }, left, right);
   root.replaceChildren(

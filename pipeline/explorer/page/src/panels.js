@@ -29,7 +29,7 @@ class Panels {
     this.liveNote = el("p", { class: "hint", role: "status", hidden: true });
     element.replaceChildren(this.hint, this.liveNote, this.grid);
     this.build();
-    this.forget = [state.on(["selected"], () => this.select()), state.on(["dark"], themeChanged)];
+    this.forget = [state.on(["selected"], () => this.select()), state.on(["curvePoint"], () => this.selectOnCurve()), state.on(["dark"], themeChanged)];
     if (this.live) this.forget.push(this.live.on((status) => this.showLive(status)));
     this.select();
   }
@@ -110,6 +110,27 @@ class Panels {
     if (asked === this.asked) this.showOwn(new Orbit(packed, this.view.model), selected);
   }
 
+  /** Show the orbit at a point of a bifurcation curve. */
+  async selectOnCurve() {
+    const { curvePoint } = this.state.get(), asked = ++this.asked;
+    if (!curvePoint) return;
+    this.grid.setAttribute("aria-busy", "true");
+    if (this.grid.hidden) this.say("Integrating the orbit …");
+    try {
+      const packed = await this.source.curveOrbit(curvePoint);
+      if (asked !== this.asked) return;
+      this.own = null;
+      this.reveal(true);
+      this.display(new Orbit(packed, this.view.model), false);
+      this.plane.show(this.orbit, true);
+      this.grid.dataset.shown = `curve-${curvePoint.curve}-${curvePoint.point}`;
+    } catch (error) {
+      if (asked === this.asked) this.say(error.message);
+    } finally {
+      if (asked === this.asked) this.grid.removeAttribute("aria-busy");
+    }
+  }
+
   say(text) {
     this.hint.textContent = text;
     show(this.hint, Boolean(text));
@@ -153,6 +174,7 @@ class Panels {
 
   display(orbit, keepsTime) {
     this.orbit = orbit;
+    show(this.cards.follow.element, this.own !== null); // an orbit on a curve belongs to no cell that could be followed
     showFacts(this.cards.facts.body, orbit, this.view);
     this.portraits.show(orbit);
     this.series.show(orbit);

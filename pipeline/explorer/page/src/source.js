@@ -88,6 +88,16 @@ export class ServerSource {
     return this.packed(`plane${queryOf({ at })}`);
   }
 
+  /** Bifurcation curves in the plane of two parameters, over the run's map if it has one. */
+  parameterPlane() {
+    return this.json("parameter-plane");
+  }
+
+  /** The orbit at a point of a bifurcation curve. */
+  curveOrbit({ curve, point }) {
+    return this.packed(`curve-orbit${queryOf({ curve, point })}`);
+  }
+
   attractors({ at }) {
     return this.json(`attractors${queryOf({ at })}`);
   }

@@ -108,10 +108,10 @@ def _silent(text: str) -> None:
 
 
 @contextmanager
-def served(directory: Path) -> Iterator[str]:
+def served(directory: Path, *words: str) -> Iterator[str]:
     """Serve the page of a run in a process of its own; gives its address."""
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    command = [sys.executable, "-m", "pipeline.cli.main", "explore", str(directory), "--no-browser"]
+    command = [sys.executable, "-m", "pipeline.cli.main", "explore", str(directory), "--no-browser", *words]
     with subprocess.Popen(
         command, cwd=ROOT, env=environment, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
     ) as process:

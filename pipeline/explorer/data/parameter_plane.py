@@ -1,0 +1,175 @@
+"""Read bifurcation curves in the plane of two parameters over the map of regimes, and integrate an orbit on a curve."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from matplotlib import colormaps
+from matplotlib.colors import to_hex
+
+from magpend_core.models.model import Parameters
+from magpend_core.orbits import section_map
+from pipeline.analysis.branches.bifurcations import KINDS
+from pipeline.explorer.data.arrays import pack_arrays
+from pipeline.explorer.data.clicked_orbit import TOLERANCE, finite
+from pipeline.explorer.data.explored import ExploredRun, ExplorerError
+from pipeline.explorer.data.series import fixed_points, orbit_series
+from pipeline.layout.vocabulary import ATTRACTS, FREQUENCY_DIM, frequency_of, split_dims
+from pipeline.plots.branches import NAMES
+from pipeline.plots.curve_lines import POINT_NAMES
+from pipeline.plots.labels import swept_label
+from pipeline.store.run import Run
+
+NOTHING = "no bifurcation curves: compute them with magpend analyse curves, or name their run with --curves"
+
+
+def parameter_plane(run: Run) -> dict[str, Any]:
+    """Return the bifurcation curves of a run, over its map of regimes if it sweeps the two parameters.
+
+    Parameters
+    ----------
+    run
+        An opened run.
+
+    Returns
+    -------
+    dict
+        ``axes``: names and labels across and upwards; ``curves`` and ``points`` of codimension two; ``map``: values
+        of both axes, the number of attractors at each point, and colours, or None; ``note``: why there are no
+        curves, or None.
+    """
+    explored = ExploredRun.of(run)
+    found = explored.bifurcation_curves()
+    if found is None:
+        return {"axes": [], "curves": [], "points": [], "map": None, "note": NOTHING}
+    names = [str(found.attrs[f"{role}_parameter"]) for role in ("first", "second")]
+    return {
+        "axes": [
+            {"name": name, "label": swept_label(name, str(found[role].attrs["units"]))}
+            for name, role in zip(names, ("first", "second"), strict=True)
+        ],
+        "curves": [_curve(found, i) for i in range(found.sizes["curve"])],
+        "points": [_special(found, k) for k in range(found.sizes["special"])],
+        "map": _map(explored, names),
+        "note": None,
+    }
+
+
+def _curve(found: xr.Dataset, i: int) -> dict[str, Any]:
+    n, period = int(found["n_points"][i]), int(found["orbit_period"][i])
+    return {
+        "id": i,
+        "kind": NAMES[KINDS[int(found["kind"][i])]],
+        "period": period,
+        "x": found["first"].values[i, :n].tolist(),
+        "y": found["second"].values[i, :n].tolist(),
+    }
+
+
+def _special(found: xr.Dataset, k: int) -> dict[str, Any]:
+    names = str(found["special_kind"].attrs["flag_meanings"]).split()
+    kind = names[int(found["special_kind"][k])]
+    return {
+        "kind": kind.replace("_", " "),
+        "label": POINT_NAMES[kind],
+        "x": float(found["special_first"][k]),
+        "y": float(found["special_second"][k]),
+        "period": int(found["special_period"][k]),
+    }
+
+
+def _map(run: ExploredRun, names: list[str]) -> dict[str, Any] | None:
+    """Return the number of attractors over both parameters; None unless the run sweeps exactly these two."""
+    attractors = run.kept("attractors")
+    if attractors is None:
+        return None
+    swept = [d for d in map(str, split_dims(attractors["attractor_id"])[0]) if attractors.sizes[d] > 1]
+    if sorted(swept) != sorted(names):
+        return None
+    attracting = (attractors["kind"] > 0) & (attractors["stability"] == ATTRACTS)
+    number = attracting.sum("attractor").squeeze().transpose(names[1], names[0]).sortby(names)
+    most = int(number.max())
+    shades = colormaps["cividis"](np.linspace(0.25, 1.0, max(most, 1)))
+    colours = [to_hex("0.8"), *map(to_hex, shades)]
+    return {
+        "x": number[names[0]].values.tolist(),
+        "y": number[names[1]].values.tolist(),
+        "number": number.values.ravel().tolist(),
+        "colours": colours,
+    }
+
+
+def curve_orbit(run: Run, curve: int, point: int) -> bytes:
+    """Return the orbit at a point of a bifurcation curve as arrays and attributes, packed for the page.
+
+    Parameters
+    ----------
+    run
+        An opened run.
+    curve, point
+        Number of the curve, and of its point.
+
+    Raises
+    ------
+    ExplorerError
+        If there is no such point.
+    ArithmeticError
+        If the trajectory ends early.
+    """
+    explored = ExploredRun.of(run)
+    found = explored.bifurcation_curves()
+    n_curves = 0 if found is None else found.sizes["curve"]
+    if found is None or not 0 <= curve < n_curves:
+        raise ExplorerError(f"curve = {curve} is out of bounds: there are {n_curves} curves.")
+    n_points = int(found["n_points"][curve])
+    if not 0 <= point < n_points:
+        raise ExplorerError(f"point = {point} is out of bounds: the curve has points 0 to {n_points - 1}.")
+    source = explored if explored.curves is None else ExploredRun.of(explored.curves)
+    parameters, clock_hz = _parameters_at(source, found.isel(curve=curve, point=point))
+    state, period = found["section"].values[curve, point], int(found["orbit_period"][curve])
+    ends = section_map(parameters.pack()[None], np.array([clock_hz]), state[None], period, system=source.model.system)
+    seconds = np.cumsum(ends.times[0])
+    multipliers = np.linalg.eigvals(ends.derivatives[0])
+    arrays = orbit_series(parameters, clock_hz, state, period, float(seconds[-1]), rtol=TOLERANCE, atol=TOLERANCE)
+    images = np.concatenate([state[None], ends.images[0, : period - 1]])
+    arrays = {**arrays, "section": images, "section_times": np.concatenate([[0.0], seconds])}
+    kind = NAMES[KINDS[int(found["kind"][curve])]]
+    return pack_arrays(arrays, _attrs(source, parameters, clock_hz, period, multipliers, kind))
+
+
+def _parameters_at(run: ExploredRun, one: xr.Dataset) -> tuple[Parameters, float]:
+    """Return the parameters at a point of a curve and the drive frequency [Hz]; of a flow what stands for it."""
+    values = {str(one.attrs[f"{role}_parameter"]): float(one[role]) for role in ("first", "second")}
+    base = {FREQUENCY_DIM: run.spec.frequency_hz} if run.spec.frequency_hz is not None else {}
+    clock = frequency_of(run.model, base | values)
+    own = {name: value for name, value in values.items() if name != FREQUENCY_DIM}
+    return run.parameters.replace(**own), clock
+
+
+def _attrs(
+    run: ExploredRun, parameters: Parameters, clock_hz: float, period: int, multipliers: np.ndarray, kind: str
+) -> dict[str, Any]:
+    """Return what the page shows of an orbit on a curve; it belongs to no cell of the run."""
+    unknown = dict.fromkeys(
+        ("cell", "at", "motion", "attractor", "share", "low", "high", "stability", "evidence", "exponents", "start")
+    )
+    return {
+        **unknown,
+        "parameters": parameters.as_dict(),
+        "frequency": clock_hz if run.model.crossing is None else None,
+        "status": "periodic",
+        "status_meaning": f"an orbit on a curve of bifurcations: {kind}",
+        "kind": f"{kind}, period {period}",
+        "stable": None,
+        "multipliers": [[finite(m.real), finite(m.imag)] for m in multipliers],
+        "note": None,
+        "exponents_from": None,
+        "seeds": [],
+        "fixed": fixed_points(run.model, parameters),
+        "quantities": [q.name for q in run.model.quantities],
+        "period": period,
+        "point": 0,
+        "n_periods": period,
+    }
