@@ -139,7 +139,8 @@ def derive(
 
 
 def stored(source: Source, name: str) -> xr.Dataset | None:
-    """Return the stored result of an analysis of a run's present cells, or None; nothing is computed.
+    """Return the stored result of an analysis for the cells that a run has now, or None if there is none; compute
+    nothing.
 
     Parameters
     ----------

@@ -56,14 +56,16 @@ def figure(
 
 
 def ready(source: Source, name: str, options: FigureOptions, echo: Echo | None) -> tuple[AnalysedRun, FigureOptions]:
-    """Open a run; return it with the figure's options completed and in the names of the run's cube."""
+    """Open a run; return it and the figure's options, with missing ones filled in and names translated to those of the
+    run's cube.
+    """
     run = AnalysedRun.of(source, echo)
     settled: Any = prepared(run, FIGURES[name], options)
     return run, settled
 
 
 def drawn(run: AnalysedRun, name: str, options: FigureOptions) -> DataFigure:
-    """Draw a figure with options that `ready` has completed."""
+    """Draw a figure of an opened run with the options that `ready` has completed."""
     from pipeline.plots import draw_figure
 
     with refused(run.name):

@@ -171,7 +171,9 @@ def _sample(spec: Spec, plan: Plan, rng: np.random.Generator, n_branches: int, *
 
 
 def _points(n_points: int, rng: np.random.Generator, *, pairs: bool) -> np.ndarray:
-    """Return indices of random points along a continuation path, one point or one pair from each of its equal parts."""
+    """Return random indices along a continuation path: one point, or two adjacent points, from each of several equal
+    parts of the path.
+    """
     n_parts = min(POINTS, n_points // 2 if pairs and n_points > 1 else n_points)
     edges = np.linspace(0, n_points, n_parts + 1)
     first = np.array([rng.integers(math.ceil(a), math.ceil(b)) for a, b in itertools.pairwise(edges)])
@@ -182,8 +184,8 @@ def _points(n_points: int, rng: np.random.Generator, *, pairs: bool) -> np.ndarr
 
 
 def _speed(spec: Spec, inputs: Inputs, most: float) -> tuple[float, int, float]:
-    """Measure the integration speed; return the ratio of time to the rule of thumb, periods per cell, and the seconds
-    spent.
+    """Measure the integration speed; return the ratio of measured to rule-of-thumb time, the periods integrated per
+    cell, and the seconds spent.
 
     Two stretches are measured: one from the initial states, and one from the end of the first, which
     represents the rest of the cell.
@@ -200,8 +202,8 @@ def _speed(spec: Spec, inputs: Inputs, most: float) -> tuple[float, int, float]:
 
 
 def _stretch(spec: Spec, inputs: Inputs, n_periods: int) -> tuple[np.ndarray, float, float]:
-    """Integrate the sample; return its final states, the ratio of processor time to the rule of thumb, and the time
-    [s].
+    """Integrate the sampled cells; return their final states, the ratio of the processor time to a rule-of-thumb
+    estimate, and that time [s].
 
     The time is processor time, so that other programs do not count.
     """
@@ -221,7 +223,7 @@ def _stretch(spec: Spec, inputs: Inputs, n_periods: int) -> tuple[np.ndarray, fl
 
 
 def _periods_until_closed(spec: Spec, plan: Plan, most: float, ratio: float) -> float:
-    """Return the mean number of periods that a trajectory needs in a run that stops when orbits have closed.
+    """Return the mean number of periods that a trajectory needs if each one stops once its orbit has closed.
 
     A first sample gives the number of cells for which there is time.
     """
@@ -248,7 +250,8 @@ def _periods_until_closed(spec: Spec, plan: Plan, most: float, ratio: float) -> 
 
 
 def mean_with_tail(periods: np.ndarray, cap: float, most: float) -> float:
-    """Return the mean number of periods, extrapolated for trajectories that were stopped at `cap` to a limit of `most`.
+    """Return the mean number of periods per trajectory; those stopped at `cap` periods are extrapolated to a limit of
+    `most` periods.
 
     These cells are assumed to end at the rate at which cells ended in the second half of the observed
     periods.

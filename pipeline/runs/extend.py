@@ -67,19 +67,21 @@ class Extension:
 
     @property
     def digest(self) -> str:
-        """Digest of the wider run."""
+        """Digest that identifies the wider run by everything that decides its numbers and layout."""
         return digest_of(self.identity)
 
     @property
     def share(self) -> float:
-        """Drive periods left to integrate, as a fraction of those of a run from nothing."""
+        """Drive periods left to integrate, as a fraction of the periods that the wider run would need without reused
+        cells.
+        """
         counts = zip(self.runs, self.counts, strict=True)
         left = self.plan.n_cells - self.reused + sum(count * self._more(run) for run, count in counts)
         return left / self.plan.n_cells
 
     def _more(self, run: Run) -> float:
-        """Return the fraction of a cell's periods that reused cells of `run` must still be integrated, if more sections
-        are kept.
+        """Return the fraction of a cell's periods still to be integrated for cells reused from `run`, if the wider run
+        keeps more section points.
         """
         integration = self.spec.integration
         n_more = integration.n_keep - run.spec.integration.n_keep
@@ -298,7 +300,9 @@ def _build(extension: Extension, files: Files, *, echo: Echo, **how: Any) -> Sta
 
 
 def _record(extension: Extension, files: Files) -> None:
-    """Write a file that lists the runs from which cells were reused; it is not part of the result."""
+    """Write a file that lists the runs from which cells were reused; this file is not part of the wider run's
+    result.
+    """
     taken: dict[int, int] = {}
     with contextlib.suppress(FileNotFoundError):
         for line in files.read(TIMINGS).decode().splitlines():
@@ -375,7 +379,9 @@ def _exchange(directory: Path, built: Path, echo: Echo) -> None:
 
 
 def _finish_exchange(directory: Path, echo: Echo) -> None:
-    """Complete an interrupted `extend`: rename the widened run to the run's name if that was still to be done."""
+    """Complete an interrupted `extend` whose old run was already renamed: give the finished wider run the original name
+    of that run.
+    """
     built = _beside(directory)
     if directory.exists() or not is_run(open_files(built)):
         return

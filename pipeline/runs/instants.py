@@ -146,7 +146,9 @@ def _nice(value: float) -> float:
 
 
 def _common(periods: Sequence[float], cycle: float) -> float | None:
-    """Return the least common multiple of the motions' periods [s]; None if there is none, 0 if all motions rest."""
+    """Return the least common multiple of the motions' periods [s]; None if they have none, 0 if all motions are at
+    rest.
+    """
     if any(math.isnan(p) for p in periods):
         return None
     if not periods:
@@ -228,8 +230,8 @@ def filmed(moving: Sequence[Moving], plan: Schedule) -> xr.Dataset:
 
 
 def _told(moving: Sequence[Moving]) -> dict[str, Any]:
-    """Return attributes that describe the motions: model, parameters, units; parameters that differ are listed by
-    motion.
+    """Return attributes that describe the motions: model, units, parameters; a parameter that differs between motions
+    is listed for each.
     """
     first = moving[0].parameters
     lines = [f"{name} = {value!r}" for name, value in first.as_dict().items()]

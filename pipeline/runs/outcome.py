@@ -106,12 +106,14 @@ def summary(run: Run) -> list[str]:
 
 
 def lost_cells(found: Iterable[Outcome]) -> list[Outcome]:
-    """Return those of the given outcomes whose cells diverged or failed."""
+    """Return, from `Outcome` objects (one per status of cells), those of the statuses diverged and failed."""
     return [o for o in found if o.status in (DIVERGED, *FAILED)]
 
 
 def warning(run: Run) -> str:
-    """Return a warning if the fraction of diverged or failed cells exceeds `WORTH_A_WARNING`; else an empty string."""
+    """Return a warning if more than a fixed small fraction of a run's computed cells diverged or failed; else an empty
+    string.
+    """
     found = outcomes_of(run)
     lost, computed = lost_cells(found), sum(o.n_cells for o in found if o.status != PENDING)
     n_lost = sum(o.n_cells for o in lost)

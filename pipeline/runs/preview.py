@@ -52,7 +52,9 @@ def figure_command(plan: Plan, directory: str | Path) -> str:
 
 
 def _long(plan: Plan) -> tuple[int, int]:
-    """Count the swept parameters, and the axes of the grid of initial conditions, that have more than one value."""
+    """Return two counts, each of axes with more than one value: swept parameters, and axes of the grid of initial
+    conditions.
+    """
     long = [d for d, n in zip(plan.dims, plan.shape, strict=True) if n > 1]
     return sum(not is_start_dim(d) for d in long), sum(is_grid_dim(d) for d in long)
 
@@ -125,9 +127,7 @@ def describe_plan(
 
 
 def time_line(spec: Spec, plan: Plan, share: float, n_tasks: int, workers: int | None) -> str:
-    """Return a line with the estimated time for a fraction `share` of a run's cells in `n_tasks` tasks, from a few
-    timed cells.
-    """
+    """Return a line with the estimated time to compute a fraction `share` of a run's cells in `n_tasks` tasks."""
     from pipeline.compute.execute import default_workers
 
     if not share:

@@ -73,7 +73,9 @@ def listen() -> None:
 
 @contextlib.contextmanager
 def in_order() -> Iterator[None]:
-    """Let the first signal raise `Stopped` inside this context; a second one ends the process."""
+    """Let a first Ctrl-C, SIGTERM or SIGHUP raise `Stopped` inside this context, so that code can clean up; a second
+    one ends the process.
+    """
     _listener.is_in_order = True
     try:
         yield
@@ -113,7 +115,8 @@ def leave(number: int) -> NoReturn:
 
 @contextlib.contextmanager
 def stoppable(directory: str | Path) -> Iterator[None]:
-    """Turn Ctrl-C, SIGTERM and SIGHUP inside this context into `InterruptedRunError`, after inner contexts are closed.
+    """Let Ctrl-C, SIGTERM and SIGHUP inside this context end in an `InterruptedRunError`, raised after the code inside
+    has cleaned up.
 
     Parameters
     ----------
@@ -131,7 +134,9 @@ def stoppable(directory: str | Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _raising() -> Iterator[None]:
-    """Let signals that have their default action raise `Stopped` inside this context; other handlers stay installed."""
+    """Let those of SIGINT, SIGTERM and SIGHUP that have the system's default action raise `Stopped` inside this
+    context.
+    """
 
     def stop(number: int, frame: Any) -> None:
         raise Stopped(number)

@@ -1,4 +1,6 @@
-"""Compute versions of analyses: digests of the code that each one uses, so that editing one leaves the others valid."""
+"""Compute versions of analyses as digests of their code; stored results stay valid when only other analyses are
+edited.
+"""
 
 from __future__ import annotations
 

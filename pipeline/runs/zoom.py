@@ -189,14 +189,16 @@ def _check(spec: Spec, changes: Changes) -> list[str]:
 
 
 def _points(spec: Spec, key: str, changes: Changes) -> int:
-    """Return the number of points of a new range: as requested, else as in the old range, else 0."""
+    """Return the number of points of a new range: the requested one, else that of the old range, else 0."""
     asked = changes.nums.get(_state(spec, key) or key, changes.num)
     old = _old_range(spec, key)
     return asked if asked is not None else (len(old.array()) if old is not None else 0)
 
 
 def _old(spec: Spec, key: str) -> tuple[Any, float]:
-    """Return the old value or range of a state or parameter, and the factor that converts it to the unit of `key`."""
+    """Return the value or range of a state or parameter in the old specification, and the factor that converts it to
+    the unit of its new value.
+    """
     state = _state(spec, key)
     if state is None:
         return spec.axes.get(key), 1.0
@@ -214,7 +216,9 @@ def _old_range(spec: Spec, key: str) -> Range | None:
 
 
 def _extent(spec: Spec, key: str) -> tuple[float, float] | None:
-    """Return the ends of the old range of a state or parameter, in the unit of `key`; None if it had no range."""
+    """Return the ends of the range that a state or parameter had in the old specification, in the unit of its new
+    value; None without a range.
+    """
     value, factor = _old(spec, key)
     if isinstance(value, Range):
         array = value.array()

@@ -148,7 +148,7 @@ class Cluster(Table):
 
     @property
     def stagger_s(self) -> int:
-        """Range over which the stop times of workers are spread [s]."""
+        """Length of the time interval over which the stop times of the workers are spread [s]."""
         if self.lifetime_stagger is not None:
             return seconds_of(self.lifetime_stagger)
         return self.margin_s // 3

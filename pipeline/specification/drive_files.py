@@ -90,7 +90,9 @@ class RecordedDrive:
 
     @cached_property
     def _times(self) -> np.ndarray:
-        """Ends of the integration intervals of a torque: its samples, and stroboscopic sections between them [s]."""
+        """Ends of the integration intervals of a recorded torque [s]: the times of its samples, and of stroboscopic
+        sections between them.
+        """
         between = np.searchsorted(self.first, self.sections_s)
         gap = np.minimum(
             np.abs(self.first[np.minimum(between, len(self.first) - 1)] - self.sections_s),
@@ -100,7 +102,7 @@ class RecordedDrive:
 
     @cached_property
     def intervals(self) -> Drive:
-        """Recorded drive as the `Drive` object that the engine integrates; this imports the compiler."""
+        """Recorded drive as the `Drive` object that the integration engine uses; the first access imports numba."""
         from magpend_core.sampling import Drive
 
         if self.kind == EDGES:

@@ -39,7 +39,7 @@ def load_model(reference: str | Path | Mapping[str, Any] | Model = "pendulum") -
 
 
 def _found(reference: str | Path | Mapping[str, Any] | Model) -> Model:
-    """Return the model as `load_model` does, but without warnings."""
+    """Return a model given by name, path, TOML text or table, like `load_model` but without warnings."""
     if isinstance(reference, str) and not reference.lstrip().startswith("{") and is_toml_text(reference):
         return _model_in(toml_tables(reference.encode(), "the text"), Path())
     if isinstance(reference, Path) or (isinstance(reference, str) and is_model_file(reference)):

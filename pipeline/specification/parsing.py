@@ -73,8 +73,8 @@ class Spec:
 
     @property
     def refine(self) -> int | None:
-        """Refinement of the grid of initial conditions: every how many-th cell is integrated first; None without
-        refinement.
+        """Spacing n of the initial conditions that are integrated first (every n-th grid point along each axis); None
+        without refinement.
         """
         starts = self.initial_conditions
         return starts.refine if isinstance(starts, GridStarts) else None
@@ -184,8 +184,8 @@ def _with_smoke(data: dict[str, Any], smoke: bool, folder: Path) -> dict[str, An
 
 
 def _raise_new(plain: dict[str, Any], folder: Path, smoke_error: SpecError) -> None:
-    """Raise a `SpecError` with the problems of the full specification and those that only its ``[smoke]`` table
-    causes.
+    """Raise a `SpecError` with all problems of the full specification, and the further ones that appear only with its
+    ``[smoke]`` table.
     """
     try:
         parse_spec(plain, folder)

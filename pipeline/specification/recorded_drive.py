@@ -44,7 +44,7 @@ def with_drive(data: Mapping[str, Any], folder: str | Path, problems: list[str])
 
 
 def is_whole(table: Any) -> bool:
-    """Return whether the recording in a ``[drive]`` table has the sha256 stored with it; True without a table."""
+    """Return whether the recording in a ``[drive]`` table has the sha256 stored with it, or there is no such table."""
     if not isinstance(table, Mapping):
         return True
     return hashlib.sha256(str(table.get("text", "")).encode()).hexdigest() == table.get("sha256")

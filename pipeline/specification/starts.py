@@ -136,7 +136,7 @@ class ListStarts(Table):
 
 
 def positions(model: Model) -> tuple[str, ...]:
-    """Return the states before the first velocity; rows of a list of initial conditions may end there."""
+    """Return the states before the velocities; a row in a list of initial conditions may give these only."""
     rates = {s.rate for s in model.states if s.rate}
     names = model.state_names
     first = next((i for i, name in enumerate(names) if name in rates), len(names))

@@ -176,7 +176,9 @@ class Integration(Table):
 
 
 class Execution(Table):
-    """The table ``[execution]``: sizes of tasks, which affect the layout of the store but not the numbers."""
+    """The table ``[execution]``: how many cells or points a task computes; affects the layout of the stored files but
+    not the numbers.
+    """
 
     trajectories_per_task: Annotated[int, Field(ge=1, le=MAX_POINTS)] | None = Field(
         None, description="Cells or branches of a task; by default chosen by chunk size and time."

@@ -96,7 +96,9 @@ def odd_keys(files: Files, skeleton: Iterable[str]) -> list[str]:
 
 
 def name_of(index: int) -> str:
-    """Return the file name of a task's commit record; the record itself may lie in a pack, a file of many records."""
+    """Return the name of the file for a single task's commit record, even if the record has been merged into a pack, a
+    file of many records.
+    """
     return marker_key(index).removeprefix(f"{COMMITS}/")
 
 

@@ -96,8 +96,8 @@ def write_cube(run: Run, folder: Path, along: str | None, layers: Layers) -> dic
 
 
 class _Columns:
-    """Chunking of the rewritten cube: a chunk holds one state of all initial conditions at some values of one
-    parameter.
+    """Chunk layout of the rewritten cube: a chunk holds one state for all initial conditions at several values of one
+    swept parameter.
     """
 
     def __init__(self, run: Run, along: str | None) -> None:
@@ -110,7 +110,9 @@ class _Columns:
         self._order = [*starts, *([] if along is None else [along]), *others]
 
     def chunks(self, itemsize: int, own: tuple[str, ...] = ()) -> tuple[int, ...]:
-        """Return the chunk shape of an array that has the dims of the cells, followed by the dims `own`."""
+        """Return the chunk shape of an array whose dimensions are those of the cells, then the further dimensions
+        `own`, such as ``state``.
+        """
         apart = tuple(1 if dim == "state" else self._sizes[dim] for dim in own)
         room = max(1, CHUNK_BYTES // (itemsize * math.prod(apart)))
         found = {}
@@ -120,7 +122,9 @@ class _Columns:
         return (*(found[dim] for dim in self.dims), *apart)
 
     def slabs(self, chunks: tuple[int, ...], bytes_per_cell: int) -> Iterator[tuple[slice, ...]]:
-        """Yield slices along the horizontal axis: whole chunks, as many at a time as `SLAB_BYTES` of memory hold."""
+        """Yield index slices along the explorer's horizontal axis: whole chunks, as many per slice as fit in a fixed
+        amount of memory.
+        """
         if self._along is None:
             yield (slice(None),) * len(self.dims)
             return

@@ -84,8 +84,8 @@ class Files(Protocol):
         ...
 
     def read_each(self, keys: Iterable[str]) -> Iterator[tuple[str, bytes | FileNotFoundError]]:
-        """Read several files; yield each key with its content, or with the error if there is none, in the order of the
-        keys.
+        """Read several files; yield each key, in the given order, with the file's content, or with a
+        `FileNotFoundError` for a missing file.
 
         This is faster than reading one key at a time.
         """
@@ -134,7 +134,9 @@ class Files(Protocol):
         ...
 
     def move_aside(self, key: str) -> str:
-        """Move a file or folder that is in the way into the folder `ASIDE`; return its new path."""
+        """Move a file or folder that occupies a path needed by the run into the run's folder ``aside``; return its new
+        path.
+        """
         ...
 
     def refuse_links(self, *prefixes: str) -> None:
@@ -152,7 +154,8 @@ class Files(Protocol):
         ...
 
     def lock(self) -> AbstractContextManager[bool | None]:
-        """Hold the run's lock against other writers inside a context; committed data are safe without it, too.
+        """Hold the run's lock inside this context, so that no second writer starts; even without the lock, committed
+        data stay intact.
 
         Yields False where locks do not work; another process may then be writing, too.
 

@@ -79,7 +79,7 @@ class Leased(Protocol):
         """Client of the package obstore for the object store."""
 
     def put_lines(self) -> None:
-        """Write the lines that were appended and kept in memory."""
+        """Write the lines that were appended to objects but kept in memory so far."""
 
     def is_there(self, key: str) -> bool:
         """Return whether there is an object."""

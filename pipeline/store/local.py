@@ -65,7 +65,9 @@ class LocalFiles:
         return content
 
     def read_each(self, keys: Iterable[str]) -> Iterator[tuple[str, bytes | FileNotFoundError]]:
-        """Read several files; yield each key with its content, or with the error if there is none."""
+        """Read several files; yield each key with the file's content, or with a `FileNotFoundError` for a missing
+        file.
+        """
         for key in keys:
             try:
                 yield key, self.read(key)
@@ -138,7 +140,9 @@ class LocalFiles:
         return found + [name for name in OWN_FILES if os.path.isdir(self.root / name)]
 
     def move_aside(self, key: str) -> str:
-        """Move a file or folder that is in the way into the folder `ASIDE` inside this one; return its new path."""
+        """Move a file or folder that occupies a path needed by the run into the subfolder ``aside``; return its new
+        path.
+        """
         path = self.root / key
         target = self.root / ASIDE / f"{key.replace('/', '-')}.{uuid.uuid4().hex[:8]}"
         refuse_links(target.parent)
@@ -163,8 +167,8 @@ class LocalFiles:
 
 
 def _measure(folder: Path, prefix: str, found: dict[str, int]) -> None:
-    """Add the sizes of the files below a folder to `found`; raise `RefusedError` for a folder at its top level that is
-    a link.
+    """Add the size of each file below a folder to a dict, by key; raise `RefusedError` if a folder directly in it is a
+    symbolic link.
     """
     with unreadable(folder), os.scandir(folder) as entries:
         below = list(entries)
@@ -206,7 +210,7 @@ def sync_file(path: Path) -> None:
 
 
 def sync(files: Iterable[Path], top: Path) -> None:
-    """Make files durable on disk, then every folder from theirs up to `top`."""
+    """Make files durable on disk, then all folders that contain them, up to the folder `top`."""
     folders: set[Path] = set()
     for file in files:
         sync_file(file)
@@ -282,7 +286,7 @@ def refuse_links(*paths: Path) -> None:
 
 
 def run_around(path: Path) -> Path | None:
-    """Return the run directory that a path is or lies in; None if there is none."""
+    """Return the run directory at or above a path; None if there is none."""
     real = path.absolute().resolve()
     for folder in (real, *real.parents):
         if sum(os.path.lexists(folder / name) for name in (RUN_FILE, CUBE, COMMITS)) >= 2:

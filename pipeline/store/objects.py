@@ -127,7 +127,9 @@ class ObjectFiles:
         return self._store
 
     def below(self, prefix: str) -> ObjectFiles:
-        """Return the files below a prefix; repeated calls return the same object, which keeps its connections."""
+        """Return the files below a prefix; calls with the same prefix return the same `ObjectFiles` object, which keeps
+        its connections.
+        """
         if prefix not in self._below:
             self._below[prefix] = ObjectFiles(self.bucket, f"{self.prefix}/{prefix}".lstrip("/"))
         return self._below[prefix]
@@ -164,7 +166,9 @@ class ObjectFiles:
         return self._ask(key, lambda: bytes(obstore.get(self.store, key).bytes()))
 
     def read_each(self, keys: Iterable[str]) -> Iterator[tuple[str, bytes | FileNotFoundError]]:
-        """Read several objects at once; yield each key with its content, or with the error if there is none."""
+        """Read several objects at once; yield each key with the object's content, or with a `FileNotFoundError` for a
+        missing object.
+        """
 
         def read(key: str) -> bytes | FileNotFoundError:
             try:

@@ -179,7 +179,7 @@ def _sealed_attrs(files: Files, group: bytes | FileNotFoundError | None, digests
 
 
 def remove_product(place: Place) -> None:
-    """Remove a product; a missing one is no error, and of a link only the link is removed.
+    """Remove a product (stored analysis result) if it exists; of a symbolic link, remove the link but not its target.
 
     Raises
     ------
@@ -230,7 +230,9 @@ def _own(attrs: Mapping[Any, Any]) -> dict[str, Any]:
 
 
 def _put_in_place(temporary: Path, path: Path, attrs: Mapping[str, Any]) -> None:
-    """Rename a finished product to its final path; remove a damaged or different product there."""
+    """Rename a finished product (stored analysis result) to its final path; first remove a damaged or different one
+    found there.
+    """
     for _ in range(_MOST_TRIES):
         try:
             temporary.rename(path)
@@ -266,7 +268,9 @@ def _write_group(store: Store, ds: xr.Dataset, digests: Callable[[], Digests]) -
 
 
 def _seal(attrs: Mapping[str, Any], digests: Digests) -> str:
-    """Return a digest of a product's attributes and of its files."""
+    """Return one digest of a product (stored analysis result), computed from its attributes and the digests of its
+    files.
+    """
     digest = hashlib.sha256(json.dumps(_own(attrs), sort_keys=True).encode())
     for key, sha256 in sorted(digests, key=lambda entry: entry[0].split("/")):
         digest.update(f"\n{key} {sha256}".encode())

@@ -41,7 +41,7 @@ def _short(text: str) -> str:
 
 @dataclass(frozen=True)
 class Run:
-    """An opened run directory with the commit records of that moment, so that all results use the same cells.
+    """An opened run directory with the commit records found when it was opened, so that all results use the same cells.
 
     Attributes
     ----------

@@ -53,5 +53,7 @@ def _loop_words(loop: xr.Dataset, unit: str) -> Words:
 
 
 def _met(counts: np.ndarray) -> str:
-    """Format the ids of the attractors that were met, each with the number of parameter points."""
+    """Format the ids of the attractors that a continuation met, each with the number of parameter points at which it
+    met them.
+    """
     return ", ".join(f"{i} ({counted(counts[i], 'point')})" for i in np.flatnonzero(counts)) or "-"

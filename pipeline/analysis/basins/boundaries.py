@@ -317,7 +317,9 @@ class _Line(NamedTuple):
 
 
 def _epsilons(epsilons: Sequence[int] | None, shape: tuple[int, ...], method: Scaling) -> Ints:
-    """Return the perturbations or box sides [cells] in rising order, checked against the grid."""
+    """Return the sizes epsilon [cells] of perturbations or boxes in rising order; ValueError if they do not fit the
+    grid.
+    """
     first = 1 if method == "perturbation" else 2
     shortest = min(shape)
     # a perturbation needs room on both sides, a box must fit
@@ -338,7 +340,7 @@ def _epsilons(epsilons: Sequence[int] | None, shape: tuple[int, ...], method: Sc
 
 
 def _perturbed(codes: Codes, eps: Ints) -> tuple[Floats, Floats]:
-    """Count per epsilon and tile the cells tested, and those of uncertain outcome: the label changes at a distance
+    """Count, per perturbation epsilon and tile of the grid, the cells tested and those whose label changes within
     epsilon.
 
     Every epsilon has the same trials: the cells that have room for the largest epsilon. Otherwise f would not
@@ -361,8 +363,8 @@ def _perturbed(codes: Codes, eps: Ints) -> tuple[Floats, Floats]:
 
 
 def _boxed(codes: Codes, eps: Ints, method: Scaling) -> tuple[Floats, Floats]:
-    """Count the boxes per side length (epsilon) and tile, and those with several labels (or sum the entropies of the
-    boxes).
+    """Count, per box side epsilon and tile of the grid, all boxes and those with several labels (or sum the boxes'
+    entropies).
     """
     n_tiles = tiles_per_side(codes.shape) ** codes.ndim
     trials, hits = np.zeros((eps.size, n_tiles)), np.zeros((eps.size, n_tiles))

@@ -111,14 +111,15 @@ def spread(resampled: Floats, confidence: float) -> tuple[Floats, Floats, Floats
 
 
 def tiles_per_side(shape: tuple[int, ...], total: int = 64) -> int:
-    """Return the number of tiles along each axis, at least 2, for about `total` tiles in all."""
+    """Return into how many tiles to divide a grid along each axis, at least 2, for about `total` tiles in all."""
     return max(2, int(np.rint(total ** (1.0 / len(shape)))))
 
 
 def tile_numbers(
     shape: tuple[int, ...], grid: tuple[int, ...], step: int = 1, margin: tuple[int, ...] | None = None
 ) -> Ints:
-    """Return the number of the tile that holds each element's centre, for an array laid over the grid.
+    """Return for each element of an array laid over the grid of cells the number of the tile that holds the element's
+    centre.
 
     Parameters
     ----------
@@ -141,6 +142,6 @@ def tile_numbers(
 
 
 def tile_sums(values: npt.NDArray[np.generic], tile: Ints, n_tiles: int) -> Floats:
-    """Sum the values in each tile."""
+    """Sum an array's values over each of the tiles into which a grid of cells is divided."""
     weights = values.ravel().astype(np.float64)
     return np.bincount(tile.ravel(), weights=weights, minlength=n_tiles).astype(np.float64)

@@ -191,7 +191,7 @@ def tipping_probabilities(
 def _kept_dims(
     labels: npt.ArrayLike | xr.DataArray, dims: Sequence[str] | None
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the names of the dims that stay in the result, and of the dims to count over."""
+    """Return the names of the dims of the labels that stay in the result, and of those over which cells are counted."""
     if dims is None:
         over = tuple(str(dim) for dim in labels.dims) if isinstance(labels, xr.DataArray) else ()
         return (), over
@@ -204,7 +204,7 @@ def _kept_dims(
 
 
 def _count_rows(grid: LabelGrid, shape: tuple[int, ...]) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """Count the cells per label and the unfinished cells, for each element of the leading axes of shape `shape`."""
+    """Count the cells of each label and the unfinished cells, separately for each element of the leading axes."""
     n_rows, width = int(np.prod(shape)), grid.ids.size + 1
     codes = grid.codes.reshape(n_rows, -1).astype(np.int64) + 1
     codes += width * np.arange(n_rows)[:, None]
@@ -261,7 +261,9 @@ def _upper_bound(count: npt.NDArray[np.int64], n: npt.NDArray[np.int64], confide
 
 
 def _same_cells(before: xr.DataArray, after: xr.DataArray) -> xr.DataArray:
-    """Check that both arrays lie on the same cells, and transpose `after` to the dims of `before`."""
+    """Check that the labels before and after a change are of the same cells, and return those after with the dims of
+    those before.
+    """
     if set(before.dims) != set(after.dims):
         raise ValueError(
             f"labels before have the dims {before.dims}, after {after.dims}: select one parameter value from each"
@@ -274,7 +276,9 @@ def _same_cells(before: xr.DataArray, after: xr.DataArray) -> xr.DataArray:
 
 
 def _provenance(unfinished: Collection[int], confidence: float, method: Interval) -> dict[str, object]:
-    """Return dataset attributes: the options and the references of the intervals."""
+    """Return dataset attributes: method, confidence level and reference of the intervals, and the codes of unfinished
+    cells.
+    """
     return {
         "interval": method,
         "confidence": confidence,

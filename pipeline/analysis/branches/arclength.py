@@ -112,7 +112,7 @@ def tangent_of(value: Value, along: np.ndarray) -> np.ndarray | None:
 
 
 def kernel_of(value: Value) -> np.ndarray:
-    """Return a unit vector of the derivative's kernel, with either sign."""
+    """Return a unit vector in the kernel of the derivative of a curve's equations; its sign is arbitrary."""
     return np.asarray(np.linalg.svd(value.derivative)[2][-1])
 
 

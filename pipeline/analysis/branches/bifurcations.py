@@ -54,7 +54,7 @@ def _branching_test(point: Point) -> float:
 
 
 def _of_orbits(test: Callable[[np.ndarray], float]) -> Test:
-    """Return a test of the monodromy matrix that never vanishes at equilibria."""
+    """Turn a test function of the monodromy matrix into one of a branch's points that is always 1 at equilibria."""
     return lambda point: 1.0 if point.value.is_rest else test(point.value.monodromy)
 
 
@@ -201,7 +201,9 @@ Tested = tuple[Point, float]
 def find_root(
     problem: Problem, a: Tested, b: Tested, test: Callable[[Point], Steps[float]], settings: Settings
 ) -> Steps[tuple[Tested, Tested] | None]:
-    """Bracket a zero of a test function between two points to `WIDTH`; None if a solution between is not found."""
+    """Narrow the bracket of a test function's zero between two points of a curve to `WIDTH`; None if Newton's method
+    fails between.
+    """
     (first, at_first), (last_point, at_last) = a, b
     chord = last_point.u - first.u
     length = float(np.linalg.norm(chord))

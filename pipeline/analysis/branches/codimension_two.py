@@ -127,8 +127,8 @@ class Detector:
         return turned, values
 
     def _coefficient(self, case: Case) -> Steps[float]:
-        """Compute the normal form coefficient at a point of the curve, with the step of differences chosen at the first
-        point.
+        """Compute the normal form coefficient at a point of the curve, by differences with the step size chosen at the
+        first point.
         """
         if case.kind == TORUS and case.critical.imag == 0.0:  # beyond R1 or R2
             return float("nan")
@@ -142,8 +142,8 @@ class Detector:
         return float(value.residual[0])
 
     def _locate(self, kind: str, a: Tested, b: Tested, frame: _Frame) -> Steps[None]:
-        """Locate the zero of a test function between two points of the curve, and keep it; count it as missed if that
-        fails.
+        """Locate the zero of a test function between two curve points and store this point of codimension two; count a
+        failure as missed.
         """
 
         def test(point: Point) -> Steps[float]:
@@ -192,8 +192,8 @@ class _Frame:
 
     @classmethod
     def of(cls, case: Case, before: _Frame | None) -> _Frame:
-        """Return the critical eigenvector and plane at a point of a curve, with the signs and the basis nearest to
-        those before.
+        """Return the critical eigenvector and plane at a point of a curve; the plane's basis is the nearest to that of
+        the point before.
         """
         if case.kind != TORUS:
             return cls(case.q, None)
@@ -276,7 +276,9 @@ def merged(points: Mapping[int, list[SpecialPoint]]) -> list[SpecialPoint]:
 
 
 def _is_known(one: SpecialPoint, other: SpecialPoint) -> bool:
-    """Return whether two located points are the same orbit: at equal parameter values, from whichever section point."""
+    """Return whether two located points of codimension two are the same orbit: equal parameter values, a common section
+    point.
+    """
     if one.kind != other.kind or one.family.period != other.family.period:
         return False
     if np.abs(one.point.u[-2:] - other.point.u[-2:]).max() > SAME_POINT:

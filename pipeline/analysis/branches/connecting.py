@@ -66,12 +66,12 @@ class Found:
 
     @property
     def period(self) -> int:
-        """Period [drive periods]."""
+        """Period of the orbit [drive periods]."""
         return self.family.period
 
     def distance(self, u: np.ndarray) -> tuple[float, int]:
-        """Return the Euclidean scaled distance of unknowns from the orbit's nearest section point, and this point's
-        index.
+        """Return the scaled distance of a point of a branch from the orbit's nearest section point, and the index of
+        the latter.
         """
         away = [float(np.linalg.norm(self.family.mismatch(u, point))) for point in self.points]
         nearest = int(np.argmin(away))
@@ -167,15 +167,17 @@ def _neighbours(line: Sequence[Found], start: dict[int, Point | None]) -> Links:
 
 
 def _is_one_step(a: Found, b: Found, start: dict[int, Point | None]) -> bool:
-    """Return whether the tangent at each of two orbits leads to the other one, with consistent order of the section
-    points.
+    """Return whether the tangent at each of two orbits leads to the other one, with the section points in the same
+    order.
     """
     phases = [_leads_to(start[a.number], b), _leads_to(start[b.number], a)]
     return all(p is not None for p in phases) and sum(p for p in phases if p is not None) % a.period == 0
 
 
 def _leads_to(point: Point | None, other: Found) -> int | None:
-    """Return the index of another orbit's section point to which the tangent leads; None if it leads elsewhere."""
+    """Return the index of another orbit's section point to which a step along the tangent leads; None if it leads to
+    none.
+    """
     if point is None or point.tangent[-1] == 0.0:
         return None
     change = other.value / other.family.scales[0] - point.u[-1]
@@ -189,8 +191,8 @@ def _leads_to(point: Point | None, other: Found) -> int | None:
 
 
 def _targets(one: Found, line: Sequence[Found], way: int, known: Links) -> list[Found]:
-    """Return the orbits that one orbit's branch can meet: of equal period only upwards, of half, quarter, ... in both
-    directions.
+    """Return the orbits that one orbit's branch can meet: of half, quarter, ... of its period or, only upwards, of
+    equal period.
     """
     if one.number in (known.up if way > 0 else known.down):
         return []

@@ -15,7 +15,8 @@ from pipeline.analysis.branches.units import parameter_units, state_units
 
 
 def curves_dataset(curves: Sequence[Curve], first: str, second: str, model: Model | None = None) -> xr.Dataset:
-    """Return curves as a dataset: dims ``curve``, ``point`` (NaN beyond a curve's own), ``state`` and ``special``.
+    """Return bifurcation curves as a dataset; dims: ``curve``, ``point`` (NaN beyond a curve's end), ``state``,
+    ``special`` points.
 
     ``special`` counts the points of codimension two: ``special_kind``, ``special_first`` and ``special_second``
     with their errors ``..._error``, ``special_period``, ``special_section`` and the curve on which each was found.

@@ -31,8 +31,8 @@ SAME_TIME = 1e-6
 
 
 def cycle_family(equilibria: Family, at: Bifurcation) -> Family | None:
-    """Return the family of limit cycles around a Hopf point, with a section through it; None if cycles do not cross
-    that.
+    """Return the family of limit cycles around a Hopf point, with a Poincare section through it; None if they do not
+    cross this section.
 
     That is so for a system without a section by crossing, and if the crossing state does not oscillate.
     """

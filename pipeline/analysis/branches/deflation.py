@@ -169,8 +169,8 @@ def _newton(matrices: np.ndarray, mismatch: np.ndarray) -> np.ndarray:
 def _stretch(
     states: np.ndarray, periods: np.ndarray, steps: np.ndarray, known: Sequence[FoundOrbit], system: System
 ) -> np.ndarray:
-    """Return the factors by which deflation changes Newton steps: 1/(1 - grad(log m) . step), m the product of 1 +
-    1/d^2.
+    """Return the factors by which deflation stretches Newton steps: 1/(1 - grad(log m) . step), m = product of 1 +
+    1/(distance from a known orbit)^2.
     """
     scales, along = np.asarray(system.scales), np.zeros(len(states))
     for one in known:
@@ -192,8 +192,8 @@ def _add(
     packed: np.ndarray,
     system: System,
 ) -> None:
-    """Add the orbits through some section points that are not known yet, and count how often the first round met
-    each.
+    """Add the new orbits among those through some section points, and count how often the first round of the search met
+    each orbit.
     """
     if not len(states):
         return

@@ -20,7 +20,7 @@ class EquilibriumProblem:
 
     @property
     def size(self) -> int:
-        """Number of unknowns."""
+        """Number of unknowns: the states and the free parameter."""
         return self.family.system.n_states + 1
 
     @property
@@ -29,7 +29,7 @@ class EquilibriumProblem:
         return self.family.system
 
     def rows(self, u: np.ndarray) -> Rows:
-        """Return an empty request: equilibria need no trajectories."""
+        """Return an empty list of trajectories to integrate: equations for equilibria need none."""
         return self.family.rows(u[None][:0])
 
     def value(self, u: np.ndarray, ends: Ends) -> Value:

@@ -357,7 +357,7 @@ def _adopt_cycles(branches: Sequence[Branch]) -> None:
 
 
 def _hopf_at(branches: Sequence[Branch], cycles: Branch, end: Point) -> Bifurcation | None:
-    """Return the Hopf point nearest to the last limit cycle of a branch; None if it is farther than `AT_HOPF`."""
+    """Return the Hopf point nearest to the last limit cycle of a branch; None if none is near enough."""
     near = [
         (max(_gap(cycles.family, end, one), abs(end.u[-1] - one.point.u[-1])), one)
         for other in branches
@@ -417,8 +417,8 @@ def _equal_runs(periods: np.ndarray) -> list[tuple[int, int]]:
 
 
 def _other_sections(cycles: Branch, own: Family, branches: Sequence[Branch]) -> list[Family]:
-    """Return a family of orbits for each Poincare section of the known branches but that of `cycles`, the run's own
-    first.
+    """Return a family of orbits for each Poincare section of the known branches, the run's own first, without that of
+    `cycles`.
     """
     families = [own, *(b.family for b in branches if b.family.period and b.family.free == own.free)]
     by_section = {_fixed(family).tobytes(): family for family in reversed(families)}
@@ -427,7 +427,7 @@ def _other_sections(cycles: Branch, own: Family, branches: Sequence[Branch]) -> 
 
 
 def _parts(cycles: Branch, wanted: np.ndarray) -> list[Branch]:
-    """Return the parts of a branch at the wanted points, as branches; each has one more point at both sides."""
+    """Cut a branch of limit cycles into the stretches of wanted points, each with one more point at both ends."""
     n, parts = len(wanted), []
     for first, last in [(max(a - 1, 0), min(b + 1, n - 1)) for a, b in _equal_runs(wanted.astype(int))]:
         ends = cycles.ends[0] if first == 0 else "other_section", cycles.ends[1] if last == n - 1 else "other_section"

@@ -28,7 +28,9 @@ REST = 0.5
 
 
 def problem_of(family: Family) -> OneParameter:
-    """Return the equations of a family of orbits or equilibria, as an object for one computation."""
+    """Return a new object that evaluates the equations of a family of orbits or equilibria, for use by one
+    computation.
+    """
     return OrbitProblem(family) if family.period else EquilibriumProblem(family)
 
 
@@ -105,7 +107,7 @@ class _Stop:
         return False
 
     def _difference(self, state: np.ndarray, parameter: float, u: np.ndarray) -> np.ndarray:
-        """Return the scaled unknowns of a state and a parameter value, minus `u`."""
+        """Return the scaled difference between a state with its parameter value and the point `u` of a branch."""
         return np.append(self.family.mismatch(u, state), parameter - u[-1])
 
 
@@ -191,7 +193,7 @@ def _is_known(one: Bifurcation, found: list[Bifurcation]) -> bool:
 
 
 def _cut(problem: OneParameter, found: Trace, low: float, high: float, settings: Settings) -> Steps[None]:
-    """Replace the last point, which lies beyond a parameter bound, by one on the bound."""
+    """Replace the last point of a traced curve, which lies beyond a parameter bound, by the solution on the bound."""
     family = problem.family
     before, beyond = found.points[-2:]
     values = [family.values(p.u)[0] for p in (before, beyond)]
@@ -232,7 +234,7 @@ def joined(family: Family, backward: Half, forward: Half) -> Branch:
 
 
 def opposite(point: Point) -> Point:
-    """Return the same point with the opposite tangent."""
+    """Return the same point of a solution curve with its tangent reversed."""
     return Point(point.u, -point.tangent, point.value, point.n_iterations)
 
 

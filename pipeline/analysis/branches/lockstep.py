@@ -64,8 +64,8 @@ def run_together(computations: Sequence[Steps[T]], what: str = "") -> list[T]:
 def _report(
     what: str, queries: Mapping[int, Query], waiting: Iterable[int], seen: dict[int, tuple[float, float]], n: int
 ) -> None:
-    """Report the progress of computations; `seen` has the range covered by each one's last unknown, updated in
-    place.
+    """Report the progress of computations; `seen` has the range that the last unknown (a parameter) of each has covered
+    so far.
     """
     for i, query in queries.items():
         last = float(query.u[-1])
@@ -100,7 +100,7 @@ def _calls(systems: Sequence[tuple[int, System]]) -> list[list[int]]:
 
 
 def integrated(rows: Sequence[Rows], system: System) -> list[Ends]:
-    """Integrate the trajectories of some requests in one call."""
+    """Integrate the trajectories that several computations requested, in one call of the engine."""
     if not any(len(r.states) for r in rows):  # equilibria alone
         n = system.n_states
         none = np.zeros((0, n))

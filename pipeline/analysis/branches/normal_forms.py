@@ -90,15 +90,15 @@ class Case:
             self.q, self.p = -self.q, -self.p
 
     def neighbours(self) -> np.ndarray:
-        """Return the scaled unknowns of states displaced from the orbit along the critical eigenvector, for the
-        differences.
+        """Return the scaled unknowns displaced from the orbit along the critical eigenvector, at which differences are
+        evaluated.
         """
         parts = [self.q.real, self.q.imag] if self.kind in (TORUS, HOPF) else [self.q.real]
         shifts = np.concatenate([np.outer(sign * self.steps, part) for part in parts for sign in (1.0, -1.0)])
         return np.asarray(self.u + np.pad(shifts, ((0, 0), (0, len(self.u) - len(self.q)))))
 
     def coefficients(self, form: Form, neighbours: np.ndarray) -> np.ndarray:
-        """Compute a normal form coefficient with each step size but the largest.
+        """Compute a normal form coefficient by finite differences, for each step size but the largest.
 
         `neighbours` are the derivatives of the map, or Jacobians, at `self.neighbours()`, unscaled.
         """
@@ -172,20 +172,24 @@ class CoefficientProblem:
 
     @property
     def size(self) -> int:
-        """Number of unknowns."""
+        """Number of unknowns: the states and the free parameters."""
         return len(self.case.u)
 
     @property
     def system(self) -> System:
-        """System to integrate."""
+        """System of equations to integrate."""
         return self.case.family.system
 
     def rows(self, u: np.ndarray) -> Rows:
-        """Return the trajectories from the states near the orbit that the differences need."""
+        """Return the trajectories to integrate for finite differences: they start at states displaced from the
+        orbit.
+        """
         return self.case.family.rows(self.case.neighbours())
 
     def value(self, u: np.ndarray, ends: Ends) -> Value:
-        """Compute the normal form coefficient from the ends of the trajectories, for each step size."""
+        """Compute the normal form coefficient for each step size but the largest, from trajectories displaced from the
+        orbit.
+        """
         found = self.case.coefficients(FORMS[self.case.kind], ends.monodromy)
         return Value(found, np.zeros((len(found), self.size)), ends.images[0], ends.monodromy[0])
 
@@ -221,7 +225,9 @@ def _bend(middle: np.ndarray, ahead: np.ndarray, behind: np.ndarray, steps: np.n
 
 
 def settled(values: np.ndarray) -> tuple[float, float, int]:
-    """Return the value that changes least between neighbouring step sizes, its change as error, and its index."""
+    """Return, of a coefficient's values for successive step sizes, the one that changes least, its change as error, and
+    its index.
+    """
     changes = np.abs(np.diff(values))
     errors = np.maximum(changes[:-1], changes[1:])
     if np.isnan(errors).all():
@@ -250,7 +256,7 @@ def _quadratic(case: Case, bends: Sequence[Bend]) -> float:
 
 
 def _size(case: Case, bends: Sequence[Bend]) -> float:
-    """Compute an upper bound of the quadratic coefficient, to compare the coefficient with."""
+    """Compute an upper bound of the quadratic normal form coefficient, as a scale to compare the coefficient with."""
     (bend,) = bends
     return float(0.5 * np.linalg.norm(case.p) * np.linalg.norm(bend.first))
 
@@ -270,7 +276,9 @@ def _cubic(case: Case, bends: Sequence[Bend]) -> float:
 
 
 def _complex_parts(case: Case, bends: Sequence[Bend]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the matrices B(q, .) and B(conj(q), .), and the vector C(q, q, conj(q)), from the derivatives along q."""
+    """Return derivatives of the map along the eigenvector q: second ones as matrices B(q, .), B(conj(q), .), third as
+    C(q, q, conj(q)).
+    """
     real, imag = bends
     along, against = real.first + 1j * imag.first, real.first - 1j * imag.first
     return along, against, (real.second + imag.second) @ case.q

@@ -226,11 +226,13 @@ class OrbitProblem:
 
     @property
     def system(self) -> System:
-        """System to integrate."""
+        """System of equations to integrate."""
         return self.family.system
 
     def rows(self, u: np.ndarray) -> Rows:
-        """Return the trajectories to integrate: the orbit, or each of its periods, and a neighbour in the parameter."""
+        """Return the trajectories to integrate: the orbit or each of its periods, each also at a slightly changed
+        parameter value.
+        """
         step = np.zeros(self.size)
         step[-1] = ONE_SIDED_STEP
         if self._known is None:
@@ -240,8 +242,8 @@ class OrbitProblem:
         return replace(self.family.rows(np.concatenate([own, own + step])), period=1)
 
     def value(self, u: np.ndarray, ends: Ends) -> Value | None:
-        """Compute the orbit's mismatch after its period, and its derivative; None if other trajectories must be
-        integrated.
+        """Compute the orbit's mismatch after its period, and its derivative; None if trajectories from other starts are
+        needed first.
         """
         is_whole = ends.images.shape[1] == self.family.period
         return self._of_whole(u, ends) if is_whole else self._of_segments(u, ends)
@@ -261,7 +263,9 @@ class OrbitProblem:
         return None
 
     def _of_segments(self, u: np.ndarray, ends: Ends) -> Value | None:
-        """Combine the separately integrated periods of an orbit into its images, derivative and mismatch."""
+        """Combine an orbit's separately integrated periods into section points, mismatch and derivative; None if the
+        gaps are too wide.
+        """
         n, scales = self.size - 1, np.asarray(self.system.scales)
         starts = np.split(ends.starts / scales, 2)[0]
         images, beside = np.split(ends.images[:, 0], 2)
@@ -296,7 +300,7 @@ class OrbitProblem:
 
 
 def _is_joined(gap: float, residual: float) -> bool:
-    """Return whether the gaps between the separately integrated periods of an orbit are small enough beside the
+    """Return whether the gaps between an orbit's separately integrated periods are small enough for the present
     residual.
 
     F errs by the square of the gap, the derivative by the gap. Far from the solution Newton's method needs
@@ -350,12 +354,12 @@ class BifurcationProblem:
 
     @property
     def size(self) -> int:
-        """Number of unknowns."""
+        """Number of unknowns: the states and two free parameters."""
         return self.family.system.n_states + 2
 
     @property
     def system(self) -> System:
-        """System to integrate."""
+        """System of equations to integrate."""
         return self.family.system
 
     @property
@@ -364,7 +368,9 @@ class BifurcationProblem:
         return np.array([STATE_STEP] * n + [PARAMETER_STEP] * 2)
 
     def rows(self, u: np.ndarray) -> Rows:
-        """Return the trajectories to integrate: the orbit, and two neighbours in every unknown."""
+        """Return the trajectories to integrate: the orbit, and for differences two more per unknown, displaced to
+        either side.
+        """
         shifts = np.diag(self._steps)
         return self.family.rows(np.concatenate([u[None], u + shifts, u - shifts]))
 

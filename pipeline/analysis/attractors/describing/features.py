@@ -70,7 +70,9 @@ class Cells:
     seconds: list[np.ndarray] = field(default_factory=list)
 
     def add(self, block: Block, cells: np.ndarray, labels: np.ndarray, geometry: Geometry) -> None:
-        """Add some cells of a block; `labels` has the classifier code of every cell of the block."""
+        """Add the statistics of some cells of a block of trajectories; `labels` has the classifier code of every cell
+        of the block.
+        """
         section = block.section[cells]
         self.n += len(cells)
         flat = section.reshape(-1, section.shape[-1])
@@ -164,8 +166,8 @@ def mean_rotation(section: np.ndarray, turns: np.ndarray, geometry: Geometry) ->
 
 
 def sides_of(section: np.ndarray, turns: np.ndarray, frequency: float, parameters: Parameters | None) -> np.ndarray:
-    """Classify trajectories by the model's classifier, from their section points; `UNKNOWN` without a classifier or
-    with a NaN.
+    """Classify trajectories by the model's classifier, from their section points; "unknown" without a classifier or for
+    NaN points.
     """
     classifier = parameters.model.classifier if parameters is not None else None
     if classifier is None or parameters is None:

@@ -156,7 +156,9 @@ def _conservative(point: Point, labels: _Labels) -> BoundedSet:
 
 
 def _label_orbits(point: Point, state: State, labels: _Labels, search: Search) -> np.ndarray:
-    """Label the cells on orbits; return the group of each closed cell that is on no orbit, -1 for all other cells."""
+    """Label the cells on known orbits; return the group number of each closed cell that is on none of them, -1 for all
+    other cells.
+    """
     groups = np.full(point.n_cells, -1, np.int64)
     for block in point.blocks():
         own = block.cells
@@ -192,8 +194,8 @@ def _probe(point: Point, state: State, labels: _Labels, search: Search) -> Work[
 
 
 def _label_courses(point: Point, found: Outcome, labels: _Labels, groups: np.ndarray, search: Search) -> None:
-    """Label cells by the attractor, or other end, that a sampled cell of the same box or group reached when integrated
-    further.
+    """Label cells by the end (attractor, equilibrium, divergence) of a cell of the same box or group that was
+    integrated further.
     """
     ends = {course.key: course.end for course in found.courses if not course.goes_on}
     if not ends:
@@ -231,7 +233,9 @@ def _label_raw(point: Point, state: State, groups: np.ndarray, labels: _Labels, 
 def _label_sets(
     point: Point, first: int, sets: Sequence[BoundedSet], labels: _Labels, groups: np.ndarray, search: Search
 ) -> None:
-    """Label the cells of each non-periodic set: its sampled cells, and all others whose section points lie on it."""
+    """Label the cells on each non-periodic set: those integrated further on it, and all others whose section points lie
+    on it.
+    """
     for i, one in enumerate(sets):
         own = one.cells[labels.label[one.cells] < 0]
         labels.put(own, first + i, SAME_SET)
@@ -256,9 +260,7 @@ def _label_ends(block: Block, ends: Mapping[int, int], label: np.ndarray, decisi
 def _representatives(
     block: Block, group: np.ndarray, best: dict[int, tuple[float, int, np.ndarray]], geometry: Geometry
 ) -> None:
-    """Store for each group of closed cells the last period of the cell that closes best, among those not on a polished
-    orbit.
-    """
+    """Store, for each group of closed cells on no polished orbit, the last period of the cell that closes best."""
     rows = np.flatnonzero(group >= 0)
     if not len(rows):
         return
@@ -340,7 +342,9 @@ def _number_ends(
 def _features_of(
     number: int, cells: Cells, orbits: Sequence[Orbit], sets: Sequence[BoundedSet], point: Point, search: Search
 ) -> Features:
-    """Return the features of the orbit, bounded set, equilibrium or limit cycle with this provisional number."""
+    """Return the features of the set (orbit, bounded set, equilibrium or limit cycle) that has this provisional
+    number.
+    """
     resting = len(orbits) + len(sets)
     if number < len(orbits):
         return _of_orbit(cells, orbits[number], point, search)

@@ -142,7 +142,9 @@ def _dataset(here: xr.Dataset, orbits: list[np.ndarray], parameters: Parameters,
 
 
 def _drawn(result: xr.Dataset, table: np.ndarray, parameters: Parameters) -> xr.Dataset:
-    """Add the positions along each motion of the points in the model's drawing, if the model has a drawing."""
+    """Add how the points of the model's drawing move during the motion on each attractor, if the model has a
+    drawing.
+    """
     drawing = parameters.model.drawing
     if drawing is None:
         return result

@@ -117,7 +117,9 @@ def describe(
 
 
 def left_behind(left: Sequence[Course], settings: Settings) -> BoundedSet:
-    """Return the transient set on which cells were before they left it, for the case that no sampled cell stayed."""
+    """Describe the transient set on which trajectories were before they left it, if no sampled trajectory stayed on
+    it.
+    """
     paths = [course.stayed for course in left]
     return BoundedSet(
         np.zeros(0, np.int64),
@@ -144,7 +146,7 @@ def ends_of(left: Iterable[Course]) -> dict[int, int]:
 
 
 def were_on(course: Course, own: Sequence[Course], settings: Settings) -> bool:
-    """Return whether a trajectory was on the same set as the trajectories `own` before it left."""
+    """Return whether a trajectory, before it left its set, was on the same set as the trajectories `own`."""
     points = np.concatenate([other.stayed for other in own])
     return bool(mixing(course.stayed, points, settings.geometry, settings.closure) >= OTHER)
 
@@ -189,7 +191,7 @@ def _growth(own: Sequence[Course], point: Point, settings: Settings, most: int) 
 
 
 def _closes_above(own: Sequence[Course], growth: Growth | None, settings: Settings) -> int:
-    """Return the least period beyond the search limit with which a contracting set recurs; 0 if no such period is
+    """Return the smallest period above the search limit with which a contracting set repeats itself; 0 if none is
     seen.
     """
     if growth is None or not growth.contracts:

@@ -69,7 +69,9 @@ def mixing(a: np.ndarray, b: np.ndarray, geometry: Geometry, least: float = 0.0)
 
 
 def _crossing(own: np.ndarray, other: np.ndarray, n: int, geometry: Geometry, least: float) -> float:
-    """Compute the share of points in the later half of `own` whose nearest neighbour lies in `other`."""
+    """Compute the share of a sample's later points that are nearer to another sample than to the sample's own earlier
+    points.
+    """
     # take points from the whole duration of the other sample
     trees = [geometry.tree(points) for points in (own[:n], thinned(other, n))]
     near = [np.maximum(tree.query(geometry.scaled(own[n : 2 * n]), p=np.inf)[0], least) for tree in trees]
@@ -147,7 +149,9 @@ class Cloud:
 
     @classmethod
     def of(cls, samples: Sequence[np.ndarray], geometry: Geometry, least: float) -> Cloud:
-        """Build the cloud from section points of some cells; its point spacing is at least `least`."""
+        """Build the search tree from section points of some trajectories; `least` is the lower limit of its point
+        spacing.
+        """
         points = _pooled(samples)
         # distances from one half to the other: a safe spacing, since the whole is twice as dense
         order = np.random.default_rng(0).permutation(len(points))

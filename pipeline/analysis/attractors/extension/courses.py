@@ -66,7 +66,7 @@ class Course:
 
     @property
     def has_left(self) -> bool:
-        """Whether the trajectory ended after at least `LEAST_SEEN` section points on another set."""
+        """Whether the trajectory stayed on a set for at least `LEAST_SEEN` section points before it ended elsewhere."""
         return not self.goes_on and not self.is_leaving and len(self.stayed) >= LEAST_SEEN
 
     @property
@@ -76,5 +76,7 @@ class Course:
 
 
 def rest_number(end: int) -> int | None:
-    """Return the number of the equilibrium that an end code means; None if the code means another end."""
+    """Return the number of the equilibrium that a trajectory's end code stands for; None if the code stands for another
+    end.
+    """
     return AT_REST - end if end <= AT_REST else None

@@ -83,7 +83,8 @@ class Outcome:
 def extend(
     point: Point, orbits: Sequence[Orbit], label: np.ndarray, settings: Settings, budget: float, n_sample: int
 ) -> Work[Outcome]:
-    """Integrate samples of the cells with label -1 further, until the sets on which they end are known.
+    """Integrate samples of the cells without a known attractor (label -1) further, until the sets on which they end are
+    known.
 
     Parameters
     ----------
@@ -141,7 +142,9 @@ class _Extension:
     # ---- samples -------------------------------------------------------------------------------
 
     def sample(self, loose: np.ndarray, n: int) -> list[Course]:
-        """Choose the next `n` cells to integrate further: one per box of last section points, by rising hash."""
+        """Choose `n` more cells to integrate further: one from each box that last section points fall into, in
+        pseudorandom order.
+        """
         known = {course.key for course in self.courses}
         best: dict[int, tuple[int, int, np.ndarray, float]] = {}
         is_loose = np.zeros(self.point.n_cells, bool)
@@ -160,14 +163,18 @@ class _Extension:
         return [Course(cell, key, kept, kept[-1], step) for key, (_, cell, kept, step) in chosen]
 
     def left_of(self, loose: np.ndarray) -> np.ndarray:
-        """Return the unassigned cells that were not sampled and lie on no set with a final verdict."""
+        """Return the unassigned cells that were not integrated further and lie on no set whose stability is decided for
+        good.
+        """
         done = np.zeros(self.point.n_cells, bool)
         done[self.told(loose)[0]] = True
         done[[course.cell for course in self.courses]] = True
         return np.asarray(loose[~done[loose]])
 
     def told(self, loose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the unassigned cells that lie on sets with a final verdict, and the numbers of these sets."""
+        """Return the unassigned cells that lie on sets whose stability is decided for good, and the numbers of these
+        sets.
+        """
         final = [i for i, one in enumerate(self.sets) if one.stability in (ATTRACTS, NEUTRAL) or not self.budget]
         clouds = [one for i in final if (one := self.sets[i].cloud) is not None]
         is_loose = np.zeros(self.point.n_cells, bool)
@@ -204,8 +211,8 @@ class _Extension:
             target = 2 * max(c.length for c in self.courses if c.goes_on)
 
     def conclude(self) -> Work[None]:
-        """Describe the sets of unfinished trajectories without integrating further, unless their description is up to
-        date.
+        """Describe the sets of unfinished trajectories, without further integration, if trajectories grew since the
+        last description.
         """
         if self._told != self._lengths():
             yield from self._tell_sets()
@@ -243,7 +250,9 @@ class _Extension:
         return self.settings.seen + max(left, default=0.0)
 
     def _take(self, going: Sequence[Course], leg: Extended) -> Work[None]:
-        """Record `LEG` more sections of each trajectory, and end those that reached an orbit or an equilibrium."""
+        """Record the newly integrated section points of each trajectory, and end those that reached an orbit or an
+        equilibrium.
+        """
         computed = np.isin(leg.status, (Status.PERIODIC, Status.BOUNDED))
         for course, state, step, section, ok in zip(going, leg.state, leg.step, leg.section, computed, strict=True):
             course.state, course.step = state, float(step)
@@ -341,7 +350,9 @@ class _Extension:
     # ---- sets ----------------------------------------------------------------------------------
 
     def _tell_sets(self) -> Work[bool]:
-        """Group the unfinished trajectories into sets and describe them; return whether a set is in doubt."""
+        """Group the unfinished trajectories by the sets they are on and describe these; return whether a set or its
+        stability is uncertain.
+        """
         going = [course for course in self.courses if course.goes_on]
         has_stayed = bool(going[0].legs) and self._has_stayed(going, LEAST_STAY)
         numbers, is_sure = group([c.stayed for c in going], self.geometry, self.settings.closure)
@@ -359,8 +370,8 @@ class _Extension:
     def _with_those_left(
         self, groups: Sequence[list[Course]], gone: Sequence[Course]
     ) -> list[tuple[list[Course], list[Course]]]:
-        """Pair each group of trajectories with those that left its set; merge all groups whose set was left into
-        one.
+        """Pair each group of unfinished trajectories with those that left the same set; merge the groups whose sets
+        were left.
         """
         left = [[course for course in gone if were_on(course, own, self.settings)] for own in groups]
         joined = [course for own, some in zip(groups, left, strict=True) if some for course in own]

@@ -50,7 +50,7 @@ an interval around 0 counts as 0."""
 
 @dataclass(frozen=True)
 class Growth:
-    """Lyapunov exponents of the section map on a set, per section.
+    """Lyapunov exponents of the section map on a set, per iteration of the map.
 
     Attributes
     ----------
@@ -77,7 +77,9 @@ class Growth:
 
     @property
     def is_chaotic(self) -> bool:
-        """Whether small distances grow: the exponent's interval lies above 0 and the growth reaches `GROWN`."""
+        """Whether small distances grow: the exponent's confidence interval lies above 0, and the total growth is large
+        enough.
+        """
         return bool(self.low > 0.0 and self.rate * self.length >= GROWN)
 
     @property
@@ -88,7 +90,7 @@ class Growth:
 
     @property
     def is_zero(self) -> bool:
-        """Whether the weighted average of the largest exponent is 0 within `ZERO`."""
+        """Whether the largest Lyapunov exponent, as a weighted average, is 0 within the tolerance `ZERO`."""
         return bool(abs(self.weighted) <= ZERO and self.weighted_error <= 3.0 * ZERO)
 
     @property
@@ -177,7 +179,7 @@ def volumes_of(
 
 
 def _logarithms(derivatives: np.ndarray) -> np.ndarray:
-    """Compute the logarithmic growth of orthonormal directions at each section by QR; `GONE` for a direction that
+    """Compute by QR the logarithmic growth of orthonormal directions at each section; a large negative number if one
     vanishes.
     """
     basis = np.broadcast_to(np.eye(derivatives.shape[-1]), derivatives[:, 0].shape)
@@ -190,7 +192,7 @@ def _logarithms(derivatives: np.ndarray) -> np.ndarray:
 
 
 def _weighted(values: np.ndarray) -> np.ndarray:
-    """Compute the weighted Birkhoff average along the second axis."""
+    """Compute the weighted Birkhoff average of values (cell, section) over the sections."""
     t = (np.arange(values.shape[1]) + 1.0) / (values.shape[1] + 1.0)
     weight = np.exp(-1.0 / (t * (1.0 - t)))
     return np.asarray(values @ (weight / weight.sum()))

@@ -43,7 +43,7 @@ class _Metric:
 
     @property
     def factor(self) -> float:
-        """Upper bound of the norm of a state at scaled distance 1."""
+        """Upper bound of this norm for a vector of scaled length 1."""
         return float(np.linalg.norm(self.root, 2) * np.sqrt(len(self.root)))
 
 
@@ -100,8 +100,8 @@ def decide(
 def _nearest(
     section: np.ndarray, cells: np.ndarray, orbits: Sequence[Orbit], geometry: Geometry
 ) -> Iterator[tuple[np.ndarray, int, int]]:
-    """Yield groups of cells whose last section points are within `REACH` of the same orbit point, with orbit and
-    phase.
+    """Group cells by the orbit point near their last section point; yield each group with the orbit and the index of
+    this point.
     """
     if not orbits or not len(cells):
         return
@@ -120,7 +120,7 @@ def _on_orbit(section: np.ndarray, orbit: Orbit, phase: int, tolerance: float, g
 
 
 def _approach(section: np.ndarray, orbit: Orbit, phase: int, tolerance: float, geometry: Geometry) -> np.ndarray:
-    """Return for each cell near an orbit point whether it has reached the orbit: certain, approaching or undecided."""
+    """Return how sure it is that each cell near an orbit converges to the orbit: certain, approaching or undecided."""
     code = np.zeros(len(section), np.int8)
     last = section.shape[1] - 1 - phase
     if not orbit.is_stable or last < 2 * orbit.period:

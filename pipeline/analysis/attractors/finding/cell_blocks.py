@@ -40,8 +40,8 @@ class Block:
     step: np.ndarray | None = None
 
     def take(self, rows: np.ndarray) -> Block:
-        """Return a block with the given rows of cells; its `cells` no longer gives their indices at the parameter
-        point.
+        """Return a block of the cells at the given indices; its attribute `cells` is not updated and no longer tells
+        where they lie.
         """
         return Block(self.cells, self.section[rows], self.status[rows], self.orbit_period[rows], self.turns[rows])
 
@@ -96,11 +96,11 @@ class Guesses:
         return cls(whole, empty, whole, np.zeros((0, n_states)), np.zeros(0, np.int64))
 
     def take(self, rows: np.ndarray) -> Guesses:
-        """Return the guesses in the given rows."""
+        """Return the guesses at the given indices."""
         return Guesses(self.key[rows], self.score[rows], self.mark[rows], self.point[rows], self.period[rows])
 
     def best(self, key: np.ndarray | None = None) -> Guesses:
-        """Return the best guess per key, in rising order of the keys."""
+        """Return the best guess of each key, by default the key of the guess's box, in rising order of the keys."""
         keys = self.key if key is None else key
         order = np.lexsort((self.mark, self.score, keys))
         first = np.ones(len(order), bool)
@@ -170,7 +170,9 @@ class ClosedCells:
         self._keys.append(unique)
 
     def close(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the keys of all occupied boxes in rising order, and the number of each box's group."""
+        """Return the hash keys of all occupied boxes in rising order, and for each box the number of its group of
+        cells.
+        """
         if not self._keys:
             return np.zeros(0, np.uint64), np.zeros(0, np.int64)
         keys, first = np.unique(np.concatenate(self._keys), return_index=True)
@@ -192,7 +194,9 @@ class ClosedCells:
 
 
 def _rows_of(points: np.ndarray, p: int, geometry: Geometry, side: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the orbit period and the box of each section point, as rows of integers and as hashed keys."""
+    """Return, for each section point, its orbit period and the box that holds it as a row of integers, and a hash of
+    this row.
+    """
     boxes = geometry.boxes(points, side)
     rows = np.concatenate([np.full((*boxes.shape[:-1], 1), p, np.int64), boxes], axis=-1)
     return rows, hashes(rows)

@@ -100,7 +100,7 @@ class Orbit:
 
     @property
     def error(self) -> float:
-        """Estimate of the distance from the true orbit, from the residual."""
+        """Estimate of the distance from the true orbit, from the residual of Newton's method."""
         return float(10.0 * self.residual / max(np.abs(1.0 - self.multipliers).min(), 1e-6))
 
 
@@ -195,8 +195,8 @@ def _polished(
     system: System,
     tolerance: float,
 ) -> list[Orbit | None]:
-    """Polish guesses by Newton's method to a residual, and once more from an orbit's least section point if that
-    differs.
+    """Refine guesses of orbits by Newton's method, and repeat this from an orbit's least section point if it started
+    from another.
     """
     found = polish_orbits(packed, frequency, points, period, tolerance=tolerance, system=system)
     orbits = [_orbit_of(found, row) if found.converged[row] else None for row in range(len(points))]
@@ -225,7 +225,7 @@ def _orbit_of(found: PeriodicOrbits, row: int) -> Orbit:
 def run_on(
     packed: np.ndarray, frequency: np.ndarray, points: np.ndarray, max_orbit_period: int, system: System
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Integrate from section points (n, state) until the trajectories close within `EXTEND_CLOSURE`.
+    """Integrate on from section points (n, state) until each trajectory closes on a periodic orbit within a tolerance.
 
     Returns
     -------

@@ -116,7 +116,7 @@ def _found(point: Point, states: np.ndarray, reach: np.ndarray, geometry: Geomet
 
 
 def equilibria_near(point: Point, states: np.ndarray, geometry: Geometry) -> list[Equilibrium]:
-    """Return the distinct equilibria that Newton's method finds from states (n, state), at most `MOST`."""
+    """Return the distinct equilibria that Newton's method finds from start states (n, state), up to a fixed number."""
     found = find_equilibria(point.integrates, states, point.packed, max_iterations=ITERATIONS)
     scales = np.asarray(geometry.scales)
     kept: list[Equilibrium] = []

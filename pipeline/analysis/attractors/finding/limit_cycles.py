@@ -48,8 +48,8 @@ class _Crossings:
         self.state = state
 
     def of(self, states: np.ndarray, level: float) -> np.ndarray:
-        """Return successive crossings of the level from each start state, shape (cell, RETURNS, state), padded with
-        NaN.
+        """Return a fixed number of successive crossings of the level from each start state (cell, crossing, state),
+        padded with NaN.
         """
         n = len(states)
         found = run_branches(

@@ -59,7 +59,7 @@ class Dynamics:
         *,
         needed: bool = True,
     ) -> Dynamics:
-        """Collect the given parameters and system or, where they are missing, those of the run.
+        """Collect the model, parameters and system to use: those given or, where they are missing, those of the run.
 
         Raises
         ------
@@ -75,7 +75,7 @@ class Dynamics:
 
     @property
     def integrates(self) -> System:
-        """System of equations to integrate; it must have been given."""
+        """System of equations to integrate; an error if none was given."""
         assert self.system is not None
         return self.system
 
@@ -163,7 +163,7 @@ class Point:
 
     @property
     def integrates(self) -> System:
-        """System of equations to integrate; it must have been given."""
+        """System of equations to integrate; an error if none was given."""
         assert self.system is not None
         return self.system
 
@@ -193,7 +193,9 @@ class Point:
             yield self._known(self._read(part, slice(begin * inner, begin * inner + n), n))
 
     def _known(self, block: Block) -> Block:
-        """Return the block with cells at an equilibrium or on a limit cycle marked as neither closed nor bounded."""
+        """Return the block with a changed status for cells at an equilibrium or on a limit cycle: neither closed nor
+        bounded.
+        """
         for told in (self.at_rest, self.on_cycle):
             if told is not None:
                 status = np.where(told[block.cells] >= 0, np.int8(Status.NO_RETURN), block.status)

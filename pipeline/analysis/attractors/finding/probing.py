@@ -51,7 +51,9 @@ def _probe(points: np.ndarray, critical: np.ndarray, geometry: Geometry) -> Work
 
 
 def _falls(state: np.ndarray, points: np.ndarray, size: float, geometry: Geometry) -> Work[bool]:
-    """Return whether all trajectories, started at distance `size`, come nearer to the points every `LEG` sections."""
+    """Return whether all trajectories, started at the distance `size` from an orbit or equilibrium, keep coming nearer
+    to it.
+    """
     step, before = np.zeros(len(state)), np.full(len(state), np.inf)
     for _ in range(LEGS):
         leg: Extended = yield Leg(state, step)

@@ -31,7 +31,8 @@ LEG = 64
 
 @dataclass(frozen=True)
 class Leg:
-    """Request to integrate trajectories over `LEG` further sections, from states (n, state) with step sizes (n,).
+    """Request to integrate trajectories further over a fixed number of sections, from states (n, state) with step sizes
+    (n,).
 
     With a step size of 0 the engine chooses the step.
     """
@@ -42,7 +43,7 @@ class Leg:
 
 @dataclass(frozen=True)
 class Extended:
-    """Answer to a `Leg` request: section points, status and final states of the trajectories.
+    """Answer to a request to integrate further (`Leg`): section points, status and final states of the trajectories.
 
     Attributes
     ----------
@@ -173,8 +174,8 @@ def answer_all(
 def _gathered(
     sizes: Sequence[int], asked: Mapping[tuple[int, ...], Any], points: Mapping[tuple[int, ...], Point]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return packed parameters and frequency of each requested trajectory, and the end index of each parameter point's
-    rows.
+    """Return parameters and frequency of each requested trajectory, and where each parameter point's trajectories end
+    in the list.
     """
     packed = np.repeat([points[i].packed for i in asked], sizes, axis=0)
     frequency = np.repeat([points[i].frequency for i in asked], sizes)
@@ -255,8 +256,8 @@ def _polished(
 def _each_once(
     search: np.ndarray, start: np.ndarray, period: np.ndarray, mark: np.ndarray, ended: np.ndarray, geometry: Geometry
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Choose the guesses to polish, without duplicates; return them and the index of each guess's representative (-1:
-    none).
+    """Choose guesses of orbits to polish, without duplicates; also return for each guess the index of its chosen
+    duplicate (-1: none).
 
     Rows that were integrated further and ended in one box are on one orbit; the row of least hash represents
     them. Rows without a period have no representative.

@@ -186,7 +186,7 @@ def keys_of(section: np.ndarray, side: float, geometry: Geometry) -> np.ndarray:
 
 
 def leap(section: np.ndarray, orbits: Sequence[Orbit], geometry: Geometry) -> np.ndarray:
-    """Move trajectories that slowly leave an unstable orbit to about `LEAP` times their distance from it.
+    """Move trajectories that slowly leave an unstable orbit to a multiple (`LEAP`) of their distance from it.
 
     Near a bifurcation leaving takes thousands of periods, in which the motion follows the orbit's monodromy
     matrix. Let u be the components of a cell's distance along the unstable eigenvectors, at the sections that

@@ -63,7 +63,8 @@ def largest_error(matrix: np.ndarray, size: float, *, real: bool = False) -> flo
 
 
 def by_margin(leading: float, bound: float, error: float) -> int:
-    """Decide stability from the leading modulus or real part: `ATTRACTS` below its bound, `UNSTABLE` above it.
+    """Decide stability from a multiplier's modulus or an eigenvalue's real part: attracting below its bound, unstable
+    above it.
 
     Within the error of the bound, return `NEUTRAL`.
     """

@@ -45,8 +45,8 @@ class Connections:
         return cls(np.arange(n), np.arange(n), np.zeros(n, bool))
 
     def may_be_one(self, axis: int, first: tuple[int, int], second: tuple[int, int]) -> bool:
-        """Return whether attractors at two parameter points may be matched by distance; the first is at the lower value
-        of an axis.
+        """Return whether attractors at two parameter points may be matched by distance, as following their orbits
+        decided nothing.
 
         Parameters
         ----------

@@ -236,8 +236,8 @@ class _Ids:
         return {self._by_group[self._group[one.number]]: one for one in here}
 
     def _has_room(self, one: _Seen, identity: int) -> bool:
-        """Return whether an id is free at every parameter point at which the attractor's group of connected orbits
-        occurs.
+        """Return whether an id is still free at all parameter points where orbits connected with this attractor
+        occur.
         """
         return not self._where[self._group[one.number]] & self.taken[identity]
 
@@ -266,7 +266,7 @@ def _seen(attractors: xr.Dataset, number: int, place: Place) -> _Seen:
 def _known(
     seen: dict[tuple[int, ...], dict[int, _Seen]], index: tuple[int, ...], look_back: int
 ) -> dict[int, list[tuple[int, _Seen]]]:
-    """Return for each id the axes and, along each, the nearest earlier attractor with this id."""
+    """Return for each id the nearest earlier attractor with this id along each parameter axis, with the axis."""
     known: dict[int, list[tuple[int, _Seen]]] = {}
     for axis in range(len(index)):
         along: dict[int, _Seen] = {}
@@ -305,7 +305,9 @@ def _assign(
 
 
 def _renumbered(attractors: xr.Dataset, ids: np.ndarray, n_ids: int, dims: tuple[str, ...]) -> xr.Dataset:
-    """Move every attractor to the row of its id, and write the ids into the array of cells."""
+    """Sort the arrays of attractors by id instead of by index at each parameter point, and replace the indices of the
+    cells by ids.
+    """
     present = np.nonzero(ids >= 0)
     target = (*present[:-1], ids[present])
     variables: dict[str, Any] = {}
@@ -338,13 +340,17 @@ def _fill(name: str, dtype: np.dtype[Any]) -> float:
 
 
 def _lookup(ids: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Return the ids of the attractors in some rows at one parameter point; -1 for the row -1."""
+    """Return the ids of the attractors with these indices at one parameter point; -1 for the index -1 (no
+    attractor).
+    """
     table = np.append(ids, -1)
     return np.asarray(table[rows])
 
 
 def _destinations(values: np.ndarray, ids: np.ndarray, n_ids: int) -> np.ndarray:
-    """Convert counts of cells that left a set: from the row of the set that they reached to the id of this set."""
+    """Convert counts of the cells that left a set: list them by the id of the set they reached, not by its index at the
+    point.
+    """
     moved = np.zeros((*values.shape[:-1], n_ids), values.dtype)
     for *index, row in np.argwhere(ids >= 0).tolist():
         point = tuple(index)
