@@ -217,11 +217,57 @@ def series(
     _save(figure, out)
 
 
+def branch(
+    source: Annotated[
+        str,
+        typer.Argument(
+            metavar="SPEC|CSV", help="Specification with [measured.branch], file or shipped, or a table of orbits."
+        ),
+    ],
+    options: Any,
+    over: Annotated[Path | None, typer.Option(metavar="RUN", help="Run whose branches they are compared with.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Figure, .png, .pdf or .svg.")] = None,
+    csv: Csv = None,
+    as_json: Json = False,
+) -> None:
+    """Measure recorded orbits along a parameter, stable and unstable, and compare them with a run's branches.
+
+    Lists amplitude, frequency and their scatter over the cycles. With --over also the computed orbit of the same
+    stability, the error in per cent, and the distance in units of the scatter.
+    """
+    from pipeline.rig.measured_branch.comparison import amplitudes, branch_table, compare
+    from pipeline.rig.measured_branch.figure import plot_branch
+    from pipeline.rig.measured_branch.reading import read_branch
+    from pipeline.runs.workflows import find_spec
+
+    _check_targets(out, csv)
+    path = find_spec(source)
+    branches = computed = None
+    if over is None:
+        found = read_branch(path, None, options.state)
+    else:
+        from pipeline.cli import console
+        from pipeline.layout.vocabulary import parameters_of
+        from pipeline.runs.derive import AnalysedRun
+
+        run = AnalysedRun.of(over, console.note)
+        found = read_branch(path, run.model, options.state)
+        branches = run.derive("branches", parameter=str(found.attrs["parameter"]))
+        computed = amplitudes(branches, parameters_of(run.cube()), str(found.attrs["state"]))
+        found = compare(found, branches, computed)
+    tell(branch_table(found), csv, as_json)
+    if out is not None:
+        from pipeline.plots import Frame
+
+        _save(plot_branch(found, branches, computed, frame=Frame(options.width)), out)
+
+
 _COMMANDS: dict[str, tuple[Any, str]] = {
     "steps": (steps, "SweepOptions"),
     "diagram": (diagram, "DiagramOptions"),
     "compare": (compare, "ComparisonOptions"),
     "series": (series, "SeriesOptions"),
+    "branch": (branch, "MeasuredBranchOptions"),
 }
 """Commands, and the names of their options in `pipeline.products.measured`."""
 
@@ -235,7 +281,7 @@ def _make(name: str) -> Any:
 
 measured_app = typer.Typer(
     cls=registry_group("measured", lambda: list(_COMMANDS), _make),
-    help="Diagrams of recorded sweeps, beside and over computed ones.",
+    help="Diagrams and branches of recorded motions, beside and over computed ones.",
     no_args_is_help=True,
     rich_markup_mode=None,
     context_settings=SETTINGS,

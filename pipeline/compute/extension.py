@@ -119,7 +119,7 @@ def _more(spec: Spec, inputs: Inputs, last: np.ndarray, step_size: np.ndarray, n
 
 
 def _longer(name: str, old: np.ndarray, more: Mapping[str, np.ndarray], go: np.ndarray, n: int) -> np.ndarray:
-    """Return a variable of all cells, extended by the values in `more` for the cells `go`."""
+    """Return a copy of a variable of all cells in which the newly integrated values follow the stored ones."""
     if name in PER_SECTION:
         whole = np.full((*old.shape[:2], n, *old.shape[3:]), np.nan)
         whole[go] = np.concatenate([old[go], more[name]], axis=2)

@@ -66,7 +66,9 @@ class Way:
 
 
 def way_of(spec: Spec, block: tuple[slice, ...]) -> Way | None:
-    """Return the order in which a block's branches visit the continuation parameter's values; None in a sweep."""
+    """Return the parameter values of a continuation in the order in which a block of cells visits them; None for a
+    sweep.
+    """
     if spec.continuation is None:
         return None
     path, values = _path_of(spec)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.patheffects import withStroke
@@ -32,6 +33,20 @@ POINT_NAMES = {
     "double_neimark_sacker": "NSNS",
 }
 """Short names of points of codimension two, as MatContM writes them."""
+
+
+ROOM = (0.045, 0.045)
+"""Room that a short name takes, in units of the axes."""
+
+
+def take_room(ax: Axes, at: tuple[float, float], taken: list[np.ndarray]) -> bool:
+    """Return whether a short name at a place of the axes overlaps none of those placed before, and add it to them."""
+    (left, right), (bottom, top) = ax.get_xlim(), ax.get_ylim()
+    here = np.array([(at[0] - left) / (right - left), (at[1] - bottom) / (top - bottom)])
+    if any((np.abs(here - other) < ROOM).all() for other in taken):
+        return False
+    taken.append(here)
+    return True
 
 
 def draw_over(fig: style.DataFigure, axes: Sequence[Axes], ds: xr.Dataset, x: str) -> None:
@@ -67,13 +82,17 @@ def line_note(ds: xr.Dataset) -> str:
 
 
 def mark_points(ax: Axes, ds: xr.Dataset, along: str, across: str, size: float, named: bool = True) -> None:
-    """Mark the points of codimension two on axes with dots and, if `named`, with short names such as CP and R1."""
+    """Mark the points of codimension two on axes with dots and, if `named`, with short names such as CP and R1.
+
+    A name that would lie over another one is left out.
+    """
     names = str(ds["special_kind"].attrs["flag_meanings"]).split()
     halo = [withStroke(linewidth=2.0, foreground="white")]
+    taken: list[np.ndarray] = []
     for k in range(ds.sizes["special"]):
         at = float(ds[f"special_{along}"][k]), float(ds[f"special_{across}"][k])
         ax.plot(*at, marker="o", markersize=3.2, color="black", markeredgecolor="white", markeredgewidth=0.5, zorder=6)
-        if not named:
+        if not (named and take_room(ax, at, taken)):
             continue
         ax.annotate(
             POINT_NAMES[names[int(ds["special_kind"][k])]],

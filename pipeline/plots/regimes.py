@@ -24,6 +24,9 @@ from pipeline.plots.curve_lines import draw_over, line_note
 from pipeline.plots.figure import Run, attractors_of, frame_of, noted, values_of
 from pipeline.products.figures import RegimeOptions
 
+BESIDE = 0.85
+"""Share of the figure's width for the caption of a map with a legend beside it."""
+
 KINDS = ("periods", "attractors", "number")
 SHARE_LIMIT = 0.05
 """Share of cells without an attractor from which a point of the map is marked."""
@@ -131,7 +134,7 @@ def _draw_one(data: xr.Dataset, x: str, y: str, show: str, text: str, frame: sty
     )
     _dress(ax, data, x, y, frame)
     style.label_axes(ax, labels.parameter_label(data[x]), labels.parameter_label(data[y]))
-    style.caption(ax, text)
+    style.caption(ax, text, 1.0 if frame.compact else BESIDE)
     return fig
 
 

@@ -129,7 +129,7 @@ def _draw_staircase(fig: style.DataFigure, ax: Axes, data: xr.Dataset, axis: xr.
 
 
 def _steps(x: np.ndarray, rotation: np.ndarray, axis: xr.DataArray) -> dict[Fraction, tuple[float, float]]:
-    """Return the interval of the parameter on which cells are locked p/q, for the longer steps."""
+    """Return the parameter interval of each step p/q of a staircase; short steps are left out."""
     whole = float(axis.max() - axis.min())
     found = {}
     for value in np.unique(np.round(rotation, 9)):

@@ -220,11 +220,11 @@ def label_axes(ax: Axes, x: str | None = None, y: str | None = None) -> None:
         ax.set_ylabel(y, fontsize=size, labelpad=3.5)
 
 
-def caption(ax: Axes, text: str) -> None:
-    """Write a caption above the axes, wrapped at the figure's edge."""
+def caption(ax: Axes, text: str, share: float = 1.0) -> None:
+    """Write a caption above the axes, wrapped at the figure's edge, or at a share of its width beside a legend."""
     if text:
         look = look_of(ax)
-        width = figure_of(ax).frame.width_in - 0.6
+        width = share * figure_of(ax).frame.width_in - 0.6
         ax.set_title(folded(text, width, look.legend), fontsize=look.legend, loc="left", pad=4.0)
 
 

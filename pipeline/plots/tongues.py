@@ -9,6 +9,7 @@ from matplotlib.patheffects import withStroke
 
 from pipeline.plots import labels, style
 from pipeline.plots.bifurcation import swept_parameters
+from pipeline.plots.curve_lines import take_room
 from pipeline.plots.figure import Run, frame_of
 from pipeline.plots.rotation import draw_map, rotation_data
 from pipeline.products.figures import TongueFigureOptions
@@ -16,9 +17,6 @@ from pipeline.products.tongues import TongueOptions
 
 _COLOURS = (style.VERMILLION, style.BLUE, style.GREEN, style.PURPLE, "black")
 """Colours of the edges over a blank plane, by denominator; later denominators share the last."""
-
-_ROOM = (0.04, 0.05)
-"""Room that the name of a tongue takes, in units of the axes."""
 
 
 def plot_tongues(
@@ -113,9 +111,8 @@ def _name_tongues(fig: style.DataFigure, ax: Axes, ds: xr.Dataset) -> None:
             tops[p, q] = inside[int(np.argmax(inside[:, 1]))]
     for (p, q), top in tops.items():
         at = np.minimum(top, [1.0, 0.955])
-        if any((np.abs(at - other) < _ROOM).all() for other in taken):
+        if not take_room(ax, (left + at[0] * (right - left), bottom + at[1] * (ceiling - bottom)), taken):
             continue
-        taken.append(at)
         ax.annotate(
             f"{p}/{q}",
             at,

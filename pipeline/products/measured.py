@@ -49,3 +49,10 @@ class SeriesOptions(Options):
     )
     degrees: bool = option(False, "Use degrees instead of radians.")
     width: float = option(178.0, "Width of the figure; 85 is a journal's column.", unit="mm", gt=0.0)
+
+
+class MeasuredBranchOptions(Options):
+    """Options for measured branches of periodic orbits and their figure."""
+
+    state: str = option("", "State that the amplitudes of a CSV table are of; by default the model's first.")
+    width: float = option(178.0, "Width of the figure; 85 is a journal's column.", unit="mm", gt=0.0)

@@ -276,7 +276,9 @@ def _states(parameters: Parameters, drive: Sequence[Step] | None, start: np.ndar
 
 
 def _intervals(parameters: Parameters, drive: Sequence[Step], end_s: float) -> Any:
-    """Return the drive of all steps, period by period, with the parameter values that change between steps."""
+    """Return the drive of all its steps, period by period: durations, and the parameter values that differ between
+    steps.
+    """
     from magpend_core.sampling import Drive
 
     names = tuple(dict.fromkeys(name for step in drive for name in step.values))

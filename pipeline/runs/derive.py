@@ -213,8 +213,8 @@ def _refuse_recorded(run: Run, name: str) -> None:
 
 
 def prepared(run: AnalysedRun, product: Any, options: Options) -> Options:
-    """Return options completed for a run, with names as in its cube; raise `SpecError` if the run does not suit the
-    product.
+    """Complete the options of an analysis or figure for a run, with names as in its cube; raise `SpecError` if it does
+    not suit the run.
 
     Raises
     ------
@@ -231,8 +231,8 @@ def prepared(run: AnalysedRun, product: Any, options: Options) -> Options:
 
 
 def most_evidence(run: Run, options: Options) -> Options:
-    """Raise the options for integrating trajectories further to the largest values among stored searches for
-    attractors.
+    """Raise the options on how far trajectories are integrated further to the largest values of any comparable stored
+    search for attractors.
 
     Options without an effort are returned unchanged.
     """
@@ -244,8 +244,8 @@ def most_evidence(run: Run, options: Options) -> Options:
 
 
 def _kept_efforts(run: Run) -> list[tuple[dict[str, Any], tuple[float, int]]]:
-    """Return the options of each up-to-date stored search for attractors, with its (budget, sample size) for further
-    integration.
+    """Return, for each up-to-date stored search for attractors, its options, and apart from them how far it integrated
+    trajectories further.
     """
     try:
         kept_here = products_in(run.info.files.below(DERIVED))
@@ -266,13 +266,17 @@ def _kept_efforts(run: Run) -> list[tuple[dict[str, Any], tuple[float, int]]]:
 
 
 def _aside(options: IdentifyOptions) -> dict[str, Any]:
-    """Return the options for identifying attractors, without those on how far trajectories are integrated further."""
+    """Return the options for identifying attractors, except those that set how far trajectories are integrated
+    further.
+    """
     effort = ("extend", "budget", "n_sample")
     return {name: value for name, value in options.plain().items() if name not in effort}
 
 
 def is_outdone(run: Run, attrs: Mapping[str, Any]) -> bool:
-    """Return whether another stored result identified its attractors with a longer extension of trajectories."""
+    """Return whether a stored result is superseded: another one identified the attractors with trajectories integrated
+    further.
+    """
     name, given = str(attrs.get("derived_product")), _options_of(attrs)
     if name not in ANALYSES or not issubclass(ANALYSES[name].options, IdentifyOptions):
         return False
@@ -282,9 +286,7 @@ def is_outdone(run: Run, attrs: Mapping[str, Any]) -> bool:
 
 @contextlib.contextmanager
 def refused(directory: str | Path) -> Iterator[None]:
-    """Convert an error of an analysis or figure into one whose message names the run directory, as a context
-    manager.
-    """
+    """Run an analysis or figure such that the messages of its errors name the run directory, as a context manager."""
     try:
         yield
     except SpecError:

@@ -80,9 +80,7 @@ class Extension:
         return left / self.plan.n_cells
 
     def _more(self, run: Run) -> float:
-        """Return the fraction of a cell's periods still to be integrated for cells reused from `run`, if the wider run
-        keeps more section points.
-        """
+        """Return the fraction of its periods that a cell taken over from another run must still be integrated."""
         integration = self.spec.integration
         n_more = integration.n_keep - run.spec.integration.n_keep
         return n_more / (integration.n_transient + integration.n_keep)

@@ -124,6 +124,7 @@ _KEYS = (
     "execution",
     "drive",
     "section",
+    "measured",  # orbits of a rig, which magpend measured branch reads: no part of a run
 )
 
 

@@ -159,9 +159,7 @@ def _jump(graph: Graph, changes: list[Node], scales: tuple[float, ...]) -> Node 
 
 
 def largest(graph: Graph, nodes: list[Node]) -> Node:
-    """Return an expression for the maximum of given expressions; of their values a NaN is ignored unless it is the
-    last.
-    """
+    """Return an expression for the maximum of several expressions."""
     found = nodes[0]
     for node in nodes[1:]:
         if not node.is_number(0.0):

@@ -75,8 +75,8 @@ class Instant:
 
 @dataclass
 class Sides:
-    """Rewriter that replaces corners and jumps in expressions by signs of smooth expressions, and collects the
-    switching surfaces.
+    """Rewriter that splits expressions at their corners and jumps into smooth parts, and collects the surfaces between
+    these.
 
     Attributes
     ----------

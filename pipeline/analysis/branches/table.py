@@ -219,7 +219,7 @@ def _named(ds: xr.Dataset, k: int) -> tuple[float, str]:
 
 
 def curves_table(ds: xr.Dataset) -> Table:
-    """Return the table of the points of codimension two, with lines on the curves.
+    """Return a table with a row for each point of codimension two, below lines that describe the bifurcation curves.
 
     ``error`` is the larger of the errors of both parameters, in units of the ranges that the curves cover.
     """

@@ -148,7 +148,7 @@ def _seeds(run: ExploredRun) -> Iterator[Scheme]:
 
 
 def _ends(found: xr.Dataset) -> tuple[xr.DataArray, tuple[Category, ...]]:
-    """Return for each cell the code of its attractor, or of a grey category beyond all ids; and the grey categories.
+    """Return for each cell the number of its attractor or of its grey category, and the grey categories.
 
     Cells that diverged, failed or are pending have none.
     """

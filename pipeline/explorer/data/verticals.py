@@ -49,7 +49,7 @@ class Vertical:
 
 
 def verticals(run: ExploredRun) -> list[Vertical]:
-    """Return a run's possible vertical axes; the first is a state that differs between section points."""
+    """Return the quantities that a run's diagram can show on its vertical axis, the default first."""
     return run.remembered("verticals", lambda: _verticals(run))
 
 

@@ -238,9 +238,7 @@ class Catalog:
         return numbers
 
     def _rest(self, block: Block, numbers: np.ndarray) -> Block:
-        """Assign cells at equilibria and on limit cycles of a flow, in `numbers`; return the block with these
-        marked.
-        """
+        """Assign the cells of a flow that end at equilibria or on limit cycles to the catalogued attractors."""
         point = self._point(_dataset_of(block, self.model))
         tell_rest([point], self.tolerance, self._geometry)
         for k, found in enumerate(point.equilibria):

@@ -70,7 +70,9 @@ def fit_starts(problem: Problem, theta: Array, starts: Array) -> Starts:
 
 
 def block_rows(problem: Problem) -> list[slice]:
-    """Return the range of rows that each piece has in the compressed residual vector."""
+    """Return the range of rows that each piece of a recording has in the residual vector, which is compressed piece by
+    piece.
+    """
     n_own = len(problem.free) + len(problem.model.states)
     sizes = [min(int(np.isfinite(p.measured).sum()), n_own + 1) for p in problem.pieces]
     ends = np.cumsum([0, *sizes])
@@ -78,7 +80,9 @@ def block_rows(problem: Problem) -> list[slice]:
 
 
 class _Block(NamedTuple):
-    """Compressed residuals of a piece, and their derivatives by its initial state."""
+    """Residuals of a piece, compressed by a QR decomposition to few rows, with their derivatives by its initial
+    state.
+    """
 
     jacobian: Array
     rows: Array
@@ -107,7 +111,7 @@ def _step(jacobian: Array, rows: Array, damping: float) -> tuple[Array, float]:
 
 
 def _own(problem: Problem, evaluation: Evaluation, k: int, here: slice) -> Array:
-    """Return the derivatives of a piece's residuals by its own initial state."""
+    """Return the Jacobian of one piece's residuals with respect to the initial state of that piece."""
     n, n_free = len(problem.model.states), len(problem.free)
     return evaluation.jacobian[here, n_free + k * n : n_free + (k + 1) * n]
 

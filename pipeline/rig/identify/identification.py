@@ -170,8 +170,8 @@ def refuse_invisible(problem: Problem) -> None:
 
 
 def _is_driven(problem: Problem) -> bool:
-    """Return whether the trajectory of an undriven piece changes with the drive period, so that the model is driven
-    after all.
+    """Return whether the trajectory of a piece without recorded drive depends on the drive period, because the model
+    has a drive of its own.
     """
     piece = problem.pieces[0]
     if piece.drive is not None:

@@ -63,8 +63,8 @@ def _information(
     prior: np.ndarray,
     scale: float,
 ) -> np.ndarray:
-    """Return the information matrix of the unknowns, summed over samples, or from the whole Jacobian if pieces are
-    continuous.
+    """Return the information matrix of the unknowns: a sum over samples, or from the whole Jacobian if pieces are tied
+    by continuity.
     """
     if problem.continuity is not None:
         return eliminate_starts(fit.jacobian, len(problem.free))[0]
@@ -88,8 +88,8 @@ def loss_scale_of(problem: Problem, fit: Fit) -> float:
 
 
 def groups_of(problem: Problem) -> tuple[int, ...]:
-    """Return the number of the independent group of each piece; with a continuity weight, successive pieces form one
-    group.
+    """Return the group number of each piece; pieces that are tied together by a continuity weight form one group,
+    others are alone.
     """
     found: list[int] = []
     for k, piece in enumerate(problem.pieces):
@@ -99,7 +99,8 @@ def groups_of(problem: Problem) -> tuple[int, ...]:
 
 
 def sample_slopes(problem: Problem, fit: Fit) -> list[np.ndarray]:
-    """Return the derivatives of each piece's residuals in units of the noise, (n, n_channels, n_free + n_states).
+    """Return the derivatives of each sample's residuals by the unknowns and its piece's initial state, in units of the
+    noise, for each piece.
 
     They are central differences from one call of the engine. The starts of all pieces are changed at once,
     since no piece depends on another's start. At a bound the differences are one-sided.

@@ -80,8 +80,8 @@ class _Search:
         self._base: _Point | None = None
 
     def split(self, x: Array) -> tuple[Array, Array]:
-        """Split a scaled vector into the unknowns and the initial states; if it holds no initial states, return the
-        first guesses.
+        """Split a scaled vector into the unknowns and the initial states; first guesses stand in for initial states
+        that it lacks.
         """
         full = x * self.sizes
         if not self.joint:

@@ -53,7 +53,7 @@ class Evaluation:
 
     @property
     def cost(self) -> float:
-        """Half the sum of squares, in units of the noise."""
+        """Cost of the fit: half the sum of the squared residuals, in units of the noise."""
         return float(0.5 * self.rows @ self.rows)
 
 
@@ -111,8 +111,8 @@ def _without_slopes(problem: Problem, thetas: Array, starts: Array) -> _Motions:
 
 
 def _steps(problem: Problem, thetas: Array) -> Array:
-    """Return the finite-difference steps of the unknowns that affect the trajectory, (member, change), within the
-    bounds.
+    """Return the finite-difference steps, within the bounds, of the unknowns that the trajectory depends on, for each
+    set of unknowns.
     """
     found = np.zeros((len(thetas), len(problem.moving)))
     for j, i in enumerate(problem.moving):
@@ -124,7 +124,7 @@ def _steps(problem: Problem, thetas: Array) -> Array:
 
 
 def _changed(problem: Problem, thetas: Array, steps: Array) -> Array:
-    """Return the packed parameters after changing one unknown at a time, (member, change, n_parameters)."""
+    """Return the packed model parameters for each set of unknowns, with one unknown changed at a time."""
     members = []
     for theta, own in zip(thetas, steps, strict=True):
         rows = np.tile(theta, (len(own), 1))
@@ -175,8 +175,8 @@ def _by_tangents(problem: Problem, thetas: Array, starts: Array) -> _Motions:
 def _integrate(
     problem: Problem, parameters: Array, starts: Array, tolerance: float, system: System | None = None
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Integrate all pieces; return states (member, change, piece, time, column), and where it failed (member, change,
-    piece).
+    """Integrate all pieces for each set of unknowns and each change of one of them; return the states, and where an
+    integration failed.
     """
     shape, n = starts.shape[:3], len(problem.model.states)
     n_pieces = shape[2]
@@ -200,7 +200,9 @@ def _integrate(
 
 
 def _thrice(drive: Drive | None) -> Drive | None:
-    """Return the drive with its values repeated for the three copies of the parameters in `with_parameter_tangent`."""
+    """Return a drive whose parameter values are repeated for the three parameter sets that a finite-difference tangent
+    needs.
+    """
     if drive is None or not drive.names:
         return drive
     names = tuple(f"{name}{end}" for end in ("", PLUS, MINUS) for name in drive.names)
@@ -208,7 +210,9 @@ def _thrice(drive: Drive | None) -> Drive | None:
 
 
 def _grid(problem: Problem, k: int) -> Array:
-    """Return the sample times of a piece; with continuity, also the time at which the next piece starts."""
+    """Return the sample times of a piece, followed by the start time of the next piece if the fit penalises gaps
+    between the two.
+    """
     time = problem.pieces[k].time
     if problem.continuity is None or not any(p.follows == k for p in problem.pieces):
         return time
@@ -249,7 +253,9 @@ def _block(problem: Problem, k: int, theta: Array, member: _Motions, slopes: boo
 
 
 def _robust(z: Array, problem: Problem) -> tuple[Array, Array]:
-    """Return transformed residuals whose halved squares add up to the robust loss, and their derivative by `z`."""
+    """Transform the residuals so that half the sum of their squares is the robust loss; return them and the derivative
+    of each.
+    """
     if problem.loss == "linear":
         return z, np.ones_like(z)
     scale = problem.loss_scale
@@ -268,7 +274,9 @@ def _robust(z: Array, problem: Problem) -> tuple[Array, Array]:
 
 
 def _gaps(problem: Problem, starts: Array, member: _Motions, slopes: bool) -> list[tuple[int, Array, Array]]:
-    """Return the gaps between the end of a stretch and the start of the next as residuals, with their derivatives."""
+    """Return the gaps between the final state of a stretch and the initial state of the next as residuals, with their
+    derivatives.
+    """
     if problem.continuity is None:
         return []
     n_free, n_states = len(problem.free), len(problem.model.states)

@@ -192,7 +192,8 @@ class Problem:
 
     @cached_property
     def state_noise(self) -> np.ndarray:
-        """Standard deviation of each state by which the gaps between stretches are divided, (n_states,).
+        """Scale of each state, in units of which the gaps between one stretch's end and the next one's start are
+        measured, (n_states,).
 
         Channels have their noise. The values of other states are proportional to their spread over the
         starts.

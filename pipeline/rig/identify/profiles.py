@@ -51,7 +51,9 @@ class Profile:
 
     @property
     def lowest(self) -> float:
-        """Least increase of the cost; it is negative if the profile met a better fit than the best one."""
+        """Least increase of the cost along the profile; negative if the profile found a better fit than the search
+        did.
+        """
         return float(np.nanmin(self.growth))
 
 
@@ -135,7 +137,8 @@ def following(information: np.ndarray, index: int) -> np.ndarray:
 
 
 def interval_of(values: np.ndarray, growth: np.ndarray, estimate: float, critical: float) -> tuple[float, float]:
-    """Return the two values at which the square root of a profile reaches the critical value, interpolated linearly.
+    """Return the ends of a parameter's interval: where the square root of its profile likelihood reaches the critical
+    value.
 
     Parameters
     ----------

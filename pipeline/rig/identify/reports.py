@@ -63,17 +63,17 @@ class Finding:
 
     @property
     def values(self) -> dict[str, float]:
-        """All parameters of the model by name [SI]."""
+        """Values of all model parameters in the best fit, by name [SI]."""
         return self.problem.values(self.best.theta)
 
     @property
     def zeros(self) -> dict[str, float]:
-        """Zero offsets of the sensors, by the names of their unknowns."""
+        """Fitted zero offsets of the sensors, by the names of these unknowns."""
         return zeros_of(self.problem, self.best)
 
     @property
     def n_same(self) -> int:
-        """Number of first guesses whose fits converged to the best optimum."""
+        """Number of first guesses from which the fit converged to the best optimum found."""
         return sum(self.is_same(fit) for fit in self.starts.values())
 
     def is_same(self, fit: Fit) -> bool:
@@ -82,7 +82,7 @@ class Finding:
 
 
 def zeros_of(problem: Problem, fit: Fit) -> dict[str, float]:
-    """Return the zero offsets of the sensors that a fit found, by the names of their unknowns."""
+    """Return the zero offsets of the sensors that were fitted, by the names of these unknowns."""
     named = zip(problem.names, fit.theta, strict=True)
     return {name: float(value) for name, value in named if name.startswith(f"{ZERO}.")}
 
@@ -163,7 +163,7 @@ def _sureness(found: Finding) -> dict[str, Any]:
 
 
 def _errors(sources: Sequence[Source], findings: Sequence[Sequence[str]]) -> list[str]:
-    """Return a warning for each recording's finding of severity "error"."""
+    """Return a warning for each fault of severity "error" that was found in the recordings."""
     return [
         f"{s.file} has an {line}"
         for s, said in zip(sources, findings, strict=True)

@@ -28,7 +28,8 @@ def setting_problems(model: Model, values: Mapping[str, float], where: str) -> l
 
 
 def apply_settings(pieces: Sequence[Piece], settings: Mapping[int, Mapping[str, float]]) -> list[Piece]:
-    """Give each piece the parameter values that hold in its recording only, as parameter values of its drive.
+    """Store the parameter values that hold in one recording only as parameter values of the drive of each of its
+    pieces.
 
     Parameters
     ----------

@@ -34,7 +34,9 @@ class SensorsTable(Table):
 
 
 class RecordingTable(Table):
-    """Table ``[[recordings]]``: file of a recording, its mapping, the kind of its drive, and the part that is used."""
+    """Table ``[[recordings]]``: file of a recording, file that maps its channels to states, kind of its drive, and the
+    part used.
+    """
 
     file: str = Field(description="Recording, relative to the specification")
     mapping: str = Field(description="Mapping file of the recording, relative to the specification")
@@ -256,7 +258,9 @@ def _text(data: Mapping[str, Any], key: str, problems: list[str]) -> str | None:
 
 
 def _found(preset: str | None, folder: Path) -> str | Path | None:
-    """Return a preset's name unchanged, or the path of a preset file in the specification's folder."""
+    """Return the name of a preset unchanged; if it is the name of a file, return its path in the specification's
+    folder.
+    """
     return folder / preset if preset is not None and is_file(preset) else preset
 
 

@@ -161,8 +161,8 @@ def pooled_autocorrelation(residuals: Sequence[np.ndarray], most: int) -> np.nda
 
 
 def pooled_pairs(residuals: Sequence[np.ndarray], most: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the autocorrelation (mean not subtracted) of one channel's residuals over all pieces, and the pairs per
-    lag.
+    """Return the autocorrelation (mean not subtracted) of one channel's residuals, and the number of pairs of
+    residuals, at each lag.
 
     Parameters
     ----------
@@ -212,7 +212,8 @@ def is_autocorrelated(residuals: Sequence[np.ndarray]) -> bool:
 
 
 def memory_of(rho: np.ndarray, n: int) -> tuple[int, float]:
-    """Return the lag at which residuals have lost their correlation, and the number of residuals per independent one.
+    """Return the lag at which residuals have lost their correlation, and how many correlated residuals count as one
+    independent one.
 
     Parameters
     ----------
@@ -271,7 +272,7 @@ def robust_weights(residuals: np.ndarray, loss: str) -> tuple[np.ndarray, np.nda
 
 @dataclass(frozen=True)
 class _Scores:
-    """Scores (gradients of the cost by the parameters) along time and information matrices, piece by piece."""
+    """Scores (gradients of the cost by the parameters) at each time, and information matrices, for each piece."""
 
     scores: list[np.ndarray]
     information: list[np.ndarray]

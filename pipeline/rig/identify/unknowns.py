@@ -75,7 +75,9 @@ def validate(model: type[BaseModel], value: Any, path: str, problems: list[str])
 
 
 def table_at(data: Mapping[str, Any], key: str, problems: list[str]) -> Mapping[str, Any]:
-    """Return the table under a TOML key; empty if it is missing, or if it is no table, which adds a problem."""
+    """Return the table under a TOML key, or an empty one if the key is missing; if the value is no table, add a
+    problem.
+    """
     table = data.get(key, {})
     if isinstance(table, dict):
         return table
@@ -195,7 +197,9 @@ class ParameterTables:
         return None
 
     def _check_together(self) -> None:
-        """Check the starts and tied values against the model's relations between parameters."""
+        """Check the first guesses, fixed values and tied values together against the model's relations between its
+        parameters.
+        """
         assert self.values is not None
         starts = {u.name: u.start for u in self.unknowns}
         tied = {name: factor * starts[other] for name, (factor, other) in self.tied.items()}

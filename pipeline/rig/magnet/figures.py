@@ -220,7 +220,7 @@ def _spread(outcome: Outcome, n: int) -> list[float]:
 
 
 def _place(shown: Sequence[float], locked: float) -> int | None:
-    """Return the index of a locked angle in `shown`, or None if it is not there."""
+    """Return the index of a locked angle among those that are drawn (`shown`), or None if it is not drawn."""
     near = np.flatnonzero(np.abs(np.array(shown) - locked) < SAME_ANGLE)
     return int(near[0]) if near.size else None
 
@@ -253,8 +253,8 @@ def _readings(outcome: Outcome, rows: np.ndarray) -> xr.Dataset:
 
 
 def _numbers(outcome: Outcome, fine: np.ndarray) -> xr.Dataset:
-    """Return height, position and width of each curve's bump, and the laws of the separate and the joint fit on a fine
-    grid.
+    """Return height, position and width of each torque curve's bump, and how they follow the locked angle in the
+    separate and the joint fit.
     """
     curves = outcome.curves
     variables: dict[str, Any] = {
@@ -282,7 +282,9 @@ def _laws_at(locked: np.ndarray, values: dict[str, float], i: int) -> dict[str, 
 
 
 def _comparison(outcome: Outcome, shown: Sequence[float]) -> xr.Dataset:
-    """Return the readings at some locked angles, with the torque of both models on a fine grid of angles."""
+    """Return the readings at some locked angles, with the torques of the joint fit and of the point dipoles on a fine
+    grid of angles.
+    """
     m = outcome.measured
     own = [np.flatnonzero(np.abs(m.locked - locked) < SAME_ANGLE) for locked in shown]
     fine = np.array([_fine(m.angle[rows]) for rows in own])

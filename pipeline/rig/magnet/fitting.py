@@ -212,7 +212,7 @@ def fit_laws(curves: Sequence[CurveFit]) -> Laws:
 
 
 def _weights(errors: np.ndarray) -> np.ndarray:
-    """Return weights inversely proportional to standard errors; errors below 1e-3 of the largest count as that."""
+    """Return weights inversely proportional to standard errors, which are raised to at least 1e-3 of the largest."""
     largest = float(errors.max())
     return np.ones(len(errors)) if largest == 0.0 else largest / np.maximum(errors, 1e-3 * largest)
 
@@ -248,7 +248,7 @@ def _constant(x: np.ndarray, y: np.ndarray, weight: np.ndarray, what: str) -> La
 
 
 def fit_jointly(measured: Measurement, start: Mapping[str, float], hold: Mapping[str, float] | None = None) -> JointFit:
-    """Fit Eq. 18-19 to all readings at once.
+    """Fit the law of the torque (Eqs. 18-19) to all readings at once.
 
     Parameters
     ----------
@@ -301,7 +301,7 @@ def fit_jointly(measured: Measurement, start: Mapping[str, float], hold: Mapping
 
 
 def _upright(values: dict[str, float]) -> dict[str, float]:
-    """Make the fitted widths positive; the law contains only their squares."""
+    """Make the fitted widths positive; their sign is arbitrary, since the law contains only their squares."""
     return {n: abs(v) if n.startswith(("gamma", "c")) else v for n, v in values.items()}
 
 
@@ -326,7 +326,7 @@ def _judged(measured: Measurement, found: Solution, free: tuple[str, ...], value
 
 
 def _scale(name: str, values: Mapping[str, float]) -> float:
-    """Return the size of a change of one parameter that changes the torque substantially."""
+    """Return by how much one parameter must change for the torque to change substantially."""
     if name == "eps_mag":
         return values[name]
     kind, i = name[:-1], name[-1]
@@ -335,7 +335,7 @@ def _scale(name: str, values: Mapping[str, float]) -> float:
 
 
 def _neighbours(measured: Measurement, residuals: np.ndarray) -> float:
-    """Return the correlation between the residuals of neighbouring readings of a curve, over all curves."""
+    """Return the correlation between the residuals of neighbouring readings on a torque curve, over all curves."""
     products = squares = 0.0
     for curve in measured.curves:
         own = residuals[curve.rows[np.argsort(measured.angle[curve.rows])]]

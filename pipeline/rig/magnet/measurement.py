@@ -88,7 +88,9 @@ class SideColumn(Table):
 
 
 class Tie(Table):
-    """Tie that holds the upper link during the measurement; its weight adds a torque to the readings."""
+    """Tie that holds the pendulum's upper link during the measurement; the weight that hangs on it adds a torque to the
+    readings.
+    """
 
     mass_kg: float = Field(ge=0, description="Mass that hangs on the link [kg].")
     lever_m: float = Field(ge=0, description="Distance from the upper joint along the link to the mass [m].")
@@ -280,7 +282,7 @@ def read_measurement(path: str | Path) -> Measurement:
 def _besides(
     correction: Correction, p: Parameters, angle: np.ndarray, locked: np.ndarray, columns: Mapping[str, np.ndarray]
 ) -> np.ndarray:
-    """Return the torque in the readings that does not come from the magnets [N m]."""
+    """Return the part of the measured torque that does not come from the magnets, such as that of the weights [N m]."""
     if correction.without is not None:
         return columns["without"]
     found = laws.weight_torque(angle, locked, p) if correction.weights else np.zeros_like(angle)
@@ -346,7 +348,7 @@ def _table(path: Path, header: Header) -> tuple[dict[str, list[str]], bytes, lis
 
 
 def _wanted(header: Header) -> dict[str, str]:
-    """Return the column name in the file for each quantity (angle, torque, ...)."""
+    """Return, for each quantity (angle, torque, ...), the name of its column in the CSV table."""
     found = {name: getattr(header.columns, name).column for name in type(header.columns).model_fields}
     if header.correction.without is not None:
         found["without"] = header.correction.without
@@ -408,7 +410,9 @@ def _number(text: str, decimal: str) -> float:
 
 
 def _places(rows: Any) -> str:
-    """Format row numbers of the table for a message, at most three; the first reading is row 1."""
+    """Format row numbers of the table for a message: three at most, then the number of further ones; the first reading
+    is row 1.
+    """
     named = ", ".join(str(i) for i in rows[:MAX_NAMED])
     more = f" and {len(rows) - MAX_NAMED} more" if len(rows) > MAX_NAMED else ""
     return f"row{'s' if len(rows) > 1 else ''} {named}{more}"

@@ -137,7 +137,9 @@ def _base(measured: Measurement, model: str) -> str | Preset:
 
 
 def _error(fit: JointFit, name: str, measured: Measurement) -> str:
-    """Format the standard error of a parameter: the larger of the residuals' and the jackknife's."""
+    """Format the standard error of a parameter: the larger of two estimates, from the residuals and from a jackknife
+    over curves.
+    """
     error, unit = np.fmax(fit.errors[name], fit.errors_by_curve[name]), _unit(name, measured)
     return f"standard error {error:.2g} {unit}".rstrip()
 

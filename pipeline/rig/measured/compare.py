@@ -1,5 +1,5 @@
-"""Compare a measured bifurcation diagram with a computed one: distances of section points, periods, edges of
-windows.
+"""Compare a measured bifurcation diagram with a computed one: distances of section points, periods, frequencies where
+regimes end.
 """
 
 from __future__ import annotations
@@ -62,8 +62,8 @@ def compare(
 
 
 def compare_with(measured: xr.Dataset, computed: Computed, *, seed: int = 0) -> xr.Dataset:
-    """Compare a measured diagram with computed attractors; each frequency step already has its class of motion
-    (``side``).
+    """Compare a measured diagram with computed attractors; its frequency steps must already be labelled with their
+    class of motion (``side``).
     """
     f = measured["frequency"].values
     if not any(computed.place(float(x)) >= 0 for x in f):

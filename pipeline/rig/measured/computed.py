@@ -131,7 +131,8 @@ class Computed:
         return period, int(one["side"]) if "side" in one else 0
 
     def candidates(self, frequency_hz: float, states: Sequence[str]) -> list[Candidate]:
-        """Return the attractors that the model has at a frequency, each with its section points in the given states.
+        """Return the attractors that the model has at a frequency, each with its section points reduced to the given
+        states.
 
         Points of a closed orbit are interpolated between neighbouring frequencies if the attractor has the
         same period there. Otherwise, and for sets that do not close, they are those at the nearest frequency.

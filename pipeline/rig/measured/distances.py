@@ -195,6 +195,8 @@ def _drawn(candidate: Candidate, size: int, rng: np.random.Generator) -> Floats:
 
 
 def geometry_of(names: Sequence[str], model_names: Sequence[str], whole: Geometry) -> Geometry:
-    """Return the scales and angle flags of the recorded states only, for distances between section points."""
+    """Return, for the recorded states only, the scale of each and whether it is an angle, for distances between section
+    points.
+    """
     at = [list(model_names).index(n) for n in names]
     return Geometry(tuple(whole.is_angle[i] for i in at), tuple(whole.scales[i] for i in at))

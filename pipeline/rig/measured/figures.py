@@ -112,7 +112,9 @@ def _rig(measured: xr.Dataset) -> str:
 def _ranges(
     measured: xr.Dataset, values: np.ndarray, cube: xr.Dataset | None, frame: style.Frame
 ) -> tuple[tuple[float, float], tuple[float, float] | None]:
-    """Return the axis ranges that contain both diagrams; the second is None if the computed diagram sets the y axis."""
+    """Return the ranges of the frequency axis and the state axis; the latter is None if the computed diagram already
+    sets it.
+    """
     own = measured["frequency"].values
     f = own if cube is None else np.concatenate([own, np.atleast_1d(cube[FREQUENCY_DIM].values)])
     margin = 0.02 * float(np.ptp(f)) or 0.02 * float(f[0])
@@ -256,8 +258,8 @@ class _Met:
 
 
 def _met(compared: xr.Dataset, computed: Computed) -> _Met:
-    """Return the attractors nearest to the measurement at any step; the most frequent one of each class gets its
-    colour.
+    """Return the attractors nearest to the measurement at any step; the most frequent one of each motion class gets the
+    class's colour.
     """
     cast, motions = palette.cast_of(computed.attractors), motions_of(compared)
     winners, sides = compared["winner"].values, compared["computed_side"].values

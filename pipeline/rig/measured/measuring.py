@@ -122,7 +122,9 @@ def _instants(edges: Edges, stretches: Sequence[Stretch], phase: float) -> Edges
 
 
 def _in_place(sections: xr.Dataset, name: str, n: int) -> np.ndarray:
-    """Place section points at the indices of their drive edges; edges without a point become NaN."""
+    """Place section points at the indices of the drive edges where they were taken; edges without a point become
+    NaN.
+    """
     values = np.full((n, sections.sizes["state"]), np.nan)
     values[sections["number"].values] = sections[name].values
     return values
@@ -131,7 +133,9 @@ def _in_place(sections: xr.Dataset, name: str, n: int) -> np.ndarray:
 def _with_instants(
     points: np.ndarray, noise: np.ndarray, names: tuple[str, ...], model: Model, scatter_s: float
 ) -> np.ndarray:
-    """Return the noise of section points, with the scatter of their times added for states whose rate is measured."""
+    """Return the noise of section points; it is increased by the uncertainty of their times in states whose rate is
+    measured.
+    """
     both = noise.copy()
     for i, name in enumerate(names):
         rate = model.state(name).rate
@@ -143,7 +147,8 @@ def _with_instants(
 def _shaken(
     points: np.ndarray, noise: np.ndarray, kink: np.ndarray, names: tuple[str, ...], model: Model, shake_s: float
 ) -> np.ndarray:
-    """Return the expected scatter of a periodic motion whose drive jitters: sensor noise and the effect of late edges.
+    """Return the expected scatter of a periodic motion: sensor noise, and the effect of drive edges that come early or
+    late.
 
     A late edge lets an angle advance by its rate times the delay. It changes a rate by the jump of the rate's
     derivative times the delay.

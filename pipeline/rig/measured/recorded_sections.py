@@ -32,7 +32,7 @@ _LEAST_SPARE = 3
 
 @dataclass(frozen=True)
 class Channel:
-    """Measured state of a recording, with the rate that its slope gives if that is not measured itself.
+    """Measured state of a recording; its slope gives the rate if the rate itself is not measured.
 
     Attributes
     ----------
@@ -53,7 +53,8 @@ class Channel:
 
 
 def channels_of(recording: xr.Dataset, model: Model) -> list[Channel]:
-    """Return the measured states of a recording, each with the rate that its slope gives if that is not measured.
+    """Return the measured states of a recording; the slope of such a state gives its rate if the rate itself is not
+    measured.
 
     Raises
     ------
@@ -174,8 +175,8 @@ def _check(recording: xr.Dataset, window_s: float, order: int) -> None:
 def _fits(
     recording: xr.Dataset, edges: Edges, channels: list[Channel], window_s: float, order: int
 ) -> list[tuple[int, Floats, Floats, Floats, Floats]]:
-    """Fit the channels about each rising edge that has enough samples; return the edge's number and the results of
-    `_fit`.
+    """Fit polynomials to the channels about each rising edge of the drive that has enough samples; return edge number
+    and fit.
     """
     time = recording["time"].values
     piece = recording["piece"].values if "piece" in recording.coords else np.zeros(time.size, np.int64)
@@ -194,7 +195,7 @@ def _fits(
 
 
 def _nearest(instants: Floats, at: float, beyond: float) -> float:
-    """Return the distance from time `at` to the nearest edge more than `beyond` away; infinite if there is none.
+    """Return the time from `at` to the nearest drive edge that is more than `beyond` away; infinite if there is none.
 
     An edge placed by a fitted line differs slightly from the detected one.
     """
@@ -207,8 +208,8 @@ def _nearest(instants: Floats, at: float, beyond: float) -> float:
 def _fit(
     t: Floats, data: Floats, channels: list[Channel], half: float, order: int
 ) -> tuple[Floats, Floats, Floats, Floats] | None:
-    """Fit each channel about one edge; return value and slope (channel, 2) at t = 0, spread per unit noise, variance
-    and kink (channel,).
+    """Fit a polynomial to each channel about a drive edge; return value and slope there, their error per unit noise,
+    variance and kink.
     """
     if min((t < 0).sum(), (t >= 0).sum()) < order + _LEAST_SPARE or not np.isfinite(data).all():
         return None

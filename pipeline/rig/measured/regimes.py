@@ -96,8 +96,8 @@ def find_period(
 
 
 def _second(points: Floats, noise: Floats, k: int) -> Floats:
-    """Return the second differences of section points at lag k: their mean squares over the states, in units of their
-    noise.
+    """Return the squared second differences of section points at lag `k`, in units of their noise, averaged over the
+    states.
     """
     difference = points[2 * k :] - 2 * points[k:-k] + points[: -2 * k]
     variance = noise[2 * k :] ** 2 + 4 * noise[k:-k] ** 2 + noise[: -2 * k] ** 2
@@ -105,8 +105,8 @@ def _second(points: Floats, noise: Floats, k: int) -> Floats:
 
 
 def _closure(squares: Floats) -> Floats:
-    """Return the rms of the second differences for each period, over all section points or the later half, whichever is
-    less.
+    """Return, for each tested period, the rms second difference of the section points: of all or of the later half,
+    whichever is less.
     """
     known = np.isfinite(squares)
     values = np.where(known, squares, 0.0)
@@ -122,13 +122,13 @@ def _closure(squares: Floats) -> Floats:
 
 
 def _least(closure: Floats, limit: float) -> int:
-    """Return the row of the least period at which the motion closes, or -1 if there is none."""
+    """Return the index of the least tested period at which the motion closes, or -1 if it closes at none."""
     closed = np.flatnonzero(closure <= limit)
     return int(closed[0]) if closed.size else -1
 
 
 def _share(squares: Floats, found: int, limit: float, rng: np.random.Generator) -> float:
-    """Return the fraction of bootstrap resamples that give the same period.
+    """Return the fraction of bootstrap resamples of the section points that give the same period as all points do.
 
     Sections are drawn in blocks as long as second differences overlap, for all lags together. The limit is
     drawn log-uniformly between half and twice the chosen one, since the noise is known only to about a factor

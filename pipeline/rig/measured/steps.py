@@ -132,7 +132,7 @@ def _is_swept(edges: Edges, spans: list[tuple[int, int]]) -> bool:
 
 
 def _bend(rising: Floats, noise: float) -> float:
-    """Return the curvature of edge times against their number, in units of its standard error."""
+    """Return the curvature of the drive's edge times as a function of their number, in units of its standard error."""
     n = np.arange(rising.size) - 0.5 * (rising.size - 1)
     square = n**2 - (n**2).mean()
     return float(square @ rising / (noise * math.sqrt(square @ square)))
@@ -214,7 +214,7 @@ def _constant(edges: Edges, first: int, last: int, transient: int) -> Stretch:
 
 
 def _windows(edges: Edges, window: int) -> list[Stretch]:
-    """Cut a slow sweep into windows; the frequency of a window is that at its middle."""
+    """Cut a slow sweep into windows of consecutive drive periods; the frequency of a window is that at its middle."""
     found = []
     for first in range(0, edges.rising.size - window, window):
         rising = edges.rising[first : first + window + 1]
@@ -236,8 +236,8 @@ def _windows(edges: Edges, window: int) -> list[Stretch]:
 
 
 def _stretch(own: Edges, curve: Floats, transient: int) -> Stretch:
-    """Return a stretch with its timing; the times `curve` [s] are subtracted from the edges before the line is
-    fitted.
+    """Return a stretch of a sweep with its timing; the known bend `curve` of the edge times [s] is subtracted before a
+    line is fitted.
     """
     rising = own.rising
     # a falling edge is shifted by interpolation between its rising ones

@@ -1,4 +1,4 @@
-"""Make tables of a measured diagram: one row per frequency step, and one per window edge."""
+"""Make tables of a measured diagram: one row per frequency step, or one per frequency at which a regime ends."""
 
 from __future__ import annotations
 

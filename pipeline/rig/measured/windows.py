@@ -62,12 +62,14 @@ class WindowEdge:
 
     @property
     def shift_hz(self) -> float:
-        """Measured minus computed frequency [Hz]."""
+        """Frequency at which the regime ends on the rig minus that at which it ends in the model [Hz]."""
         return self.measured_hz - self.computed_hz
 
     @property
     def shift_error_hz(self) -> float:
-        """Sum of both half steps [Hz]: a bound, not a standard error."""
+        """Bound on the error of the shift: half the measured plus half the computed frequency step [Hz]; not a standard
+        error.
+        """
         return self.measured_error_hz + self.computed_error_hz
 
 
@@ -158,8 +160,8 @@ def _computed_end(
 
 
 def _walk(place: int, sign: int, computed: Computed, holds: Callable[[int], bool]) -> tuple[float, float, str]:
-    """Follow the computed frequencies from index `place` while a condition holds; return the end [Hz], half a step, and
-    a note.
+    """Follow the computed frequencies while a regime lasts; return where it ends [Hz], half the step there, and a note
+    if it does not end.
     """
     f = computed.frequencies
     while 0 <= place + sign < f.size:

@@ -44,7 +44,7 @@ class Signal:
         self.name, self.raw, self.time, self.piece = name, raw, time, piece
 
     def found(self, kind: str, start: int, end: int, severity: str, text: str) -> Finding:
-        """Return a finding about the samples from index `start` up to, not including, `end`."""
+        """Return a finding (fault report) about the samples from index `start` up to, not including, `end`."""
         first, last = float(self.time[start]), float(self.time[end - 1])
         return Finding(kind, self.name, first, last, severity, text)  # type: ignore[arg-type]
 
@@ -92,7 +92,7 @@ def saturated(signal: Signal, entry: ChannelMap) -> list[Finding]:
 
 
 def _beside_wraps(signal: Signal, least: float) -> np.ndarray:
-    """Return a mask of the samples next to a jump of at least `least`."""
+    """Return a mask of the samples next to a jump (wrap of an angle) that is larger than `least`."""
     jump = np.abs(np.diff(signal.raw)) > least
     beside = np.zeros(len(signal.raw), dtype=bool)
     beside[1:] |= jump

@@ -201,8 +201,8 @@ def _rate_findings(stretches: Sequence[Mapping[str, Channel]], stated: float | N
 def _aligned(
     channels: Mapping[str, Channel], step: float, source: str
 ) -> tuple[dict[str, tuple[int, int]], list[Finding]]:
-    """Return the range of samples of each channel from the latest start to the earliest end in a stretch, and
-    findings.
+    """Return each channel's range of samples that all channels of a stretch have in common, and reports of samples left
+    out.
     """
     starts = {n: float(c.time[0]) if c.time is not None and len(c) else c.start_s for n, c in channels.items()}
     known = [s for s in starts.values() if math.isfinite(s)]
@@ -286,7 +286,9 @@ def _checked_stamps(stamps: list[np.ndarray], step: float, source: str) -> list[
 def _cut(
     time: np.ndarray, forced: np.ndarray, step: float, stated: float | None
 ) -> tuple[np.ndarray, np.ndarray, float, list[Finding]]:
-    """Divide the samples into pieces at gaps and at forced cuts, and make the times even within each piece."""
+    """Divide the samples into pieces at gaps and where `forced` is true, and make the sample times even within each
+    piece.
+    """
     is_gap = _missing(time, step) > 0
     piece = np.cumsum(is_gap | np.concatenate([[False], forced[1:]])).astype(np.int64)
     even, own_step, residual = _even(time, piece, step, stated)

@@ -125,7 +125,7 @@ def _skip(lines: list[str], i: int) -> int:
 
 
 def _columns(segment: _Segment) -> dict[int, int | None]:
-    """Return the index of each channel column with that of its X column, or None without one."""
+    """Return the index of each channel column with that of its abscissa (X) column, or None if it has none."""
     last_x: int | None = None
     found: dict[int, int | None] = {}
     for j, name in enumerate(segment.names):

@@ -61,8 +61,8 @@ def _refuse_hdf5(path: Path) -> None:
 
 
 def _gather(name: str, value: Any, leaves: dict[str, list[np.ndarray]]) -> None:
-    """Add the numeric arrays of a MATLAB variable to `leaves`: one array, or one per cell; fields of structures
-    separately.
+    """Add the numeric arrays of a MATLAB variable to `leaves` under its name; each field of a structure has its own
+    entry.
     """
     if not isinstance(value, np.ndarray):
         return

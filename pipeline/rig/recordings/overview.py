@@ -68,7 +68,7 @@ def _channel_row(raw: Raw, name: str) -> dict[str, Any]:
 
 
 def describe_recording(ds: xr.Dataset) -> tuple[Table, Table]:
-    """Return two tables of a recording: one row per measured quantity, and one row per finding.
+    """Return two tables of a recording: one row per measured quantity, and one row per finding (fault or correction).
 
     Parameters
     ----------

@@ -101,8 +101,8 @@ def recording_of(raw: Raw, mapping: Mapping, *, window_s: tuple[float, float] | 
 
 
 def window(ds: xr.Dataset, window_s: tuple[float, float]) -> xr.Dataset:
-    """Return the part of a recording in a time window, with its findings; times still count from the first sample of
-    the whole.
+    """Return the part of a recording in a time window, with its findings; times still count from the start of the whole
+    recording.
 
     Parameters
     ----------
@@ -169,7 +169,7 @@ def _name_of(channel: str | int, names: Sequence[str]) -> str | None:
 
 
 def _name_but_for_unit(entry: Scaled | TimeMap | PieceMap, names: Sequence[str]) -> str | None:
-    """Return the only channel in the file whose name is that of the mapping plus a unit in brackets; None otherwise."""
+    """Return the only channel in the file whose name is the mapping's name plus a unit in brackets, otherwise None."""
     near = _names_with_unit(entry.channel, names)
     if len(near) != 1 or isinstance(entry, PieceMap) or not entry.unit:
         return None
@@ -217,8 +217,8 @@ def _name_findings(mapping: Mapping, columns: dict[str, str]) -> list[Finding]:
 def _timed(
     stretch: AnyMapping[str, Channel], mapping: Mapping, columns: dict[str, str], findings: list[Finding]
 ) -> tuple[dict[str, Channel], np.ndarray]:
-    """Return the mapped channels of a stretch under the model's names, with time stamps, and the piece numbers of the
-    samples.
+    """Return the mapped channels of a stretch under the model's names and with time stamps, and the piece number of
+    each sample.
 
     Channels longer than the time stamps or the piece numbers are cut, with a finding.
     """
@@ -249,7 +249,9 @@ def _joined(stretches: Sequence[AnyMapping[str, Channel]], name: str, clock: Clo
 
 
 def _converted(signal: checks.Signal, mapping: Mapping) -> tuple[np.ndarray, list[Finding]]:
-    """Check the readings of a channel for faults and convert them to SI units; return values and findings."""
+    """Check the readings of a channel for faults and convert them to SI units; return the values and the findings
+    (fault reports).
+    """
     entry = _entries(mapping)[signal.name]
     found = checks.missing(signal)
     raw = np.where(np.isfinite(signal.raw), signal.raw, np.nan)

@@ -214,7 +214,7 @@ def _fit(values: np.ndarray, parts: np.ndarray, width: int | None, order: int, s
 
 
 def _first_samples(parts: np.ndarray, count: int) -> np.ndarray:
-    """Return the first stretches, cut so that together they have at most `count` samples."""
+    """Return the first stretches of a recording, cut so that together they have at most `count` samples."""
     if not len(parts):
         return parts
     lengths = np.diff(parts, axis=1).ravel()
@@ -262,7 +262,9 @@ def _smoothed(values: np.ndarray, parts: np.ndarray, width: int, order: int, ste
 
 
 def _order_of(own: int, width: int, order: int) -> int:
-    """Return the polynomial order for a stretch shorter than the window; it is lower for short stretches."""
+    """Return the polynomial order for a stretch shorter than the smoothing window; the shorter the stretch, the lower
+    the order.
+    """
     return max(order - sum(own < share * width for share in SHORT), 1)
 
 

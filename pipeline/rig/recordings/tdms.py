@@ -73,7 +73,9 @@ def _channel(name: str, values: np.ndarray, properties: Mapping[str, Any], zero:
 
 
 def _numbers(data: Any, zero: int) -> np.ndarray | None:
-    """Return a channel's data as floats, time stamps as seconds since `zero`; None for data of other types."""
+    """Return a channel's data as floats (time stamps become seconds since `zero`), or None if they are neither numbers
+    nor times.
+    """
     array = np.asarray(data)
     names = array.dtype.names or ()
     if "second_fractions" in names:

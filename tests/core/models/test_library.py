@@ -78,6 +78,48 @@ def _lorenz(t, y, p):
     return p["sigma"] * (y - x), x * (p["rho"] - z) - y, x * y - p["beta"] * z
 
 
+def _flutter(t, y, p):
+    """Lee, Barton and Renson's equations M v'' + D v' + K v + (0, k2 al^2 + k3 al^3, 0) = 0 for v = (h, al, w)."""
+    rho, b, a, u = p["rho"], p["b"], p["a"], p["U"]
+    c1, c2, c3, c4 = (p[f"c{i}"] for i in range(1, 5))
+    pi, s, lag, product = np.pi, 1.0 - c1 - c3, c1 * c2 + c3 * c4, c2 * c4 * (c1 + c3)
+    off = p["mw"] * p["xa"] * b - a * pi * rho * b**3
+    mass = np.array(
+        [[p["mT"] + pi * rho * b**2, off, 0], [off, p["Ia"] + pi * (0.125 + a**2) * rho * b**4, 0], [0, 0, 1]]
+    )
+    damping = np.array(
+        [
+            [
+                p["ch"] + 2 * pi * rho * b * u * s,
+                (1 + s * (1 - 2 * a)) * pi * rho * b**2 * u,
+                2 * pi * rho * u**2 * b * lag,
+            ],
+            [
+                -2 * pi * (a + 0.5) * rho * b**2 * s * u,
+                p["ca"] + (0.5 - a) * (1 - s * (1 + 2 * a)) * pi * rho * b**3 * u,
+                -2 * pi * rho * b**2 * u**2 * (a + 0.5) * lag,
+            ],
+            [-1 / b, a - 0.5, (c2 + c4) * u / b],
+        ]
+    )
+    stiffness = np.array(
+        [
+            [p["kh"], 2 * pi * rho * b * u**2 * s, 2 * pi * rho * u**3 * product],
+            [0, p["ka"] - 2 * pi * (0.5 + a) * rho * s * b**2 * u**2, -2 * pi * rho * b * u**3 * (a + 0.5) * product],
+            [0, -u / b, c2 * c4 * u**2 / b**2],
+        ]
+    )
+    v, rate = y[:3], y[3:]
+    spring = np.array([0.0, p["ka2"] * v[1] ** 2 + p["ka3"] * v[1] ** 3, 0.0])
+    return np.concatenate([rate, np.linalg.solve(mass, -damping @ rate - stiffness @ v - spring)])
+
+
+FLUTTER = {
+    **{"U": 16.0, "kh": 3529.4, "kh3": 0.0, "ch": 14.5756, "ka": 54.1162, "ka2": 751.6, "ka3": 5006.7, "ka4": 0.0},
+    **{"ka5": 0.0, "ca": 0.5628, "Ia": 0.1724, "xa": 0.24, "mw": 5.3, "mT": 16.9, "b": 0.15, "a": -0.5, "rho": 1.204},
+    **{"c1": 0.165, "c2": 0.0455, "c3": 0.335, "c4": 0.3},
+}
+
 EQUATIONS = {
     "duffing5": (_duffing5, {"d": 0.08, "k": 1.0, "A": 0.2}),
     "driven-pendulum": (_driven_pendulum, {"d": 0.2, "w0": 1.0, "A": 1.66, "bias": 0.0}),
@@ -88,6 +130,7 @@ EQUATIONS = {
     "van-der-pol": (_van_der_pol, {"mu": 1.0}),
     "forced-van-der-pol": (_forced_van_der_pol, {"mu": 1.0, "A": 0.4}),
     "rossler": (_rossler, {"a": 0.2, "b": 0.2, "c": 5.7}),
+    "flutter": (_flutter, FLUTTER),
     "lorenz": (_lorenz, {"sigma": 10.0, "rho": 28.0, "beta": 8.0 / 3.0}),
 }
 """Right-hand sides written down once more, at 1 rad/s, and the published parameters."""

@@ -138,7 +138,7 @@ def near_closed(section: np.ndarray, max_period: int, geometry: Geometry, closin
 
 
 def _closes_in(section: np.ndarray, found: Recurrence, geometry: Geometry) -> np.ndarray:
-    """Return for each cell whether its section points recur at falling distances."""
+    """Return for each cell whether its section points recur more and more closely."""
     closes = found.centred > 0
     half = section.shape[1] // 2
     for p in np.unique(found.period[found.period > 0]).tolist():

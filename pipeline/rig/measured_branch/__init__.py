@@ -1,0 +1,1 @@
+"""Measured branches of periodic orbits, stable and unstable, beside computed ones."""

@@ -1,0 +1,197 @@
+"""Compare measured orbits with the computed branches of a run: distances in scatters and in per cent."""
+
+from __future__ import annotations
+
+import numpy as np
+import xarray as xr
+
+from magpend_core.models.model import Parameters
+from magpend_core.models.sectioned import of_flow
+from magpend_core.sampling import Drive, sample
+from pipeline.analysis.tabular import Row, Words, aligned, counted, number, values, words_of
+from pipeline.layout.vocabulary import FREQUENCY_DIM, model_of, parameter_name
+from pipeline.products.product import Table
+from pipeline.specification.problems import SpecError
+
+SAMPLES = 256
+"""Samples of a computed orbit in each period, for its amplitude."""
+
+
+def amplitudes(branches: xr.Dataset, base: Parameters, state: str) -> np.ndarray:
+    """Compute half of the peak-to-peak value of a state on every orbit of computed branches.
+
+    Parameters
+    ----------
+    branches
+        Result of the analysis ``branches``.
+    base
+        Parameters of the run.
+    state
+        Name of the state.
+
+    Returns
+    -------
+    ndarray, (branch, point)
+        0 for equilibria, NaN beyond a branch's own points.
+    """
+    flow = of_flow(base).model
+    column, parameter = flow.state_names.index(state), str(branches.attrs["parameter"])
+    found = np.full((branches.sizes["branch"], branches.sizes["point"]), np.nan)
+    for i in range(branches.sizes["branch"]):
+        n, period = int(branches["n_points"][i]), int(branches["orbit_period"][i])
+        if not period:
+            found[i, :n] = 0.0
+            continue
+        own = {name: float(branches[name][i]) for name in base.names if name in branches}
+        points = branches["parameter"].values[i, :n]
+        seconds = branches["period_s"].values[i, :n]
+        fixed = base.replace(**own)
+        rows = [fixed if parameter == FREQUENCY_DIM else fixed.replace(**{parameter: float(v)}) for v in points]
+        driven = base.model.crossing is None
+        samples = sample(
+            flow.system,
+            np.array([of_flow(row).pack() for row in rows]),
+            branches["section"].values[i, :n, 0],
+            [s * np.arange(SAMPLES * period + 1) / (SAMPLES * period) for s in seconds],
+            drives=[Drive(np.full(period, s / period)) for s in seconds] if driven else None,
+            columns=[column],
+            limits_first_step=False,
+        )
+        found[i, :n] = 0.5 * np.ptp(samples.states[:, :, 0], axis=1)
+    return found
+
+
+def compare(measured: xr.Dataset, branches: xr.Dataset, computed: np.ndarray) -> xr.Dataset:
+    """Find the computed orbit nearest to each measured one, of the same stability where that was observed.
+
+    Parameters
+    ----------
+    measured
+        From `pipeline.rig.measured_branch.reading.read_branch`.
+    branches
+        Result of the analysis ``branches`` along the same parameter.
+    computed
+        From `amplitudes`.
+
+    Returns
+    -------
+    Dataset
+        `measured` with ``computed_amplitude``, ``computed_frequency``, ``relative_error`` of the amplitude and
+        ``frequency_error`` (computed over measured, less 1), ``distance`` (difference of the amplitudes in
+        units of their scatter), and ``branch``, -1 where no computed orbit has the parameter's value and the
+        stability.
+
+    Raises
+    ------
+    SpecError
+        If the branches were followed along another parameter.
+    """
+    if str(branches.attrs["parameter"]) != str(measured.attrs["parameter"]):
+        raise SpecError(
+            [
+                f"the orbits were measured along {measured.attrs['parameter']}, and the branches of the run follow "
+                f"{branches.attrs['parameter']}; give a run that sweeps {measured.attrs['parameter']}."
+            ]
+        )
+    n = measured.sizes["orbit"]
+    amplitude, frequency = np.full(n, np.nan), np.full(n, np.nan)
+    chosen = np.full(n, -1, np.int32)
+    for k in range(n):
+        best = _nearest(measured.isel(orbit=k), branches, computed)
+        if best is not None:
+            chosen[k], amplitude[k], frequency[k] = best
+    error = amplitude / measured["amplitude"].values - 1.0
+    columns = {
+        "computed_amplitude": (amplitude, measured["amplitude"].attrs["units"]),
+        "computed_frequency": (frequency, "Hz"),
+        "relative_error": (error, "1"),
+        "frequency_error": (frequency / measured["frequency"].values - 1.0, "1"),
+        "distance": ((amplitude - measured["amplitude"].values) / measured["amplitude_sd"].values, "1"),
+        "branch": (chosen, "1"),
+    }
+    return measured.assign({name: ("orbit", array, {"units": unit}) for name, (array, unit) in columns.items()})
+
+
+def _nearest(one: xr.Dataset, branches: xr.Dataset, computed: np.ndarray) -> tuple[int, float, float] | None:
+    """Return branch, amplitude and frequency of the computed orbit whose amplitude is nearest to a measured one."""
+    value, stability = float(one["value"]), int(one["stability"])
+    best, least = None, np.inf
+    for i in range(branches.sizes["branch"]):
+        n = int(branches["n_points"][i])
+        x, unstable = branches["parameter"].values[i, :n], branches["n_unstable"].values[i, :n] > 0
+        for j in np.flatnonzero((x[:-1] - value) * (x[1:] - value) <= 0.0):
+            near = j if abs(x[j] - value) <= abs(x[j + 1] - value) else j + 1
+            if stability and unstable[near] != (stability == 2):
+                continue
+            share = (value - x[j]) / (x[j + 1] - x[j]) if x[j + 1] != x[j] else 0.0
+            amplitude = float(computed[i, j] + share * (computed[i, j + 1] - computed[i, j]))
+            rates = 1.0 / branches["period_s"].values[i, j : j + 2]
+            away = abs(amplitude - float(one["amplitude"]))
+            if amplitude > 0.0 and away < least:
+                best, least = (i, amplitude, float(rates[0] + share * (rates[1] - rates[0]))), away
+    return best
+
+
+def rms_of(measured: xr.Dataset, stability: str) -> float:
+    """Return the root mean square of the relative errors of the amplitude over the orbits of one stability."""
+    words = words_of(measured["stability"])
+    errors = measured["relative_error"].values[measured["stability"].values == words.index(stability)]
+    return float(np.sqrt(np.mean(errors**2))) if len(errors) else float("nan")
+
+
+def branch_table(measured: xr.Dataset) -> Table:
+    """Return a table of the measured orbits, with their distances from the computed branches if they were compared."""
+    name = parameter_name(str(measured.attrs["parameter"]))
+    rows = [_row(measured.isel(orbit=k), name) for k in range(measured.sizes["orbit"])]
+    lines = [f"{counted(len(rows), 'measured orbit')} of {measured.attrs['state']} along {name}"]
+    unit = _unit(measured)
+    lines += aligned([_words(row, name, unit) for row in rows])
+    if "relative_error" in measured:
+        lines += [""] + [
+            f"{word} orbits: root mean square of the amplitudes' relative errors {100.0 * rms:.1f} %"
+            for word in words_of(measured["stability"])
+            if np.isfinite(rms := rms_of(measured, word))
+        ]
+        lost = [row["name"] for row in rows if row["branch"] < 0]
+        lines += [f"no computed orbit of that stability: {', '.join(lost)}"] if lost else []
+    return Table(rows, lines)
+
+
+def _unit(measured: xr.Dataset) -> str:
+    unit = model_of(measured).state(str(measured.attrs["state"])).unit
+    return "" if unit == "1" else f" {unit}"
+
+
+_COLUMNS = ("amplitude", "amplitude_sd", "mean", "mean_sd", "frequency", "frequency_sd", "n_cycles")
+_COMPARED = ("computed_amplitude", "computed_frequency", "relative_error", "frequency_error", "distance", "branch")
+
+
+def _row(one: xr.Dataset, parameter: str) -> Row:
+    harmonics = {}
+    if "harmonic" in one:
+        harmonics = {f"harmonic_{int(k)}": float(one["harmonic"].sel(order=k)) for k in one["order"].values}
+    first = {"name": str(one["name"].item()), parameter: float(one["value"]), **values(one, "stability")}
+    return {**first, **values(one, *_COLUMNS), **harmonics, **values(one, *_COMPARED)}
+
+
+def _words(row: Row, parameter: str, unit: str) -> Words:
+    words = {
+        "orbit": row["name"],
+        parameter: f"{row[parameter]:g}",
+        "stability": row["stability"],
+        f"amplitude{unit}": _with_scatter(row["amplitude"], row["amplitude_sd"]),
+        "frequency Hz": _with_scatter(row["frequency"], row["frequency_sd"]),
+    }
+    if "distance" not in row:
+        return words
+    return words | {
+        "computed": number(row["computed_amplitude"], ".4g"),
+        "error %": number(100.0 * row["relative_error"], "+.1f"),
+        "in scatters": number(row["distance"], "+.1f"),
+        "frequency error %": number(100.0 * row["frequency_error"], "+.2f"),
+    }
+
+
+def _with_scatter(value: float, scatter: float) -> str:
+    text = number(value, ".4g")
+    return f"{text} ± {scatter:.1g}" if np.isfinite(scatter) and np.isfinite(value) else text
