@@ -15,7 +15,8 @@ import typer
 from pipeline.cli.common import Csv, Directory, Json, check_csv, json_rows, read_pairs, tell
 from pipeline.cli.groups import SETTINGS, made, registry_group
 from pipeline.cli.options import taking
-from pipeline.cli.outputs import check_place
+from pipeline.cli.outputs import check_file, check_place
+from pipeline.layout.writing import write_atomically
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -262,21 +263,47 @@ def branch(
         _save(plot_branch(found, branches, computed, frame=Frame(options.width)), out)
 
 
+def trace(
+    spec: Annotated[Path, typer.Argument(metavar="SPEC", help="Virtual rig with the table [control] (TOML).")],
+    out: Annotated[Path, typer.Option(help="Table of orbits to write, .csv.")],
+) -> None:
+    """Trace a branch of a virtual rig by control-based continuation, through its unstable orbits.
+
+    A controller keeps the rig near each target until its output is one cosine: the response is then an orbit of
+    the rig under this drive. The table is what measured branch reads.
+    """
+    from pipeline.cli import console
+    from pipeline.rig import control
+
+    check_file(out)
+    rig, targets = control.load_control(spec)
+    found = control.trace(rig, targets)
+    write_atomically(out, control.orbits_csv(rig, found))
+    counts = ", ".join(f"{found.stable.count(word)} {name}" for word, name in _STABLE.items())
+    console.result(f"{len(targets)} orbits by the slope of the branch: {counts}")
+    console.result(f"largest further harmonic of the drive: {100.0 * found.residue.max():.2g} % of the first")
+    console.result(f"table: {out}")
+
+
+_STABLE = {"yes": "stable", "no": "unstable", "unknown": "unknown"}
+
 _COMMANDS: dict[str, tuple[Any, str]] = {
     "steps": (steps, "SweepOptions"),
     "diagram": (diagram, "DiagramOptions"),
     "compare": (compare, "ComparisonOptions"),
     "series": (series, "SeriesOptions"),
     "branch": (branch, "MeasuredBranchOptions"),
+    "trace": (trace, ""),
 }
-"""Commands, and the names of their options in `pipeline.products.measured`."""
+"""Commands, and the names of their options in `pipeline.products.measured`; empty if there are none."""
 
 
 def _make(name: str) -> Any:
     from pipeline.products import measured
 
     function, options = _COMMANDS[name]
-    return made(name, taking(getattr(measured, options), function), str(function.__doc__))
+    command = taking(getattr(measured, options), function) if options else function
+    return made(name, command, str(function.__doc__))
 
 
 measured_app = typer.Typer(

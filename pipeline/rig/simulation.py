@@ -146,7 +146,7 @@ def parse_rig(data: AnyMapping[str, Any], folder: str | Path = ".") -> Rig:
         name: _checked(SensorTable, table, f"sensors.{name}", problems)
         for name, table in _table(data, "sensors", problems).items()
     }
-    parameters = _parameters(data, folder, problems)
+    parameters = rig_parameters(data, folder, problems)
     if parameters is None:
         raise SpecError(problems)
     start = _start(_table(data, "initial_state", problems), parameters.model, problems)
@@ -204,7 +204,8 @@ def _table(data: AnyMapping[str, Any], name: str, problems: list[str]) -> dict[s
     return value
 
 
-def _parameters(data: AnyMapping[str, Any], folder: str | Path, problems: list[str]) -> Parameters | None:
+def rig_parameters(data: AnyMapping[str, Any], folder: str | Path, problems: list[str]) -> Parameters | None:
+    """Return the parameters of a virtual rig from its tables; None after adding to `problems` what is wrong."""
     if "model" not in data:
         problems.append("model: missing; name the model, as magpend models lists them.")
         return None

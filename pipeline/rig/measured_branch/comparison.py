@@ -78,8 +78,8 @@ def compare(measured: xr.Dataset, branches: xr.Dataset, computed: np.ndarray) ->
     Dataset
         `measured` with ``computed_amplitude``, ``computed_frequency``, ``relative_error`` of the amplitude and
         ``frequency_error`` (computed over measured, less 1), ``distance`` (difference of the amplitudes in
-        units of their scatter), and ``branch``, -1 where no computed orbit has the parameter's value and the
-        stability.
+        units of their scatter, NaN without one), and ``branch``, -1 where no computed orbit has the parameter's
+        value and the stability.
 
     Raises
     ------
@@ -101,12 +101,13 @@ def compare(measured: xr.Dataset, branches: xr.Dataset, computed: np.ndarray) ->
         if best is not None:
             chosen[k], amplitude[k], frequency[k] = best
     error = amplitude / measured["amplitude"].values - 1.0
+    scatter = measured["amplitude_sd"].where(measured["amplitude_sd"] > 0.0).values
     columns = {
         "computed_amplitude": (amplitude, measured["amplitude"].attrs["units"]),
         "computed_frequency": (frequency, "Hz"),
         "relative_error": (error, "1"),
         "frequency_error": (frequency / measured["frequency"].values - 1.0, "1"),
-        "distance": ((amplitude - measured["amplitude"].values) / measured["amplitude_sd"].values, "1"),
+        "distance": ((amplitude - measured["amplitude"].values) / scatter, "1"),
         "branch": (chosen, "1"),
     }
     return measured.assign({name: ("orbit", array, {"units": unit}) for name, (array, unit) in columns.items()})

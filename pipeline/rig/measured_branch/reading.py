@@ -151,12 +151,14 @@ def _from_csv(path: Path, model: Model | None, state: str) -> xr.Dataset:
         )
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
-            lines = list(csv.DictReader(file))
+            header, *lines = list(csv.reader(file)) or [[]]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise SpecError([f"{path}: cannot be read as a CSV table ({error})."]) from None
-    if not lines:
+    lines = [line for line in lines if any(field.strip() for field in line)]
+    if not header or not lines:
         raise SpecError([f"{path}: has no rows; give a header and a row for each orbit."])
-    parameter, *others = lines[0]
+    # by position, since the parameter may have the name of another column
+    parameter, *others = (name.strip() for name in header)
     chosen = state or model.section_states[0]
     problems = _name_problems(model, parameter, chosen)
     problems += [
@@ -165,12 +167,13 @@ def _from_csv(path: Path, model: Model | None, state: str) -> xr.Dataset:
     if "amplitude" not in others:
         problems.append("column 'amplitude': missing; give half of the peak-to-peak value of each orbit.")
     rows, columns = [], []
-    for i, line in enumerate(lines, 2):
+    for i, (first, *rest) in enumerate(lines, 2):
+        line = dict(zip(others, rest, strict=False))
         found = {name: _number(line.get(name), f"row {i}, {name}", problems) for name in _NUMBERS}
         word = (line.get("stable") or "unknown").strip().lower()
         if word not in _YES:
             problems.append(f"row {i}, stable = {word!r}: must be yes, no or unknown.")
-        value = _number(line[parameter], f"row {i}, {parameter}", problems)
+        value = _number(first, f"row {i}, {parameter}", problems)
         if not math.isfinite(value):
             problems.append(f"row {i}, {parameter}: missing; each orbit needs the parameter's value.")
         if not math.isfinite(found["amplitude"]):

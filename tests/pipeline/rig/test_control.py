@@ -1,0 +1,114 @@
+"""Control-based continuation on a virtual rig, against computed branches."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from magpend_core.models import load_model
+from pipeline.layout.vocabulary import parameters_of
+from pipeline.rig.control import Controlled, load_control, orbits_csv, trace
+from pipeline.rig.measured_branch.comparison import amplitudes, compare
+from pipeline.rig.measured_branch.reading import read_branch
+from pipeline.runs.derive import AnalysedRun
+from pipeline.runs.run import run
+from pipeline.specification.problems import SpecError
+
+SWEEP = """
+kind = "sweep"
+model = "duffing"
+[parameters]
+preset = "hardening"
+frequency_hz = 0.22
+[axes]
+amplitude = { start = 0.05, stop = 1.8, num = 8 }
+[initial_conditions]
+kind = "list"
+points = [[0.0, 0.0], [1.8, 0.0]]
+[integration]
+rtol = 1e-9
+atol = 1e-9
+n_transient = 200
+n_keep = 4
+"""
+
+CONTROL = """
+model = "duffing"
+preset = "hardening"
+[control]
+state = "x"
+drive = "amplitude"
+frequency_hz = 0.22
+start = 0.3
+stop = 2.1
+num = 9
+"""
+
+
+@pytest.fixture(scope="module")
+def computed(tmp_path_factory):
+    """The S of the response over the drive's amplitude at .22 Hz."""
+    folder = tmp_path_factory.mktemp("computed")
+    (folder / "spec.toml").write_text(SWEEP)
+    run(folder / "spec.toml", folder / "run", workers=0, echo=lambda line: None)
+    found = AnalysedRun.of(folder / "run")
+    branches = found.derive("branches", parameter="amplitude")
+    return found, branches, amplitudes(branches, parameters_of(found.cube()), "x")
+
+
+def compared(computed, rig, targets, tmp_path):
+    """Trace a branch and compare it, through its table, with the computed one."""
+    orbits = trace(rig, targets)
+    (tmp_path / "orbits.csv").write_text(orbits_csv(rig, orbits))
+    found, branches, sizes = computed
+    return orbits, compare(read_branch(tmp_path / "orbits.csv", found.model), branches, sizes)
+
+
+def test_trace__unstable_middle_branch(computed, tmp_path):
+    """Without noise all orbits, the unstable ones too, are those of the model; control leaves one cosine."""
+    (tmp_path / "rig.toml").write_text(CONTROL)
+    orbits, found = compared(computed, *load_control(tmp_path / "rig.toml"), tmp_path)
+    assert orbits.stable.count("no") >= 3
+    assert orbits.stable.count("yes") >= 4
+    assert set(orbits.stable[-3:]) == {"yes"}
+    known = found["branch"].values >= 0
+    assert known.all()
+    assert np.abs(found["relative_error"].values).max() < 2e-3
+    assert orbits.residue.max() < 1e-3
+
+
+def test_trace__with_noise(computed, tmp_path):
+    """With noise of 2 mm in amplitudes of a metre orbits are right within per cents, and scatter."""
+    rig = Controlled(load_model("duffing").load("hardening"), 0.22, "x", "amplitude", noise=2e-3, seed=3)
+    orbits, found = compared(computed, rig, np.linspace(0.6, 1.8, 6), tmp_path)
+    assert (orbits.amplitude_sd > 1e-4).all()
+    near = found["branch"].values >= 0
+    assert near.sum() >= 4
+    assert np.abs(found["relative_error"].values[near]).max() < 0.03
+
+
+def test_trace__command(computed, tmp_path, command):
+    """The command writes the table, and measured branch reads it."""
+    (tmp_path / "rig.toml").write_text(CONTROL.replace("num = 10", "num = 4"))
+    out, _ = command(tmp_path, "measured", "trace", "rig.toml", "--out", "orbits.csv")
+    assert "4 orbits by the slope of the branch" in out
+    rows = (tmp_path / "orbits.csv").read_text().splitlines()
+    assert rows[0] == "amplitude,amplitude,amplitude_sd,frequency,stable,name"
+    assert len(rows) == 5
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('state = "x"', 'state = "y"', "'y'"),
+        ('drive = "amplitude"', 'drive = "amplitde"', "amplitde"),
+        ('drive = "amplitude"', 'drive = "damping"', "does not act as amplitude times cos"),
+        ("start = 0.3", "start = -0.3", "control.start = -0.3"),
+        ('model = "duffing"', 'modl = "duffing"', "modl"),
+    ],
+)
+def test_control__mistakes(tmp_path, old, new, message):
+    (tmp_path / "rig.toml").write_text(CONTROL.replace(old, new))
+    with pytest.raises(SpecError) as raised:
+        trace(*load_control(tmp_path / "rig.toml"))
+    assert message in str(raised.value)
