@@ -227,6 +227,7 @@ def branch(
     ],
     options: Any,
     over: Annotated[Path | None, typer.Option(metavar="RUN", help="Run whose branches they are compared with.")] = None,
+    model: Annotated[str, typer.Option(help="Model of a CSV table without --over: its name, or a file.")] = "",
     out: Annotated[Path | None, typer.Option(help="Figure, .png, .pdf or .svg.")] = None,
     csv: Csv = None,
     as_json: Json = False,
@@ -245,7 +246,9 @@ def branch(
     path = find_spec(source)
     branches = computed = None
     if over is None:
-        found = read_branch(path, None, options.state)
+        from magpend_core.models import load_model
+
+        found = read_branch(path, load_model(model) if model else None, options.state)
     else:
         from pipeline.cli import console
         from pipeline.layout.vocabulary import parameters_of

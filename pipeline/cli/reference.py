@@ -352,6 +352,23 @@ def public() -> str:
     return ", ".join(f"`{name}`" for name in dir(magpend) if not name.startswith("_"))
 
 
+def measured_branch() -> str:
+    """Return Markdown tables of the keys of measured branches, and of a virtual rig under control."""
+    from pipeline.rig.control import ControlTable
+    from pipeline.rig.measured_branch.reading import MeasuredBranch, RecordedOrbit
+
+    parts = [
+        _keys(
+            "[measured.branch]", MeasuredBranch, "In the specification of a run, or in a file of its own.", ("orbits",)
+        ),
+        _keys("[[measured.branch.orbits]]", RecordedOrbit, "One for each orbit.", ()),
+        _keys(
+            "[control]", ControlTable, "Beside `model`, `preset` and `parameters`: for `magpend measured trace`.", ()
+        ),
+    ]
+    return "\n\n".join(parts)
+
+
 TABLES: dict[str, Callable[[], str]] = {
     "commands": commands,
     "options": options,
@@ -363,6 +380,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "mapping": mapping,
     "findings": findings,
     "virtual rig": virtual_rig,
+    "measured branch": measured_branch,
     "study": study,
     "measures": measures,
     "variables": variables,

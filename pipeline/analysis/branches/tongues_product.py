@@ -69,7 +69,8 @@ def tongues(run: Run, options: TongueOptions) -> xr.Dataset:
     starts = locked_orbits(_cells(point, first), search, options.max_denominator)
     found = {f: s for f, s in starts.items() if s is not None}
     longest = max((s.family.period for s in found.values()), default=1)
-    run.echo(f"tongues: {len(found)} starting orbits of {len(starts)} fractions, periods up to {longest}")
+    of = f"{counted(len(found), 'starting orbit')} of {counted(len(starts), 'fraction')}"
+    run.echo(f"tongues: {of}, periods up to {longest}")
     branches = explore(list(found.values()), Scope(options.low, options.high, longest, 0, IN_TONGUE))
     numbers = fractions_of(branches, search)
     located = dataset_of(branches, first, base)

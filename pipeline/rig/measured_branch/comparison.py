@@ -143,6 +143,7 @@ def rms_of(measured: xr.Dataset, stability: str) -> float:
 def branch_table(measured: xr.Dataset) -> Table:
     """Return a table of the measured orbits, with their distances from the computed branches if they were compared."""
     name = parameter_name(str(measured.attrs["parameter"]))
+    name = f"{name} (parameter)" if name in _COLUMNS else name
     rows = [_row(measured.isel(orbit=k), name) for k in range(measured.sizes["orbit"])]
     lines = [f"{counted(len(rows), 'measured orbit')} of {measured.attrs['state']} along {name}"]
     unit = _unit(measured)

@@ -147,7 +147,10 @@ def _columns_of(cycles: Cycles) -> dict[str, float]:
 def _from_csv(path: Path, model: Model | None, state: str) -> xr.Dataset:
     if model is None:
         raise SpecError(
-            [f"{path}: a table of orbits names no model; give the run that it is compared with: --over RUN."]
+            [
+                f"{path}: a table of orbits names no model; name it with --model, or give the run that it is compared "
+                "with: --over RUN."
+            ]
         )
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 
@@ -70,10 +72,12 @@ def test_trace__unstable_middle_branch(computed, tmp_path):
     orbits, found = compared(computed, *load_control(tmp_path / "rig.toml"), tmp_path)
     assert orbits.stable.count("no") >= 3
     assert orbits.stable.count("yes") >= 4
-    assert set(orbits.stable[-3:]) == {"yes"}
+    assert set(orbits.stable[-2:]) == {"yes"}
     known = found["branch"].values >= 0
     assert known.all()
-    assert np.abs(found["relative_error"].values).max() < 2e-3
+    error = np.abs(found["relative_error"].values)
+    assert error.max() < 4e-3  # beside the fold, where the response is steep
+    assert np.median(error) < 4e-4
     assert orbits.residue.max() < 1e-3
 
 
@@ -89,9 +93,14 @@ def test_trace__with_noise(computed, tmp_path):
 
 def test_trace__command(computed, tmp_path, command):
     """The command writes the table, and measured branch reads it."""
-    (tmp_path / "rig.toml").write_text(CONTROL.replace("num = 10", "num = 4"))
+    (tmp_path / "rig.toml").write_text(CONTROL.replace("num = 9", "num = 4"))
     out, _ = command(tmp_path, "measured", "trace", "rig.toml", "--out", "orbits.csv")
     assert "4 orbits by the slope of the branch" in out
+    table, _ = command(tmp_path, "measured", "branch", "orbits.csv", "--model", "duffing", "--json")
+    first = json.loads(table)[0]
+    size, omega = first["amplitude"], 2.0 * np.pi * 0.22  # harmonic balance
+    balance = size * np.hypot(1.0 - omega**2 + 0.375 * size**2, 0.1 * omega)
+    assert first["amplitude (parameter)"] == pytest.approx(balance, rel=0.02)
     rows = (tmp_path / "orbits.csv").read_text().splitlines()
     assert rows[0] == "amplitude,amplitude,amplitude_sd,frequency,stable,name"
     assert len(rows) == 5
