@@ -173,7 +173,8 @@ def _between_cells(row: Row, search: Search, gaps: dict[Fraction, tuple[int, int
     states = np.array([row.section[i, j] for i, j in gaps.values()])
     for _ in range(BISECTIONS):
         middle = ends.mean(axis=1)
-        states = search.sections(middle, states, N_TRANSIENT, 1)[:, -1]
+        reached = search.sections(middle, states, N_TRANSIENT, 1)[:, -1]
+        states = np.where(np.isfinite(reached).all(axis=1)[:, None], reached, states)
         off = search.rotation(middle, states) - targets
         is_low = (off < 0.0) == rising
         is_done = ~(np.abs(off) > LOCKED)  # NaN: nothing more can be learnt there

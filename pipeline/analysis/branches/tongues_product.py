@@ -24,6 +24,7 @@ from pipeline.analysis.tabular import Words, aligned, counted, number
 from pipeline.analysis.tolerances import BRANCH_RTOL
 from pipeline.layout.vocabulary import axis_name, parameter_name, parameters_of, split_dims
 from pipeline.products.product import Table
+from pipeline.products.rotation import RotationFlag
 from pipeline.products.tongues import TongueOptions
 
 PURPOSE = "tongues are searched on one row of cells"
@@ -66,7 +67,7 @@ def tongues(run: Run, options: TongueOptions) -> xr.Dataset:
     base = base.replace(**dict(zip(base.names, map(float, packed), strict=True)))
     family = family_of(base.model.system, 1, frequency, packed, first, options.high - options.low)
     search = Search(family, *_turning(run))
-    starts = locked_orbits(_cells(point, first), search, options.max_denominator)
+    starts = locked_orbits(cells_of(point, first), search, options.max_denominator)
     found = {f: s for f, s in starts.items() if s is not None}
     longest = max((s.family.period for s in found.values()), default=1)
     of = f"{counted(len(found), 'starting orbit')} of {counted(len(starts), 'fraction')}"
@@ -104,9 +105,11 @@ def _turning(run: Run) -> tuple[TurningState, int]:
     return TurningState(tuple(map(names.index, options.of)), options.center, options.section), options.n_periods
 
 
-def _cells(point: xr.Dataset, first: str) -> Row:
+def cells_of(point: xr.Dataset, first: str) -> Row:
+    """Return a row of cells by rising values of the first parameter; rotation numbers that are not good are NaN."""
     starts = [d for d in point["status"].dims if d != first]
-    stacked = point[["rotation", "orbit_period"]].transpose(first, *starts)
+    good = point["rotation"].where(point["rotation_flag"] == RotationFlag.GOOD)
+    stacked = point[["orbit_period"]].assign(rotation=good).transpose(first, *starts)
     last = point["section"].isel(period_index=-1).transpose(first, *starts, "state").values
     order = np.argsort(point[first].values)
     n = point.sizes[first]

@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import root
 
 from pipeline.analysis.branches.tongues import fractions_between
-from pipeline.analysis.branches.tongues_product import tongues_table
+from pipeline.analysis.branches.tongues_product import cells_of, tongues_table
 from pipeline.plots.rotation import plot_rotation
 from pipeline.plots.tongues import plot_tongues
 from pipeline.products.rotation import RotationFlag
@@ -239,6 +239,15 @@ def test_tongues__thin_one_between_cells(van_der_pol):
     """2/3 is locked on 3e-4 Hz, between two cells .02 Hz apart; the search finds it."""
     cube = van_der_pol.cube()
     assert not (np.abs(cube["rotation"] - 2.0 / 3.0) < 1e-6).any()
+
+
+def test_cells__only_good_rotation_numbers(van_der_pol):
+    """A rotation number whose turns may be miscounted starts no search."""
+    point = van_der_pol.cube().isel(A=0)
+    flags = point["rotation_flag"].copy()
+    flags[{"frequency": 3}] = RotationFlag.COARSE
+    known = np.isfinite(cells_of(point.assign(rotation_flag=flags), "frequency").rotation)
+    assert np.flatnonzero(~known.all(axis=1)).tolist() == [3]
 
 
 def test_figures(van_der_pol):
