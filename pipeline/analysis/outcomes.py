@@ -51,8 +51,8 @@ def outcomes(ids: xr.Dataset) -> xr.DataArray:
 
 
 def stability_of_cells(ids: xr.Dataset) -> np.ndarray:
-    """Return the stability code of the set that each cell ends on (0: none), on the parameter dims and then the start
-    dims.
+    """Return the stability code of the attractor or other set that each cell ends on (0: none), parameter dims
+    first.
     """
     dims, _ = split_dims(ids["attractor_id"])
     cells, stability = _cells(ids, "attractor_id"), ids["stability"].transpose(*dims, "attractor").values

@@ -24,7 +24,7 @@ def start_dims(attractors: xr.Dataset) -> list[str]:
 
 
 def choose(ds: xr.Dataset, at: Mapping[str, float] | None, keep: tuple[str, ...], purpose: str) -> xr.Dataset:
-    """Select one value of each axis that is not in `keep`.
+    """Select one value on each axis of a dataset, except on the axes in `keep`.
 
     Parameters
     ----------
@@ -81,14 +81,14 @@ def place(axis: xr.DataArray, value: float) -> int:
 
 
 def _slack(values: Floats, index: int) -> float:
-    """Return the tolerance for matching a number to an axis value."""
+    """Return how far a number may lie from an axis value and still count as equal to it."""
     apart = np.abs(values - values[index])
     spacing = apart[apart > 0].min() if (apart > 0).any() else abs(values[index])
     return float(1e-6 * spacing)
 
 
 def snap(ds: xr.Dataset, at: Mapping[str, float]) -> dict[str, float]:
-    """Replace parameter values by the nearest axis values; keep values outside of an axis."""
+    """Replace parameter values by the nearest axis values; values outside an axis's range stay unchanged."""
     found = {}
     for name, value in at.items():
         axis = ds[name].values.astype(np.float64).ravel() if name in ds.dims else np.array([value])

@@ -94,7 +94,7 @@ class Geometry:
         return boxes
 
     def box_pairs(self, boxes: np.ndarray, side: float) -> np.ndarray:
-        """Return the pairs of (unique) boxes that touch, also at corners, as row numbers (n, 2)."""
+        """Return which of the given boxes touch, also at corners, as pairs of row numbers (n, 2)."""
         if len(boxes) < 2:
             return np.empty((0, 2), np.int64)
         # lengths in boxes: a circle is as long as its number of boxes
@@ -151,7 +151,7 @@ def mean_distance(a: np.ndarray, b: np.ndarray, geometry: Geometry) -> float:
 
 
 def order_by_points(points: list[np.ndarray], geometry: Geometry) -> list[int]:
-    """Return the canonical order of sets: lexicographic by the rounded least point of each.
+    """Return the canonical order of sets, sorted by the lexicographically smallest rounded point of each set.
 
     In a tie the shorter set comes first; then all points decide, in the order given.
     """

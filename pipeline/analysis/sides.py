@@ -98,8 +98,8 @@ def _label(
     swept: list[str],
     n_angles: int,
 ) -> np.ndarray:
-    """Return the classifier code of each cell of a block; leading dims broadcast, the last dims of sections are period
-    and state.
+    """Return the classifier code of each cell of a block; the last dims of `section` are period and state, others
+    broadcast.
     """
     values = {**fixed, **dict(zip(swept, rest, strict=False))}
     turns = rest[len(swept)] if len(rest) > len(swept) else np.zeros((1,) * status.ndim + (n_angles,), int)

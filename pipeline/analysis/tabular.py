@@ -38,7 +38,7 @@ def words_of(array: xr.DataArray) -> list[str]:
 
 
 def values(one: xr.Dataset, *names: str) -> Row:
-    """Return the values of scalar variables by name, codes as their labels; missing variables are left out."""
+    """Return scalar variables of a dataset as a dict; codes become their labels, and missing variables are left out."""
     found = {name: one[name].item() for name in names if name in one}
     return {n: words_of(one[n])[v] if "flag_meanings" in one[n].attrs else v for n, v in found.items()}
 
@@ -56,9 +56,7 @@ def points_of(ds: xr.Dataset, dims: Sequence[str]) -> Iterator[tuple[dict[str, i
 
 
 def sets_of(ds: xr.Dataset, there: xr.DataArray, dims: Sequence[str]) -> Iterator[tuple[Row, xr.Dataset]]:
-    """Yield the sets (attractors and others) for which `there` is true: the parameter values, and the variables of the
-    set.
-    """
+    """Yield the attractors and other sets that a mask selects: the parameter values and the variables of each."""
     for *index, i in np.argwhere(there.transpose(*dims, "attractor").values).tolist():
         at = dict(zip(dims, index, strict=True))
         yield where_of(ds, at), ds.isel({**at, "attractor": i})
@@ -99,12 +97,12 @@ def with_interval(row: Row, names: Sequence[str], spec: str) -> str:
 
 
 def distinct(values: Iterable[Any]) -> str:
-    """Join the distinct values in sorted order."""
+    """Join the distinct ones of some values into one text, sorted and separated by commas."""
     return ", ".join(map(str, sorted(set(values))))
 
 
 def ranges(ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str]) -> dict[str, str]:
-    """Return the table columns with the range of each axis and the number of parameter points."""
+    """Return the table columns that summarise some rows: the range of each axis, and the number of parameter points."""
     words = {}
     for d in dims:
         values = [row[d] for row in rows]
@@ -113,7 +111,7 @@ def ranges(ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str]) -> dict[str
 
 
 def largest_share(ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str]) -> str:
-    """Format the largest basin fraction among rows, and the parameter point at which it occurs."""
+    """Format the largest basin fraction in some table rows, and the parameter point at which it occurs."""
     best = max(rows, key=lambda row: (np.nan_to_num(row["fraction"], nan=-1.0),))
     if not np.isfinite(best["fraction"]):
         return "-"
@@ -124,7 +122,7 @@ def largest_share(ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str]) -> s
 def summary(
     ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str], describe: Callable[..., Words], key: str
 ) -> list[str]:
-    """Group rows by the value of `key`, and return the lines of a table with one line per group."""
+    """Group table rows by their value of `key`, and return the lines of a table with one line per group."""
     groups: dict[int, list[Row]] = {}
     for row in rows:
         groups.setdefault(row[key], []).append(row)
@@ -148,7 +146,9 @@ def with_error(value: float, error: float, most: int = 6) -> str:
 
 
 def axis_ranges(ds: xr.Dataset, dim: str, rows: Sequence[Row], alone: bool) -> str:
-    """Format the ranges of neighbouring axis values; the whole range if they are many or the table has several axes."""
+    """Format axis values as ranges of neighbouring values; as one range if there are many or the table has several
+    axes.
+    """
     axis = ds[dim].values.astype(np.float64)
     values = np.array(sorted({row[dim] for row in rows}))
     places = np.searchsorted(np.sort(axis), values)

@@ -125,7 +125,9 @@ def _start(
     transient: int,
     alone: bool,
 ) -> Start | None:
-    """Return the initial state and model that the options give; None if a run is given and no initial state."""
+    """Return the initial state and model from the command-line options; None if a run is animated from its own
+    cells.
+    """
     from pipeline.runs.filming import Start
     from pipeline.specification.problems import SpecError
 
@@ -162,7 +164,9 @@ def _contradictions(
 
 
 def _place(run: Run | None, at: dict[str, float], attractor: list[str] | None, cell: list[int] | None) -> Path:
-    """Return the default file of an animation: among the run's figures, named by its content."""
+    """Return the default file of an animation: in the run's figures folder, named by parameter values, attractors and
+    cells.
+    """
     if run is None:
         return Path("animation.gif")
     files = run.info.files

@@ -169,7 +169,7 @@ class Display:
             pause = BAR_EVERY_S if self._terminal else LINE_EVERY_S
 
     def stop(self) -> None:
-        """End `watch`, and remove the bar."""
+        """Stop redrawing the progress at intervals, and remove the progress bar."""
         self._over.set()
         self.clear()
 

@@ -74,7 +74,7 @@ class TopGroup(TyperGroup):
 
 
 def registry_group(verb: str, names: Callable[[], list[str]], make: Callable[[str], Any]) -> type[TyperGroup]:
-    """Return a class of command groups whose commands are created by the function `make`."""
+    """Return a class of command groups, from a function that lists the command names and one that creates a command."""
 
     class Group(RegistryGroup):
         def names(self) -> list[str]:

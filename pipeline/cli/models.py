@@ -20,7 +20,7 @@ DEFAULT = "pendulum"
 
 
 def names() -> Iterable[str]:
-    """Return the names of the models that ship."""
+    """Return the names of the models that ship with magpend."""
     from magpend_core.models import model_names
 
     return model_names()

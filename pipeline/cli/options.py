@@ -58,7 +58,7 @@ def speaking(command: Command) -> Command:
 
 
 def taking(model: type[Options], command: Command) -> Command:
-    """Replace the parameter ``options`` of a command function by one command-line option per field of `model`.
+    """Replace the parameter ``options`` of a command function by one command-line option per field of an options class.
 
     The given values are validated together, and the command is called with the model.
     """
@@ -84,7 +84,7 @@ def taking(model: type[Options], command: Command) -> Command:
 
 
 def completing(words: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]:
-    """Return a function that lists the `words` that begin with an incomplete word, for completion in the shell."""
+    """Return a function for shell completion that lists the words beginning with the incomplete word."""
 
     def complete(incomplete: str) -> list[str]:
         return [word for word in words() if word.startswith(incomplete)]
@@ -93,13 +93,13 @@ def completing(words: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]
 
 
 def flag_of(model: type[Options], name: str) -> str:
-    """Return the command-line flag of a field, such as ``--max-period``."""
+    """Return the command-line flag of an option's field, such as ``--max-period``."""
     extra: Any = model.model_fields[name].json_schema_extra or {}
     return str(extra.get("flag") or f"--{name.replace('_', '-')}")
 
 
 def help_of(info: FieldInfo) -> str:
-    """Return the help of a field with its unit and bounds."""
+    """Return the help text of an option: its description, unit and bounds."""
     extra: Any = info.json_schema_extra or {}
     text = (info.description or "").rstrip(".")
     unit = f" [{extra['unit']}]" if extra.get("unit") else ""
@@ -108,7 +108,9 @@ def help_of(info: FieldInfo) -> str:
 
 
 def bounds_of(info: FieldInfo) -> str:
-    """Return the bounds of a field in words, such as ``above 0, at most 1``; empty if there are none."""
+    """Return the allowed range of an option's value in words, such as ``above 0, at most 1``; empty if it has no
+    bounds.
+    """
     words = {"gt": "above {}", "ge": "{} or more", "lt": "below {}", "le": "at most {}"}
     found = []
     for bound in info.metadata:
@@ -119,7 +121,7 @@ def bounds_of(info: FieldInfo) -> str:
 
 
 def kind_of(info: FieldInfo) -> Any:
-    """Return the type of a field without ``None``."""
+    """Return the type of an option's field; for an optional field, the type other than ``None``."""
     kind = info.annotation
     if get_origin(kind) in (Union, types.UnionType):
         (kind,) = [part for part in get_args(kind) if part is not type(None)]

@@ -97,7 +97,9 @@ def _refuse(path: Path, option: str) -> None:
 
 
 def _is_own(path: Path) -> bool:
-    """Return whether a file is empty, mentions magpend at its begin or end, or is a CSV table with a header."""
+    """Return whether a file may be magpend's own: empty, naming magpend at its beginning or end, or a CSV table with a
+    header.
+    """
     with path.open("rb") as file:
         begin = file.read(_LOOKED_AT)
         file.seek(max(0, path.stat().st_size - _LOOKED_AT))

@@ -76,7 +76,9 @@ def _target_of(options: FigureOptions) -> Path:
 
 
 def _in_run(files: Files, name: str, options: FigureOptions) -> Path:
-    """Return the default file: in the run directory, or for an object store in ``figures/NAME``."""
+    """Return the default file of a figure: in the run directory, or for a run in an object store in
+    ``figures/NAME``.
+    """
     folder = files.local / "figures" if files.local else Path("figures") / files.name.rpartition("/")[2]
     return folder / f"{name}{options.label()}.{options.format or 'png'}"
 

@@ -161,8 +161,8 @@ def _keep(file: Path, out: Path) -> None:
 
 
 def _check_recording(out: Path) -> None:
-    """Raise an error if the output file exists and magpend did not write it; `_beside` checks a file that has a
-    mapping.
+    """Raise an error if a recording cannot be written to a path: in a run directory, or over a file magpend did not
+    write.
     """
     check_place(out)
     if not out.with_suffix(".toml").exists():
@@ -170,7 +170,7 @@ def _check_recording(out: Path) -> None:
 
 
 def _beside(out: Path, text: str) -> Path:
-    """Return the path of a recording's mapping file; raise `SpecError` if it holds another text."""
+    """Return the path of a recording's mapping file; raise `SpecError` if a file with other content exists there."""
     from pipeline.specification.problems import SpecError
 
     path = out.with_suffix(".toml")

@@ -19,12 +19,12 @@ _BLOCK = re.compile(r"(<!-- reference: ([\w ]+) -->\n).*?(<!-- /reference -->)",
 
 
 def pages() -> list[Path]:
-    """Return the files that have tables."""
+    """Return the README and docs files in which tables are regenerated."""
     return [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 
 def rendered(text: str) -> str:
-    """Return the text of a page with all its tables regenerated.
+    """Return the text of a documentation page with all its tables regenerated.
 
     Raises
     ------
@@ -129,7 +129,7 @@ def _text(text: str) -> str:
 
 
 def workflows() -> str:
-    """Return the table of specifications that ship."""
+    """Return the table of the specifications that ship with magpend."""
     from pipeline.runs.workflows import shipped_identifications, shipped_workflows
 
     def title(path: Path) -> str:
@@ -333,7 +333,7 @@ def statuses() -> str:
 
 
 def models() -> str:
-    """Return the table of models that ship."""
+    """Return the table of the models that ship with magpend."""
     from magpend_core.models import load_model, model_names
 
     rows = []
@@ -391,7 +391,7 @@ TABLES: dict[str, Callable[[], str]] = {
 
 
 def main() -> None:
-    """Rewrite the pages that are out of date, or list them if ``--check`` is given."""
+    """Rewrite the README and docs pages whose tables are out of date, or list them if ``--check`` is given."""
     check = "--check" in sys.argv[1:]
     stale = [page for page in pages() if rendered(page.read_text("utf-8")) != page.read_text("utf-8")]
     for page in stale:

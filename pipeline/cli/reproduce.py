@@ -13,7 +13,7 @@ from pipeline.cli.options import completing
 
 
 def studies() -> Iterable[str]:
-    """Return the names of the studies that ship."""
+    """Return the names of the studies that ship with magpend."""
     from pipeline.report.study import shipped_studies
 
     return shipped_studies()

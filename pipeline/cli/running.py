@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def workflow_names() -> Iterable[str]:
-    """Return the names of the workflows that ship."""
+    """Return the names of the workflows (specifications) that ship with magpend."""
     from pipeline.runs.workflows import shipped_workflows
 
     return shipped_workflows()
@@ -154,7 +154,7 @@ def verify(
         ),
     ] = False,
 ) -> None:
-    """Compare every committed byte with the commit records, and metadata and coordinates with run.json."""
+    """Check a run for damage: stored bytes against the commit records, metadata and coordinates against run.json."""
     from pipeline.cli import console
     from pipeline.runs import verify as verification
 

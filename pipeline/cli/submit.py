@@ -21,7 +21,8 @@ def submit(
         bool, typer.Option("--smoke", help="Run the specification's small size, which takes seconds.")
     ] = False,
 ) -> None:
-    """Run a specification as a job of SLURM, PBS, Grid Engine or LSF, and print the commands that follow it.
+    """Submit a specification as a job of SLURM, PBS, Grid Engine or LSF, and print commands to watch and cancel the
+    job.
 
     The job continues where an earlier one was stopped.
     """

@@ -55,7 +55,7 @@ class Address:
 
     @property
     def named(self) -> str:
-        """Address for messages; its source is added unless the option ``--scheduler`` gave it."""
+        """Address as messages show it, with the setting it comes from unless that is the option ``--scheduler``."""
         return self.url if self.source == OPTION else f"{self.url} (from {self.source})"
 
 

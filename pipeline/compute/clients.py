@@ -53,11 +53,12 @@ class Where:
 
     @classmethod
     def of(cls, scheduler: Where | str | None) -> Where:
-        """Make a `Where` from a scheduler's name; return a `Where` unchanged."""
+        """Make a `Where` (where tasks run) from the name of a scheduler; return a given `Where` unchanged."""
         return scheduler if isinstance(scheduler, Where) else cls(scheduler)
 
     def resolved(self) -> Address | Cluster | str:
-        """Return a scheduler's address, a batch system's settings, ``local`` or ``none``; start nothing.
+        """Return where tasks run: a scheduler's address, a batch system's settings, ``local`` or ``none``; start
+        nothing.
 
         Raises
         ------
@@ -109,7 +110,7 @@ class Where:
 
 
 def reach(where: Where) -> None:
-    """Check within seconds that an existing scheduler answers; do nothing if none is named.
+    """Check within seconds that the dask scheduler the user chose answers; do nothing if the user chose none.
 
     Raises
     ------
@@ -123,7 +124,7 @@ def reach(where: Where) -> None:
 
 @contextlib.contextmanager
 def connected(where: Where, n_workers: int, echo: Echo = print) -> Iterator[Any]:
-    """Yield a client whose workers have arrived, have the same programs and see the run directory.
+    """Yield a dask client once its workers have started, have the same software and see the run directory.
 
     Parameters
     ----------

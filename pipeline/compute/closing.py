@@ -116,12 +116,14 @@ def _lag_distances(sections: np.ndarray, p: int, system: System) -> np.ndarray:
 
 
 def _late(distances: np.ndarray) -> float:
-    """Return the largest of the last quarter of the distances."""
+    """Return the largest value in the last quarter of a sequence of distances."""
     return float(distances[-(len(distances) // 4) :].max())
 
 
 def _judged(p: int, distances: np.ndarray) -> Closing:
-    """Return the distance from an orbit of period `p`, and the time to converge, from distances of points `p` apart."""
+    """Estimate the distance from an orbit of period `p` and the time to converge, from distances of points `p` periods
+    apart.
+    """
     quarter = len(distances) // 4
     last = distances[len(distances) - 4 * quarter :].reshape(4, quarter).max(axis=1)
     if last[2:].max() <= 0.01 * TOLERANCE:  # errors of integration hide what shrinks

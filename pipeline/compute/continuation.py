@@ -1,4 +1,4 @@
-"""Continue branches of a continuation from the states in which a preceding task ended them, bit for bit."""
+"""Continue branches from the final states of the preceding task, bit for bit as if one task had computed them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ WALKED = ("section", "rest_state", "status", "step_size")
 
 
 def going_on(inputs: Inputs, before: Mapping[str, np.ndarray]) -> Inputs:
-    """Return the inputs of branches whose initial states are the final states of the preceding task.
+    """Return the inputs of branches, with the final states of the preceding task as their initial states.
 
     Parameters
     ----------

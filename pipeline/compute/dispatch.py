@@ -57,7 +57,7 @@ class _Flight:
 
 
 def announced(task: Task, topic: str, ticket: int, index: int) -> dict[str, Any]:
-    """Run a task on a worker, and report its start first."""
+    """Run a task on a dask worker; before it begins, report its start to the client."""
     from distributed import get_worker
 
     worker = get_worker()
@@ -66,7 +66,7 @@ def announced(task: Task, topic: str, ticket: int, index: int) -> dict[str, Any]
 
 
 class Window:
-    """Runner of an `Order`'s tasks on the workers of a dask client, with a limited number of tasks in flight.
+    """Runner of the tasks of an `Order` on the workers of a dask client, with a limited number of tasks at a time.
 
     Parameters
     ----------
@@ -238,7 +238,7 @@ class Window:
 
 
 class Watch:
-    """The record of workers and of the time when each last reported.
+    """Record of when each dask worker last reported, to find workers that hang.
 
     Its clock goes on only while it is looked at: time in which this process was itself stopped, by Ctrl-Z
     or a closed lid, blames nobody.
@@ -264,7 +264,7 @@ class Watch:
 
     @property
     def now(self) -> float:
-        """Time of this clock [s], which stops while this process is stopped."""
+        """Time of the record's own clock [s], which does not advance while this process is suspended."""
         now = self._clock()
         self._time += min(now - self._last, 5 * TICK_S)
         self._last = now
@@ -295,7 +295,7 @@ class Watch:
 
 
 async def _fetched(client: Any, future: Any) -> tuple[Any, BaseException | None]:
-    """Fetch the result of a future; return (result, None) or (None, error)."""
+    """Fetch the result of a dask future; return (result, None), or (None, error) if it failed."""
     try:
         return await client.gather(future, asynchronous=True), None
     except (Exception, asyncio.CancelledError) as error:
@@ -303,7 +303,7 @@ async def _fetched(client: Any, future: Any) -> tuple[Any, BaseException | None]
 
 
 def _restarted(client: Any, address: str) -> None:
-    """Restart a worker and wait for it; runs in a separate thread, since a stopped process is slow."""
+    """Restart a dask worker and wait for it; runs in a separate thread, since a suspended worker answers slowly."""
     with contextlib.suppress(Exception):
         client.restart_workers([address], timeout=ANSWER_S, raise_for_error=False)
 

@@ -1,4 +1,6 @@
-"""Compute the product ``lyapunov``: Lyapunov exponents of each cell of a task, from its last stored section point."""
+"""Compute the product ``lyapunov``: Lyapunov exponents of each cell of a task, starting at the cell's last section
+point.
+"""
 
 from __future__ import annotations
 
@@ -66,7 +68,8 @@ def _falling(rates: np.ndarray) -> np.ndarray:
 
 
 def flags(found: LyapunovExponents, *, is_flow: bool = False) -> np.ndarray:
-    """Return a code of `LyapunovFlag` for each cell, shape (cell,); a full spectrum is compared with the divergence.
+    """Return a quality flag per cell; the sum of a full Lyapunov spectrum is checked against the vector field's
+    divergence.
 
     One exponent of a flow must be 0, unless the motion comes to rest.
     """

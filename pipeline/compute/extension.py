@@ -24,7 +24,9 @@ PER_SECTION = ("section", "extremes")
 
 
 def obstacle(old: Spec, new: Spec) -> str:
-    """Return why stored cells cannot be extended to another run's `n_keep`; empty if they can."""
+    """Return why the stored cells of a run cannot get as many section points as another run keeps; empty if they
+    can.
+    """
     had, wanted = old.integration.n_keep, new.integration.n_keep
     if had == wanted:
         return ""
@@ -48,7 +50,7 @@ def _judged(spec: Spec) -> int:
 
 
 def kept_on(spec: Spec, inputs: Inputs, stored: Mapping[str, np.ndarray], n_old: int) -> tuple[Any, Values]:
-    """Integrate stored cells further until they have as many section points as the new run keeps.
+    """Integrate stored cells of an earlier run further, until they have as many section points as the new run keeps.
 
     A cell is left out if its outcome could differ from that of a longer run: if the moment at which its orbit
     closed is not known, or if it fails later.
@@ -100,7 +102,7 @@ def kept_on(spec: Spec, inputs: Inputs, stored: Mapping[str, np.ndarray], n_old:
 
 
 def _more(spec: Spec, inputs: Inputs, last: np.ndarray, step_size: np.ndarray, n_old: int) -> Values:
-    """Integrate the additional periods from the stored last states, and return their variables."""
+    """Integrate cells over additional periods from their stored last states; return the variables of these periods."""
     integration = spec.integration
     cells = more_sections(
         inputs.parameters,

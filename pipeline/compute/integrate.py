@@ -58,7 +58,8 @@ def integrate(spec: Spec, inputs: Inputs) -> dict[str, np.ndarray]:
 
 
 def walk(inputs: Inputs, system: System, integration: Integration, quantities: Sequence[str] | None) -> Sections:
-    """Integrate branches by `magpend_core.run_branches`; branches that had failed earlier get the status UNREACHED.
+    """Integrate branches by `magpend_core.run_branches`; branches that failed in a preceding task get the status
+    UNREACHED.
 
     Parameters
     ----------
@@ -96,7 +97,9 @@ def walk(inputs: Inputs, system: System, integration: Integration, quantities: S
 
 
 def _spread(name: str, found: Any, alive: np.ndarray) -> Any:
-    """Copy the results of the integrated branches into arrays over all branches; fill the others."""
+    """Copy the results of the integrated branches into arrays over all branches; branches not integrated get fill
+    values.
+    """
     if found is None:
         return None
     fill = int(Status.UNREACHED) if name == "status" else np.nan if found.dtype.kind == "f" else 0

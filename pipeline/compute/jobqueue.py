@@ -90,7 +90,7 @@ def settings(cluster: Cluster, folder: Path) -> dict[str, Any]:
 
 
 def worker_script(cluster: Cluster, folder: Path) -> str:
-    """Return the batch script of a job, with placeholders for the scheduler's address and the name."""
+    """Return the batch script of a job, with placeholders for the scheduler's address and the worker's name."""
     import dask_jobqueue
 
     job = getattr(dask_jobqueue, _CLASSES[cluster.kind]).job_cls

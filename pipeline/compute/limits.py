@@ -39,7 +39,7 @@ class Limits:
             self._worst = max(self._worst, took_s / max(self._seconds(index), 1e-9))
 
     def limit_s(self, index: int, tries: int) -> float:
-        """Return the time limit of a task [s] at its try number `tries`."""
+        """Return the time limit of a task [s], which grows with each further try."""
         if self._seconds is None:
             return float("inf")
         return max(LEAST_S, FACTOR * self._worst * self._seconds(index)) * MORE ** (tries - 1)

@@ -217,7 +217,7 @@ def _start_tracker() -> None:
 
 @contextlib.contextmanager
 def _signals_put_off() -> Iterator[None]:
-    """Delay SIGINT, SIGTERM and SIGHUP until the end of the block, and raise them there."""
+    """Delay SIGINT, SIGTERM and SIGHUP until the end of the context, and raise them there."""
     if threading.current_thread() is not threading.main_thread():
         yield  # signals are handled by the main thread alone
         return
@@ -237,7 +237,7 @@ def _signals_put_off() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _blocked(numbers: set[signal.Signals]) -> Iterator[None]:
-    """Block signals in this thread, and in threads and processes that it starts inside the block."""
+    """Block signals in this thread while the context lasts, and in threads and processes that it starts meanwhile."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
     try:
         yield

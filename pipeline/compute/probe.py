@@ -28,7 +28,7 @@ _LATE_S, _AGAIN_S = 5.0, 0.2
 
 @cache
 def installation() -> dict[str, str]:
-    """Return the versions of the programs here, and digests of magpend's own code."""
+    """Return the versions of Python and the packages installed here, and digests of magpend's own code."""
     from magpend_core.source_digests import kernel_version, meaning_digest
 
     pipeline = Path(__file__).parents[1]
@@ -140,7 +140,7 @@ class MisfitError(Exception):
 
 
 class Fitting:
-    """Task that first compares the software of its worker with this process, also on workers that join later.
+    """A task that first checks that its worker has the same software as the process that submitted the task.
 
     Parameters
     ----------
@@ -154,7 +154,9 @@ class Fitting:
         self.task, self.programs = task, programs or installation()
 
     def __call__(self, index: int) -> dict[str, Any]:
-        """Run the task; raise `MisfitError` if the software versions differ."""
+        """Run the task; raise `MisfitError` if the worker's software versions differ from those of the submitting
+        process.
+        """
         if why := _difference(self.programs, installation()):
             raise MisfitError(f"this worker has other programs ({why}); install the same versions everywhere")
         return self.task(index)

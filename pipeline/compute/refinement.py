@@ -66,8 +66,8 @@ class Orbits:
     _known: list[tuple[np.ndarray, np.ndarray]] = field(default_factory=list)
 
     def classes(self, cells: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Return the number of each cell's orbit, `NO_ORBIT` if it is not closed or its period exceeds the kept
-        sections.
+        """Return the number of each cell's orbit; -1 (`NO_ORBIT`) if it is not closed or longer than the kept section
+        points.
 
         Parameters
         ----------
@@ -96,7 +96,9 @@ class Orbits:
         return found
 
     def _on(self, sections: np.ndarray, points: np.ndarray) -> np.ndarray:
-        """Return which section sequences (cell, period, n_states) equal the given points in some cyclic order."""
+        """Return for each sequence of section points whether it matches the points of a known orbit in some cyclic
+        order.
+        """
         shifts = (np.roll(points, shift, axis=0) for shift in range(len(points)))
         near = [scaled_distance(sections, p, self.system).max(axis=1, initial=0.0) <= self.tolerance for p in shifts]
         return np.asarray(np.any(near, axis=0))
@@ -148,7 +150,7 @@ def infer(
 
 
 def refine(shape: tuple[int, ...], stride: int, classes_of: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-    """Choose the cells of a tile to integrate, and for every other cell the one whose result it takes.
+    """Choose the cells of a block to integrate, and for every other cell the integrated cell whose result it takes.
 
     Parameters
     ----------
@@ -192,7 +194,9 @@ def _first_boxes(shape: tuple[int, ...], stride: int) -> np.ndarray:
 
 
 def _corners(boxes: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Return the flat indices of the boxes' corners, shape (box, corner), the first corner first."""
+    """Return the flat indices of the corner cells of boxes, shape (box, corner); each box's lowest corner comes
+    first.
+    """
     dims = range(len(shape))
     ends = itertools.product((0, 1), repeat=len(shape))
     at = [[boxes[:, e, i] for i, e in zip(dims, end, strict=True)] for end in ends]
@@ -200,7 +204,7 @@ def _corners(boxes: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def _halves(boxes: np.ndarray) -> np.ndarray:
-    """Halve each box along each dim in which it has inner cells; both parts include the cells of the cut."""
+    """Halve each box of cells along each dim in which it has inner cells; both halves include the cells of the cut."""
     for i in range(boxes.shape[2]):
         wide = boxes[:, 1, i] - boxes[:, 0, i] > 1
         lower, upper = boxes[wide].copy(), boxes[wide].copy()
@@ -210,7 +214,9 @@ def _halves(boxes: np.ndarray) -> np.ndarray:
 
 
 def _by_extent(boxes: np.ndarray, shape: tuple[int, ...]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yield groups of boxes of equal size: their row numbers, and the flat indices of their cells (box, cell)."""
+    """Group boxes of cells by their size; yield each group's row numbers and the flat indices of its cells (box,
+    cell).
+    """
     first = np.ravel_multi_index(tuple(boxes[:, 0].T), shape)
     extents, which = np.unique(boxes[:, 1] - boxes[:, 0], axis=0, return_inverse=True)
     for i, extent in enumerate(extents):
@@ -220,7 +226,9 @@ def _by_extent(boxes: np.ndarray, shape: tuple[int, ...]) -> Iterator[tuple[np.n
 
 
 def _uniform(boxes: np.ndarray, known: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Return which boxes need no division: all integrated cells in and next to them end on one orbit."""
+    """Return for each box of cells whether all integrated cells in and next to it end on one orbit, so that it stays
+    whole.
+    """
     own = known[np.ravel_multi_index(tuple(boxes[:, 0].T), shape)]
     padded = np.pad(known.reshape(shape), 1, constant_values=NOT_COMPUTED)
     classes = padded.ravel()
@@ -232,7 +240,9 @@ def _uniform(boxes: np.ndarray, known: np.ndarray, shape: tuple[int, ...]) -> np
 
 
 def _sources(boxes: np.ndarray, known: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Return for each cell the cell whose result it takes: itself, or the least first corner of the boxes around it."""
+    """Return for each cell the cell whose result it takes: itself if integrated, else the lowest first corner of the
+    boxes around it.
+    """
     source = np.arange(len(known))
     rest = known == NOT_COMPUTED
     source[rest] = len(known)

@@ -73,7 +73,7 @@ class Source:
         self._read = lru_cache(maxsize=2)(partial(read_block, self.run, names=tuple(self.names)))
 
     def find(self, inputs: Inputs, way: Way | None = None) -> np.ndarray:
-        """Return the flat index in this run of the cell with each input; `NOWHERE` if it is not committed.
+        """Find for each wanted cell the run's cell with the same inputs; return its flat index, -1 if none is stored.
 
         In a refined grid some of these were inferred, which `take` leaves out.
         """
@@ -81,7 +81,9 @@ class Source:
         return np.where(self._is_committed[self._task(place)], place, NOWHERE)
 
     def take(self, place: np.ndarray) -> tuple[np.ndarray, Values]:
-        """Read cells from the run: return which ones could be used (integrated, undamaged), and their variables."""
+        """Read cells of the run; return for each whether it can be used (integrated, undamaged), and the variables of
+        these.
+        """
         taken = np.zeros(len(place), bool)
         values: Values = {}
         tasks = self._task(place)
@@ -102,7 +104,7 @@ class Source:
         return taken, {name: array[taken] for name, array in values.items()}
 
     def _task(self, place: np.ndarray) -> np.ndarray:
-        """Return the number of the task that contains each cell, or the number of tasks for a cell that is not in the
+        """Return the number of the task that contains each cell; a number beyond the last task for a cell not in the
         run.
         """
         plan = self.run.plan
@@ -118,7 +120,9 @@ class Source:
 
 
 def same_products(run: Run, wanted: Spec) -> list[str]:
-    """Return the products that a run has computed with the wanted options and the same code."""
+    """Return those products of a wanted specification that a run has computed with the same options and the same
+    code.
+    """
     code = run.info.identity["code"]
     return [
         name
@@ -128,12 +132,12 @@ def same_products(run: Run, wanted: Spec) -> list[str]:
 
 
 def _module(product: str) -> str:
-    """Return the name of the module that computes a product, in the form of `layout.identity`."""
+    """Return the name of the module that computes a product, without the leading ``pipeline.``."""
     return CELL_PRODUCTS[product].compute.partition(":")[0].removeprefix("pipeline.")
 
 
 def obstacles(run: Run, wanted: Spec, identity: Mapping[str, Any]) -> list[str]:
-    """Return the reasons why a run's cells cannot be used by another; empty if they can.
+    """Return the reasons why another run cannot use a run's cells; empty if it can.
 
     Parameters
     ----------
@@ -169,7 +173,7 @@ class Pool:
         self.sources = [Source(run, spec) for run in runs]
 
     def count(self, inputs: Inputs, way: Way | None) -> list[int]:
-        """Count the cells that each source provides."""
+        """Count the cells that can be copied from each of the other runs."""
         counts, rest = [], np.arange(len(inputs.initial_states))
         for source in self.sources:
             place = source.find(inputs.take(rest), way)
@@ -182,7 +186,8 @@ class Pool:
         return counts
 
     def integrator(self, cells: CellMap, block: tuple[slice, ...], tally: list[int]) -> Integrate:
-        """Return an integrator for a block that copies known cells from other runs; results are the same bit for bit.
+        """Return a function that computes a block's cells, copying known ones from other runs; results are the same bit
+        for bit.
 
         The numbers of cells that were taken are appended to `tally`.
         """
@@ -222,7 +227,9 @@ class Pool:
     def _go_on(
         self, spec: Spec, inputs: Inputs, source: Source, taken: np.ndarray, stored: Values
     ) -> tuple[np.ndarray, Values]:
-        """Extend copied cells of a sweep to more section points; return which succeeded, and their variables."""
+        """Integrate copied cells of a sweep further to get more section points; return for which it succeeded, and
+        their variables.
+        """
         rows = np.flatnonzero(taken)
         points = {name: array[:, None] for name, array in stored.items()}
         is_exact, longer = kept_on(spec, inputs.take(rows), points, source.run.spec.integration.n_keep)
@@ -232,7 +239,7 @@ class Pool:
 
 
 def _leading(taken: np.ndarray) -> np.ndarray:
-    """Count for each branch the copied cells before its first missing one; later ones cannot be used."""
+    """Count the copied cells at the start of each branch; cells after the first one that is missing cannot be used."""
     return np.asarray(np.cumprod(taken, axis=1).sum(axis=1))
 
 

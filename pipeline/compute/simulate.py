@@ -40,7 +40,9 @@ CLOCK_HZ, FLOW_PERIODS = 1.0, 50
 
 @dataclass(frozen=True)
 class Series:
-    """Settings of a time series: drive periods before it and in it (None: all), samples per period, tolerances."""
+    """Settings of a time series: drive periods before it, its own (None: the default), samples per period,
+    tolerances.
+    """
 
     n_transient: int
     n_periods: int | None
@@ -178,7 +180,9 @@ def _at_frequency(parameters: Parameters, frequency_hz: float, state: np.ndarray
 
 
 def _closing(sections: np.ndarray, parameters: Parameters, series: Series) -> dict[str, Any]:
-    """Return attributes that tell whether the motion has closed on an orbit; empty if there are too few points."""
+    """Return dataset attributes on whether the motion has settled on a closed orbit; empty if there are too few section
+    points.
+    """
     found = closing_of(sections[-LOOKED_AT:], parameters.model.system)
     if found is None:
         return {}
@@ -294,7 +298,7 @@ def check_output(path: Path) -> None:
 
 
 def write_series(ds: xr.Dataset, path: Path) -> Path:
-    """Write a series as CSV (names with units, 17 digits) or as NetCDF, by the suffix."""
+    """Write a time series as CSV (names with units, 17 digits) or as NetCDF, depending on the file's suffix."""
     check_output(path)
     if path.suffix.lower() == ".nc":
         write_netcdf(path, ds)

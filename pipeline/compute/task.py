@@ -32,7 +32,9 @@ from pipeline.store.task_cells import read_cells
 
 @lru_cache(maxsize=4)
 def _prepare(directory: str, digest: str, origin: tuple[str, str] | None) -> tuple[RunInfo, Spec, Plan, CellMap]:
-    """Read a run once per worker; raise `RefusedError` if this installation would compute other results."""
+    """Read a run once per worker; raise `RefusedError` if the magpend installed on the worker would compute other
+    results.
+    """
     if origin is not None:
         import_model(*origin)
     info = read_run(directory)
@@ -129,7 +131,9 @@ def run_task(
 
 
 def _left(info: RunInfo, plan: Plan, cells: CellMap, index: int) -> dict[str, Any]:
-    """Read the final states of branches that began in the preceding task; empty if they begin in this task."""
+    """Read the final states in which the preceding task left this task's branches; empty if the branches begin in this
+    task.
+    """
     predecessor = plan.predecessor(index)
     if predecessor is None:
         return {}
@@ -146,7 +150,9 @@ def _taking(
     block: tuple[slice, ...],
     taken: list[int],
 ) -> dict[str, Any]:
-    """Return the integrator that copies cells from other runs first, as keyword; empty if there are no other runs."""
+    """Return a keyword argument with the integrator that copies cells from other runs; empty if there are no other
+    runs.
+    """
     if not sources:
         return {}
     from pipeline.compute.reuse import pool_of

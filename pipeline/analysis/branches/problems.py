@@ -116,7 +116,9 @@ class Problem(Protocol):
         """Return the trajectories to integrate for the value of F at `u`."""
 
     def value(self, u: np.ndarray, ends: Ends) -> Value | None:
-        """Compute F and its derivative from the ends of trajectories; None if other trajectories must be integrated."""
+        """Compute F and its derivative from the end points of trajectories; None if further trajectories must be
+        integrated first.
+        """
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,7 +166,7 @@ class Family:
         return np.asarray(u[self.system.n_states :] * np.asarray(self.scales))
 
     def rows(self, many: np.ndarray) -> Rows:
-        """Return the trajectories to integrate over one period of the orbit, from many unknowns (m, size)."""
+        """Return the trajectories to integrate over one period of the orbit, one for each row of unknowns (m, size)."""
         n = self.system.n_states
         frequency = np.full(len(many), self.frequency_hz)
         packed = np.tile(self.parameters, (len(many), 1))
@@ -201,7 +203,9 @@ class _Segments:
     slopes: np.ndarray
 
     def at(self, u: np.ndarray) -> np.ndarray:
-        """Return the section points at other unknowns, to first order; the first point is exact."""
+        """Estimate the orbit's section points at other values of the unknowns to first order; the first point is
+        exact.
+        """
         return np.asarray(self.points + self.slopes @ (u - self.u))
 
 

@@ -13,7 +13,7 @@ LEAST_PERIOD = 4
 
 
 def settle_branches(run: Run, options: BranchOptions) -> BranchOptions:
-    """Complete the parameter interval from the run's axis; raise SpecError if it is empty."""
+    """Complete the parameter interval from the run's axis; raise SpecError if the interval is empty."""
     parameter = options.parameter
     _refuse_frequency_of_flow(run, parameter)
     low, high = interval_of(run, parameter, options.low, options.high)

@@ -34,7 +34,7 @@ class Listed:
 
 
 def listed(attractors: xr.Dataset, parameters: Parameters, parameter: str, scale: float) -> Iterator[Listed]:
-    """Yield all attractors of a run; those with a polished closed orbit have a starting orbit.
+    """Yield all attractors of a run; those whose closed orbit Newton's method found have a starting orbit for a branch.
 
     Parameters
     ----------
@@ -63,8 +63,8 @@ def listed(attractors: xr.Dataset, parameters: Parameters, parameter: str, scale
 def attracting(
     attractors: xr.Dataset, parameters: Parameters, parameter: str, interval: tuple[float, float], max_period: int = 0
 ) -> tuple[list[Start], list[str]]:
-    """Return starting orbits from the polished closed orbits among a run's attractors, and a line on each attractor
-    left out.
+    """Return starting orbits from a run's attractors whose closed orbit Newton's method found, and a line on each
+    attractor left out.
 
     Parameters
     ----------
@@ -232,7 +232,9 @@ def orbits_near(
 def _spread(
     section: np.ndarray, places: Sequence[tuple[np.intp, ...]], distance: np.ndarray, system: System
 ) -> list[np.ndarray]:
-    """Choose starting points at the closest recurrences, skipping any within `RECURRENCE` of a chosen one."""
+    """Choose starting points where trajectories recur most closely, skipping points within `RECURRENCE` of a chosen
+    one.
+    """
     chosen: list[np.ndarray] = []
     for place in places:
         if len(chosen) == TRIES or not distance[place] <= RECURRENCE:

@@ -133,7 +133,7 @@ def _with_error(value: float, error: float) -> str:
 
 
 def _number(z: complex, period: int) -> str:
-    """Format a multiplier, or with period 0 an eigenvalue."""
+    """Format a Floquet multiplier, or for an equilibrium (period 0) an eigenvalue."""
     return (f"{z.real:.5f}" if abs(z.imag) < 1e-9 else f"{z.real:.5f}{z.imag:+.5f}i") + ("" if period else " 1/s")
 
 
@@ -178,7 +178,9 @@ def windows_of(ds: xr.Dataset) -> list[dict[str, Any]]:
 
 
 def _stable_runs(stable: np.ndarray, closed: bool) -> list[tuple[int, int]]:
-    """Return the first and last index of each run of stable points; on a closed branch a run may wrap around."""
+    """Return the first and last index of each stretch of consecutive stable points; on a closed branch one may wrap
+    around.
+    """
     edges = np.flatnonzero(np.diff(np.concatenate([[0], stable.astype(np.int8), [0]])))
     runs = [(int(a), int(b) - 1) for a, b in edges.reshape(-1, 2)]
     if closed and len(runs) > 1 and stable[0] and stable[-1]:

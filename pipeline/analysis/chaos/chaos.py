@@ -103,8 +103,8 @@ def chaotic_cells(ds: xr.Dataset, options: ChaosOptions | None = None, **changes
 
 
 def check_chaos(ds: xr.Dataset, options: ChaosOptions) -> None:
-    """Raise ValueError unless the cube allows Lyapunov exponents or the 0-1 test, or orbits are polished and have
-    multipliers.
+    """Raise ValueError unless an indicator of chaos can be computed: exponents, 0-1 test, or multipliers of refined
+    orbits.
 
     Raises
     ------

@@ -270,9 +270,7 @@ def _dimension_of(section: Floats, theiler: int, floor: float, geometry: Geometr
 
 
 def _extent(points: Floats, geometry: Geometry) -> float:
-    """Return the largest scaled extent of the points over all state components; an angle counts at most half its
-    circle.
-    """
+    """Return the largest extent of the points in any state component [scaled]; for an angle at most half its circle."""
     extent = 0.0
     for i, length in enumerate(geometry.circumference):
         x = geometry.scaled(points)[:, i]
@@ -334,7 +332,7 @@ class _Pairs:
         return np.asarray(self.by_part.sum(axis=0))
 
     def without(self, part: int) -> npt.NDArray[np.int64]:
-        """Return the numbers of pairs among the points outside of one part of the sample, shape (radius,)."""
+        """Return the numbers of pairs that remain if one part of the sample's points is left out, shape (radius,)."""
         return np.asarray(self.all - 2 * self.by_part[part] + self.within[part])
 
 
@@ -343,8 +341,8 @@ def _logarithm(values: npt.NDArray[Any]) -> Floats:
 
 
 def _slope(x: Floats, y: Floats, rows: npt.NDArray[np.int64]) -> float:
-    """Fit the slope of y against x over some radii by least squares, without radii that no pair of points is closer
-    than.
+    """Compute the least-squares slope of y against x over some radii, leaving out radii within which no pair of points
+    lies.
     """
     rows = rows[np.isfinite(y[rows])]
     x, y = x[rows] - x[rows].mean(), y[rows] - y[rows[0]]  # a flat curve has the slope 0 exactly

@@ -153,7 +153,7 @@ def motion_attrs() -> dict[str, Any]:
 
 
 def transients(ds: xr.Dataset, *, n_sigma: float, least: float) -> xr.DataArray:
-    """Detect cells with transient chaos: it ended within the time blocks over which their exponents are averaged.
+    """Mark the cells in which chaos ended while the exponents were averaged: 1 yes, 0 no, -1 unknown.
 
     Returns
     -------
@@ -184,7 +184,8 @@ def transients(ds: xr.Dataset, *, n_sigma: float, least: float) -> xr.DataArray:
 
 
 def on_attractor(ds: xr.Dataset, *, n_sigma: float, least: float) -> xr.DataArray:
-    """Return for each cell whether its largest exponent describes the set on which it ended.
+    """Return for each cell whether its largest exponent is valid and describes the final motion, not a chaotic
+    transient.
 
     Their flag is good, or only the first exponent is resolved, and they are no transients.
     """

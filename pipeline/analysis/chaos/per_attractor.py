@@ -104,7 +104,7 @@ _FROM = ("none", "multipliers", "cells", "eigenvalues")
 
 @dataclass
 class _Cells:
-    """Cells of one parameter point, as rows of arrays.
+    """Variables of the cells of one parameter point: an array for each, with the cells on its first axis.
 
     Attributes
     ----------
@@ -131,7 +131,7 @@ class _Cells:
 
 
 def chaos_per_attractor(ds: xr.Dataset, cells: xr.Dataset, attractors: xr.Dataset, options: ChaosOptions) -> xr.Dataset:
-    """Add variables per attractor to the chaos indicators of the cells; the text of this module lists them.
+    """Add variables per attractor to the cells' chaos indicators; the docstring of this module lists the variables.
 
     Parameters
     ----------
@@ -262,9 +262,7 @@ def _exponents(one: xr.Dataset, cells: _Cells, is_own: npt.NDArray[np.bool_], n_
 
 
 def _nature(one: xr.Dataset, found: dict[str, Any], options: ChaosOptions) -> Nature:
-    """Classify the motion on a set by the set's kind and stability or, if these do not decide, by exponents or the 0-1
-    test.
-    """
+    """Classify the motion on an attractor or other set by its kind and stability, else by exponents or the 0-1 test."""
     kind, stability = int(one["kind"]), int(one["stability"])
     if kind in (PERIODIC_ORBIT, EQUILIBRIUM):
         return Nature.UNDECIDED if stability == UNSTABLE else Nature.REGULAR

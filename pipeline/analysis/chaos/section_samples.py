@@ -43,13 +43,13 @@ def computed(ds: xr.Dataset, geometry: Geometry) -> xr.DataArray:
 
 
 def at_least(name: str, value: int, least: int) -> int:
-    """Return a number if it is at least `least`; otherwise raise ValueError."""
+    """Return a number, or raise ValueError if it is below a given minimum."""
     if value < least:
         raise ValueError(f"{name} is {value}, below {least}: give {least} or more")
     return int(value)
 
 
 def with_coords(ds: xr.Dataset, dims: Sequence[object], variables: Mapping[str, Any]) -> xr.Dataset:
-    """Build a dataset of variables, with those coordinates of `ds` that lie on the given dims."""
+    """Build a dataset from variables, with those coordinates of another dataset that lie on the given dims."""
     coords = {name: c for name, c in ds.coords.items() if set(c.dims) <= set(dims)}
     return xr.Dataset(variables, coords=coords)

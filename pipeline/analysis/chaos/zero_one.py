@@ -149,7 +149,9 @@ def _observable(section: Floats, state: int | None, geometry: Geometry) -> Float
 
 
 def _zero_one(phi: Floats, c: Floats) -> Floats:
-    """Compute the six measures of `zero_one_test` for observables (cell, n), shape (6, cell)."""
+    """Compute the measures of the 0-1 test (K, its error, quartiles, K of the later half, extent per step), shape (6,
+    cell).
+    """
     n = phi.shape[1]
     k = np.sort(_growth(phi, c), axis=1)
     half = np.full(len(phi), np.nan)

@@ -115,7 +115,9 @@ class Saddle:
 
 @dataclass(frozen=True)
 class Resolution:
-    """Resolution of a manifold: longest chord [scaled], length [scaled], most points."""
+    """Resolution of a manifold: longest chord between points [scaled], total length [scaled], largest number of
+    points.
+    """
 
     chord: float = 0.02
     length: float = 20.0
@@ -192,8 +194,8 @@ def _grow(saddle: Saddle, side: float, stable: bool, resolution: Resolution) -> 
 
 @dataclass(eq=False)
 class _Curve:
-    """A manifold under construction: positions on its first segment, and their images (or preimages) in each
-    generation.
+    """A manifold under construction: positions on a first segment, and their repeated images (or preimages) under the
+    section map.
     """
 
     saddle: Saddle
@@ -204,12 +206,12 @@ class _Curve:
     n_periods: int
 
     def __post_init__(self) -> None:
-        """Set the first segment with nine positions."""
+        """Place nine equally spaced positions on the manifold's first segment."""
         self.places = np.linspace(0.0, 1.0, 9)
         self.generations = [self.first(self.places)]
 
     def grow(self) -> Manifold:
-        """Add generations until the manifold has the requested length."""
+        """Add further images (or preimages) of the first segment until the manifold has the requested length."""
         points, times, length, end = [self.generations[0][:1]], [np.zeros(1)], 0.0, "generations"
         for number in range(MOST_GENERATIONS):
             if number:
@@ -243,7 +245,7 @@ class _Curve:
         self.generations.append(self.step(self.generations[-1], self.generations[-1]))
 
     def _add_preimages(self) -> None:
-        """Add the next generation of a stable manifold: preimages one after the other, each from its neighbour's
+        """Compute the preimages of a stable manifold's latest points one by one, each starting from its neighbour's
         preimage.
 
         Where the step to the next one is long, or Newton's method fails, a place is inserted between them.
@@ -275,7 +277,9 @@ class _Curve:
         self.generations.append(np.concatenate([np.array(found), rest]))
 
     def _refine(self) -> None:
-        """Insert positions on the first segment until the last generation's points are close enough together."""
+        """Insert positions on the manifold's first segment until the points of its latest image (or preimage) are close
+        enough.
+        """
         while len(self.places) < self.resolution.most:
             coarse = self._coarse(self.generations[-1]) & (np.diff(self.places) > SHORTEST)
             if not coarse.any():
@@ -283,8 +287,8 @@ class _Curve:
             self._insert(np.flatnonzero(coarse))
 
     def _insert(self, at: np.ndarray, share: float = 0.5) -> None:
-        """Insert a new position after each of some positions on the first segment, and its point in every
-        generation.
+        """Insert a new position after each of some positions on the manifold's first segment, and add its images (or
+        preimages).
         """
         middle = self.places[at] + share * (self.places[at + 1] - self.places[at])
         new = [self.first(middle)]
@@ -295,8 +299,8 @@ class _Curve:
         self.generations = [np.insert(points, at + 1, inserted, axis=0) for points, inserted in pairs]
 
     def _between(self, points: np.ndarray, at: np.ndarray, middle: np.ndarray) -> np.ndarray:
-        """Interpolate a generation's points at new positions: by the cubic through four neighbours, at the ends by a
-        line.
+        """Interpolate an image of the manifold's first segment at new positions: by cubics through four points, at the
+        ends by lines.
         """
         last = len(points) - 1
         result = np.empty((len(at), points.shape[1]))
@@ -323,7 +327,7 @@ class _Curve:
 
 
 def _preimages(saddle: Saddle, points: np.ndarray, guesses: np.ndarray, n_periods: int) -> np.ndarray:
-    """Solve P(y) = x by Newton's method for each point x; NaN where it fails.
+    """Solve P(y) = x for the section map P by Newton's method, for each point x; NaN where the method fails.
 
     The map expands and contracts by large factors, so that the size of P(y) - x says little. A step is accepted if the
     next step, with the same derivative, is shorter (natural monotonicity; Deuflhard, Newton Methods for

@@ -208,7 +208,9 @@ def _followed(saddle: Saddle, base: Parameters, parameter: str, options: Tangenc
 
 
 def tangency_table(ds: xr.Dataset) -> Table:
-    """Return a row per located tangency, and for each pair of manifold sides without one a line that says why."""
+    """Return a row per located tangency, and for each pair of an unstable and a stable side without one a line that
+    says why.
+    """
     name = parameter_name(str(ds.attrs["parameter"]))
     every = [
         {

@@ -65,8 +65,7 @@ def first_tangency(
 
 
 def gap(saddle: Saddle, sides: tuple[float, float], resolution: Resolution = FINE) -> tuple[float, float]:
-    """Compute the least and largest signed distance of one generation of the unstable manifold from the stable
-    manifold.
+    """Compute the least and largest signed distance of a stretch of the unstable manifold from the stable manifold.
 
     Both have one sign if the manifolds are apart, and two if they cross.
     """
@@ -78,7 +77,9 @@ def gap(saddle: Saddle, sides: tuple[float, float], resolution: Resolution = FIN
 
 
 def _oriented(saddle: Saddle, side: float, stable: bool) -> float:
-    """Return the sign to use with the eigenvector, so that a side is named by the sign of its first component."""
+    """Return the sign that orients a saddle's eigenvector, so that side 1 begins towards larger values of the first
+    state.
+    """
     _, vector = saddle.direction(stable)
     return side * float(np.sign(vector[0]))
 
@@ -103,7 +104,9 @@ def _extremes(unstable: Manifold, stable: Manifold, saddle: Saddle) -> tuple[flo
 
 
 def _first_maximum(values: np.ndarray) -> int:
-    """Return the index of the first maximum of a list: where the manifold first turns back to the saddle."""
+    """Return the index of the first maximum of the distances from the saddle, where the unstable manifold first turns
+    back.
+    """
     falling = np.flatnonzero(np.diff(values) < 0.0)
     if not len(falling):
         raise ValueError("the unstable manifold does not turn back; it needs a greater length.")

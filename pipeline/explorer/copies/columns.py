@@ -119,7 +119,7 @@ def _packed(
 
 
 def thinned(column: Column, period: np.ndarray, each: int) -> Column:
-    """Keep the last period of closed orbits, and every `each`-th section point of other cells.
+    """Keep the last period of each closed orbit, and every `each`-th section point of other cells; 0 keeps all points.
 
     The last section of every cell stays. Nothing is left out if `each` is 0.
     """
