@@ -79,14 +79,24 @@ def identify(
 
 def check(
     directory: Annotated[Path, typer.Argument(metavar="DIR", help="Directory of an identification.")],
-    recording: Annotated[Path, typer.Argument(metavar="RECORDING", help="A file with the same channels.")],
+    recording: Annotated[
+        Path, typer.Argument(metavar="FILE", help="A recording with the same channels, or a table of measured orbits.")
+    ],
     like: Annotated[
         int, typer.Option(min=0, help="Index of the fitted recording with the same mapping, drive and zeros.")
     ] = 0,
     as_json: Json = False,
 ) -> None:
-    """Test identified parameters on another recording; only the initial states of its pieces are fitted."""
+    """Test identified parameters on another recording, or on a table of measured orbits.
+
+    Only the initial states of a recording's pieces are fitted. Orbits are compared with the computed branches.
+    """
     from pipeline.cli import console
+    from pipeline.rig.identify.check_orbits import is_table
+
+    if is_table(recording):
+        _check_orbits(directory, recording, as_json)
+        return
     from pipeline.rig.identify import check as checking
     from pipeline.rig.identify.reports import judgement_lines
 
@@ -104,12 +114,28 @@ def check(
         console.result(f"piece {piece['piece']}: {values}")
 
 
+def _check_orbits(directory: Path, table: Path, as_json: bool) -> None:
+    from pipeline.cli import console
+    from pipeline.rig.identify.check_orbits import check_orbits
+    from pipeline.rig.identify.orbit_reports import orbit_lines
+
+    found = check_orbits(directory, table)
+    if as_json:
+        console.result(json.dumps(found, indent=1))
+        return
+    for one in found["orbits"]:
+        error = "lost" if one["relative_error"] is None else f"{100.0 * one['relative_error']:+.1f} %"
+        console.result(f"{one['name']} ({one['stability']}): amplitude {one['amplitude']:.4g}, error {error}")
+    for line in orbit_lines([found]):
+        console.result(line.removeprefix("fitted "))
+
+
 def compare(
     directories: Annotated[list[Path], typer.Argument(metavar="DIR...", help="Finished identifications.")],
     as_json: Json = False,
     csv: Csv = None,
 ) -> None:
-    """Compare identifications by their errors on held-out pieces of the recordings; the best one comes first."""
+    """Compare identifications by their errors on held-out pieces or orbits; the best one comes first."""
     from pipeline.cli.common import check_csv, tell
     from pipeline.rig.identify.comparison import compare as comparing
 

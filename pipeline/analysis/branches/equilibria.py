@@ -8,7 +8,7 @@ import numpy as np
 
 from magpend_core.engine.system import System
 from magpend_core.pointwise import jacobian_at, rates_at
-from pipeline.analysis.branches.problems import PARAMETER_STEP, Ends, Family, OrbitProblem, Rows, Value
+from pipeline.analysis.branches.problems import PARAMETER_STEP, STATE_STEP, Ends, Family, OrbitProblem, Rows, Value
 
 
 @dataclass(eq=False)
@@ -50,6 +50,41 @@ class EquilibriumProblem:
             norm = float(np.linalg.norm(self.family.scaled(jacobian)))
             self._unit = 1.0 / norm if norm > 0.0 and np.isfinite(norm) else 1.0
         return self._unit
+
+
+@dataclass(frozen=True, eq=False)
+class HopfProblem:
+    """Equations for equilibria at a Hopf point, with two free parameters: the rates vanish, and so does `hopf_test`."""
+
+    family: Family
+
+    @property
+    def size(self) -> int:
+        """Number of unknowns: the states and two free parameters."""
+        return self.family.system.n_states + 2
+
+    @property
+    def system(self) -> System:
+        """System whose equilibria are solved for."""
+        return self.family.system
+
+    def rows(self, u: np.ndarray) -> Rows:
+        """Return an empty list of trajectories to integrate: equations for equilibria need none."""
+        return self.family.rows(u[None][:0])
+
+    def value(self, u: np.ndarray, ends: Ends) -> Value:
+        """Compute the scaled rates and the test function, with their derivatives by central differences."""
+        n, scales = self.family.system.n_states, np.asarray(self.system.scales)
+        steps = np.array([STATE_STEP] * n + [PARAMETER_STEP] * 2)
+        rows = self.family.rows(np.concatenate([u[None], u + np.diag(steps), u - np.diag(steps)]))
+        at = list(zip(rows.states[:, None], rows.parameters, strict=True))
+        jacobians = [jacobian_at(self.system, state, p)[0] for state, p in at]
+        norm = float(np.linalg.norm(self.family.scaled(jacobians[0]))) or 1.0
+        tests = np.array([hopf_test(j) if np.isfinite(j).all() else np.nan for j in jacobians])
+        rates = np.array([rates_at(self.system, state, p)[0] for state, p in at]) / scales / norm
+        both = np.column_stack([rates, tests])
+        derivative = (both[1 : 1 + self.size] - both[1 + self.size :]).T / (2.0 * steps)
+        return Value(both[0], derivative, rows.states[:1], jacobians[0], is_rest=True)
 
 
 OneParameter = OrbitProblem | EquilibriumProblem

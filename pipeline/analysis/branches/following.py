@@ -86,7 +86,7 @@ class _Stop:
             return "bound"
         if self._is_closed(points):
             return "closed"
-        if self.family.period and (end := _end_of_crossings(self.family, here)):
+        if self.family.period and (end := end_of_crossings(self.family, here)):
             return end
         return "period_halving" if len(points) > 2 and has_halved(self.family, points) else ""
 
@@ -111,7 +111,7 @@ class _Stop:
         return np.append(self.family.mismatch(u, state), parameter - u[-1])
 
 
-def _end_of_crossings(family: Family, point: Point) -> str:
+def end_of_crossings(family: Family, point: Point) -> str:
     """Return ``tangent`` or ``equilibrium`` if a limit cycle hardly crosses its section, else an empty text."""
     crossed = crossed_state(family.system)
     if crossed is None:

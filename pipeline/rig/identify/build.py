@@ -13,6 +13,7 @@ import xarray as xr
 from magpend_core.models.model import Model
 from magpend_core.sampling import Drive
 from pipeline.rig.edges import Edges, find_edges
+from pipeline.rig.identify.measured_orbits import MeasuredTable, first_orbits
 from pipeline.rig.identify.problem import ZERO, Free, Piece, Problem
 from pipeline.rig.identify.settings import apply_settings
 from pipeline.rig.identify.specification import IdentificationSpec, RecordingTable
@@ -40,6 +41,8 @@ class Built:
     problem : Problem
     held_out : tuple of Piece
         Pieces that are judged afterwards; only their starts are fitted.
+    tables : tuple of MeasuredTable
+        Measured orbits, with those that only judge the fit.
     simulated : bool
         Whether any of the recordings is simulated.
     findings : tuple of tuple of str
@@ -48,6 +51,7 @@ class Built:
 
     problem: Problem
     held_out: tuple[Piece, ...]
+    tables: tuple[MeasuredTable, ...] = ()
     simulated: bool = False
     findings: tuple[tuple[str, ...], ...] = ()
 
@@ -82,8 +86,9 @@ def read_all(spec: IdentificationSpec) -> list[xr.Dataset]:
     return found
 
 
-def build(spec: IdentificationSpec, recordings: Sequence[xr.Dataset]) -> Built:
-    """Build the least-squares problem of a specification and its recordings, and set the held-out pieces apart.
+def build(spec: IdentificationSpec, recordings: Sequence[xr.Dataset], tables: Sequence[MeasuredTable] = ()) -> Built:
+    """Build the least-squares problem of a specification, its recordings and its measured orbits, and set the held-out
+    pieces apart.
 
     Raises
     ------
@@ -92,7 +97,7 @@ def build(spec: IdentificationSpec, recordings: Sequence[xr.Dataset]) -> Built:
         too short, held-out pieces that do not exist, nothing left to fit.
     """
     problems: list[str] = []
-    channels = channels_of(spec.model, spec.fit.channels, recordings, problems)
+    channels = channels_of(spec.model, spec.fit.channels, recordings, problems) if recordings else ()
     problems += drive_problems(spec.model, spec.recordings, recordings, "recordings")
     if problems:
         raise SpecError(problems)
@@ -110,7 +115,7 @@ def build(spec: IdentificationSpec, recordings: Sequence[xr.Dataset]) -> Built:
         kept += _rechained([p for p in own if p.number not in table.hold_out], len(kept))
     if problems:
         raise SpecError(problems)
-    if not kept:
+    if recordings and not kept:
         raise SpecError(["recordings: all pieces are held out; leave some to be fitted."])
     both = apply_settings([*kept, *held], {i: t.parameters for i, t in enumerate(spec.recordings)})
     kept, held = both[: len(kept)], both[len(kept) :]
@@ -128,9 +133,10 @@ def build(spec: IdentificationSpec, recordings: Sequence[xr.Dataset]) -> Built:
         slopes=spec.fit.slopes,
         recorded=any(t.drive == "recorded" for t in spec.recordings),
     )
+    problem = replace(problem, orbits=first_orbits(tables, problem.values(problem.start)))
     simulated = any(bool(ds.attrs.get("simulated")) for ds in recordings)
     said = tuple(tuple(summary(f for f in findings_of(ds) if f.severity != "note")) for ds in recordings)
-    return Built(problem, tuple(replace(p, follows=-1) for p in held), simulated, said)
+    return Built(problem, tuple(replace(p, follows=-1) for p in held), tuple(tables), simulated, said)
 
 
 def channels_of(

@@ -26,7 +26,9 @@ def compare(directories: Sequence[str | Path]) -> Table:
         A row for each identification: directory, title and number of unknowns. ``fit`` and ``held_out`` are
         the root mean squares over all channels of fitted and of held-out pieces, each channel in units of its
         noise in the first identification. ``fit_NAME`` and ``held_out_NAME`` are those of each channel [SI].
-        Without held-out pieces their values are NaN, and rows are sorted by ``fit``.
+        ``orbits_fit`` and ``orbits_held_out`` are the root mean squares of the amplitudes' relative errors of measured
+        orbits. Rows are sorted by held-out pieces, else held-out orbits, else by the fit; without one of these its
+        values are NaN.
 
     Raises
     ------
@@ -39,7 +41,7 @@ def compare(directories: Sequence[str | Path]) -> Table:
     _require_alike(found)
     noise = found[0][2]["noise"]
     rows = [_row(directory, result, noise) for directory, _, result in found]
-    rows.sort(key=lambda r: r["fit"] if math.isnan(r["held_out"]) else r["held_out"])
+    rows.sort(key=lambda r: next(r[k] for k in _ORDER if not math.isnan(r[k])))
     return Table(rows, _lines(rows, found[0][2]))
 
 
@@ -48,6 +50,7 @@ def _require_alike(found: Sequence[tuple[Path, Any, Any]]) -> None:
     for directory, info, result in found[1:]:
         for what, a, b in (
             ("recordings", _recordings(first[1]), _recordings(info)),
+            ("measured orbits", _orbits(first[2]), _orbits(result)),
             ("channels", first[2]["channels"], result["channels"]),
             ("held-out pieces", _held(first[2]), _held(result)),
         ):
@@ -69,6 +72,24 @@ def _held(result: Any) -> list[tuple[int, int]]:
     return [(p["recording"], p["piece"]) for p in pieces]
 
 
+_ORDER = ("held_out", "orbits_held_out", "fit", "orbits_fit")
+
+
+def _orbits(result: Any) -> list[tuple[str, bool]]:
+    return [(o["name"], o["held_out"]) for table in result["orbits"] for o in table["orbits"]]
+
+
+def _orbit_error(result: Any, is_held_out: bool) -> float:
+    """Return the root mean square of the relative errors of the amplitudes; infinite if an orbit is not there."""
+    errors = [
+        math.inf if o["relative_error"] is None else o["relative_error"]
+        for table in result["orbits"]
+        for o in table["orbits"]
+        if o["held_out"] == is_held_out
+    ]
+    return math.sqrt(sum(e**2 for e in errors) / len(errors)) if errors else math.nan
+
+
 def _row(directory: Path, result: Any, noise: dict[str, float]) -> dict[str, Any]:
     held = result["held_out"]
     row: dict[str, Any] = {
@@ -77,6 +98,8 @@ def _row(directory: Path, result: Any, noise: dict[str, float]) -> dict[str, Any
         "unknowns": len(result["names"]),
         "fit": _overall(result["rms"], noise),
         "held_out": _overall(held["rms"], noise) if held is not None else math.nan,
+        "orbits_fit": _orbit_error(result, False),
+        "orbits_held_out": _orbit_error(result, True),
     }
     for channel in result["channels"]:
         row[f"fit_{channel}"] = result["rms"][channel]
@@ -85,7 +108,7 @@ def _row(directory: Path, result: Any, noise: dict[str, float]) -> dict[str, Any
 
 
 def _overall(rms: dict[str, float], noise: dict[str, float]) -> float:
-    return math.sqrt(sum((rms[c] / noise[c]) ** 2 for c in rms) / len(rms))
+    return math.sqrt(sum((rms[c] / noise[c]) ** 2 for c in rms) / len(rms)) if rms else math.nan
 
 
 def _lines(rows: Sequence[dict[str, Any]], result: Any) -> list[str]:
@@ -96,7 +119,11 @@ def _lines(rows: Sequence[dict[str, Any]], result: Any) -> list[str]:
             values = [(c, row[f"{what}_{c}"]) for c in result["channels"]]
             if not math.isnan(row[what]):
                 parts.append(f"{words} " + ", ".join(f"{c} {v:.4g} {result['units'][c]}" for c, v in values))
+        for what, words in (("orbits_held_out", "held-out orbits"), ("orbits_fit", "fitted orbits")):
+            if not math.isnan(row[what]):
+                error = "lost" if math.isinf(row[what]) else f"{100.0 * row[what]:.3g} %"
+                parts.append(f"amplitude of {words} {error}")
         lines.append(f"{row['directory']}: {'; '.join(parts)}; {row['unknowns']} unknowns")
-    if math.isnan(rows[0]["held_out"]):
+    if math.isnan(rows[0]["held_out"]) and math.isnan(rows[0]["orbits_held_out"]):
         lines.append("no pieces were held out (hold_out): the fit alone favours whatever has more unknowns")
     return lines

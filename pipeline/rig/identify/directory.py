@@ -27,6 +27,7 @@ from magpend_core.models.imported import is_object_path
 from magpend_core.source_digests import meaning_digest
 from pipeline.layout.identity import canonical, differences, digest_of
 from pipeline.layout.writing import sync_folder, write_atomically
+from pipeline.rig.identify.measured_orbits import MeasuredTable
 from pipeline.rig.identify.specification import IdentificationSpec
 from pipeline.rig.recordings import load_mapping
 from pipeline.specification.models import is_model_file
@@ -48,7 +49,9 @@ IDENTIFICATION, RESULT, RESIDUALS, PRESET, OUTCOMES = (
 )
 _OWN = frozenset({IDENTIFICATION, RESULT, RESIDUALS, PRESET, OUTCOMES, FIGURES, LOCK, HOLDER})
 _ROOM = Path(__file__).parent
-_NOT_NUMBERS = ("check.py", "comparison.py", "directory.py", "figures.py", "reports.py", "residuals.py")
+_NOT_NUMBERS = (
+    "check.py", "comparison.py", "directory.py", "figures.py", "orbit_reports.py", "reports.py", "residuals.py",
+)  # fmt: skip
 """Modules that do not affect the numbers."""
 
 
@@ -137,7 +140,9 @@ def _kept(path: Path) -> str:
     return text if is_whole else load_mapping(path).toml()
 
 
-def identity_of(spec: IdentificationSpec, sources: Sequence[Source]) -> dict[str, Any]:
+def identity_of(
+    spec: IdentificationSpec, sources: Sequence[Source], orbits: Sequence[MeasuredTable] = ()
+) -> dict[str, Any]:
     """Return all inputs that decide the numerical results: specification, recordings, kernel version, model and code
     digests.
     """
@@ -146,13 +151,20 @@ def identity_of(spec: IdentificationSpec, sources: Sequence[Source]) -> dict[str
         del table["file"], table["mapping"]
         table["sha256"] = source.sha256
         table["mapping_text"] = source.mapping
+    for table, measured in zip(tables["orbits"], orbits, strict=True):
+        table.pop("file", None)
+        table["data"] = measured.as_dict()
     own = [p for p in _ROOM.glob("*.py") if p.name not in _NOT_NUMBERS]
     return {
         "format": FORMAT,
         "spec": tables,
         "kernel_version": kernel_version(),
         "model_digest": spec.model.digest,
-        "code": {"identify": meaning_digest(own), "recordings": meaning_digest([_ROOM.parent / "recordings"])},
+        "code": {
+            "identify": meaning_digest(own),
+            "recordings": meaning_digest([_ROOM.parent / "recordings"]),
+            "measured_branch": meaning_digest([_ROOM.parent / "measured_branch"]),
+        },
     }
 
 
@@ -238,11 +250,17 @@ def _short(line: str) -> str:
     return flat if len(flat) <= 400 else f"{flat[:197]} ... {flat[-197:]}"
 
 
-def establish(directory: Path, spec: IdentificationSpec, sources: Sequence[Source], spec_text: str) -> Info:
+def establish(
+    directory: Path,
+    spec: IdentificationSpec,
+    sources: Sequence[Source],
+    spec_text: str,
+    orbits: Sequence[MeasuredTable] = (),
+) -> Info:
     """Create the directory of an identification and its ``identification.json``, or return the identification that it
     holds.
     """
-    identity = identity_of(spec, sources)
+    identity = identity_of(spec, sources, orbits)
     if check(directory, identity) is None:
         directory.mkdir(parents=True, exist_ok=True)
         content = {

@@ -5,7 +5,8 @@ correlations.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from pipeline.layout.vocabulary import model_of
 from pipeline.plots import labels, style
 from pipeline.plots.files import save_data, save_figure
 from pipeline.rig.identify.residuals import Series, per_piece, pieces_in, rate_of, residual_views
+from pipeline.rig.measured_branch.figure import plot_branch
 
 MOST_PIECES = 4
 """Most pieces that are drawn over the data."""
@@ -39,7 +41,12 @@ SQUARE = style.Frame(width=131.0)
 FITTED, HELD = style.BLUE, style.VERMILLION
 
 
-def draw_all(folder: Path, residuals: xr.Dataset, result: Mapping[str, Any]) -> list[str]:
+def draw_all(
+    folder: Path,
+    residuals: xr.Dataset,
+    result: Mapping[str, Any],
+    branches: Sequence[tuple[xr.Dataset, xr.Dataset, np.ndarray]] = (),
+) -> list[str]:
     """Draw all figures of an identification, and save each with the data that it shows.
 
     Parameters
@@ -50,17 +57,20 @@ def draw_all(folder: Path, residuals: xr.Dataset, result: Mapping[str, Any]) -> 
         See `pipeline.rig.identify.reports.residuals_of`.
     result
         Content of ``result.json``.
+    branches
+        For each table of measured orbits the judged orbits, the computed branches and the amplitudes of their orbits.
 
     Returns
     -------
     list of str
         Names of the files.
     """
-    drawings: dict[str, Callable[[], style.DataFigure]] = {
-        "fit": lambda: plot_fit(residuals),
-        "residuals": lambda: plot_residuals(residuals),
-        "correlations": lambda: plot_correlations(residuals.attrs, result),
-    }
+    drawings: dict[str, Callable[[], style.DataFigure]] = {}
+    if residuals.sizes["sample"]:
+        drawings |= {"fit": lambda: plot_fit(residuals), "residuals": lambda: plot_residuals(residuals)}
+    if len(result["names"]) > 1:
+        drawings["correlations"] = lambda: plot_correlations(residuals.attrs, result)
+    drawings |= {f"branch-{i}": partial(plot_branch, *one) for i, one in enumerate(branches) if "orbit" in one[0].sizes}
     if result["profiles"]:
         drawings["profiles"] = lambda: plot_profiles(residuals.attrs, result)
     files = []

@@ -45,7 +45,7 @@ def fit_starts(problem: Problem, theta: Array, starts: Array) -> Starts:
     Starts
         No start is worse than its guess.
     """
-    held = replace(problem.without(dict(zip(problem.names, theta, strict=True))), continuity=None)
+    held = replace(problem.without(dict(zip(problem.names, theta, strict=True))), continuity=None, orbits=())
     found = np.array(starts)
     damping = np.full(len(found), FIRST_DAMPING)
     blocks = _blocks(held, found)

@@ -21,7 +21,9 @@ from pipeline.rig.identify.directory import Outcomes, Source
 from pipeline.rig.identify.judging import judge, judge_fit
 from pipeline.rig.identify.linearise import linearise, loss_scale_of
 from pipeline.rig.identify.local import Fit, fit_local
+from pipeline.rig.identify.measured_orbits import judge_orbits, read_orbits
 from pipeline.rig.identify.objective import evaluate
+from pipeline.rig.identify.orbits import Solution
 from pipeline.rig.identify.problem import ZERO, Problem
 from pipeline.rig.identify.profiles import Curvature, Profile, following, profile
 from pipeline.rig.identify.search import search
@@ -81,17 +83,17 @@ def identify(
     path = find_spec(spec)
     parsed = load_identification(path)
     folder = directory_of(spec, out)
-    sources = store.sources_of(parsed)
-    if store.check(folder, store.identity_of(parsed, sources)) is not None and store.is_complete(folder):
+    sources, tables = store.sources_of(parsed), read_orbits(parsed)
+    if store.check(folder, store.identity_of(parsed, sources, tables)) is not None and store.is_complete(folder):
         echo(f"{folder} is complete; nothing to do.")
         return store.read_result(folder)
-    built = build(parsed, read_all(parsed))
+    built = build(parsed, read_all(parsed), tables)
     for i, said in enumerate(built.findings):
         for line in said:
             echo(f"{parsed.recordings[i].file}: {line}")
     refuse_invisible(built.problem)
     with writer_lock(folder):
-        info = store.establish(folder, parsed, sources, path.read_text("utf-8"))
+        info = store.establish(folder, parsed, sources, path.read_text("utf-8"), tables)
         outcomes = Outcomes(folder / store.OUTCOMES)
         with stoppable(folder):
             found = find(parsed, built, outcomes, echo)
@@ -127,7 +129,8 @@ def _write(
         report("drawing", 0, 0)
         refuse_links(folder / FIGURES)
         make_folder(folder / FIGURES)
-        files += [f"{FIGURES}/{name}" for name in draw_all(folder / FIGURES, residuals, result)]
+        branches = [(one, *table.branches(found.values)) for table, one in zip(built.tables, found.orbits, strict=True)]
+        files += [f"{FIGURES}/{name}" for name in draw_all(folder / FIGURES, residuals, result, branches)]
     store.write_result(folder, result, files)
     return store.read_result(folder)
 
@@ -151,8 +154,8 @@ def refuse_invisible(problem: Problem) -> None:
     if first.failed:
         raise SpecError(
             [
-                f"identify: at the start, the trajectories of {first.failed} of {len(problem.pieces)} pieces "
-                "diverge; give starts that are nearer."
+                f"identify: at the start, {first.failed} trajectories of pieces or measured orbits are lost; give "
+                "starts that are nearer."
             ]
         )
     columns = first.jacobian[:, : len(problem.free)]
@@ -162,7 +165,7 @@ def refuse_invisible(problem: Problem) -> None:
     if names:
         raise SpecError(
             [
-                f"identify.{name}: the recordings do not depend on it at all, at the start; fix it under "
+                f"identify.{name}: the data do not depend on it at all, at the start; fix it under "
                 "[parameters], give others values with which it matters, or add a recording in which it does."
                 for name in names
             ]
@@ -173,9 +176,9 @@ def _is_driven(problem: Problem) -> bool:
     """Return whether the trajectory of a piece without recorded drive depends on the drive period, because the model
     has a drive of its own.
     """
-    piece = problem.pieces[0]
-    if piece.drive is not None:
+    if not problem.pieces or problem.pieces[0].drive is not None:
         return False
+    piece = problem.pieces[0]
     motions = []
     for share in (0.37, 0.61):
         duration = share * float(piece.time[-1])
@@ -215,6 +218,7 @@ def find(spec: IdentificationSpec, built: Built, outcomes: Outcomes, echo: Echo)
             "(search.n_starts) or narrower bounds."
         )
     report("how sure it is", 0, 0)
+    problem = problem.with_orbits(best.known)
     linear = linearise(problem, best)
     scale = _sizes(problem, best)
     covariance = covariance_of(linear, scale)
@@ -224,6 +228,7 @@ def find(spec: IdentificationSpec, built: Built, outcomes: Outcomes, echo: Echo)
         held, fit = judge(problem, problem.values(best.theta), reports.zeros_of(problem, best), built.held_out)
         require_starts(fit, "held-out pieces")
     at_bound = _at_bound(problem, best, scale)
+    judged = [judge_orbits(table, problem.values(best.theta)) for table in built.tables]
     found = reports.Finding(
         problem,
         keep.fits,
@@ -234,6 +239,7 @@ def find(spec: IdentificationSpec, built: Built, outcomes: Outcomes, echo: Echo)
         held,
         dict(zip(problem.channels, n_effective(linear.residuals), strict=True)),
         at_bound,
+        judged,
     )
     profiles = _profiles(found, linear, scale, outcomes) if table.profiles else {}
     return replace(found, profiles=profiles, warnings=_warnings(found, profiles))
@@ -248,8 +254,10 @@ def require_starts(fit: Fit, what: str) -> None:
 
 
 def _sizes(problem: Problem, best: Fit) -> np.ndarray:
-    measured = np.concatenate([p.measured for p in problem.pieces])
-    spread = dict(zip(problem.channels, np.nanstd(measured, axis=0), strict=True))
+    spread = {}
+    if problem.pieces:
+        measured = np.concatenate([p.measured for p in problem.pieces])
+        spread = dict(zip(problem.channels, np.nanstd(measured, axis=0), strict=True))
     sensed = [spread[f.name.split(".")[1]] if f.name.startswith(f"{ZERO}.") else np.nan for f in problem.free]
     return identifiability.sizes_of(best.theta, problem.start, problem.lower, problem.upper, np.array(sensed))
 
@@ -343,15 +351,21 @@ def _name(number: int) -> str:
     return f"start-{number:04d}"
 
 
+_KNOWN = ("packed", "unknowns", "tangents")
+"""Fields of a `Solution` that are stored."""
+
+
 def pack_fit(fit: Fit) -> dict[str, np.ndarray]:
     """Return all fields of a fit as named arrays, to be stored in a file."""
     lengths = np.array([len(r) for r in fit.residuals], np.int64)
+    known = {f"orbits-{i}-{name}": getattr(own, name) for i, own in enumerate(fit.known) for name in _KNOWN}
     return {
+        **known,
         "theta": fit.theta,
         "starts": fit.starts,
         "rows": fit.rows,
         "jacobian": fit.jacobian,
-        "residuals": np.concatenate(fit.residuals),
+        "residuals": np.concatenate(fit.residuals) if fit.residuals else np.zeros(0),
         "lengths": lengths,
         "cost": np.array(fit.cost),
         "converged": np.array(fit.converged),
@@ -362,7 +376,12 @@ def pack_fit(fit: Fit) -> dict[str, np.ndarray]:
 
 def unpack_fit(data: Mapping[str, np.ndarray]) -> Fit:
     """Rebuild a fit from the arrays of `pack_fit`."""
-    residuals = np.split(data["residuals"], np.cumsum(data["lengths"])[:-1])
+    residuals = np.split(data["residuals"], np.cumsum(data["lengths"])[:-1]) if len(data["lengths"]) else []
+    n_tables = sum(key.endswith(f"-{_KNOWN[0]}") for key in data)
+    known = []
+    for i in range(n_tables):
+        packed, unknowns, tangents = (data[f"orbits-{i}-{name}"] for name in _KNOWN)
+        known.append(Solution(packed, unknowns, tangents))
     return Fit(
         data["theta"],
         data["starts"],
@@ -373,4 +392,5 @@ def unpack_fit(data: Mapping[str, np.ndarray]) -> Fit:
         tuple(residuals),
         data["rows"],
         data["jacobian"],
+        tuple(known),
     )

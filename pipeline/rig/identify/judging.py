@@ -48,6 +48,8 @@ class Judgement:
         return self._rms([self.residuals[k]])
 
     def _rms(self, residuals: Sequence[np.ndarray]) -> dict[str, float]:
+        if not residuals:
+            return {}
         stacked = np.concatenate(residuals)
         count = np.isfinite(stacked).sum(axis=0)
         with np.errstate(invalid="ignore"):
@@ -57,6 +59,8 @@ class Judgement:
     @property
     def correlation(self) -> dict[str, float]:
         """Pearson's correlation coefficient between measured and computed values, by channel."""
+        if not self.pieces:
+            return {}
         measured = np.concatenate([p.measured for p in self.pieces])
         computed = measured - np.concatenate(self.residuals)
         return {name: _pearson(measured[:, c], computed[:, c]) for c, name in enumerate(self.channels)}

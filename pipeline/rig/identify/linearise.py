@@ -8,6 +8,7 @@ import numpy as np
 
 from pipeline.rig.identify.local import Fit
 from pipeline.rig.identify.objective import evaluate
+from pipeline.rig.identify.orbits import OrbitRows, orbit_rows
 from pipeline.rig.identify.problem import Problem
 from pipeline.rig.identify.statistics import Linearised, eliminate_starts, robust_weights
 
@@ -29,7 +30,7 @@ def linearise(problem: Problem, fit: Fit) -> Linearised:
     """
     n_free, n_states = len(problem.free), len(problem.model.states)
     scale = loss_scale_of(problem, fit)
-    full = sample_slopes(problem, fit)
+    full = sample_slopes(problem, fit) if problem.pieces else []
     joined = problem.continuity is not None
     follow = eliminate_starts(fit.jacobian, n_free)[1] if joined else None
     slopes, following = [], []
@@ -41,7 +42,10 @@ def linearise(problem: Problem, fit: Fit) -> Linearised:
         following.append(-moves)
     prior = np.array([f.prior_sd**-2 if f.has_prior else 0.0 for f in problem.free])
     residuals = tuple(r / problem.noise for r in fit.residuals)
+    of_orbits = _at_orbits(problem, fit)
     information = _information(problem, fit, slopes, residuals, prior, scale)
+    if of_orbits is not None and not joined:
+        information = information + of_orbits.jacobian.T @ of_orbits.jacobian
     return Linearised(
         information,
         prior,
@@ -52,7 +56,16 @@ def linearise(problem: Problem, fit: Fit) -> Linearised:
         problem.loss,
         scale,
         np.array(following),
+        None if of_orbits is None else of_orbits.jacobian,
+        None if of_orbits is None else of_orbits.rows,
     )
+
+
+def _at_orbits(problem: Problem, fit: Fit) -> OrbitRows | None:
+    """Return residuals and slopes of the measured orbits at a fit; None without any."""
+    if not problem.orbits:
+        return None
+    return orbit_rows(problem.with_orbits(fit.known), fit.theta[None], slopes=True)[0]
 
 
 def _information(
@@ -123,7 +136,7 @@ def sample_slopes(problem: Problem, fit: Fit) -> list[np.ndarray]:
             thetas.append(fit.theta)
             starts.append(moved)
         widths.append(2 * STEP * scale)
-    exact = replace(problem, rtol=min(problem.rtol, RTOL), continuity=None)
+    exact = replace(problem, rtol=min(problem.rtol, RTOL), continuity=None, orbits=())
     found = evaluate(exact, np.array(thetas), np.array(starts), slopes=False)
     slopes = []
     for k in range(len(problem.pieces)):

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from pipeline.rig.identify.first_guesses import carry_starts, fit_starts, project_starts_out
 from pipeline.rig.identify.objective import Evaluation, evaluate
+from pipeline.rig.identify.orbits import Solution
 from pipeline.rig.identify.problem import Problem
 
 Array = NDArray[np.float64]
@@ -41,6 +42,8 @@ class Fit:
     n_evaluations : int
     residuals, rows, jacobian
         See `Evaluation`.
+    known : tuple of Solution
+        Computed counterparts of the measured orbits, one entry per table.
     """
 
     theta: Array
@@ -52,6 +55,7 @@ class Fit:
     residuals: tuple[Array, ...]
     rows: Array
     jacobian: Array
+    known: tuple[Solution, ...] = ()
 
     @property
     def rms(self) -> Array:
@@ -106,6 +110,8 @@ class _Search:
             self.count += 1
             if evaluation.cost < self.best:
                 self.best, self._base = evaluation.cost, self._last
+                # Newton's method for measured orbits starts from those of the best point so far
+                self.problem = replace(self.problem, orbits=evaluation.orbits)
                 if self.echo is not None:
                     self.echo(theta, self.best)
         return self._last
@@ -243,7 +249,8 @@ def _starts_alone(walk: _Search) -> Fit:
 def _outcome(point: _Point, count: int, ended: bool, message: str) -> Fit:
     evaluation, failed = point.evaluation, point.evaluation.failed
     if failed:
-        message = f"the trajectories of {failed} of {len(point.starts)} pieces diverge"
+        total = len(point.starts) + sum(len(table.data) for table in evaluation.orbits)
+        message = f"{failed} of {total} trajectories and measured orbits are lost"
     return Fit(
         point.theta,
         point.starts,
@@ -254,6 +261,7 @@ def _outcome(point: _Point, count: int, ended: bool, message: str) -> Fit:
         evaluation.residuals,
         evaluation.rows,
         evaluation.jacobian,
+        tuple(table.known for table in evaluation.orbits),
     )
 
 
@@ -271,7 +279,7 @@ def _fit_others(
     )
     theta = np.array([fixed.get(name, 0.0) for name in problem.names])
     theta[~held] = part.theta
-    whole = evaluate(problem, theta[None], part.starts[None], slopes=True)[0]
+    whole = evaluate(problem.with_orbits(part.known), theta[None], part.starts[None], slopes=True)[0]
     return replace(
         part, theta=theta, cost=whole.cost, residuals=whole.residuals, rows=whole.rows, jacobian=whole.jacobian
     )

@@ -12,6 +12,7 @@ from magpend_core.engine.system import System
 from magpend_core.engine.variational import MINUS, PLUS, with_parameter_tangent
 from magpend_core.sampling import Drive, sample
 from magpend_core.status import Status
+from pipeline.rig.identify.orbits import OrbitData, OrbitRows, orbit_rows
 from pipeline.rig.identify.problem import Problem
 
 Array = NDArray[np.float64]
@@ -43,13 +44,16 @@ class Evaluation:
     jacobian : ndarray, (m, n_free + n_piece*n_states)
         Slopes of `rows`: the unknowns first, then the starts, piece by piece; empty without slopes.
     failed : int
-        Number of pieces whose trajectory did not reach its end.
+        Number of pieces whose trajectory did not reach its end, and of measured orbits that were not found.
+    orbits : tuple of OrbitData
+        Measured orbits, with the computed ones of these unknowns.
     """
 
     residuals: tuple[Array, ...]
     rows: Array
     jacobian: Array
     failed: int
+    orbits: tuple[OrbitData, ...] = ()
 
     @property
     def cost(self) -> float:
@@ -85,7 +89,10 @@ def evaluate(problem: Problem, thetas: Array, starts: Array, *, slopes: bool) ->
     list of Evaluation
         One for each member.
     """
-    if not slopes:
+    of_orbits = orbit_rows(problem, thetas, slopes=slopes) if problem.orbits else [None] * len(thetas)
+    if not problem.pieces:
+        motions = _no_motions(len(thetas))
+    elif not slopes:
         motions = _without_slopes(problem, thetas, starts)
     elif problem.slopes == VARIATIONAL:
         motions = _by_tangents(problem, thetas, starts)
@@ -100,9 +107,16 @@ def evaluate(problem: Problem, thetas: Array, starts: Array, *, slopes: bool) ->
             p.measured - _read(problem, k, member.states[k]) - problem.zeros[p.recording] @ thetas[i]
             for k, p in enumerate(problem.pieces)
         )
-        rows, jacobian = _with_priors(problem, thetas[i], blocks, slopes)
-        found.append(Evaluation(residuals, rows, jacobian, int(member.failed.sum())))
+        orbits = of_orbits[i]
+        rows, jacobian = _with_priors(problem, thetas[i], blocks, orbits, slopes)
+        failed = int(member.failed.sum()) + (orbits.lost if orbits is not None else 0)
+        found.append(Evaluation(residuals, rows, jacobian, failed, orbits.tables if orbits is not None else ()))
     return found
+
+
+def _no_motions(n: int) -> _Motions:
+    none = np.zeros((n, 0))
+    return _Motions(none, none, np.zeros((n, 0), bool))
 
 
 def _without_slopes(problem: Problem, thetas: Array, starts: Array) -> _Motions:
@@ -298,14 +312,15 @@ def _gaps(problem: Problem, starts: Array, member: _Motions, slopes: bool) -> li
 
 
 def _with_priors(
-    problem: Problem, theta: Array, blocks: list[tuple[int, Array, Array]], slopes: bool
+    problem: Problem, theta: Array, blocks: list[tuple[int, Array, Array]], orbits: OrbitRows | None, slopes: bool
 ) -> tuple[Array, Array]:
-    """Stack the residuals of all pieces and priors, and place their derivatives in the columns of the whole
+    """Stack the residuals of all pieces, orbits and priors, and place their derivatives in the columns of the whole
     Jacobian.
     """
     priors = [(i, f) for i, f in enumerate(problem.free) if f.has_prior]
     last = np.array([(f.prior_mean - theta[i]) / f.prior_sd for i, f in priors])
-    rows = np.concatenate([*(b[1] for b in blocks), last])
+    measured = orbits.rows if orbits is not None else np.zeros(0)
+    rows = np.concatenate([*(b[1] for b in blocks), measured, last])
     if not slopes:
         return rows, np.zeros((0, 0))
     n_free, n_states = len(problem.free), len(problem.model.states)
@@ -320,6 +335,9 @@ def _with_priors(
             part = block[:, n_free + place * n_states : n_free + (place + 1) * n_states]
             jacobian[here, columns : columns + n_states] = part
         at += len(own)
+    if orbits is not None:
+        jacobian[at : at + len(measured), :n_free] = orbits.jacobian
+        at += len(measured)
     for row, (i, f) in enumerate(priors, at):
         jacobian[row, i] = -1.0 / f.prior_sd
     return rows, jacobian

@@ -5,7 +5,7 @@ unknowns.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -15,6 +15,7 @@ from magpend_core.defaults import RTOL
 from magpend_core.engine.system import System
 from magpend_core.models.model import Model, Parameters
 from magpend_core.sampling import Drive, with_recorded_drive
+from pipeline.rig.identify.orbits import OrbitData, Solution
 
 ZERO = "zero"
 """Prefix of the names of sensors' zeros: ``zero.CHANNEL`` or ``zero.CHANNEL.RECORDING``."""
@@ -120,6 +121,8 @@ class Problem:
         Method for slopes: ``differences`` between lanes or ``variational`` equations.
     recorded : bool
         Whether the pieces' drives are measured torques instead of the model's own drive.
+    orbits : tuple of OrbitData
+        Measured orbits and bifurcations that are fitted.
     """
 
     model: Model
@@ -135,6 +138,7 @@ class Problem:
     rtol: float = RTOL
     slopes: str = "differences"
     recorded: bool = False
+    orbits: tuple[OrbitData, ...] = ()
 
     @cached_property
     def system(self) -> System:
@@ -164,7 +168,7 @@ class Problem:
     @cached_property
     def starts(self) -> np.ndarray:
         """First guesses of the initial states of the pieces, (n_piece, n_states)."""
-        return np.array([p.start for p in self.pieces])
+        return np.array([p.start for p in self.pieces]).reshape(-1, len(self.model.states))
 
     @cached_property
     def columns(self) -> tuple[int, ...]:
@@ -222,6 +226,11 @@ class Problem:
             packed[:, names.index(name)] = factor * packed[:, names.index(other)]
         more = len(self.system.parameter_names) - len(names)
         return np.hstack([packed, np.zeros((len(thetas), more))])
+
+    def with_orbits(self, known: Sequence[Solution]) -> Problem:
+        """Return the problem with other computed orbits from which Newton's method starts, one solution per table."""
+        orbits = tuple(replace(table, known=own) for table, own in zip(self.orbits, known, strict=True))
+        return replace(self, orbits=orbits)
 
     def without(self, fixed: Mapping[str, float]) -> Problem:
         """Return the problem with some unknowns fixed at given values.

@@ -17,6 +17,7 @@ from pipeline.rig.identify.directory import Source
 from pipeline.rig.identify.identifiability import Direction
 from pipeline.rig.identify.judging import Judgement
 from pipeline.rig.identify.local import Fit
+from pipeline.rig.identify.orbit_reports import orbit_lines, orbits_result
 from pipeline.rig.identify.problem import ZERO, Problem
 from pipeline.rig.identify.profiles import Profile
 from pipeline.rig.identify.specification import IdentificationSpec
@@ -46,6 +47,8 @@ class Finding:
         Number of independent residuals by channel.
     at_bound : list of str
         For each unknown, the bound at which its estimate lies: ``lower``, ``upper`` or an empty text.
+    orbits : list of Dataset
+        Judged orbits and bifurcations, one dataset per table.
     warnings : list of str
     """
 
@@ -58,6 +61,7 @@ class Finding:
     held_out: Judgement | None
     n_effective: Mapping[str, float]
     at_bound: Sequence[str]
+    orbits: Sequence[xr.Dataset] = ()
     profiles: Mapping[str, Profile] = field(default_factory=dict)
     warnings: Sequence[str] = ()
 
@@ -108,6 +112,7 @@ def result_of(
         "units": {c: spec.model.state(c).unit for c in found.problem.channels},
         **found.fitted.as_dict(),
         "held_out": None if found.held_out is None else found.held_out.as_dict(),
+        "orbits": orbits_result(found.orbits),
         **_sureness(found),
         "starts": [
             {
@@ -214,7 +219,7 @@ def _plain(values: Any) -> Any:
 
 def write_values(path: Path, spec: IdentificationSpec, found: Finding, sources: Sequence[Source]) -> None:
     """Write the identified, tied and fixed parameters as a preset, each with its origin."""
-    files = ", ".join(f"{s.file} (sha256 {s.sha256[:12]})" for s in sources)
+    files = ", ".join(f"{s.file} (sha256 {s.sha256[:12]})" for s in sources) or "measured orbits"
     phrases = {}
     for i, free in enumerate(found.problem.free):
         low, high = interval_of(found, i)
@@ -247,6 +252,9 @@ def residuals_of(spec: IdentificationSpec, found: Finding) -> xr.Dataset:
             for c, channel in enumerate(judgement.channels):
                 add(f"{channel}_measured", piece.measured[:, c])
                 add(f"{channel}_residual", residuals[:, c])
+    names = ["recording", "piece", "held_out", "time"]
+    for name in () if columns else names:
+        add(name, np.zeros(0))
     ds = xr.Dataset({name: ("sample", np.concatenate(values)) for name, values in columns.items()})
     for channel in found.problem.channels:
         unit = spec.model.state(channel).unit
@@ -255,7 +263,7 @@ def residuals_of(spec: IdentificationSpec, found: Finding) -> xr.Dataset:
     ds["time"].attrs = {"units": "s", "long_name": "time since the piece's start"}
     ds["held_out"].attrs = {"long_name": "1 in pieces that were not fitted"}
     attrs = {"model": model_attribute(spec.model), "title": spec.title, "channels": " ".join(found.problem.channels)}
-    return ds.set_coords(["recording", "piece", "held_out", "time"]).assign_attrs(attrs)
+    return ds.set_coords(names).assign_attrs(attrs)
 
 
 def lines_of(result: Mapping[str, Any]) -> list[str]:
@@ -272,6 +280,7 @@ def lines_of(result: Mapping[str, Any]) -> list[str]:
     lines += judgement_lines(result, result["units"])
     if result["held_out"] is not None:
         lines += [f"held out: {line}" for line in judgement_lines(result["held_out"], result["units"])]
+    lines += orbit_lines(result["orbits"])
     same = sum(s["best"] for s in result["starts"])
     lines.append(f"{same} of {len(result['starts'])} starts reached this optimum")
     lines.append(f"intervals: {result['covariance']['why']}")

@@ -201,6 +201,8 @@ def _stages(problem: Problem) -> list[Problem]:
     """Return the problem over short, longer and still longer stretches, with initial states estimated from the
     recordings.
     """
+    if not problem.pieces:
+        return [problem]
     longest = max(p.time[-1] for p in problem.pieces)
     period = slowest_period(problem)
     lengths = [share * period for share in STRETCHES if share * period < 0.8 * longest]

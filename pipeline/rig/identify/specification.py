@@ -16,6 +16,7 @@ from magpend_core.models import model_names
 from magpend_core.models.model import Model, Parameters
 from magpend_core.models.parameters import near_names
 from magpend_core.models.presets import is_file
+from pipeline.rig.identify.orbit_tables import OrbitsTable
 from pipeline.rig.identify.settings import setting_problems
 from pipeline.rig.identify.unknowns import Pair, ParameterTables, Unknown, table_at, validate
 from pipeline.specification.files import read_toml
@@ -126,7 +127,7 @@ class IdentificationSpec:
         Identified parameters.
     tied : dict
         By parameter, the factor and the name of the identified parameter that it follows.
-    sensors, recordings, fit, search
+    sensors, recordings, orbits, fit, search
         Tables of the specification.
     folder : Path
         Folder that paths of files are relative to.
@@ -141,6 +142,7 @@ class IdentificationSpec:
     tied: dict[str, tuple[float, str]]
     sensors: SensorsTable
     recordings: tuple[RecordingTable, ...]
+    orbits: tuple[OrbitsTable, ...]
     fit: FitTable
     search: SearchTable
     folder: Path
@@ -178,6 +180,7 @@ class IdentificationSpec:
             "tied": {name: [factor, other] for name, (factor, other) in self.tied.items()},
             "sensors": self.sensors.model_dump(mode="json"),
             "recordings": [r.model_dump(mode="json", exclude_none=True) for r in self.recordings],
+            "orbits": [t.model_dump(mode="json", exclude_none=True) for t in self.orbits],
             "fit": self.fit.model_dump(mode="json"),
             "search": self.search.model_dump(mode="json"),
         }
@@ -188,7 +191,10 @@ def _plain(bound: float) -> float | str:
     return bound if math.isfinite(bound) else str(bound)
 
 
-_KEYS = ("kind", "title", "model", "preset", "parameters", "identify", "tied", "sensors", "recordings", "fit", "search")
+_KEYS = (
+    "kind", "title", "model", "preset", "parameters", "identify", "tied", "sensors", "recordings", "orbits", "fit",
+    "search",
+)  # fmt: skip
 
 
 def load_identification(path: str | Path) -> IdentificationSpec:
@@ -224,6 +230,7 @@ def parse_identification(data: Mapping[str, Any], folder: Path) -> Identificatio
     fit = _table(data, "fit", FitTable, problems)
     search = _table(data, "search", SearchTable, problems)
     recordings = _recordings(data, folder, problems)
+    orbits = _orbits(data, folder, problems)
     if model is None:
         raise SpecError(problems)
     problems += _channel_problems(model, sensors, fit)
@@ -243,6 +250,7 @@ def parse_identification(data: Mapping[str, Any], folder: Path) -> Identificatio
         own.tied,
         sensors,
         recordings,
+        orbits,
         fit,
         search,
         folder,
@@ -277,9 +285,12 @@ def _table(data: Mapping[str, Any], key: str, model: type[Table], problems: list
 
 def _recordings(data: Mapping[str, Any], folder: Path, problems: list[str]) -> tuple[RecordingTable, ...]:
     """Validate the tables ``[[recordings]]``, and return those that are valid."""
-    tables = data.get("recordings")
-    if not isinstance(tables, list) or not tables:
-        problems.append("recordings: missing; add a table [[recordings]] with file and mapping for each.")
+    tables = data.get("recordings", [] if data.get("orbits") else None)
+    if not isinstance(tables, list) or (not tables and not data.get("orbits")):
+        problems.append(
+            "recordings: missing; add a table [[recordings]] with file and mapping for each, or [[orbits]] with "
+            "measured orbits."
+        )
         return ()
     found = []
     for i, table in enumerate(tables):
@@ -301,6 +312,22 @@ def _recordings(data: Mapping[str, Any], folder: Path, problems: list[str]) -> t
         if len(set(one.hold_out)) < len(one.hold_out):
             problems.append(f"recordings[{i}].hold_out: names a piece twice; name each once.")
     return tuple(found)
+
+
+def _orbits(data: Mapping[str, Any], folder: Path, problems: list[str]) -> tuple[OrbitsTable, ...]:
+    """Validate the tables ``[[orbits]]``, and return those that are valid."""
+    tables = data.get("orbits", [])
+    if not isinstance(tables, list):
+        problems.append("orbits: must be a list of tables; write [[orbits]].")
+        return ()
+    found = [validate(OrbitsTable, table, f"orbits[{i}]", problems) for i, table in enumerate(tables)]
+    problems += [
+        f"orbits[{i}].file = {one.file!r}: no such file ({folder / one.file}); paths count from the specification's "
+        "folder."
+        for i, one in enumerate(found)
+        if one is not None and one.file and not (folder / one.file).is_file()
+    ]
+    return tuple(one for one in found if one is not None)
 
 
 def _channel_problems(model: Model, sensors: SensorsTable | None, fit: FitTable | None) -> list[str]:

@@ -20,6 +20,7 @@ that
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -40,7 +41,7 @@ LAGS = 20
 SINGULAR = 1e-12
 """Ratio to the largest eigenvalue of the scaled information below which a direction is not determined."""
 
-Estimator = Literal["white", "pieces", "newey-west"]
+Estimator = Literal["white", "pieces", "newey-west", "orbits"]
 
 
 @dataclass(frozen=True)
@@ -67,6 +68,10 @@ class Linearised:
         Residual above which a robust loss grows slower than the square.
     following : ndarray (n_piece, n_states, n_free), optional
         Derivative of the optimum of the starts by the parameters.
+    orbits : ndarray (n_orbit_residuals, n_free), optional
+        Slopes of the residuals of measured orbits, in standard deviations.
+    orbit_residuals : ndarray (n_orbit_residuals,), optional
+        Their residuals.
     """
 
     information: np.ndarray
@@ -78,6 +83,14 @@ class Linearised:
     loss: str = "linear"
     loss_scale: float = 1.0
     following: np.ndarray | None = None
+    orbits: np.ndarray | None = None
+    orbit_residuals: np.ndarray | None = None
+
+    @property
+    def stated(self) -> np.ndarray:
+        """Information of data with a stated error, priors and measured orbits, (n_free, n_free)."""
+        own = np.diag(self.prior).astype(float)
+        return own if self.orbits is None else own + self.orbits.T @ self.orbits
 
     @property
     def n_samples(self) -> int:
@@ -240,6 +253,8 @@ def memory_of(rho: np.ndarray, n: int) -> tuple[int, float]:
 
 def n_effective(residuals: Sequence[np.ndarray]) -> list[float]:
     """Return the effective number of independent residuals of each channel, given their autocorrelation."""
+    if not residuals:
+        return []
     most = max(1, max(len(r) for r in residuals) // 3)
     found = []
     for c in range(residuals[0].shape[1]):
@@ -310,6 +325,8 @@ def covariance_of(fit: Linearised, scale: np.ndarray, estimator: Estimator | Non
     Covariance
         Covariance with its method and critical value.
     """
+    if not fit.residuals:
+        return _of_orbits(fit, scale)
     parts = _scores(fit)
     n_groups = len(set(fit.groups))
     correlated = is_autocorrelated(fit.residuals)
@@ -337,6 +354,22 @@ def covariance_of(fit: Linearised, scale: np.ndarray, estimator: Estimator | Non
     trace = float(np.trace(matrix[both] @ fit.information[both])) if known.size else 1.0
     inflation = float(np.sqrt(max(trace, 0.0) / max(known.size, 1)))
     return Covariance(matrix, estimator, why, critical, degrees, inflation)
+
+
+def _of_orbits(fit: Linearised, scale: np.ndarray) -> Covariance:
+    """Return the covariance of a fit to measured orbits alone; errors stated too small are raised to the scatter."""
+    assert fit.orbit_residuals is not None
+    residuals, n_free = fit.orbit_residuals, len(fit.prior)
+    degrees = len(residuals) + int((fit.prior > 0.0).sum()) - n_free
+    ratio = float(residuals @ residuals) / degrees if degrees > 0 else 1.0
+    inflation = math.sqrt(max(ratio, 1.0))
+    inverse, lost = _inverse(fit.information, scale)
+    why = "measured orbits count with their stated errors"
+    if inflation > 1.0:
+        why += f", raised by a factor of {inflation:.2g} to the scatter of the residuals"
+    return Covariance(
+        _without(inverse * inflation**2, lost), "orbits", why, _t(max(degrees, 1)), float(max(degrees, 1)), inflation
+    )
 
 
 def _inverse(information: np.ndarray, scale: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -390,7 +423,7 @@ def _pieces(fit: Linearised, parts: _Scores, scale: np.ndarray) -> tuple[np.ndar
     about = np.array(moves) - np.mean(moves, axis=0)
     matrix = (n - 1) / n * about.T @ about
     inverse, lost = _inverse(fit.information, scale)
-    matrix = matrix + (inverse * fit.prior) @ inverse
+    matrix = matrix + inverse @ fit.stated @ inverse
     return _without(matrix, lost), float(n - 1), _t(n - 1)
 
 
@@ -402,7 +435,7 @@ def _newey_west(fit: Linearised, parts: _Scores, scale: np.ndarray) -> tuple[np.
         own = [r[:, c] for r in fit.residuals]
         memory = max(memory, memory_of(pooled_autocorrelation(own, max(1, longest // 3)), n)[0])
     bandwidth = max(1, min(2 * memory, longest // 3))
-    meat = np.diag(fit.prior).astype(float)
+    meat = fit.stated
     for s in parts.scores:
         meat = meat + _bartlett(s, min(bandwidth, len(s) - 1))
     degrees = max(min(n_effective(fit.residuals)) - fit.n_fitted / len(fit.groups), 2.0)

@@ -6,15 +6,14 @@ import numpy as np
 import xarray as xr
 
 from magpend_core.models.model import Parameters
-from magpend_core.models.sectioned import of_flow
-from magpend_core.sampling import Drive, sample
 from pipeline.analysis.tabular import Row, Words, aligned, counted, number, values, words_of
 from pipeline.layout.vocabulary import FREQUENCY_DIM, model_of, parameter_name
 from pipeline.products.product import Table
+from pipeline.rig.measured_branch.shapes import shapes_of
 from pipeline.specification.problems import SpecError
 
-SAMPLES = 256
-"""Samples of a computed orbit in each period, for its amplitude."""
+REST = 1e-3
+"""Amplitude, in units of the measured one, below which a computed orbit is an equilibrium that a trajectory nears."""
 
 
 def amplitudes(branches: xr.Dataset, base: Parameters, state: str) -> np.ndarray:
@@ -34,8 +33,7 @@ def amplitudes(branches: xr.Dataset, base: Parameters, state: str) -> np.ndarray
     ndarray, (branch, point)
         0 for equilibria, NaN beyond a branch's own points.
     """
-    flow = of_flow(base).model
-    column, parameter = flow.state_names.index(state), str(branches.attrs["parameter"])
+    parameter = str(branches.attrs["parameter"])
     found = np.full((branches.sizes["branch"], branches.sizes["point"]), np.nan)
     for i in range(branches.sizes["branch"]):
         n, period = int(branches["n_points"][i]), int(branches["orbit_period"][i])
@@ -43,21 +41,11 @@ def amplitudes(branches: xr.Dataset, base: Parameters, state: str) -> np.ndarray
             found[i, :n] = 0.0
             continue
         own = {name: float(branches[name][i]) for name in base.names if name in branches}
-        points = branches["parameter"].values[i, :n]
-        seconds = branches["period_s"].values[i, :n]
-        fixed = base.replace(**own)
-        rows = [fixed if parameter == FREQUENCY_DIM else fixed.replace(**{parameter: float(v)}) for v in points]
-        driven = base.model.crossing is None
-        samples = sample(
-            flow.system,
-            np.array([of_flow(row).pack() for row in rows]),
-            branches["section"].values[i, :n, 0],
-            [s * np.arange(SAMPLES * period + 1) / (SAMPLES * period) for s in seconds],
-            drives=[Drive(np.full(period, s / period)) for s in seconds] if driven else None,
-            columns=[column],
-            limits_first_step=False,
-        )
-        found[i, :n] = 0.5 * np.ptp(samples.states[:, :, 0], axis=1)
+        packed = np.tile(base.replace(**own).pack(), (n, 1))
+        if parameter != FREQUENCY_DIM:
+            packed[:, base.names.index(parameter)] = branches["parameter"].values[i, :n]
+        states, seconds = branches["section"].values[i, :n, 0], branches["period_s"].values[i, :n]
+        found[i, :n] = shapes_of(base.model, packed, states, seconds, period, state).amplitude
     return found
 
 
@@ -115,21 +103,53 @@ def compare(measured: xr.Dataset, branches: xr.Dataset, computed: np.ndarray) ->
 
 def _nearest(one: xr.Dataset, branches: xr.Dataset, computed: np.ndarray) -> tuple[int, float, float] | None:
     """Return branch, amplitude and frequency of the computed orbit whose amplitude is nearest to a measured one."""
-    value, stability = float(one["value"]), int(one["stability"])
+    place = nearest_orbit(branches, computed, float(one["value"]), int(one["stability"]), float(one["amplitude"]))
+    if place is None:
+        return None
+    i, j, share = place
+    rates = int(branches["orbit_period"][i]) / branches["period_s"].values[i, j : j + 2]
+    amplitude = float(computed[i, j] + share * (computed[i, j + 1] - computed[i, j]))
+    return i, amplitude, float(rates[0] + share * (rates[1] - rates[0]))
+
+
+def nearest_orbit(
+    branches: xr.Dataset, computed: np.ndarray, value: float, stability: int, amplitude: float, period: int = 0
+) -> tuple[int, int, float] | None:
+    """Find the computed orbit at a value of the parameter whose amplitude is nearest to a given one.
+
+    Parameters
+    ----------
+    branches, computed
+        Result of the analysis ``branches``, and the amplitudes of its orbits.
+    value
+        Value of the parameter.
+    stability
+        Code of `STABILITIES`; only orbits of that stability count, unless it is unknown.
+    amplitude
+        Amplitude to be near to.
+    period
+        Only orbits of this period count; 0 for all.
+
+    Returns
+    -------
+    tuple of int, int, float, or None
+        Branch, index of the point before the value, and the share of the way to the next point; None without such
+        an orbit.
+    """
     best, least = None, np.inf
     for i in range(branches.sizes["branch"]):
-        n = int(branches["n_points"][i])
+        n, own = int(branches["n_points"][i]), int(branches["orbit_period"][i])
+        if not own or (period and own != period):
+            continue
         x, unstable = branches["parameter"].values[i, :n], branches["n_unstable"].values[i, :n] > 0
         for j in np.flatnonzero((x[:-1] - value) * (x[1:] - value) <= 0.0):
             near = j if abs(x[j] - value) <= abs(x[j + 1] - value) else j + 1
             if stability and unstable[near] != (stability == 2):
                 continue
             share = (value - x[j]) / (x[j + 1] - x[j]) if x[j + 1] != x[j] else 0.0
-            amplitude = float(computed[i, j] + share * (computed[i, j + 1] - computed[i, j]))
-            rates = 1.0 / branches["period_s"].values[i, j : j + 2]
-            away = abs(amplitude - float(one["amplitude"]))
-            if amplitude > 0.0 and away < least:
-                best, least = (i, amplitude, float(rates[0] + share * (rates[1] - rates[0]))), away
+            size = float(computed[i, j] + share * (computed[i, j + 1] - computed[i, j]))
+            if abs(size - amplitude) < least and size > REST * amplitude:
+                best, least = (i, int(j), share), abs(size - amplitude)
     return best
 
 

@@ -1,0 +1,115 @@
+"""Compute the branches of orbits along a parameter without a run: from orbits that trajectories settle on, and from
+equilibria.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import xarray as xr
+
+from magpend_core.models.model import Model, Parameters
+from magpend_core.sections import run_branches
+from magpend_core.status import Status
+from pipeline.analysis.branches import Scope, Start, dataset_of, explore
+from pipeline.analysis.branches.problems import Family
+from pipeline.layout.vocabulary import FREQUENCY_DIM
+
+SETTLING = 2000
+"""Most drive periods or returns for which a trajectory settles."""
+
+TOLERANCE = 1e-8
+"""Tolerance of the integration while trajectories settle; continuation then finds the orbits exactly."""
+
+
+@dataclass(frozen=True)
+class Along:
+    """Parameter interval of branches.
+
+    Attributes
+    ----------
+    model : Model
+        Forced model, or a flow with its Poincare section.
+    parameter : str
+        Parameter that changes, ``frequency`` for the drive frequency.
+    low, high : float
+        Interval [SI].
+    frequency_hz : float
+        Drive frequency [Hz], unless it is the parameter; of a flow one over the longest time between crossings.
+    max_period : int
+        Longest period of the orbits [drive periods or returns].
+    """
+
+    model: Model
+    parameter: str
+    low: float
+    high: float
+    frequency_hz: float = float("nan")
+    max_period: int = 2
+
+    def family(self, period: int, packed: np.ndarray) -> Family:
+        """Return the family of the orbits of one period, or with period 0 of the equilibria, along the parameter."""
+        scale = self.high - self.low
+        return Family(self.model.system, period, self.frequency_hz, packed, (self.parameter,), (scale,))
+
+    def rows(self, packed: np.ndarray, values: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
+        """Return packed parameters (n, n_parameters) and drive frequencies (n,) at values of the parameter."""
+        rows, frequency = np.tile(packed, (len(values), 1)), np.full(len(values), self.frequency_hz)
+        if self.parameter == FREQUENCY_DIM:
+            frequency = np.array(values, float)
+        else:
+            rows[:, self.model.parameter_names.index(self.parameter)] = values
+        return rows, frequency
+
+
+def branches_along(along: Along, parameters: Parameters, values: Sequence[float], states: np.ndarray) -> xr.Dataset:
+    """Compute the branches that are connected with settled orbits and equilibria.
+
+    Parameters
+    ----------
+    along
+        Parameter and interval.
+    parameters
+        Parameters of the model.
+    values
+        Values of the parameter at which trajectories settle, shape (n,).
+    states
+        Their initial states, shape (n, n_states).
+
+    Returns
+    -------
+    Dataset
+        As of the analysis ``branches``.
+    """
+    packed = parameters.pack()
+    starts = _settled(along, packed, values, states)
+    if along.model.crossing is not None:
+        rest = np.zeros(len(along.model.states))
+        starts += [Start(along.family(0, packed), rest, value) for value in (along.low, along.high)]
+    found = explore(starts, Scope(along.low, along.high, along.max_period, 1))
+    return dataset_of(found, along.parameter, parameters)
+
+
+def _settled(along: Along, packed: np.ndarray, values: Sequence[float], states: np.ndarray) -> list[Start]:
+    """Integrate trajectories until they close, and return the closed ones as starting orbits."""
+    rows, frequency = along.rows(packed, values)
+    found = run_branches(
+        rows[:, None],
+        frequency[:, None],
+        states,
+        n_transient=SETTLING,
+        n_keep=1,
+        rtol=TOLERANCE,
+        atol=TOLERANCE,
+        stop_when_closed=True,
+        max_orbit_period=along.max_period,
+        system=along.model.system,
+    )
+    is_closed = found.status[:, 0] == Status.PERIODIC
+    return [
+        Start(along.family(int(found.orbit_period[i, 0]), rows[i]), found.section[i, 0, -1], float(value))
+        for i, value in enumerate(values)
+        if is_closed[i]
+    ]

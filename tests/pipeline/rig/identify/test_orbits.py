@@ -1,0 +1,235 @@
+"""Measured orbits as data of a fit, on an oscillator with closed forms.
+
+    r' = (m - h) r + r^3 - g r^5,  angle' = w
+
+Its cycles have g r^4 - r^2 - (m - h) = 0 and frequency w/2 pi: the larger r is stable, the smaller one is not. The fold
+of cycles lies at m = h - 1/(4 g), the Hopf point at m = h.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize_scalar
+
+from pipeline.rig.identify.build import build
+from pipeline.rig.identify.check_orbits import check_orbits, is_table
+from pipeline.rig.identify.comparison import compare
+from pipeline.rig.identify.identification import identify
+from pipeline.rig.identify.local import fit_local
+from pipeline.rig.identify.measured_orbits import read_orbits
+from pipeline.rig.identify.objective import evaluate
+from pipeline.rig.identify.specification import parse_identification
+from pipeline.specification.problems import SpecError
+
+TRUTH = {"g": 1.2, "h": 0.05, "w": 6.0}
+
+MODEL = {
+    "name": "bautin-cycle",
+    "states": {"x": {"scale": 1.0}, "y": {"scale": 1.0}},
+    "parameters": {name: {"value": value} for name, value in {"m": 0.0, **TRUTH}.items()},
+    "define": {"r2": "x**2 + y**2", "growth": "m - h + r2 - g*r2**2"},
+    "equations": {"x": "growth*x - w*y", "y": "growth*y + w*x"},
+}
+
+SECTION = {"of": "y", "value": 0.0, "direction": "up", "longest": 20.0}
+
+START = {"g": {"start": 1.15, "bounds": [0.5, 3.0]}, "h": {"start": 0.04, "bounds": [-0.5, 0.5]}, "w": {"start": 6.2}}
+
+STABLE, UNSTABLE = (-0.1, -0.05, 0.1), (-0.1, -0.02)
+
+
+def radius(m, sign, g=TRUTH["g"], h=TRUTH["h"]):
+    return math.sqrt((1.0 + sign * math.sqrt(1.0 + 4.0 * g * (m - h))) / (2.0 * g))
+
+
+def table_of(path, values, sign, sd=0.002, factor=1.0):
+    lines = ["m,name,stable,amplitude,amplitude_sd,frequency,frequency_sd"]
+    for m in values:
+        size = factor * radius(m, sign)
+        word = "yes" if sign > 0 else "no"
+        lines.append(f"{m},{word} {m},{word},{size!r},{sd},{TRUTH['w'] / (2 * math.pi)!r},0.001")
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+@pytest.fixture
+def data(tmp_path):
+    table_of(tmp_path / "stable.csv", STABLE, 1)
+    table_of(tmp_path / "unstable.csv", UNSTABLE, -1)
+    common = {"section": SECTION, "range": [-0.3, 0.3]}
+    return {
+        "kind": "identification",
+        "model": MODEL,
+        "identify": {name: dict(one) for name, one in START.items()},
+        "orbits": [{"file": "stable.csv", **common}, {"file": "unstable.csv", **common}],
+    }
+
+
+def built(data, folder):
+    spec = parse_identification(data, folder)
+    return build(spec, [], read_orbits(spec))
+
+
+def expected(theta):
+    """Residuals of both tables at values of g, h, w, from the closed form."""
+    g, h, w = theta
+    rows = []
+    for values, sign in ((STABLE, 1), (UNSTABLE, -1)):
+        for m in values:
+            rows += [(radius(m, sign) - radius(m, sign, g, h)) / 0.002, (TRUTH["w"] - w) / (2 * math.pi) / 0.001]
+    return np.array(rows)
+
+
+def test_evaluate__residuals_and_slopes_are_those_of_the_closed_form(data, tmp_path):
+    problem = built(data, tmp_path).problem
+    theta = np.array([1.1, 0.03, 6.1])
+    found = evaluate(problem, theta[None], problem.starts[None], slopes=True)[0]
+    np.testing.assert_allclose(found.rows, expected(theta), rtol=1e-7, atol=1e-5)
+    for i, h in enumerate((1e-6, 1e-6, 1e-6)):
+        step = np.eye(3)[i] * h
+        slope = (expected(theta + step) - expected(theta - step)) / (2 * h)
+        np.testing.assert_allclose(found.jacobian[:, i], slope, rtol=1e-5, atol=1e-3)
+
+
+def test_fit_local__finds_the_parameters_from_stable_and_unstable_cycles(data, tmp_path):
+    problem = built(data, tmp_path).problem
+    fit = fit_local(problem, problem.start)
+    assert fit.converged
+    np.testing.assert_allclose(fit.theta, list(TRUTH.values()), rtol=1e-6)
+
+
+def test_bifurcations__are_data(data, tmp_path):
+    g, h = TRUTH["g"], TRUTH["h"]
+    fold = h - 1.0 / (4.0 * g)
+    data["orbits"] = [
+        {
+            "parameter": "m",
+            "section": SECTION,
+            "range": [-0.4, 0.3],
+            "bifurcations": [
+                {"kind": "fold", "interval": [fold - 0.01, fold + 0.01]},
+                {"kind": "hopf", "interval": [h - 0.01, h + 0.01]},
+            ],
+        }
+    ]
+    del data["identify"]["w"]
+    problem = built(data, tmp_path).problem
+    theta = np.array([1.1, 0.03])
+    found = evaluate(problem, theta[None], problem.starts[None], slopes=True)[0]
+    sd = 0.02 / 3.919928
+    np.testing.assert_allclose(found.rows * sd, [fold - (0.03 - 1 / 4.4), h - 0.03], atol=1e-7)
+    np.testing.assert_allclose(found.jacobian * sd, [[-1 / (4 * 1.1**2), -1.0], [0.0, -1.0]], atol=1e-4)
+    np.testing.assert_allclose(fit_local(problem, problem.start).theta, [g, h], atol=1e-6)
+
+
+def test_parameter_sd__compares_the_nearest_orbit_beside_a_fold(data, tmp_path):
+    # beyond the fold at these parameters there is no orbit; the nearest one is
+    sd, g, h, measured = 0.02, 1.6, 0.05, radius(-0.1, 1)
+    data["orbits"] = [{"file": "stable.csv", "section": SECTION, "range": [-0.3, 0.3], "parameter_sd": sd}]
+    problem = built(data, tmp_path).problem
+    found = evaluate(problem, np.array([[g, h, TRUTH["w"]]]), problem.starts[None], slopes=True)[0]
+    assert h - 1 / (4 * g) > -0.12
+
+    def distance(r):
+        return ((measured - r) / 0.002) ** 2 + ((-0.1 - (g * r**4 - r**2 + h)) / sd) ** 2
+
+    best = minimize_scalar(distance, bounds=(0.3, 1.2), method="bounded", options={"xatol": 1e-10})
+    assert float(found.rows[:3] @ found.rows[:3]) == pytest.approx(best.fun, rel=1e-6)
+    up = evaluate(problem, np.array([[g + 1e-4, h, TRUTH["w"]]]), problem.starts[None], slopes=False)[0]
+    down = evaluate(problem, np.array([[g - 1e-4, h, TRUTH["w"]]]), problem.starts[None], slopes=False)[0]
+    assert found.jacobian[:, 0] @ found.rows == pytest.approx((up.cost - down.cost) / 2e-4, rel=1e-3)
+
+
+def test_parameter_sd__adds_to_the_variance_along_the_branch(data, tmp_path):
+    # effective variance: sd_A^2 + (dA/dm sd_m)^2
+    sd, (g, h, _) = 0.02, TRUTH.values()
+    data["orbits"] = [{"file": "stable.csv", "section": SECTION, "range": [-0.3, 0.3], "parameter_sd": sd}]
+    problem = built(data, tmp_path).problem
+    theta = np.array([list(TRUTH.values())])
+    found = evaluate(problem, theta, problem.starts[None], slopes=True)[0]
+    for i, m in enumerate(STABLE):
+        by_g = (radius(m, 1, g + 1e-6) - radius(m, 1, g - 1e-6)) / 2e-6
+        by_m = (radius(m + 1e-6, 1) - radius(m - 1e-6, 1)) / 2e-6
+        own = found.jacobian[3 * i : 3 * i + 3, 0]
+        assert own @ own == pytest.approx(by_g**2 / (0.002**2 + (by_m * sd) ** 2), rel=1e-4)
+
+
+def test_lost__an_orbit_beyond_its_fold_is_counted(data, tmp_path):
+    problem = built(data, tmp_path).problem
+    found = evaluate(problem, np.array([[2.5, 0.05, 6.0]]), problem.starts[None], slopes=False)[0]
+    assert 1 - 4 * 2.5 * 0.15 < 0 < 1 - 4 * 2.5 * 0.07
+    assert found.failed == 3
+    assert found.cost > 1e11
+
+
+def write(folder, data):
+    """Write a specification as TOML."""
+
+    def value(v):
+        if isinstance(v, dict):
+            return "{ " + ", ".join(f"{k} = {value(x)}" for k, x in v.items()) + " }"
+        return json.dumps(v)
+
+    lines = [f"{k} = {value(v)}" for k, v in data.items() if k != "orbits"]
+    for table in data["orbits"]:
+        lines += ["[[orbits]]", *(f"{k} = {value(v)}" for k, v in table.items())]
+    path = folder / "fit.toml"
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def test_identify__judges_orbits_that_were_held_out(data, tmp_path):
+    data["orbits"][1]["hold_out"] = ["no -0.02"]
+    data["search"] = {"n_starts": 1, "profiles": False}
+    path = write(tmp_path, data)
+    result = identify(path, tmp_path / "out", figures=True, echo=lambda line: None)
+    rows = result["orbits"][1]["orbits"]
+    assert [row["held_out"] for row in rows] == [False, True]
+    assert result["orbits"][1]["rms"]["held_out"]["unstable"]["amplitude"] < 1e-4
+    # information of closed-form slopes
+    theta = np.array([result["estimates"][name]["value"] for name in "ghw"])
+    kept = np.r_[:8]
+    slopes = np.array([(expected(theta + s) - expected(theta - s))[kept] / 2e-6 for s in 1e-6 * np.eye(3)])
+    np.testing.assert_allclose(result["covariance"]["matrix"], np.linalg.inv(slopes @ slopes.T), rtol=1e-3, atol=1e-12)
+    assert (tmp_path / "out/figures/branch-0.png").is_file()
+    first = (tmp_path / "out/result.json").read_bytes()
+    # resumed from the kept outcome: the same bytes
+    (tmp_path / "out/result.json").unlink()
+    identify(path, tmp_path / "out", figures=False, echo=lambda line: None)
+    again = json.loads((tmp_path / "out/result.json").read_text())
+    assert again["estimates"] == json.loads(first)["estimates"]
+    assert again["orbits"] == json.loads(first)["orbits"]
+
+    table_of(tmp_path / "more.csv", (0.05, 0.15), 1, factor=1.1)
+    assert is_table(tmp_path / "more.csv")
+    judged = check_orbits(tmp_path / "out", tmp_path / "more.csv")
+    assert judged["rms"]["fitted"]["stable"]["amplitude"] == pytest.approx(1 - 1 / 1.1, abs=1e-5)
+    table = compare([tmp_path / "out"])
+    assert table.rows[0]["orbits_held_out"] < 1e-4
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"hold_out": ["nobody"]}, "hold_out: 'nobody' is no orbit"),
+        ({"section": {"of": "z"}}, "'z': is not a state"),
+        ({"file": "none.csv"}, "no such file"),
+        ({"range": [0.3, -0.3]}, "must rise"),
+        ({"parameters": {"q": 1.0}}, "parameters.q"),
+        ({"quantities": ["amplitudes"]}, "quantities"),
+    ],
+)
+def test_read_orbits__names_the_problem(data, tmp_path, change, words):
+    data["orbits"] = [{**data["orbits"][0], **change}]
+    with pytest.raises(SpecError, match=words):
+        read_orbits(parse_identification(data, tmp_path))
+
+
+def test_build__an_orbit_that_the_model_does_not_have_at_the_start(data, tmp_path):
+    data["identify"]["g"]["start"] = 2.5
+    with pytest.raises(SpecError, match=r"'yes -0.1': at the start of the fit the model has no stable orbit"):
+        built(data, tmp_path)
