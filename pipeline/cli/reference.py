@@ -172,12 +172,15 @@ def specification() -> str:
 def identification() -> str:
     """Return Markdown tables of the keys of an identification's TOML file."""
     from pipeline.rig.identify import specification as tables
+    from pipeline.rig.identify.orbit_tables import BifurcationTable, OrbitsTable
     from pipeline.rig.identify.unknowns import Identified
 
     parts = [
         ("[identify] NAME = {...}", Identified, "NAME is a parameter of the model."),
         ("[sensors]", tables.SensorsTable, ""),
         ("[[recordings]]", tables.RecordingTable, ""),
+        ("[[orbits]]", OrbitsTable, "Measured orbits of one branch."),
+        ("[[orbits.bifurcations]]", BifurcationTable, ""),
         ("[fit]", tables.FitTable, ""),
         ("[search]", tables.SearchTable, ""),
     ]

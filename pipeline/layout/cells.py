@@ -224,7 +224,7 @@ class Inputs:
 
 
 class CellMap:
-    """Map between a block of cells of the cube and the kernel's arrays over branches and their parameter points.
+    """Map between a block of cells of the cube and the kernel's arrays, which have the dims (branch, parameter point).
 
     In a sweep each cell is a branch with one point. In a continuation the branches of a block walk the
     block's part of the path: upward ones from its first point, downward ones from its last.
@@ -262,7 +262,9 @@ class CellMap:
         return Inputs(parameters, values.get(FREQUENCY, fixed), self._states.at(self._start_of(index[:, :, 0])))
 
     def last_cells(self, block: tuple[slice, ...]) -> tuple[slice, ...]:
-        """Return the last cell of each branch in a block whose branches all run in one direction."""
+        """Return slices that select the last cell of each branch of a block. All branches of the block must run in the
+        same direction.
+        """
         assert self.path is not None
         part = block[self.path]
         down = self._down(np.array([block[-1].start]))[0]
@@ -279,8 +281,8 @@ class CellMap:
         return np.asarray(np.ravel_multi_index(tuple(own), self._states.shape))
 
     def _branch_first(self, cells: np.ndarray, block: tuple[slice, ...]) -> np.ndarray:
-        """Return cell indices, shape (dim, branch, point), with the points in the order in which each branch visits
-        them.
+        """Return cell indices, shape (dim, branch, point). The points of a branch are in the order in which the
+        continuation visits them.
         """
         sizes = [s.stop - s.start for s in block]
         index = cells + np.array([s.start for s in block], dtype=np.int64).reshape(-1, 1)

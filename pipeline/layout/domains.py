@@ -26,7 +26,7 @@ MOST_CORNERS = 64
 
 
 def check_starts(spec: Spec) -> None:
-    """Refuse a run if its model's equations, written as text, cannot be evaluated at the initial conditions.
+    """Refuse a run of a model written as text if its equations cannot be evaluated at the initial conditions.
 
     They are evaluated at time 0 at all starts (at most `MOST_STARTS`), at both ends of every axis. If they
     have values at some of the ends, the run is not refused: the status of its cells shows where they have

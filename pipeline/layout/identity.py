@@ -1,4 +1,6 @@
-"""Define when two runs are the same: by a digest of their identity, and by the keys in which identities differ."""
+"""Define when two runs are the same: compute a run's identity and its digest, and list the differences between two
+identities.
+"""
 
 from __future__ import annotations
 
@@ -77,7 +79,9 @@ def code_version(module: str) -> str:
 
 
 def canonical(data: Any) -> str:
-    """Return canonical JSON, the same text for equal data: sorted keys, shortest round-trip numbers."""
+    """Return data as canonical JSON (sorted keys, shortest round-trip numbers), so that equal data give the
+    same text.
+    """
     return json.dumps(data, sort_keys=True, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
 
 

@@ -119,7 +119,7 @@ def check_space(plan: Plan, folder: Path | None, n_cells: int | None = None) -> 
 
 
 def _nearest(folder: Path) -> Path:
-    """Return the folder, or its nearest parent that exists."""
+    """Return a folder if it exists, else its nearest parent that exists."""
     absolute = folder.absolute()
     return next(place for place in (absolute, *absolute.parents) if place.exists())
 
@@ -133,7 +133,7 @@ def _free_files(place: Path) -> int | None:
 
 
 def in_words(n_bytes: float) -> str:
-    """Format a number of bytes, such as ``1.5 GB``."""
+    """Format a number of bytes with a unit, such as ``1.5 GB``."""
     units = ["bytes", "kB", "MB", "GB", "TB", "PB"]
     while n_bytes >= 1000 and len(units) > 1:
         n_bytes /= 1000

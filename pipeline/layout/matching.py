@@ -42,13 +42,15 @@ def deciding(identity: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def unlike(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
-    """Return a line of text per difference in integration settings that keeps two runs from sharing cells."""
+    """Return a line of text for each difference in integration settings between two runs. Runs with such a difference
+    share no cells.
+    """
     return differences(deciding(old), deciding(new))
 
 
 @dataclass(frozen=True)
 class Way:
-    """Order in which a continuation visits its parameter values, and the position of a block of cells in it.
+    """Order in which a continuation visits its parameter values, and the position of a block of cells in this order.
 
     Attributes
     ----------
@@ -66,7 +68,7 @@ class Way:
 
 
 def way_of(spec: Spec, block: tuple[slice, ...]) -> Way | None:
-    """Return the parameter values of a continuation in the order in which a block of cells visits them; None for a
+    """Return the order in which a block of cells of a continuation visits the parameter values. Return None for a
     sweep.
     """
     if spec.continuation is None:
@@ -115,7 +117,8 @@ class Finder:
         self.shape = (*(len(a.values) for a in self._axes), *n_last)
 
     def find(self, inputs: Inputs, way: Way | None = None) -> np.ndarray:
-        """Return the flat index in this run of each given cell, shape (branch, point); `NOWHERE` if this run lacks it.
+        """Return the flat index in this run of each given cell, shape (branch, point). The index is `NOWHERE` for cells
+        that this run lacks.
 
         Parameters
         ----------
@@ -219,7 +222,9 @@ class _Rows:
 
 
 def _bits(values: Any) -> np.ndarray:
-    """Return the bit patterns of floats as integers: 0.0 and -0.0 differ, equal NaN patterns agree."""
+    """Return the bit patterns of floats as integers. In this form 0.0 and -0.0 differ, and NaNs with the same bits are
+    equal.
+    """
     return np.asarray(np.ascontiguousarray(values, np.float64).view(np.int64)).reshape(np.shape(values))
 
 

@@ -102,7 +102,7 @@ class Plan:
 
     @property
     def n_points(self) -> int:
-        """Number of parameter points per branch; 1 in a sweep."""
+        """Number of parameter points per branch. It is 1 in a sweep."""
         return 1 if self.path is None else self.shape[self.path]
 
     @property
@@ -112,7 +112,7 @@ class Plan:
 
     @property
     def task_grid(self) -> tuple[int, ...]:
-        """Number of tasks along each dim."""
+        """Number of tasks along each dim of the cube."""
         return tuple(-(-n // b) for n, b in zip(self.shape, self.block, strict=True))
 
     @property
@@ -155,14 +155,16 @@ class Plan:
         return self.directions[first * len(self.directions) // self.shape[-1]] == "down"
 
     def depth(self, index: int) -> int:
-        """Return the number of tasks that precede a task along its branches; 0 in a sweep."""
+        """Return the number of tasks that compute earlier points of a task's branches. Return 0 in a sweep."""
         if self.path is None:
             return 0
         place = self._place(index)[self.path]
         return self.task_grid[self.path] - 1 - place if self.walks_down(index) else place
 
     def predecessor(self, index: int) -> int | None:
-        """Return the index of the task whose last states this task continues from; None if its branches start here."""
+        """Return the index of the task whose last states a task continues from. Return None if the task's branches
+        begin in the task itself.
+        """
         if self.path is None or self.depth(index) == 0:
             return None
         stride = math.prod(self.task_grid[self.path + 1 :])
@@ -177,7 +179,9 @@ class Plan:
         return math.prod(s.stop - s.start for s in self.task(index))
 
     def chunks(self, variable: Variable) -> tuple[int, ...]:
-        """Return the chunk shape of a variable: the task's block, cut along the continuation dim if it is too large."""
+        """Return the chunk shape of a variable: a task's block of cells and the variable's own dims. A block that is
+        too large is cut along the continuation dim.
+        """
         sizes = self.sizes
         chunk = list(self.block)
         if self.path is not None:
@@ -243,7 +247,9 @@ def mean_seconds_per_period(spec: Spec) -> float:
 
 
 def periods_per_cell(spec: Spec) -> tuple[float, float]:
-    """Return the most drive periods integrated per cell, and the cost of the cell's products in drive periods."""
+    """Return the largest number of drive periods that a cell is integrated for, and the cost of its products in drive
+    periods.
+    """
     products = sum(CELL_PRODUCTS[name].cost(options) for name, options in spec.products.items())
     return float(spec.integration.n_transient + spec.integration.n_keep), float(products)
 
@@ -283,8 +289,8 @@ def _wanted_seconds(core_seconds: float) -> float:
 
 
 def _walk_block(spec: Spec, cells: CellMap, wanted: int, seconds_per_cell: float) -> tuple[int, ...]:
-    """Return the block shape of a continuation's task: branches of one direction, over a stretch of the parameter
-    axis.
+    """Return the block shape of a continuation's task. A task takes branches of one direction over a stretch of the
+    parameter axis.
     """
     assert spec.continuation is not None
     assert cells.path is not None
@@ -310,15 +316,15 @@ def _walk_block(spec: Spec, cells: CellMap, wanted: int, seconds_per_cell: float
 
 
 def _group(n_seeds: int, wanted: int, most: int) -> int:
-    """Return the number of initial states per task, a divisor of `n_seeds`, so that no task mixes up and down
-    branches.
+    """Return the number of initial states per task. It divides `n_seeds`, so that no task has branches of both
+    directions.
     """
     divisors = [d for d in range(1, min(n_seeds, max(most, 1)) + 1) if n_seeds % d == 0]
     return min(divisors, key=lambda d: (max(d / wanted, wanted / d), -d))
 
 
 def _share(n: int, most: int) -> int:
-    """Return the size of equal parts of `n`: as few parts as possible, none larger than `most`."""
+    """Return the size of the parts if `n` is split into the fewest about equal parts of at most `most` each."""
     return -(-n // -(-n // most))
 
 
@@ -334,8 +340,8 @@ def _bytes_per_cell(spec: Spec) -> int:
 
 
 def _block(shape: tuple[int, ...], path: int | None, wanted: int) -> tuple[int, ...]:
-    """Return the shape of a block of about `wanted` cells, filled from the last dim; the continuation dim is taken
-    whole.
+    """Return the shape of a block of about `wanted` cells. It is filled from the last dim, and the continuation dim is
+    taken whole.
     """
     block = [1] * len(shape)
     for i in reversed(range(len(shape))):
@@ -348,7 +354,8 @@ def _block(shape: tuple[int, ...], path: int | None, wanted: int) -> tuple[int, 
 
 
 def _tile(shape: tuple[int, ...], stride: int, wanted: int) -> tuple[int, ...]:
-    """Return the side lengths of a tile of at most `wanted` cells if possible, as multiples of the stride.
+    """Return the side lengths of a task's tile of a refined grid, as multiples of the stride. The tile has at most
+    `wanted` cells if possible.
 
     A side may also be a whole axis. The shortest side that can grow is enlarged first. Then the tiles along
     an axis are made about equal.

@@ -82,7 +82,9 @@ def split_dims(cells: xr.DataArray) -> tuple[tuple[str, ...], tuple[str, ...]]:
 
 
 def axis_name(parameter: str) -> str:
-    """Return the name of a parameter's dim in the cube; accept both names of the drive frequency."""
+    """Return the name of a parameter's dim in the cube. The drive frequency may be given as ``frequency`` or
+    ``frequency_hz``.
+    """
     return FREQUENCY_DIM if parameter in (FREQUENCY, FREQUENCY_DIM) else parameter
 
 
@@ -153,7 +155,8 @@ def frequency_of(model: Model | None, values: Mapping[str, Any]) -> float:
 
 
 def parameters_of(ds: xr.Dataset) -> Parameters:
-    """Read a run's parameters from the dataset attribute ``parameters``, one line ``name = value`` for each.
+    """Read a run's parameters from the dataset attribute ``parameters``, which has a line ``name = value`` for each
+    parameter.
 
     Raises
     ------

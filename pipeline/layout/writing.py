@@ -118,7 +118,7 @@ def _open_plain(path: str, flags: int) -> int:
 
 
 def write_atomically(path: Path, content: str | bytes) -> None:
-    """Write a file atomically, so that a crash never leaves it incomplete; replace a link at its path.
+    """Write a file atomically, so that a crash never leaves it incomplete. A link at the path is replaced by the file.
 
     Raises
     ------

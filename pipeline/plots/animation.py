@@ -78,7 +78,7 @@ class Animation:
         return f"{self.n_frames} frames, {self.n_frames / self.fps:.3g} s: {told}"
 
     def frames(self) -> Iterator[Pixels]:
-        """Draw the frames one after the other, each (height, width, 3)."""
+        """Yield the frames one after the other as RGB images, shape (height, width, 3)."""
         canvas: Any = FigureCanvasAgg(self.figure)
         with style.TEXT_LOCK:
             canvas.draw()

@@ -128,8 +128,8 @@ def _axes(attractors: xr.Dataset, at: Mapping[str, float] | None) -> tuple[str, 
 def _codes(
     data: xr.Dataset, part: xr.Dataset, axes: tuple[str, str], cast: palette.Cast
 ) -> tuple[np.ndarray, dict[int, int]]:
-    """Return the colour code of each cell (attractor id, `_OTHERS`, or a grey from `_FIRST_GREY` down), and cells per
-    code.
+    """Return each cell's colour code (attractor id, `_OTHERS`, or a grey from `_FIRST_GREY` down), and the number of
+    cells per code.
     """
     ids, dims = np.maximum(data["outcome"].values, -1), part["attractor_id"].dims
     table = np.full(len(cast.names) + 1, _OTHERS, np.int32)
@@ -145,7 +145,9 @@ def _codes(
 
 
 def _colour_table(cast: palette.Cast) -> np.ndarray:
-    """Return RGB colours by code, shape (codes, 3): attractor ids first, so that negative codes index from the end."""
+    """Return the RGB colour of each code, shape (codes, 3). Attractor ids come first, and negative codes index from the
+    end.
+    """
     greys = list(reversed(palette.GREYS.values()))
     colours = [*(cast.colours[i] for i in range(len(cast.names))), *greys, palette.OTHERS]
     return np.array([to_rgb(c) for c in colours], dtype=np.float32)

@@ -115,7 +115,7 @@ class Diagram:
         at: Mapping[str, float] | None = None,
         frame: style.Frame = style.WIDE,
     ) -> Diagram:
-        """Make the bifurcation diagram of a cube, after reading the cube once for ranges; arguments as for
+        """Make the bifurcation diagram of a cube. The cube is read once to find the ranges. The arguments are those of
         `plot_bifurcation`.
         """
         if quantity and state:
@@ -208,7 +208,7 @@ class Diagram:
 
 
 def with_diagram(data: xr.Dataset, drawn: xr.Dataset) -> xr.Dataset:
-    """Add the data of a bifurcation diagram to those of a figure, under names that end in ``_diagram``."""
+    """Add the data of a bifurcation diagram to the data of a figure, under names that end in ``_diagram``."""
     drawn = drawn.drop_vars([c for c in drawn.coords if c in data.variables or c in data.dims])
     renamed = drawn.rename({str(n): f"{n}_diagram" for n in (*drawn.data_vars, *drawn.dims)})
     return data.merge(renamed).assign_attrs(data.attrs)
@@ -266,8 +266,8 @@ def swept_parameter(ds: xr.Dataset) -> str:
 
 
 def _layers(names: Sequence[str], layout: str) -> list[tuple[int, ...]]:
-    """Return the layers (directions of continuation) of each panel; raise ValueError if layout ``side`` lacks a
-    direction.
+    """Return the layers (directions of continuation) of each panel. Raise ValueError if the cube lacks a direction that
+    layout ``side`` needs.
     """
     if layout == "overlay":
         return [tuple(range(len(names)))]

@@ -135,7 +135,9 @@ def _stored(ds: xr.Dataset) -> xr.Dataset:
 
 
 def pieces(ds: xr.Dataset, branch: int, measure: Measure) -> Iterator[tuple[np.ndarray, np.ndarray, bool]]:
-    """Yield polylines of a branch: one per section point and stretch of equal stability, cut where an angle wraps."""
+    """Yield polylines of a branch, one for each section point of the orbit and each stretch of equal stability. A line
+    is cut where an angle wraps.
+    """
     n = int(ds["n_points"][branch])
     period = max(int(ds["orbit_period"][branch]), 1)
     x = ds["parameter"].values[branch, :n]
@@ -173,8 +175,8 @@ class _Name:
 
 
 def _mark(ax: Axes, ds: xr.Dataset, chosen: list[int], measure: Measure, scale: bool) -> list[_Name]:
-    """Draw markers at the bifurcations of chosen branches; return labels for those where a stable orbit appears or
-    disappears.
+    """Draw markers at the bifurcations of chosen branches. Return labels for the bifurcations at which a stable orbit
+    appears or disappears.
     """
     names = []
     size = 3.4 if style.figure_of(ax).frame.compact else 4.5
@@ -206,7 +208,8 @@ def _mark(ax: Axes, ds: xr.Dataset, chosen: list[int], measure: Measure, scale: 
 
 
 def _name(ax: Axes, names: list[_Name]) -> None:
-    """Write labels where they cover neither lines nor other labels, each joined by a thin line to its bifurcation.
+    """Write labels where they cover neither lines nor other labels, and join each label to its bifurcation by a thin
+    line.
 
     Short periods come first. A label without room nearby is left out; its marker remains.
     """
@@ -242,7 +245,9 @@ def _name(ax: Axes, names: list[_Name]) -> None:
 
 
 def _ink(drawn: Line2D, points: float) -> np.ndarray:
-    """Return points [pt] covered by a plotted line, sampled about every 3 pt, or by its markers."""
+    """Return positions [pt] about every 3 pt along a plotted line. If only markers are drawn, return the positions of
+    the markers.
+    """
     line = drawn.get_transform().transform(np.asarray(drawn.get_xydata(), dtype=np.float64)) * points
     line = line[np.isfinite(line).all(axis=1)]
     if len(line) < 2 or drawn.get_linestyle() == "None":

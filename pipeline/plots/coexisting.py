@@ -119,8 +119,8 @@ def _points(part: xr.Dataset, parameter: str, measure: labels.Measure) -> xr.Dat
 
 
 def _loops(found: xr.Dataset, part: xr.Dataset, parameter: str) -> list[tuple[float, float]]:
-    """Return the parameter limits of hysteresis loops at the values chosen for other parameters, widened by half a
-    step.
+    """Return the parameter limits of the hysteresis loops at the chosen values of the other parameters. Each loop is
+    widened by half a step at both ends.
     """
     axis = part[parameter].values.astype(np.float64)
     edges = style.edges(axis)
@@ -137,7 +137,9 @@ def _loops(found: xr.Dataset, part: xr.Dataset, parameter: str) -> list[tuple[fl
 
 
 def _spread(one: xr.Dataset, parameter: str, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return parameter value, plotted value and parameter index of an attractor's points at chosen parameters."""
+    """Return three arrays for an attractor's points at the chosen parameter values: parameter value, plotted value and
+    parameter index.
+    """
     values = one["value"].transpose(parameter, "point").values
     row, column = np.nonzero(np.isfinite(values) & chosen[:, None])
     return one[parameter].values[row].astype(np.float64), values[row, column], row
@@ -152,7 +154,9 @@ def _draw_weighted(ax: Axes, one: xr.Dataset, parameter: str, cast: palette.Cast
 
 
 def _draw_others(ax: Axes, data: xr.Dataset, parameter: str) -> None:
-    """Draw the section points of invariant sets where they do not attract, in the grey of their stability."""
+    """Draw the section points of invariant sets at parameter values where they do not attract, in a grey that shows
+    their stability.
+    """
     for code, grey in palette.GREY_OF.items():
         chosen = (data["stability"].values == code)[..., None] & np.isfinite(data["value"].values)
         row, *_ = np.nonzero(chosen)
@@ -182,8 +186,8 @@ def _diameter(share: Any) -> Any:
 
 
 def _draw_directions(ax: Axes, one: xr.Dataset, parameter: str, cast: palette.Cast) -> None:
-    """Draw an attractor's points of both directions: large light points below small dark ones, so that both stay
-    visible.
+    """Draw an attractor's points for both directions of continuation: small dark points over large light points, so
+    that both stay visible.
     """
     number = int(one["attractor"])
     for word in one["direction"].values[::-1]:

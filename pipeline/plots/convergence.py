@@ -135,7 +135,7 @@ def _convergence(ds: xr.Dataset, exponent: int, per: str, at: Mapping[str, float
 
 
 def _own(data: xr.Dataset, kind: Motion) -> np.ndarray:
-    """Return the indices of the cells that have one class of motion and an exponent."""
+    """Return the indices of the cells of a given class of motion that have a Lyapunov exponent."""
     return np.flatnonzero((data["motion"].values == kind) & np.isfinite(data["exponent_value"].values))
 
 
@@ -175,7 +175,7 @@ def _draw_running(ax: Axes, final: Axes, data: xr.Dataset) -> list[Any]:
 
 
 def _draw_final(final: Axes, data: xr.Dataset, own: np.ndarray, rank: np.ndarray, colour: str) -> None:
-    """Draw the final exponents with errors over their rank; omit the errors if there are many cells."""
+    """Draw the final exponents with their standard errors over their rank. Omit the errors if there are many cells."""
     value, error = data["exponent_value"].values, data["exponent_stderr"].values
     flagged = data["lyapunov_flag"].values[own] > GOOD
     many = data.sizes["cell"] > 4 * MOST_LINES

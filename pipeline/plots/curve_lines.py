@@ -40,7 +40,9 @@ ROOM = (0.045, 0.045)
 
 
 def take_room(ax: Axes, at: tuple[float, float], taken: list[np.ndarray]) -> bool:
-    """Return whether a short name at a place of the axes overlaps none of those placed before, and add it to them."""
+    """Return whether a short name at a position would overlap none of the names placed before. If so, add its position
+    to `taken`.
+    """
     (left, right), (bottom, top) = ax.get_xlim(), ax.get_ylim()
     here = np.array([(at[0] - left) / (right - left), (at[1] - bottom) / (top - bottom)])
     if any((np.abs(here - other) < ROOM).all() for other in taken):
@@ -50,7 +52,7 @@ def take_room(ax: Axes, at: tuple[float, float], taken: list[np.ndarray]) -> boo
 
 
 def draw_over(fig: style.DataFigure, axes: Sequence[Axes], ds: xr.Dataset, x: str) -> None:
-    """Draw curves in black over the panels of a map whose horizontal axis is the parameter `x`.
+    """Draw bifurcation curves in black over the panels of a map whose horizontal axis is the parameter `x`.
 
     Points of codimension two have their names if there is one panel; several are too small.
     """

@@ -16,7 +16,9 @@ UNITS = ("s", "period")
 
 
 def left_out(part: xr.Dataset) -> str:
-    """Return a text that counts the cells without a Lyapunov exponent by reason; empty if all cells have one."""
+    """Return a text with the number of cells without a Lyapunov exponent, by reason. The text is empty if every cell
+    has an exponent.
+    """
     status = part["status"]
     missing = part["lyapunov"].isel(exponent=0, drop=True).isnull().transpose(*status.dims)
     counts = {name: int((missing & status.isin(codes)).sum()) for name, codes in ABSENT.items()}

@@ -78,7 +78,7 @@ def draw_figure(run: Run, name: str, options: FigureOptions) -> DataFigure:
 
 
 def request(name: str, options: Options) -> dict[str, Any]:
-    """Return the name of a figure and those of its options that differ from the defaults."""
+    """Return the name of a figure and the options that differ from their defaults."""
     wanted = {key: value for key, value in options.changed().items() if key not in ("out", "format")}
     return {"figure": name, "options": wanted}
 
@@ -136,7 +136,9 @@ def noted(figure: DataFigure, notes: list[str]) -> DataFigure:
 
 
 def attractors_of(run: Run, options: Options) -> xr.Dataset:
-    """Return the attractors of a run, matched along its axes with the options for matching."""
+    """Return the attractors of a run, matched along its parameter axes with the options of the analysis
+    ``attractors``.
+    """
     from pipeline.products.attractors import AttractorOptions
 
     return run.derive("attractors", **options.part(AttractorOptions))

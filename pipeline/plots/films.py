@@ -23,7 +23,7 @@ PALETTE_FRAMES, PALETTE_COLOURS = 8, 96
 
 
 def film_problems(path: Path, fps: float) -> list[str]:
-    """Return the reasons why a film cannot be written to a path; check before anything is drawn."""
+    """Return the reasons why a film cannot be written to a path. Call this before anything is drawn."""
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         return [f"{path}: the suffix must be one of {', '.join(SUFFIXES)}."]

@@ -61,7 +61,7 @@ class Measure:
         return math.pi * self.factor
 
     def shown(self, values: np.ndarray, *, wrap: bool = False) -> np.ndarray:
-        """Convert values to the drawn unit; if `wrap` is set, wrap angles to half a turn about 0."""
+        """Convert values to the drawn unit. If `wrap` is set, first wrap angles to the range from -pi to pi."""
         folded = wrapped(values) if wrap and self.on_circle else values
         return np.asarray(folded * self.factor if self.factor != 1.0 else folded)
 
@@ -147,14 +147,18 @@ def wrapped(angle: np.ndarray) -> np.ndarray:
 
 
 def on_circle(angle: np.ndarray, *others: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Wrap an angle to [-pi, pi), and insert NaN into it and other arrays where it jumps across the edge."""
+    """Wrap an angle to [-pi, pi). Insert NaN into the angle and into other arrays where the angle jumps across the
+    edge.
+    """
     folded = wrapped(angle)
     jumps = np.flatnonzero(np.abs(np.diff(folded)) > math.pi) + 1
     return tuple(np.insert(values, jumps, np.nan) for values in (folded, *others))
 
 
 def angle_ticks(ax: Axes, measure: Measure, axis: str = "y", most: float | None = None) -> None:
-    """Set round ticks on an angle axis: multiples of pi for wide ranges in radians, of 15, 30 ... for degrees."""
+    """Set round ticks on an angle axis: simple multiples of pi for wide ranges in radians, and steps such as 15 or 30
+    for degrees.
+    """
     if not measure.on_circle:
         return
     low, high = ax.get_ylim() if axis == "y" else ax.get_xlim()

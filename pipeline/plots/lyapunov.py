@@ -98,7 +98,7 @@ def plot_lyapunov(
 
 
 def _lost(diagram: Diagram, data: xr.Dataset) -> Survey:
-    """Return the cell counts of the diagram's survey, with added counts of cells that have points but no exponent."""
+    """Return the diagram's survey, with the count of cells that have points but no exponent added."""
     found = diagram.survey
     value = data["exponent_value"].isel(exponent=0)
     others = [d for d in value.dims if d != diagram.parameter]
@@ -109,7 +109,9 @@ def _lost(diagram: Diagram, data: xr.Dataset) -> Survey:
 
 
 def _draw_lost(top: Axes, bottom: Axes, strip: Axes, diagram: Diagram, lost: Survey) -> None:
-    """Draw the share of cells without an exponent in a strip, and shade both panels where no cell has one."""
+    """Draw the share of cells without an exponent in a strip. Shade the diagram where all cells lack points, and the
+    lower panel where all lack an exponent.
+    """
     style.style_axes(strip, minor=False)
     shade_blank(top, diagram.x, diagram.survey, diagram.layers)
     draw_absent(bottom, strip, diagram.x, lost, diagram.layers)
@@ -146,7 +148,9 @@ def _draw_exponents(ax: Axes, data: xr.Dataset, parameter: str, spectrum: bool, 
 def _draw_class(
     ax: Axes, x: np.ndarray, value: np.ndarray, error: np.ndarray, flag: np.ndarray, colour: str, gid: str
 ) -> None:
-    """Draw the points and the error band of one class of motion in its colour; the arrays have shape (x, cell)."""
+    """Draw points and error bands of one class of motion, or of one exponent of the spectrum, in one colour. The arrays
+    have shape (x, cell).
+    """
     there = np.isfinite(value)
     if not there.any():
         return
@@ -189,7 +193,7 @@ def _union(value: np.ndarray, error: np.ndarray) -> list[tuple[float, float]]:
 
 
 def draw(run: Run, options: LyapunovFigureOptions) -> style.DataFigure:
-    """Draw the figure ``lyapunov`` of a run, over one parameter or as a map."""
+    """Draw the figure ``lyapunov`` of a run, over one parameter or as a map over two."""
     cube = run.cube()
     at, notes = values_of(run, options)
     if options.as_map:

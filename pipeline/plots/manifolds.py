@@ -1,4 +1,4 @@
-"""Draw stable and unstable manifolds in the plane of two states, over the basins where there are any."""
+"""Draw stable and unstable manifolds in the plane of two states, alone or over the basins of attraction."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def plot_manifolds(
 
 
 def _shade(colour: str) -> str:
-    """Return the legend's colour of a line: grey for white lines, which would be invisible."""
+    """Return a line's colour in the legend. A white line is grey there, because white would be invisible."""
     return "0.75" if colour == "white" else colour
 
 
@@ -76,7 +76,7 @@ def _draw_lines(ax: Axes, ds: xr.Dataset, scales: list[float], colours: dict[int
 
 
 def draw(run: Run, options: ManifoldFigureOptions) -> style.DataFigure:
-    """Draw the figure ``manifolds`` of a run, over its basins if it starts on a grid of two states."""
+    """Draw the figure ``manifolds`` of a run, over the basins if the run's initial states form a grid in two states."""
     at, notes = values_of(run, options)
     found = run.derive("manifolds", **options.part(ManifoldOptions))
     frame, below = frame_of(options), None

@@ -25,7 +25,8 @@ LOOKS: dict[str, dict[str, Any]] = {
 
 
 def draw_absent(ax: Axes, strip: Axes, x: np.ndarray, survey: Survey, layers: Sequence[int]) -> None:
-    """Draw the share of absent cells in the strip, and shade the diagram at parameter values where all are absent.
+    """Draw the share of absent cells (cells without a point to draw) in the strip. Shade the diagram at parameter
+    values where all cells are absent.
 
     Parameters
     ----------
@@ -54,7 +55,7 @@ def draw_absent(ax: Axes, strip: Axes, x: np.ndarray, survey: Survey, layers: Se
 
 
 def shade_blank(ax: Axes, x: np.ndarray, survey: Survey, layers: Sequence[int]) -> None:
-    """Shade a diagram at parameter values where all cells are absent; arguments as for `draw_absent`."""
+    """Shade a diagram at parameter values where all cells are absent. The arguments are those of `draw_absent`."""
     shown = list(layers)
     absent = sum((counts[shown].sum(0) for counts in survey.absent.values()), np.zeros(x.size, np.int64))
     blank = (absent >= np.maximum(survey.cells[shown].sum(0), 1)).astype(float)
@@ -65,7 +66,7 @@ def shade_blank(ax: Axes, x: np.ndarray, survey: Survey, layers: Sequence[int]) 
 
 
 def absent_handles(survey: Survey) -> list[Patch]:
-    """Return legend handles for cells that are not drawn: the reason and the number of cells of each kind."""
+    """Return legend handles that list the reasons why cells are not drawn, with the number of cells for each reason."""
     total = int(survey.cells.sum())
     return [
         Patch(label=f"{name}: {int(counts.sum())} of {total} cells", **LOOKS[name])
@@ -75,7 +76,7 @@ def absent_handles(survey: Survey) -> list[Patch]:
 
 
 def say_empty(ax: Axes, survey: Survey, shown: str = "") -> None:
-    """Write the reason why there is nothing to draw into empty axes."""
+    """Write a text into empty axes that gives the reason why there is nothing to draw."""
     n_cells = int(survey.cells.sum())
     absent = {name: int(counts.sum()) for name, counts in survey.absent.items() if counts.any()}
     text = f"nothing to draw: of {n_cells} cells, " + style.join(f"{n} {name}" for name, n in absent.items())

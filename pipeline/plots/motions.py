@@ -40,7 +40,7 @@ class Motions:
 
 
 def motions_of(ds: xr.Dataset) -> Motions:
-    """Return the labels and colours of a model's classes of motion; a single class if the model has no classifier."""
+    """Return the labels and colours of a model's classes of motion. A model without a classifier has a single class."""
     classifier = model_of(ds).classifier
     if classifier is None:
         return Motions(("motion",), (PLAIN,), (0,))
@@ -53,6 +53,6 @@ def motions_of(ds: xr.Dataset) -> Motions:
 
 
 def motion_codes(cells: xr.Dataset) -> xr.DataArray:
-    """Return the code of the class of motion of each cell, on the dims of ``status``."""
+    """Return the code of each cell's class of motion, as an array with the dims of the variable ``status``."""
     found = classify(cells)
     return xr.zeros_like(cells["status"], dtype=np.int8) if found is None else found

@@ -29,7 +29,8 @@ Floats = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Trail:
-    """Samples of the fading trail behind a moving point; in a repeating film the trail continues across the film's end.
+    """Fading trail behind a moving point, counted in samples. In a film that repeats, the trail continues across the
+    film's end.
 
     Attributes
     ----------
@@ -64,7 +65,7 @@ class Trail:
 
 @dataclass(frozen=True)
 class Point:
-    """A point that moves along a path with a fading trail; for a motion that does not repeat, the path so far stays
+    """A point that moves along a path with a fading trail. If the motion does not repeat, the whole path so far stays
     visible.
     """
 
@@ -99,8 +100,8 @@ class Point:
 
 
 def _point(ax: Axes, path: Floats, colour: str, trail: Trail, *, jumps: float, size: float, thick: float) -> Point:
-    """Make the artists of a point that moves along a path: dot, fading trail and, if the motion does not repeat, its
-    path.
+    """Create the dot and the fading trail of a moving point. If the motion does not repeat, create the line of its path
+    too.
     """
     colours = np.empty((max(trail.length, 1), 4))
     colours[:, :3], colours[:, 3] = to_rgb(colour), np.linspace(0.0, 1.0, len(colours)) ** 1.5
@@ -141,7 +142,9 @@ def moving_portrait(ax: Axes, one: xr.Dataset, pair: tuple[str, str], trail: Tra
 
 
 def _path(measures: Sequence[Measure], values: Sequence[Floats]) -> tuple[Floats, float]:
-    """Return the polyline of a phase portrait in drawn units, and the distance that marks a jump of a wrapped angle."""
+    """Return the polyline of a phase portrait in the units of the axes, and the distance from which a step counts as a
+    jump of a wrapped angle.
+    """
     columns, jumps = [], math.inf
     for measure, column in zip(measures, values, strict=True):
         turning = measure.on_circle and np.ptp(column) >= 2.0 * np.pi
@@ -155,7 +158,7 @@ def _path(measures: Sequence[Measure], values: Sequence[Floats]) -> tuple[Floats
 
 @dataclass(frozen=True)
 class Scene:
-    """The plane that the mechanical drawings of all motions in a film share.
+    """Region of the plane that contains the mechanical drawings of all motions in a film.
 
     Attributes
     ----------
@@ -170,14 +173,14 @@ class Scene:
 
     @classmethod
     def of(cls, ds: xr.Dataset, drawing: Drawing) -> Scene:
-        """Return the plane that contains all points of a film's mechanical drawings."""
+        """Return the region that contains all points of a film's mechanical drawings."""
         places = ds["points"].values.reshape(-1, 2)
         if "fixed" in ds:
             places = np.concatenate([places, ds["fixed"].values.reshape(-1, 2)])
         return cls(drawing, np.nanmin(places, axis=0), np.nanmax(places, axis=0))
 
     def limit(self, ax: Axes) -> float:
-        """Set axis limits of equal scale that contain everything at all times; return the width in model units."""
+        """Set axis limits of equal scale that contain the drawings at all times. Return the width in model units."""
         box = ax.get_window_extent()
         shape = np.array([box.width, box.height])
         scale = 1.22 * max(*((self.high - self.low) / shape), 1e-12)
@@ -262,7 +265,7 @@ def _fix(ax: Axes, still: dict[str, Floats], scene: Scene, named: bool) -> None:
 
 
 def _scale_bar(ax: Axes, width: float, unit: str) -> None:
-    """Draw a scale bar of round length, in place of axes."""
+    """Draw a scale bar in place of axes. Its length is 1, 2 or 5 times a power of ten."""
     power = 10.0 ** math.floor(math.log10(0.25 * width))
     length = max(f * power for f in (1.0, 2.0, 5.0) if f * power <= 0.25 * width)
     share = length / width
@@ -280,14 +283,16 @@ def _scale_bar(ax: Axes, width: float, unit: str) -> None:
 
 @dataclass(frozen=True)
 class Clock:
-    """Moving text that shows the model time, in drive periods if all motions have the same period."""
+    """Text that shows the model time in an animation: in drive periods if all motions have the same drive period, else
+    in seconds.
+    """
 
     text: Any
     time: Floats
     period: float
 
     def at(self, i: int) -> list[Artist]:
-        """Set the time text to a sample, and return it as a list of artists."""
+        """Show the time of a sample, and return the text as a list of artists."""
         if self.period:
             self.text.set_text(f"{self.time[i] / self.period:.2f} drive periods")
         else:
@@ -296,7 +301,7 @@ class Clock:
 
 
 def moving_clock(fig: style.DataFigure, ds: xr.Dataset) -> Clock:
-    """Write the playback speed into a figure, and return the moving text that shows the time."""
+    """Write the playback speed into a figure, and return the `Clock` that shows the model time."""
     frequencies = ds["drive_frequency"].values
     forced = not model_of(ds).autonomous and np.ptp(frequencies) == 0.0
     width, height = fig.get_size_inches()

@@ -87,7 +87,9 @@ _FAILED = ("step limit", "step underflow", "unreached")
 
 
 def other_cells(part: xr.Dataset) -> dict[str, np.ndarray]:
-    """Return masks of the cells without an attractor by the names of `GREYS`; parameter dims first, then the others."""
+    """Return masks of the cells that end on no attractor, by the reasons that `GREYS` names. The dims of the swept
+    parameters come first.
+    """
     found: dict[str, np.ndarray] = {}
     for name, which in outcomes.other_cells(part).items():
         own = "failed" if name in _FAILED else name
@@ -138,13 +140,16 @@ def cast_of(attractors: xr.Dataset, part: xr.Dataset | None = None) -> Cast:
 
 
 def _grey_of(stability: xr.DataArray) -> str:
-    """Return the grey for an invariant set that attracts nowhere, by its most frequent stability."""
+    """Return the grey for an invariant set that attracts at no parameter point. It depends on the set's most frequent
+    stability.
+    """
     codes = stability.values[np.isin(stability.values, list(GREY_OF))]
     return GREY_OF[int(np.bincount(codes).argmax())] if codes.size else OTHERS
 
 
 def describe(one: xr.Dataset) -> str:
-    """Describe an attractor or other invariant set in words: period or kind, class of motion, turns, stability.
+    """Describe an attractor or other invariant set in words: its period or its kind, class of motion, turns per period,
+    stability.
 
     Only points where the set is present count.
     """
@@ -158,14 +163,14 @@ def describe(one: xr.Dataset) -> str:
 
 
 def _stability(one: xr.Dataset) -> str:
-    """Return the stabilities of an invariant set where it does not attract, as text."""
+    """Return as text the stabilities of an invariant set at the parameter points where it does not attract."""
     found = sorted({int(code) for code in one["stability"].values.ravel()} - {ABSENT, ATTRACTS})
     words = " or ".join(STABILITIES[code].replace("_", " ") for code in found)
     return f"{words} in parts" if words and (one["stability"].values == ATTRACTS).any() else words
 
 
 def _seconds(one: xr.Dataset) -> str:
-    """Return the range of a limit cycle's period [s] as text; empty for a forced system."""
+    """Return the range of a limit cycle's period [s] as text. The text is empty for a forced system."""
     if not model_of(one).autonomous or "period_s" not in one:
         return ""
     known = one["period_s"].values[np.isfinite(one["period_s"].values)]
@@ -202,7 +207,9 @@ def _words(one: xr.Dataset, codes: np.ndarray) -> str:
 
 
 def _turns(one: xr.Dataset, present: np.ndarray) -> str:
-    """Return the mean turns per period as text; empty unless the motion rotates equally at all parameter points."""
+    """Return the mean turns per period as text. The text is empty unless the motion rotates equally at all parameter
+    points.
+    """
     dim = model_of(one).angle_dim
     if "rotation" not in one or dim not in one["rotation"].dims:
         return ""
@@ -228,7 +235,7 @@ Entry = tuple[str, str] | Artist
 def new_panel(
     data: xr.Dataset, entries: Sequence[Entry], frame: style.Frame, height: float = 4.3
 ) -> tuple[style.DataFigure, Axes]:
-    """Make a figure with one panel, and a legend beside it or, in a narrow figure, below it.
+    """Make a figure with one panel and a legend. The legend is beside the panel, or below it in a narrow figure.
 
     Parameters
     ----------

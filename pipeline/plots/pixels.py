@@ -1,4 +1,4 @@
-"""Draw points of a cube: a few as markers, many as an image whose pixels count them.
+"""Draw points of a cube as markers or, if there are many, as an image whose pixels count the points.
 
 In an image a pixel takes the colour of the motion that has most points in it, and is the darker the more
 there are; all panels of a figure share one scale of darkness.
@@ -27,7 +27,7 @@ TINT = 0.5
 
 @dataclass(frozen=True)
 class Look:
-    """Marker style of one layer.
+    """Marker style of one layer of points (one direction of continuation).
 
     Attributes
     ----------
@@ -45,7 +45,9 @@ class Look:
 
 
 def looks(diameter: float, shown: Sequence[int]) -> dict[int, Look]:
-    """Return the marker styles of the layers: small dark markers over large light ones, so that both stay visible."""
+    """Return the marker styles of the layers. Small dark markers lie over large light markers, so that both stay
+    visible.
+    """
     if len(shown) < 2:
         return {i: Look(diameter) for i in shown}
     dark = max(diameter, 0.95)
@@ -158,7 +160,9 @@ Counts = Mapping[tuple[int, int], np.ndarray]
 
 
 def _pixels(ax: Axes) -> tuple[int, int]:
-    """Return height and width [pixels] of the image that fills the axes; it is finer than the figure's resolution."""
+    """Return height and width [pixels] of the image that fills the axes. The image has a finer resolution than the
+    figure.
+    """
     box = ax.get_window_extent()
     return max(1, round(box.height * SUPERSAMPLING)), max(1, round(box.width * SUPERSAMPLING))
 
@@ -204,7 +208,9 @@ def _draw_images(
 
 
 def _spread(counts: Counts, looks: Mapping[int, Look]) -> dict[int, dict[int, np.ndarray]]:
-    """Return the largest count of points within a dot around each pixel, by layer and class of motion."""
+    """Return for each pixel the largest count of points on any pixel within a dot around it, by layer and class of
+    motion.
+    """
     return {
         i: {
             code: _dilate(grid, _disc(look.diameter / 72.0 * style.DPI * SUPERSAMPLING))
@@ -259,7 +265,7 @@ def _opacity(counts: np.ndarray, faintest: float, reference: float) -> np.ndarra
 
 
 def _disc(diameter: float) -> list[tuple[int, int]]:
-    """Return the (row, column) offsets of the pixels that lie within a round dot from its centre."""
+    """Return the (row, column) offsets of all pixels inside a round dot, counted from its centre."""
     radius = max(0.5, 0.5 * diameter)
     reach = math.ceil(radius)
     around = range(-reach, reach + 1)

@@ -173,7 +173,8 @@ def _joined(known: Range, values: np.ndarray) -> Range:
 
 
 def survey(view: View, *, along: str = "", xlim: Range | None = None, ylim: Range | None = None) -> Survey:
-    """Read the cube once to find the ranges of its points, the classes of motion that occur, and the absent cells.
+    """Read the cube once to find the ranges of its points, the classes of motion that occur, and the numbers of cells
+    without points.
 
     Parameters
     ----------
@@ -218,7 +219,9 @@ def _count_absent(view: View, block: xr.Dataset, found: Survey) -> None:
 
 
 def selections(array: xr.DataArray, inner: tuple[str, ...] = ()) -> Iterator[dict[str, slice]]:
-    """Yield selections, a slice per dim, that tile the cells of an array and follow its chunks if it has any."""
+    """Yield selections (one slice per dim) that together cover the cells of an array once. They follow the array's
+    chunks if it has any.
+    """
     own = inner or tuple(str(d) for d in array.dims if d in _OWN_DIMS)
     dims = [str(dim) for dim in array.dims if dim not in own]
     each = math.prod(array.sizes[dim] for dim in own)

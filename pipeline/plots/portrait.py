@@ -104,7 +104,8 @@ def _dress(ax: Axes, measures: list[Measure], turning: list[bool]) -> None:
 
 
 def draw_path(ax: Axes, drawing: Drawing, parameters: Mapping[str, float], motion: Motion) -> list[str]:
-    """Draw the path of the point that a model's mechanical drawing traces, with the fixed points nearby.
+    """Draw the path of the point that a model's mechanical drawing traces, and the nearby points of the drawing that do
+    not move.
 
     Parameters
     ----------
@@ -154,13 +155,15 @@ def _marker(fixed: Mapping[str, np.ndarray], name: str) -> str:
 
 
 def fixed_handles(drawing: Drawing, parameters: Mapping[str, float], shown: Collection[str]) -> list[Any]:
-    """Return legend handles for those fixed points of a mechanical drawing that are shown."""
+    """Return legend handles for the points of a mechanical drawing that do not move and are shown."""
     fixed = drawing.fixed(parameters)
     return [style.dot(n, "0.2", 4.0, marker=_marker(fixed, n)) for n in fixed if n in shown]
 
 
 def _near(fixed: Mapping[str, np.ndarray], place: np.ndarray) -> list[str]:
-    """Return the names of the fixed points that are near enough to a path to be drawn with it."""
+    """Return the names of the unmoving points of a mechanical drawing that are near enough to a path to be drawn with
+    the path.
+    """
     if not place.size:
         return list(fixed)
     size = max(float(np.ptp(place, axis=0).max()), 1e-12)

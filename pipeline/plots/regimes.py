@@ -49,7 +49,7 @@ def plot_regimes(
     curves: xr.Dataset | None = None,
     frame: style.Frame = style.WIDE,
 ) -> style.DataFigure:
-    """Draw a map of the coexisting attractors, or of their orbit periods, over two swept parameters.
+    """Draw a map of the coexisting attractors, of their orbit periods, or of their number, over two swept parameters.
 
     Parameters
     ----------
@@ -106,7 +106,7 @@ def plot_regimes(
 
 
 def _with_curves(data: xr.Dataset, curves: xr.Dataset, x: str, y: str) -> xr.Dataset:
-    """Add the numbers of the curves to those of the map, under names that end in ``_curves``."""
+    """Add the data of the bifurcation curves to the dataset of the map, under names that end in ``_curves``."""
     plane = [str(curves.attrs[f"{role}_parameter"]) for role in ("first", "second")]
     if sorted(plane) != sorted([x, y]):
         raise ValueError(f"the curves lie in the plane of {' and '.join(plane)}, and the map in that of {x} and {y}.")
@@ -189,7 +189,7 @@ def _member_colour(member: str, show: str, cast: palette.Cast) -> str:
 
 
 def _dress(ax: Axes, data: xr.Dataset, x: str, y: str, frame: style.Frame) -> None:
-    """Mark parameter points with many cells without an attractor, and set the axis ranges."""
+    """Mark the parameter points at which many cells have no attractor, and set the axis ranges."""
     row, column = np.nonzero(data["share_without"].values > SHARE_LIMIT)
     if row.size:
         ax.plot(data[x].values[column], data[y].values[row], gid="without", **_CROSS)
@@ -240,7 +240,7 @@ def _regimes(part: xr.Dataset, x: str, y: str, show: str) -> xr.Dataset:
 
 
 def _members(present: np.ndarray, periods: np.ndarray, share: np.ndarray, x: str, y: str, show: str) -> xr.Dataset:
-    """Return the share of cells on each attractor, or summed over the attractors of each period."""
+    """Return the share of cells on each attractor, or on all attractors of each orbit period."""
     if show == "attractors":
         kinds = np.broadcast_to(np.arange(present.shape[-1]), present.shape)
         names = {i: letter(i) for i in range(present.shape[-1])}
@@ -257,7 +257,9 @@ def _members(present: np.ndarray, periods: np.ndarray, share: np.ndarray, x: str
 
 
 def _numbers(part: xr.Dataset, x: str, y: str) -> dict[str, Any]:
-    """Return each attractor's basin share, its 95 % interval, and the bound on the share of an unseen basin."""
+    """Return each attractor's basin share with its 95 % interval, and an upper bound on the share of a basin that no
+    cell revealed.
+    """
     dims = (y, x, "attractor")
     share = part["share"].transpose(*dims).values
     numbers: dict[str, Any] = {
@@ -318,7 +320,7 @@ def draw(run: Run, options: RegimeOptions) -> style.DataFigure:
 
 
 def _curves_of(run: Run, attractors: xr.Dataset, at: Mapping[str, float]) -> xr.Dataset:
-    """Return the bifurcation curves of a run in the plane and the ranges of a map."""
+    """Return the bifurcation curves of a run, computed in the plane of a map and within the map's ranges."""
     x, y = _axes(attractors, at)
     axis = _swept_of(run, x, y)
     other = y if axis == x else x
@@ -335,6 +337,8 @@ def _curves_of(run: Run, attractors: xr.Dataset, at: Mapping[str, float]) -> xr.
 
 
 def _swept_of(run: Run, x: str, y: str) -> str:
-    """Return the parameter along which a run's branches are followed: the one of the map's that it sweeps."""
+    """Return the parameter along which a run's branches are continued. It is the only one of the map's two parameters
+    that the run sweeps, else ``x``.
+    """
     swept = [name for name in (x, y) if run.cube().sizes.get(name, 1) > 1]
     return swept[0] if len(swept) == 1 else x

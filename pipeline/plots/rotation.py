@@ -84,7 +84,9 @@ def plot_rotation(
 
 
 def rotation_data(part: xr.Dataset, swept: list[str]) -> xr.Dataset:
-    """Return the rotation numbers and the locked cells; over two parameters the median and the share of the cells."""
+    """Return each cell's rotation number and whether the cell is locked. Over two parameters, return the median
+    rotation number and the share of locked cells.
+    """
     locked = (part["orbit_period"] > 0).where(part["rotation"].notnull())
     data = xr.Dataset({"rotation": part["rotation"], "locked": locked}).load()
     if len(swept) == 2:
@@ -98,7 +100,9 @@ def rotation_data(part: xr.Dataset, swept: list[str]) -> xr.Dataset:
 
 
 def _about(part: xr.Dataset) -> str:
-    """Return a text with the largest error and the number of cells without a rotation number."""
+    """Return a text with the largest and median errors of the rotation numbers, and the number of cells without a
+    rotation number.
+    """
     known, error = part["rotation"].notnull(), part["rotation_error"]
     size = (
         f"errors up to {float(error.max()):.1g}, half of them below {float(error.median()):.1g}" if known.any() else ""

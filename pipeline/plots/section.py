@@ -89,7 +89,7 @@ def plot_section(
 
 
 def _measures(part: xr.Dataset, states: tuple[str, str] | None, degrees: bool) -> list[labels.Measure]:
-    """Return the axis measures (symbol, unit, factor) of the horizontal and vertical states."""
+    """Return the measures (symbol, unit, factor) of the states on the horizontal and vertical axes."""
     model = model_of(part)
     names = states or section_pair(model)
     for name in names:
@@ -101,7 +101,9 @@ def _measures(part: xr.Dataset, states: tuple[str, str] | None, degrees: bool) -
 
 
 def section_pair(model: Model, first: str = "") -> tuple[str, str]:
-    """Return the states of the horizontal and vertical axes, if possible those of a phase portrait."""
+    """Return the states to draw on the horizontal and vertical axes. If possible, they are a pair for which the model
+    declares a phase portrait.
+    """
     states = model.section_states
     pairs = [p for p in model.portraits if set(p) <= set(states) and p[0] == (first or p[0])]
     if pairs:
@@ -112,8 +114,8 @@ def section_pair(model: Model, first: str = "") -> tuple[str, str]:
 
 
 def _view(part: xr.Dataset, measures: list[labels.Measure], attractors: xr.Dataset | None) -> View:
-    """Return a `View` of the section points, coloured by class of motion or by attractor, with all directions in one
-    layer.
+    """Return a `View` of the section points, coloured by class of motion or by attractor. All directions of
+    continuation share one layer.
     """
 
     def coordinates(block: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
@@ -153,7 +155,9 @@ def _handles(view: View, found: set[int]) -> list[Any]:
 
 
 def _by_attractor(view: View, part: xr.Dataset, attractors: xr.Dataset) -> View:
-    """Colour points by their cell's attractor, or by a grey for the status of cells without one."""
+    """Colour each point by its cell's attractor. Points of cells without an attractor get the grey of the cell's
+    outcome.
+    """
     chosen = attractors
     for dim in split_dims(attractors["attractor_id"])[0]:
         chosen = chosen.sel({dim: float(part[dim])})

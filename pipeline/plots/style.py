@@ -221,7 +221,9 @@ def label_axes(ax: Axes, x: str | None = None, y: str | None = None) -> None:
 
 
 def caption(ax: Axes, text: str, share: float = 1.0) -> None:
-    """Write a caption above the axes, wrapped at the figure's edge, or at a share of its width beside a legend."""
+    """Write a caption above the axes, in lines no longer than the given share of the figure's width. The share is less
+    than 1 beside a legend.
+    """
     if text:
         look = look_of(ax)
         width = share * figure_of(ax).frame.width_in - 0.6
@@ -339,7 +341,7 @@ def check_choice(what: str, value: str, allowed: Sequence[str]) -> None:
 
 
 def limits(ax: Axes, frame: Frame, x: tuple[float, float] | None = None, y: tuple[float, float] | None = None) -> None:
-    """Set the axis ranges: those of the `Frame`, else the given ones, else unchanged.
+    """Set the axis ranges to those of the `Frame`, or else to the given ranges. Without either, leave them unchanged.
 
     Raises
     ------
@@ -378,7 +380,7 @@ def span(x: np.ndarray) -> tuple[float, float]:
 def fill_columns(
     ax: Axes, edges: np.ndarray, low: np.ndarray, high: np.ndarray, looks: Mapping[str, Any], gid: str
 ) -> PolyCollection:
-    """Fill each column of a plot from `low` to `high`, with one rectangle per run of equal neighbouring columns."""
+    """Fill each column of a plot from `low` to `high`. Equal neighbouring columns share one rectangle."""
     levels = np.column_stack([low, high])
     starts = np.flatnonzero(np.r_[True, (np.diff(levels, axis=0) != 0).any(1)])
     ends = np.r_[starts[1:], len(levels)]

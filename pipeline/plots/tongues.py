@@ -96,7 +96,9 @@ def _draw_edges(ax: Axes, ds: xr.Dataset, over_map: bool) -> None:
 
 
 def _name_tongues(fig: style.DataFigure, ax: Axes, ds: xr.Dataset) -> None:
-    """Write the names of the tongues where their edges are highest, if there is room; small denominators first."""
+    """Write each tongue's name p/q at the highest point of its edges, if there is room. Small denominators have
+    priority.
+    """
     halo = [withStroke(linewidth=2.0, foreground="white")]
     taken: list[np.ndarray] = []
     (left, right), (bottom, ceiling) = ax.get_xlim(), ax.get_ylim()
@@ -136,7 +138,7 @@ def _explain(fig: style.DataFigure, ds: xr.Dataset) -> None:
 
 
 def draw(run: Run, options: TongueFigureOptions) -> style.DataFigure:
-    """Draw the figure ``tongues`` of a run, over the map of rotation numbers if the run spans the plane."""
+    """Draw the figure ``tongues`` of a run, over the map of rotation numbers if the run sweeps both parameters."""
     found = run.derive("tongues", **options.part(TongueOptions))
     plane = {str(found.attrs[f"{role}_parameter"]) for role in ("first", "second")}
     cube = run.cube()

@@ -25,7 +25,8 @@ COLOURS = (style.BLUE, style.VERMILLION, style.GREEN, style.PURPLE, style.ORANGE
 
 
 def plot_trajectory(ds: xr.Dataset, *, degrees: bool = False, frame: style.Frame = style.WIDE) -> style.DataFigure:
-    """Draw a trajectory: its time series, a phase portrait per pair of states, and the path of a traced point.
+    """Draw a trajectory: its time series, a phase portrait per pair of states, and the path of a point of the
+    mechanical drawing.
 
     Parameters
     ----------
@@ -160,7 +161,7 @@ def _section_times(ds: xr.Dataset, time: np.ndarray) -> np.ndarray:
 
 
 def _units(model: Model) -> list[tuple[str, ...]]:
-    """Group the states into panels: one panel per unit, with angles apart."""
+    """Group the states into panels by unit. Angles have a panel of their own, and so has each dimensionless state."""
     kinds: dict[tuple[str, bool], tuple[str, ...]] = {}
     for s in model.states:
         key = (s.unit, s.on_circle) if s.unit != "1" else (s.name, False)

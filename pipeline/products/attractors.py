@@ -36,11 +36,15 @@ class IdentifyOptions(Options):
 
     @property
     def effort(self) -> tuple[float, int]:
-        """Time budget and sample size for integrating unassigned cells further; zeros if they are not integrated."""
+        """Return the time budget and sample size for integrating cells on no known attractor further. Both are 0 if
+        these cells are not integrated.
+        """
         return (self.budget, self.n_sample) if self.extend and self.budget else (0.0, 0)
 
     def with_effort(self, effort: tuple[float, int]) -> Self:
-        """Return the same options with another time budget and sample size for integrating unassigned cells further."""
+        """Return a copy of the options with another time budget and sample size for integrating cells on no known
+        attractor further.
+        """
         budget, n_sample = effort
         if not budget:
             return self.model_copy(update={"extend": False})

@@ -15,7 +15,7 @@ Per = Literal["s", "period"]
 
 
 def _without(options: FigureOptions, name: str) -> str:
-    """Return the part of a figure's file name made from options, as if one option had its default."""
+    """Return the part of a figure's file name that lists the options, without the option `name`."""
     return FigureOptions.label(options.model_copy(update={name: ""}))
 
 
@@ -30,7 +30,7 @@ class BifurcationOptions(StateOptions):
     layout: Literal["overlay", "side"] = option("overlay", "Both directions in one panel, or one panel each.")
 
     def label(self) -> str:
-        """Return the part of the figure's file name made from options; the state is not named if a quantity is
+        """Return the part of the figure's file name that lists the options. It omits the state if a quantity is
         drawn.
         """
         return super().label() if not self.quantity else _without(self, "state")
@@ -74,7 +74,9 @@ class LyapunovFigureOptions(StateOptions):
     per: Per = option("s", "Exponents per second, or per drive period or return.")
 
     def label(self) -> str:
-        """Return the part of the figure's file name made from options; a map does not name the state."""
+        """Return the part of the figure's file name that lists the options. It omits the state if the figure is
+        a map.
+        """
         return _without(self, "state") if self.as_map else super().label()
 
 
@@ -93,8 +95,8 @@ class _AlongOptions(BranchOptions, FigureOptions):
     """Options of a figure of branches along a continuation parameter."""
 
     def label(self) -> str:
-        """Return the part of the figure's file name made from options; the drive frequency is not named as the
-        parameter.
+        """Return the part of the figure's file name that lists the options. It omits the continuation parameter if that
+        is the drive frequency.
         """
         return _without(self, "parameter") if self.parameter == "frequency_hz" else super().label()
 
@@ -127,7 +129,9 @@ class TongueFigureOptions(TongueOptions, FigureOptions):
     """Options of a figure of Arnold tongues."""
 
     def label(self) -> str:
-        """Return the part of the figure's file name made from options; the drive frequency is not named."""
+        """Return the part of the figure's file name that lists the options. It omits the continuation parameter if that
+        is the drive frequency.
+        """
         return _without(self, "parameter") if self.parameter == "frequency_hz" else super().label()
 
 

@@ -1,4 +1,6 @@
-"""Declare the product ``lyapunov``: Lyapunov exponents of each cell, integrated on from its last section point."""
+"""Declare the product ``lyapunov``: Lyapunov exponents of each cell. The integration continues from the cell's last
+section point.
+"""
 
 from __future__ import annotations
 

@@ -69,7 +69,7 @@ class Options(BaseModel):
 
 
 def default_of(model: type[Options], name: str) -> Any:
-    """Return the default of an option as a JSON value; None for a required option."""
+    """Return the default of an option as a JSON value. Return None for a required option."""
     info: FieldInfo = model.model_fields[name]
     value = info.get_default(call_default_factory=True)
     if value is PydanticUndefined:

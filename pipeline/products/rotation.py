@@ -1,4 +1,6 @@
-"""Declare the product ``rotation``: the rotation number of each cell, integrated on from its last section point."""
+"""Declare the product ``rotation``: the rotation number of each cell. The integration continues from the cell's last
+section point.
+"""
 
 from __future__ import annotations
 
@@ -78,7 +80,9 @@ ROTATION_VARIABLES = (
 
 
 def _settled(options: RotationOptions, model: Any) -> RotationOptions:
-    """Return the options with the model's angle or plane filled in; raise ValueError if they do not fit the model."""
+    """Fill in the angle or plane in which turns are counted, if the model determines it. Raise ValueError if the
+    options do not fit the model.
+    """
     from magpend_core.models.parameters import near_names
 
     if model.crossing is not None:

@@ -51,7 +51,9 @@ class Variable:
 
 
 def flag_attrs(codes: Any) -> dict[str, Any]:
-    """Return CF attributes of a variable that holds codes of an `IntEnum` whose members have a `sentence`."""
+    """Return the CF flag attributes of a variable that holds codes of an `IntEnum`. Each member of the enum must have a
+    ``sentence``.
+    """
     return {
         "flag_values": [int(s) for s in codes],
         "flag_meanings": " ".join(s.name.lower() for s in codes),

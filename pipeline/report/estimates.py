@@ -1,4 +1,6 @@
-"""Define the `Estimate` that every measure of a study returns, and the protocol for the results that measures read."""
+"""Define `Estimate`, the return type of all measures of a study, and the protocol through which measures read the
+study's results.
+"""
 
 from __future__ import annotations
 
@@ -44,7 +46,7 @@ class Estimate:
 
 
 def absent(why: str, step: float | None = None) -> Estimate:
-    """Return the estimate that stands for a missing measurement, with the reason."""
+    """Return an `Estimate` of NaN for a quantity that could not be measured, with the reason."""
     return Estimate(NOWHERE, NOWHERE, NOWHERE, step=step, missing=why)
 
 

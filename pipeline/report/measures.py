@@ -30,7 +30,9 @@ Measure = Callable[[Results, Sequence[str], Options], Estimate]
 
 
 def _cells(results: Results, name: str) -> tuple[xr.Dataset, str]:
-    """Return the cells of a run with one swept axis, with dims (axis, cell), and the name of the axis."""
+    """Return the cells of a run that sweeps one axis, as a dataset with dims (axis, cell), and the name of this
+    axis.
+    """
     cube = results.run(name).cube()
     axes, starts = split_dims(cube["status"])
     wide = [d for d in axes if cube.sizes[d] > 1] or list(axes[:1])
@@ -58,7 +60,7 @@ def _within(ds: xr.Dataset, axis: str, options: Options) -> xr.Dataset:
 
 
 def _index(ds: xr.Dataset, axis: str, value: float) -> int | None:
-    """Return the index of a value on an axis; None if the axis lacks the value."""
+    """Return the index of a value on an axis. Return None if the axis lacks the value."""
     try:
         return place(ds[axis], value)
     except ValueError:
@@ -70,7 +72,9 @@ def _step(values: np.ndarray) -> float | None:
 
 
 def _matches(ds: xr.Dataset, options: Options) -> np.ndarray:
-    """Return a mask of the cells with a wanted orbit period (one or several; 0: not closed) and class of motion."""
+    """Return a mask of the cells that have a wanted orbit period and the wanted class of motion. Period 0 selects
+    orbits that are not closed.
+    """
     wanted = options.get("period")
     periods = ds["orbit_period"].values
     found = np.ones(periods.shape, bool)
@@ -92,7 +96,7 @@ def _share(count: int, n: int, confidence: float = 0.95) -> tuple[float, float]:
 
 
 def least_share(results: Results, of: Sequence[str], options: Options) -> Estimate:
-    """Return the smallest fraction of cells with an orbit period or class of motion, over all axis values.
+    """Return the smallest fraction, over the axis values, of cells that have a given orbit period or class of motion.
 
     Options: ``at``, or ``low`` and ``high``; ``period``, ``motion``. The interval is Clopper and Pearson's.
     Its level is corrected for the number of axis values (Bonferroni), since the least of many fractions is
@@ -112,7 +116,7 @@ def least_share(results: Results, of: Sequence[str], options: Options) -> Estima
 
 
 def largest_share(results: Results, of: Sequence[str], options: Options) -> Estimate:
-    """Return the largest fraction of cells with an orbit period or class of motion, over all axis values.
+    """Return the largest fraction, over the axis values, of cells that have a given orbit period or class of motion.
 
     Options and interval: see `least_share`.
     """
@@ -135,8 +139,8 @@ def _asked(options: Options) -> str:
 
 
 def window(results: Results, of: Sequence[str], options: Options) -> tuple[Estimate, int, int, xr.Dataset, str]:
-    """Return the width of a periodic window about an axis value, its first and last index, the cells, and the axis
-    name.
+    """Return the width of the periodic window about an axis value, the indices of its first and last axis values, the
+    cells, and the axis name.
     """
     ds, axis = _cells(results, of[0])
     here = _within(ds, axis, {k: v for k, v in options.items() if k in ("low", "high")})
@@ -221,7 +225,8 @@ def change_of_period(results: Results, of: Sequence[str], options: Options) -> E
 
 
 def located_bifurcation(results: Results, of: Sequence[str], options: Options) -> Estimate:
-    """Return the parameter value of bifurcations of a type, located by continuation of orbits from the run's cells.
+    """Return the parameter value at which bifurcations of a given type occur. They are located by continuation of the
+    orbits on which the run's cells end.
 
     Options: ``type``, as `magpend analyse branches` names it; ``low`` and ``high``; ``max_period``, the
     longest period of continued orbits. The interval spans all bifurcations found. Each is located exactly,
@@ -243,8 +248,8 @@ def located_bifurcation(results: Results, of: Sequence[str], options: Options) -
 
 
 def rarest_motion(results: Results, of: Sequence[str], options: Options) -> Estimate:
-    """Return the smallest fraction of cells on any of the given motions at one axis value; above 0, all of them
-    coexist.
+    """Return the smallest of the fractions of cells in the given classes of motion at one axis value. If it exceeds 0,
+    all these classes coexist.
 
     Options: ``at``, ``motions``, ``period``.
     """
@@ -284,7 +289,8 @@ def largest_exponent(results: Results, of: Sequence[str], options: Options) -> E
 
 
 def agreement(results: Results, of: Sequence[str], options: Options) -> Estimate:
-    """Return the fraction of axis values common to two runs at which most of their cells have the same orbit period.
+    """Return the fraction of the common axis values of two runs at which both runs have the same most frequent orbit
+    period.
 
     Options: ``low``, ``high``. Periods above 16 count as one outcome, and so do cells that are not closed.
     """
@@ -305,8 +311,8 @@ def agreement(results: Results, of: Sequence[str], options: Options) -> Estimate
 
 
 def share_above(results: Results, of: Sequence[str], options: Options) -> Estimate:
-    """Return the fraction of a drive period, from its start, in which a model quantity is positive for the state at
-    rest.
+    """Return the fraction of a drive period, counted from its start, during which a model quantity is positive while
+    the model is at rest.
 
     Options: ``quantity``, ``frequency_hz``. The time of the sign change is found by bisection. The quantity
     must be positive at the start and change sign once.
@@ -336,7 +342,7 @@ def share_above(results: Results, of: Sequence[str], options: Options) -> Estima
 
 
 def recorded_duty_cycle(results: Results, of: Sequence[str], options: Options) -> Estimate:
-    """Return the duty cycle of a recorded drive, from its edges."""
+    """Return the duty cycle of a recorded drive, computed from the drive's switching edges."""
     from pipeline.rig.edges import edges_of
 
     timing = edges_of(results.recording(of[0])).frequency()

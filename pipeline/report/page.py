@@ -119,7 +119,7 @@ class Facts:
 
 @dataclass(frozen=True)
 class Source:
-    """A block of a page with unchanged text, collapsed at first, such as a specification."""
+    """A block of a page with verbatim text, such as a specification. The block is collapsed at first."""
 
     title: str
     text: str

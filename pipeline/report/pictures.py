@@ -24,7 +24,9 @@ _FINE = 2001
 
 
 def picture(results: Results, table: PictureTable) -> Block:
-    """Draw a picture of a study, and return it as a block of the page, or as a note with the reason for failure."""
+    """Draw a picture of a study, and return it as a block of the page. If drawing fails, return a note with the
+    reason.
+    """
     alt = f"{table.caption.rstrip('.')} ({table.of})"
     try:
         drawn = _DRAW[table.kind](results, table)

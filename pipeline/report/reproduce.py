@@ -1,4 +1,4 @@
-"""Reproduce a study: compute its runs and judge its claims; ``magpend reproduce``."""
+"""Reproduce a study (``magpend reproduce``): compute its runs and judge its claims."""
 
 from __future__ import annotations
 
@@ -57,7 +57,9 @@ class Judgement:
 
     @property
     def fails(self) -> bool:
-        """Whether a required claim is contradicted, even if parameters were calibrated on it."""
+        """Return whether the claim is required and contradicted. A claim on which parameters were calibrated can fail
+        too.
+        """
         return self.claim.required and self.plain is Verdict.NOT_MET
 
 
@@ -146,7 +148,7 @@ def _chosen(study: Study, figures: Sequence[str]) -> list[FigureTable]:
 
 
 def judge(results: Results, figure: str, claim: ClaimTable) -> Judgement:
-    """Measure the quantity of a claim, and judge the claim by it.
+    """Measure the quantity of a claim, and judge the claim by the result.
 
     The verdict is undecided if the axis is coarser, or the sample smaller, than the claim requires.
     """
@@ -171,7 +173,7 @@ def judge(results: Results, figure: str, claim: ClaimTable) -> Judgement:
 
 
 def _decides(claim: ClaimTable) -> str:
-    """Return a sentence on the axis step and number of cells that a claim needs to be decided."""
+    """Return a sentence that states the axis step and the number of cells needed to decide a claim."""
     steps = f"steps of at most {claim.step:g}" if claim.step else ""
     cells = f"at least {claim.n} cells" if claim.n else ""
     both = " and ".join(part for part in (steps, cells) if part)
@@ -278,13 +280,17 @@ def headline(judgements: Sequence[Judgement], smoke: bool) -> str:
 
 
 def decided_first(judgements: Sequence[Judgement]) -> list[Judgement]:
-    """Return the claims that test the model (no parameter was calibrated on them), decided claims first."""
+    """Return the claims that test the model, with the decided claims first. Claims on which parameters were calibrated
+    are left out.
+    """
     tests = [j for j in judgements if j.verdict is not Verdict.CALIBRATED]
     return sorted(tests, key=lambda j: j.verdict is Verdict.UNDECIDED)
 
 
 def calibrated_on(judgements: Sequence[Judgement]) -> str:
-    """Return a paragraph that lists the claims on which parameters were calibrated; empty if there are none."""
+    """Return a paragraph that lists the claims on which parameters were calibrated. It is empty if there are no such
+    claims.
+    """
     own = [j for j in judgements if j.verdict is Verdict.CALIBRATED]
     if not own:
         return ""

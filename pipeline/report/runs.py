@@ -97,8 +97,8 @@ class Shown:
         return shlex.quote(self.run.name)
 
     def options_of(self, name: str) -> list[dict[str, Any]]:
-        """Return the options with which an analysis is shown: those of stored results, else the defaults if it may be
-        computed.
+        """Return the options of the stored results of an analysis. If none is stored and the analysis may be computed,
+        return the default options.
         """
         known = stored_options(self.run, name)
         return known or ([{}] if name in self.computed else [])
@@ -253,7 +253,9 @@ def _counted(rows: list[dict[str, Any]], told: str) -> str:
 
 
 def _richest(rows: list[dict[str, Any]], axes: tuple[str, ...]) -> dict[str, float]:
-    """Return the axis values at which most attractors coexist; the first such values in a tie."""
+    """Return the axis values with the largest number of coexisting attractors. In a tie, return the first such
+    values.
+    """
     counts: dict[tuple[float, ...], int] = {}
     for row in rows:
         place: tuple[float, ...] = tuple(row[name] for name in axes)
@@ -287,7 +289,9 @@ def _attractor_grid(
 
 
 def _share(rows: list[dict[str, Any]], axes: tuple[str, ...]) -> str:
-    """Return the largest basin fraction of an attractor, its interval and its parameter values, as text."""
+    """Return as text the largest basin fraction of an attractor, its interval, and the parameter values at which it
+    occurs.
+    """
     best = max(rows, key=lambda row: float(np.nan_to_num(row["fraction"], nan=-1.0)))
     if not np.isfinite(best["fraction"]):  # it attracts nowhere
         return "-"
@@ -297,7 +301,9 @@ def _share(rows: list[dict[str, Any]], axes: tuple[str, ...]) -> str:
 
 
 def _analyses(shown: Shown) -> Iterator[Part]:
-    """Yield a section for each further analysis: its table and figure, or the command that computes it."""
+    """Yield a section for each analysis other than ``attractors``: its table and figure, or the command that computes
+    it.
+    """
     for name in SHOWN[1:]:
         if not _suits(shown, name):
             continue
@@ -352,7 +358,9 @@ _OF_ATTRACTORS = {
 
 
 def _with_letters(row: Mapping[str, Any], path: str) -> dict[str, Any]:
-    """Return a table row with letters instead of attractor ids, and with the axis name added to ends of a range."""
+    """Return a table row with letters instead of attractor ids. The names of the columns ``from`` and ``to`` get the
+    axis name.
+    """
     found: dict[str, Any] = {}
     for name, value in row.items():
         if name in _OF_ATTRACTORS:

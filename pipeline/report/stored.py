@@ -16,7 +16,8 @@ from pipeline.store.run import Run
 
 
 def stored_options(run: Run, name: str) -> list[dict[str, Any]]:
-    """Return the options of each stored result of an analysis that `pipeline.runs.derive.derive` would use.
+    """Return the options of each stored result of an analysis, if `pipeline.runs.derive.derive` would still use this
+    result.
 
     Parameters
     ----------
@@ -47,7 +48,7 @@ def stored_options(run: Run, name: str) -> list[dict[str, Any]]:
 
 
 def settled_options(name: str, attrs: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the non-default options of a stored analysis result, with open defaults filled in.
+    """Return those options of a stored analysis result that differ from their defaults.
 
     Options that were left open are filled in, such as a range that defaults to the axis'.
     """

@@ -37,7 +37,7 @@ class TorqueTable(Table):
 
 
 class PictureTable(Table):
-    """A table ``[[figures.pictures]]`` of a study's file: a picture of a figure."""
+    """A table ``[[figures.pictures]]`` of a study's file: a picture to draw for a figure of the paper."""
 
     kind: Literal["plot", "quantities", "recording", "series", "torques"] = Field(
         description="plot: a figure of a run, by the name of its command; quantities: quantities of the "

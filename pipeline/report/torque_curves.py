@@ -55,7 +55,8 @@ def curves_described(outcome: Outcome, options: Mapping[str, Any]) -> Estimate:
 
 
 def gain_over_dipoles(outcome: Outcome, options: Mapping[str, Any]) -> Estimate:
-    """Return the fraction by which the joint fit reduces the squared residuals of the point-dipole fit.
+    """Return the fraction by which the sum of squared residuals of the joint fit is smaller than that of the point-
+    dipole fit.
 
     The interval is a bootstrap over whole curves, so residuals within a curve may be correlated.
     """
@@ -74,7 +75,7 @@ def _squares(outcome: Outcome, residuals: np.ndarray) -> np.ndarray:
 
 
 def width_spread(outcome: Outcome, options: Mapping[str, Any]) -> Estimate:
-    """Return the change of the torque bumps' widths over the locked angle, relative to the mean width.
+    """Return the variation of the torque peaks' width with the locked angle, relative to the mean width.
 
     A parabola in the locked angle is fitted to the widths. Its range over the measured angles is divided by
     its mean. The interval is a bootstrap over the curves.
@@ -102,7 +103,9 @@ def _width(values: Mapping[str, float]) -> float:
 
 
 def signs_apart(outcome: Outcome, options: Mapping[str, Any]) -> Estimate:
-    """Return the fraction of readings whose torque has the sign of the angle's distance from the transition line."""
+    """Return the fraction of readings whose torque has the same sign as the angle's signed distance from the transition
+    line.
+    """
     from magpend_core.models.pendulum import magnet_torque as laws
     from pipeline.analysis.intervals import binomial_interval
 

@@ -1,1 +1,1 @@
-"""Analyse data of a test rig: recordings, magnet torque, identification, measured bifurcation diagrams."""
+"""Analyse data of a test rig: recordings, magnet torque, parameter identification, measured bifurcation diagrams."""

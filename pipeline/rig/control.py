@@ -41,7 +41,7 @@ SURE = 2.0
 
 @dataclass(frozen=True)
 class Controlled:
-    """Setting of a virtual rig with control.
+    """Settings of a virtual rig under feedback control: model, drive, gains, noise and measuring times.
 
     Attributes
     ----------
@@ -75,7 +75,8 @@ class Controlled:
 
 @dataclass(frozen=True)
 class TracedOrbits:
-    """Orbits of the rig, one for each target: medians over the measured periods, and the scatter of single ones.
+    """Orbits of the rig, one for each target: medians over the measured drive periods, and standard deviations between
+    the periods.
 
     Attributes
     ----------
@@ -98,7 +99,8 @@ class TracedOrbits:
 
 
 def trace(rig: Controlled, targets: Sequence[float] | np.ndarray) -> TracedOrbits:
-    """Trace a branch: one orbit for each amplitude of the target's first harmonic, each on a rig of its own.
+    """Trace a branch: find one orbit for each amplitude of the target's first harmonic. Each orbit has a separate
+    virtual rig.
 
     Raises
     ------
@@ -135,7 +137,9 @@ def trace(rig: Controlled, targets: Sequence[float] | np.ndarray) -> TracedOrbit
 
 @dataclass(frozen=True)
 class _Plant:
-    """A rig for each target: the model without its own drive, and the direction in which the drive acts."""
+    """Virtual rigs, one for each target: the model with its drive amplitude set to 0, and the direction in state space
+    in which the drive acts.
+    """
 
     rig: Controlled
     parameters: Parameters
@@ -144,7 +148,9 @@ class _Plant:
 
     @classmethod
     def of(cls, rig: Controlled, targets: np.ndarray) -> _Plant:
-        """Check a setting, and return its plant."""
+        """Check the settings of a virtual rig and the targets, and return the rigs. Raise SpecError if the settings are
+        not valid.
+        """
         model, problems = rig.parameters.model, []
         if rig.state not in model.state_names or not model.state(rig.state).rate:
             known = [s.name for s in model.states if s.rate]
@@ -164,7 +170,9 @@ class _Plant:
     def run(
         self, state: np.ndarray, target: np.ndarray, n_periods: int, random: np.random.Generator
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Integrate for some periods; return the last states, and measured state and output at each sample."""
+        """Integrate the controlled rigs for some drive periods. Return the final states, and the measured state and the
+        controller's output at each sample.
+        """
         period = 1.0 / self.rig.frequency_hz
         step, omega = period / SAMPLES, 2.0 * np.pi * self.rig.frequency_hz
         orders = np.arange(N_HARMONICS + 1)
@@ -183,7 +191,7 @@ class _Plant:
         return state, seen, output
 
     def _step(self, y: np.ndarray, force: np.ndarray, h: float) -> np.ndarray:
-        """Integrate one sample by the classical Runge-Kutta method, with a constant force."""
+        """Integrate over one sampling interval by the classical Runge-Kutta method, with a constant control force."""
 
         def rate(state: np.ndarray) -> np.ndarray:
             found = rates(np.zeros(len(state)), state, self.parameters, self.rig.frequency_hz)
@@ -197,8 +205,8 @@ class _Plant:
 
 
 def _push(still: Parameters, one: Parameters, frequency_hz: float) -> np.ndarray:
-    """Return the change of the rates by a drive of amplitude 1; raise SpecError unless it is one direction times a
-    cosine.
+    """Return the change of the rates under a drive of amplitude 1 at phase 0. Raise SpecError unless the drive acts as
+    a cosine in one fixed direction.
     """
     shares = np.array([0.0, 0.125, 0.25, 0.5])
     states = np.stack([np.zeros(len(still.model.state_names)), 0.3 * np.asarray(still.model.scales)])
@@ -230,7 +238,9 @@ def _harmonics(signal: np.ndarray) -> np.ndarray:
 
 
 def _stabilities(targets: np.ndarray, drive: np.ndarray, scatter: np.ndarray) -> tuple[str, ...]:
-    """Return whether each orbit is stable, by the slope of the drive's amplitude along the branch."""
+    """Return ``yes``, ``no`` or ``unknown`` for the stability of each orbit, from the slope of the drive's amplitude
+    along the branch.
+    """
     if len(targets) < 2:
         return ("unknown",) * len(targets)
     order = np.argsort(targets)
@@ -245,7 +255,9 @@ def _stabilities(targets: np.ndarray, drive: np.ndarray, scatter: np.ndarray) ->
 
 
 class ControlTable(Table):
-    """Table ``[control]`` of a virtual rig: what is controlled, and the targets of its branch."""
+    """Table ``[control]`` of a virtual rig: controlled state, drive, gains, noise, and the range of target
+    amplitudes.
+    """
 
     state: str = Field(description="Controlled state; its rate is measured as well.")
     drive: str = Field(description="Parameter that is the amplitude of the drive, a cosine; control acts through it.")
@@ -262,7 +274,8 @@ class ControlTable(Table):
 
 
 def load_control(path: str | Path) -> tuple[Controlled, np.ndarray]:
-    """Read the specification of a virtual rig with the table ``[control]``; return the setting and the targets.
+    """Read the specification of a virtual rig with the table ``[control]``. Return the settings and the target
+    amplitudes.
 
     Raises
     ------

@@ -137,7 +137,8 @@ class Edges:
         return mean / period, math.hypot(*errors) / period
 
     def common_error(self, fitted: Floats, scatter: float) -> float:
-        """Return the standard error [s] that is common to all times on a line fitted through the edges.
+        """Return the standard error [s] of the offset of a line fitted through the edges. It is common to all times on
+        the line.
 
         Parameters
         ----------
@@ -202,7 +203,7 @@ def find_edges(time: npt.ArrayLike, drive: npt.ArrayLike, *, hysteresis: float |
 
 
 def edges_of(recording: xr.Dataset, *, hysteresis: float | None = None) -> Edges:
-    """Return the drive edges in all pieces of a recording; no edge lies in a gap between pieces.
+    """Return the edges of the drive signal in all pieces of a recording. Edges in gaps between the pieces are left out.
 
     Parameters
     ----------
@@ -233,7 +234,9 @@ def edges_of(recording: xr.Dataset, *, hysteresis: float | None = None) -> Edges
 
 @dataclass(frozen=True)
 class _Switch:
-    """A two-level signal: middle and distance of its levels, width of the band about the middle, noise of a sample."""
+    """Two-level signal: middle and distance of its levels, width of the hysteresis band about the middle, and noise of
+    a sample.
+    """
 
     middle: float
     span: float
@@ -242,7 +245,9 @@ class _Switch:
 
 
 def _switch(x: Floats, hysteresis: float | None) -> _Switch:
-    """Estimate the two levels of a drive signal and its noise; raise SpecError if they are not distinct."""
+    """Estimate the two levels of a drive signal and its noise. Raise SpecError if the difference of the levels is
+    within the noise.
+    """
     low, high, noise = _levels(x)
     span = high - low
     if span <= _LEAST_CONTRAST * noise or span <= 0:
@@ -261,7 +266,9 @@ def _switch(x: Floats, hysteresis: float | None) -> _Switch:
 
 
 def _found(parts: Sequence[tuple[Floats, Floats]], switch: _Switch) -> Edges:
-    """Return the edges in a sequence of sample stretches (times, signal), in order."""
+    """Return the edges of a drive signal, in order. The signal is a sequence of stretches, each a pair of arrays
+    (sample times, values).
+    """
     instants, rises, sharp, slopes, steps = [], [], [], [], [0.0]
     for t, x in parts:
         above = x - switch.middle
@@ -309,7 +316,9 @@ def _levels(x: Floats) -> tuple[float, float, float]:
 
 
 def _crossing(t: Floats, above: Floats) -> float:
-    """Return the time of a sign change by linear interpolation; the mean of the first and last if there are several."""
+    """Return the time of a sign change, by linear interpolation. If there are several sign changes, return the mean of
+    the first and the last.
+    """
     at = np.flatnonzero((above[:-1] > 0) != (above[1:] > 0))[[0, -1]]
     share = above[at] / (above[at] - above[at + 1])
     return float((t[at] + share * (t[at + 1] - t[at])).mean())

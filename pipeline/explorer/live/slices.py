@@ -99,8 +99,8 @@ class _Grid:
             n *= 2
 
     def missing(self, n: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return rows and columns, in the finest grid, of those initial states of a coarser one that have no label
-        yet.
+        """Return the initial states of a coarser grid that have no label yet, as row and column indices of the finest
+        grid.
         """
         step = self.n // n
         rows, columns = np.nonzero(self.labels[::step, ::step] == NOT_YET)
@@ -114,7 +114,7 @@ class _Grid:
         return states
 
     def image(self, n: int) -> np.ndarray:
-        """Return the labels of a grid of n x n cells; missing ones are taken from the next coarser grid."""
+        """Return the labels of the grid of n x n cells. Missing labels are taken from the next coarser grid."""
         step = self.n // n
         own = self.labels[::step, ::step].astype(np.int16)
         if n == LEAST_RESOLUTION:
@@ -124,7 +124,9 @@ class _Grid:
 
 
 class _Slice:
-    """Computation of a slice (labelled plane of initial states), one grid after the other, in several threads."""
+    """Computation of a slice (labelled plane of initial states) in several threads, from the coarsest grid to the
+    finest.
+    """
 
     def __init__(self, live: LiveRun, job: Job, grid: _Grid, catalog: Catalog) -> None:
         self._live, self._job, self._grid, self._catalog = live, job, grid, catalog

@@ -72,7 +72,7 @@ def _end(live: LiveRun, job: Job, place: Place, block: Block, number: int, perio
 
 
 class _Path:
-    """Trajectory of an initial state over its first periods, sent piece by piece."""
+    """Trajectory of an initial state over its first periods. It is sent to the page in parts."""
 
     def __init__(self, live: LiveRun, job: Job, place: Place, state: np.ndarray) -> None:
         self._live, self._job, self._place = live, job, place
@@ -80,7 +80,9 @@ class _Path:
         self._period = self._seconds()
 
     def _seconds(self) -> float:
-        """Return the drive period, or the mean of a flow's first return times [s]."""
+        """Return the drive period [s]. For a model with a Poincare section, return the mean of the first return times
+        [s].
+        """
         place = self._place
         if self._live.model.crossing is None:
             return 1.0 / place.frequency
@@ -122,7 +124,7 @@ class _Path:
 
 
 class _Sections:
-    """Buffer that sends section points to the page in pieces of reasonable size."""
+    """Buffer that collects section points and sends them to the page at intervals."""
 
     def __init__(self, job: Job) -> None:
         self._job, self._told = job, time.perf_counter()
@@ -130,14 +132,14 @@ class _Sections:
         self.done = 0
 
     def take(self, section: np.ndarray, done: int) -> None:
-        """Add section points, shape (k, n_states); send the buffer if enough time has passed."""
+        """Add section points, shape (k, n_states). Send the buffer if enough time has passed since it was last sent."""
         self._kept.append(section[np.isfinite(section).all(axis=1)])
         self.done = done
         if time.perf_counter() - self._told >= MOST_EVERY_S:
             self.flush()
 
     def flush(self) -> None:
-        """Send the buffered sections."""
+        """Send the buffered section points to the page."""
         section = np.concatenate(self._kept) if self._kept else np.zeros((0, 1))
         self._kept, self._told = [], time.perf_counter()
         if len(section):

@@ -61,7 +61,7 @@ class Query:
 
     @property
     def at(self) -> dict[str, int]:
-        """Index on each swept axis, from the arguments ``at.NAME``."""
+        """Return the index on each swept axis by axis name, from the arguments ``at.NAME``."""
         names = [name for name in self.words if name.startswith(_AT)]
         return {name.removeprefix(_AT): self.count(name) for name in names}
 

@@ -1,4 +1,6 @@
-"""Open the page in a browser by a private redirect file, since command lines of processes are public."""
+"""Open the page in a browser through a private redirect file. This keeps the secret token off command lines, which are
+public.
+"""
 
 from __future__ import annotations
 

@@ -44,12 +44,12 @@ class Guard:
 
     @property
     def hosts(self) -> tuple[str, ...]:
-        """Host names, with port, under which this server may be addressed."""
+        """Return the host names, with port, that requests may use for this server."""
         return f"127.0.0.1:{self.port}", f"localhost:{self.port}"
 
     def foreign(self, headers: Mapping[str, str]) -> str | None:
-        """Return the reason to reject a request as coming from another page or naming another host; None if there is
-        none.
+        """Return the reason to reject a request that comes from another page or names another host. Return None for
+        other requests.
         """
         if headers.get("Host", "").lower() not in self.hosts:
             return "this server answers to its own address alone; use the one that it printed"
@@ -61,7 +61,7 @@ class Guard:
         return None
 
     def knows(self, given: str) -> bool:
-        """Return whether a text is the token, in a comparison of constant time."""
+        """Return whether a text equals the token. The comparison takes constant time."""
         return hmac.compare_digest(given.encode("utf-8", "replace"), self.token.encode())
 
     def authorised(self, headers: Mapping[str, str], argument: str = "") -> bool:
@@ -73,7 +73,9 @@ class Guard:
 
 
 def content_policy(port: int) -> str:
-    """Return the content security policy (HTTP header) of the page: its own script, style and connections."""
+    """Return the content security policy (HTTP header) of the page. It allows only the page's own script, style, images
+    and connections.
+    """
     sockets = f"ws://127.0.0.1:{port} ws://localhost:{port}"  # some browsers do not take 'self' for these
     return (
         "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; "
@@ -110,7 +112,7 @@ class Rate:
         self._left, self._then = float(burst), time.monotonic()
 
     def allows(self) -> bool:
-        """Return whether another request is allowed now, and count it."""
+        """Return whether another request is allowed now, and count it if it is."""
         now = time.monotonic()
         self._left = min(self._burst, self._left + (now - self._then) * self._per_second)
         self._then = now

@@ -125,7 +125,7 @@ class Service:
         first.add_done_callback(lambda done: None if done.cancelled() else live.warm(tell))
 
     async def work(self, function: Callable[[], Any], *, integrates: bool = False) -> Any:
-        """Call a function in a thread; raises `TooManyError` if too many wait.
+        """Call a function in a worker thread and return its result. Raise `TooManyError` if too many requests wait.
 
         One that integrates waits until what it needs is compiled, once, and not in these threads.
         """
@@ -147,7 +147,7 @@ class Service:
 
 
 class TooManyError(ValueError):
-    """Raised if the server has more waiting requests than it accepts."""
+    """Error raised if more requests wait than the server accepts."""
 
 
 class Handler(web.RequestHandler):
@@ -172,7 +172,9 @@ class Handler(web.RequestHandler):
         return None
 
     def prepare(self) -> None:
-        """Reject a request with a bad origin, a wrong token or too high a rate, before any work."""
+        """Reject a request whose origin or token is wrong, whose address is too long, or that exceeds the rate
+        limit.
+        """
         guard, headers = self.service.guard, self.request.headers
         if len(self.request.uri or "") > MOST_ADDRESS:
             self.refuse(414, "the address is too long")
@@ -321,7 +323,7 @@ def application(service: Service) -> web.Application:
 
 
 def _live_routes(service: Service) -> list[Any]:
-    """Return the websocket route for live computing, if the run allows it."""
+    """Return the websocket route for live computing. Return an empty list if the run cannot be computed live."""
     if service.live is None:
         return []
 

@@ -35,7 +35,7 @@ Route = tuple[str, type[WebSocketHandler], dict[str, Any]]
 
 
 def socket_routes(live: LiveRun, authorised: Authorised, path: str = r"/ws") -> list[Route]:
-    """Return the routes of a tornado application for the live connection.
+    """Return the tornado routes of the websocket for live computing.
 
     Parameters
     ----------

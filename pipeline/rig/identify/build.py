@@ -34,7 +34,8 @@ LEAST_NOISE = 1e-6
 
 @dataclass(frozen=True)
 class Built:
-    """Least-squares problem of an identification, with the held-out pieces that only judge the fit.
+    """Least-squares problem of an identification, and the held-out pieces of the recordings, on which the fit is only
+    tested.
 
     Attributes
     ----------
@@ -142,8 +143,8 @@ def build(spec: IdentificationSpec, recordings: Sequence[xr.Dataset], tables: Se
 def channels_of(
     model: Model, wanted: Sequence[str], recordings: Sequence[xr.Dataset], problems: list[str]
 ) -> tuple[str, ...]:
-    """Return the names of the measured states (channels) to compare: those of the specification, else those in all
-    recordings.
+    """Return the names of the measured states (channels) to compare with the model: those in the specification, or by
+    default those that all recordings contain.
 
     By default a rate is left out if its state is measured, since it adds no information.
     """
@@ -227,7 +228,7 @@ def free_of(spec: IdentificationSpec, channels: Sequence[str], n_recordings: int
 def noise_of(
     model: Model, channels: Sequence[str], smoothed: Sequence[xr.Dataset], stated: Mapping[str, float]
 ) -> np.ndarray:
-    """Return the standard deviation of each channel by which its residuals are divided [SI].
+    """Return the noise of each channel [SI]: the standard deviation by which its residuals are divided.
 
     The specification may state it. Otherwise the recordings give it, one value for all channels of a unit: in
     most rigs the model's error exceeds the sensors' noise and is not proportional to it.
@@ -311,7 +312,8 @@ def pieces_of(
 
 
 def stretches(ds: xr.Dataset, piece_s: float | None, recording: int) -> list[Stretch]:
-    """Cut each uninterrupted piece of a recording into equal stretches of about `piece_s`; return all stretches.
+    """Cut each uninterrupted piece of a recording into equal stretches of about `piece_s` seconds; return all
+    stretches.
 
     Parameters
     ----------
@@ -371,7 +373,9 @@ class _Driven:
     end_s: float
 
     def window(self, begin: float, end: float) -> Drive:
-        """Return the part of the drive between two times [s]; a drive of zero torque if no drive was recorded."""
+        """Return the drive between two times of the recording [s]. If no drive was recorded, return a drive of zero
+        torque.
+        """
         if self.drive is None:
             # no torque here, while other recordings have one
             return Drive.from_torque(np.array([0.0, end - begin]), np.zeros(2))
@@ -379,7 +383,7 @@ class _Driven:
 
 
 def _drive_of(table: RecordingTable, ds: xr.Dataset) -> _Driven | None:
-    """Return the drive of a recording and the times that it covers; None if the drive was off."""
+    """Return the drive of a recording with the times that it covers, or None if the drive was off."""
     time = ds["time"].values
     if table.drive == "none":
         return None
@@ -405,8 +409,8 @@ def _drive_of(table: RecordingTable, ds: xr.Dataset) -> _Driven | None:
 
 
 def _steadied(edges: Edges) -> Edges:
-    """Replace the edges of a drive by evenly spaced ones from a fitted line if they scatter by less than the sampling
-    interval.
+    """Replace the edges of a drive by evenly spaced ones on a fitted line, if rounding to samples explains their
+    scatter about the line.
 
     A single edge is known to half a sampling interval; a line through many edges is known far better.
     """
@@ -427,6 +431,8 @@ def _steadied(edges: Edges) -> Edges:
 
 
 def _rechained(pieces: list[Piece], offset: int) -> list[Piece]:
-    """Renumber the preceding piece of each piece (`Piece.follows`) after pieces were removed; -1 if it was removed."""
+    """Update each piece's index of its preceding piece (`Piece.follows`) after pieces were removed. The index is -1 if
+    the preceding piece was removed.
+    """
     numbers = {p.number: offset + k for k, p in enumerate(pieces)}
     return [replace(p, follows=numbers.get(p.number - 1, -1) if p.follows >= 0 else -1) for p in pieces]

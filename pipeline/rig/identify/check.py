@@ -1,4 +1,4 @@
-"""Test a finished identification on another recording, with only the initial states of its pieces fitted."""
+"""Test a finished identification on another recording. Only the initial states of the recording's pieces are fitted."""
 
 from __future__ import annotations
 

@@ -131,8 +131,8 @@ def sources_of(spec: IdentificationSpec) -> list[Source]:
 
 
 def _kept(path: Path) -> str:
-    """Return the text of a mapping file; if its model is a file or an object, return the parsed mapping as TOML
-    instead.
+    """Return the text of a mapping file. If its model is a model file or a Python object, return the mapping as TOML
+    that contains the model.
     """
     text = path.read_text("utf-8")
     model = tomllib.loads(text).get("model")
@@ -207,7 +207,8 @@ def read_info(directory: str | Path) -> Info:
 
 
 def check(directory: Path, identity: Mapping[str, Any]) -> Info | None:
-    """Return the same identification if a directory holds it, None if it is free; raise if it holds anything else.
+    """Return the identification in a directory if it has the given identity, or None if the directory is free. Raise
+    RefusedError if it holds anything else.
 
     Returns
     -------
@@ -257,8 +258,8 @@ def establish(
     spec_text: str,
     orbits: Sequence[MeasuredTable] = (),
 ) -> Info:
-    """Create the directory of an identification and its ``identification.json``, or return the identification that it
-    holds.
+    """Create the directory of an identification with its ``identification.json``, unless they exist. Return the content
+    of this file.
     """
     identity = identity_of(spec, sources, orbits)
     if check(directory, identity) is None:
@@ -280,7 +281,7 @@ def establish(
 
 
 class Outcomes:
-    """Files of the outcomes of local fits and profiles, one file per outcome; a later run reads them again.
+    """Stored outcomes of local fits and profiles, one file per outcome. A continued identification reads them again.
 
     Parameters
     ----------
@@ -293,7 +294,7 @@ class Outcomes:
         self.recalled = 0
 
     def recall(self, name: str, unpack: Callable[[Mapping[str, np.ndarray]], T]) -> T | None:
-        """Return a stored outcome; None if its file is missing or damaged."""
+        """Return a stored outcome, or None if its file is missing or damaged."""
         path = self._folder / f"{name}.npz"
         if not is_there(path):
             return None

@@ -1,6 +1,4 @@
-"""Draw the figures of an identification: computed over measured values, residuals, profile likelihoods,
-correlations.
-"""
+"""Draw the figures of an identification: measured and computed values, residuals, profile likelihoods, correlations."""
 
 from __future__ import annotations
 
@@ -188,7 +186,8 @@ def _share_range(row: list[Axes]) -> None:
 
 
 def plot_residuals(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.DataFigure:
-    """Draw the residuals of each channel: autocorrelation, rms by piece, residuals against the rate, histogram.
+    """Draw the residuals of each channel: autocorrelation, rms by piece, residuals against the channel's rate of
+    change, and histogram.
 
     Parameters
     ----------
@@ -383,8 +382,8 @@ def _draw_profile(ax: Axes, data: xr.Dataset, name: str, estimate: Mapping[str, 
 
 
 def _engineering(size: float) -> tuple[float, int]:
-    """Return a power-of-ten factor and its exponent (a multiple of 3) that bring a very small or large number to 1 to
-    1000.
+    """Return the factor that scales a very small or very large number to 1 to 1000, and the exponent of ten that it
+    removes (a multiple of 3).
     """
     if not size > 0 or 1e-2 <= size < 1e4:
         return 1.0, 0

@@ -1,4 +1,6 @@
-"""Fit the initial states of the pieces for given parameters, or eliminate them from the least-squares problem."""
+"""Fit the initial states of the pieces of recordings for given parameters, or eliminate these states from the least-
+squares problem.
+"""
 
 from __future__ import annotations
 
@@ -70,9 +72,7 @@ def fit_starts(problem: Problem, theta: Array, starts: Array) -> Starts:
 
 
 def block_rows(problem: Problem) -> list[slice]:
-    """Return the range of rows that each piece of a recording has in the residual vector, which is compressed piece by
-    piece.
-    """
+    """Return, for each piece of a recording, the range of its rows in the compressed residual vector."""
     n_own = len(problem.free) + len(problem.model.states)
     sizes = [min(int(np.isfinite(p.measured).sum()), n_own + 1) for p in problem.pieces]
     ends = np.cumsum([0, *sizes])
@@ -80,9 +80,7 @@ def block_rows(problem: Problem) -> list[slice]:
 
 
 class _Block(NamedTuple):
-    """Residuals of a piece, compressed by a QR decomposition to few rows, with their derivatives by its initial
-    state.
-    """
+    """Residuals of a piece and their derivatives by its initial state, compressed to few rows by a QR decomposition."""
 
     jacobian: Array
     rows: Array

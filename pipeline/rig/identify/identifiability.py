@@ -1,4 +1,6 @@
-"""Find out which parameters the data determine, and describe it in numbers and sentences."""
+"""Analyse which parameters the data determine: directions in parameter space with their standard errors, and warnings
+in words.
+"""
 
 from __future__ import annotations
 
@@ -54,7 +56,7 @@ class Direction:
 def sizes_of(
     theta: np.ndarray, start: np.ndarray, lower: np.ndarray, upper: np.ndarray, sensed: np.ndarray
 ) -> np.ndarray:
-    """Return a typical size of each parameter, as the unit of its changes.
+    """Return a typical size of each parameter, the unit in which its changes are measured.
 
     Parameters
     ----------
@@ -110,8 +112,8 @@ def warnings_of(
     prior_sd: np.ndarray,
     at_bound: Sequence[str],
 ) -> list[str]:
-    """Return warnings: parameters and combinations that the data do not determine, estimates at a bound or set by a
-    prior.
+    """Return warnings about parameters and combinations that the data do not determine, and about estimates at a bound
+    or set by a prior.
 
     Parameters
     ----------

@@ -173,8 +173,8 @@ def refuse_invisible(problem: Problem) -> None:
 
 
 def _is_driven(problem: Problem) -> bool:
-    """Return whether the trajectory of a piece without recorded drive depends on the drive period, because the model
-    has a drive of its own.
+    """Return whether the model's own drive acts on a piece without a recorded drive. The drive acts if the trajectory
+    changes with the drive period.
     """
     if not problem.pieces or problem.pieces[0].drive is not None:
         return False
@@ -316,13 +316,16 @@ def _unpack_profile(name: str, data: Mapping[str, np.ndarray]) -> Profile:
 
 
 def _plain_errors(linear: Linearised, scale: np.ndarray) -> np.ndarray:
-    """Return the standard errors for independent residuals with the assumed noise."""
+    """Return the standard errors of the estimates under the assumption that the residuals are independent and have the
+    assumed noise.
+    """
     inverse = np.linalg.pinv(linear.information * np.outer(scale, scale), rcond=1e-12, hermitian=True)
     return np.asarray(np.sqrt(np.diag(inverse)) * scale)
 
 
 class Kept:
-    """Store of finished local fits, by the number of their first guess, for `pipeline.rig.identify.search.search`.
+    """Store of finished local fits for `pipeline.rig.identify.search.search`. The key of a fit is the number of its
+    first guess.
 
     Parameters
     ----------

@@ -93,7 +93,9 @@ def _pearson(x: np.ndarray, y: np.ndarray) -> float:
 
 
 def judge_fit(problem: Problem, fit: Fit) -> Judgement:
-    """Return the residuals of a fit on the pieces that it was fitted to, with their measures."""
+    """Judge a fit on the pieces that it was fitted to. Return the residuals, with root mean squares and
+    correlations.
+    """
     return Judgement(problem.channels, problem.pieces, fit.residuals)
 
 

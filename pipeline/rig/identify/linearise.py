@@ -1,4 +1,6 @@
-"""Linearise a fit for its statistics: residuals and their derivatives at each sample, initial states eliminated."""
+"""Linearise a fit for its statistics: compute residuals and their derivatives at each sample, and eliminate the initial
+states.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +10,7 @@ import numpy as np
 
 from pipeline.rig.identify.local import Fit
 from pipeline.rig.identify.objective import evaluate
-from pipeline.rig.identify.orbits import OrbitRows, orbit_rows
+from pipeline.rig.identify.orbit_rows import OrbitRows, orbit_rows
 from pipeline.rig.identify.problem import Problem
 from pipeline.rig.identify.statistics import Linearised, eliminate_starts, robust_weights
 
@@ -76,8 +78,8 @@ def _information(
     prior: np.ndarray,
     scale: float,
 ) -> np.ndarray:
-    """Return the information matrix of the unknowns: a sum over samples, or from the whole Jacobian if pieces are tied
-    by continuity.
+    """Return the information matrix of the unknowns. It is a sum over samples, or comes from the whole Jacobian if a
+    continuity weight ties the pieces.
     """
     if problem.continuity is not None:
         return eliminate_starts(fit.jacobian, len(problem.free))[0]
@@ -101,8 +103,8 @@ def loss_scale_of(problem: Problem, fit: Fit) -> float:
 
 
 def groups_of(problem: Problem) -> tuple[int, ...]:
-    """Return the group number of each piece; pieces that are tied together by a continuity weight form one group,
-    others are alone.
+    """Return the group number of each piece. Consecutive pieces tied by a continuity weight form one group; any other
+    piece forms a group alone.
     """
     found: list[int] = []
     for k, piece in enumerate(problem.pieces):
@@ -112,8 +114,8 @@ def groups_of(problem: Problem) -> tuple[int, ...]:
 
 
 def sample_slopes(problem: Problem, fit: Fit) -> list[np.ndarray]:
-    """Return the derivatives of each sample's residuals by the unknowns and its piece's initial state, in units of the
-    noise, for each piece.
+    """Return, for each piece, the derivatives of the residuals at each sample by the unknowns and by the piece's
+    initial state, in units of the noise.
 
     They are central differences from one call of the engine. The starts of all pieces are changed at once,
     since no piece depends on another's start. At a bound the differences are one-sided.

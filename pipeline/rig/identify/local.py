@@ -84,8 +84,8 @@ class _Search:
         self._base: _Point | None = None
 
     def split(self, x: Array) -> tuple[Array, Array]:
-        """Split a scaled vector into the unknowns and the initial states; first guesses stand in for initial states
-        that it lacks.
+        """Split a scaled vector into the unknowns and the initial states. If it contains no initial states, return
+        their first guesses.
         """
         full = x * self.sizes
         if not self.joint:
@@ -153,7 +153,8 @@ def fit_local(
     tolerance: float = TOLERANCE,
     echo: Echo | None = None,
 ) -> Fit:
-    """Fit by least squares from a first guess (`scipy.optimize.least_squares`, trust region with bounds).
+    """Fit the unknowns and the initial states by least squares from a first guess (`scipy.optimize.least_squares`,
+    trust region with bounds).
 
     Parameters
     ----------

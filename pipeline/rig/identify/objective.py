@@ -12,7 +12,8 @@ from magpend_core.engine.system import System
 from magpend_core.engine.variational import MINUS, PLUS, with_parameter_tangent
 from magpend_core.sampling import Drive, sample
 from magpend_core.status import Status
-from pipeline.rig.identify.orbits import OrbitData, OrbitRows, orbit_rows
+from pipeline.rig.identify.orbit_rows import OrbitRows, orbit_rows
+from pipeline.rig.identify.orbits import OrbitData
 from pipeline.rig.identify.problem import Problem
 
 Array = NDArray[np.float64]
@@ -125,8 +126,8 @@ def _without_slopes(problem: Problem, thetas: Array, starts: Array) -> _Motions:
 
 
 def _steps(problem: Problem, thetas: Array) -> Array:
-    """Return the finite-difference steps, within the bounds, of the unknowns that the trajectory depends on, for each
-    set of unknowns.
+    """Return the finite-difference steps for each set of unknowns, for the unknowns on which the trajectories depend.
+    The steps stay within the bounds.
     """
     found = np.zeros((len(thetas), len(problem.moving)))
     for j, i in enumerate(problem.moving):
@@ -148,8 +149,8 @@ def _changed(problem: Problem, thetas: Array, steps: Array) -> Array:
 
 
 def _by_differences(problem: Problem, thetas: Array, starts: Array) -> _Motions:
-    """Compute derivatives by finite differences: each trajectory has one unknown or one component of the initial state
-    changed.
+    """Compute trajectories and their derivatives by finite differences, with one unknown or one component of the
+    initial state changed at a time.
     """
     steps, n = _steps(problem, thetas), len(problem.model.states)
     moves = STEP * np.diag(problem.model.scales)
@@ -166,8 +167,8 @@ def _by_differences(problem: Problem, thetas: Array, starts: Array) -> _Motions:
 
 
 def _by_tangents(problem: Problem, thetas: Array, starts: Array) -> _Motions:
-    """Compute derivatives by variational equations, with one tangent vector per unknown and per component of the
-    initial state.
+    """Compute trajectories, and their derivatives by variational equations, with one tangent vector per unknown and per
+    component of the initial state.
     """
     system, steps = with_parameter_tangent(problem.system), _steps(problem, thetas)
     n, n_moving = len(problem.model.states), len(problem.moving)
@@ -189,8 +190,8 @@ def _by_tangents(problem: Problem, thetas: Array, starts: Array) -> _Motions:
 def _integrate(
     problem: Problem, parameters: Array, starts: Array, tolerance: float, system: System | None = None
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Integrate all pieces for each set of unknowns and each change of one of them; return the states, and where an
-    integration failed.
+    """Integrate all pieces for each set of unknowns and each change of one unknown. Return the states, and a mask of
+    the integrations that failed.
     """
     shape, n = starts.shape[:3], len(problem.model.states)
     n_pieces = shape[2]
@@ -214,8 +215,8 @@ def _integrate(
 
 
 def _thrice(drive: Drive | None) -> Drive | None:
-    """Return a drive whose parameter values are repeated for the three parameter sets that a finite-difference tangent
-    needs.
+    """Return a drive with its parameter values given three times: for the unchanged, the increased and the decreased
+    parameters of a finite-difference tangent.
     """
     if drive is None or not drive.names:
         return drive
@@ -234,7 +235,7 @@ def _grid(problem: Problem, k: int) -> Array:
 
 
 def _read(problem: Problem, k: int, states: Array) -> Array:
-    """Select the measured states from computed states, at the sample times of a piece, (..., n, n_channels)."""
+    """Return the computed values of the measured states at the sample times of a piece, shape (..., n, n_channels)."""
     n = len(problem.pieces[k].time)
     read = states if problem.continuity is None else states[..., list(problem.columns)]
     return np.asarray(read[..., :n, :])

@@ -142,7 +142,9 @@ class Problem:
 
     @cached_property
     def system(self) -> System:
-        """System of equations that is integrated; it takes the measured torque as its drive if the problem has one."""
+        """System of equations that is integrated. If the recordings contain a measured torque, this torque is its
+        drive.
+        """
         return with_recorded_drive(self.model.system) if self.recorded else self.model.system
 
     @property
@@ -196,8 +198,8 @@ class Problem:
 
     @cached_property
     def state_noise(self) -> np.ndarray:
-        """Scale of each state, in units of which the gaps between one stretch's end and the next one's start are
-        measured, (n_states,).
+        """Scale of each state, (n_states,). The gaps between the end of one piece and the start of the next are divided
+        by it.
 
         Channels have their noise. The values of other states are proportional to their spread over the
         starts.

@@ -125,7 +125,9 @@ def profile(problem: Problem, best: Fit, name: str, about: Curvature, fit_local:
 
 
 def following(information: np.ndarray, index: int) -> np.ndarray:
-    """Return the derivative of the optimum of all parameters by one of them that is held fixed, shape (n_free,)."""
+    """Return the change of all optimal parameters per unit change of one parameter that is held fixed, shape
+    (n_free,).
+    """
     others = np.delete(np.arange(len(information)), index)
     moves = np.ones(len(information))
     both = information[np.ix_(others, others)]

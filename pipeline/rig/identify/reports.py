@@ -72,7 +72,7 @@ class Finding:
 
     @property
     def zeros(self) -> dict[str, float]:
-        """Fitted zero offsets of the sensors, by the names of these unknowns."""
+        """Fitted zero offsets of the sensors, by name of the unknown."""
         return zeros_of(self.problem, self.best)
 
     @property
@@ -86,7 +86,7 @@ class Finding:
 
 
 def zeros_of(problem: Problem, fit: Fit) -> dict[str, float]:
-    """Return the zero offsets of the sensors that were fitted, by the names of these unknowns."""
+    """Return the fitted zero offsets of the sensors, by name of the unknown."""
     named = zip(problem.names, fit.theta, strict=True)
     return {name: float(value) for name, value in named if name.startswith(f"{ZERO}.")}
 
@@ -206,7 +206,7 @@ def interval_of(found: Finding, i: int) -> tuple[float, float]:
 
 
 def _number(value: float) -> float | None:
-    """Return a number that JSON can hold; None if it is not finite."""
+    """Return a number unchanged, or None if it is not finite and JSON cannot hold it."""
     return float(value) if math.isfinite(value) else None
 
 
@@ -288,7 +288,9 @@ def lines_of(result: Mapping[str, Any]) -> list[str]:
 
 
 def judgement_lines(judged: Mapping[str, Any], units: Mapping[str, str]) -> list[str]:
-    """Return one printed line for each channel: root mean square of its residuals and correlation."""
+    """Return one printed line for each channel: rms of its residuals, and correlation of its measured and computed
+    values.
+    """
     lines = []
     for name, rms in judged["rms"].items():
         shown = "-" if rms is None else f"{rms:.4g} {units[name]}"

@@ -1,4 +1,6 @@
-"""Arrange residuals for drawing: rms by piece, autocorrelation, mean against the rate, and histogram."""
+"""Arrange residuals for drawing: rms by piece, autocorrelation, mean against the channel's rate of change, and
+histogram.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,7 @@ BINS = 30
 
 @dataclass(frozen=True)
 class Series:
-    """Piece in a dataset of residuals: its numbers, its range of samples, and the size of its residuals.
+    """Piece in a dataset of residuals: indices of recording and piece, range of samples, and size of the residuals.
 
     Attributes
     ----------
@@ -93,7 +95,8 @@ def rate_of(ds: xr.Dataset, channel: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def residual_views(ds: xr.Dataset, channels: list[str]) -> xr.Dataset:
-    """Return the data of the residual plots: autocorrelation, mean against the rate, and density.
+    """Return the data of the residual plots: autocorrelation, mean residual against the channel's rate of change,
+    density, and rms by piece.
 
     Parameters
     ----------

@@ -36,7 +36,7 @@ POPULATION = 32
 
 
 class Keep(Protocol):
-    """Protocol of a store for finished fits, by the number of their first guess."""
+    """Protocol of a store for finished fits. The key of a fit is the number of its first guess."""
 
     def recall(self, number: int) -> Fit | None:
         """Return the fit from first guess `number`, or None if it is not stored."""
@@ -143,8 +143,8 @@ def sobol(problem: Problem, n: int, seed: int, spread: float) -> Array:
 
 
 def costs(problem: Problem, thetas: Array) -> Array:
-    """Return the cost of each row of unknowns, with initial states as first guessed; infinite if a trajectory
-    diverges.
+    """Return the cost of each row of unknowns, at the first guesses of the initial states. The cost is infinite if a
+    trajectory diverges.
     """
     found = []
     for at in range(0, len(thetas), POPULATION):
@@ -158,6 +158,8 @@ def _evolve(problem: Problem, start: Array, seed: int, spread: float) -> Array:
     """Minimise the cost over short stretches by the evolution strategy CMA-ES, with one engine call per population."""
     import cma
 
+    if problem.pieces:
+        problem = replace(problem, orbits=())
     sizes = np.array([f.size for f in problem.free])
     lower, upper = problem.lower / sizes, problem.upper / sizes
     options = {
@@ -184,7 +186,8 @@ def refine(problem: Problem, theta: Array, *, stages: Sequence[Problem] | None =
     Noise may lead short stretches to a wrong optimum from which longer ones do not return. The last fit
     therefore begins from the stage whose outcome has the least cost over whole pieces.
     """
-    candidates = []
+    # measured orbits are known at the guess itself, and may be lost where the stages end
+    candidates = [np.clip(theta, problem.lower, problem.upper)] if problem.orbits else []
     for stage in _stages(problem) if stages is None else stages:
         fit = fit_local(stage, theta, max_evaluations=STAGE_EVALUATIONS, tolerance=STAGE_TOLERANCE)
         if np.isfinite(fit.cost):
@@ -198,8 +201,8 @@ def refine(problem: Problem, theta: Array, *, stages: Sequence[Problem] | None =
 
 
 def _stages(problem: Problem) -> list[Problem]:
-    """Return the problem over short, longer and still longer stretches, with initial states estimated from the
-    recordings.
+    """Return versions of the problem with short, longer and still longer stretches. Their initial states are estimated
+    from the recordings.
     """
     if not problem.pieces:
         return [problem]
@@ -229,8 +232,8 @@ def slowest_period(problem: Problem) -> float:
 
 
 def cut(problem: Problem, length_s: float) -> Problem:
-    """Return the problem with pieces cut into stretches of about `length_s` and thinned; initial states come from the
-    data.
+    """Return the problem with its pieces cut into stretches of about `length_s` seconds, with fewer samples. The
+    initial states are estimated from the data.
 
     Local cubic polynomials through a sixth of a stretch on either side give the rates at the starts.
     """
@@ -258,9 +261,7 @@ def _stretches(problem: Problem, piece: Piece, length_s: float) -> list[Piece]:
 
 
 def _read_off(problem: Problem, piece: Piece, at: int, half: int) -> Array:
-    """Estimate the state at a sample from local cubic polynomials through the channels: their values and
-    derivatives.
-    """
+    """Estimate the state at a sample: the values and slopes of local cubic polynomials fitted to the channels."""
     window = slice(max(at - half, 0), at + half + 1)
     t = piece.time[window] - piece.time[at]
     state = np.array(piece.start)

@@ -35,8 +35,8 @@ class SensorsTable(Table):
 
 
 class RecordingTable(Table):
-    """Table ``[[recordings]]``: file of a recording, file that maps its channels to states, kind of its drive, and the
-    part used.
+    """Table ``[[recordings]]``: file of a recording, mapping of its channels to states, kind of its drive, time window
+    and held-out pieces.
     """
 
     file: str = Field(description="Recording, relative to the specification")
@@ -162,7 +162,7 @@ class IdentificationSpec:
         return self.folder / name
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the specification as plain data with all defaults and without title; equal data mean equal
+        """Return the specification as plain data with all defaults but without the title. Equal data mean equal
         identifications.
         """
         return {
@@ -187,7 +187,7 @@ class IdentificationSpec:
 
 
 def _plain(bound: float) -> float | str:
-    """Return a finite bound as a number, an infinite one as text, for JSON."""
+    """Return a finite bound as a number and an infinite bound as text, for JSON."""
     return bound if math.isfinite(bound) else str(bound)
 
 

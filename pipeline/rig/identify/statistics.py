@@ -1,4 +1,4 @@
-"""Estimate the errors of a fit: covariance without the initial states, intervals, autocorrelation of residuals.
+"""Estimate the errors of a fit: covariance with the initial states eliminated, intervals, autocorrelation of residuals.
 
 Everything is in units of the noise that the fit was weighted with. Let J = (A, B) be the slopes of the
 residuals by the parameters and by the starts, ``H = J'J`` and ``X = H_ss^-1 H_sp``. With the starts
@@ -225,8 +225,8 @@ def is_autocorrelated(residuals: Sequence[np.ndarray]) -> bool:
 
 
 def memory_of(rho: np.ndarray, n: int) -> tuple[int, float]:
-    """Return the lag at which residuals have lost their correlation, and how many correlated residuals count as one
-    independent one.
+    """Return the lag at which the residuals have lost their correlation, and the number of residuals that count as one
+    independent residual.
 
     Parameters
     ----------
@@ -373,7 +373,7 @@ def _of_orbits(fit: Linearised, scale: np.ndarray) -> Covariance:
 
 
 def _inverse(information: np.ndarray, scale: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the pseudo-inverse of the information matrix, and which parameters are not determined."""
+    """Return the pseudo-inverse of the information matrix, and a mask of the parameters that are not determined."""
     values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
     good = values > SINGULAR * max(float(values.max(initial=0.0)), 1e-300)
     inverse = (vectors[:, good] / values[good]) @ vectors[:, good].T

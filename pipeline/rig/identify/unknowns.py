@@ -1,6 +1,4 @@
-"""Check the parameters of a specification: which are identified, tied to others or fixed, and whether this is
-consistent.
-"""
+"""Read and check the identified, tied and fixed parameters of an identification's specification."""
 
 from __future__ import annotations
 
@@ -75,8 +73,8 @@ def validate(model: type[BaseModel], value: Any, path: str, problems: list[str])
 
 
 def table_at(data: Mapping[str, Any], key: str, problems: list[str]) -> Mapping[str, Any]:
-    """Return the table under a TOML key, or an empty one if the key is missing; if the value is no table, add a
-    problem.
+    """Return the table under a TOML key, or an empty table if the key is missing. If the value is no table, add a
+    problem and return an empty table.
     """
     table = data.get(key, {})
     if isinstance(table, dict):
@@ -151,8 +149,8 @@ class ParameterTables:
         return Unknown(name, start, max(low, least), min(high, most), one.prior)
 
     def _bounds(self, name: str, start: float) -> tuple[float, float]:
-        """Return the model's bounds on a parameter; a bound that is not allowed itself is replaced by one close to
-        it.
+        """Return the model's bounds on a parameter. A bound that is not itself an allowed value is replaced by an
+        allowed value close to it.
         """
         return {
             POSITIVE: (_LEAST * start, math.inf),
@@ -210,7 +208,7 @@ class ParameterTables:
 
 
 def _number(text: str | None) -> float:
-    """Return the factor in a tie such as ``-1.0*NAME``; NaN if it is not a number."""
+    """Return the factor in a tie such as ``-1.0*NAME``, or NaN if its text is not a number."""
     try:
         return 1.0 if text is None else float(text.replace(" ", ""))
     except ValueError:

@@ -79,7 +79,8 @@ def draw_curves(outcome: Outcome, frame: style.Frame = style.WIDE) -> style.Data
 
 
 def draw_numbers(outcome: Outcome, frame: style.Frame = style.WIDE) -> style.DataFigure:
-    """Draw height, position and width of the fitted bumps over the locked angle, with the laws fitted to them (Fig. 7).
+    """Draw height, position and width of the fitted bumps against the locked angle, with the laws fitted to these
+    values (Fig. 7).
 
     Bars are standard errors. Full lines are the laws through the points; dashed lines are the joint fit's.
     """
@@ -150,7 +151,9 @@ def draw_map(outcome: Outcome, frame: style.Frame = style.WIDE) -> style.DataFig
 
 
 def draw_comparison(outcome: Outcome, frame: style.Frame = style.WIDE) -> style.DataFigure:
-    """Draw the torques of the joint fit and of point dipoles over the readings, with the residuals of both (Fig. 9)."""
+    """Draw the torques of the joint fit and of point dipoles together with the readings, and the residuals of both
+    (Fig. 9).
+    """
     shown = _spread(outcome, COMPARED)
     figure = style.new_figure(4.4, _comparison(outcome, shown), frame)
     grid = figure.subplots(2, len(shown), sharex="col", sharey="row", height_ratios=[1.5, 1.0], squeeze=False)
@@ -253,8 +256,8 @@ def _readings(outcome: Outcome, rows: np.ndarray) -> xr.Dataset:
 
 
 def _numbers(outcome: Outcome, fine: np.ndarray) -> xr.Dataset:
-    """Return height, position and width of each torque curve's bump, and how they follow the locked angle in the
-    separate and the joint fit.
+    """Return height, position and width of each torque curve's bump. Add the laws for them over the locked angle,
+    fitted separately and jointly.
     """
     curves = outcome.curves
     variables: dict[str, Any] = {

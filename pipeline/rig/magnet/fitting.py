@@ -33,7 +33,7 @@ FARTHEST_DIPOLES = 3.0
 
 @dataclass(frozen=True)
 class CurveFit:
-    """Bump fitted to one torque curve (Eq. 17).
+    """Fit of one Gaussian bump to one torque curve (Eq. 17), with standard errors and quality.
 
     Attributes
     ----------
@@ -51,7 +51,7 @@ class CurveFit:
 
 @dataclass(frozen=True)
 class Laws:
-    """Laws of the bumps' height, position and width over the locked angle (Eq. 18).
+    """Fitted height, position and width of the bumps as functions of the locked angle (Eq. 18).
 
     Attributes
     ----------
@@ -180,7 +180,8 @@ def fit_curves(measured: Measurement) -> tuple[CurveFit, ...]:
 
 
 def fit_laws(curves: Sequence[CurveFit]) -> Laws:
-    """Fit how the bumps' height, position and width depend on the locked angle: Gaussian, line, constant (Eq. 18).
+    """Fit the bumps' height by a Gaussian, their position by a line and their width by a constant, as functions of the
+    locked angle (Eq. 18).
 
     Each value is weighted by its standard error. The laws' own errors come from the scatter about them.
 
@@ -326,7 +327,7 @@ def _judged(measured: Measurement, found: Solution, free: tuple[str, ...], value
 
 
 def _scale(name: str, values: Mapping[str, float]) -> float:
-    """Return by how much one parameter must change for the torque to change substantially."""
+    """Return the scale of a parameter: the change that changes the torque substantially."""
     if name == "eps_mag":
         return values[name]
     kind, i = name[:-1], name[-1]
@@ -388,7 +389,7 @@ def fit_dipoles(measured: Measurement, *, place: bool = False) -> DipoleFit:
 
 @dataclass(frozen=True)
 class Outcome:
-    """All fits to a measurement.
+    """All fits to a measurement of the magnets' torque.
 
     Attributes
     ----------

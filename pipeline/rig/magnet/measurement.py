@@ -44,7 +44,7 @@ TORQUE_UNITS = {"N m": 1.0, "mN m": 1e-3, "N": 1.0}
 
 
 class AngleColumn(Table):
-    """Column of the table with angles."""
+    """Column of the CSV table that contains angles: its name, unit and allowed range."""
 
     column: str = Field(description="Its name in the table's first row.")
     unit: Literal["deg", "rad"] = Field(description="Unit in the file.")
@@ -60,7 +60,7 @@ class AngleColumn(Table):
 
 
 class TorqueColumn(Table):
-    """Column of the table with torque or force readings."""
+    """Column of the CSV table that contains torque or force readings: its name, unit, lever arm and sign."""
 
     column: str = Field(description="Its name in the table's first row.")
     unit: Literal["N m", "mN m", "N"] = Field(description="Unit in the file; N: a force at the end of arm_m.")
@@ -88,7 +88,7 @@ class SideColumn(Table):
 
 
 class Tie(Table):
-    """Tie that holds the pendulum's upper link during the measurement; the weight that hangs on it adds a torque to the
+    """Tie that holds the pendulum's upper link during the measurement. The weight of the tie adds a torque to the
     readings.
     """
 
@@ -97,7 +97,9 @@ class Tie(Table):
 
 
 class Correction(Table):
-    """Table of the header that lists the torques to subtract from the readings, besides the magnets' own."""
+    """Header table ``[correction]``: torques in the readings that do not come from the magnets and must be
+    subtracted.
+    """
 
     weights: bool = Field(description="Whether the readings include the torque of the links' weights.")
     tie: Tie | None = Field(None, description="Weight of the tie, if the readings include it.")
@@ -149,7 +151,7 @@ class Header(Table):
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """Torque curve: the readings at one locked angle on one side of the fixed magnet.
+    """Torque curve: the readings at one locked angle, on one side of the fixed magnet.
 
     Attributes
     ----------
@@ -282,7 +284,9 @@ def read_measurement(path: str | Path) -> Measurement:
 def _besides(
     correction: Correction, p: Parameters, angle: np.ndarray, locked: np.ndarray, columns: Mapping[str, np.ndarray]
 ) -> np.ndarray:
-    """Return the part of the measured torque that does not come from the magnets, such as that of the weights [N m]."""
+    """Return the part of the measured torque that does not come from the magnets but, for example, from the links'
+    weights [N m].
+    """
     if correction.without is not None:
         return columns["without"]
     found = laws.weight_torque(angle, locked, p) if correction.weights else np.zeros_like(angle)
@@ -356,7 +360,9 @@ def _wanted(header: Header) -> dict[str, str]:
 
 
 def _but_for_units(wanted: dict[str, str], names: list[str], header: Header) -> tuple[dict[str, str], list[str]]:
-    """Accept columns whose names differ from the header's only by a unit in brackets, and warn of them."""
+    """Accept columns whose names differ from those in the header only by a unit in brackets. Return the names found,
+    and warnings.
+    """
     found, warnings = dict(wanted), []
     for key, name in wanted.items():
         near = units.names_with_unit(name, names)
@@ -410,8 +416,8 @@ def _number(text: str, decimal: str) -> float:
 
 
 def _places(rows: Any) -> str:
-    """Format row numbers of the table for a message: three at most, then the number of further ones; the first reading
-    is row 1.
+    """Format row numbers of the table for a message: at most three numbers, then the count of further rows. The first
+    reading is row 1.
     """
     named = ", ".join(str(i) for i in rows[:MAX_NAMED])
     more = f" and {len(rows) - MAX_NAMED} more" if len(rows) > MAX_NAMED else ""

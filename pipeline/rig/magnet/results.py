@@ -96,7 +96,7 @@ def write_results(outcome: Outcome, folder: Path) -> list[Path]:
 
 
 def write_presets(outcome: Outcome, folder: Path) -> list[Path]:
-    """Write the preset of the fitted torque, and one of point dipoles for comparison."""
+    """Write a preset of the fitted torque, and a preset of point dipoles for comparison."""
     m, joint = outcome.measured, outcome.joint
     kind = "SYNTHETIC readings, " if m.header.synthetic else ""
     origin = f"{len(outcome.curves)} torque curves ({kind}{m.header.file}, sha256 {m.digest[:12]})"
@@ -123,7 +123,7 @@ def write_presets(outcome: Outcome, folder: Path) -> list[Path]:
 
 
 def _base(measured: Measurement, model: str) -> str | Preset:
-    """Return the preset that supplies the parameters which are not fitted; a preset file is reduced to the model's
+    """Return the preset for the parameters that are not fitted. From a preset file, keep only the model's
     parameters.
     """
     name = measured.header.preset

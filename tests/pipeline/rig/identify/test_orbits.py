@@ -146,7 +146,7 @@ def test_parameter_sd__compares_the_nearest_orbit_beside_a_fold(data, tmp_path):
 
 def test_parameter_sd__adds_to_the_variance_along_the_branch(data, tmp_path):
     # effective variance: sd_A^2 + (dA/dm sd_m)^2
-    sd, (g, h, _) = 0.02, TRUTH.values()
+    sd, g = 0.02, TRUTH["g"]
     data["orbits"] = [{"file": "stable.csv", "section": SECTION, "range": [-0.3, 0.3], "parameter_sd": sd}]
     problem = built(data, tmp_path).problem
     theta = np.array([list(TRUTH.values())])
