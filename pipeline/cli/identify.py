@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from pipeline.cli.common import EXIT_HELP, Csv, Json
+from pipeline.cli.common import EXIT_HELP, Csv, Json, json_rows
 from pipeline.cli.groups import SETTINGS
 from pipeline.cli.options import completing, speaking
 
@@ -33,7 +33,8 @@ class IdentifyGroup(TyperGroup):
 identify_app = typer.Typer(
     cls=IdentifyGroup,
     help="Identify parameters from recordings: magpend identify SPEC --out DIR; judge a result on another "
-    "recording: magpend identify check DIR RECORDING; compare results: magpend identify compare DIR DIR.",
+    "recording: magpend identify check DIR RECORDING; compare results: magpend identify compare DIR DIR; say how sure "
+    "they are: magpend identify posterior DIR.",
     no_args_is_help=True,
     rich_markup_mode=None,
     context_settings=SETTINGS,
@@ -114,6 +115,33 @@ def check(
         console.result(f"piece {piece['piece']}: {values}")
 
 
+def posterior(
+    directory: Annotated[Path, typer.Argument(metavar="DIR", help="Directory of a finished identification.")],
+    n: Annotated[int, typer.Option("-n", min=20, max=100_000, help="Number of draws.")] = 200,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the draws.")] = 1,
+    no_figures: Annotated[bool, typer.Option("--no-figures", help="Draw no figures.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Draw parameter sets from an identification, and say how sure its diagram of measured orbits is.
+
+    The draws are written to DIR/posterior.nc. With measured orbits they are carried through the branches: 95 %
+    intervals of folds, doublings and Hopf points, and bands about the branches, in DIR/bands-N.nc and
+    DIR/figures/bands-N.png.
+    """
+    from pipeline.cli import console
+    from pipeline.rig.identify.posterior_files import write_posterior
+
+    parameters, bifurcations, written = write_posterior(directory, n, seed, figures=not no_figures)
+    if as_json:
+        rows = {"parameters": json_rows(parameters), "bifurcations": json_rows(bifurcations)}
+        console.result(json.dumps(rows, indent=1))
+        return
+    for line in (*parameters.lines, *bifurcations.lines):
+        console.result(line)
+    for path in written:
+        console.note(f"written: {path}")
+
+
 def _check_orbits(directory: Path, table: Path, as_json: bool) -> None:
     from pipeline.cli import console
     from pipeline.rig.identify.check_orbits import check_orbits
@@ -145,4 +173,5 @@ def compare(
 
 identify_app.command(RUN, epilog=EXIT_HELP, context_settings=SETTINGS)(speaking(identify))
 identify_app.command("check", epilog=EXIT_HELP, context_settings=SETTINGS)(speaking(check))
+identify_app.command("posterior", epilog=EXIT_HELP, context_settings=SETTINGS)(speaking(posterior))
 identify_app.command("compare", epilog=EXIT_HELP, context_settings=SETTINGS)(speaking(compare))

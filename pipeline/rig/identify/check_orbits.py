@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.rig.identify.directory import read_info, read_result
-from pipeline.rig.identify.measured_orbits import MeasuredTable, judge_orbits
+from pipeline.rig.identify.measured_orbits import judge_orbits, measured_table
 from pipeline.rig.identify.orbit_reports import orbits_result
 from pipeline.rig.identify.orbit_tables import OrbitsTable
 from pipeline.rig.identify.specification import IdentificationSpec, parse_identification
@@ -55,7 +55,7 @@ def check_orbits(directory: str | Path, table: str | Path) -> dict[str, Any]:
     """
     info, result = read_info(directory), read_result(directory)
     spec, own = _stored(info.identity["spec"], result), _table(info.identity["spec"], Path(table))
-    measured = MeasuredTable(spec, own, str(table))
+    measured = measured_table(spec, own, str(table))
     found = orbits_result([judge_orbits(measured, result["values"])])[0]
     return {"directory": str(directory), "file": Path(table).name, **found}
 

@@ -47,10 +47,16 @@ IDENTIFICATION, RESULT, RESIDUALS, PRESET, OUTCOMES = (
     "preset.toml",
     "outcomes",
 )
+ORBITS = "orbits-{}.nc"
+"""Name of the file of the judged orbits of each table."""
+
+POSTERIOR = "posterior.nc"
+
 _OWN = frozenset({IDENTIFICATION, RESULT, RESIDUALS, PRESET, OUTCOMES, FIGURES, LOCK, HOLDER})
 _ROOM = Path(__file__).parent
 _NOT_NUMBERS = (
-    "check.py", "comparison.py", "directory.py", "figures.py", "orbit_reports.py", "reports.py", "residuals.py",
+    "bands.py", "check.py", "check_orbits.py", "comparison.py", "directory.py", "figures.py", "orbit_reports.py",
+    "posterior.py", "posterior_files.py", "reports.py", "residuals.py",
 )  # fmt: skip
 """Modules that do not affect the numbers."""
 

@@ -123,6 +123,9 @@ def _write(
     write_netcdf(folder / store.RESIDUALS, residuals)
     result = reports.result_of(spec, found, sources, digest, built.findings)
     files = [store.PRESET, store.RESIDUALS]
+    for i, one in enumerate(found.orbits):
+        files.append(store.ORBITS.format(i))
+        write_netcdf(folder / files[-1], one)
     if figures:
         from pipeline.rig.identify.figures import draw_all
 

@@ -6,11 +6,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
 
+from magpend_core.crossing import Crossing
 from magpend_core.models.model import Model, Parameters
 from magpend_core.models.sectioned import sectioned
 from pipeline.analysis.branches.bifurcations import DOUBLING, FOLD, HOPF, KINDS, TORUS
@@ -41,8 +43,9 @@ MEDIAN = math.sqrt(math.pi / 2.0)
 _KINDS = {"fold": FOLD, "doubling": DOUBLING, "torus": TORUS, "hopf": HOPF}
 
 
+@dataclass(frozen=True)
 class MeasuredTable:
-    """Measured orbits of one table ``[[orbits]]``, read and checked.
+    """Measured orbits and bifurcations of one table ``[[orbits]]``, read and checked.
 
     Attributes
     ----------
@@ -57,31 +60,12 @@ class MeasuredTable:
         Values of parameters in these measurements alone.
     """
 
-    def __init__(self, spec: IdentificationSpec, table: OrbitsTable, where: str) -> None:
-        problems: list[str] = []
-        self.settings = dict(table.parameters)
-        self.measured = _read(spec, table, where)
-        parameter = axis_name(table.parameter or ("" if self.measured is None else self.measured.attrs["parameter"]))
-        model = _model(spec, table, where)
-        self.state = "" if self.measured is None else str(self.measured.attrs["state"])
-        problems += _parameter_problems(spec, table, model, parameter, where)
-        data = [*_orbits(table, self.measured, model, where, problems), *_bifurcations(table, where, problems)]
-        names = [d.name for d in data]
-        problems += [
-            f"{where}.hold_out: {name!r} is no orbit or bifurcation of it; there are {', '.join(names)}."
-            for name in table.hold_out
-            if name not in names
-        ]
-        if not data:
-            problems.append(f"{where}: has neither a file of orbits nor bifurcations; add one of them.")
-        if problems:
-            raise SpecError(problems)
-        self.fitted = tuple(d for d in data if d.name not in table.hold_out)
-        self.held_out = tuple(d for d in data if d.name in table.hold_out)
-        low, high = table.range or _range(data)
-        frequency = model.crossing.frequency_hz if model.crossing is not None else table.frequency_hz or math.nan
-        longest = 2 * max(d.period for d in data)
-        self.along = Along(model, parameter, low, high, frequency, max(longest, 2))
+    along: Along
+    state: str
+    fitted: tuple[Datum, ...]
+    held_out: tuple[Datum, ...]
+    measured: xr.Dataset | None
+    settings: Mapping[str, float]
 
     @property
     def data(self) -> tuple[Datum, ...]:
@@ -113,7 +97,7 @@ class MeasuredTable:
             "interval": [self.along.low, self.along.high],
             "frequency_hz": self.along.frequency_hz if math.isfinite(self.along.frequency_hz) else None,
             "state": self.state,
-            "parameters": self.settings,
+            "parameters": dict(self.settings),
             "fitted": [_plain(d) for d in self.fitted],
             "held_out": [_plain(d) for d in self.held_out],
         }
@@ -121,6 +105,59 @@ class MeasuredTable:
 
 def _plain(datum: Datum) -> dict[str, Any]:
     return {**vars(datum), "measured": datum.measured.tolist(), "sd": datum.sd.tolist()}
+
+
+def measured_table(spec: IdentificationSpec, table: OrbitsTable, where: str) -> MeasuredTable:
+    """Read and check one table ``[[orbits]]``.
+
+    Raises
+    ------
+    SpecError
+        With all problems at once.
+    """
+    problems: list[str] = []
+    measured = _read(spec, table, where)
+    parameter = axis_name(table.parameter or ("" if measured is None else measured.attrs["parameter"]))
+    model = _model(spec, table, where)
+    problems += _parameter_problems(spec, table, model, parameter, where)
+    data = [*_orbits(table, measured, model, where, problems), *_bifurcations(table, where, problems)]
+    names = [d.name for d in data]
+    problems += [
+        f"{where}.hold_out: {name!r} is no orbit or bifurcation of it; there are {', '.join(names)}."
+        for name in table.hold_out
+        if name not in names
+    ]
+    if not data:
+        problems.append(f"{where}: has neither a file of orbits nor bifurcations; add one of them.")
+    if problems:
+        raise SpecError(problems)
+    low, high = table.range or _range(data)
+    frequency = model.crossing.frequency_hz if model.crossing is not None else table.frequency_hz or math.nan
+    return MeasuredTable(
+        Along(model, parameter, low, high, frequency, 2 * max([1, *(d.period for d in data)])),
+        "" if measured is None else str(measured.attrs["state"]),
+        tuple(d for d in data if d.name not in table.hold_out),
+        tuple(d for d in data if d.name in table.hold_out),
+        measured,
+        dict(table.parameters),
+    )
+
+
+def stored_table(data: Mapping[str, Any], model: Model, measured: xr.Dataset | None) -> MeasuredTable:
+    """Restore a table from the plain data of `MeasuredTable.as_dict`, the model, and its measured orbits."""
+    section = data["section"]
+    whole = model if section is None else sectioned(model, Crossing(**section))
+    fitted, held_out = (tuple(_datum(d) for d in data[key]) for key in ("fitted", "held_out"))
+    frequency = math.nan if data["frequency_hz"] is None else float(data["frequency_hz"])
+    low, high = data["interval"]
+    longest = 2 * max([1, *(d.period for d in (*fitted, *held_out))])
+    along = Along(whole, data["parameter"], low, high, frequency, longest)
+    return MeasuredTable(along, data["state"], fitted, held_out, measured, data["parameters"])
+
+
+def _datum(data: Mapping[str, Any]) -> Datum:
+    arrays = {key: np.array(data[key]) for key in ("measured", "sd")}
+    return Datum(**{**data, **arrays, "quantities": tuple(data["quantities"])})
 
 
 def read_orbits(spec: IdentificationSpec) -> list[MeasuredTable]:
@@ -134,7 +171,7 @@ def read_orbits(spec: IdentificationSpec) -> list[MeasuredTable]:
     found, problems = [], []
     for i, table in enumerate(spec.orbits):
         try:
-            found.append(MeasuredTable(spec, table, f"orbits[{i}]"))
+            found.append(measured_table(spec, table, f"orbits[{i}]"))
         except SpecError as error:
             problems += error.problems
     if problems:

@@ -2,12 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 
 from pipeline.plots import labels, style
 from pipeline.rig.measured_branch.reading import STABILITIES
+
+
+@dataclass(frozen=True)
+class Bands:
+    """95 % bands of a diagram: of branches (``x``, ``low``, ``high`` each) and of bifurcations (name, low, high)."""
+
+    tubes: Sequence[Mapping[str, np.ndarray]]
+    intervals: Sequence[tuple[str, float, float]]
+
 
 BARS = 2.0
 """Half length of the error bars, in scatters of single cycles."""
@@ -21,6 +34,7 @@ def plot_branch(
     branches: xr.Dataset | None = None,
     computed: np.ndarray | None = None,
     *,
+    bands: Bands | None = None,
     frame: style.Frame = style.WIDE,
 ) -> style.DataFigure:
     """Draw the amplitudes of measured orbits over the parameter, with computed branches if there are any.
@@ -31,6 +45,8 @@ def plot_branch(
         From `read_branch`, compared or not.
     branches, computed
         Result of the analysis ``branches``, and the amplitudes of its orbits.
+    bands
+        95 % bands of the branches and intervals of the bifurcations, to be shaded.
     frame
         Width of the figure and ranges of its axes.
 
@@ -52,8 +68,8 @@ def plot_branch(
     style.style_axes(ax)
     if branches is not None and computed is not None:
         _draw_computed(ax, branches, computed)
+    entries = _draw_bands(ax, bands) if bands is not None else []
     low, high = float(measured["value"].min()), float(measured["value"].max())
-    entries = []
     for code, word in enumerate(STABILITIES):
         part = measured.isel(orbit=np.flatnonzero(measured["stability"].values == code))
         if not part.sizes["orbit"]:
@@ -83,11 +99,34 @@ def plot_branch(
         labels.with_unit(f"amplitude of {state}", unit),
     )
     room = 0.12 * (high - low) or 0.1 * abs(high) or 1.0
-    style.limits(ax, frame, (low - room, high + room), (0.0, 1.15 * float(measured["amplitude"].max())))
+    left, right = low - room, high + room
+    for _, begin, end in bands.intervals if bands is not None else ():
+        left, right = min(left, begin - 0.2 * room), max(right, end + 0.2 * room)
+    style.limits(ax, frame, (left, right), (0.0, 1.15 * float(measured["amplitude"].max())))
     style.caption(ax, f"bars: ±{BARS:g} scatters of single cycles")
     style.legend_above(fig, [*_computed_entries(ax), *entries])
     style.finish(fig)
     return fig
+
+
+def _draw_bands(ax: Axes, bands: Bands) -> list[Any]:
+    """Shade the bands and draw the intervals of the bifurcations near the bottom; return their entries of the
+    legend.
+    """
+    entries: list[Any] = []
+    for tube in bands.tubes:
+        shade = ax.fill_between(
+            tube["x"], tube["low"], tube["high"], color=style.BLUE, alpha=0.25, linewidth=0.0, zorder=1, label="95 %"
+        )
+        entries = [shade]
+    for k, (name, low, high) in enumerate(bands.intervals):
+        y = 0.06 + 0.06 * k
+        ax.plot([low, high], [y, y], transform=ax.get_xaxis_transform(), color=style.BLUE, linewidth=3.0, zorder=4)
+        ax.annotate(
+            name, (0.5 * (low + high), y), xycoords=ax.get_xaxis_transform(), xytext=(0.0, 4.0),
+            textcoords="offset points", ha="center", color=style.BLUE, fontsize=style.look_of(ax).legend,
+        )  # fmt: skip
+    return entries
 
 
 def _draw_computed(ax: Axes, branches: xr.Dataset, computed: np.ndarray) -> None:

@@ -13,8 +13,10 @@ import math
 
 import numpy as np
 import pytest
+import xarray as xr
 from scipy.optimize import minimize_scalar
 
+from pipeline.rig.identify.bands import bands, stored_tables
 from pipeline.rig.identify.build import build
 from pipeline.rig.identify.check_orbits import check_orbits, is_table
 from pipeline.rig.identify.comparison import compare
@@ -22,6 +24,8 @@ from pipeline.rig.identify.identification import identify
 from pipeline.rig.identify.local import fit_local
 from pipeline.rig.identify.measured_orbits import read_orbits
 from pipeline.rig.identify.objective import evaluate
+from pipeline.rig.identify.posterior import draw_posterior
+from pipeline.rig.identify.posterior_files import write_posterior
 from pipeline.rig.identify.specification import parse_identification
 from pipeline.specification.problems import SpecError
 
@@ -210,6 +214,64 @@ def test_identify__judges_orbits_that_were_held_out(data, tmp_path):
     assert judged["rms"]["fitted"]["stable"]["amplitude"] == pytest.approx(1 - 1 / 1.1, abs=1e-5)
     table = compare([tmp_path / "out"])
     assert table.rows[0]["orbits_held_out"] < 1e-4
+
+
+@pytest.fixture
+def fitted(data, tmp_path):
+    """An identification with errors of some per cent."""
+    for name, values, sign in (("stable", STABLE, 1), ("unstable", UNSTABLE, -1)):
+        table_of(tmp_path / f"{name}.csv", values, sign, sd=0.02)
+    data["search"] = {"n_starts": 1, "profiles": False}
+    result = identify(write(tmp_path, data), tmp_path / "out", figures=False, echo=lambda line: None)
+    return tmp_path / "out", result
+
+
+def test_posterior__draws_are_those_of_the_covariance(fitted):
+    directory, result = fitted
+    drawn = draw_posterior(directory, 4000, seed=3)
+    values = drawn["value"].sel(parameter=list("ghw")).values
+    matrix = np.array(result["covariance"]["matrix"])
+    order = [result["names"].index(name) for name in "ghw"]
+    np.testing.assert_allclose(np.cov(values.T), matrix[np.ix_(order, order)], rtol=0.15, atol=3e-6)
+    assert (drawn["value"].sel(parameter="m").values == result["values"]["m"]).all()
+    xr.testing.assert_identical(drawn, draw_posterior(directory, 4000, seed=3))
+    assert not drawn.equals(draw_posterior(directory, 4000, seed=4))
+
+
+def test_posterior__bifurcations_and_branches_of_each_draw_are_those_of_the_closed_form(fitted):
+    directory, result = fitted
+    _, bifurcations, written = write_posterior(directory, 40, seed=2)
+    assert all(path.is_file() for path in written)
+    drawn = draw_posterior(directory, 40, seed=2)
+    g, h = (drawn["value"].sel(parameter=name).values for name in "gh")
+    found = bands(stored_tables(directory)[0], result["values"], drawn)
+    by_kind = {str(kind): found["bifurcation_value"].values[:, b] for b, kind in enumerate(found["kind"].values)}
+    np.testing.assert_allclose(by_kind["fold"], h - 1 / (4 * g), atol=1e-6)
+    np.testing.assert_allclose(by_kind["hopf"], h, atol=1e-6)
+    low, high = np.quantile(h - 1 / (4 * g), [0.025, 0.975])
+    fold = next(row for row in bifurcations.rows if row["kind"] == "fold")
+    assert (fold["low"], fold["high"]) == (pytest.approx(low, abs=1e-6), pytest.approx(high, abs=1e-6))
+    assert fold["n_draws"] == 40
+    for k in range(found.sizes["orbit"]):
+        m, is_stable = float(found["parameter_value"][k]), bool(found["is_stable"][k])
+        inside = 1 + 4 * g * (m - h)
+        there = (inside > 0) & (is_stable | (m < h))
+        root = np.sqrt(np.where(there, inside, np.nan))
+        expected = np.sqrt((1 + (root if is_stable else -root)) / (2 * g))
+        clear = ~there | (np.nan_to_num(root) > 0.05) & ((expected > 0.05) | ~there)
+        own = found["amplitude"].values[:, k]
+        # close to the fold and the rest an orbit may be lost; where it is found it is the right one
+        known = np.isfinite(own)
+        np.testing.assert_allclose(own[known], expected[known], atol=1e-5)
+        assert (known == there)[clear].all()
+
+
+def test_posterior__parameter_that_is_not_determined(fitted):
+    directory, result = fitted
+    result["covariance"]["matrix"][0][0] = None
+    (directory / "result.json").write_text(json.dumps(result))
+    with pytest.raises(SpecError, match=r"g: the data do not determine it"):
+        draw_posterior(directory, 20)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,70 @@
+"""Write the posterior of an identification, and the bands of its diagrams, to its directory."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+
+from pipeline.layout.writing import write_netcdf
+from pipeline.plots.files import save_data, save_figure
+from pipeline.products.product import Table
+from pipeline.rig.identify.bands import bands, bands_table, stored_tables, tubes
+from pipeline.rig.identify.directory import POSTERIOR, read_result
+from pipeline.rig.identify.measured_orbits import MeasuredTable
+from pipeline.rig.identify.posterior import LEVELS, draw_posterior, posterior_table
+from pipeline.rig.measured_branch.figure import Bands, plot_branch
+from pipeline.store.files import FIGURES, local_path
+from pipeline.store.local import make_folder, refuse_links, writer_lock
+
+SHORT = {"period_doubling": "doubling", "neimark_sacker": "torus", "hopf": "Hopf"}
+"""Names of bifurcations in figures."""
+
+
+def write_posterior(
+    directory: str | Path, n: int, seed: int = 1, *, figures: bool = True
+) -> tuple[Table, Table, list[Path]]:
+    """Draw the posterior, carry it through the diagrams of the measured orbits, and write both.
+
+    Returns
+    -------
+    tuple of Table, Table, list of Path
+        Parameters, bifurcations, and the written files.
+
+    Raises
+    ------
+    SpecError, RefusedError
+        See `draw_posterior`.
+    """
+    folder = local_path(directory)
+    drawn, result = draw_posterior(folder, n, seed), read_result(folder)
+    found, written = [], [folder / POSTERIOR]
+    with writer_lock(folder):
+        write_netcdf(written[0], drawn)
+        for i, table in enumerate(stored_tables(folder)):
+            one = bands(table, result["values"], drawn)
+            found.append(one)
+            written.append(folder / f"bands-{i}.nc")
+            write_netcdf(written[-1], one.assign(kind=("bifurcation", one["kind"].values.astype(str))))
+            if figures and table.measured is not None:
+                written += _draw(folder, i, table, result["values"], one)
+    return posterior_table(drawn), bands_table(found), written
+
+
+def _draw(folder: Path, i: int, table: MeasuredTable, values: dict[str, float], found: xr.Dataset) -> list[Path]:
+    branches, computed = table.branches(values)
+    intervals = []
+    for b in range(found.sizes["bifurcation"]):
+        known = found["bifurcation_value"].values[:, b]
+        known = known[np.isfinite(known)]
+        if 2 * len(known) >= found.sizes["draw"]:
+            kind = str(found["kind"].values[b])
+            low, _, high = np.quantile(known, LEVELS)
+            intervals.append((SHORT.get(kind, kind), float(low), float(high)))
+    assert table.measured is not None
+    figure = plot_branch(table.measured, branches, computed, bands=Bands(tubes(found), intervals))
+    refuse_links(folder / FIGURES)
+    make_folder(folder / FIGURES)
+    path = folder / FIGURES / f"bands-{i}.png"
+    return [save_figure(figure, path), save_data(figure, path)]
