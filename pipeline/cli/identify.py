@@ -142,6 +142,23 @@ def posterior(
         console.note(f"written: {path}")
 
 
+def spread(
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of magpend run SPEC --posterior DIR.")],
+    branches: Annotated[
+        bool, typer.Option("--branches", help="Follow the branches of each run, and list their bifurcations.")
+    ] = False,
+    as_json: Json = False,
+    csv: Csv = None,
+) -> None:
+    """List how fractions of cells and bifurcations are distributed over the runs of a posterior."""
+    from pipeline.cli import console
+    from pipeline.cli.common import check_csv, tell
+    from pipeline.rig.identify.posterior_runs import spread as spreading
+
+    check_csv(csv)
+    tell(spreading(folder, branches=branches, echo=console.note), csv, as_json)
+
+
 def _check_orbits(directory: Path, table: Path, as_json: bool) -> None:
     from pipeline.cli import console
     from pipeline.rig.identify.check_orbits import check_orbits
@@ -174,4 +191,5 @@ def compare(
 identify_app.command(RUN, epilog=EXIT_HELP, context_settings=SETTINGS)(speaking(identify))
 identify_app.command("check", epilog=EXIT_HELP, context_settings=SETTINGS)(speaking(check))
 identify_app.command("posterior", epilog=EXIT_HELP, context_settings=SETTINGS)(speaking(posterior))
+identify_app.command("spread", epilog=EXIT_HELP, context_settings=SETTINGS)(speaking(spread))
 identify_app.command("compare", epilog=EXIT_HELP, context_settings=SETTINGS)(speaking(compare))

@@ -68,6 +68,10 @@ def run(
     plot: Annotated[
         bool, typer.Option("--plot", help="Draw the finished run: a diagram, its exponents, or a map.")
     ] = False,
+    posterior: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Run once for each draw of the posterior of an identification.")
+    ] = None,
+    n_draws: Annotated[int, typer.Option("-n", "--draws", min=1, max=100_000, help="Number of draws.")] = 200,
 ) -> None:
     """Compute all cells (trajectories) of a specification, or those still missing in its run directory.
 
@@ -80,6 +84,9 @@ def run(
     from pipeline.runs import run as runs
     from pipeline.store.run import Run
 
+    if posterior is not None:
+        _run_posterior(spec, posterior, n_draws, out, smoke=smoke, workers=workers)
+        return
     if dry_run:
         for line in preview.describe_plan(spec, out, workers=workers, smoke=smoke):
             console.result(line)
@@ -102,6 +109,16 @@ def run(
         console.LOG.warning(text)
     if plot:
         _plot(done)
+
+
+def _run_posterior(spec: str, directory: Path, n: int, out: str | None, *, smoke: bool, workers: int | None) -> None:
+    from pipeline.cli import console
+    from pipeline.rig.identify.posterior_runs import run_posterior, spread
+
+    folder = run_posterior(spec, directory, n, out, smoke=smoke, workers=workers, echo=console.note)
+    for line in spread(folder, echo=console.note).lines:
+        console.result(line)
+    console.result(f"runs: {folder}; their bifurcations: magpend identify spread {folder} --branches")
 
 
 def _plot(run: Run) -> None:

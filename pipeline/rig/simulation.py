@@ -205,7 +205,9 @@ def _table(data: AnyMapping[str, Any], name: str, problems: list[str]) -> dict[s
 
 
 def rig_parameters(data: AnyMapping[str, Any], folder: str | Path, problems: list[str]) -> Parameters | None:
-    """Return the parameters of a virtual rig from its tables; None after adding to `problems` what is wrong."""
+    """Return the parameters of a virtual rig from its tables. If they are not valid, add the errors to `problems` and
+    return None.
+    """
     if "model" not in data:
         problems.append("model: missing; name the model, as magpend models lists them.")
         return None

@@ -276,8 +276,8 @@ def _states(parameters: Parameters, drive: Sequence[Step] | None, start: np.ndar
 
 
 def _intervals(parameters: Parameters, drive: Sequence[Step], end_s: float) -> Any:
-    """Return the drive of all its steps, period by period: durations, and the parameter values that differ between
-    steps.
+    """Return the drive period by period over all its steps: the durations, and the values of the parameters that differ
+    between steps.
     """
     from magpend_core.sampling import Drive
 

@@ -36,7 +36,7 @@ class Words:
     number: str = r"(?P<job>\d+)"
 
     def job(self, output: str) -> str | None:
-        """Return the job's number found in the output of the submit command, or None without one."""
+        """Return the job's number in the output of the submit command, or None if the output contains no number."""
         match = re.search(self.number, output)
         return match["job"] if match else None
 
@@ -149,7 +149,7 @@ _MARKS = {"slurm": "#SBATCH", "pbs": "#PBS", "sge": "#$", "lsf": "#BSUB"}
 
 
 def _directives(cluster: Cluster) -> list[str]:
-    """Return the user's additional batch directives; a job of one core drops those for a parallel environment
+    """Return the user's additional batch directives. A job of one core omits the directives for a parallel environment
     (``-pe``).
     """
     return [line for line in cluster.directives if is_whole(cluster) or not line.strip().startswith("-pe")]

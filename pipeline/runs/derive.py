@@ -61,7 +61,7 @@ def _silent(_: str) -> None:
 
 @dataclass(frozen=True, repr=False)
 class AnalysedRun(Run):
-    """Opened run that is passed to analyses; from it, an analysis obtains the results of other analyses.
+    """Opened run that is passed to an analysis. The analysis obtains the results of other analyses from it.
 
     Attributes
     ----------
@@ -87,7 +87,7 @@ class AnalysedRun(Run):
 def derive(
     source: Source, name: str, options: Mapping[str, Any] | Options | None = None, *, echo: Echo | None = None
 ) -> xr.Dataset:
-    """Return the result of an analysis of a run: the stored one, or a new one, which is then stored.
+    """Return the stored result of an analysis of a run. If there is none, compute the result and store it.
 
     Parameters
     ----------
@@ -139,8 +139,8 @@ def derive(
 
 
 def stored(source: Source, name: str) -> xr.Dataset | None:
-    """Return the stored result of an analysis for the cells that a run has now, or None if there is none; compute
-    nothing.
+    """Return the stored result of an analysis for the current cells of a run, or None if there is none. Nothing is
+    computed.
 
     Parameters
     ----------
@@ -200,7 +200,7 @@ def _options_of(attrs: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _refuse_recorded(run: Run, name: str) -> None:
-    """Raise `SpecError` for a run driven by a recording: analyses integrate further, but the recording ends."""
+    """Raise `SpecError` for a run driven by a recording. Analyses would integrate beyond the end of the recording."""
     if run.spec.recorded is not None:
         raise SpecError(
             [
@@ -213,8 +213,8 @@ def _refuse_recorded(run: Run, name: str) -> None:
 
 
 def prepared(run: AnalysedRun, product: Any, options: Options) -> Options:
-    """Complete the options of an analysis or figure for a run, with names as in its cube; raise `SpecError` if it does
-    not suit the run.
+    """Complete the options of an analysis or figure, with names as in the run's cube. Raise `SpecError` if the run does
+    not suit the analysis or figure.
 
     Raises
     ------
@@ -231,8 +231,8 @@ def prepared(run: AnalysedRun, product: Any, options: Options) -> Options:
 
 
 def most_evidence(run: Run, options: Options) -> Options:
-    """Raise the options on how far trajectories are integrated further to the largest values of any comparable stored
-    search for attractors.
+    """Increase the options that extend the integration of trajectories to the largest values in any stored search for
+    attractors with equal other options.
 
     Options without an effort are returned unchanged.
     """
@@ -244,8 +244,8 @@ def most_evidence(run: Run, options: Options) -> Options:
 
 
 def _kept_efforts(run: Run) -> list[tuple[dict[str, Any], tuple[float, int]]]:
-    """Return, for each up-to-date stored search for attractors, its options, and apart from them how far it integrated
-    trajectories further.
+    """Return the options of each up-to-date stored search for attractors, and separately its effort, which tells by how
+    much the integration of trajectories was extended.
     """
     try:
         kept_here = products_in(run.info.files.below(DERIVED))
@@ -274,8 +274,8 @@ def _aside(options: IdentifyOptions) -> dict[str, Any]:
 
 
 def is_outdone(run: Run, attrs: Mapping[str, Any]) -> bool:
-    """Return whether a stored result is superseded: another one identified the attractors with trajectories integrated
-    further.
+    """Return whether a stored result is superseded by another result that identified the attractors with a longer
+    integration of trajectories.
     """
     name, given = str(attrs.get("derived_product")), _options_of(attrs)
     if name not in ANALYSES or not issubclass(ANALYSES[name].options, IdentifyOptions):
@@ -286,7 +286,7 @@ def is_outdone(run: Run, attrs: Mapping[str, Any]) -> bool:
 
 @contextlib.contextmanager
 def refused(directory: str | Path) -> Iterator[None]:
-    """Run an analysis or figure such that the messages of its errors name the run directory, as a context manager."""
+    """Add the run directory to the error messages of an analysis or figure, as a context manager."""
     try:
         yield
     except SpecError:

@@ -56,7 +56,7 @@ _OWN = frozenset({IDENTIFICATION, RESULT, RESIDUALS, PRESET, OUTCOMES, FIGURES, 
 _ROOM = Path(__file__).parent
 _NOT_NUMBERS = (
     "bands.py", "check.py", "check_orbits.py", "comparison.py", "directory.py", "figures.py", "orbit_reports.py",
-    "posterior.py", "posterior_files.py", "reports.py", "residuals.py",
+    "posterior.py", "posterior_files.py", "posterior_runs.py", "reports.py", "residuals.py",
 )  # fmt: skip
 """Modules that do not affect the numbers."""
 

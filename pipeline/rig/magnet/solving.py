@@ -71,7 +71,8 @@ def solve(
     start: Sequence[float],
     what: str,
 ) -> Solution:
-    """Solve a nonlinear least-squares problem by the Levenberg-Marquardt method, to rounding error.
+    """Solve a nonlinear least-squares problem by the Levenberg-Marquardt method, with tolerances at the level of
+    rounding errors.
 
     Parameters
     ----------
@@ -114,7 +115,9 @@ def solve(
 
 
 def _inverse(jacobian: np.ndarray) -> np.ndarray:
-    """Return the inverse of the normal matrix ``J.T @ J``; columns are scaled to equal size for accuracy."""
+    """Return the inverse of the normal matrix ``J.T @ J``. The columns of the Jacobian ``J`` are scaled to equal size
+    for accuracy.
+    """
     size = np.linalg.norm(jacobian, axis=0)
     _, s, right = np.linalg.svd(jacobian / size, full_matrices=False)
     if not s[-1] > len(jacobian) * _EPS * s[0]:
@@ -124,7 +127,8 @@ def _inverse(jacobian: np.ndarray) -> np.ndarray:
 
 
 def errors_by_cluster(found: Solution, clusters: Sequence[np.ndarray]) -> np.ndarray:
-    """Return standard errors by a jackknife over clusters of readings; residuals may be correlated within a cluster.
+    """Return the standard errors of fitted parameters by a jackknife over clusters of readings. Residuals may be
+    correlated within a cluster.
 
     This is the jackknife over clusters about the fit to all readings (CR3): each cluster is left out in turn,
     to first order. Unlike the plain sandwich, its errors are not too small with few clusters: MacKinnon,

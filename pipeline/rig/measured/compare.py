@@ -1,5 +1,5 @@
-"""Compare a measured bifurcation diagram with a computed one: distances of section points, periods, frequencies where
-regimes end.
+"""Compare a measured bifurcation diagram with a computed one: distances between section points, periods, and the
+frequencies at which regimes (period and class of motion) end.
 """
 
 from __future__ import annotations
@@ -62,8 +62,8 @@ def compare(
 
 
 def compare_with(measured: xr.Dataset, computed: Computed, *, seed: int = 0) -> xr.Dataset:
-    """Compare a measured diagram with computed attractors; its frequency steps must already be labelled with their
-    class of motion (``side``).
+    """Compare a measured diagram with computed attractors. The measured frequency steps must already have their class
+    of motion (``side``).
     """
     f = measured["frequency"].values
     if not any(computed.place(float(x)) >= 0 for x in f):
@@ -106,8 +106,8 @@ def compare_with(measured: xr.Dataset, computed: Computed, *, seed: int = 0) -> 
 
 
 def _step(measured: xr.Dataset, step: int, computed: Computed, distances: np.ndarray, seed: int) -> dict[str, float]:
-    """Compare the model with the measurement at one drive frequency; write the distances from all attractors into
-    `distances`.
+    """Compare the measurement with the model at one frequency step. Write the distance from each attractor into
+    `distances`, and return the other results by name.
     """
     states = [str(s) for s in measured["state"].values]
     geometry = geometry_of(states, computed.model.state_names, Geometry.of(computed.model))

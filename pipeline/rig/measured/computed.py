@@ -1,4 +1,6 @@
-"""Read the attractors of a computed run at the drive frequencies of a rig: points, periods and classes of motion."""
+"""Read the attractors of a computed run at a rig's drive frequencies, with their section points, periods and classes of
+motion.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,8 @@ Floats = npt.NDArray[np.float64]
 def cube_and_parameters(
     run: AnalysedRun, model: str | Model, at: Mapping[str, float] | None = None
 ) -> tuple[xr.Dataset, Parameters]:
-    """Return a run's cube over the drive frequency, at one value of every other axis, and its parameters there.
+    """Return a run's cube over the drive frequency, with one value chosen on every other axis, and the model's
+    parameters at the chosen values.
 
     Raises
     ------
@@ -85,7 +88,7 @@ class Computed:
 
     @classmethod
     def of(cls, run: AnalysedRun, model: str | Model, at: Mapping[str, float] | None = None) -> Computed:
-        """Read a run and its attractors; the attractors are computed if no stored result exists.
+        """Read a run and its attractors. Compute the attractors if no stored result exists.
 
         Raises
         ------
@@ -111,7 +114,9 @@ class Computed:
         return np.asarray(self.attractors[FREQUENCY_DIM].values, np.float64)
 
     def place(self, frequency_hz: float) -> int:
-        """Return the index of the nearest computed frequency, or -1 if the nearest is too far away."""
+        """Return the index of the computed frequency nearest to `frequency_hz`, or -1 if `frequency_hz` lies more than
+        about half a step outside the computed range.
+        """
         f = self.frequencies
         i = int(np.abs(f - frequency_hz).argmin())
         near = np.abs(np.delete(f, i) - f[i])
@@ -119,7 +124,8 @@ class Computed:
         return i if abs(f[i] - frequency_hz) <= reach or f[0] < frequency_hz < f[-1] else -1
 
     def regime(self, place: int, attractor: int) -> tuple[int, int] | None:
-        """Return period and class of motion of an attractor at frequency index `place`; period 0 if it is aperiodic.
+        """Return period and class of motion of an attractor at frequency index `place`. The period is 0 if the
+        attractor is aperiodic.
 
         None if the set does not exist there or is unstable, since a rig does not show unstable sets.
         """
@@ -131,7 +137,7 @@ class Computed:
         return period, int(one["side"]) if "side" in one else 0
 
     def candidates(self, frequency_hz: float, states: Sequence[str]) -> list[Candidate]:
-        """Return the attractors that the model has at a frequency, each with its section points reduced to the given
+        """Return the model's attractors at a frequency, with their section points. The points hold only the given
         states.
 
         Points of a closed orbit are interpolated between neighbouring frequencies if the attractor has the

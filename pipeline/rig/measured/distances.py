@@ -1,4 +1,4 @@
-"""Compute Wasserstein-1 distances between sets of section points, and the distance that noise alone gives.
+"""Compute Wasserstein-1 distances between sets of section points, and the noise floor of a measurement.
 
 For two sets of equally many points, Wasserstein-1 is the mean distance in the cheapest pairing, found by
 `scipy.optimize.linear_sum_assignment` (a shortest augmenting path: Crouse, IEEE Trans. Aerosp. Electron.
@@ -49,7 +49,9 @@ def wasserstein(a: Floats, b: Floats, geometry: Geometry) -> float:
 
 
 def _transport(ways: Floats) -> float:
-    """Return the mean distance in the cheapest transport between two sets of equally weighted points."""
+    """Return the smallest mean transport distance between two sets of equally weighted points, given all pairwise
+    distances.
+    """
     m, n = ways.shape
     if min(m, n) == 1:
         return float(ways.mean())
@@ -103,12 +105,13 @@ class Cloud:
 
     @property
     def cycle(self) -> int:
-        """Number of section points after which the motion repeats; 1 if it is aperiodic."""
+        """Number of section points after which the motion repeats. It is 1 if the motion is aperiodic."""
         return max(self.orbit_period, 1)
 
     @property
     def size(self) -> int:
-        """Number of section points in each half, in whole cycles of the orbit if the half is long enough.
+        """Number of section points in each half of the measurement. It is a whole number of cycles if the half is long
+        enough.
 
         Otherwise the halves would hold the points of an orbit in unequal numbers, which adds a distance from
         one point of the orbit to another.
@@ -131,7 +134,7 @@ class Cloud:
 
 
 def cloud_of(points: Floats, noise: Floats, orbit_period: int) -> Cloud:
-    """Return the measured section points of one frequency step; cycles with a missing point (NaN) are left out."""
+    """Return the measured section points of one frequency step. Leave out cycles with a missing point (NaN)."""
     known = np.asarray(np.isfinite(points).all(axis=1), np.bool_)
     last = int(np.flatnonzero(known)[-1]) + 1
     cycle = max(orbit_period, 1)
@@ -187,7 +190,9 @@ def distance_to(candidate: Candidate, cloud: Cloud, geometry: Geometry, rng: np.
 
 
 def _drawn(candidate: Candidate, size: int, rng: np.random.Generator) -> Floats:
-    """Draw at least `size` section points of an attractor; a periodic orbit is repeated as a whole."""
+    """Return at least `size` section points of an attractor: random points of an aperiodic attractor, or whole
+    repetitions of a periodic orbit.
+    """
     points = candidate.points
     if candidate.orbit_period:
         return np.tile(points, (max(1, -(-size // len(points))), 1))
@@ -195,8 +200,6 @@ def _drawn(candidate: Candidate, size: int, rng: np.random.Generator) -> Floats:
 
 
 def geometry_of(names: Sequence[str], model_names: Sequence[str], whole: Geometry) -> Geometry:
-    """Return, for the recorded states only, the scale of each and whether it is an angle, for distances between section
-    points.
-    """
+    """Return the geometry for distances between section points: scale and angle flag of each recorded state."""
     at = [list(model_names).index(n) for n in names]
     return Geometry(tuple(whole.is_angle[i] for i in at), tuple(whole.scales[i] for i in at))

@@ -112,8 +112,8 @@ def _rig(measured: xr.Dataset) -> str:
 def _ranges(
     measured: xr.Dataset, values: np.ndarray, cube: xr.Dataset | None, frame: style.Frame
 ) -> tuple[tuple[float, float], tuple[float, float] | None]:
-    """Return the ranges of the frequency axis and the state axis; the latter is None if the computed diagram already
-    sets it.
+    """Return the ranges of the frequency axis and the state axis. The range of the state axis is None if a computed
+    diagram sets it.
     """
     own = measured["frequency"].values
     f = own if cube is None else np.concatenate([own, np.atleast_1d(cube[FREQUENCY_DIM].values)])
@@ -141,7 +141,9 @@ def _dress(ax: Axes, measured: xr.Dataset, measure: labels.Measure, ranges: Any)
 
 
 def _draw_steps(ax: Axes, measured: xr.Dataset, values: np.ndarray, over: bool) -> None:
-    """Draw the measured section points by sweep direction and class of motion, with upward sweeps on top."""
+    """Draw the measured section points separately for each sweep direction and class of motion. Upward sweeps are drawn
+    on top.
+    """
     motions = motions_of(measured)
     codes = measured["side"].values if "side" in measured else np.zeros(measured.sizes["step"], int)
     f, ways = measured["frequency"].values, measured["direction"].values.astype(str)
@@ -190,7 +192,8 @@ def _handles(measured: xr.Dataset, motions: Motions, diagram: Diagram | None, ov
 def plot_comparison(
     compared: xr.Dataset, computed: Computed, *, state: str = "", degrees: bool = False, frame: style.Frame = style.WIDE
 ) -> style.DataFigure:
-    """Draw measured points over the attractors, their distances in units of noise, and the periods of rig and model.
+    """Draw three panels: measured points over the computed attractors, distances in units of the noise floor, and
+    periods and classes of motion of rig and model.
 
     Parameters
     ----------
@@ -258,8 +261,8 @@ class _Met:
 
 
 def _met(compared: xr.Dataset, computed: Computed) -> _Met:
-    """Return the attractors nearest to the measurement at any step; the most frequent one of each motion class gets the
-    class's colour.
+    """Return the attractors that are nearest to the measurement at some step. The most frequent attractor of each class
+    of motion gets the colour of the class.
     """
     cast, motions = palette.cast_of(computed.attractors), motions_of(compared)
     winners, sides = compared["winner"].values, compared["computed_side"].values
@@ -326,8 +329,8 @@ def _draw_distances(ax: Axes, compared: xr.Dataset, met: _Met) -> None:
 
 
 def _draw_regimes(ax: Axes, compared: xr.Dataset, motions: Motions, ways: Sequence[str]) -> None:
-    """Draw period and class of motion over the frequency as coloured strips: one for the rig, one for the model, per
-    direction.
+    """Draw period and class of motion over the frequency as coloured strips. Each sweep direction has one strip for the
+    rig and one for the model.
     """
     rows: list[str] = []
     for way in ways:

@@ -133,8 +133,8 @@ def _in_place(sections: xr.Dataset, name: str, n: int) -> np.ndarray:
 def _with_instants(
     points: np.ndarray, noise: np.ndarray, names: tuple[str, ...], model: Model, scatter_s: float
 ) -> np.ndarray:
-    """Return the noise of section points; it is increased by the uncertainty of their times in states whose rate is
-    measured.
+    """Return the noise of section points. For each state whose rate is measured, it includes the effect of the
+    uncertain times of the points.
     """
     both = noise.copy()
     for i, name in enumerate(names):

@@ -19,7 +19,7 @@ SUFFIX = "_computed"
 
 
 def plot_series(ds: xr.Dataset, *, degrees: bool = False, frame: style.Frame = style.WIDE) -> style.DataFigure:
-    """Draw measured over computed time series from `pipeline.rig.measured.series.series_of`, and phase portraits.
+    """Draw measured and computed time series from `pipeline.rig.measured.series.series_of`, and their phase portraits.
 
     Parameters
     ----------
@@ -108,8 +108,8 @@ def _draw_portrait(ax: Axes, ds: xr.Dataset, pair: list[labels.Measure]) -> None
 
 
 def _looks(name: str) -> tuple[tuple[str, dict[str, Any]], ...]:
-    """Return variable names and line styles of a measured and a computed state; the computed line is thinner and on
-    top.
+    """Return variable name and line style of a state, first measured, then computed. The computed line is thinner and
+    on top.
     """
     return (
         (name, {"color": RIG, "linewidth": 1.3, "zorder": 2.0}),

@@ -1,4 +1,4 @@
-"""Find the phase of the drive period at which a model takes its stroboscopic section, counted from the rising edge."""
+"""Find the phase of a model's stroboscopic section, counted from the rising edge of the drive."""
 
 from __future__ import annotations
 

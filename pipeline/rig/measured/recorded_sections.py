@@ -32,7 +32,7 @@ _LEAST_SPARE = 3
 
 @dataclass(frozen=True)
 class Channel:
-    """Measured state of a recording; its slope gives the rate if the rate itself is not measured.
+    """Measured state of a recording. The slope of the state gives its rate if the rate itself is not measured.
 
     Attributes
     ----------
@@ -53,7 +53,7 @@ class Channel:
 
 
 def channels_of(recording: xr.Dataset, model: Model) -> list[Channel]:
-    """Return the measured states of a recording; the slope of such a state gives its rate if the rate itself is not
+    """Return the measured states of a recording. The slope of a state gives its rate if the rate itself is not
     measured.
 
     Raises
@@ -175,8 +175,8 @@ def _check(recording: xr.Dataset, window_s: float, order: int) -> None:
 def _fits(
     recording: xr.Dataset, edges: Edges, channels: list[Channel], window_s: float, order: int
 ) -> list[tuple[int, Floats, Floats, Floats, Floats]]:
-    """Fit polynomials to the channels about each rising edge of the drive that has enough samples; return edge number
-    and fit.
+    """Fit polynomials to the channels about each rising edge of the drive that has enough samples around it. Return the
+    number and the fit of each such edge.
     """
     time = recording["time"].values
     piece = recording["piece"].values if "piece" in recording.coords else np.zeros(time.size, np.int64)
@@ -195,7 +195,8 @@ def _fits(
 
 
 def _nearest(instants: Floats, at: float, beyond: float) -> float:
-    """Return the time from `at` to the nearest drive edge that is more than `beyond` away; infinite if there is none.
+    """Return the time from `at` to the nearest drive edge that is more than `beyond` away. Return infinity if there is
+    none.
 
     An edge placed by a fitted line differs slightly from the detected one.
     """
@@ -208,8 +209,8 @@ def _nearest(instants: Floats, at: float, beyond: float) -> float:
 def _fit(
     t: Floats, data: Floats, channels: list[Channel], half: float, order: int
 ) -> tuple[Floats, Floats, Floats, Floats] | None:
-    """Fit a polynomial to each channel about a drive edge; return value and slope there, their error per unit noise,
-    variance and kink.
+    """Fit a polynomial to each channel about a drive edge. Return value and slope at the edge, their errors per unit
+    noise, the residual variance, and the kink.
     """
     if min((t < 0).sum(), (t >= 0).sum()) < order + _LEAST_SPARE or not np.isfinite(data).all():
         return None
@@ -232,8 +233,8 @@ def _fit(
 
 
 def _basis(x: Floats, order: int, smooth: bool) -> Floats:
-    """Return the design matrix of a polynomial fit around a switching edge of the drive, with separate terms on its two
-    sides.
+    """Return the design matrix of a polynomial fit around a drive edge, with separate terms before and after
+    the edge.
     """
     left, right = np.where(x < 0, x, 0.0), np.where(x < 0, 0.0, x)
     first = 2 if smooth else 1

@@ -105,8 +105,8 @@ def _second(points: Floats, noise: Floats, k: int) -> Floats:
 
 
 def _closure(squares: Floats) -> Floats:
-    """Return, for each tested period, the rms second difference of the section points: of all or of the later half,
-    whichever is less.
+    """Return the rms second difference of the section points for each tested period. It is computed for all points and
+    for the later half, and the smaller value is kept.
     """
     known = np.isfinite(squares)
     values = np.where(known, squares, 0.0)

@@ -1,4 +1,4 @@
-"""Compare time series: a recording, and a computed trajectory from the same state at a rising edge of the drive."""
+"""Compare a recorded time series with a trajectory computed from the recorded state at a rising edge of the drive."""
 
 from __future__ import annotations
 
@@ -33,7 +33,8 @@ def series_of(
     order: int = ORDER,
     hysteresis: float | None = None,
 ) -> xr.Dataset:
-    """Return part of a recording from a rising edge on, with the model's trajectory from the same state.
+    """Return part of a recording that begins at a rising edge of the drive, with the model's trajectory from the same
+    initial state.
 
     Local polynomials give the model's initial state at the edge. The drive frequency is that of a line
     through the edges of the stretch of constant frequency.
@@ -103,7 +104,9 @@ def series_of(
 def _part(
     recording: xr.Dataset, edges: Edges, sections: xr.Dataset, start_s: float | None, n_periods: int
 ) -> tuple[int, int]:
-    """Return the first and the last rising edge of the part to compare, within one stretch of constant frequency."""
+    """Return the first and the last rising edge of the part of a recording to compare. The drive frequency is constant
+    between them.
+    """
     begin = -math.inf if start_s is None else start_s
     known = [int(n) for n in sections["number"].values if edges.rising[int(n)] >= begin]
     for first in known:
@@ -121,7 +124,7 @@ def _part(
 
 
 def _first_timing(edges: Edges) -> float:
-    """Return a rough drive frequency from the median distance of rising edges [Hz]."""
+    """Return a rough drive frequency [Hz]: the inverse of the median time between rising edges."""
     if edges.rising.size < _LEAST:
         raise SpecError([f"drive: {edges.rising.size} rising edges; a series needs {_LEAST} of them."])
     return 1 / float(np.median(np.diff(edges.rising)))

@@ -1,4 +1,4 @@
-"""Cut a sweep into stretches of constant frequency, or a slow sweep into windows."""
+"""Cut a stepped sweep into stretches of constant frequency, or a slow continuous sweep into windows."""
 
 from __future__ import annotations
 
@@ -121,8 +121,8 @@ def cut(edges: Edges, *, transient: int = TRANSIENT, window: int | None = None) 
 
 
 def _is_swept(edges: Edges, spans: list[tuple[int, int]]) -> bool:
-    """Return whether the frequency changes all the time: stretches are short, or most are curved in the same
-    direction.
+    """Return whether the frequency changes continuously. It does if most stretches of constant frequency are short, or
+    if most are curved in the same direction.
     """
     if len(spans) > 3 and np.median([b - a for a, b in spans]) < LEAST:
         return True
@@ -132,7 +132,9 @@ def _is_swept(edges: Edges, spans: list[tuple[int, int]]) -> bool:
 
 
 def _bend(rising: Floats, noise: float) -> float:
-    """Return the curvature of the drive's edge times as a function of their number, in units of its standard error."""
+    """Return the curvature of the drive's edge times as a function of the edge number, in units of its standard
+    error.
+    """
     n = np.arange(rising.size) - 0.5 * (rising.size - 1)
     square = n**2 - (n**2).mean()
     return float(square @ rising / (noise * math.sqrt(square @ square)))
@@ -166,7 +168,9 @@ def _noise(edges: Edges) -> float:
 
 
 def _reach(t: Floats, first: int, noise: float) -> int:
-    """Return the last edge up to which the drive frequency is constant, so that all edges lie on a line."""
+    """Return the index of the last edge before the drive frequency changes. From edge `first` up to it, the edge times
+    lie on a line.
+    """
     if first + 2 >= t.size:
         return int(t.size - 1)
     period = t[first + 1] - t[first]
@@ -192,7 +196,9 @@ def _reach(t: Floats, first: int, noise: float) -> int:
 
 
 def _placed(t: Floats, first: int, last: int) -> int:
-    """Return the edge at which the frequency steps: there, two lines through the edges before and after fit best."""
+    """Return the index of the edge at which the frequency steps. It gives the best fit of two lines, one through the
+    edges before it and one through the edges after it.
+    """
     low, high = max(first, last - _AROUND), min(t.size - 1, last + _AROUND)
     choices = range(max(low + 2, first + 1), min(last + 2, high - 1))
     costs = {k: _misfit(t[low : k + 1]) + _misfit(t[k : high + 1]) for k in choices}
@@ -236,8 +242,8 @@ def _windows(edges: Edges, window: int) -> list[Stretch]:
 
 
 def _stretch(own: Edges, curve: Floats, transient: int) -> Stretch:
-    """Return a stretch of a sweep with its timing; the known bend `curve` of the edge times [s] is subtracted before a
-    line is fitted.
+    """Return a stretch of a sweep with its timing. The known bend `curve` [s] is subtracted from the edge times before
+    a line is fitted to them.
     """
     rising = own.rising
     # a falling edge is shifted by interpolation between its rising ones
@@ -254,8 +260,8 @@ def _stretch(own: Edges, curve: Floats, transient: int) -> Stretch:
 
 
 def _line(rising: Floats) -> Floats:
-    """Return the times on a line fitted to edge times over the edge number; a missing edge does not shift later
-    numbers.
+    """Fit a line to edge times as a function of the edge number, and return the times on the line. A missing edge does
+    not shift the numbers of later edges.
     """
     gaps = np.diff(rising)
     n = np.concatenate([[0.0], np.cumsum(np.maximum(np.rint(gaps / np.median(gaps)), 1.0))])
@@ -265,8 +271,8 @@ def _line(rising: Floats) -> Floats:
 
 
 def _directed(stretches: list[Stretch]) -> list[Stretch]:
-    """Set the sweep direction of each stretch from the change of frequency; the first stretch takes that of the
-    second.
+    """Set the sweep direction of each stretch from the frequency change against the stretch before. The first stretch
+    takes the direction of the next.
     """
     f = np.array([s.timing.frequency_hz for s in stretches])
     error = np.array([s.timing.frequency_error_hz for s in stretches])

@@ -17,7 +17,9 @@ FAR = 5.0
 
 
 def steps_table(measured: xr.Dataset) -> Table:
-    """Return a table of the frequency steps: frequency, jitter, duty cycle, period, confidence, and any comparison."""
+    """Return a table of the frequency steps: frequency, jitter, duty cycle, period, confidence, and the comparison with
+    a computed run if there is one.
+    """
     rows = [_row(measured.isel(step=i)) for i in range(measured.sizes["step"])]
     return Table(rows, [counted(len(rows), "step"), *aligned([_words(r) for r in rows])])
 
@@ -35,7 +37,7 @@ def _row(one: xr.Dataset) -> Row:
 
 
 def words_of(measured: xr.Dataset) -> tuple[str, ...]:
-    """Return the labels of the model's motion classifier; empty if it has none."""
+    """Return the labels of the model's motion classifier, or an empty tuple if the model has no classifier."""
     classifier = model_of(measured).classifier
     return classifier.words if classifier is not None else ()
 

@@ -1,5 +1,5 @@
-"""Find windows (frequency ranges with one regime) of a sweep, and compare where they end on the rig and in the
-model.
+"""Find windows (frequency ranges with one regime) in a sweep, and compare the frequencies at which they end on the rig
+and in the model.
 """
 
 from __future__ import annotations
@@ -67,8 +67,8 @@ class WindowEdge:
 
     @property
     def shift_error_hz(self) -> float:
-        """Bound on the error of the shift: half the measured plus half the computed frequency step [Hz]; not a standard
-        error.
+        """Bound on the error of the shift [Hz]: half the measured plus half the computed frequency step. It is not a
+        standard error.
         """
         return self.measured_error_hz + self.computed_error_hz
 
@@ -86,8 +86,8 @@ def words_for(regime: Regime, words: tuple[str, ...]) -> str:
 
 
 def windows_of(measured: xr.Dataset, *, confident: float = CONFIDENT) -> list[Window]:
-    """Return the parameter windows of all recordings: runs of consecutive frequency steps with the same kind of
-    motion.
+    """Return the windows of all recordings. A window is a run of consecutive frequency steps with the same regime
+    (period and class of motion).
     """
     keys = list(zip(measured["recording"].values.tolist(), measured["direction"].values.tolist(), strict=True))
     sure = [i for i in range(len(keys)) if measured["confidence"].values[i] >= confident]
@@ -160,8 +160,8 @@ def _computed_end(
 
 
 def _walk(place: int, sign: int, computed: Computed, holds: Callable[[int], bool]) -> tuple[float, float, str]:
-    """Follow the computed frequencies while a regime lasts; return where it ends [Hz], half the step there, and a note
-    if it does not end.
+    """Follow a regime along the computed frequencies. Return the frequency at which it ends [Hz], half the frequency
+    step there, and a note if it does not end.
     """
     f = computed.frequencies
     while 0 <= place + sign < f.size:

@@ -1,4 +1,6 @@
-"""Compare measured orbits with the computed branches of a run: distances in scatters and in per cent."""
+"""Compare measured orbits with the computed branches of a run. Differences are given in per cent and in units of the
+measured scatter.
+"""
 
 from __future__ import annotations
 
@@ -50,7 +52,8 @@ def amplitudes(branches: xr.Dataset, base: Parameters, state: str) -> np.ndarray
 
 
 def compare(measured: xr.Dataset, branches: xr.Dataset, computed: np.ndarray) -> xr.Dataset:
-    """Find the computed orbit nearest to each measured one, of the same stability where that was observed.
+    """Find the computed orbit nearest to each measured one. The computed orbit must have the measured stability, if
+    that is known.
 
     Parameters
     ----------
@@ -154,7 +157,7 @@ def nearest_orbit(
 
 
 def rms_of(measured: xr.Dataset, stability: str) -> float:
-    """Return the root mean square of the relative errors of the amplitude over the orbits of one stability."""
+    """Return the root mean square of the relative amplitude errors of all measured orbits with a given stability."""
     words = words_of(measured["stability"])
     errors = measured["relative_error"].values[measured["stability"].values == words.index(stability)]
     return float(np.sqrt(np.mean(errors**2))) if len(errors) else float("nan")

@@ -17,7 +17,7 @@ LEAST_CYCLES = 3
 
 
 class CyclesError(ValueError):
-    """Raised for a signal without enough whole cycles."""
+    """Error raised for a signal with too few whole cycles."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class Cycles:
 
 
 def cycles_of(time: np.ndarray, values: np.ndarray) -> Cycles:
-    """Measure the cycles of a signal between its upward crossings of its mean.
+    """Measure the cycles of a signal. Each cycle lies between two upward crossings of the signal's mean.
 
     Parameters
     ----------
@@ -77,7 +77,9 @@ def cycles_of(time: np.ndarray, values: np.ndarray) -> Cycles:
 
 
 def _upward_crossings(time: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return the times at which a signal rises through its mean, after it was below the band about it [s]."""
+    """Return the times [s] at which a signal rises through its mean. Before each crossing, the signal must have been
+    below a hysteresis band about the mean.
+    """
     if len(values) < 2:
         return np.zeros(0)
     away = values - values.mean()

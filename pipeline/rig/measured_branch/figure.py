@@ -1,4 +1,6 @@
-"""Draw measured orbits over computed branches: stable filled, unstable open, with error bars."""
+"""Draw measured orbits with error bars over computed branches. The markers of stable orbits are filled, the markers of
+unstable orbits are open.
+"""
 
 from __future__ import annotations
 
@@ -143,6 +145,6 @@ def _draw_computed(ax: Axes, branches: xr.Dataset, computed: np.ndarray) -> None
 
 
 def _computed_entries(ax: Axes) -> list[object]:
-    """Return one line for each name of computed orbits."""
+    """Return the legend entries of the computed orbits: one line for each label."""
     found = {str(line.get_label()): line for line in ax.lines if str(line.get_label()).startswith("computed")}
     return [found[name] for name in sorted(found)]

@@ -1,4 +1,4 @@
-"""Read a measured branch: a table of orbits in a CSV file, or recordings of them listed in a specification."""
+"""Read a measured branch from a CSV table of orbits, or from recordings of orbits listed in a specification."""
 
 from __future__ import annotations
 
@@ -189,7 +189,9 @@ def _from_csv(path: Path, model: Model | None, state: str) -> xr.Dataset:
 
 
 def _number(text: str | None, where: str, problems: list[str]) -> float:
-    """Return a number of a table; NaN for an empty field."""
+    """Return the number in a field of a CSV table. Return NaN if the field is empty, or, with an entry in `problems`,
+    if it is not a number.
+    """
     if text is None or not text.strip():
         return math.nan
     try:

@@ -1,4 +1,4 @@
-"""Read recordings of a rig: files, mapping of channels to states, faults found, smoothed rates."""
+"""Read recordings of a rig: read files, map channels to states, report faults, and estimate rates by smoothing."""
 
 from pipeline.rig.recordings.findings import Finding, findings_of, summary
 from pipeline.rig.recordings.mapping import Mapping, load_mapping, parse_mapping

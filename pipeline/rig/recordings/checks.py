@@ -26,7 +26,7 @@ LEAP_AROUND = 9
 
 
 class Signal:
-    """Readings of one channel, with the recording's times and pieces.
+    """Readings of one channel, with the time and the piece number of each sample.
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ def constant(signal: Signal, severity: str = "warning") -> list[Finding]:
 
 
 def saturated(signal: Signal, entry: ChannelMap) -> list[Finding]:
-    """Find samples at the ends of the sensor's range, or, if the range is not stated, peaks that look clipped.
+    """Report samples at the ends of the sensor's range. If the range is not stated, report peaks that look clipped.
 
     Samples in a dead band at the end of the range are not saturated; `in_dead_band` finds them.
     """

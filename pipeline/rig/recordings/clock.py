@@ -1,4 +1,4 @@
-"""Give all channels of a file the same uniform sample times, in pieces between gaps."""
+"""Give all channels of a file the same sample times, evenly spaced within each piece between gaps."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ UNEVEN = 0.5
 
 @dataclass(eq=False)
 class Clock:
-    """Uniform sample times of a recording, and the range of samples that is used of each channel.
+    """Uniform sample times of a recording, and the range of samples used from each channel.
 
     Attributes
     ----------
@@ -201,8 +201,8 @@ def _rate_findings(stretches: Sequence[Mapping[str, Channel]], stated: float | N
 def _aligned(
     channels: Mapping[str, Channel], step: float, source: str
 ) -> tuple[dict[str, tuple[int, int]], list[Finding]]:
-    """Return each channel's range of samples that all channels of a stretch have in common, and reports of samples left
-    out.
+    """Return the sample range of each channel in which all channels of a stretch have data, and findings about samples
+    left out.
     """
     starts = {n: float(c.time[0]) if c.time is not None and len(c) else c.start_s for n, c in channels.items()}
     known = [s for s in starts.values() if math.isfinite(s)]
@@ -272,7 +272,9 @@ def _length_findings(lengths: Mapping[str, int], n_common: int, step: float) -> 
 
 
 def _checked_stamps(stamps: list[np.ndarray], step: float, source: str) -> list[np.ndarray]:
-    """Check that time stamps are finite and do not decrease; count from 0 if the file states no start."""
+    """Check that time stamps are finite and do not decrease. If the file states no start, return times that
+    begin at 0.
+    """
     if all(np.isnan(s).all() for s in stamps):
         return [step * np.arange(len(s)) for s in stamps]
     for s in stamps:
@@ -362,7 +364,9 @@ def _refuse_backwards(stamps: list[np.ndarray], source: str) -> None:
 
 
 def _one_after_another(stamps: list[np.ndarray], step: float, findings: list[Finding]) -> tuple[list[np.ndarray], bool]:
-    """Shift stretches whose time restarts so that they follow the stretch before; return whether any was shifted."""
+    """Shift stretches whose time restarts so that they follow the previous stretch. Return the time stamps, and whether
+    any stretch was shifted.
+    """
     placed = [stamps[0]]
     moved = 0
     for s in stamps[1:]:
@@ -388,7 +392,7 @@ def _one_after_another(stamps: list[np.ndarray], step: float, findings: list[Fin
 def _even(
     time: np.ndarray, piece: np.ndarray, step: float, stated: float | None
 ) -> tuple[np.ndarray, float, np.ndarray]:
-    """Fit one line per piece, all of the same slope, to the time stamps; return times on the lines, slope and
+    """Fit lines of equal slope to the time stamps, one line per piece. Return the times on the lines, the slope and the
     residuals.
     """
     count = np.bincount(piece)
@@ -410,7 +414,9 @@ def _even(
 
 
 def _jitter_findings(time: np.ndarray, residual: np.ndarray, step: float) -> list[Finding]:
-    """Report time stamps that deviate from even steps; as a warning if they deviate by half a step or more."""
+    """Report time stamps that deviate from even steps. The report is a warning if they deviate by half a step
+    or more.
+    """
     worst, spread = float(np.abs(residual).max()), float(residual.std())
     if worst <= EVEN * step:
         return []

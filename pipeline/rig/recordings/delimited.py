@@ -1,4 +1,4 @@
-"""Read CSV files; delimiter, header and decimal sign are stated or detected."""
+"""Read CSV files. Delimiter, header and decimal sign are stated in the mapping or detected."""
 
 from __future__ import annotations
 
@@ -98,7 +98,9 @@ def read_csv(path: Path, stated: CsvMap) -> Raw:
 
 
 def _columns(body: list[str], form: _Form) -> dict[int, np.ndarray]:
-    """Return the numeric columns, and the columns of dates or times of day [s since the first]."""
+    """Return the numeric columns, and the columns of dates or times of day, which are converted to seconds since the
+    first row.
+    """
     numbers = [j for j in range(form.n_columns) if j not in form.texts]
     values = table(body, numbers, form.delimiter, form.decimal)
     found = {j: values[:, k] for k, j in enumerate(numbers)}
@@ -146,7 +148,7 @@ def _form(path: Path, rows: list[str], stated: CsvMap) -> _Form:
 
 
 def _try(rows: list[str], delimiter: str, decimal: str, header: bool | None) -> _Form | None:
-    """Try to read the rows with one delimiter and decimal sign; return the form of the text, or None if they do not
+    """Try to read the rows with one delimiter and decimal sign. Return the form of the text, or None if the rows do not
     fit.
     """
     sample = rows[:LOOKED_AT]

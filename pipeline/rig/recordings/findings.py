@@ -101,7 +101,8 @@ def _group_line(severity: str, kind: str, channel: str, own: Sequence[Finding]) 
 
 
 def runs(mask: np.ndarray, piece: np.ndarray | None = None) -> np.ndarray:
-    """Return the first and last-plus-one index of each stretch of true entries in a mask.
+    """Return the start and end index of each run of true entries in a mask. The end index is one after the last true
+    entry.
 
     Parameters
     ----------

@@ -125,7 +125,9 @@ def _skip(lines: list[str], i: int) -> int:
 
 
 def _columns(segment: _Segment) -> dict[int, int | None]:
-    """Return the index of each channel column with that of its abscissa (X) column, or None if it has none."""
+    """Map the index of each channel column to the index of its abscissa (X) column, or to None if it has no such
+    column.
+    """
     last_x: int | None = None
     found: dict[int, int | None] = {}
     for j, name in enumerate(segment.names):

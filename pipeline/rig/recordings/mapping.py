@@ -81,7 +81,9 @@ class PieceMap(Table):
 
 
 class CsvMap(Table):
-    """Table ``[csv]``: delimiter, decimal sign and header of a CSV file, where they should not be detected."""
+    """Table ``[csv]``: delimiter, decimal sign and header of a CSV file, for files in which they should not be detected
+    automatically.
+    """
 
     delimiter: Annotated[str, Field(min_length=1, max_length=1)] | None = Field(
         default=None, description="Separator of fields."
@@ -132,7 +134,7 @@ class Mapping(Table):
         return _units(self.system)[name]
 
     def factor_of(self, name: str) -> float:
-        """Return the factor from the numbers of a quantity in the file to SI units, with its sign."""
+        """Return the signed factor that converts the readings of a quantity in the file to SI units."""
         entry: Scaled = self.drive_map if name == DRIVE and self.drive_map else self.channels[name]
         known = units.factor(entry.unit, self.unit_of(name))
         return entry.sign * (1.0 if entry.scale is None else entry.scale) * (1.0 if known is None else known)

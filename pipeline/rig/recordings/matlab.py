@@ -85,7 +85,7 @@ def _gather(name: str, value: Any, leaves: dict[str, list[np.ndarray]]) -> None:
 
 
 def _cell(value: Any) -> Any:
-    """Return the content of a MATLAB cell; cells of one element are unpacked repeatedly."""
+    """Return the content of a MATLAB cell. Nested cells of one element are unpacked completely."""
     while isinstance(value, np.ndarray) and value.dtype == object and value.size == 1:
         value = value.flat[0]
     return value
@@ -100,7 +100,9 @@ def _plain(value: np.ndarray) -> np.ndarray:
 
 
 def _step(leaves: dict[str, list[np.ndarray]]) -> float:
-    """Return the sampling interval from the variable ``dt`` of the file [s]; NaN without one."""
+    """Return the sampling interval [s] from the variable ``dt`` of the file. Return NaN if there is no such
+    variable.
+    """
     for name, arrays in leaves.items():
         if name.rpartition(".")[2] == STEP and all(a.size == 1 for a in arrays):
             return float(arrays[0].flat[0])
@@ -124,7 +126,7 @@ def _stretches(path: Path, leaves: dict[str, list[np.ndarray]], step: float) -> 
 
 
 def _channels(name: str, array: np.ndarray, step: float) -> list[Channel]:
-    """Return an array as channels with their samples along its longer side."""
+    """Convert an array to channels. The samples of each channel lie along the longer dimension of the array."""
     rows = array if array.shape[1] >= array.shape[0] else array.T
     if rows.shape[1] == 1:
         return []

@@ -1,4 +1,4 @@
-"""Define what all readers return: named channels as in the file, each with its own sample times."""
+"""Define the data that all readers return: named channels as in the file, each with separate sample times."""
 
 from __future__ import annotations
 

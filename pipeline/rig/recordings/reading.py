@@ -67,7 +67,7 @@ def read_recording(
 
 
 def recording_of(raw: Raw, mapping: Mapping, *, window_s: tuple[float, float] | None = None) -> xr.Dataset:
-    """Convert a file that was already read into a recording; see `read_recording`.
+    """Convert the channels already read from a file to a recording. See `read_recording`.
 
     Parameters
     ----------
@@ -101,8 +101,8 @@ def recording_of(raw: Raw, mapping: Mapping, *, window_s: tuple[float, float] | 
 
 
 def window(ds: xr.Dataset, window_s: tuple[float, float]) -> xr.Dataset:
-    """Return the part of a recording in a time window, with its findings; times still count from the start of the whole
-    recording.
+    """Return the part of a recording in a time window, with the findings there. Times still count from the start of the
+    whole recording.
 
     Parameters
     ----------
@@ -137,7 +137,9 @@ def _entries(mapping: Mapping) -> dict[str, Scaled]:
 
 
 def _resolved(raw: Raw, mapping: Mapping) -> dict[str, str]:
-    """Return the name in the file of each mapped channel, and of the channels for ``time`` and ``piece``."""
+    """Return the channel name in the file for each mapped quantity, and for ``time`` and ``piece``. Raise `SpecError`
+    if a channel is missing.
+    """
     wanted: dict[str, Scaled | TimeMap | PieceMap] = dict(_entries(mapping))
     for name, axis in (("time", mapping.time), ("piece", mapping.piece)):
         if axis is not None:
@@ -169,7 +171,9 @@ def _name_of(channel: str | int, names: Sequence[str]) -> str | None:
 
 
 def _name_but_for_unit(entry: Scaled | TimeMap | PieceMap, names: Sequence[str]) -> str | None:
-    """Return the only channel in the file whose name is the mapping's name plus a unit in brackets, otherwise None."""
+    """Return the channel name in the file that consists of the mapping's name and a unit in brackets. Return None
+    unless there is exactly one.
+    """
     near = _names_with_unit(entry.channel, names)
     if len(near) != 1 or isinstance(entry, PieceMap) or not entry.unit:
         return None

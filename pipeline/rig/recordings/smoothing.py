@@ -1,4 +1,5 @@
-"""Smooth measured states and estimate their rates by local polynomials without phase shift, with the noise of both.
+"""Smooth measured states and estimate their rates by local polynomials without phase shift. Estimate the noise of
+states and rates.
 
 A polynomial of low order is fitted by least squares to the samples of a window (Savitzky and Golay, Anal.
 Chem. 36, 1964, 1627). In the middle of a stretch the window is centred, so the phase is not shifted. At the
@@ -145,8 +146,8 @@ def _switches(ds: xr.Dataset) -> np.ndarray:
 
 
 def _parts(ds: xr.Dataset, name: str, edges: np.ndarray) -> np.ndarray:
-    """Return the first and last-plus-one sample of each stretch without gap, missing value or switch of the drive, (n,
-    2).
+    """Return the start and end index, (n, 2), of each stretch without a gap, a missing value or a switch of the drive.
+    The end index is one after the last sample.
     """
     values, piece, time = ds[name].values, ds["piece"].values, ds["time"].values
     known = np.isfinite(values)
@@ -269,8 +270,8 @@ def _order_of(own: int, width: int, order: int) -> int:
 
 
 def _fit_ends(values: np.ndarray, parts: np.ndarray, width: int, order: int, out: tuple[np.ndarray, ...]) -> None:
-    """Smooth the samples within half a window of the start or end of each stretch, with the first or last whole
-    window.
+    """Smooth the samples within half a window of the start or end of each stretch, by the polynomial of the first or
+    last whole window.
     """
     basis, half = _basis(width, order), width // 2
     for begins, rows in ((parts[:, 0], slice(0, half + 1)), (parts[:, 1] - width, slice(half, width))):

@@ -85,7 +85,9 @@ def _numbers(data: Any, zero: int) -> np.ndarray | None:
 
 
 def _earliest(file: Any) -> int:
-    """Return a whole second before the start of all channels, from which times are counted without loss of digits."""
+    """Return the whole second at or before the earliest start of all channels. Times are counted from it without loss
+    of digits.
+    """
     starts = [c.properties.get("wf_start_time") for g in file.groups() for c in g.channels()]
     return min((int(s.seconds) for s in starts if s is not None), default=0)
 
@@ -95,7 +97,9 @@ def _seconds(stamp: Any, zero: int) -> float:
 
 
 def _truncations(path: Path, file: Any, warnings: list[str]) -> list[Finding]:
-    """Report data that the file states but does not hold, from the warnings of npTDMS."""
+    """Report data that the file announces but does not contain, from the file's segment lengths and the warnings of
+    npTDMS.
+    """
     status = file.file_status
     remedy = "copy the file again, or take care that the writing program closes it"
     if status.channel_statuses:

@@ -34,7 +34,7 @@ def read_text(path: Path) -> str:
 
 
 def number(field: str, decimal: str) -> float | None:
-    """Return the number in a text field; NaN for an empty field, None for any other text."""
+    """Return the number in a text field. Return NaN for an empty field and None for any other text."""
     text = field.strip().strip('"').strip()
     if not text:
         return float("nan")

@@ -57,7 +57,8 @@ def spelled(unit: str) -> str:
 
 
 def factor(unit: str, wanted: str) -> float | None:
-    """Return the factor from a unit to an SI unit; None if they measure different quantities or the unit is unknown.
+    """Return the factor from a unit to an SI unit. Return None if the two measure different quantities or the unit is
+    unknown.
 
     Parameters
     ----------
@@ -70,7 +71,7 @@ def factor(unit: str, wanted: str) -> float | None:
 
 
 def kind_of(unit: str) -> str | None:
-    """Return the SI unit that a unit can be converted to; None if the unit is unknown."""
+    """Return the SI unit that a unit can be converted to. Return None if the unit is unknown."""
     return next((si for si, known in UNITS.items() if unit in known), None)
 
 

@@ -16,6 +16,7 @@ import pytest
 import xarray as xr
 from scipy.optimize import minimize_scalar
 
+from pipeline.layout.vocabulary import parameters_of
 from pipeline.rig.identify.bands import bands, stored_tables
 from pipeline.rig.identify.build import build
 from pipeline.rig.identify.check_orbits import check_orbits, is_table
@@ -26,8 +27,11 @@ from pipeline.rig.identify.measured_orbits import read_orbits
 from pipeline.rig.identify.objective import evaluate
 from pipeline.rig.identify.posterior import draw_posterior
 from pipeline.rig.identify.posterior_files import write_posterior
+from pipeline.rig.identify.posterior_runs import run_posterior, spread
 from pipeline.rig.identify.specification import parse_identification
+from pipeline.runs.derive import AnalysedRun
 from pipeline.specification.problems import SpecError
+from pipeline.store.errors import RefusedError
 
 TRUTH = {"g": 1.2, "h": 0.05, "w": 6.0}
 
@@ -170,17 +174,17 @@ def test_lost__an_orbit_beyond_its_fold_is_counted(data, tmp_path):
     assert found.cost > 1e11
 
 
+def toml(v):
+    if isinstance(v, dict):
+        return "{ " + ", ".join(f"{k} = {toml(x)}" for k, x in v.items()) + " }"
+    return json.dumps(v)
+
+
 def write(folder, data):
     """Write a specification as TOML."""
-
-    def value(v):
-        if isinstance(v, dict):
-            return "{ " + ", ".join(f"{k} = {value(x)}" for k, x in v.items()) + " }"
-        return json.dumps(v)
-
-    lines = [f"{k} = {value(v)}" for k, v in data.items() if k != "orbits"]
+    lines = [f"{k} = {toml(v)}" for k, v in data.items() if k != "orbits"]
     for table in data["orbits"]:
-        lines += ["[[orbits]]", *(f"{k} = {value(v)}" for k, v in table.items())]
+        lines += ["[[orbits]]", *(f"{k} = {toml(v)}" for k, v in table.items())]
     path = folder / "fit.toml"
     path.write_text("\n".join(lines) + "\n")
     return path
@@ -264,6 +268,50 @@ def test_posterior__bifurcations_and_branches_of_each_draw_are_those_of_the_clos
         known = np.isfinite(own)
         np.testing.assert_allclose(own[known], expected[known], atol=1e-5)
         assert (known == there)[clear].all()
+
+
+SWEEP = {
+    "kind": "sweep",
+    "model": MODEL,
+    "section": SECTION,
+    "axes": {"m": {"start": -0.3, "stop": 0.2, "num": 6}},
+    "initial_conditions": {"kind": "list", "points": [[1.0, 0.0], [0.01, 0.0]]},
+    "integration": {"n_transient": 200, "n_keep": 2, "stop_when_closed": True},
+}
+
+
+def test_run_posterior__each_draw_is_a_run_and_its_bifurcations_are_those_of_the_closed_form(fitted, tmp_path):
+    directory, result = fitted
+    path = tmp_path / "sweep.toml"
+    path.write_text("\n".join(f"{k} = {toml(v)}" for k, v in SWEEP.items()))
+    folder = run_posterior(path, directory, 3, tmp_path / "study", workers=0, echo=lambda line: None)
+    drawn = draw_posterior(directory, 3)
+    names = [str(name) for name in drawn["parameter"].values]
+    for k in range(3):
+        parameters = parameters_of(AnalysedRun.of(folder / f"draw-{k:04d}").cube())
+        assert parameters["g"] == drawn["value"].values[k, names.index("g")]
+    before = (folder / "draw-0001/run.json").stat().st_mtime_ns
+    run_posterior(path, directory, 3, tmp_path / "study", workers=0, echo=lambda line: None)
+    assert (folder / "draw-0001/run.json").stat().st_mtime_ns == before
+    with pytest.raises(RefusedError, match="different: draws"):
+        run_posterior(path, directory, 2, tmp_path / "study", workers=0)
+    rows = {(row["what"], row["name"]): row for row in spread(folder, branches=True, echo=lambda line: None).rows}
+    values = drawn["value"].values[:, names.index("h")]
+    fold, g = rows["value", "fold 1"], drawn["value"].values[:, names.index("g")]
+    assert fold["median"] == pytest.approx(np.median(values - 1 / (4 * g)), abs=1e-6)
+    hopf = rows["value", "hopf 0"]
+    assert hopf["best"] == pytest.approx(result["values"]["h"], abs=1e-6)
+    assert hopf["median"] == pytest.approx(np.median(values), abs=1e-6)
+    assert hopf["n_draws"] == 3
+    assert sum(row["best"] for row in rows.values() if row["what"] == "fraction") == pytest.approx(1.0)
+
+    path.write_text(
+        "\n".join(
+            f"{k} = {toml(v)}" for k, v in {**SWEEP, "axes": {"g": {"start": 1.0, "stop": 1.1, "num": 2}}}.items()
+        )
+    )
+    with pytest.raises(SpecError, match=r"axes.g: is an identified parameter"):
+        run_posterior(path, directory, 3, tmp_path / "other", workers=0)
 
 
 def test_posterior__parameter_that_is_not_determined(fitted):

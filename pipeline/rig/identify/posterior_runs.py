@@ -1,0 +1,236 @@
+"""Run a specification once for each draw of a posterior, and collect the distribution of what the runs show."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.analysis.tabular import words_of
+from pipeline.layout.identity import canonical, digest_of
+from pipeline.layout.writing import write_atomically
+from pipeline.products.product import Table
+from pipeline.rig.identify.directory import read_result
+from pipeline.rig.identify.posterior import LEVELS, draw_posterior
+from pipeline.runs.derive import AnalysedRun
+from pipeline.runs.run import run
+from pipeline.runs.workflows import find_spec, read_given
+from pipeline.specification.files import read_toml
+from pipeline.specification.models import is_model_file
+from pipeline.specification.problems import SpecError
+from pipeline.store.errors import RefusedError
+from pipeline.store.files import local_path
+
+Echo = Callable[[str], None]
+
+STUDY, BEST = "posterior.json", "best"
+"""Name of the file that describes the runs, and of the folder of the run at the best estimates."""
+
+
+def run_posterior(
+    spec: str | Path,
+    identification: str | Path,
+    n: int,
+    out: str | Path | None = None,
+    *,
+    seed: int = 1,
+    smoke: bool = False,
+    workers: int | None = None,
+    echo: Echo = print,
+) -> Path:
+    """Run a specification at the best estimates of an identification and at each draw of its posterior.
+
+    Parameters
+    ----------
+    spec
+        TOML file, or the name of a shipped workflow, of the identified model.
+    identification
+        Directory of a finished identification.
+    n, seed
+        Number of draws, and their seed.
+    out
+        Folder; by default ``runs/<name>-posterior``. It has an ordinary run directory for each draw, ``draw-0000``
+        and so on, and one at the best estimates, ``best``. A stopped command continues.
+    smoke, workers, echo
+        See `pipeline.runs.run.run`.
+
+    Returns
+    -------
+    Path
+        The folder.
+
+    Raises
+    ------
+    SpecError
+        If the model is not the identified one, or the specification sweeps an identified parameter.
+    RefusedError
+        If the folder holds the runs of another specification or posterior.
+    """
+    path, result = find_spec(spec), read_result(identification)
+    parsed, _, default = read_given(path, smoke=smoke)
+    names = [name for name in result["names"] if name in result["values"]] + list(result["tied"])
+    _refuse_other_model(parsed.model.reference, result, list(parsed.axes), names)
+    drawn = draw_posterior(identification, n, seed)
+    tables = read_toml(path)
+    if isinstance(tables.get("model"), str) and is_model_file(tables["model"]):
+        tables["model"] = str((path.parent / tables["model"]).resolve())
+    values = drawn["value"].sel(parameter=names).values
+    folder = local_path(out) if out is not None else default.with_name(f"{default.name}-posterior")
+    _establish(folder, tables, values, names, smoke)
+    places = [BEST, *(f"draw-{k:04d}" for k in range(n))]
+    sets = [np.array([result["values"][name] for name in names]), *values]
+    for k, (place, own) in enumerate(zip(places, sets, strict=True)):
+        echo(f"run {k + 1} of {len(places)}: {place}")
+        changed = {name: float(v) for name, v in zip(names, own, strict=True)}
+        given = tables.get("parameters", {})
+        overrides = {**given.get("overrides", {}), **changed}
+        whole = {**tables, "parameters": {**given, "overrides": overrides}}
+        run(whole, folder / place, workers=workers, smoke=smoke, echo=_silent)
+    return folder
+
+
+def _silent(line: str) -> None:
+    """Print nothing."""
+
+
+def _refuse_other_model(reference: Any, result: Mapping[str, Any], axes: list[str], names: list[str]) -> None:
+    problems = []
+    if canonical(reference) != canonical(result["model"]):
+        problems.append("model: is not the one that was identified; give a specification of it.")
+    problems += [
+        f"axes.{name}: is an identified parameter, which the draws set; remove the axis."
+        for name in axes
+        if name in names
+    ]
+    if problems:
+        raise SpecError(problems)
+
+
+def _establish(folder: Path, tables: Mapping[str, Any], values: np.ndarray, names: list[str], smoke: bool) -> None:
+    """Write what the folder holds, or raise unless it holds the same."""
+    content = {"specification": digest_of(dict(tables)), "draws": values.tolist(), "names": names, "smoke": smoke}
+    path = folder / STUDY
+    if path.is_file():
+        known = json.loads(path.read_text("utf-8"))
+        different = [key for key in content if known.get(key) != content[key]]
+        if different:
+            raise RefusedError(
+                f"{folder}: holds the runs of another posterior or specification (different: {', '.join(different)}); "
+                "give another --out."
+            )
+        return
+    if folder.is_dir() and any(folder.iterdir()):
+        raise RefusedError(f"{folder}: is not empty and has no {STUDY}; give another --out.")
+    folder.mkdir(parents=True, exist_ok=True)
+    write_atomically(path, canonical(content))
+
+
+# ---- distributions -----------------------------------------------------------------------------
+
+
+def spread(folder: str | Path, *, branches: bool = False, echo: Echo = print) -> Table:
+    """Collect the distribution of fractions of cells, and of bifurcations, over the runs of `run_posterior`.
+
+    Parameters
+    ----------
+    folder
+        Folder of the runs.
+    branches
+        Whether to follow the branches of each run, and to collect their bifurcations. Results are kept in the runs.
+    echo
+        Function that prints a line.
+
+    Returns
+    -------
+    Table
+        A row for each status and orbit period with the ``fraction`` of cells, and for each bifurcation of the best run
+        with its ``value``: ``best``, ``median``, ``low`` and ``high`` (95 %), and ``n_draws`` that have it.
+
+    Raises
+    ------
+    RefusedError
+        If the folder holds no such runs.
+    """
+    folder = local_path(folder)
+    if not (folder / STUDY).is_file():
+        raise RefusedError(f"{folder}: has no {STUDY}; make the runs by magpend run SPEC --posterior DIR.")
+    n = len(json.loads((folder / STUDY).read_text("utf-8"))["draws"])
+    runs = [AnalysedRun.of(folder / place) for place in (BEST, *(f"draw-{k:04d}" for k in range(n)))]
+    rows = _fraction_rows([_fractions(one) for one in runs])
+    if branches:
+        found = []
+        for k, one in enumerate(runs):
+            echo(f"branches {k + 1} of {len(runs)}")
+            found.append(_bifurcations(one))
+        rows += _bifurcation_rows(found)
+    return Table(rows, [_line(row) for row in rows])
+
+
+def _fractions(one: AnalysedRun) -> dict[str, float]:
+    """Return the fraction of a run's cells of each status; of periodic ones by their period."""
+    cube = one.cube()
+    words = words_of(cube["status"])
+    status, period = cube["status"].values.ravel(), cube["orbit_period"].values.ravel()
+    names = [
+        f"{words[s]} {p}" if p > 0 and words[s] == "periodic" else words[s] for s, p in zip(status, period, strict=True)
+    ]
+    return {name: count / len(names) for name, count in Counter(names).items()}
+
+
+def _fraction_rows(found: list[dict[str, float]]) -> list[dict[str, Any]]:
+    names = sorted({name for one in found for name in one})
+    rows = []
+    for name in names:
+        values = np.array([one.get(name, 0.0) for one in found[1:]])
+        rows.append(_row("fraction", name, found[0].get(name, 0.0), values, int(np.count_nonzero(values))))
+    return rows
+
+
+def _bifurcations(one: AnalysedRun) -> list[tuple[str, float]]:
+    """Return kind with period, and parameter value, of all bifurcations of a run's branches."""
+    branches = one.derive("branches")
+    if "kind" not in branches:
+        return []
+    words, periods = words_of(branches["kind"]), branches["orbit_period"].values[branches["of_branch"].values]
+    kinds = [words[int(k)] for k in branches["kind"].values]
+    return [(f"{kind} {p}", float(v)) for kind, p, v in zip(kinds, periods, branches["value"].values, strict=True)]
+
+
+def _bifurcation_rows(found: list[list[tuple[str, float]]]) -> list[dict[str, Any]]:
+    """Match each bifurcation of the best run with the nearest one of its kind and period in each draw; none twice."""
+    matched: list[list[float]] = [[] for _ in found[0]]
+    for own in found[1:]:
+        left = list(own)
+        pairs = sorted(
+            (abs(value - other[1]), i, other)
+            for i, (name, value) in enumerate(found[0])
+            for other in own
+            if other[0] == name
+        )
+        done: set[int] = set()
+        for _, i, other in pairs:
+            if i not in done and other in left:
+                done.add(i)
+                left.remove(other)
+                matched[i].append(other[1])
+    return [
+        _row("value", name, value, np.array(values), len(values))
+        for (name, value), values in zip(found[0], matched, strict=True)
+    ]
+
+
+def _row(what: str, name: str, best: float, values: np.ndarray, n: int) -> dict[str, Any]:
+    low, middle, high = np.quantile(values, LEVELS) if len(values) else (np.nan,) * 3
+    return {"what": what, "name": name, "best": best, "median": middle, "low": low, "high": high, "n_draws": n}
+
+
+def _line(row: Mapping[str, Any]) -> str:
+    name = str(row["name"]).replace("_", " ")
+    return (
+        f"{row['what']} {name}: {row['best']:.6g}   95 %: {row['low']:.6g} to {row['high']:.6g} "
+        f"({row['n_draws']} draws have it)"
+    )
