@@ -85,7 +85,9 @@ def __dir__() -> list[str]:
 
 
 class _Package(ModuleType):
-    """A package in which `sections` and `trajectory` stay functions when the modules of these names are imported."""
+    """Package whose attributes `sections` and `trajectory` remain functions when the modules of the same names are
+    imported.
+    """
 
     def __setattr__(self, name: str, value: Any) -> None:
         if not (name in _HOME_OF and isinstance(value, ModuleType)):

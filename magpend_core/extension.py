@@ -85,8 +85,7 @@ def more_sections(
 def orbit_periods(
     sections: np.ndarray, *, closure_tolerance: float, max_orbit_period: int, system: System
 ) -> np.ndarray:
-    """Return the orbit period that each trajectory's section points show, or 0 where they show none, by the rule of
-    `run_branches`.
+    """Return the orbit period found in each trajectory's section points, by the rule of `run_branches`; 0 if aperiodic.
 
     Parameters
     ----------
@@ -113,7 +112,7 @@ def orbit_periods(
 
 
 def judge(rings: Any, last: int, settings: Settings, found: Any) -> None:
-    """Write to `found` the orbit period that each trajectory's last section points show, or 0 where they show none."""
+    """Write the orbit period of each row of section points to `found`; 0 if the points show no period."""
     for i in range(len(rings)):
         found[i] = closed_period(rings[i], last, settings)
 

@@ -130,9 +130,7 @@ def _orthonormalise(state: Any, memory: Any, settings: Any) -> None:
 
 
 def _average(section: Any, turns: Any, i_period: int, memory: Any, record: Any, measures: Any, settings: Any) -> int:
-    """Add the growth rates of a drive period to the sums of its block of periods, and to the weighted sums over all
-    periods.
-    """
+    """Add the growth rates of one drive period to the sums for its block, and to the weighted sums over all periods."""
     n_vectors = N_TANGENTS // N_BASE
     i = i_period - settings.n_transient
     n_periods = settings.n_blocks * settings.periods_per_block

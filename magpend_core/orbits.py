@@ -105,7 +105,7 @@ def section_map(
     rtol: float = RTOL,
     system: System = PENDULUM_FITTED,
 ) -> Returns:
-    """Map section points through a number of periods, and compute the derivative of the last image by the point.
+    """Iterate the section map from given points; return all images, and the derivative of the last image by the point.
 
     Parameters
     ----------
@@ -330,8 +330,7 @@ def polish_orbits(
 def _take(
     found: PeriodicOrbits, rows: np.ndarray, ends: Returns, tolerance: float, least_period: bool, system: System
 ) -> np.ndarray:
-    """Store the residuals of some guesses and the orbits that have converged; return which guesses need more
-    iterations.
+    """Store residuals and converged orbits after a Newton iteration; return a mask of the guesses to iterate further.
 
     A row that closes after a divisor of its period gets this period, and -1 iterations.
     """

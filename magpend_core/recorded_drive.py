@@ -1,4 +1,4 @@
-"""Compute sections and quantities under a recorded drive, whose intervals the engine treats as points of a branch.
+"""Compute section points and quantities of trajectories under a recorded drive, interval by interval.
 
 A branch of `engine.entry.integrate` goes from point to point with its state and its step, and each point has
 a drive frequency and parameters of its own. That is a recorded drive: an interval is a period of its own
@@ -36,7 +36,7 @@ def driven_system(system: System, drive: Drive) -> System:
 
 
 def _padded(packed: np.ndarray, system: System) -> np.ndarray:
-    """Append zeros to packed parameters, as places for the parameters that the recorded drive sets."""
+    """Append zeros to packed parameters, for the additional parameters of a system with a recorded drive."""
     more = len(system.parameter_names) - packed.shape[-1]
     return np.pad(packed, [(0, 0)] * (packed.ndim - 1) + [(0, more)])
 
@@ -150,16 +150,14 @@ def _check_marks(marks: np.ndarray, total: int, n_intervals: int, start_s: float
 
 
 def _chunks(first_kept: int, last: int, most: int) -> Iterator[tuple[int, int]]:
-    """Split a drive's intervals into ranges of limited length; one range ends at the first section point to be
-    stored.
-    """
+    """Split the intervals of a drive into ranges of limited length, with a cut at the first section point to store."""
     for begin, end in ((0, first_kept), (first_kept, last)):
         for first in range(begin, end, most):
             yield first, min(first + most, end)
 
 
 def _points(system: System, drive: Drive, packed: np.ndarray, part: slice) -> tuple[np.ndarray, np.ndarray]:
-    """Return the parameter vector and frequency that each trajectory has in each interval of the drive."""
+    """Return parameter vectors and frequencies, shape (trajectory, interval, ...), for the intervals of a drive."""
     durations = drive.durations_s[part]
     shape = (len(packed), len(durations))
     points = np.repeat(packed[:, None], len(durations), axis=1)
@@ -243,7 +241,7 @@ class _Walk:
 
 
 def closed_periods(sections: np.ndarray, settings: Settings, system: System) -> np.ndarray:
-    """Return the period at which each trajectory's sections close, 0 if they do not; see `observers.closed_period`.
+    """Return the period of each trajectory's section points, or 0 if aperiodic; see `observers.closed_period`.
 
     Parameters
     ----------
@@ -318,7 +316,7 @@ def recorded_trajectory(
 def evaluate_recorded(
     names: Sequence[str], t: np.ndarray, state: np.ndarray, parameters: Parameters, drive: Drive
 ) -> np.ndarray:
-    """Compute named quantities under a recorded drive, at instants that each lie in one interval of the drive.
+    """Compute named quantities of a model under a recorded drive, at given times and states.
 
     Parameters
     ----------

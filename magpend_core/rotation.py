@@ -39,7 +39,7 @@ CLOSED_TURNS = 0.05
 
 @dataclass(frozen=True)
 class TurningState:
-    """What turns: an angle, or the direction of a point of a plane of two states as seen from a centre.
+    """Angle whose turns are counted: an angle of the model, or the polar angle of two states about a centre.
 
     Attributes
     ----------

@@ -20,7 +20,7 @@ __all__ = ["Drive", "Samples", "sample", "with_recorded_drive"]
 
 @dataclass(frozen=True)
 class Drive:
-    """A drive in consecutive intervals, each with its own length and its own values of some parameters.
+    """Recorded drive: consecutive time intervals, each with its duration and its values of some parameters.
 
     The periods between measured rising edges, each with its duty cycle; or the intervals between the samples
     of a measured torque, for `with_recorded_drive`. Within an interval the system's forcing is that of a
@@ -250,8 +250,8 @@ def _offsets(parts: Sequence[np.ndarray]) -> np.ndarray:
 def _drive_table(
     system: System, grids: list[np.ndarray], drives: Sequence[Drive | None] | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the drives as arrays for the engine: durations, values, each drive's first interval, the parameters
-    changed, and start times.
+    """Return the drives as flat arrays for the engine: durations, values, first intervals, changed parameters, start
+    times.
     """
     given = [None] * len(grids) if drives is None else list(drives)
     if len(given) != len(grids):

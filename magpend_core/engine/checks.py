@@ -53,7 +53,7 @@ class SystemCheckError(ValueError):
 
 @dataclass
 class _Checked:
-    """Ranges of the parameters and, as the last entry, of the frequency, over which a system has been checked."""
+    """Smallest and largest checked value of each parameter of a system; the last entry is the drive frequency."""
 
     low: np.ndarray
     high: np.ndarray
@@ -179,9 +179,7 @@ def _declaration(system: System, linearised: bool) -> Iterator[str]:
 
 
 def _extremes(packed: np.ndarray, frequency: np.ndarray, checked: _Checked | None) -> list[int]:
-    """Return the indices of the parameter sets in which a parameter or the frequency is extreme and outside the ranges
-    already checked.
-    """
+    """Return the indices of parameter sets with a minimum or maximum of a parameter outside the checked ranges."""
     cells = {0} if checked is None else set()
     for i, column in enumerate((*packed.T, frequency)):
         for cell in (int(column.argmin()), int(column.argmax())):
@@ -297,9 +295,7 @@ class _Motion:
         self.u: Any = 0.0
 
     def _constants_at(self, times: np.ndarray) -> tuple[Any, ...]:
-        """Return the arguments of a check at given times: the system's constants, then the modes of its switches,
-        contacts and time segments.
-        """
+        """Return the constants of the system, then the modes of switches, contacts and time segments at given times."""
         return (*self.own, *event_checks.modes_at(self.system, times, self.edges))
 
     def _states(self, states: np.ndarray) -> np.ndarray:
@@ -363,7 +359,9 @@ class _Motion:
             )
 
     def _check_period(self) -> None:
-        """Check that the rates are equal at both ends of a drive period, with time itself passed as the forcing."""
+        """Check that the rates at time 0 equal those at the end of the drive period, with time itself as the forcing
+        value.
+        """
         ends = []
         for time in (0.0, self.period):
             self.u = np.full(N_SAMPLES, time)

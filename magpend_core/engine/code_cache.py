@@ -1,4 +1,5 @@
-"""Cache machine code on disk; use a cache file only if it is undamaged, of this code, and written by this user.
+"""Cache machine code on disk. Use a cache file only if it is intact, fits the present code, and was written by this
+user.
 
 numba unpickles what it finds in its cache and jumps into the machine code in there. So an entry here is one
 file that begins with the sha256 of the rest, and the rest begins with what it was compiled from: one that is
@@ -101,7 +102,7 @@ def _below(home: Path, folder: Path) -> list[Path]:
 
 
 def _exposed(found: os.stat_result) -> str:
-    """Describe who else can write to a file or folder; empty if nobody can, or if the system has no file owners."""
+    """Return a text that says who else can write to a file or folder; empty if only the owner can."""
     if not hasattr(os, "geteuid"):
         return ""
     mode = f"mode {stat.S_IMODE(found.st_mode):04o}"

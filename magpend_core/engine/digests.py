@@ -1,4 +1,4 @@
-"""Compute digests of compiled functions defined outside the package, with everything that decides their machine code.
+"""Compute digests of compiled functions outside the package; a digest covers all that determines their machine code.
 
 Machine code may be kept for such functions only under a digest of everything that they reach, since
 `jit.source_digest` does not change with them. What cannot be followed to its end has none, and is not kept.
@@ -92,7 +92,9 @@ def _parts(value: Any, seen: dict[int, int]) -> Iterator[bytes]:
 
 
 def _plain(value: Any) -> bytes:
-    """Return bytes that identify a number or text by its value, or a function that the compiler knows by its name."""
+    """Return bytes that identify an object: a number or text by its value, a function of numba, numpy or magpend by its
+    name.
+    """
     if value is None or isinstance(value, bool | int | float | complex | str | bytes | np.generic):
         return f"{type(value).__name__} {value!r}".encode()
     module = getattr(value, "__module__", None) or ""
@@ -104,7 +106,7 @@ def _plain(value: Any) -> bytes:
 
 
 def _options(dispatcher: Any) -> bytes:
-    """Return the compiler options of a numba function as bytes, in a fixed order."""
+    """Return the compiler options of a numba function as bytes, sorted by name."""
     options = {**dispatcher.targetoptions, "locals": dispatcher.locals}
     rows = []
     for name, option in sorted(options.items()):
@@ -138,7 +140,7 @@ def reached(function: Any, path: tuple[str, ...]) -> Any:
 
 
 def _found(value: Any, attributes: tuple[str, ...]) -> Any:
-    """Return the object that a dotted path of attributes leads to; only attributes of modules are followed."""
+    """Return the object at a dotted path such as ``module.submodule.NAME``; stop at the first non-module."""
     for name in attributes:
         if not isinstance(value, ModuleType):
             break

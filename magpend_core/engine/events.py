@@ -95,7 +95,7 @@ def _events_of(system: System) -> Callable[..., Any]:
 
 
 def _middle_of(n: int) -> Callable[..., Any]:
-    """Return a function that gives the states in the middle of a step by cubic Hermite interpolation."""
+    """Return a function that computes the states in the middle of a step by cubic Hermite interpolation."""
     lines = ["def middle_of(y0, dy0, y1, dy1, h):", "eighth = 0.125 * h"]
     parts = [f"multiply_add(eighth, dy0[{i}] - dy1[{i}], 0.5 * (y0[{i}] + y1[{i}]))" for i in range(n)]
     lines.append(f"return ({', '.join(parts)},)")
@@ -105,9 +105,7 @@ def _middle_of(n: int) -> Callable[..., Any]:
 
 
 def event_bindings(system: System) -> dict[str, Any]:
-    """Return the values, for a given system, of the global names that the function templates of this module leave
-    open.
-    """
+    """Return the values of this module's free global names (such as ``N_EVENTS``) for a system."""
     of, direction = system.section or (0, 0)
     directions = [0.0] * system.n_switches + [float(d) for d in system.impact_directions]
     starts = [1.0] * system.n_switches + [-float(d) for d in system.impact_directions]
@@ -147,9 +145,7 @@ def cubic_dip(a: Any, da: Any, b: Any, db: Any) -> Any:
 
 
 def may_dip(a: Any, da: Any, b: Any, db: Any) -> Any:
-    """Return 1 where a quick bound on a cubic (see `cubic_dip`) does not exclude a value below 0 between its ends, else
-    0.
-    """
+    """Return 1 where a cubic may fall below 0 between its ends, by a fast bound (see `cubic_dip`); else 0."""
     least = minimum(multiply_add(1.0 / 3.0, da, a), multiply_add(-1.0 / 3.0, db, b))
     steepest = maximum(maximum(da, db), multiply_add(3.0, b - a, -(da + db)))
     return where_less(least, 0.0, where_less(0.0, steepest, 1.0, 0.0), 0.0)
@@ -176,8 +172,7 @@ def cubic_root(a: Any, da: Any, b: Any, db: Any, right: Any) -> Any:
 
 
 def margin(w: Any, base: int, k: int, near: Any, far: Any) -> Any:
-    """Return value and rate of event function `k` at both ends of a step, with the sign chosen so that it is positive
-    before the event.
+    """Return value and rate of event function `k` at both ends of a step, multiplied by its sign before the event.
 
     `near` and `far` are pairs of value and rate. A value at the near end that is beyond zero, by rounding
     or after an event, counts as zero.
@@ -194,13 +189,15 @@ def pair(w: Any, row: int, k: int) -> Any:
 
 
 def fires(w: Any, base: int, k: int) -> Any:
-    """Return 1 where a sign change of event function `k` from its present side is an event, else 0."""
+    """Return 1 where a zero of event function `k` is an event: its sign changes in the declared direction. Else return
+    0.
+    """
     return where_less(DIRECTIONS[k] * load(w, base + ROWS.side + k * WIDTH), 0.5, 1.0, 0.0)
 
 
 def hides_events(w: Any, base: int) -> Any:
-    """Return 1 where an event function may have two hidden zeros: at mid-step it is far from the cubic through the
-    step's ends.
+    """Return 1 where an event function may pass zero twice within a step: mid-step it differs from its cubic
+    interpolant.
     """
     h, t, level = load(w, base + ROWS.step), load(w, base + ROWS.time), load(w, base + ROWS.level)
     y0, y1 = load_rows(w, base + ROWS.state, N_KNOWN), load_rows(w, base + ROWS.trial, N_KNOWN)
@@ -227,8 +224,7 @@ def hides_events(w: Any, base: int) -> Any:
 
 
 def judge_events(w: Any, base: int, failed: Any) -> Any:
-    """Return for each SIMD lane whether a step is accepted, taken back or ends on an event; `failed` is 1 where its
-    error is too large.
+    """Return for each SIMD lane a verdict on the attempted step: accept it, take it back, or end on an event.
 
     ACCEPT, TAKE_BACK or LANDED; in the last case `fired` tells on which.
     """
@@ -284,9 +280,7 @@ def settle_events(w: Any, base: int, failed: Any) -> Any:
 
 
 def turn_sides(w: Any, base: int, accepted: Any, lands: Any) -> None:
-    """After an accepted step, reverse the stored sign of each event function that has passed zero; mark the events as
-    fired.
-    """
+    """Flip the stored sign of each event function that passed zero in an accepted step, and mark its event as fired."""
     for k in range(N_EVENTS):
         row = base + k * WIDTH
         _, _, b, _ = margin(w, base, k, pair(w, base + ROWS.known, k), pair(w, base + ROWS.found, k))
@@ -297,8 +291,7 @@ def turn_sides(w: Any, base: int, accepted: Any, lands: Any) -> None:
 
 
 def aim(w: Any, base: int, takes: Any, goes_on: Any, narrow: Any) -> None:
-    """Set the length of the next attempted step to end at the nearest zero of an event function that an attempt has
-    passed.
+    """Set the length of the next step so that it ends at the nearest zero of the event functions.
 
     After an attempt that is taken back, that is within its length; after a step that ended before the
     zero, within what is left of an earlier one.
@@ -333,8 +326,8 @@ def aim(w: Any, base: int, takes: Any, goes_on: Any, narrow: Any) -> None:
 
 
 def section_counts(w: Any, base: int, lane: int) -> bool:
-    """Return whether the last step ended on the Poincare section; for an angle, exclude the zero of its sine half a
-    turn away.
+    """Return whether the last step ended on the Poincare section, not half a turn away, where the sine of an angle is
+    0, too.
     """
     if w[base + ROWS.fired + (N_EVENTS - 1) * WIDTH + lane] < 0.5:
         return False

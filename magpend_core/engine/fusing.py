@@ -1,5 +1,4 @@
-"""Fuse products with sums (multiply-add) by a fixed rule instead of the compiler's, so that results are the same bits
-everywhere.
+"""Fuse products with sums (multiply-add) by a fixed rule, so that results have the same bits on every CPU.
 
 A fused product and sum, ``a * b + c`` rounded once, costs half as much as the two apart, so that every
 compiler wants to fuse. Left to it, what is fused depends on the CPU, on its version and on what was inlined
@@ -81,7 +80,7 @@ def _fused(instruction: ir.Instruction) -> Any:
 
 
 def _is_negation(value: Any) -> bool:
-    """Return whether an instruction negates a value, which numba also writes as a difference from minus zero."""
+    """Return whether an LLVM instruction negates a value, written as ``fneg`` or as a difference -0.0 - x."""
     opname = getattr(value, "opname", None)
     if opname != "fsub":
         return bool(opname == "fneg")
@@ -91,7 +90,7 @@ def _is_negation(value: Any) -> bool:
 
 
 def _factors(builder: ir.IRBuilder, value: Any) -> tuple[Any, Any] | None:
-    """Return the factors of a product, also of a scalar product spread over SIMD lanes; None for anything else."""
+    """Return the two factors if an LLVM value is a product, or a scalar product copied to all SIMD lanes; else None."""
     opname = getattr(value, "opname", None)
     if opname == "fmul":
         return tuple(value.operands)
@@ -105,7 +104,7 @@ def _factors(builder: ir.IRBuilder, value: Any) -> tuple[Any, Any] | None:
 
 
 def _like(builder: ir.IRBuilder, spread: Any, scalar: Any) -> Any:
-    """Spread a scalar over the SIMD lanes by the same instructions with which another value was spread."""
+    """Copy a scalar to all SIMD lanes, by instructions like those that made `spread`."""
     inserted, undefined, mask = spread.operands
     first = builder.insert_element(inserted.operands[0], scalar, inserted.operands[2])
     return builder.shuffle_vector(first, undefined, mask)

@@ -15,9 +15,7 @@ def places_of(system: System) -> Sequence[int]:
 
 
 def rows_of_entries(system: System) -> list[dict[int, int]]:
-    """Return for each row of the Jacobian a dict: from the column of an entry to its index in the tuple of
-    `system.jacobian`.
-    """
+    """Return a dict per row of the Jacobian: column of an entry -> its index in the tuple from `system.jacobian`."""
     n = system.n_states
     rows: list[dict[int, int]] = [{} for _ in range(n)]
     for k, place in enumerate(places_of(system)):

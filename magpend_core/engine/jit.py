@@ -161,8 +161,8 @@ _ARRAYS = frozenset(("IS_ANGLE", "SCALES", "ESCAPE", "DIRECTIONS", "STARTS", "SA
 
 
 def bound_part(template: Callable[..., Any], bindings: Mapping[str, Any], dissolves: bool) -> Any:
-    """Bind the free names of a template and compile it for use by other compiled functions; equal bindings give the
-    same function.
+    """Fill in a template's free names and compile it, for calls from compiled code only. Equal names and values give
+    one function.
 
     Parameters
     ----------
@@ -201,8 +201,8 @@ def _part(template: Callable[..., Any], used: Mapping[str, Any], dissolves: bool
 
 
 def _without_size(name: str, value: Any, names: set[str], sizes: dict[str, Any]) -> Any:
-    """Replace a system size, such as the number of states, by a placeholder and note it in `sizes`; return other values
-    unchanged.
+    """Return a placeholder for a system size (such as the number of states) and note the size in `sizes`; else return
+    `value`.
     """
     if type(value) is int and value > 0 and name in _SIZES:
         sizes[name] = value
@@ -247,7 +247,7 @@ def _names_in(code: CodeType) -> set[str]:
 
 
 def _identity(value: Any, names: set[str]) -> Any:
-    """Return a hashable key of a value bound to a template; values with equal keys compile to the same code.
+    """Return a hashable key of a value for a template's free name; values with equal keys compile to the same code.
 
     Of a tuple with named fields it is the fields that are in `names`: they are looked up by name alone.
     """
@@ -263,12 +263,12 @@ def _identity(value: Any, names: set[str]) -> Any:
 
 
 def is_covered(*functions: Callable[..., Any]) -> bool:
-    """Return whether all functions are defined in ``magpend_core``, so that `source_digest` covers them."""
+    """Return whether all functions are defined in ``magpend_core``, whose sources `source_digest` covers."""
     return all(f.__module__.partition(".")[0] == PACKAGE for f in functions)
 
 
 def keeping(*functions: Callable[..., Any]) -> str | None:
-    """Return the cache key of the machine code that calls `functions`; None if the code must not be cached.
+    """Return the cache key for machine code that calls `functions`; None if the code must not be cached.
 
     Returns
     -------
@@ -282,8 +282,7 @@ def keeping(*functions: Callable[..., Any]) -> str | None:
 def entry(
     template: Callable[..., Any], name: str, bindings: Mapping[str, Any], kept: str | None = ""
 ) -> Callable[..., Any]:
-    """Bind the free names of a template and compile it as a function that Python calls; keep its machine code in the
-    cache.
+    """Fill in a template's free names and compile it as a function that Python can call, with its machine code cached.
 
     The template becomes a part. What Python calls is one line around it, since numba takes long over code
     that is reached from Python.

@@ -160,8 +160,8 @@ def rows_of(system: System, n_watched: int = 0) -> Rows:
 
 
 def step_ratio(room: Any) -> Any:
-    """Return the largest step near a layer or forcing edge, relative to the distance from the singularity in the
-    complex plane.
+    """Return the largest safe step near a layer or forcing edge, as a multiple of the distance to the complex
+    singularity.
 
     The right-hand side near a layer behaves like (J/pi) atan(t/d), whose derivatives at a distance R
     from the poles at +-i d grow like J d n!/R^(n+1): a step h = c R leaves an error in proportion to
@@ -201,9 +201,7 @@ def choose_step(w: Any, base: int, slack: float) -> None:
 
 
 def limited_by_layers(w: Any, base: int, slack: float, t: Any, h: Any) -> Any:
-    """Return the step size `h`, reduced where the state is near a layer in which the right-hand side changes
-    quickly.
-    """
+    """Return the step size `h`, reduced near a layer (a narrow region where the right-hand side changes quickly)."""
     y = load_rows(w, base + ROWS.state, N_KNOWN)
     dy = load_rows(w, base + ROWS.slopes, N_KNOWN)
     c = load_rows(w, base + ROWS.constants, NC)
@@ -337,7 +335,7 @@ def squared_error_of_two(w: Any, base: int, rtol: float, atol: float) -> Any:
 
 
 def finish_step(w: Any, base: int, rtol: float, atol: float, max_attempts: float) -> bool:
-    """Accept or reject the attempted step lane by lane, and set the next step size and the event of each lane.
+    """Accept or reject the attempted step in each SIMD lane; set the next step size and what happens next (the event).
 
     Return whether a lane of the group has an event.
     """
@@ -439,8 +437,8 @@ def load_cell(
 
 
 def begin_period(w: Any, base: int, lane: int, edge_table: Any) -> int:
-    """Set a lane's time to the start of a drive period; return the number of the forcing edge that ends its first
-    segment.
+    """Set the time of a SIMD lane to 0, the start of a drive period; return the index of the forcing edge to integrate
+    to.
     """
     w[base + ROWS.time + lane] = 0.0
     w[base + ROWS.attempts + lane] = 0.0
@@ -457,8 +455,8 @@ def begin_period(w: Any, base: int, lane: int, edge_table: Any) -> int:
 
 
 def set_target(w: Any, base: int, lane: int, time: float, edge_table: Any, edge: int) -> None:
-    """Let a SIMD lane's time segment end at `time`, at the forcing edge number `edge`; ``edge = n_edges`` stands for no
-    edge.
+    """Set the end of a SIMD lane's present time segment: forcing edge `edge` at `time`, or no edge if ``edge =
+    n_edges``.
     """
     w[base + ROWS.target + lane] = time
     w[base + ROWS.target_width + lane] = edge_table[1, edge] if edge < NE else np.inf
@@ -468,8 +466,8 @@ def set_target(w: Any, base: int, lane: int, time: float, edge_table: Any, edge:
 
 
 def begin_segment(w: Any, base: int, lane: int, edge_table: Any, edge: int) -> int:
-    """Let a SIMD lane integrate on, from the end of its last time segment to forcing edge number `edge` or to the end
-    of the period.
+    """Begin the next time segment of a SIMD lane, up to forcing edge `edge` or, with ``edge = n_edges``, the period's
+    end.
     """
     w[base + ROWS.start + lane] = w[base + ROWS.target + lane]
     w[base + ROWS.start_width + lane] = w[base + ROWS.target_width + lane]
@@ -855,7 +853,7 @@ def _name(system: System, observer: Observer, watched: tuple[int, ...]) -> str:
 
 
 def _layers_at(system: System) -> Callable[..., Any]:
-    """Return ``system.layers`` as a function that also takes the time, as its first argument."""
+    """Return ``system.layers`` wrapped so that it accepts the time as an additional first argument."""
     rates = "dy + (t,)" if system.timed_layers else "dy"
     scope: dict[str, Any] = {"__name__": system.rhs.__module__, "_layers": system.layers}
     exec(f"def layers_at(t, y, dy, c):\n    return _layers(y, {rates}, c)\n", scope)
@@ -863,9 +861,7 @@ def _layers_at(system: System) -> Callable[..., Any]:
 
 
 def engine_bindings(system: System, observer: Observer, watched: tuple[int, ...] = ()) -> dict[str, Any]:
-    """Return the values, for a given system and observer, of the global names that the function templates of this
-    module leave open.
-    """
+    """Return the values of this module's free global names (such as ``N``, ``rhs``) for a system and an observer."""
     bindings: dict[str, Any] = {
         "ROWS": rows_of(system, len(watched)),
         "WATCHES": len(watched) > 0,

@@ -1,4 +1,5 @@
-"""Link the LLVM code of an engine's precompiled functions (parts); system sizes get their values at link time.
+"""Link the precompiled functions (parts) of an engine as LLVM code, and set the sizes of the system (number of states,
+...).
 
 A *size* of a system, such as the number of its states, is a constant without a value in the code of a part.
 While numba compiles the part, an integer that occurs nowhere else stands for it (`placeholder`). In the LLVM
@@ -60,8 +61,8 @@ class PartLibrary(FusedLibrary):
         self.add_llvm_module(module)
 
     def finalize(self) -> None:
-        """Link in the libraries that are not engine parts, such as numba's ``max``; the engine's library links the
-        parts later.
+        """Link in numba's own libraries (such as that of ``max``). Engine parts are linked later, into the engine's
+        library.
         """
         own = _defined(self._final_module)
         for library in dict.fromkeys(self._linking_libraries):
@@ -73,7 +74,7 @@ class PartLibrary(FusedLibrary):
         self._finalized = True
 
     def get_pointer_to_function(self, name: str) -> int:
-        """Return 0 for every name: a part has no machine code to point to."""
+        """Return 0 as the address of every function, because a part has no machine code."""
         self._ensure_finalized()
         return 0
 
@@ -141,7 +142,7 @@ def _hide_others(module: Any, own: set[str]) -> None:
 
 
 def _link(module: Any, library: Any) -> None:
-    """Link an LLVM module with all libraries that it depends on, and define the size constants that these use."""
+    """Link an LLVM module with all libraries that it uses, and add the size constants of its system."""
     sizes: dict[str, Any] = dict(library.dispatcher.sizes) if isinstance(library, PartLibrary) else {}
     for reached_one in _reached_libraries(library):
         if isinstance(reached_one, PartLibrary):
@@ -190,8 +191,8 @@ def placeholder_of_array(name: str, array: np.ndarray) -> np.ndarray:
 
 
 def sizes_as_loads(module: ir.Module) -> None:
-    """Replace placeholders of system sizes in an LLVM module by loads from named constants, defined when it is
-    linked.
+    """Replace each placeholder integer in an LLVM module by a load from a named constant, which the linker defines
+    later.
     """
     names = {value: name for name, value in _NAMES.items()}
     for function in module.functions:
@@ -200,9 +201,7 @@ def sizes_as_loads(module: ir.Module) -> None:
 
 
 def _arrays_by_name(text: str) -> str:
-    """Replace the arrays that serve as placeholders in LLVM text by references to named constants, defined when the
-    code is linked.
-    """
+    """Replace placeholder arrays in LLVM text by references to named constants, which the linker defines later."""
     names = {number: name for name, number in _NAMES.items()}
     used: set[str] = set()
     for definition, symbol, content in _ARRAY.findall(text):

@@ -65,7 +65,7 @@ def _numbers(n: int) -> Callable[..., Any]:
 
 
 def _reset_along(system: System, n: int) -> Callable[..., Any]:
-    """Return a function that applies an impact map at a point on a line through a state and a time."""
+    """Return a function that applies the impact maps to the state ``y + s*dy`` at the time ``t + s*dt``."""
     line = "".join(f"y[{i}] + s * dy[{i}], " for i in range(n))
     scope: dict[str, Any] = {"__name__": system.rhs.__module__, "_reset": system.reset}
     exec(f"def reset_along(k, t, y, c, dt, dy, s):\n    return _reset(k, t + s * dt, ({line}), c)\n", scope)
@@ -73,9 +73,7 @@ def _reset_along(system: System, n: int) -> Callable[..., Any]:
 
 
 def mode_bindings(system: System) -> dict[str, Any]:
-    """Return the values, for a given system, of the global names that the function templates of this module leave
-    open.
-    """
+    """Return the values of this module's free global names (such as ``N_VECTORS``) for a system."""
     base = system.tangents_of or system
     has_divergence = system.tangents_of is not None and system.state_names[-1] == DIVERGENCE
     n_vectors = (system.n_states - has_divergence) // base.n_states - 1
@@ -124,9 +122,7 @@ def lane_rates(w: Any, base: int, lane: int) -> Any:
 
 
 def seat_switches(w: Any, base: int, lane: int, given: bool) -> None:
-    """Set each switch mode by the side of the surface on which the state lies; on the surface itself it becomes 1, or
-    stays if `given`.
-    """
+    """Set each switch mode to the sign of its event function (+1 or -1). At 0 set +1, or with `given` keep the mode."""
     for k in range(N_SWITCHES):
         mode = base + ROWS.constants + (N_OWN + k) * WIDTH + lane
         if not given or w[mode] == 0.0:
@@ -140,7 +136,7 @@ def seat_switches(w: Any, base: int, lane: int, given: bool) -> None:
 
 
 def gradient_along(w: Any, base: int, lane: int, k: int, vector: Any) -> float:
-    """Return the derivative of event function `k` along a change `vector` of the states."""
+    """Return the derivative of event function `k` in the direction `vector` of state space."""
     at_rest = lane_pairs(w, base, lane, ZEROS)
     return lane_pairs(w, base, lane, vector)[2 * k + 1] - at_rest[2 * k + 1]
 
@@ -168,7 +164,7 @@ def next_mode(w: Any, base: int, lane: int, k: int, mode: float) -> float:
 
 
 def keep_switches(w: Any, base: int, lane: int) -> None:
-    """Correct the switch modes after an edge of the forcing, where event values and forces can jump."""
+    """Correct the switch modes after a forcing edge, at which event functions and rates can jump."""
     pairs = lane_pairs(w, base, lane, lane_states(w, base + ROWS.state + lane))
     for k in range(N_SWITCHES):
         own = base + ROWS.constants + (N_OWN + k) * WIDTH + lane
@@ -189,7 +185,7 @@ def keep_switches(w: Any, base: int, lane: int) -> None:
 
 
 def begin_events(w: Any, base: int, lane: int) -> None:
-    """Clear the event data of a SIMD lane, set its switch modes from its states, and find the surfaces it rests on."""
+    """Reset the event data of a SIMD lane; set its switch modes and resting contacts from its state."""
     for k in range(N_EVENTS):
         w[base + ROWS.side + k * WIDTH + lane] = 0.0
         w[base + ROWS.fired + k * WIDTH + lane] = 0.0
@@ -204,7 +200,7 @@ def begin_events(w: Any, base: int, lane: int) -> None:
 
 
 def contact_row(base: int, lane: int, k: int) -> int:
-    """Return the index of the contact mode (0 at rest, else 1) of impact `k` in the engine's work array."""
+    """Return the work-array index of the contact mode of impact `k` (0 while the state rests on it, else 1)."""
     return base + ROWS.constants + (N_OWN + N_SWITCHES + k) * WIDTH + lane
 
 
@@ -225,7 +221,7 @@ def bend(w: Any, base: int, lane: int, event: int) -> float:
 
 
 def is_chatter(w: Any, base: int, lane: int, k: int, arriving: float) -> bool:
-    """Return whether an impact at speed `arriving` starts an infinite sequence of impacts that ends almost at once."""
+    """Return whether an impact at speed `arriving` begins chatter: ever smaller bounces that soon end."""
     event = N_SWITCHES + k
     leaving = -DIRECTIONS[event] * lane_pairs(w, base, lane, lane_rates(w, base, lane))[2 * event + 1]
     if not (abs(leaving) < arriving and leaving > -ELASTIC * arriving):
@@ -237,7 +233,7 @@ def is_chatter(w: Any, base: int, lane: int, k: int, arriving: float) -> bool:
 
 
 def rest_on(w: Any, base: int, lane: int, k: int) -> None:
-    """Put a trajectory at rest on the surface of impact `k`; end it if it rests on another that excludes this one."""
+    """Bring a trajectory to rest on the surface of impact `k`; end it if it rests on an incompatible surface."""
     for i in range(N_IMPACTS):
         if i != k and STICKS[k] == 2 and STICKS[i] == 2 and w[contact_row(base, lane, i)] == 0.0:
             w[base + ROWS.event + lane] = CHATTERED
@@ -263,17 +259,15 @@ def hold_on(w: Any, base: int, lane: int, k: int) -> None:
 
 
 def hold_contacts(w: Any, base: int, lane: int) -> None:
-    """Move the states of a resting trajectory back onto the surfaces that rounding and step errors have moved them
-    off.
-    """
+    """Move a resting state back onto its contact surfaces, to remove the drift from rounding and step errors."""
     for k in range(N_IMPACTS):
         if STICKS[k] > 0 and w[contact_row(base, lane, k)] == 0.0:
             hold_on(w, base, lane, k)
 
 
 def seat_contacts(w: Any, base: int, lane: int, begins: bool) -> None:
-    """Let a trajectory rest on each impact surface that it is pressed against without moving and where it rested
-    before.
+    """Decide for each impact surface whether the trajectory still rests on it: no relative speed, and pressed against
+    it.
 
     At the begin of a cell, `begins`, on any.
     """
@@ -321,7 +315,7 @@ def turn_switch(w: Any, base: int, lane: int, k: int) -> None:
 
 
 def vector_row(base: int, lane: int, j: int) -> int:
-    """Return the work array's first row of vector `j` of those mapped at an impact: tangent vectors first, then unit
+    """Return the work-array index of vector `j` to be mapped at an impact: first the tangent vectors, then unit
     vectors.
     """
     if j < N_VECTORS:
@@ -330,8 +324,8 @@ def vector_row(base: int, lane: int, j: int) -> int:
 
 
 def map_vector(w: Any, base: int, lane: int, k: int, at: int, shift: float, t: float, y: Any) -> None:
-    """Replace the vector stored from row `at` by its image under the linearised map `k` (an impact, or coming to rest);
-    `shift` is its time shift.
+    """Replace a tangent vector (stored at `at`) by its image under the linearised impact map `k`, by finite
+    differences.
     """
     c, size = lane_constants(w, base + ROWS.constants + lane), 0.0
     for i in range(N_BASE):
@@ -345,7 +339,7 @@ def map_vector(w: Any, base: int, lane: int, k: int, at: int, shift: float, t: f
 
 
 def jump_vectors(w: Any, base: int, lane: int, k: int) -> None:
-    """Map all tangent and unit vectors through impact `k`, and store how much each shifts the time of the impact."""
+    """Map all tangent and unit vectors through impact `k`; store each vector's shift of the impact time."""
     t, y = w[base + ROWS.time + lane], lane_base(w, base + ROWS.state + lane)
     before = lane_rates(w, base, lane)
     rate = lane_pairs(w, base, lane, before)[2 * (N_SWITCHES + k) + 1]
@@ -360,18 +354,14 @@ def jump_vectors(w: Any, base: int, lane: int, k: int) -> None:
 
 
 def set_units(w: Any, base: int, lane: int) -> None:
-    """Write unit vectors to the work array; mapped at an impact together with the tangent vectors, they give the change
-    of volume.
-    """
+    """Write unit vectors to the work array. Mapped through an impact, they give the determinant of its Jacobian."""
     for j in range(N_VECTORS, N_THROUGH):
         for i in range(N_BASE):
             w[vector_row(base, lane, j) + i * WIDTH] = 1.0 if i == j - N_VECTORS else 0.0
 
 
 def log_volume(w: Any, at: int) -> float:
-    """Return log |det| of the matrix whose vectors are stored in the work array from row `at` on; the matrix is
-    overwritten.
-    """
+    """Return log |det| of the matrix stored in the work array from index `at` on; overwrite the matrix."""
     total, n = 0.0, N_BASE
     for j in range(n):
         best = j
@@ -430,7 +420,9 @@ def jump(w: Any, base: int, lane: int, k: int) -> None:
 
 
 def act_on_events(w: Any, base: int, lane: int) -> bool:
-    """Apply the events at which the last step of a SIMD lane ended; return whether it ended on the Poincare section."""
+    """Carry out the events at which a SIMD lane's last step ended; return whether the step ended on the Poincare
+    section.
+    """
     on_section = False
     if HAS_SECTION:
         on_section = section_counts(w, base, lane)

@@ -1,4 +1,4 @@
-"""Define observers: functions called after each period that record the section, measure, and can end the trajectory.
+"""Define observers: functions that run after each period, record section points, and can end a trajectory.
 
 An observer is a pair of functions bound at compile time.
 
@@ -73,7 +73,7 @@ def _keeps_none(i_period: int, memory: Any, settings: Any) -> bool:
 
 @dataclass(frozen=True)
 class Observer:
-    """Functions that the engine calls after each period of a trajectory, with the values of their free names.
+    """Functions that the engine calls after each period of a trajectory, and the values of the free names in them.
 
     They are plain Python functions, compiled when they are bound to a system: inside, `N` is the number of
     states, `IS_ANGLE` (0 or 1) and `SCALES` are arrays of the system's, and further free names are those of
@@ -130,9 +130,7 @@ _SETTLED, _PERIOD, _KEPT, _RING = 0, 1, 2, 3
 
 
 def _lag_distance(ring: Any, i: int, j: int, window: int) -> float:
-    """Return the largest scaled difference between the states at sections `i` and `j` (1, 2, ...), angles on the
-    circle.
-    """
+    """Return the largest scaled difference between the states at sections `i` and `j` (1, 2, ...); angles mod 2 pi."""
     a, b = ((i - 1) % window) * N, ((j - 1) % window) * N
     largest = 0.0
     for k in range(N):
@@ -178,8 +176,8 @@ def closed_period(ring: Any, last: int, settings: Settings) -> int:
 
 
 def _largest_lag(ring: Any, first: int, last: int, p: int, settings: Settings) -> float:
-    """Return the largest distance of a section point from that `p` periods before, for the points after number `first`
-    up to `last`.
+    """Return the largest distance between section points `p` periods apart; the later one has number `first` + 1 to
+    `last`.
     """
     largest = 0.0
     for i in range(first + 1, last + 1):
@@ -252,7 +250,7 @@ RECORD = Observer("record", _record, _memory_size, n_kept=_n_kept, keeps_next=_k
 
 
 class MapSettings(NamedTuple):
-    """Settings of the observer `MAP`: only its memory size, since each trajectory has its own number of periods."""
+    """Settings of the observer `MAP`. The number of periods is not among them, because each trajectory has its own."""
 
     n_memory: int = 1
 
@@ -260,9 +258,7 @@ class MapSettings(NamedTuple):
 def _keep_all(
     section: Any, turns: Any, i_period: int, memory: Any, record: Any, measures: Any, settings: MapSettings
 ) -> int:
-    """Record the section of each period, and end the trajectory after as many periods as the first of `measures` asks
-    for.
-    """
+    """Record the section point of every period; end the trajectory after ``measures[0]`` periods."""
     for k in range(N):
         record[i_period - 1, k] = section[k]
     memory[0] = float(i_period)

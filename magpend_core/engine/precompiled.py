@@ -55,7 +55,7 @@ from magpend_core.engine.linking import EntryLibrary, PartLibrary
 
 @register_pass(mutates_CFG=False, analysis_only=False)
 class _NameFields(FunctionPass):
-    """Compiler pass that replaces a field of a named tuple of integers by that integer.
+    """Compiler pass that replaces each field access of a global named tuple (such as ``ROWS.state``) by its integer.
 
     numba would make a constant of the whole tuple at each place where one of its fields is read.
     """
@@ -66,7 +66,7 @@ class _NameFields(FunctionPass):
         FunctionPass.__init__(self)
 
     def run_pass(self, state: Any) -> bool:
-        """Replace fields of global named tuples by their integers; return whether there were any."""
+        """Replace the field accesses in a function's numba IR; return whether there were any."""
         found = [block for block in state.func_ir.blocks.values() if _name_fields(block)]
         if found:
             # where they are defined has changed
@@ -122,7 +122,7 @@ class _GivePartLibrary(FunctionPass):
         FunctionPass.__init__(self)
 
     def run_pass(self, state: Any) -> bool:
-        """Give a part its code library, and an identifier that makes its symbol the same in all processes."""
+        """Give a part its code library, and a symbol that is the same in all processes."""
         dispatcher = _COMPILED_NOW[-1]
         state.library = PartLibrary(state.targetctx.codegen(), state.func_id.func_qualname)
         state.library.dispatcher = dispatcher
@@ -143,7 +143,7 @@ class EntryCompiler(CompilerBase):
             return super().compile_extra(func)
 
     def define_pipelines(self) -> list[Any]:
-        """Return numba's own compiler passes, with two of magpend's added."""
+        """Return numba's standard compiler passes and two of magpend's: named-tuple fields, and the code library."""
         passes = DefaultPassBuilder.define_nopython_pipeline(self.state)
         passes.add_pass_after(_NameFields, IRProcessing)
         passes.add_pass_after(self._gives, NopythonTypeInference)
@@ -186,7 +186,8 @@ _COMPILED_NOW: list[Any] = []
 
 
 class PartDispatcher(CPUDispatcher):
-    """Numba dispatcher of an engine part, for calls from compiled code; a call from Python compiles a copy of it first.
+    """Numba dispatcher of an engine part (a function called from compiled code). For calls from Python it compiles a
+    copy.
 
     Parameters
     ----------
@@ -241,7 +242,7 @@ class PartDispatcher(CPUDispatcher):
                 _COMPILED_NOW.pop()
 
     def add_overload(self, cres: Any) -> None:
-        """Register the code compiled for a signature, without an entry point for Python."""
+        """Register the compiled code of one signature, without the wrapper that lets Python call it."""
         self.overloads[tuple(cres.signature.args)] = cres
         cres.library.symbol = cres.fndesc.mangled_name
         _OWNERS[cres.library] = tuple(cres.signature.args)
@@ -318,7 +319,9 @@ class PartCache:
         return f"{self._dispatcher.py_func.__name__[:40]}-{hashlib.sha256(text.encode()).hexdigest()[:24]}"
 
     def _callees(self, library: PartLibrary) -> list[Any] | None:
-        """Return each part that the function calls and where it refers to it; None if it calls something else."""
+        """Return the parts that a function calls, with the dotted name of each in its source; None if it calls other
+        functions.
+        """
         source = self._dispatcher.py_func
         paths = {id(reached(source, path)): path for path in lookups(source.__code__)}
         declared = {function.name for function in library._final_module.functions}
@@ -371,6 +374,4 @@ class PartCache:
 
 
 class _Key:
-    """Stand-in for the entry point from Python that cached code lacks; numba needs an object as key to find the
-    code.
-    """
+    """Dummy function object for code loaded from the cache, which numba registers by such an object."""

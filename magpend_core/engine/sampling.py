@@ -47,9 +47,7 @@ COINCIDENT_S = 1e-9
 
 
 class Samples(NamedTuple):
-    """Input and output arrays of `follow_all`; the time grids and drives of all recordings stand one after the
-    other.
-    """
+    """Input and output arrays of `follow_all`; the time grids and drives of all recordings are concatenated."""
 
     parameters: Any  # (trajectory, n_parameters)
     initial: Any  # (trajectory, n_states)
@@ -70,7 +68,7 @@ class Samples(NamedTuple):
 
 
 class Seats(NamedTuple):
-    """Arrays with the state of the sampling loop: trajectory, next sample and drive interval of each SIMD lane."""
+    """Working arrays of the sampling loop: which trajectory, sample and drive interval each SIMD lane is at."""
 
     lanes: Any  # float64, the groups' rows
     before: Any  # float64: rows of each group's written states, then their first slopes, before the attempt
@@ -179,9 +177,7 @@ def write_due(samples: Samples, seats: Seats, lane: int, until: float) -> None:
 
 
 def go_on(samples: Samples, seats: Seats, lane: int, scratch: Any) -> int:
-    """Handle the step that a SIMD lane has attempted; return the trajectory's final status, or PENDING while it goes
-    on.
-    """
+    """Process the last attempted step of a SIMD lane; return the final status of its trajectory, or PENDING."""
     base, column = (lane // WIDTH) * ROWS.size, lane % WIDTH
     w = seats.lanes
     event = w[base + ROWS.event + column]

@@ -1,4 +1,4 @@
-"""Define a numba type for a group of SIMD lanes: WIDTH float64 numbers on which every operation acts at once.
+"""Define a numba type for a group of SIMD lanes: WIDTH float64 numbers that each operation processes together.
 
 The kernels advance many trajectories in step. Instead of hoping that the compiler turns a loop over
 trajectories into vector instructions, they compute with values of the type `Lanes`, a vector of
@@ -190,7 +190,7 @@ def floor(x: Any) -> Any:
 
 
 def upper(x: Any) -> Any:
-    """Return `x` cut off after 26 binary digits: products of two such numbers are exact."""
+    """Return `x` with its last 27 mantissa bits set to 0, so that products of two such numbers are exact."""
     bits = np.asarray(x, np.float64).view(np.int64) & np.int64(-(2**27))
     return bits.view(np.float64)[()]
 

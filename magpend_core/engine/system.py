@@ -333,8 +333,8 @@ class System:
 
     @property
     def known(self) -> int:
-        """Number of states that the system's own functions take, without tangent vectors that the engine integrates by
-        itself.
+        """Number of states that `rhs` and the other functions take; tangent vectors of large systems are not among
+        them.
         """
         return self.n_states if self.n_known is None else self.n_known
 

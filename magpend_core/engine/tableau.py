@@ -65,12 +65,12 @@ class Tableau(NamedTuple):
 
     @property
     def n_stages(self) -> int:
-        """Number of stages, the new state among them."""
+        """Number of stages of the method; the last stage is the new state."""
         return len(self.nodes)
 
     @property
     def has_two_errors(self) -> bool:
-        """Whether the method has a second estimate of the error."""
+        """Whether the method combines error estimates of two orders."""
         return bool(self.other_error.any())
 
 

@@ -24,7 +24,7 @@ DIVERGENCE = "divergence"
 
 
 def order_of(row: dict[int, int]) -> list[int]:
-    """Return the columns of a row of the Jacobian in the order in which their products are summed.
+    """Return the columns of one Jacobian row in the order in which a matrix-vector product adds them.
 
     The first product is rounded by itself, the others are fused with the sum. Where neither of the first two
     columns is 0, the second comes first, as in a written-out sum (see `fusing`). So leaving out the zeros of a
@@ -40,9 +40,7 @@ def trace_of(rows: list[dict[int, int]], name: str) -> str:
 
 
 def n_entries(system: System) -> int:
-    """Return how many numbers of the Jacobian are stored at each Runge-Kutta stage; 0 if the engine integrates no
-    tangent vectors.
-    """
+    """Return the number of Jacobian entries stored per Runge-Kutta stage; 0 if `rhs` itself has the tangent vectors."""
     if system.known == system.n_states or system.tangents_of is None:
         return 0
     return sum(map(len, rows_of_entries(system.tangents_of))) + _has_trace(system)
@@ -54,9 +52,7 @@ def _has_trace(system: System) -> bool:
 
 
 def tangent_bindings(system: System) -> dict[str, Any]:
-    """Return the values, for a given system, of the global names that the function templates of this module leave
-    open.
-    """
+    """Return the values of this module's free global names (such as ``N_ENTRIES``) for a system."""
     known, base = system.known, system.tangents_of
     names = {"N_KNOWN": known, "N_ENTRIES": n_entries(system), "CARRIES": n_entries(system) > 0}
     if base is None or not names["CARRIES"]:
@@ -78,8 +74,8 @@ def tangent_bindings(system: System) -> dict[str, Any]:
 
 
 def _tangent_entries(base: System, order: list[int], has_trace: bool) -> Callable[..., Any]:
-    """Return a function that computes the Jacobian's entries, in the order in which products with vectors sum them, and
-    the trace.
+    """Return a function that computes the Jacobian's entries in the order of summation (see `order_of`), then its
+    trace.
     """
     parts = [f"entries[{k}]" for k in order]
     if has_trace:
@@ -91,7 +87,7 @@ def _tangent_entries(base: System, order: list[int], has_trace: bool) -> Callabl
 
 
 def stage_row(w: Any, row: int, s: int, h: Any) -> None:
-    """Compute one component of the state at Runge-Kutta stage `s`."""
+    """Compute one component of the state at Runge-Kutta stage `s` from the slopes of earlier stages."""
     total = STAGES[s, 0] * load(w, row + ROWS.slopes)
     for j in range(1, s):
         # half of the eighth-order method's coefficients are 0, and add nothing

@@ -28,7 +28,7 @@ def _first(n: int) -> str:
 
 
 def _products(system: System, n_vectors: int) -> list[str]:
-    """Return source code for the entries of J v for each tangent vector v, one vector after the other."""
+    """Return source code for the components of J v, for each tangent vector v in turn."""
     n, found = system.n_states, []
     for k in range(n_vectors):
         for row in rows_of_entries(system):
@@ -41,7 +41,7 @@ def _products(system: System, n_vectors: int) -> list[str]:
 
 
 def _compile(source: str, name: str, wrapped: Callable[..., Any], bindings: dict[str, Any]) -> Any:
-    """Compile a function from its source, for example one that returns a tuple of given length.
+    """Compile a function from source text; numba's cache treats it as part of the module of `wrapped`.
 
     It passes for a function of the module of `wrapped`, which it calls (see `jit.keeping`).
     """
@@ -150,7 +150,7 @@ PLUS, MINUS, PER_STEP = "_plus", "_minus", "per_step"
 
 @cache
 def with_parameter_tangent(system: System) -> System:
-    """Return `system` extended by the tangent vector of a parameter change: its equation has a source term.
+    """Extend a system by one tangent vector: the derivative of the trajectory with respect to a parameter.
 
     The vector v obeys v' = J v + (f(c_plus) - f(c_minus)) per_step: the Jacobian J is analytic, the direct
     effect of the parameters on the right-hand side f, and on the forcing, a central difference at each stage.

@@ -150,8 +150,8 @@ def exp2_falling(x: Any) -> Any:
 
 @inline
 def _quarter_turns(x: Any) -> Any:
-    """Return sine and cosine of what is left of `x` after whole quarter turns, and the number of these turns in the low
-    bits of a float.
+    """Reduce an angle `x` by quarter turns: return sine and cosine of the rest, and a float that holds the number of
+    turns.
     """
     shifted = x * TWO_OVER_PI + _ROUND
     n = shifted - _ROUND

@@ -1,4 +1,4 @@
-"""Track minimum, maximum and mean of named quantities over those drive periods whose end is recorded.
+"""Track minimum, maximum and mean of named quantities over each drive period at whose end a section point is recorded.
 
 Templates for the engine, see `lanes`. After an accepted step each quantity is known at its begin, its
 middle (from the pair's continuous extension) and its end: the parabola through the three gives the
@@ -122,8 +122,8 @@ def set_watching(work: Any, lane: int, watching: int) -> None:
 
 
 def begin_watch(work: Any, lane: int, wanted: bool) -> None:
-    """Begin a period of a SIMD lane: reset extremes and integrals, and note whether the quantities are to be
-    tracked.
+    """Reset minimum, maximum and integral of the tracked quantities at the start of a period; note whether to track
+    them.
     """
     set_watching(work, lane, 1 if wanted else 0)
     base, column = (lane // WIDTH) * ROWS.size, lane % WIDTH

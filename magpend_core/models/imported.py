@@ -96,7 +96,7 @@ def import_model(path: str, folder: str | Path | None = None) -> Model:
 
 
 def _description(path: str, model: Model) -> dict[str, Any]:
-    """Return a model's description as plain data, as a run stores it."""
+    """Return a model's names, states, parameters and presets as plain data, as stored in a run."""
     table: dict[str, Any] = {KEY: path, "digest": model.digest}
     table |= {name: getattr(model, name) for name in ("name", "title", "section", "angle_dim")}
     table["autonomous"] = model.autonomous
@@ -143,7 +143,7 @@ class DescribedModel(Model):
 
 
 def origin(model: Model) -> tuple[str, str] | None:
-    """Return the arguments with which another process can call `import_model`; None if the model was not imported."""
+    """Return the object path and the folder from which another process can import the model; None if not imported."""
     path = "" if model.text is None else str(model.text.get(KEY, ""))
     known = _imported.get(path)
     if known is None or known.text != model.text:

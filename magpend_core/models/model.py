@@ -257,7 +257,7 @@ class Model:
 
     @property
     def scales(self) -> tuple[float, ...]:
-        """Return for each state the size that counts as 1 when states are compared."""
+        """Return the typical size of each state, by which differences between states are divided."""
         return tuple(s.scale for s in self.states)
 
     @property

@@ -113,7 +113,7 @@ def is_file(name: str | Path) -> bool:
 
 
 def find_preset(name: str | Path, folder: str | Path = ".") -> str | Preset:
-    """Return a preset read from its file, or the name of one that ships unchanged, as `Model.load` accepts it.
+    """Return the preset in a file, or the name of a shipped preset unchanged; `Model.load` accepts both.
 
     Parameters
     ----------
@@ -131,7 +131,7 @@ def find_preset(name: str | Path, folder: str | Path = ".") -> str | Preset:
 
 
 class Owner(Protocol):
-    """Protocol with the attributes of a `Model` that its presets need."""
+    """Protocol of a model with presets: the attributes of `Model` that this module uses."""
 
     @property
     def name(self) -> str:
@@ -157,7 +157,7 @@ class Owner(Protocol):
 
 
 def completed(preset: Preset, model: Owner, model_named: Callable[[str], Owner]) -> Preset:
-    """Return a preset filled up with the values of its base preset, checked against the model that is to use it.
+    """Return a preset with missing values taken from its base preset, checked against a model.
 
     Raises
     ------

@@ -11,7 +11,7 @@ from magpend_core.models.model import Model, Parameters
 
 
 def checks_of(model: Model) -> list[str]:
-    """Return the names of the checks that `describe` makes."""
+    """Return the names of the checks that `describe` makes for a model."""
     return [
         "finite at the starts",
         "Jacobian equal to differences",
@@ -84,7 +84,7 @@ def _written(model: Model) -> tuple[dict[str, str], dict[str, str], list[str]]:
 
 
 def _found(parameters: Parameters, frequency_hz: float, states: np.ndarray) -> Iterator[str]:
-    """Yield a sentence on each edge, layer, switch and impact of the equations that steps are adapted to."""
+    """Yield a sentence for each forcing edge, layer, switch and impact at which the integrator adapts its steps."""
     from magpend_core.engine.plain_python import plain
     from magpend_core.models.text.model import TextModel
 

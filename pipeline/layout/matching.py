@@ -25,7 +25,7 @@ _CODE = (*CODE, "compute.continuation", "compute.recorded_drive", "specification
 
 
 def deciding(identity: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the part of a run's identity that determines how each cell is integrated.
+    """Return the part of a run's identity that affects how a cell is integrated.
 
     It leaves out the cells themselves (axes, starts, parameters), their layout, the rules of inference
     between them, the number of kept sections, and the products, which have their own conditions.
@@ -42,8 +42,8 @@ def deciding(identity: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def unlike(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
-    """Return a line of text for each difference in integration settings between two runs. Runs with such a difference
-    share no cells.
+    """Return a line of text for each integration setting that differs between two runs; if any differs, no cell is
+    shared.
     """
     return differences(deciding(old), deciding(new))
 
@@ -117,8 +117,8 @@ class Finder:
         self.shape = (*(len(a.values) for a in self._axes), *n_last)
 
     def find(self, inputs: Inputs, way: Way | None = None) -> np.ndarray:
-        """Return the flat index in this run of each given cell, shape (branch, point). The index is `NOWHERE` for cells
-        that this run lacks.
+        """Return the flat index in this run of each given cell, shape (branch, point); `NOWHERE` for a cell not in this
+        run.
 
         Parameters
         ----------

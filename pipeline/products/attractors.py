@@ -36,15 +36,13 @@ class IdentifyOptions(Options):
 
     @property
     def effort(self) -> tuple[float, int]:
-        """Return the time budget and sample size for integrating cells on no known attractor further. Both are 0 if
-        these cells are not integrated.
+        """Return time budget [s] and sample size for integrating undecided cells further; both are 0 if this is turned
+        off.
         """
         return (self.budget, self.n_sample) if self.extend and self.budget else (0.0, 0)
 
     def with_effort(self, effort: tuple[float, int]) -> Self:
-        """Return a copy of the options with another time budget and sample size for integrating cells on no known
-        attractor further.
-        """
+        """Return the options with another time budget [s] and sample size for integrating undecided cells further."""
         budget, n_sample = effort
         if not budget:
             return self.model_copy(update={"extend": False})

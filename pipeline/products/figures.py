@@ -15,7 +15,7 @@ Per = Literal["s", "period"]
 
 
 def _without(options: FigureOptions, name: str) -> str:
-    """Return the part of a figure's file name that lists the options, without the option `name`."""
+    """Return a figure's label (the options in its file name) without the option `name`."""
     return FigureOptions.label(options.model_copy(update={name: ""}))
 
 

@@ -75,8 +75,7 @@ class Controlled:
 
 @dataclass(frozen=True)
 class TracedOrbits:
-    """Orbits of the rig, one for each target: medians over the measured drive periods, and standard deviations between
-    the periods.
+    """Traced orbits of the rig, one per target: median and standard deviation over the measured drive periods.
 
     Attributes
     ----------
@@ -137,9 +136,7 @@ def trace(rig: Controlled, targets: Sequence[float] | np.ndarray) -> TracedOrbit
 
 @dataclass(frozen=True)
 class _Plant:
-    """Virtual rigs, one for each target: the model with its drive amplitude set to 0, and the direction in state space
-    in which the drive acts.
-    """
+    """Virtual rigs, one per target: the model without its drive, and the direction in which the control force acts."""
 
     rig: Controlled
     parameters: Parameters
@@ -205,8 +202,8 @@ class _Plant:
 
 
 def _push(still: Parameters, one: Parameters, frequency_hz: float) -> np.ndarray:
-    """Return the change of the rates under a drive of amplitude 1 at phase 0. Raise SpecError unless the drive acts as
-    a cosine in one fixed direction.
+    """Return the change of the rates under a drive of amplitude 1 at phase 0; raise SpecError unless the drive is a
+    cosine.
     """
     shares = np.array([0.0, 0.125, 0.25, 0.5])
     states = np.stack([np.zeros(len(still.model.state_names)), 0.3 * np.asarray(still.model.scales)])

@@ -137,8 +137,7 @@ class Edges:
         return mean / period, math.hypot(*errors) / period
 
     def common_error(self, fitted: Floats, scatter: float) -> float:
-        """Return the standard error [s] of the offset of a line fitted through the edges. It is common to all times on
-        the line.
+        """Return the standard error [s] of the time offset of a line fitted through the edges.
 
         Parameters
         ----------
@@ -150,7 +149,7 @@ class Edges:
         return self._error(fitted, np.full(fitted.size, 1 / fitted.size), scatter, drifts=1)
 
     def _error(self, fitted: Floats, weights: Floats, scatter: float, drifts: int = _DRIFTS) -> float:
-        """Return the standard error [s] of a weighted sum of edge times.
+        """Return the standard error [s] of a weighted sum of edge times, with correlated rounding errors.
 
         A time known to one sample is rounded to the middle of the interval. The rounding error is a sawtooth
         in the time, so it is not independent from edge to edge. Its harmonics have unknown phase; their

@@ -291,9 +291,7 @@ def _sha256(content: bytes) -> str:
 
 
 def _product_chunks(values: np.ndarray) -> tuple[int, ...]:
-    """Return the chunk shape of an array: the whole array if it is small, else pieces of some megabytes along the first
-    dims.
-    """
+    """Return the chunk shape of an array: the whole array, or pieces of some megabytes along its first dimensions."""
     chunks = [max(n, 1) for n in values.shape]
     for i, n in enumerate(chunks):
         rest = values.itemsize * int(np.prod(chunks[i + 1 :]))

@@ -275,7 +275,7 @@ def _loads_and_components(a1: Any, a2: Any, f: Any, k: Any) -> Any:
 
 @inline
 def _newton_change(r1: Any, r2: Any, loads_there: Any, effect: Any, f: Any, k: Any) -> Any:
-    """Compute the change of (a1, a2) by a Newton step, for the residual (r1, r2) of a = a_free + P N(a).
+    """Compute one Newton step for (a1, a2), given the residual (r1, r2) of the equation a = a_free + P N(a).
 
     With K = P dN/da, about 2e-3 in size, the inverse of 1 - K is taken as 1 + K.
     """

@@ -40,7 +40,7 @@ class Layer:
 
 @dataclass(frozen=True)
 class Wave:
-    """Edges of the forcing: the `count` instants in a drive period at which a smooth function of time passes zero."""
+    """Periodic edges of the forcing: a smooth function of time passes zero `count` times per drive period."""
 
     value: Node
     slope: Node
@@ -168,9 +168,7 @@ def _breaks(graph: Graph, rates: tuple[Node, ...], presets: Sequence[Mapping[int
 def _smoothed(
     graph: Graph, rates: tuple[Node, ...], scales: tuple[float, ...], values: Mapping[int, float]
 ) -> frozenset[int]:
-    """Return the node numbers of those corners (of ``abs``) that coincide with a narrow steep layer, where steps are
-    short anyway.
-    """
+    """Return the node numbers of ``abs`` corners inside a narrow steep layer, where the steps are short anyway."""
     cores = set()
     for node in in_order(rates):
         place = place_of(graph, node)
@@ -185,7 +183,7 @@ def _smoothed(
 
 
 def _is_layer(steep: Steep) -> bool:
-    """Return whether a steep place of the equations depends on the state, and on no sign that only time changes."""
+    """Return whether a steep function depends on the state, and on no sign that changes with time alone."""
     return steep.value.kind == STATED and not any(n.op == "clock" for n in in_order([steep.value]))
 
 
@@ -230,7 +228,7 @@ MOST_LOOKED_AT = 100
 
 
 def forcing_of(graph: Graph, roots: tuple[Node, ...], preferred: Node | None) -> Node | None:
-    """Return the largest expression without states through which alone time enters; None if time does not enter."""
+    """Return the largest state-free expression that contains every occurrence of time; None if time does not occur."""
     if preferred is not None and preferred.kind == TIMED and not _reaches_time(roots, preferred):
         return preferred
     order = in_order(roots)
@@ -278,7 +276,7 @@ class Builder:
         return {**own, self.graph.leaf("frequency").number: 1.0}
 
     def node(self, tree: Tree) -> Node:
-        """Return the graph node of a parsed expression; adds the definitions that it needs first."""
+        """Return the graph node of a parsed expression; first add the definitions used in it."""
         for name in self.definition.used([tree]):
             if name not in self.names:
                 node = self._node(self.definition.define[name])

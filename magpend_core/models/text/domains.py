@@ -101,7 +101,7 @@ def _is_constant(tree: Tree, known: Mapping[str, Any]) -> bool:
 def _look_at_constants(
     tree: Tree, place: str, known: Mapping[str, Any], rows: np.ndarray, found: list[Fault], *, guards: bool
 ) -> None:
-    """Append a fault for each part of an expression that has only known names and no finite value.
+    """Append a fault for each part of an expression that uses only known names and has no finite value.
 
     With `guards` a branch of `where` counts where a condition of known names takes it.
     """
@@ -145,9 +145,7 @@ def _start_faults(definition: Definition, values: Mapping[str, Any]) -> list[Fau
 
 
 def _look(tree: Tree, place: str, known: Mapping[str, Any], rows: np.ndarray, found: list[Fault]) -> np.ndarray:
-    """Append a `Fault` for each innermost part of an expression without a finite value; return at which sample points
-    it has none.
-    """
+    """Append a `Fault` for each innermost part of an expression that is not finite; return a mask of sample points."""
     if tree.kind == "inverse":  # told with its product
         return _look(tree.args[0], place, known, rows, found)
     bad = np.zeros(rows.shape, bool)
@@ -169,8 +167,8 @@ def _look(tree: Tree, place: str, known: Mapping[str, Any], rows: np.ndarray, fo
 
 
 def _taken(tree: Tree, known: Mapping[str, Any], rows: np.ndarray) -> list[np.ndarray]:
-    """Return for each argument of an expression the sample points at which its value is used; ``where`` uses only the
-    one that it chooses.
+    """Return, for each argument of an expression, a mask of the sample points at which it is used (`where` uses one
+    branch).
     """
     if tree.kind == "call" and tree.value == "where":
         chosen = np.broadcast_to(value_of(tree.args[0], known), rows.shape).astype(bool)

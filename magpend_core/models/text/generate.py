@@ -44,7 +44,7 @@ class Writer:
         return [self.name(root) for root in roots]
 
     def _wanted(self, roots: list[Node]) -> dict[int, Node]:
-        """Return the nodes that need a variable of their own; products within sums do not."""
+        """Return the nodes that get a variable in the generated code; a product inside a sum gets none."""
         wanted: dict[int, Node] = {}
         pending = list(roots)
         while pending:
@@ -90,9 +90,7 @@ class Writer:
         self.lines.append(f"{target} = {self._value(node)}")
 
     def _by_root(self, above: Node, x: Node, n: int) -> str:
-        """Return source code for a number divided by x**(n/2), by an inverse square root and products that the compiler
-        cannot fuse with sums.
-        """
+        """Return source code for a / x**(n/2), from an inverse square root and products never fused with sums."""
         root = f"w{x.number}"
         if x.number not in self.inverse_roots:
             self.inverse_roots.add(x.number)
@@ -141,7 +139,7 @@ class Writer:
 
 
 def root_under(node: Node) -> tuple[Node, int] | None:
-    """Return x and n if a node is a quotient by x**(n/2) with n = 1, 3 or 5 that depends on the state, else None."""
+    """Return x and n if a node has the form a / x**(n/2) with n = 1, 3 or 5 and depends on the state; else None."""
     if node.op != "div" or node.args[1].kind != STATED:
         return None
     below = node.args[1]
@@ -171,7 +169,7 @@ def _twin(node: Node, wanted: Mapping[int, Node]) -> Node | None:
 
 
 def constants_of(roots: Iterable[Node]) -> list[Node]:
-    """Return the subexpressions without time and state that the others use: they are computed once per trajectory."""
+    """Return the largest subexpressions without time and state; they are computed once per trajectory."""
     roots = list(roots)
     found = {root.number: root for root in roots if root.kind == CONSTANT}
     for node in in_order(roots):
@@ -182,7 +180,7 @@ def constants_of(roots: Iterable[Node]) -> list[Node]:
 
 @dataclass(frozen=True)
 class Source:
-    """Source of a system's functions, and the numbers of constants, modes and edges that they use.
+    """Generated source of a system's functions, with the number of constants, modes and edges in it.
 
     Attributes
     ----------
@@ -257,9 +255,7 @@ def _leaves(derived: Derived, constants: list[Node], n_constants: int, n_modes: 
 
 
 def _cell(roots: Iterable[Node]) -> dict[int, str]:
-    """Return what parameters, frequency, time and the ranks of edges are called in generated code, by the number of
-    their node.
-    """
+    """Return the name in generated code of each parameter, frequency, time and edge-rank node, by node number."""
     names = {}
     for node in in_order(roots):
         if node.op == "parameter":
@@ -287,9 +283,7 @@ def _constants(constants: list[Node]) -> str:
 
 
 def _scalar(name: str, arguments: str, roots: list[Node]) -> str:
-    """Return source code of a function of plain numbers (frequency, parameters and perhaps time) that returns
-    expressions' values.
-    """
+    """Return source code of a function of plain numbers (frequency, parameters, time) that computes expressions."""
     writer = Writer(_cell(roots))
     names = [f"{name} + 0.0" for name in writer.write(roots)]
     return _function(name, arguments, [*writer.lines, f"return {', '.join(names)}" + "," * (len(names) > 1)])

@@ -432,7 +432,7 @@ class _Parser:
             self.numbers(tuple(args), name)
 
     def numbers(self, parts: tuple[Tree, ...], token: _Token) -> tuple[Tree, ...]:
-        """Return the operands of an arithmetic operation; report those that are conditions instead of numbers."""
+        """Return the operands of an arithmetic operation; report each that is a condition, not a number."""
         self.problems += [
             f"a condition stands at character {part.at} where {token.text!r} needs a number; use where(condition, a, b)"
             for part in parts
@@ -441,7 +441,7 @@ class _Parser:
         return parts
 
     def conditions(self, parts: tuple[Tree, ...], token: _Token) -> None:
-        """Report operands that are numbers where conditions are needed."""
+        """Report an error for each operand of ``and``, ``or``, ``not`` that is a number, not a condition."""
         self.problems += [
             f"a number stands at character {part.at} where {token.text!r} needs a condition (x < 0, say)"
             for part in parts

@@ -1,4 +1,4 @@
-"""Hold expressions as a graph in which equal parts are one node, with simplifications that are exact or nearly so.
+"""Represent expressions as a graph: equal subexpressions share one node, and simplifications change at most rounding.
 
 A graph belongs to one model and grows in an order that the model's meaning decides alone, so that the code
 generated from it is the same in every process. Sums and products are brought into a form in which what needs
@@ -131,7 +131,9 @@ class Graph:
     # ---- sums ------------------------------------------------------------------------------------
 
     def add(self, *terms: Node) -> Node:
-        """Add nodes: first the terms without state and time, then those that depend on time alone, then the rest."""
+        """Return the sum of nodes, grouped so that its part without state, and its part without state and time, are
+        nodes.
+        """
         groups: tuple[list[Node], ...] = ([], [], [])
         for term in self._collected(terms):
             groups[term.kind].append(term)
@@ -141,9 +143,7 @@ class Graph:
         return self._sum(groups[STATED]) if groups[STATED] else self.zero
 
     def _collected(self, terms: Iterable[Node]) -> list[Node]:
-        """Combine the terms of a sum: add up numbers, and the coefficients of terms that differ only by a numerical
-        factor.
-        """
+        """Simplify the terms of a sum: add numbers, and merge terms that differ only by a numerical factor."""
         total, factors = 0.0, {}  # type: ignore[var-annotated]
         for term in terms:
             factor, core = 1.0, term
@@ -206,8 +206,8 @@ class Graph:
         return self.neg(found) if negative else found
 
     def _chain(self, factors: list[Node]) -> Node:
-        """Return the product of factors, joined from the left; factors of one kind are sorted, so that x*y and y*x are
-        one node.
+        """Return the product of factors, multiplied from left to right; sort factors so that x*y and y*x share one
+        node.
         """
         if len({f.kind for f in factors}) == 1:
             factors = sorted(factors, key=lambda f: (f.op != "number", f.number))

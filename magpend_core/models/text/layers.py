@@ -30,7 +30,7 @@ GENERIC = (0.37, -0.59, 0.83, -0.21, 0.67, -0.43)
 
 @dataclass(frozen=True)
 class Steep:
-    """A place at which a model's equations are steep, with its half-width and the jump of the rates across it.
+    """Steep place of a model's equations, with its half-width and the jump of the rates across it.
 
     Attributes
     ----------
@@ -55,9 +55,7 @@ class Steep:
 
 @dataclass(frozen=True)
 class Place:
-    """A steep function: its argument, the distance of its nearest complex singularity, and its change across the steep
-    part.
-    """
+    """Steep function such as tanh: its argument, distance to its nearest complex singularity, and total change."""
 
     argument: Node
     distance: Node
@@ -66,7 +64,7 @@ class Place:
 
 
 def steep_places(graph: Graph, rates: tuple[Node, ...], scales: tuple[float, ...]) -> list[Steep]:
-    """Find the steep functions in the rates, each once, with half-width and jump.
+    """Find all steep functions in the rates; return each with its half-width and the jump of the rates.
 
     Parameters
     ----------
@@ -139,9 +137,7 @@ def core_of(graph: Graph, node: Node) -> tuple[Node, Node]:
 
 
 def _jump(graph: Graph, changes: list[Node], scales: tuple[float, ...]) -> Node | None:
-    """Return an expression for the largest absolute value of given changes; long ones are replaced by their values at
-    two sample states.
-    """
+    """Return an expression for the largest absolute change; a long one is replaced by values at two sample states."""
     changes = [graph.call("absolute", c) for c in changes if not c.is_number(0.0)]
     if not changes:
         return None

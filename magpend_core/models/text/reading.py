@@ -144,9 +144,7 @@ class _Reading(ViewsReader):
         return True
 
     def _entry(self, value: Any, place: str, keys: tuple[str, ...], short: str) -> dict[str, Any]:
-        """Return an entry as a table; an entry that is a plain value becomes a table with this value under the key
-        `short`.
-        """
+        """Return a table entry as a dict; a plain value ``v`` becomes ``{short: v}``."""
         if not isinstance(value, Mapping):
             return {short: value}
         entry = self.table(value, place, 20, "keys")
@@ -297,7 +295,7 @@ def _circle(define: Mapping[str, Tree]) -> list[str]:
 
 
 def _with_rate(state: State, tree: Tree | None, states: Iterable[str]) -> State:
-    """Return a state; if its equation is just the name of another state, that state is noted as its `rate`."""
+    """Return a state; if its equation is only the name of another state, set that name as its `rate`."""
     if tree is None or tree.kind != "name" or str(tree.value) not in states or tree.value == state.name:
         return state
     return State(**{**vars(state), "rate": str(tree.value)})

@@ -1,4 +1,4 @@
-"""Sort the edge times of a drive period; functions of plain numbers that generated code calls."""
+"""Sort the forcing edges of a drive period by time. Generated code calls these functions."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from magpend_core.engine.jit import inline
 
 @inline
 def rank(at: Any, i: int) -> int:
-    """Return the rank in time, from 0, of instant number `i` among all instants of a period; of two equal ones the
-    first comes first.
+    """Return the rank (0, 1, ...) of instant `i` when the instants of a period are sorted by time; ties keep their
+    order.
     """
     place = 0
     for j in range(len(at)):

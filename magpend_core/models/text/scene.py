@@ -81,7 +81,7 @@ Classify = Callable[[np.ndarray, np.ndarray, np.ndarray, Mapping[str, Any]], np.
 
 
 def classifier_of(definition: Definition) -> Classifier | None:
-    """Return a text's classifier of motions: a motion gets the first word whose condition all stored sections meet."""
+    """Return a text model's classifier: a motion gets the first label that holds at all its section points."""
     text = definition.classifier
     if text is None:
         return None

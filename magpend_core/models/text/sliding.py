@@ -1,4 +1,4 @@
-"""Derive sliding on switching surfaces: on a surface, Filippov's equivalent control replaces the sign of its side.
+"""Derive sliding motion on switching surfaces, with Filippov's equivalent control in place of the side's sign.
 
 Where the motions of both sides point to the surface, the state stays on it. What then stands for the side is
 the number sigma in [-1, 1] for which the surface's value does not change: with the rate of that value, r(s),
@@ -23,7 +23,7 @@ MAX_JOINT = 3
 
 @dataclass(frozen=True)
 class Sliding:
-    """Expressions that replace the sides of switching surfaces in the engine's functions, including sliding.
+    """Expressions that stand for the sign of each switching surface's side, during sliding as well.
 
     Attributes
     ----------
@@ -42,14 +42,14 @@ class Sliding:
     pairs: tuple[tuple[Node, Node], ...]
 
     def lowered(self, roots: Iterable[Node]) -> list[Node]:
-        """Return expressions in which the sign of each surface's side is replaced by the switch mode or, while sliding,
-        the equivalent control.
+        """Return expressions in which each surface's sign is replaced by the switch mode or, in sliding, by equivalent
+        control.
         """
         return _spelled(self.graph, substituted(self.graph, list(roots), self.effective))
 
 
 def sliding_of(graph: Graph, rates: Sequence[Node], switches: Sequence[Switch]) -> Sliding:
-    """Find the switching surfaces on which a state can slide, and what replaces the sign of the side while it does.
+    """Find the switching surfaces on which a state can slide, and the equivalent control on each.
 
     Parameters
     ----------
@@ -83,9 +83,7 @@ def sliding_of(graph: Graph, rates: Sequence[Node], switches: Sequence[Switch]) 
 
 
 def _spelled(graph: Graph, roots: list[Node]) -> list[Node]:
-    """Rewrite `choice` nodes as comparisons of their side with 0; keep the interpolation only where sliding puts the
-    side between -1 and 1.
-    """
+    """Rewrite `choice` nodes as comparisons with 0; interpolate only where a sliding mode lies between -1 and 1."""
     known: dict[int, Node] = {}
     for node in in_order(roots):
         args = tuple(known[a.number] for a in node.args)
@@ -120,14 +118,14 @@ def _speed(graph: Graph, value: Node, rates: Sequence[Node]) -> Node:
 
 
 def _along(graph: Graph, value: Node) -> Node:
-    """Return the time derivative of an expression, in terms of the states' time derivatives as symbols."""
+    """Return the time derivative of an expression, in terms of symbols for the states' time derivatives."""
     seeds = {n: graph.leaf("rate", int(n.value)) for n in in_order([value]) if n.op == "state"}
     (found,) = derivatives(graph, (value,), {**seeds, graph.leaf("time"): graph.one})
     return found
 
 
 def _pull(graph: Graph, speed: Node, side: Node) -> Node:
-    """Return half the difference of `speed`, the rate of a surface's value, between the two sides of a surface."""
+    """Return half the jump of `speed` (time derivative of a surface function) between the two sides of a surface."""
     (slope,) = derivatives(graph, (speed,), {side: graph.one})
     if side not in in_order([slope]):
         return slope
@@ -143,7 +141,7 @@ def _solved(
     switches: Sequence[Switch],
     modes: Sequence[Node],
 ) -> list[Node]:
-    """Return for each switching surface its equivalent control, or its mode if no state can slide on it."""
+    """Return the equivalent control on each switching surface, or the switch mode where no state can slide."""
     zeros = {s.side: graph.zero for s in switches}
     found = []
     for k in range(len(switches)):

@@ -75,8 +75,8 @@ class Instant:
 
 @dataclass
 class Sides:
-    """Rewriter that splits expressions at their corners and jumps into smooth parts, and collects the surfaces between
-    these.
+    """Rewriter of expressions: it replaces corners and jumps by signs of smooth expressions, and collects their zero
+    surfaces.
 
     Attributes
     ----------
@@ -97,7 +97,7 @@ class Sides:
     _surface: dict[int, Node] = field(default_factory=dict)
 
     def rewritten(self, roots: Iterable[Node], *, more: bool = True) -> list[Node]:
-        """Return expressions in which the signs of other expressions replace corners and jumps.
+        """Return expressions in which corners and jumps are written with the signs of smooth expressions.
 
         Parameters
         ----------
@@ -117,8 +117,7 @@ class Sides:
         return [known[root.number] for root in roots]
 
     def _as_surface(self, node: Node, rewritten: Node) -> Node:
-        """Return an expression in the form that defines a switching surface: it must not depend on the modes of other
-        switches.
+        """Return the form of an expression that may define a switching surface, without the modes of other switches.
 
         Engines find out on which sides a start is one after the other, so that none may need another.
         """
@@ -130,9 +129,7 @@ class Sides:
         return node if same else made_again(self.graph, node, args)
 
     def _smooth(self, node: Node, args: tuple[Node, ...], more: bool) -> Node:
-        """Return a node with rewritten arguments; if it has a corner or a jump, write it with the sign of a switching
-        surface.
-        """
+        """Rebuild a node with rewritten arguments; write a corner or jump with the sign of a switching surface."""
         g = self.graph
         same = all(a is b for a, b in zip(args, node.args, strict=True))
         plain = node if same else made_again(g, node, args)
@@ -157,8 +154,8 @@ class Sides:
     def side(
         self, value: Node, rewritten: Node, jumps: bool, more: bool = True, written: Node | None = None
     ) -> Node | None:
-        """Return a node for the sign of an expression, of a new switch if need be; None if the sign is to be computed
-        as it stands.
+        """Return a node for the sign of an expression, adding a switch if necessary; None if no switch can stand for
+        the sign.
         """
         g = self.graph
         if value.op == "neg":
@@ -190,9 +187,7 @@ class Sides:
         return switch.side if jumps else switch.mode
 
     def _in_time(self, value: Node) -> Node | None:
-        """Return the sign of a + b t, with constant a and b, as a jump at a known instant; None for another
-        expression.
-        """
+        """Return the sign of a + b t (a, b constant) as a jump at a computed instant; None for any other expression."""
         g, time = self.graph, self.graph.leaf("time")
         if any(n.op in CORNERED or n.op == "segment" for n in in_order([value])):
             return None
@@ -215,7 +210,7 @@ class Sides:
         return self._after(instant, inside(g.neg(after), middle), inside(after, middle))
 
     def break_at_start(self) -> None:
-        """Add the start of the period to the instants at which the right-hand side may jump."""
+        """Register time 0 of the drive period as an instant at which the right-hand side may jump."""
         self._instant(self.graph.zero)
 
     def _instant(self, time: Node) -> Instant:
@@ -235,9 +230,7 @@ class Sides:
         return g.where_less(g.leaf("segment"), g.sub(instant.rank, g.number(0.5)), before, after)
 
     def _square(self, node: Node, more: bool) -> Node | None:
-        """Return a square wave whose phase is n t f + a (n whole) as jumps at known instants of the drive period; None
-        if it has another form.
-        """
+        """Return a square wave as jumps at computed instants; None unless its phase is n f t + a, n integer."""
         g = self.graph
         phase, duty = node.args
         (slope,) = derivatives(g, (phase,), {g.leaf("time"): g.one})
@@ -280,9 +273,7 @@ def _moves(rewritten: Node) -> bool:
 
 
 def _plain(value: Node, written: Node) -> Node | None:
-    """Return the expression as the user wrote it if the expression of the switching surface differs from it, else
-    None.
-    """
+    """Return the user's form of an expression if it differs from that of the switching surface; else None."""
     return None if value is written else written
 
 
@@ -291,7 +282,7 @@ def _at_time_zero(graph: Graph, node: Node) -> list[Node]:
 
 
 def _multiple_of(slope: Node, frequency: Node) -> int | None:
-    """Return the whole number n if the slope of a square wave's phase is n times the drive frequency, else None."""
+    """Return the whole number n if `slope` is n times the drive frequency; else None."""
     if slope is frequency:
         return 1
     if slope.op == "mul" and slope.args[0].op == "number" and slope.args[1] is frequency:

@@ -72,7 +72,7 @@ def fit_starts(problem: Problem, theta: Array, starts: Array) -> Starts:
 
 
 def block_rows(problem: Problem) -> list[slice]:
-    """Return, for each piece of a recording, the range of its rows in the compressed residual vector."""
+    """Return the range of rows (a slice) of each piece in the compressed residual vector."""
     n_own = len(problem.free) + len(problem.model.states)
     sizes = [min(int(np.isfinite(p.measured).sum()), n_own + 1) for p in problem.pieces]
     ends = np.cumsum([0, *sizes])
@@ -115,7 +115,7 @@ def _own(problem: Problem, evaluation: Evaluation, k: int, here: slice) -> Array
 
 
 def carry_starts(problem: Problem, evaluation: Evaluation, starts: Array, change: Array) -> Array:
-    """Return the optimal initial states after a change of the unknowns, to first order, (n_piece, n_states)."""
+    """Return the optimal initial states after a small change of the unknowns, by linearisation, (n_piece, n_states)."""
     found, n_free = np.array(starts), len(problem.free)
     for k, here in enumerate(block_rows(problem)):
         wanted = evaluation.rows[here] + evaluation.jacobian[here, :n_free] @ change

@@ -69,7 +69,7 @@ class MeasuredTable:
 
     @property
     def data(self) -> tuple[Datum, ...]:
-        """All orbits and bifurcations, the fitted ones first."""
+        """All measured orbits and bifurcations: first those that are fitted, then those held out."""
         return (*self.fitted, *self.held_out)
 
     def branches(self, values: Mapping[str, float]) -> tuple[xr.Dataset, Array]:
@@ -89,7 +89,7 @@ class MeasuredTable:
         return found, amplitudes(found, parameters, state)
 
     def as_dict(self) -> dict[str, Any]:
-        """Return everything that decides the numbers as plain data."""
+        """Return the measured data and settings as plain data, to be stored and compared."""
         crossing = self.along.model.crossing
         return {
             "section": None if crossing is None else vars(crossing),
@@ -191,7 +191,7 @@ def _read(spec: IdentificationSpec, table: OrbitsTable, where: str) -> xr.Datase
 
 
 def _model(spec: IdentificationSpec, table: OrbitsTable, where: str) -> Model:
-    """Return the model that is fitted, with the Poincare section of the table or of its file if it has no drive."""
+    """Return the fitted model; without a drive it gets the Poincare section of the table or its file."""
     model, section = spec.model, table.section
     if not model.autonomous:
         if section is not None:
@@ -243,9 +243,7 @@ def _parameter_problems(
 def _orbits(
     table: OrbitsTable, measured: xr.Dataset | None, model: Model, where: str, problems: list[str]
 ) -> list[Datum]:
-    """Return the measured orbits with the standard deviations of their quantities; add what is missing to
-    `problems`.
-    """
+    """Return the measured orbits as `Datum` objects; add missing quantities and standard deviations to `problems`."""
     found: list[Datum] = []
     if measured is None:
         return found
@@ -296,9 +294,7 @@ def _measured_quantity(one: xr.Dataset, quantity: str, allowed: float) -> list[t
 
 
 def _error(scatter: float, n_cycles: int) -> float:
-    """Return the standard error of the median over the cycles; without a number of cycles the scatter counts as the
-    error.
-    """
+    """Return the standard error of a median over the cycles, from their scatter; the scatter if `n_cycles` < 2."""
     if not math.isfinite(scatter):
         return 0.0
     return scatter * MEDIAN / math.sqrt(n_cycles) if n_cycles > 1 else scatter
@@ -336,7 +332,7 @@ def _parameters(model: Model, values: Mapping[str, float]) -> Parameters:
 
 
 def first_orbits(tables: Sequence[MeasuredTable], values: Mapping[str, float]) -> tuple[OrbitData, ...]:
-    """Find the computed counterparts of the fitted orbits and bifurcations for first values of all parameters.
+    """Find the computed orbit or bifurcation for each fitted measurement, at the first guess of the parameters.
 
     Raises
     ------
@@ -396,7 +392,7 @@ def _first_orbit(table: MeasuredTable, datum: Datum, branches: xr.Dataset, compu
 
 
 def _first_point(datum: Datum, branches: xr.Dataset) -> Array | None:
-    """Return section point and parameter value of the computed bifurcation of a kind nearest to the measured one."""
+    """Return section point and parameter value of the computed bifurcation of a kind nearest to a measured one."""
     words = words_of(branches["kind"]) if "kind" in branches else KINDS
     periods = branches["orbit_period"].values[branches["of_branch"].values]
     fits = [
@@ -415,7 +411,7 @@ def _first_point(datum: Datum, branches: xr.Dataset) -> Array | None:
 
 
 def judge_orbits(table: MeasuredTable, values: Mapping[str, float]) -> xr.Dataset:
-    """Compare the measured orbits of a table with branches that are computed afresh, for values of all parameters.
+    """Compare the measured orbits and bifurcations of a table with newly computed branches.
 
     Returns
     -------

@@ -139,7 +139,7 @@ def _steps(problem: Problem, thetas: Array) -> Array:
 
 
 def _changed(problem: Problem, thetas: Array, steps: Array) -> Array:
-    """Return the packed model parameters for each set of unknowns, with one unknown changed at a time."""
+    """Return packed model parameters for finite differences: each set of unknowns with one changed at a time."""
     members = []
     for theta, own in zip(thetas, steps, strict=True):
         rows = np.tile(theta, (len(own), 1))
@@ -215,8 +215,8 @@ def _integrate(
 
 
 def _thrice(drive: Drive | None) -> Drive | None:
-    """Return a drive with its parameter values given three times: for the unchanged, the increased and the decreased
-    parameters of a finite-difference tangent.
+    """Return a drive with three copies of its parameter values: plain, increased and decreased (for
+    `with_parameter_tangent`).
     """
     if drive is None or not drive.names:
         return drive

@@ -61,8 +61,8 @@ def _bifurcation_rows(ds: xr.Dataset) -> list[dict[str, Any]]:
 
 
 def _rms(ds: xr.Dataset) -> dict[str, dict[str, dict[str, Any]]]:
-    """Return root mean squares of relative errors by group, stability and quantity; None where an orbit is not
-    there.
+    """Return the rms of the relative errors by group (fitted, held out), stability and quantity; None if an orbit is
+    lost.
     """
     found: dict[str, dict[str, dict[str, Any]]] = {group: {} for group in GROUPS}
     if "orbit" not in ds.sizes:

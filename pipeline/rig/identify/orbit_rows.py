@@ -91,9 +91,7 @@ def _residuals(table: OrbitData, values: Sequence[Array]) -> tuple[Array, NDArra
 
 
 def _slopes(problem: Problem, table: OrbitData, theta: Array, values: Sequence[Array]) -> tuple[Array, OrbitData]:
-    """Return the derivatives of a table's residuals by the unknowns, and the table with the derivatives of its
-    orbits.
-    """
+    """Return the derivatives of a table's residuals by the unknowns; the table returned holds those of its orbits."""
     jacobian = np.zeros((sum(len(d.measured) for d in table.data), len(problem.free)))
     ends, widths = _ends(problem, theta)
     if not len(ends):
@@ -112,7 +110,7 @@ def _slopes(problem: Problem, table: OrbitData, theta: Array, values: Sequence[A
 
 
 def _ends(problem: Problem, theta: Array) -> tuple[Array, list[Array]]:
-    """Return the unknowns displaced to either side, one at a time, and the two displacements of each."""
+    """Return the vectors for central differences: each unknown moved up and down, and both displacements of each."""
     ends, widths = [], []
     for i in problem.moving:
         free = problem.free[i]
@@ -125,9 +123,7 @@ def _ends(problem: Problem, theta: Array) -> tuple[Array, list[Array]]:
 
 
 def _difference(here: Array, there: Sequence[Array], widths: Array) -> Array:
-    """Return the derivative from values at two neighbours, central where both are known, else from one; 0 if neither
-    is.
-    """
+    """Return a central difference, or a one-sided one where only one neighbour is finite; 0 where none is."""
     with np.errstate(invalid="ignore", divide="ignore"):
         central = (there[0] - there[1]) / (widths[0] - widths[1])
         sides = [(one - here) / width for one, width in zip(there, widths, strict=True)]
@@ -136,7 +132,7 @@ def _difference(here: Array, there: Sequence[Array], widths: Array) -> Array:
 
 
 def _along_removed(table: OrbitData, packed: Array, points: Sequence[Point | None], jacobian: Array) -> Array:
-    """Project the direction along the branch out of the derivatives of each orbit whose parameter has an error.
+    """Remove the component along the branch from the derivatives of orbits with an uncertain parameter value.
 
     Its place on the branch is fitted for every set of unknowns (variable projection; see ``local``).
     """

@@ -261,7 +261,7 @@ def _stretches(problem: Problem, piece: Piece, length_s: float) -> list[Piece]:
 
 
 def _read_off(problem: Problem, piece: Piece, at: int, half: int) -> Array:
-    """Estimate the state at a sample: the values and slopes of local cubic polynomials fitted to the channels."""
+    """Estimate the state at a sample from the data: value and slope of a cubic polynomial fitted to each channel."""
     window = slice(max(at - half, 0), at + half + 1)
     t = piece.time[window] - piece.time[at]
     state = np.array(piece.start)

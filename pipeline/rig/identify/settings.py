@@ -1,4 +1,4 @@
-"""Apply values of parameters that hold in single recordings only, such as a drive amplitude of 0."""
+"""Apply parameter values that hold for a single recording, such as a drive amplitude of 0."""
 
 from __future__ import annotations
 

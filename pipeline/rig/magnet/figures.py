@@ -324,7 +324,7 @@ def _points(ax: Axes, angle: np.ndarray, torque: np.ndarray, place: int, side: i
 def _done(
     figure: style.DataFigure, ax: Axes, outcome: Outcome, handles: list[Any], *, short: bool = False
 ) -> style.DataFigure:
-    """Add a figure's title and legend, and finish its layout."""
+    """Add the measurement's name and the legend to a figure, and finish its layout."""
     text = outcome.measured.label
     if short:
         figure.suptitle(

@@ -168,9 +168,7 @@ def _noise(edges: Edges) -> float:
 
 
 def _reach(t: Floats, first: int, noise: float) -> int:
-    """Return the index of the last edge before the drive frequency changes. From edge `first` up to it, the edge times
-    lie on a line.
-    """
+    """Return the index of the last edge before the frequency changes; up to there, edge times lie on a line."""
     if first + 2 >= t.size:
         return int(t.size - 1)
     period = t[first + 1] - t[first]
@@ -196,9 +194,7 @@ def _reach(t: Floats, first: int, noise: float) -> int:
 
 
 def _placed(t: Floats, first: int, last: int) -> int:
-    """Return the index of the edge at which the frequency steps. It gives the best fit of two lines, one through the
-    edges before it and one through the edges after it.
-    """
+    """Return the index of the edge at which the frequency steps, by the best fit of two lines to the edge times."""
     low, high = max(first, last - _AROUND), min(t.size - 1, last + _AROUND)
     choices = range(max(low + 2, first + 1), min(last + 2, high - 1))
     costs = {k: _misfit(t[low : k + 1]) + _misfit(t[k : high + 1]) for k in choices}

@@ -18,7 +18,7 @@ from pipeline.rig.measured_branch.reading import STABILITIES
 
 @dataclass(frozen=True)
 class Bands:
-    """95 % bands of a diagram: of branches (``x``, ``low``, ``high`` each) and of bifurcations (name, low, high)."""
+    """Data of the 95 % bands in a figure: (``x``, ``low``, ``high``) per branch, (name, low, high) per bifurcation."""
 
     tubes: Sequence[Mapping[str, np.ndarray]]
     intervals: Sequence[tuple[str, float, float]]
@@ -112,9 +112,7 @@ def plot_branch(
 
 
 def _draw_bands(ax: Axes, bands: Bands) -> list[Any]:
-    """Shade the bands and draw the intervals of the bifurcations near the bottom; return their entries of the
-    legend.
-    """
+    """Shade the bands of the branches and draw bars for the bifurcations' intervals; return legend entries."""
     entries: list[Any] = []
     for tube in bands.tubes:
         shade = ax.fill_between(

@@ -329,7 +329,7 @@ def _missing(time: np.ndarray, step: float) -> np.ndarray:
 
 
 def _skipped(time: np.ndarray, step: float, late: np.ndarray, is_sure: np.ndarray) -> np.ndarray:
-    """Return the number of samples missing before each late time stamp, from the delay of the stamps after it.
+    """Return the number of samples lost before each late time stamp, from the shift of the stamps around it.
 
     Stamps beyond another gap are not used. Of neighbouring doubtful stamps the one with the largest shift
     counts.
