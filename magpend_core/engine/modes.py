@@ -1,13 +1,14 @@
 """Apply events to a trajectory: change the modes of switches, apply impact maps to states and tangent vectors.
 
-Templates for the engine's scalar pass, see `lanes`; they run once per event, on plain numbers of one lane.
+These templates belong to the engine's scalar pass, see `lanes`: they run once per event, on plain numbers of one
+lane.
 
-At a switch the right-hand side changes from f- to f+. If both sides point to the surface, the trajectory
-slides along it (Filippov): the mode is 0 until the equivalent control leaves its bounds. A tangent vector v
-changes by the saltation matrix, v + (f+ - f-) (grad g . v)/(dg/dt-), where g is the event's function; at an
-impact with the map R it becomes R'(v + f- s) - f+ s with s = -(grad g . v)/(dg/dt-), the shift of the
-impact's time (di Bernardo et al., Piecewise-smooth Dynamical Systems, Springer 2008, section 2.5). R' is a
-difference of order four, exact for maps up to the fourth power.
+At a switch the right-hand side changes from f- to f+. If f on both sides points to the surface, the trajectory
+slides along it (Filippov): the mode is 0 until the equivalent control leaves its bounds. With the event function
+g, a tangent vector v becomes v + (f+ - f-) (grad g . v)/(dg/dt-) (saltation matrix). At an impact with the map R
+it becomes R'(v + f- s) - f+ s, where s = -(grad g . v)/(dg/dt-) is the shift of the impact time (di Bernardo et
+al., Piecewise-smooth Dynamical Systems, Springer 2008, section 2.5). R' is a finite difference of order four,
+exact for polynomial maps up to degree four.
 
 Reading order: `act_on_events` is called by `lanes.serve`. It finds the event that happened, then switches a mode or
 applies an impact, and corrects the tangent vectors.
@@ -25,35 +26,35 @@ from magpend_core.engine.tangents import DIVERGENCE
 from magpend_core.engine.vecmath import log
 
 STEP = 1e-3
-"""Step of the differences of an impact's map, in units of the states' scales."""
+"""Step of the finite differences of an impact map, in units of the states' scales."""
 
 NEAR = 1e-12
-"""An impact that leaves its function within this distance of zero, in units of rate and period, leaves it at zero."""
+"""After an impact, an event function closer to zero than this (times rate and period) counts as zero."""
 
 AWAY = 1e-7
-"""A switch further from zero after an edge, in units of its rate and the period, is not on its surface."""
+"""After a forcing edge, a switch further from zero than this (times rate and period) has left its surface."""
 
 CHATTERED = 6.0
-"""Code of an event, like `lanes.NOTHING`: the impacts chatter, and the lane's cell ends."""
+"""Event code, like `lanes.NOTHING`: the impacts chatter, and the trajectory ends."""
 
 CHATTER, LEAST_LOSS = 1e-6, 0.3
-"""A flight between impacts that is shorter than the product of both numbers [periods] counts as the last of
-infinitely many. If an impact takes a larger share of the speed than `LEAST_LOSS`, its own share is the factor.
+"""Chatter begins at a flight between impacts shorter than ``CHATTER * max(loss, LEAST_LOSS)`` [periods].
 
-The rest of the series then lasts for 1e-6 periods, or longer if less speed is lost.
+The loss is the fraction of the speed that an impact takes. All later flights together then last for about
+1e-6 periods, or longer if the loss is below `LEAST_LOSS`.
 """
 
 ELASTIC = 1e-9
-"""An impact that takes less than this share of the speed counts as elastic."""
+"""An impact that takes less than this fraction of the speed counts as elastic."""
 
 LOOK = 1e-6
-"""Step of the difference that gives a second derivative [periods]."""
+"""Time step of the finite difference for a second derivative [periods]."""
 
 AT_REST = 1e-5
-"""A state begins at rest on a surface that it would fall on within this time [periods]."""
+"""A state rests on a surface at the start if it would fall onto it within this time [periods]."""
 
 LEAST_VOLUME = 1e-300
-"""Factor by which volumes count as changed where they vanish: where a trajectory begins to slide."""
+"""Least change of a volume, so that its logarithm is finite where it vanishes: where a trajectory begins to slide."""
 
 
 def _numbers(n: int) -> Callable[..., Any]:
@@ -94,7 +95,7 @@ def mode_bindings(system: System) -> dict[str, Any]:
         "ZEROS": (0.0,) * system.known,
         "N_BASE": base.n_states,
         "N_VECTORS": n_vectors,
-        # with unit vectors, where the change of volumes is wanted
+        # the unit vectors are needed only for the change of volumes
         "N_THROUGH": n_vectors + (base.n_states if has_divergence else 0),
         "HAS_DIVERGENCE": has_divergence,
         "lane_states": _numbers(system.known),
@@ -228,7 +229,7 @@ def is_chatter(w: Any, base: int, lane: int, k: int, arriving: float) -> bool:
         return False
     lost = 1.0 - max(leaving, 0.0) / arriving
     pushes = DIRECTIONS[event] * bend(w, base, lane, event)
-    flight = 2.0 * max(leaving, 0.0)  # times what pushes
+    flight = 2.0 * max(leaving, 0.0)  # flight time, multiplied by the acceleration `pushes`
     return lost > ELASTIC and flight < CHATTER * max(lost, LEAST_LOSS) * w[base + ROWS.period + lane] * pushes
 
 
@@ -269,7 +270,7 @@ def seat_contacts(w: Any, base: int, lane: int, begins: bool) -> None:
     """Decide for each impact surface whether the trajectory still rests on it: no relative speed, and pressed against
     it.
 
-    At the begin of a cell, `begins`, on any.
+    With `begins` (start of a parameter point), test every surface, else only those of earlier rest.
     """
     for k in range(N_IMPACTS):
         mode, event = contact_row(base, lane, k), N_SWITCHES + k
@@ -306,7 +307,7 @@ def turn_switch(w: Any, base: int, lane: int, k: int) -> None:
             for i in range(N_BASE):
                 w[base + ROWS.state + (N_BASE * (1 + j) + i) * WIDTH + lane] += (after[i] - before[i]) * share
         if HAS_DIVERGENCE:
-            # the determinant of the saltation matrix is the quotient of the rates of the same function
+            # the determinant of the saltation matrix is the ratio of the event function's rates after and before
             w[own] = mode
             quotient = lane_pairs(w, base, lane, after)[2 * k + 1] / rate if rate != 0.0 else 1.0
             w[own] = new
@@ -403,7 +404,7 @@ def jump(w: Any, base: int, lane: int, k: int) -> None:
         if HAS_DIVERGENCE:
             volume = log_volume(w, base + ROWS.slopes + lane)
             w[base + ROWS.state + (N - 1) * WIDTH + lane] += volume
-    # it comes back to the side that it came from, unless the map has put it elsewhere
+    # after the impact the state is on the side from which it came, unless the map puts it beyond the surface
     side = -w[base + ROWS.side + event * WIDTH + lane]
     moved = side * lane_pairs(w, base, lane, ZEROS)[2 * event]
     bound = 4.0 * abs(value) + NEAR * abs(rate) * w[base + ROWS.period + lane]
@@ -436,7 +437,7 @@ def act_on_events(w: Any, base: int, lane: int) -> bool:
         for k in range(N_IMPACTS):
             if w[fired + (N_SWITCHES + k) * WIDTH] > 0.5:
                 if HAS_CONTACTS and STICKS[k] > 0 and w[contact_row(base, lane, k)] == 0.0:
-                    # pulled off: neither states nor rates jump
+                    # a resting state lifts off: neither states nor rates jump
                     w[contact_row(base, lane, k)] = 1.0
                     w[base + ROWS.side + (N_SWITCHES + k) * WIDTH + lane] = STARTS[N_SWITCHES + k]
                 else:
@@ -448,7 +449,7 @@ def act_on_events(w: Any, base: int, lane: int) -> bool:
 
 
 INLINE = ("lane_pairs", "lane_rates", "gradient_along", "switch_rate", "vector_row", "contact_row")
-"""Templates here that dissolve into their callers, callees first; they come before those of `CALLED`."""
+"""Templates of this module that are inlined into their callers. Callees come first; `CALLED` follows after them."""
 
 CALLED = (
     "seat_switches",
@@ -469,4 +470,4 @@ CALLED = (
     "jump",
     "act_on_events",
 )
-"""The others."""
+"""Templates of this module that are compiled as functions of their own."""
