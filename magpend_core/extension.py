@@ -90,12 +90,12 @@ def orbit_periods(
     Parameters
     ----------
     sections
-        The last ones of each cell, shape (cell, n, n_states): `observers.window_of` of them, or as many as
-        there have been drive periods.
+        Last section points of each cell, shape (cell, n, n_states); n is `observers.window_of`, or the number of drive
+        periods if that is smaller.
     closure_tolerance, max_orbit_period
         As for `run_branches`.
     system
-        What was integrated.
+        System that was integrated.
 
     Returns
     -------

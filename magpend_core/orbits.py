@@ -112,15 +112,15 @@ def section_map(
     parameters
         Packed parameters, shape (n, n_parameters) [SI].
     frequency_hz
-        Shape (n,) [Hz]; with a section by crossing one over the longest wait.
+        Drive frequencies, shape (n,) [Hz]; with a section by level crossing, 1 over the longest time to wait.
     points
-        Shape (n, n_states); the state that crosses is put at the level. Rows that are not finite give NaN.
+        Shape (n, n_states); the state that defines the section is set to its level. Rows that are not finite give NaN.
     n_periods
-        Periods of the drive, or returns: a number, or one per row, whose derivative is that after its own.
+        Number of drive periods or returns: one number, or one per row; the derivative is that of the row's last image.
     rtol
         Relative and absolute tolerance.
     system
-        What is integrated.
+        System to integrate.
 
     Raises
     ------

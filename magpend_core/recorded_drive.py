@@ -1,9 +1,9 @@
 """Compute section points and quantities of trajectories under a recorded drive, interval by interval.
 
-A branch of `engine.entry.integrate` goes from point to point with its state and its step, and each point has
-a drive frequency and parameters of its own. That is a recorded drive: an interval is a period of its own
-length, with its own duty cycle or its own line of torque. So equal intervals give the numbers of an ordinary
-run.
+A branch of `engine.entry.integrate` is a sequence of points, each with its drive frequency and parameters; state and
+step size pass from one point to the next. A recorded drive is integrated as such a branch: each interval is a point
+whose drive period is the interval's length, with its own duty cycle or linear torque. So a recorded drive with equal
+intervals gives the same numbers as an ordinary run.
 """
 
 from __future__ import annotations
@@ -248,9 +248,9 @@ def closed_periods(sections: np.ndarray, settings: Settings, system: System) -> 
     sections
         Shape (cell, section, n_states).
     settings
-        Of which `window` is the number of sections.
+        Settings of the observer; `window` is the number of sections.
     system
-        Says which states are angles, and their scales.
+        System that was integrated.
     """
     out = np.zeros(len(sections), np.int64)
     flat = np.ascontiguousarray(sections.reshape(len(sections), -1))

@@ -44,11 +44,11 @@ class TurningState:
     Attributes
     ----------
     states : tuple of int
-        Number of the angle, or of the two states of the plane.
+        Index of the angle, or of the two states of the plane.
     center : tuple of float
         Centre in the plane [the states' units].
     of_section : bool
-        Turns of the section points about their mean in place of turns of the trajectory about `center`.
+        Whether to count turns of the section points about their mean, not of the trajectory about `center`.
     """
 
     states: tuple[int, ...]

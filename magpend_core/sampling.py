@@ -22,20 +22,20 @@ __all__ = ["Drive", "Samples", "sample", "with_recorded_drive"]
 class Drive:
     """Recorded drive: consecutive time intervals, each with its duration and its values of some parameters.
 
-    The periods between measured rising edges, each with its duty cycle; or the intervals between the samples
-    of a measured torque, for `with_recorded_drive`. Within an interval the system's forcing is that of a
-    drive of the interval's length as its period.
+    An interval is the period between two measured rising edges, with its duty cycle, or the time between two samples of
+    a measured torque (for `with_recorded_drive`). Within an interval, the system's forcing is that of a drive whose
+    period is the interval's length.
 
     Attributes
     ----------
     durations_s : ndarray, (interval,)
-        Above 0 [s].
+        Lengths of the intervals, above 0 [s].
     names : tuple of str
-        Parameters that change with the interval.
+        Names of the parameters that change with the interval.
     values : ndarray, (interval, name)
-        NaN leaves what the trajectory has.
+        Their values; NaN: the parameter keeps the trajectory's value.
     start_s : float
-        Where in the first interval the trajectory starts [s].
+        Start of the trajectory within the first interval [s].
     """
 
     durations_s: np.ndarray

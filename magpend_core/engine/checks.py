@@ -1,8 +1,12 @@
 """Check the functions of a system against its declaration, in plain Python, before they are compiled.
 
-The engine trusts its functions. One that returns a number too few reads what lies beside it; a wrong Jacobian
-gives wrong exponents, whose audit it passes; an edge outside of the period never comes. So the functions are
-first run as plain Python (every primitive of `simd` has that form) at a few states and instants.
+The engine does not check what the functions of a system return. A tuple that is too short would make it read other
+memory; a wrong Jacobian would give wrong exponents without a warning; an edge outside the period would never occur. So
+the functions are first run as plain Python (every primitive of `simd` has that form) at a few states and instants.
+
+Reading order: `check_system` is called before each integration. `_Functions` calls the functions and collects
+problems; `_Motion` holds the checks of `rhs`, `jacobian`, `forcing` and `layers`. Checks of switches and impacts are in
+`event_checks`.
 """
 
 from __future__ import annotations
@@ -22,17 +26,17 @@ N_SAMPLES = 16
 """States and instants at which the functions are run."""
 
 STEP = 1e-4
-"""Largest step of the differences, in units of a state's scale."""
+"""Largest step of the finite differences, in units of a state's scale."""
 
 LEAST_MISTAKE = 1e-3
-"""Smallest relative error of the Jacobian that counts.
+"""Smallest relative error of the Jacobian that is reported.
 
-That of an implicit equation, which the rates solve by a fixed number of iterations, may be off by a tenth of
-it where these converge slowly.
+If the rates solve an implicit equation by a fixed number of iterations, the Jacobian may differ by a tenth of this
+where the iterations converge slowly.
 """
 
 TWICE = 2
-"""A difference counts if it is seen at this many samples: one may lie within a layer."""
+"""An error is reported if it occurs at this many samples; a single sample may lie within a layer."""
 
 _NOT_RUN = object()
 
@@ -72,11 +76,10 @@ def check_system(
 ) -> None:
     """Check a system before it is integrated; raise `SystemCheckError` if its functions contradict its declaration.
 
-    The lengths of what the functions return, the edges' times and widths, that constants are finite, that
-    the forcing has the drive's period and that nothing changes as an angle goes round once; and the Jacobian
-    against differences, if it is asked for or tangent vectors are carried along. All of it once for each
-    system; constants and edges again where a parameter goes beyond the range in which they were looked at.
-    Functions without a form in plain Python (numba's intrinsics, say) are passed over.
+    The checks are: the lengths of the returned tuples; times and widths of the edges; finite constants; a forcing with
+    the drive's period; equal rates after a full turn of an angle; and, if the Jacobian is used, the Jacobian against
+    finite differences. They are made once for each system. Constants and edges are checked again if a parameter leaves
+    the range that was checked. Functions that cannot run as plain Python (such as intrinsics of numba) are skipped.
 
     Parameters
     ----------
@@ -97,7 +100,7 @@ def check_system(
         With all problems by name.
     """
     subject = system if system.tangents_of is None else system.tangents_of
-    if subject.recorded_for is not None:  # a recording has no period; all else is the system's own
+    if subject.recorded_for is not None:  # a recorded drive has no period: check the original system
         subject = subject.recorded_for
     parameters = parameters[..., : len(subject.parameter_names)]
     key = (subject, jacobian or system.tangents_of is not None)
@@ -143,7 +146,7 @@ def _problems(
     for i in np.unique(np.linspace(0, len(packed) - 1, N_SAMPLES).astype(int)):
         if functions.has_values(f := np.float64(frequency[i]), packed[i]):
             return _Motion(system, functions, packed[i], f, states).problems(linearised)
-    return []  # every cell lies at a pole
+    return []  # the constants are not finite at any of the parameter sets
 
 
 def _declaration(system: System, linearised: bool) -> Iterator[str]:

@@ -1,11 +1,11 @@
 """Cache machine code on disk. Use a cache file only if it is intact, fits the present code, and was written by this
 user.
 
-numba unpickles what it finds in its cache and jumps into the machine code in there. So an entry here is one
-file that begins with the sha256 of the rest, and the rest begins with what it was compiled from: one that is
-empty, cut, changed or another's is compiled again and written anew. A checksum is no signature: who can write
-to the folder decides what is executed. Folders are made for their owner alone, and one that others can write
-to or own is not used.
+numba unpickles a cache file and executes the machine code in it. So a cache file here begins with the sha256 of its
+content, and the content begins with the key and the digest of the source. A file that is empty, cut short, changed
+or made for another function is not used: the function is compiled again and the file written anew. A checksum is
+no signature: whoever can write to the folder decides what is executed. So folders are created for their owner
+alone, and a folder that others own or can write to is not used.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _DIGEST = hashlib.sha256
 _LENGTH = _DIGEST().digest_size
 
 _PICKING = threading.Lock()
-"""One thread at a time changes numba's settings: another would be given the folder of neither."""
+"""Lock for changes of numba's settings, which all threads share: two threads at once would mix up their folders."""
 
 
 @cache
@@ -48,14 +48,14 @@ def keep(dispatcher: Any, home: Path, folder: Path) -> Any:
     Parameters
     ----------
     dispatcher
-        What numba's decorator returned.
+        Object returned by numba's decorator.
     home, folder
-        The folder of all caches, and the one in there for this function.
+        The folder of all caches, and the subfolder for this function.
 
     Returns
     -------
     dispatcher
-        The same one; without a cache where the folder cannot be used, which is said.
+        The given dispatcher. If the folder cannot be used, it has no cache and a warning is logged.
     """
     if not hasattr(dispatcher, "py_func"):  # NUMBA_DISABLE_JIT
         return dispatcher
@@ -66,7 +66,7 @@ def keep(dispatcher: Any, home: Path, folder: Path) -> Any:
     if not problem:
         try:
             dispatcher._cache = KeptCode(function, folder)
-        except RuntimeError as error:  # the folder has gone since it was looked at
+        except RuntimeError as error:  # the folder was removed after the check
             problem = f"{error};"
     if problem:
         say(
@@ -123,7 +123,7 @@ class KeptCode(FunctionCache):
     _impl_class = _InItsFolder
 
     def __init__(self, function: Callable[..., Any], folder: Path) -> None:
-        # numba picks its folder from settings, which are put back for other users of numba
+        # numba takes its folder from global settings; restore them for other users of numba
         settings: Any = numba.config
         with _PICKING:
             before = settings.CACHE_DIR, settings.CACHE_LOCATOR_CLASSES
@@ -140,7 +140,7 @@ class KeptCode(FunctionCache):
         try:
             return super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
         except Exception as error:
-            # what is whole and cannot be read was written by another Python or numpy than it says
+            # intact but unreadable: written by another version of Python or numpy than the cache key says
             say(f"a compiled kernel in {self._cache_path} cannot be used ({error!r}); it is compiled again.")
             return None
 
@@ -199,7 +199,7 @@ def _read_sealed(path: str) -> bytes | None:
     except FileNotFoundError:
         return None
     content = sealed[_LENGTH:]
-    # the digest of nothing does not begin an empty file
+    # an empty file fails here, too: it does not begin with the digest of an empty content
     if not problem and _DIGEST(content).digest() == sealed[:_LENGTH]:
         return content
     say(f"a compiled kernel is not used: {path} {problem or 'is damaged'}; it is compiled again.")

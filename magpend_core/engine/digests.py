@@ -1,7 +1,8 @@
 """Compute digests of compiled functions outside the package; a digest covers all that determines their machine code.
 
-Machine code may be kept for such functions only under a digest of everything that they reach, since
-`jit.source_digest` does not change with them. What cannot be followed to its end has none, and is not kept.
+`jit.source_digest` does not change with such functions. So their machine code may be cached only under a digest of
+everything that they use, directly or through other functions. A function that uses an object whose code is not
+known has no digest, and is not cached.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ import numpy as np
 PACKAGE = __name__.partition(".")[0]
 
 _COMPILERS_OWN = ("math", "cmath", "numpy", "operator", "builtins")
-"""Modules whose functions mean to numba what its version says; that version names the cache folder."""
+"""Modules whose functions numba implements itself. Its version, part of the cache folder's name, covers them."""
 
 _GLOBALS, _ATTRIBUTES = ("LOAD_GLOBAL", "LOAD_NAME"), ("LOAD_ATTR", "LOAD_METHOD")
 
@@ -43,14 +44,14 @@ class _UnknownError(Exception):
 def functions_digest(*functions: Callable[..., Any]) -> str | None:
     """Return a digest of compiled functions and of everything they refer to.
 
-    It covers the bytecode, its constants, the compiler's options, default values, and each global and
-    closed-over value that is looked up: other compiled functions in the same way; numbers, strings, tuples
-    and arrays by value; functions of this package, of numpy and of the standard library's arithmetic by name.
+    It covers the bytecode, its constants, the compiler options, default values, and each global or closed-over
+    value that the code looks up: other compiled functions in the same way; numbers, strings, tuples and arrays by
+    value; functions of this package, of numpy and of the modules of arithmetic by name.
 
     Parameters
     ----------
     functions
-        Dispatchers of numba's.
+        Dispatchers of numba.
 
     Returns
     -------
@@ -76,7 +77,7 @@ def _parts(value: Any, seen: dict[int, int]) -> Iterator[bytes]:
     source = getattr(value, "py_func", None)
     if isinstance(source, FunctionType):
         if source.__module__ not in sys.modules:
-            # machine code from the cache asks for its functions' modules
+            # loading cached machine code imports the modules of its functions
             raise _UnknownError
         seen[id(value)] = len(seen)
         yield _options(value)

@@ -10,10 +10,10 @@ import numpy as np
 from magpend_core.engine.system import System
 
 STEP = 1e-5
-"""Step of the differences of values along the motion, in periods or in units of its shortest time."""
+"""Time step of the finite differences along the motion, in periods or in units of its shortest time scale."""
 
 WRONG = 1e-3
-"""Smallest relative error of a rate that counts."""
+"""Smallest relative error of a rate that is reported."""
 
 
 def declaration(system: System) -> Iterator[str]:

@@ -189,4 +189,4 @@ METHODS = {
     "dopri5": Tableau(NODES, STAGES, ERROR, np.zeros(N_STAGES), 5),
     "dop853": Tableau(np.array(_NODES_8), _filled(_STAGES_8, 12), _ERRORS_8[0], _ERRORS_8[1], 8),
 }
-"""By the names that their authors gave them."""
+"""Methods by name, as given by their authors."""

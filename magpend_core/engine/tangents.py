@@ -1,10 +1,10 @@
 """Integrate the tangent vectors of large systems, by loops over the stages of a Runge-Kutta step.
 
-Templates for the engine, see `lanes`. For a small system the products of the Jacobian J and tangent vectors
-are written out in the right-hand side (see `variational.with_tangents`). For a large one the right-hand side
-knows the states alone. The engine computes all stages of the states first, and keeps the entries of J at each
-stage. Then it takes the vectors through all stages one by one, so that the rows of a vector stay in the
-first-level cache. No vector acts on the states, so this order changes no number.
+These functions are templates for the engine, see `lanes`. For a small system the products of the Jacobian J and the
+tangent vectors are written out in the right-hand side (see `variational.with_tangents`). For a large one the
+right-hand side computes only the rates of the states. The engine computes all stages of the states first, and stores
+the entries of J at each stage. Then it computes all stages of the first vector, of the second, and so on, so that the
+rows of a vector stay in the first-level cache. The states do not depend on the vectors, so this order changes no bit.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ DIVERGENCE = "divergence"
 def order_of(row: dict[int, int]) -> list[int]:
     """Return the columns of one Jacobian row in the order in which a matrix-vector product adds them.
 
-    The first product is rounded by itself, the others are fused with the sum. Where neither of the first two
-    columns is 0, the second comes first, as in a written-out sum (see `fusing`). So leaving out the zeros of a
-    row changes no bit of the sum.
+    The first product is rounded; the others are fused with the sum. If the row has entries in columns 0 and 1, column 1
+    comes first, as in a sum written out in source code (see `fusing`). So the sum has the same bits with and without
+    the zeros of the row.
     """
     columns = sorted(row)
     return [1, 0, *columns[2:]] if columns[:2] == [0, 1] else columns
@@ -139,7 +139,7 @@ def run_stages_and_vectors(w: Any, base: int) -> None:
 
 
 INLINE = ("stage_row",)
-"""Templates here that dissolve into their callers, callees first."""
+"""Templates of this module that are inlined into their callers; callees come first."""
 
 CALLED = ("carry_vector", "carry_trace")
-"""The others, but for `run_stages_and_vectors`, which stands for `lanes.run_stages`."""
+"""Templates compiled as functions of their own; `run_stages_and_vectors` takes the place of `lanes.run_stages`."""

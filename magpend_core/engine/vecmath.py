@@ -1,17 +1,17 @@
 """Branch-free elementary functions, with the same bits on every CPU.
 
-numba has no vector math library, so ``math.exp`` in a kernel is a call into libm for each number,
-and its last bit depends on the machine. The functions here are made of additions, products, at most
-one division and selects; they take a float64 or a group of lanes (see `simd`).
+numba has no vector math library, so ``math.exp`` in a kernel calls libm for each number, and its last bit depends on
+the machine. The functions here consist of sums, products, `where_less` and at most one division; their arguments are
+float64 numbers or groups of lanes (see `simd`).
 
 Accuracy: the largest errors, in units in the last place, are below 1 for `exp`, `exp2_falling` and
 `log`, 1.5 for `cosh`, `acos` and
 `inverse_sqrt`, 1.6 for `sincos`, 2 for `sin`, `cos` and `expm1`, 2.5 for `asin` and
 `sinh`, 3 for `tan` and `atan2`, 3.5 for `atan` (between 0.41 and 0.55; 1.6 elsewhere), 4 for `tanh`. That
 of ``power(x, y)`` grows with y: 1 for y = 1.5 and 2.5 for y = 17.3, at any x. Measured against 40-digit
-arithmetic in ``tests/core/engine/test_vecmath.py``. Next to their zeros beyond the first the sines are off
-by up to 3e-27 times the argument, which there is more. The polynomials interpolate in Chebyshev nodes,
-with errors below 2e-17, or are fdlibm's. A NaN stays one.
+arithmetic in ``tests/core/engine/test_vecmath.py``. Near a zero at x = k pi (k not 0), the sines have an absolute error
+of up to 3e-27 |x|, which may be larger than these limits. The polynomials interpolate in Chebyshev nodes, with errors
+below 2e-17, or come from fdlibm. NaN gives NaN.
 """
 
 from __future__ import annotations

@@ -118,14 +118,14 @@ def find_preset(name: str | Path, folder: str | Path = ".") -> str | Preset:
     Parameters
     ----------
     name
-        Of one that ships, or of a file: a path, or a text that ends in ``.toml``.
+        Name of a shipped preset, or a file: a path, or a text that ends in ``.toml``.
     folder
-        From where the path of a file counts.
+        Folder to which the path of a file is relative.
 
     Raises
     ------
     ParameterError
-        If it is a file that cannot be read or is no preset.
+        If the file cannot be read or is no preset.
     """
     return Preset.read(Path(folder) / name) if is_file(name) else str(name)
 
@@ -162,8 +162,8 @@ def completed(preset: Preset, model: Owner, model_named: Callable[[str], Owner])
     Raises
     ------
     ParameterError
-        If it is of a model that shares no presets with this one, lacks a phrase of provenance, or has an
-        unknown name, a value out of bounds or an unknown base; all problems at once.
+        If the preset is for a model with other presets, a value has no provenance or is out of bounds, or a name or
+        the base is unknown; lists all problems.
     """
     where = f"{preset.name}{SUFFIX}"
     if not preset.model:

@@ -37,9 +37,9 @@ class _Contact:
     push : Node
         Second derivative of the impact's value without the contact.
     reaction : tuple of Node
-        What the contact adds to each rate.
+        Term that the contact adds to each rate.
     direction : tuple of Node
-        In which it pushes.
+        Direction in state space in which the surface pushes.
     slopes : list of Node
         Derivatives of the value's rate by the states.
     """

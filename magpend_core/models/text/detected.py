@@ -27,13 +27,13 @@ def found_in(
     Parameters
     ----------
     model
-        Read from text.
+        Model given as text.
     parameters
-        For half-widths and jumps.
+        Parameters for which half-widths and jumps are computed.
     frequency_hz
-        Of the drive [Hz].
+        Drive frequency [Hz].
     state
-        Where half-widths and jumps are told, if they change with it.
+        State for which half-widths and jumps are computed, if they depend on the state.
     """
     derived, own = model.derived, model.definition
     for layer in derived.layers:

@@ -187,7 +187,7 @@ class Source:
     text : str
         Python source.
     n_constants, n_modes, n_edges : int
-        Numbers of what they use and fill.
+        Number of constants, modes and edges.
     jacobian_entries : tuple of int or None
         See `System.jacobian_entries`.
     """

@@ -37,13 +37,13 @@ class Steep:
     node : Node
         The steep function.
     value : Node
-        Passes zero there.
+        Expression that passes zero at the steep place.
     half_width : Node
-        Imaginary part of the singularity of `value`; changes with the cell alone.
+        Imaginary part of the nearest singularity, in terms of `value`; depends on parameters and frequency only.
     jump : Node
-        Change of the fastest changing rate across.
+        Change across the place of the rate that changes most.
     form : str
-        What was recognised, for people.
+        Description of the steep function, for messages.
     """
 
     node: Node
@@ -69,11 +69,11 @@ def steep_places(graph: Graph, rates: tuple[Node, ...], scales: tuple[float, ...
     Parameters
     ----------
     graph
-        To which `rates` belong.
+        Expression graph that contains `rates`.
     rates
         Time derivatives of the states.
     scales
-        Of the states.
+        Scales of the states.
     """
     found: list[Steep] = []
     for node in in_order(rates):

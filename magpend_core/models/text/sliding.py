@@ -1,8 +1,8 @@
 """Derive sliding motion on switching surfaces, with Filippov's equivalent control in place of the side's sign.
 
-Where the motions of both sides point to the surface, the state stays on it. What then stands for the side is
-the number sigma in [-1, 1] for which the surface's value does not change: with the rate of that value, r(s),
-linear in the sides s, the solution of r(sigma) = 0.
+Where the motions on both sides point to the surface, the state stays on it. The sign s of the side is then replaced by
+a number sigma in [-1, 1] such that the surface's function stays 0. Its time derivative r(s) is linear in s, so sigma
+solves r(sigma) = 0.
 """
 
 from __future__ import annotations
@@ -28,12 +28,13 @@ class Sliding:
     Attributes
     ----------
     graph : Graph
+        Expression graph of the model.
     effective : dict
-        What stands for each side, by its leaf.
+        Expression that replaces the sign of each side, by the leaf of the sign.
     slides : tuple of bool
-        For which switches sliding is looked for.
+        On which switches the state can slide.
     pairs : tuple of (Node, Node)
-        Value and rate of each switch, as `System.switches` has them.
+        Value and rate of each switch, as `System.switches` returns them.
     """
 
     graph: Graph
@@ -54,14 +55,14 @@ def sliding_of(graph: Graph, rates: Sequence[Node], switches: Sequence[Switch]) 
     Parameters
     ----------
     graph
-        To which all belong.
+        Expression graph of the model.
     rates
-        Time derivatives of the states, with sides.
+        Time derivatives of the states, written with the signs of the sides.
     switches
-        All of them.
+        All switching surfaces of the model.
     """
     speeds = [_speed(graph, s.value, rates) for s in switches]
-    # on the surface, where all of this is used
+    # these rates are used only on the surface of the switch, where its mode is 0
     speeds = [substituted(graph, [v], {s.mode: graph.zero})[0] for v, s in zip(speeds, switches, strict=True)]
     pulls = [[_pull(graph, speed, s.side) for s in switches] for speed in speeds]
     slides = [s.jumps and not pulls[k][k].is_number(0.0) for k, s in enumerate(switches)]

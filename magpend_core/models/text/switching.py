@@ -82,10 +82,11 @@ class Sides:
     ----------
     graph : Graph
     smoothed : set of int
-        Numbers of nodes whose corner lies in a layer of the same argument: they stay as they are.
+        Numbers of nodes that are not rewritten, since their corner lies in a steep layer.
     switches, instants : list
+        Switching surfaces and instants found so far.
     left : list of Node
-        Jumps in time that were neither: steps do not end on them.
+        Jumps in time for which neither a switch nor an instant was found: steps do not end on them.
     """
 
     graph: Graph
@@ -102,9 +103,9 @@ class Sides:
         Parameters
         ----------
         roots
-            Expressions.
+            Expressions to rewrite.
         more
-            Whether new places may be found; if not, what is not known yet stays as it is.
+            Whether new switches and instants may be added; if not, corners and jumps not known yet stay unchanged.
         """
         roots = list(roots)
         known = self._known if more else dict(self._known)
@@ -119,7 +120,7 @@ class Sides:
     def _as_surface(self, node: Node, rewritten: Node) -> Node:
         """Return the form of an expression that may define a switching surface, without the modes of other switches.
 
-        Engines find out on which sides a start is one after the other, so that none may need another.
+        The engine sets the modes of an initial state one after the other, so no surface may depend on another's mode.
         """
         free = not any(n.op in ("clock", "mode_clock") for n in in_order([rewritten]))
         if node.kind == TIMED and free:
@@ -146,7 +147,7 @@ class Sides:
         yes, no = args[-2:] if node.op != "maximum" else args[::-1]
         a, b = (self._surface[arg.number] for arg in node.args[:2])
         if node.op == "less" and not _moves(g.sub(args[1], args[0])):
-            return plain  # of sides alone: they may be equal for a while, and then neither is less
+            return plain  # both depend on signs only, so they may stay equal for a while: no crossing to detect
         value, written = g.sub(b, a), g.sub(node.args[1], node.args[0])
         side = self.side(value, g.sub(args[1], args[0]), node.op == "less", more, _plain(value, written))
         return plain if side is None else g.choice(side, yes, no)
@@ -161,11 +162,11 @@ class Sides:
         if value.op == "neg":
             inner = self.side(value.args[0], g.neg(rewritten), jumps, more, written)
             return None if inner is None else g.neg(inner)
-        if value.op == "mul" and value.args[0].op == "number":  # above 0; it does not matter to `rewritten`
+        if value.op == "mul" and value.args[0].op == "number":  # a positive factor, which does not change the sign
             return self.side(value.args[1], rewritten, jumps, more, written)
         if keeps_sign(g, value):
             return g.one
-        if not _moves(rewritten):  # of sides alone: it may be 0 for a while
+        if not _moves(rewritten):  # depends on signs only, so it may be 0 for a while: no crossing to detect
             below = g.where_less(rewritten, g.zero, g.number(-1.0), g.zero)
             return g.where_less(g.zero, rewritten, g.one, below)
         for switch in self.switches:
