@@ -182,7 +182,7 @@ def _declaration(system: System, linearised: bool) -> Iterator[str]:
 
 
 def _extremes(packed: np.ndarray, frequency: np.ndarray, checked: _Checked | None) -> list[int]:
-    """Return the indices of parameter sets with a minimum or maximum of a parameter outside the checked ranges."""
+    """Return the indices of the parameter sets to check: those that exceed the checked range of any parameter."""
     cells = {0} if checked is None else set()
     for i, column in enumerate((*packed.T, frequency)):
         for cell in (int(column.argmin()), int(column.argmax())):
@@ -362,8 +362,8 @@ class _Motion:
             )
 
     def _check_period(self) -> None:
-        """Check that the rates at time 0 equal those at the end of the drive period, with time itself as the forcing
-        value.
+        """Check that the rates are equal at the start and the end of a drive period, for a `forcing` that returns the
+        time.
         """
         ends = []
         for time in (0.0, self.period):

@@ -44,9 +44,7 @@ def declaration(system: System) -> Iterator[str]:
 
 
 def modes_at(system: System, times: np.ndarray, edges: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Return the modes for a check at given times: every switch at +1, no contact, and the number of forcing edges
-    passed.
-    """
+    """Return modes for a check at given times: switches at +1, no contact, and the number of forcing edges passed."""
     modes = [np.ones(len(times))] * (system.n_switches + system.n_contacts)
     if system.has_segments:
         modes.append(np.searchsorted(edges[0], times, side="right").astype(np.float64))

@@ -194,9 +194,7 @@ def pair(w: Any, row: int, k: int) -> Any:
 
 
 def fires(w: Any, base: int, k: int) -> Any:
-    """Return 1 where a zero of event function `k` is an event: its sign changes in the declared direction. Else return
-    0.
-    """
+    """Return 1 where a zero of event function `k` is an event (a sign change in the declared direction), else 0."""
     return where_less(DIRECTIONS[k] * load(w, base + ROWS.side + k * WIDTH), 0.5, 1.0, 0.0)
 
 

@@ -164,8 +164,8 @@ _ARRAYS = frozenset(("IS_ANGLE", "SCALES", "ESCAPE", "DIRECTIONS", "STARTS", "SA
 
 
 def bound_part(template: Callable[..., Any], bindings: Mapping[str, Any], dissolves: bool) -> Any:
-    """Fill in a template's free names and compile it, for calls from compiled code only. Equal names and values give
-    one function.
+    """Compile a template, with given values for its free names, for calls from compiled code; equal values give one
+    function.
 
     Parameters
     ----------
@@ -204,7 +204,7 @@ def _part(template: Callable[..., Any], used: Mapping[str, Any], dissolves: bool
 
 
 def _without_size(name: str, value: Any, names: set[str], sizes: dict[str, Any]) -> Any:
-    """Return a placeholder for a system size (such as the number of states) and note the size in `sizes`; else return
+    """Return a placeholder if `value` is a system size, such as the number of states (noted in `sizes`); else return
     `value`.
     """
     if type(value) is int and value > 0 and name in _SIZES:

@@ -338,7 +338,7 @@ def squared_error_of_two(w: Any, base: int, rtol: float, atol: float) -> Any:
 
 
 def finish_step(w: Any, base: int, rtol: float, atol: float, max_attempts: float) -> bool:
-    """Accept or reject the attempted step in each SIMD lane; set the next step size and what happens next (the event).
+    """Accept or reject the attempted step in each SIMD lane; set the size of the next step and the event code.
 
     Return whether a lane of the group has an event.
     """

@@ -1,5 +1,4 @@
-"""Link the precompiled functions (parts) of an engine as LLVM code, and set the sizes of the system (number of states,
-...).
+"""Link the precompiled functions (parts) of an engine as LLVM code, and set system sizes such as the number of states.
 
 A *size* of a system, such as the number of its states, is a constant whose value the code of a part does not contain.
 While numba compiles the part, a unique integer stands for it (`placeholder`). In the LLVM code this integer is

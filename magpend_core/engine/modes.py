@@ -267,8 +267,7 @@ def hold_contacts(w: Any, base: int, lane: int) -> None:
 
 
 def seat_contacts(w: Any, base: int, lane: int, begins: bool) -> None:
-    """Decide for each impact surface whether the trajectory still rests on it: no relative speed, and pressed against
-    it.
+    """Test for each impact surface whether the trajectory (still) rests on it, and set the contact mode.
 
     With `begins` (start of a parameter point), test every surface, else only those of earlier rest.
     """

@@ -72,7 +72,7 @@ def _keeps_none(i_period: int, memory: Any, settings: Any) -> bool:
 
 @dataclass(frozen=True)
 class Observer:
-    """Functions that the engine calls after each period of a trajectory, and the values of the free names in them.
+    """Observer: functions that the engine calls after each period of a trajectory, with values for their free names.
 
     They are plain Python functions, compiled for each system. In them, `N` is the number of states, `IS_ANGLE` (0 or
     1) and `SCALES` are arrays of the system, and `bindings` defines further free names. They run once per period of a

@@ -374,4 +374,4 @@ class PartCache:
 
 
 class _Key:
-    """Dummy function object for code loaded from the cache, which numba registers by such an object."""
+    """Dummy for the entry point from Python, which cached code lacks; numba uses it as a dictionary key."""

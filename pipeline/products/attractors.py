@@ -36,13 +36,13 @@ class IdentifyOptions(Options):
 
     @property
     def effort(self) -> tuple[float, int]:
-        """Return time budget [s] and sample size for integrating undecided cells further; both are 0 if this is turned
+        """Return the limits for extending the integration of undecided cells: `budget` and `n_sample`; both 0 if turned
         off.
         """
         return (self.budget, self.n_sample) if self.extend and self.budget else (0.0, 0)
 
     def with_effort(self, effort: tuple[float, int]) -> Self:
-        """Return the options with another time budget [s] and sample size for integrating undecided cells further."""
+        """Return the options with other values of `budget` and `n_sample`, given as from `effort`."""
         budget, n_sample = effort
         if not budget:
             return self.model_copy(update={"extend": False})

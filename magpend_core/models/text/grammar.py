@@ -441,7 +441,7 @@ class _Parser:
         return parts
 
     def conditions(self, parts: tuple[Tree, ...], token: _Token) -> None:
-        """Report an error for each operand of ``and``, ``or``, ``not`` that is a number, not a condition."""
+        """Report an error for each operand that is a number where a condition is needed."""
         self.problems += [
             f"a number stands at character {part.at} where {token.text!r} needs a condition (x < 0, say)"
             for part in parts

@@ -131,8 +131,8 @@ class Graph:
     # ---- sums ------------------------------------------------------------------------------------
 
     def add(self, *terms: Node) -> Node:
-        """Return the sum of nodes, grouped so that its part without state, and its part without state and time, are
-        nodes.
+        """Return the sum of nodes, grouped so that all terms without state, and all without state and time, form one
+        node each.
         """
         groups: tuple[list[Node], ...] = ([], [], [])
         for term in self._collected(terms):

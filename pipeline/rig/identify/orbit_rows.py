@@ -91,7 +91,9 @@ def _residuals(table: OrbitData, values: Sequence[Array]) -> tuple[Array, NDArra
 
 
 def _slopes(problem: Problem, table: OrbitData, theta: Array, values: Sequence[Array]) -> tuple[Array, OrbitData]:
-    """Return the derivatives of a table's residuals by the unknowns; the table returned holds those of its orbits."""
+    """Return the derivatives of a table's residuals by the unknowns, and the table with the derivatives of its orbits
+    added.
+    """
     jacobian = np.zeros((sum(len(d.measured) for d in table.data), len(problem.free)))
     ends, widths = _ends(problem, theta)
     if not len(ends):
@@ -110,7 +112,7 @@ def _slopes(problem: Problem, table: OrbitData, theta: Array, values: Sequence[A
 
 
 def _ends(problem: Problem, theta: Array) -> tuple[Array, list[Array]]:
-    """Return the vectors for central differences: each unknown moved up and down, and both displacements of each."""
+    """Return the unknowns for central differences (each moved up and down in turn), and all displacements."""
     ends, widths = [], []
     for i in problem.moving:
         free = problem.free[i]

@@ -225,7 +225,7 @@ def solve(table: OrbitData, packed: Array) -> list[list[Point | None]]:
 
 
 def _carried(table: OrbitData, k: int, packed: Array) -> Steps[Point | None]:
-    """Follow one orbit from the known parameters to other ones, in as few steps as possible; None if it is lost."""
+    """Follow one orbit from the known parameters to others, in as few steps as possible; None if the orbit is lost."""
     known, datum = table.known, table.data[k]
     if not np.isfinite(known.unknowns[k]).all():
         return None

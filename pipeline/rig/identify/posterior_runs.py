@@ -94,7 +94,7 @@ def run_posterior(
 
 
 def _silent(line: str) -> None:
-    """Ignore a line of output."""
+    """Ignore a line of text: the output function of a silent run."""
 
 
 def _refuse_other_model(reference: Any, result: Mapping[str, Any], axes: list[str], names: list[str]) -> None:
