@@ -85,7 +85,7 @@ def other_cells(ids: xr.Dataset) -> Mapping[str, np.ndarray]:
 
 
 def share_interval(count: np.ndarray, share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Compute the 95 % Wilson interval of basin shares from numbers of cells; NaN where the share is 0.
+    """Compute the 95 % Wilson interval of basin fractions from cell counts; NaN where the fraction is 0.
 
     Parameters
     ----------

@@ -264,7 +264,7 @@ class Watch:
 
     @property
     def now(self) -> float:
-        """Time of the record's own clock [s], which does not advance while this process is suspended."""
+        """Time [s] on a clock that stops while this process is suspended."""
         now = self._clock()
         self._time += min(now - self._last, 5 * TICK_S)
         self._last = now
@@ -295,7 +295,7 @@ class Watch:
 
 
 async def _fetched(client: Any, future: Any) -> tuple[Any, BaseException | None]:
-    """Fetch the result of a dask future; return (result, None), or (None, error) if it failed."""
+    """Fetch the result of a dask future as (result, None), or its error as (None, error)."""
     try:
         return await client.gather(future, asynchronous=True), None
     except (Exception, asyncio.CancelledError) as error:

@@ -237,7 +237,7 @@ def _signals_put_off() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _blocked(numbers: set[signal.Signals]) -> Iterator[None]:
-    """Block signals in this thread while the context lasts, and in threads and processes that it starts meanwhile."""
+    """Block signals for this thread, and for threads and processes started inside the context."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
     try:
         yield
@@ -247,7 +247,7 @@ def _blocked(numbers: set[signal.Signals]) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _hushed() -> Iterator[None]:
-    """Silence dask's log messages about connections; after an exception they stay silent.
+    """Silence dask's log messages about connections inside the context, and after it if the code inside raises.
 
     dask logs some connections only after a cluster has closed.
     """

@@ -40,9 +40,7 @@ CLOCK_HZ, FLOW_PERIODS = 1.0, 50
 
 @dataclass(frozen=True)
 class Series:
-    """Settings of a time series: drive periods before it, its own (None: the default), samples per period,
-    tolerances.
-    """
+    """Settings of a time series: transient and shown drive periods, samples per period, tolerances."""
 
     n_transient: int
     n_periods: int | None

@@ -150,9 +150,7 @@ def _taking(
     block: tuple[slice, ...],
     taken: list[int],
 ) -> dict[str, Any]:
-    """Return a keyword argument with the integrator that copies cells from other runs; empty if there are no other
-    runs.
-    """
+    """Return ``{"integrate": ...}``, a function that copies cells from other runs; an empty dict without such runs."""
     if not sources:
         return {}
     from pipeline.compute.reuse import pool_of

@@ -97,9 +97,7 @@ def _draw_map(fig: style.DataFigure, ax: Axes, data: xr.Dataset, part: xr.Datase
 
 
 def _scale(grid: np.ndarray) -> tuple[Normalize, str]:
-    """Return a colour scale symmetric about 0, and the ends of the scale that values exceed: ``neither``, ``min``,
-    ``max`` or ``both``.
-    """
+    """Return a colour scale symmetric about 0, and at which of its ends values are cut off, such as ``both``."""
     known = grid[np.isfinite(grid)]
     most = float(np.abs(known).max(initial=0.0))
     half = float(np.quantile(np.abs(known), _SHOWN)) if known.size else 1.0

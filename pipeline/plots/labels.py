@@ -61,7 +61,7 @@ class Measure:
         return math.pi * self.factor
 
     def shown(self, values: np.ndarray, *, wrap: bool = False) -> np.ndarray:
-        """Convert values to the drawn unit. If `wrap` is set, first wrap angles to the range from -pi to pi."""
+        """Convert values to the drawn unit; with `wrap`, wrap angles to [-pi, pi) first."""
         folded = wrapped(values) if wrap and self.on_circle else values
         return np.asarray(folded * self.factor if self.factor != 1.0 else folded)
 
@@ -136,7 +136,7 @@ def start_measure(ds: xr.Dataset, dim: str, degrees: bool = False) -> Measure:
 
 
 def some_angle(model: Model, degrees: bool, what: str) -> None:
-    """Raise ValueError if degrees are requested and no state is an angle."""
+    """Raise ValueError if `degrees` is set for a model without angles."""
     if degrees and not any(s.unit.startswith("rad") for s in model.states):
         raise ValueError(f"{what} of {model.name} have no angle; draw them without degrees")
 
@@ -147,9 +147,7 @@ def wrapped(angle: np.ndarray) -> np.ndarray:
 
 
 def on_circle(angle: np.ndarray, *others: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Wrap an angle to [-pi, pi). Insert NaN into the angle and into other arrays where the angle jumps across the
-    edge.
-    """
+    """Wrap an angle to [-pi, pi). NaN is inserted at each jump, in the angle and in the other arrays."""
     folded = wrapped(angle)
     jumps = np.flatnonzero(np.abs(np.diff(folded)) > math.pi) + 1
     return tuple(np.insert(values, jumps, np.nan) for values in (folded, *others))

@@ -98,7 +98,7 @@ def plot_lyapunov(
 
 
 def _lost(diagram: Diagram, data: xr.Dataset) -> Survey:
-    """Return the diagram's survey, with the count of cells that have points but no exponent added."""
+    """Return the diagram's cell counts with one more reason for absent cells: no Lyapunov exponent."""
     found = diagram.survey
     value = data["exponent_value"].isel(exponent=0)
     others = [d for d in value.dims if d != diagram.parameter]
@@ -109,9 +109,7 @@ def _lost(diagram: Diagram, data: xr.Dataset) -> Survey:
 
 
 def _draw_lost(top: Axes, bottom: Axes, strip: Axes, diagram: Diagram, lost: Survey) -> None:
-    """Draw the share of cells without an exponent in a strip. Shade the diagram where all cells lack points, and the
-    lower panel where all lack an exponent.
-    """
+    """Draw the share of cells without an exponent as a strip; shade parameter values without points or exponents."""
     style.style_axes(strip, minor=False)
     shade_blank(top, diagram.x, diagram.survey, diagram.layers)
     draw_absent(bottom, strip, diagram.x, lost, diagram.layers)

@@ -48,7 +48,7 @@ def loads(
     rings: int = RINGS,
     spokes: int = SPOKES,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Force (n, 2) [N], to the right and upwards, and its moment about joint 1 (n,) [N m].
+    """Compute the force between the disc magnets [N], shape (n, 2), and its moment about joint 1 [N m], shape (n,).
 
     Parameters
     ----------
@@ -83,7 +83,7 @@ def loads(
 
 
 def read(header: Mapping[str, Any]) -> list[tuple[float, float, str, float]]:
-    """Readings: psi1, psi_rel [deg], side, torque [N m]."""
+    """Compute the synthetic readings as rows (psi1 [deg], psi_rel [deg], side, torque [N m])."""
     p = load_model(header["model"]).load(header["preset"], **header["parameters"])
     made, tie = header["synthesis"], header["correction"]["tie"]
     noise = np.random.default_rng(made["seed"])

@@ -118,8 +118,7 @@ def tiles_per_side(shape: tuple[int, ...], total: int = 64) -> int:
 def tile_numbers(
     shape: tuple[int, ...], grid: tuple[int, ...], step: int = 1, margin: tuple[int, ...] | None = None
 ) -> Ints:
-    """Return for each element of an array laid over the grid of cells the number of the tile that holds the element's
-    centre.
+    """Return the number of the tile in which each element of an array (laid over the grid of cells) has its centre.
 
     Parameters
     ----------

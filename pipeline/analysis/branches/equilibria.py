@@ -45,7 +45,9 @@ class EquilibriumProblem:
         return Value(rates[0] * unit, derivative, rows.states[:1], jacobian, is_rest=True)
 
     def _unit_of(self, jacobian: np.ndarray) -> float:
-        """Return the unit of time of the equations [s]: the inverse of the Jacobian's norm at the first evaluation."""
+        """Return the unit of time [s] that scales the rates: the inverse of the Jacobian's norm at the first
+        evaluation.
+        """
         if not self._unit:
             norm = float(np.linalg.norm(self.family.scaled(jacobian)))
             self._unit = 1.0 / norm if norm > 0.0 and np.isfinite(norm) else 1.0

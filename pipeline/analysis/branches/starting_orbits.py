@@ -34,7 +34,7 @@ class Listed:
 
 
 def listed(attractors: xr.Dataset, parameters: Parameters, parameter: str, scale: float) -> Iterator[Listed]:
-    """Yield all attractors of a run; those whose closed orbit Newton's method found have a starting orbit for a branch.
+    """Yield the attractors of a run; one that Newton's method refined comes with a starting orbit for a branch.
 
     Parameters
     ----------
@@ -63,8 +63,7 @@ def listed(attractors: xr.Dataset, parameters: Parameters, parameter: str, scale
 def attracting(
     attractors: xr.Dataset, parameters: Parameters, parameter: str, interval: tuple[float, float], max_period: int = 0
 ) -> tuple[list[Start], list[str]]:
-    """Return starting orbits from a run's attractors whose closed orbit Newton's method found, and a line on each
-    attractor left out.
+    """Return starting orbits from the refined attractors of a run, and a text line for each attractor left out.
 
     Parameters
     ----------
@@ -232,9 +231,7 @@ def orbits_near(
 def _spread(
     section: np.ndarray, places: Sequence[tuple[np.intp, ...]], distance: np.ndarray, system: System
 ) -> list[np.ndarray]:
-    """Choose starting points where trajectories recur most closely, skipping points within `RECURRENCE` of a chosen
-    one.
-    """
+    """Choose section points of close recurrence, closest first, that lie more than `RECURRENCE` apart."""
     chosen: list[np.ndarray] = []
     for place in places:
         if len(chosen) == TRIES or not distance[place] <= RECURRENCE:

@@ -73,7 +73,7 @@ def describe_view(run: Run, live: bool) -> dict[str, Any]:
 
 
 def _name(run: Run) -> str:
-    """Return the directory's name without its path."""
+    """Return the run directory's name without the path to it."""
     files = run.info.files
     return files.local.resolve().name if files.local else files.name.rstrip("/").rpartition("/")[2]
 
@@ -250,7 +250,7 @@ def commands(run: ExploredRun, directory: str) -> dict[str, str]:
 
 
 def _can_have(run: ExploredRun, name: str) -> bool:
-    """Return whether the run has the input that an analysis with default options needs."""
+    """Return whether an analysis with default options can be computed from this run."""
     if run.spec.recorded is not None:
         return False
     analysis = ANALYSES[name]

@@ -49,7 +49,7 @@ SAME_SECONDS = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Entry:
-    """Entry of a catalog: an attractor, or a class of cells that reached no known one.
+    """Catalog entry: an attractor, or a class of cells that reached no known attractor.
 
     Attributes
     ----------
@@ -86,7 +86,7 @@ class Entry:
 
 @dataclass(frozen=True, eq=False)
 class Known:
-    """Stored attractors and cells of the run at a parameter point, as far as they exist.
+    """Data of the run at one parameter point: its stored attractors and its cells, None where the run has none.
 
     Attributes
     ----------
@@ -204,7 +204,7 @@ class Catalog:
         return np.asarray(numbers[label])
 
     def unsure(self, block: Block, numbers: np.ndarray) -> np.ndarray:
-        """Return which undecided cells come back so near that they are worth integrating further."""
+        """Return a mask of the undecided cells that nearly recur, so that integrating them further pays."""
         rows = np.flatnonzero(block.is_bounded & (numbers < 0))
         near = np.zeros(len(numbers), bool)
         longest = self.options.max_orbit_period
@@ -261,9 +261,7 @@ class Catalog:
         return Block(block.cells, block.section, status, block.orbit_period, block.turns, block.rest)
 
     def _learn(self, block: Block, numbers: np.ndarray) -> None:
-        """Refine new closed orbits by Newton's method, add them to the catalog, and assign cells to them; change
-        `numbers`.
-        """
+        """Add the closed orbits of unassigned cells to the catalog, and write the new numbers into `numbers`."""
         for row in np.flatnonzero(block.is_closed & (numbers < 0)):
             if numbers[row] >= 0 or self._n_new >= MOST_ENTRIES:
                 continue
@@ -334,8 +332,8 @@ class Catalog:
         return None
 
     def _class_of(self, block: Block, row: int) -> Entry:
-        """Return the entry of the class of cells (status, period, motion) to which a cell without an attractor
-        belongs.
+        """Return the entry for cells of the same status, period and motion as a cell without an attractor; make it if
+        needed.
         """
         status = int(block.status[row])
         alive = bool(block.is_bounded[row] or block.is_closed[row])
@@ -385,7 +383,7 @@ class Catalog:
 
 
 class _WholePoint(Point):
-    """A parameter point whose cells (initial conditions) are handled as one block."""
+    """Parameter point that holds all its cells (initial conditions) in one block."""
 
     def whole(self) -> Block:
         """Return all cells of the parameter point."""
@@ -408,7 +406,7 @@ def _options_of(here: xr.Dataset | None) -> IdentifyOptions:
 
 
 def _tolerance_of(here: xr.Dataset | None, closure_tolerance: float) -> float:
-    """Return the largest distance between a closed cell and its orbit, the same as in `identify`."""
+    """Return the distance within which a closed cell counts as on an orbit, the tolerance that `identify` used."""
     found = 0.0 if here is None else float(here.attrs.get("identify_tolerance", 0.0))
     return found or max(1e-4, 10.0 * closure_tolerance)
 

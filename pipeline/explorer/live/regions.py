@@ -84,9 +84,7 @@ def changes_of(run: Run, region: Region) -> Changes:
 
 
 def _names(run: Run, region: Region, swept: list[str]) -> tuple[str, str | None]:
-    """Return the specification keys of the region's intervals; None for an interval of neither parameter nor initial
-    state.
-    """
+    """Return the specification keys that a region's two intervals restrict; the second is None if there is only one."""
     walk = run.spec.continuation
     if region.axes is None:
         if not swept:

@@ -50,7 +50,7 @@ def slice_of(live: LiveRun, job: Job) -> None:
 
 
 class _Grid:
-    """Grid of initial states in a plane, and the labels (attractors) found so far.
+    """Grid of initial states in a plane, with the attractor that each is known to reach.
 
     Attributes
     ----------
@@ -99,7 +99,7 @@ class _Grid:
             n *= 2
 
     def missing(self, n: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the initial states of a coarser grid that have no label yet, as row and column indices of the finest
+        """Return the initial states of the n x n grid that have no label yet, as row and column indices in the finest
         grid.
         """
         step = self.n // n

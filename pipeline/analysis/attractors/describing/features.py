@@ -70,8 +70,8 @@ class Cells:
     seconds: list[np.ndarray] = field(default_factory=list)
 
     def add(self, block: Block, cells: np.ndarray, labels: np.ndarray, geometry: Geometry) -> None:
-        """Add the statistics of some cells of a block of trajectories; `labels` has the classifier code of every cell
-        of the block.
+        """Add the given cells of a block to the statistics; `labels` has the class of motion (a code) of every cell of
+        the block.
         """
         section = block.section[cells]
         self.n += len(cells)

@@ -56,9 +56,7 @@ def tell_rest(points: Iterable[Point], tolerance: float, geometry: Geometry) -> 
 
 
 def _ends(point: Point, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return each cell's last state (NaN if it has none) and the distance within which it counts as at an
-    equilibrium.
-    """
+    """Return each cell's last state (NaN if none), and the distance within which it counts as at an equilibrium."""
     states = np.full((point.n_cells, point.n_states), np.nan)
     reach = np.full(point.n_cells, tolerance)
     for block in point.blocks():
@@ -72,9 +70,7 @@ def _ends(point: Point, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _waited(point: Point, states: np.ndarray) -> np.ndarray:
-    """Integrate trajectories that have not returned to the section until they are near an equilibrium; NaN for those
-    that return.
-    """
+    """Integrate states that do not return to the section until they are near an equilibrium; NaN if they do return."""
     states, system = states.copy(), point.integrates
     far = np.flatnonzero(np.isfinite(states).all(axis=1))
     for _ in range(WAITS):
@@ -100,9 +96,7 @@ def _waited(point: Point, states: np.ndarray) -> np.ndarray:
 
 
 def _found(point: Point, states: np.ndarray, reach: np.ndarray, geometry: Geometry) -> list[Equilibrium]:
-    """Find equilibria by Newton's method from last states close to them and a sample of other states, in canonical
-    order.
-    """
+    """Find the equilibria near the cells' last states by Newton's method, sorted in canonical order."""
     if not len(states):
         return []
     steps, _ = newton_steps(point.integrates, states, point.packed)
@@ -143,7 +137,7 @@ def _settled(point: Point, states: np.ndarray, reach: np.ndarray, geometry: Geom
 
 
 def put_at_rest(point: Point, tolerance: float, geometry: Geometry) -> None:
-    """Label in place the cells near degenerate equilibria that nearby trajectories were seen to approach."""
+    """Mark the cells near a degenerate equilibrium that was seen to attract as at this equilibrium, in place."""
     states, _ = _ends(point, tolerance)
     assert point.at_rest is not None
     for k, one in enumerate(point.equilibria):
@@ -189,8 +183,8 @@ def approaching(
 
 
 def rest_near(point: Point, state: np.ndarray, geometry: Geometry) -> int | None:
-    """Return the index of the stable equilibrium near the last state of a trajectory that does not return; append it if
-    new.
+    """Return the index of the stable equilibrium that a trajectory without returns ends at; add the equilibrium if it
+    is new.
     """
     if not np.isfinite(state).all():
         return None
