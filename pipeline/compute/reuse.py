@@ -81,7 +81,7 @@ class Source:
         return np.where(self._is_committed[self._task(place)], place, NOWHERE)
 
     def take(self, place: np.ndarray) -> tuple[np.ndarray, Values]:
-        """Read stored cells of the run; return a mask of the usable (integrated, undamaged) ones, and their variables."""
+        """Read stored cells of the run; return a mask of the usable (integrated, undamaged) cells and their variables."""
         taken = np.zeros(len(place), bool)
         values: Values = {}
         tasks = self._task(place)
