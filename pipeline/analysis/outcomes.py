@@ -37,7 +37,7 @@ _BY_STATUS = {
 
 
 def outcomes(ids: xr.Dataset) -> xr.DataArray:
-    """Label each cell by the attractor that it ends on, by -2 (`DIVERGED`), or by -1 for all others.
+    """Return the outcome of each cell: the id of its attractor, -2 (`DIVERGED`), or -1 if it ends on no attractor.
 
     Parameters
     ----------
@@ -63,7 +63,7 @@ def stability_of_cells(ids: xr.Dataset) -> np.ndarray:
 
 
 def other_cells(ids: xr.Dataset) -> Mapping[str, np.ndarray]:
-    """Group the cells that do not end on an attractor by their fate.
+    """Group the cells that do not end on an attractor, by the reason.
 
     Returns
     -------

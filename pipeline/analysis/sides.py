@@ -22,7 +22,7 @@ _COMPUTED = (PERIODIC, BOUNDED, INFERRED)
 
 
 def classify(ds: xr.Dataset, *, parameters: Parameters | None = None) -> xr.DataArray | None:
-    """Label each cell by the classifier of the model; lazy if `ds` is lazy.
+    """Return the class of motion of each cell by the model's classifier, as codes; lazy if `ds` is lazy.
 
     Parameters
     ----------

@@ -97,7 +97,9 @@ def walk(inputs: Inputs, system: System, integration: Integration, quantities: S
 
 
 def _spread(name: str, found: Any, alive: np.ndarray) -> Any:
-    """Spread the results of the integrated branches over arrays for all branches; the others get fill values."""
+    """Copy the results of the integrated branches into arrays for all branches; branches not integrated get fill
+    values.
+    """
     if found is None:
         return None
     fill = int(Status.UNREACHED) if name == "status" else np.nan if found.dtype.kind == "f" else 0

@@ -247,7 +247,7 @@ def _blocked(numbers: set[signal.Signals]) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _hushed() -> Iterator[None]:
-    """Silence dask's log messages about connections inside the context, and after it if the code inside raises.
+    """Silence dask's log messages about connections inside the context. They stay silent if the code inside raises.
 
     dask logs some connections only after a cluster has closed.
     """

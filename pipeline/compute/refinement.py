@@ -66,8 +66,8 @@ class Orbits:
     _known: list[tuple[np.ndarray, np.ndarray]] = field(default_factory=list)
 
     def classes(self, cells: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Return the number of each cell's closed orbit; -1 (`NO_ORBIT`) for a cell that is not closed or closes too
-        slowly.
+        """Return the number of each cell's closed orbit; -1 (`NO_ORBIT`) if it is not closed or its period exceeds the
+        kept points.
 
         Parameters
         ----------
@@ -238,7 +238,7 @@ def _uniform(boxes: np.ndarray, known: np.ndarray, shape: tuple[int, ...]) -> np
 
 
 def _sources(boxes: np.ndarray, known: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Return for each cell the cell that its result is copied from: itself if integrated, else a corner of its box."""
+    """Return for each cell the cell whose result it takes: itself if it was integrated, else a corner of its box."""
     source = np.arange(len(known))
     rest = known == NOT_COMPUTED
     source[rest] = len(known)

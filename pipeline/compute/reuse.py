@@ -81,7 +81,7 @@ class Source:
         return np.where(self._is_committed[self._task(place)], place, NOWHERE)
 
     def take(self, place: np.ndarray) -> tuple[np.ndarray, Values]:
-        """Read stored cells of the run; return a mask of the usable (integrated, undamaged) cells and their variables."""
+        """Read stored cells of the run; return a mask of the usable ones (integrated, undamaged) and their variables."""
         taken = np.zeros(len(place), bool)
         values: Values = {}
         tasks = self._task(place)
@@ -222,7 +222,7 @@ class Pool:
     def _go_on(
         self, spec: Spec, inputs: Inputs, source: Source, taken: np.ndarray, stored: Values
     ) -> tuple[np.ndarray, Values]:
-        """Integrate copied cells of a sweep further, to more section points; return a mask of successes, and the
+        """Integrate copied cells of a sweep further for more section points; return a mask of successes and the
         variables.
         """
         rows = np.flatnonzero(taken)

@@ -225,7 +225,7 @@ def _section(ds: xr.Dataset, state: str, degrees: bool) -> tuple[Measure, Any]:
 
 
 def _extreme(ds: xr.Dataset, quantity: str, degrees: bool) -> tuple[Measure, Any]:
-    """Return axis label data (`Measure`) for an extreme such as ``psi1.max``, and a function that reads its values."""
+    """Return the label data (`Measure`) for an extreme such as ``NAME.max``, and a function that reads its values."""
     if "extremes" not in ds:
         wanted = quantity.rpartition(".")[0] or quantity
         raise ValueError(

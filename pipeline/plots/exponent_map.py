@@ -97,7 +97,9 @@ def _draw_map(fig: style.DataFigure, ax: Axes, data: xr.Dataset, part: xr.Datase
 
 
 def _scale(grid: np.ndarray) -> tuple[Normalize, str]:
-    """Return a colour scale symmetric about 0, and at which of its ends values are cut off, such as ``both``."""
+    """Return a colour scale symmetric about 0, and the ends at which it cuts values off: ``neither``, ``min``, ``max``,
+    ``both``.
+    """
     known = grid[np.isfinite(grid)]
     most = float(np.abs(known).max(initial=0.0))
     half = float(np.quantile(np.abs(known), _SHOWN)) if known.size else 1.0

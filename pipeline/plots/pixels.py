@@ -208,7 +208,7 @@ def _draw_images(
 
 
 def _spread(counts: Counts, looks: Mapping[int, Look]) -> dict[int, dict[int, np.ndarray]]:
-    """Spread each pixel's count over a marker's disc by the maximum, for every layer and class of motion."""
+    """Spread each pixel's count over the disc of a marker, by the maximum, for every layer and class of motion."""
     return {
         i: {
             code: _dilate(grid, _disc(look.diameter / 72.0 * style.DPI * SUPERSAMPLING))

@@ -230,8 +230,7 @@ def prepared(run: AnalysedRun, product: Any, options: Options) -> Options:
 
 
 def most_evidence(run: Run, options: Options) -> Options:
-    """Raise the options that limit how far trajectories are integrated to the largest values of a matching stored
-    result.
+    """Return options with the largest effort of any stored search for attractors whose other options are equal.
 
     Options without an effort are returned unchanged.
     """
@@ -243,7 +242,7 @@ def most_evidence(run: Run, options: Options) -> Options:
 
 
 def _kept_efforts(run: Run) -> list[tuple[dict[str, Any], tuple[float, int]]]:
-    """Return the options of each valid stored search for attractors, split into the effort and all others."""
+    """Return the options of each valid stored search for attractors, as pairs: all other options, and the effort."""
     try:
         kept_here = products_in(run.info.files.below(DERIVED))
     except NotADirectoryError:

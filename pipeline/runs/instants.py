@@ -146,7 +146,7 @@ def _nice(value: float) -> float:
 
 
 def _common(periods: Sequence[float], cycle: float) -> float | None:
-    """Return the time [s] after which all motions repeat together; None if they never do, 0 without motions."""
+    """Return the time [s] after which all motions repeat together; None if there is none, 0 if `periods` is empty."""
     if any(math.isnan(p) for p in periods):
         return None
     if not periods:

@@ -60,7 +60,7 @@ def named(run: Run, options: Options) -> Options:
 
 
 def _swept(run: Run, others: Iterable[str]) -> str:
-    """Return the one parameter besides `others` that a run sweeps, or the drive frequency if it sweeps none.
+    """Return the parameter that a run sweeps besides `others`; the drive frequency if it sweeps no other parameter.
 
     Raises
     ------

@@ -196,7 +196,9 @@ def _points(spec: Spec, key: str, changes: Changes) -> int:
 
 
 def _old(spec: Spec, key: str) -> tuple[Any, float]:
-    """Return the old value or range of a state or parameter, and the factor to the unit of the new value."""
+    """Return the old value or range of a state or parameter, and the factor that converts it to the unit of the new
+    value.
+    """
     state = _state(spec, key)
     if state is None:
         return spec.axes.get(key), 1.0

@@ -203,7 +203,7 @@ def _id_summary(ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str]) -> Wor
 
 
 def _known(*ids: int) -> str:
-    """Format the distinct ids of sets that are not negative; a dash if there is none."""
+    """Format the distinct non-negative ids; a dash if there is none."""
     return distinct(i for i in ids if i >= 0) or "-"
 
 

@@ -293,7 +293,9 @@ def _pool(values: npt.NDArray[np.generic], block: int) -> Floats:
 
 
 def _entropies(sums: Floats) -> Floats:
-    """Compute the mean entropy over all boxes and over boundary boxes, from (summed entropy, boxes, boundary boxes)."""
+    """Compute the mean entropy over all boxes and over boundary boxes; `sums` has the total entropy and both box
+    counts.
+    """
     return _ratio(np.array([sums[0], sums[0]]), sums[1:])
 
 

@@ -192,7 +192,7 @@ class _Frame:
 
     @classmethod
     def of(cls, case: Case, before: _Frame | None) -> _Frame:
-        """Return the frame at a point of a curve, with the plane's basis turned as near as possible to that of
+        """Return the critical eigenvector and plane at a point of a curve, with the plane's basis turned close to
         `before`.
         """
         if case.kind != TORUS:

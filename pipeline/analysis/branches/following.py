@@ -107,12 +107,12 @@ class _Stop:
         return False
 
     def _difference(self, state: np.ndarray, parameter: float, u: np.ndarray) -> np.ndarray:
-        """Return the scaled difference of state and parameter value from those of a branch point `u`."""
+        """Return the scaled difference between a state with a parameter value and a branch point `u`."""
         return np.append(self.family.mismatch(u, state), parameter - u[-1])
 
 
 def end_of_crossings(family: Family, point: Point) -> str:
-    """Return ``tangent`` or ``equilibrium`` if a limit cycle hardly crosses its section, else an empty text."""
+    """Return why a limit cycle cannot be followed on its section: ``tangent`` or ``equilibrium``; empty if it can."""
     crossed = crossed_state(family.system)
     if crossed is None:
         return ""

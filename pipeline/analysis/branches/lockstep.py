@@ -64,7 +64,7 @@ def run_together(computations: Sequence[Steps[T]], what: str = "") -> list[T]:
 def _report(
     what: str, queries: Mapping[int, Query], waiting: Iterable[int], seen: dict[int, tuple[float, float]], n: int
 ) -> None:
-    """Report progress: finished computations, and the parameter range that each running one has covered (`seen`)."""
+    """Report the progress of running computations; `seen` has the parameter range that each one has covered so far."""
     for i, query in queries.items():
         last = float(query.u[-1])
         low, high = seen.get(i, (last, last))

@@ -1,4 +1,4 @@
-"""Compute normal form coefficients of located bifurcations: they decide whether the bifurcating orbits are stable.
+"""Compute normal form coefficients of located bifurcations, whose signs tell whether the bifurcating orbits are stable.
 
 The coefficients need the second and third derivatives B and C of the section map (of the rates, for equilibria)
 along the critical eigenvectors. They are differences of its exact first derivative A at neighbours of the orbit.

@@ -144,7 +144,7 @@ def places(run: ExploredRun, but: str = "") -> Iterator[Place]:
 
 
 def place_key(run: ExploredRun, at: Mapping[str, int], x: str = "") -> str:
-    """Return the text key of axis indices, such as ``frequency=3&B1=0``; `placeKey` in the page's script makes the
+    """Return the text key of indices on the axes, such as ``frequency=3&amplitude=0``; the page's `placeKey` makes the
     same.
     """
     parts = [f"{a.name}={at.get(a.name, 0)}" for a in run.axes if a.name != x]

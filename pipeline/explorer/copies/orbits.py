@@ -106,7 +106,7 @@ def choose(run: ExploredRun, layers: Mapping[str, np.ndarray], count: np.ndarray
 
 
 def _labels(layers: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Return a number per cell that tells the attractors (or motions) of one parameter point apart."""
+    """Return a number for each cell that distinguishes the attractors (or motions) of one parameter point."""
     if "colour_attractor" in layers:
         return np.asarray(layers["colour_attractor"], np.int64)
     motion = layers.get("colour_motion", np.zeros_like(layers["status"])).astype(np.int64)

@@ -406,7 +406,7 @@ def _options_of(here: xr.Dataset | None) -> IdentifyOptions:
 
 
 def _tolerance_of(here: xr.Dataset | None, closure_tolerance: float) -> float:
-    """Return the distance within which a closed cell counts as on an orbit, the tolerance that `identify` used."""
+    """Return the distance from an orbit within which a closed cell counts as on it; the same as in `identify`."""
     found = 0.0 if here is None else float(here.attrs.get("identify_tolerance", 0.0))
     return found or max(1e-4, 10.0 * closure_tolerance)
 

@@ -84,7 +84,9 @@ def changes_of(run: Run, region: Region) -> Changes:
 
 
 def _names(run: Run, region: Region, swept: list[str]) -> tuple[str, str | None]:
-    """Return the specification keys that a region's two intervals restrict; the second is None if there is only one."""
+    """Return the specification keys of the region's two intervals; the second is None if the region restricts one key
+    only.
+    """
     walk = run.spec.continuation
     if region.axes is None:
         if not swept:

@@ -50,7 +50,7 @@ def slice_of(live: LiveRun, job: Job) -> None:
 
 
 class _Grid:
-    """Grid of initial states in a plane, with the attractor that each is known to reach.
+    """Grid of initial states in a plane, with labels for the attractors that they reach.
 
     Attributes
     ----------

@@ -101,8 +101,8 @@ class Cells:
         return float(np.sort(np.concatenate(self.seconds)).mean()) if self.seconds else np.nan
 
     def side(self, parameters: Parameters, frequency: float) -> int:
-        """Return the attractor's classifier code: the common code of its cells, or else the code of their pooled
-        section points.
+        """Return the class of motion (a code) of the attractor: that of all its cells or, if they differ, of their
+        pooled points.
 
         The pooled points are classified with the median of the cells' turns.
         """

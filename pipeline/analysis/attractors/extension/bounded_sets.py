@@ -1,4 +1,4 @@
-"""Describe non-periodic sets from trajectories on them that were integrated further."""
+"""Describe non-periodic sets from the trajectories that were integrated further on them."""
 
 from __future__ import annotations
 
@@ -144,7 +144,7 @@ def ends_of(left: Iterable[Course]) -> dict[int, int]:
 
 
 def were_on(course: Course, own: Sequence[Course], settings: Settings) -> bool:
-    """Return whether a trajectory that has left a set was on the set that the trajectories `own` are on."""
+    """Return whether a finished trajectory, before it left its set, was on the same set as the trajectories `own`."""
     points = np.concatenate([other.stayed for other in own])
     return bool(mixing(course.stayed, points, settings.geometry, settings.closure) >= OTHER)
 
@@ -189,7 +189,7 @@ def _growth(own: Sequence[Course], point: Point, settings: Settings, most: int) 
 
 
 def _closes_above(own: Sequence[Course], growth: Growth | None, settings: Settings) -> int:
-    """Return the orbit period of a contracting set if it exceeds the longest period searched for; 0 if none is seen."""
+    """Return the period of trajectories that close only beyond the longest period searched for; 0 if they do not close."""
     if growth is None or not growth.contracts:
         return 0
     path = min((c.extension for c in own), key=len)

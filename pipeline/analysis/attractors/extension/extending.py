@@ -1,4 +1,5 @@
-"""Integrate trajectories further that are on no known orbit or equilibrium, until the set on which they end is known.
+"""Extend the integration of trajectories that are on no known orbit or equilibrium, until the set on which they end is
+known.
 
 A sample of these cells is integrated further from the last section, leg by leg. After each leg, cells that
 reached an orbit or an equilibrium, known or new, leave the sample. The others are grouped into sets
@@ -162,7 +163,7 @@ class _Extension:
         return [Course(cell, key, kept, kept[-1], step) for key, (_, cell, kept, step) in chosen]
 
     def left_of(self, loose: np.ndarray) -> np.ndarray:
-        """Return the cells in `loose` that still need a sample: neither integrated further nor on a set of decided
+        """Return the unassigned cells (of `loose`) that were not integrated further and lie on no set of decided
         stability.
         """
         done = np.zeros(self.point.n_cells, bool)
@@ -171,7 +172,9 @@ class _Extension:
         return np.asarray(loose[~done[loose]])
 
     def told(self, loose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the cells in `loose` that lie on sets of decided stability, and the number of each cell's set."""
+        """Return the unassigned cells (of `loose`) that lie on sets of decided stability, and the number of each cell's
+        set.
+        """
         final = [i for i, one in enumerate(self.sets) if one.stability in (ATTRACTS, NEUTRAL) or not self.budget]
         clouds = [one for i in final if (one := self.sets[i].cloud) is not None]
         is_loose = np.zeros(self.point.n_cells, bool)
@@ -373,7 +376,7 @@ class _Extension:
     def _with_those_left(
         self, groups: Sequence[list[Course]], gone: Sequence[Course]
     ) -> list[tuple[list[Course], list[Course]]]:
-        """Pair each group of unfinished trajectories with the finished ones that left the same set."""
+        """Pair each group of unfinished trajectories with those that left its set; merge the groups whose set was left."""
         left = [[course for course in gone if were_on(course, own, self.settings)] for own in groups]
         joined = [course for own, some in zip(groups, left, strict=True) if some for course in own]
         found = [(own, some) for own, some in zip(groups, left, strict=True) if not some]

@@ -70,7 +70,9 @@ def _ends(point: Point, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _waited(point: Point, states: np.ndarray) -> np.ndarray:
-    """Integrate states that do not return to the section until they are near an equilibrium; NaN if they do return."""
+    """Integrate states outside the section until they are near an equilibrium; NaN for those that return to the
+    section.
+    """
     states, system = states.copy(), point.integrates
     far = np.flatnonzero(np.isfinite(states).all(axis=1))
     for _ in range(WAITS):

@@ -254,7 +254,7 @@ def _polished(
 def _each_once(
     search: np.ndarray, start: np.ndarray, period: np.ndarray, mark: np.ndarray, ended: np.ndarray, geometry: Geometry
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Choose the guesses to polish, one of each set of duplicates; also return the choice that represents each guess.
+    """Choose the guesses to polish, without duplicates; return them, and for each guess the position of its duplicate.
 
     Rows that were integrated further and ended in one box are on one orbit; the row of least hash represents
     them. Rows without a period have no representative.

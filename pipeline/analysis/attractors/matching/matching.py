@@ -188,7 +188,7 @@ def _geometry(attractors: xr.Dataset, system: System | None) -> Geometry:
 
 
 def _neutral(attractors: xr.Dataset) -> frozenset[int]:
-    """Return the classifier codes that are compatible with every other code."""
+    """Return the class-of-motion codes that are compatible with every other code."""
     classifier = model_of(attractors).classifier
     return frozenset(classifier.neutral if classifier else ())
 
@@ -346,7 +346,7 @@ def _lookup(ids: np.ndarray, rows: np.ndarray) -> np.ndarray:
 
 
 def _destinations(values: np.ndarray, ids: np.ndarray, n_ids: int) -> np.ndarray:
-    """Reorder counts of cells that left a set: from the index of the reached set at its parameter point to its id."""
+    """Convert counts of cells that left a set: from the reached set's index at its parameter point to the set's id."""
     moved = np.zeros((*values.shape[:-1], n_ids), values.dtype)
     for *index, row in np.argwhere(ids >= 0).tolist():
         point = tuple(index)
