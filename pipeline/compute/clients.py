@@ -129,9 +129,9 @@ def connected(where: Where, n_workers: int, echo: Echo = print) -> Iterator[Any]
     Parameters
     ----------
     where
-        Where tasks are computed; not ``none``.
+        Choice of where tasks run; not ``none``.
     n_workers
-        Processes of a local cluster.
+        Number of processes of a local cluster.
     echo
         Function that prints a line.
 

@@ -25,7 +25,7 @@ def exponents(job: Job, options: LyapunovOptions) -> dict[str, np.ndarray]:
     job
         The cells as they were integrated.
     options
-        What is asked for.
+        Options of the product.
 
     Returns
     -------

@@ -67,7 +67,7 @@ def kept_on(spec: Spec, inputs: Inputs, stored: Mapping[str, np.ndarray], n_old:
     Returns
     -------
     is_exact : ndarray of bool, (branch,)
-        Which cells have the values of a longer run.
+        Mask of the cells that have the values of a longer run.
     values : dict
         Variables of these cells.
     """

@@ -199,8 +199,8 @@ def _sweep() -> None:
 def _start_tracker() -> None:
     """Start the process that removes semaphores of killed processes, without its warnings.
 
-    What it removes is what it is there for; nobody can do anything about the warning. It must outlive a
-    terminal that closes, as it does Ctrl-C.
+    Its purpose is to remove semaphores, so its warning about them helps nobody. The process must outlive a
+    closing terminal, as it outlives Ctrl-C.
     """
     name, before = "PYTHONWARNINGS", os.environ.get("PYTHONWARNINGS")
     quiet = "ignore::UserWarning:multiprocessing.resource_tracker"

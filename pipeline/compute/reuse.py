@@ -81,7 +81,7 @@ class Source:
         return np.where(self._is_committed[self._task(place)], place, NOWHERE)
 
     def take(self, place: np.ndarray) -> tuple[np.ndarray, Values]:
-        """Read stored cells of the run; return a mask of the usable ones (integrated, undamaged) and their variables."""
+        """Read stored cells of the run; return a mask of the usable ones (integrated, intact) and their variables."""
         taken = np.zeros(len(place), bool)
         values: Values = {}
         tasks = self._task(place)
@@ -138,9 +138,9 @@ def obstacles(run: Run, wanted: Spec, identity: Mapping[str, Any]) -> list[str]:
     Parameters
     ----------
     run
-        That has cells.
+        Run whose cells may be copied.
     wanted, identity
-        Specification and identity of the run that would take them.
+        Specification and identity of the run that would copy them.
     """
     lines = unlike(run.info.identity, identity)
     if line := obstacle(run.spec, wanted):

@@ -236,7 +236,7 @@ def start_of(model: str | Model, given: Mapping[str, float]) -> tuple[float, ...
     model
         The model, or its name.
     given
-        By name: ``x``, or ``x_deg`` of a state in rad or rad/s; the others are 0.
+        Values by name: ``x``, or ``x_deg`` for a state in rad or rad/s; the other states are 0.
 
     Raises
     ------

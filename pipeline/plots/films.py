@@ -49,7 +49,7 @@ def save_animation(film: Animation, path: str | Path) -> Path:
     film
         The film.
     path
-        Where to write; the folder must exist.
+        File to write; the folder must exist.
 
     Returns
     -------

@@ -82,9 +82,9 @@ def state_measure(ds: xr.Dataset, state: str = "", degrees: bool = False) -> Mea
     Parameters
     ----------
     ds
-        Of a run, so that its model is known.
+        Dataset of a run, from which the model is read.
     state
-        Name; by default the model's first that differs from section to section.
+        Name of the state; by default the first one whose values differ between section points.
     degrees
         Degrees for angles and their rates.
 
@@ -211,7 +211,7 @@ def caption(ds: xr.Dataset, *, drop: Iterable[str] = (), with_start: bool = True
     Parameters
     ----------
     ds
-        What is drawn: its scalar coordinates and its dims of size 1 are fixed.
+        Drawn data; scalar coordinates and dims of size 1 are the fixed values.
     drop
         Dims that the figure shows on its axes.
     with_start

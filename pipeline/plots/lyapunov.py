@@ -49,7 +49,7 @@ def plot_lyapunov(
     per
         ``s``: per unit time [1/s]; ``period``: per drive period or return.
     state, degrees
-        Of the diagram, as for `plot_bifurcation`.
+        State and unit of the diagram, as for `plot_bifurcation`.
     at
         Values of further swept parameters.
     frame

@@ -47,11 +47,11 @@ def draw_portrait(ax: Axes, ds: xr.Dataset, pair: tuple[str, str], motion: Motio
     ax
         The panel.
     ds
-        Of the run, so that its model is known.
+        Dataset of the run, from which the model is read.
     pair
         States to the right and upwards.
     motion
-        What is drawn.
+        Motion to draw.
     degrees
         Degrees for angles and their rates.
     """
@@ -111,11 +111,11 @@ def draw_path(ax: Axes, drawing: Drawing, parameters: Mapping[str, float], motio
     ax
         The panel.
     drawing
-        Of the model.
+        Mechanical drawing of the model.
     parameters
-        Values of its parameters.
+        Parameter values of the model.
     motion
-        What is drawn.
+        Motion to draw.
 
     Returns
     -------

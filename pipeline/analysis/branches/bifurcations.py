@@ -115,7 +115,7 @@ class Bifurcation:
     def critical_multiplier(self) -> complex:
         """The multiplier on the unit circle, or the eigenvalue on the imaginary axis [1/s].
 
-        Of a complex pair it is the one with positive imaginary part.
+        For a complex pair it is the one with positive imaginary part.
         """
         if self.point.value.is_rest:
             values = eigenvalues_of(self.point)

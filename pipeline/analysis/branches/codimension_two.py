@@ -66,9 +66,9 @@ class SpecialPoint:
     kind : str
         One of `POINT_KINDS`.
     family : Family
-        Of the orbit.
+        Family of the orbit.
     point : Point
-        The orbit there.
+        The orbit at the point.
     bracket : ndarray, (2,)
         Distance of the values of both parameters between which the test function changes its sign.
     curve : int

@@ -112,7 +112,7 @@ def connect(lines: Sequence[Sequence[Found]], settings: Settings = CONNECT) -> l
     lines
         Orbits along one parameter each, all others fixed; numbers are unique within a line.
     settings
-        How to trace; arclengths are in units of the families' scales.
+        Settings of the trace; arclengths are in units of the families' scales.
 
     Returns
     -------

@@ -62,7 +62,7 @@ class Curve:
     Attributes
     ----------
     family : Family
-        Of the orbits, with two free parameters.
+        Family of the curve's orbits, with two free parameters.
     kind : str
         Kind of bifurcation.
     points : list of Point

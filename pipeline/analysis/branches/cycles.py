@@ -34,7 +34,7 @@ def cycle_family(equilibria: Family, at: Bifurcation) -> Family | None:
     """Return the family of limit cycles near a Hopf point, on a Poincare section through this point; None if it has
     none.
 
-    That is so for a system without a section by crossing, and if the crossing state does not oscillate.
+    There is none if the system has no section by crossing, or if the crossing state does not oscillate.
     """
     crossed = crossed_state(equilibria.system)
     if crossed is None or _direction(equilibria, at) is None:

@@ -100,14 +100,14 @@ def search_orbits(
     packed
         Packed parameters.
     system
-        What is integrated.
+        System of equations to integrate.
     rounds
-        Most rounds with deflation.
+        Largest number of rounds with deflation.
 
     Returns
     -------
     list of FoundOrbit
-        By rising period, then by falling number of hits.
+        Orbits found, sorted by rising period, then by falling number of hits.
     """
     found: list[FoundOrbit] = []
     generator, spread = np.random.default_rng(0), ELSEWHERE * starts.std(axis=0)

@@ -55,13 +55,13 @@ class Ends:
     Attributes
     ----------
     starts : ndarray, (m, n_states)
-        Where they began.
+        Start states of the trajectories.
     images : ndarray, (m, period, n_states)
         Sections after 1, 2, ... drive periods or returns.
     monodromy : ndarray, (m, n_states, n_states)
         Derivative of the last image by the start.
     times : ndarray, (m, period)
-        How long each took [s].
+        Duration of each drive period or return [s].
     """
 
     starts: np.ndarray

@@ -41,11 +41,11 @@ def listed(attractors: xr.Dataset, parameters: Parameters, parameter: str, scale
     attractors
         From `pipeline.analysis.attractors.attractors`.
     parameters
-        What was integrated, axes of the cube aside.
+        Parameters of the run, apart from those on the cube's axes.
     parameter
-        What is to be continued.
+        Parameter to continue.
     scale
-        Change of it that counts as 1.
+        Change of the parameter that counts as 1.
     """
     for point in _points(attractors):
         frequency, packed = parameters_at(point, parameters)
@@ -70,11 +70,11 @@ def attracting(
     attractors
         From `pipeline.analysis.attractors.attractors`.
     parameters
-        What was integrated, axes of the cube aside.
+        Parameters of the run, apart from those on the cube's axes.
     parameter
-        What is to be continued.
+        Parameter to continue.
     interval
-        Where; its length counts as 1.
+        Interval of the parameter; its length counts as 1.
     max_period
         Longest period taken [drive periods]; 0 takes all.
 
@@ -162,7 +162,7 @@ def parameters_at(point: xr.Dataset, base: Parameters) -> tuple[float, np.ndarra
 def recurrent(cube: xr.Dataset, parameters: Parameters, parameter: str, scale: float, max_period: int) -> list[Start]:
     """Find the orbits, mostly unstable, that bounded trajectories of a cube come near.
 
-    Where two sections of a trajectory are close, p periods apart, Newton's method from the first often
+    Where two section points of a trajectory, p periods apart, are close, Newton's method from the first often
     leads to an orbit of period p (Auerbach et al., Phys. Rev. Lett. 58, 1987, 2387).
 
     Parameters
@@ -208,7 +208,7 @@ def orbits_near(
     max_period
         Longest period [drive periods].
     system
-        What is integrated.
+        System of equations to integrate.
 
     Returns
     -------

@@ -126,7 +126,7 @@ def locked_orbits(row: Row, search: Search, most: int) -> dict[Fraction, Start |
     Returns
     -------
     dict
-        By rising fraction; None where no closed cell has it and the search between two cells failed as well.
+        Starting orbit by fraction, in rising order; None where no closed cell has it and the search failed.
     """
     known = row.rotation[np.isfinite(row.rotation)]
     if not known.size:

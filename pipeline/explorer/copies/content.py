@@ -48,11 +48,11 @@ class Copied:
     view : dict
         As `describe_view` gives it.
     about : dict
-        What the page must know of the copy.
+        Facts on the export for the page's script.
     objects : dict
         Data by name.
     sentences : list of str
-        What a reader must know of the copy.
+        Notes on the export for its readers.
     """
 
     run: ExploredRun

@@ -43,10 +43,10 @@ class Exported:
     ----------
     path : Path
     size : int
-        Of all that was written [bytes].
+        Size of everything written [bytes].
     orbits : int
     sentences : list of str
-        What the copy says of itself.
+        Notes that the export shows to its readers.
     """
 
     path: Path

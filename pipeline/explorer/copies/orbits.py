@@ -145,13 +145,13 @@ def add_orbits(copied: Copied, choosing: Callable[[int], Chosen], count: np.ndar
     Parameters
     ----------
     copied
-        What they are added to.
+        Export to which the orbits are added.
     choosing
-        Gives the choice for a number of orbits at most.
+        Function that chooses at most a given number of orbits.
     count
         Number of each cell's points; an orbit starts from the last.
     room
-        What they may take.
+        Limits on number and size of the orbits.
     """
     if copied.run.spec.recorded is not None:
         missing = "This copy has no orbits: the drive of the run is a recording, which does not repeat."

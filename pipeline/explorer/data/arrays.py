@@ -32,7 +32,7 @@ def pack_arrays(arrays: Mapping[str, np.ndarray], attrs: Mapping[str, Any] | Non
     Parameters
     ----------
     arrays
-        By name, of a type in `DTYPES`.
+        Arrays by name, of a type in `DTYPES`.
     attrs
         Values that JSON can store. NaN and infinity are not allowed; None stands for a missing value.
 

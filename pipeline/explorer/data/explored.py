@@ -41,7 +41,7 @@ class Axis:
     Attributes
     ----------
     name : str
-        Of the cube's dim; of a run that sweeps nothing, of the one value that it has.
+        Name of the cube's dim; in a run that sweeps nothing, name of the one value that it has.
     parameter : str
         Its name in a specification.
     values : ndarray

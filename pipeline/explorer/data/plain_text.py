@@ -34,7 +34,7 @@ def plain(symbol: str, name: str) -> str:
     symbol
         LaTeX without dollar signs; may be empty.
     name
-        What stands there without a symbol.
+        Name to use if there is no symbol.
 
     Examples
     --------

@@ -91,7 +91,7 @@ def plane(run: Run, at: Mapping[str, int]) -> bytes:
 def plane_of(run: ExploredRun, at: Mapping[str, int]) -> Plane:
     """Read the labelled plane of initial states at a parameter point; arguments as for `plane`.
 
-    Of a grid of more than two states the first two are shown, at the middle of the others.
+    For a grid of more than two states the first two are shown, at the middle of the others' ranges.
     """
     place = run.place(at)
     scheme = _scheme(run)

@@ -156,7 +156,7 @@ def _section(model: Model) -> str:
 def _parameter(run: ExploredRun, parameter: Parameter) -> dict[str, Any]:
     """Return a parameter with its value (None if swept) and the range in which the page lets users change it.
 
-    That is the range of its axis; else from half to one and a half times its value, within its bound.
+    This is the range of its axis; without an axis, 0.5 to 1.5 times its value, within its bounds.
     """
     swept = {a.parameter: a.values for a in run.axes if a.swept}
     if parameter.name in swept:

@@ -54,7 +54,7 @@ class Entry:
     Attributes
     ----------
     number : int
-        By which slices name it: the run's id of an attractor, and larger numbers for everything else.
+        Number of the entry in slices: the run's id of an attractor, or a larger number for any other entry.
     attractor : int or None
         The run's id.
     kind : int
@@ -91,11 +91,11 @@ class Known:
     Attributes
     ----------
     attractors : Dataset or None
-        Of all points of the run.
+        Attractors of all parameter points of the run.
     cells : Dataset or None
         The cube at the point; None where it has no such point.
     index : tuple of int or None
-        Of the point.
+        Index of the point in the cube.
     """
 
     attractors: xr.Dataset | None = None
@@ -118,9 +118,9 @@ class Catalog:
     place
         The point.
     known
-        What the run's analysis says of it.
+        Stored attractors and cells of the run at the point.
     closure_tolerance
-        Of the run.
+        Closure tolerance of the run.
     """
 
     def __init__(self, place: Place, known: Known, closure_tolerance: float) -> None:

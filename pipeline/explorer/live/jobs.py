@@ -34,7 +34,7 @@ class Job:
     Parameters
     ----------
     request
-        What is asked for.
+        Request that the job answers.
     """
 
     def __init__(self, request: Request) -> None:

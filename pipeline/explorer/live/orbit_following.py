@@ -82,9 +82,9 @@ class Reached:
     Attributes
     ----------
     value : float
-        Of the parameter.
+        Parameter value that was reached.
     point : Point
-        The orbit there.
+        The orbit at this value.
     sentence : str
         Why no farther; empty if it was followed to the value wanted.
     lost : bool
@@ -206,7 +206,7 @@ def cell_orbit(live: LiveRun, cell: int, point: int) -> Held:
     cell
         Number of the cell in C order.
     point
-        Which of its kept sections.
+        Number of one of its stored section points.
 
     Raises
     ------

@@ -102,7 +102,7 @@ class Flight:
     status : ndarray of int8, (n,)
         ``BOUNDED`` for those that go on, else what ended them.
     state : ndarray, (n, n_states)
-        Where each is.
+        Current state of each trajectory.
     """
 
     def __init__(self, place: Place, integration: Integration, starts: np.ndarray, check: Check) -> None:
@@ -185,7 +185,7 @@ def run_start(flight: Flight, integration: Integration, tell: Tell, periods: int
     Parameters
     ----------
     flight
-        Of one cell.
+        Integration of one cell.
     integration
         The run's settings.
     tell
@@ -258,9 +258,9 @@ def run_on(
     place, integration
         Where, and the run's settings.
     ends
-        What is known there.
+        Catalog of the attractors at the parameter point.
     block
-        The cells, undecided.
+        The undecided cells.
     states
         Their last sections.
     check, tell
@@ -311,7 +311,7 @@ def settle_cells(place: Place, integration: Integration, ends: Ends, starts: np.
     place, integration
         Where, and the run's settings.
     ends
-        What is known there; it learns.
+        Catalog of the attractors at the parameter point; new ones are added.
     starts
         Initial states, shape (n, n_states).
     check

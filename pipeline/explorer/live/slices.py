@@ -59,7 +59,7 @@ class _Grid:
     axes : tuple of ndarray
         Values of the two states at the centres of its cells.
     labels : ndarray, (n, n)
-        What each ends on, rows by the second state; `NOT_YET` before.
+        Number of the attractor that each cell reaches, rows by the second state; `NOT_YET` before it is known.
     """
 
     def __init__(self, columns: tuple[int, int], base: np.ndarray, axes: tuple[np.ndarray, np.ndarray]) -> None:

@@ -189,7 +189,7 @@ def _growth(own: Sequence[Course], point: Point, settings: Settings, most: int) 
 
 
 def _closes_above(own: Sequence[Course], growth: Growth | None, settings: Settings) -> int:
-    """Return the period of trajectories that close only beyond the longest period searched for; 0 if they do not close."""
+    """Return the period with which trajectories close above the longest period searched for; 0 if none is seen."""
     if growth is None or not growth.contracts:
         return 0
     path = min((c.extension for c in own), key=len)

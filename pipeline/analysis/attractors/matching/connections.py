@@ -30,7 +30,7 @@ class Connections:
     followed : ndarray of bool
         Whether each was followed.
     outcomes : dict
-        How following ended, by axis, direction (1 or -1) and number; values as in
+        Reason why following an orbit ended, by axis, direction (1 or -1) and number; values as in
         `pipeline.analysis.branches.connecting.Links`.
     """
 
