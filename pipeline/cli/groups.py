@@ -40,7 +40,7 @@ class RegistryGroup(TyperGroup):
         return [*self.names(), *super().list_commands(ctx)]
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        """Return a command by name; create it if it is one of the registry."""
+        """Return a command by name; create it if it is in the registry."""
         return self.make(cmd_name) if cmd_name in self.names() else super().get_command(ctx, cmd_name)
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:

@@ -98,7 +98,7 @@ def plot_lyapunov(
 
 
 def _lost(diagram: Diagram, data: xr.Dataset) -> Survey:
-    """Return the diagram's cell counts with one more reason for absent cells: no Lyapunov exponent."""
+    """Return the diagram's counts of absent cells, extended by the cells that have points but no Lyapunov exponent."""
     found = diagram.survey
     value = data["exponent_value"].isel(exponent=0)
     others = [d for d in value.dims if d != diagram.parameter]

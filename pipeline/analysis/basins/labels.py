@@ -118,7 +118,7 @@ def tiles_per_side(shape: tuple[int, ...], total: int = 64) -> int:
 def tile_numbers(
     shape: tuple[int, ...], grid: tuple[int, ...], step: int = 1, margin: tuple[int, ...] | None = None
 ) -> Ints:
-    """Return the number of the tile in which each element of an array (laid over the grid of cells) has its centre.
+    """Return for each element of an array the number of the tile, a part of the grid of cells, that holds its centre.
 
     Parameters
     ----------

@@ -33,7 +33,7 @@ class EquilibriumProblem:
         return self.family.rows(u[None][:0])
 
     def value(self, u: np.ndarray, ends: Ends) -> Value:
-        """Compute the scaled rates at a state and their derivatives by the state and the parameter."""
+        """Compute the scaled rates at a state, and their derivatives with respect to the state and the parameter."""
         step = np.zeros(self.size)
         step[-1] = PARAMETER_STEP
         rows, scales = self.family.rows(np.stack([u, u + step, u - step])), np.asarray(self.system.scales)

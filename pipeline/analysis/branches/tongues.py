@@ -166,7 +166,7 @@ def _passed(row: Row, fraction: Fraction) -> tuple[int, int] | None:
 
 
 def _between_cells(row: Row, search: Search, gaps: dict[Fraction, tuple[int, int]]) -> dict[Fraction, Start | None]:
-    """Find orbits between neighbouring cells by halving the interval of the parameter, all fractions side by side."""
+    """Find locked orbits between neighbouring cells by bisection in the parameter, for all fractions together."""
     if not gaps:
         return {}
     targets = np.array([float(f) for f in gaps])

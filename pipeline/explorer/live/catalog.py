@@ -282,9 +282,7 @@ class Catalog:
                 self._add_orbit(orbit, entry)
 
     def _in_sets(self, block: Block, numbers: np.ndarray) -> None:
-        """Assign undecided bounded cells to the run's aperiodic attractors, by comparing section points; change
-        `numbers`.
-        """
+        """Assign undecided bounded cells to the run's aperiodic attractors by their section points, in `numbers`."""
         rows = np.flatnonzero(block.is_bounded & (numbers < 0))
         if not len(rows) or not self._sets:
             return

@@ -1,4 +1,4 @@
-"""Compute the features of an attractor: ranges, rotation, classifier code, energy, mirror image.
+"""Compute the features of an attractor: ranges, rotation, class of motion, energy, mirror image.
 
 Half a drive period
 -------------------

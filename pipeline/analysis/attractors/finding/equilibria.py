@@ -36,7 +36,7 @@ GUESSES, GUESS_BOX = 64, 0.1
 
 
 def tell_rest(points: Iterable[Point], tolerance: float, geometry: Geometry) -> None:
-    """Find the equilibria of some parameter points and the cells that are at them; store both in the points.
+    """Find the equilibria of each parameter point, and the cells that are at one; store both in the points.
 
     Parameters
     ----------
@@ -139,7 +139,7 @@ def _settled(point: Point, states: np.ndarray, reach: np.ndarray, geometry: Geom
 
 
 def put_at_rest(point: Point, tolerance: float, geometry: Geometry) -> None:
-    """Mark the cells near a degenerate equilibrium that was seen to attract as at this equilibrium, in place."""
+    """Mark the cells near an attracting degenerate equilibrium as at rest there; changes `point.at_rest`."""
     states, _ = _ends(point, tolerance)
     assert point.at_rest is not None
     for k, one in enumerate(point.equilibria):
