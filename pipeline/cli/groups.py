@@ -40,11 +40,11 @@ class RegistryGroup(TyperGroup):
         return [*self.names(), *super().list_commands(ctx)]
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        """Return a command by name; create it if it is one of the registry."""
+        """Return a command by name; create it if it is in the registry."""
         return self.make(cmd_name) if cmd_name in self.names() else super().get_command(ctx, cmd_name)
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """Find a command by name; raise an error with the right word order if the directory was given first."""
+        """Find a command by name; if the directory came before the name, raise an error that shows the right order."""
         if args and args[0] not in self.list_commands(ctx):
             later = [a for a in args[1:] if a in self.list_commands(ctx)]
             if later:

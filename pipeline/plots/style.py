@@ -96,7 +96,7 @@ class DataFigure(Figure):
     frame : Frame
     look : Look
     notes : list of str
-        What whoever asked for the figure must know beside it.
+        Notes for the user who asked for the figure.
     """
 
     data: xr.Dataset
@@ -115,9 +115,9 @@ def new_figure(
     height
         [in] of a figure of full width; narrow ones are lower, but not in proportion.
     data
-        What will be drawn.
+        Data that will be drawn.
     frame
-        Its width.
+        Width of the figure and ranges of its axes.
     arranged
         Whether `finish` finds the places of axes, labels and legends.
     exact

@@ -34,7 +34,7 @@ class Job:
     Parameters
     ----------
     request
-        What is asked for.
+        Request that the job answers.
     """
 
     def __init__(self, request: Request) -> None:
@@ -44,7 +44,7 @@ class Job:
         self.began = time.perf_counter()
 
     def answers_to(self, emit: Emit) -> None:
-        """Set the function that receives the job's answers."""
+        """Set the function that sends the job's answers."""
         self._emit = emit
 
     def cancel(self) -> None:
