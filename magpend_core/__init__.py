@@ -85,8 +85,8 @@ def __dir__() -> list[str]:
 
 
 class _Package(ModuleType):
-    """Package whose attributes `sections` and `trajectory` remain functions when the modules of the same names are
-    imported.
+    """Module type of the package. It keeps the functions `sections` and `trajectory` when submodules of the same names
+    are imported.
     """
 
     def __setattr__(self, name: str, value: Any) -> None:

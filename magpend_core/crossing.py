@@ -19,7 +19,7 @@ DIRECTIONS = {"up": 1, "down": -1}
 
 @dataclass(frozen=True)
 class Crossing:
-    """A Poincare section of a flow without forcing: where a state crosses a level.
+    """A Poincare section of a system without forcing: the points where one state crosses a level.
 
     A period is then the time from one crossing to the next, a *return*. Crossings are steps of the
     integration that end on the level (see `engine.events`, which says what can be missed). An angle crosses
@@ -70,8 +70,8 @@ class Crossing:
         return f"{self.of} = {self.value:g} going {self.direction}"
 
     def applied(self, parameters: np.ndarray, system: System) -> tuple[System, np.ndarray, np.ndarray]:
-        """Add this Poincare section to a system. Return the system, its parameters with the level appended, and a
-        frequency [Hz].
+        """Add this Poincare section to a system. Return the new system, its parameters with the level appended, and the
+        frequency [Hz] to give to the engine.
 
         Parameters
         ----------

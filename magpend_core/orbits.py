@@ -105,7 +105,8 @@ def section_map(
     rtol: float = RTOL,
     system: System = PENDULUM_FITTED,
 ) -> Returns:
-    """Iterate the section map from given points; return all images, and the derivative of the last image by the point.
+    """Iterate the section map from given points; return all images, and the derivative of each last image with respect
+    to its starting point.
 
     Parameters
     ----------
@@ -184,7 +185,8 @@ def crossed_state(system: System) -> int | None:
 
 
 def on_section(points: np.ndarray, parameters: np.ndarray, system: System) -> np.ndarray:
-    """Return points with the state that defines the Poincare section set to its level; unchanged for a driven system.
+    """Move points onto the Poincare section: set the state that defines it to its level. Points of a driven system stay
+    unchanged.
 
     Parameters
     ----------

@@ -36,7 +36,6 @@ def driven_system(system: System, drive: Drive) -> System:
 
 
 def _padded(packed: np.ndarray, system: System) -> np.ndarray:
-    """Append zeros to packed parameters, for the additional parameters of a system with a recorded drive."""
     more = len(system.parameter_names) - packed.shape[-1]
     return np.pad(packed, [(0, 0)] * (packed.ndim - 1) + [(0, more)])
 
@@ -59,7 +58,7 @@ def recorded_sections(
     quantities: Sequence[str] | None = None,
     n_points: int | None = None,
 ) -> Sections:
-    """Return the sections of many trajectories under one recorded drive, from its start.
+    """Return the section points of many trajectories under one recorded drive, from its start.
 
     Parameters
     ----------
@@ -216,7 +215,6 @@ class _Walk:
         self.alive = alive[~failed]
 
     def outcome(self, with_extremes: bool) -> Sections:
-        """Return the results of all trajectories as `Sections`."""
         failed = self.status != Status.BOUNDED
         self.seen[failed], self.watched[failed], self.turns[failed] = np.nan, np.nan, 0
         period = np.zeros(len(failed), np.int64)

@@ -1,4 +1,4 @@
-"""Sample many trajectories at the instants of recordings, under recorded drives, for fits."""
+"""Sample many trajectories under recorded drives, at the sampling instants of the recordings to be fitted."""
 
 from __future__ import annotations
 
@@ -157,7 +157,7 @@ def sample(
     limits_first_step: bool = True,
     n_lanes: int = N_LANES,
 ) -> Samples:
-    """Return the states of many trajectories at the instants of recordings.
+    """Return the states of many trajectories at the sampling instants of recordings.
 
     Parameters
     ----------

@@ -103,7 +103,6 @@ def _write(node: object, out: list[str]) -> None:
 
 
 def _is_remark(node: object) -> bool:
-    """Return whether a statement does nothing: a docstring, another bare string, ``pass`` or ``...``."""
     if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
         return isinstance(node.value.value, str) or node.value.value is ...
     return isinstance(node, ast.Pass)

@@ -57,7 +57,7 @@ class SystemCheckError(ValueError):
 
 @dataclass
 class _Checked:
-    """Smallest and largest checked value of each parameter of a system; the last entry is the drive frequency."""
+    """Range over which each parameter of a system has been checked; the last entry is the drive frequency."""
 
     low: np.ndarray
     high: np.ndarray
@@ -129,8 +129,8 @@ def _problems(
     frequency: np.ndarray,
     states: np.ndarray,
 ) -> list[str]:
-    """Check the declaration, the constants at extreme parameters, and the motion from a few states; return the
-    problems.
+    """Return the problems of a system: in its declaration, in its constants at extreme parameters, and in its functions
+    at sample states.
     """
     if checked is None:
         problems = list(_declaration(system, linearised))
@@ -150,7 +150,7 @@ def _problems(
 
 
 def _declaration(system: System, linearised: bool) -> Iterator[str]:
-    """Yield the problems of a system's fields that are not functions, such as names, scales and counts."""
+    """Yield the problems in a system's plain fields, such as names, scales and counts."""
     n, names = system.n_states, ", ".join(system.state_names)
     if not n:
         yield "state_names is empty; a system has one state at least."
@@ -182,7 +182,7 @@ def _declaration(system: System, linearised: bool) -> Iterator[str]:
 
 
 def _extremes(packed: np.ndarray, frequency: np.ndarray, checked: _Checked | None) -> list[int]:
-    """Return the indices of the parameter sets to check: those that exceed the checked range of any parameter."""
+    """Return the indices of the cells to check: those with a parameter outside the range checked so far."""
     cells = {0} if checked is None else set()
     for i, column in enumerate((*packed.T, frequency)):
         for cell in (int(column.argmin()), int(column.argmax())):
@@ -192,7 +192,7 @@ def _extremes(packed: np.ndarray, frequency: np.ndarray, checked: _Checked | Non
 
 
 class _Functions:
-    """The functions of a system as plain Python; problems in their calls are collected."""
+    """A system's functions as plain Python. Problems in calls are collected in a list."""
 
     def __init__(self, system: System) -> None:
         self.system = system
@@ -210,8 +210,8 @@ class _Functions:
             return _NOT_RUN
 
     def numbers(self, name: str, wanted: int, what: str, *arguments: Any) -> tuple[np.ndarray, ...] | None:
-        """Call a function of the system that must return a tuple of `wanted` numbers; if it does not, report a problem
-        and return None.
+        """Call a function that must return a tuple of `wanted` numbers. If it does not, report a problem and return
+        None.
         """
         values = self.call(name, *arguments)
         if values is _NOT_RUN:
@@ -224,26 +224,24 @@ class _Functions:
         return None
 
     def constants(self, frequency: np.float64, p: np.ndarray) -> tuple[np.float64, ...]:
-        """Return the constants that the system computes from the frequency and the parameters."""
         out = np.full(self.system.n_constants, np.nan)
         self.call("constants", frequency, p, out)
         return tuple(out)
 
     def has_values(self, frequency: np.float64, p: np.ndarray) -> bool:
-        """Return whether the constants are finite at one frequency and parameter vector; always True if the system
-        declares no poles.
+        """Return whether the constants are finite for a frequency and parameters. Always True if the system declares no
+        poles.
         """
         return not self.system.has_poles or bool(np.isfinite(self.constants(frequency, p)).all())
 
     def edges(self, frequency: np.float64, p: np.ndarray) -> np.ndarray:
-        """Return times, half-widths and jumps of the forcing's edges, shape (3, n_edges)."""
         table = np.full((3, self.system.n_edges), np.nan)
         self.call("edges", frequency, p, *table)
         return table
 
     def cell_problems(self, frequency: np.float64, p: np.ndarray) -> list[str]:
-        """Check the constants and the edges of the forcing at one frequency and parameter vector; return the
-        problems.
+        """Check the constants and the edges of the forcing for one frequency and parameter vector; return
+        the problems.
         """
         self.problems = []
         at = f"at frequency_hz = {frequency:g}"
@@ -280,7 +278,9 @@ def _edge_problems(table: np.ndarray, period: float, at: str) -> Iterator[str]:
 
 
 class _Motion:
-    """Checks of the functions that are called at every step, on sample states and times like those of a run."""
+    """Checks of the functions that the engine calls at every step. They run on sample states and times like those of a
+    run.
+    """
 
     def __init__(
         self, system: System, functions: _Functions, p: np.ndarray, frequency: np.float64, states: np.ndarray
@@ -298,7 +298,6 @@ class _Motion:
         self.u: Any = 0.0
 
     def _constants_at(self, times: np.ndarray) -> tuple[Any, ...]:
-        """Return the constants of the system, then the modes of switches, contacts and time segments at given times."""
         return (*self.own, *event_checks.modes_at(self.system, times, self.edges))
 
     def _states(self, states: np.ndarray) -> np.ndarray:
@@ -362,9 +361,7 @@ class _Motion:
             )
 
     def _check_period(self) -> None:
-        """Check that the rates are equal at the start and the end of a drive period, for a `forcing` that returns the
-        time.
-        """
+        """Check that the rates repeat after one drive period, for a system whose `forcing` returns the time itself."""
         ends = []
         for time in (0.0, self.period):
             self.u = np.full(N_SAMPLES, time)
@@ -404,8 +401,8 @@ class _Motion:
                 )
 
     def _check_jacobian(self, rates: np.ndarray) -> None:
-        """Compare the Jacobian with finite differences of the rates; two step sizes give a bound of the differences'
-        own error.
+        """Compare the Jacobian with finite differences of the rates. Differences with two step sizes bound their own
+        error.
         """
         n, names = self.system.n_states, self.system.state_names
         what = "the derivatives of each rate by each state, row by row"
@@ -433,7 +430,6 @@ class _Motion:
                 )
 
     def _slopes(self, j: int, step: float) -> np.ndarray:
-        """Return central differences of the rates with respect to state `j`, shape (n_states, sample)."""
         right, left = self.y.copy(), self.y.copy()
         right[j] += step
         left[j] -= step

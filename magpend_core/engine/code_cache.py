@@ -78,8 +78,8 @@ def keep(dispatcher: Any, home: Path, folder: Path) -> Any:
 
 @cache
 def _made(home: Path, folder: Path) -> str:
-    """Create a cache folder that only its owner can write to; return why it cannot be used, or an empty text if it
-    can.
+    """Create a cache folder that only its owner can write to. Return the reason if it cannot be used, else an empty
+    text.
     """
     try:
         home.parent.mkdir(parents=True, exist_ok=True)
@@ -102,7 +102,7 @@ def _below(home: Path, folder: Path) -> list[Path]:
 
 
 def _exposed(found: os.stat_result) -> str:
-    """Return a text that says who else can write to a file or folder; empty if only the owner can."""
+    """Return who else can write to a file or folder, as text; empty if only the owner can."""
     if not hasattr(os, "geteuid"):
         return ""
     mode = f"mode {stat.S_IMODE(found.st_mode):04o}"
@@ -189,9 +189,7 @@ def _for_the_owner(path: str, flags: int) -> int:
 
 
 def _read_sealed(path: str) -> bytes | None:
-    """Return the content of a cache file if its checksum fits and nobody else can write to it; else return None and
-    warn.
-    """
+    """Read a cache file. If its checksum is wrong or others can write to it, warn and return None."""
     try:
         with open(path, "rb") as file:
             problem = _exposed(os.fstat(file.fileno()))

@@ -38,7 +38,7 @@ def code_length(function: Callable[..., Any]) -> int:
 
 
 class _UnknownError(Exception):
-    """An error for a function that depends on an object whose code is unknown, so that it has no digest."""
+    """Error: a function uses an object whose code is unknown, so the function has no digest."""
 
 
 def functions_digest(*functions: Callable[..., Any]) -> str | None:
@@ -93,9 +93,7 @@ def _parts(value: Any, seen: dict[int, int]) -> Iterator[bytes]:
 
 
 def _plain(value: Any) -> bytes:
-    """Return bytes that identify an object: a number or text by its value, a function of numba, numpy or magpend by its
-    name.
-    """
+    """Return bytes that identify a plain value by its text, or a function of numba, numpy or magpend by its name."""
     if value is None or isinstance(value, bool | int | float | complex | str | bytes | np.generic):
         return f"{type(value).__name__} {value!r}".encode()
     module = getattr(value, "__module__", None) or ""
@@ -107,7 +105,6 @@ def _plain(value: Any) -> bytes:
 
 
 def _options(dispatcher: Any) -> bytes:
-    """Return the compiler options of a numba function as bytes, sorted by name."""
     options = {**dispatcher.targetoptions, "locals": dispatcher.locals}
     rows = []
     for name, option in sorted(options.items()):
@@ -141,7 +138,9 @@ def reached(function: Any, path: tuple[str, ...]) -> Any:
 
 
 def _found(value: Any, attributes: tuple[str, ...]) -> Any:
-    """Return the object at a dotted path such as ``module.submodule.NAME``; stop at the first non-module."""
+    """Follow a dotted path such as ``module.submodule.NAME`` from module to module, up to the first object that is no
+    module.
+    """
     for name in attributes:
         if not isinstance(value, ModuleType):
             break
@@ -173,7 +172,9 @@ def _code(code: CodeType, seen: dict[int, int]) -> Iterator[bytes]:
 
 
 def lookups(code: CodeType) -> list[tuple[str, ...]]:
-    """Return the global names that a function and its inner functions look up, with the attributes read of each."""
+    """Return the global names that a function and its inner functions look up, each with the attributes
+    read from it.
+    """
     found: set[tuple[str, ...]] = set()
     path: tuple[str, ...] = ()
     for instruction in dis.get_instructions(code):

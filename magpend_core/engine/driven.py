@@ -20,7 +20,7 @@ LEVEL, SLOPE = "recorded_drive", "recorded_drive_slope"
 
 
 def _wrapped(source: str, module: str, **bindings: Any) -> Any:
-    """Compile a function from source text; numba's cache treats it as part of `module` (see `jit.keeping`)."""
+    """Compile a function from source text. numba's cache treats it as part of `module` (see `jit.keeping`)."""
     scope: dict[str, Any] = {"__name__": module, **bindings}
     exec(source, scope)
     return inline(scope["function"])

@@ -36,7 +36,7 @@ LEAST_RTOL = 1e-13
 
 
 def slack_of(rtol: float, atol: float) -> float:
-    """Return the constant that limits the step size near steep layers and forcing edges, for given tolerances."""
+    """Return the slack for given tolerances: the constant that limits steps near boundary layers and forcing edges."""
     tolerance = rtol + atol
     return SLACK * tolerance * max(1.0, tolerance / LOOSE) ** 2
 
@@ -91,8 +91,8 @@ def integrate(
     quantities: Sequence[str] | None = None,
     measures: np.ndarray | None = None,
 ) -> Cells:
-    """Integrate branches (sequences of parameter points, each started from the last state of the one before) and let an
-    observer record.
+    """Integrate branches and let an observer record them. A branch is a sequence of parameter points, each started from
+    the last state of the previous one.
 
     Parameters
     ----------

@@ -17,7 +17,7 @@ WRONG = 1e-3
 
 
 def declaration(system: System) -> Iterator[str]:
-    """Yield the problems of a system's fields for switches and impacts that are not functions."""
+    """Yield the problems in a system's plain fields for switches and impacts."""
     least = system.n_switches + system.n_contacts + system.has_segments
     if system.n_modes != least:
         yield (
@@ -44,7 +44,9 @@ def declaration(system: System) -> Iterator[str]:
 
 
 def modes_at(system: System, times: np.ndarray, edges: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Return modes for a check at given times: switches at +1, no contact, and the number of forcing edges passed."""
+    """Return the modes used in checks at given times: switches at +1, no contact, and the number of forcing edges
+    passed.
+    """
     modes = [np.ones(len(times))] * (system.n_switches + system.n_contacts)
     if system.has_segments:
         modes.append(np.searchsorted(edges[0], times, side="right").astype(np.float64))

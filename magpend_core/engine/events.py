@@ -134,8 +134,8 @@ def event_bindings(system: System) -> dict[str, Any]:
 
 
 def cubic_dip(a: Any, da: Any, b: Any, db: Any) -> Any:
-    """Return the position in (0, 1) of a cubic's negative minimum, or 2 if it has none; `a`, `b` are its end values,
-    `da`, `db` its slopes.
+    """Return where in (0, 1) a cubic has a negative minimum, or 2 if it has none. The cubic has end values `a`, `b` and
+    end slopes `da`, `db`.
     """
     c3 = 2.0 * (a - b) + (da + db)
     c2 = multiply_add(3.0, b - a, -(da + da) - db)
@@ -149,7 +149,7 @@ def cubic_dip(a: Any, da: Any, b: Any, db: Any) -> Any:
 
 
 def may_dip(a: Any, da: Any, b: Any, db: Any) -> Any:
-    """Return 1 where a cubic may fall below 0 between its ends, by a fast bound (see `cubic_dip`); else 0."""
+    """Return 1 where a cubic may fall below 0 between its ends, else 0. This is the fast test before `cubic_dip`."""
     least = minimum(multiply_add(1.0 / 3.0, da, a), multiply_add(-1.0 / 3.0, db, b))
     steepest = maximum(maximum(da, db), multiply_add(3.0, b - a, -(da + db)))
     return where_less(least, 0.0, where_less(0.0, steepest, 1.0, 0.0), 0.0)
@@ -199,8 +199,8 @@ def fires(w: Any, base: int, k: int) -> Any:
 
 
 def hides_events(w: Any, base: int) -> Any:
-    """Return 1 where an event function may pass zero twice within a step: mid-step it differs from its cubic
-    interpolant.
+    """Return 1 where an event function may pass zero twice within a step, since its mid-step value differs from the
+    cubic interpolant; else 0.
     """
     h, t, level = load(w, base + ROWS.step), load(w, base + ROWS.time), load(w, base + ROWS.level)
     y0, y1 = load_rows(w, base + ROWS.state, N_KNOWN), load_rows(w, base + ROWS.trial, N_KNOWN)
@@ -331,8 +331,8 @@ def aim(w: Any, base: int, takes: Any, goes_on: Any, narrow: Any) -> None:
 
 
 def section_counts(w: Any, base: int, lane: int) -> bool:
-    """Return whether the last step ended on the Poincare section, not half a turn away, where the sine of an angle is
-    0, too.
+    """Return whether the last step ended on the Poincare section. For an angle, exclude the point half a turn away,
+    where the sine is also zero.
     """
     if w[base + ROWS.fired + (N_EVENTS - 1) * WIDTH + lane] < 0.5:
         return False

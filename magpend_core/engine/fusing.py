@@ -90,7 +90,9 @@ def _is_negation(value: Any) -> bool:
 
 
 def _factors(builder: ir.IRBuilder, value: Any) -> tuple[Any, Any] | None:
-    """Return the two factors if an LLVM value is a product, or a scalar product copied to all SIMD lanes; else None."""
+    """Return the two factors of a product, or of a scalar product copied to all SIMD lanes; None for any other LLVM
+    value.
+    """
     opname = getattr(value, "opname", None)
     if opname == "fmul":
         return tuple(value.operands)

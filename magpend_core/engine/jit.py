@@ -120,7 +120,6 @@ class _Uncollected(event.Listener):
         self._lock, self._depth, self._resumes = threading.Lock(), 0, False
 
     def on_start(self, event: Any) -> None:
-        """Turn the garbage collector off when the compilation of a function begins."""
         with self._lock:
             if self._depth == 0:
                 self._resumes = gc.isenabled()
@@ -128,7 +127,6 @@ class _Uncollected(event.Listener):
             self._depth += 1
 
     def on_end(self, event: Any) -> None:
-        """Turn the garbage collector on again when the outermost compilation has ended."""
         with self._lock:
             self._depth -= 1
             if self._depth == 0 and self._resumes:
@@ -164,8 +162,8 @@ _ARRAYS = frozenset(("IS_ANGLE", "SCALES", "ESCAPE", "DIRECTIONS", "STARTS", "SA
 
 
 def bound_part(template: Callable[..., Any], bindings: Mapping[str, Any], dissolves: bool) -> Any:
-    """Compile a template, with given values for its free names, for calls from compiled code; equal values give one
-    function.
+    """Compile a template, with values for its free names, as a function for compiled callers. Equal values give the
+    same function.
 
     Parameters
     ----------
@@ -204,8 +202,8 @@ def _part(template: Callable[..., Any], used: Mapping[str, Any], dissolves: bool
 
 
 def _without_size(name: str, value: Any, names: set[str], sizes: dict[str, Any]) -> Any:
-    """Return a placeholder if `value` is a system size, such as the number of states (noted in `sizes`); else return
-    `value`.
+    """Replace a system size, such as the number of states, by a placeholder and note it in `sizes`; return any other
+    value unchanged.
     """
     if type(value) is int and value > 0 and name in _SIZES:
         sizes[name] = value
@@ -244,13 +242,12 @@ def _template_digest(
 
 
 def _names_in(code: CodeType) -> set[str]:
-    """Return the global names that a function and its inner functions use."""
     within = (_names_in(c) for c in code.co_consts if isinstance(c, CodeType))
     return set(code.co_names).union(*within)
 
 
 def _identity(value: Any, names: set[str]) -> Any:
-    """Return a hashable key of a value for a template's free name; values with equal keys compile to the same code.
+    """Return a hashable key for the value of a template's free name. Values with equal keys compile to the same code.
 
     A named tuple counts by its fields in `names`, the only ones that the code reads.
     """

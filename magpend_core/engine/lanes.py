@@ -95,7 +95,7 @@ ENDS_IN_CHATTER = int(Status.CHATTER)
 
 
 class Rows(NamedTuple):
-    """Offsets of the rows in the work array of a group of SIMD lanes, in float64 numbers from the group's first."""
+    """Offsets of the rows in the work array of one group of SIMD lanes, in float64 numbers from the group's start."""
 
     state: int
     slopes: int  # N_STAGES * n_states rows
@@ -163,7 +163,7 @@ def rows_of(system: System, n_watched: int = 0) -> Rows:
 
 
 def step_ratio(room: Any) -> Any:
-    """Return the largest safe step near a layer or forcing edge, as a multiple of the distance to the complex
+    """Return the largest safe step near a boundary layer or forcing edge, as a multiple of the distance to the complex
     singularity.
 
     The right-hand side near a layer behaves like (J/pi) atan(t/d), whose derivatives at a distance R
@@ -204,7 +204,9 @@ def choose_step(w: Any, base: int, slack: float) -> None:
 
 
 def limited_by_layers(w: Any, base: int, slack: float, t: Any, h: Any) -> Any:
-    """Return the step size `h`, reduced near a layer (a narrow region where the right-hand side changes quickly)."""
+    """Return the step size `h`, reduced near a boundary layer (a narrow region where the right-hand side changes
+    quickly).
+    """
     y = load_rows(w, base + ROWS.state, N_KNOWN)
     dy = load_rows(w, base + ROWS.slopes, N_KNOWN)
     c = load_rows(w, base + ROWS.constants, NC)
@@ -338,7 +340,8 @@ def squared_error_of_two(w: Any, base: int, rtol: float, atol: float) -> Any:
 
 
 def finish_step(w: Any, base: int, rtol: float, atol: float, max_attempts: float) -> bool:
-    """Accept or reject the attempted step in each SIMD lane; set the size of the next step and the event code.
+    """Accept or reject the attempted step in each SIMD lane. Set the next step size and the code of the event, if any,
+    at the step's end.
 
     Return whether a lane of the group has an event.
     """
@@ -423,7 +426,7 @@ def attempt(
 def load_cell(
     w: Any, base: int, lane: int, frequency: float, p: Any, slack: float, scratch: Any, edge_table: Any
 ) -> None:
-    """Load the constants and forcing edges of a parameter point into a SIMD lane; the state stays."""
+    """Load the constants and forcing edges of a parameter point into a SIMD lane; leave the lane's state unchanged."""
     constants(frequency, p, scratch)
     for i in range(N_OWN):
         w[base + ROWS.constants + i * WIDTH + lane] = scratch[i]
@@ -660,9 +663,7 @@ def end_branch(cells: Cells, work: Work, lane: int, status: int) -> None:
 
 
 def serve(cells: Cells, work: Work, lane: int, settings: Any, section: Any, scratch: Any) -> bool:
-    """Handle what ended a SIMD lane's integration (end of a segment or period, or a failure); return whether its branch
-    has ended.
-    """
+    """Handle the end of a SIMD lane's segment or period, or its failure. Return whether the lane's branch has ended."""
     w, base, column = work.lanes, (lane // WIDTH) * ROWS.size, lane % WIDTH
     event = w[base + ROWS.event + column]
     w[base + ROWS.event + column] = NOTHING
@@ -856,7 +857,7 @@ def _name(system: System, observer: Observer, watched: tuple[int, ...]) -> str:
 
 
 def _layers_at(system: System) -> Callable[..., Any]:
-    """Return ``system.layers`` wrapped so that it accepts the time as an additional first argument."""
+    """Return ``system.layers`` with the time as an additional first argument."""
     rates = "dy + (t,)" if system.timed_layers else "dy"
     scope: dict[str, Any] = {"__name__": system.rhs.__module__, "_layers": system.layers}
     exec(f"def layers_at(t, y, dy, c):\n    return _layers(y, {rates}, c)\n", scope)

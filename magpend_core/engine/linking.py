@@ -60,8 +60,8 @@ class PartLibrary(FusedLibrary):
         self.add_llvm_module(module)
 
     def finalize(self) -> None:
-        """Link in numba's own libraries (such as that of ``max``). Engine parts are linked later, into the engine's
-        library.
+        """Link numba's own libraries (such as that of ``max``) into this part. Other parts are linked later, into the
+        engine's library.
         """
         own = _defined(self._final_module)
         for library in dict.fromkeys(self._linking_libraries):
@@ -91,7 +91,9 @@ class PartLibrary(FusedLibrary):
 
 
 class _NoMachineCode:
-    """Wrapper of numba's code generator for LLVM code that is not machine code yet: it forwards all but `set_env`."""
+    """Wrapper of numba's code generator for LLVM code that is not machine code yet. It forwards all calls but
+    `set_env`.
+    """
 
     def __init__(self, codegen: Any) -> None:
         self._codegen = codegen

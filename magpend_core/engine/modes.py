@@ -123,7 +123,9 @@ def lane_rates(w: Any, base: int, lane: int) -> Any:
 
 
 def seat_switches(w: Any, base: int, lane: int, given: bool) -> None:
-    """Set each switch mode to the sign of its event function (+1 or -1). At 0 set +1, or with `given` keep the mode."""
+    """Set the mode of each switch to the sign of its event function, +1 or -1. Where the sign is 0, set +1, or keep the
+    mode if `given`.
+    """
     for k in range(N_SWITCHES):
         mode = base + ROWS.constants + (N_OWN + k) * WIDTH + lane
         if not given or w[mode] == 0.0:
@@ -149,7 +151,9 @@ def switch_rate(w: Any, base: int, lane: int, k: int, side: float) -> float:
 
 
 def next_mode(w: Any, base: int, lane: int, k: int, mode: float) -> float:
-    """Return the mode of switch `k` after its event: 1, -1, or 0 while it slides."""
+    """Return the mode of switch `k` after its event: +1 or -1 for the side of the switching surface, 0 for sliding
+    along it.
+    """
     if not SLIDES[k]:
         return -mode
     above, below = switch_rate(w, base, lane, k, 1.0), switch_rate(w, base, lane, k, -1.0)
@@ -165,7 +169,7 @@ def next_mode(w: Any, base: int, lane: int, k: int, mode: float) -> float:
 
 
 def keep_switches(w: Any, base: int, lane: int) -> None:
-    """Correct the switch modes after a forcing edge, at which event functions and rates can jump."""
+    """Correct the modes of all switches after a forcing edge, where event functions and their rates can jump."""
     pairs = lane_pairs(w, base, lane, lane_states(w, base + ROWS.state + lane))
     for k in range(N_SWITCHES):
         own = base + ROWS.constants + (N_OWN + k) * WIDTH + lane
@@ -201,7 +205,9 @@ def begin_events(w: Any, base: int, lane: int) -> None:
 
 
 def contact_row(base: int, lane: int, k: int) -> int:
-    """Return the work-array index of the contact mode of impact `k` (0 while the state rests on it, else 1)."""
+    """Return the work-array index of the contact mode of impact `k`. The mode is 0 while the state rests on the impact
+    surface, else 1.
+    """
     return base + ROWS.constants + (N_OWN + N_SWITCHES + k) * WIDTH + lane
 
 
@@ -234,7 +240,9 @@ def is_chatter(w: Any, base: int, lane: int, k: int, arriving: float) -> bool:
 
 
 def rest_on(w: Any, base: int, lane: int, k: int) -> None:
-    """Bring a trajectory to rest on the surface of impact `k`; end it if it rests on an incompatible surface."""
+    """Bring a trajectory to rest on the surface of impact `k`. End it if it already rests on a surface that excludes
+    this one.
+    """
     for i in range(N_IMPACTS):
         if i != k and STICKS[k] == 2 and STICKS[i] == 2 and w[contact_row(base, lane, i)] == 0.0:
             w[base + ROWS.event + lane] = CHATTERED
@@ -267,7 +275,7 @@ def hold_contacts(w: Any, base: int, lane: int) -> None:
 
 
 def seat_contacts(w: Any, base: int, lane: int, begins: bool) -> None:
-    """Test for each impact surface whether the trajectory (still) rests on it, and set the contact mode.
+    """Test for each impact surface whether the trajectory rests on it, and set the contact mode.
 
     With `begins` (start of a parameter point), test every surface, else only those of earlier rest.
     """

@@ -72,7 +72,7 @@ def _keeps_none(i_period: int, memory: Any, settings: Any) -> bool:
 
 @dataclass(frozen=True)
 class Observer:
-    """Observer: functions that the engine calls after each period of a trajectory, with values for their free names.
+    """Functions that the engine calls after each period of a trajectory, to record or to end it.
 
     They are plain Python functions, compiled for each system. In them, `N` is the number of states, `IS_ANGLE` (0 or
     1) and `SCALES` are arrays of the system, and `bindings` defines further free names. They run once per period of a
@@ -117,7 +117,7 @@ class Observer:
 
     @property
     def rewrites(self) -> bool:
-        """Whether `renew` is able to change the states."""
+        """Whether this observer has a `renew` that can change the states."""
         return self.renew is not _leave
 
 
@@ -175,8 +175,8 @@ def closed_period(ring: Any, last: int, settings: Settings) -> int:
 
 
 def _largest_lag(ring: Any, first: int, last: int, p: int, settings: Settings) -> float:
-    """Return the largest distance between section points `p` periods apart; the later one has number `first` + 1 to
-    `last`.
+    """Return the largest distance between section points `p` periods apart, where the later point is one of `first` + 1
+    to `last`.
     """
     largest = 0.0
     for i in range(first + 1, last + 1):
@@ -185,7 +185,7 @@ def _largest_lag(ring: Any, first: int, last: int, p: int, settings: Settings) -
 
 
 def _smallest_divisor(ring: Any, last: int, half: int, p: int, settings: Settings) -> int:
-    """Return the smallest divisor of the period `p` that is a period of the orbit, too.
+    """Return the smallest divisor of the period `p` that is also a period of the orbit.
 
     Along a slow spiral, sections p periods apart can converge before sections q apart do. All points of the younger
     half lie within a few tolerances of the orbit, so a limit of ten tolerances distinguishes the periods.

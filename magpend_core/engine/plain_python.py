@@ -58,7 +58,6 @@ def _rebuilt(dispatcher: Any, source: FunctionType, known: dict[int, Any]) -> Fu
 
 
 def _names(code: CodeType) -> Iterator[str]:
-    """Yield the names that the code of a function, and of functions nested in it, looks up."""
     yield from code.co_names
     for constant in code.co_consts:
         if isinstance(constant, CodeType):

@@ -66,7 +66,6 @@ class _NameFields(FunctionPass):
         FunctionPass.__init__(self)
 
     def run_pass(self, state: Any) -> bool:
-        """Replace the field accesses in a function's numba IR; return whether there were any."""
         found = [block for block in state.func_ir.blocks.values() if _name_fields(block)]
         if found:
             # update numba's table of definitions after the change
@@ -143,7 +142,9 @@ class EntryCompiler(CompilerBase):
             return super().compile_extra(func)
 
     def define_pipelines(self) -> list[Any]:
-        """Return numba's standard compiler passes and two of magpend's: named-tuple fields, and the code library."""
+        """Return numba's standard compiler passes and two of magpend's: one replaces named-tuple fields, one sets the
+        code library.
+        """
         passes = DefaultPassBuilder.define_nopython_pipeline(self.state)
         passes.add_pass_after(_NameFields, IRProcessing)
         passes.add_pass_after(self._gives, NopythonTypeInference)
@@ -319,8 +320,8 @@ class PartCache:
         return f"{self._dispatcher.py_func.__name__[:40]}-{hashlib.sha256(text.encode()).hexdigest()[:24]}"
 
     def _callees(self, library: PartLibrary) -> list[Any] | None:
-        """Return the parts that a function calls, with the dotted name of each in its source; None if it calls other
-        functions.
+        """Return the engine parts that a function calls, each with its dotted name in the function's source. None if it
+        calls anything else.
         """
         source = self._dispatcher.py_func
         paths = {id(reached(source, path)): path for path in lookups(source.__code__)}

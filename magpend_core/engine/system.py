@@ -1,4 +1,4 @@
-"""Describe a dynamical system for the engine."""
+"""Define `System`, the description of a dynamical system that the engine integrates."""
 
 from __future__ import annotations
 
@@ -330,8 +330,8 @@ class System:
 
     @property
     def known(self) -> int:
-        """Number of states that `rhs` and the other functions take; tangent vectors of large systems are not among
-        them.
+        """Number of states passed to `rhs` and the other functions. The tangent vectors of a large system are not
+        passed.
         """
         return self.n_states if self.n_known is None else self.n_known
 

@@ -40,14 +40,15 @@ def trace_of(rows: list[dict[int, int]], name: str) -> str:
 
 
 def n_entries(system: System) -> int:
-    """Return the number of Jacobian entries stored per Runge-Kutta stage; 0 if `rhs` itself has the tangent vectors."""
+    """Return the number of Jacobian entries stored per Runge-Kutta stage; 0 if `rhs` itself computes the tangent
+    vectors.
+    """
     if system.known == system.n_states or system.tangents_of is None:
         return 0
     return sum(map(len, rows_of_entries(system.tangents_of))) + _has_trace(system)
 
 
 def _has_trace(system: System) -> bool:
-    """Return whether the last state integrates the trace of the Jacobian."""
     return system.state_names[-1] == DIVERGENCE
 
 

@@ -40,7 +40,7 @@ def _products(system: System, n_vectors: int) -> list[str]:
 
 
 def _compile(source: str, name: str, wrapped: Callable[..., Any], bindings: dict[str, Any]) -> Any:
-    """Compile a function from source text; numba's cache treats it as part of the module of `wrapped`.
+    """Compile a function from source text. numba's cache treats it as part of the module of `wrapped`.
 
     See `jit.keeping` for the reason. The function calls `wrapped`.
     """

@@ -331,7 +331,7 @@ def _artanh_rest(u: Any) -> Any:
 
 @inline
 def log(x: Any) -> Any:
-    """Compute the natural logarithm; minus infinity of 0, NaN of a negative number."""
+    """Compute the natural logarithm: minus infinity for 0, NaN for a negative number."""
     f, k = _fraction_and_exponent(x)
     s = f / (2.0 + f)
     u = s * s
@@ -344,7 +344,7 @@ def log(x: Any) -> Any:
 
 @inline
 def power(x: Any, y: Any) -> Any:
-    """Compute `x` to the real power `y`: NaN of a negative `x`, 0 of 0 to a positive power.
+    """Compute `x` to the real power `y`. A negative `x` gives NaN; 0 to a positive power gives 0.
 
     Results beyond exp(+-700) count as these. For whole powers products are better.
     """
@@ -380,7 +380,7 @@ def power(x: Any, y: Any) -> Any:
 
 @inline
 def inverse_sqrt(x: Any) -> Any:
-    """Compute the inverse square root; NaN below 2.2e-308, 0 included; not finite for infinity.
+    """Compute the inverse square root. The result is NaN below 2.2e-308, also for 0, and not finite for infinity.
 
     A dozen products, where a root and a division keep the dividers busy for several times as long.
     """
@@ -397,7 +397,7 @@ def inverse_sqrt(x: Any) -> Any:
 
 @inline
 def sign(x: Any) -> Any:
-    """Return the sign of `x`: -1, 0 or 1; NaN of NaN."""
+    """Return the sign of `x`: -1, 0 or 1; NaN for NaN."""
     return where_less(0.0, x, 1.0, where_less(x, 0.0, -1.0, x))
 
 
@@ -429,7 +429,7 @@ def exp2_rough(x: Any) -> Any:
 
 @inline
 def hypot_rough(x: Any, y: Any) -> Any:
-    """Compute sqrt(a**2 + b**2) for sides of at least 0, to 2.2 %: for step sizes, not for physics."""
+    """Compute sqrt(x**2 + y**2) for non-negative `x` and `y`, to 2.2 %: for step sizes, not for physics."""
     longer = maximum(x, y)
     return maximum(longer, multiply_add(0.898, longer, 0.486 * minimum(x, y)))
 

@@ -1,4 +1,4 @@
-"""Track minimum, maximum and mean of named quantities over each drive period at whose end a section point is recorded.
+"""Track minimum, maximum and mean of named quantities over each drive period that ends with a recorded section point.
 
 These functions are templates for the engine, see `lanes`; "watched" means tracked. After an accepted step each quantity
 is known at the start, in the middle (from the method's continuous extension) and at the end of the step. The parabola
@@ -38,8 +38,7 @@ LOWEST, HIGHEST, MEAN = 0, 1, 2
 
 
 def watched_function(system: System, watched: tuple[int, ...]) -> Callable[..., Any]:
-    """Return a compiled function with the arguments of ``system.quantities`` that returns only the values to be
-    tracked.
+    """Compile a function like ``system.quantities`` that returns only the quantities to be tracked.
 
     `watched` holds indices into ``system.state_names + system.quantity_names``. numba cannot select tuple entries by
     indices that it learns at run time, so the source of the function is generated. The cache treats it as part of the

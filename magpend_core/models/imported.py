@@ -1,4 +1,4 @@
-"""Import models that are Python objects if the user names one; otherwise use a stored description of them.
+"""Import a model that is a Python object if the user names it; otherwise use the description stored in a run.
 
 A run keeps a description: names, units, bounds, presets, and the digest of the files that decide the
 equations. Opening or drawing needs no more, and imports nothing. What integrates needs the object itself,
@@ -40,8 +40,8 @@ def is_object_path(text: str) -> bool:
 
 
 def import_model(path: str, folder: str | Path | None = None) -> Model:
-    """Import a model from ``package.module:NAME``, which runs the module's code: call it only if the user named the
-    object.
+    """Import a model from ``package.module:NAME``. This runs the module's code: call it only for an object that the
+    user named.
 
     Parameters
     ----------
@@ -111,7 +111,6 @@ def _description(path: str, model: Model) -> dict[str, Any]:
 
 
 def _plain(one: Any) -> dict[str, Any]:
-    """Return the fields of a dataclass as a dict, without its name and without fields that have their default value."""
     values = {f.name: (getattr(one, f.name), f.default) for f in fields(one) if f.name != "name"}
     return {name: value for name, (value, default) in values.items() if value != default}
 
@@ -155,7 +154,7 @@ def origin(model: Model) -> tuple[str, str] | None:
 
 
 def known_model(table: Mapping[str, Any]) -> Model | None:
-    """Return the model already imported in this process that a description or an object path belongs to, or None."""
+    """Return the model that this process has imported for a description or an object path, or None."""
     known = _imported.get(str(table[KEY]))
     return known if known is not None and (len(table) == 1 or known.text == table) else None
 

@@ -99,7 +99,7 @@ def with_contacts(
 
 
 def along(graph: Graph, nodes: tuple[Node, ...]) -> list[Node]:
-    """Return the time derivatives of expressions along a motion, with symbols for those of the states."""
+    """Return the time derivatives of expressions along a motion. The states' own derivatives enter as symbols."""
     states = {n: graph.leaf("rate", int(n.value)) for n in in_order(nodes) if n.op == "state"}
     return derivatives(graph, nodes, {**states, graph.leaf("time"): graph.one})
 
@@ -149,7 +149,6 @@ def _of_motion(graph: Graph, node: Node, free: tuple[Node, ...]) -> Node:
 
 
 def _slopes(graph: Graph, node: Node, n: int) -> list[Node]:
-    """Return the derivatives of an expression by all states."""
     return [derivatives(graph, (node,), {graph.leaf("state", i): graph.one})[0] for i in range(n)]
 
 
@@ -159,5 +158,4 @@ def _change(graph: Graph, slopes: Sequence[Node], direction: Sequence[Node]) -> 
 
 
 def _at_rest(graph: Graph, mode: Node, yes: Node, no: Node) -> Node:
-    """Return an expression that equals `yes` while the state rests on the surface of an impact, else `no`."""
     return graph.where_less(mode, graph.number(0.5), yes, no)

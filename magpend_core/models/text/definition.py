@@ -48,7 +48,9 @@ class DrawingText:
 
 @dataclass(frozen=True)
 class ClassifierText:
-    """Classes of motion, each with a condition on the states that all stored sections of a motion must meet."""
+    """Classes of motion. A motion is in a class if all its stored section points meet the class's condition on the
+    states.
+    """
 
     meaning: str
     words: Mapping[str, Tree]
@@ -90,8 +92,8 @@ class Definition:
     table: Mapping[str, Any] = field(repr=False)
 
     def used(self, trees: Iterable[Tree]) -> tuple[str, ...]:
-        """Return all names used in expressions, directly or through definitions, sorted so that no name precedes one it
-        needs.
+        """Return all names that expressions use, directly or through definitions, each after the names that
+        it needs.
         """
         found: dict[str, None] = {}
         pending = [(name, False) for tree in trees for name, _ in names(tree)][::-1]
@@ -157,7 +159,6 @@ class Definition:
 
 
 def _suggestion(name: str, table: str, used: Iterable[str]) -> str:
-    """Return a suggestion for an unused name, as the end of a sentence."""
     near = difflib.get_close_matches(name, sorted(used), n=1, cutoff=0.6)
     meant = f"did you mean it where an expression has {near[0]}? Else" if near else ""
     effect = " (to sweep it would change nothing)" if table == "parameters" else ""

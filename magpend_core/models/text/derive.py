@@ -27,8 +27,8 @@ SCANNED = 256
 
 @dataclass(frozen=True)
 class Layer:
-    """Expressions that `System.layers` returns for one layer, a narrow region where the right-hand side changes
-    quickly.
+    """Expressions that `System.layers` returns for one boundary layer (a narrow region where the right-hand side
+    changes quickly).
     """
 
     value: Node
@@ -40,7 +40,7 @@ class Layer:
 
 @dataclass(frozen=True)
 class Wave:
-    """Periodic edges of the forcing: a smooth function of time passes zero `count` times per drive period."""
+    """Forcing edges at the zeros of a smooth function of time, which has `count` zeros per drive period."""
 
     value: Node
     slope: Node
@@ -52,7 +52,7 @@ class Wave:
 
 @dataclass(frozen=True)
 class Derived:
-    """Expressions derived from a model given as text: rates, Jacobian, layers, edges, switches, impacts.
+    """Expressions derived from a model given as text: rates, Jacobian, boundary layers, edges, switches, impacts.
 
     Attributes
     ----------
@@ -95,7 +95,7 @@ class Derived:
 
     @property
     def timed_layers(self) -> bool:
-        """Whether the layers depend on time."""
+        """Whether the boundary layers depend on time."""
         nodes = [n for la in self.layers for n in (la.value, la.rate, la.half_width, la.per_strength)]
         return any(n.op == "time" for n in in_order(nodes))
 
@@ -106,7 +106,7 @@ class Derived:
 
 
 def derive(definition: Definition) -> Derived:
-    """Derive rates, Jacobian, layers, edges, switches and impacts of a model given as text.
+    """Derive rates, Jacobian, boundary layers, edges, switches and impacts of a model given as text.
 
     Raises
     ------
@@ -168,7 +168,7 @@ def _breaks(graph: Graph, rates: tuple[Node, ...], presets: Sequence[Mapping[int
 def _smoothed(
     graph: Graph, rates: tuple[Node, ...], scales: tuple[float, ...], values: Mapping[int, float]
 ) -> frozenset[int]:
-    """Return the node numbers of ``abs`` corners inside a narrow steep layer, where the steps are short anyway."""
+    """Return the graph node numbers of ``abs`` corners inside a narrow boundary layer, where steps are short anyway."""
     cores = set()
     for node in in_order(rates):
         place = place_of(graph, node)
@@ -183,7 +183,9 @@ def _smoothed(
 
 
 def _is_layer(steep: Steep) -> bool:
-    """Return whether a steep function depends on the state, and on no sign that changes with time alone."""
+    """Return whether a steep function makes a boundary layer: it depends on the state, and on no sign that changes with
+    time alone.
+    """
     return steep.value.kind == STATED and not any(n.op == "clock" for n in in_order([steep.value]))
 
 
@@ -271,7 +273,7 @@ class Builder:
         graph.positive = frozenset(i for i, p in enumerate(definition.parameters) if p.bound == POSITIVE)
 
     def leaf_values(self, parameters: Mapping[str, float]) -> dict[int, float]:
-        """Return the values of parameters by the number of their graph node, with the drive frequency 1 Hz."""
+        """Return parameter values by graph node number, with a drive frequency of 1 Hz."""
         own = {self.names[name].number: value for name, value in parameters.items()}
         return {**own, self.graph.leaf("frequency").number: 1.0}
 

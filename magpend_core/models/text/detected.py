@@ -22,7 +22,8 @@ _LEAVES = {"time": "t", "frequency": "f"}
 def found_in(
     model: TextModel, parameters: Mapping[str, float], frequency_hz: float, state: Sequence[float]
 ) -> Iterator[str]:
-    """Yield a sentence for each layer, switch and impact, and for each steep function that step control ignores.
+    """Yield a sentence for each boundary layer, switch and impact, and for each steep function that step control
+    ignores.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Find the parts of an expression that have no finite value, and the numbers for which that happens.
+"""Find the parts of a model's expressions that have no finite value, and the arguments for which that happens.
 
 Looked for before anything is derived or compiled, by numpy on the text as it was written.
 """
@@ -145,7 +145,9 @@ def _start_faults(definition: Definition, values: Mapping[str, Any]) -> list[Fau
 
 
 def _look(tree: Tree, place: str, known: Mapping[str, Any], rows: np.ndarray, found: list[Fault]) -> np.ndarray:
-    """Append a `Fault` for each innermost part of an expression that is not finite; return a mask of sample points."""
+    """Append a `Fault` for each innermost part of an expression that is not finite; return a mask of the sample points
+    concerned.
+    """
     if tree.kind == "inverse":  # told with its product
         return _look(tree.args[0], place, known, rows, found)
     bad = np.zeros(rows.shape, bool)
@@ -167,8 +169,8 @@ def _look(tree: Tree, place: str, known: Mapping[str, Any], rows: np.ndarray, fo
 
 
 def _taken(tree: Tree, known: Mapping[str, Any], rows: np.ndarray) -> list[np.ndarray]:
-    """Return, for each argument of an expression, a mask of the sample points at which it is used (`where` uses one
-    branch).
+    """Return, for each argument of an expression, a mask of the sample points at which its value is used. `where` uses
+    one branch per point.
     """
     if tree.kind == "call" and tree.value == "where":
         chosen = np.broadcast_to(value_of(tree.args[0], known), rows.shape).astype(bool)
@@ -207,7 +209,7 @@ _BINDING = {"or": 0, "and": 1, "compare": 3, "sum": 4, "negative": 4, "product":
 
 
 def readable(tree: Tree) -> str:
-    """Write an expression as readable text: brackets only where needed, numbers short."""
+    """Write an expression as readable text, with brackets only where needed and with short numbers."""
     return _readable(tree, 0)
 
 
@@ -228,7 +230,6 @@ def _readable(tree: Tree, least: int) -> str:
 
 
 def _joined(tree: Tree, own: int) -> str:
-    """Return the text of an expression's operands with the operators between them."""
     if tree.kind == "negative":
         return f"-{_readable(tree.args[0], 5)}"
     if tree.kind == "power":

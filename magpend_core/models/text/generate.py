@@ -35,7 +35,9 @@ class Writer:
         self.inverse_roots: set[int] = set()
 
     def write(self, roots: Iterable[Node]) -> list[str]:
-        """Write the lines that compute some nodes; return the names of their values in the code."""
+        """Write the lines that compute the given graph nodes; return the names of their values in the
+        generated code.
+        """
         roots = list(roots)
         wanted = self._wanted(roots)
         for node in in_order(wanted.values()):
@@ -66,7 +68,7 @@ class Writer:
         return wanted
 
     def name(self, node: Node) -> str:
-        """Return the name of a node's value in the generated code."""
+        """Return what stands for a graph node's value in the generated code: a variable or a number."""
         if node.number in self.leaves:
             return self.leaves[node.number]
         if node.op == "number":
@@ -90,7 +92,9 @@ class Writer:
         self.lines.append(f"{target} = {self._value(node)}")
 
     def _by_root(self, above: Node, x: Node, n: int) -> str:
-        """Return source code for a / x**(n/2), from an inverse square root and products never fused with sums."""
+        """Return source code for a / x**(n/2), from an inverse square root and products. The products are never fused
+        with sums.
+        """
         root = f"w{x.number}"
         if x.number not in self.inverse_roots:
             self.inverse_roots.add(x.number)
@@ -158,9 +162,7 @@ def root_under(node: Node) -> tuple[Node, int] | None:
 
 
 def _twin(node: Node, wanted: Mapping[int, Node]) -> Node | None:
-    """Return the node of the cosine (for a sine) or sine (for a cosine) of the same argument, if the code needs
-    both.
-    """
+    """For a sine, return the node of the cosine of the same argument if the code needs both; likewise for a cosine."""
     other = "cos" if node.op == "sin" else "sin"
     for candidate in wanted.values():
         if candidate.op == other and candidate.args[0] is node.args[0]:
@@ -233,7 +235,7 @@ def source_of(derived: Derived) -> Source:
 
 
 def _entries(derived: Derived) -> tuple[int, ...] | None:
-    """Return the positions of the entries of a large Jacobian that are not always 0; None for a small Jacobian."""
+    """Return the positions of those entries of a large Jacobian that can differ from 0; None for a small Jacobian."""
     if len(derived.rates) <= WRITTEN_OUT:
         return None
     found = tuple(i for i, node in enumerate(derived.jacobian) if not node.is_number(0.0))
@@ -255,7 +257,9 @@ def _leaves(derived: Derived, constants: list[Node], n_constants: int, n_modes: 
 
 
 def _cell(roots: Iterable[Node]) -> dict[int, str]:
-    """Return the name in generated code of each parameter, frequency, time and edge-rank node, by node number."""
+    """Return how generated code writes each parameter, the frequency, the time and the rank of a forcing edge, by graph
+    node number.
+    """
     names = {}
     for node in in_order(roots):
         if node.op == "parameter":

@@ -85,7 +85,7 @@ _AT_ZERO = {
 
 
 def _finite(function: Callable[[float, float], float], a: float, b: float) -> float:
-    """Return the value of a function of two numbers; raise `GraphError` if it is too large."""
+    """Return the value of a function of two numbers; raise `GraphError` if the value is not finite."""
     try:
         value = function(a, b)
     except OverflowError:
@@ -131,8 +131,8 @@ class Graph:
     # ---- sums ------------------------------------------------------------------------------------
 
     def add(self, *terms: Node) -> Node:
-        """Return the sum of nodes, grouped so that all terms without state, and all without state and time, form one
-        node each.
+        """Return the sum of nodes. Terms without the state form one node, and terms without state and time form
+        another.
         """
         groups: tuple[list[Node], ...] = ([], [], [])
         for term in self._collected(terms):
@@ -217,7 +217,7 @@ class Graph:
         return found
 
     def div(self, a: Node, b: Node) -> Node:
-        """Divide nodes; a divisor that depends on neither state nor time becomes a factor, its inverse."""
+        """Divide nodes. A divisor that depends on neither state nor time is replaced by a factor, its inverse."""
         if a.is_number(0.0) or b.is_number(1.0):
             return a
         if a.op == "number" and b.op == "number" and b.value != 0.0 and math.isfinite(a.value / b.value):
@@ -312,7 +312,7 @@ class Graph:
 
 
 def in_order(roots: Iterable[Node]) -> list[Node]:
-    """Return the nodes of some expressions with all their arguments, each after its own arguments."""
+    """Return all graph nodes that expressions consist of, each after its arguments."""
     found: dict[int, Node] = {}
     pending = list(roots)
     while pending:

@@ -137,7 +137,9 @@ def core_of(graph: Graph, node: Node) -> tuple[Node, Node]:
 
 
 def _jump(graph: Graph, changes: list[Node], scales: tuple[float, ...]) -> Node | None:
-    """Return an expression for the largest absolute change; a long one is replaced by values at two sample states."""
+    """Return an expression for the largest absolute change. A long expression is replaced by its values at two sample
+    states.
+    """
     changes = [graph.call("absolute", c) for c in changes if not c.is_number(0.0)]
     if not changes:
         return None

@@ -295,14 +295,13 @@ def _circle(define: Mapping[str, Tree]) -> list[str]:
 
 
 def _with_rate(state: State, tree: Tree | None, states: Iterable[str]) -> State:
-    """Return a state; if its equation is only the name of another state, set that name as its `rate`."""
+    """Set the `rate` of a state whose equation is just the name of another state; return any other state unchanged."""
     if tree is None or tree.kind != "name" or str(tree.value) not in states or tree.value == state.name:
         return state
     return State(**{**vars(state), "rate": str(tree.value)})
 
 
 def _plain(value: Any) -> Any:
-    """Return nested tables and lists as plain dicts with text keys and lists, as in JSON."""
     if isinstance(value, Mapping):
         return {str(key): _plain(inner) for key, inner in value.items()}
     if isinstance(value, (list, tuple)):

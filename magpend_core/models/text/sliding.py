@@ -1,4 +1,4 @@
-"""Derive sliding motion on switching surfaces, with Filippov's equivalent control in place of the side's sign.
+"""Derive sliding motion on switching surfaces, with Filippov's equivalent control in place of the sign of the side.
 
 Where the motions on both sides point to the surface, the state stays on it. The sign s of the side is then replaced by
 a number sigma in [-1, 1] such that the surface's function stays 0. Its time derivative r(s) is linear in s, so sigma
@@ -23,7 +23,7 @@ MAX_JOINT = 3
 
 @dataclass(frozen=True)
 class Sliding:
-    """Expressions that stand for the sign of each switching surface's side, during sliding as well.
+    """Sliding motion as expressions: for each switching surface, the expression that replaces the sign of its side.
 
     Attributes
     ----------
@@ -43,8 +43,8 @@ class Sliding:
     pairs: tuple[tuple[Node, Node], ...]
 
     def lowered(self, roots: Iterable[Node]) -> list[Node]:
-        """Return expressions in which each surface's sign is replaced by the switch mode or, in sliding, by equivalent
-        control.
+        """Replace the sign of each switching surface in expressions: by the mode of its switch or, during sliding, by
+        the equivalent control.
         """
         return _spelled(self.graph, substituted(self.graph, list(roots), self.effective))
 
@@ -84,7 +84,9 @@ def sliding_of(graph: Graph, rates: Sequence[Node], switches: Sequence[Switch]) 
 
 
 def _spelled(graph: Graph, roots: list[Node]) -> list[Node]:
-    """Rewrite `choice` nodes as comparisons with 0; interpolate only where a sliding mode lies between -1 and 1."""
+    """Rewrite `choice` nodes of the expression graph as comparisons with 0; interpolate only where a sliding mode lies
+    between -1 and 1.
+    """
     known: dict[int, Node] = {}
     for node in in_order(roots):
         args = tuple(known[a.number] for a in node.args)
@@ -142,7 +144,7 @@ def _solved(
     switches: Sequence[Switch],
     modes: Sequence[Node],
 ) -> list[Node]:
-    """Return the equivalent control on each switching surface, or the switch mode where no state can slide."""
+    """Return the equivalent control on each switching surface, or the mode of the switch where no state can slide."""
     zeros = {s.side: graph.zero for s in switches}
     found = []
     for k in range(len(switches)):
@@ -164,7 +166,7 @@ def _solved(
 
 
 def _quotient(graph: Graph, top: Node, bottom: Node) -> Node:
-    """Return a quotient, with 1 as divisor where the given divisor is 0.
+    """Return a quotient whose divisor is replaced by 1 where it is 0.
 
     Where that is 0, as of friction without a coefficient, no state stays on the surface: any number will do.
     """

@@ -118,7 +118,8 @@ class Sides:
         return [known[root.number] for root in roots]
 
     def _as_surface(self, node: Node, rewritten: Node) -> Node:
-        """Return the form of an expression that may define a switching surface, without the modes of other switches.
+        """Return an expression in the form in which it may define a switching surface: without the modes of other
+        switches.
 
         The engine sets the modes of an initial state one after the other, so no surface may depend on another's mode.
         """
@@ -283,7 +284,6 @@ def _at_time_zero(graph: Graph, node: Node) -> list[Node]:
 
 
 def _multiple_of(slope: Node, frequency: Node) -> int | None:
-    """Return the whole number n if `slope` is n times the drive frequency; else None."""
     if slope is frequency:
         return 1
     if slope.op == "mul" and slope.args[0].op == "number" and slope.args[1] is frequency:
