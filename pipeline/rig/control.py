@@ -1,4 +1,4 @@
-"""Trace a branch of a virtual rig by control-based continuation: stable and unstable orbits of a driven oscillator.
+"""Trace a branch of stable and unstable orbits of a virtual rig, a driven oscillator, by control-based continuation.
 
 A proportional and derivative controller acts through the rig's drive and keeps a state near a periodic target. Its
 output is the whole drive. Harmonics of the target other than the first are replaced by those of the response

@@ -324,14 +324,15 @@ def _crossing(t: Floats, above: Floats) -> float:
 
 
 def _numbers(rising: Floats) -> Floats:
-    """Return the number of each rising edge, counted in drive periods from the first; missing edges are counted too."""
+    """Return the number of each rising edge, counted in drive periods from the first. Missing edges are counted as
+    well.
+    """
     gaps = np.diff(rising)
     steps = np.maximum(np.rint(gaps / np.median(gaps)), 1.0)
     return np.concatenate([[0.0], np.cumsum(steps)])
 
 
 def _line(number: Floats, rising: Floats) -> tuple[float, float]:
-    """Fit a line by centred least squares; return intercept and slope."""
     centred = number - number.mean()
     slope = float(centred @ (rising - rising.mean()) / (centred @ centred))
     return float(rising.mean() - slope * number.mean()), slope

@@ -1,4 +1,6 @@
-"""Compute 95 % bands of branches and intervals of bifurcations from draws of the posterior."""
+"""Compute 95 % bands of the amplitude along branches, and 95 % intervals of bifurcation values, from draws of the
+posterior.
+"""
 
 from __future__ import annotations
 

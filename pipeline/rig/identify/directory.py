@@ -250,7 +250,6 @@ def check(directory: Path, identity: Mapping[str, Any]) -> Info | None:
 
 
 def _short(line: str) -> str:
-    """Shorten a line of a message to 400 characters."""
     flat = " ".join(line.split())
     return flat if len(flat) <= 400 else f"{flat[:197]} ... {flat[-197:]}"
 

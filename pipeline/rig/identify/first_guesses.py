@@ -72,7 +72,7 @@ def fit_starts(problem: Problem, theta: Array, starts: Array) -> Starts:
 
 
 def block_rows(problem: Problem) -> list[slice]:
-    """Return the range of rows (a slice) of each piece in the compressed residual vector."""
+    """Return which rows of the compressed residual vector belong to each piece of the recordings, as slices."""
     n_own = len(problem.free) + len(problem.model.states)
     sizes = [min(int(np.isfinite(p.measured).sum()), n_own + 1) for p in problem.pieces]
     ends = np.cumsum([0, *sizes])
@@ -80,7 +80,9 @@ def block_rows(problem: Problem) -> list[slice]:
 
 
 class _Block(NamedTuple):
-    """Residuals of a piece and their derivatives by its initial state, compressed to few rows by a QR decomposition."""
+    """Residuals of one piece of a recording and their derivatives by its initial state, compressed to few rows by a QR
+    decomposition.
+    """
 
     jacobian: Array
     rows: Array

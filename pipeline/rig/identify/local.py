@@ -64,7 +64,7 @@ class Fit:
 
 
 class _Search:
-    """Residual function that `least_squares` minimises; it stores its last and its best evaluation.
+    """Residual function for `least_squares`. It stores its last and its best evaluation.
 
     The vector holds the unknowns in units of their sizes. With a weight on the gaps it also holds all starts.
     Without a weight each start depends on its own piece alone. It is then fitted for the unknowns of each

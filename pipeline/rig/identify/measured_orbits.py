@@ -191,7 +191,7 @@ def _read(spec: IdentificationSpec, table: OrbitsTable, where: str) -> xr.Datase
 
 
 def _model(spec: IdentificationSpec, table: OrbitsTable, where: str) -> Model:
-    """Return the fitted model; without a drive it gets the Poincare section of the table or its file."""
+    """Return the fitted model. A model without a drive gets the Poincare section that the table or its file gives."""
     model, section = spec.model, table.section
     if not model.autonomous:
         if section is not None:
@@ -294,7 +294,9 @@ def _measured_quantity(one: xr.Dataset, quantity: str, allowed: float) -> list[t
 
 
 def _error(scatter: float, n_cycles: int) -> float:
-    """Return the standard error of a median over the cycles, from their scatter; the scatter if `n_cycles` < 2."""
+    """Return the standard error of a median over cycles, from the scatter of the cycles. For fewer than two cycles
+    return the scatter itself.
+    """
     if not math.isfinite(scatter):
         return 0.0
     return scatter * MEDIAN / math.sqrt(n_cycles) if n_cycles > 1 else scatter
@@ -392,7 +394,9 @@ def _first_orbit(table: MeasuredTable, datum: Datum, branches: xr.Dataset, compu
 
 
 def _first_point(datum: Datum, branches: xr.Dataset) -> Array | None:
-    """Return section point and parameter value of the computed bifurcation of a kind nearest to a measured one."""
+    """Return section point and parameter value of the computed bifurcation that is nearest to a measured one of the
+    same kind.
+    """
     words = words_of(branches["kind"]) if "kind" in branches else KINDS
     periods = branches["orbit_period"].values[branches["of_branch"].values]
     fits = [

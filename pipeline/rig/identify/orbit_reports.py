@@ -61,8 +61,8 @@ def _bifurcation_rows(ds: xr.Dataset) -> list[dict[str, Any]]:
 
 
 def _rms(ds: xr.Dataset) -> dict[str, dict[str, dict[str, Any]]]:
-    """Return the rms of the relative errors by group (fitted, held out), stability and quantity; None if an orbit is
-    lost.
+    """Return the rms of the relative errors by group (fitted, held out), stability and quantity; None if an orbit was
+    not found.
     """
     found: dict[str, dict[str, dict[str, Any]]] = {group: {} for group in GROUPS}
     if "orbit" not in ds.sizes:
@@ -79,7 +79,6 @@ def _rms(ds: xr.Dataset) -> dict[str, dict[str, dict[str, Any]]]:
 
 
 def _known(value: Any) -> Any:
-    """Return a value that JSON can hold; None for a number that is not finite."""
     return None if isinstance(value, float) and not np.isfinite(value) else value
 
 

@@ -84,7 +84,9 @@ def _table_rows(problem: Problem, table: OrbitData, thetas: Array, slopes: bool)
 
 
 def _residuals(table: OrbitData, values: Sequence[Array]) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the residuals of a table in standard deviations, and which of them belong to orbits that were lost."""
+    """Return the residuals of a table in standard deviations, and a mask of the residuals of orbits that were not
+    found.
+    """
     rows = np.concatenate([(d.measured - v) / d.sd for d, v in zip(table.data, values, strict=True)])
     is_lost = ~np.isfinite(rows)
     return np.where(is_lost, LOST, rows), is_lost

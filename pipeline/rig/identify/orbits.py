@@ -1,4 +1,4 @@
-"""Fit measured orbits and bifurcations: find their computed counterparts by Newton's method for any parameters.
+"""Find the computed counterparts of measured orbits and bifurcations for any parameters, by Newton's method.
 
 The computed orbit at a measured value of the parameter is found by Newton's method from the orbit of the last
 accepted parameters. Where this fails, the way there is made in smaller steps. So no trajectory settles, and unstable
@@ -140,7 +140,8 @@ class OrbitData:
 
 
 def nearest(table: OrbitData, packed: Array) -> list[list[Point | None]]:
-    """Return the computed orbit or bifurcation nearest to each measured one, for each row of parameters; None if lost.
+    """Return the computed orbit or bifurcation nearest to each measured one, for each row of parameters; None where
+    none is found.
 
     An orbit whose parameter has an error is moved along its branch to where it is nearest to the measured one.
     """
@@ -214,8 +215,8 @@ def _moved(table: OrbitData, k: int, packed: Array, point: Point | None, step: f
 
 
 def solve(table: OrbitData, packed: Array) -> list[list[Point | None]]:
-    """Compute a table's orbits and bifurcations at each row of packed parameters, starting from the known ones; None if
-    lost.
+    """Compute a table's orbits and bifurcations at each row of packed parameters, starting from the known ones; None
+    for those not found.
 
     Orbits stay at the value of the parameter, or if it has an error in the plane normal to the branch.
     """
@@ -225,7 +226,9 @@ def solve(table: OrbitData, packed: Array) -> list[list[Point | None]]:
 
 
 def _carried(table: OrbitData, k: int, packed: Array) -> Steps[Point | None]:
-    """Follow one orbit from the known parameters to others, in as few steps as possible; None if the orbit is lost."""
+    """Follow one orbit from the known parameters to others, in as few steps as possible; None if the orbit cannot be
+    followed.
+    """
     known, datum = table.known, table.data[k]
     if not np.isfinite(known.unknowns[k]).all():
         return None
@@ -286,7 +289,9 @@ def _raw(table: OrbitData, datum: Datum, point: Point) -> Array:
 
 
 def solution_of(table: OrbitData, packed: Array, points: Sequence[Point | None]) -> Solution:
-    """Return section points, parameter values and tangents of all orbits of a table; NaN for lost ones."""
+    """Return section points, parameter values and tangents of all orbits of a table; NaN for orbits that were not
+    found.
+    """
     unknowns = np.full(table.known.unknowns.shape, np.nan)
     tangents = unknowns.copy()
     for k, (datum, point) in enumerate(zip(table.data, points, strict=True)):

@@ -187,7 +187,6 @@ class IdentificationSpec:
 
 
 def _plain(bound: float) -> float | str:
-    """Return a finite bound as a number and an infinite bound as text, for JSON."""
     return bound if math.isfinite(bound) else str(bound)
 
 
@@ -284,7 +283,6 @@ def _table(data: Mapping[str, Any], key: str, model: type[Table], problems: list
 
 
 def _recordings(data: Mapping[str, Any], folder: Path, problems: list[str]) -> tuple[RecordingTable, ...]:
-    """Validate the tables ``[[recordings]]``, and return those that are valid."""
     tables = data.get("recordings", [] if data.get("orbits") else None)
     if not isinstance(tables, list) or (not tables and not data.get("orbits")):
         problems.append(
@@ -315,7 +313,6 @@ def _recordings(data: Mapping[str, Any], folder: Path, problems: list[str]) -> t
 
 
 def _orbits(data: Mapping[str, Any], folder: Path, problems: list[str]) -> tuple[OrbitsTable, ...]:
-    """Validate the tables ``[[orbits]]``, and return those that are valid."""
     tables = data.get("orbits", [])
     if not isinstance(tables, list):
         problems.append("orbits: must be a list of tables; write [[orbits]].")

@@ -352,7 +352,6 @@ def _table(path: Path, header: Header) -> tuple[dict[str, list[str]], bytes, lis
 
 
 def _wanted(header: Header) -> dict[str, str]:
-    """Return, for each quantity (angle, torque, ...), the name of its column in the CSV table."""
     found = {name: getattr(header.columns, name).column for name in type(header.columns).model_fields}
     if header.correction.without is not None:
         found["without"] = header.correction.without

@@ -164,7 +164,6 @@ def _shaken(
 
 
 def _check(steps: Sequence[_Step], recordings: Sequence[xr.Dataset]) -> None:
-    """Raise `SpecError` if the recordings give no section points, or have different states."""
     if not steps:
         names = ", ".join(name_of(r) for r in recordings)
         raise SpecError(

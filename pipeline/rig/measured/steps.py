@@ -202,7 +202,6 @@ def _placed(t: Floats, first: int, last: int) -> int:
 
 
 def _misfit(t: Floats) -> float:
-    """Return the sum of squared residuals of a line through edge times."""
     n = np.arange(t.size) - 0.5 * (t.size - 1)
     x = t - t.mean()
     return float(((x - n * (n @ x) / (n @ n)) ** 2).sum())
