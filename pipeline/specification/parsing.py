@@ -346,7 +346,6 @@ def _is_table(data: Mapping[str, Any], name: str, problems: list[str]) -> bool:
 
 
 def _validate(model: type[BaseModel], value: Any, path: str, problems: list[str]) -> Any:
-    """Return the validated table; if it is not valid, add its problems to `problems` and return None."""
     try:
         return model.model_validate(value)
     except ValidationError as error:
@@ -361,7 +360,6 @@ def _table(data: Mapping[str, Any], name: str, model: type[Table], problems: lis
 
 
 def _axes(data: Mapping[str, Any], problems: list[str]) -> dict[str, Range]:
-    """Return the valid axes in the order of the file; add the problems of the other axes to `problems`."""
     if not _is_table(data, "axes", problems):
         return {}
     axes = {n: _validate(Range, value, f"axes.{n}", problems) for n, value in data.get("axes", {}).items()}

@@ -94,7 +94,7 @@ def write_task(
 
 
 def _require_metadata(info: RunInfo, plan: Plan) -> None:
-    """Raise `DamagedError` if the metadata of a variable have changed; chunks would be encoded wrongly."""
+    """Raise `DamagedError` if the metadata of a variable have changed: with them, chunks would be encoded wrongly."""
     own = {key: info.skeleton[key] for key in (f"{v.name}/zarr.json" for v in plan.variables)}
     problems = problems_of(info.files.below(CUBE), own)
     if problems:

@@ -278,7 +278,6 @@ def _seal(attrs: Mapping[str, Any], digests: Digests) -> str:
 
 
 def _digests(files: Files) -> Digests:
-    """Return the key and sha256 of each file of a product except ``zarr.json``."""
     return _digests_of(files.read_each(key for key in files.everything() if key != _GROUP))
 
 
@@ -326,7 +325,6 @@ def _with_words(ds: xr.Dataset) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:
-    """Convert attributes to values that JSON can hold."""
     if isinstance(value, Mapping):
         return {str(k): _plain(v) for k, v in value.items()}
     if isinstance(value, (list, tuple)):

@@ -69,7 +69,6 @@ def check(place: str | Path | Files, identity: Mapping[str, Any]) -> RunInfo | N
 
 
 def _refuse_place(folder: Path) -> None:
-    """Raise `RefusedError` for a broken symbolic link, or a place inside another run directory."""
     if folder.is_symlink() and not folder.exists():
         raise RefusedError(f"{folder}: is a link that leads nowhere; remove it, or give another --out.")
     outer = run_around(folder.absolute().resolve().parent)
@@ -144,7 +143,7 @@ def _holds_something(files: Files, name: str) -> bool:
 
 
 def _digests(files: Files) -> set[str]:
-    """Return the digests of runs that the cube's metadata and the commit records name."""
+    """Return the digests of runs that the result cube's metadata and the commit records name."""
     records = [f"{COMMITS}/{key}" for key in files.below(COMMITS).everything() if key.endswith((".json", ".jsonl"))]
     # a pack names the digest in its first record
     found = {_text_in(content, "digest") for _, content in files.read_each(records)}
@@ -234,7 +233,7 @@ def establish(
 
 
 def rebuild_skeleton(info: RunInfo, spec: Spec, plan: Plan) -> list[str]:
-    """Rebuild damaged metadata and coordinates of the cube; return the problems that remain.
+    """Rebuild damaged metadata and coordinates of the result cube; return the problems that remain.
 
     A file is written only if its digest is the one in ``run.json``. Another version of zarr or of magpend may
     write other bytes.

@@ -1,4 +1,4 @@
-"""Make the files of an empty cube: the metadata of all variables, and the coordinates.
+"""Make the files of an empty result cube: the metadata of all variables, and the coordinates.
 
 Their bytes follow from the specification, the plan, the identity and the text alone, so that a damaged file
 can be rebuilt.
@@ -29,8 +29,8 @@ GROUP_KEY = "zarr.json"
 
 
 def skeleton_files(spec: Spec, plan: Plan, identity: Mapping[str, Any], spec_text: str, title: str) -> dict[str, bytes]:
-    """Return the contents of all files of an empty cube (metadata and coordinates) by key; those of the group come
-    first.
+    """Return the contents of all files of an empty result cube (metadata and coordinates) by key; those of the group
+    come first.
     """
     attrs = {
         "kind": plan.kind,
@@ -100,7 +100,7 @@ def entries_of(files: Mapping[str, bytes]) -> dict[str, dict[str, Any]]:
 
 
 def write_skeleton(files: Files, contents: Mapping[str, bytes], keys: Iterable[str]) -> None:
-    """Write some of the metadata and coordinate files of a cube, each atomically, in the given order."""
+    """Write some of the metadata and coordinate files of a result cube, each atomically, in the given order."""
     files.prepare(CUBE)
     written = [f"{CUBE}/{key}" for key in keys]
     for key in written:

@@ -1,4 +1,5 @@
-"""Define a view of the cube that shows only committed cells: others read as pending, changed chunks raise an error.
+"""Define a view of a result cube that shows only committed cells: others read as pending, changed chunks raise an
+error.
 
 Every chunk is compared with the sha256 in its commit record when it is read; metadata and coordinates are
 compared with ``run.json``. ``MAGPEND_VERIFY=0`` in the environment turns this off. The chunk's own crc32c
@@ -41,7 +42,7 @@ def checks_chunks() -> bool:
 
 
 class Shown:
-    """Files of the cube that readers see (metadata, coordinates and committed chunks), with size and sha256."""
+    """Files of the result cube that readers see (metadata, coordinates and committed chunks), with size and sha256."""
 
     def __init__(self, info: RunInfo, plan: Plan, commits: Mapping[int, Commit]) -> None:
         self._skeleton = info.skeleton
@@ -50,7 +51,7 @@ class Shown:
         self._commits = commits
 
     def arrays(self) -> list[str]:
-        """Return the names of the arrays in the cube."""
+        """Return the names of the arrays in the result cube."""
         return sorted({key.partition("/")[0] for key in self._skeleton})
 
     def entry(self, key: str) -> Mapping[str, Any] | None:
@@ -64,7 +65,7 @@ class Shown:
 
 
 class CommittedStore(WrapperStore[Store]):
-    """A read-only zarr store of the cube, in which chunks without a valid commit record do not exist.
+    """A read-only zarr store of the result cube, in which chunks without a valid commit record do not exist.
 
     zarr then reads the fill value, which means pending. A chunk that has a record but is missing or has
     changed raises `DamagedError`.
@@ -196,7 +197,8 @@ def _slice(byte_range: ByteRequest, size: int) -> slice:
 def committed_view(
     info: RunInfo, plan: Plan, commits: Mapping[int, Commit], *, check: bool | None = None
 ) -> CommittedStore:
-    """Return a read-only zarr store that shows the metadata, the coordinates and the committed chunks of a run's cube.
+    """Return a read-only zarr store that shows the metadata, the coordinates and the committed chunks of a run's result
+    cube.
 
     Parameters
     ----------

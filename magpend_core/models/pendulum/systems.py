@@ -192,7 +192,7 @@ def _square_wave_edges(frequency: Any, p: Any, times: Any, half_widths: Any, jum
 
 
 def _no_edges(frequency: Any, p: Any, times: Any, half_widths: Any, jumps: Any) -> None:
-    """Set no edges: the sine drive is smooth."""
+    """Set no forcing edges: the sine drive is smooth."""
 
 
 _MAGNETS: dict[str, tuple[int, Any, Any, Any, Any]] = {

@@ -26,7 +26,7 @@ LEAP_AROUND = 9
 
 
 class Signal:
-    """Readings of one channel, with the time and the piece number of each sample.
+    """Readings of one channel, with the time of each sample and the number of its piece (part without a gap).
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Give all channels of a file the same sample times, evenly spaced within each piece between gaps."""
+"""Give all channels of a file the same sample times, evenly spaced within each piece (part without a gap)."""
 
 from __future__ import annotations
 
@@ -364,8 +364,8 @@ def _refuse_backwards(stamps: list[np.ndarray], source: str) -> None:
 
 
 def _one_after_another(stamps: list[np.ndarray], step: float, findings: list[Finding]) -> tuple[list[np.ndarray], bool]:
-    """Shift stretches whose time restarts so that they follow the previous stretch. Return the time stamps, and whether
-    any stretch was shifted.
+    """Shift those stretches of a file whose time restarts, so that they follow the previous stretch. Return the time
+    stamps, and whether any stretch was shifted.
     """
     placed = [stamps[0]]
     moved = 0

@@ -191,7 +191,6 @@ def _channels(segment: _Segment, style: _Style, zero: float) -> dict[str, Channe
 
 
 def _truncations(segment: _Segment, channels: dict[str, Channel], style: _Style) -> list[Finding]:
-    """Report segments that have fewer samples than their header states."""
     findings = []
     for j, channel in zip(_columns(segment), channels.values(), strict=True):
         stated = _number(segment, "Samples", j, style)

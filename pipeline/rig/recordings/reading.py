@@ -1,4 +1,4 @@
-"""Read a recording's file through its mapping into a dataset with names and SI units."""
+"""Read a recording into a dataset with names and SI units, by means of its mapping file."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ DIM = "sample"
 def read_recording(
     path: str | Path, mapping: Mapping | str | Path, *, window_s: tuple[float, float] | None = None
 ) -> xr.Dataset:
-    """Read a recording through its mapping, and check its channels for faults.
+    """Read a recording by means of its mapping file, and check its channels for faults.
 
     Parameters
     ----------

@@ -195,7 +195,6 @@ class _Fit:
         self.values, self.rates, self.noise, self.width, self.score = values, rates, noise, width, score
 
     def attrs(self, order: int, step: float, derivative: int) -> dict[str, Any]:
-        """Return the attributes of the smoothed values or rates: noise and window length."""
         gain = _gain(self.width, order, derivative, step)
         raw = {"noise": self.noise} if derivative == 0 else {}
         return {**raw, "noise_smoothed": self.noise * gain, "window_s": self.width * step}
