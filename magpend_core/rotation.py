@@ -151,7 +151,6 @@ def rotation_numbers(
 
 
 def _batches(lengths: np.ndarray, turning: TurningState) -> list[np.ndarray]:
-    """Split the cells into batches of equal numbers of periods, small enough for the memory."""
     batches: list[np.ndarray] = []
     for length in np.unique(lengths):
         cells = np.flatnonzero(lengths == length)
@@ -231,7 +230,6 @@ def _wrapped(angle: np.ndarray) -> np.ndarray:
 
 
 def _averaged(turns: np.ndarray, turning: TurningState, is_closed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mean of the turns per period and its error, for each cell."""
     n = turns.shape[1]
     if is_closed.all():
         total = turns.sum(axis=1)

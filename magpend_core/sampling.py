@@ -278,7 +278,6 @@ def _drive_table(
 
 
 def _check_drive(number: int, drive: Drive, names: tuple[str, ...], end_s: float) -> np.ndarray:
-    """Return the durations of a drive's intervals, after checking that the drive lasts until the last sample."""
     durations = check_array(f"drives[{number}].durations_s", drive.durations_s, 1)
     if drive.names != names or (names and np.shape(drive.values) != (len(durations), len(names))):
         raise ValueError(

@@ -240,9 +240,6 @@ class _Functions:
         return table
 
     def cell_problems(self, frequency: np.float64, p: np.ndarray) -> list[str]:
-        """Check the constants and the edges of the forcing for one frequency and parameter vector; return
-        the problems.
-        """
         self.problems = []
         at = f"at frequency_hz = {frequency:g}"
         values = self.constants(frequency, p)

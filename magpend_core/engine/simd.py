@@ -61,7 +61,6 @@ def _splat(builder: Any, scalar: Any) -> Any:
 
 
 def _as(builder: Any, value: Any, numba_type: Any, target: Any) -> Any:
-    """Broadcast a scalar over the lanes if the result type is a group of lanes."""
     if isinstance(target, LanesType) and not isinstance(numba_type, LanesType):
         return _splat(builder, value)
     return value

@@ -170,7 +170,6 @@ def _reduced(parameters: Parameters) -> tuple[Any, ...]:
 def _again(
     reference: str | Mapping[str, Any], values: dict[str, float], crossing: Crossing | None = None
 ) -> Parameters:
-    """Restore pickled parameters from the model's reference, the values, and the Poincare section if there is one."""
     found = load_model(reference)
     return Parameters(found if crossing is None else sectioned(found, crossing), values)
 

@@ -96,7 +96,6 @@ def import_model(path: str, folder: str | Path | None = None) -> Model:
 
 
 def _description(path: str, model: Model) -> dict[str, Any]:
-    """Return a model's names, states, parameters and presets as plain data, as stored in a run."""
     table: dict[str, Any] = {KEY: path, "digest": model.digest}
     table |= {name: getattr(model, name) for name in ("name", "title", "section", "angle_dim")}
     table["autonomous"] = model.autonomous
@@ -196,7 +195,6 @@ def described_model(table: Mapping[str, Any]) -> Model:
 
 
 def _outer_problems(table: Mapping[str, Any]) -> list[str]:
-    """Return a sentence for each key of a description that is missing, unknown or of the wrong type."""
     known = (KEY, *_TEXTS, *_TABLES, "autonomous", "mirror")
     problems = [f"{key}: no part of a model's description." for key in table if key not in known]
     problems += [f"{key}: must be a text." for key in _TEXTS if not isinstance(table.get(key), str)]

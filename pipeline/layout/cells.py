@@ -273,7 +273,6 @@ class CellMap:
         return tuple(last if i == self.path else s for i, s in enumerate(block))
 
     def _start_of(self, index: np.ndarray) -> np.ndarray:
-        """Return the flat index of each branch's initial state."""
         own = index[len(self._axes) :]
         if self._walk is not None:
             return np.asarray(own[0] % len(self._states))

@@ -187,7 +187,6 @@ class _Grid:
         return len(self._states)
 
     def find(self, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the flat index of each state in the grid, and whether the grid contains the state."""
         assert self._states.grid is not None
         here = np.ones(len(wanted), bool)
         place = np.zeros(len(wanted), np.int64)
@@ -214,7 +213,6 @@ class _Rows:
         return len(self._table)
 
     def find(self, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the index of the first row equal to each state, and whether such a row exists."""
         place = np.searchsorted(self._marks, _marks(wanted))
         row = self._order[np.minimum(place, len(self._order) - 1)]
         # if two different states share a mark, the second one is not found; a wrong one is never returned
@@ -229,7 +227,6 @@ def _bits(values: Any) -> np.ndarray:
 
 
 def _on_axis(axis: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the index of each value on an increasing axis, and whether the axis contains the value."""
     step = np.minimum(np.searchsorted(axis, values), len(axis) - 1)
     return step, _bits(axis[step]) == _bits(values)
 

@@ -44,7 +44,6 @@ REST_STATE = Variable(
 
 
 def _counts(periods: str) -> tuple[Variable, ...]:
-    """Return the variables for a cell's status, period and counts; `periods` is the model's word for periods."""
     codes = flag_attrs(Status)
     return (
         Variable("status", (), "int8", int(Status.PENDING), "1", "what became of the cell", codes),

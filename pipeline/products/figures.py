@@ -15,7 +15,6 @@ Per = Literal["s", "period"]
 
 
 def _without(options: FigureOptions, name: str) -> str:
-    """Return the part of the figure's file name that lists the options, without the option `name`."""
     return FigureOptions.label(options.model_copy(update={name: ""}))
 
 

@@ -145,9 +145,6 @@ class _Plant:
 
     @classmethod
     def of(cls, rig: Controlled, targets: np.ndarray) -> _Plant:
-        """Check the settings of a virtual rig and the targets, and return the rigs. Raise SpecError if the settings are
-        not valid.
-        """
         model, problems = rig.parameters.model, []
         if rig.state not in model.state_names or not model.state(rig.state).rate:
             known = [s.name for s in model.states if s.rate]

@@ -224,7 +224,6 @@ def rig_parameters(data: AnyMapping[str, Any], folder: str | Path, problems: lis
 
 
 def _start(given: AnyMapping[str, Any], model: Model, problems: list[str]) -> tuple[float, ...]:
-    """Return the initial state from values by name; angles and rates may be in degrees."""
     values = dict.fromkeys(model.state_names, 0.0)
     for key, value in given.items():
         name = state_of_key(key, model)

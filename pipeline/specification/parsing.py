@@ -312,7 +312,6 @@ def _declared(data: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def _valid_keys(model: type[ParametersTable], table: Any) -> ParametersTable:
-    """Return the table ``[parameters]`` without its invalid keys, so that the others can be checked further."""
     valid: dict[str, Any] = {}
     for key, value in table.items() if isinstance(table, dict) else ():
         if _validate(model, {key: value}, "", []) is not None:
@@ -395,7 +394,6 @@ def _starts(data: Mapping[str, Any], model: Model, problems: list[str]) -> Start
 def _walk(
     kind: str, data: Mapping[str, Any], walk: Continuation | None, axes: dict[str, Range], problems: list[str]
 ) -> Continuation | None:
-    """Check ``[continuation]`` against the kind of run and the axes; return it for a continuation, else None."""
     if kind != "continuation":
         if kind == "sweep" and "continuation" in data:
             problems.append('continuation: a sweep has no such table; set kind = "continuation" or drop the table.')

@@ -95,9 +95,6 @@ def _found(table: SectionTable, model: Model, problems: list[str]) -> SectionTab
 
 
 def _missing(model: Model, data: Mapping[str, Any]) -> list[str]:
-    """Return a problem if the specification of an autonomous model has neither a ``[section]`` table nor a
-    frequency.
-    """
     if FREQUENCY in _keys(data, "parameters") or FREQUENCY in _keys(data, "axes") or "drive" in data:
         return []
     return [

@@ -121,7 +121,6 @@ def damaged_records(info: RunInfo, plan: Plan, *, contents: bool) -> tuple[Recor
 
 
 def _changed_objects(info: RunInfo, records: Records) -> dict[int, str]:
-    """Compare every file of the committed tasks with its recorded sha256; return the problems by task."""
     cube, found = info.files.below(CUBE), {}
     for n, index in enumerate(records):
         if n % _TASKS_PER_REPORT == 0:

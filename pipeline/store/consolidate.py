@@ -201,7 +201,6 @@ def _plain(attrs: Mapping[Any, Any]) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def _unwarned() -> Iterator[None]:
-    """Silence zarr's warnings about codecs and metadata that are not in version 3 of its format."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Consolidated metadata")
         warnings.filterwarnings("ignore", message="Numcodecs codecs are not")

@@ -158,13 +158,11 @@ def read_product_attrs(place: Place) -> dict[str, Any]:
 
 
 def _refuse_declared(files: Files, contents: Iterable[tuple[str, bytes | FileNotFoundError]]) -> None:
-    """Raise `DamagedError` if a product's files declare other codecs or sizes than they should."""
     if problem := product_problem((key, value) for key, value in contents if isinstance(value, bytes)):
         raise DamagedError(f"{files.name}: {problem}")
 
 
 def _sealed_attrs(files: Files, group: bytes | FileNotFoundError | None, digests: Digests) -> dict[str, Any]:
-    """Return the attributes of a product; raise `DamagedError` if the digest in them does not fit its files."""
     if not isinstance(group, bytes):
         if digests:
             raise DamagedError(f"{files.name}: it has no {_GROUP}")
@@ -314,7 +312,6 @@ def _coded(name: str, variable: xr.Variable) -> tuple[np.ndarray, dict[str, Any]
 
 
 def _with_words(ds: xr.Dataset) -> dict[str, Any]:
-    """Return the variables that hold integer codes of text labels, with the labels restored."""
     found = {}
     for name, variable in ds.variables.items():
         if _WORDS in variable.attrs:

@@ -104,7 +104,6 @@ def _refuse_foreign(files: Files, names: list[str], digest: str) -> None:
 
 
 def _refuse_notes(files: Files) -> None:
-    """Raise `RefusedError` if the directory has a ``lock.json`` or ``timings.jsonl`` that no run wrote."""
     for name, is_own in ((HOLDER, is_note), (TIMINGS, _is_timings)):
         for _, content in files.read_each([name]):
             if isinstance(content, bytes) and not is_own(content):
@@ -112,7 +111,6 @@ def _refuse_notes(files: Files) -> None:
 
 
 def _is_timings(content: bytes) -> bool:
-    """Return whether a file's content is empty or begins as that of ``timings.jsonl`` does."""
     try:
         first = json.loads(content.split(b"\n")[0] or b'{"task": 0}')
     except (ValueError, RecursionError):
@@ -153,7 +151,6 @@ def _digests(files: Files) -> set[str]:
 
 
 def _text_in(content: bytes | FileNotFoundError, *keys: str) -> str | None:
-    """Return the text at nested keys of a JSON file; None if the file or the text is missing or damaged."""
     if isinstance(content, FileNotFoundError):
         return None
     try:

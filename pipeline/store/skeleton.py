@@ -73,7 +73,6 @@ def skeleton_keys(spec: Spec, plan: Plan) -> list[str]:
 
 
 def _labels(spec: Spec) -> list[Coordinate]:
-    """Return the coordinates along dims other than those of the cells, such as the names of the states."""
     model = spec.model
     found = [
         Coordinate("state", ("state",), _values(model.state_names), {"long_name": "component of the state"}),
@@ -89,7 +88,6 @@ def _labels(spec: Spec) -> list[Coordinate]:
 
 
 def _values(labels: Iterable[Any]) -> np.ndarray:
-    """Convert coordinate labels to a numpy array: of objects for texts, of int32 for numbers."""
     values = list(labels)
     return np.array(values, dtype=object if isinstance(values[0], str) else np.int32)
 

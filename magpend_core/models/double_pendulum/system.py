@@ -111,7 +111,6 @@ def _air(c12: Any, w1: Any, w2: Any, c: Any) -> Any:
 
 @inline
 def _torques(y: Any, c: Any) -> Any:
-    """Compute the friction torques F1, F2 of both joints and the torques A1, A2 of the air drag [N m]."""
     w1, w2 = y[2], y[3]
     c12 = sincos(y[0] - y[1])[1]
     v = w2 - w1

@@ -121,7 +121,6 @@ def _fitted_layers(y: Any, dy: Any, c: Any) -> Any:
 
 @inline
 def _plain_layers(y: Any, dy: Any, c: Any) -> Any:
-    """Return the boundary layers of the friction alone; the field of the dipoles has none."""
     return _friction_layers(y, dy, LinkConstants(*c[:N_LINK]))
 
 

@@ -30,24 +30,12 @@ class Jump:
 
 @dataclass(frozen=True)
 class _Contact:
-    """Contact of a resting state with the surface of an impact, as expressions: push, reaction and direction.
+    """Contact of a resting state with the surface of an impact, as expressions: push, reaction and direction."""
 
-    Attributes
-    ----------
-    push : Node
-        Second derivative of the impact's value without the contact.
-    reaction : tuple of Node
-        Term that the contact adds to each rate.
-    direction : tuple of Node
-        Direction in state space in which the surface pushes.
-    slopes : list of Node
-        Derivatives of the value's rate by the states.
-    """
-
-    push: Node
-    reaction: tuple[Node, ...]
-    direction: tuple[Node, ...]
-    slopes: list[Node]
+    push: Node  # second derivative of the impact's value without the contact
+    reaction: tuple[Node, ...]  # term that the contact adds to each rate
+    direction: tuple[Node, ...]  # direction in state space in which the surface pushes
+    slopes: list[Node]  # derivatives of the value's rate by the states
 
 
 def with_contacts(

@@ -280,7 +280,6 @@ class _Parser:
         return tree
 
     def unexpected(self, token: _Token) -> GrammarError:
-        """Return an error for a token that cannot follow here, with a remedy if one is known."""
         hints = {
             "==": "; compare with < or >",
             "!=": "; compare with < or >",
@@ -410,7 +409,6 @@ class _Parser:
         return Tree("call", name.at, name.text, tuple(args))
 
     def check_arguments(self, name: _Token, args: list[Tree]) -> None:
-        """Report a wrong number of function arguments, and conditions given as arguments in place of numbers."""
         least, most = FUNCTIONS.get(name.text, (0, len(args)))
         if not least <= len(args) <= most:
             wanted = f"{least}" if least == most else f"{least} to {most}"
@@ -425,7 +423,6 @@ class _Parser:
             self.numbers(tuple(args), name)
 
     def numbers(self, parts: tuple[Tree, ...], token: _Token) -> tuple[Tree, ...]:
-        """Return the operands of an arithmetic operation; report each that is a condition, not a number."""
         self.problems += [
             f"a condition stands at character {part.at} where {token.text!r} needs a number; use where(condition, a, b)"
             for part in parts

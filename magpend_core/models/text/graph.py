@@ -85,7 +85,6 @@ _AT_ZERO = {
 
 
 def _finite(function: Callable[[float, float], float], a: float, b: float) -> float:
-    """Return the value of a function of two numbers; raise `GraphError` if the value is not finite."""
     try:
         value = function(a, b)
     except OverflowError:

@@ -104,7 +104,6 @@ def symbol_of(name: str, symbols: Mapping[str, str]) -> str:
 
 
 def _upright(word: str) -> str:
-    """Return the LaTeX of a word: several letters upright, one letter as a variable."""
     return word if len(word) == 1 else rf"\mathrm{{{word}}}"
 
 

@@ -105,7 +105,6 @@ def place_of(graph: Graph, node: Node) -> Place | None:
 
 
 def _logistic(graph: Graph, node: Node) -> Place | None:
-    """Return the `Place` (nearest singularity and change) of a quotient by 1 + exp(w); None for another quotient."""
     above, below = node.args
     if below.op != "add" or len(below.args) != 2 or not any(a.is_number(1.0) for a in below.args):
         return None
@@ -114,9 +113,6 @@ def _logistic(graph: Graph, node: Node) -> Place | None:
 
 
 def _smoothed_sign(graph: Graph, node: Node) -> Place | None:
-    """Return the `Place` (nearest singularity and change) of a quotient u/sqrt(u**2 + e**2); None for another
-    quotient.
-    """
     above, below = node.args
     if below.op != "sqrt" or below.args[0].op != "add" or len(below.args[0].args) != 2:
         return None

@@ -37,6 +37,7 @@ def fit_starts(problem: Problem, theta: Array, starts: Array) -> Starts:
     Parameters
     ----------
     problem
+        Least-squares problem of the identification.
     theta
         Unknowns, (n_free,).
     starts
@@ -131,6 +132,7 @@ def project_starts_out(problem: Problem, evaluation: Evaluation) -> tuple[Array,
     Parameters
     ----------
     problem
+        Least-squares problem of the identification.
     evaluation
         Evaluation with slopes, at starts that are optimal for its unknowns.
 

@@ -156,7 +156,6 @@ def judge(
 
 
 def _beginning(problem: Problem, length_s: float) -> Problem:
-    """Return the problem with each piece cut to its first `length_s` seconds."""
     fewest = 4 * len(problem.model.states)
     pieces = []
     for p in problem.pieces:

@@ -64,7 +64,6 @@ def linearise(problem: Problem, fit: Fit) -> Linearised:
 
 
 def _at_orbits(problem: Problem, fit: Fit) -> OrbitRows | None:
-    """Return residuals of measured orbits and their derivatives at the optimum of a fit; None without orbits."""
     if not problem.orbits:
         return None
     return orbit_rows(problem.with_orbits(fit.known), fit.theta[None], slopes=True)[0]

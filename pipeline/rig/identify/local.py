@@ -159,6 +159,7 @@ def fit_local(
     Parameters
     ----------
     problem
+        Least-squares problem of the identification.
     theta0
         First guess of the unknowns, (n_free,); clipped to the bounds.
     starts
@@ -236,7 +237,6 @@ def _least_squares(walk: _Search, x: Array, ending: _Ending) -> tuple[Array, boo
 
 
 def _starts_alone(walk: _Search) -> Fit:
-    """Fit the initial states of the pieces if there are no other unknowns."""
     problem, nothing = walk.problem, np.zeros(0)
     starts, settled = fit_starts(problem, nothing, walk.starts)
     n = int(np.count_nonzero(~settled))

@@ -280,7 +280,6 @@ def _orbits(
 
 
 def _measured_quantity(one: xr.Dataset, quantity: str, allowed: float) -> list[tuple[str, float, float]]:
-    """Return names, values and standard deviations of a measured quantity; harmonics have several."""
     if quantity == "harmonics":
         if "harmonic" not in one:
             return []

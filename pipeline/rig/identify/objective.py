@@ -78,6 +78,7 @@ def evaluate(problem: Problem, thetas: Array, starts: Array, *, slopes: bool) ->
     Parameters
     ----------
     problem
+        Least-squares problem of the identification.
     thetas
         Unknowns, shape (n, n_free) [SI].
     starts

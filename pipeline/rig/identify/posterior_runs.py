@@ -111,7 +111,6 @@ def _refuse_other_model(reference: Any, result: Mapping[str, Any], axes: list[st
 
 
 def _establish(folder: Path, tables: Mapping[str, Any], values: np.ndarray, names: list[str], smoke: bool) -> None:
-    """Create the folder of the runs with a record of its inputs; raise RefusedError if it holds other runs."""
     content = {"specification": digest_of(dict(tables)), "draws": values.tolist(), "names": names, "smoke": smoke}
     path = folder / STUDY
     if path.is_file():
@@ -171,7 +170,6 @@ def spread(folder: str | Path, *, branches: bool = False, echo: Echo = print) ->
 
 
 def _fractions(one: AnalysedRun) -> dict[str, float]:
-    """Return the fraction of a run's cells by status, with periodic cells split by orbit period."""
     cube = one.cube()
     words = words_of(cube["status"])
     status, period = cube["status"].values.ravel(), cube["orbit_period"].values.ravel()

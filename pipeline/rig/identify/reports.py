@@ -168,7 +168,6 @@ def _sureness(found: Finding) -> dict[str, Any]:
 
 
 def _errors(sources: Sequence[Source], findings: Sequence[Sequence[str]]) -> list[str]:
-    """Return a warning for each fault of severity "error" that was found in the recordings."""
     return [
         f"{s.file} has an {line}"
         for s, said in zip(sources, findings, strict=True)
@@ -206,12 +205,10 @@ def interval_of(found: Finding, i: int) -> tuple[float, float]:
 
 
 def _number(value: float) -> float | None:
-    """Return a number unchanged, or None if it is not finite and JSON cannot hold it."""
     return float(value) if math.isfinite(value) else None
 
 
 def _plain(values: Any) -> Any:
-    """Return an array or sequence as nested lists for JSON; values that are not finite become None."""
     if isinstance(values, np.ndarray | list | tuple):
         return [_plain(v) for v in values]
     return _number(float(values))

@@ -61,6 +61,7 @@ def search(
     Parameters
     ----------
     problem
+        Least-squares problem of the identification.
     n_starts
         Number of first guesses that are followed to an optimum; the first is the problem's own.
     seed
@@ -102,7 +103,6 @@ def _kept(
     keep: Keep | None,
     tell: Callable[[str], None],
 ) -> Fit:
-    """Return the fit from first guess `k`: the stored one, or a new one, which is then stored."""
     fit = keep.recall(k) if keep is not None else None
     if fit is None:
         fit = refine(

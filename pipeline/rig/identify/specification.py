@@ -265,9 +265,6 @@ def _text(data: Mapping[str, Any], key: str, problems: list[str]) -> str | None:
 
 
 def _found(preset: str | None, folder: Path) -> str | Path | None:
-    """Return the name of a preset unchanged; if it is the name of a file, return its path in the specification's
-    folder.
-    """
     return folder / preset if preset is not None and is_file(preset) else preset
 
 

@@ -219,14 +219,12 @@ def write_figures(outcome: Outcome, folder: Path) -> list[Path]:
 
 
 def _spread(outcome: Outcome, n: int) -> list[float]:
-    """Return up to `n` of the measured locked angles, evenly spread from the least to the largest."""
     every = sorted(fit.curve.locked for fit in outcome.curves)
     angles = [a for a, b in zip(every, [*every[1:], np.inf], strict=True) if b - a > SAME_ANGLE]
     return [angles[i] for i in np.unique(np.linspace(0, len(angles) - 1, n).round().astype(int))]
 
 
 def _place(shown: Sequence[float], locked: float) -> int | None:
-    """Return the index of a locked angle among those that are drawn (`shown`), or None if it is not drawn."""
     near = np.flatnonzero(np.abs(np.array(shown) - locked) < SAME_ANGLE)
     return int(near[0]) if near.size else None
 

@@ -122,9 +122,6 @@ def _instants(edges: Edges, stretches: Sequence[Stretch], phase: float) -> Edges
 
 
 def _in_place(sections: xr.Dataset, name: str, n: int) -> np.ndarray:
-    """Place section points at the indices of the drive edges where they were taken; edges without a point become
-    NaN.
-    """
     values = np.full((n, sections.sizes["state"]), np.nan)
     values[sections["number"].values] = sections[name].values
     return values

@@ -112,7 +112,6 @@ def plot_branch(
 
 
 def _draw_bands(ax: Axes, bands: Bands) -> list[Any]:
-    """Shade the bands of the branches and draw bars for the bifurcations' intervals; return legend entries."""
     entries: list[Any] = []
     for tube in bands.tubes:
         shade = ax.fill_between(
@@ -143,6 +142,5 @@ def _draw_computed(ax: Axes, branches: xr.Dataset, computed: np.ndarray) -> None
 
 
 def _computed_entries(ax: Axes) -> list[object]:
-    """Return the legend entries of the computed orbits: one line for each label."""
     found = {str(line.get_label()): line for line in ax.lines if str(line.get_label()).startswith("computed")}
     return [found[name] for name in sorted(found)]

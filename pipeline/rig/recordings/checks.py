@@ -92,7 +92,6 @@ def saturated(signal: Signal, entry: ChannelMap) -> list[Finding]:
 
 
 def _beside_wraps(signal: Signal, least: float) -> np.ndarray:
-    """Return a mask of the samples next to a jump (wrap of an angle) that is larger than `least`."""
     jump = np.abs(np.diff(signal.raw)) > least
     beside = np.zeros(len(signal.raw), dtype=bool)
     beside[1:] |= jump

@@ -130,7 +130,6 @@ def _changes(
 
 
 def _stamps(channel: Channel, stated: float | None) -> np.ndarray:
-    """Return the sample times of a channel [s]; they are NaN if the file does not state the start."""
     if channel.time is not None and stated is None:
         return channel.time
     step = channel.step_s if stated is None else stated
@@ -182,7 +181,6 @@ def _refuse_mixed(steps: Mapping[str, float], source: str) -> None:
 
 
 def _rate_findings(stretches: Sequence[Mapping[str, Channel]], stated: float | None) -> list[Finding]:
-    """Report channels whose sampling rate in the file differs from that of the mapping."""
     if stated is None:
         return []
     findings = []
@@ -272,9 +270,6 @@ def _length_findings(lengths: Mapping[str, int], n_common: int, step: float) -> 
 
 
 def _checked_stamps(stamps: list[np.ndarray], step: float, source: str) -> list[np.ndarray]:
-    """Check that time stamps are finite and do not decrease. If the file states no start, return times that
-    begin at 0.
-    """
     if all(np.isnan(s).all() for s in stamps):
         return [step * np.arange(len(s)) for s in stamps]
     for s in stamps:

@@ -266,7 +266,6 @@ def _units(model: Model) -> dict[str, str]:
 
 
 def _quantity_problems(model: Model, channels: dict[str, ChannelMap], drive: DriveMap | None) -> list[str]:
-    """Return problems with the mapped channels: unknown quantities, unsuitable units or scales."""
     problems = []
     known = _units(model)
     for name, entry in channels.items():

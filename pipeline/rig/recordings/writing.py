@@ -136,7 +136,6 @@ def _write_tdms(channels: Sequence[Channel], path: Path, is_simulated: bool) -> 
 
 
 def _write_csv(channels: Sequence[Channel], path: Path, is_simulated: bool) -> None:
-    """Write a CSV file with one column for each channel. Numbers are written with all digits."""
     columns = [(c.name, c.values) for c in channels]
     step = channels[0].step_s
     if not any(name == "time" for name, _ in columns) and math.isfinite(step):
