@@ -21,7 +21,7 @@ def heard_by(listener: Callable[[bool], None]) -> Iterator[None]:
 
 @contextlib.contextmanager
 def compiling() -> Iterator[None]:
-    """Report to the listener, if there is one, that a compilation runs inside this context."""
+    """Tell the listener, if there is one, that code is being compiled while this context is open."""
     listener = _listener.get()
     if listener is None:
         yield

@@ -119,7 +119,7 @@ def judge(rings: Any, last: int, settings: Settings, found: Any) -> None:
 
 @cache
 def judge_of(system: System) -> Callable[..., None]:
-    """Compile `judge` for a system, with its angles and scales."""
+    """Compile `judge`, the test for periodic orbits, for a system with its angles and scales."""
     bindings: dict[str, Any] = {
         "N": system.n_states,
         "IS_ANGLE": np.array(system.is_angle, np.int64),

@@ -192,7 +192,9 @@ def rates_at(system: System, states: np.ndarray, packed: np.ndarray) -> np.ndarr
 
 
 def jacobian_at(system: System, states: np.ndarray, packed: np.ndarray) -> np.ndarray:
-    """Return the Jacobians of `rates_at`, shape (n, n_states, n_states)."""
+    """Return the Jacobians of the rates of an autonomous system at many states, shape (n, n_states, n_states). Nothing
+    is checked.
+    """
     return whole_jacobian(system, _flow_at("jacobian", len(places_of(system)), system, states, packed))
 
 

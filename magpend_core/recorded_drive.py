@@ -31,7 +31,7 @@ CHUNK_NUMBERS = 4_000_000
 
 
 def driven_system(system: System, drive: Drive) -> System:
-    """Return the system for a drive: unchanged, or with its forcing replaced by the recorded one."""
+    """Return the system to integrate under a drive: unchanged, or with its forcing replaced by a recorded torque."""
     return with_recorded_drive(system) if LEVEL in drive.names else system
 
 

@@ -58,7 +58,7 @@ def _python_meaning(source: bytes) -> bytes:
 
 @cache
 def kernel_version() -> str:
-    """Return the digest of the numerical core without its models, stored as ``kernel_version``.
+    """Return a digest of the sources of the numerical core, models excluded; a run stores it as ``kernel_version``.
 
     It follows the meaning of the sources (see `meaning_digest`): an edited sentence bars nobody from
     completing a run.

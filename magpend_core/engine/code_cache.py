@@ -102,7 +102,7 @@ def _below(home: Path, folder: Path) -> list[Path]:
 
 
 def _exposed(found: os.stat_result) -> str:
-    """Return who else can write to a file or folder, as text; empty if only the owner can."""
+    """Return, as text, who else can write to a file or folder; empty if only the owner can."""
     if not hasattr(os, "geteuid"):
         return ""
     mode = f"mode {stat.S_IMODE(found.st_mode):04o}"

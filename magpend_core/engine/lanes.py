@@ -174,7 +174,7 @@ def step_ratio(room: Any) -> Any:
 
 
 def choose_step(w: Any, base: int, slack: float) -> None:
-    """Set the size of the next attempted step from error control, layers, forcing edges and events.
+    """Set the size of the next attempted step from error control, boundary layers, forcing edges and events.
 
     The step is the smallest of several bounds. One is the size that error control allows. Each layer and each edge
     gives another, in proportion to the distance from its complex singularity. Let D be the time until the state

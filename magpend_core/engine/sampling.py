@@ -1,4 +1,4 @@
-"""Integrate many trajectories in SIMD lanes, and sample each at its own instants by the engine's dense output.
+"""Integrate many trajectories in SIMD lanes, and sample each at its own times by the engine's dense output.
 
 `lanes.advance` records a trajectory once per period. This loop instead writes the states at given times, by the
 continuous extension of the Dormand-Prince pair. And the drive may change from interval to interval: each interval has

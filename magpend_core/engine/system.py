@@ -320,7 +320,7 @@ class System:
 
     @property
     def n_contacts(self) -> int:
-        """Number of modes that say whether the state rests on an impact surface: one per impact, or 0."""
+        """Number of contact modes, which say whether the state rests on an impact surface: one per impact, or 0."""
         return self.n_impacts if any(self.sticks) else 0
 
     @property

@@ -166,7 +166,8 @@ def parse_rig(data: AnyMapping[str, Any], folder: str | Path = ".") -> Rig:
 
 
 def simulated(rig: Rig, *, is_csv: bool = False) -> tuple[Raw, Mapping]:
-    """Simulate a virtual rig; return its readings, and the mapping for the file that they are written to.
+    """Simulate a virtual rig. Return its readings, and the mapping (description of the channels) for the file that they
+    are written to.
 
     Parameters
     ----------

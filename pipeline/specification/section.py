@@ -38,7 +38,9 @@ class SectionTable(Table):
 
 
 def seen_through(model: Model, section: SectionTable | None) -> Model:
-    """Return the model with the Poincare section of a table ``[section]``; without a table, the model unchanged."""
+    """Return the model with the Poincare section of a table ``[section]``. Without such a table, return the model
+    unchanged.
+    """
     return model if section is None else sectioned(model, section.crossing)
 
 

@@ -266,7 +266,9 @@ class _Scan:
         return block is not None and (self._blocks is None or block in self._blocks)
 
     def _alone(self, name: str) -> bool:
-        """Return whether a file with one commit record must be read because no valid pack holds its record."""
+        """Return whether a file with one commit record must be read because no valid pack (file of many records) holds
+        its record.
+        """
         stem = name.removesuffix(".json")
         if not stem.isdecimal():
             return self._blocks is None  # not the name of a record: read it in a full scan, to report it

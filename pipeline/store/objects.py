@@ -189,7 +189,7 @@ class ObjectFiles:
         self._ask(key, lambda: obstore.put(self.store, key, content, use_multipart=False), writing=True)
 
     def write_once(self, key: str, content: bytes) -> None:
-        """Put an object unless it exists; an existing one must have the same content.
+        """Write an object unless it exists. An existing object must have the same content.
 
         Raises
         ------

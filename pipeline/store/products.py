@@ -131,7 +131,7 @@ def open_product(place: Place) -> xr.Dataset:
 
 
 def read_product_attrs(place: Place) -> dict[str, Any]:
-    """Return the attributes of a product after comparing the digest in them with its files.
+    """Compare the files of a product (stored analysis result) with the digest in its attributes; return the attributes.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Create a run directory, or rebuild its damaged metadata and coordinates from the specification."""
+"""Create a run directory, or rebuild damaged metadata and coordinates of its result cube from the specification."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ Echo = Callable[[str], None]
 
 
 def check(place: str | Path | Files, identity: Mapping[str, Any]) -> RunInfo | None:
-    """Check whether a run can be started or continued in a directory; change nothing.
+    """Check whether a run can be started or continued in a directory, without changing anything there.
 
     Returns
     -------
@@ -163,7 +163,7 @@ def _text_in(content: bytes | FileNotFoundError, *keys: str) -> str | None:
 
 
 def create(place: str | Path | Files, spec: Spec, plan: Plan, identity: Mapping[str, Any], spec_text: str) -> RunInfo:
-    """Create a run directory: an empty cube (metadata and coordinates), then ``run.json``.
+    """Create a run directory: an empty result cube (metadata and coordinates), then ``run.json``.
 
     Call `check` first: files with the same names are replaced.
     """
@@ -184,7 +184,7 @@ def establish(
     *,
     alone: bool = True,
 ) -> RunInfo:
-    """Create a run directory or, if it exists, open it and rebuild its damaged metadata and coordinates.
+    """Create a run directory or, if it exists, open it and rebuild damaged metadata and coordinates of its result cube.
 
     Only the holder of the lock may call this.
 

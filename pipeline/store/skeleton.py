@@ -67,7 +67,7 @@ def skeleton_files(spec: Spec, plan: Plan, identity: Mapping[str, Any], spec_tex
 
 
 def skeleton_keys(spec: Spec, plan: Plan) -> list[str]:
-    """Return the keys of the metadata files of all variables and coordinates."""
+    """Return the keys of the metadata files of all variables and coordinates of the result cube."""
     names = [v.name for v in plan.variables] + [c.name for c in (*coordinates(spec), *_labels(spec))]
     return [f"{name}/{GROUP_KEY}" for name in names]
 
@@ -107,14 +107,15 @@ def write_skeleton(files: Files, contents: Mapping[str, bytes], keys: Iterable[s
 
 
 def skeleton_problems(info: RunInfo) -> list[str]:
-    """Return a line for each metadata or coordinate file that is missing or has changed."""
+    """Return a line for each metadata or coordinate file of the result cube that is missing or has changed."""
     folders = {key.partition("/")[0] for key in info.skeleton if "/" in key}
     info.files.refuse_links(CUBE, *(f"{CUBE}/{folder}" for folder in folders))
     return problems_of(info.files.below(CUBE), info.skeleton)
 
 
 def check_skeleton(info: RunInfo) -> None:
-    """Compare metadata and coordinates with their digests in ``run.json``; raise `DamagedError` if one differs.
+    """Compare the result cube's metadata and coordinates with their digests in ``run.json``; raise `DamagedError` if
+    one differs.
 
     Raises
     ------

@@ -92,7 +92,7 @@ class CommittedStore(WrapperStore[Store]):
         return type(self)(store, self._files, self._shown, self._checks)
 
     async def get(self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None) -> Buffer | None:
-        """Return the content of a file of the cube for zarr; None if readers must not see the file.
+        """Return the content of a file of the result cube for zarr; None if readers must not see the file.
 
         Raises
         ------
@@ -157,7 +157,7 @@ class CommittedStore(WrapperStore[Store]):
         )
 
     async def exists(self, key: str) -> bool:
-        """Return whether a key belongs to the metadata, the coordinates or a committed chunk."""
+        """Return whether a key belongs to the metadata, the coordinates or a committed chunk of the result cube."""
         return self._shown.entry(key) is not None
 
     async def list_dir(self, prefix: str) -> AsyncIterator[str]:

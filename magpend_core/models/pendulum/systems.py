@@ -206,7 +206,7 @@ _DRIVES: dict[str, tuple[int, Any, Any, Any]] = {
 
 
 def _system(model: Model, magnets: str, driven: str) -> System:
-    """Build the system for one kind of magnets and drive from the function templates here."""
+    """Build the system for one kind of magnets and drive from the function templates of this module."""
     n_magnet, fill, torques, layers, slopes = _MAGNETS[magnets]
     n_edges, drive_constants, drive_torque, edges = _DRIVES[driven]
     name = "pendulum_" + (magnets if driven == "square" else f"{magnets}_{driven}")

@@ -46,7 +46,7 @@ class Writer:
         return [self.name(root) for root in roots]
 
     def _wanted(self, roots: list[Node]) -> dict[int, Node]:
-        """Return the nodes that get a variable in the generated code; a product inside a sum gets none."""
+        """Return the graph nodes that get a variable in the generated code; a product inside a sum gets none."""
         wanted: dict[int, Node] = {}
         pending = list(roots)
         while pending:
@@ -143,7 +143,9 @@ class Writer:
 
 
 def root_under(node: Node) -> tuple[Node, int] | None:
-    """Return x and n if a node has the form a / x**(n/2) with n = 1, 3 or 5 and depends on the state; else None."""
+    """Return x and n if a graph node has the form a / x**(n/2) with n = 1, 3 or 5 and depends on the state;
+    else None.
+    """
     if node.op != "div" or node.args[1].kind != STATED:
         return None
     below = node.args[1]

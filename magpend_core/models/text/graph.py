@@ -48,7 +48,7 @@ class Node:
         self.op, self.args, self.value, self.kind, self.number = op, args, value, kind, number
 
     def is_number(self, value: float) -> bool:
-        """Return whether the node is this number."""
+        """Return whether the node is a number with this value."""
         return self.op == "number" and self.value == value
 
 
@@ -166,20 +166,20 @@ class Graph:
         return self.node("add", *terms)
 
     def neg(self, x: Node) -> Node:
-        """Return the negative of a node."""
+        """Return the graph node of an expression's negative."""
         if x.op == "number":
             return self.number(-x.value)
         return x.args[0] if x.op == "neg" else self.node("neg", x)
 
     def sub(self, a: Node, b: Node) -> Node:
-        """Return the difference of two nodes."""
+        """Return the graph node of a difference."""
         return self.add(a, self.neg(b))
 
     # ---- products --------------------------------------------------------------------------------
 
     def mul(self, *factors: Node) -> Node:
-        """Multiply nodes: first the factors without state and time, then those that depend on time alone, then the
-        rest.
+        """Return the graph node of a product: first the factors without state and time, then those that depend on time
+        alone, then the rest.
         """
         total, negative, groups = 1.0, False, ([], [], [])  # type: ignore[var-annotated]
         pending = list(factors)[::-1]
@@ -216,7 +216,9 @@ class Graph:
         return found
 
     def div(self, a: Node, b: Node) -> Node:
-        """Divide nodes. A divisor that depends on neither state nor time is replaced by a factor, its inverse."""
+        """Return the graph node of a quotient. A divisor that depends on neither state nor time is replaced by a
+        factor, its inverse.
+        """
         if a.is_number(0.0) or b.is_number(1.0):
             return a
         if a.op == "number" and b.op == "number" and b.value != 0.0 and math.isfinite(a.value / b.value):

@@ -131,7 +131,9 @@ class Sides:
         return node if same else made_again(self.graph, node, args)
 
     def _smooth(self, node: Node, args: tuple[Node, ...], more: bool) -> Node:
-        """Rebuild a node with rewritten arguments; write a corner or jump with the sign of a switching surface."""
+        """Rebuild a graph node with rewritten arguments; write a corner or jump with the sign of a
+        switching surface.
+        """
         g = self.graph
         same = all(a is b for a, b in zip(args, node.args, strict=True))
         plain = node if same else made_again(g, node, args)
@@ -156,8 +158,8 @@ class Sides:
     def side(
         self, value: Node, rewritten: Node, jumps: bool, more: bool = True, written: Node | None = None
     ) -> Node | None:
-        """Return a node for the sign of an expression, adding a switch if necessary; None if no switch can stand for
-        the sign.
+        """Return a graph node for the sign of an expression, adding a switch if necessary; None if no switch can stand
+        for the sign.
         """
         g = self.graph
         if value.op == "neg":

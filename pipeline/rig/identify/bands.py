@@ -35,7 +35,7 @@ FOLLOWED = (FOLD, DOUBLING, TORUS, HOPF)
 
 
 def stored_tables(directory: str | Path) -> list[MeasuredTable]:
-    """Return the measured orbits of a finished identification."""
+    """Return the measured orbits of a finished identification, one `MeasuredTable` per table ``[[orbits]]``."""
     info, result = read_info(directory), read_result(directory)
     model = load_model(result["model"])
     found = []
@@ -143,7 +143,9 @@ def _orbits(
 
 
 def _solvable(table: OrbitData) -> OrbitData:
-    """Return the table with each orbit solved at the best parameters; drop orbits for which Newton's method fails."""
+    """Return the table of orbits with each orbit solved at the best parameters; drop orbits for which Newton's method
+    fails.
+    """
     whole = settled(table)
     if whole is not None:
         return whole
@@ -158,7 +160,9 @@ def _solvable(table: OrbitData) -> OrbitData:
 
 
 def _carried(table: OrbitData, drawn: xr.Dataset) -> np.ndarray:
-    """Return amplitude or bifurcation value of each datum, shape (draw, datum); NaN where an orbit is lost."""
+    """Return amplitude or bifurcation value for each measured orbit or bifurcation, shape (draw, datum); NaN where none
+    is found.
+    """
     names = [str(name) for name in drawn["parameter"].values]
     packed = np.array([table.packed(dict(zip(names, row, strict=True))) for row in drawn["value"].values])
     found = []
@@ -188,8 +192,7 @@ def bands_table(found: Sequence[xr.Dataset]) -> Table:
 
 
 def tubes(found: xr.Dataset) -> list[dict[str, np.ndarray]]:
-    """Return the 95 % bands of the branches: values of the parameter, lower and upper amplitude, one per branch and
-    stability.
+    """Return the 95 % amplitude bands, one per branch and stability: parameter values with lower and upper amplitude.
 
     A band is there where at least half of the draws have the orbit.
     """

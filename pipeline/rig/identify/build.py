@@ -59,7 +59,7 @@ class Built:
 
 @dataclass(frozen=True)
 class Stretch:
-    """Range of samples of a recording that is to become one piece of the fit."""
+    """Range of samples of a recording that is fitted as one piece, with its own initial state."""
 
     recording: int
     number: int

@@ -31,7 +31,7 @@ def is_table(path: str | Path) -> bool:
 
 
 def check_orbits(directory: str | Path, table: str | Path) -> dict[str, Any]:
-    """Compare the orbits of a table with the branches of an identified model.
+    """Compare the orbits of a measured table with the branches of an identified model.
 
     Parameters
     ----------

@@ -1,6 +1,4 @@
-"""Fit the initial states of the pieces of recordings for given parameters, or eliminate these states from the least-
-squares problem.
-"""
+"""Fit the initial states of the pieces of recordings for given parameters, or eliminate these states from the fit."""
 
 from __future__ import annotations
 

@@ -25,7 +25,8 @@ MAD = 1.4826
 
 
 def linearise(problem: Problem, fit: Fit) -> Linearised:
-    """Return residuals and their derivatives by the parameters at a fit's optimum, with the initial states eliminated.
+    """Return the residuals at a fit's optimum and their derivatives by the parameters, with the initial states
+    eliminated.
 
     The fit's own slopes are compressed piece by piece. Statistics of autocorrelated residuals need them along
     time.

@@ -73,8 +73,8 @@ class MeasuredTable:
         return (*self.fitted, *self.held_out)
 
     def branches(self, values: Mapping[str, float]) -> tuple[xr.Dataset, Array]:
-        """Compute the branches along the parameter, and the amplitudes of their orbits, for values of all
-        parameters.
+        """Compute the model's branches along the measured parameter, and the amplitudes of their orbits, for values of
+        all parameters.
         """
         parameters = _parameters(self.along.model, {**values, **self.settings})
         state = self.state or self.along.model.section_states[0]
@@ -89,7 +89,7 @@ class MeasuredTable:
         return found, amplitudes(found, parameters, state)
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the measured data and settings as plain data, to be stored and compared."""
+        """Return the measured orbits and settings as plain data, to be stored and compared."""
         crossing = self.along.model.crossing
         return {
             "section": None if crossing is None else vars(crossing),
@@ -108,7 +108,7 @@ def _plain(datum: Datum) -> dict[str, Any]:
 
 
 def measured_table(spec: IdentificationSpec, table: OrbitsTable, where: str) -> MeasuredTable:
-    """Read and check one table ``[[orbits]]``.
+    """Read and check one table ``[[orbits]]``: measured orbits and bifurcations.
 
     Raises
     ------
@@ -144,7 +144,7 @@ def measured_table(spec: IdentificationSpec, table: OrbitsTable, where: str) -> 
 
 
 def stored_table(data: Mapping[str, Any], model: Model, measured: xr.Dataset | None) -> MeasuredTable:
-    """Restore a table from the plain data of `MeasuredTable.as_dict`, the model, and its measured orbits."""
+    """Restore a `MeasuredTable` from the plain data of its `as_dict`, the model, and its measured orbits."""
     section = data["section"]
     whole = model if section is None else sectioned(model, Crossing(**section))
     fitted, held_out = (tuple(_datum(d) for d in data[key]) for key in ("fitted", "held_out"))
@@ -161,7 +161,7 @@ def _datum(data: Mapping[str, Any]) -> Datum:
 
 
 def read_orbits(spec: IdentificationSpec) -> list[MeasuredTable]:
-    """Read all tables ``[[orbits]]`` of a specification.
+    """Read all tables ``[[orbits]]`` (measured orbits and bifurcations) of a specification.
 
     Raises
     ------
@@ -414,7 +414,7 @@ def _first_point(datum: Datum, branches: xr.Dataset) -> Array | None:
 
 
 def judge_orbits(table: MeasuredTable, values: Mapping[str, float]) -> xr.Dataset:
-    """Compare the measured orbits and bifurcations of a table with newly computed branches.
+    """Compare the orbits and bifurcations of a measured table with newly computed branches.
 
     Returns
     -------

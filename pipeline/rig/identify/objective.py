@@ -73,7 +73,7 @@ class _Motions(NamedTuple):
 
 
 def evaluate(problem: Problem, thetas: Array, starts: Array, *, slopes: bool) -> list[Evaluation]:
-    """Compute residuals, and on request their derivatives, for each row of a matrix of unknowns.
+    """Compute the residuals of a fit, and on request their derivatives, for each row of a matrix of unknowns.
 
     Parameters
     ----------
@@ -243,7 +243,7 @@ def _read(problem: Problem, k: int, states: Array) -> Array:
 
 
 def _block(problem: Problem, k: int, theta: Array, member: _Motions, slopes: bool) -> tuple[int, Array, Array]:
-    """Return a piece's number, its compressed residuals, and their derivatives by the unknowns and its own initial
+    """Return the number of a piece, its compressed residuals, and their derivatives by the unknowns and its own initial
     state.
     """
     piece, n_free = problem.pieces[k], len(problem.free)

@@ -15,7 +15,8 @@ GROUPS = ("fitted", "held_out")
 
 
 def orbits_result(judged: Sequence[xr.Dataset]) -> list[dict[str, Any]]:
-    """Return the judged orbits and bifurcations of all tables as plain data.
+    """Return the comparison of measured and computed orbits and bifurcations as plain data, one entry per table
+    ``[[orbits]]``.
 
     Parameters
     ----------
@@ -83,7 +84,7 @@ def _known(value: Any) -> Any:
 
 
 def orbit_lines(result: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return the judged orbits of ``result.json`` as printed lines."""
+    """Return the comparison of measured and computed orbits in ``result.json`` as printed lines."""
     lines = []
     for table in result:
         for group in GROUPS:

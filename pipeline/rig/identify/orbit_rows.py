@@ -84,8 +84,8 @@ def _table_rows(problem: Problem, table: OrbitData, thetas: Array, slopes: bool)
 
 
 def _residuals(table: OrbitData, values: Sequence[Array]) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the residuals of a table in standard deviations, and a mask of the residuals of orbits that were not
-    found.
+    """Return the residuals of a table of orbits in standard deviations, and a mask of the residuals of orbits that were
+    not found.
     """
     rows = np.concatenate([(d.measured - v) / d.sd for d, v in zip(table.data, values, strict=True)])
     is_lost = ~np.isfinite(rows)
@@ -93,8 +93,8 @@ def _residuals(table: OrbitData, values: Sequence[Array]) -> tuple[Array, NDArra
 
 
 def _slopes(problem: Problem, table: OrbitData, theta: Array, values: Sequence[Array]) -> tuple[Array, OrbitData]:
-    """Return the derivatives of a table's residuals by the unknowns, and the table with the derivatives of its orbits
-    added.
+    """Return the derivatives by the unknowns of a table's residuals, and the table of orbits with the derivatives of
+    its orbits added.
     """
     jacobian = np.zeros((sum(len(d.measured) for d in table.data), len(problem.free)))
     ends, widths = _ends(problem, theta)
@@ -114,7 +114,7 @@ def _slopes(problem: Problem, table: OrbitData, theta: Array, values: Sequence[A
 
 
 def _ends(problem: Problem, theta: Array) -> tuple[Array, list[Array]]:
-    """Return the unknowns for central differences (each moved up and down in turn), and all displacements."""
+    """Return the unknowns for central differences, with one unknown moved up or down in turn, and all displacements."""
     ends, widths = [], []
     for i in problem.moving:
         free = problem.free[i]
@@ -136,7 +136,7 @@ def _difference(here: Array, there: Sequence[Array], widths: Array) -> Array:
 
 
 def _along_removed(table: OrbitData, packed: Array, points: Sequence[Point | None], jacobian: Array) -> Array:
-    """Remove the component along the branch from the derivatives of orbits with an uncertain parameter value.
+    """Remove the component along the branch from the derivatives of those orbits whose parameter value is uncertain.
 
     Its place on the branch is fitted for every set of unknowns (variable projection; see ``local``).
     """

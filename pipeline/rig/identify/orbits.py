@@ -50,7 +50,7 @@ LOCATED = Settings(tolerance=1e-8, max_iterations=12)
 
 @dataclass(frozen=True)
 class Datum:
-    """Measured orbit or bifurcation.
+    """One measured orbit or bifurcation.
 
     Attributes
     ----------
@@ -88,7 +88,7 @@ class Datum:
 
 @dataclass(frozen=True)
 class Solution:
-    """Computed orbits and bifurcations, one for each measured one of a table, at one set of parameters.
+    """Computed orbits and bifurcations at one set of parameters, one for each measured orbit or bifurcation of a table.
 
     Attributes
     ----------
@@ -110,7 +110,7 @@ class Solution:
 
 @dataclass(frozen=True)
 class OrbitData:
-    """Measured orbits and bifurcations of a table, with the computed ones from which Newton's method starts.
+    """Measured orbits and bifurcations of a table ``[[orbits]]``, with computed ones from which Newton's method starts.
 
     Attributes
     ----------
@@ -133,7 +133,7 @@ class OrbitData:
     settings: Mapping[str, float] = field(default_factory=dict)
 
     def packed(self, values: Mapping[str, float]) -> Array:
-        """Return packed parameters from values by name; the table's own settings replace values of the fit."""
+        """Return packed parameters from values by name. Settings of the table of orbits replace values of the fit."""
         merged = {**values, **self.settings}
         names = self.along.model.parameter_names
         return np.array([merged.get(name, self.known.packed[i]) for i, name in enumerate(names)])
@@ -215,8 +215,8 @@ def _moved(table: OrbitData, k: int, packed: Array, point: Point | None, step: f
 
 
 def solve(table: OrbitData, packed: Array) -> list[list[Point | None]]:
-    """Compute a table's orbits and bifurcations at each row of packed parameters, starting from the known ones; None
-    for those not found.
+    """Compute a table's orbits and bifurcations at each row of packed parameters, starting from those at the last
+    accepted parameters; None for those not found.
 
     Orbits stay at the value of the parameter, or if it has an error in the plane normal to the branch.
     """
@@ -226,8 +226,8 @@ def solve(table: OrbitData, packed: Array) -> list[list[Point | None]]:
 
 
 def _carried(table: OrbitData, k: int, packed: Array) -> Steps[Point | None]:
-    """Follow one orbit from the known parameters to others, in as few steps as possible; None if the orbit cannot be
-    followed.
+    """Follow one orbit from the last accepted parameters to others, in as few steps as possible; None if the orbit
+    cannot be followed.
     """
     known, datum = table.known, table.data[k]
     if not np.isfinite(known.unknowns[k]).all():
@@ -282,7 +282,9 @@ def _is_wanted(table: OrbitData, datum: Datum, point: Point) -> bool:
 
 
 def _raw(table: OrbitData, datum: Datum, point: Point) -> Array:
-    """Return section point and parameter value of a solution in SI units, unscaled."""
+    """Return section point and parameter value of a computed orbit in SI units, from the scaled unknowns of Newton's
+    method.
+    """
     scales = np.asarray(table.along.model.system.scales)
     n = len(scales)
     return np.append(point.u[:n] * scales, point.u[n] * (table.along.high - table.along.low))
@@ -302,7 +304,9 @@ def solution_of(table: OrbitData, packed: Array, points: Sequence[Point | None])
 
 
 def settled(table: OrbitData) -> OrbitData | None:
-    """Solve all orbits of a table at their measured parameter values, from its first guesses; None if one fails."""
+    """Solve all orbits of a table at their measured parameter values, starting from its first guesses; None if one
+    fails.
+    """
     plain = tuple(
         replace(d, quantities=tuple(q for q in d.quantities if q != PARAMETER or d.kind != ORBIT)) for d in table.data
     )
@@ -318,7 +322,8 @@ def settled(table: OrbitData) -> OrbitData | None:
 
 
 def quantities_of(table: OrbitData, packed: Array, points: Sequence[Sequence[Point | None]]) -> list[list[Array]]:
-    """Return the computed values of the measured quantities, for each row of packed parameters and each datum.
+    """Return the computed values of the measured quantities, for each row of packed parameters and each measured orbit
+    or bifurcation.
 
     NaN where an orbit is lost.
     """

@@ -22,7 +22,7 @@ LEVELS = (0.025, 0.5, 0.975)
 
 
 def draw_posterior(directory: str | Path, n: int, seed: int = 1) -> xr.Dataset:
-    """Draw parameter sets from the Gaussian given by estimates and covariance, truncated to the bounds.
+    """Draw parameter sets from the Gaussian that the estimates and their covariance define, truncated to the bounds.
 
     Parameters
     ----------

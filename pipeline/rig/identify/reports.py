@@ -215,7 +215,7 @@ def _plain(values: Any) -> Any:
 
 
 def write_values(path: Path, spec: IdentificationSpec, found: Finding, sources: Sequence[Source]) -> None:
-    """Write the identified, tied and fixed parameters as a preset, each with its origin."""
+    """Write the identified, tied and fixed parameters as a preset file, each with its origin."""
     files = ", ".join(f"{s.file} (sha256 {s.sha256[:12]})" for s in sources) or "measured orbits"
     phrases = {}
     for i, free in enumerate(found.problem.free):

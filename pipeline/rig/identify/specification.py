@@ -35,8 +35,8 @@ class SensorsTable(Table):
 
 
 class RecordingTable(Table):
-    """Table ``[[recordings]]``: file of a recording, mapping of its channels to states, kind of its drive, time window
-    and held-out pieces.
+    """Table ``[[recordings]]``: file of a recording, mapping file of its channels, kind of its drive, time window and
+    held-out pieces.
     """
 
     file: str = Field(description="Recording, relative to the specification")

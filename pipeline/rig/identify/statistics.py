@@ -289,7 +289,9 @@ def robust_weights(residuals: np.ndarray, loss: str) -> tuple[np.ndarray, np.nda
 
 @dataclass(frozen=True)
 class _Scores:
-    """Scores (gradients of the cost by the parameters) at each time, and information matrices, for each piece."""
+    """Scores (gradients of the cost by the parameters) at each sample time, and information matrices, for
+    each piece.
+    """
 
     scores: list[np.ndarray]
     information: list[np.ndarray]

@@ -171,9 +171,7 @@ def _name_of(channel: str | int, names: Sequence[str]) -> str | None:
 
 
 def _name_but_for_unit(entry: Scaled | TimeMap | PieceMap, names: Sequence[str]) -> str | None:
-    """Return the channel name in the file that consists of the mapping's name and a unit in brackets. Return None
-    unless there is exactly one.
-    """
+    """Return the one channel in the file whose name is the mapping's name followed by a unit in brackets, else None."""
     near = _names_with_unit(entry.channel, names)
     if len(near) != 1 or isinstance(entry, PieceMap) or not entry.unit:
         return None
