@@ -1,4 +1,4 @@
-"""Continue trajectories from their last stored section, with the same bits as one longer run."""
+"""Continue trajectories from their last stored section point, with the same bits as one longer run."""
 
 from __future__ import annotations
 
@@ -29,7 +29,8 @@ def more_sections(
     system: System,
     quantities: Sequence[str] | None = None,
 ) -> Sections:
-    """Continue trajectories from their last section, and return the sections of the drive periods that follow.
+    """Continue trajectories from their last section point, and return the section points of the drive periods that
+    follow.
 
     Parameters
     ----------

@@ -33,7 +33,7 @@ def _named(t: Any, y: Any, c: Any) -> Any:
 
 
 def _set_modes(t: float, y: Any, rows: Any, lane: int, edge_times: Any) -> None:
-    """Set the switch modes of a SIMD lane from the signs of its event functions; no switch slides."""
+    """Set the modes of the switches of a SIMD lane from the signs of the event functions; no switch slides."""
     for k in range(N_OWN, NC):
         rows[k * WIDTH + lane] = 1.0
     if HAS_SWITCHES:

@@ -618,12 +618,12 @@ def start_point(cells: Cells, work: Work, lane: int, point: int, settings: Any, 
 
 
 def has_failed(status: int) -> bool:
-    """Return whether a status means that the trajectory failed and its sections must not be used."""
+    """Return whether a status means that the trajectory failed and its section points must not be used."""
     return status == DIVERGED or status == STEP_LIMIT or status == STEP_UNDERFLOW or status == ENDS_IN_CHATTER
 
 
 def forget(cells: Cells, branch: int, point: int) -> None:
-    """Set the recorded sections of a failed trajectory to NaN."""
+    """Set the recorded section points of a failed trajectory to NaN."""
     for i in range(cells.section.shape[2]):
         for k in range(N):
             cells.section[branch, point, i, k] = np.nan

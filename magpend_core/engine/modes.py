@@ -190,7 +190,7 @@ def keep_switches(w: Any, base: int, lane: int) -> None:
 
 
 def begin_events(w: Any, base: int, lane: int) -> None:
-    """Reset the event data of a SIMD lane; set its switch modes and resting contacts from its state."""
+    """Reset the event data of a SIMD lane; set the modes of its switches and its resting contacts from its state."""
     for k in range(N_EVENTS):
         w[base + ROWS.side + k * WIDTH + lane] = 0.0
         w[base + ROWS.fired + k * WIDTH + lane] = 0.0

@@ -129,7 +129,9 @@ _SETTLED, _PERIOD, _KEPT, _RING = 0, 1, 2, 3
 
 
 def _lag_distance(ring: Any, i: int, j: int, window: int) -> float:
-    """Return the largest scaled difference between the states at sections `i` and `j` (1, 2, ...); angles mod 2 pi."""
+    """Return the largest scaled difference between the states at section points number `i` and `j` (1, 2, ...); angles
+    mod 2 pi.
+    """
     a, b = ((i - 1) % window) * N, ((j - 1) % window) * N
     largest = 0.0
     for k in range(N):

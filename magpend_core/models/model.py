@@ -89,7 +89,7 @@ class Quantity:
 
 @dataclass(frozen=True)
 class Classifier:
-    """Classification of a model's motions into named classes, computed from stored sections.
+    """Classification of a model's motions into named classes, computed from stored section points.
 
     Attributes
     ----------

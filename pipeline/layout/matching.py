@@ -82,7 +82,9 @@ def way_of(spec: Spec, block: tuple[slice, ...]) -> Way | None:
 
 
 def _path_of(spec: Spec) -> tuple[int, np.ndarray]:
-    """Return the continuation parameter's axis: its index among the cube's parameter axes, and its values."""
+    """Return the continuation parameter's axis: its index among the parameter axes of the result cube, and
+    its values.
+    """
     assert spec.continuation is not None
     axes = parameter_axes(spec)
     path = [a.parameter for a in axes].index(spec.continuation.path)

@@ -321,7 +321,7 @@ def _group(n_seeds: int, wanted: int, most: int) -> int:
 
 
 def _share(n: int, most: int) -> int:
-    """Return the size of the parts if `n` is split into the fewest about equal parts of at most `most` each."""
+    """Return the part size for splitting `n` into the fewest, about equal parts of at most `most` each."""
     return -(-n // -(-n // most))
 
 

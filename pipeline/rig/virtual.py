@@ -165,7 +165,8 @@ def readings(
     sensors: Sensors,
     seed: int,
 ) -> tuple[Raw, Mapping]:
-    """Simulate the sensors' readings, and return them with the mapping that converts them to states.
+    """Simulate the sensors' readings. Return them with the mapping (description of the channels) that converts them to
+    states.
 
     Returns
     -------

@@ -161,7 +161,7 @@ class CommittedStore(WrapperStore[Store]):
         return self._shown.entry(key) is not None
 
     async def list_dir(self, prefix: str) -> AsyncIterator[str]:
-        """Yield the names in a folder of the cube; at its top level, the names of its arrays."""
+        """Yield the names in a folder of the result cube; at its top level, the names of its arrays."""
         if prefix.strip("/"):
             async for name in self._store.list_dir(prefix):
                 yield name
@@ -172,7 +172,7 @@ class CommittedStore(WrapperStore[Store]):
     async def get_partial_values(
         self, prototype: BufferPrototype, key_ranges: Iterable[tuple[str, ByteRequest | None]]
     ) -> list[Buffer | None]:
-        """Return the requested byte ranges of several files of the cube, for zarr."""
+        """Return the requested byte ranges of several files of the result cube, for zarr."""
         return [await self.get(key, prototype, byte_range) for key, byte_range in key_ranges]
 
     async def _get_many(

@@ -127,7 +127,7 @@ def _ends(problem: Problem, theta: Array) -> tuple[Array, list[Array]]:
 
 
 def _difference(here: Array, there: Sequence[Array], widths: Array) -> Array:
-    """Return a central difference, or a one-sided one where only one neighbour is finite; 0 where none is."""
+    """Return a central difference, or a one-sided one where only one of the two values is finite; 0 where none is."""
     with np.errstate(invalid="ignore", divide="ignore"):
         central = (there[0] - there[1]) / (widths[0] - widths[1])
         sides = [(one - here) / width for one, width in zip(there, widths, strict=True)]

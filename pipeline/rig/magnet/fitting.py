@@ -337,7 +337,7 @@ def _scale(name: str, values: Mapping[str, float]) -> float:
 
 
 def _neighbours(measured: Measurement, residuals: np.ndarray) -> float:
-    """Return the correlation between the residuals of neighbouring readings on a torque curve, over all curves."""
+    """Return the correlation between the residuals of successive readings on a torque curve, over all curves."""
     products = squares = 0.0
     for curve in measured.curves:
         own = residuals[curve.rows[np.argsort(measured.angle[curve.rows])]]

@@ -80,7 +80,7 @@ class TorqueColumn(Table):
 
 
 class SideColumn(Table):
-    """Column of the table that gives the side of the fixed magnet on which the pendulum was."""
+    """Column of the measurement's CSV table that gives the side of the fixed magnet on which the pendulum was."""
 
     column: str = Field(description="Its name in the table's first row.")
     right: str = Field("right", description="Entry for the right side, where torques are positive.")

@@ -141,8 +141,8 @@ def _bend(rising: Floats, noise: float) -> float:
 
 
 def constant_spans(edges: Edges) -> list[tuple[int, int]]:
-    """Return the first and last rising edge of each stretch of constant frequency; neighbouring stretches share an
-    edge.
+    """Return the first and last rising edge of each stretch of constant frequency; successive stretches
+    share an edge.
     """
     t = edges.rising
     noise = _noise(edges)

@@ -156,7 +156,8 @@ def in_dead_band(signal: Signal, entry: ChannelMap) -> tuple[np.ndarray, list[Fi
 
 
 def unwrapped(signal: Signal, angle: np.ndarray, wraps: bool) -> tuple[np.ndarray, list[Finding]]:
-    """Unwrap an angle within each piece if the mapping says that it wraps; otherwise report jumps by a full turn.
+    """Unwrap an angle within each piece if the recording's mapping file says that it wraps; otherwise report jumps by a
+    full turn.
 
     Parameters
     ----------

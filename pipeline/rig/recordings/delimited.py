@@ -1,4 +1,4 @@
-"""Read CSV files. Delimiter, header and decimal sign are stated in the mapping or detected."""
+"""Read CSV files. The mapping file states delimiter, header and decimal sign; otherwise they are detected."""
 
 from __future__ import annotations
 

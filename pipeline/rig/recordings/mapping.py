@@ -140,7 +140,7 @@ class Mapping(Table):
         return entry.sign * (1.0 if entry.scale is None else entry.scale) * (1.0 if known is None else known)
 
     def toml(self) -> str:
-        """Return the mapping as the text of a TOML file."""
+        """Return the recording's mapping as the text of a TOML file."""
         plain = self.model_dump(mode="json", exclude_none=True, exclude_defaults=True)
         tables = {key: plain.pop(key) for key in ("csv", "channels", "drive") if isinstance(plain.get(key), dict)}
         model = model_toml(plain.pop("model")).rstrip("\n")

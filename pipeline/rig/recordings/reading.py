@@ -171,7 +171,9 @@ def _name_of(channel: str | int, names: Sequence[str]) -> str | None:
 
 
 def _name_but_for_unit(entry: Scaled | TimeMap | PieceMap, names: Sequence[str]) -> str | None:
-    """Return the one channel in the file whose name is the mapping's name followed by a unit in brackets, else None."""
+    """Return the one channel in the file whose name is that in the mapping file followed by a unit in brackets, else
+    None.
+    """
     near = _names_with_unit(entry.channel, names)
     if len(near) != 1 or isinstance(entry, PieceMap) or not entry.unit:
         return None
