@@ -1,4 +1,4 @@
-"""What all tests share: one compile cache, a command called in this process, how hypothesis draws examples.
+"""What all tests share: one compile cache, temporary files in memory, a command called in this process, examples drawn.
 
 ``HYPOTHESIS_PROFILE=fresh`` draws new examples in every run, more of them, and remembers what failed;
 otherwise they are the same ones in every run. ``MAGPEND_LONG=1`` runs what is marked ``long``, too.
@@ -45,8 +45,26 @@ def _share_compile_cache() -> None:
     os.environ["MAGPEND_CACHE_DIR"] = str(folder)
 
 
+MEMORY, ROOM = Path("/dev/shm"), 8 * 2**30
+"""A file system in memory where there is one, and how many bytes must be free there."""
+
+
+def _keep_temporary_files_in_memory() -> None:
+    """Put the tests' folders where a sync takes no time: runs sync each file that they write.
+
+    Name a folder in ``TMPDIR`` to keep what a failed test has written.
+    """
+    if os.environ.get("TMPDIR") or not _is_writable(MEMORY) or shutil.disk_usage(MEMORY).free < ROOM:
+        return
+    folder = Path(tempfile.mkdtemp(prefix="magpend-tests-", dir=MEMORY))
+    _TO_REMOVE.append(folder)
+    # for pytest's own folders, its workers and all processes that tests start
+    os.environ["TMPDIR"] = tempfile.tempdir = str(folder)
+
+
 _TO_REMOVE: list[Path] = []
 _share_compile_cache()
+_keep_temporary_files_in_memory()
 
 
 def pytest_unconfigure() -> None:
