@@ -395,7 +395,8 @@ class _Table:
             arrays[name][at] = getattr(x, name)
 
     def share(self, index: tuple[int, ...], one: Found) -> None:
-        """Write each attractor's share of the trajectories that reach an attractor or diverge at one parameter point.
+        """Write each attractor's share of the trajectories that reach an attractor or diverge at one parameter
+        point.
         """
         counts = np.array(one.counts, np.int64)
         attracts = np.array([x.stability == ATTRACTS for x in one.features], bool)

@@ -35,7 +35,8 @@ _NUMBERS = ("lyapunov_max", "lyapunov_low", "lyapunov_high", "mean_lifetime", "l
 
 
 def attractors_table(ds: xr.Dataset) -> Table:
-    """Return the table of attractors. It has rows per parameter point or, if there are many points, per attractor id.
+    """Return the table of attractors. It has rows per parameter point or, if there are many points, per attractor
+    id.
     """
     rows = _rows(ds)
     dims, _ = split_dims(ds["attractor_id"])

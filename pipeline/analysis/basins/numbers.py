@@ -204,7 +204,8 @@ def _kept_dims(
 
 
 def _count_rows(grid: LabelGrid, shape: tuple[int, ...]) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """Count the cells of each label, and the unfinished cells, for each index of the leading axes (parameter points).
+    """Count the cells of each label, and the unfinished cells, for each index of the leading axes (parameter
+    points).
     """
     n_rows, width = int(np.prod(shape)), grid.ids.size + 1
     codes = grid.codes.reshape(n_rows, -1).astype(np.int64) + 1

@@ -235,7 +235,8 @@ def find_root(
 
 
 def _root(known: list[tuple[float, float]]) -> float:
-    """Estimate the root of a function by inverse interpolation of (argument, value) pairs; NaN if two values are equal.
+    """Estimate the root of a function by inverse interpolation of (argument, value) pairs; NaN if two values are
+    equal.
     """
     total = 0.0
     for i, (at, value) in enumerate(known):

@@ -206,7 +206,8 @@ def fill_cycle(found: Features, cycle: Cycle) -> None:
 
 
 def of_equilibrium(found: Equilibrium, parameters: Parameters | None, n_angles: int) -> Features:
-    """Return the features of an equilibrium. Its largest Lyapunov exponent is the largest real part of the eigenvalues.
+    """Return the features of an equilibrium. Its largest Lyapunov exponent is the largest real part of the
+    eigenvalues.
     """
     x = Features(
         found.state[None],

@@ -256,7 +256,8 @@ def _label_ends(block: Block, ends: Mapping[int, int], label: np.ndarray, decisi
 def _representatives(
     block: Block, group: np.ndarray, best: dict[int, tuple[float, int, np.ndarray]], geometry: Geometry
 ) -> None:
-    """Find one representative cell for each group of closed (periodic) cells: the cell whose orbit closes most exactly.
+    """Find one representative cell for each group of closed (periodic) cells: the cell whose orbit closes most
+    exactly.
     """
     rows = np.flatnonzero(group >= 0)
     if not len(rows):

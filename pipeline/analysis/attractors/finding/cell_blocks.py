@@ -172,7 +172,8 @@ class ClosedCells:
         self._keys.append(unique)
 
     def close(self) -> tuple[np.ndarray, np.ndarray]:
-        """Form the groups. Return the sorted keys (hashes) of the occupied boxes, and the number of each box's group.
+        """Form the groups. Return the sorted keys (hashes) of the occupied boxes, and the number of each box's
+        group.
         """
         if not self._keys:
             return np.zeros(0, np.uint64), np.zeros(0, np.int64)

@@ -142,7 +142,8 @@ def _settled(point: Point, states: np.ndarray, reach: np.ndarray, geometry: Geom
 
 
 def put_at_rest(point: Point, tolerance: float, geometry: Geometry) -> None:
-    """Mark cells near a degenerate equilibrium as at rest there, if that equilibrium attracts; changes `point.at_rest`.
+    """Mark cells near a degenerate equilibrium as at rest there, if that equilibrium attracts; changes
+    `point.at_rest`.
     """
     states, _ = _ends(point, tolerance)
     assert point.at_rest is not None

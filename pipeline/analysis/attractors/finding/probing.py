@@ -23,7 +23,8 @@ LEGS, FALL = 32, 0.7
 
 
 def probe_orbit(orbit: Orbit, geometry: Geometry) -> Work[float]:
-    """Find the scaled distance from which trajectories on both sides approach an orbit; 0 if they do not approach it.
+    """Find the scaled distance from which trajectories on both sides approach an orbit; 0 if they do not approach
+    it.
     """
     matrix = scaled_derivative(orbit, geometry)
     values, vectors = np.linalg.eig(matrix)

@@ -55,7 +55,8 @@ class _Seen:
 
     @property
     def family(self) -> int:
-        """Odd part of the orbit period. All orbits of one period-doubling cascade share it; it is 0 for bounded sets.
+        """Odd part of the orbit period. All orbits of one period-doubling cascade share it; it is 0 for bounded
+        sets.
         """
         return self.period // (self.period & -self.period) if self.period else 0
 
