@@ -279,7 +279,8 @@ def _is_torus(one: Bifurcation) -> bool:
 
 
 def _is_pair(one: Bifurcation) -> bool:
-    """Return whether a located zero is a Hopf point (complex eigenvalues), and not a neutral saddle (real eigenvalues).
+    """Return whether a located zero is a Hopf point (complex eigenvalues), and not a neutral saddle (real
+    eigenvalues).
     """
     values = eigenvalues_of(one.point)
     upper = values[values.imag > 0.0]

@@ -167,7 +167,8 @@ def _neighbours(line: Sequence[Found], start: dict[int, Point | None]) -> Links:
 
 
 def _is_one_step(a: Found, b: Found, start: dict[int, Point | None]) -> bool:
-    """Return whether one step along the tangent leads from each of two orbits to the other, at matching section points.
+    """Return whether one step along the tangent leads from each of two orbits to the other, at matching section
+    points.
     """
     phases = [_leads_to(start[a.number], b), _leads_to(start[b.number], a)]
     return all(p is not None for p in phases) and sum(p for p in phases if p is not None) % a.period == 0

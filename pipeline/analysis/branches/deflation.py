@@ -169,7 +169,8 @@ def _newton(matrices: np.ndarray, mismatch: np.ndarray) -> np.ndarray:
 def _stretch(
     states: np.ndarray, periods: np.ndarray, steps: np.ndarray, known: Sequence[FoundOrbit], system: System
 ) -> np.ndarray:
-    """Return the factor by which deflation stretches each Newton step, to keep it away from the orbits that are known.
+    """Return the factor by which deflation stretches each Newton step, to keep it away from the orbits that are
+    known.
     """
     scales, along = np.asarray(system.scales), np.zeros(len(states))
     for one in known:

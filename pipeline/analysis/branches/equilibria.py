@@ -45,7 +45,8 @@ class EquilibriumProblem:
         return Value(rates[0] * unit, derivative, rows.states[:1], jacobian, is_rest=True)
 
     def _unit_of(self, jacobian: np.ndarray) -> float:
-        """Return the time [s] that makes the rates dimensionless: the inverse of the Jacobian's norm at the first call.
+        """Return the time [s] that makes the rates dimensionless: the inverse of the Jacobian's norm at the first
+        call.
         """
         if not self._unit:
             norm = float(np.linalg.norm(self.family.scaled(jacobian)))

@@ -137,7 +137,8 @@ def _half_way(family: Family, point: Point) -> np.ndarray:
 
 
 def half_orbit(family: Family, point: Point) -> tuple[np.ndarray, float]:
-    """Return a section point and the parameter value of the orbit of half the period that a branch has nearly reached.
+    """Return a section point and the parameter value of the orbit of half the period that a branch has nearly
+    reached.
     """
     u = point.u.copy()
     u[:-1] += 0.5 * _half_way(family, point)

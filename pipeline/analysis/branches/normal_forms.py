@@ -183,7 +183,8 @@ class CoefficientProblem:
         return self.case.family.rows(self.case.neighbours())
 
     def value(self, u: np.ndarray, ends: Ends) -> Value:
-        """Compute the normal form coefficient for each step size except the largest, from the integrated trajectories.
+        """Compute the normal form coefficient for each step size except the largest, from the integrated
+        trajectories.
         """
         found = self.case.coefficients(FORMS[self.case.kind], ends.monodromy)
         return Value(found, np.zeros((len(found), self.size)), ends.images[0], ends.monodromy[0])
@@ -222,7 +223,8 @@ def _bend(middle: np.ndarray, ahead: np.ndarray, behind: np.ndarray, steps: np.n
 
 
 def settled(values: np.ndarray) -> tuple[float, float, int]:
-    """Choose the value of a coefficient that changes least with the step size. Return it with its error and its index.
+    """Choose the value of a coefficient that changes least with the step size. Return it with its error and its
+    index.
     """
     changes = np.abs(np.diff(values))
     errors = np.maximum(changes[:-1], changes[1:])

@@ -167,7 +167,8 @@ class Family:
         return np.asarray(u[self.system.n_states :] * np.asarray(self.scales))
 
     def rows(self, many: np.ndarray) -> Rows:
-        """Return the trajectories to integrate over one period of the orbit, one for each vector of unknowns in `many`.
+        """Return the trajectories to integrate over one period of the orbit, one for each vector of unknowns in
+        `many`.
         """
         n = self.system.n_states
         frequency = np.full(len(many), self.frequency_hz)
@@ -350,7 +351,8 @@ TESTS: dict[str, Callable[[np.ndarray], float]] = {
 
 @dataclass(frozen=True, eq=False)
 class BifurcationProblem:
-    """Equations for orbits at a bifurcation, with two free parameters: the orbit closes, and a test function is zero.
+    """Equations for orbits at a bifurcation, with two free parameters: the orbit closes, and a test function is
+    zero.
     """
 
     family: Family
