@@ -1,1 +1,1 @@
-"""Carry out commands on runs: run, status, verify, derive, draw, extend, zoom."""
+"""Do what the commands on runs do: run, status, verify, derive, draw, extend, zoom."""
