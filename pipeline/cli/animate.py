@@ -125,7 +125,9 @@ def _start(
     transient: int,
     alone: bool,
 ) -> Start | None:
-    """Read from the command line's options which motion to animate without a run; None if a run is animated."""
+    """Read the initial state, the model and its parameters from the options; None if a run's own motions are
+    animated.
+    """
     from pipeline.runs.filming import Start
     from pipeline.specification.problems import SpecError
 
@@ -161,7 +163,6 @@ def _contradictions(
 
 
 def _place(run: Run | None, at: dict[str, float], attractor: list[str] | None, cell: list[int] | None) -> Path:
-    """Return the default file of an animation, named by the parameter values, attractors and cells that it shows."""
     if run is None:
         return Path("animation.gif")
     files = run.info.files

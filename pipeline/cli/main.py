@@ -114,7 +114,6 @@ def _codes() -> list[tuple[tuple[type[BaseException], ...], Exit]]:
 
 
 def _complain(error: BaseException) -> None:
-    """Print an error to the standard error, with one line per problem."""
     from pipeline.cli.console import LOG
 
     lines: list[Any] = getattr(error, "problems", None) or [str(error)]
@@ -169,7 +168,6 @@ def main() -> None:
 
 
 def _usage(error: Any) -> None:
-    """Print what is wrong in a command line, and the command that shows the help."""
     context = getattr(error, "ctx", None)
     message = error.format_message()
     near = getattr(error, "possibilities", None)

@@ -53,7 +53,6 @@ def _load(paths: list[Path], mappings: list[Path]) -> list[Mapping]:
 
 
 def _read(paths: list[Path], mappings: list[Mapping]) -> list[xr.Dataset]:
-    """Read recordings, and print the defects found in them."""
     from pipeline.cli import console
     from pipeline.rig.recordings import findings_of, read_recording, summary
 

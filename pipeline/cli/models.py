@@ -90,7 +90,6 @@ def all_of(model: Model) -> list[str]:
 
 
 def _preset(model: Model, name: str | Preset) -> list[str]:
-    """Return text lines with the parameter values of a preset, and the source of each value."""
     from pipeline.products.product import padded
 
     found = model.preset(name)

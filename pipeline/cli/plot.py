@@ -70,7 +70,6 @@ def draw(directory: str, name: str, options: FigureOptions) -> None:
 
 
 def _target_of(options: FigureOptions) -> Path:
-    """Return the file that ``--out`` names, with the suffix of ``--format`` added if it is missing."""
     out, suffix = Path(options.out), f".{options.format}"
     return out.with_name(out.name + suffix) if options.format and out.suffix.lower() != suffix else out
 

@@ -196,7 +196,6 @@ def _smoothed(ds: xr.Dataset, wanted: bool, window_s: float | None) -> xr.Datase
 
 
 def _tell(ds: xr.Dataset, as_json: bool) -> None:
-    """Print the quantities of a recording and the defects found in it, as text lines or as one JSON object."""
     from pipeline.cli import console
     from pipeline.cli.common import json_rows
     from pipeline.rig.recordings.overview import describe_recording

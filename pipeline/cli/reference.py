@@ -115,7 +115,6 @@ def _metavar(parameter: Any) -> str:
 
 
 def _help(parameter: Any) -> str:
-    """Return the help text of a command-line option, with its default value if it has one."""
     has_default = isinstance(parameter.default, (int, float, str, Path)) and parameter.default is not False
     return _text(parameter.help or "") + (f" Default: {parameter.default}." if has_default else "")
 

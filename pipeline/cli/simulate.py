@@ -107,7 +107,6 @@ def simulate(
 
 
 def _draw(ds: xr.Dataset, target: Path, series: Path) -> None:
-    """Draw a time series, and write the figure; write also its data, unless the series file already holds them."""
     from pipeline.cli import console
     from pipeline.plots import plot_trajectory, save_data, save_figure
 

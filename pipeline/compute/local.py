@@ -115,7 +115,6 @@ def local_cluster(n_workers: int, *, dashboard: bool = False) -> Iterator[Any]:
 
 
 def _await_one(cluster: Any) -> None:
-    """Wait for the first worker process; raise SchedulerError if none starts in time."""
     end = time.monotonic() + START_S
     while not cluster.scheduler.workers:
         if time.monotonic() > end:
@@ -246,7 +245,7 @@ def _blocked(numbers: set[signal.Signals]) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _hushed() -> Iterator[None]:
-    """Silence dask's log messages about connections, from here on if the code inside the context raises.
+    """Silence dask's log messages about connections inside the context, and for good if the code inside raises.
 
     dask logs some connections only after a cluster has closed.
     """

@@ -238,7 +238,6 @@ def _leading(taken: np.ndarray) -> np.ndarray:
 
 
 def _points(inputs: Inputs, part: slice) -> Inputs:
-    """Return the inputs of branches at some of their parameter points."""
     return replace(inputs, parameters=inputs.parameters[:, part], frequency_hz=inputs.frequency_hz[:, part])
 
 

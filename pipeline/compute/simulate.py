@@ -156,7 +156,6 @@ def _recording(
 
 
 def _at_frequency(parameters: Parameters, frequency_hz: float, state: np.ndarray, series: Series) -> xr.Dataset:
-    """Integrate a trajectory under the model's own drive at a fixed frequency."""
     from magpend_core import evaluate, trajectory
 
     n, samples = series.n_periods or DEFAULT_PERIODS, series.samples_per_period
@@ -186,7 +185,6 @@ def _closing(sections: np.ndarray, parameters: Parameters, series: Series) -> di
 
 
 def _under_recording(parameters: Parameters, drive: RecordedDrive, state: np.ndarray, series: Series) -> xr.Dataset:
-    """Integrate a trajectory under a recorded drive, from the recording's start."""
     from magpend_core.recorded_drive import evaluate_recorded, recorded_trajectory
 
     marks = np.append(drive.start_s, drive.sections_s)

@@ -210,14 +210,12 @@ class _Plan:
 
     @property
     def row(self) -> float:
-        """Return the height of one row of motions [in]."""
         if self.n == 1:
             return self.drawing + self.above
         return self.above + self.drawing + self.n_pairs * (self.portrait + self.below)
 
     @property
     def foot(self) -> float:
-        """Return the height of the text line at the foot of a frame [in]."""
         return self.below if self.n == 1 else 0.5 * self.below
 
     @property
@@ -261,7 +259,6 @@ class _Plan:
 
 
 def _title(fig: style.DataFigure, plan: _Plan, box: Box, text: str) -> None:
-    """Write the name of a motion above its panels, cut to their width."""
     room = plan.width / plan.columns - 0.2
     lines = style.folded(text, room, fig.look.legend).split("\n")
     short = lines[0] if len(lines) == 1 else lines[0].rstrip(",:") + " \N{HORIZONTAL ELLIPSIS}"

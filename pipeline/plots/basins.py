@@ -91,7 +91,6 @@ def plot_basins(
 
 
 def _write_letters(ax: Axes, codes: np.ndarray, cast: palette.Cast) -> None:
-    """Write the label of each attractor (a letter) into the visible part of its basin."""
     left, right, bottom, top = ax.get_images()[0].get_extent()
     row, column = (
         np.clip(((np.arange(400) + 0.5) / 400 * (b - a) + a - low) / (high - low) * n, 0, n - 1).astype(int)
@@ -174,7 +173,6 @@ def _timed(data: xr.Dataset, part: xr.Dataset) -> np.ndarray:
 
 
 def _scale(data: xr.Dataset, part: xr.Dataset) -> LogNorm | None:
-    """Return the logarithmic colour scale of convergence times; None if no time is known."""
     if "n_periods" not in data:
         return None
     times = data["n_periods"].values[_timed(data, part)]
@@ -187,7 +185,6 @@ def _scale(data: xr.Dataset, part: xr.Dataset) -> LogNorm | None:
 def _extent(
     data: xr.Dataset, attractors: xr.Dataset, axes: tuple[str, str], degrees: bool
 ) -> tuple[float, float, float, float]:
-    """Return the limits of the image, at the outer edges of its outermost cells."""
     x, y = (
         labels.start_measure(attractors, d, degrees).shown(style.edges(data[d].values.astype(np.float64))) for d in axes
     )
@@ -209,9 +206,6 @@ def _dress(ax: Axes, attractors: xr.Dataset, axes: tuple[str, str], degrees: boo
 
 
 def _entries(cast: palette.Cast, counts: Mapping[int, int], total: int) -> list[tuple[str, str]]:
-    """Return the legend: attractors by falling basin fraction, then minor ones together, then cells without an
-    attractor.
-    """
     own = sorted((i for i in counts if i >= 0), key=lambda i: (-counts[i], i))
     entries = [(f"{cast.names[i]}, {palette.percent(counts[i] / total)}", cast.colours[i]) for i in own]
     if _OTHERS in counts:

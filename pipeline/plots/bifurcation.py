@@ -262,7 +262,6 @@ def swept_parameter(ds: xr.Dataset) -> str:
 
 
 def _layers(names: Sequence[str], layout: str) -> list[tuple[int, ...]]:
-    """Return the directions of continuation that each panel shows."""
     if layout == "overlay":
         return [tuple(range(len(names)))]
     if len(names) < 2:

@@ -116,7 +116,6 @@ def _chosen(ds: xr.Dataset, max_period: int | None) -> list[int]:
 
 
 def _draw_lines(ax: Axes, ds: xr.Dataset, chosen: list[int], measure: Measure, scale: bool) -> list[_Name]:
-    """Draw branches and mark their bifurcations; return the labels to write at these."""
     for i in chosen:
         for x, y, stable in pieces(ds, i, measure):
             ax.plot(x, y, scalex=scale, scaley=scale, **(_STABLE if stable else _UNSTABLE))

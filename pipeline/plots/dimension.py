@@ -95,14 +95,12 @@ def _of_one_attractor(ds: xr.Dataset) -> xr.Dataset:
 
 
 def _scales(ds: xr.Dataset) -> str:
-    """Return a text with the lengths that the radius is measured in, for example ``1 for 1 rad, 10 rad/s``."""
     model = model_of(ds)
     units = {s.unit: s.scale for s in model.states}
     return "1 for " + ", ".join(f"{scale:g}" + (f" {unit}" if unit != "1" else "") for unit, scale in units.items())
 
 
 def _draw_fit(top: Axes, bottom: Axes, data: xr.Dataset) -> None:
-    """Draw the fitted straight line, and the range of radii to which it was fitted."""
     fit = tuple(float(data[name]) for name in ("fit_low", "fit_high"))
     if not np.isfinite(fit).all():
         return

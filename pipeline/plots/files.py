@@ -89,7 +89,6 @@ def with_provenance(ds: xr.Dataset, provenance: Mapping[str, Any]) -> xr.Dataset
 
 
 def _metadata(attrs: Mapping[Any, Any], suffix: str) -> dict[str, Any]:
-    """Return the metadata to write into a figure's file, under the keys of its format."""
     title, source = str(attrs.get("title", "")), str(attrs.get("source", "magpend"))
     rest = {k: v for k, v in attrs.items() if isinstance(v, str | int | float) and k not in ("title",)}
     about = "; ".join(f"{key}: {value}" for key, value in rest.items()).replace("\n", ", ")

@@ -103,7 +103,6 @@ def _webp(film: Animation, path: Path) -> None:
 
 
 def _save(film: Animation, path: Path, images: Iterator[Image.Image], grain_ms: int, **options: Any) -> None:
-    """Write images as a film that repeats for ever, by Pillow."""
     duration = durations(film.n_frames, film.fps, grain_ms)
     next(images).save(path, save_all=True, append_images=images, loop=0, duration=duration, **options)
 

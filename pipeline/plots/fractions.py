@@ -128,7 +128,6 @@ def _fractions(part: xr.Dataset, parameter: str, cast: palette.Cast) -> xr.Datas
 
 
 def _about(data: xr.Dataset) -> str:
-    """Return a text on the number of cells per parameter value, and on the width of the confidence intervals."""
     n = int(data["n_cells"].max())
     if "low" not in data:
         return f"{n} branches each"

@@ -125,7 +125,6 @@ class _Layout:
         return _LINE_IN * (self.lines + 1) + 0.08 + self.rows * self.row
 
     def axes(self, fig: style.DataFigure, k: int, column: int) -> Axes:
-        """Make the axes of one panel of attractor number `k` in the gallery."""
         width, height = self.panel
         x = self.left + ((k % self.beside) * self.each + column) * self.pitch
         if self.drawing and column == self.each - 1:
@@ -139,13 +138,11 @@ class _Layout:
 
 
 def _described(attractors: xr.Dataset, portraits: xr.Dataset) -> xr.Dataset:
-    """Select the attractors at the parameter point of the portraits."""
     at = {d: float(portraits[d]) for d in attractors["kind"].dims if d in portraits.coords and d != "attractor"}
     return attractors.sel(at)
 
 
 def _title(one: xr.Dataset, cast: palette.Cast, layout: _Layout) -> str:
-    """Return the title of an attractor's panels: its name and its basin fraction, in lines that fit."""
     attracts = int(one["stability"]) == ATTRACTS
     share = f", share {palette.percent(float(one['share']))}" if attracts else ""
     room, size = layout.each * layout.pitch - layout.left, style.look_at(layout.frame).legend
@@ -179,13 +176,11 @@ def _draw_one(
 
 
 def _parameters(one: xr.Dataset) -> dict[str, float]:
-    """Return all parameter values at which a phase portrait was computed."""
     values = parameters_of(one).as_dict()
     return {name: float(one[name]) if name in one.coords else value for name, value in values.items()}
 
 
 def _told(data: xr.Dataset, portraits: xr.Dataset, here: xr.Dataset) -> str:
-    """Return the caption of the gallery: its parameter values, and how many attractors and cells it leaves out."""
     text = labels.caption(portraits.assign_attrs(data.attrs), with_start=False)
     if (rest := portraits.sizes["attractor"] - data.sizes["attractor"]) > 0:
         share = palette.percent(float(portraits["share"].sum() - data["share"].sum()))

@@ -178,7 +178,6 @@ def _draw_class(
 
 
 def _union(value: np.ndarray, error: np.ndarray) -> list[tuple[float, float]]:
-    """Return the intervals from value - error to value + error, with overlapping ones joined."""
     joined: list[tuple[float, float]] = []
     for low, high in sorted(zip((value - error).tolist(), (value + error).tolist(), strict=True)):
         if joined and low <= joined[-1][1]:

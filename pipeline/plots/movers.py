@@ -260,7 +260,6 @@ def _fix(ax: Axes, still: dict[str, Floats], scene: Scene, named: bool) -> None:
 
 
 def _scale_bar(ax: Axes, width: float, unit: str) -> None:
-    """Draw a bar that shows the scale of the drawing; its length is 1, 2 or 5 times a power of ten."""
     power = 10.0 ** math.floor(math.log10(0.25 * width))
     length = max(f * power for f in (1.0, 2.0, 5.0) if f * power <= 0.25 * width)
     share = length / width

@@ -158,14 +158,12 @@ def describe(one: xr.Dataset) -> str:
 
 
 def _stability(one: xr.Dataset) -> str:
-    """Return a text on the stability of a set where it does not attract."""
     found = sorted({int(code) for code in one["stability"].values.ravel()} - {ABSENT, ATTRACTS})
     words = " or ".join(STABILITIES[code].replace("_", " ") for code in found)
     return f"{words} in parts" if words and (one["stability"].values == ATTRACTS).any() else words
 
 
 def _seconds(one: xr.Dataset) -> str:
-    """Return a text with the range of a limit cycle's period [s]; an empty text for a forced system."""
     if not model_of(one).autonomous or "period_s" not in one:
         return ""
     known = one["period_s"].values[np.isfinite(one["period_s"].values)]

@@ -107,7 +107,6 @@ def plot_regimes(
 
 
 def _with_curves(data: xr.Dataset, curves: xr.Dataset, x: str, y: str) -> xr.Dataset:
-    """Add the data of bifurcation curves to the data of a regime map, under names that end in ``_curves``."""
     plane = [str(curves.attrs[f"{role}_parameter"]) for role in ("first", "second")]
     if sorted(plane) != sorted([x, y]):
         raise ValueError(f"the curves lie in the plane of {' and '.join(plane)}, and the map in that of {x} and {y}.")
@@ -117,7 +116,6 @@ def _with_curves(data: xr.Dataset, curves: xr.Dataset, x: str, y: str) -> xr.Dat
 
 
 def _draw_one(data: xr.Dataset, x: str, y: str, show: str, text: str, frame: style.Frame) -> style.DataFigure:
-    """Draw one regime map, with a colour for each regime."""
     colours, entries = _looks(data, show)
     if (data["share_without"] > SHARE_LIMIT).any():
         label = f"over {100 * SHARE_LIMIT:g} % of the cells\nwithout an attractor"
@@ -296,7 +294,6 @@ def _label(present: np.ndarray, periods: np.ndarray, show: str) -> str:
 
 
 def _looks(data: xr.Dataset, show: str) -> tuple[list[str], list[palette.Entry]]:
-    """Return the colour of each regime, and the entries of the legend."""
     names = [str(v) for v in data["label"].values]
     if show == "number":
         ramp = matplotlib.colormaps["cividis"]

@@ -100,7 +100,6 @@ def rotation_data(part: xr.Dataset, swept: list[str]) -> xr.Dataset:
 
 
 def _about(part: xr.Dataset) -> str:
-    """Return a text on the errors of the rotation numbers, and on the number of cells without one."""
     known, error = part["rotation"].notnull(), part["rotation_error"]
     size = (
         f"errors up to {float(error.max()):.1g}, half of them below {float(error.median()):.1g}" if known.any() else ""

@@ -89,7 +89,6 @@ def plot_section(
 
 
 def _measures(part: xr.Dataset, states: tuple[str, str] | None, degrees: bool) -> list[labels.Measure]:
-    """Return how the states of the two axes are shown: symbol, unit and factor to this unit."""
     model = model_of(part)
     names = states or section_pair(model)
     for name in names:
@@ -112,8 +111,6 @@ def section_pair(model: Model, first: str = "") -> tuple[str, str]:
 
 
 def _view(part: xr.Dataset, measures: list[labels.Measure], attractors: xr.Dataset | None) -> View:
-    """Describe what is drawn: section points coloured by class of motion or by attractor."""
-
     def coordinates(block: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
         section = block["section"].transpose(*block["status"].dims, "period_index", "state")
         x, y = (m.shown(section.sel(state=m.name).values) for m in measures)

@@ -127,7 +127,6 @@ def _name_tongues(fig: style.DataFigure, ax: Axes, ds: xr.Dataset) -> None:
 
 
 def _explain(fig: style.DataFigure, ds: xr.Dataset) -> None:
-    """Add a legend for the colours of the denominators."""
     present = sorted({int(q) for q in ds["denominator"].values if q})
     names = [f"denominator {q}" if q < len(_COLOURS) else f"denominator {len(_COLOURS)} or more" for q in present]
     colours = dict(zip(names, map(_colour, present), strict=True))

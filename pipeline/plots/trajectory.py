@@ -87,7 +87,6 @@ def plot_trajectory(ds: xr.Dataset, *, degrees: bool = False, frame: style.Frame
 
 
 def _draw_path(ax: Axes, ds: xr.Dataset, drawing: Drawing, motion: Motion) -> list[Any]:
-    """Draw the path of the traced point of the model's drawing, and return legend entries."""
     style.style_axes(ax)
     parameters = parameters_of(ds).as_dict()
     shown = draw_path(ax, drawing, parameters, motion)
@@ -143,7 +142,6 @@ def _data(ds: xr.Dataset, series: dict[str, np.ndarray], drawing: Drawing | None
 
 
 def _section_times(ds: xr.Dataset, time: np.ndarray) -> np.ndarray:
-    """Return the times of the section points in the time series [s]."""
     if "section_times" in ds:
         times = np.asarray(ds["section_times"].values, dtype=np.float64)
     elif "frequency_hz" in ds.attrs:
@@ -181,7 +179,6 @@ def _colour(pair: int) -> str:
 
 
 def _colours(model: Model) -> dict[str, str]:
-    """Return the colour of each state, which is that of the first phase portrait with this state."""
     found: dict[str, str] = {}
     for k, pair in enumerate(model.portraits):
         for name in pair:
@@ -221,7 +218,6 @@ def _draw_series(
 
 
 def _draw_others(ax: Axes, ds: xr.Dataset, time: np.ndarray, names: Sequence[str]) -> None:
-    """Draw the time series of variables that are not states in one panel."""
     quantities = {q.name: q.symbol for q in model_of(ds).quantities}
     symbols = [f"${quantities[n]}$" if quantities.get(n) else n.replace("_", " ") for n in names]
     for name, symbol, look in zip(names, symbols, ("0.15", style.ORANGE), strict=False):

@@ -47,7 +47,6 @@ def _cells(results: Results, name: str) -> tuple[xr.Dataset, str]:
 
 
 def _within(ds: xr.Dataset, axis: str, options: Options) -> xr.Dataset:
-    """Select the cells at the axis value ``at``, or between the axis values ``low`` and ``high``."""
     values = ds[axis].values
     if "at" in options:
         at = _index(ds, axis, float(options["at"]))

@@ -65,7 +65,6 @@ _DRAW = {"plot": _plot, "quantities": _quantities, "recording": _recording, "ser
 
 
 def _command(results: Results, table: PictureTable) -> str:
-    """Return the shell command that draws a picture from the results of the study."""
     if table.kind == "plot":
         place = shlex.quote(str(results.folder / "runs" / table.of))
         return command_of(f"plot {table.figure}", table.options, place)

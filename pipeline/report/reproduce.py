@@ -171,7 +171,6 @@ def judge(results: Results, figure: str, claim: ClaimTable) -> Judgement:
 
 
 def _decides(claim: ClaimTable) -> str:
-    """Return a sentence on the axis step and the number of cells that would decide a claim."""
     steps = f"steps of at most {claim.step:g}" if claim.step else ""
     cells = f"at least {claim.n} cells" if claim.n else ""
     both = " and ".join(part for part in (steps, cells) if part)
@@ -179,7 +178,6 @@ def _decides(claim: ClaimTable) -> str:
 
 
 def _part(results: Results, figure: FigureTable, judgements: Sequence[Judgement]) -> Part:
-    """Make the page's section about a figure of the paper, with its pictures and the verdicts on its claims."""
     many = len(figure.numbers) > 1
     blocks: list[Block] = []
     if figure.says:
@@ -300,7 +298,6 @@ def calibrated_on(judgements: Sequence[Judgement]) -> str:
 
 
 def _provenance(results: Results) -> list[Part]:
-    """Make the page's section about the runs behind the figures, with digests, versions and specifications."""
     runs = results.computed()
     if not runs:
         return []

@@ -135,7 +135,6 @@ def part_of(source: str | AnalysedRun, echo: Callable[[str], None], computed: tu
 
 
 def _state(shown: Shown) -> Iterator[Block]:
-    """Make the block of a report that says what a run consists of and how much of it is computed."""
     run, found = shown.run, state(shown.run)
     swept = ", ".join(f"{name} {_span(shown.cube, name)}" for name in shown.axes) or "nothing"
     model = run.model
@@ -164,7 +163,6 @@ def _span(cube: xr.Dataset, name: str) -> str:
 
 
 def _parameters(shown: Shown) -> Iterator[Block]:
-    """Make the table of a run's parameters, with their values, units and sources."""
     run = shown.run
     chosen = run.model.preset(run.spec.parameters.chosen)
     over, swept = run.spec.parameters.overrides, {parameter_name(name): name for name in shown.axes}
@@ -185,7 +183,6 @@ def _parameters(shown: Shown) -> Iterator[Block]:
 
 
 def _diagram(shown: Shown) -> Iterator[Block]:
-    """Draw the bifurcation diagram of a run or, if it sweeps nothing, its section points."""
     if len(shown.axes) > 1:
         at = _first_of_others(shown)
         yield from _drawn(shown, "bifurcation", "Bifurcation diagram at the first values of the other axes", at=at)
@@ -196,7 +193,6 @@ def _diagram(shown: Shown) -> Iterator[Block]:
 
 
 def _first_of_others(shown: Shown) -> dict[str, float]:
-    """Return the first value of each axis that the diagram does not show, by axis name."""
     continuation = shown.run.spec.continuation
     path = next((d for d in shown.axes if continuation and parameter_name(d) == continuation.path), shown.axes[0])
     return {d: float(shown.cube[d].values[0]) for d in shown.axes if d != path}
@@ -240,7 +236,6 @@ def _attractors(shown: Shown) -> Iterator[Block]:
 
 
 def _counted(rows: list[dict[str, Any]], told: str) -> str:
-    """Return a text on the number of attractors and of other sets."""
     attract = {r["attractor_id"] for r in rows if r["stability"] == "attracts"}
     others = {r["attractor_id"] for r in rows} - attract
     more = f", {counted(len(others), 'other set')}" if others else ""
@@ -248,7 +243,6 @@ def _counted(rows: list[dict[str, Any]], told: str) -> str:
 
 
 def _richest(rows: list[dict[str, Any]], axes: tuple[str, ...]) -> dict[str, float]:
-    """Return the axis values at which most attractors coexist."""
     counts: dict[tuple[float, ...], int] = {}
     for row in rows:
         place: tuple[float, ...] = tuple(row[name] for name in axes)
@@ -280,7 +274,6 @@ def _attractor_grid(
 
 
 def _share(rows: list[dict[str, Any]], axes: tuple[str, ...]) -> str:
-    """Format the largest basin fraction of an attractor, with its interval and where it occurs."""
     best = max(rows, key=lambda row: float(np.nan_to_num(row["fraction"], nan=-1.0)))
     if not np.isfinite(best["fraction"]):  # it attracts nowhere
         return "-"
@@ -290,7 +283,6 @@ def _share(rows: list[dict[str, Any]], axes: tuple[str, ...]) -> str:
 
 
 def _analyses(shown: Shown) -> Iterator[Part]:
-    """Make a section for each further analysis: its table and figure, or the command that computes it."""
     for name in SHOWN[1:]:
         if not _suits(shown, name):
             continue
@@ -302,7 +294,6 @@ def _analyses(shown: Shown) -> Iterator[Part]:
 
 
 def _suits(shown: Shown, name: str) -> bool:
-    """Return whether an analysis makes sense for a run."""
     if shown.run.spec.recorded is not None:  # the recording ends, so no cell can be integrated further
         return False
     if name == "hysteresis":
@@ -356,7 +347,6 @@ def _with_letters(row: Mapping[str, Any], path: str) -> dict[str, Any]:
 
 
 def _exponents(shown: Shown) -> Iterator[Block]:
-    """Draw the Lyapunov exponents of a run, or say how to compute them."""
     if shown.run.spec.recorded is not None:
         return
     if "lyapunov" not in shown.run.spec.products:
@@ -390,7 +380,6 @@ def provenance_of(run: AnalysedRun, spec: str = "SPEC") -> Iterator[Block]:
 
 
 def _drawn(shown: Shown, name: str, caption: str, **options: Any) -> Iterator[Block]:
-    """Draw a figure as a block of the report, or make a note on why it cannot be drawn."""
     try:
         drawn = figure(shown.run, name, options)
     except SpecError as error:

@@ -195,7 +195,6 @@ def _problems(table: StudyTable) -> list[str]:
 
 
 def _plot_problems(at: str, picture: PictureTable) -> list[str]:
-    """Return what is wrong with a picture of a study: an unknown figure, or wrong options."""
     if picture.figure not in FIGURES:
         return [f"{at}.figure: {unknown_name('figure', picture.figure, FIGURES)}"]
     try:

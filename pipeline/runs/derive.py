@@ -173,7 +173,6 @@ def stored(source: Source, name: str) -> xr.Dataset | None:
 
 
 def _changed_options(run: Run, name: str, attrs: Mapping[str, Any]) -> int:
-    """Count the options of a stored result that differ from the defaults."""
     try:
         options = prepared(AnalysedRun.of(run), ANALYSES[name], validated(ANALYSES[name].options, {})).plain()
     except SpecError:  # the run does not suit the defaults
@@ -285,7 +284,6 @@ def refused(directory: str | Path) -> Iterator[None]:
 
 
 def _key(run: Run, analysis: Analysis, options: Options) -> dict[str, str]:
-    """Return the attributes that identify a stored result: analysis, options, digests of the cells and of the code."""
     plain = {name: value for name, value in options.plain().items() if name not in analysis.ignores}
     parts = {
         "derived_product": analysis.name,

@@ -173,7 +173,6 @@ def _fitting(runs: Sequence[Run], wide: Spec, identity: Mapping[str, Any]) -> tu
 
 
 def _census(wide: Spec, plan: Plan, runs: Sequence[Run]) -> list[int]:
-    """Count the cells of the wider run that are copied from each earlier run."""
     from pipeline.compute.reuse import Pool
 
     pool, cells = Pool(wide, runs), CellMap(wide)
@@ -286,7 +285,6 @@ def extend(
 
 
 def _build(extension: Extension, files: Files, *, echo: Echo, **how: Any) -> State:
-    """Compute the wider run in a directory of its own, or continue if that was stopped."""
     for line in extension.lines():
         echo(line)
     sources = [(run.info.files.place, run.info.digest) for run in extension.runs]
@@ -317,7 +315,6 @@ def _record(extension: Extension, files: Files) -> None:
 
 
 def _folder(files: Files) -> Path:
-    """Return the local folder of a run; raise RefusedError if the run is in an object store."""
     if files.local is None:
         raise RefusedError(f"{files.name}: is not a folder on this machine, so it cannot be replaced; give --out.")
     return files.local

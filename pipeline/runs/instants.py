@@ -227,7 +227,6 @@ def filmed(moving: Sequence[Moving], plan: Schedule) -> xr.Dataset:
 
 
 def _told(moving: Sequence[Moving]) -> dict[str, Any]:
-    """Return dataset attributes that describe the motions: model, units and parameters."""
     first = moving[0].parameters
     lines = [f"{name} = {value!r}" for name, value in first.as_dict().items()]
     told = {

@@ -54,7 +54,6 @@ def examine(name: str) -> tuple[Model, Description]:
 
 
 def _specification(name: str) -> Spec | None:
-    """Read a run's specification from a file; None if the file or name is that of a model only."""
     if not is_model_file(name) or read_toml(name).get("kind") not in KINDS:
         return None
     return load_spec(find_spec(name))

@@ -109,7 +109,6 @@ def _chosen(name: str, here: xr.Dataset, letters: Sequence[str]) -> tuple[list[i
 
 
 def _at_point(ds: xr.Dataset, here: xr.Dataset) -> tuple[Parameters, float]:
-    """Return the parameters and the drive frequency of one parameter point."""
     values = {str(k): float(v) for k, v in here.coords.items() if not v.ndim and v.dtype.kind == "f"}
     base = parameters_of(ds)
     base = base.replace(**{k: v for k, v in values.items() if k in base})
@@ -117,7 +116,6 @@ def _at_point(ds: xr.Dataset, here: xr.Dataset) -> tuple[Parameters, float]:
 
 
 def _period(one: xr.Dataset, parameters: Parameters, frequency: float) -> float:
-    """Return the period of an attractor [s]: 0 for an equilibrium, NaN for a non-periodic set."""
     kind, periods = int(one["kind"]), int(one["orbit_period"])
     if kind == EQUILIBRIUM:
         return 0.0
@@ -183,7 +181,6 @@ def of_cells(run: AnalysedRun, numbers: Sequence[int]) -> list[Moving]:
 
 
 def _where(one: xr.Dataset) -> str:
-    """Format where a cell is in the run, such as its frequency and its initial state."""
     said = []
     for key, value in one.coords.items():
         if value.ndim or str(key) in ("seed",):

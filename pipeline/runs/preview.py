@@ -92,7 +92,7 @@ def shown(run: Run) -> tuple[str, dict[str, Any], str]:
 def describe_plan(
     spec: str | Path, out: str | Path | None, *, workers: int | None = None, smoke: bool = False
 ) -> Iterator[str]:
-    """Yield the text lines that a dry run prints; nothing is computed or written but the compile cache.
+    """Yield the text lines that a dry run prints; nothing but the compile cache is written.
 
     The time is measured on some of the run's own cells, after the lines that cost nothing.
 

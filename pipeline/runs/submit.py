@@ -128,7 +128,6 @@ def prepare(
 
 
 def _command(cluster: Cluster, file: Path, spec: Path, place: str, smoke: bool) -> list[str]:
-    """Return the ``magpend run`` command that the batch job executes."""
     where = ["--scheduler", "local", "--workers", str(cluster.cores)]
     if not is_whole(cluster):
         where = ["--scheduler", cluster.kind, "--cluster", str(file.absolute())]

@@ -188,7 +188,6 @@ def _check(spec: Spec, changes: Changes) -> list[str]:
 
 
 def _points(spec: Spec, key: str, changes: Changes) -> int:
-    """Return the number of points of a new range; the default is that of the old range, or 0 without one."""
     asked = changes.nums.get(_state(spec, key) or key, changes.num)
     old = _old_range(spec, key)
     return asked if asked is not None else (len(old.array()) if old is not None else 0)
@@ -213,7 +212,6 @@ def _old_range(spec: Spec, key: str) -> Range | None:
 
 
 def _extent(spec: Spec, key: str) -> tuple[float, float] | None:
-    """Return the ends of the old range of a state or parameter, in the unit of the new value; None without a range."""
     value, factor = _old(spec, key)
     if isinstance(value, Range):
         array = value.array()

@@ -351,7 +351,6 @@ _ELSEWHERE = (
 
 
 def _names(dynamics: Dynamics) -> list[str]:
-    """Return the names of the output variables, without those that the model cannot provide."""
     model = dynamics.model
     has_energy = model is not None and any(q.name == ENERGY for q in model.quantities)
     left_out = {

@@ -82,7 +82,6 @@ def _rows(ds: xr.Dataset) -> list[Row]:
 
 
 def _attractor(one: xr.Dataset) -> Row:
-    """Return the table's columns for one attractor at one parameter point."""
     row: Row = {"attractor_id": int(one["attractor"])}
     row |= values(one, "kind", "stability", "evidence", "orbit_period", "period_s", "side")
     if "rotation" in one:
@@ -166,7 +165,6 @@ _SHOWN_BY = {
 
 
 def _shown_by(row: Row) -> str:
-    """Format the evidence for the stability of a set, for instance how many trajectories stayed on it."""
     low = number(row["lifetime_low"], ".0f")
     if row["evidence"] == "stayed":
         return f"{row['n_sampled']} stayed, lifetime above {low}"
@@ -177,7 +175,6 @@ def _shown_by(row: Row) -> str:
 
 
 def _eigenvalue(row: Row) -> str:
-    """Format the leading eigenvalue of an equilibrium [1/s]."""
     if not np.isfinite(row["eigenvalue_real"]):
         return "-"
     imaginary = f" \u00b1 {row['eigenvalue_imag']:.4g}i" if row["eigenvalue_imag"] else ""

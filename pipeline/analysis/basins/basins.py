@@ -130,7 +130,6 @@ def _unfinished(ids: xr.Dataset, dims: tuple[str, ...]) -> dict[str, xr.DataArra
 
 
 def _no_grid(ds: xr.Dataset, start_dims: tuple[str, ...]) -> str:
-    """Return the reason why the initial conditions form no regular grid; an empty text if they form one."""
     if "initial_condition" in start_dims:
         return "boundaries: the starts are no grid"
     for dim in start_dims:
@@ -181,7 +180,6 @@ class _Points:
         self._uncertain: dict[tuple[int, ...], np.ndarray] = {}
 
     def add(self, index: tuple[int, ...], name: str, value: Any) -> None:
-        """Store one basin measure of one parameter point."""
         if name == "uncertain":
             self._epsilon, self._uncertain[index] = value["epsilon"].values, value.values
         else:

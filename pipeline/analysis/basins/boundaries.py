@@ -250,7 +250,6 @@ def uncertainty_exponent(
 
 
 def _box_sides(box: int | Sequence[int], shape: tuple[int, ...]) -> tuple[int, ...]:
-    """Return the side lengths of a box [cells]; ValueError unless the box fits the grid."""
     given = np.atleast_1d(np.asarray(box, dtype=np.int64)).tolist()
     sides = tuple(given) * (len(shape) if len(given) == 1 else 1)
     if len(sides) != len(shape):

@@ -217,7 +217,6 @@ def _count_rows(grid: LabelGrid, shape: tuple[int, ...]) -> tuple[npt.NDArray[np
 def _count_inferred(
     grid: LabelGrid, inferred: npt.NDArray[np.generic], shape: tuple[int, ...]
 ) -> npt.NDArray[np.int64]:
-    """Count per label the cells whose outcome was inferred from neighbouring cells."""
     if inferred.dtype != bool or inferred.shape != grid.codes.shape:
         raise ValueError(
             f"inferred is {inferred.dtype} of shape {inferred.shape}, the labels are of shape "

@@ -170,7 +170,6 @@ def _distances(shape: tuple[int, ...], boundaries: list[Ints], radii: Ints, metr
 
 
 def _distance_field(shape: tuple[int, ...], target: Ints, metric: Metric) -> npt.NDArray[np.int32]:
-    """Compute the distance of every cell of a grid from the nearest target cell; return it flattened."""
     outside: Bools = np.ones(int(np.prod(shape)), dtype=np.bool_)
     outside[target] = False
     field = ndimage.distance_transform_cdt(outside.reshape(shape), metric=metric)

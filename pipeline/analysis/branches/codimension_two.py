@@ -120,7 +120,6 @@ class Detector:
         return True
 
     def _tests(self, point: Point, frame: _Frame | None) -> Steps[tuple[_Frame, dict[str, float]]]:
-        """Compute all test functions for codimension two at a point of the bifurcation curve."""
         family, kind = self.problem.family, self.problem.kind
         case = Case(family, kind, point.u, point.value.monodromy, STEPS, frame.vector if frame else None)
         turned = _Frame.of(case, frame)

@@ -127,7 +127,6 @@ class _Arrays:
         self.period_s = np.full(shape, np.nan)
 
     def put(self, i: int, j: int, branch: Branch, point: Any) -> None:
-        """Write the data of point `j` of branch `i` into the output arrays."""
         self.parameter[i, j] = branch.family.values(point.u)[0]
         self.section[i, j, : max(branch.family.period, 1)] = _orbit(branch, point)
         self.multiplier[i, j] = multipliers_of(point)
@@ -172,7 +171,6 @@ class _Arrays:
         }
 
     def _eigenvalues(self) -> dict[str, Any]:
-        """Return the eigenvalues as dataset variables; an empty dict if no branch has equilibria."""
         if np.isnan(self.eigenvalue).all():
             return {}
         dims, about = ("branch", "point", "multiplier"), "eigenvalues of an equilibrium"

@@ -154,7 +154,6 @@ def _both_ways(starts: Sequence[Start], scope: Scope, what: str) -> list[Branch 
 
 
 def _lie_on(starts: Sequence[Start], branches: Sequence[Branch]) -> list[bool]:
-    """Return for each starting orbit whether it lies on one of the branches."""
     asked = [(i, guess) for i, s in enumerate(starts) for b in branches for guess in _near(s, b)]
     settings = Settings()
     found = run_together([_at_value(starts[i].family, guess, settings) for i, guess in asked])
@@ -195,7 +194,6 @@ def _near(start: Start, branch: Branch) -> Iterator[np.ndarray]:
 
 
 def _same_others(a: Family, b: Family) -> bool:
-    """Return whether two families have the same free parameter, and equal values of all other parameters."""
     return a.free == b.free and np.array_equal(_fixed(a), _fixed(b))
 
 
@@ -355,7 +353,6 @@ def _adopt_cycles(branches: Sequence[Branch]) -> None:
 
 
 def _hopf_at(branches: Sequence[Branch], cycles: Branch, end: Point) -> Bifurcation | None:
-    """Return the Hopf point nearest to the last limit cycle of a branch; None if no Hopf point is near enough."""
     near = [
         (max(_gap(cycles.family, end, one), abs(end.u[-1] - one.point.u[-1])), one)
         for other in branches

@@ -105,7 +105,6 @@ class _Stop:
         return False
 
     def _difference(self, state: np.ndarray, parameter: float, u: np.ndarray) -> np.ndarray:
-        """Return the scaled difference between a state with its parameter value and a branch point `u`."""
         return np.append(self.family.mismatch(u, state), parameter - u[-1])
 
 
@@ -184,7 +183,6 @@ def half_branch(
 
 
 def _is_known(one: Bifurcation, found: list[Bifurcation]) -> bool:
-    """Return whether a bifurcation was already located on an earlier step."""
     return any(
         b.kind == one.kind and b.after < one.after and abs(b.point.u[-1] - one.point.u[-1]) < 1e-6 for b in found
     )

@@ -90,7 +90,6 @@ def _evaluate(queries: Sequence[Query]) -> list[Value]:
 
 
 def _calls(systems: Sequence[tuple[int, System]]) -> list[list[int]]:
-    """Group the indices of queries by the system that they integrate; each group is one call of the engine."""
     by_system: dict[str, list[int]] = {}
     for i, system in systems:
         by_system.setdefault(system.label, []).append(i)

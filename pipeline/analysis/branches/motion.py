@@ -65,7 +65,6 @@ def _sides(branch: Branch, base: Parameters, classifier: Classifier) -> np.ndarr
 
 
 def _rest_sides(branch: Branch, base: Parameters, classifier: Classifier) -> np.ndarray:
-    """Return the class of motion (a code) of each equilibrium of a branch."""
     name, n_angles = branch.family.free[0], sum(branch.family.system.is_angle)
     own = base.replace(**dict(zip(base.names, map(float, branch.family.parameters), strict=True)))
     codes = []

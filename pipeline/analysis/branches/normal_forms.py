@@ -241,7 +241,6 @@ Form = Callable[[Case, Sequence[Bend]], float]
 
 
 def _solved(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Solve linear equations; return NaN if the matrix is singular."""
     try:
         return np.asarray(np.linalg.solve(matrix, right))
     except np.linalg.LinAlgError:

@@ -122,7 +122,6 @@ def orbits_table(ds: xr.Dataset) -> Table:
 
 
 def _index_lines(ds: xr.Dataset, expected: int) -> list[str]:
-    """Return text lines that say for which periods orbits are missing, from the sums of fixed-point indices."""
     sums = {int(p): int(total) for p, total in zip(ds["times"].values, ds["index_sum"].values, strict=True)}
     wrong = [f"{p}: {total}" for p, total in sums.items() if total != expected]
     if not wrong:

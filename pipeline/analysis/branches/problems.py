@@ -204,7 +204,6 @@ class _Segments:
     slopes: np.ndarray
 
     def at(self, u: np.ndarray) -> np.ndarray:
-        """Estimate the section points of the orbit at unknowns `u` to first order."""
         return np.asarray(self.points + self.slopes @ (u - self.u))
 
 

@@ -146,7 +146,6 @@ def _dims(ds: xr.Dataset) -> list[str]:
 
 
 def _points(ds: xr.Dataset) -> list[xr.Dataset]:
-    """Split a dataset into one dataset per parameter point."""
     dims = _dims(ds)
     indices = np.ndindex(*(ds.sizes[d] for d in dims))
     return [ds.isel(dict(zip(dims, map(int, index), strict=True))) for index in indices]

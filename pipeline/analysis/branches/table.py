@@ -35,7 +35,6 @@ def branches_table(ds: xr.Dataset) -> Table:
 
 
 def _why_none(ds: xr.Dataset) -> str:
-    """Return a text that says why there is no branch, with the number of attractors for each reason."""
     name = parameter_name(str(ds.attrs["parameter"]))
     lines = str(ds.attrs.get("left_out", "")).splitlines()
     reasons = Counter(line.partition(": ")[2] for line in lines)
@@ -118,7 +117,6 @@ def _words(ds: xr.Dataset, row: Row) -> Words:
 
 
 def _at(ds: xr.Dataset, branch: int) -> str:
-    """Format the fixed parameters of a branch, for example " at 1.2 Hz"; an empty text if there are none."""
     found = [
         f"{value:g} Hz" if name == parameter_name(FREQUENCY) else f"{name} {value:g}"
         for name, value in fixed_of(ds, branch).items()
@@ -138,7 +136,6 @@ def _with_error(value: float, error: float) -> str:
 
 
 def _number(z: complex, period: int) -> str:
-    """Format a Floquet multiplier or, for an equilibrium (period 0), an eigenvalue."""
     return (f"{z.real:.5f}" if abs(z.imag) < 1e-9 else f"{z.real:.5f}{z.imag:+.5f}i") + ("" if period else " 1/s")
 
 

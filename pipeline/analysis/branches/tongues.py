@@ -200,7 +200,6 @@ def _between_cells(row: Row, search: Search, gaps: dict[Fraction, tuple[int, int
 
 
 def _closest_return(family: Family, points: np.ndarray, value: float) -> Start | None:
-    """Return the section point to which a trajectory returns most closely after the period of the family."""
     distance = scaled_distance(points[family.period :], points[: -family.period], family.system)
     if not np.isfinite(distance).all():
         return None

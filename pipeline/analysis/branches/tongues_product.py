@@ -91,7 +91,6 @@ def tongues(run: Run, options: TongueOptions) -> xr.Dataset:
 
 
 def _row_of(run: Run, options: TongueOptions) -> xr.Dataset:
-    """Return the part of the run's result cube along the first parameter, at one value of each other parameter."""
     cube, first = run.cube(), axis_name(options.parameter)
     part = select_points(cube, options.at)
     others = [d for d in map(str, split_dims(part["status"])[0]) if d != first]
@@ -103,9 +102,6 @@ def _row_of(run: Run, options: TongueOptions) -> xr.Dataset:
 
 
 def _turning(run: Run) -> tuple[TurningState, int]:
-    """Return the rotating state and the number of averaged periods, from the options of the run's product
-    ``rotation``.
-    """
     options: Any = run.spec.products["rotation"]
     names = run.model.state_names
     return TurningState(tuple(map(names.index, options.of)), options.center, options.section), options.n_periods
@@ -128,7 +124,6 @@ def cells_of(point: xr.Dataset, first: str) -> Row:
 
 
 def _parts(fractions: Sequence[Fraction | None]) -> dict[str, np.ndarray]:
-    """Split fractions into numerators and denominators, shape (n,); an unknown fraction becomes 0 / 0."""
     pairs = [(0, 0) if f is None else (f.numerator, f.denominator) for f in fractions]
     columns = np.array(pairs, np.int32).reshape(-1, 2)
     return {"numerator": columns[:, 0], "denominator": columns[:, 1]}

@@ -139,9 +139,6 @@ def _of_exponents(ds: xr.Dataset, options: ChaosOptions) -> xr.Dataset:
 
 
 def _without_exponents(ds: xr.Dataset) -> xr.Dataset:
-    """Return the class of motion of cells without Lyapunov exponents: regular if the cell is periodic, otherwise
-    unknown.
-    """
     closed = is_closed(ds)
     motion = xr.full_like(closed, Motion.UNKNOWN, dtype=np.int8)
     motion = motion.where(~closed, np.int8(Motion.REGULAR)).assign_attrs(motion_attrs())

@@ -322,7 +322,6 @@ class _Pairs:
 
     @property
     def all(self) -> npt.NDArray[np.int64]:
-        """Number of pairs closer than each radius in the whole sample, shape (radius,)."""
         return np.asarray(self.by_part.sum(axis=0))
 
     def without(self, part: int) -> npt.NDArray[np.int64]:

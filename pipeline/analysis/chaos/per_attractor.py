@@ -312,7 +312,6 @@ def pooled(point: xr.Dataset, starts: Sequence[str], which: npt.NDArray[np.bool_
 
 
 def _with_kaplan_yorke(result: xr.Dataset) -> xr.Dataset:
-    """Add the Kaplan-Yorke dimension of each attractor, computed from its Lyapunov exponents."""
     exponents = {
         "attractor_lyapunov": result["attractor_lyapunov"],
         "attractor_lyapunov_stderr": result["attractor_lyapunov_stderr"],

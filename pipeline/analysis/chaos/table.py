@@ -68,7 +68,6 @@ def _row(one: xr.Dataset) -> Row:
 
 
 def _spectrum(one: xr.Dataset) -> Row:
-    """Return the table's columns for Lyapunov exponents (per second and per drive period) and for multipliers."""
     frequency = float(one.coords["frequency"]) if "frequency" in one.coords else np.nan
     row: Row = {}
     for k in range(one.sizes["rank"]):
@@ -100,7 +99,6 @@ def _words(row: Row) -> Words:
 
 
 def _flags(rows: Sequence[Row]) -> str:
-    """Format how many cells have each of the warning flags."""
     counts = [(sum(row[name] for row in rows), text) for name, text in _FLAGS.items()]
     return ", ".join(f"{n} {text}" for n, text in counts if n)
 
@@ -140,7 +138,6 @@ def _summary(ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str]) -> list[s
 
 
 def _extremes(ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str]) -> list[str]:
-    """Return a text line with the largest Lyapunov exponent of all attractors, and where it occurs."""
     known = [row for row in rows if np.isfinite(row["lyapunov_1"])]
     if not known:
         return []

@@ -207,7 +207,6 @@ class _Curve:
     n_periods: int
 
     def __post_init__(self) -> None:
-        """Place nine equally spaced positions on the first segment of the manifold."""
         self.places = np.linspace(0.0, 1.0, 9)
         self.generations = [self.first(self.places)]
 
@@ -236,7 +235,6 @@ class _Curve:
         return self._cut(np.concatenate(points), np.concatenate(times), end)
 
     def _cut(self, points: np.ndarray, times: np.ndarray, end: str) -> Manifold:
-        """Shorten the manifold to the requested length and number of points."""
         away = np.linalg.norm(self.saddle.scaled(np.diff(points, axis=0)), axis=1)
         far = np.flatnonzero(np.cumsum(away) > self.resolution.length)
         n = min(int(far[0]) + 2 if len(far) else len(points), self.resolution.most)

@@ -55,7 +55,6 @@ def manifolds(run: Run, options: ManifoldOptions) -> xr.Dataset:
 
 
 def _saddles(found: xr.Dataset, frequency_hz: float, packed: np.ndarray, base: Parameters) -> list[tuple[int, Saddle]]:
-    """Return the saddle orbits among the orbits of the analysis ``orbits``, each with its number there."""
     saddles = []
     for number in range(found.sizes["orbit"]):
         one = found.isel(orbit=number)

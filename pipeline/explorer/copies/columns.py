@@ -107,7 +107,6 @@ def fit(columns: Mapping[str, Column], period: np.ndarray, most_bytes: float) ->
 def _packed(
     columns: Mapping[str, Column], period: np.ndarray, level: Level, most_bytes: float
 ) -> dict[str, bytes] | None:
-    """Pack the diagram points at one level of detail; None if they exceed `most_bytes`."""
     objects, size = {}, 0
     for name, column in columns.items():
         part = thinned(column, period, level.each)

@@ -111,7 +111,6 @@ def export_page(
 
 
 def _html(copied: Copied) -> bytes:
-    """Return the HTML of the exported page with all data collected so far."""
     generator = f"magpend {copied.view['version']}"
     return inline_html(copied.run.info.title, generator, finished(copied)).encode()
 

@@ -188,7 +188,6 @@ def add_orbits(copied: Copied, choosing: Callable[[int], Chosen], count: np.ndar
 
 
 def _bytes_each(copied: Copied, chosen: Chosen, count: np.ndarray, room: Room) -> float:
-    """Estimate the bytes of one packed orbit from a sample of orbits."""
     some = chosen.cells[:: max(1, len(chosen.cells) // SAMPLE)][:SAMPLE]
     sizes = []
     for cell in some.tolist():

@@ -204,7 +204,6 @@ _TOLD = ("attractor", "share", "low", "high", "kind", "stability", "evidence")
 
 
 def _is_stable(stability: str | None, multipliers: np.ndarray | None) -> bool | None:
-    """Return whether an orbit attracts, by the stored analysis or else by its multipliers; None if neither decides."""
     if stability is not None:
         return {STABILITIES[ATTRACTS]: True, STABILITIES[UNSTABLE]: False}.get(stability)
     return None if multipliers is None else bool(np.abs(multipliers).max() < 1.0)

@@ -146,7 +146,6 @@ class _Table:
         self.codes = {s.name: np.full(sizes, NONE, np.uint16) for s in self.schemes}
 
     def read(self, ds: xr.Dataset, selection: Mapping[str, slice]) -> None:
-        """Read the values, status and colour codes of a block of cells."""
         block = ds[self.names].isel(selection).load()
         where: Any = tuple(selection[d] for d in self.dims)
         status = block["status"].transpose(*self.dims)

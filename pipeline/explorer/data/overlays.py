@@ -204,7 +204,6 @@ def branches(run: Run, x: str, y: str, at: Mapping[str, int]) -> dict[str, Any]:
 
 
 def _is_at(run: ExploredRun, found: xr.Dataset, branch: int, place: Mapping[str, int]) -> bool:
-    """Return whether a branch was followed at the given values of the other axes of the run."""
     for name, index in place.items():
         value = float(run.axis(name).values[index])
         there = float(found[name][branch]) if name in found else _base(run, name)
@@ -214,7 +213,6 @@ def _is_at(run: ExploredRun, found: xr.Dataset, branch: int, place: Mapping[str,
 
 
 def _base(run: ExploredRun, axis: str) -> float:
-    """Return the value that a swept parameter has in the base parameters of the specification."""
     if axis == FREQUENCY_DIM:
         own = run.spec.frequency_hz
         return math.nan if own is None else float(own)
@@ -222,7 +220,6 @@ def _base(run: ExploredRun, axis: str) -> float:
 
 
 def _segments(x: np.ndarray, y: np.ndarray, stable: bool) -> Iterator[dict[str, Any]]:
-    """Split a line at NaN into its parts, as dictionaries for the page."""
     gaps = np.flatnonzero(~np.isfinite(x))
     for first, stop in zip([0, *(gaps + 1)], [*gaps, len(x)], strict=True):
         if stop - first >= 2:
@@ -230,7 +227,6 @@ def _segments(x: np.ndarray, y: np.ndarray, stable: bool) -> Iterator[dict[str, 
 
 
 def _motion(found: xr.Dataset, branch: int) -> str | None:
-    """Return the model's name for the class of motion on a branch; None if there is none."""
     classifier = model_of(found).classifier
     if classifier is None or "side" not in found:
         return None
@@ -239,7 +235,6 @@ def _motion(found: xr.Dataset, branch: int) -> str | None:
 
 
 def _event(found: xr.Dataset, k: int, y: str) -> dict[str, Any]:
-    """Return a located bifurcation as a dictionary for the page."""
     branch, kind = int(found["of_branch"][k]), KINDS[int(found["kind"][k])]
     period = int(found["orbit_period"][branch])
     criticality = CRITICALITIES[int(found["criticality"][k])]

@@ -143,7 +143,6 @@ def curve_orbit(run: Run, curve: int, point: int) -> bytes:
 
 
 def _parameters_at(run: ExploredRun, one: xr.Dataset) -> tuple[Parameters, float]:
-    """Return the parameters and the drive frequency [Hz] at a point of a bifurcation curve."""
     values = {str(one.attrs[f"{role}_parameter"]): float(one[role]) for role in ("first", "second")}
     base = {FREQUENCY_DIM: run.spec.frequency_hz} if run.spec.frequency_hz is not None else {}
     clock = frequency_of(run.model, base | values)

@@ -15,7 +15,6 @@ _SUBSCRIPT = re.compile(r"_(?:\{([^{}]*)\}|(.))")
 
 
 def _letter(name: str) -> str:
-    """Convert the LaTeX name of a Greek letter to the letter; return any other word unchanged."""
     known = name.lower().removeprefix("var")
     case = "SMALL" if name[0].islower() else "CAPITAL"
     # Unicode spells lambda differently

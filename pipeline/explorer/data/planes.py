@@ -102,7 +102,6 @@ def plane_of(run: ExploredRun, at: Mapping[str, int]) -> Plane:
 
 
 def _scheme(run: ExploredRun) -> Scheme:
-    """Return the colour scheme for planes of initial states: by attractor if known, else by motion, else by status."""
     known = {s.name: s for s in schemes(run)}
     return next(known[name] for name in ("attractor", "motion", "status") if name in known)
 
@@ -172,7 +171,6 @@ def _part(run: ExploredRun, scheme: Scheme, index: Mapping[str, int]) -> xr.Data
 
 
 def _labels(part: xr.Dataset, scheme: Scheme) -> xr.DataArray:
-    """Return a label for each initial state: its colour code, a code for divergence, or `NONE`."""
     codes = part["_code"].values
     told = np.where(codes < 0, NONE, codes)
     if scheme.name != "status":
@@ -181,7 +179,6 @@ def _labels(part: xr.Dataset, scheme: Scheme) -> xr.DataArray:
 
 
 def _categories(scheme: Scheme, labels: np.ndarray) -> list[Category]:
-    """Return the labels that occur, each with its text and its colour."""
     present = set(np.unique(labels).tolist())
     found = [c for c in scheme.categories if c.number in present]
     if _DIVERGED in present:

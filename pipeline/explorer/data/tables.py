@@ -89,7 +89,6 @@ def _diagram(run: ExploredRun, asked: Asked) -> xr.Dataset:
 
 
 def _words(scheme: Scheme) -> np.ndarray:
-    """Return an array that has the label of each code of a colour scheme at the index of the code."""
     words = np.full(1 << 16, "", f"U{max((len(c.label) for c in scheme.categories), default=1)}")
     for category in scheme.categories:
         words[category.number] = category.label
@@ -200,7 +199,6 @@ def _unit(run: ExploredRun, axis: str) -> str:
 
 
 def _place(run: ExploredRun, x: str, at: Mapping[str, int]) -> dict[str, float]:
-    """Return the values of the fixed axes, as dataset attributes ``at_NAME``."""
     return {f"at_{n}": float(run.axis(n).values[i]) for n, i in run.place(at, but=x).items()}
 
 

@@ -115,7 +115,6 @@ def _quantity(run: ExploredRun, name: str) -> Callable[[xr.Dataset], xr.DataArra
 
 
 def _point(run: ExploredRun, values: Mapping[str, float]) -> tuple[np.ndarray, float]:
-    """Return the packed parameters and the frequency [Hz] at given values of the swept axes."""
     changed = {parameter_name(d): v for d, v in values.items() if d != FREQUENCY_DIM}
     own = run.parameters
     packed = np.array([changed.get(n, own[n]) for n in run.model.flow.parameter_names], np.float64)

@@ -73,7 +73,6 @@ def describe_view(run: Run, live: bool) -> dict[str, Any]:
 
 
 def _name(run: Run) -> str:
-    """Return the name of the run directory, without the path to it."""
     files = run.info.files
     return files.local.resolve().name if files.local else files.name.rstrip("/").rpartition("/")[2]
 
@@ -85,7 +84,6 @@ def _version() -> str:
 
 
 def _cells(run: ExploredRun) -> dict[str, int]:
-    """Count all cells of a run, those not yet computed, and those that failed or diverged."""
     committed = sum(run.plan.cells_in(task) for task in run.commits)
     counts = np.zeros(1 + max(DIVERGED, *FAILED, PENDING), np.int64)
     if committed:
@@ -148,7 +146,6 @@ def _state(state: Any) -> dict[str, Any]:
 
 
 def _section(model: Model) -> str:
-    """Return a text that names the section and says where it lies."""
     where = model.section if model.crossing is None else model.crossing.sentence
     return f"{section_name(model)} at {where}"
 
@@ -179,7 +176,6 @@ def _parameter(run: ExploredRun, parameter: Parameter) -> dict[str, Any]:
 
 
 def _drawing(run: ExploredRun) -> dict[str, Any] | None:
-    """Return the model's drawing as a dictionary for the page; None if the model has none."""
     drawing, model = run.model.drawing, run.model
     if drawing is None:
         return None
@@ -250,7 +246,6 @@ def commands(run: ExploredRun, directory: str) -> dict[str, str]:
 
 
 def _can_have(run: ExploredRun, name: str) -> bool:
-    """Return whether a run allows an analysis with its default options."""
     if run.spec.recorded is not None:
         return False
     analysis = ANALYSES[name]

@@ -359,7 +359,6 @@ class Catalog:
         return features.sides_of(block.section, block.turns, self.place.frequency, self.place.parameters)
 
     def _motion_of(self, orbit: Orbit) -> int:
-        """Return the class of motion (a code) of a periodic orbit."""
         if self.model.classifier is None:
             return 0
         is_flow = self.model.crossing is not None
@@ -391,7 +390,6 @@ class _WholePoint(Point):
     """A parameter point that holds all its cells in one block."""
 
     def whole(self) -> Block:
-        """Return all cells of the parameter point as one block."""
         return next(self.blocks())
 
 
@@ -400,7 +398,6 @@ def _finite(points: np.ndarray) -> np.ndarray:
 
 
 def _options_of(here: xr.Dataset | None) -> IdentifyOptions:
-    """Return the options with which the run's attractors were found; the defaults if it has no attractors."""
     attrs: Mapping[Any, Any] = {} if here is None else here.attrs
     given = {}
     for name, field in IdentifyOptions.model_fields.items():

@@ -294,7 +294,6 @@ def _step(problem: OrbitProblem, here: Point, move: float, normal: np.ndarray) -
 
 
 def _has_halved(family: Family, point: Point) -> bool:
-    """Return whether an orbit already closes after half of its period."""
     if family.period % 2:
         return False
     half = family.mismatch(point.u, point.value.images[family.period // 2 - 1])
@@ -302,7 +301,6 @@ def _has_halved(family: Family, point: Point) -> bool:
 
 
 def _why(point: Point, family: Family, target: float) -> str:
-    """Return a sentence on why an orbit could not be followed beyond a point."""
     value = float(point.u[-1] * family.scales[0])
     multipliers = np.linalg.eigvals(point.value.monodromy)
     name = family.free[0]

@@ -206,7 +206,6 @@ class RegionRunner:
 
 
 def _committed(out: Path) -> int:
-    """Return how many cells of a run directory are computed; 0 if there is no run yet."""
     with contextlib.suppress(StoreError, OSError):
         return state(out).n_committed
     return 0
@@ -232,7 +231,6 @@ def _group(words: list[str], folder: Path, said: Any) -> Iterator[subprocess.Pop
 
 
 def _end_group(process: subprocess.Popen[bytes]) -> None:
-    """End a process group by SIGTERM, and by SIGKILL if it does not exit in time."""
     if process.poll() == 0:
         return
     if process.poll() is None:

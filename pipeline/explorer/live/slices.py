@@ -52,14 +52,8 @@ def slice_of(live: LiveRun, job: Job) -> None:
 class _Grid:
     """Grid of initial states in a plane, with the number of the attractor on which each of them ends.
 
-    Attributes
-    ----------
-    n : int
-        Cells along a side of the finest grid.
-    axes : tuple of ndarray
-        Values of the two states at the centres of its cells.
-    labels : ndarray, (n, n)
-        Number of the attractor that each cell reaches, rows by the second state; `NOT_YET` before it is known.
+    `axes` has the values of the two states at the centres of the finest grid's cells. In `labels`, rows run along the
+    second state, and cells not decided yet are `NOT_YET`.
     """
 
     def __init__(self, columns: tuple[int, int], base: np.ndarray, axes: tuple[np.ndarray, np.ndarray]) -> None:
@@ -92,7 +86,6 @@ class _Grid:
         return grid
 
     def levels(self) -> Iterator[int]:
-        """Yield the number of cells along a side for each grid, from the coarsest to the finest."""
         n = LEAST_RESOLUTION
         while n <= self.n:
             yield n
@@ -105,7 +98,6 @@ class _Grid:
         return rows * step, columns * step
 
     def starts(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-        """Return the initial states at given rows and columns of the finest grid."""
         states = np.tile(self._base, (len(rows), 1))
         states[:, self._columns[0]] = self.axes[0][columns]
         states[:, self._columns[1]] = self.axes[1][rows]
@@ -166,7 +158,6 @@ class _Slice:
         self._grid.labels[rows[part], columns[part]] = labels
 
     def show(self, n: int, share: float) -> None:
-        """Send the labels known so far to the page."""
         step = self._grid.n // n
         own: dict[str, Any] = {
             "label": self._grid.image(n),

@@ -137,7 +137,6 @@ class _Sections:
             self.flush()
 
     def flush(self) -> None:
-        """Send the section points in the buffer to the page."""
         section = np.concatenate(self._kept) if self._kept else np.zeros((0, 1))
         self._kept, self._told = [], time.perf_counter()
         if len(section):

@@ -321,7 +321,6 @@ def application(service: Service) -> web.Application:
 
 
 def _live_routes(service: Service) -> list[Any]:
-    """Return the route of the websocket for live computation; an empty list if the run cannot be computed live."""
     if service.live is None:
         return []
 

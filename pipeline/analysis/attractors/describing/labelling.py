@@ -339,7 +339,6 @@ def _number_ends(
 def _features_of(
     number: int, cells: Cells, orbits: Sequence[Orbit], sets: Sequence[BoundedSet], point: Point, search: Search
 ) -> Features:
-    """Return the features of the orbit, bounded set, equilibrium or limit cycle that has a given number."""
     resting = len(orbits) + len(sets)
     if number < len(orbits):
         return _of_orbit(cells, orbits[number], point, search)
@@ -354,7 +353,6 @@ def _features_of(
 
 
 def _of_points(cells: Cells, kind: int, period: int, point: Point, search: Search) -> Features:
-    """Return the features of a set that can be computed from the section points of its cells."""
     assert cells.points is not None
     points = feature.sorted_points(cells.points, search.geometry)
     found = Features(points, kind, period, cells.mean_rotation, UNKNOWN, cells.low, cells.high)

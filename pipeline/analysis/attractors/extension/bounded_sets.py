@@ -153,7 +153,6 @@ def were_on(course: Course, own: Sequence[Course], settings: Settings) -> bool:
 def _verdict(
     own: Sequence[Course], left: Sequence[Course], growth: Growth | None, has_stayed: bool, settings: Settings
 ) -> tuple[int, int]:
-    """Decide the stability of a set; return its code and the code of the evidence."""
     if growth is not None and growth.preserves_volume:
         return NEUTRAL, stability.BY_VOLUME
     if left:

@@ -136,7 +136,6 @@ class _Extension:
 
     @property
     def has_budget(self) -> bool:
-        """Whether the budget of drive periods allows more integration."""
         return self.spent < self.budget
 
     # ---- samples -------------------------------------------------------------------------------
@@ -237,7 +236,6 @@ class _Extension:
         return least >= longest or lifetime_interval(0, at_risk)[0] >= longest
 
     def _longest_transient(self) -> float:
-        """Return the longest transient seen at this parameter point [drive periods, or returns to the section]."""
         left = [c.periods for c in self.courses if not c.goes_on and not c.is_leaving]
         return self.settings.seen + max(left, default=0.0)
 
@@ -268,7 +266,6 @@ class _Extension:
         self._leap(own, leg.section[rows])
 
     def _fail(self, course: Course, status: int) -> None:
-        """Finish a trajectory whose integration stopped early: at rest, diverged or failed."""
         course.periods = float(course.length)
         course.is_leaving = not course.length
         course.end = DIVERGED if status == Status.DIVERGED else FAILED
@@ -302,7 +299,6 @@ class _Extension:
                 self.orbits.append(orbit)
 
     def _rests(self, orbit: Orbit) -> bool:
-        """Return whether a closed orbit is really an equilibrium that lies on the section."""
         return self.point.can_rest and rest_of_orbit(self.point, orbit.points[0], self.geometry) is not None
 
     def _leave(self, course: Course, number: int) -> None:

@@ -103,7 +103,6 @@ class Equilibrium:
         return np.asarray((error <= allowed + known).all(axis=1) & (size[:, -1] <= size[:, 0] + known))
 
     def _flow(self, times: np.ndarray) -> np.ndarray:
-        """Return the matrix exponential of the Jacobian over each time, shape (..., state, state)."""
         values, vectors = np.linalg.eig(self.jacobian)
         if np.linalg.cond(vectors) > 1e8:  # nearly defective: the eigenvectors are no basis
             return np.asarray(expm(self.jacobian * times[..., None, None]))

@@ -174,9 +174,6 @@ def answer_all(
 def _gathered(
     sizes: Sequence[int], asked: Mapping[tuple[int, ...], Any], points: Mapping[tuple[int, ...], Point]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Repeat each parameter point's parameters and frequency for all its requested trajectories; return also the
-    running total of `sizes`.
-    """
     packed = np.repeat([points[i].packed for i in asked], sizes, axis=0)
     frequency = np.repeat([points[i].frequency for i in asked], sizes)
     return packed, frequency, np.cumsum(sizes)

@@ -198,12 +198,8 @@ def _neutral(attractors: xr.Dataset) -> frozenset[int]:
 class _Ids:
     """Ids given to attractors so far; the parameter points are visited one by one.
 
-    Attributes
-    ----------
-    ids, basis : ndarray, (*parameter dims, row)
-        Id and basis of each appearance; -1 and 0 where there is none.
-    taken : list of set
-        For each id, the parameter points at which it is, or will be, listed.
+    `ids` and `basis` (one axis per parameter, then row) have each appearance's id and the basis for it, -1 and 0 where there is
+    none. `taken` has the parameter points at which each id is, or will be, used.
     """
 
     def __init__(self, shape: tuple[int, ...], n_rows: int, places: Sequence[Place], rule: _Rule) -> None:
