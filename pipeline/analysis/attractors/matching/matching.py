@@ -198,8 +198,8 @@ def _neutral(attractors: xr.Dataset) -> frozenset[int]:
 class _Ids:
     """Ids given to attractors so far; the parameter points are visited one by one.
 
-    `ids` and `basis` (one axis per parameter, then row) have each appearance's id and the basis for it, -1 and 0 where there is
-    none. `taken` has the parameter points at which each id is, or will be, used.
+    `ids` and `basis` (one axis per parameter, then row) have each appearance's id and the basis for it, -1 and 0 where
+    there is none. `taken` has the parameter points at which each id is, or will be, used.
     """
 
     def __init__(self, shape: tuple[int, ...], n_rows: int, places: Sequence[Place], rule: _Rule) -> None:
