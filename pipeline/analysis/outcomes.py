@@ -61,7 +61,7 @@ def stability_of_cells(ids: xr.Dataset) -> np.ndarray:
 
 
 def other_cells(ids: xr.Dataset) -> Mapping[str, np.ndarray]:
-    """Group the cells that do not end on an attractor by the reason, as masks.
+    """Group the cells that end on no attractor by the reason; return a mask for each reason.
 
     Returns
     -------

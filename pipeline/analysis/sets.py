@@ -144,8 +144,7 @@ def nearest_distances(a: np.ndarray, b: np.ndarray, geometry: Geometry) -> np.nd
 
 
 def mean_distance(a: np.ndarray, b: np.ndarray, geometry: Geometry) -> float:
-    """Compute the mean distance of the states of one set from the other set, and return the larger of the two
-    directions.
+    """Compute the mean distance of one set's states from another set, in both directions, and return the larger value.
 
     This is the modified Hausdorff distance of Dubuisson and Jain (Proc. 12th ICPR, 1994, p. 566). For samples
     of a chaotic set, outliers determine the largest distance, but not the mean.
@@ -155,7 +154,7 @@ def mean_distance(a: np.ndarray, b: np.ndarray, geometry: Geometry) -> float:
 
 
 def order_by_points(points: list[np.ndarray], geometry: Geometry) -> list[int]:
-    """Return an order of sets that does not depend on how they are given: by the least rounded point of each set.
+    """Return a canonical order of sets, by the least rounded point of each.
 
     In a tie the shorter set comes first; then all points decide, in the order given.
     """

@@ -72,7 +72,7 @@ def point_table(ds: xr.Dataset, where: Row, rows: Sequence[Row], words: Callable
 
 
 def at_point(ds: xr.Dataset, row: Row, dims: Sequence[str]) -> Words:
-    """Return the table's columns for the parameter values of a row."""
+    """Return the parameter values of a table row as columns of the table."""
     return {f"{d}{unit_of(ds, d)}": f"{row[d]:g}" for d in dims}
 
 
@@ -83,7 +83,7 @@ def unit_of(ds: xr.Dataset, dim: str) -> str:
 
 
 def number(value: float, spec: str) -> str:
-    """Format a number by a format specification; a dash if it is not finite."""
+    """Format a number by a given format, such as ``.3f``; a dash if it is not finite."""
     return format(value, spec) if np.isfinite(value) else "-"
 
 

@@ -173,7 +173,7 @@ def _client(scheduler: Any, security: Any) -> Any:
 
 
 def _patience() -> int:
-    """Return how long to wait at most for the workers of an existing scheduler [s]."""
+    """Return the longest wait for the workers of an existing scheduler [s]."""
     text = os.environ.get(WAIT) or WAIT_FOR_WORKERS
     try:
         return seconds_of(text)

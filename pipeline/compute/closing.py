@@ -1,4 +1,4 @@
-"""Decide whether a trajectory has closed on a periodic orbit, and estimate how long that would take."""
+"""Decide whether a trajectory has closed on a periodic orbit, or estimate how long it will take to close."""
 
 from __future__ import annotations
 

@@ -239,7 +239,7 @@ class Window:
 
 
 class Watch:
-    """Record of when each dask worker last reported, by which workers that hang are found.
+    """Record of when each dask worker last reported. It shows which workers hang.
 
     Its clock stops while this process is suspended, by Ctrl-Z or a closed lid: no worker is blamed for that
     time.

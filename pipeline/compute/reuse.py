@@ -104,7 +104,7 @@ class Source:
         return taken, {name: array[taken] for name, array in values.items()}
 
     def _task(self, place: np.ndarray) -> np.ndarray:
-        """Return the number of the task that contains each cell; for a cell not in this run a number beyond the last
+        """Return the number of the task that contains each cell; for cells not in this run, a number beyond the last
         task.
         """
         plan = self.run.plan

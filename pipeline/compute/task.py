@@ -150,8 +150,8 @@ def _taking(
     block: tuple[slice, ...],
     taken: list[int],
 ) -> dict[str, Any]:
-    """Return a function that copies cells from other runs, as the keyword ``integrate``; an empty dict if there are no
-    such runs.
+    """Return a function that copies cells from other runs as keyword ``integrate``; an empty dict if there are no other
+    runs.
     """
     if not sources:
         return {}

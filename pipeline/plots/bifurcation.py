@@ -141,7 +141,7 @@ class Diagram:
 
     @property
     def layers(self) -> tuple[int, ...]:
-        """Indices of the diagram's layers: one per direction of the continuation (up, down), or one for a sweep."""
+        """Indices of the directions of continuation (up, down) that the diagram shows; one index for a sweep."""
         return tuple(range(len(self.view.layers)))
 
     @property

@@ -1,4 +1,4 @@
-"""Draw a figure of a run by its name; define what all ``draw`` functions of figures need.
+"""Draw a figure of a run by its name, with helpers for the ``draw`` functions of all figures.
 
 Each figure of `pipeline.products.registry` names a function ``draw(run, options)`` of this package. It
 reads ``run.cube()`` and ``run.derive(name, **options)``, and hands numbers to a ``plot_...`` function,

@@ -28,7 +28,7 @@ _PI_STEPS = tuple(0.125 * 2**k for k in range(24))
 
 @dataclass(frozen=True)
 class Measure:
-    """How a state or a quantity is shown on an axis: its symbol, its unit, and the factor to this unit.
+    """Presentation of a state or quantity on an axis: its symbol, its unit, and the factor to this unit.
 
     Attributes
     ----------

@@ -75,7 +75,7 @@ class Point:
     dot: Any
 
     def at(self, i: int) -> list[Artist]:
-        """Move the point to sample `i`, and return what has to be drawn again."""
+        """Move the point to sample `i`, and return its artists, which are then drawn again."""
         samples = self.trail.before(i)
         segments, there = self._segments(samples)
         self.comet.set_segments(list(segments[there]))
@@ -137,9 +137,7 @@ def moving_portrait(ax: Axes, one: xr.Dataset, pair: tuple[str, str], trail: Tra
 
 
 def _path(measures: Sequence[Measure], values: Sequence[Floats]) -> tuple[Floats, float]:
-    """Return the curve of a phase portrait in units of the axes, and the length above which a step is the jump of an
-    angle.
-    """
+    """Return the curve of a phase portrait in axis units, and the step length above which an angle has jumped."""
     columns, jumps = [], math.inf
     for measure, column in zip(measures, values, strict=True):
         turning = measure.on_circle and np.ptp(column) >= 2.0 * np.pi
@@ -196,7 +194,7 @@ class Machine:
     traced: Point
 
     def at(self, i: int) -> list[Artist]:
-        """Move the drawing to sample `i`, and return what has to be drawn again."""
+        """Move the drawing to sample `i`, and return its artists, which are then drawn again."""
         for line, corners in zip(self.lines, self.corners, strict=True):
             line.set_data(*corners[i].T)
         self.joints.set_data(*self.places[i].T)
@@ -284,7 +282,7 @@ class Clock:
     period: float
 
     def at(self, i: int) -> list[Artist]:
-        """Show the time of sample `i`, and return what has to be drawn again."""
+        """Show the time of sample `i`, and return the artist of the text, which is then drawn again."""
         if self.period:
             self.text.set_text(f"{self.time[i] / self.period:.2f} drive periods")
         else:

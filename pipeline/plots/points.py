@@ -58,7 +58,7 @@ broadcasts to it."""
 
 @dataclass(frozen=True)
 class View:
-    """What is drawn of a result cube: its variables, the function that computes points, and colours.
+    """Description of what is drawn of a result cube: its variables, a function that computes points, and colours.
 
     Attributes
     ----------

@@ -84,8 +84,8 @@ def plot_rotation(
 
 
 def rotation_data(part: xr.Dataset, swept: list[str]) -> xr.Dataset:
-    """Return the rotation numbers to draw, and which cells are locked to a rational number (over two parameters: their
-    share).
+    """Return the rotation numbers to draw, and which cells (over two parameters: which share of them) are
+    phase-locked.
     """
     locked = (part["orbit_period"] > 0).where(part["rotation"].notnull())
     data = xr.Dataset({"rotation": part["rotation"], "locked": locked}).load()

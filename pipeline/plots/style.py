@@ -361,7 +361,9 @@ def check_range(name: Literal["xlim", "ylim"] | str, range_: tuple[float, float]
 
 
 def edges(x: np.ndarray) -> np.ndarray:
-    """Return the edges of the columns that are centred on given parameter values (one more than values)."""
+    """Return the edges of the columns that are centred on given parameter values; there is one more edge than
+    values.
+    """
     if x.size == 1:
         width = 0.05 * abs(float(x[0])) or 0.5
         return np.array([x[0] - width, x[0] + width])
@@ -378,7 +380,7 @@ def span(x: np.ndarray) -> tuple[float, float]:
 def fill_columns(
     ax: Axes, edges: np.ndarray, low: np.ndarray, high: np.ndarray, looks: Mapping[str, Any], gid: str
 ) -> PolyCollection:
-    """Fill each column of a plot from `low` to `high`, as few rectangles."""
+    """Fill each column of a plot from `low` to `high`; equal columns beside each other share a rectangle."""
     levels = np.column_stack([low, high])
     starts = np.flatnonzero(np.r_[True, (np.diff(levels, axis=0) != 0).any(1)])
     ends = np.r_[starts[1:], len(levels)]

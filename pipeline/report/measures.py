@@ -133,8 +133,8 @@ def _asked(options: Options) -> str:
 
 
 def window(results: Results, of: Sequence[str], options: Options) -> tuple[Estimate, int, int, xr.Dataset, str]:
-    """Measure the interval about an axis value in which every cell has a given orbit period, and return also what it
-    was measured on.
+    """Measure the interval about an axis value in which every cell has a given orbit period; return also its indices
+    and cells.
     """
     ds, axis = _cells(results, of[0])
     here = _within(ds, axis, {k: v for k, v in options.items() if k in ("low", "high")})

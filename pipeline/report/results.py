@@ -126,7 +126,7 @@ class Results:
         return self._recordings[name]
 
     def series(self, name: str, n_periods: int) -> xr.Dataset:
-        """Return the time series of a recording together with that of the model, integrated from the same state."""
+        """Return a recording's time series, and that of the model integrated from the same state."""
         from pipeline.rig.measured.series import series_of
 
         return series_of(self.recording(name), self.rig(name).parameters, n_periods=n_periods)

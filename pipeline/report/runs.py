@@ -97,8 +97,8 @@ class Shown:
         return shlex.quote(self.run.name)
 
     def options_of(self, name: str) -> list[dict[str, Any]]:
-        """Return the options of each stored result of an analysis; the default options if none is stored but it may be
-        computed.
+        """Return the options with which a report shows an analysis: those of each stored result, or else the
+        defaults.
         """
         known = stored_options(self.run, name)
         return known or ([{}] if name in self.computed else [])

@@ -1,1 +1,1 @@
-"""Do what the commands on runs do: run, status, verify, derive, draw, extend, zoom."""
+"""Carry out the commands on runs: run, status, verify, derive, draw, extend, zoom."""

@@ -50,7 +50,7 @@ WORDS = {
 
 
 def is_whole(cluster: Cluster) -> bool:
-    """Return whether one batch job does all: the process that coordinates, and the workers."""
+    """Return whether a single batch job both coordinates the run and does its work."""
     return cluster.max_jobs == 1
 
 
@@ -149,8 +149,8 @@ _MARKS = {"slurm": "#SBATCH", "pbs": "#PBS", "sge": "#$", "lsf": "#BSUB"}
 
 
 def _directives(cluster: Cluster) -> list[str]:
-    """Return the user's own lines for batch scripts; a job of one core gets none for a parallel environment
-    (``-pe``).
+    """Return the user's additional lines for batch scripts; a job of one core gets no ``-pe`` (parallel
+    environment).
     """
     return [line for line in cluster.directives if is_whole(cluster) or not line.strip().startswith("-pe")]
 

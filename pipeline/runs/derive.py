@@ -222,7 +222,8 @@ def prepared(run: AnalysedRun, product: Any, options: Options) -> Options:
 
 
 def most_evidence(run: Run, options: Options) -> Options:
-    """Raise the effort in some options to that of the best stored search for attractors whose other options are equal.
+    """Raise the effort in some options to the largest effort of a stored search for attractors with otherwise equal
+    options.
 
     Options without an effort are returned unchanged.
     """
@@ -254,13 +255,13 @@ def _kept_efforts(run: Run) -> list[tuple[dict[str, Any], tuple[float, int]]]:
 
 
 def _aside(options: IdentifyOptions) -> dict[str, Any]:
-    """Return the options of a search for attractors without those of its effort, which is how far it integrates."""
+    """Return the options of a search for attractors except its effort, that is, how far it integrates."""
     effort = ("extend", "budget", "n_sample")
     return {name: value for name, value in options.plain().items() if name not in effort}
 
 
 def is_outdone(run: Run, attrs: Mapping[str, Any]) -> bool:
-    """Return whether a stored search for attractors has integrated further than the one behind a given result."""
+    """Return whether a stored search for attractors has integrated further than the search behind a given result."""
     name, given = str(attrs.get("derived_product")), _options_of(attrs)
     if name not in ANALYSES or not issubclass(ANALYSES[name].options, IdentifyOptions):
         return False

@@ -78,7 +78,7 @@ class Extension:
         return left / self.plan.n_cells
 
     def _more(self, run: Run) -> float:
-        """Return the fraction of its periods over which a copied cell must still be integrated."""
+        """Return the fraction of a cell's periods that must still be integrated after it is copied."""
         integration = self.spec.integration
         n_more = integration.n_keep - run.spec.integration.n_keep
         return n_more / (integration.n_transient + integration.n_keep)

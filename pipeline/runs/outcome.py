@@ -1,4 +1,4 @@
-"""Summarise the cells of a run by status: how many have it, in which ranges, and how to look closer."""
+"""Summarise the cells of a run by status: their number, their parameter ranges, and commands to look closer."""
 
 from __future__ import annotations
 

@@ -61,7 +61,7 @@ _listener = _Listener()
 
 
 def listen() -> None:
-    """Install the command line's handler for Ctrl-C, SIGTERM and SIGHUP; signals that are ignored stay so."""
+    """Install the command line's handler for Ctrl-C, SIGTERM and SIGHUP, except for signals that are ignored."""
     for number in NUMBERS:
         if signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, _listener)

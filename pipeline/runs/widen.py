@@ -39,7 +39,7 @@ class Widening:
 
 
 def widened(spec: Spec, widening: Widening) -> Spec:
-    """Return a specification with the changes of a `Widening`.
+    """Return a specification enlarged by longer axes, more initial conditions, section points or products.
 
     Raises
     ------

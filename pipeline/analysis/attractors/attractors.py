@@ -272,9 +272,7 @@ def _filled(
 
 
 def _with_exponents(result: xr.Dataset, ds: xr.Dataset) -> xr.Dataset:
-    """Set the largest Lyapunov exponent of each non-periodic set from the exponents of its trajectories in the run's
-    result cube.
-    """
+    """Set the largest Lyapunov exponent of each non-periodic set, from the stored exponents of its trajectories."""
     if "lyapunov" not in ds:
         return result
     dims, signs = result["attractor_id"].dims, ChaosOptions()
@@ -394,8 +392,8 @@ class _Table:
             arrays[name][at] = getattr(x, name)
 
     def share(self, index: tuple[int, ...], one: Found) -> None:
-        """Write each attractor's share of the trajectories that reach an attractor or diverge at one parameter
-        point.
+        """Write the fraction of trajectories that end on each attractor, among those that reach an attractor or
+        diverge.
         """
         counts = np.array(one.counts, np.int64)
         attracts = np.array([x.stability == ATTRACTS for x in one.features], bool)

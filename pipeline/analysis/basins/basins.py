@@ -94,7 +94,7 @@ _OWN = ("interval", "confidence", "box", "block", "scaling", "radius", "metric",
 
 
 def check_starts(ds: xr.Dataset) -> None:
-    """Raise ValueError unless the cells are independent initial conditions, several per parameter point."""
+    """Raise ValueError unless each parameter point has several cells with independent initial conditions."""
     if "branch" in ds["status"].dims:
         raise ValueError(
             'basins need independent initial conditions, a sweep (kind = "sweep"): where a branch of a '

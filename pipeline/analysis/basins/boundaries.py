@@ -336,8 +336,8 @@ def _epsilons(epsilons: Sequence[int] | None, shape: tuple[int, ...], method: Sc
 
 
 def _perturbed(codes: Codes, eps: Ints) -> tuple[Floats, Floats]:
-    """Count for each epsilon the tested cells, and those whose label changes within this distance. The counts are per
-    tile, a part of the grid.
+    """Count for each epsilon the tested cells, and those whose label changes within this distance, in each tile of the
+    grid.
 
     Every epsilon has the same trials: the cells that have room for the largest epsilon. Otherwise f would not
     be a straight line even for a straight boundary.
@@ -359,9 +359,7 @@ def _perturbed(codes: Codes, eps: Ints) -> tuple[Floats, Floats]:
 
 
 def _boxed(codes: Codes, eps: Ints, method: Scaling) -> tuple[Floats, Floats]:
-    """Count for each epsilon the boxes of this side, and those with several labels. The counts are per tile, a part of
-    the grid.
-    """
+    """Count for each epsilon the boxes with this side, and those with several labels, in each tile of the grid."""
     n_tiles = tiles_per_side(codes.shape) ** codes.ndim
     trials, hits = np.zeros((eps.size, n_tiles)), np.zeros((eps.size, n_tiles))
     for i, e in enumerate(eps):

@@ -118,8 +118,7 @@ def tiles_per_side(shape: tuple[int, ...], total: int = 64) -> int:
 def tile_numbers(
     shape: tuple[int, ...], grid: tuple[int, ...], step: int = 1, margin: tuple[int, ...] | None = None
 ) -> Ints:
-    """Return, for each element of an array over a grid, the number of the tile of the grid that holds the element's
-    centre.
+    """Return, for each element of an array over a grid, the number of the tile of the grid that it lies in.
 
     Parameters
     ----------

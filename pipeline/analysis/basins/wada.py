@@ -38,8 +38,7 @@ def wada_merge_test(
     confidence: float = 0.95,
     seed: int = 0,
 ) -> xr.Dataset:
-    """Test whether all basins share one boundary. Merge all basins but one, for each in turn, and compare the resulting
-    boundaries.
+    """Test whether all basins share one boundary: compare the boundaries that remain if all basins but one are merged.
 
     For each basin in turn, all others are merged. If the basins have the Wada property, the boundary is the
     same for every basin. On a grid, each boundary then lies within every other boundary fattened by a radius
@@ -148,7 +147,7 @@ def _boundary_cells(codes: Codes, code: int) -> Ints:
 
 
 def _distances(shape: tuple[int, ...], boundaries: list[Ints], radii: Ints, metric: Metric) -> tuple[Floats, Floats]:
-    """Compute how far each basin boundary lies at most from each other one, and count the boundary cells beyond each
+    """Compute the largest distance of each basin boundary from each other one, and count the boundary cells beyond each
     radius.
 
     There is one distance transform per label, which is read at the boundary cells of each pair.

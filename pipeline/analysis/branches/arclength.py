@@ -71,8 +71,8 @@ class Trace:
 def correct(
     problem: Problem, guess: np.ndarray, normal: np.ndarray, settings: Settings, along: np.ndarray | None = None
 ) -> Steps[Point | None]:
-    """Refine a guess of a curve point by Newton's method, within the plane through the guess that is normal to
-    `normal`; None if the method fails.
+    """Refine a guess of a curve point by Newton's method, in the plane through the guess normal to `normal`; None on
+    failure.
 
     The point's tangent goes along `along`, by default along the normal.
     """
@@ -159,8 +159,8 @@ def trace(problem: Problem, start: Point, settings: Settings, stop: Stop, betwee
 
 
 def cubic(a: Point, b: Point, share: float) -> np.ndarray:
-    """Interpolate between two points of a curve by the cubic through them; `share` is the fraction of the chord, and
-    above 1 it extrapolates.
+    """Interpolate between two points of a curve by a cubic, at the fraction `share` of their chord (above 1:
+    extrapolate).
     """
     length = float(np.linalg.norm(b.u - a.u))
     s, rest = share, 1.0 - share

@@ -54,7 +54,7 @@ def _branching_test(point: Point) -> float:
 
 
 def _of_orbits(test: Callable[[np.ndarray], float]) -> Test:
-    """Make a test function for points of a branch from a test of the monodromy matrix; at equilibria it is always 1."""
+    """Turn a test of the monodromy matrix into a test function for points of a branch; at equilibria its value is 1."""
     return lambda point: 1.0 if point.value.is_rest else test(point.value.monodromy)
 
 
@@ -248,7 +248,7 @@ def _root(known: list[tuple[float, float]]) -> float:
 
 
 def _between(a: Point, b: Point, share: float) -> np.ndarray:
-    """Interpolate between two points of a curve, in the plane normal to their chord at the given share of it."""
+    """Interpolate between two points of a curve, at a fraction of their chord and in the plane normal to it."""
     chord = b.u - a.u
     bent = cubic(a, b, share)
     return np.asarray(bent + (share - (bent - a.u) @ chord / (chord @ chord)) * chord)

@@ -274,7 +274,7 @@ def merged(points: Mapping[int, list[SpecialPoint]]) -> list[SpecialPoint]:
 
 
 def _is_known(one: SpecialPoint, other: SpecialPoint) -> bool:
-    """Return whether two located points of codimension two are one: the same orbit at the same parameter values."""
+    """Return whether two located points of codimension two are the same orbit at the same parameter values."""
     if one.kind != other.kind or one.family.period != other.family.period:
         return False
     if np.abs(one.point.u[-2:] - other.point.u[-2:]).max() > SAME_POINT:

@@ -208,7 +208,7 @@ def _targets(one: Found, line: Sequence[Found], way: int, known: Links) -> list[
 
 @dataclass(eq=False)
 class _Meeting:
-    """Detector that checks after each step of a branch whether the branch has reached one of some target orbits."""
+    """Detector that looks after each step of a branch whether the branch has reached one of given orbits."""
 
     family: Family
     targets: Sequence[Found]
@@ -277,8 +277,8 @@ def _follow(
 
 
 def grouped(places: Sequence[Hashable], links: Iterable[Link]) -> tuple[np.ndarray, list[Link]]:
-    """Group orbits by their links, with at most one orbit of each parameter point per group. Links without period
-    doublings come first.
+    """Group linked orbits, with at most one orbit of each parameter point per group. Links without period doublings
+    count first.
 
     Parameters
     ----------

@@ -57,7 +57,7 @@ AMPLITUDES = (0.02, 0.05, 0.1)
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """Curve of bifurcations in the plane of two parameters, with its orbits and the reason for the end at either side.
+    """Curve of bifurcations in the plane of two parameters, with its orbits and the reasons for its two ends.
 
     Attributes
     ----------

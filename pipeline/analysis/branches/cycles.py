@@ -31,8 +31,8 @@ SAME_TIME = 1e-6
 
 
 def cycle_family(equilibria: Family, at: Bifurcation) -> Family | None:
-    """Return the family of limit cycles near a Hopf point, on a Poincare section through this point; None if there is
-    none.
+    """Return the family of limit cycles near a Hopf point, on a Poincare section through this point; None if they do
+    not cross it.
 
     There is none if the system has no section by crossing, or if the crossing state does not oscillate.
     """

@@ -79,7 +79,7 @@ def dataset_of(
 
 
 def _fixed(branches: Sequence[Branch], parameter: str, parameters: Parameters | None) -> dict[str, Any]:
-    """Return dataset variables for those fixed parameters that have other values on the branches than in the run."""
+    """Return dataset variables for the fixed parameters whose values differ between the branches and the run."""
     if parameters is None or not branches:
         return {}
     values = np.array([b.family.parameters for b in branches])
@@ -105,9 +105,7 @@ def _side_variables(
 
 
 def _settle_origin(counts: np.ndarray, branch: Branch) -> None:
-    """Set the number of unstable multipliers at the bifurcation where a branch starts to that of the next point, in
-    place.
-    """
+    """Copy the number of unstable multipliers at a branch's starting bifurcation from the next point, in place."""
     for j, point in enumerate(branch.points):
         if branch.origin is not None and point.u is branch.origin.point.u:
             counts[j] = counts[j + 1] if j + 1 < len(branch.points) else counts[j - 1]

@@ -129,7 +129,7 @@ def _follow_starts(starts: Sequence[Start], branches: list[Branch], scope: Scope
 
 
 def _first_of_each(starts: Sequence[Start], followed: set[int]) -> list[int]:
-    """Return the first starting orbit of each pair (attractor, period) that has not been followed yet, by index."""
+    """Return the index of the first starting orbit of each attractor and period of which no orbit has been followed."""
     kinds = [(start.attractor, start.family.period) for start in starts]
     done = {kinds[i] for i in followed}
     firsts = {kind: i for i, kind in reversed(list(enumerate(kinds))) if kind[0] >= 0 and kind not in done}
@@ -172,9 +172,7 @@ def _at_value(family: Family, guess: np.ndarray, settings: Settings) -> Steps[Po
 
 
 def _near(start: Start, branch: Branch) -> Iterator[np.ndarray]:
-    """Yield guesses of a branch's orbits at the parameter value of a starting orbit. They are interpolated on the
-    branch, and near the starting orbit.
-    """
+    """Yield guesses of the orbits on a branch that have a starting orbit's parameter value and lie near it."""
     family = branch.family
     if family.period != start.family.period or not _same_others(family, start.family):
         return
@@ -232,8 +230,8 @@ def _adopt(branches: Sequence[Branch]) -> list[Start]:
 
 
 def _doubling_at(branches: Sequence[Branch], branch: Branch, which: int) -> Bifurcation | None:
-    """Find the period doubling at the end of a branch. It is on a branch of half the period, within a few steps of the
-    end.
+    """Find the period doubling at which a branch ends. It lies on a branch of half the period, within a few steps of
+    the end.
     """
     end, inner = (branch.points[0], branch.points[1]) if which == 0 else branch.points[:-3:-1]
     reach = 3.0 * max(float(np.linalg.norm(end.u - inner.u)), 1e-3)
@@ -250,7 +248,7 @@ def _doubling_at(branches: Sequence[Branch], branch: Branch, which: int) -> Bifu
 
 
 def _gap(family: Family, end: Point, one: Bifurcation) -> float:
-    """Return the scaled distance between an orbit and the orbit at a bifurcation, from its nearest section point."""
+    """Return the scaled distance between an orbit and the nearest section point of the orbit at a bifurcation."""
     return min(float(np.linalg.norm(family.mismatch(end.u, x))) for x in one.point.value.images)
 
 

@@ -89,7 +89,9 @@ class _Stop:
         return "period_halving" if len(points) > 2 and has_halved(self.family, points) else ""
 
     def _is_closed(self, points: list[Point]) -> bool:
-        """Return whether the last step passed the branch's own start, at any section point of the orbit."""
+        """Return whether the last step of a branch came back to the branch's start, at any section point of the
+        orbit.
+        """
         if len(points) < 5:
             return False
         first, before, here = points[0], points[-2], points[-1]

@@ -223,9 +223,7 @@ def _bend(middle: np.ndarray, ahead: np.ndarray, behind: np.ndarray, steps: np.n
 
 
 def settled(values: np.ndarray) -> tuple[float, float, int]:
-    """Choose the value of a coefficient that changes least with the step size. Return it with its error and its
-    index.
-    """
+    """Choose the value of a coefficient that depends least on the step size. Return it with its error and its index."""
     changes = np.abs(np.diff(values))
     errors = np.maximum(changes[:-1], changes[1:])
     if np.isnan(errors).all():

@@ -98,7 +98,7 @@ class Value:
 
     @property
     def is_finite(self) -> bool:
-        """Whether the residual and the derivative have only finite numbers."""
+        """Whether all numbers of the residual and the derivative are finite."""
         return bool(np.isfinite(self.residual).all() and np.isfinite(self.derivative).all())
 
 
@@ -232,8 +232,8 @@ class OrbitProblem:
         return self.family.system
 
     def rows(self, u: np.ndarray) -> Rows:
-        """Return the trajectories to integrate: the whole orbit, or each of its periods separately. Each comes again at
-        a slightly changed parameter.
+        """Return the trajectories to integrate: the orbit, whole or period by period, also at a slightly changed
+        parameter.
         """
         step = np.zeros(self.size)
         step[-1] = ONE_SIDED_STEP
@@ -244,8 +244,8 @@ class OrbitProblem:
         return replace(self.family.rows(np.concatenate([own, own + step])), period=1)
 
     def value(self, u: np.ndarray, ends: Ends) -> Value | None:
-        """Compute how far the orbit is from closing after one period, and the derivative of this; None if more
-        trajectories are needed.
+        """Compute the mismatch of the orbit after one period, and its derivative; None if more trajectories are
+        needed.
         """
         is_whole = ends.images.shape[1] == self.family.period
         return self._of_whole(u, ends) if is_whole else self._of_segments(u, ends)
@@ -302,7 +302,7 @@ class OrbitProblem:
 
 
 def _is_joined(gap: float, residual: float) -> bool:
-    """Return whether the gaps between separately integrated periods are small enough for the next Newton step.
+    """Return whether the gaps between separately integrated periods are small enough for Newton's next step.
 
     F errs by the square of the gap, the derivative by the gap. Far from the solution Newton's method needs
     neither to be exact.

@@ -229,9 +229,7 @@ def orbits_near(
 def _spread(
     section: np.ndarray, places: Sequence[tuple[np.intp, ...]], distance: np.ndarray, system: System
 ) -> list[np.ndarray]:
-    """Choose section points to which a trajectory returns closely. The closest come first, and all lie more than
-    `RECURRENCE` apart.
-    """
+    """Choose section points to which a trajectory returns most closely, all more than `RECURRENCE` apart."""
     chosen: list[np.ndarray] = []
     for place in places:
         if len(chosen) == TRIES or not distance[place] <= RECURRENCE:

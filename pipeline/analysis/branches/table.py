@@ -178,7 +178,7 @@ def windows_of(ds: xr.Dataset) -> list[dict[str, Any]]:
 
 
 def _stable_runs(stable: np.ndarray, closed: bool) -> list[tuple[int, int]]:
-    """Return the first and last index of each run of successive stable points; on a closed branch a run may pass its
+    """Return the first and last index of each series of stable points; on a closed branch, a series may pass the
     start.
     """
     edges = np.flatnonzero(np.diff(np.concatenate([[0], stable.astype(np.int8), [0]])))

@@ -116,7 +116,7 @@ def fractions_between(low: float, high: float, most: int) -> list[Fraction]:
 
 
 def locked_orbits(row: Row, search: Search, most: int) -> dict[Fraction, Start | None]:
-    """Find one orbit with rotation number p/q for each such fraction in the range of a row of cells.
+    """Find an orbit for each rotation number p/q that occurs along a row of cells.
 
     Parameters
     ----------
@@ -159,9 +159,7 @@ def _of_cells(row: Row, search: Search, fraction: Fraction) -> Start | None:
 
 
 def _passed(row: Row, fraction: Fraction) -> tuple[int, int] | None:
-    """Return the indices (value, start) of a cell between which and the next the rotation number passes a fraction;
-    None if it never does.
-    """
+    """Find a cell after which the rotation number passes a fraction; return its indices (value, start), or None."""
     off = row.rotation - float(fraction)
     places = np.argwhere(off[:-1] * off[1:] < 0.0)
     if not len(places):

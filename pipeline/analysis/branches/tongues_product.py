@@ -60,9 +60,7 @@ def settle_tongues(run: Run, options: TongueOptions) -> TongueOptions:
 
 
 def tongues(run: Run, options: TongueOptions) -> xr.Dataset:
-    """Find orbits with rotation numbers p/q along a row of cells, follow them to their folds, and continue the folds in
-    the parameter plane.
-    """
+    """Find orbits with rotation numbers p/q along a row of cells, and continue their folds in the parameter plane."""
     point, base = _row_of(run, options), parameters_of(run.cube())
     first, second = axis_name(options.parameter), axis_name(options.second)
     assert options.low is not None

@@ -232,7 +232,7 @@ class _Curve:
 
 
 def _sample(section: Floats, n_max: int) -> Floats:
-    """Choose at most `n_max` section points: the last ones of evenly chosen cells."""
+    """Choose at most `n_max` section points: the last ones of cells that are spread evenly over the sample."""
     m = len(section)
     if m > n_max:
         section = section[np.linspace(0, m - 1, n_max).round().astype(int)]
@@ -270,7 +270,7 @@ def _dimension_of(section: Floats, theiler: int, floor: float, geometry: Geometr
 
 
 def _extent(points: Floats, geometry: Geometry) -> float:
-    """Return the extent of the points along the state in which they extend farthest [scaled]."""
+    """Return the largest extent of the points along any state [scaled]."""
     extent = 0.0
     for i, length in enumerate(geometry.circumference):
         x = geometry.scaled(points)[:, i]

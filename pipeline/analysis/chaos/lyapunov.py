@@ -184,7 +184,8 @@ def transients(ds: xr.Dataset, *, n_sigma: float, least: float) -> xr.DataArray:
 
 
 def on_attractor(ds: xr.Dataset, *, n_sigma: float, least: float) -> xr.DataArray:
-    """Return for each cell whether its largest exponent is valid for the final motion, and not for a chaotic transient.
+    """Return for each cell whether its largest Lyapunov exponent is that of its final motion, not of a chaotic
+    transient.
 
     Their flag is good, or only the first exponent is resolved, and they are no transients.
     """
@@ -218,7 +219,7 @@ def _audit(ds: xr.Dataset) -> xr.DataArray:
 
 
 def pooled_mean(value: Floats, stderr: Floats, which: npt.NDArray[np.bool_]) -> tuple[Floats, Floats, Floats]:
-    """Compute the mean over cells, its standard error, and the scatter between cells that exceeds their own errors.
+    """Compute the mean over cells, its standard error, and how much the cells scatter beyond their own errors.
 
     The variance S**2 of m cells includes the squared errors s_i**2 of the cells. Let T**2 be S**2 -
     mean(s_i**2), or 0 if that is negative. The variance of the mean is ``(T**2 + mean(s_i**2))/m`` (Hedges

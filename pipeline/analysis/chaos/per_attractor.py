@@ -123,7 +123,7 @@ class _Cells:
 
 
 def chaos_per_attractor(ds: xr.Dataset, cells: xr.Dataset, attractors: xr.Dataset, options: ChaosOptions) -> xr.Dataset:
-    """Add variables per attractor to the chaos indicators of the cells; the docstring of this module lists the
+    """Add the indicators of chaos per attractor to those of the cells; the docstring of this module lists the
     variables.
 
     Parameters

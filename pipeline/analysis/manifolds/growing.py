@@ -195,9 +195,7 @@ def _grow(saddle: Saddle, side: float, stable: bool, resolution: Resolution) -> 
 
 @dataclass(eq=False)
 class _Curve:
-    """A manifold while it grows: positions on a first segment, and their repeated images under the section map (for a
-    stable manifold: preimages).
-    """
+    """A manifold while it grows: a first segment, and its repeated images (or preimages) under the section map."""
 
     saddle: Saddle
     resolution: Resolution
@@ -313,7 +311,7 @@ class _Curve:
         return result
 
     def _coarse(self, points: np.ndarray) -> np.ndarray:
-        """Return which chords of a curve are too long, or have a too sharp turn at one of their ends."""
+        """Return which chords of a curve are too long, or turn too sharply at one of their ends."""
         chords = self.saddle.scaled(np.diff(points, axis=0))
         lengths = np.linalg.norm(chords, axis=1)
         inner = (chords[1:] * chords[:-1]).sum(axis=1) / np.maximum(lengths[1:] * lengths[:-1], 1e-300)

@@ -151,8 +151,8 @@ def needs_tangency(run: Run, options: TangencyOptions) -> None:
 
 
 def tangency(run: Run, options: TangencyOptions) -> xr.Dataset:
-    """Locate the parameter value at which each unstable manifold of a saddle orbit first touches each of its stable
-    manifolds.
+    """Locate the parameter value at which each unstable manifold of a saddle orbit first touches a stable one of it,
+    for all pairs.
     """
     cube = run.cube()
     base, found = parameters_of(cube), run.derive("orbits", **options.part(OrbitOptions))

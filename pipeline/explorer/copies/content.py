@@ -1,6 +1,4 @@
-"""Collect the data of an exported page: description of the run, diagrams, drawn-over results, planes of initial
-states.
-"""
+"""Collect the data of an exported page: description of the run, diagrams, curves, planes of initial states."""
 
 from __future__ import annotations
 
@@ -148,7 +146,9 @@ def places(run: ExploredRun, but: str = "") -> Iterator[Place]:
 
 
 def place_key(run: ExploredRun, at: Mapping[str, int], x: str = "") -> str:
-    """Return the key of a point on the axes, such as ``frequency=3&amplitude=0``, as the page's script makes it too."""
+    """Return the key of a point on the axes, such as ``frequency=3&amplitude=0``; the page's script makes the same
+    keys.
+    """
     parts = [f"{a.name}={at.get(a.name, 0)}" for a in run.axes if a.name != x]
     return "&".join([*([f"x={x}"] if x else []), *parts])
 

@@ -106,7 +106,7 @@ def choose(run: ExploredRun, layers: Mapping[str, np.ndarray], count: np.ndarray
 
 
 def _labels(layers: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Return a number for each cell that tells the attractors (or classes of motion) of one parameter point apart."""
+    """Return a number for each cell that distinguishes the attractors (or classes of motion) at one parameter point."""
     if "colour_attractor" in layers:
         return np.asarray(layers["colour_attractor"], np.int64)
     motion = layers.get("colour_motion", np.zeros_like(layers["status"])).astype(np.int64)
@@ -126,8 +126,8 @@ def _parameter_points(run: ExploredRun) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _nearest(groups: np.ndarray, taken: np.ndarray, axis: np.ndarray, same: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the exported orbit that is shown for each group of cells: its own, or else a near one of the same
-    attractor if possible.
+    """Return the exported orbit that is shown for each group of cells: its own, or the nearest one, if possible of the
+    same attractor.
     """
     number = np.full(len(groups), NONE, np.uint32)
     means = np.full(len(groups), NEAREST, np.uint8)

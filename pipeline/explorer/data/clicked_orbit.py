@@ -139,7 +139,7 @@ def _no_point(cell: Cell, point: int, n_points: int) -> str:
 
 
 def _seconds(run: Run, cell: Cell, state: np.ndarray, n_periods: int) -> np.ndarray:
-    """Return the time at the end of each period after a section point [s]; without a drive, periods are returns to the
+    """Return the time at which each period after a section point ends [s]; without a drive, a period is a return to the
     section.
     """
     if run.model.crossing is None:
@@ -323,7 +323,7 @@ def seeds(run: ExploredRun, cell: Cell) -> list[dict[str, Any]]:
 
 
 def _starts_of(run: ExploredRun, name: str) -> np.ndarray:
-    """Return the initial values of one state in the shape of the run's initial conditions."""
+    """Return the initial values of one state, as an array over the dims of the initial conditions."""
     coordinate = run.cube().coords[name]
     sizes = [run.plan.shape[run.plan.dims.index(d)] for d in run.start_dims]
     shaped = [n if d in coordinate.dims else 1 for d, n in zip(run.start_dims, sizes, strict=True)]

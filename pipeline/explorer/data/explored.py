@@ -103,7 +103,7 @@ class ExploredRun(Run):
             return found
 
     def bifurcation_curves(self) -> xr.Dataset | None:
-        """Return the stored bifurcation curves, of this run or of the run that was named for them; None if there are
+        """Return the stored bifurcation curves of this run, or of the other run named for them; None if there are
         none.
         """
         return self.kept("curves") if self.curves is None else ExploredRun.of(self.curves).kept("curves")
@@ -124,9 +124,7 @@ class ExploredRun(Run):
         return sorted(place.name for place in products_in(self.info.files.below(DERIVED)))
 
     def remembered(self, key: str, make: Callable[[], T]) -> T:
-        """Return the value of a key, which is computed at the first request only, even if requests come at the same
-        time.
-        """
+        """Return the cached value of a key; compute it at the first request only."""
         with self._lock:
             lock = self._opened.setdefault(f"lock {key}", threading.Lock())
         with lock:
@@ -136,9 +134,7 @@ class ExploredRun(Run):
             return found
 
     def large(self, key: str, make: Callable[[], T]) -> T:
-        """Return the value of a key, which is computed at the first request. Only the last few of these large values
-        stay in memory.
-        """
+        """Return the cached value of a key, or compute it. Only the last few of these large values stay in memory."""
         with self._lock:
             last: list[str] = self._opened.setdefault("large", [])
             if key in last:

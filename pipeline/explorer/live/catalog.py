@@ -339,7 +339,9 @@ class Catalog:
         return None
 
     def _class_of(self, block: Block, row: int) -> Entry:
-        """Return the entry for cells without an attractor that have the status, period and motion of a given cell."""
+        """Return the catalog entry for cells without an attractor that share status, period and motion with a given
+        cell.
+        """
         status = int(block.status[row])
         alive = bool(block.is_bounded[row] or block.is_closed[row])
         period = int(block.orbit_period[row]) if alive else 0
@@ -408,9 +410,7 @@ def _options_of(here: xr.Dataset | None) -> IdentifyOptions:
 
 
 def _tolerance_of(here: xr.Dataset | None, closure_tolerance: float) -> float:
-    """Return the distance within which a closed (periodic) cell counts as on a known orbit, as in the stored
-    analysis.
-    """
+    """Return the distance within which a cell counts as on a known orbit, as in the run's stored analysis."""
     found = 0.0 if here is None else float(here.attrs.get("identify_tolerance", 0.0))
     return found or max(1e-4, 10.0 * closure_tolerance)
 

@@ -62,7 +62,7 @@ def live_problem(run: Run) -> str | None:
 
 
 class Session(Protocol):
-    """What a run needs of its live sessions; a session is an open page that computes."""
+    """The methods that a run needs of its live sessions. A session is one open page that computes."""
 
     @property
     def is_over(self) -> bool:

@@ -84,9 +84,7 @@ def changes_of(run: Run, region: Region) -> Changes:
 
 
 def _names(run: Run, region: Region, swept: list[str]) -> tuple[str, str | None]:
-    """Return the names, in the specification, of what the two intervals of a region restrict; the second may be
-    None.
-    """
+    """Return the names of the one or two axes or states that a selected region restricts."""
     walk = run.spec.continuation
     if region.axes is None:
         if not swept:

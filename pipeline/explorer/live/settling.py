@@ -33,7 +33,7 @@ LEG = 32
 
 
 class Ends(Protocol):
-    """What is needed of the catalog of attractors at a parameter point; see
+    """The methods of a catalog of attractors that an integration needs; see
     `pipeline.explorer.live.catalog.Catalog`.
     """
 
@@ -185,7 +185,7 @@ Tell = Callable[[np.ndarray, int], None]
 
 
 def run_start(flight: Flight, integration: Integration, tell: Tell, periods: int | None = None) -> Block:
-    """Integrate one initial state as a cell of the run would be, and report its section points as they are computed.
+    """Integrate one initial state like a cell of the run, and report its section points as they are computed.
 
     Parameters
     ----------

@@ -39,7 +39,7 @@ SAMPLES = 256
 
 @dataclass
 class Cells:
-    """Statistics of the trajectories (cells) on one attractor, accumulated block by block in any order.
+    """Statistics of the trajectories (cells) on one attractor, collected from one block of cells after another.
 
     Attributes
     ----------
@@ -90,9 +90,7 @@ class Cells:
 
     @property
     def mean_rotation(self) -> np.ndarray:
-        """Mean rotation of the cells [turns per drive period]. The sum runs in rising order, so the order of cells does
-        not change its last bit.
-        """
+        """Mean rotation of the cells [turns per drive period]. Its bits do not depend on the order of the cells."""
         return np.asarray(np.sort(np.concatenate(self.rotations), axis=0).mean(axis=0))
 
     @property

@@ -188,8 +188,8 @@ def _probe(point: Point, state: State, labels: _Labels, search: Search) -> Work[
 
 
 def _label_courses(point: Point, found: Outcome, labels: _Labels, groups: np.ndarray, search: Search) -> None:
-    """Label the cells of which a similar cell was integrated further, by the set on which that cell ended. Similar
-    cells share a box or a group of section points.
+    """Label cells by the end of a similar cell that was integrated further. Cells are similar if they share a box or a
+    group of section points.
     """
     ends = {course.key: course.end for course in found.courses if not course.goes_on}
     if not ends:
@@ -212,8 +212,8 @@ def _label_courses(point: Point, found: Outcome, labels: _Labels, groups: np.nda
 
 
 def _label_raw(point: Point, state: State, groups: np.ndarray, labels: _Labels, search: Search) -> list[Orbit]:
-    """Return an unpolished orbit for each group of closed (periodic) cells that are on no polished orbit, and label
-    these cells.
+    """Label the closed (periodic) cells that are on no refined orbit, and return an unrefined orbit for each group of
+    them.
     """
     left = np.where((labels.label < 0) & (labels.decision != DIVERGES) & ~_is_elsewhere(point), groups, -1)
     best: dict[int, tuple[float, int, np.ndarray]] = {}
@@ -227,8 +227,8 @@ def _label_raw(point: Point, state: State, groups: np.ndarray, labels: _Labels, 
 def _label_sets(
     point: Point, first: int, sets: Sequence[BoundedSet], labels: _Labels, groups: np.ndarray, search: Search
 ) -> None:
-    """Label the cells on each non-periodic set: the sampled cells that showed it, and all cells whose section points
-    lie on it.
+    """Label the cells on each non-periodic set: the sampled cells by which it was found, and all cells whose section
+    points lie on it.
     """
     for i, one in enumerate(sets):
         own = one.cells[labels.label[one.cells] < 0]
@@ -244,8 +244,8 @@ def _label_sets(
 
 
 def _label_ends(block: Block, ends: Mapping[int, int], label: np.ndarray, decision: np.ndarray) -> None:
-    """Label the closed (periodic) cells for which a longer integration found their orbit; change `label` and `decision`
-    in place.
+    """Label each closed (periodic) cell whose orbit was found by a longer integration; change `label` and `decision` in
+    place.
     """
     rest = np.flatnonzero(block.is_closed & (label[block.cells] < 0))
     for row, mark in zip(rest, marks_of(block.section[rest]), strict=True):
@@ -324,7 +324,7 @@ def _number_ends(
     resting: int,
     table: np.ndarray,
 ) -> None:
-    """Count where the trajectories that left each transient set ended, and store the counts in its feature `n_to`."""
+    """Count where the trajectories that left each transient set ended; store the counts in the set's feature `n_to`."""
     for features, number in zip(ranked, order, strict=True):
         if first <= number < resting:
             ended = np.zeros(len(order), np.int64)

@@ -143,7 +143,7 @@ def _dataset(here: xr.Dataset, orbits: list[np.ndarray], parameters: Parameters,
 
 
 def _drawn(result: xr.Dataset, table: np.ndarray, parameters: Parameters) -> xr.Dataset:
-    """Add the coordinates of the model's drawing during the motion on each attractor, if the model has a drawing."""
+    """Add the moving points of the model's drawing on each attractor, if the model has a drawing."""
     drawing = parameters.model.drawing
     if drawing is None:
         return result

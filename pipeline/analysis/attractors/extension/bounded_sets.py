@@ -137,7 +137,7 @@ def left_behind(left: Sequence[Course], settings: Settings) -> BoundedSet:
 
 
 def ends_of(left: Iterable[Course]) -> dict[int, int]:
-    """Count trajectories by the orbit, equilibrium or failure in which each of them ended."""
+    """Count how many trajectories ended on each orbit, at each equilibrium, or by each kind of failure."""
     ended: dict[int, int] = {}
     for course in left:
         ended[course.end] = ended.get(course.end, 0) + 1
@@ -189,8 +189,8 @@ def _growth(own: Sequence[Course], point: Point, settings: Settings, most: int) 
 
 
 def _closes_above(own: Sequence[Course], growth: Growth | None, settings: Settings) -> int:
-    """Return the period of trajectories that close only after more periods than the search allows; 0 if they do not
-    close.
+    """Return an orbit period above the longest one searched for, if the trajectories close with it; 0 if they do
+    not.
     """
     if growth is None or not growth.contracts:
         return 0

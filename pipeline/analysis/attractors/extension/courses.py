@@ -49,7 +49,7 @@ class Course:
 
     @property
     def goes_on(self) -> bool:
-        """Whether the trajectory still has no known end: an orbit, an equilibrium, divergence or a failure."""
+        """Whether the trajectory is still to be integrated, because no orbit, equilibrium or failure has ended it."""
         return self.end == ON_SET
 
     @property
@@ -59,7 +59,7 @@ class Course:
 
     @property
     def stayed(self) -> np.ndarray:
-        """Section points on the set on which the trajectory stays or which it has left."""
+        """Section points on the set that the trajectory stays on, or that it was on before it left."""
         if self.goes_on:
             return self.extension if self.legs else self.kept
         return np.asarray(self.extension[: int(self.periods)])
@@ -76,5 +76,5 @@ class Course:
 
 
 def rest_number(end: int) -> int | None:
-    """Return the index of the equilibrium that an end code stands for; None if the code stands for another end."""
+    """Return the index of the equilibrium at which a trajectory ended, from its end code; None for any other end."""
     return AT_REST - end if end <= AT_REST else None

@@ -162,7 +162,9 @@ class _Extension:
         return [Course(cell, key, kept, kept[-1], step) for key, (_, cell, kept, step) in chosen]
 
     def left_of(self, loose: np.ndarray) -> np.ndarray:
-        """Return the cells of `loose` that were not integrated further and lie on no set whose stability is decided."""
+        """Return the cells of `loose` whose end is still open: not integrated further, and on no set whose stability is
+        decided.
+        """
         done = np.zeros(self.point.n_cells, bool)
         done[self.told(loose)[0]] = True
         done[[course.cell for course in self.courses]] = True
@@ -183,7 +185,7 @@ class _Extension:
         return np.concatenate(cells), np.concatenate(numbers)
 
     def add_transient(self) -> None:
-        """Add the set that trajectories have left to the list of sets, unless the list already has a transient set."""
+        """Add the set that trajectories have left as a transient set, unless the list has such a set already."""
         left = [course for course in self.courses if course.has_left]
         if left and not any(one.n_left for one in self.sets):
             self.sets.append(left_behind(left, self.settings))

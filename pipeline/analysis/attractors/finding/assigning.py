@@ -43,7 +43,7 @@ class _Metric:
 
     @property
     def factor(self) -> float:
-        """Largest value that this norm can take for a vector whose scaled components are at most 1."""
+        """Largest norm of a vector whose scaled components are at most 1."""
         return float(np.linalg.norm(self.root, 2) * np.sqrt(len(self.root)))
 
 
@@ -100,9 +100,7 @@ def decide(
 def _nearest(
     section: np.ndarray, cells: np.ndarray, orbits: Sequence[Orbit], geometry: Geometry
 ) -> Iterator[tuple[np.ndarray, int, int]]:
-    """Group the cells near any orbit by their nearest orbit point. Yield the cells, the orbit's index and the point's
-    index.
-    """
+    """Yield the cells near each point of the orbits, with the index of the orbit and of the orbit point."""
     if not orbits or not len(cells):
         return
     owner = np.repeat(np.arange(len(orbits)), [o.period for o in orbits])
@@ -120,7 +118,9 @@ def _on_orbit(section: np.ndarray, orbit: Orbit, phase: int, tolerance: float, g
 
 
 def _approach(section: np.ndarray, orbit: Orbit, phase: int, tolerance: float, geometry: Geometry) -> np.ndarray:
-    """Return a code for each cell near an orbit: surely converges to it, approaches it, or undecided."""
+    """Return for each cell near an orbit whether it surely converges to the orbit, approaches it, or is undecided (a
+    code).
+    """
     code = np.zeros(len(section), np.int8)
     last = section.shape[1] - 1 - phase
     if not orbit.is_stable or last < 2 * orbit.period:

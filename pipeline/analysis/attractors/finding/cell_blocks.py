@@ -66,7 +66,7 @@ class Block:
 
 @dataclass(frozen=True)
 class Guesses:
-    """Starting guesses for closed orbits. Each is the best cell of one box of the section.
+    """Starting guesses for closed orbits, each from the best cell of one box of section points.
 
     Attributes
     ----------
@@ -100,9 +100,7 @@ class Guesses:
         return Guesses(self.key[rows], self.score[rows], self.mark[rows], self.point[rows], self.period[rows])
 
     def best(self, key: np.ndarray | None = None) -> Guesses:
-        """Return the best guess for each key, sorted by key; the key is by default the box of the section that holds
-        the guess.
-        """
+        """Return the best guess for each key, sorted by key. By default, a guess's key is its box of section points."""
         keys = self.key if key is None else key
         order = np.lexsort((self.mark, self.score, keys))
         first = np.ones(len(order), bool)
@@ -130,7 +128,7 @@ class Guesses:
 
 @dataclass
 class ClosedCells:
-    """Groups of closed (periodic) cells whose last section points fall into the same or adjacent boxes.
+    """Groups of closed (periodic) cells, formed by the boxes that hold their last section points.
 
     A cell of period p contributes the boxes of its last p sections, whose order does not matter.
     Boxes of side `tolerance` that touch are connected, and so are all boxes of one cell. Cells of

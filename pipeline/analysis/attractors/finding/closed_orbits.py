@@ -195,7 +195,9 @@ def _polished(
     system: System,
     tolerance: float,
 ) -> list[Orbit | None]:
-    """Refine guesses of orbits by Newton's method, and again from the first point of each orbit's canonical order."""
+    """Refine guesses of orbits by Newton's method, and then once more from the first section point in canonical
+    order.
+    """
     found = polish_orbits(packed, frequency, points, period, tolerance=tolerance, system=system)
     orbits = [_orbit_of(found, row) if found.converged[row] else None for row in range(len(points))]
     least = {row: _rolled(one.points, geometry)[0] for row, one in enumerate(orbits) if one is not None}

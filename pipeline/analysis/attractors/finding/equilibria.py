@@ -56,7 +56,7 @@ def tell_rest(points: Iterable[Point], tolerance: float, geometry: Geometry) -> 
 
 
 def _ends(point: Point, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return each cell's last state (NaN if none), and its reach: the distance within which it counts as at an
+    """Return each cell's last state (NaN if none), and the distance within which the cell counts as at an
     equilibrium.
     """
     states = np.full((point.n_cells, point.n_states), np.nan)
@@ -72,8 +72,8 @@ def _ends(point: Point, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _waited(point: Point, states: np.ndarray) -> np.ndarray:
-    """Integrate trajectories that have left the section until they are near an equilibrium; NaN for those that return
-    to the section.
+    """Integrate trajectories that no longer cross the section until they are near an equilibrium; NaN if they cross it
+    again.
     """
     states, system = states.copy(), point.integrates
     far = np.flatnonzero(np.isfinite(states).all(axis=1))
@@ -189,8 +189,8 @@ def approaching(
 
 
 def rest_near(point: Point, state: np.ndarray, geometry: Geometry) -> int | None:
-    """Return the index of the stable equilibrium at which a trajectory ends that no longer crosses the section. Add the
-    equilibrium if it is new.
+    """Find the stable equilibrium at which a trajectory ends that no longer crosses the section. Return its index, and
+    add it if it is new.
     """
     if not np.isfinite(state).all():
         return None

@@ -59,7 +59,7 @@ class Equilibrium:
 
     @cached_property
     def _norm(self) -> tuple[np.ndarray, float] | None:
-        """Matrix S and rate such that |S x| decays at least as exp(-rate t) along the linear flow; None if there is no
+        """Matrix S and rate such that |S x| decays as exp(-rate t) or faster along the linear flow; None if there is no
         such matrix.
         """
         rate = -0.5 * float(self.eigenvalues.real[0])

@@ -124,7 +124,7 @@ def _tell(point: Point, tolerance: float, longest: int, residual: float, geometr
 
 
 def _ends(point: Point) -> tuple[np.ndarray, np.ndarray]:
-    """Return the last state of each cell (NaN if the cell is not bounded), and whether the cell is closed."""
+    """Return the last state of each cell (NaN if it has none), and whether the cell is on a periodic orbit."""
     states = np.full((point.n_cells, point.n_states), np.nan)
     is_closed = np.zeros(point.n_cells, bool)
     for block in point.blocks():

@@ -74,7 +74,7 @@ def _falls(state: np.ndarray, points: np.ndarray, size: float, geometry: Geometr
 
 
 def _distance(section: np.ndarray, points: np.ndarray, geometry: Geometry) -> np.ndarray:
-    """Return, for each trajectory, how far its section points are at most from the nearest of the given points."""
+    """Return each trajectory's largest distance from the given points, over its section points."""
     away = np.stack([geometry.distance(section, point) for point in points])
     return np.asarray(away.min(axis=0).max(axis=1))
 

@@ -253,8 +253,8 @@ def _polished(
 def _each_once(
     search: np.ndarray, start: np.ndarray, period: np.ndarray, mark: np.ndarray, ended: np.ndarray, geometry: Geometry
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Drop duplicates from guesses of orbits. Return the guesses to refine, and the position of each guess's
-    representative among them.
+    """Drop duplicates from guesses of orbits. Return the guesses to refine, and for each given guess the one that
+    stands for it.
 
     Rows that were integrated further and ended in one box are on one orbit; the row of least hash represents
     them. Rows without a period have no representative.

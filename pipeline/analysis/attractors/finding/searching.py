@@ -59,9 +59,7 @@ class Search:
 
     @property
     def is_loose(self) -> bool:
-        """Whether the tolerance is so large that a cell can count as closed without being on an orbit; Newton's method
-        then finds the orbit.
-        """
+        """Whether the closure tolerance is so large that a cell can count as closed without being on an orbit."""
         return self.options.polish and self.tolerance > STRICT
 
     @property

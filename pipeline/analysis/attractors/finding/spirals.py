@@ -186,8 +186,7 @@ def keys_of(section: np.ndarray, side: float, geometry: Geometry) -> np.ndarray:
 
 
 def leap(section: np.ndarray, orbits: Sequence[Orbit], geometry: Geometry) -> np.ndarray:
-    """Predict the states of trajectories that slowly leave an unstable orbit, for the time when they are `LEAP` times
-    as far from it.
+    """Predict where trajectories that slowly leave an unstable orbit will be when they are `LEAP` times as far from it.
 
     Near a bifurcation leaving takes thousands of periods, in which the motion follows the orbit's monodromy
     matrix. Let u be the components of a cell's distance along the unstable eigenvectors, at the sections that

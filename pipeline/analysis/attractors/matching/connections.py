@@ -19,8 +19,7 @@ Place = tuple[tuple[int, ...], int]
 
 @dataclass(frozen=True, eq=False)
 class Connections:
-    """Attractors at different parameter points that lie on one branch, found by following their orbits along the
-    parameters.
+    """Record of which attractors at different parameter points lie on one branch, found by following their orbits.
 
     Attributes
     ----------
@@ -42,7 +41,7 @@ class Connections:
 
     @classmethod
     def none(cls, n: int) -> Connections:
-        """Return the `Connections` of `n` attractors of which no branch was followed."""
+        """Return connections that connect none of `n` attractors, for attractors that were not followed."""
         return cls(np.arange(n), np.arange(n), np.zeros(n, bool))
 
     def may_be_one(self, axis: int, first: tuple[int, int], second: tuple[int, int]) -> bool:

@@ -15,7 +15,7 @@ from pipeline.analysis.outcomes import outcomes
 
 
 def hysteresis(ds: xr.Dataset, ids: xr.Dataset) -> xr.Dataset:
-    """Find where a continuation meets other attractors on its way up than on its way down.
+    """Find where a continuation meets different attractors on its way up and on its way down.
 
     Parameters
     ----------

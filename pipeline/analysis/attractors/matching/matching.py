@@ -234,9 +234,7 @@ class _Ids:
         return {self._by_group[self._group[one.number]]: one for one in here}
 
     def _has_room(self, one: _Seen, identity: int) -> bool:
-        """Return whether an attractor can get an id: none of the points of its branch has another attractor with this
-        id.
-        """
+        """Return whether an id is still free at all parameter points at which an attractor's branch occurs."""
         return not self._where[self._group[one.number]] & self.taken[identity]
 
     def _give(self, one: _Seen, identity: int) -> None:
@@ -341,9 +339,7 @@ def _lookup(ids: np.ndarray, rows: np.ndarray) -> np.ndarray:
 
 
 def _destinations(values: np.ndarray, ids: np.ndarray, n_ids: int) -> np.ndarray:
-    """Reorder the counts of cells that left a transient set: from the index of the set that they reached to that set's
-    id.
-    """
+    """Reorder counts of the cells that left transient sets: from indices of the sets that they reached to ids."""
     moved = np.zeros((*values.shape[:-1], n_ids), values.dtype)
     for *index, row in np.argwhere(ids >= 0).tolist():
         point = tuple(index)
