@@ -160,9 +160,7 @@ def _keep(file: Path, out: Path) -> None:
 
 
 def _check_recording(out: Path) -> None:
-    """Raise an error if a recording must not be written to a path: in a run directory, or over a file of another
-    program.
-    """
+    """Raise an error for a recording's path that lies in a run directory, or names a file of another program."""
     check_place(out)
     if not out.with_suffix(".toml").exists():
         check_file(out)

@@ -95,7 +95,7 @@ class Orbits:
         return found
 
     def _on(self, sections: np.ndarray, points: np.ndarray) -> np.ndarray:
-        """Return for each cell whether its section points are those of a known orbit, in any cyclic order."""
+        """Return which cells are on a known orbit: their section points are those of the orbit, in any cyclic order."""
         shifts = (np.roll(points, shift, axis=0) for shift in range(len(points)))
         near = [scaled_distance(sections, p, self.system).max(axis=1, initial=0.0) <= self.tolerance for p in shifts]
         return np.asarray(np.any(near, axis=0))

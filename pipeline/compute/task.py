@@ -150,8 +150,8 @@ def _taking(
     block: tuple[slice, ...],
     taken: list[int],
 ) -> dict[str, Any]:
-    """Return a function that copies cells from other runs as keyword ``integrate``; an empty dict if there are no other
-    runs.
+    """Return arguments for `compute`: a function ``integrate`` that copies cells from other runs, or none if there are
+    no such runs.
     """
     if not sources:
         return {}

@@ -167,16 +167,14 @@ def _neighbours(line: Sequence[Found], start: dict[int, Point | None]) -> Links:
 
 
 def _is_one_step(a: Found, b: Found, start: dict[int, Point | None]) -> bool:
-    """Return whether one step along the tangent leads from each of two orbits to the other, at matching section
-    points.
-    """
+    """Return whether each of two orbits is reached from the other by one step along the tangent."""
     phases = [_leads_to(start[a.number], b), _leads_to(start[b.number], a)]
     return all(p is not None for p in phases) and sum(p for p in phases if p is not None) % a.period == 0
 
 
 def _leads_to(point: Point | None, other: Found) -> int | None:
-    """Return the index of the section point of another orbit to which a step along the tangent leads; None if it leads
-    to none.
+    """Return the index of the section point of another orbit that a step along the tangent reaches; None if it misses
+    them all.
     """
     if point is None or point.tangent[-1] == 0.0:
         return None

@@ -284,8 +284,8 @@ class _Curve:
             self._insert(np.flatnonzero(coarse))
 
     def _insert(self, at: np.ndarray, share: float = 0.5) -> None:
-        """Insert new positions on the first segment of the manifold, one after each given position, with their images
-        (or preimages).
+        """Insert a new position after each given one on the manifold's first segment, and compute its images (or
+        preimages).
         """
         middle = self.places[at] + share * (self.places[at + 1] - self.places[at])
         new = [self.first(middle)]

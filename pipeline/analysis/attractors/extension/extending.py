@@ -185,7 +185,9 @@ class _Extension:
         return np.concatenate(cells), np.concatenate(numbers)
 
     def add_transient(self) -> None:
-        """Add the set that trajectories have left as a transient set, unless the list has such a set already."""
+        """Describe the set that trajectories have left, and store it as a transient set, unless one is stored
+        already.
+        """
         left = [course for course in self.courses if course.has_left]
         if left and not any(one.n_left for one in self.sets):
             self.sets.append(left_behind(left, self.settings))

@@ -339,7 +339,7 @@ def _lookup(ids: np.ndarray, rows: np.ndarray) -> np.ndarray:
 
 
 def _destinations(values: np.ndarray, ids: np.ndarray, n_ids: int) -> np.ndarray:
-    """Reorder counts of the cells that left transient sets: from indices of the sets that they reached to ids."""
+    """Replace indices by ids in the counts that say on which set the cells of a transient set ended."""
     moved = np.zeros((*values.shape[:-1], n_ids), values.dtype)
     for *index, row in np.argwhere(ids >= 0).tolist():
         point = tuple(index)
