@@ -1,4 +1,4 @@
-"""Sweep parameters and continue solutions of forced and autonomous systems: from a specification to a data cube and its
+"""Run parameter sweeps and continuations of dynamical systems: from a specification to the run's result cube and its
 figures.
 
 `open_run` opens a run directory. It is imported at its first use, so that the

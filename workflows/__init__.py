@@ -1,1 +1,1 @@
-"""Studies that ship with magpend: one TOML file each, run by name with ``magpend run NAME``."""
+"""Specifications and studies that ship with magpend, one TOML file each."""

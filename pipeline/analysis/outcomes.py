@@ -37,7 +37,7 @@ _BY_STATUS = {
 
 
 def outcomes(ids: xr.Dataset) -> xr.DataArray:
-    """Return the outcome of each cell: the id of its attractor, -2 (`DIVERGED`), or -1 if it ends on no attractor.
+    """Return the outcome of each cell: the id of its attractor, -2 (`DIVERGED`), or -1 if it reaches no attractor.
 
     Parameters
     ----------
@@ -51,9 +51,7 @@ def outcomes(ids: xr.Dataset) -> xr.DataArray:
 
 
 def stability_of_cells(ids: xr.Dataset) -> np.ndarray:
-    """Return the stability code of the attractor or other set that each cell ends on (0: none), parameter dims
-    first.
-    """
+    """Return the stability code of the set on which each cell ends (0: none), with the parameter dims first."""
     dims, _ = split_dims(ids["attractor_id"])
     cells, stability = _cells(ids, "attractor_id"), ids["stability"].transpose(*dims, "attractor").values
     found = np.zeros(cells.shape, np.int8)
@@ -63,7 +61,7 @@ def stability_of_cells(ids: xr.Dataset) -> np.ndarray:
 
 
 def other_cells(ids: xr.Dataset) -> Mapping[str, np.ndarray]:
-    """Group the cells that do not end on an attractor, by the reason.
+    """Group the cells that end on no attractor by the reason; return a mask for each reason.
 
     Returns
     -------
@@ -108,12 +106,12 @@ def _cells(ids: xr.Dataset, name: str) -> np.ndarray:
 
 
 def left_out(ids: xr.Dataset) -> str:
-    """Return the sentence on outcomes if some cells end on no attractor; otherwise an empty text."""
+    """Return a text on how many cells end on no attractor, and why; an empty text if all cells end on attractors."""
     return sentence(ids) if other_cells(ids) else ""
 
 
 def sentence(ids: xr.Dataset) -> str:
-    """Return a sentence on how many cells end on attractors, and on the fate of the others."""
+    """Return a text on how many cells end on attractors, and what happens to the others."""
     total = ids["attractor_id"].size
     others = other_cells(ids)
     n = total - sum(int(which.sum()) for which in others.values())

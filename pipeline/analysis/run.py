@@ -1,4 +1,4 @@
-"""Define the interface of a run that analyses use."""
+"""Define which parts of a run the analyses use."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from pipeline.specification.parsing import Spec
 
 
 class Run(Protocol):
-    """The parts of a run that analyses use; see `pipeline.runs.derive.AnalysedRun`."""
+    """The parts of a run that analyses use: specification, model, result cube and other analyses."""
 
     @property
     def spec(self) -> Spec:
-        """Specification of the run."""
+        """Specification of the run (what it computes)."""
 
     @property
     def model(self) -> Model:
-        """Model of the run."""
+        """Dynamical model of the run."""
 
     @property
     def echo(self) -> Callable[[str], None]:
-        """Function that prints a line."""
+        """Function with which an analysis prints a line of text."""
 
     def cube(self, chunks: Any = None) -> xr.Dataset:
-        """Return the data cube of the run."""
+        """Return the result cube of the run: a Dataset of all cells."""
 
     def derive(self, name: str, **options: Any) -> xr.Dataset:
-        """Return the result of another analysis of the same cells."""
+        """Return the result of another analysis of this run, computed now or read if it is stored."""

@@ -1,4 +1,4 @@
-"""Select parameter points and axis values of a run's cube or attractors."""
+"""Select parameter points and axis values of a run's result cube or of its attractors."""
 
 from __future__ import annotations
 
@@ -19,7 +19,9 @@ def parameter_dims(attractors: xr.Dataset) -> list[str]:
 
 
 def start_dims(attractors: xr.Dataset) -> list[str]:
-    """Return the names of the dims that distinguish the cells of one parameter point."""
+    """Return the names of the dims along which the cells of one parameter point differ, such as the initial
+    condition.
+    """
     return list(split_dims(attractors["attractor_id"])[1])
 
 
@@ -60,7 +62,7 @@ def choose(ds: xr.Dataset, at: Mapping[str, float] | None, keep: tuple[str, ...]
 
 
 def place(axis: xr.DataArray, value: float) -> int:
-    """Return the index of a value on an axis.
+    """Return the index of a value on an axis; ValueError if the axis does not have it.
 
     Raises
     ------
@@ -81,14 +83,14 @@ def place(axis: xr.DataArray, value: float) -> int:
 
 
 def _slack(values: Floats, index: int) -> float:
-    """Return the tolerance for matching a number to an axis value: 1e-6 of the spacing to the nearest other value."""
+    """Return the tolerance for matching a number to an axis value: 1e-6 of the distance to the nearest other value."""
     apart = np.abs(values - values[index])
     spacing = apart[apart > 0].min() if (apart > 0).any() else abs(values[index])
     return float(1e-6 * spacing)
 
 
 def snap(ds: xr.Dataset, at: Mapping[str, float]) -> dict[str, float]:
-    """Replace parameter values by the nearest axis values; values outside an axis's range stay unchanged."""
+    """Replace parameter values by the nearest axis values; values outside the range of an axis stay unchanged."""
     found = {}
     for name, value in at.items():
         axis = ds[name].values.astype(np.float64).ravel() if name in ds.dims else np.array([value])
@@ -98,7 +100,7 @@ def snap(ds: xr.Dataset, at: Mapping[str, float]) -> dict[str, float]:
 
 
 def select_points(ds: xr.Dataset, at: Mapping[str, float] | None, *, purpose: str = "") -> xr.Dataset:
-    """Select values of a cube's swept parameters; the selected dims stay, with length 1.
+    """Select values of the swept parameters of a result cube; the selected dims stay, with length 1.
 
     Parameters
     ----------

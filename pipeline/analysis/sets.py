@@ -28,7 +28,7 @@ _LAST_SHIFT = np.uint64(31)
 
 @dataclass(frozen=True)
 class Geometry:
-    """The geometry of states: which components are angles, and the scale of each.
+    """Geometry of the state space: which states are angles, and the scale of each state.
 
     Attributes
     ----------
@@ -48,16 +48,16 @@ class Geometry:
 
     @property
     def n_states(self) -> int:
-        """Number of states."""
+        """Number of state variables."""
         return len(self.scales)
 
     @property
     def circumference(self) -> np.ndarray:
-        """Scaled length of each angle's circle; 0 for components that are no angles."""
+        """Circumference of each angle's circle in units of its scale; 0 for states that are no angles."""
         return np.where(self.is_angle, TWO_PI / np.asarray(self.scales), 0.0)
 
     def scaled(self, points: np.ndarray) -> np.ndarray:
-        """Return states (..., state) in units of the scales, angles in [0, circumference)."""
+        """Divide states (..., state) by their scales, and wrap angles to [0, circumference)."""
         scaled = np.asarray(points, np.float64) / np.asarray(self.scales)
         for i, length in enumerate(self.circumference):
             if length > 0.0:
@@ -66,7 +66,7 @@ class Geometry:
         return np.asarray(scaled)
 
     def difference(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        """Return the scaled difference a - b, along the shorter arc for angles."""
+        """Return the difference a - b in units of the scales, along the shorter arc for angles."""
         difference = (np.asarray(a) - np.asarray(b)) / np.asarray(self.scales)
         for i, length in enumerate(self.circumference):
             if length > 0.0:
@@ -74,15 +74,17 @@ class Geometry:
         return np.asarray(difference)
 
     def distance(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        """Return the distance of two states: the largest scaled difference of a component, over the last axis."""
+        """Return the distance between states: the largest of the scaled differences of their components."""
         return np.asarray(np.abs(self.difference(a, b)).max(axis=-1))
 
     def tree(self, points: np.ndarray) -> cKDTree:
-        """Build a search tree of states (query it with `scaled` states and ``p=inf``)."""
+        """Build a nearest-neighbour search tree of states (query it with `scaled` states and ``p=inf``)."""
         return cKDTree(self.scaled(points), boxsize=self.circumference)
 
     def boxes(self, points: np.ndarray, side: float) -> np.ndarray:
-        """Return the integer coordinates of each state's box; the circle of an angle holds a whole number of boxes."""
+        """Return the integer coordinates of the box that holds each state; boxes have the side `side` in scaled
+        states.
+        """
         scaled = self.scaled(points)
         boxes = np.empty(scaled.shape, np.int64)
         for i, length in enumerate(self.circumference):
@@ -94,7 +96,7 @@ class Geometry:
         return boxes
 
     def box_pairs(self, boxes: np.ndarray, side: float) -> np.ndarray:
-        """Return which of the given boxes touch, also at corners, as pairs of row numbers (n, 2)."""
+        """Return which boxes touch each other (also at corners), as pairs of row numbers (n, 2)."""
         if len(boxes) < 2:
             return np.empty((0, 2), np.int64)
         # lengths in boxes: a circle is as long as its number of boxes
@@ -108,7 +110,8 @@ class Geometry:
 
 
 def hashes(rows: np.ndarray) -> np.ndarray:
-    """Hash each row to a uint64 that depends on the row's bits alone, to sort rows reproducibly.
+    """Hash each row of an array to a uint64. The hash depends on the row's bits alone, so that sorting by it is
+    reproducible.
 
     Zeros of both signs have the same hash.
     """
@@ -129,7 +132,7 @@ def hashes(rows: np.ndarray) -> np.ndarray:
 
 
 def groups(n: int, pairs: np.ndarray) -> np.ndarray:
-    """Return the number of each node's connected component, for `n` nodes and edges (m, 2)."""
+    """Return the number of the connected component of each node, in a graph of `n` nodes with edges (m, 2)."""
     edges = np.asarray(pairs, np.int64).reshape(-1, 2)
     graph = coo_array((np.ones(len(edges), np.int8), (edges[:, 0], edges[:, 1])), shape=(n, n))
     return np.asarray(connected_components(graph, directed=False)[1], np.int64)
@@ -141,7 +144,7 @@ def nearest_distances(a: np.ndarray, b: np.ndarray, geometry: Geometry) -> np.nd
 
 
 def mean_distance(a: np.ndarray, b: np.ndarray, geometry: Geometry) -> float:
-    """Compute the mean distance of one set's states from the other set, the larger of both directions.
+    """Compute the mean distance of one set's states from another set, in both directions, and return the larger value.
 
     This is the modified Hausdorff distance of Dubuisson and Jain (Proc. 12th ICPR, 1994, p. 566). For samples
     of a chaotic set, outliers determine the largest distance, but not the mean.
@@ -151,7 +154,7 @@ def mean_distance(a: np.ndarray, b: np.ndarray, geometry: Geometry) -> float:
 
 
 def order_by_points(points: list[np.ndarray], geometry: Geometry) -> list[int]:
-    """Return the canonical order of sets, sorted by the lexicographically smallest rounded point of each set.
+    """Return a canonical order of sets, by the least rounded point of each.
 
     In a tie the shorter set comes first; then all points decide, in the order given.
     """
@@ -164,6 +167,6 @@ def order_by_points(points: list[np.ndarray], geometry: Geometry) -> list[int]:
 
 
 def rounded_points(points: np.ndarray, geometry: Geometry) -> np.ndarray:
-    """Return scaled points, angles wrapped to (-pi, pi], rounded to 1e-6 so that their sort order is reproducible."""
+    """Scale states, wrap their angles to (-pi, pi], and round them to 1e-6 so that sorting them is reproducible."""
     centred = geometry.difference(points, np.zeros(points.shape[-1]))
     return np.asarray(np.round(centred, 6) + 0.0)

@@ -1,4 +1,4 @@
-"""Format the tables of analyses: rows of numbers for programs, aligned lines for people.
+"""Format the tables of analyses, as rows of numbers for programs and as aligned text lines for people.
 
 A table is declared by dicts. A row for programs lists the names of its variables (`values`). A row for people
 maps each heading to a text; a column with None is not shown for that row (`aligned`).
@@ -28,60 +28,62 @@ Words = Mapping[str, str | None]
 
 
 def where_of(ds: xr.Dataset, at: Mapping[str, int]) -> Row:
-    """Return the parameter values at a point, by dim."""
+    """Return the parameter values of a parameter point, by axis name."""
     return {d: float(ds[d].values[i]) for d, i in at.items()}
 
 
 def words_of(array: xr.DataArray) -> list[str]:
-    """Return the labels of an array of codes, in the order of the codes."""
+    """Return the labels that belong to an array's codes, in the order of the codes."""
     return str(array.attrs["flag_meanings"]).split()
 
 
 def values(one: xr.Dataset, *names: str) -> Row:
-    """Return scalar variables of a dataset as a dict; codes become their labels, and missing variables are left out."""
+    """Return scalar variables of a dataset by name. Codes are replaced by their labels, and missing variables are left
+    out.
+    """
     found = {name: one[name].item() for name in names if name in one}
     return {n: words_of(one[n])[v] if "flag_meanings" in one[n].attrs else v for n, v in found.items()}
 
 
 def counted(n: int, noun: str) -> str:
-    """Return a number and its noun, in the plural unless the number is 1."""
+    """Format a number with its noun, in the plural unless the number is 1."""
     return f"{n} {noun}{'' if n == 1 else 's'}"
 
 
 def points_of(ds: xr.Dataset, dims: Sequence[str]) -> Iterator[tuple[dict[str, int], Row]]:
-    """Yield the index of each parameter point, by dim, and its parameter values."""
+    """Yield each parameter point: its index along each axis, and its parameter values."""
     for index in np.ndindex(*(ds.sizes[d] for d in dims)):
         at = dict(zip(dims, index, strict=True))
         yield at, where_of(ds, at)
 
 
 def sets_of(ds: xr.Dataset, there: xr.DataArray, dims: Sequence[str]) -> Iterator[tuple[Row, xr.Dataset]]:
-    """Yield the attractors and other sets that a mask selects: the parameter values and the variables of each."""
+    """Yield the attractors and other sets that a mask selects, each as its parameter values and its variables."""
     for *index, i in np.argwhere(there.transpose(*dims, "attractor").values).tolist():
         at = dict(zip(dims, index, strict=True))
         yield where_of(ds, at), ds.isel({**at, "attractor": i})
 
 
 def point_table(ds: xr.Dataset, where: Row, rows: Sequence[Row], words: Callable[[Row], Words]) -> list[str]:
-    """Return the lines of the table of one parameter point, without a heading if nothing is swept."""
+    """Return the text lines of the table for one parameter point; there is no heading if nothing is swept."""
     text = ", ".join(f"{d} {v:g}{unit_of(ds, d)}" for d, v in where.items())
     here = [row for row in rows if all(row[k] == v for k, v in where.items())]
     return [f"{text}:"] * bool(text) + aligned([words(row) for row in here])
 
 
 def at_point(ds: xr.Dataset, row: Row, dims: Sequence[str]) -> Words:
-    """Return the table columns with the parameter values of a row."""
+    """Return the parameter values of a table row as columns of the table."""
     return {f"{d}{unit_of(ds, d)}": f"{row[d]:g}" for d in dims}
 
 
 def unit_of(ds: xr.Dataset, dim: str) -> str:
-    """Return the unit of an axis with a leading space; empty for a dimensionless axis."""
+    """Return the unit of an axis with a leading space; an empty text for a dimensionless axis."""
     unit = ds[dim].attrs.get("units", "1")
     return "" if unit == "1" else f" {unit}"
 
 
 def number(value: float, spec: str) -> str:
-    """Format a number; return a dash if it is not finite."""
+    """Format a number by a given format, such as ``.3f``; a dash if it is not finite."""
     return format(value, spec) if np.isfinite(value) else "-"
 
 
@@ -91,18 +93,18 @@ def plain(label: str) -> str:
 
 
 def with_interval(row: Row, names: Sequence[str], spec: str) -> str:
-    """Format the columns of a number and its interval; return a dash if the number is not finite."""
+    """Format a number with its confidence interval from three columns of a table row; a dash if it is not finite."""
     value, low, high = (row[name] for name in names)
     return f"{value:{spec}} ({low:{spec}} to {high:{spec}})" if np.isfinite(value) else "-"
 
 
 def distinct(values: Iterable[Any]) -> str:
-    """Join the distinct ones of some values into one text, sorted and separated by commas."""
+    """Join the distinct values of a list into one text, sorted and separated by commas."""
     return ", ".join(map(str, sorted(set(values))))
 
 
 def ranges(ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str]) -> dict[str, str]:
-    """Return the columns that summarise table rows: the range on each axis, and the number of parameter points."""
+    """Summarise table rows in columns: the range of values on each axis, and the number of parameter points."""
     words = {}
     for d in dims:
         values = [row[d] for row in rows]
@@ -111,7 +113,7 @@ def ranges(ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str]) -> dict[str
 
 
 def largest_share(ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str]) -> str:
-    """Format the largest basin fraction in some table rows, and the parameter point at which it occurs."""
+    """Format the largest basin fraction among some table rows, with the parameter values where it occurs."""
     best = max(rows, key=lambda row: (np.nan_to_num(row["fraction"], nan=-1.0),))
     if not np.isfinite(best["fraction"]):
         return "-"
@@ -122,7 +124,7 @@ def largest_share(ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str]) -> s
 def summary(
     ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str], describe: Callable[..., Words], key: str
 ) -> list[str]:
-    """Group table rows by their value of `key`, and return the lines of a table with one line per group."""
+    """Group table rows by the value of a column, and return a text table with one line per group."""
     groups: dict[int, list[Row]] = {}
     for row in rows:
         groups.setdefault(row[key], []).append(row)
@@ -130,7 +132,9 @@ def summary(
 
 
 def aligned(rows: Sequence[Words], indent: str = "  ", *, right: bool = False) -> list[str]:
-    """Align rows under their headings; with `right` all columns but the first are aligned to the right."""
+    """Align table rows in columns under their headings. With `right`, all columns but the first are aligned to the
+    right.
+    """
     names = list(dict.fromkeys(name for row in rows for name, text in row.items() if text is not None))
     return padded([names, *([row.get(name) or "" for name in names] for row in rows)], indent, right) if rows else []
 
@@ -146,9 +150,7 @@ def with_error(value: float, error: float, most: int = 6) -> str:
 
 
 def axis_ranges(ds: xr.Dataset, dim: str, rows: Sequence[Row], alone: bool) -> str:
-    """Format axis values as ranges of neighbouring values; as one range if there are many or the table has several
-    axes.
-    """
+    """Format the axis values of some table rows as ranges, such as "1 to 1.4, 2 to 2.2"."""
     axis = ds[dim].values.astype(np.float64)
     values = np.array(sorted({row[dim] for row in rows}))
     places = np.searchsorted(np.sort(axis), values)

@@ -1,4 +1,4 @@
-"""List the tolerances of the analyses, each with its reason.
+"""List the numerical tolerances of all analyses, each with its reason.
 
 Distances are in units of the states' scales. A ``..._RTOL`` is the relative and absolute tolerance of an integration.
 The tolerances of Newton's method on orbits are arguments of `magpend_core.orbits.polish_orbits`; those that users can

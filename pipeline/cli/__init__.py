@@ -1,1 +1,1 @@
-"""Run the commands of ``magpend``: parse arguments, call the library, print results."""
+"""Define the command line ``magpend``: parse arguments, call the library, print results."""

@@ -1,4 +1,4 @@
-"""Define ``magpend animate``: a motion as GIF, WebP or MP4."""
+"""Define ``magpend animate``, which draws a motion as GIF, WebP or MP4."""
 
 from __future__ import annotations
 
@@ -125,8 +125,8 @@ def _start(
     transient: int,
     alone: bool,
 ) -> Start | None:
-    """Return the initial state and model from the command-line options; None if a run is animated from its own
-    cells.
+    """Read the initial state, the model and its parameters from the options; None if a run's own motions are
+    animated.
     """
     from pipeline.runs.filming import Start
     from pipeline.specification.problems import SpecError
@@ -149,7 +149,6 @@ def _contradictions(
     cell: list[int] | None,
     start: Start | None,
 ) -> list[str]:
-    """Return a message for each pair of options that exclude each other."""
     of_run: dict[str, Any] = {"--at": at, "--attractor": attractor, "--cell": cell}
     problems = []
     if directory is None:
@@ -164,9 +163,6 @@ def _contradictions(
 
 
 def _place(run: Run | None, at: dict[str, float], attractor: list[str] | None, cell: list[int] | None) -> Path:
-    """Return the default file of an animation: in the run's figures folder, named by parameter values, attractors and
-    cells.
-    """
     if run is None:
         return Path("animation.gif")
     files = run.info.files

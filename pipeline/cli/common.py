@@ -1,4 +1,4 @@
-"""Define the arguments, the list of exit codes and the output of tables that commands share."""
+"""Define what commands share: arguments, the list of exit codes, the output of tables."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ Json = Annotated[bool, typer.Option("--json", help="Write the table as JSON to t
 
 
 def read_pairs(option: str, texts: list[str], example: str) -> dict[str, float]:
-    """Parse ``NAME=VALUE`` texts into numbers by name; raise `SpecError` that lists every invalid text."""
+    """Parse texts of the form ``NAME=VALUE`` into numbers by name; raise a `SpecError` that lists all invalid texts."""
     from pipeline.specification.problems import SpecError
 
     found, problems = {}, []
@@ -47,7 +47,7 @@ def read_pairs(option: str, texts: list[str], example: str) -> dict[str, float]:
 
 
 def check_csv(path: str | None) -> None:
-    """Raise SpecError if a CSV file cannot be written, before anything is computed."""
+    """Raise an error if a CSV file cannot be written, before anything is computed."""
     from pipeline.cli.outputs import check_file
     from pipeline.specification.problems import SpecError
 
@@ -79,11 +79,11 @@ def tell(table: Table, csv: str | None, as_json: bool) -> None:
 
 
 def json_rows(table: Table) -> list[dict[str, Any]]:
-    """Return the rows of a table in types that JSON can hold."""
+    """Convert the rows of a table to types that JSON can hold."""
     return [{name: _json(value) for name, value in row.items()} for row in table.rows]
 
 
 def _json(value: Any) -> Any:
-    """Convert numpy numbers to Python's, and NaN and infinity, which JSON lacks, to None."""
+    """Convert a number to what JSON can hold: numpy numbers to Python's, NaN and infinity to None."""
     plain = value.item() if hasattr(value, "item") else value
     return None if isinstance(plain, float) and not math.isfinite(plain) else plain

@@ -1,4 +1,4 @@
-"""Print results to the standard output, and everything else to the standard error.
+"""Print results to the standard output, and notes, progress and errors to the standard error.
 
 Notes, warnings and progress go to the standard error and, with ``--log``, with times to a file. A program, or
 ``head``, can therefore read the standard output.
@@ -29,7 +29,7 @@ class EnoughError(Exception):
 
 
 def visible(text: str) -> str:
-    """Replace control characters by their escapes, so that a text from a file cannot control the terminal."""
+    """Replace the control characters of a text by escapes, so that a text from a file cannot control the terminal."""
     if text.isprintable():
         return text
     return "".join(c if c.isprintable() or c == "\n" else repr(c)[1:-1] for c in text)
@@ -41,7 +41,7 @@ class _Visible(logging.Formatter):
 
 
 def note(line: str) -> None:
-    """Print a note, unless ``--quiet`` is given."""
+    """Print a line for the user to the standard error, unless ``--quiet`` is given."""
     LOG.info(line)
 
 
@@ -61,12 +61,12 @@ def result(line: str) -> None:
 
 
 def is_shown() -> bool:
-    """Return whether notes are shown, that is without ``--quiet``."""
+    """Return whether notes are printed: they are unless ``--quiet`` is given."""
     return any(isinstance(h, _Stderr) and h.level <= logging.INFO for h in LOG.handlers)
 
 
 class _Stderr(logging.Handler):
-    """A log handler that writes to the standard error, above a progress bar if one is drawn."""
+    """Log handler that writes to the standard error, above the progress bar if there is one."""
 
     def emit(self, record: logging.LogRecord) -> None:
         bar = Display.current
@@ -76,7 +76,7 @@ class _Stderr(logging.Handler):
 
 
 def configure(quiet: bool, verbose: bool, log: Path | None) -> None:
-    """Set up the log: choose the messages that are printed to the standard error, and open the ``--log`` file.
+    """Set up the log: which messages are printed to the standard error, and the ``--log`` file.
 
     Raises
     ------
@@ -111,7 +111,7 @@ def close() -> None:
 
 
 class Display:
-    """The display of a command's progress: a bar on a terminal, else a line at intervals.
+    """Display of a command's progress: a bar on a terminal, or else a line of text at intervals.
 
     It listens to `pipeline.products.reporting`. After the first seconds it shows at intervals the present
     work and its duration, even without new reports.
@@ -143,7 +143,7 @@ class Display:
             self._work.done, self._work.total, self._work.heard = done, total, self._clock()
 
     def show(self) -> None:
-        """Print the current progress: a bar on a terminal, else a line of the log."""
+        """Print the current progress: as a bar on a terminal, or else as a line of the log."""
         with self._lock:
             line = self._work.line(self._clock())
             if not self._terminal:
@@ -162,21 +162,21 @@ class Display:
                 self._drawn = False
 
     def watch(self) -> None:
-        """Redraw the progress of the command at intervals until `stop` is called."""
+        """Redraw the progress at intervals, until `stop` is called."""
         pause = FIRST_LINE_S
         while not self._over.wait(pause):
             self.show()
             pause = BAR_EVERY_S if self._terminal else LINE_EVERY_S
 
     def stop(self) -> None:
-        """Stop redrawing the progress at intervals, and remove the progress bar."""
+        """Stop redrawing the progress, and remove the progress bar."""
         self._over.set()
         self.clear()
 
 
 @dataclass
 class Work:
-    """A piece of work with its progress.
+    """A named piece of work, with the amounts done and in total.
 
     Attributes
     ----------
@@ -203,7 +203,7 @@ class Work:
     expected_s: float = 0.0
 
     def line(self, now: float) -> str:
-        """Return a line on the progress and the remaining time."""
+        """Return a line of text with the progress and the remaining time."""
         elapsed = max(now - self.started, 0.0)
         if not self.total:
             return f"{self.what}: {duration(elapsed)} so far"
@@ -220,14 +220,14 @@ class Work:
 
 
 def at_rest() -> None:
-    """Stop showing progress, for a command that lasts until the user ends it."""
+    """Stop showing progress. A command that lasts until the user ends it calls this."""
     if Display.current is not None:
         Display.current.stop()
 
 
 @contextlib.contextmanager
 def progress(name: str) -> Iterator[None]:
-    """Show the progress of the work that runs inside this context, under a name."""
+    """Show the progress of the work that is done inside this context."""
     display = Display(name)
     Display.current = display
     watcher = threading.Thread(target=display.watch, daemon=True)

@@ -1,4 +1,4 @@
-"""Start the command line; signal handlers are installed before the slow imports."""
+"""Start the command line. Signal handlers are installed first, since the imports that follow take seconds."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from pipeline.runs import stopping
 
 
 def main() -> None:
-    """Run the command line."""
+    """Install the signal handlers, and run the command line."""
     stopping.listen()
     from pipeline.cli.main import main as command_line
 

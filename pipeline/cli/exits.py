@@ -6,7 +6,7 @@ from enum import IntEnum
 
 
 class Exit(IntEnum):
-    """The exit codes of a command."""
+    """Exit codes of all commands."""
 
     DONE = 0
     BUG = 1
@@ -21,7 +21,7 @@ class Exit(IntEnum):
 
     @property
     def sentence(self) -> str:
-        """Meaning of the code."""
+        """Meaning of the exit code, for the documentation."""
         return _SENTENCES[self]
 
 

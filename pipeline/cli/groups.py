@@ -1,4 +1,4 @@
-"""Build command groups whose commands are created from a registry only when they are used."""
+"""Define groups of commands whose commands are created from a registry when they are first used."""
 
 from __future__ import annotations
 
@@ -16,35 +16,37 @@ SETTINGS = {"help_option_names": ["-h", "--help"]}
 
 
 def made(name: str, function: Command, help: str) -> Any:
-    """Create a command-line command from a Python function."""
+    """Turn a Python function into a command of the command line."""
     app = typer.Typer(add_completion=False, rich_markup_mode=None)
     app.command(name, help=help, epilog=EXIT_HELP, context_settings=SETTINGS)(speaking(function))
     return get_command(app)
 
 
 class RegistryGroup(TyperGroup):
-    """The command group ``magpend VERB``: commands created from a registry, and explicitly defined ones."""
+    """Group of commands ``magpend VERB``: some are created from a registry, others are defined by functions."""
 
     verb = ""
 
     def names(self) -> list[str]:
-        """Return the names of the commands from the registry."""
+        """Return the names of the commands that the registry can create."""
         raise NotImplementedError
 
     def make(self, name: str) -> Any:
-        """Create the registry's command of a given name."""
+        """Create one command from the registry, by name."""
         raise NotImplementedError
 
     def list_commands(self, ctx: Any) -> list[str]:
-        """Return the names of all commands."""
+        """Return the names of all commands of the group."""
         return [*self.names(), *super().list_commands(ctx)]
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        """Return a command by name; create it if it is in the registry."""
+        """Return a command of the group by name, and create it if it is in the registry."""
         return self.make(cmd_name) if cmd_name in self.names() else super().get_command(ctx, cmd_name)
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """Find a command by name; if the directory came before the name, raise an error that shows the right order."""
+        """Find the command that is named first. If a directory comes first, raise an error that shows the right
+        order.
+        """
         if args and args[0] not in self.list_commands(ctx):
             later = [a for a in args[1:] if a in self.list_commands(ctx)]
             if later:
@@ -60,10 +62,10 @@ _MOVED = {"branches": "magpend analyse branches DIR", "analyze": "magpend analys
 
 
 class TopGroup(TyperGroup):
-    """The top-level command group ``magpend``; it suggests a name for an unknown or renamed command."""
+    """The top-level group of commands, ``magpend``; it suggests a name for an unknown or renamed command."""
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """Find a command by name; for an unknown name, raise an error that suggests the nearest or the new name."""
+        """Find a command by name. For an unknown name, raise an error that suggests a similar or a new name."""
         if args and args[0] not in self.list_commands(ctx) and not args[0].startswith("-"):
             from pipeline.specification.problems import unknown_name
 
@@ -74,7 +76,7 @@ class TopGroup(TyperGroup):
 
 
 def registry_group(verb: str, names: Callable[[], list[str]], make: Callable[[str], Any]) -> type[TyperGroup]:
-    """Return a class of command groups, from a function that lists the command names and one that creates a command."""
+    """Make a class of command groups, from a function that lists command names and one that creates a command."""
 
     class Group(RegistryGroup):
         def names(self) -> list[str]:

@@ -19,12 +19,12 @@ RUN = "spec"
 
 
 class IdentifyGroup(TyperGroup):
-    """The command group ``magpend identify``: ``identify SPEC``, ``identify check`` and ``identify compare``."""
+    """Group of commands ``magpend identify``, in which ``magpend identify SPEC`` works without a command's name."""
 
     default = RUN
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Insert the default command if the first argument is not the name of a command."""
+        """Insert the name of the default command, unless the first argument is the name of a command."""
         known = (*self.list_commands(ctx), "--help", "-h", "--install-completion", "--show-completion")
         meant = [self.default, *args] if args and args[0] not in known else args
         return list(super().parse_args(ctx, meant))

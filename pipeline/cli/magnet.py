@@ -58,7 +58,6 @@ def fit_magnet(
 
 
 def _folder(path: Path) -> Path:
-    """Return the folder of the results; raise an error if it cannot be written to."""
     from pipeline.cli.outputs import check_place
     from pipeline.specification.problems import SpecError
 

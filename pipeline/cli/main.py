@@ -1,4 +1,4 @@
-"""Define ``magpend`` with all its commands. Each command imports its heavy modules itself."""
+"""Define the command line ``magpend`` with all its commands. Each command imports its heavy modules itself."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ app.add_typer(identify_app, name="identify")
 
 
 def _codes() -> list[tuple[tuple[type[BaseException], ...], Exit]]:
-    """Return the exceptions that users can act on, with their exit codes."""
+    """Return the exceptions that mean a user's error or a failed run, with the exit code of each."""
     from magpend_core.models.parameters import ParameterError
     from pipeline.compute.addresses import SchedulerError
     from pipeline.compute.execute import TaskFailedError
@@ -114,7 +114,6 @@ def _codes() -> list[tuple[tuple[type[BaseException], ...], Exit]]:
 
 
 def _complain(error: BaseException) -> None:
-    """Print an error: one line per problem."""
     from pipeline.cli.console import LOG
 
     lines: list[Any] = getattr(error, "problems", None) or [str(error)]
@@ -128,7 +127,7 @@ def _complain(error: BaseException) -> None:
 
 
 def _short(text: str) -> str:
-    """Shorten an error message to `MOST_SAID` bytes: long lines lose their middle, further lines are dropped."""
+    """Shorten an error message to `MOST_SAID` bytes: cut the middle of long lines, and drop the last lines."""
     said: list[str] = []
     size = 0
     lines = visible(text).split("\n")
@@ -142,7 +141,7 @@ def _short(text: str) -> str:
 
 
 def main() -> None:
-    """Run the command line; turn errors into messages and exit codes."""
+    """Run the command line, and turn errors into messages and exit codes."""
     code: Any = Exit.DONE
     try:
         with stopping.in_order():
@@ -169,7 +168,6 @@ def main() -> None:
 
 
 def _usage(error: Any) -> None:
-    """Print which word of a command line is wrong, and the command that shows the help."""
     context = getattr(error, "ctx", None)
     message = error.format_message()
     near = getattr(error, "possibilities", None)
@@ -182,7 +180,6 @@ def _usage(error: Any) -> None:
 
 
 def _leave_quietly() -> None:
-    """Redirect the standard output to the null device, since its reader (such as ``head``) has closed it."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 

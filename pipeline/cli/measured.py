@@ -35,7 +35,9 @@ Set = Annotated[list[str] | None, typer.Option("--set", metavar="NAME=VALUE", he
 
 
 def _load(paths: list[Path], mappings: list[Path]) -> list[Mapping]:
-    """Load the mapping file of each recording; raise `SpecError` unless all mappings name the same model."""
+    """Read the file that describes the channels of each recording (its mapping); raise SpecError unless all name the
+    same model.
+    """
     from pipeline.rig.recordings import load_mapping
     from pipeline.specification.problems import SpecError
 
@@ -51,7 +53,6 @@ def _load(paths: list[Path], mappings: list[Path]) -> list[Mapping]:
 
 
 def _read(paths: list[Path], mappings: list[Mapping]) -> list[xr.Dataset]:
-    """Read recordings, and print the problems found in them."""
     from pipeline.cli import console
     from pipeline.rig.recordings import findings_of, read_recording, summary
 

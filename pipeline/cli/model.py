@@ -1,4 +1,4 @@
-"""Define ``magpend model``: show a model's equations as magpend reads them, or write a template for a new model."""
+"""Define ``magpend model``, which shows a model's equations or writes a template for a new model."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Define ``magpend models`` and ``magpend presets``: list models and their parameter values."""
+"""Define ``magpend models`` and ``magpend presets``, which list models and their parameter values."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def models(
 
 
 def described(model: Model) -> dict[str, Any]:
-    """Return a model's properties as a dictionary for JSON."""
+    """Return all properties of a model as a dictionary that can be written as JSON."""
     about = [
         {"name": s.name, "unit": s.unit, "meaning": s.meaning, "on_circle": s.on_circle, "scale": s.scale}
         for s in model.states
@@ -71,7 +71,7 @@ def described(model: Model) -> dict[str, Any]:
 
 
 def all_of(model: Model) -> list[str]:
-    """Return lines of text that list a model's states, parameters, quantities, motions and presets."""
+    """Return text lines that list the states, parameters, quantities, motions and presets of a model."""
     from pipeline.products.product import padded
 
     seen = "no drive: the equations do not depend on time" if model.autonomous else ""
@@ -90,7 +90,6 @@ def all_of(model: Model) -> list[str]:
 
 
 def _preset(model: Model, name: str | Preset) -> list[str]:
-    """Return lines of text with the parameter values of a preset and the source of each value."""
     from pipeline.products.product import padded
 
     found = model.preset(name)

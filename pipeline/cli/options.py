@@ -1,4 +1,4 @@
-"""Turn the fields of an options class into command-line options, with types, defaults, bounds and help."""
+"""Turn the fields of an options class into options of the command line, with types, defaults, bounds and help."""
 
 from __future__ import annotations
 
@@ -35,7 +35,9 @@ _IMPORTED = "import_model"
 
 
 def speaking(command: Command) -> Command:
-    """Add the options that all commands share (``--quiet``, ``--log``, ...), and show the command's progress."""
+    """Wrap a command so that it has the options that all commands share (``--quiet``, ``--log``, ...) and shows its
+    progress.
+    """
     has_force = any(p.name == "force" for p in _own(command))
 
     def run(*args: Any, **given: Any) -> None:
@@ -58,7 +60,8 @@ def speaking(command: Command) -> Command:
 
 
 def taking(model: type[Options], command: Command) -> Command:
-    """Replace the parameter ``options`` of a command function by one command-line option per field of an options class.
+    """Replace the parameter ``options`` of a command's function by one command-line option for each field of an options
+    class.
 
     The given values are validated together, and the command is called with the model.
     """
@@ -84,7 +87,7 @@ def taking(model: type[Options], command: Command) -> Command:
 
 
 def completing(words: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]:
-    """Return a function for shell completion that lists the words beginning with the incomplete word."""
+    """Return a function for shell completion, which lists the words that begin with what the user has typed."""
 
     def complete(incomplete: str) -> list[str]:
         return [word for word in words() if word.startswith(incomplete)]
@@ -93,13 +96,13 @@ def completing(words: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]
 
 
 def flag_of(model: type[Options], name: str) -> str:
-    """Return the command-line flag of an option's field, such as ``--max-period``."""
+    """Return the command-line flag of a field, such as ``--max-period``."""
     extra: Any = model.model_fields[name].json_schema_extra or {}
     return str(extra.get("flag") or f"--{name.replace('_', '-')}")
 
 
 def help_of(info: FieldInfo) -> str:
-    """Return the help text of an option: its description, unit and bounds."""
+    """Return the help text of a field: its description, its unit and its bounds."""
     extra: Any = info.json_schema_extra or {}
     text = (info.description or "").rstrip(".")
     unit = f" [{extra['unit']}]" if extra.get("unit") else ""
@@ -108,9 +111,7 @@ def help_of(info: FieldInfo) -> str:
 
 
 def bounds_of(info: FieldInfo) -> str:
-    """Return the allowed range of an option's value in words, such as ``above 0, at most 1``; empty if it has no
-    bounds.
-    """
+    """Return the bounds of a field in words, such as ``above 0, at most 1``; an empty text if there are none."""
     words = {"gt": "above {}", "ge": "{} or more", "lt": "below {}", "le": "at most {}"}
     found = []
     for bound in info.metadata:
@@ -121,7 +122,7 @@ def bounds_of(info: FieldInfo) -> str:
 
 
 def kind_of(info: FieldInfo) -> Any:
-    """Return the type of an option's field; for an optional field, the type other than ``None``."""
+    """Return the type of a field; for an optional field, the type other than ``None``."""
     kind = info.annotation
     if get_origin(kind) in (Union, types.UnionType):
         (kind,) = [part for part in get_args(kind) if part is not type(None)]

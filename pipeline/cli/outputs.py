@@ -1,4 +1,4 @@
-"""Check where a command may write: not into a run directory, not over files of other programs."""
+"""Check where a command may write: not into a run directory, and not over files of other programs."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _forced = False
 
 
 def allow(force: bool) -> None:
-    """Set whether the current command may replace files that magpend did not write (``--force``)."""
+    """Set whether this command may replace files that magpend did not write (``--force``)."""
     global _forced
     _forced = force
 
@@ -43,7 +43,7 @@ def check_place(path: Path, option: str = "--out", within: str = "") -> None:
 
 
 def check_file(path: Path, option: str = "--out", within: str = "") -> None:
-    """Raise an error for a path that cannot be written to, or for an existing file that magpend did not write.
+    """Raise an error if a file cannot be written, or if it exists and magpend did not write it.
 
     Raises
     ------
@@ -56,7 +56,7 @@ def check_file(path: Path, option: str = "--out", within: str = "") -> None:
 
 
 def check_table(path: Path, header: str, option: str = "--csv") -> None:
-    """Raise `SpecError` if the file exists and its header differs, since it may be another program's table.
+    """Raise SpecError if a CSV file exists and has another header, since it may be another program's table.
 
     Raises
     ------
@@ -72,7 +72,7 @@ def check_table(path: Path, header: str, option: str = "--csv") -> None:
 
 
 def check_log(path: Path) -> None:
-    """Raise `SpecError` if the file exists and is not a log file.
+    """Raise SpecError if a file exists that is no log file of magpend.
 
     Raises
     ------
@@ -97,9 +97,7 @@ def _refuse(path: Path, option: str) -> None:
 
 
 def _is_own(path: Path) -> bool:
-    """Return whether a file may be magpend's own: empty, naming magpend at its beginning or end, or a CSV table with a
-    header.
-    """
+    """Return whether a file may be replaced, because it is empty, mentions magpend, or is a CSV table."""
     with path.open("rb") as file:
         begin = file.read(_LOOKED_AT)
         file.seek(max(0, path.stat().st_size - _LOOKED_AT))

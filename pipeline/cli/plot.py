@@ -45,7 +45,7 @@ plot_app = typer.Typer(
 
 
 def draw(directory: str, name: str, options: FigureOptions) -> None:
-    """Draw a figure of a run, write it with its data, and print their places."""
+    """Draw a figure of a run, write it with its data, and print where they are."""
     from pipeline.cli import console
     from pipeline.runs.drawing import drawn, ready
     from pipeline.store.errors import RefusedError
@@ -70,13 +70,12 @@ def draw(directory: str, name: str, options: FigureOptions) -> None:
 
 
 def _target_of(options: FigureOptions) -> Path:
-    """Return the figure file given by ``--out``, with the suffix of ``--format`` added if it is missing."""
     out, suffix = Path(options.out), f".{options.format}"
     return out.with_name(out.name + suffix) if options.format and out.suffix.lower() != suffix else out
 
 
 def _in_run(files: Files, name: str, options: FigureOptions) -> Path:
-    """Return the default file of a figure: in the run directory, or for a run in an object store in
+    """Return the default file of a figure: in the run directory or, for a run in an object store, in
     ``figures/NAME``.
     """
     folder = files.local / "figures" if files.local else Path("figures") / files.name.rpartition("/")[2]

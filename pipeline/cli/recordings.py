@@ -153,7 +153,6 @@ def drive(
 
 
 def _keep(file: Path, out: Path) -> None:
-    """Raise `SpecError` if the output file would overwrite the input file."""
     from pipeline.specification.problems import SpecError
 
     if out.exists() and file.exists() and out.samefile(file):
@@ -161,16 +160,14 @@ def _keep(file: Path, out: Path) -> None:
 
 
 def _check_recording(out: Path) -> None:
-    """Raise an error if a recording cannot be written to a path: in a run directory, or over a file magpend did not
-    write.
-    """
+    """Raise an error for a recording's path that lies in a run directory, or names a file of another program."""
     check_place(out)
     if not out.with_suffix(".toml").exists():
         check_file(out)
 
 
 def _beside(out: Path, text: str) -> Path:
-    """Return the path of a recording's mapping file; raise `SpecError` if a file with other content exists there."""
+    """Return the path of the mapping file (the channels of a recording); raise SpecError if another file is there."""
     from pipeline.specification.problems import SpecError
 
     path = out.with_suffix(".toml")
@@ -197,7 +194,6 @@ def _smoothed(ds: xr.Dataset, wanted: bool, window_s: float | None) -> xr.Datase
 
 
 def _tell(ds: xr.Dataset, as_json: bool) -> None:
-    """Print the quantities of a recording and the problems found in it, as lines or as one JSON object."""
     from pipeline.cli import console
     from pipeline.cli.common import json_rows
     from pipeline.rig.recordings.overview import describe_recording

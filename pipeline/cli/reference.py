@@ -1,4 +1,4 @@
-"""Make the tables of README and docs from the code: ``python -m pipeline.cli.reference``.
+"""Write the tables of README and docs from the code: ``python -m pipeline.cli.reference``.
 
 A table stands between the marks ``<!-- reference: NAME -->`` and ``<!-- /reference -->``. The text between
 the marks is replaced. With ``--check`` nothing is written, and the exit code is 1 if a page is out of date.
@@ -19,12 +19,12 @@ _BLOCK = re.compile(r"(<!-- reference: ([\w ]+) -->\n).*?(<!-- /reference -->)",
 
 
 def pages() -> list[Path]:
-    """Return the README and docs files in which tables are regenerated."""
+    """Return the Markdown files whose tables are generated: README and docs."""
     return [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 
 def rendered(text: str) -> str:
-    """Return the text of a documentation page with all its tables regenerated.
+    """Return the text of a documentation page with all its tables generated anew.
 
     Raises
     ------
@@ -35,7 +35,7 @@ def rendered(text: str) -> str:
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Return a Markdown table from its head and rows."""
+    """Format a Markdown table from its head and its rows."""
     lines = [list(head), ["---"] * len(head), *(list(row) for row in rows)]
     return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |" for row in lines)
 
@@ -44,7 +44,7 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 def commands() -> str:
-    """Return the table of all commands, one line each."""
+    """Return the Markdown table of all commands, with one line for each."""
     rows = ((f"`magpend {name}{_arguments(command)}`", _first(command)) for name, command in _commands())
     return table(("command", "does"), rows)
 
@@ -54,7 +54,7 @@ SHARED = ("plot fractions", "analyse attractors", "analyse branches")
 
 
 def options() -> str:
-    """Return the description of every command with a table of its options, as Markdown."""
+    """Return the Markdown text that describes every command, with a table of its options."""
     found, parts = dict(_commands()), []
     listed = {name: dict(_options(found[name])) for name in SHARED}
     for name, command in found.items():
@@ -83,7 +83,7 @@ def _options(command: Any) -> list[tuple[str, str]]:
 
 
 def exit_codes() -> str:
-    """Return the table of exit codes."""
+    """Return the Markdown table of the exit codes of all commands."""
     from pipeline.cli.exits import Exit
 
     return table(("code", "meaning"), ((str(int(code)), code.sentence) for code in Exit))
@@ -115,7 +115,6 @@ def _metavar(parameter: Any) -> str:
 
 
 def _help(parameter: Any) -> str:
-    """Return the help text of a command-line option, with its default value if the option has one."""
     has_default = isinstance(parameter.default, (int, float, str, Path)) and parameter.default is not False
     return _text(parameter.help or "") + (f" Default: {parameter.default}." if has_default else "")
 
@@ -129,7 +128,7 @@ def _text(text: str) -> str:
 
 
 def workflows() -> str:
-    """Return the table of the specifications that ship with magpend."""
+    """Return the Markdown table of the specifications that ship with magpend."""
     from pipeline.runs.workflows import shipped_identifications, shipped_workflows
 
     def title(path: Path) -> str:
@@ -170,7 +169,7 @@ def specification() -> str:
 
 
 def identification() -> str:
-    """Return Markdown tables of the keys of an identification's TOML file."""
+    """Return Markdown tables of the keys of the TOML file that describes an identification."""
     from pipeline.rig.identify import specification as tables
     from pipeline.rig.identify.orbit_tables import BifurcationTable, OrbitsTable
     from pipeline.rig.identify.unknowns import Identified
@@ -191,7 +190,7 @@ _STATES = "Give each state of the model under its own name: {}. For an angle or 
 
 
 def products() -> str:
-    """Return Markdown tables of a specification's products and their keys."""
+    """Return Markdown tables of the products of a run's specification, with their keys."""
     from pipeline.products.registry import CELL_PRODUCTS
 
     return "\n\n".join(
@@ -200,7 +199,7 @@ def products() -> str:
 
 
 def mapping() -> str:
-    """Return Markdown tables of the keys of a recording's mapping file."""
+    """Return Markdown tables of the keys of the file that describes a recording's channels."""
     from pipeline.rig.recordings import mapping as found
 
     top = ("csv", "channels", "drive")
@@ -216,14 +215,14 @@ def mapping() -> str:
 
 
 def findings() -> str:
-    """Return the Markdown table of the problems that are searched for in recordings."""
+    """Return the Markdown table of the defects that are searched for in recordings."""
     from pipeline.rig.recordings.findings import KINDS
 
     return table(("finding", "meaning"), ((f"`{kind}`", meaning) for kind, meaning in KINDS.items()))
 
 
 def virtual_rig() -> str:
-    """Return Markdown tables of the keys of a virtual experiment's TOML file."""
+    """Return Markdown tables of the keys of the TOML file that describes a virtual experiment."""
     from pipeline.rig import simulation
 
     parts = [
@@ -236,7 +235,7 @@ def virtual_rig() -> str:
 
 
 def study() -> str:
-    """Return Markdown tables of the keys of a study's TOML file."""
+    """Return Markdown tables of the keys of the TOML file that describes a study (figures and claims of a paper)."""
     from pipeline.report import study as tables
 
     parts = [
@@ -252,7 +251,7 @@ def study() -> str:
 
 
 def measures() -> str:
-    """Return the Markdown table of the measures that a study's claims can use, with their options."""
+    """Return the Markdown table of the measures that the claims of a study can use, with their options."""
     from pipeline.report import torque_curves
     from pipeline.report.measures import MEASURES
 
@@ -306,7 +305,7 @@ def _bounds(info: Any) -> str:
 
 
 def variables() -> str:
-    """Return the Markdown table of a data cube's variables, those of products last."""
+    """Return the Markdown table of the variables of a run's result cube; those of products come last."""
     from magpend_core.models import load_model
     from pipeline.layout.schema import REST_STATE, RETURN_TIME, base_variables
     from pipeline.products.registry import CELL_PRODUCTS
@@ -336,7 +335,7 @@ def statuses() -> str:
 
 
 def models() -> str:
-    """Return the table of the models that ship with magpend."""
+    """Return the Markdown table of the models that ship with magpend."""
     from magpend_core.models import load_model, model_names
 
     rows = []
@@ -349,14 +348,14 @@ def models() -> str:
 
 
 def public() -> str:
-    """Return the public names of the Python package."""
+    """Return the public names of the Python package, as Markdown text."""
     import magpend
 
     return ", ".join(f"`{name}`" for name in dir(magpend) if not name.startswith("_"))
 
 
 def measured_branch() -> str:
-    """Return Markdown tables of the keys of measured branches, and of a virtual rig under control."""
+    """Return Markdown tables of the keys that describe measured branches, and a virtual rig under control."""
     from pipeline.rig.control import ControlTable
     from pipeline.rig.measured_branch.reading import MeasuredBranch, RecordedOrbit
 
@@ -394,7 +393,7 @@ TABLES: dict[str, Callable[[], str]] = {
 
 
 def main() -> None:
-    """Rewrite the README and docs pages whose tables are out of date, or list them if ``--check`` is given."""
+    """Rewrite the documentation pages whose tables are out of date or, with ``--check``, list them."""
     check = "--check" in sys.argv[1:]
     stale = [page for page in pages() if rendered(page.read_text("utf-8")) != page.read_text("utf-8")]
     for page in stale:

@@ -1,4 +1,4 @@
-"""Define ``magpend report``, which writes one HTML page on runs."""
+"""Define ``magpend report``, which writes one HTML page about runs."""
 
 from __future__ import annotations
 

@@ -71,7 +71,6 @@ def reproduce(
 
 
 def _check_folder(folder: Path) -> None:
-    """Raise an error if the folder cannot be written to, before anything is computed."""
     from pipeline.cli.outputs import check_place
     from pipeline.specification.problems import SpecError
     from pipeline.store.errors import RefusedError

@@ -1,4 +1,4 @@
-"""Define ``magpend run``, ``status`` and ``verify``."""
+"""Define ``magpend run``, ``magpend status`` and ``magpend verify``."""
 
 from __future__ import annotations
 
@@ -122,7 +122,7 @@ def _run_posterior(spec: str, directory: Path, n: int, out: str | None, *, smoke
 
 
 def _plot(run: Run) -> None:
-    """Draw the figure that gives the best overview of a finished run; if drawing fails, print the reason."""
+    """Draw the figure that shows a finished run best; if it cannot be drawn, print the reason."""
     from pipeline.cli import console
     from pipeline.cli.plot import draw
     from pipeline.products.registry import FIGURES

@@ -1,4 +1,4 @@
-"""Define ``magpend simulate``: integrate one trajectory of any model."""
+"""Define ``magpend simulate``, which integrates one trajectory of any model."""
 
 from __future__ import annotations
 
@@ -107,7 +107,6 @@ def simulate(
 
 
 def _draw(ds: xr.Dataset, target: Path, series: Path) -> None:
-    """Write the figure of a time series, and its data unless the series file already holds them."""
     from pipeline.cli import console
     from pipeline.plots import plot_trajectory, save_data, save_figure
 
@@ -118,12 +117,13 @@ def _draw(ds: xr.Dataset, target: Path, series: Path) -> None:
 
 
 def _states(words: list[str]) -> dict[str, float]:
-    """Parse ``--NAME VALUE`` pairs into the values of states by name."""
     return {name: values[0] for name, values in read_named(words, 1).items()}
 
 
 def read_named(words: list[str], n: int) -> dict[str, Any]:
-    """Parse ``--NAME VALUE ...`` with `n` numbers each into a dict; raise `SpecError` with all mistakes."""
+    """Parse options ``--NAME VALUE ...`` with `n` numbers each into a dict; raise a `SpecError` that lists all
+    mistakes.
+    """
     from pipeline.specification.problems import SpecError
 
     found: dict[str, Any] = {}

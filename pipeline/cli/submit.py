@@ -1,4 +1,4 @@
-"""Define ``magpend submit``: run a specification as a batch job."""
+"""Define ``magpend submit``, which runs a specification as a batch job."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Define ``magpend zoom``: write a narrower specification from an old one."""
+"""Define ``magpend zoom``, which writes a specification with narrower ranges."""
 
 from __future__ import annotations
 

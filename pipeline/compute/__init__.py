@@ -1,1 +1,1 @@
-"""Run tasks: the only package that uses dask, and the pipeline's entry to the kernel."""
+"""Compute the tasks of a run. Only this package uses dask, and through it the pipeline calls the compiled core."""

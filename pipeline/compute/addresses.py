@@ -28,12 +28,12 @@ _TLS_SETTINGS = (
 
 
 class SchedulerError(Exception):
-    """Raised for an unusable scheduler or worker; the message gives the reason and the remedy."""
+    """Raised if a dask scheduler or worker cannot be used; the message has the reason and the remedy."""
 
 
 @dataclass(frozen=True)
 class Address:
-    """The address of a scheduler.
+    """Address of a dask scheduler, with the setting from which it was read.
 
     Attributes
     ----------
@@ -55,12 +55,12 @@ class Address:
 
     @property
     def named(self) -> str:
-        """Address as messages show it, with the setting it comes from unless that is the option ``--scheduler``."""
+        """Address for messages; it names the setting that it comes from, unless that is the option ``--scheduler``."""
         return self.url if self.source == OPTION else f"{self.url} (from {self.source})"
 
 
 def read_address(text: str, source: str) -> Address:
-    """Read an address such as ``tcp://host:8786``, or a scheduler's JSON file.
+    """Read the address of a dask scheduler, such as ``tcp://host:8786``, or from the scheduler's JSON file.
 
     Raises
     ------
@@ -108,7 +108,7 @@ def _from_file(path: Path) -> Address:
 
 
 def security_of(address: Address) -> Any:
-    """Return the TLS keys for an address, from dask's own settings; None for a plain connection.
+    """Return dask's TLS settings for an encrypted address; None for a plain connection.
 
     Raises
     ------
@@ -133,7 +133,7 @@ def security_of(address: Address) -> Any:
 
 
 def ask(address: Address) -> None:
-    """Raise `SchedulerError` unless a dask scheduler answers at an address within seconds.
+    """Raise SchedulerError unless a dask scheduler answers at an address within seconds.
 
     Raises
     ------
@@ -188,7 +188,7 @@ def _asked(address: Address, security: Any) -> dict[str, Any]:
 
 
 async def _identity(address: Address, security: Any) -> dict[str, Any]:
-    """Ask a dask server for its identity."""
+    """Connect to a dask server, and return its description of itself."""
     from distributed.comm.core import connect
 
     keys = _keys(security) if security is not None else {}

@@ -31,7 +31,7 @@ _SAY_EVERY_S, _CONNECT_S = 30.0, 10.0
 
 @dataclass(frozen=True)
 class Where:
-    """Choice of where tasks run: in this process, in local processes, on a dask scheduler or in a batch system.
+    """Choice of where tasks run: in this process, in local processes, on a dask scheduler or as jobs of a batch system.
 
     Attributes
     ----------
@@ -53,12 +53,12 @@ class Where:
 
     @classmethod
     def of(cls, scheduler: Where | str | None) -> Where:
-        """Make a `Where` (where tasks run) from the name of a scheduler; return a given `Where` unchanged."""
+        """Convert the name or address of a scheduler to a `Where`; return a `Where` unchanged."""
         return scheduler if isinstance(scheduler, Where) else cls(scheduler)
 
     def resolved(self) -> Address | Cluster | str:
-        """Return where tasks run: a scheduler's address, a batch system's settings, ``local`` or ``none``; start
-        nothing.
+        """Decide where tasks run, without starting anything: an address, a batch system's settings, ``local`` or
+        ``none``.
 
         Raises
         ------
@@ -110,7 +110,7 @@ class Where:
 
 
 def reach(where: Where) -> None:
-    """Check within seconds that the dask scheduler the user chose answers; do nothing if the user chose none.
+    """Check within seconds that the chosen dask scheduler answers; do nothing if none was chosen.
 
     Raises
     ------
@@ -124,7 +124,7 @@ def reach(where: Where) -> None:
 
 @contextlib.contextmanager
 def connected(where: Where, n_workers: int, echo: Echo = print) -> Iterator[Any]:
-    """Yield a dask client once its workers have started, have the same software and see the run directory.
+    """Yield a dask client when its workers have started, have the same software, and see the run directory.
 
     Parameters
     ----------
@@ -173,7 +173,7 @@ def _client(scheduler: Any, security: Any) -> Any:
 
 
 def _patience() -> int:
-    """Return the longest wait for workers of an existing scheduler [s], from the environment or the default."""
+    """Return the longest wait for the workers of an existing scheduler [s]."""
     text = os.environ.get(WAIT) or WAIT_FOR_WORKERS
     try:
         return seconds_of(text)
@@ -182,7 +182,7 @@ def _patience() -> int:
 
 
 def _wait(client: Any, name: str, patience_s: int, echo: Echo) -> None:
-    """Wait for the first worker, and print a line while waiting."""
+    """Wait for the first worker of a scheduler, and print a line now and then."""
     started = said = time.monotonic()
     first = True
     while not _workers(client):

@@ -1,4 +1,4 @@
-"""Decide whether a trajectory has converged to a periodic orbit, and estimate how long it would take."""
+"""Decide whether a trajectory has closed on a periodic orbit, or estimate how long it will take to close."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ TOLERANCE: float = Integration.model_fields["closure_tolerance"].default
 
 
 class Closing(NamedTuple):
-    """Distance of a trajectory from a periodic orbit, and the estimated time until it has converged.
+    """How far a trajectory is from a periodic orbit, and how long it would take to close on it.
 
     Attributes
     ----------
@@ -49,7 +49,9 @@ class Closing(NamedTuple):
         return self.to_go == 0.0
 
     def sentence(self, n_transient: int) -> str:
-        """Return a sentence on the result; for a motion not closed yet it suggests a sufficient ``--transient``."""
+        """Return a sentence on whether the trajectory has closed; if not, it suggests a value of ``--transient`` that
+        suffices.
+        """
         periods = f"{self.period} drive period{'s' if self.period > 1 else ''}"
         if self.is_closed:
             return f"closed: the motion repeats after {periods} (distance {self.distance:.1e})"
@@ -64,7 +66,7 @@ class Closing(NamedTuple):
 
 
 def closing_of(sections: np.ndarray, system: System) -> Closing | None:
-    """Decide whether a trajectory closes, by comparing stroboscopic points that are whole numbers of periods apart.
+    """Decide whether a trajectory has closed on a periodic orbit, by comparing its stroboscopic points.
 
     The distances of a period fall into four quarters. If the largest of each quarter shrinks from quarter
     to quarter, the sum of all that follow bounds the distance from the orbit, as in
@@ -105,9 +107,6 @@ def closing_of(sections: np.ndarray, system: System) -> Closing | None:
 
 
 def _lag_distances(sections: np.ndarray, p: int, system: System) -> np.ndarray:
-    """Return the scaled distances of stroboscopic points `p` periods apart, with angle differences taken on the
-    circle.
-    """
     apart = np.abs(sections[p:] - sections[:-p])
     angles = np.array(system.is_angle, dtype=bool)
     turned = apart[:, angles] % (2.0 * np.pi)
@@ -116,12 +115,11 @@ def _lag_distances(sections: np.ndarray, p: int, system: System) -> np.ndarray:
 
 
 def _late(distances: np.ndarray) -> float:
-    """Return the largest value in the last quarter of a sequence of distances."""
     return float(distances[-(len(distances) // 4) :].max())
 
 
 def _judged(p: int, distances: np.ndarray) -> Closing:
-    """Judge whether a trajectory closes with period `p`, from distances of points `p` periods apart along its end."""
+    """Decide from the distances between points `p` periods apart whether a trajectory closes with period `p`."""
     quarter = len(distances) // 4
     last = distances[len(distances) - 4 * quarter :].reshape(4, quarter).max(axis=1)
     if last[2:].max() <= 0.01 * TOLERANCE:  # errors of integration hide what shrinks

@@ -1,4 +1,4 @@
-"""Continue branches from the final states of the preceding task, bit for bit as if one task had computed them."""
+"""Continue branches in a new task from the final states of the preceding task, with the same bits as in one task."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ WALKED = ("section", "rest_state", "status", "step_size")
 
 
 def going_on(inputs: Inputs, before: Mapping[str, np.ndarray]) -> Inputs:
-    """Return the inputs of branches, with the final states of the preceding task as their initial states.
+    """Replace the initial states of branches by the states in which the preceding task ended.
 
     Parameters
     ----------

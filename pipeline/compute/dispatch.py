@@ -1,4 +1,4 @@
-"""Run tasks on the workers of a dask scheduler, a few in flight per thread, and restart workers that hang.
+"""Run tasks on the workers of a dask scheduler, with few tasks per thread at a time, and restart workers that hang.
 
 All waiting happens in the client's event loop. Results and starts of tasks arrive in one queue, so that a
 stopped worker cannot hold up the others.
@@ -48,7 +48,7 @@ Echo = Callable[[str], None]
 
 @dataclass
 class _Flight:
-    """A submitted task: its index, future, start time and worker."""
+    """A task that was sent to a worker: its index, its future, its start time and the worker."""
 
     index: int
     future: Any
@@ -57,7 +57,7 @@ class _Flight:
 
 
 def announced(task: Task, topic: str, ticket: int, index: int) -> dict[str, Any]:
-    """Run a task on a dask worker; before it begins, report its start to the client."""
+    """Run a task on a dask worker, after telling the client that it starts."""
     from distributed import get_worker
 
     worker = get_worker()
@@ -66,7 +66,7 @@ def announced(task: Task, topic: str, ticket: int, index: int) -> dict[str, Any]
 
 
 class Window:
-    """Runner of the tasks of an `Order` on the workers of a dask client, with a limited number of tasks at a time.
+    """Sends the tasks of an `Order` to the workers of a dask client, with a limited number of tasks at a time.
 
     Parameters
     ----------
@@ -103,7 +103,7 @@ class Window:
         self._waiting_since: float | None = None
 
     def results(self) -> Iterator[dict[str, Any]]:
-        """Yield results in the order in which tasks finish.
+        """Yield the results of tasks in the order in which the tasks finish.
 
         Raises
         ------
@@ -124,7 +124,9 @@ class Window:
             self._fill()
 
     def _fill(self) -> None:
-        """Submit ready tasks until enough are in flight; once none is left, submit failed tasks one at a time."""
+        """Send ready tasks to the workers until enough are in flight. At the end, send failed tasks again, one at a
+        time.
+        """
         wanted = WINDOW * max(self._watch.n_threads, 1) - len(self._flights)
         chosen: list[int] = []
         while len(chosen) < wanted and (index := self._order.take()) is not None:
@@ -146,7 +148,7 @@ class Window:
         self._news.put(("start", event[1]["ticket"], event[1]["worker"]))
 
     def _on_end(self, ticket: int, future: Any) -> None:
-        """Start fetching a finished task's result; runs in a thread of the client."""
+        """Start to fetch the result of a finished task. This runs in a thread of the dask client."""
         if ticket not in self._flights:
             return
         if future.status in ("error", "cancelled"):
@@ -157,7 +159,7 @@ class Window:
             fetch.add_done_callback(lambda fetched: self._news.put(("end", ticket, fetched.result())))
 
     def _wait(self) -> Iterator[tuple[str, int, Any]]:
-        """Wait at most `TICK_S` for events (starts and ends of tasks), and yield those that have arrived."""
+        """Wait for tasks to start or end, at most `TICK_S`, and yield these events."""
         with contextlib.suppress(queue.Empty):
             yield self._news.get(timeout=TICK_S)
             while True:
@@ -189,7 +191,7 @@ class Window:
         )
 
     def _look(self) -> None:
-        """Update the record of workers, and restart those that do not answer."""
+        """Ask the scheduler which workers have reported, and restart those that are silent for too long."""
         try:
             seen = self._client.sync(self._client.scheduler.identity, n_workers=-1, callback_timeout=ANSWER_S)
         except (OSError, TimeoutError) as error:
@@ -210,7 +212,7 @@ class Window:
             self._echo("the scheduler has no workers; waiting for some")
 
     def _give_up_late(self) -> None:
-        """Cancel tasks that exceed their time limit, and restart their workers."""
+        """Give up tasks that exceed their time limit, and restart their workers."""
         for ticket, flight in list(self._flights.items()):
             if flight.started is None:
                 continue
@@ -232,13 +234,12 @@ class Window:
             self._order.failed(flight.index, text)
 
     def _restart(self, address: str) -> None:
-        """Restart a worker process; the scheduler moves its tasks to other workers."""
         self._watch.forget(address)
         threading.Thread(target=_restarted, args=(self._client, address), daemon=True).start()
 
 
 class Watch:
-    """Record of when each dask worker last reported, to find workers that hang.
+    """Record of when each dask worker last reported. It shows which workers hang.
 
     Its clock stops while this process is suspended, by Ctrl-Z or a closed lid: no worker is blamed for that
     time.
@@ -255,7 +256,7 @@ class Watch:
 
     @property
     def limit_s(self) -> float:
-        """Time after which a silent worker counts as hung [s].
+        """Time after which a silent worker is taken to hang [s].
 
         It doubles with each check that finds silent workers, since all workers of an overloaded machine
         answer slowly.
@@ -265,18 +266,20 @@ class Watch:
 
     @property
     def now(self) -> float:
-        """Time [s] on a clock that stops while this process is suspended."""
+        """Time on a clock [s] that stops while this process is suspended."""
         now = self._clock()
         self._time += min(now - self._last, 5 * TICK_S)
         self._last = now
         return self._time
 
     def due(self) -> bool:
-        """Return whether the next check of the workers is due."""
+        """Return whether it is time to check the workers again."""
         return self.now - self._looked >= max(TICK_S, len(self._heard) / MOST_LOOKED_AT)
 
     def look(self, workers: dict[str, Any]) -> list[str]:
-        """Update the record from the scheduler's list of workers, and return the addresses of silent workers."""
+        """Update the record from the scheduler's list of workers. Return the addresses of workers that are silent for
+        too long.
+        """
         now = self._looked = self.now
         self.n_threads = sum(w["nthreads"] for w in workers.values())
         heard = {}
@@ -291,12 +294,11 @@ class Watch:
         return silent
 
     def forget(self, address: str) -> None:
-        """Delete the record of a worker's last report."""
+        """Delete a worker from the record."""
         self._heard.pop(address, None)
 
 
 async def _fetched(client: Any, future: Any) -> tuple[Any, BaseException | None]:
-    """Fetch the result of a dask future as (result, None), or its error as (None, error)."""
     try:
         return await client.gather(future, asynchronous=True), None
     except (Exception, asyncio.CancelledError) as error:
@@ -304,7 +306,9 @@ async def _fetched(client: Any, future: Any) -> tuple[Any, BaseException | None]
 
 
 def _restarted(client: Any, address: str) -> None:
-    """Restart a dask worker and wait for it; runs in a separate thread, since a suspended worker answers slowly."""
+    """Restart a dask worker and wait for it. This runs in a thread of its own, since a suspended worker answers
+    slowly.
+    """
     with contextlib.suppress(Exception):
         client.restart_workers([address], timeout=ANSWER_S, raise_for_error=False)
 

@@ -34,7 +34,7 @@ def run_tasks(
     scheduler: Where | str | None = None,
     echo: Echo = print,
 ) -> Iterator[dict[str, Any]]:
-    """Run `task` for every index and yield the results as they come.
+    """Run a task function for every index, and yield the results as they come.
 
     If a task fails, the others continue; the failed task is tried again alone at the end.
 

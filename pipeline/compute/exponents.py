@@ -1,4 +1,4 @@
-"""Compute the product ``lyapunov``: the Lyapunov exponents of each cell, from its last section point on."""
+"""Compute the product ``lyapunov``: the Lyapunov exponents of each cell, from its last section point onwards."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SIGMA = 5.0
 
 
 def exponents(job: Job, options: LyapunovOptions) -> dict[str, np.ndarray]:
-    """Return the variables `LYAPUNOV_VARIABLES` (exponents, errors, flags) for the cells of a task.
+    """Compute the Lyapunov exponents of the cells of a task, with their errors and quality flags.
 
     Parameters
     ----------
@@ -66,8 +66,8 @@ def _falling(rates: np.ndarray) -> np.ndarray:
 
 
 def flags(found: LyapunovExponents, *, is_flow: bool = False) -> np.ndarray:
-    """Return a quality flag per cell; the sum of a full Lyapunov spectrum is checked against the vector field's
-    divergence.
+    """Return a quality flag for the Lyapunov exponents of each cell. A full spectrum must add up to the divergence of
+    the vector field.
 
     One exponent of a flow must be 0, unless the motion comes to rest.
     """

@@ -1,4 +1,4 @@
-"""Extend the trajectories of a stored sweep, so that a run that keeps more section points can use them."""
+"""Integrate the cells of a stored run further, for a new run that keeps more section points."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ PER_SECTION = ("section", "extremes")
 
 
 def obstacle(old: Spec, new: Spec) -> str:
-    """Return why stored cells cannot be integrated further to keep more section points; empty if they can."""
+    """Return the reason why stored cells cannot be integrated further for a new run; an empty text if they can."""
     had, wanted = old.integration.n_keep, new.integration.n_keep
     if had == wanted:
         return ""
@@ -42,13 +42,13 @@ def obstacle(old: Spec, new: Spec) -> str:
 
 
 def _judged(spec: Spec) -> int:
-    """Return the number of last section points that are checked to decide whether an orbit has closed."""
+    """Return the number of last section points from which a run decides whether an orbit has closed."""
     n_periods = spec.integration.n_transient + spec.integration.n_keep
     return min(n_periods, window_of(spec.integration.max_orbit_period))
 
 
 def kept_on(spec: Spec, inputs: Inputs, stored: Mapping[str, np.ndarray], n_old: int) -> tuple[Any, Values]:
-    """Integrate stored cells of an earlier run further, to as many section points as the new run keeps.
+    """Integrate cells of an earlier run further, until they have as many section points as the new run keeps.
 
     A cell is left out if its outcome could differ from that of a longer run: if the moment at which its orbit
     closed is not known, or if it fails later.
@@ -100,7 +100,7 @@ def kept_on(spec: Spec, inputs: Inputs, stored: Mapping[str, np.ndarray], n_old:
 
 
 def _more(spec: Spec, inputs: Inputs, last: np.ndarray, step_size: np.ndarray, n_old: int) -> Values:
-    """Integrate cells over additional periods from their stored last states; return the variables of these periods."""
+    """Integrate cells from their stored last states over the missing periods; return the variables of these periods."""
     integration = spec.integration
     cells = more_sections(
         inputs.parameters,
@@ -119,7 +119,6 @@ def _more(spec: Spec, inputs: Inputs, last: np.ndarray, step_size: np.ndarray, n
 
 
 def _longer(name: str, old: np.ndarray, more: Mapping[str, np.ndarray], go: np.ndarray, n: int) -> np.ndarray:
-    """Return a copy of a variable of all cells in which the newly integrated values follow the stored ones."""
     if name in PER_SECTION:
         whole = np.full((*old.shape[:2], n, *old.shape[3:]), np.nan)
         whole[go] = np.concatenate([old[go], more[name]], axis=2)

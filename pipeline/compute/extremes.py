@@ -1,4 +1,4 @@
-"""Return the product ``extremes``: extremes and means that the integrator recorded in the last `n_keep` periods."""
+"""Compute the product ``extremes``: minimum, maximum and mean of quantities in each of the last `n_keep` periods."""
 
 from __future__ import annotations
 

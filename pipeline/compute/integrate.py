@@ -1,4 +1,4 @@
-"""Integrate branches (chains of cells): their section points, and the products computed from them."""
+"""Integrate branches (chains of cells), and compute the products of their cells."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from pipeline.specification.tables import Integration
 
 @dataclass(frozen=True)
 class Job:
-    """Integrated cells with their specification and inputs, as input of the products computed from them.
+    """Integrated cells with their specification and inputs, from which products are computed.
 
     Attributes
     ----------
@@ -38,12 +38,12 @@ class Job:
 
     @property
     def system(self) -> System:
-        """Integrated system with the integration method of the run."""
+        """System of the run's model, with the integration method of the run."""
         return replace(self.spec.model.system, method=self.spec.integration.method)
 
 
 def integrate(spec: Spec, inputs: Inputs) -> dict[str, np.ndarray]:
-    """Integrate branches and return all their variables, products included, with leading dims (branch, point)."""
+    """Integrate branches, compute their products, and return all variables with the leading dims (branch, point)."""
     how = spec.model.system, spec.integration, watched_quantities(spec)
     cells = walk(inputs, *how) if spec.recorded is None else under_recording(spec.recorded, inputs, *how)
     own = {REST_STATE.name: rest_states(cells)} if spec.section is not None else {}
@@ -58,8 +58,7 @@ def integrate(spec: Spec, inputs: Inputs) -> dict[str, np.ndarray]:
 
 
 def walk(inputs: Inputs, system: System, integration: Integration, quantities: Sequence[str] | None) -> Sections:
-    """Integrate branches by `magpend_core.run_branches`; branches that failed in a preceding task get the status
-    UNREACHED.
+    """Integrate branches point by point. Branches that failed in the preceding task get the status UNREACHED.
 
     Parameters
     ----------
@@ -97,9 +96,7 @@ def walk(inputs: Inputs, system: System, integration: Integration, quantities: S
 
 
 def _spread(name: str, found: Any, alive: np.ndarray) -> Any:
-    """Copy the results of the integrated branches into arrays for all branches; branches not integrated get fill
-    values.
-    """
+    """Copy results of the integrated branches into arrays of all branches, with fill values for the other branches."""
     if found is None:
         return None
     fill = int(Status.UNREACHED) if name == "status" else np.nan if found.dtype.kind == "f" else 0
@@ -109,12 +106,12 @@ def _spread(name: str, found: Any, alive: np.ndarray) -> Any:
 
 
 def watched_quantities(spec: Spec) -> list[str] | None:
-    """Return the names of the quantities that products record during integration; None if there are none."""
+    """Return the names of the quantities that products record during the integration; None if there are none."""
     return [name for k, options in spec.products.items() for name in CELL_PRODUCTS[k].watches(options)] or None
 
 
 def rest_states(cells: Sections) -> np.ndarray:
-    """Return the final states of trajectories that never returned to the section; NaN for all others."""
+    """Return the final states of trajectories that never returned to the Poincare section; NaN for all others."""
     is_left = cells.status == Status.NO_RETURN
     return np.where(is_left[..., None], cells.final_state, np.nan)
 

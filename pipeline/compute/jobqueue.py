@@ -1,4 +1,4 @@
-"""Start dask workers in jobs of a batch system, as many jobs as the work needs."""
+"""Start dask workers as jobs of a batch system, as many as the work needs."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _TARGET = "0.1 s"
 
 
 def check_means(cluster: Cluster) -> None:
-    """Raise `SpecError` unless batch jobs can be submitted from this machine.
+    """Raise SpecError unless batch jobs can be submitted from this machine.
 
     Raises
     ------
@@ -56,7 +56,7 @@ def jobs_folder(place: str) -> Path:
 
 
 def settings(cluster: Cluster, folder: Path) -> dict[str, Any]:
-    """Return the keyword arguments for the cluster classes of dask-jobqueue.
+    """Return the keyword arguments with which dask-jobqueue starts jobs on a cluster.
 
     Parameters
     ----------
@@ -90,7 +90,9 @@ def settings(cluster: Cluster, folder: Path) -> dict[str, Any]:
 
 
 def worker_script(cluster: Cluster, folder: Path) -> str:
-    """Return the batch script of a job, with placeholders for the scheduler's address and the worker's name."""
+    """Return the batch script of one worker's job, with placeholders for the scheduler's address and the worker's
+    name.
+    """
     import dask_jobqueue
 
     job = getattr(dask_jobqueue, _CLASSES[cluster.kind]).job_cls
@@ -98,7 +100,7 @@ def worker_script(cluster: Cluster, folder: Path) -> str:
 
 
 def _keys(folder: Path) -> Any:
-    """Write TLS keys to a folder that the jobs read; scheduler, workers and client share them."""
+    """Write new TLS keys, shared by scheduler, workers and client, to a folder that the jobs can read."""
     from distributed import Security
 
     made = Security.temporary()  # type: ignore[no-untyped-call]
@@ -118,7 +120,7 @@ def _keys(folder: Path) -> Any:
 
 @contextlib.contextmanager
 def job_cluster(cluster: Cluster, folder: Path, *, dashboard: bool, echo: Callable[[str], None]) -> Iterator[Any]:
-    """Start a dask cluster whose workers are batch jobs, yield it, and stop it at the end of the context.
+    """Start a dask cluster whose workers are batch jobs, and yield it; stop it at the end of the context.
 
     Scheduler and workers identify each other by keys made for this cluster. The keys lie in `folder`,
     readable by their owner alone, until the cluster ends. Others on the network can neither read nor send

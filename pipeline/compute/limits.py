@@ -1,4 +1,4 @@
-"""Limit the run time of tasks by their estimated times, corrected by the accuracy of earlier estimates."""
+"""Limit the run time of tasks: by estimated times, and by how far earlier estimates were wrong."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ SILENT_S = 20.0
 
 
 class Limits:
-    """Run-time limits of tasks, from estimates and from measured times.
+    """Limits of the run time of tasks, from estimated and measured times.
 
     Parameters
     ----------
@@ -34,12 +34,12 @@ class Limits:
         self._worst = 1.0
 
     def finished(self, index: int, took_s: float) -> None:
-        """Update the worst ratio of measured to estimated time with a finished task."""
+        """Record how long a finished task took, to correct the estimates for the others."""
         if self._seconds is not None and took_s > SHORT_S:
             self._worst = max(self._worst, took_s / max(self._seconds(index), 1e-9))
 
     def limit_s(self, index: int, tries: int) -> float:
-        """Return the time limit of a task [s], which grows with each further try."""
+        """Return the time after which a task is given up [s]; it is longer for each further try."""
         if self._seconds is None:
             return float("inf")
         return max(LEAST_S, FACTOR * self._worst * self._seconds(index)) * MORE ** (tries - 1)

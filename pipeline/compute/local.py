@@ -1,4 +1,4 @@
-"""Run a cluster of processes on this machine, for the duration of a run.
+"""Run a dask cluster of processes on this machine, for the duration of a run.
 
 The cluster is protected from other users of the machine. It listens on loopback alone. Every connection uses
 TLS with a certificate on both sides, made for this cluster and kept in a folder that only its owner may
@@ -58,13 +58,13 @@ _scratch_folders: set[Path] = set()
 
 
 def memory_per_worker(n_workers: int) -> float:
-    """Return the fraction of the machine's memory at which dask restarts a worker."""
+    """Return the fraction of the machine's memory above which dask restarts a worker."""
     return 1.0 / n_workers
 
 
 @contextlib.contextmanager
 def local_cluster(n_workers: int, *, dashboard: bool = False) -> Iterator[Any]:
-    """Start a dask cluster of single-threaded processes, reachable only with its own TLS keys, and yield it.
+    """Start a dask cluster of processes on this machine, protected by TLS keys of its own, and yield it.
 
     The first worker has started; others may still be starting. The dashboard shows the computation to
     everyone on this machine.
@@ -115,7 +115,6 @@ def local_cluster(n_workers: int, *, dashboard: bool = False) -> Iterator[Any]:
 
 
 def _await_one(cluster: Any) -> None:
-    """Wait for the first worker; raise `SchedulerError` if none starts in time."""
     end = time.monotonic() + START_S
     while not cluster.scheduler.workers:
         if time.monotonic() > end:
@@ -125,7 +124,7 @@ def _await_one(cluster: Any) -> None:
 
 @contextlib.contextmanager
 def _loop() -> Iterator[Any]:
-    """Run an event loop in a separate thread, and yield it.
+    """Run an event loop in a thread of its own, and yield it.
 
     Ctrl-C goes to every process of the terminal, but only the coordinator should handle it. Workers inherit
     the blocked signals from this thread.
@@ -142,7 +141,7 @@ def _loop() -> Iterator[Any]:
 
 
 def _security(scratch: Path) -> Any:
-    """Create a TLS key and certificate for this cluster, required on both sides of every connection."""
+    """Create a TLS key and a certificate for this cluster; every connection needs them at both ends."""
     from distributed import Security
 
     made = Security.temporary()  # type: ignore[no-untyped-call]
@@ -162,7 +161,7 @@ def _security(scratch: Path) -> Any:
 
 @contextlib.contextmanager
 def _scratch() -> Iterator[Path]:
-    """Yield a temporary folder of this process, and remove the folders of processes that were killed."""
+    """Yield a temporary folder of this process. Remove the folders that killed processes left behind."""
     _sweep()
     folder = Path(tempfile.mkdtemp(prefix=PREFIX))
     _scratch_folders.add(folder)
@@ -176,7 +175,6 @@ def _scratch() -> Iterator[Path]:
 
 
 def _remove(folder: Path) -> None:
-    """Remove a folder; retry while workers that were just starting still write into it."""
     for _ in range(REMOVALS):
         kill_workers()
         shutil.rmtree(folder, ignore_errors=True)
@@ -197,7 +195,7 @@ def _sweep() -> None:
 
 
 def _start_tracker() -> None:
-    """Start the process that removes semaphores of killed processes, without its warnings.
+    """Start the process that removes the semaphores of killed processes, and silence its warnings.
 
     Its purpose is to remove semaphores, so its warning about them helps nobody. The process must outlive a
     closing terminal, as it outlives Ctrl-C.
@@ -217,7 +215,7 @@ def _start_tracker() -> None:
 
 @contextlib.contextmanager
 def _signals_put_off() -> Iterator[None]:
-    """Delay SIGINT, SIGTERM and SIGHUP until the end of the context, and raise them there."""
+    """Delay SIGINT, SIGTERM and SIGHUP until the end of the context."""
     if threading.current_thread() is not threading.main_thread():
         yield  # signals are handled by the main thread alone
         return
@@ -237,7 +235,7 @@ def _signals_put_off() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _blocked(numbers: set[signal.Signals]) -> Iterator[None]:
-    """Block signals for this thread, and for threads and processes started inside the context."""
+    """Block signals for this thread, and for the threads and processes that it starts inside the context."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
     try:
         yield
@@ -247,7 +245,7 @@ def _blocked(numbers: set[signal.Signals]) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _hushed() -> Iterator[None]:
-    """Silence dask's log messages about connections inside the context. They stay silent if the code inside raises.
+    """Silence dask's log messages about connections inside the context, and for good if the code inside raises.
 
     dask logs some connections only after a cluster has closed.
     """
@@ -261,7 +259,7 @@ def _hushed() -> Iterator[None]:
 
 
 def kill_workers() -> None:
-    """End the workers at once, without waiting for their tasks."""
+    """Kill the worker processes at once, without waiting for their tasks."""
     for process in multiprocessing.active_children():
         if process.name.startswith("Dask Worker process"):
             with contextlib.suppress(ValueError):  # closed meanwhile
@@ -269,7 +267,7 @@ def kill_workers() -> None:
 
 
 def abandon() -> None:
-    """Kill the workers and remove their folders; called just before this process exits."""
+    """Kill the worker processes and remove their folders, just before this process exits."""
     kill_workers()
     for folder in list(_scratch_folders):
         _remove(folder)

@@ -1,4 +1,4 @@
-"""Decide which task comes next: predecessors first, long chains first, failed tasks alone at the end.
+"""Decide which task comes next: none before its predecessor, long chains first, failed tasks at the end.
 
 This module only keeps the books; it runs no task.
 """
@@ -22,7 +22,7 @@ Predecessor = Callable[[int], int | None]
 
 
 class TaskFailedError(Exception):
-    """Error of tasks that failed twice, or of too many failures; the message names tasks and reasons.
+    """Raised if tasks failed twice, or too many tasks failed; the message names the tasks and the reasons.
 
     Attributes
     ----------
@@ -56,7 +56,7 @@ def why(error: BaseException) -> str:
 
 
 class Order:
-    """Queue of tasks: each waits for its predecessor, and the start of the longest chain comes first.
+    """Queue of tasks. Each task waits for its predecessor, and tasks that begin long chains come first.
 
     Parameters
     ----------
@@ -108,15 +108,15 @@ class Order:
         return -self._chain.get(index, 0), index
 
     def take(self) -> int | None:
-        """Return a task that may start, or None if there is none now."""
+        """Remove a task that may start from the queue, and return it; None if there is none now."""
         return heapq.heappop(self._ready)[1] if self._ready else next(self._unseen, None)
 
     def take_failed(self) -> int | None:
-        """Return a failed task for its second try; None if there is none."""
+        """Remove a task that failed once, and return it for its second try; None if there is none."""
         return self._second.popleft() if self._second else None
 
     def done(self, index: int) -> None:
-        """Mark a task as done, so that the tasks that follow it may start."""
+        """Mark a task as done, so that the tasks that wait for it may start."""
         self._in_a_row = 0
         self._left -= 1
         self._failed.pop(index, None)
@@ -124,7 +124,7 @@ class Order:
             heapq.heappush(self._ready, self._key(follower))
 
     def failed(self, index: int, reason: str) -> None:
-        """Record a failed task for a second try after all others.
+        """Record that a task failed; it is tried again after all other tasks.
 
         Raises
         ------

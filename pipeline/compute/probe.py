@@ -28,7 +28,7 @@ _LATE_S, _AGAIN_S = 5.0, 0.2
 
 @cache
 def installation() -> dict[str, str]:
-    """Return the versions of Python and the packages installed here, and digests of magpend's own code."""
+    """Return the versions of Python and of the installed packages, and digests of magpend's own code."""
     from magpend_core.source_digests import kernel_version, meaning_digest
 
     pipeline = Path(__file__).parents[1]
@@ -44,7 +44,7 @@ def installation() -> dict[str, str]:
 
 
 def check_versions(client: Any, workers: Iterable[str]) -> None:
-    """Raise `SchedulerError` unless all workers have the same software versions as this process.
+    """Raise SchedulerError unless all workers have the same software versions as this process.
 
     Raises
     ------
@@ -74,7 +74,7 @@ def _difference(here: Mapping[str, str], there: Any) -> str:
 
 
 def check_directory(client: Any, workers: Iterable[str], place: str) -> None:
-    """Raise `SchedulerError` unless all workers see the run directory and can write to it.
+    """Raise SchedulerError unless all workers can read and write the run directory.
 
     All workers must read a temporary file there, so that another directory with the same name is detected.
 
@@ -101,7 +101,7 @@ def check_directory(client: Any, workers: Iterable[str], place: str) -> None:
 
 
 def sees(place: str, key: str, token: str) -> str:
-    """Return the reason why this process cannot use a run directory; empty if it can."""
+    """Return the reason why this process cannot use a run directory; an empty text if it can."""
     deadline = time.monotonic() + _LATE_S
     while True:
         try:
@@ -136,11 +136,11 @@ def _listed(problems: Mapping[str, str]) -> str:
 
 
 class MisfitError(Exception):
-    """Raised on a worker whose software differs from that of the process that submitted the task."""
+    """Raised on a worker that has other software versions than the process that sent the task."""
 
 
 class Fitting:
-    """A task that first checks that its worker has the same software as the process that submitted the task.
+    """Task that first checks whether its worker has the same software versions as the process that sent it.
 
     Parameters
     ----------
@@ -154,9 +154,7 @@ class Fitting:
         self.task, self.programs = task, programs or installation()
 
     def __call__(self, index: int) -> dict[str, Any]:
-        """Run the task; raise `MisfitError` if the worker's software versions differ from those of the submitting
-        process.
-        """
+        """Run the task; raise MisfitError if the worker has other software versions."""
         if why := _difference(self.programs, installation()):
             raise MisfitError(f"this worker has other programs ({why}); install the same versions everywhere")
         return self.task(index)

@@ -1,4 +1,4 @@
-"""Integrate cells under a recorded drive."""
+"""Integrate cells under a drive that was recorded in an experiment."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pipeline.specification.tables import Integration
 def under_recording(
     drive: RecordedDrive, inputs: Inputs, system: System, integration: Integration, quantities: Sequence[str] | None
 ) -> Sections:
-    """Integrate the cells of a sweep from the recording's start, and return their last section points.
+    """Integrate the cells of a sweep under a recorded drive, from its start, and return their last section points.
 
     Parameters
     ----------

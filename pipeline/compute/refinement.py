@@ -1,4 +1,4 @@
-"""Refine grids of initial conditions near basin boundaries; infer the attractor of cells well inside a basin.
+"""Integrate a grid of initial conditions only near basin boundaries, and infer the attractor of cells inside a basin.
 
 A tile of cells is cut into boxes by every `stride`-th cell of each dim, and its last. The cells at the
 corners of the boxes are integrated. Then, until nothing changes: a box stays as it is if all integrated
@@ -51,7 +51,7 @@ Integrate = Callable[[np.ndarray], Mapping[str, np.ndarray]]
 
 @dataclass
 class Orbits:
-    """The closed orbits found so far in a tile, numbered in the order of their discovery.
+    """Periodic orbits found so far in a block of cells, numbered in the order in which they were found.
 
     Attributes
     ----------
@@ -66,8 +66,7 @@ class Orbits:
     _known: list[tuple[np.ndarray, np.ndarray]] = field(default_factory=list)
 
     def classes(self, cells: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Return the number of each cell's closed orbit; -1 (`NO_ORBIT`) if it is not closed or its period exceeds the
-        kept points.
+        """Return the number of the periodic orbit on which each cell ends; -1 (`NO_ORBIT`) if it has not closed on one.
 
         Parameters
         ----------
@@ -96,9 +95,7 @@ class Orbits:
         return found
 
     def _on(self, sections: np.ndarray, points: np.ndarray) -> np.ndarray:
-        """Return for each sequence of section points whether it matches the points of a known orbit in some cyclic
-        order.
-        """
+        """Return which cells are on a known orbit: their section points are those of the orbit, in any cyclic order."""
         shifts = (np.roll(points, shift, axis=0) for shift in range(len(points)))
         near = [scaled_distance(sections, p, self.system).max(axis=1, initial=0.0) <= self.tolerance for p in shifts]
         return np.asarray(np.any(near, axis=0))
@@ -107,7 +104,8 @@ class Orbits:
 def infer(
     shape: tuple[int, ...], stride: int, integrate: Integrate, *, closure_tolerance: float, system: System
 ) -> dict[str, np.ndarray]:
-    """Return all variables of a block of initial conditions; integrate cells near basin boundaries, infer the others.
+    """Return all variables of a block of initial conditions. Only cells near basin boundaries are integrated; the
+    others are inferred.
 
     Parameters
     ----------
@@ -150,7 +148,8 @@ def infer(
 
 
 def refine(shape: tuple[int, ...], stride: int, classes_of: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-    """Choose the cells of a block to integrate, and for every other cell the integrated cell whose result it takes.
+    """Choose the cells of a block to integrate. Return for each cell the integrated cell from which it takes its
+    result.
 
     Parameters
     ----------
@@ -194,9 +193,7 @@ def _first_boxes(shape: tuple[int, ...], stride: int) -> np.ndarray:
 
 
 def _corners(boxes: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Return the flat indices of the corner cells of boxes, shape (box, corner); each box's lowest corner comes
-    first.
-    """
+    """Return the flat indices of the corner cells of boxes, shape (box, corner), the lowest corner first."""
     dims = range(len(shape))
     ends = itertools.product((0, 1), repeat=len(shape))
     at = [[boxes[:, e, i] for i, e in zip(dims, end, strict=True)] for end in ends]
@@ -204,7 +201,7 @@ def _corners(boxes: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def _halves(boxes: np.ndarray) -> np.ndarray:
-    """Halve each box of cells along every dim in which it has inner cells; both halves contain the cells on the cut."""
+    """Halve each box of cells along every dim in which it has inner cells; both halves have the cells on the cut."""
     for i in range(boxes.shape[2]):
         wide = boxes[:, 1, i] - boxes[:, 0, i] > 1
         lower, upper = boxes[wide].copy(), boxes[wide].copy()
@@ -214,7 +211,7 @@ def _halves(boxes: np.ndarray) -> np.ndarray:
 
 
 def _by_extent(boxes: np.ndarray, shape: tuple[int, ...]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Group boxes of cells by their size; yield each group's row numbers and the flat indices of its cells (box,
+    """Group boxes of cells by their size. Yield each group's row numbers, and the flat indices of its cells (box,
     cell).
     """
     first = np.ravel_multi_index(tuple(boxes[:, 0].T), shape)
@@ -226,7 +223,9 @@ def _by_extent(boxes: np.ndarray, shape: tuple[int, ...]) -> Iterator[tuple[np.n
 
 
 def _uniform(boxes: np.ndarray, known: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Return for each box whether all integrated cells in and beside it end on one orbit, so that it is not halved."""
+    """Return for each box whether all integrated cells in it and beside it end on one orbit, so that it need not be
+    halved.
+    """
     own = known[np.ravel_multi_index(tuple(boxes[:, 0].T), shape)]
     padded = np.pad(known.reshape(shape), 1, constant_values=NOT_COMPUTED)
     classes = padded.ravel()
@@ -238,7 +237,9 @@ def _uniform(boxes: np.ndarray, known: np.ndarray, shape: tuple[int, ...]) -> np
 
 
 def _sources(boxes: np.ndarray, known: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Return for each cell the cell whose result it takes: itself if it was integrated, else a corner of its box."""
+    """Return for each cell the cell from which it takes its result: itself if it was integrated, else a corner of its
+    box.
+    """
     source = np.arange(len(known))
     rest = known == NOT_COMPUTED
     source[rest] = len(known)

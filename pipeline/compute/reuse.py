@@ -1,4 +1,4 @@
-"""Copy cells (trajectories) with the same inputs from other runs, instead of integrating them.
+"""Copy cells (trajectories) from other runs that have cells with the same inputs, instead of integrating them again.
 
 A worker opens the runs that cells are taken from once. For each task it looks up which of its cells they
 hold, reads these from their committed chunks, compared with the records, and integrates the rest. What a run
@@ -41,7 +41,7 @@ ABSENT = (Status.PENDING, Status.INFERRED)
 
 @dataclass
 class Source:
-    """A run from which another run copies cells.
+    """An earlier run from which a new run copies cells.
 
     Attributes
     ----------
@@ -73,7 +73,7 @@ class Source:
         self._read = lru_cache(maxsize=2)(partial(read_block, self.run, names=tuple(self.names)))
 
     def find(self, inputs: Inputs, way: Way | None = None) -> np.ndarray:
-        """Find for each wanted cell the run's cell with the same inputs; return its flat index, -1 if none is stored.
+        """Return for each wanted cell the flat index of the cell with the same inputs in this run; -1 if it has none.
 
         In a refined grid some of these were inferred, which `take` leaves out.
         """
@@ -81,7 +81,9 @@ class Source:
         return np.where(self._is_committed[self._task(place)], place, NOWHERE)
 
     def take(self, place: np.ndarray) -> tuple[np.ndarray, Values]:
-        """Read stored cells of the run; return a mask of the usable ones (integrated, intact) and their variables."""
+        """Read stored cells of this run. Return which of them can be used (integrated and undamaged), and their
+        variables.
+        """
         taken = np.zeros(len(place), bool)
         values: Values = {}
         tasks = self._task(place)
@@ -102,8 +104,8 @@ class Source:
         return taken, {name: array[taken] for name, array in values.items()}
 
     def _task(self, place: np.ndarray) -> np.ndarray:
-        """Return the number of the task that contains each cell; a number beyond the last task for a cell not in the
-        run.
+        """Return the number of the task that contains each cell; for cells not in this run, a number beyond the last
+        task.
         """
         plan = self.run.plan
         steps = np.unravel_index(np.maximum(place, 0), plan.shape)
@@ -112,13 +114,12 @@ class Source:
         return np.where(place == NOWHERE, plan.n_tasks, tasks)
 
     def _inside(self, task: int, place: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Return the indices of cells relative to the first cell of their task's block."""
         steps = np.unravel_index(place, self.run.plan.shape)
         return tuple(step - s.start for step, s in zip(steps, self.run.plan.task(task), strict=True))
 
 
 def same_products(run: Run, wanted: Spec) -> list[str]:
-    """Return the products of a specification that a run has already computed with the same options and code."""
+    """Return those products of a specification that a run has already computed with the same options and code."""
     code = run.info.identity["code"]
     return [
         name
@@ -128,12 +129,11 @@ def same_products(run: Run, wanted: Spec) -> list[str]:
 
 
 def _module(product: str) -> str:
-    """Return the name of the module that computes a product, without the leading ``pipeline.``."""
     return CELL_PRODUCTS[product].compute.partition(":")[0].removeprefix("pipeline.")
 
 
 def obstacles(run: Run, wanted: Spec, identity: Mapping[str, Any]) -> list[str]:
-    """Return the reasons why another run cannot use a run's cells; empty if it can.
+    """Return the reasons why a new run cannot copy the cells of an earlier run; an empty list if it can.
 
     Parameters
     ----------
@@ -154,7 +154,7 @@ def obstacles(run: Run, wanted: Spec, identity: Mapping[str, Any]) -> list[str]:
 
 
 class Pool:
-    """Cells of a run that can be copied from other runs.
+    """Earlier runs from which a new run copies cells.
 
     Parameters
     ----------
@@ -169,7 +169,7 @@ class Pool:
         self.sources = [Source(run, spec) for run in runs]
 
     def count(self, inputs: Inputs, way: Way | None) -> list[int]:
-        """Count the cells that can be copied from each of the other runs."""
+        """Count the cells that can be copied from each earlier run."""
         counts, rest = [], np.arange(len(inputs.initial_states))
         for source in self.sources:
             place = source.find(inputs.take(rest), way)
@@ -182,7 +182,8 @@ class Pool:
         return counts
 
     def integrator(self, cells: CellMap, block: tuple[slice, ...], tally: list[int]) -> Integrate:
-        """Return a function that computes the cells of a block and copies known ones from other runs, bit for bit.
+        """Return a function that computes the cells of a block, and copies those that earlier runs have, with the same
+        bits.
 
         The numbers of cells that were taken are appended to `tally`.
         """
@@ -192,7 +193,7 @@ class Pool:
         return lambda spec, inputs: self._give(spec, inputs, cells.inputs(block), way, tally)
 
     def _give(self, spec: Spec, inputs: Inputs, begin: Inputs, way: Way | None, tally: list[int]) -> Values:
-        """Return the variables of branches: copied cells first, the rest of each branch continued or integrated."""
+        """Return the variables of branches. The first points of each branch are copied, and the rest is integrated."""
         values: Values = {}
         n_branches, n_points = inputs.frequency_hz.shape
         rest = np.arange(n_branches)
@@ -222,9 +223,7 @@ class Pool:
     def _go_on(
         self, spec: Spec, inputs: Inputs, source: Source, taken: np.ndarray, stored: Values
     ) -> tuple[np.ndarray, Values]:
-        """Integrate copied cells of a sweep further for more section points; return a mask of successes and the
-        variables.
-        """
+        """Integrate copied cells further for more section points. Return which cells succeeded, and their variables."""
         rows = np.flatnonzero(taken)
         points = {name: array[:, None] for name, array in stored.items()}
         is_exact, longer = kept_on(spec, inputs.take(rows), points, source.run.spec.integration.n_keep)
@@ -234,12 +233,11 @@ class Pool:
 
 
 def _leading(taken: np.ndarray) -> np.ndarray:
-    """Count the copied cells at the start of each branch, up to its first missing cell."""
+    """Count the copied cells of each branch from its start up to the first missing cell."""
     return np.asarray(np.cumprod(taken, axis=1).sum(axis=1))
 
 
 def _points(inputs: Inputs, part: slice) -> Inputs:
-    """Return the inputs of the parameter points `part` of each branch."""
     return replace(inputs, parameters=inputs.parameters[:, part], frequency_hz=inputs.frequency_hz[:, part])
 
 
@@ -251,7 +249,7 @@ def _put(values: Values, rows: np.ndarray, part: Mapping[str, np.ndarray], n: in
 
 
 def _products(spec: Spec, inputs: Inputs, values: Mapping[str, np.ndarray], names: Sequence[str]) -> Values:
-    """Compute the named products of cells whose section points and status are known."""
+    """Compute products of cells whose section points and status are known."""
     if not names:
         return {}
     no_turns = np.zeros((*inputs.frequency_hz.shape, 0), np.int32)
@@ -276,7 +274,7 @@ def _products(spec: Spec, inputs: Inputs, values: Mapping[str, np.ndarray], name
 
 @lru_cache(maxsize=2)
 def pool_of(directory: str, digest: str, sources: tuple[Origin, ...]) -> Pool:
-    """Open the runs from which a run copies cells, once per worker.
+    """Open the earlier runs from which a run copies cells, once per worker.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Compute the product ``rotation``: the rotation number of each cell of a task, from its last stored section point."""
+"""Compute the product ``rotation``: the rotation number of each cell, from its last section point onwards."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pipeline.products.rotation import ROTATION_VARIABLES, RotationFlag, Rotatio
 
 
 def rotation(job: Job, options: RotationOptions) -> dict[str, np.ndarray]:
-    """Return the variables `ROTATION_VARIABLES` (rotation number, error, flag) for the cells of a task.
+    """Compute the rotation numbers of the cells of a task, with their errors and quality flags.
 
     Parameters
     ----------
@@ -49,7 +49,7 @@ def rotation(job: Job, options: RotationOptions) -> dict[str, np.ndarray]:
 
 
 def flags(found: RotationNumbers) -> np.ndarray:
-    """Return a code of `RotationFlag` for each cell, shape (cell,)."""
+    """Return a quality flag (`RotationFlag`) for the rotation number of each cell."""
     flag = np.full(len(found.status), RotationFlag.GOOD, np.int8)
     flag[found.widest_turn > WIDEST_TURN] = RotationFlag.COARSE
     flag[found.status != Status.BOUNDED] = RotationFlag.FAILED

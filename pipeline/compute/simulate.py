@@ -40,7 +40,7 @@ CLOCK_HZ, FLOW_PERIODS = 1.0, 50
 
 @dataclass(frozen=True)
 class Series:
-    """Settings of a time series: transient and shown drive periods, samples per period, tolerances."""
+    """Settings of a time series: periods of the transient, periods shown, samples per period and tolerances."""
 
     n_transient: int
     n_periods: int | None
@@ -63,7 +63,7 @@ def simulate(
     rtol: float = RTOL,
     atol: float = ATOL,
 ) -> xr.Dataset:
-    """Integrate one trajectory, from time 0 at a section or from the start of a recorded drive.
+    """Integrate one trajectory under the model's own or a recorded drive, and return it as a labelled time series.
 
     Parameters
     ----------
@@ -131,7 +131,7 @@ def simulate(
 def _recording(
     drive: str | Path | None, frequency_hz: float | None, model: Model, series: Series, problems: list[str]
 ) -> RecordedDrive | None:
-    """Load the recorded drive, if one is given; append problems with it or with the frequency to `problems`."""
+    """Read the recorded drive, if one is given. Problems with it, or with the frequency, are appended to `problems`."""
     if drive is None:
         if frequency_hz is None or not (math.isfinite(frequency_hz) and frequency_hz > 0):
             problems.append(f"frequency_hz = {frequency_hz!r}: must be a finite number greater than 0.")
@@ -156,7 +156,6 @@ def _recording(
 
 
 def _at_frequency(parameters: Parameters, frequency_hz: float, state: np.ndarray, series: Series) -> xr.Dataset:
-    """Integrate a trajectory under the model's own drive at a fixed frequency."""
     from magpend_core import evaluate, trajectory
 
     n, samples = series.n_periods or DEFAULT_PERIODS, series.samples_per_period
@@ -178,9 +177,7 @@ def _at_frequency(parameters: Parameters, frequency_hz: float, state: np.ndarray
 
 
 def _closing(sections: np.ndarray, parameters: Parameters, series: Series) -> dict[str, Any]:
-    """Return dataset attributes on whether the motion has settled on a closed orbit; empty if there are too few section
-    points.
-    """
+    """Return dataset attributes that say whether the trajectory has closed on a periodic orbit."""
     found = closing_of(sections[-LOOKED_AT:], parameters.model.system)
     if found is None:
         return {}
@@ -188,7 +185,6 @@ def _closing(sections: np.ndarray, parameters: Parameters, series: Series) -> di
 
 
 def _under_recording(parameters: Parameters, drive: RecordedDrive, state: np.ndarray, series: Series) -> xr.Dataset:
-    """Integrate a trajectory under a recorded drive, from the start of the recording."""
     from magpend_core.recorded_drive import evaluate_recorded, recorded_trajectory
 
     marks = np.append(drive.start_s, drive.sections_s)
@@ -210,7 +206,7 @@ def _under_recording(parameters: Parameters, drive: RecordedDrive, state: np.nda
 def _labelled(
     parameters: Parameters, time: np.ndarray, clock: str, states: np.ndarray, values: np.ndarray
 ) -> xr.Dataset:
-    """Build the dataset of a time series: states and quantities with names and units, and the parameters."""
+    """Build the dataset of a time series: states and quantities with their names and units, and the parameters."""
     import xarray as xr
 
     model = parameters.model
@@ -229,7 +225,7 @@ def _labelled(
 
 
 def start_of(model: str | Model, given: Mapping[str, float]) -> tuple[float, ...]:
-    """Return a model's initial state from values by name; angles and rates may be in degrees.
+    """Return the initial state of a model from values by name; names ending in ``_deg`` take degrees.
 
     Parameters
     ----------
@@ -288,7 +284,7 @@ def _problems(series: Series) -> list[str]:
 
 
 def check_output(path: Path) -> None:
-    """Raise `SpecError` if a time series cannot be written to a path."""
+    """Raise SpecError if a time series cannot be written to a path."""
     if path.suffix.lower() not in SUFFIXES:
         raise SpecError([f"{path}: the suffix must be one of {', '.join(SUFFIXES)}."])
     if not path.parent.is_dir():
@@ -296,7 +292,7 @@ def check_output(path: Path) -> None:
 
 
 def write_series(ds: xr.Dataset, path: Path) -> Path:
-    """Write a time series as CSV (names with units, 17 digits) or as NetCDF, depending on the file's suffix."""
+    """Write a time series as CSV or NetCDF; the suffix of the file decides."""
     check_output(path)
     if path.suffix.lower() == ".nc":
         write_netcdf(path, ds)

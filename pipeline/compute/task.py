@@ -1,4 +1,4 @@
-"""Compute one task: integrate a block of cells and commit it to the store.
+"""Compute one task of a run: integrate a block of cells, and commit the results to the store.
 
 A task is named by the run directory, the run's digest and its index; it reads the rest from
 ``run.json``. Its result is a small dict; the numbers go straight to the store.
@@ -32,7 +32,7 @@ from pipeline.store.task_cells import read_cells
 
 @lru_cache(maxsize=4)
 def _prepare(directory: str, digest: str, origin: tuple[str, str] | None) -> tuple[RunInfo, Spec, Plan, CellMap]:
-    """Read a run once per worker; raise `RefusedError` if the magpend installed on the worker would compute other
+    """Read the run that a task belongs to, once per worker; raise RefusedError if this worker would compute other
     results.
     """
     if origin is not None:
@@ -57,7 +57,7 @@ def compute(
     before: Mapping[str, np.ndarray] | None = None,
     integrate: Integrate = integrate,
 ) -> dict[str, np.ndarray]:
-    """Return all variables of a block of cells, in the block's shape.
+    """Compute all variables of a block of cells, and return them in the block's shape.
 
     Parameters
     ----------
@@ -131,7 +131,7 @@ def run_task(
 
 
 def _left(info: RunInfo, plan: Plan, cells: CellMap, index: int) -> dict[str, Any]:
-    """Read the final states in which the preceding task left this task's branches; empty if the branches begin in this
+    """Read the states in which the preceding task left the branches of this task; an empty dict if there is no such
     task.
     """
     predecessor = plan.predecessor(index)
@@ -150,7 +150,9 @@ def _taking(
     block: tuple[slice, ...],
     taken: list[int],
 ) -> dict[str, Any]:
-    """Return ``{"integrate": ...}``, a function that copies cells from other runs; an empty dict without such runs."""
+    """Return arguments for `compute`: a function ``integrate`` that copies cells from other runs, or none if there are
+    no such runs.
+    """
     if not sources:
         return {}
     from pipeline.compute.reuse import pool_of
@@ -159,7 +161,7 @@ def _taking(
 
 
 def warm_up(spec: Spec) -> float:
-    """Compile the kernel that the run needs into the compile cache and return the seconds it took.
+    """Compile the functions that a run needs into the compile cache; return the time that this took [s].
 
     One process compiles, so that workers find the machine code instead of each making it: what they
     will do is done here for a single cell over no more than a few periods.

@@ -1,4 +1,4 @@
-"""Draw figures of a cube: from an xarray Dataset to a matplotlib Figure.
+"""Draw figures of a run's results: from an xarray Dataset to a matplotlib Figure.
 
 No module here opens a store or uses pyplot. Figures are plain objects, so any thread can make them, and no
 display is needed. `draw_figure` draws any figure of a run by name. `Frame` holds the size of a figure and the

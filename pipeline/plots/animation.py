@@ -1,4 +1,4 @@
-"""Draw films of motions: the model's mechanical drawing beside its phase portraits.
+"""Draw films of motions: the model's drawing, and phase portraits beside it.
 
 The background is drawn once, and only the moving artists are drawn anew. So a frame takes a few milliseconds.
 """
@@ -41,7 +41,7 @@ Pixels = npt.NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class Animation:
-    """A film whose frames are drawn on demand.
+    """A film, whose frames are drawn when they are needed.
 
     Attributes
     ----------
@@ -66,9 +66,7 @@ class Animation:
 
     @property
     def summary(self) -> str:
-        """Describe the film in text: frames, length [s], model time covered [s, drive periods], speed relative to real
-        time.
-        """
+        """Return a text on the film: its frames, its length, and how much faster or slower than reality it runs."""
         data = self.figure.data
         shown, frequencies = float(data["time"][-1]), np.unique(data["drive_frequency"].values)
         told = f"{shown:.4g} s of the model"
@@ -78,7 +76,7 @@ class Animation:
         return f"{self.n_frames} frames, {self.n_frames / self.fps:.3g} s: {told}"
 
     def frames(self) -> Iterator[Pixels]:
-        """Yield the frames one after the other as RGB images, shape (height, width, 3)."""
+        """Draw the frames one after another, and yield them as RGB images (height, width, 3)."""
         canvas: Any = FigureCanvasAgg(self.figure)
         with style.TEXT_LOCK:
             canvas.draw()
@@ -94,7 +92,7 @@ class Animation:
 
 
 def plot_animation(ds: xr.Dataset, *, degrees: bool = False, portrait: str = "", size: int = 800) -> Animation:
-    """Lay out an animation that shows one or more motions side by side.
+    """Lay out a film that shows one or more motions side by side.
 
     Parameters
     ----------
@@ -149,9 +147,7 @@ def plot_animation(ds: xr.Dataset, *, degrees: bool = False, portrait: str = "",
 
 
 def portraits_of(model: Model, portrait: str, n: int, degrees: bool = False) -> tuple[tuple[str, str], ...]:
-    """Return the state pairs whose phase portraits are drawn for each of `n` motions; raise ValueError on invalid
-    options.
-    """
+    """Return the pairs of states whose phase portraits a film of `n` motions shows; ValueError on invalid options."""
     labels.some_angle(model, degrees, "animations")
     if portrait:
         found = tuple(pair for pair in model.portraits if portrait in pair)
@@ -169,7 +165,7 @@ Box = tuple[float, float, float, float]
 
 @dataclass(frozen=True)
 class _Plan:
-    """Panel positions [in] of a film frame: several motions in columns, or the panels of one motion side by side."""
+    """Positions of the panels of a film's frame [in]."""
 
     n: int
     n_pairs: int
@@ -214,14 +210,12 @@ class _Plan:
 
     @property
     def row(self) -> float:
-        """Return the height of a row of motions [in]."""
         if self.n == 1:
             return self.drawing + self.above
         return self.above + self.drawing + self.n_pairs * (self.portrait + self.below)
 
     @property
     def foot(self) -> float:
-        """Return the height of the text line at the foot of a frame [in]."""
         return self.below if self.n == 1 else 0.5 * self.below
 
     @property
@@ -231,7 +225,9 @@ class _Plan:
         return 2 * round(whole * SCREEN_DPI / 2) / SCREEN_DPI
 
     def boxes(self, k: int) -> list[Box]:
-        """Return the panel rectangles of a motion: its mechanical drawing if it has one, then its phase portraits."""
+        """Return the rectangles of the panels of motion `k`: the model's drawing if it has one, then phase
+        portraits.
+        """
         return [self._box(*inches) for inches in (self._single() if self.n == 1 else self._column(k))]
 
     def _single(self) -> list[Box]:
@@ -263,7 +259,6 @@ class _Plan:
 
 
 def _title(fig: style.DataFigure, plan: _Plan, box: Box, text: str) -> None:
-    """Write a motion's name above its panels, shortened to fit the panels' width."""
     room = plan.width / plan.columns - 0.2
     lines = style.folded(text, room, fig.look.legend).split("\n")
     short = lines[0] if len(lines) == 1 else lines[0].rstrip(",:") + " \N{HORIZONTAL ELLIPSIS}"

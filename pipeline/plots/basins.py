@@ -1,4 +1,4 @@
-"""Draw basins of attraction: colour each initial state of a grid by the attractor that it ends on."""
+"""Draw basins of attraction: each initial state has the colour of the attractor on which it ends."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def plot_basins(
     n_periods: xr.DataArray | None = None,
     frame: style.Frame = style.WIDE,
 ) -> style.DataFigure:
-    """Draw the basins of attraction on a plane of initial states, a colour per attractor.
+    """Draw the basins of attraction in a plane of initial states, with one colour per attractor.
 
     Parameters
     ----------
@@ -91,7 +91,6 @@ def plot_basins(
 
 
 def _write_letters(ax: Axes, codes: np.ndarray, cast: palette.Cast) -> None:
-    """Write the letter of each attractor into the visible part of its basin."""
     left, right, bottom, top = ax.get_images()[0].get_extent()
     row, column = (
         np.clip(((np.arange(400) + 0.5) / 400 * (b - a) + a - low) / (high - low) * n, 0, n - 1).astype(int)
@@ -104,7 +103,7 @@ def _write_letters(ax: Axes, codes: np.ndarray, cast: palette.Cast) -> None:
 
 
 def _axes(attractors: xr.Dataset, at: Mapping[str, float] | None) -> tuple[str, str]:
-    """Return the dims of the two axes of the image: horizontal, vertical."""
+    """Return the dims of the image's horizontal and vertical axis; ValueError unless two are left."""
     dims = start_dims(attractors)
     grid = [grid_dim(name) for name in model_of(attractors).state_names if grid_dim(name) in dims]
     if len(grid) < 2:
@@ -128,7 +127,9 @@ def _axes(attractors: xr.Dataset, at: Mapping[str, float] | None) -> tuple[str, 
 def _codes(
     data: xr.Dataset, part: xr.Dataset, axes: tuple[str, str], cast: palette.Cast
 ) -> tuple[np.ndarray, dict[int, int]]:
-    """Return the colour code of each cell (an attractor id or a negative code), and the number of cells per code."""
+    """Return the colour code of each cell (an attractor id, or a negative code), and the number of cells of each
+    code.
+    """
     ids, dims = np.maximum(data["outcome"].values, -1), part["attractor_id"].dims
     table = np.full(len(cast.names) + 1, _OTHERS, np.int32)
     table[list(cast.main)] = cast.main
@@ -143,7 +144,7 @@ def _codes(
 
 
 def _colour_table(cast: palette.Cast) -> np.ndarray:
-    """Return the RGB colour of each code, shape (codes, 3). Attractor ids come first, and negative codes index from the
+    """Return the RGB colour of each code, shape (codes, 3). Attractor ids come first; negative codes count from the
     end.
     """
     greys = list(reversed(palette.GREYS.values()))
@@ -165,14 +166,13 @@ def _painted(
 
 
 def _timed(data: xr.Dataset, part: xr.Dataset) -> np.ndarray:
-    """Return a mask of the cells whose convergence time is known: integrated, and ended on a periodic orbit."""
+    """Return which cells have a known convergence time: those that were integrated and ended on a periodic orbit."""
     closed = np.append(part["kind"].values == PERIODIC_ORBIT, False)
     ids = np.maximum(data["outcome"].values, -1)
     return np.asarray(closed[ids] & (data["status"].values != INFERRED))
 
 
 def _scale(data: xr.Dataset, part: xr.Dataset) -> LogNorm | None:
-    """Return the logarithmic scale of convergence times (1st to 99th percentile); None if there are no times."""
     if "n_periods" not in data:
         return None
     times = data["n_periods"].values[_timed(data, part)]
@@ -185,7 +185,6 @@ def _scale(data: xr.Dataset, part: xr.Dataset) -> LogNorm | None:
 def _extent(
     data: xr.Dataset, attractors: xr.Dataset, axes: tuple[str, str], degrees: bool
 ) -> tuple[float, float, float, float]:
-    """Return the limits of the image: the outer edges of the outermost cells."""
     x, y = (
         labels.start_measure(attractors, d, degrees).shown(style.edges(data[d].values.astype(np.float64))) for d in axes
     )
@@ -193,7 +192,6 @@ def _extent(
 
 
 def _is_square(data: xr.Dataset, attractors: xr.Dataset, axes: tuple[str, str]) -> bool:
-    """Return whether both axes have the same unit and equally long ranges."""
     left, right, bottom, top = _extent(data, attractors, axes, False)
     units = {labels.start_measure(attractors, d).unit for d in axes}
     return len(units) == 1 and bool(np.isclose(right - left, top - bottom, rtol=0.02))
@@ -208,9 +206,6 @@ def _dress(ax: Axes, attractors: xr.Dataset, axes: tuple[str, str], degrees: boo
 
 
 def _entries(cast: palette.Cast, counts: Mapping[int, int], total: int) -> list[tuple[str, str]]:
-    """Return the legend entries: attractors by falling share, then minor attractors, then cells without an
-    attractor.
-    """
     own = sorted((i for i in counts if i >= 0), key=lambda i: (-counts[i], i))
     entries = [(f"{cast.names[i]}, {palette.percent(counts[i] / total)}", cast.colours[i]) for i in own]
     if _OTHERS in counts:
@@ -223,7 +218,6 @@ def _entries(cast: palette.Cast, counts: Mapping[int, int], total: int) -> list[
 
 
 def _draw_scale(fig: style.DataFigure, ax: Axes, scale: LogNorm, periods: str) -> None:
-    """Draw a colour bar below the image: the shade of each convergence time."""
     ramp = LinearSegmentedColormap.from_list("time", [(0.85,) * 3, (0.85 * (1.0 - _DARKEST),) * 3])
     bar = fig.colorbar(ScalarMappable(scale, ramp), ax=ax, orientation="horizontal", shrink=0.6, aspect=24, pad=0.02)
     bar.outline.set_linewidth(style.LINE_PT)
@@ -236,7 +230,6 @@ def _draw_scale(fig: style.DataFigure, ax: Axes, scale: LogNorm, periods: str) -
 
 
 def _stored(data: xr.Dataset, part: xr.Dataset, cast: palette.Cast) -> xr.Dataset:
-    """Return the data to store with the figure: the cells drawn, and the names of the attractors."""
     stored = data.reset_coords(drop=True).assign(share=part["share"].variable)
     stored = stored.assign_coords(attractor=part["attractor"].variable, name=("attractor", list(cast.names.values())))
     scalars = {k: v for k, v in part.coords.items() if v.ndim == 0 and v.dtype.kind == "f"}

@@ -1,4 +1,4 @@
-"""Draw bifurcation diagrams: stored section points over the swept parameter, coloured by class of motion.
+"""Draw bifurcation diagrams: section points over the swept parameter, coloured by class of motion.
 
 The cube is read block by block, twice: first for the range of the points and the shares of absent cells,
 then for the points. So memory does not grow with the cube.
@@ -37,7 +37,7 @@ def plot_bifurcation(
     at: Mapping[str, float] | None = None,
     frame: style.Frame = style.WIDE,
 ) -> style.DataFigure:
-    """Draw stored section points over the swept parameter, coloured by class of motion.
+    """Draw the bifurcation diagram of a run: its section points over the swept parameter, coloured by class of motion.
 
     Everything is read from the cube; nothing is integrated. The model's classifier defines the classes of
     motion; without a classifier, all points have one colour. Where cells are pending, diverged, failed or
@@ -115,9 +115,7 @@ class Diagram:
         at: Mapping[str, float] | None = None,
         frame: style.Frame = style.WIDE,
     ) -> Diagram:
-        """Make the bifurcation diagram of a cube. The cube is read once to find the ranges. The arguments are those of
-        `plot_bifurcation`.
-        """
+        """Prepare the bifurcation diagram of a result cube, with the arguments of `plot_bifurcation`."""
         if quantity and state:
             raise ValueError(f"a diagram is drawn of a state or of a quantity; drop {state!r} or {quantity!r}")
         part = at_points(ds, at)
@@ -143,21 +141,21 @@ class Diagram:
 
     @property
     def layers(self) -> tuple[int, ...]:
-        """Return the indices of all layers: one layer per direction of continuation."""
+        """Indices of the directions of continuation (up, down) that the diagram shows; one index for a sweep."""
         return tuple(range(len(self.view.layers)))
 
     @property
     def caption(self) -> str:
-        """Return the caption: the fixed values of all axes except the swept parameter."""
+        """Caption of the diagram: the values of all axes that are not drawn."""
         return labels.caption(self.view.ds, drop=[self.parameter])
 
     @property
     def with_strip(self) -> bool:
-        """Return whether some cells have no points to draw; a strip below the diagram then shows their share."""
+        """Whether a strip below the diagram is needed, which shows the share of cells without points."""
         return any(counts.any() for counts in self.survey.absent.values())
 
     def dress(self, ax: Axes) -> None:
-        """Set limits, ticks and vertical label of the diagram on given axes."""
+        """Set the limits, the ticks and the vertical label of axes for the diagram."""
         style.style_axes(ax)
         style.limits(ax, self.frame, style.span(self.x), self._heights())
         labels.angle_ticks(ax, self.measure)
@@ -178,7 +176,7 @@ class Diagram:
         return low - margin, high + margin
 
     def handles(self, *, layers: bool = True, absent: bool = True) -> list[Any]:
-        """Return legend handles for classes of motion, directions of continuation and absent cells."""
+        """Return the legend's entries for classes of motion, directions of continuation and cells without points."""
         motions, kinds = self.view.motions, {code for _, code in self.survey.classes}
         found: list[Any] = []
         if motions.told:
@@ -189,7 +187,7 @@ class Diagram:
         return found + (absent_handles(self.survey) if absent else [])
 
     def draw(self, panels: Sequence[pixels.Panel]) -> xr.Dataset:
-        """Draw the points into axes whose positions are final, and return the data drawn."""
+        """Draw the points into axes that have their final positions, and return the drawn data."""
         width = 72.0 * self.frame.width_in * 0.88 / len(panels)
         left, right = panels[0].ax.get_xlim()
         shown = int(np.count_nonzero((self.x >= min(left, right)) & (self.x <= max(left, right))))
@@ -208,14 +206,14 @@ class Diagram:
 
 
 def with_diagram(data: xr.Dataset, drawn: xr.Dataset) -> xr.Dataset:
-    """Add the data of a bifurcation diagram to the data of a figure, under names that end in ``_diagram``."""
+    """Add the drawn data of a bifurcation diagram to the data of a figure, under names that end in ``_diagram``."""
     drawn = drawn.drop_vars([c for c in drawn.coords if c in data.variables or c in data.dims])
     renamed = drawn.rename({str(n): f"{n}_diagram" for n in (*drawn.data_vars, *drawn.dims)})
     return data.merge(renamed).assign_attrs(data.attrs)
 
 
 def fixed_of(ds: xr.Dataset) -> dict[str, Any]:
-    """Return the scalar coordinates of a dataset with floating-point values, by name."""
+    """Return the scalar coordinates of a dataset that are floating-point numbers, by name."""
     return {str(k): v.variable for k, v in ds.coords.items() if not v.ndim and v.dtype.kind == "f"}
 
 
@@ -225,7 +223,7 @@ def _section(ds: xr.Dataset, state: str, degrees: bool) -> tuple[Measure, Any]:
 
 
 def _extreme(ds: xr.Dataset, quantity: str, degrees: bool) -> tuple[Measure, Any]:
-    """Return the label data (`Measure`) for an extreme such as ``NAME.max``, and a function that reads its values."""
+    """Return the axis label of an extreme such as ``NAME.max``, and a function that reads its values."""
     if "extremes" not in ds:
         wanted = quantity.rpartition(".")[0] or quantity
         raise ValueError(
@@ -243,12 +241,12 @@ def _extreme(ds: xr.Dataset, quantity: str, degrees: bool) -> tuple[Measure, Any
 
 
 def swept_parameters(ds: xr.Dataset) -> list[str]:
-    """Return the swept parameters of a cube."""
+    """Return the names of the swept parameters of a result cube."""
     return list(split_dims(ds["status"])[0])
 
 
 def swept_parameter(ds: xr.Dataset) -> str:
-    """Return the one swept parameter of a cube; raise ValueError if there is none or more than one."""
+    """Return the one swept parameter of a result cube; raise ValueError if there are several or none."""
     outer = swept_parameters(ds)
     long = [dim for dim in outer if ds.sizes[dim] > 1]
     if len(long) > 1:
@@ -264,9 +262,6 @@ def swept_parameter(ds: xr.Dataset) -> str:
 
 
 def _layers(names: Sequence[str], layout: str) -> list[tuple[int, ...]]:
-    """Return the layers (directions of continuation) of each panel. Raise ValueError if the cube lacks a direction that
-    layout ``side`` needs.
-    """
     if layout == "overlay":
         return [tuple(range(len(names)))]
     if len(names) < 2:
@@ -278,7 +273,7 @@ def _layers(names: Sequence[str], layout: str) -> list[tuple[int, ...]]:
 
 
 def _panels(fig: style.DataFigure, diagram: Diagram, layers: Sequence[tuple[int, ...]]) -> list[pixels.Panel]:
-    """Make one panel per group of layers: axes for the diagram, and a strip for the share of absent cells."""
+    """Make the diagram's panels. Each has axes for the points and, if needed, a strip for cells without points."""
     strip = diagram.with_strip
     grid = fig.add_gridspec(2 if strip else 1, len(layers), height_ratios=[1.0, 0.08] if strip else None)
     panels: list[pixels.Panel] = []

@@ -48,7 +48,7 @@ def plot_branches(
     at: Mapping[str, float] | None = None,
     frame: style.Frame = style.WIDE,
 ) -> style.DataFigure:
-    """Draw the section points of periodic orbits over a parameter: stable orbits solid, unstable ones dashed.
+    """Draw branches of periodic orbits over a parameter by their section points: stable solid, unstable dashed.
 
     All bifurcations are marked. Where a stable orbit appears or disappears, the name and period (for example
     PD1) stand beside the curves if there is room.
@@ -98,14 +98,12 @@ def plot_branches(
 def _below(
     cube: xr.Dataset | None, measure: Measure, degrees: bool, at: Mapping[str, float] | None, frame: style.Frame
 ) -> Diagram | None:
-    """Return the bifurcation diagram to draw under the branches, or None without a cube."""
     if cube is None:
         return None
     return Diagram.of(cube, state=measure.name, degrees=degrees, at=at, frame=frame)
 
 
 def _dress(ax: Axes, frame: style.Frame, measure: Measure) -> None:
-    """Set style, limits and ticks of the axes for a figure without a bifurcation diagram."""
     style.style_axes(ax)
     ax.margins(y=0.08)
     style.limits(ax, frame)
@@ -113,13 +111,11 @@ def _dress(ax: Axes, frame: style.Frame, measure: Measure) -> None:
 
 
 def _chosen(ds: xr.Dataset, max_period: int | None) -> list[int]:
-    """Return the indices of the branches whose orbit period is at most `max_period`."""
     periods = ds["orbit_period"].values.tolist()
     return [i for i, period in enumerate(periods) if max_period is None or period <= max_period]
 
 
 def _draw_lines(ax: Axes, ds: xr.Dataset, chosen: list[int], measure: Measure, scale: bool) -> list[_Name]:
-    """Draw branches and mark their bifurcations; return the bifurcations' labels."""
     for i in chosen:
         for x, y, stable in pieces(ds, i, measure):
             ax.plot(x, y, scalex=scale, scaley=scale, **(_STABLE if stable else _UNSTABLE))
@@ -127,7 +123,7 @@ def _draw_lines(ax: Axes, ds: xr.Dataset, chosen: list[int], measure: Measure, s
 
 
 def _stored(ds: xr.Dataset) -> xr.Dataset:
-    """Return the branch data without variables and attributes of types that NetCDF cannot store."""
+    """Drop from the branches' dataset what NetCDF cannot store."""
     plain = {k: v for k, v in ds.attrs.items() if isinstance(v, str | int | float | np.ndarray)}
     return ds.drop_vars([k for k, v in ds.variables.items() if v.dtype == object]).assign_attrs(
         {**plain, "title": "branches of periodic orbits"}
@@ -135,8 +131,8 @@ def _stored(ds: xr.Dataset) -> xr.Dataset:
 
 
 def pieces(ds: xr.Dataset, branch: int, measure: Measure) -> Iterator[tuple[np.ndarray, np.ndarray, bool]]:
-    """Yield polylines of a branch, one for each section point of the orbit and each stretch of equal stability. A line
-    is cut where an angle wraps.
+    """Yield the lines of a branch to draw: one for each section point and each range of equal stability, cut where an
+    angle wraps.
     """
     n = int(ds["n_points"][branch])
     period = max(int(ds["orbit_period"][branch]), 1)
@@ -165,7 +161,7 @@ def pieces(ds: xr.Dataset, branch: int, measure: Measure) -> Iterator[tuple[np.n
 
 @dataclass(frozen=True)
 class _Name:
-    """A label at a bifurcation: its text, its position, and the range of the orbit's section points there."""
+    """Label of a bifurcation: its text, its place, and the range of the orbit's section points there."""
 
     period: int
     x: float
@@ -175,7 +171,7 @@ class _Name:
 
 
 def _mark(ax: Axes, ds: xr.Dataset, chosen: list[int], measure: Measure, scale: bool) -> list[_Name]:
-    """Draw markers at bifurcations. Return labels for those at which a stable orbit appears or disappears."""
+    """Draw markers at bifurcations. Return labels for those where a stable orbit appears or disappears."""
     names = []
     size = 3.4 if style.figure_of(ax).frame.compact else 4.5
     for k in range(ds.sizes["bifurcation"]):
@@ -206,8 +202,8 @@ def _mark(ax: Axes, ds: xr.Dataset, chosen: list[int], measure: Measure, scale: 
 
 
 def _name(ax: Axes, names: list[_Name]) -> None:
-    """Write labels where they cover neither lines nor other labels, and join each label to its bifurcation by a thin
-    line.
+    """Write labels of bifurcations where they cover neither lines nor other labels, each with a thin line to its
+    bifurcation.
 
     Short periods come first. A label without room nearby is left out; its marker remains.
     """
@@ -243,7 +239,7 @@ def _name(ax: Axes, names: list[_Name]) -> None:
 
 
 def _ink(drawn: Line2D, points: float) -> np.ndarray:
-    """Return positions [pt] spaced about 3 pt along a plotted line, or the marker positions if no line is drawn."""
+    """Return positions along a drawn line, some 3 pt apart, which labels must not cover."""
     line = drawn.get_transform().transform(np.asarray(drawn.get_xydata(), dtype=np.float64)) * points
     line = line[np.isfinite(line).all(axis=1)]
     if len(line) < 2 or drawn.get_linestyle() == "None":
@@ -264,7 +260,7 @@ def _free(
     taken: list[np.ndarray],
     bounds: np.ndarray,
 ) -> np.ndarray | None:
-    """Return the free position [pt] nearest to an anchor for a text of a given size; None if there is no room."""
+    """Return the nearest free place [pt] for a text of a given size beside a point; None if there is none."""
     half = 0.5 * np.asarray(size)
     for distance in (9.0, 14.0, 20.0, 28.0, 38.0):
         for angle in (0.0, 0.6, -0.6, 1.1, -1.1):

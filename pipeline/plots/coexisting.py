@@ -1,4 +1,4 @@
-"""Draw the section points of all coexisting attractors over the swept parameter, a colour per attractor."""
+"""Draw the section points of all coexisting attractors over the swept parameter, with one colour per attractor."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def plot_coexisting(
     hysteresis: xr.Dataset | None = None,
     frame: style.Frame = style.WIDE,
 ) -> style.DataFigure:
-    """Draw the section points of all attractors over the swept parameter.
+    """Draw the section points of all attractors of a run over the swept parameter.
 
     Parameters
     ----------
@@ -90,7 +90,7 @@ def plot_coexisting(
 
 
 def _points(part: xr.Dataset, parameter: str, measure: labels.Measure) -> xr.Dataset:
-    """Return the section values to draw, with each attractor's basin share and stability."""
+    """Return the section points to draw, with the basin fraction and the stability of each attractor."""
     values = part["attractor_points"].sel(state=measure.name, drop=True)
     values = values.transpose(parameter, "attractor", "point")
     shown = values.copy(data=measure.shown(values.values, wrap=True))
@@ -119,9 +119,7 @@ def _points(part: xr.Dataset, parameter: str, measure: labels.Measure) -> xr.Dat
 
 
 def _loops(found: xr.Dataset, part: xr.Dataset, parameter: str) -> list[tuple[float, float]]:
-    """Return the parameter limits of the hysteresis loops at the chosen values of the other parameters. Each loop is
-    widened by half a step at both ends.
-    """
+    """Return the parameter limits of the hysteresis loops at the chosen values of the other parameters."""
     axis = part[parameter].values.astype(np.float64)
     edges = style.edges(axis)
     here = np.ones(found.sizes["loop"], bool)
@@ -137,7 +135,9 @@ def _loops(found: xr.Dataset, part: xr.Dataset, parameter: str) -> list[tuple[fl
 
 
 def _spread(one: xr.Dataset, parameter: str, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return an attractor's points as three arrays: parameter value, plotted value, index of the parameter value."""
+    """Return the chosen points of an attractor as arrays: parameter value, drawn value, index of the parameter
+    value.
+    """
     values = one["value"].transpose(parameter, "point").values
     row, column = np.nonzero(np.isfinite(values) & chosen[:, None])
     return one[parameter].values[row].astype(np.float64), values[row, column], row
@@ -152,9 +152,7 @@ def _draw_weighted(ax: Axes, one: xr.Dataset, parameter: str, cast: palette.Cast
 
 
 def _draw_others(ax: Axes, data: xr.Dataset, parameter: str) -> None:
-    """Draw the section points of invariant sets at parameter values where they do not attract, in a grey that shows
-    their stability.
-    """
+    """Draw the section points of sets that do not attract, in a grey for each kind of stability."""
     for code, grey in palette.GREY_OF.items():
         chosen = (data["stability"].values == code)[..., None] & np.isfinite(data["value"].values)
         row, *_ = np.nonzero(chosen)
@@ -179,14 +177,11 @@ def _word(stability: int) -> str:
 
 
 def _diameter(share: Any) -> Any:
-    """Return the diameter of a point [pt]; its area grows with the basin fraction that the point stands for."""
     return np.sqrt(_LEAST_PT**2 + _GROWTH_PT**2 * np.asarray(share))
 
 
 def _draw_directions(ax: Axes, one: xr.Dataset, parameter: str, cast: palette.Cast) -> None:
-    """Draw an attractor's points for both directions of continuation: small dark points over large light points, so
-    that both stay visible.
-    """
+    """Draw an attractor's points for both directions of continuation: small dark ones over large light ones."""
     number = int(one["attractor"])
     for word in one["direction"].values[::-1]:
         chosen = (one["present"].sel(direction=word).values > 0) & (one["stability"].values == ATTRACTS)

@@ -1,4 +1,4 @@
-"""Draw the convergence of Lyapunov exponents: a few cells as lines, many as quantile bands."""
+"""Draw how Lyapunov exponents converge in time: few cells as lines, many as bands of quantiles."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def plot_convergence(
     at: Mapping[str, float] | None = None,
     frame: style.Frame = style.WIDE,
 ) -> style.DataFigure:
-    """Draw the convergence of the Lyapunov exponents of all cells at one parameter point.
+    """Draw how the Lyapunov exponents of all cells at one parameter point converge in time.
 
     Parameters
     ----------
@@ -102,7 +102,7 @@ def plot_convergence(
 
 
 def _convergence(ds: xr.Dataset, exponent: int, per: str, at: Mapping[str, float] | None) -> xr.Dataset:
-    """Return the exponents to draw over time at one parameter point, with the dims `cell` and `period`."""
+    """Return the Lyapunov exponents to draw over time at one parameter point, with the dims `cell` and `period`."""
     part = select_points(ds, at, purpose="convergence is drawn at one parameter point")
     dims, starts = split_dims(part["status"])
     summary = summarise(part)
@@ -135,7 +135,6 @@ def _convergence(ds: xr.Dataset, exponent: int, per: str, at: Mapping[str, float
 
 
 def _own(data: xr.Dataset, kind: Motion) -> np.ndarray:
-    """Return the indices of the cells of a given class of motion that have a Lyapunov exponent."""
     return np.flatnonzero((data["motion"].values == kind) & np.isfinite(data["exponent_value"].values))
 
 
@@ -175,7 +174,7 @@ def _draw_running(ax: Axes, final: Axes, data: xr.Dataset) -> list[Any]:
 
 
 def _draw_final(final: Axes, data: xr.Dataset, own: np.ndarray, rank: np.ndarray, colour: str) -> None:
-    """Draw the final exponents with their standard errors over their rank. Omit the errors if there are many cells."""
+    """Draw the final exponents of cells over their rank, with standard errors unless there are many cells."""
     value, error = data["exponent_value"].values, data["exponent_stderr"].values
     flagged = data["lyapunov_flag"].values[own] > GOOD
     many = data.sizes["cell"] > 4 * MOST_LINES
@@ -208,7 +207,7 @@ def _draw_final(final: Axes, data: xr.Dataset, own: np.ndarray, rank: np.ndarray
 
 
 def _draw_cells(ax: Axes, data: xr.Dataset, variable: str, kind: Motion, colour: str) -> None:
-    """Draw the exponents of cells of one class of motion over time, as lines or as quantile bands about the median."""
+    """Draw the exponents of the cells of one class of motion over time, as lines or as bands of quantiles."""
     own = _own(data, kind)
     if not own.size:
         return

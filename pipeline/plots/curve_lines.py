@@ -1,4 +1,4 @@
-"""Draw bifurcation curves over the panels of a map, and mark their points of codimension two."""
+"""Draw bifurcation curves over panels that show a parameter plane, and mark their points of codimension two."""
 
 from __future__ import annotations
 
@@ -40,9 +40,7 @@ ROOM = (0.045, 0.045)
 
 
 def take_room(ax: Axes, at: tuple[float, float], taken: list[np.ndarray]) -> bool:
-    """Return whether a short name at a position would overlap none of the names placed before. If so, add its position
-    to `taken`.
-    """
+    """Reserve the place of a short name on axes. Return False if it would overlap a name already placed."""
     (left, right), (bottom, top) = ax.get_xlim(), ax.get_ylim()
     here = np.array([(at[0] - left) / (right - left), (at[1] - bottom) / (top - bottom)])
     if any((np.abs(here - other) < ROOM).all() for other in taken):
@@ -52,7 +50,7 @@ def take_room(ax: Axes, at: tuple[float, float], taken: list[np.ndarray]) -> boo
 
 
 def draw_over(fig: style.DataFigure, axes: Sequence[Axes], ds: xr.Dataset, x: str) -> None:
-    """Draw bifurcation curves in black over the panels of a map whose horizontal axis is the parameter `x`.
+    """Draw bifurcation curves in black over panels that show a parameter plane, whose horizontal axis is `x`.
 
     Points of codimension two have their names if there is one panel; several are too small.
     """
@@ -78,13 +76,13 @@ def draw_over(fig: style.DataFigure, axes: Sequence[Axes], ds: xr.Dataset, x: st
 
 
 def line_note(ds: xr.Dataset) -> str:
-    """Return a text that says which line style stands for which kind of bifurcation."""
+    """Return a text on which line style stands for which kind of bifurcation."""
     present = {KINDS[int(kind)] for kind in ds["kind"].values}
     return ", ".join(f"{_STYLE_NAMES[kind]} {NAMES[kind]}" for kind in _ON_MAP if kind in present)
 
 
 def mark_points(ax: Axes, ds: xr.Dataset, along: str, across: str, size: float, named: bool = True) -> None:
-    """Mark the points of codimension two on axes with dots and, if `named`, with short names such as CP and R1.
+    """Mark points of codimension two by dots and, if `named`, by short names such as CP (cusp) and R1.
 
     A name that would lie over another one is left out.
     """

@@ -1,4 +1,4 @@
-"""Draw two-parameter bifurcation curves and their points of codimension two, alone or over a map of regimes."""
+"""Draw bifurcation curves in the plane of two parameters, alone or over a regime map of this plane."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _COLOURS = dict(zip(KINDS[:4], (style.BLUE, style.VERMILLION, style.GREEN, style
 
 
 def plot_curves(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.DataFigure:
-    """Draw two-parameter bifurcation curves.
+    """Draw bifurcation curves and points of codimension two in the plane of two parameters.
 
     Parameters
     ----------
@@ -63,7 +63,7 @@ def plot_curves(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.Dat
 
 
 def draw(run: Run, options: CurveFigureOptions) -> style.DataFigure:
-    """Draw the figure ``curves`` of a run, alone or over the map of another run."""
+    """Draw the figure ``curves`` of a run, alone or over the regime map of another run."""
     found = run.derive("curves", **options.part(CurveOptions))
     if not options.over:
         return plot_curves(found, frame=frame_of(options))

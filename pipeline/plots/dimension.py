@@ -15,7 +15,7 @@ from pipeline.products.figures import DimensionFigureOptions
 
 
 def plot_dimension(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.DataFigure:
-    """Draw the correlation sum over the radius, with the fit and the local slope.
+    """Draw the correlation sum of an attractor over the radius, with the fitted line and the local slope.
 
     Parameters
     ----------
@@ -84,7 +84,7 @@ def plot_dimension(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.
 
 
 def _of_one_attractor(ds: xr.Dataset) -> xr.Dataset:
-    """Select the attractor with the most cells, among those with a correlation sum."""
+    """Select the attractor with the most cells, among those that have a correlation sum."""
     if "attractor" not in ds["correlation_dimension"].dims:
         return ds
     others = [d for d in ds["n_points"].dims if d != "attractor"]
@@ -95,14 +95,12 @@ def _of_one_attractor(ds: xr.Dataset) -> xr.Dataset:
 
 
 def _scales(ds: xr.Dataset) -> str:
-    """Return a text with the scale of each unit's states, for example ``1 for 1 rad, 10 rad/s``."""
     model = model_of(ds)
     units = {s.unit: s.scale for s in model.states}
     return "1 for " + ", ".join(f"{scale:g}" + (f" {unit}" if unit != "1" else "") for unit, scale in units.items())
 
 
 def _draw_fit(top: Axes, bottom: Axes, data: xr.Dataset) -> None:
-    """Draw the fitted line and the range of radii used in the fit."""
     fit = tuple(float(data[name]) for name in ("fit_low", "fit_high"))
     if not np.isfinite(fit).all():
         return
@@ -127,7 +125,7 @@ def _draw_fit(top: Axes, bottom: Axes, data: xr.Dataset) -> None:
 
 
 def _correlation(ds: xr.Dataset) -> xr.Dataset:
-    """Return the radii, the share of point pairs within each radius, and the slope between neighbouring radii."""
+    """Return the correlation sum over the radius, and its local slope, as the data of the figure."""
     dims = [str(d) for d in ds["correlation_dimension"].dims]
     one = ds.isel(dict.fromkeys(dims, 0))
     x, y = one["log_radius"].values, one["log_correlation_sum"].values

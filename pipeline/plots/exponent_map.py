@@ -1,4 +1,4 @@
-"""Draw the map of the largest Lyapunov exponent over two parameters."""
+"""Draw the largest Lyapunov exponent as colours in the plane of two swept parameters."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _SHOWN = 0.98
 def plot_lyapunov_map(
     ds: xr.Dataset, *, per: str = "s", at: Mapping[str, float] | None = None, frame: style.Frame = style.WIDE
 ) -> style.DataFigure:
-    """Draw the largest Lyapunov exponent over two swept parameters as a map.
+    """Draw the largest Lyapunov exponent as colours in the plane of two swept parameters.
 
     Parameters
     ----------
@@ -97,9 +97,7 @@ def _draw_map(fig: style.DataFigure, ax: Axes, data: xr.Dataset, part: xr.Datase
 
 
 def _scale(grid: np.ndarray) -> tuple[Normalize, str]:
-    """Return a colour scale symmetric about 0, and the ends at which it cuts values off: ``neither``, ``min``, ``max``,
-    ``both``.
-    """
+    """Return a colour scale that is symmetric about 0, and a word for the ends at which values lie outside it."""
     known = grid[np.isfinite(grid)]
     most = float(np.abs(known).max(initial=0.0))
     half = float(np.quantile(np.abs(known), _SHOWN)) if known.size else 1.0

@@ -1,4 +1,4 @@
-"""Read Lyapunov exponents from a cube, for the figures that show them."""
+"""Read Lyapunov exponents from a run's result cube, for the figures that show them."""
 
 from __future__ import annotations
 
@@ -16,9 +16,7 @@ UNITS = ("s", "period")
 
 
 def left_out(part: xr.Dataset) -> str:
-    """Return a text with the number of cells without a Lyapunov exponent, by reason. The text is empty if every cell
-    has an exponent.
-    """
+    """Return a text on how many cells have no Lyapunov exponent, and why; an empty text if all have one."""
     status = part["status"]
     missing = part["lyapunov"].isel(exponent=0, drop=True).isnull().transpose(*status.dims)
     counts = {name: int((missing & status.isin(codes)).sum()) for name, codes in ABSENT.items()}
@@ -28,7 +26,7 @@ def left_out(part: xr.Dataset) -> str:
 
 
 def demand(ds: xr.Dataset) -> None:
-    """Raise ValueError if a cube has no Lyapunov exponents."""
+    """Raise ValueError if a result cube has no Lyapunov exponents."""
     if "lyapunov" not in ds:
         raise ValueError(
             "the cube has no Lyapunov exponents; run it with [products] lyapunov = {} in its specification"
@@ -36,7 +34,7 @@ def demand(ds: xr.Dataset) -> None:
 
 
 def exponent_values(part: xr.Dataset, per: str, spectrum: bool) -> xr.Dataset:
-    """Return Lyapunov exponents and errors per second or per period, with quality flags and classes of motion."""
+    """Return the Lyapunov exponents and their errors per second or per period, with flags and classes of motion."""
     scale = period_seconds(part) if per == "period" else xr.DataArray(1.0)
     chosen = part if spectrum else part.isel(exponent=slice(1))
     dims = chosen["lyapunov"].dims
@@ -59,6 +57,6 @@ def exponent_values(part: xr.Dataset, per: str, spectrum: bool) -> xr.Dataset:
 
 
 def rate_unit(data: xr.Dataset) -> str:
-    """Return the unit of Lyapunov exponents for an axis label."""
+    """Return the unit of the Lyapunov exponents, for an axis label."""
     per = str(data["exponent_value"].attrs["per"])
     return "1/s" if per == "unit time" else f"1/{per.split()[-1]}"

@@ -1,4 +1,4 @@
-"""Draw a figure of a run: `draw_figure`, and the helpers that every ``draw`` function needs.
+"""Draw a figure of a run by its name, with helpers for the ``draw`` functions of all figures.
 
 Each figure of `pipeline.products.registry` names a function ``draw(run, options)`` of this package. It
 reads ``run.cube()`` and ``run.derive(name, **options)``, and hands numbers to a ``plot_...`` function,
@@ -22,11 +22,11 @@ from pipeline.products.registry import FIGURES
 
 
 class Run(Protocol):
-    """Protocol for the parts of a run that figures use; see `pipeline.runs.derive.AnalysedRun`."""
+    """The parts of a run that figures use: its record, its result cube and its analyses."""
 
     @property
     def info(self) -> Any:
-        """Return the content of ``run.json``."""
+        """Return the record of the run (``run.json``)."""
 
     @property
     def digest(self) -> str:
@@ -34,20 +34,20 @@ class Run(Protocol):
 
     @property
     def echo(self) -> Callable[[str], None]:
-        """Return the function that prints a line of text for the user."""
+        """Return the function that prints a line for the user."""
 
     def of(self, source: str) -> Run:
         """Open another run by its source, such as a run directory."""
 
     def cube(self, chunks: Any = None) -> xr.Dataset:
-        """Return the cube of the run's cells as a dataset."""
+        """Return the result cube of the run as a dataset."""
 
     def derive(self, name: str, **options: Any) -> xr.Dataset:
-        """Return the result of a named analysis of the run."""
+        """Return the result of an analysis of the run, computed now or read if it is stored."""
 
 
 def draw_figure(run: Run, name: str, options: FigureOptions) -> DataFigure:
-    """Draw a figure of a run by name, and add its provenance to the figure's data.
+    """Draw a figure of a run by the figure's name, and record in its data where they come from.
 
     Parameters
     ----------
@@ -78,13 +78,13 @@ def draw_figure(run: Run, name: str, options: FigureOptions) -> DataFigure:
 
 
 def request(name: str, options: Options) -> dict[str, Any]:
-    """Return the request stored with a figure: its name, and the options that differ from their defaults."""
+    """Return what identifies a figure: its name, and the options that differ from their defaults."""
     wanted = {key: value for key, value in options.changed().items() if key not in ("out", "format")}
     return {"figure": name, "options": wanted}
 
 
 def run_provenance(run: Run) -> dict[str, Any]:
-    """Return the provenance of a run's data: source, title, digests, versions."""
+    """Return where a run's data come from: source, title, digests and versions."""
     info, attrs = run.info, run.cube().attrs
     found: dict[str, Any] = {
         "source": str(attrs.get("source", "magpend")),
@@ -98,12 +98,12 @@ def run_provenance(run: Run) -> dict[str, Any]:
 
 
 def frame_of(options: FigureOptions) -> Frame:
-    """Return the figure's width and axis ranges from the options."""
+    """Return the width and the axis ranges of a figure from its options."""
     return Frame(options.width, options.xlim, options.ylim)
 
 
 def values_of(run: Run, options: FigureOptions | AnimationOptions) -> tuple[dict[str, float], list[str]]:
-    """Return the axis values to draw at, and notes where they differ from the requested values.
+    """Return the axis values at which a figure is drawn, and notes where they differ from the options.
 
     Raises
     ------
@@ -136,9 +136,7 @@ def noted(figure: DataFigure, notes: list[str]) -> DataFigure:
 
 
 def attractors_of(run: Run, options: Options) -> xr.Dataset:
-    """Return the attractors of a run, matched along its parameter axes with the options of the analysis
-    ``attractors``.
-    """
+    """Return the attractors of a run, with ids that stay the same along its parameters."""
     from pipeline.products.attractors import AttractorOptions
 
     return run.derive("attractors", **options.part(AttractorOptions))

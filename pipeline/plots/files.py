@@ -1,4 +1,4 @@
-"""Write figures to files: the picture and the data it shows, both with their provenance."""
+"""Write figures to files, and the data that they show beside them, both with their provenance."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _SETTINGS: dict[str, Any] = {"svg.hashsalt": "magpend", "svg.fonttype": "none", 
 
 
 def save_figure(fig: Figure, path: str | Path) -> Path:
-    """Write a figure as PNG, PDF or SVG, chosen by the suffix of the path.
+    """Write a figure as PNG, PDF or SVG; the suffix of the path decides.
 
     The file holds no time stamp of its own and no random identifier: the same figure gives the same bytes
     with the same version of matplotlib. Texts of PDF and SVG stay texts; PDF embeds the fonts as outlines.
@@ -69,7 +69,7 @@ def save_figure(fig: Figure, path: str | Path) -> Path:
 
 
 def save_data(fig: DataFigure, path: str | Path) -> Path:
-    """Write the data of a figure as NetCDF, next to the figure's file and with the suffix ``.nc``.
+    """Write the data of a figure as NetCDF beside the figure's file, with the suffix ``.nc``.
 
     Empty variables are left out, because NetCDF reads a dim of length 0 as an unlimited one.
     """
@@ -80,7 +80,7 @@ def save_data(fig: DataFigure, path: str | Path) -> Path:
 
 
 def with_provenance(ds: xr.Dataset, provenance: Mapping[str, Any]) -> xr.Dataset:
-    """Return a dataset with its provenance added to the attributes; values other than text or numbers become JSON."""
+    """Add provenance to the attributes of a dataset. Values other than text or numbers become JSON."""
     plain = {
         key: value if isinstance(value, str | int | float) else json.dumps(value, sort_keys=True)
         for key, value in provenance.items()
@@ -89,7 +89,6 @@ def with_provenance(ds: xr.Dataset, provenance: Mapping[str, Any]) -> xr.Dataset
 
 
 def _metadata(attrs: Mapping[Any, Any], suffix: str) -> dict[str, Any]:
-    """Return the metadata of a figure file under the keys that its format defines."""
     title, source = str(attrs.get("title", "")), str(attrs.get("source", "magpend"))
     rest = {k: v for k, v in attrs.items() if isinstance(v, str | int | float) and k not in ("title",)}
     about = "; ".join(f"{key}: {value}" for key, value in rest.items()).replace("\n", ", ")
@@ -103,7 +102,7 @@ def _metadata(attrs: Mapping[Any, Any], suffix: str) -> dict[str, Any]:
 
 
 def _save_vectors(fig: Figure, buffer: io.BytesIO, options: dict[str, Any]) -> None:
-    """Save a figure as PDF or SVG, with text kept as text and with reproducible identifiers.
+    """Write a figure as PDF or SVG, such that text remains text and equal figures have equal bytes.
 
     matplotlib reads these options from its shared settings only. The keys are set while the lock is held;
     all others stay unchanged.

@@ -1,4 +1,4 @@
-"""Write films to files: GIF and WebP by Pillow, MP4 by ffmpeg where it is installed."""
+"""Write films to files: GIF and WebP by Pillow, MP4 by ffmpeg if it is installed."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ PALETTE_FRAMES, PALETTE_COLOURS = 8, 96
 
 
 def film_problems(path: Path, fps: float) -> list[str]:
-    """Return the reasons why a film cannot be written to a path. Call this before anything is drawn."""
+    """Return the reasons why a film cannot be written to a path, before anything is drawn."""
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         return [f"{path}: the suffix must be one of {', '.join(SUFFIXES)}."]
@@ -40,7 +40,7 @@ def film_problems(path: Path, fps: float) -> list[str]:
 
 
 def save_animation(film: Animation, path: str | Path) -> Path:
-    """Write a film as GIF, WebP or MP4, chosen by the suffix of the path.
+    """Write a film as GIF, WebP or MP4; the suffix of the path decides.
 
     GIF and WebP loop for ever. The file appears only when it is complete; an existing file is replaced.
 
@@ -78,7 +78,6 @@ def save_animation(film: Animation, path: str | Path) -> Path:
 
 
 def _about(film: Animation) -> str:
-    """Return the metadata text of a film file."""
     attrs = film.figure.data.attrs
     return "magpend; " + "; ".join(
         f"{k}: {v}" for k, v in attrs.items() if k in ("title", "source", "run", "cube_digest")
@@ -86,7 +85,7 @@ def _about(film: Animation) -> str:
 
 
 def durations(n: int, fps: float, grain_ms: int) -> list[int]:
-    """Return the duration of each frame [ms]: multiples of `grain_ms` whose sum is the film's length."""
+    """Return the duration of each frame of a film [ms]: multiples of `grain_ms` that add up to the film's length."""
     ends = np.round(np.arange(n + 1) * (1000.0 / fps / grain_ms)).astype(int)
     return [int(d) * grain_ms for d in np.diff(ends)]
 
@@ -104,13 +103,12 @@ def _webp(film: Animation, path: Path) -> None:
 
 
 def _save(film: Animation, path: Path, images: Iterator[Image.Image], grain_ms: int, **options: Any) -> None:
-    """Write images as a film that loops for ever, by Pillow."""
     duration = durations(film.n_frames, film.fps, grain_ms)
     next(images).save(path, save_all=True, append_images=images, loop=0, duration=duration, **options)
 
 
 def _palette(film: Animation) -> Image.Image:
-    """Return one colour palette for all frames, computed from a sample of them."""
+    """Compute one colour palette for all frames, from a sample of the frames."""
     chosen = np.unique(np.linspace(0, film.n_frames - 1, PALETTE_FRAMES).astype(int))
     frames = np.vstack([f for k, f in enumerate(islice(film.frames(), int(chosen[-1]) + 1)) if k in chosen])
     inked = frames[(frames != 255).any(axis=-1)]

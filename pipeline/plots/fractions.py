@@ -28,7 +28,7 @@ _BAR: dict[str, Any] = {"linewidth": 0.7, "color": "black"}
 def plot_fractions(
     attractors: xr.Dataset, *, at: Mapping[str, float] | None = None, frame: style.Frame = style.WIDE
 ) -> style.DataFigure:
-    """Draw the share of the initial states that end on each attractor, over the swept parameter.
+    """Draw the fraction of the initial states that end on each attractor, as stacked bands over the swept parameter.
 
     Parameters
     ----------
@@ -76,7 +76,7 @@ def plot_fractions(
 
 
 def swept_parameter(attractors: xr.Dataset, at: Mapping[str, float] | None, what: str) -> str:
-    """Return the one swept parameter that `at` does not fix; raise ValueError unless there is exactly one."""
+    """Return the one swept parameter that `at` does not fix; raise ValueError if there are several or none."""
     dims = parameter_dims(attractors)
     left = [d for d in dims if d not in (at or {})]
     long = [d for d in left if attractors.sizes[d] > 1]
@@ -94,7 +94,9 @@ def swept_parameter(attractors: xr.Dataset, at: Mapping[str, float] | None, what
 
 
 def _fractions(part: xr.Dataset, parameter: str, cast: palette.Cast) -> xr.Dataset:
-    """Return, per parameter value, the basin fraction of each attractor and the share of cells without an attractor."""
+    """Return the basin fraction of each attractor, and the share of cells without an attractor, at each parameter
+    value.
+    """
     n = part.sizes[parameter]
     ids = outcomes(part).transpose(parameter, ...).values.reshape(n, -1)
     kinds, others = list(palette.GREYS), palette.other_cells(part)
@@ -126,7 +128,6 @@ def _fractions(part: xr.Dataset, parameter: str, cast: palette.Cast) -> xr.Datas
 
 
 def _about(data: xr.Dataset) -> str:
-    """Describe the number of cells per parameter value and the width of the confidence intervals in text."""
     n = int(data["n_cells"].max())
     if "low" not in data:
         return f"{n} branches each"
@@ -137,7 +138,7 @@ def _about(data: xr.Dataset) -> str:
 
 @dataclass(frozen=True)
 class _Band:
-    """A stacked band: name, colour, height at each parameter value, and attractor id (-1 for none)."""
+    """One of the stacked bands: name, colour, height at each parameter value, and attractor id (-1 for none)."""
 
     name: str
     colour: str
@@ -146,7 +147,7 @@ class _Band:
 
 
 def _bands(data: xr.Dataset, cast: palette.Cast) -> list[_Band]:
-    """Return the bands from the bottom up: attractors by falling share, minor attractors, cells without an
+    """Return the bands from the bottom up: attractors by falling basin fraction, then minor ones, then cells without an
     attractor.
     """
     share = data["fraction"].values
@@ -187,7 +188,7 @@ def _write_letters(ax: Axes, data: xr.Dataset, parameter: str, bands: Sequence[_
 
 
 def _draw_intervals(ax: Axes, data: xr.Dataset, parameter: str, bands: Sequence[_Band]) -> None:
-    """Draw the binomial interval of the upper edge of each band. Intervals of one column stand side by side."""
+    """Draw the confidence interval of the upper edge of each band, side by side."""
     limits = style.edges(data[parameter].values.astype(np.float64))
     n = data["n_cells"].values
     floor = np.zeros(n.size)
@@ -205,7 +206,7 @@ def _draw_intervals(ax: Axes, data: xr.Dataset, parameter: str, bands: Sequence[
 def _raster(
     edges: np.ndarray, codes: np.ndarray, heights: np.ndarray, xlim: tuple[float, float], ylim: tuple[float, float]
 ) -> np.ndarray:
-    """Return the attractor id at each pixel of a 300 x 300 image of the bands, bottom row first; -1 for none."""
+    """Return an image of the bands that has the attractor id at each pixel, bottom row first; -1 for none."""
     place = (np.arange(300) + 0.5) / 300
     x, y = (low + place * (high - low) for low, high in (xlim, ylim))
     column = np.clip(np.searchsorted(edges, x) - 1, 0, heights.shape[1] - 1)

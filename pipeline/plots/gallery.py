@@ -1,4 +1,6 @@
-"""Draw all attractors of one parameter point: phase portraits, and the path of a point of the mechanical drawing."""
+"""Draw all attractors of one parameter point, with their phase portraits and the path of a point of the model's
+drawing.
+"""
 
 from __future__ import annotations
 
@@ -31,8 +33,7 @@ _PATH_IN = 0.14
 def plot_gallery(
     attractors: xr.Dataset, portraits: xr.Dataset, *, degrees: bool = False, frame: style.Frame = style.WIDE
 ) -> style.DataFigure:
-    """Draw each attractor of one parameter point: its phase portraits, and the path of a point of the mechanical
-    drawing.
+    """Draw each attractor of one parameter point: its phase portraits, and the path of a point of the model's drawing.
 
     Parameters
     ----------
@@ -86,11 +87,7 @@ def plot_gallery(
 
 @dataclass(frozen=True)
 class _Layout:
-    """Panel positions [in] of a gallery: attractors side by side in rows, several panels for each.
-
-    The last panel of each attractor is a path if the model has a `drawing`. Above all panels stand
-    `lines` lines of text and a legend.
-    """
+    """Positions of the panels of a gallery [in]: attractors side by side in rows, with several panels for each."""
 
     frame: style.Frame
     rows: int
@@ -128,7 +125,6 @@ class _Layout:
         return _LINE_IN * (self.lines + 1) + 0.08 + self.rows * self.row
 
     def axes(self, fig: style.DataFigure, k: int, column: int) -> Axes:
-        """Make the axes of one panel of the k-th attractor."""
         width, height = self.panel
         x = self.left + ((k % self.beside) * self.each + column) * self.pitch
         if self.drawing and column == self.each - 1:
@@ -142,13 +138,11 @@ class _Layout:
 
 
 def _described(attractors: xr.Dataset, portraits: xr.Dataset) -> xr.Dataset:
-    """Select the attractors at the portraits' parameter point."""
     at = {d: float(portraits[d]) for d in attractors["kind"].dims if d in portraits.coords and d != "attractor"}
     return attractors.sel(at)
 
 
 def _title(one: xr.Dataset, cast: palette.Cast, layout: _Layout) -> str:
-    """Return the name and basin share of an attractor, broken into lines that fit its panels."""
     attracts = int(one["stability"]) == ATTRACTS
     share = f", share {palette.percent(float(one['share']))}" if attracts else ""
     room, size = layout.each * layout.pitch - layout.left, style.look_at(layout.frame).legend
@@ -182,13 +176,11 @@ def _draw_one(
 
 
 def _parameters(one: xr.Dataset) -> dict[str, float]:
-    """Return the parameter values at which a phase portrait was computed."""
     values = parameters_of(one).as_dict()
     return {name: float(one[name]) if name in one.coords else value for name, value in values.items()}
 
 
 def _told(data: xr.Dataset, portraits: xr.Dataset, here: xr.Dataset) -> str:
-    """Return a text with the parameter values of the gallery, and the number of attractors and cells not drawn."""
     text = labels.caption(portraits.assign_attrs(data.attrs), with_start=False)
     if (rest := portraits.sizes["attractor"] - data.sizes["attractor"]) > 0:
         share = palette.percent(float(portraits["share"].sum() - data["share"].sum()))
@@ -222,7 +214,7 @@ def _fixed_handles(data: xr.Dataset, shown: set[str]) -> list[Any]:
 
 
 def draw(run: Run, options: AttractorFigureOptions) -> style.DataFigure:
-    """Draw the figure ``gallery`` of a run; this integrates the motions for the portraits."""
+    """Draw the figure ``gallery`` of a run; the motion on each attractor is integrated for it."""
     from pipeline.analysis.attractors.describing.portraits import portraits
 
     at, notes = values_of(run, options)

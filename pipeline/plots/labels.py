@@ -1,4 +1,4 @@
-"""Build axis labels and captions: symbols and units of states, parameters and fixed values.
+"""Make axis labels and captions from the symbols and units of states, parameters and quantities.
 
 Names, symbols and units come from the model and from the dataset's coordinates; none is hard-coded here.
 """
@@ -28,8 +28,7 @@ _PI_STEPS = tuple(0.125 * 2**k for k in range(24))
 
 @dataclass(frozen=True)
 class Measure:
-    """Axis measure of a state or quantity: its symbol, its drawn unit, and the factor that converts values to this
-    unit.
+    """Presentation of a state or quantity on an axis: its symbol, its unit, and the factor to this unit.
 
     Attributes
     ----------
@@ -52,22 +51,22 @@ class Measure:
 
     @property
     def label(self) -> str:
-        """Return the axis label: symbol and unit."""
+        """Label of the axis: symbol and unit."""
         return with_unit(self.symbol, self.unit)
 
     @property
     def half_turn(self) -> float:
-        """Return half a turn in the drawn unit."""
+        """Half a turn in the unit of the axis."""
         return math.pi * self.factor
 
     def shown(self, values: np.ndarray, *, wrap: bool = False) -> np.ndarray:
-        """Convert values to the drawn unit; with `wrap`, wrap angles to [-pi, pi) first."""
+        """Convert values to the unit of the axis; with `wrap`, wrap angles to [-pi, pi) first."""
         folded = wrapped(values) if wrap and self.on_circle else values
         return np.asarray(folded * self.factor if self.factor != 1.0 else folded)
 
 
 def with_unit(name: str, unit: str) -> str:
-    """Return an axis label of name and unit, without a unit for dimensionless numbers."""
+    """Return an axis label from a name and a unit; the unit is left out if it is 1."""
     return name if unit in ("", "1") else f"{name} [{raised(unit)}]"
 
 
@@ -77,7 +76,7 @@ def raised(unit: str) -> str:
 
 
 def state_measure(ds: xr.Dataset, state: str = "", degrees: bool = False) -> Measure:
-    """Return the axis measure (symbol, unit, factor) of a state of a dataset.
+    """Return how a state is shown on an axis: its symbol, its unit and the factor to this unit.
 
     Parameters
     ----------
@@ -101,9 +100,7 @@ def state_measure(ds: xr.Dataset, state: str = "", degrees: bool = False) -> Mea
 
 
 def quantity_measure(ds: xr.Dataset, name: str, degrees: bool = False) -> Measure:
-    """Return the axis measure (symbol, unit, factor) of a model's quantity or state; raise ValueError if it is
-    unknown.
-    """
+    """Return how a quantity of the model is shown on an axis; raise ValueError if the model has none of this name."""
     model = model_of(ds)
     if name in model.state_names:
         return state_measure(ds, name, degrees)
@@ -123,7 +120,7 @@ def _measure(name: str, symbol: str, unit: str, degrees: bool, on_circle: bool) 
 
 
 def start_measure(ds: xr.Dataset, dim: str, degrees: bool = False) -> Measure:
-    """Return the axis measure (symbol, unit, factor) of a state's initial values; `degrees` affects angles only."""
+    """Return how the initial value of a state is shown on an axis."""
     model = model_of(ds)
     one = model.state(dim.removesuffix("_0"))
     return _measure(
@@ -136,7 +133,7 @@ def start_measure(ds: xr.Dataset, dim: str, degrees: bool = False) -> Measure:
 
 
 def some_angle(model: Model, degrees: bool, what: str) -> None:
-    """Raise ValueError if `degrees` is set for a model without angles."""
+    """Raise ValueError if degrees are requested for a model without angles."""
     if degrees and not any(s.unit.startswith("rad") for s in model.states):
         raise ValueError(f"{what} of {model.name} have no angle; draw them without degrees")
 
@@ -147,16 +144,14 @@ def wrapped(angle: np.ndarray) -> np.ndarray:
 
 
 def on_circle(angle: np.ndarray, *others: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Wrap an angle to [-pi, pi). NaN is inserted at each jump, in the angle and in the other arrays."""
+    """Wrap an angle to [-pi, pi), and insert NaN where it jumps, in the angle and in the other arrays."""
     folded = wrapped(angle)
     jumps = np.flatnonzero(np.abs(np.diff(folded)) > math.pi) + 1
     return tuple(np.insert(values, jumps, np.nan) for values in (folded, *others))
 
 
 def angle_ticks(ax: Axes, measure: Measure, axis: str = "y", most: float | None = None) -> None:
-    """Set round ticks on an angle axis: simple multiples of pi for wide ranges in radians, and steps such as 15 or 30
-    for degrees.
-    """
+    """Set round ticks on the axis of an angle: fractions of pi in radians, or steps such as 30 in degrees."""
     if not measure.on_circle:
         return
     low, high = ax.get_ylim() if axis == "y" else ax.get_xlim()
@@ -169,7 +164,6 @@ def angle_ticks(ax: Axes, measure: Measure, axis: str = "y", most: float | None 
 
 
 def _step(span: float, most: float, steps: Sequence[float]) -> float:
-    """Return the smallest of the given steps that divides a span into at most `most` intervals, else the last step."""
     return next((step for step in steps if span / step <= most), steps[-1])
 
 
@@ -181,7 +175,7 @@ def _set_step(ax: Axes, axis: str, step: float, formatter: Formatter | None) -> 
 
 
 def pi_fraction(value: float, _position: int | None = None) -> str:
-    """Write a multiple of pi/8 as a fraction of pi."""
+    """Format an angle, a multiple of pi/8, as a fraction of pi."""
     eighths = round(8.0 * value / math.pi)
     if eighths == 0:
         return "0"
@@ -193,7 +187,7 @@ def pi_fraction(value: float, _position: int | None = None) -> str:
 
 
 def parameter_label(coordinate: xr.DataArray) -> str:
-    """Return the axis label of a parameter: its long name and its unit."""
+    """Return the axis label of a parameter: its name and its unit."""
     name = str(coordinate.attrs.get("long_name", coordinate.name))
     if coordinate.name == "frequency":
         name = "drive frequency"
@@ -206,7 +200,7 @@ def swept_label(name: str, units: str) -> str:
 
 
 def caption(ds: xr.Dataset, *, drop: Iterable[str] = (), with_start: bool = True) -> str:
-    """Return a caption that names the fixed values of a figure: parameters first, then the initial state.
+    """Return a caption with the fixed values of a figure: the parameters, then the initial state.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Draw Lyapunov exponents under the bifurcation diagram; for two parameters see `exponent_map`."""
+"""Draw Lyapunov exponents below the bifurcation diagram of a run."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def plot_lyapunov(
     at: Mapping[str, float] | None = None,
     frame: style.Frame = style.WIDE,
 ) -> style.DataFigure:
-    """Draw Lyapunov exponents under the bifurcation diagram, on the same axis.
+    """Draw the Lyapunov exponents of a run below its bifurcation diagram, on the same horizontal axis.
 
     Parameters
     ----------
@@ -98,7 +98,7 @@ def plot_lyapunov(
 
 
 def _lost(diagram: Diagram, data: xr.Dataset) -> Survey:
-    """Return the diagram's counts of absent cells, extended by the cells that have points but no Lyapunov exponent."""
+    """Count the cells without points or without a Lyapunov exponent, at each parameter value and by reason."""
     found = diagram.survey
     value = data["exponent_value"].isel(exponent=0)
     others = [d for d in value.dims if d != diagram.parameter]
@@ -109,7 +109,7 @@ def _lost(diagram: Diagram, data: xr.Dataset) -> Survey:
 
 
 def _draw_lost(top: Axes, bottom: Axes, strip: Axes, diagram: Diagram, lost: Survey) -> None:
-    """Draw the share of cells without an exponent as a strip; shade parameter values without points or exponents."""
+    """Draw in a strip the share of cells without an exponent, and shade parameter values where no cell has one."""
     style.style_axes(strip, minor=False)
     shade_blank(top, diagram.x, diagram.survey, diagram.layers)
     draw_absent(bottom, strip, diagram.x, lost, diagram.layers)
@@ -146,9 +146,7 @@ def _draw_exponents(ax: Axes, data: xr.Dataset, parameter: str, spectrum: bool, 
 def _draw_class(
     ax: Axes, x: np.ndarray, value: np.ndarray, error: np.ndarray, flag: np.ndarray, colour: str, gid: str
 ) -> None:
-    """Draw points and error bands of one class of motion, or of one exponent of the spectrum, in one colour. The arrays
-    have shape (x, cell).
-    """
+    """Draw the exponents of one class of motion, or one exponent of the spectrum, with error bands."""
     there = np.isfinite(value)
     if not there.any():
         return
@@ -180,7 +178,6 @@ def _draw_class(
 
 
 def _union(value: np.ndarray, error: np.ndarray) -> list[tuple[float, float]]:
-    """Return the intervals value +- error, with overlapping intervals joined."""
     joined: list[tuple[float, float]] = []
     for low, high in sorted(zip((value - error).tolist(), (value + error).tolist(), strict=True)):
         if joined and low <= joined[-1][1]:
@@ -191,7 +188,7 @@ def _union(value: np.ndarray, error: np.ndarray) -> list[tuple[float, float]]:
 
 
 def draw(run: Run, options: LyapunovFigureOptions) -> style.DataFigure:
-    """Draw the figure ``lyapunov`` of a run, over one parameter or as a map over two."""
+    """Draw the figure ``lyapunov`` of a run: over one parameter, or as colours in the plane of two."""
     cube = run.cube()
     at, notes = values_of(run, options)
     if options.as_map:

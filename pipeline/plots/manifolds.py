@@ -23,7 +23,7 @@ _NAMES = {0: "unstable manifold", 1: "stable manifold"}
 def plot_manifolds(
     ds: xr.Dataset, basins: style.DataFigure | None = None, *, degrees: bool = False, frame: style.Frame = style.WIDE
 ) -> style.DataFigure:
-    """Draw manifolds in the plane of the first two states, alone or on a figure of basins.
+    """Draw the manifolds of saddle orbits in the plane of the first two states, alone or over a figure of basins.
 
     Parameters
     ----------
@@ -60,7 +60,6 @@ def plot_manifolds(
 
 
 def _shade(colour: str) -> str:
-    """Return the colour for a line's legend entry: the line's own, but grey for a white line."""
     return "0.75" if colour == "white" else colour
 
 

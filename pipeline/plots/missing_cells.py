@@ -1,4 +1,4 @@
-"""Show the share of cells without points in a strip below a diagram, and explain an empty diagram."""
+"""Show the share of cells without points in a strip below a diagram, and say why a diagram is empty."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ LOOKS: dict[str, dict[str, Any]] = {
 
 
 def draw_absent(ax: Axes, strip: Axes, x: np.ndarray, survey: Survey, layers: Sequence[int]) -> None:
-    """Draw the share of absent cells (cells without a point to draw) in the strip. Shade the diagram at parameter
-    values where all cells are absent.
+    """Draw in a strip the share of cells that have no point in the diagram, and shade parameter values where no cell
+    has one.
 
     Parameters
     ----------
@@ -55,7 +55,7 @@ def draw_absent(ax: Axes, strip: Axes, x: np.ndarray, survey: Survey, layers: Se
 
 
 def shade_blank(ax: Axes, x: np.ndarray, survey: Survey, layers: Sequence[int]) -> None:
-    """Shade a diagram at parameter values where all cells are absent. The arguments are those of `draw_absent`."""
+    """Shade a diagram at the parameter values where no cell has a point."""
     shown = list(layers)
     absent = sum((counts[shown].sum(0) for counts in survey.absent.values()), np.zeros(x.size, np.int64))
     blank = (absent >= np.maximum(survey.cells[shown].sum(0), 1)).astype(float)
@@ -66,7 +66,7 @@ def shade_blank(ax: Axes, x: np.ndarray, survey: Survey, layers: Sequence[int]) 
 
 
 def absent_handles(survey: Survey) -> list[Patch]:
-    """Return legend handles that list the reasons why cells are not drawn, with the number of cells for each reason."""
+    """Return legend entries for the cells that have no point in the diagram: their number for each reason."""
     total = int(survey.cells.sum())
     return [
         Patch(label=f"{name}: {int(counts.sum())} of {total} cells", **LOOKS[name])
@@ -76,7 +76,7 @@ def absent_handles(survey: Survey) -> list[Patch]:
 
 
 def say_empty(ax: Axes, survey: Survey, shown: str = "") -> None:
-    """Write a text into empty axes that gives the reason why there is nothing to draw."""
+    """Write into empty axes why there is nothing to draw."""
     n_cells = int(survey.cells.sum())
     absent = {name: int(counts.sum()) for name, counts in survey.absent.items() if counts.any()}
     text = f"nothing to draw: of {n_cells} cells, " + style.join(f"{n} {name}" for name, n in absent.items())

@@ -1,4 +1,4 @@
-"""Assign colours to the classes of motion that a model's classifier distinguishes."""
+"""Give names and colours to the classes of motion that a model's classifier distinguishes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ PLAIN = "#1A3A5C"
 
 @dataclass(frozen=True)
 class Motions:
-    """Labels and colours of the classes of motion of a dataset, by code.
+    """Names and colours of the classes of motion of a run, by code.
 
     Attributes
     ----------
@@ -35,12 +35,12 @@ class Motions:
 
     @property
     def told(self) -> bool:
-        """Return whether the model distinguishes classes of motion."""
+        """Whether the model distinguishes classes of motion."""
         return len(self.words) > 1
 
 
 def motions_of(ds: xr.Dataset) -> Motions:
-    """Return the labels and colours of a model's classes of motion. A model without a classifier has a single class."""
+    """Return the names and colours of a model's classes of motion; a model without a classifier has one class."""
     classifier = model_of(ds).classifier
     if classifier is None:
         return Motions(("motion",), (PLAIN,), (0,))
@@ -53,6 +53,6 @@ def motions_of(ds: xr.Dataset) -> Motions:
 
 
 def motion_codes(cells: xr.Dataset) -> xr.DataArray:
-    """Return the code of each cell's class of motion, as an array with the dims of the variable ``status``."""
+    """Return the class of motion of each cell, as a code."""
     found = classify(cells)
     return xr.zeros_like(cells["status"], dtype=np.int8) if found is None else found

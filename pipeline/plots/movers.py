@@ -1,4 +1,4 @@
-"""Build the moving parts of an animation: points with trails, links, the clock."""
+"""Make the moving parts of an animation: points with trails, bars of the drawing, the clock."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ Floats = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Trail:
-    """Fading trail behind a moving point, measured in samples. In a looping film the trail continues from the end.
+    """Trail behind a moving point, which fades. In a film that repeats, it goes on from the end to the start.
 
     Attributes
     ----------
@@ -48,7 +48,7 @@ class Trail:
 
     @classmethod
     def of(cls, one: xr.Dataset) -> Trail:
-        """Return the trail of a motion in a film."""
+        """Make the trail for a motion of a film."""
         samples, times = one.sizes["sample"] - 1, one["time"].values
         length = int(TRAIL_S * one.attrs["fps"] * one.attrs["substeps"])
         period = float(one["period"])
@@ -56,7 +56,7 @@ class Trail:
         return cls(samples, min(length, samples), bool(one.attrs["repeats"]), min(closed, samples))
 
     def before(self, i: int) -> npt.NDArray[np.intp]:
-        """Return the indices of the trail's samples up to sample `i`."""
+        """Return the indices of the samples that the trail shows when the point is at sample `i`."""
         if self.repeats:
             return np.arange(i - self.length, i + 1) % self.n
         return np.arange(max(0, i - self.length), i + 1)
@@ -64,9 +64,7 @@ class Trail:
 
 @dataclass(frozen=True)
 class Point:
-    """A point that moves along a path with a fading trail. If the motion does not repeat, the whole path so far stays
-    visible.
-    """
+    """A point that moves along a curve, with a fading trail."""
 
     path: Floats
     jumps: float
@@ -77,7 +75,7 @@ class Point:
     dot: Any
 
     def at(self, i: int) -> list[Artist]:
-        """Move the point to a sample, and return its artists."""
+        """Move the point to sample `i`, and return its artists, which are then drawn again."""
         samples = self.trail.before(i)
         segments, there = self._segments(samples)
         self.comet.set_segments(list(segments[there]))
@@ -99,9 +97,7 @@ class Point:
 
 
 def _point(ax: Axes, path: Floats, colour: str, trail: Trail, *, jumps: float, size: float, thick: float) -> Point:
-    """Create the dot and the fading trail of a moving point. If the motion does not repeat, create the line of its path
-    too.
-    """
+    """Make a moving point with its trail and, if its motion does not repeat, the line of its path so far."""
     colours = np.empty((max(trail.length, 1), 4))
     colours[:, :3], colours[:, 3] = to_rgb(colour), np.linspace(0.0, 1.0, len(colours)) ** 1.5
     comet = LineCollection([], linewidths=thick, animated=True, capstyle="butt")
@@ -121,7 +117,7 @@ def _dots(ax: Axes, size: float, colour: str, edge: str, thick: float) -> Any:
 
 
 def moving_portrait(ax: Axes, one: xr.Dataset, pair: tuple[str, str], trail: Trail, degrees: bool) -> Point:
-    """Draw the fixed parts of a phase portrait, and return its moving parts."""
+    """Draw the parts of a phase portrait that do not move, and return its moving point."""
     style.style_axes(ax)
     model, colour = model_of(one), str(one["colour"].values)
     orbit = {name: one["orbit"].sel(state=name).values for name in model.state_names}
@@ -141,7 +137,7 @@ def moving_portrait(ax: Axes, one: xr.Dataset, pair: tuple[str, str], trail: Tra
 
 
 def _path(measures: Sequence[Measure], values: Sequence[Floats]) -> tuple[Floats, float]:
-    """Return the polyline of a phase portrait in axis units, and the length above which a step is an angle's jump."""
+    """Return the curve of a phase portrait in axis units, and the step length above which an angle has jumped."""
     columns, jumps = [], math.inf
     for measure, column in zip(measures, values, strict=True):
         turning = measure.on_circle and np.ptp(column) >= 2.0 * np.pi
@@ -155,7 +151,7 @@ def _path(measures: Sequence[Measure], values: Sequence[Floats]) -> tuple[Floats
 
 @dataclass(frozen=True)
 class Scene:
-    """Region of the plane that contains the mechanical drawings of all motions in a film.
+    """Part of the plane that contains the model's drawing in all motions of a film.
 
     Attributes
     ----------
@@ -170,14 +166,14 @@ class Scene:
 
     @classmethod
     def of(cls, ds: xr.Dataset, drawing: Drawing) -> Scene:
-        """Return the region that contains all points of a film's mechanical drawings."""
+        """Find the part of the plane that contains the model's drawing in all motions of a film."""
         places = ds["points"].values.reshape(-1, 2)
         if "fixed" in ds:
             places = np.concatenate([places, ds["fixed"].values.reshape(-1, 2)])
         return cls(drawing, np.nanmin(places, axis=0), np.nanmax(places, axis=0))
 
     def limit(self, ax: Axes) -> float:
-        """Set axis limits of equal scale that contain the drawings at all times. Return the width in model units."""
+        """Set the limits of axes, with equal scales, so that the drawing is always inside. Return their width."""
         box = ax.get_window_extent()
         shape = np.array([box.width, box.height])
         scale = 1.22 * max(*((self.high - self.low) / shape), 1e-12)
@@ -189,7 +185,7 @@ class Scene:
 
 @dataclass(frozen=True)
 class Machine:
-    """Moving parts of a model's mechanical drawing: lines, joints, and the traced path."""
+    """Moving parts of the model's drawing: lines, joints, and a point whose path is traced."""
 
     lines: tuple[Any, ...]
     corners: tuple[Floats, ...]
@@ -198,7 +194,7 @@ class Machine:
     traced: Point
 
     def at(self, i: int) -> list[Artist]:
-        """Move the parts to a sample, and return them as a list of artists."""
+        """Move the drawing to sample `i`, and return its artists, which are then drawn again."""
         for line, corners in zip(self.lines, self.corners, strict=True):
             line.set_data(*corners[i].T)
         self.joints.set_data(*self.places[i].T)
@@ -207,7 +203,7 @@ class Machine:
 
 
 def moving_machine(ax: Axes, scene: Scene, one: xr.Dataset, trail: Trail, *, named: bool) -> Machine:
-    """Draw the fixed parts of a model's mechanical drawing, and return its moving parts."""
+    """Draw the parts of the model's drawing that do not move, and return its moving parts."""
     drawing, colour = scene.drawing, str(one["colour"].values)
     ax.set_axis_off()
     width = scene.limit(ax)
@@ -235,7 +231,7 @@ def moving_machine(ax: Axes, scene: Scene, one: xr.Dataset, trail: Trail, *, nam
 
 
 def _fix(ax: Axes, still: dict[str, Floats], scene: Scene, named: bool) -> None:
-    """Draw the fixed points of a mechanical drawing, with names beside them if `named` is set."""
+    """Draw the points of the model's drawing that do not move, with their names if `named`."""
     ends = {name for names in scene.drawing.lines for name in names}
     for name, place in still.items():
         held = name in ends
@@ -262,7 +258,6 @@ def _fix(ax: Axes, still: dict[str, Floats], scene: Scene, named: bool) -> None:
 
 
 def _scale_bar(ax: Axes, width: float, unit: str) -> None:
-    """Draw a scale bar in place of axes. Its length is 1, 2 or 5 times a power of ten."""
     power = 10.0 ** math.floor(math.log10(0.25 * width))
     length = max(f * power for f in (1.0, 2.0, 5.0) if f * power <= 0.25 * width)
     share = length / width
@@ -280,16 +275,14 @@ def _scale_bar(ax: Axes, width: float, unit: str) -> None:
 
 @dataclass(frozen=True)
 class Clock:
-    """Text that shows the model time in an animation: in drive periods if all motions have the same drive period, else
-    in seconds.
-    """
+    """Text that shows the time of the model in a film, in drive periods or in seconds."""
 
     text: Any
     time: Floats
     period: float
 
     def at(self, i: int) -> list[Artist]:
-        """Show the time of a sample, and return the text as a list of artists."""
+        """Show the time of sample `i`, and return the artist of the text, which is then drawn again."""
         if self.period:
             self.text.set_text(f"{self.time[i] / self.period:.2f} drive periods")
         else:
@@ -298,7 +291,7 @@ class Clock:
 
 
 def moving_clock(fig: style.DataFigure, ds: xr.Dataset) -> Clock:
-    """Write the playback speed into a figure, and return the `Clock` that shows the model time."""
+    """Write the speed of a film into its figure, and return the clock that shows the time of the model."""
     frequencies = ds["drive_frequency"].values
     forced = not model_of(ds).autonomous and np.ptp(frequencies) == 0.0
     width, height = fig.get_size_inches()

@@ -96,7 +96,7 @@ def _multipliers(ds: xr.Dataset, branch: int, z: np.ndarray, x: np.ndarray) -> x
 
 
 def _crossings(ax: Axes, ds: xr.Dataset, here: np.ndarray) -> list[Line2D]:
-    """Mark the critical multipliers at bifurcations; return legend handles that list the bifurcations."""
+    """Mark the multipliers on the unit circle at bifurcations, and return legend entries for these bifurcations."""
     critical = (ds["critical_real"] + 1j * ds["critical_imag"]).values[here]
     look: dict[str, Any] = {
         "markerfacecolor": "none",

@@ -1,4 +1,4 @@
-"""Assign colours, letters and names to attractors, the same in every figure of a run.
+"""Give each attractor a colour, a letter and a name, which are the same in every figure of a run.
 
 The twelve attractors with the most cells have a colour each; the others share one more. They come from Okabe
 & Ito (https://jfly.uni-koeln.de/color/) and five chosen for their distance from them: any two, and any
@@ -87,9 +87,7 @@ _FAILED = ("step limit", "step underflow", "unreached")
 
 
 def other_cells(part: xr.Dataset) -> dict[str, np.ndarray]:
-    """Return masks of the cells that end on no attractor, by the reasons that `GREYS` names. The dims of the swept
-    parameters come first.
-    """
+    """Return which cells end on no attractor, as masks by reason, with the swept parameters first."""
     found: dict[str, np.ndarray] = {}
     for name, which in outcomes.other_cells(part).items():
         own = "failed" if name in _FAILED else name
@@ -99,7 +97,7 @@ def other_cells(part: xr.Dataset) -> dict[str, np.ndarray]:
 
 @dataclass(frozen=True)
 class Cast:
-    """Colours and names of the attractors and other invariant sets of a dataset.
+    """Colours and names of the attractors (and other sets) of a run.
 
     Attributes
     ----------
@@ -117,7 +115,7 @@ class Cast:
 
 
 def cast_of(attractors: xr.Dataset, part: xr.Dataset | None = None) -> Cast:
-    """Assign colours and names to the attractors and other invariant sets of a dataset.
+    """Choose colours and names for the attractors (and other sets) of a run.
 
     Parameters
     ----------
@@ -140,16 +138,13 @@ def cast_of(attractors: xr.Dataset, part: xr.Dataset | None = None) -> Cast:
 
 
 def _grey_of(stability: xr.DataArray) -> str:
-    """Return the grey for an invariant set that attracts at no parameter point. It depends on the set's most frequent
-    stability.
-    """
+    """Return the grey for a set that attracts nowhere, by its most frequent stability."""
     codes = stability.values[np.isin(stability.values, list(GREY_OF))]
     return GREY_OF[int(np.bincount(codes).argmax())] if codes.size else OTHERS
 
 
 def describe(one: xr.Dataset) -> str:
-    """Describe an attractor or other invariant set in words: its period or its kind, class of motion, turns per period,
-    stability.
+    """Describe an attractor (or other set) in words, for instance by its period and its class of motion.
 
     Only points where the set is present count.
     """
@@ -163,14 +158,12 @@ def describe(one: xr.Dataset) -> str:
 
 
 def _stability(one: xr.Dataset) -> str:
-    """Return as text the stabilities of an invariant set at the parameter points where it does not attract."""
     found = sorted({int(code) for code in one["stability"].values.ravel()} - {ABSENT, ATTRACTS})
     words = " or ".join(STABILITIES[code].replace("_", " ") for code in found)
     return f"{words} in parts" if words and (one["stability"].values == ATTRACTS).any() else words
 
 
 def _seconds(one: xr.Dataset) -> str:
-    """Return the range of a limit cycle's period [s] as text. The text is empty for a forced system."""
     if not model_of(one).autonomous or "period_s" not in one:
         return ""
     known = one["period_s"].values[np.isfinite(one["period_s"].values)]
@@ -207,9 +200,7 @@ def _words(one: xr.Dataset, codes: np.ndarray) -> str:
 
 
 def _turns(one: xr.Dataset, present: np.ndarray) -> str:
-    """Return the mean turns per period as text. The text is empty unless the motion rotates equally at all parameter
-    points.
-    """
+    """Return a text with the mean turns per period; an empty text unless they are equal at all parameter points."""
     dim = model_of(one).angle_dim
     if "rotation" not in one or dim not in one["rotation"].dims:
         return ""
@@ -235,7 +226,7 @@ Entry = tuple[str, str] | Artist
 def new_panel(
     data: xr.Dataset, entries: Sequence[Entry], frame: style.Frame, height: float = 4.3
 ) -> tuple[style.DataFigure, Axes]:
-    """Make a figure with one panel and a legend. The legend is beside the panel, or below it in a narrow figure.
+    """Make a figure with one panel, and a legend beside it (or below it in a narrow figure).
 
     Parameters
     ----------
@@ -291,13 +282,13 @@ def _handle(entry: Entry, text: str) -> Artist:
 
 
 def percent(share: float) -> str:
-    """Write a share as a percentage with one decimal."""
+    """Format a share as a percentage with one decimal."""
     text = f"{100.0 * share:.1f}" if share >= 5e-4 or share == 0.0 else "<\u00a00.1"
     return text + "\u00a0%"
 
 
 def write_letters(ax: Axes, codes: np.ndarray, attractors: Iterable[int]) -> None:
-    """Write each attractor's letter into the widest part of its area in an image, if the letter fits.
+    """Write the letter of each attractor into the widest part of its area in an image, if the letter fits there.
 
     Parameters
     ----------

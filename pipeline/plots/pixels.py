@@ -1,4 +1,4 @@
-"""Draw points of a cube as markers or, if there are many, as an image whose pixels count the points.
+"""Draw the section points of a result cube as markers or, if there are many, as an image that counts points per pixel.
 
 In an image a pixel takes the colour of the motion that has most points in it, and is the darker the more
 there are; all panels of a figure share one scale of darkness.
@@ -27,7 +27,7 @@ TINT = 0.5
 
 @dataclass(frozen=True)
 class Look:
-    """Marker style of one layer of points (one direction of continuation).
+    """Marker style for the points of one direction of a continuation.
 
     Attributes
     ----------
@@ -45,9 +45,7 @@ class Look:
 
 
 def looks(diameter: float, shown: Sequence[int]) -> dict[int, Look]:
-    """Return the marker styles of the layers. Small dark markers lie over large light markers, so that both stay
-    visible.
-    """
+    """Choose marker styles for the directions of a continuation: small dark markers over large light ones."""
     if len(shown) < 2:
         return {i: Look(diameter) for i in shown}
     dark = max(diameter, 0.95)
@@ -56,7 +54,7 @@ def looks(diameter: float, shown: Sequence[int]) -> dict[int, Look]:
 
 @dataclass(frozen=True)
 class Panel:
-    """Axes of a panel, and the layers (directions of continuation) drawn in it."""
+    """Axes of one panel, and the directions of continuation that are drawn in it."""
 
     ax: Axes
     layers: tuple[int, ...]
@@ -125,7 +123,7 @@ def _draw_markers(panel: Panel, points: Points, view: View, diameter: float, x: 
 
 
 def distinct(x: np.ndarray, y: np.ndarray, xlim: Range, ylim: Range) -> tuple[np.ndarray, np.ndarray]:
-    """Drop points that would be drawn at the same position as another point.
+    """Drop points that would cover another point exactly.
 
     Many markers on one spot would darken their smoothed rims, and dots would become squares.
     """
@@ -160,9 +158,7 @@ Counts = Mapping[tuple[int, int], np.ndarray]
 
 
 def _pixels(ax: Axes) -> tuple[int, int]:
-    """Return height and width [pixels] of the image that fills the axes. The image has a finer resolution than the
-    figure.
-    """
+    """Return the height and the width of the image that fills the axes [pixels]; it is finer than the figure."""
     box = ax.get_window_extent()
     return max(1, round(box.height * SUPERSAMPLING)), max(1, round(box.width * SUPERSAMPLING))
 
@@ -208,7 +204,9 @@ def _draw_images(
 
 
 def _spread(counts: Counts, looks: Mapping[int, Look]) -> dict[int, dict[int, np.ndarray]]:
-    """Spread each pixel's count over the disc of a marker, by the maximum, for every layer and class of motion."""
+    """Spread the count of each pixel over the disc of a marker, for every direction of continuation and class of
+    motion.
+    """
     return {
         i: {
             code: _dilate(grid, _disc(look.diameter / 72.0 * style.DPI * SUPERSAMPLING))
@@ -222,7 +220,7 @@ def _spread(counts: Counts, looks: Mapping[int, Look]) -> dict[int, dict[int, np
 def paint(
     picture: np.ndarray, spread: Mapping[int, np.ndarray], look: Look, colours: Sequence[str], reference: float
 ) -> None:
-    """Paint the points of one layer into an image; each pixel takes the colour of the class of motion with most points.
+    """Paint points into an image. Each pixel has the colour of the class of motion that has most points there.
 
     Parameters
     ----------
@@ -253,7 +251,7 @@ def paint(
 
 
 def _opacity(counts: np.ndarray, faintest: float, reference: float) -> np.ndarray:
-    """Return opacities that grow with the logarithm of the counts: `faintest` for one point, 1 for `reference`
+    """Return opacities that grow with the logarithm of the counts, from `faintest` for one point to 1 for `reference`
     points.
     """
     if reference <= 1.0:
@@ -263,7 +261,6 @@ def _opacity(counts: np.ndarray, faintest: float, reference: float) -> np.ndarra
 
 
 def _disc(diameter: float) -> list[tuple[int, int]]:
-    """Return the (row, column) offsets of all pixels inside a round dot, counted from its centre."""
     radius = max(0.5, 0.5 * diameter)
     reach = math.ceil(radius)
     around = range(-reach, reach + 1)
@@ -281,7 +278,7 @@ def _dilate(grid: np.ndarray, dot: Sequence[tuple[int, int]]) -> np.ndarray:
 
 
 def _pixel_table(counts: Counts, x: Range, y: Range, view: View) -> xr.Dataset:
-    """Return a dataset of the non-empty pixels: centre, count of points, class of motion and layer."""
+    """Return the pixels that have points as a dataset: place, number of points, class of motion and direction."""
     parts = []
     for (own_layer, code), grid in counts.items():
         rows, columns = np.nonzero(grid)

@@ -1,4 +1,4 @@
-"""Read the points to plot from a cube block by block, so that memory does not grow with the cube."""
+"""Read the points to draw from a result cube in blocks, so that the needed memory does not grow with the cube."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ Range = tuple[float, float]
 
 @dataclass(frozen=True)
 class Points:
-    """Points of a block of the cube: x, y, class of motion and layer, each of shape (n,)."""
+    """Points to draw: x, y, class of motion and direction of continuation, each of shape (n,)."""
 
     x: np.ndarray
     y: np.ndarray
@@ -43,7 +43,7 @@ class Points:
     """Index into the layers of the view."""
 
     def inside(self, x: Range | None, y: Range | None) -> Points:
-        """Select the points within ranges of x and y; None sets no limit."""
+        """Select the points inside ranges of x and y; None sets no limit."""
         kept = np.ones(self.x.size, bool)
         for values, limits in ((self.x, x), (self.y, y)):
             if limits is not None:
@@ -58,7 +58,7 @@ broadcasts to it."""
 
 @dataclass(frozen=True)
 class View:
-    """Variables, layers and colours for drawing the points of a cube.
+    """Description of what is drawn of a result cube: its variables, a function that computes points, and colours.
 
     Attributes
     ----------
@@ -81,14 +81,14 @@ class View:
     motions: Motions
 
     def blocks(self) -> Iterator[xr.Dataset]:
-        """Yield loaded blocks of the cube, each of at most some tens of megabytes."""
+        """Load the result cube in blocks of at most some tens of megabytes, and yield them."""
         needed = {*self.names, "status", *(("section", "turns") if self.motions.told else ())}
         part = self.ds[[name for name in self.ds.data_vars if name in needed]]
         for selection in track(list(selections(self.ds[self.names[0]])), "reading the cube"):
             yield part.isel(selection).load()
 
     def points(self, block: xr.Dataset) -> Points:
-        """Return the points to draw from a loaded block of the cube."""
+        """Return the points to draw from one block of the result cube."""
         x, y = self.coordinates(block)
         shape = (*block["status"].shape, max(x.shape[-1], y.shape[-1]))
         x, y = np.broadcast_to(x, shape), np.broadcast_to(y, shape)
@@ -100,20 +100,18 @@ class View:
         return Points(x[there], y[there], *spread)
 
     def all_points(self) -> Iterator[Points]:
-        """Yield the points to plot from the cube, block by block."""
+        """Yield the points to draw, block by block."""
         for block in self.blocks():
             yield self.points(block)
 
     def kinds(self, block: xr.Dataset) -> xr.DataArray:
-        """Return the colour code of each cell: of its attractor if attractors are given, else of its class of
-        motion.
-        """
+        """Return the colour code of each cell: its attractor if attractors are given, otherwise its class of motion."""
         if "_kind" in block.coords:
             return block["_kind"] + xr.zeros_like(block["status"], dtype=np.int32)
         return motion_codes(block)
 
     def layer_index(self, block: xr.Dataset) -> xr.DataArray:
-        """Return the index of each cell's layer (direction of continuation)."""
+        """Return the direction of continuation of each cell, as an index."""
         zero = xr.zeros_like(block["status"], dtype=np.int8)
         if self.layers == ("",):
             return zero
@@ -122,7 +120,7 @@ class View:
 
 
 def make_view(ds: xr.Dataset, names: tuple[str, ...], coordinates: Coordinates) -> View:
-    """Return a `View` of a cube; the function `coordinates` computes its points from the variables `names`."""
+    """Describe what is drawn of a result cube; `coordinates` computes the points from the variables `names`."""
     layers: tuple[str, ...] = ("",)
     if "branch" in ds["status"].dims and "direction" in ds.coords:
         present = {str(name) for name in ds["direction"].values}
@@ -133,7 +131,7 @@ def make_view(ds: xr.Dataset, names: tuple[str, ...], coordinates: Coordinates) 
 
 @dataclass
 class Survey:
-    """Result of `survey`: ranges of the points, classes of motion that occur, numbers of cells.
+    """Ranges of the points to draw, the classes of motion that occur, and the numbers of cells.
 
     Attributes
     ----------
@@ -155,11 +153,11 @@ class Survey:
 
     @property
     def empty(self) -> bool:
-        """Return whether there is no point to draw."""
+        """Whether there is no point to draw."""
         return not self.classes
 
     def add(self, points: Points, n_motions: int) -> None:
-        """Extend the survey's ranges and classes of motion by further points."""
+        """Add points to the survey: widen its ranges, and note their classes of motion."""
         if not points.x.size:
             return
         self.x = _joined(self.x, points.x)
@@ -173,8 +171,8 @@ def _joined(known: Range, values: np.ndarray) -> Range:
 
 
 def survey(view: View, *, along: str = "", xlim: Range | None = None, ylim: Range | None = None) -> Survey:
-    """Read the cube once to find the ranges of its points, the classes of motion that occur, and the numbers of cells
-    without points.
+    """Read a result cube once to find the ranges of its points, the classes of motion that occur, and the cells without
+    points.
 
     Parameters
     ----------
@@ -219,9 +217,7 @@ def _count_absent(view: View, block: xr.Dataset, found: Survey) -> None:
 
 
 def selections(array: xr.DataArray, inner: tuple[str, ...] = ()) -> Iterator[dict[str, slice]]:
-    """Yield selections (one slice per dim) that together cover the cells of an array once. They follow the array's
-    chunks if it has any.
-    """
+    """Yield selections of an array (a slice for each dim) that together cover all its cells once, chunk by chunk."""
     own = inner or tuple(str(d) for d in array.dims if d in _OWN_DIMS)
     dims = [str(dim) for dim in array.dims if dim not in own]
     each = math.prod(array.sizes[dim] for dim in own)

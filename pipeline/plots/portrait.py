@@ -1,4 +1,4 @@
-"""Draw panels of one motion: a phase portrait of two states, and the path of a point of the mechanical drawing."""
+"""Draw panels for one motion: its phase portrait, and the path of a point of the model's drawing."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _AIR = 1.16
 
 @dataclass(frozen=True)
 class Motion:
-    """One motion to draw in several panels: its orbit, its section points and its colour.
+    """One motion to draw: its trajectory, its section points and its colour.
 
     Attributes
     ----------
@@ -40,7 +40,7 @@ class Motion:
 
 
 def draw_portrait(ax: Axes, ds: xr.Dataset, pair: tuple[str, str], motion: Motion, *, degrees: bool = False) -> None:
-    """Draw a phase portrait: the motion as a line, its section points as dots; angles that make full turns are wrapped.
+    """Draw a phase portrait: the motion as a line, and its section points as dots.
 
     Parameters
     ----------
@@ -104,7 +104,7 @@ def _dress(ax: Axes, measures: list[Measure], turning: list[bool]) -> None:
 
 
 def draw_path(ax: Axes, drawing: Drawing, parameters: Mapping[str, float], motion: Motion) -> list[str]:
-    """Draw the path of the traced point of a mechanical drawing, and the drawing's fixed points near it.
+    """Draw the path of the traced point of the model's drawing, and the near points that do not move.
 
     Parameters
     ----------
@@ -154,13 +154,13 @@ def _marker(fixed: Mapping[str, np.ndarray], name: str) -> str:
 
 
 def fixed_handles(drawing: Drawing, parameters: Mapping[str, float], shown: Collection[str]) -> list[Any]:
-    """Return legend handles for the points of a mechanical drawing that do not move and are shown."""
+    """Return legend entries for those shown points of the model's drawing that do not move."""
     fixed = drawing.fixed(parameters)
     return [style.dot(n, "0.2", 4.0, marker=_marker(fixed, n)) for n in fixed if n in shown]
 
 
 def _near(fixed: Mapping[str, np.ndarray], place: np.ndarray) -> list[str]:
-    """Return the names of the fixed points of a mechanical drawing that are near enough to a path to be shown."""
+    """Return the names of the points of the model's drawing that do not move and lie near a path."""
     if not place.size:
         return list(fixed)
     size = max(float(np.ptp(place, axis=0).max()), 1e-12)
@@ -171,7 +171,7 @@ def _near(fixed: Mapping[str, np.ndarray], place: np.ndarray) -> list[str]:
 
 
 def equalise(ax: Axes) -> None:
-    """Set axis limits of equal scale that contain all lines; call it when the axes have their final position."""
+    """Set the limits of axes so that both scales are equal and all lines are inside."""
     points = np.concatenate([line.get_xydata() for line in ax.get_lines()])
     box = ax.get_window_extent()
     low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)

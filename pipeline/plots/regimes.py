@@ -1,4 +1,4 @@
-"""Draw regime maps over two swept parameters: the coexisting attractors, their periods, or their number."""
+"""Draw regime maps in the plane of two swept parameters: coexisting attractors, their periods, or their number."""
 
 from __future__ import annotations
 
@@ -49,7 +49,8 @@ def plot_regimes(
     curves: xr.Dataset | None = None,
     frame: style.Frame = style.WIDE,
 ) -> style.DataFigure:
-    """Draw a map of the coexisting attractors, of their orbit periods, or of their number, over two swept parameters.
+    """Draw a regime map in the plane of two swept parameters: the coexisting attractors, their periods, or their
+    number.
 
     Parameters
     ----------
@@ -106,7 +107,6 @@ def plot_regimes(
 
 
 def _with_curves(data: xr.Dataset, curves: xr.Dataset, x: str, y: str) -> xr.Dataset:
-    """Add the data of the bifurcation curves to the dataset of the map, under names that end in ``_curves``."""
     plane = [str(curves.attrs[f"{role}_parameter"]) for role in ("first", "second")]
     if sorted(plane) != sorted([x, y]):
         raise ValueError(f"the curves lie in the plane of {' and '.join(plane)}, and the map in that of {x} and {y}.")
@@ -116,7 +116,6 @@ def _with_curves(data: xr.Dataset, curves: xr.Dataset, x: str, y: str) -> xr.Dat
 
 
 def _draw_one(data: xr.Dataset, x: str, y: str, show: str, text: str, frame: style.Frame) -> style.DataFigure:
-    """Draw one map over two parameters, with a colour for each regime."""
     colours, entries = _looks(data, show)
     if (data["share_without"] > SHARE_LIMIT).any():
         label = f"over {100 * SHARE_LIMIT:g} % of the cells\nwithout an attractor"
@@ -141,7 +140,7 @@ def _draw_one(data: xr.Dataset, x: str, y: str, show: str, text: str, frame: sty
 def _draw_multiples(
     data: xr.Dataset, x: str, y: str, show: str, text: str, frame: style.Frame, cast: palette.Cast
 ) -> style.DataFigure:
-    """Draw one map per attractor or period, shaded by its share of the cells."""
+    """Draw one panel per attractor or period, shaded by its share of the cells."""
     most = len(palette.COLOURS)
     total = data["share_of"].sum([x, y]).values
     chosen = np.sort(np.argsort(-total, kind="stable")[:most])
@@ -189,7 +188,7 @@ def _member_colour(member: str, show: str, cast: palette.Cast) -> str:
 
 
 def _dress(ax: Axes, data: xr.Dataset, x: str, y: str, frame: style.Frame) -> None:
-    """Cross out parameter points at which many cells have no attractor, and set the axis ranges."""
+    """Cross out the parameter points where many cells have no attractor, and set the limits of the axes."""
     row, column = np.nonzero(data["share_without"].values > SHARE_LIMIT)
     if row.size:
         ax.plot(data[x].values[column], data[y].values[row], gid="without", **_CROSS)
@@ -212,7 +211,7 @@ def _axes(attractors: xr.Dataset, at: Mapping[str, float] | None) -> tuple[str, 
 
 
 def _regimes(part: xr.Dataset, x: str, y: str, show: str) -> xr.Dataset:
-    """Return the regime of each parameter point; regimes are numbered from the most frequent one."""
+    """Return the regime of each parameter point as a number; the most frequent regime has number 0."""
     present = part["stability"].transpose(y, x, "attractor").values == ATTRACTS
     periods = part["orbit_period"].transpose(y, x, "attractor").values
     values = np.empty(present.shape[:2], object)
@@ -240,7 +239,7 @@ def _regimes(part: xr.Dataset, x: str, y: str, show: str) -> xr.Dataset:
 
 
 def _members(present: np.ndarray, periods: np.ndarray, share: np.ndarray, x: str, y: str, show: str) -> xr.Dataset:
-    """Return the share of cells on each attractor, or on all attractors of each orbit period."""
+    """Return the share of the cells on each attractor or, in a map of periods, on all attractors of each period."""
     if show == "attractors":
         kinds = np.broadcast_to(np.arange(present.shape[-1]), present.shape)
         names = {i: letter(i) for i in range(present.shape[-1])}
@@ -257,7 +256,7 @@ def _members(present: np.ndarray, periods: np.ndarray, share: np.ndarray, x: str
 
 
 def _numbers(part: xr.Dataset, x: str, y: str) -> dict[str, Any]:
-    """Return the variables of basin fractions with 95 % intervals, and the bound on the size of an undetected basin."""
+    """Return the basin fractions with their 95 % intervals, and a bound on the size of a basin that was missed."""
     dims = (y, x, "attractor")
     share = part["share"].transpose(*dims).values
     numbers: dict[str, Any] = {
@@ -295,7 +294,6 @@ def _label(present: np.ndarray, periods: np.ndarray, show: str) -> str:
 
 
 def _looks(data: xr.Dataset, show: str) -> tuple[list[str], list[palette.Entry]]:
-    """Return the colour of each regime, and the legend entries."""
     names = [str(v) for v in data["label"].values]
     if show == "number":
         ramp = matplotlib.colormaps["cividis"]
@@ -318,7 +316,7 @@ def draw(run: Run, options: RegimeOptions) -> style.DataFigure:
 
 
 def _curves_of(run: Run, attractors: xr.Dataset, at: Mapping[str, float]) -> xr.Dataset:
-    """Return the bifurcation curves of a run, computed in the plane of a map and within the map's ranges."""
+    """Compute the bifurcation curves of a run in the plane of a regime map, within the map's ranges."""
     x, y = _axes(attractors, at)
     axis = _swept_of(run, x, y)
     other = y if axis == x else x
@@ -335,6 +333,6 @@ def _curves_of(run: Run, attractors: xr.Dataset, at: Mapping[str, float]) -> xr.
 
 
 def _swept_of(run: Run, x: str, y: str) -> str:
-    """Return the parameter along which branches are continued: the one of `x` and `y` that the run sweeps, else `x`."""
+    """Return the parameter along which branches are followed: `x` or `y`, whichever the run sweeps."""
     swept = [name for name in (x, y) if run.cube().sizes.get(name, 1) > 1]
     return swept[0] if len(swept) == 1 else x

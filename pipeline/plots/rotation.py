@@ -1,4 +1,4 @@
-"""Draw rotation numbers: the devil's staircase over one parameter, or a map over two."""
+"""Draw rotation numbers: a devil's staircase over one parameter, or colours in the plane of two."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ UNKNOWN, CMAP = "0.8", "cividis"
 def plot_rotation(
     ds: xr.Dataset, *, at: Mapping[str, float] | None = None, frame: style.Frame = style.WIDE
 ) -> style.DataFigure:
-    """Draw the rotation numbers of a cube with the product ``rotation``.
+    """Draw the rotation numbers of a run's cells over one swept parameter, or in the plane of two.
 
     Parameters
     ----------
@@ -84,8 +84,8 @@ def plot_rotation(
 
 
 def rotation_data(part: xr.Dataset, swept: list[str]) -> xr.Dataset:
-    """Return each cell's rotation number and whether the cell is locked. Over two parameters, return the median
-    rotation number and the share of locked cells.
+    """Return the rotation numbers to draw, and which cells (over two parameters: which share of them) are
+    phase-locked.
     """
     locked = (part["orbit_period"] > 0).where(part["rotation"].notnull())
     data = xr.Dataset({"rotation": part["rotation"], "locked": locked}).load()
@@ -100,9 +100,6 @@ def rotation_data(part: xr.Dataset, swept: list[str]) -> xr.Dataset:
 
 
 def _about(part: xr.Dataset) -> str:
-    """Return a text with the largest and median errors of the rotation numbers, and the number of cells without a
-    rotation number.
-    """
     known, error = part["rotation"].notnull(), part["rotation_error"]
     size = (
         f"errors up to {float(error.max()):.1g}, half of them below {float(error.median()):.1g}" if known.any() else ""
@@ -133,7 +130,7 @@ def _draw_staircase(fig: style.DataFigure, ax: Axes, data: xr.Dataset, axis: xr.
 
 
 def _steps(x: np.ndarray, rotation: np.ndarray, axis: xr.DataArray) -> dict[Fraction, tuple[float, float]]:
-    """Return the parameter interval of each step p/q of a staircase; short steps are left out."""
+    """Return the parameter interval of each step p/q of a devil's staircase; short steps are left out."""
     whole = float(axis.max() - axis.min())
     found = {}
     for value in np.unique(np.round(rotation, 9)):
@@ -147,7 +144,9 @@ def _steps(x: np.ndarray, rotation: np.ndarray, axis: xr.DataArray) -> dict[Frac
 
 
 def draw_map(fig: style.DataFigure, ax: Axes, data: xr.Dataset, swept: list[str]) -> None:
-    """Draw the rotation numbers over two parameters, with white dots where all cells are locked."""
+    """Draw the rotation numbers as colours in the plane of two parameters, with white dots where all cells are
+    locked.
+    """
     grid, locked = data["rotation"].values, data["locked"].values
     x, y = (data[d].values.astype(np.float64) for d in swept)
     known = grid[np.isfinite(grid)]

@@ -35,7 +35,7 @@ def plot_section(
     degrees: bool = False,
     frame: style.Frame = style.WIDE,
 ) -> style.DataFigure:
-    """Draw the stored section points of all cells at one parameter point, in the plane of two states.
+    """Draw the section points of all cells at one parameter point, in the plane of two states.
 
     Parameters
     ----------
@@ -89,7 +89,6 @@ def plot_section(
 
 
 def _measures(part: xr.Dataset, states: tuple[str, str] | None, degrees: bool) -> list[labels.Measure]:
-    """Return the measures (symbol, unit, factor) of the states on the horizontal and vertical axes."""
     model = model_of(part)
     names = states or section_pair(model)
     for name in names:
@@ -101,9 +100,7 @@ def _measures(part: xr.Dataset, states: tuple[str, str] | None, degrees: bool) -
 
 
 def section_pair(model: Model, first: str = "") -> tuple[str, str]:
-    """Return the states to draw on the horizontal and vertical axes. If possible, they are a pair for which the model
-    declares a phase portrait.
-    """
+    """Choose the two states to draw, if possible a pair for which the model has a phase portrait."""
     states = model.section_states
     pairs = [p for p in model.portraits if set(p) <= set(states) and p[0] == (first or p[0])]
     if pairs:
@@ -114,10 +111,6 @@ def section_pair(model: Model, first: str = "") -> tuple[str, str]:
 
 
 def _view(part: xr.Dataset, measures: list[labels.Measure], attractors: xr.Dataset | None) -> View:
-    """Return a `View` of the section points, coloured by class of motion or by attractor. All directions of
-    continuation share one layer.
-    """
-
     def coordinates(block: xr.Dataset) -> tuple[np.ndarray, np.ndarray]:
         section = block["section"].transpose(*block["status"].dims, "period_index", "state")
         x, y = (m.shown(section.sel(state=m.name).values) for m in measures)
@@ -155,9 +148,7 @@ def _handles(view: View, found: set[int]) -> list[Any]:
 
 
 def _by_attractor(view: View, part: xr.Dataset, attractors: xr.Dataset) -> View:
-    """Colour each point by its cell's attractor. Points of cells without an attractor get the grey of the cell's
-    outcome.
-    """
+    """Colour each point by the attractor of its cell, or by the grey for the reason why the cell has none."""
     chosen = attractors
     for dim in split_dims(attractors["attractor_id"])[0]:
         chosen = chosen.sel({dim: float(part[dim])})

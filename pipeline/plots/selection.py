@@ -1,4 +1,4 @@
-"""Select values on those axes of a cube that a figure does not show."""
+"""Select values on those axes of a run that a figure does not show."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pipeline.layout.vocabulary import split_dims
 
 
 def at_points(ds: xr.Dataset, at: Mapping[str, float] | None) -> xr.Dataset:
-    """Select values of a cube's swept parameters and initial states; the selected dims become scalar coordinates.
+    """Select values of a result cube's swept parameters and initial states; the selected dims become scalars.
 
     Raises
     ------

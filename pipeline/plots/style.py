@@ -1,4 +1,4 @@
-"""Set the common look of all figures: sizes, fonts, colours, axes, legends and captions.
+"""Define the common look of all figures: sizes, fonts, colours, axes, legends and captions.
 
 The look is set on each object, never through `matplotlib.rcParams`: these are shared by all threads.
 """
@@ -46,7 +46,7 @@ SKY, GREY = "#56B4E9", "#7F7F7F"
 
 @dataclass(frozen=True)
 class Frame:
-    """A figure's width and the ranges of its axes.
+    """Width of a figure, and the ranges of its axes.
 
     Attributes
     ----------
@@ -62,7 +62,7 @@ class Frame:
 
     @property
     def compact(self) -> bool:
-        """Return whether the figure is too narrow for a legend beside the axes."""
+        """Whether the figure is too narrow for a legend beside its axes."""
         return self.width < COMPACT_MM
 
     @property
@@ -87,7 +87,7 @@ _LOOKS = {False: Look(10.0, 9.0, 9.0), True: Look(8.0, 7.0, 7.0)}
 
 
 class DataFigure(Figure):
-    """A matplotlib figure that carries the data it shows.
+    """A matplotlib figure that also holds the data that it shows.
 
     Attributes
     ----------
@@ -108,7 +108,7 @@ class DataFigure(Figure):
 def new_figure(
     height: float, data: xr.Dataset, frame: Frame = WIDE, *, arranged: bool = True, exact: bool = False
 ) -> DataFigure:
-    """Make an empty figure that carries the data to be drawn in it.
+    """Make an empty figure that holds the data to be drawn in it.
 
     Parameters
     ----------
@@ -155,7 +155,7 @@ def look_of(ax: Axes) -> Look:
 
 
 def finish(figure: DataFigure) -> None:
-    """Set the common font on all texts of a figure, compute its layout, and keep it fixed."""
+    """Set the common font on all texts of a figure, compute its layout, and fix it."""
     for text in figure.findobj(Text):
         assert isinstance(text, Text)
         text.set_fontfamily(FONT)
@@ -168,7 +168,7 @@ def finish(figure: DataFigure) -> None:
 
 
 def style_axes(ax: Axes, *, inside: bool = True, minor: bool = True) -> None:
-    """Set the common style of lines, ticks and fonts on axes.
+    """Give axes the common style of lines, ticks and fonts.
 
     Parameters
     ----------
@@ -199,7 +199,7 @@ def style_axes(ax: Axes, *, inside: bool = True, minor: bool = True) -> None:
 
 
 def few_ticks(ax: Axes, x: int = 4, y: int = 4) -> None:
-    """Set at most `x` and `y` ticks on the two axes of a small panel."""
+    """Limit the number of ticks on the two axes of a small panel."""
     ax.xaxis.set_major_locator(MaxNLocator(x))
     ax.yaxis.set_major_locator(MaxNLocator(y))
 
@@ -221,9 +221,7 @@ def label_axes(ax: Axes, x: str | None = None, y: str | None = None) -> None:
 
 
 def caption(ax: Axes, text: str, share: float = 1.0) -> None:
-    """Write a caption above the axes, in lines no longer than the given share of the figure's width. The share is less
-    than 1 beside a legend.
-    """
+    """Write a caption above axes, in lines that use at most a share of the figure's width."""
     if text:
         look = look_of(ax)
         width = share * figure_of(ax).frame.width_in - 0.6
@@ -231,7 +229,7 @@ def caption(ax: Axes, text: str, share: float = 1.0) -> None:
 
 
 def folded(text: str, width: float, size: float, indent: str = "") -> str:
-    """Break a text between words into lines of at most a given width [in]."""
+    """Break a text between words into lines that are at most `width` wide [in]."""
     lines: list[str] = []
     for word in text.split(" "):
         if lines and _width(lines[-1] + " " + word, size) <= width:
@@ -242,13 +240,13 @@ def folded(text: str, width: float, size: float, indent: str = "") -> str:
 
 
 def _width(text: str, size: float) -> float:
-    """Estimate the width of a text [in]: 0.48 of the font size per letter."""
+    """Estimate the width of a text [in] from its number of characters."""
     plain = text.replace("$", "").replace("\\", "").replace("{", "").replace("}", "")
     return 0.48 * size / 72.0 * len(plain)
 
 
 def legend_above(figure: DataFigure, handles: Sequence[Any], *, size: float | None = None) -> None:
-    """Place a legend above all axes of a figure, on the right, in as few rows as fit."""
+    """Place a legend at the top right of a figure, in as few rows as fit."""
     if not handles:
         return
     size = figure.look.legend if size is None else size
@@ -268,14 +266,14 @@ def legend_above(figure: DataFigure, handles: Sequence[Any], *, size: float | No
 
 
 def complete(figure: DataFigure, ax: Axes, text: str, handles: Sequence[Any] = ()) -> None:
-    """Write the caption and a legend above the axes, then compute and fix the figure's layout."""
+    """Write the caption and the legend of a figure, then compute and fix its layout."""
     caption(ax, text)
     legend_above(figure, handles)
     finish(figure)
 
 
 def legend_below(figure: DataFigure, handles: Sequence[Any]) -> None:
-    """Place a legend below all axes of a figure, on the left."""
+    """Place a legend at the bottom left of a figure."""
     if handles:
         size = figure.look.legend
         texts = [str(h.get_label()) for h in handles]
@@ -294,7 +292,7 @@ def legend_below(figure: DataFigure, handles: Sequence[Any]) -> None:
 
 
 def columns(frame: Frame, texts: Sequence[str], size: float) -> int:
-    """Return the number of legend columns that fit the figure's width."""
+    """Return how many columns of a legend fit into the figure's width."""
     width = frame.width_in - 0.15
     for rows in range(1, len(texts)):
         n = math.ceil(len(texts) / rows)
@@ -305,7 +303,7 @@ def columns(frame: Frame, texts: Sequence[str], size: float) -> int:
 
 
 def dot(label: str, colour: Any, size: float = 5.0, *, face: Any = None, marker: str = "o") -> Line2D:
-    """Return a legend handle that shows one marker."""
+    """Make a legend entry that shows one marker."""
     return Line2D(
         [],
         [],
@@ -320,7 +318,7 @@ def dot(label: str, colour: Any, size: float = 5.0, *, face: Any = None, marker:
 
 
 def tinted(colour: str, tint: float) -> tuple[float, float, float]:
-    """Mix a colour with white; `tint` is the share of white."""
+    """Mix a colour with white; `tint` is the share of white, 0 to 1."""
     red, green, blue = (float(c) + (1.0 - float(c)) * tint for c in to_rgb(colour))
     return red, green, blue
 
@@ -341,7 +339,7 @@ def check_choice(what: str, value: str, allowed: Sequence[str]) -> None:
 
 
 def limits(ax: Axes, frame: Frame, x: tuple[float, float] | None = None, y: tuple[float, float] | None = None) -> None:
-    """Set the axis ranges to those of the `Frame`, or else to the given ranges. Without either, leave them unchanged.
+    """Set the ranges of the axes to those of the `Frame` or, if it has none, to the given ones.
 
     Raises
     ------
@@ -363,7 +361,9 @@ def check_range(name: Literal["xlim", "ylim"] | str, range_: tuple[float, float]
 
 
 def edges(x: np.ndarray) -> np.ndarray:
-    """Return the edges of columns centred on the parameter values: one more edge than values."""
+    """Return the edges of the columns that are centred on given parameter values; there is one more edge than
+    values.
+    """
     if x.size == 1:
         width = 0.05 * abs(float(x[0])) or 0.5
         return np.array([x[0] - width, x[0] + width])
@@ -372,7 +372,7 @@ def edges(x: np.ndarray) -> np.ndarray:
 
 
 def span(x: np.ndarray) -> tuple[float, float]:
-    """Return the range that columns centred on the parameter values cover."""
+    """Return the range that the columns centred on given parameter values cover."""
     limits = edges(np.asarray(x, dtype=np.float64))
     return float(limits.min()), float(limits.max())
 
@@ -380,7 +380,7 @@ def span(x: np.ndarray) -> tuple[float, float]:
 def fill_columns(
     ax: Axes, edges: np.ndarray, low: np.ndarray, high: np.ndarray, looks: Mapping[str, Any], gid: str
 ) -> PolyCollection:
-    """Fill each column of a plot from `low` to `high`. Equal neighbouring columns share one rectangle."""
+    """Fill each column of a plot from `low` to `high`; equal columns beside each other share a rectangle."""
     levels = np.column_stack([low, high])
     starts = np.flatnonzero(np.r_[True, (np.diff(levels, axis=0) != 0).any(1)])
     ends = np.r_[starts[1:], len(levels)]
@@ -393,5 +393,5 @@ def fill_columns(
 
 
 def join(parts: Iterable[str]) -> str:
-    """Join the non-empty texts with commas."""
+    """Join the texts that are not empty with commas."""
     return ", ".join(part for part in parts if part)

@@ -22,7 +22,7 @@ _COLOURS = (style.VERMILLION, style.BLUE, style.GREEN, style.PURPLE, "black")
 def plot_tongues(
     ds: xr.Dataset, cube: xr.Dataset | None = None, *, frame: style.Frame = style.WIDE
 ) -> style.DataFigure:
-    """Draw the edges of Arnold tongues, each with its name p/q.
+    """Draw the edges of Arnold tongues in the plane of two parameters, each with its name p/q.
 
     Parameters
     ----------
@@ -81,7 +81,6 @@ def _colour(denominator: int) -> str:
 
 
 def _draw_edges(ax: Axes, ds: xr.Dataset, over_map: bool) -> None:
-    """Draw the edges of all tongues."""
     halo = [withStroke(linewidth=2.0, foreground="white")]
     for i in range(ds.sizes["curve"]):
         n, p, q = (int(ds[name][i]) for name in ("n_points", "numerator", "denominator"))
@@ -96,9 +95,7 @@ def _draw_edges(ax: Axes, ds: xr.Dataset, over_map: bool) -> None:
 
 
 def _name_tongues(fig: style.DataFigure, ax: Axes, ds: xr.Dataset) -> None:
-    """Write each tongue's name p/q at the highest point of its edges, if there is room. Small denominators have
-    priority.
-    """
+    """Write the name p/q of each tongue at the highest point of its edges, if there is room."""
     halo = [withStroke(linewidth=2.0, foreground="white")]
     taken: list[np.ndarray] = []
     (left, right), (bottom, ceiling) = ax.get_xlim(), ax.get_ylim()
@@ -130,7 +127,6 @@ def _name_tongues(fig: style.DataFigure, ax: Axes, ds: xr.Dataset) -> None:
 
 
 def _explain(fig: style.DataFigure, ds: xr.Dataset) -> None:
-    """Add a legend of the denominators' colours."""
     present = sorted({int(q) for q in ds["denominator"].values if q})
     names = [f"denominator {q}" if q < len(_COLOURS) else f"denominator {len(_COLOURS)} or more" for q in present]
     colours = dict(zip(names, map(_colour, present), strict=True))
@@ -138,7 +134,7 @@ def _explain(fig: style.DataFigure, ds: xr.Dataset) -> None:
 
 
 def draw(run: Run, options: TongueFigureOptions) -> style.DataFigure:
-    """Draw the figure ``tongues`` of a run, over the map of rotation numbers if the run sweeps both parameters."""
+    """Draw the figure ``tongues`` of a run, over its rotation numbers if the run sweeps both parameters."""
     found = run.derive("tongues", **options.part(TongueOptions))
     plane = {str(found.attrs[f"{role}_parameter"]) for role in ("first", "second")}
     cube = run.cube()

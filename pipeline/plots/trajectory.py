@@ -1,4 +1,4 @@
-"""Draw one trajectory: time series, phase portraits, and the path of a point of the mechanical drawing."""
+"""Draw one trajectory: time series, phase portraits, and the path of a point of the model's drawing."""
 
 from __future__ import annotations
 
@@ -25,8 +25,7 @@ COLOURS = (style.BLUE, style.VERMILLION, style.GREEN, style.PURPLE, style.ORANGE
 
 
 def plot_trajectory(ds: xr.Dataset, *, degrees: bool = False, frame: style.Frame = style.WIDE) -> style.DataFigure:
-    """Draw a trajectory: its time series, a phase portrait per pair of states, and the path of a point of the
-    mechanical drawing.
+    """Draw one trajectory: its time series, its phase portraits, and the path of a point of the model's drawing.
 
     Parameters
     ----------
@@ -88,7 +87,6 @@ def plot_trajectory(ds: xr.Dataset, *, degrees: bool = False, frame: style.Frame
 
 
 def _draw_path(ax: Axes, ds: xr.Dataset, drawing: Drawing, motion: Motion) -> list[Any]:
-    """Draw the path of the point that the model's mechanical drawing traces; return legend handles."""
     style.style_axes(ax)
     parameters = parameters_of(ds).as_dict()
     shown = draw_path(ax, drawing, parameters, motion)
@@ -105,9 +103,7 @@ def _place(ds: xr.Dataset) -> str:
 
 
 def _grids(fig: style.DataFigure, n_rows: int, n_panels: int) -> tuple[list[SubplotSpec], list[SubplotSpec]]:
-    """Return the layout grids of the time series and of the phase portraits: side by side, or stacked in a narrow
-    figure.
-    """
+    """Return the places of the time series and of the phase portraits: side by side or, in a narrow figure, stacked."""
     if not fig.frame.compact:
         outer = fig.add_gridspec(1, 2, width_ratios=[1.35, 1.0])
         left, right = outer[0].subgridspec(n_rows, 1), outer[1].subgridspec(n_panels, 1)
@@ -146,7 +142,6 @@ def _data(ds: xr.Dataset, series: dict[str, np.ndarray], drawing: Drawing | None
 
 
 def _section_times(ds: xr.Dataset, time: np.ndarray) -> np.ndarray:
-    """Return the times of the section points within the time series [s]."""
     if "section_times" in ds:
         times = np.asarray(ds["section_times"].values, dtype=np.float64)
     elif "frequency_hz" in ds.attrs:
@@ -161,7 +156,7 @@ def _section_times(ds: xr.Dataset, time: np.ndarray) -> np.ndarray:
 
 
 def _units(model: Model) -> list[tuple[str, ...]]:
-    """Group the states into panels by unit. Angles have a panel of their own, and so has each dimensionless state."""
+    """Group the states into panels by unit; angles, and each dimensionless state, have panels of their own."""
     kinds: dict[tuple[str, bool], tuple[str, ...]] = {}
     for s in model.states:
         key = (s.unit, s.on_circle) if s.unit != "1" else (s.name, False)
@@ -170,9 +165,7 @@ def _units(model: Model) -> list[tuple[str, ...]]:
 
 
 def _others(ds: xr.Dataset, model: Model) -> list[tuple[str, ...]]:
-    """Group variables that are not states by unit; keep only the first few units and the first few variables of
-    each.
-    """
+    """Group the other variables of the time series into panels by unit, up to a limit."""
     found: dict[str, tuple[str, ...]] = {}
     for name, values in ds.data_vars.items():
         if values.dims == ("time",) and str(name) not in (*model.state_names, "section_times"):
@@ -186,7 +179,6 @@ def _colour(pair: int) -> str:
 
 
 def _colours(model: Model) -> dict[str, str]:
-    """Return the colour of each state: that of the first phase portrait that contains the state."""
     found: dict[str, str] = {}
     for k, pair in enumerate(model.portraits):
         for name in pair:
@@ -226,7 +218,6 @@ def _draw_series(
 
 
 def _draw_others(ax: Axes, ds: xr.Dataset, time: np.ndarray, names: Sequence[str]) -> None:
-    """Draw the time series of variables that are not states in one panel, with a legend if there are several."""
     quantities = {q.name: q.symbol for q in model_of(ds).quantities}
     symbols = [f"${quantities[n]}$" if quantities.get(n) else n.replace("_", " ") for n in names]
     for name, symbol, look in zip(names, symbols, ("0.15", style.ORANGE), strict=False):

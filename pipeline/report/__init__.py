@@ -1,1 +1,1 @@
-"""Report runs and studies (reproductions of a paper) as HTML pages, with figures and judged claims."""
+"""Write HTML pages about runs and about studies (reproductions of a paper), with figures and judged claims."""

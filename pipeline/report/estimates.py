@@ -1,6 +1,4 @@
-"""Define `Estimate`, the return type of all measures of a study, and the protocol through which measures read the
-study's results.
-"""
+"""Define the estimate that every measure of a study returns, and the results that measures can read."""
 
 from __future__ import annotations
 
@@ -18,7 +16,7 @@ NOWHERE = math.nan
 
 @dataclass(frozen=True)
 class Estimate:
-    """A measured value with its 95 % interval.
+    """A measured value with its 95 % confidence interval.
 
     Attributes
     ----------
@@ -46,18 +44,18 @@ class Estimate:
 
 
 def absent(why: str, step: float | None = None) -> Estimate:
-    """Return an `Estimate` of NaN for a quantity that could not be measured, with the reason."""
+    """Return an estimate without a value, with the reason why it could not be measured."""
     return Estimate(NOWHERE, NOWHERE, NOWHERE, step=step, missing=why)
 
 
 class Results(Protocol):
-    """Protocol for the results of a study, read by name; see `pipeline.report.results.Results`."""
+    """The results of a study that measures can read by name: runs, recordings and torque fits."""
 
     def run(self, name: str) -> AnalysedRun:
         """Return a run of the study by name."""
 
     def recording(self, name: str) -> xr.Dataset:
-        """Return a recording of a simulated test rig by name."""
+        """Return a simulated recording of the study by name."""
 
     def torques(self, name: str) -> Any:
-        """Return the fit of a study's torque readings by name."""
+        """Return the fit of the study's torque readings by name."""

@@ -1,4 +1,4 @@
-"""Measure quantities in a study's results: estimates with 95 % intervals.
+"""Measure quantities in the results of a study, as estimates with 95 % intervals.
 
 A measure is a function of results and options that returns an `Estimate`. No measure depends on a model:
 classes of motion are the labels of the run's own classifier; axes and quantities are given by name. All
@@ -30,9 +30,7 @@ Measure = Callable[[Results, Sequence[str], Options], Estimate]
 
 
 def _cells(results: Results, name: str) -> tuple[xr.Dataset, str]:
-    """Return the cells of a run that sweeps one axis, as a dataset with dims (axis, cell), and the name of this
-    axis.
-    """
+    """Return the cells of a run that sweeps one axis, with the dims (axis, cell), and the name of the axis."""
     cube = results.run(name).cube()
     axes, starts = split_dims(cube["status"])
     wide = [d for d in axes if cube.sizes[d] > 1] or list(axes[:1])
@@ -49,7 +47,6 @@ def _cells(results: Results, name: str) -> tuple[xr.Dataset, str]:
 
 
 def _within(ds: xr.Dataset, axis: str, options: Options) -> xr.Dataset:
-    """Select the cells at the axis value ``at``, or those between the axis values ``low`` and ``high``."""
     values = ds[axis].values
     if "at" in options:
         at = _index(ds, axis, float(options["at"]))
@@ -60,7 +57,6 @@ def _within(ds: xr.Dataset, axis: str, options: Options) -> xr.Dataset:
 
 
 def _index(ds: xr.Dataset, axis: str, value: float) -> int | None:
-    """Return the index of a value on an axis. Return None if the axis lacks the value."""
     try:
         return place(ds[axis], value)
     except ValueError:
@@ -72,9 +68,7 @@ def _step(values: np.ndarray) -> float | None:
 
 
 def _matches(ds: xr.Dataset, options: Options) -> np.ndarray:
-    """Return a mask of the cells that have a wanted orbit period and the wanted class of motion. Period 0 selects
-    orbits that are not closed.
-    """
+    """Return which cells have the wanted orbit period and class of motion; period 0 means orbits that do not close."""
     wanted = options.get("period")
     periods = ds["orbit_period"].values
     found = np.ones(periods.shape, bool)
@@ -139,7 +133,9 @@ def _asked(options: Options) -> str:
 
 
 def window(results: Results, of: Sequence[str], options: Options) -> tuple[Estimate, int, int, xr.Dataset, str]:
-    """Measure the periodic window around an axis value: width, first and last index, selected cells, axis name."""
+    """Measure the interval about an axis value in which every cell has a given orbit period; return also its indices
+    and cells.
+    """
     ds, axis = _cells(results, of[0])
     here = _within(ds, axis, {k: v for k, v in options.items() if k in ("low", "high")})
     values, n = here[axis].values, here.sizes["cell"]

@@ -1,4 +1,4 @@
-"""Define the content of a report page, and render it as one HTML file.
+"""Define what a report page consists of, and write it as one HTML file.
 
 A page is data: a title, and sections with blocks of a few kinds (`Picture`, `Grid`, `Text`, `Note`, `Facts`,
 `Source`, `Outcome`). The template escapes every text, so no text of a run, a specification or a study becomes
@@ -33,7 +33,7 @@ MOST_ROWS = 60
 
 @dataclass(frozen=True)
 class Picture:
-    """A picture of a page, with its caption.
+    """Block of a page: a picture with its caption.
 
     Attributes
     ----------
@@ -59,13 +59,13 @@ class Picture:
 
     @property
     def source(self) -> str:
-        """Data URL with the picture's content."""
+        """Address (data URL) that contains the picture itself."""
         return "data:image/png;base64," + base64.b64encode(self.png).decode("ascii")
 
 
 @dataclass(frozen=True)
 class Grid:
-    """A table of a page.
+    """Block of a page: a table.
 
     Attributes
     ----------
@@ -94,7 +94,7 @@ class Grid:
 
 @dataclass(frozen=True)
 class Text:
-    """A paragraph of a page."""
+    """Block of a page: a paragraph."""
 
     text: str
     kind: str = "text"
@@ -102,7 +102,7 @@ class Text:
 
 @dataclass(frozen=True)
 class Note:
-    """A block of a page with a sentence, and a command that computes a missing or additional result."""
+    """Block of a page: a sentence, and a command that computes a missing or further result."""
 
     text: str
     command: str = ""
@@ -111,7 +111,7 @@ class Note:
 
 @dataclass(frozen=True)
 class Facts:
-    """A block of a page that lists names with values, such as digests and versions."""
+    """Block of a page: names with values, such as digests and versions."""
 
     items: Mapping[str, str]
     kind: str = "facts"
@@ -119,7 +119,7 @@ class Facts:
 
 @dataclass(frozen=True)
 class Source:
-    """A block of a page with verbatim text, such as a specification. The block is collapsed at first."""
+    """Block of a page: text to be shown as it is, such as a specification; it is collapsed at first."""
 
     title: str
     text: str
@@ -128,7 +128,7 @@ class Source:
 
 @dataclass(frozen=True)
 class Outcome:
-    """A block of a page that shows a claim, the measured result, and the verdict.
+    """Block of a page: a claim, the measured result, and the verdict.
 
     Attributes
     ----------
@@ -163,7 +163,7 @@ Block = Picture | Grid | Text | Note | Facts | Source | Outcome
 
 @dataclass(frozen=True)
 class Part:
-    """A section of a report page: title, blocks and subsections."""
+    """Section of a page: its title, blocks and subsections."""
 
     title: str
     blocks: Sequence[Block]
@@ -172,7 +172,7 @@ class Part:
 
 @dataclass(frozen=True)
 class Page:
-    """Content of a report page: title, summary and sections.
+    """Content of a report page: its title, summary and sections.
 
     Attributes
     ----------
@@ -193,20 +193,20 @@ class Page:
 
 
 def render(page: Page) -> str:
-    """Render a page as HTML text; equal pages give equal bytes."""
+    """Return a page as HTML; equal pages give equal bytes."""
     style = (_TEMPLATES / "page.css").read_text("utf-8")
     return _environment().get_template("page.html.j2").render(page=page, style=style, parts=anchored(page.parts))
 
 
 def write(page: Page, path: Path) -> None:
-    """Write a page as an HTML file atomically: complete or not at all."""
+    """Write a page as an HTML file, which is complete or absent at any time."""
     from pipeline.layout.writing import write_atomically
 
     write_atomically(path, render(page))
 
 
 def anchored(parts: Sequence[Part], prefix: str = "part") -> list[dict[str, Any]]:
-    """Return the page's sections as nested dictionaries, each with an anchor for the table of contents."""
+    """Return the sections of a page as nested dictionaries, each with an anchor for the table of contents."""
     return [
         {"title": part.title, "blocks": part.blocks, "anchor": name, "parts": anchored(part.parts, name)}
         for name, part in ((f"{prefix}-{i}", part) for i, part in enumerate(parts, 1))
@@ -228,7 +228,7 @@ def _environment() -> Environment:
 
 
 def picture_of(figure: Figure, alt: str, caption: str = "", command: str = "") -> Picture:
-    """Return a matplotlib figure as a picture block of the page."""
+    """Make a picture block from a matplotlib figure."""
     from pipeline.plots.style import TEXT_LOCK
 
     buffer = io.BytesIO()
@@ -239,7 +239,7 @@ def picture_of(figure: Figure, alt: str, caption: str = "", command: str = "") -
 
 
 def grid_of(rows: Sequence[Mapping[str, Any]], caption: str = "", command: str = "", most: int = MOST_ROWS) -> Grid:
-    """Return rows of values as a table block of the page, without empty columns."""
+    """Make a table block from rows of values; empty columns are left out."""
     names = list(dict.fromkeys(name for row in rows for name in row))
     cells = [[text_of(row.get(name)) for name in names] for row in rows[:most]]
     kept = [k for k in range(len(names)) if any(line[k] not in ("", "-") for line in cells)]
@@ -249,7 +249,7 @@ def grid_of(rows: Sequence[Mapping[str, Any]], caption: str = "", command: str =
 
 
 def text_of(value: Any) -> str:
-    """Format a value for a table: six digits, a dash for a number that is not finite."""
+    """Format a value for a table: six digits, or a dash for a number that is not finite."""
     if value is None:
         return ""
     if isinstance(value, bool):
@@ -261,5 +261,5 @@ def text_of(value: Any) -> str:
 
 
 def plain(text: str) -> str:
-    """Strip math markup from a label, for screen readers."""
+    """Remove the math markup from a label, for screen readers."""
     return re.sub(r"\s+", " ", re.sub(r"[$\\{}]", "", text)).strip()

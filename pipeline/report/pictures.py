@@ -24,9 +24,7 @@ _FINE = 2001
 
 
 def picture(results: Results, table: PictureTable) -> Block:
-    """Draw a picture of a study, and return it as a block of the page. If drawing fails, return a note with the
-    reason.
-    """
+    """Draw a picture of a study as a block of the page; if it cannot be drawn, return a note with the reason."""
     alt = f"{table.caption.rstrip('.')} ({table.of})"
     try:
         drawn = _DRAW[table.kind](results, table)
@@ -67,7 +65,6 @@ _DRAW = {"plot": _plot, "quantities": _quantities, "recording": _recording, "ser
 
 
 def _command(results: Results, table: PictureTable) -> str:
-    """Return the shell command that draws a picture from the study's results."""
     if table.kind == "plot":
         place = shlex.quote(str(results.folder / "runs" / table.of))
         return command_of(f"plot {table.figure}", table.options, place)
@@ -79,7 +76,7 @@ def _command(results: Results, table: PictureTable) -> str:
 
 
 def draw_quantities(parameters: Parameters, names: tuple[str, ...], frequency_hz: float) -> DataFigure:
-    """Draw quantities of a model over one drive period, for the state at rest.
+    """Draw quantities of a model over one drive period, with all states at 0.
 
     Parameters
     ----------

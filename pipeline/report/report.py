@@ -1,4 +1,4 @@
-"""Make a report page on one or several runs: ``magpend report``."""
+"""Make the report page about one or several runs, for ``magpend report``."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def report(
     only_stored: bool = False,
     echo: Echo = print,
 ) -> Page:
-    """Return the report page on one or several runs.
+    """Make the report page about one or several runs.
 
     Parameters
     ----------
@@ -55,12 +55,11 @@ def report(
 
 
 def made_by() -> str:
-    """Return the program's name and version."""
+    """Return the name and the version of this program."""
     return f"magpend {metadata.version('magpend')}"
 
 
 def _summary(runs: Sequence[AnalysedRun]) -> Grid:
-    """Return a table that lists the runs of a page with several runs."""
     rows = [
         (run.info.title or run.name, run.name, run.model.name, run.spec.kind, str(run.plan.n_cells), run.digest[:12])
         for run in runs

@@ -1,4 +1,4 @@
-"""Reproduce a study (``magpend reproduce``): compute its runs and judge its claims."""
+"""Reproduce a study: compute its runs, judge its claims, and write a page about them."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ Echo = Callable[[str], None]
 
 @dataclass(frozen=True)
 class Judgement:
-    """A claim with its estimate and its verdict.
+    """A claim with its measured estimate and the verdict.
 
     Attributes
     ----------
@@ -57,13 +57,13 @@ class Judgement:
 
     @property
     def fails(self) -> bool:
-        """Return whether the claim is required and contradicted; claims used for calibration are judged as well."""
+        """Whether a required claim is contradicted by the result."""
         return self.claim.required and self.plain is Verdict.NOT_MET
 
 
 @dataclass(frozen=True)
 class Reproduced:
-    """Result of reproducing a study: folder, report page and judged claims.
+    """Result of reproducing a study: its folder, its report page and the judged claims.
 
     Attributes
     ----------
@@ -81,7 +81,7 @@ class Reproduced:
 
     @property
     def failed(self) -> list[Judgement]:
-        """Judged claims that are required and contradicted."""
+        """Required claims that the results contradict."""
         return [judgement for judgement in self.judgements if judgement.fails]
 
 
@@ -146,7 +146,7 @@ def _chosen(study: Study, figures: Sequence[str]) -> list[FigureTable]:
 
 
 def judge(results: Results, figure: str, claim: ClaimTable) -> Judgement:
-    """Measure the quantity of a claim, and judge the claim by the result.
+    """Measure the quantity of a claim, and compare it with the claimed range.
 
     The verdict is undecided if the axis is coarser, or the sample smaller, than the claim requires.
     """
@@ -171,7 +171,6 @@ def judge(results: Results, figure: str, claim: ClaimTable) -> Judgement:
 
 
 def _decides(claim: ClaimTable) -> str:
-    """Return a sentence with the axis step and the number of cells that a claim needs to be decided."""
     steps = f"steps of at most {claim.step:g}" if claim.step else ""
     cells = f"at least {claim.n} cells" if claim.n else ""
     both = " and ".join(part for part in (steps, cells) if part)
@@ -179,7 +178,6 @@ def _decides(claim: ClaimTable) -> str:
 
 
 def _part(results: Results, figure: FigureTable, judgements: Sequence[Judgement]) -> Part:
-    """Return the page section on a figure of the paper: the paper's statement, pictures, verdicts, command."""
     many = len(figure.numbers) > 1
     blocks: list[Block] = []
     if figure.says:
@@ -213,7 +211,7 @@ def _outcome(judgement: Judgement) -> Outcome:
 
 
 def spelled(judgement: Judgement) -> str:
-    """Return the measured result of a judged claim with its interval, and the claimed range, as text."""
+    """Return a text with the measured result of a claim, its interval, and the claimed range."""
     found, claim = judgement.estimate, judgement.claim
     if found.missing:
         return "not measured."
@@ -225,7 +223,6 @@ def spelled(judgement: Judgement) -> str:
 
 
 def _digits(width: float) -> str:
-    """Return a format string with enough decimals to show two digits of an interval's width."""
     if not (math.isfinite(width) and width > 1e-8):
         return "{:.7g}"
     return f"{{:.{min(max(0, 1 - math.floor(math.log10(width))), 9)}f}}"
@@ -239,7 +236,7 @@ def _range(claim: ClaimTable) -> str:
 
 
 def _summary(results: Results, judgements: Sequence[Judgement]) -> list[Block]:
-    """Return the blocks of the page above its figures: counts of verdicts, source, all claims, versions."""
+    """Make the blocks at the top of the page: counts of verdicts, source, all claims, versions."""
     table = results.study.table
     counts = {verdict: sum(j.verdict is verdict for j in judgements) for verdict in Verdict}
     failed = sum(j.fails for j in judgements)
@@ -269,7 +266,7 @@ def _summary(results: Results, judgements: Sequence[Judgement]) -> list[Block]:
 
 
 def headline(judgements: Sequence[Judgement], smoke: bool) -> str:
-    """Return a sentence with the numbers of claims that are met, not met or undecided."""
+    """Return a sentence on how many claims are met, not met or undecided."""
     tests = decided_first(judgements)
     met, failed, left = (sum(j.verdict is v for j in tests) for v in (Verdict.MET, Verdict.NOT_MET, Verdict.UNDECIDED))
     text = f"Of {len(tests)} claims that are tests, {met} are met, {failed} not met, {left} undecided."
@@ -278,15 +275,13 @@ def headline(judgements: Sequence[Judgement], smoke: bool) -> str:
 
 
 def decided_first(judgements: Sequence[Judgement]) -> list[Judgement]:
-    """Return the claims that test the model, decided ones first. Claims used for calibration are omitted."""
+    """Return the claims that test the model, decided ones first; claims used for calibration are left out."""
     tests = [j for j in judgements if j.verdict is not Verdict.CALIBRATED]
     return sorted(tests, key=lambda j: j.verdict is Verdict.UNDECIDED)
 
 
 def calibrated_on(judgements: Sequence[Judgement]) -> str:
-    """Return a paragraph that lists the claims on which parameters were calibrated. It is empty if there are no such
-    claims.
-    """
+    """Return a paragraph on the claims on which parameters were calibrated; an empty text if there are none."""
     own = [j for j in judgements if j.verdict is Verdict.CALIBRATED]
     if not own:
         return ""
@@ -303,7 +298,6 @@ def calibrated_on(judgements: Sequence[Judgement]) -> str:
 
 
 def _provenance(results: Results) -> list[Part]:
-    """Return the page section on the runs behind the figures: digests, versions, specifications."""
     runs = results.computed()
     if not runs:
         return []
@@ -318,7 +312,6 @@ def _provenance(results: Results) -> list[Part]:
 
 
 def _rows(judgements: Sequence[Judgement]) -> str:
-    """Return all judged claims as JSON text."""
     rows = [
         {
             "figure": j.figure,

@@ -1,4 +1,4 @@
-"""Compute the results of a study once: runs, recordings of simulated test rigs, fits of torque readings."""
+"""Compute the results of a study, each once: runs, simulated recordings, and fits of torque readings."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Echo = Callable[[str], None]
 
 
 class Results:
-    """Results of a study in a folder: each is computed when it is first needed.
+    """Results of a study in a folder; each is computed when it is first needed.
 
     Runs lie in ``runs/`` and are completed, not repeated. Recordings and fits take seconds and are computed
     again, with the same numbers.
@@ -50,7 +50,7 @@ class Results:
         self._torques: dict[str, Any] = {}
 
     def prepare(self, names: set[str]) -> None:
-        """Check all inputs that the named results need, then compute the runs among these results.
+        """Check the inputs of the results that are needed, then compute the runs among them.
 
         Raises
         ------
@@ -63,7 +63,7 @@ class Results:
                 self.run(name)
 
     def _check(self, names: set[str]) -> None:
-        """Read all needed specifications, simulated rigs and torque headers; raise SpecError with all problems."""
+        """Read all needed specifications and headers; raise a SpecError that lists all problems."""
         table, problems = self.study.table, []
         checks: list[tuple[str, Callable[[str], Any]]] = [
             *((name, lambda name: load_spec(self.spec(name), smoke=self.smoke)) for name in table.runs),
@@ -80,9 +80,7 @@ class Results:
             raise SpecError(problems)
 
     def spec(self, name: str) -> Path:
-        """Return the path of a run's specification: a file of the study, or a specification shipped with the
-        package.
-        """
+        """Return the path of the specification of one of the study's runs."""
         given = self.study.table.runs[name].spec
         return self.study.file(given) if given.endswith(".toml") else find_spec(given)
 
@@ -92,7 +90,7 @@ class Results:
         return measured(self.study.table.torques[name].header, self.study.path.parent)
 
     def run(self, name: str) -> AnalysedRun:
-        """Return a run of the study by name, after computing its missing cells."""
+        """Compute the missing cells of one of the study's runs, and return the run."""
         if name not in self._runs:
             place = self.folder / "runs" / name
             place.parent.mkdir(parents=True, exist_ok=True)
@@ -102,17 +100,17 @@ class Results:
         return self._runs[name]
 
     def computed(self) -> dict[str, AnalysedRun]:
-        """Return the runs computed or opened so far, by name."""
+        """Return the runs of the study that are computed so far, by name."""
         return dict(self._runs)
 
     def rig(self, name: str) -> Rig:
-        """Return the simulated test rig of a recording."""
+        """Return the simulated test rig that makes a recording of the study."""
         from pipeline.rig.simulation import load_rig
 
         return load_rig(self.study.file(self.study.table.recordings[name].rig))
 
     def recording(self, name: str) -> xr.Dataset:
-        """Return a recording of a simulated test rig by name, marked as simulated; compute it at the first call."""
+        """Return a recording of a simulated test rig by name; it is computed at the first call."""
         if name not in self._recordings:
             from pipeline.rig.recordings import read_recording
             from pipeline.rig.recordings.writing import write_raw
@@ -128,13 +126,13 @@ class Results:
         return self._recordings[name]
 
     def series(self, name: str, n_periods: int) -> xr.Dataset:
-        """Return the time series of a recording, and of the model integrated from the same state."""
+        """Return a recording's time series, and that of the model integrated from the same state."""
         from pipeline.rig.measured.series import series_of
 
         return series_of(self.recording(name), self.rig(name).parameters, n_periods=n_periods)
 
     def torques(self, name: str) -> Any:
-        """Return the fit of a study's torque readings by name; compute it at the first call."""
+        """Return a fit of the study's torque readings by name; it is computed at the first call."""
         if name not in self._torques:
             from pipeline.report.torque_curves import fitted
 

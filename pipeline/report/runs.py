@@ -1,4 +1,4 @@
-"""Write the sections of a report on one run: diagram, attractors, bifurcations, exponents, parameters.
+"""Write the sections of a report about one run: diagram, attractors, bifurcations, exponents, parameters.
 
 A report shows the cube and the results in ``derived/``. Attractors, basins, and the hysteresis of a
 continuation are computed if they are missing, as ``magpend analyse`` does. For other missing results the
@@ -76,7 +76,7 @@ _CAPTIONS = {
 
 
 class Shown:
-    """A run shown in a report, with its cube.
+    """A run that a report shows, with its result cube.
 
     Parameters
     ----------
@@ -97,13 +97,15 @@ class Shown:
         return shlex.quote(self.run.name)
 
     def options_of(self, name: str) -> list[dict[str, Any]]:
-        """Return the options of each stored result of an analysis, or default options if it may be computed."""
+        """Return the options with which a report shows an analysis: those of each stored result, or else the
+        defaults.
+        """
         known = stored_options(self.run, name)
         return known or ([{}] if name in self.computed else [])
 
 
 def part_of(source: str | AnalysedRun, echo: Callable[[str], None], computed: tuple[str, ...] = CHEAP) -> Part:
-    """Return the section of a report on one run.
+    """Make the section of a report about one run.
 
     Parameters
     ----------
@@ -133,7 +135,6 @@ def part_of(source: str | AnalysedRun, echo: Callable[[str], None], computed: tu
 
 
 def _state(shown: Shown) -> Iterator[Block]:
-    """Yield the block with facts about the run and its progress."""
     run, found = shown.run, state(shown.run)
     swept = ", ".join(f"{name} {_span(shown.cube, name)}" for name in shown.axes) or "nothing"
     model = run.model
@@ -155,7 +156,6 @@ def _state(shown: Shown) -> Iterator[Block]:
 
 
 def _span(cube: xr.Dataset, name: str) -> str:
-    """Return the range of an axis, its unit and its number of values as text."""
     values, unit = cube[name].values, str(cube[name].attrs.get("units", "1"))
     if values.size == 1:
         return f"{values[0]:g}{'' if unit == '1' else ' ' + unit}"
@@ -163,7 +163,6 @@ def _span(cube: xr.Dataset, name: str) -> str:
 
 
 def _parameters(shown: Shown) -> Iterator[Block]:
-    """Yield the table of the run's parameters with values, units and sources."""
     run = shown.run
     chosen = run.model.preset(run.spec.parameters.chosen)
     over, swept = run.spec.parameters.overrides, {parameter_name(name): name for name in shown.axes}
@@ -184,7 +183,6 @@ def _parameters(shown: Shown) -> Iterator[Block]:
 
 
 def _diagram(shown: Shown) -> Iterator[Block]:
-    """Yield the figure of the bifurcation diagram, or of the section points if nothing is swept."""
     if len(shown.axes) > 1:
         at = _first_of_others(shown)
         yield from _drawn(shown, "bifurcation", "Bifurcation diagram at the first values of the other axes", at=at)
@@ -195,16 +193,13 @@ def _diagram(shown: Shown) -> Iterator[Block]:
 
 
 def _first_of_others(shown: Shown) -> dict[str, float]:
-    """Return the first value on each axis other than the diagram's horizontal axis, by axis."""
     continuation = shown.run.spec.continuation
     path = next((d for d in shown.axes if continuation and parameter_name(d) == continuation.path), shown.axes[0])
     return {d: float(shown.cube[d].values[0]) for d in shown.axes if d != path}
 
 
 def _attractors(shown: Shown) -> Iterator[Block]:
-    """Yield the table of attractors with periods, motions, ranges and basin fractions, and figures of the
-    attractors.
-    """
+    """Make the table of a run's attractors and the figures of these."""
     known = shown.options_of("attractors")
     if not known:
         yield _missing(shown, "attractors")
@@ -241,9 +236,6 @@ def _attractors(shown: Shown) -> Iterator[Block]:
 
 
 def _counted(rows: list[dict[str, Any]], told: str) -> str:
-    """Return a text with the numbers of attractors and of other invariant sets, and a sentence on the outcomes of
-    cells.
-    """
     attract = {r["attractor_id"] for r in rows if r["stability"] == "attracts"}
     others = {r["attractor_id"] for r in rows} - attract
     more = f", {counted(len(others), 'other set')}" if others else ""
@@ -251,9 +243,6 @@ def _counted(rows: list[dict[str, Any]], told: str) -> str:
 
 
 def _richest(rows: list[dict[str, Any]], axes: tuple[str, ...]) -> dict[str, float]:
-    """Return the axis values with the largest number of coexisting attractors. In a tie, return the first such
-    values.
-    """
     counts: dict[tuple[float, ...], int] = {}
     for row in rows:
         place: tuple[float, ...] = tuple(row[name] for name in axes)
@@ -265,9 +254,7 @@ def _richest(rows: list[dict[str, Any]], axes: tuple[str, ...]) -> dict[str, flo
 def _attractor_grid(
     ds: xr.Dataset, rows: list[dict[str, Any]], axes: tuple[str, ...]
 ) -> tuple[list[str], list[list[str]]]:
-    """Return a table with a row per attractor: kind, period, motion, ranges, largest basin fraction with its
-    interval.
-    """
+    """Return the heads and the rows of a table with one row per attractor."""
     motion, sampled = any("side" in r for r in rows), any("fraction" in r for r in rows)
     names = ["", "kind", "stability", "shown by", "period", *(["motion"] if motion else []), *axes, "cells"]
     names += ["basin fraction (95 % interval)"] if sampled else []
@@ -287,9 +274,6 @@ def _attractor_grid(
 
 
 def _share(rows: list[dict[str, Any]], axes: tuple[str, ...]) -> str:
-    """Return as text the largest basin fraction of an attractor, its interval, and the parameter values at which it
-    occurs.
-    """
     best = max(rows, key=lambda row: float(np.nan_to_num(row["fraction"], nan=-1.0)))
     if not np.isfinite(best["fraction"]):  # it attracts nowhere
         return "-"
@@ -299,9 +283,6 @@ def _share(rows: list[dict[str, Any]], axes: tuple[str, ...]) -> str:
 
 
 def _analyses(shown: Shown) -> Iterator[Part]:
-    """Yield a section for each analysis other than ``attractors``: its table and figure, or the command that computes
-    it.
-    """
     for name in SHOWN[1:]:
         if not _suits(shown, name):
             continue
@@ -313,7 +294,6 @@ def _analyses(shown: Shown) -> Iterator[Part]:
 
 
 def _suits(shown: Shown, name: str) -> bool:
-    """Return whether an analysis applies to the run that is shown."""
     if shown.run.spec.recorded is not None:  # the recording ends, so no cell can be integrated further
         return False
     if name == "hysteresis":
@@ -356,7 +336,7 @@ _OF_ATTRACTORS = {
 
 
 def _with_letters(row: Mapping[str, Any], path: str) -> dict[str, Any]:
-    """Return a table row with letters for attractor ids, and the parameter's name added to the headings from and to."""
+    """Replace the attractor ids of a table row by letters, and name the parameter in its heads."""
     found: dict[str, Any] = {}
     for name, value in row.items():
         if name in _OF_ATTRACTORS:
@@ -367,7 +347,6 @@ def _with_letters(row: Mapping[str, Any], path: str) -> dict[str, Any]:
 
 
 def _exponents(shown: Shown) -> Iterator[Block]:
-    """Yield the figure of the cube's Lyapunov exponents, or a note on how to compute them."""
     if shown.run.spec.recorded is not None:
         return
     if "lyapunov" not in shown.run.spec.products:
@@ -385,7 +364,7 @@ def _exponents(shown: Shown) -> Iterator[Block]:
 
 
 def provenance_of(run: AnalysedRun, spec: str = "SPEC") -> Iterator[Block]:
-    """Yield the blocks on a run's provenance: command, digests, versions and specification."""
+    """Make the blocks on where the results of a run come from: command, digests, versions and specification."""
     info = run.info
     made = dict(info.versions)
     facts = {
@@ -401,7 +380,6 @@ def provenance_of(run: AnalysedRun, spec: str = "SPEC") -> Iterator[Block]:
 
 
 def _drawn(shown: Shown, name: str, caption: str, **options: Any) -> Iterator[Block]:
-    """Yield a figure as a picture block, or a note with the reason why it was not drawn."""
     try:
         drawn = figure(shown.run, name, options)
     except SpecError as error:
@@ -418,7 +396,7 @@ def _missing(shown: Shown, name: str) -> Note:
 
 
 def command_of(words: str, options: Mapping[str, Any], place: str) -> str:
-    """Return the shell command for one analysis or figure with given options."""
+    """Return the shell command for an analysis or a figure with given options."""
     verb, _, name = words.partition(" ")
     model = (ANALYSES if verb == "analyse" else FIGURES)[name].options
     parts = []
@@ -435,5 +413,5 @@ def command_of(words: str, options: Mapping[str, Any], place: str) -> str:
 
 
 def text_of_option(value: Any) -> str:
-    """Format the value of an option for the command line."""
+    """Format the value of an option for a shell command."""
     return " ".join(f"{part:.15g}" for part in value) if isinstance(value, list | tuple) else str(value)

@@ -1,4 +1,4 @@
-"""Find the stored analysis results of a run that belong to its present cells."""
+"""Find the stored results of analyses that are valid for the present cells of a run."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from pipeline.store.run import Run
 
 
 def stored_options(run: Run, name: str) -> list[dict[str, Any]]:
-    """Return the options of each stored result of an analysis that is still valid.
+    """Return the options of each valid stored result of an analysis.
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ def stored_options(run: Run, name: str) -> list[dict[str, Any]]:
 
 
 def settled_options(name: str, attrs: Mapping[str, Any]) -> dict[str, Any]:
-    """Return those options of a stored analysis result that differ from their defaults.
+    """Return the options of a stored result that differ from their defaults.
 
     Options that were left open are filled in, such as a range that defaults to the axis'.
     """
@@ -57,7 +57,6 @@ def settled_options(name: str, attrs: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _tuples(value: Any) -> Any:
-    """Convert lists from JSON to tuples, also inside dictionaries and lists."""
     if isinstance(value, dict):
         return {name: _tuples(part) for name, part in value.items()}
     return tuple(_tuples(part) for part in value) if isinstance(value, list) else value

@@ -19,25 +19,25 @@ STUDY = "study.toml"
 
 
 class RunTable(Table):
-    """A table ``[runs.NAME]`` of a study's file: a run of the study."""
+    """Table ``[runs.NAME]`` of a study's file: a run of the study."""
 
     spec: str = Field(description="Specification: a file, relative to the study, or the name of one that ships.")
 
 
 class RecordingTable(Table):
-    """A table ``[recordings.NAME]`` of a study's file: a recording of a simulated test rig."""
+    """Table ``[recordings.NAME]`` of a study's file: a recording of a simulated test rig."""
 
     rig: str = Field(description="Virtual rig: a file, relative to the study.")
 
 
 class TorqueTable(Table):
-    """A table ``[torques.NAME]`` of a study's file: torque readings to fit."""
+    """Table ``[torques.NAME]`` of a study's file: torque readings to fit."""
 
     header: str = Field(description="Header of torque readings: a file, or the name of one that ships.")
 
 
 class PictureTable(Table):
-    """A table ``[[figures.pictures]]`` of a study's file: a picture to draw for a figure of the paper."""
+    """Table ``[[figures.pictures]]`` of a study's file: a picture that reproduces (part of) a figure of the paper."""
 
     kind: Literal["plot", "quantities", "recording", "series", "torques"] = Field(
         description="plot: a figure of a run, by the name of its command; quantities: quantities of the "
@@ -53,7 +53,7 @@ class PictureTable(Table):
 
 
 class ClaimTable(Table):
-    """A table ``[[figures.claims]]`` of a study's file: a claim with the measure that decides it."""
+    """Table ``[[figures.claims]]`` of a study's file: a claim, and the measure that decides it."""
 
     statement: str = Field(description="The claim, paraphrased.")
     source: str = Field(description="Author and place of the claim.")
@@ -78,7 +78,9 @@ class ClaimTable(Table):
 
 
 class FigureTable(Table):
-    """A table ``[[figures]]`` of a study's file: one or several figures of the paper, with pictures and claims."""
+    """Table ``[[figures]]`` of a study's file: figures of the paper, with the pictures and claims that reproduce
+    them.
+    """
 
     number: str = Field(description="Number of the figure, or several numbers.")
     title: str = Field(description="Title of the figure.")
@@ -91,17 +93,17 @@ class FigureTable(Table):
 
     @property
     def numbers(self) -> list[str]:
-        """Numbers of the paper's figures that this table covers."""
+        """Numbers that the figures have in the paper."""
         return self.number.replace(",", " ").split()
 
     @property
     def needs(self) -> set[str]:
-        """Names of all runs, recordings and torque readings that the figure's pictures and claims use."""
+        """Names of the runs, recordings and torque readings that the pictures and claims use."""
         return {p.of for p in self.pictures} | {name for claim in self.claims for name in claim.of}
 
 
 class StudyTable(Table):
-    """Content of a study's TOML file."""
+    """Content of the TOML file of a study."""
 
     title: str = Field(description="Title of the report.")
     source: str = Field(description="Citation of the reproduced paper.")
@@ -117,7 +119,7 @@ class StudyTable(Table):
 
 
 class Study:
-    """A study: its name, the path of its TOML file, and the file's content.
+    """A study: its name, the path of its TOML file and the content of this file.
 
     Parameters
     ----------
@@ -133,12 +135,12 @@ class Study:
         self.name, self.path, self.table = name, path, table
 
     def file(self, name: str) -> Path:
-        """Return the path of a file given relative to the study's file."""
+        """Return the path of a file that is given relative to the study's TOML file."""
         return self.path.parent / name
 
 
 def shipped_studies() -> dict[str, Path]:
-    """Return the paths of the studies shipped with the package, by name."""
+    """Return the paths of the studies that ship with the package, by name."""
     try:
         folder = Path(str(resources.files("workflows")))
     except ModuleNotFoundError:
@@ -147,7 +149,7 @@ def shipped_studies() -> dict[str, Path]:
 
 
 def load_study(name: str | Path) -> Study:
-    """Read a study from a file, or by the name of a study shipped with the package.
+    """Read a study, given by its TOML file or by the name of a study that ships with the package.
 
     Raises
     ------
@@ -170,7 +172,7 @@ def load_study(name: str | Path) -> Study:
 
 
 def _problems(table: StudyTable) -> list[str]:
-    """Return the problems of a study's names: duplicates, and unknown inputs, figures or measures."""
+    """Return what is wrong with the names in a study: duplicates, and unknown inputs, figures or measures."""
     from pipeline.report.measures import MEASURES
 
     known = [*table.runs, *table.recordings, *table.torques]
@@ -193,7 +195,6 @@ def _problems(table: StudyTable) -> list[str]:
 
 
 def _plot_problems(at: str, picture: PictureTable) -> list[str]:
-    """Return the problems of a picture's entry in the study: an unknown figure name, or wrong options."""
     if picture.figure not in FIGURES:
         return [f"{at}.figure: {unknown_name('figure', picture.figure, FIGURES)}"]
     try:

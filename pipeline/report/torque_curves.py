@@ -1,4 +1,4 @@
-"""Measure and draw the fits of magnet torque curves for a study."""
+"""Measure and draw the fits of torque curves for a study."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Judge claims: compare a measured interval with a claimed range."""
+"""Judge claims by comparing a measured interval with a claimed range."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ class Verdict(Enum):
 
     @property
     def words(self) -> str:
-        """Verdict in words."""
+        """Verdict in words, for people."""
         return self.value
 
     @property
     def css(self) -> str:
-        """CSS class of the block that shows the verdict on a page."""
+        """CSS class of the block that shows this verdict on a page."""
         return self.name.lower().replace("_", "-")
 
     def __str__(self) -> str:
@@ -31,7 +31,7 @@ class Verdict(Enum):
 
 
 def judged(low: float, high: float, least: float, most: float) -> Verdict:
-    """Judge a claim: compare the confidence interval of a measured number with the claimed range.
+    """Judge a claim by comparing the confidence interval of a measured number with the claimed range.
 
     Parameters
     ----------

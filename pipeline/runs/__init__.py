@@ -1,1 +1,1 @@
-"""Carry out commands on runs: run, status, verify, derive, draw, extend, zoom."""
+"""Carry out the commands on runs: run, status, verify, derive, draw, extend, zoom."""

@@ -1,4 +1,4 @@
-"""Write batch scripts for clusters, and define each batch system's commands to submit, query and cancel a job."""
+"""Write batch scripts for clusters; define how each batch system submits, queries and cancels a job."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pipeline.specification.clusters import Cluster, bytes_of, clock, hours_and_
 
 @dataclass(frozen=True)
 class Words:
-    """Commands of a batch system to submit, query and cancel jobs, with the patterns of their output.
+    """Commands of a batch system that submit, query and cancel jobs, and patterns of their output.
 
     Attributes
     ----------
@@ -36,7 +36,7 @@ class Words:
     number: str = r"(?P<job>\d+)"
 
     def job(self, output: str) -> str | None:
-        """Return the job's number in the output of the submit command, or None if the output contains no number."""
+        """Find the number of the job in the output of the submit command; None if it has none."""
         match = re.search(self.number, output)
         return match["job"] if match else None
 
@@ -50,12 +50,12 @@ WORDS = {
 
 
 def is_whole(cluster: Cluster) -> bool:
-    """Return whether a single job holds the coordinator process and all workers."""
+    """Return whether a single batch job both coordinates the run and does its work."""
     return cluster.max_jobs == 1
 
 
 def coordinator_script(cluster: Cluster, name: str, log: str, folder: str, command: Sequence[str]) -> str:
-    """Return the batch script for the job of the coordinator process.
+    """Return the batch script of the job that coordinates a run.
 
     Parameters
     ----------
@@ -149,8 +149,8 @@ _MARKS = {"slurm": "#SBATCH", "pbs": "#PBS", "sge": "#$", "lsf": "#BSUB"}
 
 
 def _directives(cluster: Cluster) -> list[str]:
-    """Return the user's additional batch directives. A job of one core omits the directives for a parallel environment
-    (``-pe``).
+    """Return the user's additional lines for batch scripts; a job of one core gets no ``-pe`` (parallel
+    environment).
     """
     return [line for line in cluster.directives if is_whole(cluster) or not line.strip().startswith("-pe")]
 

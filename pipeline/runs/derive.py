@@ -1,4 +1,4 @@
-"""Compute the results of a run's analyses once, and store them in its folder ``derived/``.
+"""Compute the analyses of a run, each once, and store their results in the run's folder ``derived/``.
 
 A result's key holds everything that decides its numbers: the digest of the committed cells, the analysis'
 name, its options, and the version of its code (`code_version`). `derive` returns the stored result with that
@@ -61,7 +61,7 @@ def _silent(_: str) -> None:
 
 @dataclass(frozen=True, repr=False)
 class AnalysedRun(Run):
-    """Opened run that is passed to an analysis. The analysis obtains the results of other analyses from it.
+    """An opened run for analyses; an analysis gets from it the results of other analyses.
 
     Attributes
     ----------
@@ -73,21 +73,21 @@ class AnalysedRun(Run):
 
     @classmethod
     def of(cls, source: Source, echo: Echo | None = None) -> AnalysedRun:
-        """Open a run directory for analyses, or wrap a run that is already opened."""
+        """Open a run directory for analyses, or convert a run that is open already."""
         run = Run.open(source)
         if isinstance(run, AnalysedRun) and echo is None:
             return run
         return cls(**{f.name: getattr(run, f.name) for f in fields(Run)}, echo=echo or _silent)
 
     def derive(self, name: str, **options: Any) -> xr.Dataset:
-        """Return the result of another analysis of the same run; see `derive`."""
+        """Return the result of an analysis of this run, computed now or read if it is stored."""
         return derive(self, name, options)
 
 
 def derive(
     source: Source, name: str, options: Mapping[str, Any] | Options | None = None, *, echo: Echo | None = None
 ) -> xr.Dataset:
-    """Return the stored result of an analysis of a run. If there is none, compute the result and store it.
+    """Return the result of an analysis of a run. It is read if it is stored, or else computed and stored.
 
     Parameters
     ----------
@@ -139,8 +139,7 @@ def derive(
 
 
 def stored(source: Source, name: str) -> xr.Dataset | None:
-    """Return the stored result of an analysis for the current cells of a run, or None if there is none. Nothing is
-    computed.
+    """Return the stored result of an analysis for the present cells of a run; None if there is none.
 
     Parameters
     ----------
@@ -174,7 +173,6 @@ def stored(source: Source, name: str) -> xr.Dataset | None:
 
 
 def _changed_options(run: Run, name: str, attrs: Mapping[str, Any]) -> int:
-    """Return the number of options of a stored result that differ from the defaults."""
     try:
         options = prepared(AnalysedRun.of(run), ANALYSES[name], validated(ANALYSES[name].options, {})).plain()
     except SpecError:  # the run does not suit the defaults
@@ -183,13 +181,7 @@ def _changed_options(run: Run, name: str, attrs: Mapping[str, Any]) -> int:
 
 
 def _options_of(attrs: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the options that a stored result was computed with.
-
-    Raises
-    ------
-    DamagedError
-        If they cannot be read.
-    """
+    """Return the options with which a stored result was computed; raise DamagedError if they cannot be read."""
     try:
         given = json.loads(str(attrs.get("derived_options", "{}")))
     except ValueError:
@@ -200,7 +192,7 @@ def _options_of(attrs: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _refuse_recorded(run: Run, name: str) -> None:
-    """Raise `SpecError` for a run driven by a recording. Analyses would integrate beyond the end of the recording."""
+    """Raise SpecError if the drive of a run is a recording, since analyses would integrate beyond its end."""
     if run.spec.recorded is not None:
         raise SpecError(
             [
@@ -213,7 +205,7 @@ def _refuse_recorded(run: Run, name: str) -> None:
 
 
 def prepared(run: AnalysedRun, product: Any, options: Options) -> Options:
-    """Return the options of an analysis or figure with names and missing values filled in from the run.
+    """Complete the options of an analysis or figure from the run: full names, and missing values.
 
     Raises
     ------
@@ -230,7 +222,8 @@ def prepared(run: AnalysedRun, product: Any, options: Options) -> Options:
 
 
 def most_evidence(run: Run, options: Options) -> Options:
-    """Return options with the largest effort of any stored search for attractors whose other options are equal.
+    """Raise the effort in some options to the largest effort of a stored search for attractors with otherwise equal
+    options.
 
     Options without an effort are returned unchanged.
     """
@@ -242,7 +235,7 @@ def most_evidence(run: Run, options: Options) -> Options:
 
 
 def _kept_efforts(run: Run) -> list[tuple[dict[str, Any], tuple[float, int]]]:
-    """Return the options of each valid stored search for attractors, as pairs: all other options, and the effort."""
+    """Return the options of each valid stored search for attractors, split into its effort and all others."""
     try:
         kept_here = products_in(run.info.files.below(DERIVED))
     except NotADirectoryError:
@@ -262,13 +255,13 @@ def _kept_efforts(run: Run) -> list[tuple[dict[str, Any], tuple[float, int]]]:
 
 
 def _aside(options: IdentifyOptions) -> dict[str, Any]:
-    """Return the options of a search for attractors without its effort (how far trajectories are integrated)."""
+    """Return the options of a search for attractors except its effort, that is, how far it integrates."""
     effort = ("extend", "budget", "n_sample")
     return {name: value for name, value in options.plain().items() if name not in effort}
 
 
 def is_outdone(run: Run, attrs: Mapping[str, Any]) -> bool:
-    """Return whether another stored result found the attractors with longer integrations than this one."""
+    """Return whether a stored search for attractors has integrated further than the search behind a given result."""
     name, given = str(attrs.get("derived_product")), _options_of(attrs)
     if name not in ANALYSES or not issubclass(ANALYSES[name].options, IdentifyOptions):
         return False
@@ -278,7 +271,7 @@ def is_outdone(run: Run, attrs: Mapping[str, Any]) -> bool:
 
 @contextlib.contextmanager
 def refused(directory: str | Path) -> Iterator[None]:
-    """Add the run directory to the error messages of an analysis or figure, as a context manager."""
+    """Add the name of the run directory to errors of an analysis or figure inside this context."""
     try:
         yield
     except SpecError:
@@ -292,7 +285,6 @@ def refused(directory: str | Path) -> Iterator[None]:
 
 
 def _key(run: Run, analysis: Analysis, options: Options) -> dict[str, str]:
-    """Return the attributes that identify a result: analysis, options, digests of the run and of the code."""
     plain = {name: value for name, value in options.plain().items() if name not in analysis.ignores}
     parts = {
         "derived_product": analysis.name,
@@ -327,8 +319,7 @@ def _placed(ds: xr.Dataset, place: Files) -> xr.Dataset:
 
 
 def stale(source: Source) -> list[str]:
-    """Return the paths of stored results that are outdated or damaged, and of results left incomplete by killed
-    processes.
+    """Return the paths of stored results that are outdated, damaged or incomplete.
 
     Outdated results belong to an earlier cube or an earlier version of the code. A leftover was begun by a
     process that was killed. Leftovers younger than an hour may belong to a running process and are not
@@ -355,7 +346,7 @@ def _stale(run: Run) -> list[Files]:
 
 
 def prune(source: Source) -> list[str]:
-    """Remove the outdated, damaged or incomplete results that `stale` lists; return their paths."""
+    """Remove the stored results that `stale` lists, and return their paths."""
     found = _stale(Run.open(source))
     for place in found:
         remove_product(place)

@@ -1,4 +1,4 @@
-"""Draw the figures of a run by name, as the command ``magpend plot`` does."""
+"""Draw the figures of a run by name, as ``magpend plot`` does."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def figure(
     echo: Echo | None = None,
     **more: Any,
 ) -> DataFigure:
-    """Draw one of the figures of a run, chosen by its name.
+    """Draw a figure of a run by the figure's name.
 
     Parameters
     ----------
@@ -56,14 +56,14 @@ def figure(
 
 
 def ready(source: Source, name: str, options: FigureOptions, echo: Echo | None) -> tuple[AnalysedRun, FigureOptions]:
-    """Open a run. Return it with the figure's options, in which names and missing values are filled in."""
+    """Open a run to draw a figure; return it with the figure's completed options."""
     run = AnalysedRun.of(source, echo)
     settled: Any = prepared(run, FIGURES[name], options)
     return run, settled
 
 
 def drawn(run: AnalysedRun, name: str, options: FigureOptions) -> DataFigure:
-    """Draw a figure of an opened run with the options that `ready` has completed."""
+    """Draw a figure of an opened run, with the options that `ready` has completed."""
     from pipeline.plots import draw_figure
 
     with refused(run.name):

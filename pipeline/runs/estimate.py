@@ -1,4 +1,4 @@
-"""Estimate a run's computing time on this machine by integrating a sample of its cells over a few periods.
+"""Estimate how long a run takes on this machine, by integrating a sample of its cells over a few periods.
 
 The rule of thumb in `pipeline.layout.plan` gives the dependence of the time on frequency and tolerance. Two
 further quantities are measured: the speed of this processor for this system, and, if the run stops when
@@ -52,7 +52,7 @@ FILE_S = 0.004
 
 @dataclass(frozen=True)
 class Estimate:
-    """Estimated computing time of a run on one core.
+    """Estimated computing time of a run on one core of this machine.
 
     Attributes
     ----------
@@ -70,7 +70,7 @@ class Estimate:
 
 
 def estimate(spec: Spec, plan: Plan) -> Estimate:
-    """Estimate a run's computing time on one core of this machine by timing a sample of its cells.
+    """Estimate the computing time of a run on one core of this machine, from a sample of its cells.
 
     This takes a second or two, after compiling. The time of products (exponents) is their number of periods
     times the measured time of one.
@@ -95,7 +95,7 @@ def estimate(spec: Spec, plan: Plan) -> Estimate:
 
 
 def writing_seconds(spec: Spec, plan: Plan) -> float:
-    """Measure the time to write one task's files in a temporary folder; the run's disk may be slower.
+    """Measure how long it takes to write the files of one task to a temporary folder [s].
 
     Returns
     -------
@@ -128,7 +128,7 @@ def writing_seconds(spec: Spec, plan: Plan) -> float:
 
 
 def wall_seconds(core_seconds: float, n_tasks: int, workers: int) -> float:
-    """Return the elapsed time of a run from its time on one core and the number of worker processes [s].
+    """Convert the time that a run takes on one core to the time with a number of worker processes [s].
 
     Parameters
     ----------
@@ -145,7 +145,7 @@ def wall_seconds(core_seconds: float, n_tasks: int, workers: int) -> float:
 
 
 def _sample(spec: Spec, plan: Plan, rng: np.random.Generator, n_branches: int, *, pairs: bool) -> Inputs:
-    """Return parameters, frequencies and initial states of cells drawn at random from the whole run.
+    """Draw cells at random from the whole run; return their parameters, frequencies and initial states.
 
     With `pairs`, the points of a continuation's branch come in neighbouring pairs, so that the second point
     of a pair starts where it would start in the run.
@@ -171,7 +171,7 @@ def _sample(spec: Spec, plan: Plan, rng: np.random.Generator, n_branches: int, *
 
 
 def _points(n_points: int, rng: np.random.Generator, *, pairs: bool) -> np.ndarray:
-    """Return random indices along a continuation path, one or two adjacent points from each of several equal parts."""
+    """Draw random points along the axis of a continuation, single or in adjacent pairs."""
     n_parts = min(POINTS, n_points // 2 if pairs and n_points > 1 else n_points)
     edges = np.linspace(0, n_points, n_parts + 1)
     first = np.array([rng.integers(math.ceil(a), math.ceil(b)) for a, b in itertools.pairwise(edges)])
@@ -182,7 +182,7 @@ def _points(n_points: int, rng: np.random.Generator, *, pairs: bool) -> np.ndarr
 
 
 def _speed(spec: Spec, inputs: Inputs, most: float) -> tuple[float, int, float]:
-    """Time the integration of sampled cells: ratio to the rule-of-thumb time, periods per cell, seconds spent.
+    """Measure how long sampled cells take, relative to a rule of thumb.
 
     Two stretches are measured: one from the initial states, and one from the end of the first, which
     represents the rest of the cell.
@@ -199,7 +199,7 @@ def _speed(spec: Spec, inputs: Inputs, most: float) -> tuple[float, int, float]:
 
 
 def _stretch(spec: Spec, inputs: Inputs, n_periods: int) -> tuple[np.ndarray, float, float]:
-    """Integrate sampled cells and time it: final states, ratio to the rule-of-thumb time, processor time [s].
+    """Integrate sampled cells over some periods, and measure the processor time that this takes.
 
     The time is processor time, so that other programs do not count.
     """
@@ -219,7 +219,8 @@ def _stretch(spec: Spec, inputs: Inputs, n_periods: int) -> tuple[np.ndarray, fl
 
 
 def _periods_until_closed(spec: Spec, plan: Plan, most: float, ratio: float) -> float:
-    """Estimate the mean number of periods per cell if integration stops once an orbit has closed, from a sample.
+    """Estimate from a sample how many periods a cell takes on average, if its integration stops once its orbit has
+    closed.
 
     A first sample gives the number of cells for which there is time.
     """
@@ -246,7 +247,8 @@ def _periods_until_closed(spec: Spec, plan: Plan, most: float, ratio: float) -> 
 
 
 def mean_with_tail(periods: np.ndarray, cap: float, most: float) -> float:
-    """Return the mean number of periods per trajectory, with an estimate for those still running after `cap` periods.
+    """Return the mean number of periods per trajectory, with an estimate for those that were stopped after `cap`
+    periods.
 
     These cells are assumed to end at the rate at which cells ended in the second half of the observed
     periods.

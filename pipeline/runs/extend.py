@@ -1,4 +1,4 @@
-"""Extend a run to a wider specification: reuse all cells that are computed, and integrate the others.
+"""Extend a run to a wider specification: copy the cells that are computed, and integrate the others.
 
 A cell's numbers depend on its inputs alone, bit for bit. A wider run therefore has the same bytes whether it
 begins from nothing or reuses the cells of other runs, which is faster. It is an ordinary run with its own
@@ -38,7 +38,7 @@ from pipeline.store.runfile import is_run
 
 @dataclass(frozen=True)
 class Extension:
-    """Plan of a wider run, with the existing runs whose cells it reuses.
+    """Plan of a wider run, with the earlier runs from which it copies cells.
 
     Attributes
     ----------
@@ -62,29 +62,29 @@ class Extension:
 
     @property
     def reused(self) -> int:
-        """Number of cells that are reused from existing runs."""
+        """Number of cells that are copied from earlier runs."""
         return sum(self.counts)
 
     @property
     def digest(self) -> str:
-        """Digest that identifies the wider run by everything that decides its numbers and layout."""
+        """Digest of everything that decides the numbers and the layout of the wider run."""
         return digest_of(self.identity)
 
     @property
     def share(self) -> float:
-        """Fraction of the wider run's integration that is left after reusing cells."""
+        """Fraction of the wider run's integration that is left when cells are copied."""
         counts = zip(self.runs, self.counts, strict=True)
         left = self.plan.n_cells - self.reused + sum(count * self._more(run) for run, count in counts)
         return left / self.plan.n_cells
 
     def _more(self, run: Run) -> float:
-        """Return the fraction of its drive periods for which a reused cell must still be integrated."""
+        """Return the fraction of a cell's periods that must still be integrated after it is copied."""
         integration = self.spec.integration
         n_more = integration.n_keep - run.spec.integration.n_keep
         return n_more / (integration.n_transient + integration.n_keep)
 
     def lines(self) -> Iterator[str]:
-        """Yield printed lines on the numbers of reused and remaining cells."""
+        """Yield text lines on how many cells are copied, and how many are left to compute."""
         yield from self.notes
         n = self.plan.n_cells
         for run, count in zip(self.runs, self.counts, strict=True):
@@ -97,7 +97,7 @@ class Extension:
 def plan_extension(
     sources: Sequence[str | Path], spec: str | Path | None = None, widening: Widening | None = None
 ) -> Extension:
-    """Plan a wider run that reuses cells of existing runs; no file is changed.
+    """Plan a wider run that copies cells of earlier runs; no file is changed.
 
     Parameters
     ----------
@@ -132,7 +132,7 @@ def plan_extension(
 
 
 def _wide(run: Run, spec: str | Path | None, widening: Widening) -> tuple[Spec, str]:
-    """Return the wider specification, parsed and as text."""
+    """Return the specification of the wider run, as an object and as text."""
     if spec is None and not widening:
         raise SpecError(
             ["extend: nothing to change; give a wider SPEC, or an option such as --axis NAME=LOW:HIGH:NUM."]
@@ -154,7 +154,7 @@ def _printable(text: str) -> str:
 
 
 def _fitting(runs: Sequence[Run], wide: Spec, identity: Mapping[str, Any]) -> tuple[list[Run], list[str]]:
-    """Return the runs whose cells can be reused, with notes on those that are incomplete or unsuitable."""
+    """Select the earlier runs whose cells can be copied, with notes on the others."""
     from pipeline.compute.reuse import obstacles
 
     fitting, notes = [], []
@@ -173,7 +173,6 @@ def _fitting(runs: Sequence[Run], wide: Spec, identity: Mapping[str, Any]) -> tu
 
 
 def _census(wide: Spec, plan: Plan, runs: Sequence[Run]) -> list[int]:
-    """Count the cells of the wider run that each old run supplies. No cell is counted twice."""
     from pipeline.compute.reuse import Pool
 
     pool, cells = Pool(wide, runs), CellMap(wide)
@@ -185,14 +184,14 @@ def _census(wide: Spec, plan: Plan, runs: Sequence[Run]) -> list[int]:
 
 
 def _strangers(run: Run, wide: Spec) -> list[str]:
-    """Return the reasons why none of a run's cells can be reused although its settings are compatible."""
+    """Return why none of the cells of an earlier run can be copied, although its settings fit."""
     if not run.commits:
         return [f"{run.name}: it has no committed cells"]
     return [f"{run.name}: {line}" for line in apart(run.spec, wide)]
 
 
 def describe_extension(extension: Extension, *, workers: int | None = None) -> Iterator[str]:
-    """Yield the printed lines of a dry run: size, reused and remaining cells, and the measured time estimate."""
+    """Yield the text lines of a dry run: size, copied and remaining cells, and the estimated time."""
     spec, plan = extension.spec, extension.plan
     if spec.title:
         yield spec.title
@@ -219,7 +218,7 @@ def extend(
     dashboard: bool = False,
     echo: Echo = print,
 ) -> State:
-    """Compute a wider run and reuse every cell that is already computed, in a new directory or in place of the old run.
+    """Compute a wider run, in a new directory or in place of the old run; computed cells are copied.
 
     The result has the same bytes as a run of the wider specification from nothing. If it is killed at any
     moment, the same call continues. The runs whose cells are reused are only read; damaged cells are
@@ -286,7 +285,6 @@ def extend(
 
 
 def _build(extension: Extension, files: Files, *, echo: Echo, **how: Any) -> State:
-    """Compute the wider run in its own directory, or continue a stopped computation."""
     for line in extension.lines():
         echo(line)
     sources = [(run.info.files.place, run.info.digest) for run in extension.runs]
@@ -296,9 +294,7 @@ def _build(extension: Extension, files: Files, *, echo: Echo, **how: Any) -> Sta
 
 
 def _record(extension: Extension, files: Files) -> None:
-    """Write a file that lists the runs from which cells were reused; this file is not part of the wider run's
-    result.
-    """
+    """Write a file that lists the runs from which cells were copied."""
     taken: dict[int, int] = {}
     with contextlib.suppress(FileNotFoundError):
         for line in files.read(TIMINGS).decode().splitlines():
@@ -319,20 +315,19 @@ def _record(extension: Extension, files: Files) -> None:
 
 
 def _folder(files: Files) -> Path:
-    """Return the local folder of a run; raise `RefusedError` if it is in an object store."""
     if files.local is None:
         raise RefusedError(f"{files.name}: is not a folder on this machine, so it cannot be replaced; give --out.")
     return files.local
 
 
 def _beside(directory: Path) -> Path:
-    """Return the folder ``NAME.extending``, in which the wider run is computed before it replaces the old one."""
+    """Return the folder ``NAME.extending`` in which the wider run is computed, before it replaces the old run."""
     real = directory.resolve()
     return real.with_name(f"{real.name}.extending")
 
 
 def _aside(directory: Path) -> Path:
-    """Return a free path ``NAME.before...`` to which the old run is renamed."""
+    """Return a path ``NAME.before...`` that does not exist yet, to which the old run is renamed."""
     real = directory.resolve()
     names = (real.with_name(f"{real.name}.before{i}") for i in ("", *(f".{n}" for n in range(2, 10_000))))
     return next(name for name in names if not name.exists())
@@ -349,7 +344,7 @@ def _as_it_is(run: Run, echo: Echo) -> State:
 
 
 def _refuse_loss(run: Run, wide: Spec) -> None:
-    """Raise `RefusedError` if the wider run lacks cells or products of the run that it would replace."""
+    """Raise RefusedError if the wider run lacks cells or products of the run that it would replace."""
     cells, finder, lost = CellMap(run.spec), Finder(wide), 0
     for index in run.commits:
         block = run.plan.task(index)
@@ -365,7 +360,7 @@ def _refuse_loss(run: Run, wide: Spec) -> None:
 
 
 def _exchange(directory: Path, built: Path, echo: Echo) -> None:
-    """Replace a run directory by the finished wider run; the old run is renamed, and both exist at every moment."""
+    """Replace a run directory by the finished wider run; the old run is renamed and stays."""
     real, aside = directory.resolve(), _aside(directory)
     real.rename(aside)
     sync_folder(real.parent)
@@ -375,7 +370,7 @@ def _exchange(directory: Path, built: Path, echo: Echo) -> None:
 
 
 def _finish_exchange(directory: Path, echo: Echo) -> None:
-    """Complete an interrupted replacement: give the finished wider run the name of the old run."""
+    """Finish an interrupted replacement: give the wider run the name of the old run."""
     built = _beside(directory)
     if directory.exists() or not is_run(open_files(built)):
         return

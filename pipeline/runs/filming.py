@@ -1,4 +1,4 @@
-"""Make animations of motions from a run or a given initial state, as the command ``magpend animate`` does."""
+"""Make an animation of motions, from a run or from an initial state, as ``magpend animate`` does."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ CLOCK_HZ, DEFAULT_HZ = 1.0, 2.2
 
 @dataclass(frozen=True)
 class Start:
-    """Initial state of a motion to animate, with a model and parameters if no run gives them.
+    """Initial state of a motion to animate, with model and parameters if there is no run.
 
     Attributes
     ----------
@@ -55,7 +55,7 @@ def animation(
     echo: Echo | None = None,
     **more: Any,
 ) -> Animation:
-    """Make an animation of motions: the model's drawing in motion, and phase portraits.
+    """Make an animation of motions: the moving drawing of the model, and phase portraits.
 
     Parameters
     ----------
@@ -132,7 +132,7 @@ def _of_run(
 
 
 def _alone(start: Start) -> instants.Moving:
-    """Return the motion from an initial state of a model, without any run."""
+    """Integrate a model from an initial state as a motion to animate, without a run."""
     import numpy as np
 
     from pipeline.compute.simulate import start_of

@@ -1,4 +1,4 @@
-"""Choose the frame times of an animation, and integrate its motions over them."""
+"""Choose the times of the frames of an animation, and integrate its motions at these times."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ MOST_SAMPLES = 2_000_000
 
 @dataclass(frozen=True)
 class Moving:
-    """Motion to animate: parameters, initial state, section points, period, name and colour.
+    """A motion to animate: parameters, initial state, section points, period, name and colour.
 
     Attributes
     ----------
@@ -63,7 +63,7 @@ class Moving:
 
 @dataclass(frozen=True)
 class Schedule:
-    """Times of an animation: speed, duration, frames, and samples between frames.
+    """Timing of an animation: speed, duration, frames, and samples between frames.
 
     Attributes
     ----------
@@ -87,13 +87,13 @@ class Schedule:
 
     @property
     def times(self) -> np.ndarray:
-        """Times of all samples [s], from the first frame to the end of the last."""
+        """Times of all samples [s], from the first frame to the end of the last one."""
         n = self.n_frames * self.substeps
         return np.asarray(np.arange(n + 1) * (self.duration / n))
 
 
 def schedule(moving: Sequence[Moving], options: AnimationOptions) -> Schedule:
-    """Choose speed and frames of an animation; if possible, it shows a whole number of periods of all motions.
+    """Choose the speed and the frames of an animation, if possible such that all motions repeat when the film does.
 
     The speed is changed so that whole periods are shown, where all motions repeat: by `MOST_CHANGE` at most,
     of a speed that was given by `MOST_CHANGE_OF_SPEED`.
@@ -133,20 +133,19 @@ def schedule(moving: Sequence[Moving], options: AnimationOptions) -> Schedule:
 
 
 def _cycle(one: Moving) -> float:
-    """Return the unit in which a film is timed [s]: the drive period, or the orbit's period of an autonomous model."""
+    """Return the time unit of a motion [s]: the drive period or, without a drive, the period of the orbit."""
     if not one.parameters.model.autonomous:
         return 1.0 / one.frequency_hz
     return one.period_s if one.period_s > 0.0 else 2.0
 
 
 def _nice(value: float) -> float:
-    """Round a positive number to the nearest (by ratio) of 1, 2, 5 and 10 times a power of ten."""
     power = 10.0 ** math.floor(math.log10(value))
     return min((factor * power for factor in (1.0, 2.0, 5.0, 10.0)), key=lambda v: abs(math.log(v / value)))
 
 
 def _common(periods: Sequence[float], cycle: float) -> float | None:
-    """Return the time [s] after which all motions repeat together; None if there is none, 0 if `periods` is empty."""
+    """Return the time [s] after which all motions repeat together; None if they never do, 0 if `periods` is empty."""
     if any(math.isnan(p) for p in periods):
         return None
     if not periods:
@@ -161,7 +160,7 @@ def _common(periods: Sequence[float], cycle: float) -> float | None:
 
 
 def filmed(moving: Sequence[Moving], plan: Schedule) -> xr.Dataset:
-    """Integrate the motions of an animation over its sample times.
+    """Integrate the motions of an animation, and return them at all its sample times.
 
     Parameters
     ----------
@@ -228,9 +227,6 @@ def filmed(moving: Sequence[Moving], plan: Schedule) -> xr.Dataset:
 
 
 def _told(moving: Sequence[Moving]) -> dict[str, Any]:
-    """Return attributes that describe the motions: model, units, parameters; a parameter that differs between motions
-    is listed for each.
-    """
     first = moving[0].parameters
     lines = [f"{name} = {value!r}" for name, value in first.as_dict().items()]
     told = {

@@ -1,4 +1,4 @@
-"""Check a run's files against its commit records before the run continues, and discard damaged tasks."""
+"""Compare the files of a run with its commit records before the run continues, and discard damaged tasks."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _NAMED = 10
 
 
 def sound_commits(info: RunInfo, plan: Plan, echo: Echo, *, alone: bool = True) -> Records:
-    """Return the commit records of tasks whose files are undamaged; damaged tasks are withdrawn, to be computed again.
+    """Return the commit records of all undamaged tasks; damaged tasks are discarded, to be computed again.
 
     Equal sizes and times prove nothing, so every committed file is read. With ``MAGPEND_VERIFY=0`` in the
     environment only sizes are compared. Files without a record are removed. Only the holder of the lock may

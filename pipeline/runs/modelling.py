@@ -1,4 +1,4 @@
-"""Describe and check a model before any run, as the command ``magpend model`` does."""
+"""Describe and check a model without a run, as ``magpend model`` does."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ NEAR_ZERO = (0.0, 0.1, -0.2, 0.3)
 
 
 def examine(name: str) -> tuple[Model, Description]:
-    """Describe a model at initial states near 0, or at those of a specification that uses it.
+    """Describe and check a model, at initial states near 0 or at those of a specification that uses it.
 
     Parameters
     ----------
@@ -54,7 +54,6 @@ def examine(name: str) -> tuple[Model, Description]:
 
 
 def _specification(name: str) -> Spec | None:
-    """Return the run specification in a file; None if the file or name gives only a model."""
     if not is_model_file(name) or read_toml(name).get("kind") not in KINDS:
         return None
     return load_spec(find_spec(name))
@@ -87,7 +86,7 @@ def _first_cells(spec: Spec) -> tuple[Parameters, float, np.ndarray]:
 
 
 def write_template(path: Path | None) -> str:
-    """Return the template of a specification that defines its own model; write it to a file if a path is given.
+    """Return the template of a specification with its own model; write it to a file if a path is given.
 
     Raises
     ------

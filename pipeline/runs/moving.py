@@ -1,4 +1,4 @@
-"""Collect the motions of an animation from attractors or cells of a run, or from an initial state.
+"""Collect the motions of an animation: attractors or cells of a run, or a motion from an initial state.
 
 A motion begins at a section point of an attractor or a cell, or at a given start. It is integrated again with
 the tolerance of portraits, since a cube stores no states between sections.
@@ -31,7 +31,7 @@ MOST_MOTIONS = 8
 def of_attractors(
     run: AnalysedRun, options: AnimationOptions, letters: Sequence[str] = ()
 ) -> tuple[list[Moving], list[str]]:
-    """Return the attractors at one parameter point of a run as motions to animate, with notes on what is left out.
+    """Return the attractors of a run at one parameter point as motions to animate, with notes on those left out.
 
     Parameters
     ----------
@@ -80,7 +80,9 @@ def of_attractors(
 
 
 def _chosen(name: str, here: xr.Dataset, letters: Sequence[str]) -> tuple[list[int], list[str]]:
-    """Choose attractors by letter or else by largest basin fraction; return their ids, and notes on those left out."""
+    """Choose attractors by letter or, without letters, by basin fraction. Return their ids, and notes on those left
+    out.
+    """
     there = [int(i) for i in here["attractor"].values]
     if not there:
         raise SpecError([f"{name}: no attractor was found at this point; look with magpend analyse attractors."])
@@ -107,7 +109,6 @@ def _chosen(name: str, here: xr.Dataset, letters: Sequence[str]) -> tuple[list[i
 
 
 def _at_point(ds: xr.Dataset, here: xr.Dataset) -> tuple[Parameters, float]:
-    """Return the model parameters and the drive frequency at one parameter point of a dataset."""
     values = {str(k): float(v) for k, v in here.coords.items() if not v.ndim and v.dtype.kind == "f"}
     base = parameters_of(ds)
     base = base.replace(**{k: v for k, v in values.items() if k in base})
@@ -115,7 +116,6 @@ def _at_point(ds: xr.Dataset, here: xr.Dataset) -> tuple[Parameters, float]:
 
 
 def _period(one: xr.Dataset, parameters: Parameters, frequency: float) -> float:
-    """Return the period of an attractor [s]: 0 for an equilibrium, NaN if it is aperiodic."""
     kind, periods = int(one["kind"]), int(one["orbit_period"])
     if kind == EQUILIBRIUM:
         return 0.0
@@ -127,7 +127,7 @@ def _period(one: xr.Dataset, parameters: Parameters, frequency: float) -> float:
 
 
 def of_cells(run: AnalysedRun, numbers: Sequence[int]) -> list[Moving]:
-    """Return chosen cells of a run as motions that begin at the cell's first stored section point.
+    """Return cells of a run as motions to animate, from the first section point of each.
 
     Parameters
     ----------
@@ -181,7 +181,6 @@ def of_cells(run: AnalysedRun, numbers: Sequence[int]) -> list[Moving]:
 
 
 def _where(one: xr.Dataset) -> str:
-    """Return the coordinate values of a cell as text, such as its frequency and initial state."""
     said = []
     for key, value in one.coords.items():
         if value.ndim or str(key) in ("seed",):
@@ -239,7 +238,7 @@ def of_start(parameters: Parameters, frequency_hz: float, state: Sequence[float]
 
 
 def point_of_run(run: AnalysedRun, options: AnimationOptions) -> tuple[Parameters, float, list[str]]:
-    """Return parameters and drive frequency at the parameter point of a run that the options select, with notes.
+    """Return parameters, drive frequency and notes for the parameter point that the options of an animation choose.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Translate the accepted spellings of axes, parameters and states to the names in a run's cube and model."""
+"""Translate the spellings that users may give of axes, parameters and states to the names in a run."""
 
 from __future__ import annotations
 
@@ -20,8 +20,7 @@ DEGREES = "_deg"
 
 
 def named(run: Run, options: Options) -> Options:
-    """Return the options of an analysis or a figure, with axis, parameter and state names translated to those of the
-    cube and the model.
+    """Translate the names of axes, parameters and states in some options to those of the run.
 
     ``at`` accepts ``frequency`` or ``frequency_hz``, a parameter, and for a grid of initial states its axis
     ``x_0``, the state ``x`` or, for an angle, ``x_deg``. ``parameter`` and ``second`` accept both names of
@@ -60,12 +59,8 @@ def named(run: Run, options: Options) -> Options:
 
 
 def _swept(run: Run, others: Iterable[str]) -> str:
-    """Return the parameter that a run sweeps besides `others`; the drive frequency if it sweeps no other parameter.
-
-    Raises
-    ------
-    SpecError
-        If it sweeps several, or none and has no drive.
+    """Return the one parameter that a run sweeps besides `others`, or the drive frequency if it sweeps none; raise
+    SpecError if it sweeps several.
     """
     cube = run.cube()
     swept = [name for name in run.spec.axes if cube.sizes.get(axis_name(name), 1) > 1]
@@ -94,7 +89,7 @@ def _unknown(what: str, given: str, name: str, known: Iterable[str]) -> list[str
 
 
 def place(cube: xr.Dataset, name: str, value: float, degrees: bool = False) -> tuple[str, float]:
-    """Return the cube axis that a name given by the user refers to, and the value converted to the unit of that axis.
+    """Return the axis that a name given by the user refers to, and the value in the unit of this axis.
 
     Parameters
     ----------

@@ -1,6 +1,4 @@
-"""Summarise the trajectories (cells) of a run by status: their number, their parameter ranges, and a command that zooms
-in.
-"""
+"""Summarise the cells of a run by status: their number, their parameter ranges, and commands to look closer."""
 
 from __future__ import annotations
 
@@ -27,7 +25,7 @@ Range = tuple[str, float, float, str]
 
 @dataclass(frozen=True)
 class Outcome:
-    """Number, fraction and parameter ranges of the cells of a run that have one status, such as diverged.
+    """Cells of a run that have one status, such as diverged: their number, share and parameter ranges.
 
     Attributes
     ----------
@@ -48,13 +46,13 @@ class Outcome:
 
     @property
     def word(self) -> str:
-        """Name of the status in lower case, with spaces instead of underscores."""
+        """Status in words."""
         return self.status.name.lower().replace("_", " ")
 
     @property
     def place(self) -> str:
-        """Parameter ranges in which the cells lie, such as ``frequency = 2.4 to 2.5 Hz``; empty if they cover all
-        values.
+        """Parameter ranges of the cells, such as ``frequency = 2.4 to 2.5 Hz``; an empty text if they are
+        everywhere.
         """
         return ", ".join(
             f"{name} = {low:.6g}" + (f" to {high:.6g}" if high > low else "") + (f" {unit}" if unit else "")
@@ -63,15 +61,13 @@ class Outcome:
 
     @property
     def line(self) -> str:
-        """Line of the summary: status, number of cells, percentage, and parameter ranges."""
+        """Text line with the status, the number of cells, their percentage and their parameter ranges."""
         text = f"  {self.word:15s} {self.n_cells:>10d} {100 * self.share:>6.1f} %"
         return text + (f"  {self.place}" if self.where else "")
 
 
 def outcomes_of(run: Run) -> list[Outcome]:
-    """Return, for each status, the number of cells of a run and their parameter ranges; this reads ``status`` of every
-    cell.
-    """
+    """Count the cells of a run that have each status, and find their parameter ranges."""
     status = run.cube()["status"].load()
     codes = np.flatnonzero(np.bincount(status.values.ravel().astype(np.int64)))
     return [_outcome(status, Status(int(code))) for code in codes]
@@ -91,9 +87,7 @@ def _outcome(status: xr.DataArray, code: Status) -> Outcome:
 
 
 def summary(run: Run) -> list[str]:
-    """Return the last lines that ``magpend run`` prints: cell counts by status, their parameter ranges, and suggested
-    commands.
-    """
+    """Return the text lines that ``magpend run`` prints at its end: cells by status, and suggested commands."""
     found = outcomes_of(run)
     lines = [f"{run.plan.n_cells} cells by status:", *(o.line for o in found)]
     lines.append(f"plot it with: {figure_command(run.plan, run.name)}")
@@ -106,14 +100,12 @@ def summary(run: Run) -> list[str]:
 
 
 def lost_cells(found: Iterable[Outcome]) -> list[Outcome]:
-    """Return the outcomes whose status is diverged or failed."""
+    """Select the outcomes of cells that diverged or failed."""
     return [o for o in found if o.status in (DIVERGED, *FAILED)]
 
 
 def warning(run: Run) -> str:
-    """Return a warning if more than a fixed small fraction of a run's computed cells diverged or failed; else an empty
-    string.
-    """
+    """Return a warning if too many of a run's cells diverged or failed; an empty text otherwise."""
     found = outcomes_of(run)
     lost, computed = lost_cells(found), sum(o.n_cells for o in found if o.status != PENDING)
     n_lost = sum(o.n_cells for o in lost)
@@ -129,8 +121,8 @@ def warning(run: Run) -> str:
 
 
 def _zoom(lost: list[Outcome], run: Run) -> str:
-    """Return the ``magpend zoom`` command for the parameter range of the diverged or failed cells; empty without such a
-    range.
+    """Return a ``magpend zoom`` command for the ranges in which cells diverged or failed; an empty text if there are
+    none.
     """
     whole = dict(zip(run.plan.dims, run.plan.shape, strict=True))
     spans: dict[str, tuple[float, float]] = {}

@@ -1,4 +1,4 @@
-"""Describe a run before it starts (``magpend run --dry-run``), and choose the figure that shows its result."""
+"""Describe a run before it starts, and choose the figure that shows its result best."""
 
 from __future__ import annotations
 
@@ -25,9 +25,7 @@ MANY_SECTIONS = 500
 
 
 def first_figure(plan: Plan) -> str:
-    """Choose the figure that gives an overview of a run by its swept parameters and products; return the figure's
-    name.
-    """
+    """Return the name of the figure that gives the best overview of a run."""
     n_swept, n_grid = _long(plan)
     if plan.is_recorded:  # its cells cannot be integrated further, so it has no attractors to draw
         return "bifurcation" if n_swept else "section"
@@ -45,20 +43,20 @@ def first_figure(plan: Plan) -> str:
 
 
 def figure_command(plan: Plan, directory: str | Path) -> str:
-    """Return the ``magpend plot`` command for the figure that `first_figure` chooses."""
+    """Return the ``magpend plot`` command that draws the best overview of a run."""
     name = first_figure(plan)
     as_map = name == "lyapunov" and _long(plan)[0] >= 2
     return f"magpend plot {name} {directory}" + (" --map" if as_map else "")
 
 
 def _long(plan: Plan) -> tuple[int, int]:
-    """Count the axes with more than one value: first the swept parameters, then the axes of initial conditions."""
+    """Count the axes with more than one value: swept parameters, and axes of initial conditions."""
     long = [d for d, n in zip(plan.dims, plan.shape, strict=True) if n > 1]
     return sum(not is_start_dim(d) for d in long), sum(is_grid_dim(d) for d in long)
 
 
 def shown(run: Run) -> tuple[str, dict[str, Any], str]:
-    """Return the figure that ``magpend run --plot`` draws: its name, its options, and a note on what it omits.
+    """Return the figure that ``magpend run --plot`` draws: its name, its options, and a note on what it leaves out.
 
     Returns
     -------
@@ -94,7 +92,7 @@ def shown(run: Run) -> tuple[str, dict[str, Any], str]:
 def describe_plan(
     spec: str | Path, out: str | Path | None, *, workers: int | None = None, smoke: bool = False
 ) -> Iterator[str]:
-    """Yield the lines that a dry run prints; nothing but the compile cache is written to disk.
+    """Yield the text lines that a dry run prints; nothing but the compile cache is written.
 
     The time is measured on some of the run's own cells, after the lines that cost nothing.
 
@@ -125,7 +123,7 @@ def describe_plan(
 
 
 def time_line(spec: Spec, plan: Plan, share: float, n_tasks: int, workers: int | None) -> str:
-    """Return a line with the estimated time to compute a fraction `share` of a run's cells in `n_tasks` tasks."""
+    """Return a text line with the estimated time for a fraction `share` of a run's cells."""
     from pipeline.compute.execute import default_workers
 
     if not share:

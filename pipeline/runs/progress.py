@@ -34,7 +34,7 @@ def size(n_bytes: float) -> str:
 
 
 class Progress:
-    """A context manager that counts finished cells, and draws a bar, prints lines or calls a registered listener.
+    """Context that counts finished cells, and shows their number as a bar or as text lines.
 
     Parameters
     ----------
@@ -81,7 +81,7 @@ class Progress:
             self._bar.stop()
 
     def add(self, cells: int) -> None:
-        """Add newly finished cells to the count, and update the display."""
+        """Count newly finished cells, and show the progress."""
         self._done += cells
         if is_heard():
             report(WORK, self._done, self._total)
@@ -92,12 +92,12 @@ class Progress:
             self._echo(self.line())
 
     def rate(self) -> float:
-        """Return the number of cells computed per second since this object was created."""
+        """Return how many cells per second were computed so far."""
         elapsed = self._clock() - self._started
         return (self._done - self._before) / elapsed if elapsed > 0 else 0.0
 
     def line(self) -> str:
-        """Return the progress as a line of text: finished cells, percentage, rate and remaining time."""
+        """Return the progress as a text line: finished cells, percentage, rate and remaining time."""
         rate = self.rate()
         left = f", {duration((self._total - self._done) / rate)} left" if rate > 0 and self._done < self._total else ""
         share = 100 * self._done / self._total

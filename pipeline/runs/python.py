@@ -1,6 +1,4 @@
-"""Define two functions of `import magpend`: `run`, which computes and opens a run, and `table`, which returns a pandas
-table.
-"""
+"""Define functions of ``import magpend``: `run` computes and opens a run, `table` returns a pandas table."""
 
 from __future__ import annotations
 
@@ -27,7 +25,7 @@ def run(
     echo: Callable[[str], None] = print,
     **options: Any,
 ) -> Run:
-    """Compute the missing cells of the run that a specification describes, and return the opened run.
+    """Compute the missing cells of a specification's run, and return the opened run.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Compute all cells that a specification (TOML file) describes, and store them in a run directory."""
+"""Compute all cells of a specification, and store them in a run directory."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def run(
     smoke: bool = False,
     echo: Echo = print,
 ) -> State:
-    """Compute the tasks of a specification that its run directory lacks; return the progress of the run.
+    """Compute the tasks of a specification that its run directory lacks, and return the state of the run.
 
     Damaged ``run.json``, metadata or coordinates are rebuilt from the specification. Committed cells that fit
     their records stay.
@@ -109,7 +109,7 @@ def run(
 def carry_out(
     spec: Spec, text: str, files: Files, *, workers: int | None, where: Where, echo: Echo, sources: Sources = ()
 ) -> None:
-    """Compute the missing tasks of a specification in a run directory, which is created if necessary.
+    """Compute the missing tasks of a specification in a run directory, which is created if it does not exist.
 
     Parameters
     ----------
@@ -144,8 +144,8 @@ def carry_out(
 
 
 def identity_here(spec: Spec, plan: Plan) -> dict[str, Any]:
-    """Return the identity of a run: everything that decides its numbers and layout, the installed kernel version
-    included.
+    """Return everything that decides the numbers and the layout of a run, with the installed version of the compiled
+    core.
 
     Raises
     ------
@@ -168,7 +168,7 @@ def _complete(
     echo: Echo,
     sources: Sources = (),
 ) -> None:
-    """Compute all tasks without a valid commit record."""
+    """Compute all tasks of a run that are not committed."""
     from pipeline.compute import clients, execute, task
 
     packer = Packer(info, plan, commits)
@@ -208,7 +208,7 @@ def _complete(
 
 
 def _require_all(info: RunInfo, plan: Plan, echo: Echo) -> None:
-    """Raise `IncompleteError` unless every task has a commit record; remove files left by stopped workers."""
+    """Raise IncompleteError unless every task is committed; remove the files that stopped workers left."""
     commits, problems = damaged_records(info, plan, contents=False)
     absent = [i for i in range(plan.n_tasks) if i not in commits or name_of(i) in problems]
     if absent:

@@ -1,4 +1,4 @@
-"""Report the progress of a run: ``magpend status``."""
+"""Read how much of a run is computed, for ``magpend status``."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pipeline.store.run import Run
 
 @dataclass(frozen=True)
 class State:
-    """Progress of a run: its committed tasks, and the number of committed cells by status.
+    """State of a run: its committed tasks, and the number of committed cells by status.
 
     Attributes
     ----------
@@ -42,17 +42,17 @@ class State:
 
     @property
     def n_committed(self) -> int:
-        """Number of cells that have been computed and committed."""
+        """Number of cells that are computed and committed."""
         return sum(self.cells.values())
 
     @property
     def complete(self) -> bool:
-        """Whether every task of the run has been computed and committed."""
+        """Whether every task of the run is committed."""
         return len(self.done) == self.plan.n_tasks
 
 
 def state(source: str | Path | Files | Run) -> State:
-    """Read the commit records of a run; return its progress: finished tasks, and cells by status.
+    """Read the state of a run: its committed tasks, and the number of cells by status.
 
     Raises
     ------

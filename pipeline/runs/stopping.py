@@ -1,4 +1,4 @@
-"""Handle signals that end a command: Ctrl-C, SIGTERM, and SIGHUP from a terminal that closes.
+"""Handle the signals that end a command: Ctrl-C, SIGTERM, and SIGHUP of a closing terminal.
 
 The first signal ends a command in order: current tasks are given up, workers end, temporary files and folders
 are removed. The second signal ends it at once. Before a command has begun, the first signal ends it at once.
@@ -19,7 +19,7 @@ NUMBERS = tuple(getattr(signal, n) for n in ("SIGINT", "SIGTERM", "SIGHUP") if h
 
 
 class Stopped(KeyboardInterrupt):
-    """Exception that a received signal raises; a subclass of `KeyboardInterrupt`.
+    """Raised by a signal that ends a command; a subclass of `KeyboardInterrupt`.
 
     Attributes
     ----------
@@ -32,7 +32,7 @@ class Stopped(KeyboardInterrupt):
 
 
 class InterruptedRunError(Exception):
-    """An error for a run that a signal stopped; results of finished tasks stay.
+    """Raised if a signal stopped a run; the results of finished tasks stay.
 
     Attributes
     ----------
@@ -45,9 +45,7 @@ class InterruptedRunError(Exception):
 
 
 class _Listener:
-    """Signal handler of the command line: raises `Stopped` for a first signal where that is allowed, else ends the
-    process.
-    """
+    """Signal handler of the command line: it raises `Stopped` at a first signal, or ends the process."""
 
     first: int | None = None
     is_in_order = False
@@ -63,9 +61,7 @@ _listener = _Listener()
 
 
 def listen() -> None:
-    """Install the signal handler of the command line for Ctrl-C, SIGTERM and SIGHUP, except for signals that are
-    ignored.
-    """
+    """Install the command line's handler for Ctrl-C, SIGTERM and SIGHUP, except for signals that are ignored."""
     for number in NUMBERS:
         if signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, _listener)
@@ -73,8 +69,8 @@ def listen() -> None:
 
 @contextlib.contextmanager
 def in_order() -> Iterator[None]:
-    """Let a first Ctrl-C, SIGTERM or SIGHUP raise `Stopped` inside this context, so that code can clean up; a second
-    one ends the process.
+    """Let a first signal raise `Stopped` inside this context, so that code can clean up; a second one ends the
+    process.
     """
     _listener.is_in_order = True
     try:
@@ -87,12 +83,12 @@ def in_order() -> Iterator[None]:
 
 
 def first_signal() -> int | None:
-    """Return the number of the first signal that this process received; None if it received none."""
+    """Return the number of the first signal that this process has received; None if there was none."""
     return _listener.first
 
 
 def end_if_stopped(code: int) -> None:
-    """Flush the output and end this process if a signal was received."""
+    """End this process if it has received a signal, after flushing its output."""
     if _listener.first is not None:
         logging.shutdown()
         for stream in (sys.stdout, sys.stderr):
@@ -115,8 +111,7 @@ def leave(number: int) -> NoReturn:
 
 @contextlib.contextmanager
 def stoppable(directory: str | Path) -> Iterator[None]:
-    """Let Ctrl-C, SIGTERM and SIGHUP inside this context end in an `InterruptedRunError`, raised after the code inside
-    has cleaned up.
+    """Turn a signal inside this context into an `InterruptedRunError`, after the code has cleaned up.
 
     Parameters
     ----------
@@ -134,7 +129,7 @@ def stoppable(directory: str | Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _raising() -> Iterator[None]:
-    """Make SIGINT, SIGTERM and SIGHUP raise `Stopped` inside the context, unless they have another handler."""
+    """Let SIGINT, SIGTERM and SIGHUP raise `Stopped` inside the context, unless they have another handler."""
 
     def stop(number: int, frame: Any) -> None:
         raise Stopped(number)

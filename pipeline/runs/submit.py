@@ -1,4 +1,4 @@
-"""Send a run to the batch system of a computing cluster: ``magpend submit``."""
+"""Send a run to the batch system of a cluster, for ``magpend submit``."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ _AWKWARD = re.compile(r"[^\w./+,:=@-]")
 
 
 class SubmitError(Exception):
-    """An error for a job that the batch system did not accept; the message quotes its answer."""
+    """Raised if the batch system did not accept a job; the message quotes its answer."""
 
 
 @dataclass(frozen=True)
 class Submission:
-    """Batch job of a run: its script, its folder and, once it is sent, its job number.
+    """Batch job of a run: its script, its folder and, once it is sent, its number.
 
     Attributes
     ----------
@@ -67,7 +67,7 @@ class Submission:
     job: str | None = None
 
     def lines(self) -> list[str]:
-        """Return lines of text with the commands that follow, cancel and continue the job."""
+        """Return text lines with the commands that watch, cancel and continue the job."""
         words = WORDS[self.cluster.kind]
         return [
             f"sent: job {self.job}",
@@ -81,7 +81,7 @@ class Submission:
 def prepare(
     spec: str | Path, out: str | Path | None, cluster_file: str | Path | None, *, smoke: bool = False
 ) -> Submission:
-    """Make the batch script that computes a run; create no files and send nothing.
+    """Make the batch script for a run, without creating files or sending anything.
 
     Parameters
     ----------
@@ -128,7 +128,6 @@ def prepare(
 
 
 def _command(cluster: Cluster, file: Path, spec: Path, place: str, smoke: bool) -> list[str]:
-    """Return the ``magpend run`` command line that the batch job executes."""
     where = ["--scheduler", "local", "--workers", str(cluster.cores)]
     if not is_whole(cluster):
         where = ["--scheduler", cluster.kind, "--cluster", str(file.absolute())]
@@ -147,7 +146,7 @@ def _command(cluster: Cluster, file: Path, spec: Path, place: str, smoke: bool) 
 
 
 def send(submission: Submission) -> Submission:
-    """Send the job to the batch system; keep its script and its job number beside the run directory.
+    """Send a job to the batch system, and keep its script and its number beside the run directory.
 
     Raises
     ------
@@ -184,7 +183,7 @@ def send(submission: Submission) -> Submission:
 
 
 def _refuse_second(submission: Submission) -> None:
-    """Raise `LockedError` if an earlier batch job of the same run is still waiting or running."""
+    """Raise LockedError if an earlier batch job of the same run is still waiting or running."""
     try:
         sent = json.loads((submission.folder / SENT).read_text("utf-8"))
         kind, job = sent["kind"], sent["job"]

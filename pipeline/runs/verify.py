@@ -1,4 +1,4 @@
-"""Compare the stored files of a run with their recorded checksums, and repair them: ``magpend verify``."""
+"""Compare the stored files of a run with their checksums, and repair the run, for ``magpend verify``."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from pipeline.store.setup import rebuild_skeleton
 
 
 def verify_run(directory: str | Path, *, repair: bool = False) -> Verification:
-    """Compare every stored file of a run with its recorded sha256; with `repair`, rebuild or discard damaged files.
+    """Compare every stored file of a run with its checksum; with `repair`, rebuild or discard damaged files.
 
     Parameters
     ----------
@@ -55,7 +55,7 @@ def verify_run(directory: str | Path, *, repair: bool = False) -> Verification:
 
 
 def describe(found: Verification, directory: str | Path, *, repaired: bool) -> list[str]:
-    """Return the lines of text that report the result of a verification."""
+    """Return text lines on the result of a verification."""
     lines = [f"{directory}: {found.n_committed} of {found.n_tasks} tasks committed and intact"]
     odd = [f"{key}: {ODD}" for key in found.odd]
     lines += [

@@ -1,4 +1,4 @@
-"""Compute the version of an analysis as a digest of the code that it uses, so that other edits keep results valid."""
+"""Compute the version of an analysis from the code that it uses, so that edits elsewhere keep its results valid."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _COUNTED = ("pipeline.analysis", "pipeline.layout.vocabulary")
 
 @cache
 def code_version(name: str) -> str:
-    """Return a digest of the code that an analysis' numbers depend on.
+    """Return a digest of the code that decides the numbers of an analysis.
 
     It covers the numerical core, the modules of `pipeline.analysis` that the analysis imports, directly or
     not, and those of the analyses that it builds on. Comments, docstrings and the wording of errors do not
@@ -31,7 +31,7 @@ def code_version(name: str) -> str:
 
 
 def modules_of(name: str) -> set[str]:
-    """Return the modules of `pipeline.analysis` that an analysis imports, directly or not."""
+    """Return the modules that an analysis imports, directly or indirectly."""
     analysis = ANALYSES[name]
     found: set[str] = set()
     left = [analysis.compute.partition(":")[0]]
@@ -47,7 +47,7 @@ def modules_of(name: str) -> set[str]:
 
 @cache
 def _imports(module: str) -> tuple[str, ...]:
-    """Return the modules that a module imports, as far as they affect the version of an analysis."""
+    """Return the modules that a module imports and that count for the version of an analysis."""
     names: list[str] = []
     for node in ast.walk(ast.parse(_file(module).read_bytes())):
         if isinstance(node, ast.ImportFrom) and node.module and not node.level:

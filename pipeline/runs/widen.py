@@ -1,6 +1,4 @@
-"""Derive a larger specification from that of a run: longer axes, more initial conditions, section points or
-products.
-"""
+"""Enlarge the specification of a run: longer axes, more initial conditions, section points or products."""
 
 from __future__ import annotations
 
@@ -17,7 +15,7 @@ from pipeline.specification.tables import FREQUENCY
 
 @dataclass(frozen=True)
 class Widening:
-    """Changes that enlarge a specification; everything else stays unchanged.
+    """Changes that enlarge a specification: longer axes, more initial conditions, section points or products.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Find and read specifications given as TOML files, names of shipped workflows, TOML text or dicts."""
+"""Find and read specifications, given as TOML files, names of shipped workflows, TOML text or dicts."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from pipeline.specification.problems import SpecError, unknown_name
 
 
 def find_spec(name: str | Path) -> Path:
-    """Return the path of a specification, given as a path or as the name of a shipped workflow.
+    """Return the path of a specification, given as a path or by the name of a shipped workflow.
 
     Raises
     ------
@@ -33,7 +33,7 @@ def find_spec(name: str | Path) -> Path:
 
 
 def read_given(spec: str | Path | Mapping[str, Any], *, smoke: bool = False) -> tuple[Spec, str, Path]:
-    """Read a specification given as a file, the name of a shipped workflow, TOML text or a dict.
+    """Read a specification, given as a file, the name of a shipped workflow, TOML text or a dict.
 
     Parameters
     ----------
@@ -66,12 +66,12 @@ def read_given(spec: str | Path | Mapping[str, Any], *, smoke: bool = False) -> 
 
 
 def shipped_workflows() -> dict[str, Path]:
-    """Return the paths of the run specifications (workflows) shipped with magpend, by name, for ``magpend run``."""
+    """Return the paths of the run specifications that ship with magpend, by name."""
     return {name: path for name, path in _shipped().items() if not _identifies(path)}
 
 
 def shipped_identifications() -> dict[str, Path]:
-    """Return the paths of the identification specifications shipped with magpend, by name, for ``magpend identify``."""
+    """Return the paths of the specifications of identifications that ship with magpend, by name."""
     return {name: path for name, path in _shipped().items() if _identifies(path)}
 
 

@@ -1,4 +1,4 @@
-"""Make a new specification from an old one, with narrower ranges and fixed parameters."""
+"""Make a new specification with narrower ranges and fixed parameters from an old one."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _ROUNDING = 1e-9
 
 @dataclass(frozen=True)
 class Source:
-    """A specification, and the run or file that it comes from.
+    """A specification, with the run or the file that it comes from.
 
     Attributes
     ----------
@@ -42,7 +42,7 @@ class Source:
 
 @dataclass(frozen=True)
 class Changes:
-    """Changes of a specification: new ranges, fixed values and numbers of points, by state or parameter.
+    """Changes to a specification: new ranges, fixed values and numbers of points, by state or parameter.
 
     Attributes
     ----------
@@ -86,7 +86,7 @@ def read_source(path: str | Path) -> Source:
 
 
 def zoom(spec: Spec, changes: Changes) -> tuple[Spec, list[str]]:
-    """Return a specification with new ranges and fixed values, and notes on ranges that exceed the old ones.
+    """Change the ranges and values of a specification; return also notes on ranges that exceed the old ones.
 
     A range keeps its number of points. A state or parameter with one value can get a range with a given
     number of points. New ranges are evenly spaced. A ``[smoke]`` table is not copied.
@@ -117,7 +117,7 @@ def zoom(spec: Spec, changes: Changes) -> tuple[Spec, list[str]]:
 
 
 def write_zoom(source: Source, changes: Changes, out: Path) -> list[str]:
-    """Write the changed specification to a TOML file; return notes on ranges that exceed the old ones.
+    """Write a changed specification to a TOML file; return notes on ranges that exceed the old ones.
 
     Raises
     ------
@@ -145,12 +145,11 @@ def write_zoom(source: Source, changes: Changes, out: Path) -> list[str]:
 
 
 def _state(spec: Spec, key: str) -> str | None:
-    """Return the state that a key such as ``x`` or ``x_deg`` sets; None for a parameter."""
     return state_of_key(key, spec.model)
 
 
 def _check(spec: Spec, changes: Changes) -> list[str]:
-    """Return messages about requested changes that do not fit the specification."""
+    """Return messages on changes that do not fit the specification."""
     keys = [*changes.ranges, *changes.pins]
     if not keys:
         return ["zoom: nothing to change; give a range such as --axis NAME=LOW:HIGH, or --at frequency_hz=2.2."]
@@ -189,16 +188,13 @@ def _check(spec: Spec, changes: Changes) -> list[str]:
 
 
 def _points(spec: Spec, key: str, changes: Changes) -> int:
-    """Return the number of points of a new range: the requested one, else that of the old range, else 0."""
     asked = changes.nums.get(_state(spec, key) or key, changes.num)
     old = _old_range(spec, key)
     return asked if asked is not None else (len(old.array()) if old is not None else 0)
 
 
 def _old(spec: Spec, key: str) -> tuple[Any, float]:
-    """Return the old value or range of a state or parameter, and the factor that converts it to the unit of the new
-    value.
-    """
+    """Return the old value or range of a state or parameter, and the factor to the unit of the new value."""
     state = _state(spec, key)
     if state is None:
         return spec.axes.get(key), 1.0
@@ -216,7 +212,6 @@ def _old_range(spec: Spec, key: str) -> Range | None:
 
 
 def _extent(spec: Spec, key: str) -> tuple[float, float] | None:
-    """Return both ends of a state's or parameter's old range in the unit of the new value; None without a range."""
     value, factor = _old(spec, key)
     if isinstance(value, Range):
         array = value.array()
@@ -229,7 +224,7 @@ def _slack(extent: tuple[float, float]) -> float:
 
 
 def put_value(spec: Spec, data: dict[str, Any], key: str, value: Any) -> None:
-    """Set the value or range of a state or parameter in a specification's plain data (dicts), replacing the old one."""
+    """Set the value or range of a state or parameter in the plain data (dicts) of a specification."""
     state = _state(spec, key)
     if state is not None:
         data["initial_conditions"].pop(state, None)
@@ -249,7 +244,7 @@ def put_value(spec: Spec, data: dict[str, Any], key: str, value: Any) -> None:
 
 
 def to_toml(spec: Spec) -> str:
-    """Return a specification as TOML text that reads back as the same specification.
+    """Return a specification as TOML text, from which the same specification is read.
 
     A model as text comes last, with its own tables. A Python object is written as its import path.
     """

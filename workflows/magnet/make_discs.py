@@ -31,7 +31,7 @@ RINGS, SPOKES = 8, 24
 
 
 def face(radius: float, rings: int, spokes: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return points on a disc's face [m], shape (n, 2), and the area of each [m2], shape (n,)."""
+    """Return points on the face of a disc [m], shape (n, 2), and the area that each stands for [m2], shape (n,)."""
     nodes, weights = np.polynomial.legendre.leggauss(rings)
     r = radius * np.sqrt(0.5 * (nodes + 1.0))
     angle = 2.0 * np.pi * (np.arange(spokes) + 0.5) / spokes
@@ -48,8 +48,7 @@ def loads(
     rings: int = RINGS,
     spokes: int = SPOKES,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Compute the force (rightward, upward) on the moving disc [N], shape (n, 2), and its moment about joint 1 [N m],
-    shape (n,).
+    """Compute the force on the moving disc [N], shape (n, 2), and its moment about joint 1 [N m], shape (n,).
 
     Parameters
     ----------

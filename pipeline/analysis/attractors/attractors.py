@@ -144,7 +144,8 @@ def identify(
     block_bytes: int = BUDGET,
     **changes: Any,
 ) -> xr.Dataset:
-    """Find the attractors at each parameter point of a cube and assign each trajectory (cell) to one of them.
+    """Find the attractors at each parameter point of a run's result cube, and assign each trajectory (cell) to one of
+    them.
 
     Parameters
     ----------
@@ -212,7 +213,7 @@ def _flags(words: str) -> dict[str, Any]:
 
 
 def _dataset(ds: xr.Dataset, found: Mapping[tuple[int, ...], Found], search: Search) -> xr.Dataset:
-    """Build the Dataset that `identify` returns; the text of this module lists its variables."""
+    """Build the Dataset that `identify` returns; the docstring of this module lists its variables."""
     dims, start_dims = split_dims(ds["status"])
     shape = tuple(ds.sizes[d] for d in dims)
     table = _filled(ds, dims, shape, found, search)
@@ -250,7 +251,6 @@ def _filled(
     found: Mapping[tuple[int, ...], Found],
     search: Search,
 ) -> _Table:
-    """Build the output table and fill it with the attractors of all parameter points."""
     n = max((len(f.features) for f in found.values()), default=0)
     longest = max((len(x.points) for f in found.values() for x in f.features), default=0)
     n_states = ds.sizes["state"]
@@ -272,7 +272,7 @@ def _filled(
 
 
 def _with_exponents(result: xr.Dataset, ds: xr.Dataset) -> xr.Dataset:
-    """Take the largest Lyapunov exponent of each non-periodic set from its trajectories, if the cube has exponents."""
+    """Set the largest Lyapunov exponent of each non-periodic set, from the stored exponents of its trajectories."""
     if "lyapunov" not in ds:
         return result
     dims, signs = result["attractor_id"].dims, ChaosOptions()
@@ -349,7 +349,6 @@ _ELSEWHERE = (
 
 
 def _names(dynamics: Dynamics) -> list[str]:
-    """Return the names of the output variables, without those that the model cannot provide."""
     model = dynamics.model
     has_energy = model is not None and any(q.name == ENERGY for q in model.quantities)
     left_out = {
@@ -363,7 +362,7 @@ def _names(dynamics: Dynamics) -> list[str]:
 
 
 class _Table:
-    """Arrays of the output variables, with an entry per parameter point and attractor."""
+    """Arrays of the output variables of `identify`, with one entry per parameter point and attractor."""
 
     def __init__(
         self, dims: tuple[str, ...], shape: tuple[int, ...], n: int, sizes: Mapping[str, int], dynamics: Dynamics
@@ -377,7 +376,7 @@ class _Table:
             self.arrays[name] = np.full((*shape, n, *(sizes[d] for d in own)), fill, dtype)
 
     def fill(self, at: tuple[int, ...], x: Features, n_cells: int) -> None:
-        """Write the features of one attractor (or other set on which trajectories end) into the arrays."""
+        """Write the features of one attractor (or other set on which trajectories end) into the output arrays."""
         arrays = self.arrays
         arrays["n_cells"][at] = n_cells
         if x.n_to is not None:
@@ -393,7 +392,7 @@ class _Table:
             arrays[name][at] = getattr(x, name)
 
     def share(self, index: tuple[int, ...], one: Found) -> None:
-        """Write each attractor's share of the trajectories at a parameter point, among those that reach an attractor or
+        """Write the fraction of trajectories that end on each attractor, among those that reach an attractor or
         diverge.
         """
         counts = np.array(one.counts, np.int64)
@@ -403,7 +402,7 @@ class _Table:
             self.arrays["share"][index][: len(counts)] = np.where(attracts, counts / total, 0.0)
 
     def variables(self) -> dict[str, Any]:
-        """Return the arrays as (dims, values, attributes) for xarray."""
+        """Return the output arrays as (dims, values, attributes), from which xarray builds a Dataset."""
         more: dict[str, dict[str, Any]] = {
             "kind": _flags(" ".join(KINDS)),
             "stability": _flags(" ".join(STABILITIES)),

@@ -1,4 +1,4 @@
-"""Compute hysteresis as an analysis of a run (`pipeline.products.attractors`)."""
+"""Define the analysis ``hysteresis`` of a run."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pipeline.products.attractors import AttractorOptions
 
 
 def needs_directions(run: Run, options: AttractorOptions) -> None:
-    """Raise ValueError unless the run is a continuation in both directions."""
+    """Raise ValueError unless the run is a continuation both up and down its parameter."""
     from pipeline.analysis.attractors.matching.hysteresis import check_directions
 
     check_directions(run.cube())

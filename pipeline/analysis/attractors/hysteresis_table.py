@@ -10,7 +10,9 @@ from pipeline.products.product import Table
 
 
 def hysteresis_table(ds: xr.Dataset) -> Table:
-    """Return the table of hysteresis: a row per kind of jump between two attractors, and text lines on the loops."""
+    """Return the table of hysteresis. It has one row per kind of jump between two attractors, and text lines about the
+    loops.
+    """
     names = ("jump_from", "jump_to", "jump_from_id", "jump_to_id", "jump_count")
     jumps = [ds.isel(jump=i) for i in range(ds.sizes["jump"])]
     rows = [
@@ -51,7 +53,5 @@ def _loop_words(loop: xr.Dataset, unit: str) -> Words:
 
 
 def _met(counts: np.ndarray) -> str:
-    """Format the ids of the attractors that a continuation met, each with the number of parameter points at which it
-    met them.
-    """
+    """Format the ids of attractors, each with the number of parameter points at which a continuation was on it."""
     return ", ".join(f"{i} ({counted(counts[i], 'point')})" for i in np.flatnonzero(counts)) or "-"

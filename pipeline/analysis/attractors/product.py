@@ -1,4 +1,4 @@
-"""Compute attractors as an analysis of a run (`pipeline.products.attractors`)."""
+"""Define the analyses ``identified`` and ``attractors`` of a run."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from pipeline.products.attractors import AttractorOptions, IdentifyOptions
 
 
 def identified(run: Run, options: IdentifyOptions) -> xr.Dataset:
-    """Find the attractors of each parameter point of a run separately."""
+    """Find the attractors of a run at each parameter point, without ids that connect the points."""
     from pipeline.analysis.attractors.attractors import identify
 
     return identify(run.cube(), options)
 
 
 def attractors(run: Run, options: AttractorOptions) -> xr.Dataset:
-    """Find the attractors of a run and give them ids that follow them along the swept parameters."""
+    """Find the attractors of a run, and give them ids that stay the same along the swept parameters."""
     from pipeline.analysis.attractors.attractors import match
 
     found = run.derive("identified", **options.part(IdentifyOptions))

@@ -1,4 +1,4 @@
-"""Define the analysis ``settling``: the evidence on whether each non-periodic set is transient or attracts."""
+"""Define the analysis ``settling`` of a run: the evidence on whether each non-periodic set attracts or is transient."""
 
 from __future__ import annotations
 
@@ -31,6 +31,6 @@ VARIABLES = (
 
 
 def settling(run: Run, options: AttractorOptions) -> xr.Dataset:
-    """Return the evidence on whether each non-periodic set is transient or attracts."""
+    """Return the evidence on whether each non-periodic set attracts or is transient."""
     found: xr.Dataset = run.derive("attractors", **options.plain())
     return found[list(VARIABLES)]

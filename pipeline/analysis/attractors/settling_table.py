@@ -1,4 +1,4 @@
-"""Tabulate the non-periodic sets, with the evidence from trajectories that were integrated further."""
+"""Tabulate the non-periodic sets, with the evidence from trajectories that were integrated beyond the run."""
 
 from __future__ import annotations
 
@@ -13,7 +13,9 @@ from pipeline.products.product import Table
 
 
 def settling_table(ds: xr.Dataset) -> Table:
-    """Return the table of non-periodic sets: how many of the cells integrated further stayed on the set or left it."""
+    """Return the table of non-periodic sets. It counts the trajectories that stayed on or left each set when integrated
+    further.
+    """
     dims = [str(d) for d in ds["kind"].dims if d != "attractor"]
     found = sets_of(ds, ds["kind"].isin(APERIODIC), dims)
     rows = [{**where, "attractor_id": int(one["attractor"]), **_row(one)} for where, one in found]

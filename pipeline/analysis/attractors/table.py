@@ -1,4 +1,4 @@
-"""Tabulate the attractors and the other sets on which cells end."""
+"""Tabulate the attractors of a run, and the other sets on which its cells end."""
 
 from __future__ import annotations
 
@@ -35,7 +35,9 @@ _NUMBERS = ("lyapunov_max", "lyapunov_low", "lyapunov_high", "mean_lifetime", "l
 
 
 def attractors_table(ds: xr.Dataset) -> Table:
-    """Return the table of attractors: lines per parameter point if there are few points, otherwise per attractor id."""
+    """Return the table of attractors. It has rows per parameter point or, if there are many points, per attractor
+    id.
+    """
     rows = _rows(ds)
     dims, _ = split_dims(ds["attractor_id"])
     n_points = int(np.prod([ds.sizes[d] for d in dims]))
@@ -53,7 +55,7 @@ def attractors_table(ds: xr.Dataset) -> Table:
 
 
 def _rows(ds: xr.Dataset) -> list[Row]:
-    """Return a row per set and parameter point.
+    """Return one table row for each set (attractor or other) at each parameter point.
 
     `fraction` is a share of the cells that attract or diverge, with its interval; it is NaN for a set that
     does not attract. A continuation has no fractions: its branches are no sample of initial conditions.
@@ -80,7 +82,6 @@ def _rows(ds: xr.Dataset) -> list[Row]:
 
 
 def _attractor(one: xr.Dataset) -> Row:
-    """Return the table columns of one attractor, without the quantities that its model lacks."""
     row: Row = {"attractor_id": int(one["attractor"])}
     row |= values(one, "kind", "stability", "evidence", "orbit_period", "period_s", "side")
     if "rotation" in one:
@@ -97,8 +98,8 @@ def _attractor(one: xr.Dataset) -> Row:
 
 
 def _remarks(ds: xr.Dataset, rows: Sequence[Row]) -> list[str]:
-    """Return the remarks below the table: conservative flow, periods beyond the search limit, exhausted integration
-    budgets.
+    """Return the remarks below the table, for instance that the flow is conservative or that the integration budget ran
+    out.
     """
     lines = []
     if any(row["evidence"] == "volume" for row in rows):
@@ -164,7 +165,6 @@ _SHOWN_BY = {
 
 
 def _shown_by(row: Row) -> str:
-    """Format the evidence for the stability of a set, such as how many trajectories stayed and the lifetime."""
     low = number(row["lifetime_low"], ".0f")
     if row["evidence"] == "stayed":
         return f"{row['n_sampled']} stayed, lifetime above {low}"
@@ -175,7 +175,6 @@ def _shown_by(row: Row) -> str:
 
 
 def _eigenvalue(row: Row) -> str:
-    """Format the leading eigenvalue of an equilibrium [1/s]."""
     if not np.isfinite(row["eigenvalue_real"]):
         return "-"
     imaginary = f" \u00b1 {row['eigenvalue_imag']:.4g}i" if row["eigenvalue_imag"] else ""
@@ -203,12 +202,11 @@ def _id_summary(ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str]) -> Wor
 
 
 def _known(*ids: int) -> str:
-    """Format the distinct non-negative ids; a dash if there is none."""
     return distinct(i for i in ids if i >= 0) or "-"
 
 
 def _evidence(bases: Sequence[str]) -> str:
-    """Summarise how an attractor got its id: by followed branches, by period doublings, or by distance alone."""
+    """Summarise by what evidence an attractor got its id: followed branches, period doublings, or distance alone."""
     evidence = [basis for basis in bases if basis != "first_appearance"]
     told = [name for name in ("branch", "doubling") if name in evidence]
     n = evidence.count("distance")

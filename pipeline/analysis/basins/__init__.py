@@ -1,1 +1,1 @@
-"""Analyse basins of attraction: fractions, boundaries, Wada property."""
+"""Analyse basins of attraction: their fractions, their boundaries, and the Wada property."""

@@ -94,7 +94,7 @@ _OWN = ("interval", "confidence", "box", "block", "scaling", "radius", "metric",
 
 
 def check_starts(ds: xr.Dataset) -> None:
-    """Raise ValueError unless the cells are independent initial conditions, several per parameter point."""
+    """Raise ValueError unless each parameter point has several cells with independent initial conditions."""
     if "branch" in ds["status"].dims:
         raise ValueError(
             'basins need independent initial conditions, a sweep (kind = "sweep"): where a branch of a '
@@ -105,9 +105,7 @@ def check_starts(ds: xr.Dataset) -> None:
 
 
 def _unfinished(ids: xr.Dataset, dims: tuple[str, ...]) -> dict[str, xr.DataArray]:
-    """Count the cells without an outcome at each parameter point, by reason: not computed, not settled, failed and
-    others.
-    """
+    """Count the cells without an outcome at each parameter point by reason, such as "not computed" or "not settled"."""
     others = other_cells(ids)
     shape = outcomes(ids).transpose(*dims, ...).shape
     kinds = {
@@ -132,7 +130,6 @@ def _unfinished(ids: xr.Dataset, dims: tuple[str, ...]) -> dict[str, xr.DataArra
 
 
 def _no_grid(ds: xr.Dataset, start_dims: tuple[str, ...]) -> str:
-    """Return the reason why the initial conditions form no regular grid; empty if they form one."""
     if "initial_condition" in start_dims:
         return "boundaries: the starts are no grid"
     for dim in start_dims:
@@ -171,7 +168,7 @@ _SCALARS = (
 
 
 class _Points:
-    """Collector of the basin measures of each parameter point."""
+    """Arrays that collect the basin measures of all parameter points."""
 
     def __init__(self, dims: tuple[str, ...], shape: tuple[int, ...]) -> None:
         self.dims, self.shape = dims, shape
@@ -183,14 +180,13 @@ class _Points:
         self._uncertain: dict[tuple[int, ...], np.ndarray] = {}
 
     def add(self, index: tuple[int, ...], name: str, value: Any) -> None:
-        """Add one measure of a parameter point."""
         if name == "uncertain":
             self._epsilon, self._uncertain[index] = value["epsilon"].values, value.values
         else:
             self._scalars[name][index] = value
 
     def variables(self) -> dict[str, Any]:
-        """Return the basin measures as (dims, values, attributes) for xarray."""
+        """Return the basin measures as (dims, values, attributes), from which xarray builds a Dataset."""
         found: dict[str, Any] = {}
         for name, values in self._scalars.items():
             base = next((name.removesuffix(f"_{e}") for e in _ERRORS if name.endswith(f"_{e}")), name)
@@ -208,7 +204,7 @@ class _Points:
 
 
 def _boundary(grid: np.ndarray, options: BasinOptions, missing: set[str]) -> Iterator[tuple[str, Any]]:
-    """Yield the measures of the basin boundaries on one grid of labels, with their names."""
+    """Yield the name and value of each measure of the basin boundaries on one grid of labels."""
     if not (grid != -1).any():
         return
     common: dict[str, Any] = {name: getattr(options, name) for name in ("resamples", "confidence", "seed")}

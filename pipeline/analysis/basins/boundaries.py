@@ -43,7 +43,7 @@ _EXPONENT_REFERENCES = {
 
 
 class _Boxes(NamedTuple):
-    """The content of each box: entropy [nat], number of labels, number of finished cells."""
+    """Content of each box of a grid of labels: entropy [nat], number of labels, number of finished cells."""
 
     entropy: Floats
     n_labels: Ints
@@ -64,7 +64,7 @@ def basin_entropy(
     confidence: float = 0.95,
     seed: int = 0,
 ) -> xr.Dataset:
-    """Compute the basin entropy and the boundary basin entropy, with bootstrap errors over boxes.
+    """Compute the basin entropy and the boundary basin entropy of a grid of labels, with bootstrap errors.
 
     The grid is cut into boxes. The entropy of a box is the entropy of its labels,
     ``S_i = sum_j p_ij ln(1/p_ij)``. The basin entropy is the mean over all boxes, and the boundary basin
@@ -157,7 +157,8 @@ def uncertainty_exponent(
     confidence: float = 0.95,
     seed: int = 0,
 ) -> xr.Dataset:
-    """Compute the uncertainty exponent alpha: the uncertain fraction scales as ``f(eps) ~ eps**alpha``.
+    """Compute the uncertainty exponent alpha of basin boundaries: the uncertain fraction scales as ``f(eps) ~
+    eps**alpha``.
 
     alpha is the dimension of the region minus that of the boundary: 1 for a smooth boundary, and near 0 if
     more precise initial conditions hardly improve the prediction (McDonald, Grebogi, Ott and Yorke,
@@ -249,7 +250,6 @@ def uncertainty_exponent(
 
 
 def _box_sides(box: int | Sequence[int], shape: tuple[int, ...]) -> tuple[int, ...]:
-    """Return the sides of a box along each axis, checked against the grid."""
     given = np.atleast_1d(np.asarray(box, dtype=np.int64)).tolist()
     sides = tuple(given) * (len(shape) if len(given) == 1 else 1)
     if len(sides) != len(shape):
@@ -262,7 +262,7 @@ def _box_sides(box: int | Sequence[int], shape: tuple[int, ...]) -> tuple[int, .
 
 
 def _fill_boxes(codes: Codes, sides: tuple[int, ...]) -> _Boxes:
-    """Compute the entropy [nat] and the number of labels of each box, without unfinished cells.
+    """Compute the entropy [nat] and count the labels in each box of a grid; unfinished cells are left out.
 
     The cells of each box are sorted, so the work does not grow with the number of labels.
     """
@@ -285,7 +285,9 @@ def _fill_boxes(codes: Codes, sides: tuple[int, ...]) -> _Boxes:
 
 
 def _pool(values: npt.NDArray[np.generic], block: int) -> Floats:
-    """Sum values over blocks of `block` elements per side (smaller at the far edges), flattened."""
+    """Sum values over blocks of `block` elements per side, and flatten the sums; blocks at the far edges may be
+    smaller.
+    """
     out = values.astype(np.float64)
     for axis, n in enumerate(values.shape):
         out = np.add.reduceat(out, np.arange(0, n, block), axis=axis)
@@ -293,14 +295,10 @@ def _pool(values: npt.NDArray[np.generic], block: int) -> Floats:
 
 
 def _entropies(sums: Floats) -> Floats:
-    """Compute the mean entropy over all boxes and over boundary boxes; `sums` has the total entropy and both box
-    counts.
-    """
     return _ratio(np.array([sums[0], sums[0]]), sums[1:])
 
 
 def _ratio(hits: Floats, trials: Floats) -> Floats:
-    """Return hits / trials, NaN where there are no trials."""
     return np.where(trials > 0.0, hits / np.where(trials > 0.0, trials, 1.0), np.nan)
 
 
@@ -308,7 +306,7 @@ def _ratio(hits: Floats, trials: Floats) -> Floats:
 
 
 class _Line(NamedTuple):
-    """Straight line fitted to ln f against ln eps; f is the uncertain fraction."""
+    """Straight line fitted to ln f over ln eps, where f is the uncertain fraction at the distance eps."""
 
     slope: float
     intercept: float
@@ -317,9 +315,7 @@ class _Line(NamedTuple):
 
 
 def _epsilons(epsilons: Sequence[int] | None, shape: tuple[int, ...], method: Scaling) -> Ints:
-    """Return the sizes epsilon [cells] of perturbations or boxes in rising order; ValueError if they do not fit the
-    grid.
-    """
+    """Choose or check the perturbations or box sizes epsilon [cells]; ValueError if they do not fit the grid."""
     first = 1 if method == "perturbation" else 2
     shortest = min(shape)
     # a perturbation needs room on both sides, a box must fit
@@ -340,7 +336,8 @@ def _epsilons(epsilons: Sequence[int] | None, shape: tuple[int, ...], method: Sc
 
 
 def _perturbed(codes: Codes, eps: Ints) -> tuple[Floats, Floats]:
-    """Count the tested cells, and those whose label changes within the distance epsilon, for each epsilon and tile.
+    """Count for each epsilon the tested cells, and those whose label changes within this distance, in each tile of the
+    grid.
 
     Every epsilon has the same trials: the cells that have room for the largest epsilon. Otherwise f would not
     be a straight line even for a straight boundary.
@@ -362,9 +359,7 @@ def _perturbed(codes: Codes, eps: Ints) -> tuple[Floats, Floats]:
 
 
 def _boxed(codes: Codes, eps: Ints, method: Scaling) -> tuple[Floats, Floats]:
-    """Count the boxes of side epsilon, and those with several labels (or sum their entropies), for each epsilon and
-    tile.
-    """
+    """Count for each epsilon the boxes with this side, and those with several labels, in each tile of the grid."""
     n_tiles = tiles_per_side(codes.shape) ** codes.ndim
     trials, hits = np.zeros((eps.size, n_tiles)), np.zeros((eps.size, n_tiles))
     for i, e in enumerate(eps):
@@ -376,13 +371,12 @@ def _boxed(codes: Codes, eps: Ints, method: Scaling) -> tuple[Floats, Floats]:
 
 
 def _window(codes: Codes, axis: int, start: int, stop: int) -> Codes:
-    """Return the slice of a label grid between two positions along one axis."""
     return codes[tuple(slice(start, stop) if k == axis else slice(None) for k in range(codes.ndim))]
 
 
 def _fit_line(eps: Ints, f: Floats) -> _Line:
-    """Fit a line to ln f against ln eps (f: uncertain fraction) where f > 0, by least squares; NaN with fewer than
-    three points.
+    """Fit a straight line to ln f over ln eps by least squares, where the uncertain fraction f is above 0; NaN with
+    fewer than three points.
     """
     use = f > 0.0
     if use.sum() < 3:

@@ -1,4 +1,4 @@
-"""Read grids of labels for basin analyses, and cut them into tiles for resampling.
+"""Read grids of outcome labels for analyses of basins, and cut the grids into tiles for resampling.
 
 A label is the integer code of an outcome: an attractor's id, or another code that the caller counts as an
 outcome, such as divergence. *Unfinished* codes mark cells whose outcome is not known. These cells are neither
@@ -23,7 +23,7 @@ UNFINISHED = (-1,)
 
 @dataclass(frozen=True)
 class LabelGrid:
-    """Labels of a grid or sample of cells, as consecutive indices.
+    """Outcome labels of a grid or sample of cells, stored as consecutive indices.
 
     Attributes
     ----------
@@ -38,14 +38,14 @@ class LabelGrid:
 
     @property
     def fraction_unfinished(self) -> float:
-        """Share of all cells whose outcome is not known."""
+        """Share of the cells whose outcome is unknown."""
         return float((self.codes < 0).mean())
 
 
 def read_labels(
     labels: npt.ArrayLike, unfinished: Collection[int] = UNFINISHED, ids: Collection[int] = ()
 ) -> LabelGrid:
-    """Replace the labels of an array by consecutive indices, and mark the unfinished cells (outcome not known).
+    """Replace outcome labels by consecutive indices, and mark the cells whose outcome is unknown.
 
     Parameters
     ----------
@@ -89,21 +89,21 @@ def check_confidence(confidence: float) -> None:
 
 
 def check_resamples(resamples: int) -> None:
-    """Raise ValueError for fewer than two resamples, which give no standard error."""
+    """Raise ValueError unless there are at least two bootstrap resamples; fewer give no standard error."""
     if resamples < 2:
         raise ValueError(f"resamples is {resamples}, below 2: a spread needs at least 2, an interval 200")
 
 
 def bootstrap_weights(n: int, resamples: int, seed: int) -> Iterator[Floats]:
-    """Yield how often each of `n` units is drawn, with replacement, in each resample."""
+    """Yield, for each bootstrap resample, how often each of `n` units is drawn."""
     rng = np.random.default_rng(seed)
     for _ in range(resamples):
         yield np.bincount(rng.integers(n, size=n), minlength=n).astype(np.float64)
 
 
 def spread(resampled: Floats, confidence: float) -> tuple[Floats, Floats, Floats]:
-    """Compute the standard error and the percentile interval of resampled values along the first axis; NaN if any is
-    NaN.
+    """Compute the standard error and the percentile interval of resampled values (first axis: resamples); NaN if a
+    value is NaN.
     """
     tail = 50.0 * (1.0 - confidence)
     low, high = np.percentile(resampled, [tail, 100.0 - tail], axis=0)
@@ -111,14 +111,14 @@ def spread(resampled: Floats, confidence: float) -> tuple[Floats, Floats, Floats
 
 
 def tiles_per_side(shape: tuple[int, ...], total: int = 64) -> int:
-    """Return into how many tiles to divide a grid along each axis, at least 2, for about `total` tiles in all."""
+    """Return how many tiles to cut a grid into along each axis (at least 2), for about `total` tiles in all."""
     return max(2, int(np.rint(total ** (1.0 / len(shape)))))
 
 
 def tile_numbers(
     shape: tuple[int, ...], grid: tuple[int, ...], step: int = 1, margin: tuple[int, ...] | None = None
 ) -> Ints:
-    """Return for each element of an array the number of the tile, a part of the grid of cells, that holds its centre.
+    """Return, for each element of an array over a grid, the number of the tile of the grid that it lies in.
 
     Parameters
     ----------
@@ -141,6 +141,6 @@ def tile_numbers(
 
 
 def tile_sums(values: npt.NDArray[np.generic], tile: Ints, n_tiles: int) -> Floats:
-    """Sum an array's values over each of the tiles into which a grid of cells is divided."""
+    """Sum the values of an array over each tile of a grid."""
     weights = values.ravel().astype(np.float64)
     return np.bincount(tile.ravel(), weights=weights, minlength=n_tiles).astype(np.float64)

@@ -38,7 +38,7 @@ def basin_fractions(
     confidence: float = 0.95,
     method: Interval = "wilson",
 ) -> xr.Dataset:
-    """Compute the fraction of cells that goes to each attractor, with its sampling error.
+    """Compute the fraction of cells that end on each attractor, with its sampling error.
 
     `fraction` refers to the finished cells, as if the unfinished cells were distributed alike. Further
     variables state the largest change that the unfinished cells can make. A label without cells has the
@@ -204,7 +204,9 @@ def _kept_dims(
 
 
 def _count_rows(grid: LabelGrid, shape: tuple[int, ...]) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """Count the cells of each label and the unfinished cells, separately for each element of the leading axes."""
+    """Count the cells of each label, and the unfinished cells, for each index of the leading axes (parameter
+    points).
+    """
     n_rows, width = int(np.prod(shape)), grid.ids.size + 1
     codes = grid.codes.reshape(n_rows, -1).astype(np.int64) + 1
     codes += width * np.arange(n_rows)[:, None]
@@ -215,7 +217,6 @@ def _count_rows(grid: LabelGrid, shape: tuple[int, ...]) -> tuple[npt.NDArray[np
 def _count_inferred(
     grid: LabelGrid, inferred: npt.NDArray[np.generic], shape: tuple[int, ...]
 ) -> npt.NDArray[np.int64]:
-    """Count per label the cells whose outcome was inferred from neighbouring cells."""
     if inferred.dtype != bool or inferred.shape != grid.codes.shape:
         raise ValueError(
             f"inferred is {inferred.dtype} of shape {inferred.shape}, the labels are of shape "
@@ -233,9 +234,7 @@ def _with_intervals(
     method: Interval,
     name: str = "fraction",
 ) -> dict[str, tuple[tuple[str, ...], npt.NDArray[np.generic]]]:
-    """Compute outcome fractions, their intervals and the bounds due to unfinished cells, from counts (outcomes on the
-    last axis).
-    """
+    """Compute from counts the fraction of each outcome, its interval, and its bounds due to unfinished cells."""
     cells, unknown = n_cells[..., None], n_unfinished[..., None]
     finished = cells - unknown
     low, high = binomial_interval(count, finished, confidence=confidence, method=method)
@@ -255,13 +254,13 @@ def _with_intervals(
 
 
 def _upper_bound(count: npt.NDArray[np.int64], n: npt.NDArray[np.int64], confidence: float) -> npt.NDArray[np.float64]:
-    """Compute the one-sided upper Clopper-Pearson bound; 1 if all `n` trials are hits, or `n` is 0."""
+    """Compute the one-sided upper Clopper-Pearson bound of a fraction; 1 if all `n` trials are hits or `n` is 0."""
     bound = special.betaincinv(count + 1.0, np.maximum(n - count, 1), confidence)
     return np.where(count >= n, 1.0, bound)
 
 
 def _same_cells(before: xr.DataArray, after: xr.DataArray) -> xr.DataArray:
-    """Return the labels after a change with dims in the old order; raise ValueError unless the cells are the same."""
+    """Transpose the second array of labels to the dims of the first; ValueError unless both have the same cells."""
     if set(before.dims) != set(after.dims):
         raise ValueError(
             f"labels before have the dims {before.dims}, after {after.dims}: select one parameter value from each"
@@ -274,9 +273,6 @@ def _same_cells(before: xr.DataArray, after: xr.DataArray) -> xr.DataArray:
 
 
 def _provenance(unfinished: Collection[int], confidence: float, method: Interval) -> dict[str, object]:
-    """Return dataset attributes: method, confidence level and reference of the intervals, and the codes of unfinished
-    cells.
-    """
     return {
         "interval": method,
         "confidence": confidence,

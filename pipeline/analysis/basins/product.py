@@ -1,4 +1,4 @@
-"""Compute basins as an analysis of a run (`pipeline.products.basins`)."""
+"""Define the analysis ``basins`` of a run."""
 
 from __future__ import annotations
 
@@ -17,7 +17,9 @@ def needs_starts(run: Run, options: BasinOptions) -> None:
 
 
 def basins(run: Run, options: BasinOptions) -> xr.Dataset:
-    """Compute the basins of a sweep: outcomes of cells, fractions, boundaries."""
+    """Compute the basins of attraction of a sweep: the outcomes of its cells, the basin fractions and the basin
+    boundaries.
+    """
     from pipeline.analysis.basins.basins import basins as compute
 
     found = run.derive("attractors", **options.part(AttractorOptions))

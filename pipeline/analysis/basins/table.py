@@ -27,7 +27,8 @@ from pipeline.products.product import Table
 
 
 def basins_table(ds: xr.Dataset) -> Table:
-    """Return a row per outcome and parameter point: number of cells, and basin fraction with its intervals.
+    """Return the table of basins. It has one row per outcome and parameter point, with the number of cells and the
+    basin fraction.
 
     The lines have a table per point if there are few, otherwise ranges; the boundaries follow.
     """

@@ -38,7 +38,7 @@ def wada_merge_test(
     confidence: float = 0.95,
     seed: int = 0,
 ) -> xr.Dataset:
-    """Test whether all basins share one boundary: merge all basins but one in turn, and compare the boundaries.
+    """Test whether all basins share one boundary: compare the boundaries that remain if all basins but one are merged.
 
     For each basin in turn, all others are merged. If the basins have the Wada property, the boundary is the
     same for every basin. On a grid, each boundary then lies within every other boundary fattened by a radius
@@ -147,7 +147,8 @@ def _boundary_cells(codes: Codes, code: int) -> Ints:
 
 
 def _distances(shape: tuple[int, ...], boundaries: list[Ints], radii: Ints, metric: Metric) -> tuple[Floats, Floats]:
-    """Compute the largest distance of each basin boundary from each other one; count boundary cells beyond each radius.
+    """Compute the largest distance of each basin boundary from each other one, and count the boundary cells beyond each
+    radius.
 
     There is one distance transform per label, which is read at the boundary cells of each pair.
     """
@@ -168,7 +169,6 @@ def _distances(shape: tuple[int, ...], boundaries: list[Ints], radii: Ints, metr
 
 
 def _distance_field(shape: tuple[int, ...], target: Ints, metric: Metric) -> npt.NDArray[np.int32]:
-    """Compute the distance of every cell from the nearest target cell, flattened."""
     outside: Bools = np.ones(int(np.prod(shape)), dtype=np.bool_)
     outside[target] = False
     field = ndimage.distance_transform_cdt(outside.reshape(shape), metric=metric)

@@ -18,7 +18,7 @@ from pipeline.analysis.branches.problems import Problem, Value
 
 @dataclass(frozen=True, eq=False)
 class Settings:
-    """Settings for tracing a solution curve: step lengths, tolerance and limits.
+    """Settings of pseudo-arclength continuation: step lengths, tolerance and limits.
 
     Attributes
     ----------
@@ -45,7 +45,9 @@ class Settings:
 
 @dataclass(frozen=True, eq=False)
 class Point:
-    """Point of a solution curve: unknowns, unit tangent, value of the equations there, number of Newton steps."""
+    """Point of a solution curve: its unknowns, its unit tangent, the value of the equations and the number of Newton
+    steps.
+    """
 
     u: np.ndarray
     tangent: np.ndarray
@@ -60,7 +62,7 @@ class Point:
 
 @dataclass(eq=False)
 class Trace:
-    """Points of a traced solution curve in order, and the reason for its end."""
+    """Points of a traced solution curve in order, and the reason why the trace ended."""
 
     points: list[Point] = field(default_factory=list)
     end: str = ""
@@ -69,7 +71,8 @@ class Trace:
 def correct(
     problem: Problem, guess: np.ndarray, normal: np.ndarray, settings: Settings, along: np.ndarray | None = None
 ) -> Steps[Point | None]:
-    """Refine a guess by Newton's method within the plane through it normal to `normal`; None if the method fails.
+    """Refine a guess of a curve point by Newton's method, in the plane through the guess normal to `normal`; None on
+    failure.
 
     The point's tangent goes along `along`, by default along the normal.
     """
@@ -99,7 +102,9 @@ def correct(
 
 
 def tangent_of(value: Value, along: np.ndarray) -> np.ndarray | None:
-    """Return the unit tangent of the solution curve that points along `along`; None if the tangent is not unique."""
+    """Return the unit tangent of the solution curve whose direction agrees with `along`; None if the tangent is not
+    unique.
+    """
     matrix = np.vstack([value.derivative, along])
     right = np.zeros(len(matrix))
     right[-1] = 1.0
@@ -112,7 +117,7 @@ def tangent_of(value: Value, along: np.ndarray) -> np.ndarray | None:
 
 
 def kernel_of(value: Value) -> np.ndarray:
-    """Return a unit vector in the kernel of the derivative of a curve's equations; its sign is arbitrary."""
+    """Return a unit vector in the kernel of the derivative of the curve's equations; its sign is arbitrary."""
     return np.asarray(np.linalg.svd(value.derivative)[2][-1])
 
 
@@ -154,7 +159,9 @@ def trace(problem: Problem, start: Point, settings: Settings, stop: Stop, betwee
 
 
 def cubic(a: Point, b: Point, share: float) -> np.ndarray:
-    """Return the point at a share of the chord on the cubic through two points; shares above 1 extrapolate."""
+    """Interpolate between two points of a curve by a cubic, at the fraction `share` of their chord (above 1:
+    extrapolate).
+    """
     length = float(np.linalg.norm(b.u - a.u))
     s, rest = share, 1.0 - share
     middle = rest**2 * (1.0 + 2.0 * s) * a.u + s**2 * (3.0 - 2.0 * s) * b.u
@@ -162,7 +169,7 @@ def cubic(a: Point, b: Point, share: float) -> np.ndarray:
 
 
 def _ahead(points: list[Point], step: float) -> np.ndarray:
-    """Predict the next point of the curve at distance `step`, in the plane normal to the tangent there."""
+    """Predict the next point of the curve, at the distance `step` along the tangent."""
     here = points[-1]
     straight = here.u + step * here.tangent
     if len(points) < 2:

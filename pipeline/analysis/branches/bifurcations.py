@@ -54,7 +54,7 @@ def _branching_test(point: Point) -> float:
 
 
 def _of_orbits(test: Callable[[np.ndarray], float]) -> Test:
-    """Extend a test function of the monodromy matrix to points of a branch; at equilibria its value is always 1."""
+    """Turn a test of the monodromy matrix into a test function for points of a branch; at equilibria its value is 1."""
     return lambda point: 1.0 if point.value.is_rest else test(point.value.monodromy)
 
 
@@ -74,7 +74,7 @@ and the tangent are dependent.
 
 @dataclass(eq=False)
 class Bifurcation:
-    """Bifurcation located on a branch of periodic orbits.
+    """A bifurcation that was located on a branch of periodic orbits or equilibria.
 
     Attributes
     ----------
@@ -134,7 +134,7 @@ _CHANGES = {FOLD: 1, DOUBLING: 1, TORUS: 2, BRANCHING: 1, HOPF: 2}
 
 @dataclass(eq=False)
 class Watch:
-    """Detector of bifurcations between neighbouring points of a traced branch; it stores those located so far."""
+    """Detector of bifurcations between successive points of a branch; it stores the located bifurcations."""
 
     problem: OneParameter
     settings: Settings
@@ -143,8 +143,8 @@ class Watch:
     n_steps: int = 0
 
     def between(self, a: Point, b: Point) -> Steps[bool]:
-        """Locate the bifurcations between two points; return False if a shorter step is needed to explain the stability
-        change.
+        """Locate the bifurcations between two successive points. Return False if the change of stability needs a
+        shorter step.
         """
         if self.skip_first and self.n_steps == 0:
             self.n_steps += 1
@@ -167,7 +167,9 @@ class Watch:
 
 
 def _explains(kinds: list[str], change: int) -> bool:
-    """Return whether bifurcations of the given kinds can change the number of unstable multipliers by `change`."""
+    """Return whether bifurcations of the given kinds can together change the number of unstable multipliers by
+    `change`.
+    """
     reachable = {0}
     for kind in kinds:
         step = _CHANGES[kind]
@@ -177,8 +179,8 @@ def _explains(kinds: list[str], change: int) -> bool:
 
 
 def locate(problem: OneParameter, a: Point, b: Point, kind: str, settings: Settings) -> Steps[Bifurcation | None]:
-    """Locate the bifurcation between two points where its test function vanishes; None if no orbit between them is
-    found.
+    """Locate the bifurcation between two points of a branch where its test function vanishes; None if Newton's method
+    fails.
     """
     test = TESTS[kind]
 
@@ -203,7 +205,7 @@ Tested = tuple[Point, float]
 def find_root(
     problem: Problem, a: Tested, b: Tested, test: Callable[[Point], Steps[float]], settings: Settings
 ) -> Steps[tuple[Tested, Tested] | None]:
-    """Bracket a zero of a test function between two points of a curve to `WIDTH`; None if Newton's method fails."""
+    """Bracket a zero of a test function between two points of a curve within `WIDTH`; None if Newton's method fails."""
     (first, at_first), (last_point, at_last) = a, b
     chord = last_point.u - first.u
     length = float(np.linalg.norm(chord))
@@ -233,7 +235,9 @@ def find_root(
 
 
 def _root(known: list[tuple[float, float]]) -> float:
-    """Estimate a root by inverse interpolation of (argument, value) pairs; NaN for equal values."""
+    """Estimate the root of a function by inverse interpolation of (argument, value) pairs; NaN if two values are
+    equal.
+    """
     total = 0.0
     for i, (at, value) in enumerate(known):
         others = [v for j, (_, v) in enumerate(known) if j != i]
@@ -244,14 +248,16 @@ def _root(known: list[tuple[float, float]]) -> float:
 
 
 def _between(a: Point, b: Point, share: float) -> np.ndarray:
-    """Interpolate between two points at a share of the chord, in the plane normal to the chord."""
+    """Interpolate between two points of a curve, at a fraction of their chord and in the plane normal to it."""
     chord = b.u - a.u
     bent = cubic(a, b, share)
     return np.asarray(bent + (share - (bent - a.u) @ chord / (chord @ chord)) * chord)
 
 
 def tell_apart(located: list[Bifurcation], a: Point) -> list[Bifurcation]:
-    """Keep the true bifurcations, sorted along the branch: drop neutral saddles, and folds that are branch points."""
+    """Keep the true bifurcations in the order of the branch. Drop neutral saddles, and folds that are really branch
+    points.
+    """
     branching = [one.point.u for one in located if one.kind == BRANCHING]
     kept = []
     for one in located:
@@ -264,14 +270,18 @@ def tell_apart(located: list[Bifurcation], a: Point) -> list[Bifurcation]:
 
 
 def _is_torus(one: Bifurcation) -> bool:
-    """Return whether the multipliers with product 1 are complex (torus bifurcation), not real (neutral saddle)."""
+    """Return whether a located zero is a torus bifurcation (complex multipliers), and not a neutral saddle (real
+    multipliers).
+    """
     multipliers = multipliers_of(one.point)
     complex_pairs = multipliers[multipliers.imag > 0.0]
     return bool(len(complex_pairs)) and bool(np.abs(np.abs(complex_pairs) - 1.0).min() < 1e-4)
 
 
 def _is_pair(one: Bifurcation) -> bool:
-    """Return whether the eigenvalues with sum 0 are complex (Hopf point), not real (neutral saddle)."""
+    """Return whether a located zero is a Hopf point (complex eigenvalues), and not a neutral saddle (real
+    eigenvalues).
+    """
     values = eigenvalues_of(one.point)
     upper = values[values.imag > 0.0]
     return bool(len(upper)) and bool(np.abs(upper.real / np.abs(upper)).min() < 1e-4)

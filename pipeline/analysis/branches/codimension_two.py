@@ -59,7 +59,7 @@ ON_AXIS = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class SpecialPoint:
-    """A located point of codimension two, such as a cusp: its kind, orbit, both parameter values and their errors.
+    """A located point of codimension two, such as a cusp, with its orbit, both parameter values and their errors.
 
     Attributes
     ----------
@@ -83,13 +83,13 @@ class SpecialPoint:
 
     @property
     def values(self) -> np.ndarray:
-        """Values of both parameters at the point."""
+        """Values of both parameters at this point of codimension two."""
         return self.family.values(self.point.u)
 
 
 @dataclass(eq=False)
 class Detector:
-    """Detector of points of codimension two along a bifurcation curve; it keeps those that it has located.
+    """Detector of points of codimension two along a bifurcation curve; it stores the located points.
 
     `settings` are tried in turn for locating one. `n_missed` counts sign changes that none of them leads to.
 
@@ -105,7 +105,9 @@ class Detector:
     _last: tuple[Point, _Frame, dict[str, float]] | None = None
 
     def between(self, a: Point, b: Point) -> Steps[bool]:
-        """Locate the points of codimension two between two neighbouring points of the curve; always accept the step."""
+        """Locate the points of codimension two between two successive points of a bifurcation curve; always accept the
+        step.
+        """
         if self._last is None or self._last[0] is not a:
             first = yield from self._tests(a, None)
             self._last = a, *first
@@ -118,7 +120,6 @@ class Detector:
         return True
 
     def _tests(self, point: Point, frame: _Frame | None) -> Steps[tuple[_Frame, dict[str, float]]]:
-        """Compute all test functions of codimension two at a point of the curve."""
         family, kind = self.problem.family, self.problem.kind
         case = Case(family, kind, point.u, point.value.monodromy, STEPS, frame.vector if frame else None)
         turned = _Frame.of(case, frame)
@@ -127,9 +128,7 @@ class Detector:
         return turned, values
 
     def _coefficient(self, case: Case) -> Steps[float]:
-        """Compute the normal form coefficient at a point of the curve, by differences with the step size chosen at the
-        first point.
-        """
+        """Compute the normal form coefficient at a point of the curve by finite differences."""
         if case.kind == TORUS and case.critical.imag == 0.0:  # beyond R1 or R2
             return float("nan")
         if self._level is None:
@@ -142,8 +141,8 @@ class Detector:
         return float(value.residual[0])
 
     def _locate(self, kind: str, a: Tested, b: Tested, frame: _Frame) -> Steps[None]:
-        """Locate and store the point of codimension two where a test function vanishes between two points; count
-        failures.
+        """Locate and store the point of codimension two where a test function vanishes between two points of a curve;
+        count failures.
         """
 
         def test(point: Point) -> Steps[float]:
@@ -185,15 +184,15 @@ def _is_same(one: SpecialPoint, other: SpecialPoint) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class _Frame:
-    """Critical eigenvector at a point of a curve, and an orthonormal basis (n, 2) of the plane of a complex pair."""
+    """Critical eigenvector at a point of a bifurcation curve and, for a complex pair, a basis of its plane."""
 
     vector: np.ndarray
     plane: np.ndarray | None
 
     @classmethod
     def of(cls, case: Case, before: _Frame | None) -> _Frame:
-        """Return the critical eigenvector and plane at a point of a curve, with the plane's basis turned close to
-        `before`.
+        """Compute the critical eigenvector and plane at a point of a curve. The basis of the plane is turned as near as
+        possible to `before`.
         """
         if case.kind != TORUS:
             return cls(case.q, None)
@@ -208,9 +207,7 @@ class _Frame:
 
 
 def _matrix_tests(kind: str, matrix: np.ndarray, frame: _Frame) -> dict[str, float]:
-    """Compute the test functions of codimension two that depend on the monodromy matrix, for one kind of bifurcation
-    curve.
-    """
+    """Compute the test functions for codimension two that follow from the monodromy matrix."""
     if kind == TORUS:
         return _torus_tests(matrix, frame)
     critical = 1.0 if kind == FOLD else -1.0
@@ -242,12 +239,13 @@ def _torus_tests(matrix: np.ndarray, frame: _Frame) -> dict[str, float]:
 
 
 def _slope(matrix: np.ndarray, at: float) -> float:
-    """Compute the derivative of a matrix's characteristic polynomial at a number."""
     return float(np.polyval(np.polyder(np.poly(matrix)), at).real)
 
 
 def _pairs(values: np.ndarray) -> float:
-    """Compute the product of mu_i mu_j - 1 over all pairs of multipliers."""
+    """Compute the product of ``mu_i * mu_j - 1`` over all pairs of multipliers; it vanishes at a Neimark-Sacker
+    bifurcation.
+    """
     return float(np.prod([a * b - 1.0 for a, b in combinations(values, 2)]).real)
 
 
@@ -264,7 +262,9 @@ def _cosine(values: np.ndarray) -> float:
 
 
 def merged(points: Mapping[int, list[SpecialPoint]]) -> list[SpecialPoint]:
-    """Collect the points of codimension two of all curves without duplicates; `points` maps curve numbers to points."""
+    """Collect the points of codimension two of several curves without duplicates; `points` has those of each curve
+    number.
+    """
     found: list[SpecialPoint] = []
     for number, ones in points.items():
         for one in ones:
@@ -274,9 +274,7 @@ def merged(points: Mapping[int, list[SpecialPoint]]) -> list[SpecialPoint]:
 
 
 def _is_known(one: SpecialPoint, other: SpecialPoint) -> bool:
-    """Return whether two located points of codimension two are the same orbit: equal parameter values, a common section
-    point.
-    """
+    """Return whether two located points of codimension two are the same orbit at the same parameter values."""
     if one.kind != other.kind or one.family.period != other.family.period:
         return False
     if np.abs(one.point.u[-2:] - other.point.u[-2:]).max() > SAME_POINT:

@@ -1,4 +1,4 @@
-"""Link periodic orbits that were found at different values of a parameter and lie on one branch.
+"""Detect which periodic orbits at different parameter values lie on one branch, and link them.
 
 Orbits are given at several values of one parameter. Each is followed from value to value, stable or not,
 until it meets another one, at which moment the two are linked:
@@ -42,7 +42,7 @@ LINKED, APART, OPEN = "linked", "apart", "open"
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """An orbit found at one value of a parameter.
+    """A periodic orbit at one value of the parameter, to be linked with orbits at other values.
 
     Attributes
     ----------
@@ -70,8 +70,8 @@ class Found:
         return self.family.period
 
     def distance(self, u: np.ndarray) -> tuple[float, int]:
-        """Return the scaled distance from a branch point `u` to the nearest section point of the orbit, and this
-        point's index.
+        """Return the scaled distance from a branch point `u` to the nearest section point of this orbit, and the index
+        of that section point.
         """
         away = [float(np.linalg.norm(self.family.mismatch(u, point))) for point in self.points]
         nearest = int(np.argmin(away))
@@ -80,7 +80,7 @@ class Found:
 
 @dataclass(frozen=True)
 class Link:
-    """Link between two orbits of one branch, by number, with the number of period doublings between them."""
+    """Link between two orbits of one branch, with the number of period doublings between them."""
 
     first: int
     second: int
@@ -89,7 +89,7 @@ class Link:
 
 @dataclass(eq=False)
 class Links:
-    """Links between orbits along one parameter, and how following each orbit ended.
+    """Links between orbits along one parameter, and the reason why following each orbit ended.
 
     Attributes
     ----------
@@ -105,7 +105,7 @@ class Links:
 
 
 def connect(lines: Sequence[Sequence[Found]], settings: Settings = CONNECT) -> list[Links]:
-    """Link the orbits that lie on one branch, for each line of orbits along one parameter.
+    """Link the orbits that lie on one branch, separately for each line of parameter points.
 
     Parameters
     ----------
@@ -152,7 +152,7 @@ def _tangent(one: Found, settings: Settings) -> Steps[Point | None]:
 
 
 def _neighbours(line: Sequence[Found], start: dict[int, Point | None]) -> Links:
-    """Link orbits at neighbouring parameter values that a step along the tangent connects."""
+    """Link orbits at adjacent parameter values if one step along the branch's tangent leads from one to the other."""
     result = Links()
     by_place: dict[tuple[int, int], list[Found]] = {}
     for one in line:
@@ -167,14 +167,14 @@ def _neighbours(line: Sequence[Found], start: dict[int, Point | None]) -> Links:
 
 
 def _is_one_step(a: Found, b: Found, start: dict[int, Point | None]) -> bool:
-    """Return whether a tangent step from each of two orbits leads to the other, with matching section points."""
+    """Return whether each of two orbits is reached from the other by one step along the tangent."""
     phases = [_leads_to(start[a.number], b), _leads_to(start[b.number], a)]
     return all(p is not None for p in phases) and sum(p for p in phases if p is not None) % a.period == 0
 
 
 def _leads_to(point: Point | None, other: Found) -> int | None:
-    """Return the index of another orbit's section point to which a step along the tangent leads; None if it leads to
-    none.
+    """Return the index of the section point of another orbit that a step along the tangent reaches; None if it misses
+    them all.
     """
     if point is None or point.tangent[-1] == 0.0:
         return None
@@ -189,7 +189,9 @@ def _leads_to(point: Point | None, other: Found) -> int | None:
 
 
 def _targets(one: Found, line: Sequence[Found], way: int, known: Links) -> list[Found]:
-    """Return the orbits that a branch can meet: of half, quarter, ... its period and, going up, of equal period."""
+    """Return the orbits that a branch can reach: orbits of half, a quarter, ... of its period and, going up, of the
+    same period.
+    """
     if one.number in (known.up if way > 0 else known.down):
         return []
     halves = {one.period // 2**k for k in range(1, one.period.bit_length()) if one.period % 2**k == 0}
@@ -204,7 +206,7 @@ def _targets(one: Found, line: Sequence[Found], way: int, known: Links) -> list[
 
 @dataclass(eq=False)
 class _Meeting:
-    """Detector of the target orbits that a traced branch meets."""
+    """Detector that looks after each step of a branch whether the branch has reached one of given orbits."""
 
     family: Family
     targets: Sequence[Found]
@@ -213,7 +215,7 @@ class _Meeting:
     met: Found | None = None
 
     def between(self, a: Point, b: Point) -> Steps[bool]:
-        """Record the target orbit that the branch met during the last step, if any; always accept the step."""
+        """Record the target orbit, if any, that the branch reached during the last step; always accept the step."""
         chord = b.u - a.u
         for target in self.targets:
             value = target.value / self.family.scales[0]
@@ -232,7 +234,7 @@ class _Meeting:
         return True
 
     def stop(self, points: list[Point]) -> str:
-        """Return the reason to end the trace; an empty text lets it continue."""
+        """Return the reason to stop following the branch; an empty text to continue."""
         here = points[-1]
         if self.met is not None:
             return LINKED
@@ -247,7 +249,7 @@ class _Meeting:
 def _follow(
     one: Found, point: Point, targets: Sequence[Found], way: int, settings: Settings
 ) -> Steps[tuple[str, Link | None]]:
-    """Follow an orbit up or down in the parameter until it meets a target orbit; halve its period at period
+    """Follow an orbit up or down in the parameter until its branch reaches a target orbit. Halve the period at period
     doublings.
     """
     family, here = one.family, point
@@ -273,7 +275,8 @@ def _follow(
 
 
 def grouped(places: Sequence[Hashable], links: Iterable[Link]) -> tuple[np.ndarray, list[Link]]:
-    """Group orbits by their links, at most one orbit per parameter point; links without period doublings come first.
+    """Group linked orbits, with at most one orbit of each parameter point per group. Links without period doublings
+    count first.
 
     Parameters
     ----------

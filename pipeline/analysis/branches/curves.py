@@ -57,7 +57,7 @@ AMPLITUDES = (0.02, 0.05, 0.1)
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """Curve of bifurcations in the plane of two parameters: its orbits and the reasons for both ends.
+    """Curve of bifurcations in the plane of two parameters, with its orbits and the reasons for its two ends.
 
     Attributes
     ----------
@@ -100,7 +100,7 @@ def curves_from(
     settings: Settings = CURVE,
     generations: int = GENERATIONS,
 ) -> list[Curve]:
-    """Continue the bifurcations located on branches as curves, with a second free parameter.
+    """Continue the bifurcations located on branches as curves in the plane of the branches' parameter and a second one.
 
     Parameters
     ----------
@@ -143,7 +143,7 @@ def continue_curves(
     max_period: int = 0,
     generations: int = GENERATIONS,
 ) -> list[Curve]:
-    """Follow each bifurcation in both directions until a bound, its own start or a resonance; see `curves_from`.
+    """Follow each bifurcation in both directions in the parameter plane, until a bound, its own start or a resonance.
 
     Curves that spring from the points of codimension two are followed as well, up to orbits of `max_period`.
     """
@@ -174,7 +174,7 @@ Ready = tuple[int, BifurcationProblem, Point]
 
 
 def _follow_all(ready: Sequence[Ready], curves: list[Curve], bounds: Bounds, settings: Settings) -> None:
-    """Follow bifurcation curves from their first orbits in both directions, and append those that are not known yet."""
+    """Follow bifurcation curves in both directions from their first orbits, and append the new ones to `curves`."""
     ready = [r for r in ready if not any(_passes(curve, r[1].kind, r[1].family, r[2]) for curve in curves)]
     traces = run_together(
         [_follow(p, way, bounds, settings) for _, p, f in ready for way in (opposite(f), f)], "following curves"
@@ -190,7 +190,9 @@ def _follow_all(ready: Sequence[Ready], curves: list[Curve], bounds: Bounds, set
 
 
 def _sprung(problem: BifurcationProblem, at: SpecialPoint) -> Steps[tuple[BifurcationProblem, Point] | None]:
-    """Find a first orbit on the bifurcation curve that starts at a point of codimension two; None if none starts."""
+    """Find a first orbit on a bifurcation curve that starts at a point of codimension two; None if there is no such
+    curve.
+    """
     if problem.family.period == at.family.period:
         found = yield from _first(problem, at.point.u, CURVE)
         return None if found is None else (problem, found)
@@ -204,7 +206,9 @@ def _sprung(problem: BifurcationProblem, at: SpecialPoint) -> Steps[tuple[Bifurc
 
 
 def _starts(ds: xr.Dataset, parameters: Parameters, second: str, bounds: Bounds, max_period: int) -> list[CurveStart]:
-    """Return the located bifurcations to continue, each with its family of orbits and its start in scaled unknowns."""
+    """Select the located bifurcations to continue. Each comes with its family of orbits and its start in scaled
+    unknowns.
+    """
     first = str(ds.attrs["parameter"])
     scales = tuple(high - low for low, high in bounds)
     found = []
@@ -276,7 +280,7 @@ def _has_torus(point: Point) -> bool:
 
 
 def _passes(curve: Curve, kind: str, family: Family, start: Point) -> bool:
-    """Return whether a bifurcation curve passes through an orbit, starting at any of the orbit's section points."""
+    """Return whether a bifurcation curve passes through an orbit, at any of the orbit's section points."""
     if curve.kind != kind or curve.family.period != family.period:
         return False
     for a, b in pairwise(np.array([p.u for p in curve.points])):

@@ -15,8 +15,8 @@ from pipeline.analysis.branches.units import parameter_units, state_units
 
 
 def curves_dataset(curves: Sequence[Curve], first: str, second: str, model: Model | None = None) -> xr.Dataset:
-    """Return bifurcation curves as a dataset; dims: ``curve``, ``point`` (NaN beyond a curve's end), ``state``,
-    ``special`` points.
+    """Return bifurcation curves as a dataset with the dims ``curve``, ``point``, ``state`` and ``special`` (points of
+    codimension two).
 
     ``special`` counts the points of codimension two: ``special_kind``, ``special_first`` and ``special_second``
     with their errors ``..._error``, ``special_period``, ``special_section`` and the curve on which each was found.
@@ -77,7 +77,7 @@ def curves_dataset(curves: Sequence[Curve], first: str, second: str, model: Mode
 def _special_points(
     curves: Sequence[Curve], first: str, second: str, model: Model | None, n_states: int
 ) -> dict[str, tuple[object, ...]]:
-    """Return the dataset variables of the points of codimension two on all curves, each point once."""
+    """Return the points of codimension two on all curves as dataset variables, each point once."""
     found = merged({i: curve.special for i, curve in enumerate(curves)})
     values = np.array([one.values for one in found]).reshape(-1, 2)
     brackets = np.array([one.bracket for one in found]).reshape(-1, 2)

@@ -1,4 +1,4 @@
-"""Follow the cycles of a flow that leave a Hopf point, and find them again on another section.
+"""Follow the limit cycles that start at a Hopf point, and find these cycles again on another Poincare section.
 
 The section of such cycles is the level of the crossing state at the Hopf point, so that small cycles cross it.
 The first cycle has a given amplitude along the critical eigenvector; Newton's method finds its parameter value.
@@ -31,8 +31,8 @@ SAME_TIME = 1e-6
 
 
 def cycle_family(equilibria: Family, at: Bifurcation) -> Family | None:
-    """Return the family of limit cycles near a Hopf point, on a Poincare section through this point; None if it has
-    none.
+    """Return the family of limit cycles near a Hopf point, on a Poincare section through this point; None if they do
+    not cross it.
 
     There is none if the system has no section by crossing, or if the crossing state does not oscillate.
     """
@@ -49,7 +49,7 @@ def cycle_family(equilibria: Family, at: Bifurcation) -> Family | None:
 
 
 def cycles_from(family: Family, at: Bifurcation, low: float, high: float, settings: Settings) -> Steps[Half | None]:
-    """Follow the limit cycles that leave a Hopf point along the parameter; None if no small cycle is found."""
+    """Follow the limit cycles that start at a Hopf point along the parameter; None if no small cycle is found."""
     direction = _direction(family, at)
     assert direction is not None
     normal = np.append(direction / np.linalg.norm(direction), 0.0)
@@ -62,7 +62,8 @@ def cycles_from(family: Family, at: Bifurcation, low: float, high: float, settin
 
 
 def _direction(family: Family, at: Bifurcation) -> np.ndarray | None:
-    """Return the scaled direction from an equilibrium to the point where small limit cycles cross the section, or None.
+    """Return the scaled direction from an equilibrium to the point where small limit cycles cross the section; None if
+    they do not cross it.
 
     It is the real part of the critical eigenvector at the phase at which the crossing state passes its level in
     the section's direction; its largest component is 1.
@@ -81,7 +82,7 @@ def _direction(family: Family, at: Bifurcation) -> np.ndarray | None:
 
 
 def crossings_of(cycles: Branch, section: Family, most: int) -> list[tuple[np.ndarray, int]]:
-    """Find where the cycles of a branch cross another section of the same flow.
+    """Find where the limit cycles of a branch cross another Poincare section of the same flow.
 
     Parameters
     ----------

@@ -31,7 +31,7 @@ CRITICALITIES = ("", "supercritical", "subcritical", CONTRADICTORY)
 def dataset_of(
     branches: Sequence[Branch], parameter: str, parameters: Parameters | None = None, left_out: Sequence[str] = ()
 ) -> xr.Dataset:
-    """Return branches as a dataset; see `pipeline.analysis.branches` for its variables.
+    """Return branches as a labelled dataset; `pipeline.analysis.branches` lists its variables.
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ def dataset_of(
 
 
 def _fixed(branches: Sequence[Branch], parameter: str, parameters: Parameters | None) -> dict[str, Any]:
-    """Return dataset variables for the fixed parameters whose values on the branches differ from the run's."""
+    """Return dataset variables for the fixed parameters whose values differ between the branches and the run."""
     if parameters is None or not branches:
         return {}
     values = np.array([b.family.parameters for b in branches])
@@ -105,14 +105,14 @@ def _side_variables(
 
 
 def _settle_origin(counts: np.ndarray, branch: Branch) -> None:
-    """Take the number of unstable multipliers at a branch's starting bifurcation from the next point, in place."""
+    """Copy the number of unstable multipliers at a branch's starting bifurcation from the next point, in place."""
     for j, point in enumerate(branch.points):
         if branch.origin is not None and point.u is branch.origin.point.u:
             counts[j] = counts[j + 1] if j + 1 < len(branch.points) else counts[j - 1]
 
 
 class _Arrays:
-    """Arrays of the output variables per branch and point."""
+    """Arrays of the output variables, with one entry per branch and branch point."""
 
     def __init__(self, shape: tuple[int, int], longest: int, n_states: int) -> None:
         self.parameter = np.full(shape, np.nan)
@@ -125,7 +125,6 @@ class _Arrays:
         self.period_s = np.full(shape, np.nan)
 
     def put(self, i: int, j: int, branch: Branch, point: Any) -> None:
-        """Write the data of point `j` on branch `i` into the arrays."""
         self.parameter[i, j] = branch.family.values(point.u)[0]
         self.section[i, j, : max(branch.family.period, 1)] = _orbit(branch, point)
         self.multiplier[i, j] = multipliers_of(point)
@@ -135,7 +134,9 @@ class _Arrays:
         self.period_s[i, j] = point.value.seconds
 
     def variables(self, units: str, state_units: str) -> dict[str, Any]:
-        """Return the arrays as (dims, values, attributes) for xarray; `units` are those of the parameter."""
+        """Return the output arrays as (dims, values, attributes), from which xarray builds a Dataset; `units` is the
+        parameter's unit.
+        """
         dims = ("branch", "point")
         return self._eigenvalues() | {
             "parameter": (dims, self.parameter, {"units": units, "long_name": "value of the parameter"}),
@@ -168,7 +169,6 @@ class _Arrays:
         }
 
     def _eigenvalues(self) -> dict[str, Any]:
-        """Return the eigenvalues of equilibria, if there are any."""
         if np.isnan(self.eigenvalue).all():
             return {}
         dims, about = ("branch", "point", "multiplier"), "eigenvalues of an equilibrium"
@@ -179,9 +179,7 @@ class _Arrays:
 
 
 def _orbit(branch: Branch, point: Any) -> np.ndarray:
-    """Return the section points of an orbit (period, state), beginning with the given point; for an equilibrium its
-    state.
-    """
+    """Return the section points (period, state) of an orbit from the given point on; for an equilibrium its state."""
     images = np.asarray(point.value.images)
     return np.concatenate([branch.family.state(point.u)[None], images[: max(branch.family.period, 1) - 1]])
 
@@ -220,7 +218,9 @@ def _per_branch(
 
 
 def _seconds(one: Bifurcation) -> float:
-    """Return the period of the orbit at a bifurcation; at a Hopf point that of its small cycles [s]."""
+    """Return the period of the orbit at a bifurcation [s]; at a Hopf point it is the period of the limit cycles that
+    start there.
+    """
     if one.kind == HOPF:
         return 2.0 * np.pi / one.critical_multiplier.imag
     return one.point.value.seconds

@@ -1,4 +1,4 @@
-"""Search all periodic orbits of some periods at a parameter point, by deflated Newton iterations from many starts.
+"""Search for all periodic orbits of some periods at a parameter point, by deflated Newton iterations from many starts.
 
 Newton's method from many starts finds the same orbits again and again. After the first round the map's mismatch is
 multiplied by ``1 + 1/|x - x_k|^2`` for every known section point x_k, so that iterations are driven away from known
@@ -42,7 +42,8 @@ CLOSE = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class FoundOrbit:
-    """A periodic orbit found by the search: its points, monodromy matrix and number of hits.
+    """A periodic orbit found by the search: its section points, its monodromy matrix and the number of starts that led
+    to it.
 
     Attributes
     ----------
@@ -73,7 +74,7 @@ class FoundOrbit:
         return found[np.argsort(-np.abs(found), kind="stable")]
 
     def index(self, times: int = 1) -> int:
-        """Return the fixed-point index of the orbit repeated `times` times: the sign of det(1 - M^times)."""
+        """Return the fixed-point index of the orbit, traversed `times` times: the sign of det(1 - M^times)."""
         power = np.linalg.matrix_power(self.monodromy, times)
         return int(np.sign(np.linalg.det(np.eye(len(power)) - power)))
 
@@ -87,7 +88,7 @@ def search_orbits(
     *,
     rounds: int = ROUNDS,
 ) -> list[FoundOrbit]:
-    """Find the periodic orbits near many starts by plain and deflated Newton iterations, each orbit once.
+    """Find the periodic orbits near many starts by plain and then by deflated Newton iterations, each orbit once.
 
     Parameters
     ----------
@@ -130,7 +131,7 @@ def _iterate(
     system: System,
     known: Sequence[FoundOrbit],
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Iterate Newton's method from all starts; return the section points that it converged to, and their periods."""
+    """Iterate Newton's method from all starts. Return the section points to which it converged, and their periods."""
     state, scales = starts.astype(np.float64), np.asarray(system.scales)
     rows, done = np.arange(len(state)), []
     for _ in range(ITERATIONS):
@@ -162,14 +163,15 @@ def _iterate(
 
 
 def _newton(matrices: np.ndarray, mismatch: np.ndarray) -> np.ndarray:
-    """Solve for the Newton steps of many starts; by least squares where a matrix is singular."""
     return np.array([np.linalg.lstsq(a, -b, rcond=None)[0] for a, b in zip(matrices, mismatch, strict=True)])
 
 
 def _stretch(
     states: np.ndarray, periods: np.ndarray, steps: np.ndarray, known: Sequence[FoundOrbit], system: System
 ) -> np.ndarray:
-    """Return the factor by which deflation stretches each Newton step, from the distances to the known orbits."""
+    """Return the factor by which deflation stretches each Newton step, to keep it away from the orbits that are
+    known.
+    """
     scales, along = np.asarray(system.scales), np.zeros(len(states))
     for one in known:
         own = np.flatnonzero(periods % one.period == 0)
@@ -190,7 +192,9 @@ def _add(
     packed: np.ndarray,
     system: System,
 ) -> None:
-    """Polish the converged section points, add orbits not yet in `found`, and count hits of the first round."""
+    """Refine the section points to which Newton's method converged, and add new orbits to `found`. Count how often each
+    orbit was hit in the first round.
+    """
     if not len(states):
         return
     n = len(states)
@@ -212,13 +216,15 @@ def _is_same(one: FoundOrbit, points: np.ndarray, system: System) -> bool:
 
 
 def coverage(found: Sequence[FoundOrbit]) -> float:
-    """Estimate the probability that one more random start leads to an orbit already found; NaN if none was found."""
+    """Estimate the probability that one more random start leads to an orbit that is already known; NaN if none is
+    known.
+    """
     hits = np.array([one.n_hits for one in found])
     return float(1.0 - (hits == 1).sum() / hits.sum()) if hits.sum() else float("nan")
 
 
 def index_sums(found: Sequence[FoundOrbit], longest: int) -> dict[int, int]:
-    """Compute the sum of the indices of all fixed points of the p-fold section map, for p from 1 to `longest`."""
+    """Add up the fixed-point indices of all fixed points of the p-fold section map, for each p from 1 to `longest`."""
     return {
         p: sum(one.period * one.index(p // one.period) for one in found if p % one.period == 0)
         for p in range(1, longest + 1)
@@ -226,5 +232,7 @@ def index_sums(found: Sequence[FoundOrbit], longest: int) -> dict[int, int]:
 
 
 def expected_index(system: System) -> int:
-    """Return the sum of the indices of all fixed points if none is missing: 0 if a state is an angle, else 1."""
+    """Return the value to which the fixed-point indices add up if no orbit is missing: 0 if a state is an angle, else
+    1.
+    """
     return 0 if any(system.is_angle) else 1

@@ -1,4 +1,4 @@
-"""Define the equations for equilibria of flows along a parameter, and the test function of their Hopf points."""
+"""Define the equations for equilibria of flows along a parameter, and the test function for their Hopf points."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pipeline.analysis.branches.problems import PARAMETER_STEP, STATE_STEP, Ends
 
 @dataclass(eq=False)
 class EquilibriumProblem:
-    """Equations for the equilibria of a flow along one free parameter; they need no integration."""
+    """Equations for the equilibria of a flow along one free parameter. Their value needs no integration."""
 
     family: Family
     _unit: float = field(default=0.0, init=False, repr=False)
@@ -25,11 +25,11 @@ class EquilibriumProblem:
 
     @property
     def system(self) -> System:
-        """System whose equilibria are followed."""
+        """System whose equilibria are to be found."""
         return self.family.system
 
     def rows(self, u: np.ndarray) -> Rows:
-        """Return an empty list of trajectories to integrate: equations for equilibria need none."""
+        """Return no trajectories to integrate: the equations for equilibria need none."""
         return self.family.rows(u[None][:0])
 
     def value(self, u: np.ndarray, ends: Ends) -> Value:
@@ -45,8 +45,8 @@ class EquilibriumProblem:
         return Value(rates[0] * unit, derivative, rows.states[:1], jacobian, is_rest=True)
 
     def _unit_of(self, jacobian: np.ndarray) -> float:
-        """Return the unit of time [s] that scales the rates: the inverse of the Jacobian's norm at the first
-        evaluation.
+        """Return the time [s] that makes the rates dimensionless: the inverse of the Jacobian's norm at the first
+        call.
         """
         if not self._unit:
             norm = float(np.linalg.norm(self.family.scaled(jacobian)))
@@ -56,7 +56,7 @@ class EquilibriumProblem:
 
 @dataclass(frozen=True, eq=False)
 class HopfProblem:
-    """Equations for equilibria at a Hopf point, with two free parameters: the rates vanish, and so does `hopf_test`."""
+    """Equations for equilibria at a Hopf point, with two free parameters: the rates and `hopf_test` are zero."""
 
     family: Family
 
@@ -67,15 +67,15 @@ class HopfProblem:
 
     @property
     def system(self) -> System:
-        """System whose equilibria are solved for."""
+        """System whose Hopf points are to be found."""
         return self.family.system
 
     def rows(self, u: np.ndarray) -> Rows:
-        """Return an empty list of trajectories to integrate: equations for equilibria need none."""
+        """Return no trajectories to integrate: the equations for equilibria need none."""
         return self.family.rows(u[None][:0])
 
     def value(self, u: np.ndarray, ends: Ends) -> Value:
-        """Compute the scaled rates and the test function, with their derivatives by central differences."""
+        """Compute the scaled rates and the Hopf test function, and their derivatives by central differences."""
         n, scales = self.family.system.n_states, np.asarray(self.system.scales)
         steps = np.array([STATE_STEP] * n + [PARAMETER_STEP] * 2)
         rows = self.family.rows(np.concatenate([u[None], u + np.diag(steps), u - np.diag(steps)]))
@@ -94,7 +94,7 @@ OneParameter = OrbitProblem | EquilibriumProblem
 
 
 def hopf_test(jacobian: np.ndarray) -> float:
-    """Compute the product of the sums of two eigenvalues, each divided by their moduli; zero at a Hopf point."""
+    """Compute the product of the normalised sums of all pairs of eigenvalues; it is zero at a Hopf point."""
     values = np.linalg.eigvals(jacobian)
     i, j = np.triu_indices(len(values), 1)
     sums, sizes = values[i] + values[j], np.abs(values[i]) + np.abs(values[j])

@@ -1,4 +1,4 @@
-"""Follow all branches that are connected with given orbits through bifurcations, each branch once."""
+"""Follow all branches that are connected by bifurcations with some given orbits, each branch once."""
 
 from __future__ import annotations
 
@@ -42,7 +42,9 @@ GUESS = 0.05
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """A starting orbit: its family, a section point, the parameter's value, the attractor's id (-1: none)."""
+    """An orbit from which a branch starts: its family, a section point, the parameter value and the attractor's id (-1:
+    none).
+    """
 
     family: Family
     state: np.ndarray
@@ -52,7 +54,7 @@ class Start:
 
 @dataclass(frozen=True, eq=False)
 class Scope:
-    """Limits of an exploration of branches: parameter interval, longest period, generations.
+    """Limits within which branches are explored: parameter interval, longest period, number of generations.
 
     Attributes
     ----------
@@ -74,7 +76,7 @@ class Scope:
 
 
 def explore(starts: Sequence[Start], scope: Scope) -> list[Branch]:
-    """Follow the branches of all starting orbits, and the branches that bifurcate from them.
+    """Follow the branches of all starting orbits, and the branches that start at the bifurcations on them.
 
     Returns
     -------
@@ -98,7 +100,7 @@ def explore(starts: Sequence[Start], scope: Scope) -> list[Branch]:
 
 
 def _follow_starts(starts: Sequence[Start], branches: list[Branch], scope: Scope) -> None:
-    """Append the branches of starting orbits that lie on no known branch yet, in the order of the parameter values.
+    """Follow the branch of each starting orbit that lies on no known branch, and append it to `branches`.
 
     When a start is followed, so are the others at its value, and the first start of each other attractor, on
     lanes that would be idle. Most of these are needed later; one that turns out to lie on a known branch is
@@ -127,9 +129,7 @@ def _follow_starts(starts: Sequence[Start], branches: list[Branch], scope: Scope
 
 
 def _first_of_each(starts: Sequence[Start], followed: set[int]) -> list[int]:
-    """Return one starting orbit for each attractor and period, if no orbit of this attractor and period was followed
-    yet.
-    """
+    """Return the index of the first starting orbit of each attractor and period of which no orbit has been followed."""
     kinds = [(start.attractor, start.family.period) for start in starts]
     done = {kinds[i] for i in followed}
     firsts = {kind: i for i, kind in reversed(list(enumerate(kinds))) if kind[0] >= 0 and kind not in done}
@@ -154,7 +154,6 @@ def _both_ways(starts: Sequence[Start], scope: Scope, what: str) -> list[Branch 
 
 
 def _lie_on(starts: Sequence[Start], branches: Sequence[Branch]) -> list[bool]:
-    """Return for each starting orbit whether it lies on one of the branches."""
     asked = [(i, guess) for i, s in enumerate(starts) for b in branches for guess in _near(s, b)]
     settings = Settings()
     found = run_together([_at_value(starts[i].family, guess, settings) for i, guess in asked])
@@ -173,7 +172,7 @@ def _at_value(family: Family, guess: np.ndarray, settings: Settings) -> Steps[Po
 
 
 def _near(start: Start, branch: Branch) -> Iterator[np.ndarray]:
-    """Yield guesses, interpolated from a branch at a starting orbit's parameter value, that lie near this orbit."""
+    """Yield guesses of the orbits on a branch that have a starting orbit's parameter value and lie near it."""
     family = branch.family
     if family.period != start.family.period or not _same_others(family, start.family):
         return
@@ -193,7 +192,6 @@ def _near(start: Start, branch: Branch) -> Iterator[np.ndarray]:
 
 
 def _same_others(a: Family, b: Family) -> bool:
-    """Return whether two families have the same free parameter and equal values of all others."""
     return a.free == b.free and np.array_equal(_fixed(a), _fixed(b))
 
 
@@ -204,7 +202,6 @@ def _fixed(family: Family) -> np.ndarray:
 
 
 def _distance(start: Start, point: Point) -> float:
-    """Return the scaled distance of a starting orbit from the nearest section point of another orbit."""
     here = start.family.unknowns(start.state, [0.0])
     return min(float(np.abs(start.family.mismatch(here, x)).max()) for x in point.value.images)
 
@@ -213,7 +210,7 @@ def _distance(start: Start, point: Point) -> float:
 
 
 def _adopt(branches: Sequence[Branch]) -> list[Start]:
-    """Connect each branch that ends on an orbit of half its period to the period doubling there.
+    """Connect each branch that ends on an orbit of half its period to the period doubling at that orbit.
 
     Return the orbits of half the period as starts, for ends without a known doubling.
     """
@@ -233,7 +230,9 @@ def _adopt(branches: Sequence[Branch]) -> list[Start]:
 
 
 def _doubling_at(branches: Sequence[Branch], branch: Branch, which: int) -> Bifurcation | None:
-    """Find the nearest period doubling on a branch of half the period, within a few steps of this branch's end."""
+    """Find the period doubling at which a branch ends. It lies on a branch of half the period, within a few steps of
+    the end.
+    """
     end, inner = (branch.points[0], branch.points[1]) if which == 0 else branch.points[:-3:-1]
     reach = 3.0 * max(float(np.linalg.norm(end.u - inner.u)), 1e-3)
     best, nearest = None, reach
@@ -249,18 +248,17 @@ def _doubling_at(branches: Sequence[Branch], branch: Branch, which: int) -> Bifu
 
 
 def _gap(family: Family, end: Point, one: Bifurcation) -> float:
-    """Return the scaled distance of an orbit from the nearest section point of a bifurcation's orbit."""
+    """Return the scaled distance between an orbit and the nearest section point of the orbit at a bifurcation."""
     return min(float(np.linalg.norm(family.mismatch(end.u, x))) for x in one.point.value.images)
 
 
 def _half_orbit(branch: Branch, which: int) -> Start:
-    """Make a starting orbit of half the period from the orbit at the end of a branch."""
     state, value = half_orbit(branch.family, branch.points[-which])
     return Start(replace(branch.family, period=branch.family.period // 2), state, value)
 
 
 def _criticality(at: Bifurcation, child: Branch, end: int) -> str:
-    """Decide the criticality of a period doubling from the side on which the doubled branch lies."""
+    """Decide whether a period doubling is sub- or supercritical, from the side on which the doubled branch lies."""
     rising = at.point.tangent[-1] > 0.0
     worse_above = (at.n_unstable_after > at.n_unstable_before) == rising
     inner = child.points[end + 3 if end == 0 else end - 3]
@@ -268,7 +266,7 @@ def _criticality(at: Bifurcation, child: Branch, end: int) -> str:
 
 
 def _switch(branches: list[Branch], scope: Scope, what: str) -> None:
-    """Follow the branches not yet known that start at period doublings and branch points."""
+    """Follow the new branches that start at period doublings and branch points of the known branches."""
     open_ends = [
         (branch, one)
         for branch in branches
@@ -303,7 +301,7 @@ def _switch(branches: list[Branch], scope: Scope, what: str) -> None:
 
 
 def _cross(points: Sequence[tuple[Branch, Bifurcation]], branches: list[Branch], scope: Scope) -> None:
-    """Follow the other branch through each branch point, in both directions."""
+    """Follow the second branch through each branch point in both directions."""
     for parent, one in points:
         if _is_crossing(parent, one, branches):
             continue
@@ -321,14 +319,14 @@ def _cross(points: Sequence[tuple[Branch, Bifurcation]], branches: list[Branch],
 
 
 def _direction(branch: Branch, at: Bifurcation) -> np.ndarray:
-    """Return the direction of a branch at a bifurcation, from the point before it to the point after it."""
+    """Return the direction of a branch at a bifurcation: the difference of the points after and before it."""
     u = np.array([p.u for p in branch.points])
     i = int(np.argmin(np.linalg.norm(u - at.point.u, axis=1)))
     return np.asarray(u[min(i + 1, len(u) - 1)] - u[max(i - 1, 0)])
 
 
 def _is_crossing(parent: Branch, one: Bifurcation, branches: Sequence[Branch]) -> bool:
-    """Find a known branch that crosses at a branch point, and link both to it; return whether there is one."""
+    """Find a known branch that crosses at a branch point, and link the two. Return whether there is one."""
     for branch in branches:
         for other in branch.bifurcations if branch.family.period == parent.family.period else ():
             same = _gap(branch.family, one.point, other) < 1e-4 and abs(one.point.u[-1] - other.point.u[-1]) < 1e-4
@@ -342,7 +340,7 @@ def _is_crossing(parent: Branch, one: Bifurcation, branches: Sequence[Branch]) -
 
 
 def _adopt_cycles(branches: Sequence[Branch]) -> None:
-    """Connect each branch of limit cycles that shrinks to an equilibrium to the Hopf point there."""
+    """Connect each branch of limit cycles that ends at an equilibrium to the Hopf point there."""
     for branch in branches:
         for which in (0, 1):
             if branch.ends[which] == "equilibrium":
@@ -353,7 +351,6 @@ def _adopt_cycles(branches: Sequence[Branch]) -> None:
 
 
 def _hopf_at(branches: Sequence[Branch], cycles: Branch, end: Point) -> Bifurcation | None:
-    """Return the Hopf point nearest to the last limit cycle of a branch; None if none is near enough."""
     near = [
         (max(_gap(cycles.family, end, one), abs(end.u[-1] - one.point.u[-1])), one)
         for other in branches
@@ -366,7 +363,7 @@ def _hopf_at(branches: Sequence[Branch], cycles: Branch, end: Point) -> Bifurcat
 
 
 def _leave_equilibria(branches: list[Branch], scope: Scope) -> None:
-    """Follow the limit cycles that leave the Hopf points at which no known branch of limit cycles ends."""
+    """Follow the limit cycles that start at Hopf points, if no known branch of limit cycles ends there."""
     _adopt_cycles(branches)
     points = [
         (branch, one) for branch in branches for one in branch.bifurcations if one.kind == HOPF and one.child is None
@@ -385,7 +382,7 @@ def _leave_equilibria(branches: list[Branch], scope: Scope) -> None:
 
 
 def _without_known(cycles: Branch, own: Family, branches: list[Branch], scope: Scope) -> list[Branch]:
-    """Return the parts of a branch of limit cycles that are not already known on another Poincare section.
+    """Return those parts of a branch of limit cycles that are not yet known from another Poincare section.
 
     Diagrams show the section of the run, `own`. So cycles that cross it are followed there, unless they have
     been, and are left out here.
@@ -406,15 +403,13 @@ def _without_known(cycles: Branch, own: Family, branches: list[Branch], scope: S
 
 
 def _equal_runs(periods: np.ndarray) -> list[tuple[int, int]]:
-    """Return the first and last index of each run of equal numbers above 0."""
+    """Find runs of equal positive numbers in an array; return the first and last index of each."""
     bounds = np.flatnonzero(np.diff(periods, prepend=-1, append=-1))
     return [(a, b - 1) for a, b in itertools.pairwise(map(int, bounds)) if periods[a] > 0]
 
 
 def _other_sections(cycles: Branch, own: Family, branches: Sequence[Branch]) -> list[Family]:
-    """Return one family of orbits per Poincare section of the known branches, the run's own first, except that of
-    `cycles`.
-    """
+    """Return a family of orbits for each Poincare section of the known branches, except the section of `cycles`."""
     families = [own, *(b.family for b in branches if b.family.period and b.family.free == own.free)]
     by_section = {_fixed(family).tobytes(): family for family in reversed(families)}
     by_section.pop(_fixed(cycles.family).tobytes(), None)
@@ -422,7 +417,7 @@ def _other_sections(cycles: Branch, own: Family, branches: Sequence[Branch]) -> 
 
 
 def _parts(cycles: Branch, wanted: np.ndarray) -> list[Branch]:
-    """Cut a branch of limit cycles into its stretches of wanted points, extended by one point at each end."""
+    """Cut from a branch of limit cycles the ranges of wanted points, each with one more point at either end."""
     n, parts = len(wanted), []
     for first, last in [(max(a - 1, 0), min(b + 1, n - 1)) for a, b in _equal_runs(wanted.astype(int))]:
         ends = cycles.ends[0] if first == 0 else "other_section", cycles.ends[1] if last == n - 1 else "other_section"

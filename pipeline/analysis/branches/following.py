@@ -28,15 +28,13 @@ REST = 0.5
 
 
 def problem_of(family: Family) -> OneParameter:
-    """Return a new object that evaluates the equations of a family of orbits or equilibria, for use by one
-    computation.
-    """
+    """Return the equations of a family of orbits or equilibria, as a new problem for one computation."""
     return OrbitProblem(family) if family.period else EquilibriumProblem(family)
 
 
 @dataclass(eq=False)
 class Branch:
-    """A branch: the orbits of one period, or equilibria, along one parameter.
+    """A branch: orbits of one period, or equilibria, along one parameter.
 
     Attributes
     ----------
@@ -66,7 +64,7 @@ class Branch:
 
 @dataclass(eq=False)
 class Half:
-    """One direction of a branch from its start: the traced points and the bifurcations."""
+    """One half of a branch: the points and bifurcations in one direction from its start."""
 
     trace: Trace
     bifurcations: list[Bifurcation] = field(default_factory=list)
@@ -74,7 +72,7 @@ class Half:
 
 @dataclass(frozen=True, eq=False)
 class _Stop:
-    """Rule that ends the trace of a branch at a bound, on closing, at an equilibrium or at a period halving."""
+    """Rule that ends a branch at a parameter bound, when it closes, at an equilibrium or at a period halving."""
 
     family: Family
     low: float
@@ -91,7 +89,9 @@ class _Stop:
         return "period_halving" if len(points) > 2 and has_halved(self.family, points) else ""
 
     def _is_closed(self, points: list[Point]) -> bool:
-        """Return whether the last step passed the start of the branch, at any phase of the orbit."""
+        """Return whether the last step of a branch came back to the branch's start, at any section point of the
+        orbit.
+        """
         if len(points) < 5:
             return False
         first, before, here = points[0], points[-2], points[-1]
@@ -107,12 +107,13 @@ class _Stop:
         return False
 
     def _difference(self, state: np.ndarray, parameter: float, u: np.ndarray) -> np.ndarray:
-        """Return the scaled difference between a state with a parameter value and a branch point `u`."""
         return np.append(self.family.mismatch(u, state), parameter - u[-1])
 
 
 def end_of_crossings(family: Family, point: Point) -> str:
-    """Return why a limit cycle cannot be followed on its section: ``tangent`` or ``equilibrium``; empty if it can."""
+    """Return why a limit cycle cannot be followed on its Poincare section: ``tangent`` or ``equilibrium``; empty if it
+    can be.
+    """
     crossed = crossed_state(family.system)
     if crossed is None:
         return ""
@@ -125,7 +126,7 @@ def end_of_crossings(family: Family, point: Point) -> str:
 
 
 def has_halved(family: Family, points: list[Point]) -> bool:
-    """Return whether the last step passed an orbit of half the period, where the orbit's two halves change places."""
+    """Return whether the last step of a branch passed an orbit of half the period."""
     if not family.period or family.period % 2 or len(points) < 2:
         return False
     before, here = (_half_way(family, p) for p in points[-2:])
@@ -137,14 +138,16 @@ def _half_way(family: Family, point: Point) -> np.ndarray:
 
 
 def half_orbit(family: Family, point: Point) -> tuple[np.ndarray, float]:
-    """Return a section point and the parameter value of the orbit of half the period, where a trace nearly meets it."""
+    """Return a section point and the parameter value of the orbit of half the period that a branch has nearly
+    reached.
+    """
     u = point.u.copy()
     u[:-1] += 0.5 * _half_way(family, point)
     return family.state(u), float(family.values(u)[0])
 
 
 def first_point(problem: OneParameter, u: np.ndarray, settings: Settings) -> Steps[Point | None]:
-    """Correct an orbit at a fixed parameter value, and orient its tangent to rising parameter values."""
+    """Refine an orbit at a fixed parameter value, and direct its tangent to rising parameter values."""
     normal = np.zeros(problem.size)
     normal[-1] = 1.0
     found = yield from correct(problem, u, normal, settings)
@@ -157,8 +160,8 @@ def first_point(problem: OneParameter, u: np.ndarray, settings: Settings) -> Ste
 def half_branch(
     family: Family, start: Point, low: float, high: float, settings: Settings, from_bifurcation: bool = False
 ) -> Steps[Half]:
-    """Follow a branch from a point along its tangent to one end; a point beyond a parameter bound is moved onto the
-    bound.
+    """Follow a branch from a point in one direction to its end. If the last point is beyond a parameter bound, move it
+    onto the bound.
     """
     problem = problem_of(family)
     watch = Watch(problem, settings, skip_first=from_bifurcation)
@@ -182,14 +185,13 @@ def half_branch(
 
 
 def _is_known(one: Bifurcation, found: list[Bifurcation]) -> bool:
-    """Return whether the same bifurcation was located on an earlier step."""
     return any(
         b.kind == one.kind and b.after < one.after and abs(b.point.u[-1] - one.point.u[-1]) < 1e-6 for b in found
     )
 
 
 def _cut(problem: OneParameter, found: Trace, low: float, high: float, settings: Settings) -> Steps[None]:
-    """Replace the last point of a traced curve, which lies beyond a parameter bound, by the solution on the bound."""
+    """Replace the last point of a branch, which is beyond a parameter bound, by the solution on the bound."""
     family = problem.family
     before, beyond = found.points[-2:]
     values = [family.values(p.u)[0] for p in (before, beyond)]
@@ -206,7 +208,7 @@ def _cut(problem: OneParameter, found: Trace, low: float, high: float, settings:
 
 
 def joined(family: Family, backward: Half, forward: Half) -> Branch:
-    """Join the two directions of a branch, traced from one start, to a `Branch`."""
+    """Join the two halves of a branch, followed from one start in both directions."""
     if forward.trace.end == "closed":
         return Branch(family, forward.trace.points, forward.bifurcations, ("closed", "closed"))
     back = [Point(p.u, -p.tangent, p.value, p.n_iterations) for p in reversed(backward.trace.points)]
@@ -235,8 +237,8 @@ def opposite(point: Point) -> Point:
 
 
 def doubled_start(family: Family, at: Bifurcation) -> Steps[Point | None]:
-    """Return the start of the doubled branch at a period doubling: the orbit taken twice, with the tangent of the new
-    branch.
+    """Return the start of the doubled branch at a period doubling: the same orbit traversed twice, with the new
+    branch's tangent.
     """
     double = Family(
         family.system, 2 * family.period, family.frequency_hz, family.parameters, family.free, family.scales
@@ -254,7 +256,7 @@ def doubled_start(family: Family, at: Bifurcation) -> Steps[Point | None]:
 def crossing_half(
     family: Family, at: Bifurcation, own: np.ndarray, way: float, low: float, high: float, settings: Settings
 ) -> Steps[Half]:
-    """Follow the other branch through a branch point in one direction.
+    """Follow the second branch through a branch point in one direction.
 
     At a branch point the derivative's kernel has two dimensions, and the other branch's tangent lies in it.
     The known branch does not meet a plane at a small distance along the kernel's normal to it, so Newton's

@@ -1,4 +1,4 @@
-"""Run many computations in step, so that their trajectories fill the engine's SIMD lanes together.
+"""Run many continuations side by side, so that their trajectories together fill the engine's SIMD lanes.
 
 A computation is a generator: it yields a `Query`, receives the `Value` of its problem, and returns its
 result. A single orbit would fill one lane of sixteen. One call serves all waiting computations, at little
@@ -35,7 +35,7 @@ Steps = Generator[Query, Value, T]
 
 
 def run_together(computations: Sequence[Steps[T]], what: str = "") -> list[T]:
-    """Run computations in step to their ends and return their results, in their order.
+    """Run computations side by side to their ends, and return their results in the given order.
 
     If the work has a name, progress is reported. The length of a trace is unknown before its end, so it
     counts by the part of the parameter's interval that it has covered, up to nine tenths.
@@ -64,7 +64,7 @@ def run_together(computations: Sequence[Steps[T]], what: str = "") -> list[T]:
 def _report(
     what: str, queries: Mapping[int, Query], waiting: Iterable[int], seen: dict[int, tuple[float, float]], n: int
 ) -> None:
-    """Report the progress of running computations; `seen` has the parameter range that each one has covered so far."""
+    """Report the progress of running continuations, from the parameter range that each has covered so far."""
     for i, query in queries.items():
         last = float(query.u[-1])
         low, high = seen.get(i, (last, last))
@@ -90,7 +90,6 @@ def _evaluate(queries: Sequence[Query]) -> list[Value]:
 
 
 def _calls(systems: Sequence[tuple[int, System]]) -> list[list[int]]:
-    """Group the indices of queries by the system that they integrate; each group is one call of the engine."""
     by_system: dict[str, list[int]] = {}
     for i, system in systems:
         by_system.setdefault(system.label, []).append(i)
@@ -98,7 +97,7 @@ def _calls(systems: Sequence[tuple[int, System]]) -> list[list[int]]:
 
 
 def integrated(rows: Sequence[Rows], system: System) -> list[Ends]:
-    """Integrate the trajectories that several computations requested, in one call of the engine."""
+    """Integrate in one call of the engine the trajectories that several computations have requested."""
     if not any(len(r.states) for r in rows):  # equilibria alone
         n = system.n_states
         none = np.zeros((0, n))

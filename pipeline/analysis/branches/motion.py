@@ -1,4 +1,4 @@
-"""Classify the motion of whole orbits, and compute their rotation."""
+"""Classify the motion of whole periodic orbits, and compute their rotation."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SAMPLES = 64
 
 
 def sides_of(branches: Sequence[Branch], base: Parameters) -> list[np.ndarray]:
-    """Classify the orbits of each branch by the model's classifier, from the whole orbit.
+    """Return the class of motion (a code) of each orbit of each branch, by the model's classifier.
 
     Parameters
     ----------
@@ -65,7 +65,6 @@ def _sides(branch: Branch, base: Parameters, classifier: Classifier) -> np.ndarr
 
 
 def _rest_sides(branch: Branch, base: Parameters, classifier: Classifier) -> np.ndarray:
-    """Return the class of motion (a code) at each equilibrium of a branch, from the state at rest."""
     name, n_angles = branch.family.free[0], sum(branch.family.system.is_angle)
     own = base.replace(**dict(zip(base.names, map(float, branch.family.parameters), strict=True)))
     codes = []
@@ -85,7 +84,7 @@ def _values(parameters: Parameters) -> Mapping[str, Any]:
 
 
 def rotation_of(branch: Branch) -> np.ndarray:
-    """Compute the mean turns of each angle per drive period or return, on the branch's first orbit."""
+    """Compute how often each angle turns per drive period or return to the section, on the first orbit of a branch."""
     family = branch.family
     if not any(family.system.is_angle) or not family.period:
         return np.zeros(sum(family.system.is_angle))

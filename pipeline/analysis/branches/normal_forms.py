@@ -1,4 +1,4 @@
-"""Compute normal form coefficients of located bifurcations, whose signs tell whether the bifurcating orbits are stable.
+"""Compute normal form coefficients of bifurcations; their signs show whether the bifurcating orbits are stable.
 
 The coefficients need the second and third derivatives B and C of the section map (of the rates, for equilibria)
 along the critical eigenvectors. They are differences of its exact first derivative A at neighbours of the orbit.
@@ -53,7 +53,7 @@ SAME = 1e-5
 
 @dataclass(frozen=True, eq=False)
 class Bend:
-    """First and second derivatives (n, n) of the monodromy matrix or Jacobian along a direction."""
+    """First and second derivatives (n, n) of the monodromy matrix or Jacobian along one direction."""
 
     first: np.ndarray
     second: np.ndarray
@@ -90,15 +90,15 @@ class Case:
             self.q, self.p = -self.q, -self.p
 
     def neighbours(self) -> np.ndarray:
-        """Return the scaled unknowns displaced from the orbit along the critical eigenvector, at which differences are
-        evaluated.
+        """Return scaled unknowns displaced along the critical eigenvector to both sides, as points for finite
+        differences.
         """
         parts = [self.q.real, self.q.imag] if self.kind in (TORUS, HOPF) else [self.q.real]
         shifts = np.concatenate([np.outer(sign * self.steps, part) for part in parts for sign in (1.0, -1.0)])
         return np.asarray(self.u + np.pad(shifts, ((0, 0), (0, len(self.u) - len(self.q)))))
 
     def coefficients(self, form: Form, neighbours: np.ndarray) -> np.ndarray:
-        """Compute a normal form coefficient by finite differences, one value for each step size except the largest.
+        """Compute a normal form coefficient by finite differences, for each step size except the largest.
 
         `neighbours` are the derivatives of the map, or Jacobians, at `self.neighbours()`, unscaled.
         """
@@ -110,8 +110,8 @@ class Case:
 
 
 def judge(bifurcations: Sequence[tuple[Family, Bifurcation]]) -> None:
-    """Compute the normal form coefficients of bifurcations, and from them criticality and kinds of branch points; in
-    place.
+    """Compute the normal form coefficients of bifurcations. Store in them their criticality and the kinds of branch
+    points.
     """
     cases = [Case(family, one.kind, one.point.u, one.point.value.monodromy) for family, one in bifurcations]
     for (_, one), case, matrices in zip(bifurcations, cases, _matrices(cases), strict=True):
@@ -144,9 +144,7 @@ def _tell_branch_point(one: Bifurcation, case: Case, matrices: np.ndarray) -> No
 
 
 def _matrices(cases: Sequence[Case]) -> list[np.ndarray]:
-    """Compute for each bifurcation the first derivatives of the section map (or the Jacobians) at states near the
-    orbit.
-    """
+    """Compute, for each bifurcation, the monodromy matrices or Jacobians at states near the orbit."""
     found: dict[int, np.ndarray] = {}
     by_system: dict[str, list[int]] = {}
     for i, case in enumerate(cases):
@@ -163,7 +161,7 @@ def _matrices(cases: Sequence[Case]) -> list[np.ndarray]:
 
 @dataclass(frozen=True, eq=False)
 class CoefficientProblem:
-    """Request for the trajectories from which a normal form coefficient is computed; there are no equations to solve.
+    """Request for the trajectories from which a normal form coefficient is computed. No equations are solved.
 
     The residual of its value has the coefficient for each size of the step but the largest.
     """
@@ -177,25 +175,25 @@ class CoefficientProblem:
 
     @property
     def system(self) -> System:
-        """System of equations to integrate."""
+        """System whose trajectories are integrated."""
         return self.case.family.system
 
     def rows(self, u: np.ndarray) -> Rows:
-        """Return the trajectories to integrate for finite differences: they start at states displaced from the
-        orbit.
-        """
+        """Return the trajectories to integrate for finite differences: they start at states beside the orbit."""
         return self.case.family.rows(self.case.neighbours())
 
     def value(self, u: np.ndarray, ends: Ends) -> Value:
-        """Compute the normal form coefficient for each step size but the largest, from trajectories displaced from the
-        orbit.
+        """Compute the normal form coefficient for each step size except the largest, from the integrated
+        trajectories.
         """
         found = self.case.coefficients(FORMS[self.case.kind], ends.monodromy)
         return Value(found, np.zeros((len(found), self.size)), ends.images[0], ends.monodromy[0])
 
 
 def critical_vectors(matrix: np.ndarray, kind: str) -> tuple[complex, np.ndarray, np.ndarray]:
-    """Return the critical multiplier or eigenvalue of a matrix, its eigenvector q and the adjoint p, <p, q> = 1."""
+    """Return the critical multiplier or eigenvalue of a matrix, its eigenvector q, and the adjoint eigenvector p with
+    <p, q> = 1.
+    """
     values, vectors = np.linalg.eig(matrix)
     upper = np.where(values.imag > 0.0, 0.0, np.inf)
     away = {
@@ -214,7 +212,7 @@ def critical_vectors(matrix: np.ndarray, kind: str) -> tuple[complex, np.ndarray
 
 
 def _bend(middle: np.ndarray, ahead: np.ndarray, behind: np.ndarray, steps: np.ndarray) -> list[Bend]:
-    """Compute first and second derivatives of a matrix along a direction by differences of fourth order, for each step
+    """Compute first and second derivatives of a matrix along a direction, by differences of fourth order, for each step
     size.
     """
     h = steps[1:, None, None]
@@ -225,7 +223,7 @@ def _bend(middle: np.ndarray, ahead: np.ndarray, behind: np.ndarray, steps: np.n
 
 
 def settled(values: np.ndarray) -> tuple[float, float, int]:
-    """Return the value of a coefficient that depends least on the step size, with its error and its index."""
+    """Choose the value of a coefficient that depends least on the step size. Return it with its error and its index."""
     changes = np.abs(np.diff(values))
     errors = np.maximum(changes[:-1], changes[1:])
     if np.isnan(errors).all():
@@ -241,7 +239,6 @@ Form = Callable[[Case, Sequence[Bend]], float]
 
 
 def _solved(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Solve linear equations; return NaN if the matrix is singular, as where two bifurcations coincide."""
     try:
         return np.asarray(np.linalg.solve(matrix, right))
     except np.linalg.LinAlgError:
@@ -254,7 +251,9 @@ def _quadratic(case: Case, bends: Sequence[Bend]) -> float:
 
 
 def _size(case: Case, bends: Sequence[Bend]) -> float:
-    """Compute an upper bound of the quadratic normal form coefficient, the scale against which its size is judged."""
+    """Compute an upper bound of the quadratic normal form coefficient, as the scale by which to judge whether it is
+    small.
+    """
     (bend,) = bends
     return float(0.5 * np.linalg.norm(case.p) * np.linalg.norm(bend.first))
 

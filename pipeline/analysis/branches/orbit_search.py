@@ -1,4 +1,4 @@
-"""Search all periodic orbits at a parameter point of a run, as an analysis (`pipeline.products.branches`)."""
+"""Define the analysis ``orbits`` of a run: a search for all periodic orbits at one parameter point."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ def needs_point(run: Run, options: OrbitOptions) -> None:
 
 
 def point_of(cube: xr.Dataset, options: OrbitOptions) -> xr.Dataset:
-    """Return the part of a cube at the one parameter point that the options choose."""
+    """Return the part of a run's result cube at the one parameter point that the options choose."""
     part = select_points(cube, options.at, purpose="orbits are searched at one parameter point")
     return part.isel(dict.fromkeys(split_dims(part["status"])[0], 0))
 
 
 def orbits(run: Run, options: OrbitOptions) -> xr.Dataset:
-    """Search all periodic orbits up to a period at a parameter point, stable or not."""
+    """Search for all periodic orbits, stable or not, up to a given period at one parameter point."""
     cube = run.cube()
     point, base = point_of(cube, options), parameters_of(cube)
     frequency, packed = parameters_at(point, base)
@@ -54,7 +54,9 @@ def orbits(run: Run, options: OrbitOptions) -> xr.Dataset:
 
 
 def _starts(point: xr.Dataset, system: System, options: OrbitOptions) -> np.ndarray:
-    """Return start states for the search: half drawn from stored section points, half random in a wider box."""
+    """Return start states for the search: half are drawn from the run's section points, half at random from a wider
+    box.
+    """
     generator = np.random.default_rng(options.seed)
     section = point["section"].transpose(..., "state").values.reshape(-1, system.n_states)
     section = section[np.isfinite(section).all(axis=1)]
@@ -108,7 +110,7 @@ def _dataset(found: list[FoundOrbit], system: System, options: OrbitOptions, poi
 
 
 def orbits_table(ds: xr.Dataset) -> Table:
-    """Return the table of the orbits found, with lines on whether orbits may be missing."""
+    """Return the table of the orbits found, with text lines on whether orbits may be missing."""
     rows = [_row(ds.isel(orbit=i)) for i in range(ds.sizes["orbit"])]
     lines = [f"{counted(len(rows), 'orbit')} from {counted(int(ds.attrs['n_starts']), 'start')} per period", ""]
     lines += [*aligned([_words(row) for row in rows], ""), ""]
@@ -120,7 +122,6 @@ def orbits_table(ds: xr.Dataset) -> Table:
 
 
 def _index_lines(ds: xr.Dataset, expected: int) -> list[str]:
-    """Return text lines that tell by the sums of fixed-point indices for which periods orbits are missing."""
     sums = {int(p): int(total) for p, total in zip(ds["times"].values, ds["index_sum"].values, strict=True)}
     wrong = [f"{p}: {total}" for p, total in sums.items() if total != expected]
     if not wrong:

@@ -1,4 +1,4 @@
-"""Define the equations for orbits and for their bifurcations, in scaled unknowns.
+"""Define the equations for periodic orbits and for their bifurcations, in scaled unknowns.
 
 Every problem is ``F(u) = 0`` with one unknown more than equations, so that its solutions are curves. A
 problem says which trajectories it needs at some `u`, and turns their ends into `F` and its derivative;
@@ -50,7 +50,7 @@ WIDEST_GAP, MOST_TRIES = 0.05, 6
 
 @dataclass(frozen=True, eq=False)
 class Ends:
-    """End points of the trajectories that a problem requested, with their derivatives and durations.
+    """End points of integrated trajectories, with their derivatives and durations.
 
     Attributes
     ----------
@@ -72,7 +72,7 @@ class Ends:
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """Trajectories to integrate: start states (m, n_states), frequencies (m,) [Hz], packed parameters (m, k)."""
+    """Trajectories to integrate: start states (m, n_states), frequencies (m,) [Hz] and packed parameters (m, k)."""
 
     states: np.ndarray
     frequency_hz: np.ndarray
@@ -82,7 +82,8 @@ class Rows:
 
 @dataclass(frozen=True, eq=False)
 class Value:
-    """Value of F at `u`: residual (m,), derivative (m, m + 1), and data of the orbit.
+    """Value of a problem's equations F at the unknowns `u`: residual (m,), derivative (m, m + 1), and data of the
+    orbit.
 
     `images` are the orbit's sections, `monodromy` its monodromy matrix, `seconds` its period [s]. For an
     equilibrium (`is_rest`) they are its state, the Jacobian [1/s] and NaN.
@@ -97,31 +98,33 @@ class Value:
 
     @property
     def is_finite(self) -> bool:
-        """Whether F and its derivative are finite."""
+        """Whether all numbers of the residual and the derivative are finite."""
         return bool(np.isfinite(self.residual).all() and np.isfinite(self.derivative).all())
 
 
 class Problem(Protocol):
-    """System of equations ``F(u) = 0`` with one unknown more than equations."""
+    """Equations ``F(u) = 0`` with one more unknown than equations, whose solutions form a curve."""
 
     @property
     def size(self) -> int:
-        """Number of unknowns."""
+        """Number of unknowns of the equations."""
 
     @property
     def system(self) -> System:
-        """System to integrate."""
+        """System whose trajectories are integrated."""
 
     def rows(self, u: np.ndarray) -> Rows:
-        """Return the trajectories to integrate for the value of F at `u`."""
+        """Return the trajectories to integrate in order to evaluate the equations at `u`."""
 
     def value(self, u: np.ndarray, ends: Ends) -> Value | None:
-        """Compute F and its derivative from the trajectories that `rows` requested; None if it has to request more."""
+        """Compute the equations' value and derivative from the integrated trajectories; None if more trajectories are
+        needed.
+        """
 
 
 @dataclass(frozen=True, eq=False)
 class Family:
-    """Orbits of one period, or equilibria, with some parameters free.
+    """Periodic orbits of one period, or equilibria, of a system with one or two free parameters.
 
     Attributes
     ----------
@@ -147,24 +150,26 @@ class Family:
 
     @property
     def unit(self) -> np.ndarray:
-        """Scale of each unknown: of the states, then of the free parameters."""
+        """Scales of the unknowns: those of the states, then those of the free parameters."""
         return np.array([*self.system.scales, *self.scales])
 
     def unknowns(self, state: np.ndarray, values: Sequence[float]) -> np.ndarray:
-        """Return the scaled unknowns of a section point and of values of the free parameters."""
+        """Scale a section point and the values of the free parameters; return them as one vector of unknowns."""
         return np.asarray(np.concatenate([state, values]) / self.unit)
 
     def state(self, u: np.ndarray) -> np.ndarray:
-        """Return the section point in the unknowns `u` [the states' units], angles wrapped."""
+        """Return the section point that the unknowns `u` stand for, in the units of the states, with wrapped angles."""
         n = self.system.n_states
         return wrap_angles(np.asarray(u[:n] * np.asarray(self.system.scales)), self.system)
 
     def values(self, u: np.ndarray) -> np.ndarray:
-        """Return the values of the free parameters in the unknowns `u`."""
+        """Return the values of the free parameters that the unknowns `u` stand for."""
         return np.asarray(u[self.system.n_states :] * np.asarray(self.scales))
 
     def rows(self, many: np.ndarray) -> Rows:
-        """Return the trajectories to integrate over one period of the orbit, one for each row of unknowns (m, size)."""
+        """Return the trajectories to integrate over one period of the orbit, one for each vector of unknowns in
+        `many`.
+        """
         n = self.system.n_states
         frequency = np.full(len(many), self.frequency_hz)
         packed = np.tile(self.parameters, (len(many), 1))
@@ -177,37 +182,34 @@ class Family:
         return Rows(many[:, :n] * np.asarray(self.system.scales), frequency, packed, self.period)
 
     def mismatch(self, u: np.ndarray, image: np.ndarray) -> np.ndarray:
-        """Compute the scaled difference between the image of a section point and the point itself, angles on their
-        circle.
+        """Compute the scaled difference between the unknowns' section point and its image after one period, with
+        wrapped angles.
         """
         scales = np.asarray(self.system.scales)
         start = u[: self.system.n_states] * scales
         return np.asarray(wrap_angles(image - start, self.system) / scales)
 
     def scaled(self, monodromy: np.ndarray) -> np.ndarray:
-        """Return the monodromy matrix in scaled states."""
+        """Convert a monodromy matrix to scaled states."""
         scales = np.asarray(self.system.scales)
         return np.asarray(monodromy * scales / scales[:, None])
 
 
 @dataclass(frozen=True, eq=False)
 class _Segments:
-    """Scaled section points (period, n_states) of an orbit at `u`, and their derivatives with respect to the
-    unknowns.
-    """
+    """Scaled section points (period, n_states) of an orbit, with their derivatives with respect to the unknowns."""
 
     u: np.ndarray
     points: np.ndarray
     slopes: np.ndarray
 
     def at(self, u: np.ndarray) -> np.ndarray:
-        """Estimate the orbit's section points at unknowns `u` to first order in the change of the unknowns."""
         return np.asarray(self.points + self.slopes @ (u - self.u))
 
 
 @dataclass(eq=False)
 class OrbitProblem:
-    """Equations for fixed points of the p-fold stroboscopic or return map, with one free parameter.
+    """Equations for periodic orbits along one free parameter: fixed points of the p-fold stroboscopic or return map.
 
     An orbit of several periods is evaluated by multiple shooting: all its periods are integrated side by side,
     on lanes that would be idle, from the section points that the last evaluation predicts. Where these miss
@@ -221,17 +223,17 @@ class OrbitProblem:
 
     @property
     def size(self) -> int:
-        """Number of unknowns."""
+        """Number of unknowns: the states and the free parameter."""
         return self.family.system.n_states + 1
 
     @property
     def system(self) -> System:
-        """System of equations to integrate."""
+        """System whose periodic orbits are to be found."""
         return self.family.system
 
     def rows(self, u: np.ndarray) -> Rows:
-        """Return the trajectories to integrate: the orbit or each of its periods, each also at a slightly changed
-        parameter value.
+        """Return the trajectories to integrate: the orbit, whole or period by period, also at a slightly changed
+        parameter.
         """
         step = np.zeros(self.size)
         step[-1] = ONE_SIDED_STEP
@@ -242,8 +244,8 @@ class OrbitProblem:
         return replace(self.family.rows(np.concatenate([own, own + step])), period=1)
 
     def value(self, u: np.ndarray, ends: Ends) -> Value | None:
-        """Compute the orbit's mismatch after one period and its derivative; None to request trajectories from better
-        starts.
+        """Compute the mismatch of the orbit after one period, and its derivative; None if more trajectories are
+        needed.
         """
         is_whole = ends.images.shape[1] == self.family.period
         return self._of_whole(u, ends) if is_whole else self._of_segments(u, ends)
@@ -263,8 +265,8 @@ class OrbitProblem:
         return None
 
     def _of_segments(self, u: np.ndarray, ends: Ends) -> Value | None:
-        """Compute mismatch and derivative from separately integrated drive periods; None if the gaps between them are
-        too wide.
+        """Compute the mismatch of the orbit and its derivative from separately integrated periods; None if the gaps
+        between them are too wide.
         """
         n, scales = self.size - 1, np.asarray(self.system.scales)
         starts = np.split(ends.starts / scales, 2)[0]
@@ -300,7 +302,7 @@ class OrbitProblem:
 
 
 def _is_joined(gap: float, residual: float) -> bool:
-    """Return whether the gaps between separately integrated periods are small enough for the next Newton step.
+    """Return whether the gaps between separately integrated periods are small enough for Newton's next step.
 
     F errs by the square of the gap, the derivative by the gap. Far from the solution Newton's method needs
     neither to be exact.
@@ -316,17 +318,19 @@ def _wrapped(difference: np.ndarray, family: Family) -> np.ndarray:
 
 
 def fold_test(monodromy: np.ndarray) -> float:
-    """Compute det(M - 1), which vanishes where a multiplier is +1."""
+    """Compute det(M - 1) of the monodromy matrix M, which is zero where a multiplier is +1 (fold)."""
     return float(np.linalg.det(monodromy - np.eye(len(monodromy))))
 
 
 def doubling_test(monodromy: np.ndarray) -> float:
-    """Compute det(M + 1), which changes sign where a real multiplier passes -1."""
+    """Compute det(M + 1) of the monodromy matrix M, which changes sign where a real multiplier passes -1 (period
+    doubling).
+    """
     return float(np.linalg.det(monodromy + np.eye(len(monodromy))))
 
 
 def torus_test(monodromy: np.ndarray) -> float:
-    """Compute the product of mu_i mu_j - 1 over pairs of multipliers, zero where two multipliers have the product 1.
+    """Compute the product of ``mu_i * mu_j - 1`` over all pairs of multipliers; it is zero at a torus bifurcation.
 
     The determinant of the bialternate product of M with itself, minus 1 (Kuznetsov, Elements of Applied
     Bifurcation Theory, 3rd ed., 2004, Sect. 10.2.2).
@@ -346,7 +350,9 @@ TESTS: dict[str, Callable[[np.ndarray], float]] = {
 
 @dataclass(frozen=True, eq=False)
 class BifurcationProblem:
-    """Equations for orbits at a bifurcation, with two free parameters: the equations of the orbit and ``test = 0``."""
+    """Equations for orbits at a bifurcation, with two free parameters: the orbit closes, and a test function is
+    zero.
+    """
 
     family: Family
     kind: str
@@ -358,7 +364,7 @@ class BifurcationProblem:
 
     @property
     def system(self) -> System:
-        """System of equations to integrate."""
+        """System whose bifurcations are to be found."""
         return self.family.system
 
     @property
@@ -367,14 +373,16 @@ class BifurcationProblem:
         return np.array([STATE_STEP] * n + [PARAMETER_STEP] * 2)
 
     def rows(self, u: np.ndarray) -> Rows:
-        """Return the trajectories to integrate: the orbit, and for differences two more per unknown, displaced to
-        either side.
+        """Return the trajectories to integrate: the orbit, and two displaced ones for each unknown, for central
+        differences.
         """
         shifts = np.diag(self._steps)
         return self.family.rows(np.concatenate([u[None], u + shifts, u - shifts]))
 
     def value(self, u: np.ndarray, ends: Ends) -> Value:
-        """Compute the orbit's mismatch after its period and the test function, with their derivative."""
+        """Compute the mismatch of the orbit after its period and the bifurcation's test function, with their
+        derivatives.
+        """
         n, size = self.family.system.n_states, self.size
         test = TESTS[self.kind]
         tests = np.array([test(m) if np.isfinite(m).all() else np.nan for m in ends.monodromy])

@@ -1,4 +1,4 @@
-"""Compute branches of orbits and bifurcation curves as analyses of a run (`pipeline.products.branches`)."""
+"""Define the analyses ``branches`` (of orbits) and ``curves`` (of bifurcations) of a run."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ LEAST_PERIOD = 4
 
 
 def settle_branches(run: Run, options: BranchOptions) -> BranchOptions:
-    """Complete the parameter interval from the run's axis; raise SpecError if the interval is empty."""
+    """Fill in the parameter interval of the branches from the run's swept axis; raise SpecError if it is empty."""
     parameter = options.parameter
     _refuse_frequency_of_flow(run, parameter)
     low, high = interval_of(run, parameter, options.low, options.high)
@@ -21,7 +21,7 @@ def settle_branches(run: Run, options: BranchOptions) -> BranchOptions:
 
 
 def _refuse_frequency_of_flow(run: Run, parameter: str) -> None:
-    """Raise SpecError if the parameter is the frequency and the model has no drive."""
+    """Raise SpecError if branches are to follow the drive frequency, but the model has no drive."""
     from pipeline.specification.problems import SpecError
 
     if axis_name(parameter) == FREQUENCY_DIM and run.model.crossing is not None:
@@ -31,7 +31,7 @@ def _refuse_frequency_of_flow(run: Run, parameter: str) -> None:
 
 
 def branches(run: Run, options: BranchOptions) -> xr.Dataset:
-    """Follow branches of periodic orbits along a parameter, from the orbits that attract a run's cells."""
+    """Follow branches of periodic orbits along a parameter, from the attractors of a run."""
     from pipeline.analysis.branches import Scope, attracting, dataset_of, explore, recurrent
 
     cube, parameter = run.cube(), axis_name(options.parameter)
@@ -57,7 +57,9 @@ def _ends(options: BranchOptions) -> tuple[float, float]:
 
 
 def settle_curves(run: Run, options: CurveOptions) -> CurveOptions:
-    """Complete the parameter interval of the branches; raise SpecError unless two different parameters span a plane."""
+    """Fill in the parameter interval of the branches; raise SpecError unless the second parameter differs from the
+    first.
+    """
     from pipeline.specification.problems import SpecError
 
     settled = options.model_copy(update=settle_branches(run, options).part(BranchOptions))
@@ -73,7 +75,7 @@ def settle_curves(run: Run, options: CurveOptions) -> CurveOptions:
 
 
 def curves(run: Run, options: CurveOptions) -> xr.Dataset:
-    """Continue the bifurcations located by `branches` in the plane of the branches' parameter and a second one."""
+    """Continue the bifurcations on the branches in the plane of the branches' parameter and a second one."""
     from pipeline.analysis.branches import curves_dataset, curves_from
 
     located = run.derive("branches", **options.part(BranchOptions))
@@ -85,13 +87,13 @@ def curves(run: Run, options: CurveOptions) -> xr.Dataset:
 
 
 def swept_axis(run: Run, parameter: str) -> xr.DataArray | None:
-    """Return the axis of a parameter; None if the run does not sweep it."""
+    """Return the axis of a parameter in the run's result cube; None if the run does not sweep it."""
     axis = run.cube().coords.get(axis_name(parameter))
     return axis if axis is not None and axis.ndim > 0 and axis.size > 1 else None
 
 
 def interval_of(run: Run, parameter: str, low: float | None, high: float | None) -> tuple[float, float]:
-    """Check the parameter of the branches, and complete its interval from the run's axis."""
+    """Return the parameter interval of the branches; its default is the range that the run sweeps."""
     from pipeline.specification.problems import SpecError, unknown_name
 
     base = parameters_of(run.cube())

@@ -1,4 +1,4 @@
-"""Find starting orbits for branches: attractors of a cube, and orbits near which its bounded trajectories recur."""
+"""Find orbits from which to start branches: a run's attractors, and orbits that its trajectories come near."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ TRIES = 16
 
 @dataclass(frozen=True)
 class Listed:
-    """An attractor of a run at one parameter point: its id, where it is, its period (0: none)."""
+    """An attractor of a run at one parameter point: its id, its parameter values and its period (0: none)."""
 
     identity: int
     where: Mapping[str, float]
@@ -34,7 +34,8 @@ class Listed:
 
 
 def listed(attractors: xr.Dataset, parameters: Parameters, parameter: str, scale: float) -> Iterator[Listed]:
-    """Yield the attractors of a run; one that Newton's method refined comes with a starting orbit for a branch.
+    """Yield the attractors of a run. An attractor that Newton's method has refined comes with a starting orbit for a
+    branch.
 
     Parameters
     ----------
@@ -63,7 +64,7 @@ def listed(attractors: xr.Dataset, parameters: Parameters, parameter: str, scale
 def attracting(
     attractors: xr.Dataset, parameters: Parameters, parameter: str, interval: tuple[float, float], max_period: int = 0
 ) -> tuple[list[Start], list[str]]:
-    """Return starting orbits from the refined attractors of a run, and a text line for each attractor left out.
+    """Return the starting orbits of branches from a run's attractors, and a text line for each attractor left out.
 
     Parameters
     ----------
@@ -99,7 +100,7 @@ def attracting(
 
 
 def _why_not(one: Listed, interval: tuple[float, float], max_period: int) -> str:
-    """Return the reason why no branch can start from an attractor; empty if one can."""
+    """Return the reason why no branch can start from an attractor; an empty text if one can."""
     if one.is_cycle:
         return "a limit cycle seen at even times; see it at crossings: [section] of a new run"
     if not one.period and not one.is_rest:
@@ -115,7 +116,6 @@ def _why_not(one: Listed, interval: tuple[float, float], max_period: int) -> str
 
 
 def _places(where: Sequence[Mapping[str, float]]) -> str:
-    """Describe where an attractor occurs, by its range on each parameter axis."""
     if not where[0]:
         return ""
     ranges = []
@@ -129,12 +129,12 @@ def _places(where: Sequence[Mapping[str, float]]) -> str:
 def family_of(
     system: System, period: int, frequency_hz: float, packed: np.ndarray, parameter: str, scale: float
 ) -> Family:
-    """Make the family of orbits with a given period and one free parameter."""
+    """Make a family of periodic orbits with a given period and one free parameter."""
     return Family(system, period, frequency_hz, packed, (parameter,), (scale,))
 
 
 def value_of(family: Family, frequency_hz: float, packed: np.ndarray) -> float:
-    """Return the value of the family's free parameter, from a frequency [Hz] and packed parameters."""
+    """Return the value of a family's free parameter, from the drive frequency [Hz] and the packed parameters."""
     name = family.free[0]
     if name == FREQUENCY:
         return frequency_hz
@@ -142,25 +142,23 @@ def value_of(family: Family, frequency_hz: float, packed: np.ndarray) -> float:
 
 
 def _dims(ds: xr.Dataset) -> list[str]:
-    """Return the parameter dims of a dataset."""
     return [str(d) for d in ds["status"].dims if not is_start_dim(str(d))]
 
 
 def _points(ds: xr.Dataset) -> list[xr.Dataset]:
-    """Split a dataset into its parameter points, a dataset each."""
     dims = _dims(ds)
     indices = np.ndindex(*(ds.sizes[d] for d in dims))
     return [ds.isel(dict(zip(dims, map(int, index), strict=True))) for index in indices]
 
 
 def parameters_at(point: xr.Dataset, base: Parameters) -> tuple[float, np.ndarray]:
-    """Return the frequency [Hz] and the packed parameters of a point of the cube."""
+    """Return the frequency [Hz] and the packed parameters at one parameter point of a run's result cube."""
     axes = {n: float(point.coords[n]) for n in base.names if n in point.coords and not point.coords[n].dims}
     return frequency_of(base.model, {str(k): v for k, v in point.coords.items()}), base.replace(**axes).pack()
 
 
 def recurrent(cube: xr.Dataset, parameters: Parameters, parameter: str, scale: float, max_period: int) -> list[Start]:
-    """Find the orbits, mostly unstable, that bounded trajectories of a cube come near.
+    """Find the periodic orbits, mostly unstable, that trajectories of a run come near.
 
     Where two section points of a trajectory, p periods apart, are close, Newton's method from the first often
     leads to an orbit of period p (Auerbach et al., Phys. Rev. Lett. 58, 1987, 2387).
@@ -195,7 +193,7 @@ def recurrent(cube: xr.Dataset, parameters: Parameters, parameter: str, scale: f
 def orbits_near(
     section: np.ndarray, frequency_hz: float, packed: np.ndarray, max_period: int, system: System
 ) -> list[tuple[np.ndarray, int]]:
-    """Find periodic orbits near close recurrences of trajectories.
+    """Find periodic orbits where trajectories nearly return to an earlier section point.
 
     Parameters
     ----------
@@ -231,7 +229,7 @@ def orbits_near(
 def _spread(
     section: np.ndarray, places: Sequence[tuple[np.intp, ...]], distance: np.ndarray, system: System
 ) -> list[np.ndarray]:
-    """Choose section points of close recurrence, closest first, that lie more than `RECURRENCE` apart."""
+    """Choose section points to which a trajectory returns most closely, all more than `RECURRENCE` apart."""
     chosen: list[np.ndarray] = []
     for place in places:
         if len(chosen) == TRIES or not distance[place] <= RECURRENCE:

@@ -17,7 +17,8 @@ from pipeline.products.product import Table
 
 
 def branches_table(ds: xr.Dataset) -> Table:
-    """Return the table of bifurcations, with lines on stable segments and on attractors from which no branch starts.
+    """Return the table of bifurcations, with text lines on the stable segments of branches and on attractors without a
+    branch.
 
     Equilibria have the period 0, and eigenvalues [1/s] in place of multipliers. A Hopf point has the period of
     its small cycles. ``normal_form`` is the coefficient of the normal form (see
@@ -34,7 +35,6 @@ def branches_table(ds: xr.Dataset) -> Table:
 
 
 def _why_none(ds: xr.Dataset) -> str:
-    """Return a text on why there is no branch: a line per reason, with the number of attractors that it concerns."""
     name = parameter_name(str(ds.attrs["parameter"]))
     lines = str(ds.attrs.get("left_out", "")).splitlines()
     reasons = Counter(line.partition(": ")[2] for line in lines)
@@ -44,7 +44,7 @@ def _why_none(ds: xr.Dataset) -> str:
 
 
 def table_of(ds: xr.Dataset) -> list[Row]:
-    """Return a table row per located bifurcation, by rising parameter value; see `branches_table`.
+    """Return one table row per located bifurcation, sorted by parameter value.
 
     The parameter's column has its name and, for the drive's frequency, its unit: ``frequency_hz``. Parameters
     that have other values than the run's own follow, and ``side`` where the model has words for motions.
@@ -79,7 +79,9 @@ def table_of(ds: xr.Dataset) -> list[Row]:
 
 
 def fixed_of(ds: xr.Dataset, branch: int) -> dict[str, float]:
-    """Return a branch's fixed parameters: the drive frequency, and those that differ from the run's values."""
+    """Return the fixed parameters of a branch by name: the drive frequency, and those that differ from the run's
+    values.
+    """
     parameter = str(ds.attrs["parameter"])
     names = [FREQUENCY] if parameter != FREQUENCY and FREQUENCY in ds else []
     names += [str(n) for n in ds.data_vars if str(ds[n].attrs.get("long_name", "")) == f"value of {n}"]
@@ -87,7 +89,7 @@ def fixed_of(ds: xr.Dataset, branch: int) -> dict[str, float]:
 
 
 def _unstable(one: xr.Dataset, kind: str) -> tuple[str, str]:
-    """Return the numbers of unstable multipliers below and above a bifurcation's parameter value, as texts."""
+    """Return the numbers of unstable multipliers below and above a bifurcation, as texts."""
     before, after = int(one["n_unstable_before"]), int(one["n_unstable_after"])
     rises = bool(one["rises_before"])
     if kind == FOLD:
@@ -115,7 +117,6 @@ def _words(ds: xr.Dataset, row: Row) -> Words:
 
 
 def _at(ds: xr.Dataset, branch: int) -> str:
-    """Format a branch's fixed parameters."""
     found = [
         f"{value:g} Hz" if name == parameter_name(FREQUENCY) else f"{name} {value:g}"
         for name, value in fixed_of(ds, branch).items()
@@ -125,7 +126,9 @@ def _at(ds: xr.Dataset, branch: int) -> str:
 
 
 def _with_error(value: float, error: float) -> str:
-    """Format a coefficient with as many digits as its error allows (1 to 4); ``?`` if the error exceeds the value."""
+    """Format a coefficient with as many digits as its error allows (1 to 4); ``?`` if the error is larger than the
+    value.
+    """
     if not abs(value) > error:
         return "?"
     digits = int(np.clip(np.floor(np.log10(abs(value) / max(error, 1e-300))), 1, 4))
@@ -133,7 +136,6 @@ def _with_error(value: float, error: float) -> str:
 
 
 def _number(z: complex, period: int) -> str:
-    """Format a Floquet multiplier, or for an equilibrium (period 0) an eigenvalue."""
     return (f"{z.real:.5f}" if abs(z.imag) < 1e-9 else f"{z.real:.5f}{z.imag:+.5f}i") + ("" if period else " 1/s")
 
 
@@ -153,9 +155,7 @@ def _left_out(ds: xr.Dataset) -> list[str]:
 
 
 def windows_of(ds: xr.Dataset) -> list[dict[str, Any]]:
-    """Return the stable segments of the branches with their bounds, sorted by period, classifier label and parameter
-    value.
-    """
+    """Return the stable segments of all branches, with the parameter values and the names of their bounds."""
     found = []
     for i in range(ds.sizes["branch"]):
         n = int(ds["n_points"][i])
@@ -178,8 +178,8 @@ def windows_of(ds: xr.Dataset) -> list[dict[str, Any]]:
 
 
 def _stable_runs(stable: np.ndarray, closed: bool) -> list[tuple[int, int]]:
-    """Return the first and last index of each stretch of consecutive stable points; on a closed branch one may wrap
-    around.
+    """Return the first and last index of each series of stable points; on a closed branch, a series may pass the
+    start.
     """
     edges = np.flatnonzero(np.diff(np.concatenate([[0], stable.astype(np.int8), [0]])))
     runs = [(int(a), int(b) - 1) for a, b in edges.reshape(-1, 2)]
@@ -194,7 +194,9 @@ def _ends_of(ds: xr.Dataset, branch: int) -> tuple[str, str]:
 
 
 def _bound(ds: xr.Dataset, branch: int, point: int, after: int, end: int) -> tuple[float, str]:
-    """Return the parameter value and the name of a stable segment's bound: a bifurcation, or the branch's end."""
+    """Return the parameter value and the name of a bound of a stable segment: a bifurcation, or the end of the
+    branch.
+    """
     here = np.flatnonzero((ds["of_branch"].values == branch) & (ds["after"].values == after))
     value = float(ds["parameter"][branch, point])
     if len(here):
@@ -221,7 +223,7 @@ def _named(ds: xr.Dataset, k: int) -> tuple[float, str]:
 
 
 def curves_table(ds: xr.Dataset) -> Table:
-    """Return a table with a row for each point of codimension two, below lines that describe the bifurcation curves.
+    """Return the table of the points of codimension two, with text lines that describe the bifurcation curves.
 
     ``error`` is the larger of the errors of both parameters, in units of the ranges that the curves cover.
     """

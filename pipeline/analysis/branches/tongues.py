@@ -1,4 +1,4 @@
-"""Find phase-locked orbits with rotation number p/q along a row of cells with rotation numbers."""
+"""Find phase-locked orbits with rotation number p/q along a row of cells whose rotation numbers are known."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ LOCKED = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Row:
-    """Cells along one parameter: its values, their rotation numbers, periods (0: not closed) and section points.
+    """Cells along one parameter, with their rotation numbers, orbit periods (0: not closed) and section points.
 
     Attributes
     ----------
@@ -58,7 +58,9 @@ class Row:
 
 @dataclass(frozen=True, eq=False)
 class Search:
-    """Settings of the search for locked orbits: family of orbits, rotating state, number of averaged periods."""
+    """Settings of the search for locked orbits: the family of orbits, the rotating state and the number of periods to
+    average over.
+    """
 
     family: Family
     turning: TurningState
@@ -66,11 +68,11 @@ class Search:
 
     @property
     def system(self) -> System:
-        """Integrated system."""
+        """System that is integrated."""
         return self.family.system
 
     def rotation(self, values: np.ndarray, states: np.ndarray, closed: np.ndarray | None = None) -> np.ndarray:
-        """Compute the rotation numbers of trajectories from states at values of the free parameter."""
+        """Compute the rotation numbers of trajectories that start at given states and values of the free parameter."""
         rows = self.family.rows(self._unknowns(values, states))
         found = rotation_numbers(
             rows.parameters,
@@ -86,7 +88,9 @@ class Search:
         return np.asarray(np.where(found.error <= CLOSED_TURNS, found.rotation, np.nan))
 
     def sections(self, values: np.ndarray, states: np.ndarray, n_transient: int, n_keep: int) -> np.ndarray:
-        """Return section points (trajectory, n_keep, state) after a transient."""
+        """Integrate trajectories over a transient, and return the next `n_keep` section points, shape (trajectory,
+        n_keep, state).
+        """
         rows = self.family.rows(self._unknowns(values, states))
         found = run_branches(
             rows.parameters[:, None],
@@ -105,14 +109,14 @@ class Search:
 
 
 def fractions_between(low: float, high: float, most: int) -> list[Fraction]:
-    """Return all fractions in an interval whose denominators are at most `most`, rising."""
+    """Return all fractions in an interval with denominators up to `most`, in rising order."""
     return sorted(
         {Fraction(p, q) for q in range(1, most + 1) for p in range(ceil(low * q - 1e-9), floor(high * q + 1e-9) + 1)}
     )
 
 
 def locked_orbits(row: Row, search: Search, most: int) -> dict[Fraction, Start | None]:
-    """Find a starting orbit for each fraction p/q that a row of cells locks to or passes.
+    """Find an orbit for each rotation number p/q that occurs along a row of cells.
 
     Parameters
     ----------
@@ -141,7 +145,9 @@ def locked_orbits(row: Row, search: Search, most: int) -> dict[Fraction, Start |
 
 
 def _of_cells(row: Row, search: Search, fraction: Fraction) -> Start | None:
-    """Return the closed orbit of least period with a rotation number, in the middle of the cells that have it."""
+    """Return the periodic orbit of least period among the cells with a given rotation number; None if there is no such
+    cell.
+    """
     has = (row.orbit_period > 0) & (np.abs(row.rotation - float(fraction)) < LOCKED)
     if not has.any():
         return None
@@ -153,9 +159,7 @@ def _of_cells(row: Row, search: Search, fraction: Fraction) -> Start | None:
 
 
 def _passed(row: Row, fraction: Fraction) -> tuple[int, int] | None:
-    """Return indices (value, start) of the cell after which the rotation number passes a fraction; None if it never
-    does.
-    """
+    """Find a cell after which the rotation number passes a fraction; return its indices (value, start), or None."""
     off = row.rotation - float(fraction)
     places = np.argwhere(off[:-1] * off[1:] < 0.0)
     if not len(places):
@@ -166,7 +170,7 @@ def _passed(row: Row, fraction: Fraction) -> tuple[int, int] | None:
 
 
 def _between_cells(row: Row, search: Search, gaps: dict[Fraction, tuple[int, int]]) -> dict[Fraction, Start | None]:
-    """Find locked orbits between neighbouring cells by bisection in the parameter, for all fractions together."""
+    """Find locked orbits between adjacent cells by bisection in the parameter, for all fractions at once."""
     if not gaps:
         return {}
     targets = np.array([float(f) for f in gaps])
@@ -194,7 +198,6 @@ def _between_cells(row: Row, search: Search, gaps: dict[Fraction, tuple[int, int
 
 
 def _closest_return(family: Family, points: np.ndarray, value: float) -> Start | None:
-    """Return the section point of a trajectory that comes back closest after the family's period."""
     distance = scaled_distance(points[family.period :], points[: -family.period], family.system)
     if not np.isfinite(distance).all():
         return None
@@ -202,7 +205,7 @@ def _closest_return(family: Family, points: np.ndarray, value: float) -> Start |
 
 
 def _corrected(start: Start, number: int) -> Steps[Start | None]:
-    """Refine an orbit and its parameter value together; in a thin tongue the orbit exists near one value only."""
+    """Refine an orbit together with its parameter value, since a thin tongue has the orbit near one value only."""
     problem, u = problem_of(start.family), start.family.unknowns(start.state, [start.value])
     value = yield Query(problem, u)
     found = (yield from correct(problem, u, kernel_of(value), Settings())) if value.is_finite else None
@@ -213,7 +216,9 @@ def _corrected(start: Start, number: int) -> Steps[Start | None]:
 
 
 def fractions_of(branches: Sequence[Branch], search: Search) -> list[Fraction | None]:
-    """Return the rotation number p/q of the first orbit on each branch; None if its turns are not a whole number."""
+    """Return the rotation number p/q of each branch, from its first orbit; None if the orbit's turns are not a whole
+    number.
+    """
     return [_fraction_of(branch, search) for branch in branches]
 
 

@@ -1,4 +1,4 @@
-"""Compute Arnold tongues as an analysis of a run (`pipeline.products.tongues`)."""
+"""Define the analysis ``tongues`` (Arnold tongues) of a run."""
 
 from __future__ import annotations
 
@@ -37,7 +37,9 @@ ACCURACY = 10.0 * BRANCH_RTOL
 
 
 def needs_rotation(run: Run, options: TongueOptions) -> None:
-    """Raise ValueError unless the run sweeps the first parameter and has rotation numbers."""
+    """Raise ValueError unless the run has rotation numbers and sweeps the parameter along which tongues are
+    searched.
+    """
     cube = run.cube()
     if "rotation" not in cube:
         raise ValueError("the cube has no rotation numbers; run it with [products] rotation = {} in its specification")
@@ -46,7 +48,7 @@ def needs_rotation(run: Run, options: TongueOptions) -> None:
 
 
 def settle_tongues(run: Run, options: TongueOptions) -> TongueOptions:
-    """Complete the parameter, its interval and the row; raise SpecError unless two parameters span a plane."""
+    """Fill in the parameter, its interval and the row of cells; raise SpecError unless the two parameters differ."""
     from pipeline.specification.problems import SpecError
 
     parameter = options.parameter
@@ -58,7 +60,7 @@ def settle_tongues(run: Run, options: TongueOptions) -> TongueOptions:
 
 
 def tongues(run: Run, options: TongueOptions) -> xr.Dataset:
-    """Find orbits p/q along a row of cells, follow them to their folds, and continue these in the plane."""
+    """Find orbits with rotation numbers p/q along a row of cells, and continue their folds in the parameter plane."""
     point, base = _row_of(run, options), parameters_of(run.cube())
     first, second = axis_name(options.parameter), axis_name(options.second)
     assert options.low is not None
@@ -87,7 +89,6 @@ def tongues(run: Run, options: TongueOptions) -> xr.Dataset:
 
 
 def _row_of(run: Run, options: TongueOptions) -> xr.Dataset:
-    """Return the row of cells along the first parameter."""
     cube, first = run.cube(), axis_name(options.parameter)
     part = select_points(cube, options.at)
     others = [d for d in map(str, split_dims(part["status"])[0]) if d != first]
@@ -99,14 +100,13 @@ def _row_of(run: Run, options: TongueOptions) -> xr.Dataset:
 
 
 def _turning(run: Run) -> tuple[TurningState, int]:
-    """Return the rotating state, and the number of periods of the average, from the run's product ``rotation``."""
     options: Any = run.spec.products["rotation"]
     names = run.model.state_names
     return TurningState(tuple(map(names.index, options.of)), options.center, options.section), options.n_periods
 
 
 def cells_of(point: xr.Dataset, first: str) -> Row:
-    """Return a row of cells by rising values of the first parameter; rotation numbers that are not good are NaN."""
+    """Return a row of cells in rising order of the first parameter; unreliable rotation numbers are NaN."""
     starts = [d for d in point["status"].dims if d != first]
     good = point["rotation"].where(point["rotation_flag"] == RotationFlag.GOOD)
     stacked = point[["orbit_period"]].assign(rotation=good).transpose(first, *starts)
@@ -122,7 +122,6 @@ def cells_of(point: xr.Dataset, first: str) -> Row:
 
 
 def _parts(fractions: Sequence[Fraction | None]) -> dict[str, np.ndarray]:
-    """Return numerators and denominators of fractions, shape (n,); 0 / 0 for an unknown fraction."""
     pairs = [(0, 0) if f is None else (f.numerator, f.denominator) for f in fractions]
     columns = np.array(pairs, np.int32).reshape(-1, 2)
     return {"numerator": columns[:, 0], "denominator": columns[:, 1]}
@@ -130,7 +129,7 @@ def _parts(fractions: Sequence[Fraction | None]) -> dict[str, np.ndarray]:
 
 @dataclass(eq=False)
 class _Tongue:
-    """A tongue p/q on the row of cells: number of branches, bounds of its stable orbits, outermost folds."""
+    """A tongue p/q on the row of cells: its branches, the bounds of its stable orbits, and its outermost folds."""
 
     fraction: Fraction
     n_branches: int
@@ -143,7 +142,7 @@ class _Tongue:
 def _on_row(
     fractions: Sequence[Fraction], numbers: Sequence[Fraction | None], located: xr.Dataset, least: float
 ) -> list[_Tongue]:
-    """Describe each tongue on the row by the stable segments of its branches; errors are at least `least`."""
+    """Describe each tongue on the row of cells by the stable segments of its branches."""
     windows, found = windows_of(located), []
     is_fold = located["kind"].values == KINDS.index(FOLD)
     for fraction in fractions:
@@ -163,7 +162,6 @@ def _on_row(
 
 
 def _variables(tongues: Sequence[_Tongue]) -> dict[str, Any]:
-    """Return the dataset variables along ``tongue``."""
     columns = {f"tongue_{name}": values for name, values in _parts([t.fraction for t in tongues]).items()}
     columns["n_branches"] = np.array([t.n_branches for t in tongues], np.int32)
     for i, name in enumerate(("low", "high")):
@@ -176,7 +174,7 @@ def _variables(tongues: Sequence[_Tongue]) -> dict[str, Any]:
 
 
 def tongues_table(ds: xr.Dataset) -> Table:
-    """Return the table of the tongues on the row of cells, with lines on the curves of their edges."""
+    """Return the table of the tongues on the row of cells, with text lines on the curves of their edges."""
     first, second = (parameter_name(str(ds.attrs[f"{role}_parameter"])) for role in ("first", "second"))
     rows = [_row(ds.isel(tongue=k), ds) for k in range(ds.sizes["tongue"])]
     n_found = sum(row["branches"] > 0 for row in rows)

@@ -1,1 +1,1 @@
-"""Distinguish regular and chaotic motion: Lyapunov exponents, dimensions, the 0-1 test."""
+"""Distinguish regular from chaotic motion by Lyapunov exponents, dimensions and the 0-1 test."""

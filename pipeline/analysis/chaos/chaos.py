@@ -1,4 +1,4 @@
-"""Compute indicators of chaos: Lyapunov exponents, Kaplan-Yorke dimension, 0-1 test.
+"""Compute indicators of chaos: Lyapunov exponents, Kaplan-Yorke dimension and the 0-1 test.
 
     ds = pipeline.open_run(directory)
     cells = chaotic_cells(ds)               # cell by cell; integrates nothing
@@ -22,7 +22,7 @@ from pipeline.products.chaos import ChaosOptions
 
 
 def chaos(ds: xr.Dataset, attractors: xr.Dataset, options: ChaosOptions | None = None, **changes: Any) -> xr.Dataset:
-    """Compute the indicators of chaos of each cell and of each attractor.
+    """Compute the indicators of chaos for each cell (trajectory) and for each attractor.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ def chaos(ds: xr.Dataset, attractors: xr.Dataset, options: ChaosOptions | None =
 
 
 def chaotic_cells(ds: xr.Dataset, options: ChaosOptions | None = None, **changes: Any) -> xr.Dataset:
-    """Compute the indicators of chaos (Lyapunov exponents, dimension, 0-1 test) of each cell (trajectory).
+    """Compute the indicators of chaos for each cell (trajectory): Lyapunov exponents, dimension, 0-1 test.
 
     Parameters
     ----------
@@ -103,8 +103,7 @@ def chaotic_cells(ds: xr.Dataset, options: ChaosOptions | None = None, **changes
 
 
 def check_chaos(ds: xr.Dataset, options: ChaosOptions) -> None:
-    """Raise ValueError unless an indicator of chaos can be computed: exponents, 0-1 test, or multipliers of refined
-    orbits.
+    """Raise ValueError if neither Lyapunov exponents nor the 0-1 test nor multipliers can be computed.
 
     Raises
     ------
@@ -116,7 +115,9 @@ def check_chaos(ds: xr.Dataset, options: ChaosOptions) -> None:
 
 
 def reasons(ds: xr.Dataset, stride: int = 1) -> list[str]:
-    """Return a sentence for each reason why a cube does not allow Lyapunov exponents or the 0-1 test."""
+    """Return the reasons why Lyapunov exponents or the 0-1 test cannot be computed from a result cube, one sentence
+    each.
+    """
     found = []
     if "lyapunov" not in ds:
         found.append(
@@ -138,7 +139,6 @@ def _of_exponents(ds: xr.Dataset, options: ChaosOptions) -> xr.Dataset:
 
 
 def _without_exponents(ds: xr.Dataset) -> xr.Dataset:
-    """Return the class of motion of cells without Lyapunov exponents: regular if closed, otherwise unknown."""
     closed = is_closed(ds)
     motion = xr.full_like(closed, Motion.UNKNOWN, dtype=np.int8)
     motion = motion.where(~closed, np.int8(Motion.REGULAR)).assign_attrs(motion_attrs())

@@ -1,4 +1,4 @@
-"""Compute the correlation dimension of non-periodic attractors; state for other sets why they have none."""
+"""Compute the correlation dimension of non-periodic attractors, and say why other sets have none."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ HAS_DIMENSION, ABSENT, CLOSED, NO_ATTRACTOR, TOO_FEW = range(len(REASONS))
 def section_dimension(
     ds: xr.Dataset, attractors: xr.Dataset, options: DimensionOptions | None = None, **changes: Any
 ) -> xr.Dataset:
-    """Compute the correlation dimension of each non-periodic attractor, from the section points of its cells.
+    """Compute the correlation dimension of each non-periodic attractor from the section points of its cells.
 
     A cell that is still closing and a chaotic transient fill no set, so the slope of their correlation sum is
     no dimension. Only sets that were shown to attract have a dimension.

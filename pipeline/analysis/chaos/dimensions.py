@@ -1,4 +1,4 @@
-"""Compute the Kaplan-Yorke and the correlation dimension of attractors on the section.
+"""Compute the Kaplan-Yorke dimension and the correlation dimension of attractors, in the section.
 
 On the section a closed orbit is a few points, of dimension 0, and a quasi-periodic motion is a curve, of
 dimension 1. The attractor of the flow has one dimension more.
@@ -24,7 +24,7 @@ from pipeline.products.reporting import track
 def kaplan_yorke_dimension(
     ds: xr.Dataset, *, name: str = "lyapunov", dim: str = "exponent", zero: float = 0.0, flow: bool = False
 ) -> xr.Dataset:
-    """Compute the Kaplan-Yorke dimension from Lyapunov spectra.
+    """Compute the Kaplan-Yorke dimension from spectra of Lyapunov exponents.
 
     With the exponents in falling order and j the largest number whose sum S_j is not negative,
     ``D = j + S_j/|l_(j+1)|``: conjectured to be the information dimension of the attractor (Kaplan and
@@ -101,7 +101,7 @@ def kaplan_yorke_dimension(
 
 
 def _without_zero(values: np.ndarray, rates: np.ndarray) -> np.ndarray:
-    """Drop the exponent of the flow direction: the entry of `values` whose rate is nearest to 0, on the last axis."""
+    """Drop the exponent of the flow direction from `values`: the one whose rate is nearest to 0, on the last axis."""
     nearest = np.argmin(np.abs(np.nan_to_num(rates, nan=np.inf)), axis=-1)
     kept = np.arange(rates.shape[-1]) != nearest[..., None]
     return np.asarray(values[kept].reshape(*rates.shape[:-1], rates.shape[-1] - 1))
@@ -130,8 +130,8 @@ def correlation_dimension(
     floor: float = SAME_POINT,
     geometry: Geometry | None = None,
 ) -> xr.Dataset:
-    """Compute the correlation dimension of each cell's section points, with the correlation sum and the range of the
-    fit.
+    """Compute the correlation dimension of each cell's section points, with the correlation sum and the range of radii
+    that was fitted.
 
     The correlation sum C(r) is the share of pairs of points closer than r; the dimension is the
     slope of log C against log r (Grassberger and Procaccia, Phys. Rev. Lett. 50, 346 and Physica D 9,
@@ -218,7 +218,7 @@ def correlation_dimension(
 
 @dataclass(frozen=True)
 class _Curve:
-    """Correlation sum of one set, with the fitted dimension and the range of the fit."""
+    """Correlation sum of one set of points, with the fitted dimension and the range of radii of the fit."""
 
     log_radius: Floats
     log_sum: Floats
@@ -232,7 +232,7 @@ class _Curve:
 
 
 def _sample(section: Floats, n_max: int) -> Floats:
-    """Choose at most `n_max` points: the last sections of evenly chosen cells."""
+    """Choose at most `n_max` section points: the last ones of cells that are spread evenly over the sample."""
     m = len(section)
     if m > n_max:
         section = section[np.linspace(0, m - 1, n_max).round().astype(int)]
@@ -240,7 +240,7 @@ def _sample(section: Floats, n_max: int) -> Floats:
 
 
 def _dimension_of(section: Floats, theiler: int, floor: float, geometry: Geometry) -> _Curve:
-    """Compute the correlation dimension of the section points of some cells, shape (cell, n, state)."""
+    """Compute the correlation dimension of the section points of some cells together, shape (cell, n, state)."""
     n_radii = N_OCTAVES * PER_OCTAVE + 1
     nothing = _Curve(np.full(n_radii, np.nan), np.full(n_radii, np.nan))
     n_points = section.shape[0] * section.shape[1]
@@ -270,7 +270,7 @@ def _dimension_of(section: Floats, theiler: int, floor: float, geometry: Geometr
 
 
 def _extent(points: Floats, geometry: Geometry) -> float:
-    """Return the largest extent of the points in any state component [scaled]; for an angle at most half its circle."""
+    """Return the largest extent of the points along any state [scaled]."""
     extent = 0.0
     for i, length in enumerate(geometry.circumference):
         x = geometry.scaled(points)[:, i]
@@ -286,16 +286,10 @@ def _extent(points: Floats, geometry: Geometry) -> float:
 
 @dataclass(frozen=True)
 class _Pairs:
-    """Numbers of ordered pairs of points closer than each radius, without pairs close in time.
+    """Numbers of ordered pairs of points that are closer than each radius. Pairs close in time are left out.
 
-    Attributes
-    ----------
-    by_part : ndarray of int64, (part, radius)
-        Pairs whose first point is in the part.
-    within : ndarray of int64, (part, radius)
-        Pairs whose points are both in the part.
-    total : int
-        Pairs at any distance.
+    `by_part` (part, radius) counts the pairs whose first point is in a part of the sample, `within` those whose points
+    are both in it; `total` counts the pairs at any distance.
     """
 
     by_part: npt.NDArray[np.int64]
@@ -304,7 +298,7 @@ class _Pairs:
 
     @classmethod
     def of(cls, section: Floats, radii: Floats, theiler: int, geometry: Geometry) -> _Pairs:
-        """Count the pairs closer than each radius among the section points of some cells, shape (cell, n, state)."""
+        """Count the pairs of section points closer than each radius, among some cells, shape (cell, n, state)."""
         m, n, _ = section.shape
         points = section.reshape(m * n, -1)
         everything = geometry.tree(points)
@@ -328,11 +322,10 @@ class _Pairs:
 
     @property
     def all(self) -> npt.NDArray[np.int64]:
-        """Numbers of pairs among all points, shape (radius,)."""
         return np.asarray(self.by_part.sum(axis=0))
 
     def without(self, part: int) -> npt.NDArray[np.int64]:
-        """Return the numbers of point pairs without the points of one part of the sample, shape (radius,)."""
+        """Return the number of pairs closer than each radius if one part of the sample is left out, shape (radius,)."""
         return np.asarray(self.all - 2 * self.by_part[part] + self.within[part])
 
 
@@ -341,8 +334,8 @@ def _logarithm(values: npt.NDArray[Any]) -> Floats:
 
 
 def _slope(x: Floats, y: Floats, rows: npt.NDArray[np.int64]) -> float:
-    """Compute the least-squares slope of y against x over some radii, leaving out radii within which no pair of points
-    lies.
+    """Fit the slope of y over x by least squares at some radii; radii within which there is no pair of points are left
+    out.
     """
     rows = rows[np.isfinite(y[rows])]
     x, y = x[rows] - x[rows].mean(), y[rows] - y[rows[0]]  # a flat curve has the slope 0 exactly

@@ -1,4 +1,4 @@
-"""Interpret stored Lyapunov exponents: class of motion, errors, transients, means over cells.
+"""Interpret the Lyapunov exponents of a run: class of motion, errors, chaotic transients, means over cells.
 
 The functions read the variables of ``[products] lyapunov`` and integrate nothing. `spectrum_of_jacobians`
 computes the exponents of any map from its Jacobians.
@@ -26,7 +26,7 @@ FEWEST_BLOCKS = 12
 
 
 class Motion(IntEnum):
-    """Classes of a cell's motion by its Lyapunov exponents."""
+    """Classes of a cell's motion, decided by its Lyapunov exponents."""
 
     UNKNOWN = 0
     REGULAR = 1
@@ -36,7 +36,7 @@ class Motion(IntEnum):
 
 
 def summarise(ds: xr.Dataset, *, n_sigma: float = 3.0, least: float = 0.005) -> xr.Dataset:
-    """Classify the motion of each cell by its Lyapunov exponents, with errors, drift and consistency checks.
+    """Classify the motion of each cell by its Lyapunov exponents, and check the exponents for drift and consistency.
 
     Parameters
     ----------
@@ -100,7 +100,7 @@ def summarise(ds: xr.Dataset, *, n_sigma: float = 3.0, least: float = 0.005) -> 
 
 
 def period_seconds(ds: xr.Dataset) -> xr.DataArray:
-    """Return the time between two section points [s]: a drive period, or the mean return time of each cell."""
+    """Return the time between successive section points [s]: the drive period, or each cell's mean return time."""
     if "return_time" in ds:
         return ds["return_time"].mean("period_index")
     frequency = ds["frequency"] if "frequency" in ds.coords else xr.DataArray(float(ds.attrs["frequency_hz"]))
@@ -114,7 +114,7 @@ def _running(blocks: xr.DataArray) -> xr.DataArray:
 
 
 def is_closed(ds: xr.Dataset) -> xr.DataArray:
-    """Return for each cell whether its section points repeat with a period."""
+    """Return for each cell whether it is on a periodic orbit."""
     return (ds["status"] == PERIODIC) | (ds["orbit_period"] > 0)
 
 
@@ -153,7 +153,7 @@ def motion_attrs() -> dict[str, Any]:
 
 
 def transients(ds: xr.Dataset, *, n_sigma: float, least: float) -> xr.DataArray:
-    """Mark the cells in which chaos ended while the exponents were averaged: 1 yes, 0 no, -1 unknown.
+    """Mark the cells whose chaos ended while their exponents were averaged: 1 yes, 0 no, -1 unknown.
 
     Returns
     -------
@@ -184,7 +184,7 @@ def transients(ds: xr.Dataset, *, n_sigma: float, least: float) -> xr.DataArray:
 
 
 def on_attractor(ds: xr.Dataset, *, n_sigma: float, least: float) -> xr.DataArray:
-    """Return for each cell whether its largest exponent is valid and describes the final motion, not a chaotic
+    """Return for each cell whether its largest Lyapunov exponent is that of its final motion, not of a chaotic
     transient.
 
     Their flag is good, or only the first exponent is resolved, and they are no transients.
@@ -219,7 +219,7 @@ def _audit(ds: xr.Dataset) -> xr.DataArray:
 
 
 def pooled_mean(value: Floats, stderr: Floats, which: npt.NDArray[np.bool_]) -> tuple[Floats, Floats, Floats]:
-    """Compute the mean over cells, its standard error, and the scatter of cells beyond their errors.
+    """Compute the mean over cells, its standard error, and how much the cells scatter beyond their own errors.
 
     The variance S**2 of m cells includes the squared errors s_i**2 of the cells. Let T**2 be S**2 -
     mean(s_i**2), or 0 if that is negative. The variance of the mean is ``(T**2 + mean(s_i**2))/m`` (Hedges
@@ -258,7 +258,7 @@ def _over(values: Any, counts: Any) -> Floats:
 
 @dataclass(frozen=True)
 class JacobianSpectrum:
-    """The Lyapunov exponents of a map along its trajectories, per iterate.
+    """Lyapunov exponents of a map along its trajectories, per iteration of the map.
 
     Attributes
     ----------
@@ -276,7 +276,7 @@ class JacobianSpectrum:
 
 
 def spectrum_of_jacobians(jacobians: npt.ArrayLike, *, n_blocks: int = 16, n_transient: int = 0) -> JacobianSpectrum:
-    """Compute the Lyapunov spectrum of a map from its Jacobians along trajectories.
+    """Compute the Lyapunov exponents of a map from its Jacobians along trajectories.
 
     A basis is carried along by the Jacobians and made orthonormal at each by QR; an exponent is the mean
     logarithm of the diagonal of R (Benettin, Galgani, Giorgilli and Strelcyn, Meccanica 15, 9 and 21,

@@ -1,4 +1,4 @@
-"""Compute the indicators of chaos per attractor and parameter point.
+"""Compute the indicators of chaos for each attractor at each parameter point.
 
 Schema
 ------
@@ -74,7 +74,7 @@ FEWEST_POINTS = 1000
 
 
 class Nature(IntEnum):
-    """Classes of the motion on attractors by their exponents or, without exponents, by the 0-1 test."""
+    """Classes of the motion on attractors, decided by Lyapunov exponents or else by the 0-1 test."""
 
     UNKNOWN = 0
     REGULAR = 1
@@ -88,14 +88,14 @@ class Nature(IntEnum):
 
     @property
     def words(self) -> str:
-        """Label of this class in tables."""
+        """Name of this class of motion in tables."""
         by_test = self.name.endswith("_BY_TEST")
         name = self.name.removesuffix("_BY_TEST").lower().replace("quasi_", "quasi-")
         return name + (" (by the 0-1 test)" if by_test else "")
 
     @property
     def has_dimension(self) -> bool:
-        """Whether a correlation dimension is computed for attractors of this class."""
+        """Whether the correlation dimension is computed for attractors of this class."""
         return self in (Nature.CHAOTIC, Nature.HYPERCHAOTIC, Nature.CHAOTIC_BY_TEST, Nature.UNDECIDED)
 
 
@@ -104,15 +104,7 @@ _FROM = ("none", "multipliers", "cells", "eigenvalues")
 
 @dataclass
 class _Cells:
-    """Variables of the cells of one parameter point: an array for each, with the cells on its first axis.
-
-    Attributes
-    ----------
-    values : dict of ndarray
-        Arrays by variable, cells on the first axis.
-    is_flow : bool
-        Whether sections are crossings of a flow.
-    """
+    """Variables of the cells of one parameter point, as arrays with the cells on the first axis."""
 
     values: dict[str, npt.NDArray[Any]]
     is_flow: bool
@@ -131,7 +123,8 @@ class _Cells:
 
 
 def chaos_per_attractor(ds: xr.Dataset, cells: xr.Dataset, attractors: xr.Dataset, options: ChaosOptions) -> xr.Dataset:
-    """Add variables per attractor to the cells' chaos indicators; the docstring of this module lists the variables.
+    """Add the indicators of chaos per attractor to those of the cells; the docstring of this module lists the
+    variables.
 
     Parameters
     ----------
@@ -197,7 +190,6 @@ def _flags(words: Sequence[str]) -> dict[str, Any]:
 
 
 def _of_attractor(one: xr.Dataset, cells: _Cells, number: int, n_states: int, options: ChaosOptions) -> dict[str, Any]:
-    """Compute the cell counts, exponents, 0-1 test and class of motion of one attractor."""
     is_own = cells.values["attractor_id"] == number
     found: dict[str, Any] = {"kind_is_bounded": int(one["kind"]) in APERIODIC}
     found |= _counts(cells, is_own, options)
@@ -262,7 +254,9 @@ def _exponents(one: xr.Dataset, cells: _Cells, is_own: npt.NDArray[np.bool_], n_
 
 
 def _nature(one: xr.Dataset, found: dict[str, Any], options: ChaosOptions) -> Nature:
-    """Classify the motion on an attractor or other set by its kind and stability, else by exponents or the 0-1 test."""
+    """Classify the motion on an attractor or other set by its kind and stability or, if these do not decide, by
+    exponents or the 0-1 test.
+    """
     kind, stability = int(one["kind"]), int(one["stability"])
     if kind in (PERIODIC_ORBIT, EQUILIBRIUM):
         return Nature.UNDECIDED if stability == UNSTABLE else Nature.REGULAR
@@ -294,7 +288,9 @@ class _Curves:
         self._n_max = options.n_max
 
     def of(self, point: xr.Dataset, starts: Sequence[str], cells: _Cells, number: int) -> dict[str, float]:
-        """Compute the correlation dimension of one attractor from its cells; an empty dict means too few points."""
+        """Compute the correlation dimension of one attractor from its cells; an empty dict if there are too few section
+        points.
+        """
         lasting = (cells.values["attractor_id"] == number) & (cells.values["is_transient"] != 1)
         n_keep = point.sizes["period_index"]
         if min(int(lasting.sum()) * n_keep, self._n_max) < FEWEST_POINTS:
@@ -309,14 +305,13 @@ class _Curves:
 
 
 def pooled(point: xr.Dataset, starts: Sequence[str], which: npt.NDArray[np.bool_]) -> xr.Dataset:
-    """Return the sections and status of some cells of a parameter point, stacked on the dim ``cell``."""
+    """Select some cells of a parameter point, and stack their section points and status on the dim ``cell``."""
     own = point[["section", "status"]].reset_coords(drop=True)
     rows = own.stack(cell=list(starts), create_index=False) if starts else own.expand_dims("cell")
     return rows.isel(cell=np.flatnonzero(which)).assign_attrs(point.attrs)
 
 
 def _with_kaplan_yorke(result: xr.Dataset) -> xr.Dataset:
-    """Add the Kaplan-Yorke dimension of each attractor, from its own exponents."""
     exponents = {
         "attractor_lyapunov": result["attractor_lyapunov"],
         "attractor_lyapunov_stderr": result["attractor_lyapunov_stderr"],

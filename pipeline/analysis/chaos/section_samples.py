@@ -1,4 +1,4 @@
-"""Read the section points of computed cells from a cube, for the indicators of chaos."""
+"""Read the section points of computed cells from a run's result cube, for the indicators of chaos."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ Floats = npt.NDArray[np.float64]
 
 
 def geometry_of(ds: xr.Dataset, geometry: Geometry | None = None) -> Geometry:
-    """Return the given geometry of the states, or else that of the cube's model."""
+    """Return the given geometry of the states or, if it is None, that of the model of the result cube."""
     return Geometry.of(model_of(ds)) if geometry is None else geometry
 
 
 def computed(ds: xr.Dataset, geometry: Geometry) -> xr.DataArray:
-    """Return the cube's section points, with NaN in cells that were not computed to the end.
+    """Return the section points of a result cube, with NaN in the cells that were not computed to the end.
 
     Raises
     ------
@@ -50,6 +50,6 @@ def at_least(name: str, value: int, least: int) -> int:
 
 
 def with_coords(ds: xr.Dataset, dims: Sequence[object], variables: Mapping[str, Any]) -> xr.Dataset:
-    """Build a dataset from variables, with those coordinates of another dataset that lie on the given dims."""
+    """Build a dataset from variables on the given dims, with the coordinates that another dataset has on these dims."""
     coords = {name: c for name, c in ds.coords.items() if set(c.dims) <= set(dims)}
     return xr.Dataset(variables, coords=coords)

@@ -1,4 +1,4 @@
-"""Tabulate chaos and correlation dimensions, with a row per attractor and parameter point."""
+"""Tabulate chaos and correlation dimensions, with one row per attractor and parameter point."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ _TEST = ("median_zero_one", "least_zero_one", "largest_zero_one")
 
 
 def chaos_table(ds: xr.Dataset) -> Table:
-    """Return the table of exponents, multipliers, dimensions and 0-1 test per attractor and parameter point."""
+    """Return the table of exponents, multipliers, dimensions and the 0-1 test, per attractor and parameter point."""
     dims, _ = split_dims(ds["motion"])
     rows = [{**where, **_row(one)} for where, one in sets_of(ds, ds["kind"] > 0, dims)]
     n_points = int(np.prod([ds.sizes[d] for d in dims]))
@@ -68,7 +68,6 @@ def _row(one: xr.Dataset) -> Row:
 
 
 def _spectrum(one: xr.Dataset) -> Row:
-    """Return the table columns of Lyapunov exponents, per second and per drive period, and of multipliers."""
     frequency = float(one.coords["frequency"]) if "frequency" in one.coords else np.nan
     row: Row = {}
     for k in range(one.sizes["rank"]):
@@ -100,7 +99,6 @@ def _words(row: Row) -> Words:
 
 
 def _flags(rows: Sequence[Row]) -> str:
-    """Format the flags of cells, each with the number of cells that have it."""
     counts = [(sum(row[name] for row in rows), text) for name, text in _FLAGS.items()]
     return ", ".join(f"{n} {text}" for n, text in counts if n)
 
@@ -124,7 +122,7 @@ def _multipliers(row: Row) -> str:
 
 
 def _summary(ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str]) -> list[str]:
-    """Return lines on where each class of motion occurs, on the largest exponent, and on flagged cells."""
+    """Return text lines on where each class of motion occurs, on the largest exponent, and on flagged cells."""
     table = []
     for nature in Nature:
         if own := [row for row in rows if row["nature"] == nature.name.lower()]:
@@ -140,9 +138,6 @@ def _summary(ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str]) -> list[s
 
 
 def _extremes(ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str]) -> list[str]:
-    """Return a line with the largest exponent of all attractors, per second and per drive period, and where it
-    occurs.
-    """
     known = [row for row in rows if np.isfinite(row["lyapunov_1"])]
     if not known:
         return []
@@ -176,8 +171,8 @@ _OPEN = tuple(KINDS[code] for code in APERIODIC)
 
 
 def dimension_table(ds: xr.Dataset) -> Table:
-    """Return the table of correlation dimensions per attractor and parameter point, with the reason where there is
-    none.
+    """Return the table of correlation dimensions per attractor and parameter point, with the reason where there is no
+    dimension.
     """
     dims = [str(d) for d in ds["reason"].dims if d != "attractor"]
     names = ("kind", "reason", "n_cells", "n_sampled", "n_left", "n_points", "lifetime_low", *_CURVE)

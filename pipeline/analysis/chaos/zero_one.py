@@ -1,4 +1,4 @@
-"""Apply the 0-1 test for chaos to the sections of each cell."""
+"""Apply the 0-1 test for chaos to the section points of each cell."""
 
 from __future__ import annotations
 
@@ -28,7 +28,8 @@ def zero_one_test(
     seed: int = 0,
     geometry: Geometry | None = None,
 ) -> xr.Dataset:
-    """Apply the 0-1 test for chaos to the sections of each cell: near 0 regular, near 1 chaotic.
+    """Apply the 0-1 test for chaos to the section points of each cell; the result is near 0 for regular, near 1 for
+    chaotic motion.
 
     An observable of the sections, phi(1), ..., phi(N) without its mean, drives a walk in the plane,
     ``z_c(n) = sum over j <= n of phi(j) exp(i c j)``. The walk stays bounded if the motion is regular, and
@@ -131,7 +132,7 @@ def _number(ds: xr.Dataset, state: str) -> int:
 
 
 def _observable(section: Floats, state: int | None, geometry: Geometry) -> Floats:
-    """Return the observable of the 0-1 test without its mean, shape (cell, n); 0 where all section points coincide."""
+    """Reduce the section points of each cell to the one number per point that the 0-1 test uses, shape (cell, n)."""
     columns = range(section.shape[-1]) if state is None else [state]
     lines = []
     for i in columns:
@@ -149,8 +150,8 @@ def _observable(section: Floats, state: int | None, geometry: Geometry) -> Float
 
 
 def _zero_one(phi: Floats, c: Floats) -> Floats:
-    """Compute the measures of the 0-1 test (K, its error, quartiles, K of the later half, extent per step), shape (6,
-    cell).
+    """Compute the measures of the 0-1 test for each cell: K, its error, its quartiles, K of the later half, extent per
+    step.
     """
     n = phi.shape[1]
     k = np.sort(_growth(phi, c), axis=1)
@@ -169,9 +170,7 @@ def _zero_one(phi: Floats, c: Floats) -> Floats:
 
 
 def _growth(phi: Floats, c: Floats) -> Floats:
-    """Compute the correlation K_c of the 0-1 test for each observable and frequency c, shape (cell, c); 0 for a zero
-    observable.
-    """
+    """Compute the correlation K_c of the 0-1 test for each observable and each test frequency c, shape (cell, c)."""
     n = phi.shape[1]
     n_cut = n // 10
     walk = np.cumsum(phi[:, None, :] * np.exp(1j * c[:, None] * np.arange(1, n + 1)), axis=-1)

@@ -1,4 +1,4 @@
-"""Grow one-dimensional manifolds of a saddle orbit of the section map, point by point to a given resolution.
+"""Grow the one-dimensional manifolds of a saddle orbit of the section map, point by point.
 
 The unstable manifold begins as a short straight segment along the unstable eigenvector, from x0 + d q to its image.
 Each further generation is the image of the one before, and all its points are integrated side by side. Where
@@ -46,7 +46,7 @@ MOST_GENERATIONS = 60
 
 @dataclass(frozen=True, eq=False)
 class Saddle:
-    """A saddle orbit of the section map: system, parameters, a section point and the monodromy matrix.
+    """A saddle orbit of the section map, with its system, its parameters, one section point and the monodromy matrix.
 
     Attributes
     ----------
@@ -77,7 +77,8 @@ class Saddle:
         return np.asarray(self.system.scales)
 
     def direction(self, stable: bool) -> tuple[float, np.ndarray]:
-        """Return multiplier and unit eigenvector (scaled states) of the one stable or unstable direction of the orbit.
+        """Return the multiplier and the unit eigenvector of the orbit's one stable or unstable direction, in scaled
+        states.
 
         Raises
         ------
@@ -96,7 +97,7 @@ class Saddle:
         return float(values[chosen[0]].real), vector / np.linalg.norm(vector)
 
     def images(self, states: np.ndarray, n_periods: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the images of section points after some periods, and the derivatives of the section map there."""
+        """Map section points over some periods; return their images and the derivatives of the map."""
         n = len(states)
         ends = section_map(
             np.tile(self.packed, (n, 1)),
@@ -109,13 +110,13 @@ class Saddle:
         return ends.images[:, -1], ends.derivatives
 
     def scaled(self, difference: np.ndarray) -> np.ndarray:
-        """Return a difference of states in units of the states' scales, with angles between -pi and pi."""
+        """Divide a difference of states by the states' scales, with angles wrapped to between -pi and pi."""
         return np.asarray(wrap_angles(difference, self.system) / self.scales)
 
 
 @dataclass(frozen=True)
 class Resolution:
-    """Resolution of a manifold: longest chord between points [scaled], total length [scaled], largest number of
+    """Resolution of a manifold: longest distance between points [scaled], total length [scaled], largest number of
     points.
     """
 
@@ -126,7 +127,7 @@ class Resolution:
 
 @dataclass(eq=False)
 class Manifold:
-    """One side of a manifold of a saddle orbit: its points from the orbit outwards, and why it ends.
+    """One side of a manifold of a saddle orbit: its points from the orbit outwards, and the reason why it ends.
 
     Attributes
     ----------
@@ -194,9 +195,7 @@ def _grow(saddle: Saddle, side: float, stable: bool, resolution: Resolution) -> 
 
 @dataclass(eq=False)
 class _Curve:
-    """A manifold under construction: positions on a first segment, and their repeated images (or preimages) under the
-    section map.
-    """
+    """A manifold while it grows: a first segment, and its repeated images (or preimages) under the section map."""
 
     saddle: Saddle
     resolution: Resolution
@@ -206,12 +205,11 @@ class _Curve:
     n_periods: int
 
     def __post_init__(self) -> None:
-        """Place nine equally spaced positions on the manifold's first segment."""
         self.places = np.linspace(0.0, 1.0, 9)
         self.generations = [self.first(self.places)]
 
     def grow(self) -> Manifold:
-        """Add further images (or preimages) of the first segment until the manifold has the requested length."""
+        """Add images (or preimages) of the first segment until the manifold has the requested length."""
         points, times, length, end = [self.generations[0][:1]], [np.zeros(1)], 0.0, "generations"
         for number in range(MOST_GENERATIONS):
             if number:
@@ -235,7 +233,6 @@ class _Curve:
         return self._cut(np.concatenate(points), np.concatenate(times), end)
 
     def _cut(self, points: np.ndarray, times: np.ndarray, end: str) -> Manifold:
-        """Cut the manifold at the length and at the number of points that were requested."""
         away = np.linalg.norm(self.saddle.scaled(np.diff(points, axis=0)), axis=1)
         far = np.flatnonzero(np.cumsum(away) > self.resolution.length)
         n = min(int(far[0]) + 2 if len(far) else len(points), self.resolution.most)
@@ -245,8 +242,8 @@ class _Curve:
         self.generations.append(self.step(self.generations[-1], self.generations[-1]))
 
     def _add_preimages(self) -> None:
-        """Compute the preimages of a stable manifold's latest points one by one, each starting from its neighbour's
-        preimage.
+        """Compute the preimages of a stable manifold's latest points one after another; each starts from the preimage
+        before it.
 
         If the step to the next point is long, or Newton's method fails, a position is inserted between them.
         """
@@ -277,8 +274,8 @@ class _Curve:
         self.generations.append(np.concatenate([np.array(found), rest]))
 
     def _refine(self) -> None:
-        """Insert positions on the manifold's first segment until the points of its latest image (or preimage) are close
-        enough.
+        """Insert positions on the first segment until the points of its latest image (or preimage) are close enough to
+        each other.
         """
         while len(self.places) < self.resolution.most:
             coarse = self._coarse(self.generations[-1]) & (np.diff(self.places) > SHORTEST)
@@ -287,7 +284,7 @@ class _Curve:
             self._insert(np.flatnonzero(coarse))
 
     def _insert(self, at: np.ndarray, share: float = 0.5) -> None:
-        """Insert a new position after each of some positions on the manifold's first segment, and add its images (or
+        """Insert a new position after each given one on the manifold's first segment, and compute its images (or
         preimages).
         """
         middle = self.places[at] + share * (self.places[at + 1] - self.places[at])
@@ -299,8 +296,8 @@ class _Curve:
         self.generations = [np.insert(points, at + 1, inserted, axis=0) for points, inserted in pairs]
 
     def _between(self, points: np.ndarray, at: np.ndarray, middle: np.ndarray) -> np.ndarray:
-        """Interpolate an image of the manifold's first segment at new positions: by cubics through four points, at the
-        ends by lines.
+        """Interpolate an image of the first segment at new positions, by cubics through four points (at the ends by
+        lines).
         """
         last = len(points) - 1
         result = np.empty((len(at), points.shape[1]))
@@ -314,7 +311,7 @@ class _Curve:
         return result
 
     def _coarse(self, points: np.ndarray) -> np.ndarray:
-        """Return for each chord of a curve whether it is too long, or the curve turns too much at one of its ends."""
+        """Return which chords of a curve are too long, or turn too sharply at one of their ends."""
         chords = self.saddle.scaled(np.diff(points, axis=0))
         lengths = np.linalg.norm(chords, axis=1)
         inner = (chords[1:] * chords[:-1]).sum(axis=1) / np.maximum(lengths[1:] * lengths[:-1], 1e-300)
@@ -327,7 +324,7 @@ class _Curve:
 
 
 def _preimages(saddle: Saddle, points: np.ndarray, guesses: np.ndarray, n_periods: int) -> np.ndarray:
-    """Solve P(y) = x for the section map P by Newton's method, for each point x; NaN where the method fails.
+    """Compute the preimage of each point under the section map by Newton's method; NaN where the method fails.
 
     The map expands and contracts by large factors, so that the size of P(y) - x says little. A step is accepted if the
     next step, with the same derivative, is shorter (natural monotonicity; Deuflhard, Newton Methods for

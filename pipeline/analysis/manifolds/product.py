@@ -1,4 +1,4 @@
-"""Compute manifolds and homoclinic tangencies as analyses of a run (`pipeline.products.manifolds`)."""
+"""Define the analyses ``manifolds`` and ``tangency`` (homoclinic tangencies) of a run."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ SIDES = (1.0, -1.0)
 
 
 def manifolds(run: Run, options: ManifoldOptions) -> xr.Dataset:
-    """Grow the manifolds of the saddle orbits that the analysis `orbits` finds."""
+    """Grow the manifolds of the saddle orbits that the analysis ``orbits`` finds."""
     base, found = parameters_of(run.cube()), run.derive("orbits", **options.part(OrbitOptions))
     resolution = Resolution(options.chord, options.length, options.most)
     asked = [
@@ -55,7 +55,6 @@ def manifolds(run: Run, options: ManifoldOptions) -> xr.Dataset:
 
 
 def _saddles(found: xr.Dataset, frequency_hz: float, packed: np.ndarray, base: Parameters) -> list[tuple[int, Saddle]]:
-    """Return the saddle orbits among the orbits found, each with its number."""
     saddles = []
     for number in range(found.sizes["orbit"]):
         one = found.isel(orbit=number)
@@ -69,7 +68,7 @@ def _saddles(found: xr.Dataset, frequency_hz: float, packed: np.ndarray, base: P
 
 
 def _saddle(base: Parameters, frequency_hz: float, packed: np.ndarray, state: np.ndarray, period: int) -> Saddle | None:
-    """Return the saddle orbit near a section point; None if Newton's method finds no orbit of this period."""
+    """Refine a saddle orbit from a section point; None if Newton's method finds no orbit of this period."""
     system = base.model.system
     orbit = polish_orbits(packed[None], np.array([frequency_hz]), state[None], np.array([period]), system=system)
     if not orbit.converged[0] or orbit.orbit_period[0] != period:
@@ -113,7 +112,9 @@ def _dataset(curves: list[tuple[int, Saddle, float, Manifold]], base: Parameters
 
 
 def manifolds_table(ds: xr.Dataset) -> Table:
-    """Return a row per manifold: orbit, kind, side, number of points and reason for its end."""
+    """Return the table of manifolds. Each row has the orbit, the kind, the side, the number of points and the reason
+    for the end.
+    """
     rows: list[Row] = [
         {
             "orbit": int(one["orbit"]),
@@ -135,7 +136,7 @@ def manifolds_table(ds: xr.Dataset) -> Table:
 
 
 def needs_tangency(run: Run, options: TangencyOptions) -> None:
-    """Raise ValueError if the parameter point, the parameter or its interval does not suit a search for tangencies."""
+    """Raise ValueError if tangencies cannot be searched along the chosen parameter from the chosen parameter point."""
     from pipeline.specification.problems import unknown_name
 
     needs_point(run, options)
@@ -150,8 +151,8 @@ def needs_tangency(run: Run, options: TangencyOptions) -> None:
 
 
 def tangency(run: Run, options: TangencyOptions) -> xr.Dataset:
-    """Locate where unstable and stable manifolds of each saddle orbit first touch along a parameter, for all pairs of
-    sides.
+    """Locate the parameter value at which each unstable manifold of a saddle orbit first touches a stable one of it,
+    for all pairs.
     """
     cube = run.cube()
     base, found = parameters_of(cube), run.derive("orbits", **options.part(OrbitOptions))
@@ -182,8 +183,8 @@ def tangency(run: Run, options: TangencyOptions) -> xr.Dataset:
 
 
 def _followed(saddle: Saddle, base: Parameters, parameter: str, options: TangencyOptions) -> Callable[[float], Saddle]:
-    """Return a function that computes the saddle orbit at any value of the parameter, starting from the nearest known
-    value.
+    """Return a function that computes the saddle orbit at any parameter value, from the nearest value already
+    computed.
     """
     here = saddle.frequency_hz if parameter == FREQUENCY_DIM else saddle.packed[base.names.index(parameter)]
     known = {float(here): saddle}
@@ -208,7 +209,7 @@ def _followed(saddle: Saddle, base: Parameters, parameter: str, options: Tangenc
 
 
 def tangency_table(ds: xr.Dataset) -> Table:
-    """Return the table of first homoclinic tangencies, and a line for each pair of sides without a tangency."""
+    """Return the table of first homoclinic tangencies, with a text line for each pair of manifolds without one."""
     name = parameter_name(str(ds.attrs["parameter"]))
     every = [
         {

@@ -1,4 +1,4 @@
-"""Locate the first homoclinic tangency of a saddle along a parameter, for section maps with two states.
+"""Locate the first homoclinic tangency of a saddle orbit along a parameter, for section maps with two states.
 
 Over one generation of the unstable manifold, the signed distance of its points from the stable manifold is computed.
 All of them lie on one side as long as the manifolds do not touch. The least distance, with the sign that it has
@@ -27,7 +27,8 @@ def first_tangency(
     resolution: Resolution = FINE,
     tolerance: float = 1e-8,
 ) -> float:
-    """Locate the parameter value at which a side of the unstable manifold first touches one of the stable manifold.
+    """Locate the parameter value at which the unstable and the stable manifold of a saddle orbit first touch, on one
+    side of each.
 
     Parameters
     ----------
@@ -65,7 +66,8 @@ def first_tangency(
 
 
 def gap(saddle: Saddle, sides: tuple[float, float], resolution: Resolution = FINE) -> tuple[float, float]:
-    """Compute the least and largest signed distance of a stretch of the unstable manifold from the stable manifold.
+    """Compute the least and the largest signed distance from the stable manifold along a piece of the unstable
+    manifold.
 
     Both have one sign if the manifolds are apart, and two if they cross.
     """
@@ -77,7 +79,7 @@ def gap(saddle: Saddle, sides: tuple[float, float], resolution: Resolution = FIN
 
 
 def _oriented(saddle: Saddle, side: float, stable: bool) -> float:
-    """Return the sign for a saddle's eigenvector such that side 1 points to larger values of the first state."""
+    """Return the sign of a saddle's eigenvector for which side 1 points to larger values of the first state."""
     _, vector = saddle.direction(stable)
     return side * float(np.sign(vector[0]))
 
@@ -102,7 +104,7 @@ def _extremes(unstable: Manifold, stable: Manifold, saddle: Saddle) -> tuple[flo
 
 
 def _first_maximum(values: np.ndarray) -> int:
-    """Return the index of the first maximum of the distances from the saddle, where the unstable manifold first turns
+    """Return the index of the first maximum of distances along the unstable manifold, where the manifold first turns
     back.
     """
     falling = np.flatnonzero(np.diff(values) < 0.0)
@@ -112,7 +114,7 @@ def _first_maximum(values: np.ndarray) -> int:
 
 
 class _Line:
-    """A cubic spline through points (n, 2), as a function of the length along their chords."""
+    """Cubic spline through points (n, 2), as a function of the length along their chords."""
 
     def __init__(self, points: np.ndarray) -> None:
         steps = np.linalg.norm(np.diff(points, axis=0), axis=1)

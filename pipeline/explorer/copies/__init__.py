@@ -1,1 +1,1 @@
-"""Export a run's interactive page as files that a browser shows without a server: one file, or a folder."""
+"""Export the interactive page of a run as files that a browser shows without a server."""

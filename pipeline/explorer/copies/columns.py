@@ -1,4 +1,4 @@
-"""Fit the diagram data of a one-file export to a size limit: exact, else rounded, else with fewer section points."""
+"""Fit the points of exported diagrams to a size limit: in full, or rounded, or with fewer section points."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pipeline.explorer.copies.packing import packed
 
 @dataclass(frozen=True)
 class Level:
-    """Level of detail for exported diagram data: precision, and which section points are kept.
+    """Level of detail of exported diagrams: precision of the numbers, and which section points are kept.
 
     Attributes
     ----------
@@ -31,7 +31,7 @@ class Level:
 
 @dataclass(frozen=True)
 class Fitted:
-    """Diagram data packed within the size limit, and their level of detail.
+    """Diagram points that fit the size limit, packed, with their level of detail.
 
     Attributes
     ----------
@@ -52,7 +52,7 @@ class Fitted:
     others: int
 
     def sentences(self) -> list[str]:
-        """Return sentences that tell the reader about rounded numbers and omitted points."""
+        """Return sentences that tell the reader of the page about rounded numbers and omitted points."""
         found = []
         if self.level.dtype == "float32":
             found.append("Numbers are rounded to 24 bits, so each is right to 6e-8 of its size.")
@@ -73,7 +73,7 @@ def _ordinal(n: int) -> str:
 
 
 def levels(most: int) -> Iterator[Level]:
-    """Yield levels of detail, from all section points in full precision down to one point per cell."""
+    """Yield levels of detail, from all section points in full precision to one point per cell."""
     yield Level("float64", 0)
     yield Level("float32", 0)
     for each in itertools.chain([1], *([2 * 2**k, 3 * 2**k] for k in range(most.bit_length()))):
@@ -81,7 +81,7 @@ def levels(most: int) -> Iterator[Level]:
 
 
 def fit(columns: Mapping[str, Column], period: np.ndarray, most_bytes: float) -> Fitted | None:
-    """Return the diagram data at the finest level of detail within a size limit; None if no level fits.
+    """Pack the diagram points at the finest level of detail that fits a size limit; None if no level fits.
 
     Parameters
     ----------
@@ -107,7 +107,6 @@ def fit(columns: Mapping[str, Column], period: np.ndarray, most_bytes: float) ->
 def _packed(
     columns: Mapping[str, Column], period: np.ndarray, level: Level, most_bytes: float
 ) -> dict[str, bytes] | None:
-    """Pack the points of all vertical axes at a level of detail; return None once they exceed `most_bytes`."""
     objects, size = {}, 0
     for name, column in columns.items():
         part = thinned(column, period, level.each)
@@ -119,7 +118,7 @@ def _packed(
 
 
 def thinned(column: Column, period: np.ndarray, each: int) -> Column:
-    """Keep the last period of each closed orbit, and every `each`-th section point of other cells; 0 keeps all points.
+    """Keep the last period of each periodic cell, and every `each`-th section point of the others; 0 keeps all points.
 
     The last section of every cell stays. Nothing is left out if `each` is 0.
     """

@@ -1,4 +1,4 @@
-"""Collect the data of an exported page: description of the run, diagrams, overlays, planes of initial states."""
+"""Collect the data of an exported page: description of the run, diagrams, curves, planes of initial states."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ Place = dict[str, int]
 
 @dataclass
 class Copied:
-    """Data and notes of an export, collected so far.
+    """Data of an exported page, and notes to its reader, as collected so far.
 
     Attributes
     ----------
@@ -63,16 +63,16 @@ class Copied:
 
     @property
     def x(self) -> str:
-        """Name of the default horizontal axis."""
+        """Name of the horizontal axis that is shown first."""
         return str(self.view["axes"][0]["name"])
 
     def size(self) -> int:
-        """Return the size of the data [bytes]."""
+        """Return the size of the collected data [bytes]."""
         return sum(map(len, self.objects.values()))
 
 
 def gather(run: ExploredRun, quantities: Sequence[str] = ()) -> Copied:
-    """Collect the data that one-file and folder exports share; diagram data are added later.
+    """Collect the data that every export has: all except the points of the diagrams and the orbits.
 
     Parameters
     ----------
@@ -125,7 +125,9 @@ def gather(run: ExploredRun, quantities: Sequence[str] = ()) -> Copied:
 
 
 def _view(run: ExploredRun, quantities: Sequence[str]) -> tuple[dict[str, Any], int]:
-    """Return the description of a run restricted to the given quantities, and the number of axes left out."""
+    """Return the description of a run with only the given quantities of the model, and the number of vertical axes left
+    out.
+    """
     known = [q.name for q in run.model.quantities]
     if problems := [unknown_name("--quantity", name, known) for name in quantities if name not in known]:
         raise SpecError(problems)
@@ -137,22 +139,22 @@ def _view(run: ExploredRun, quantities: Sequence[str]) -> tuple[dict[str, Any], 
 
 
 def places(run: ExploredRun, but: str = "") -> Iterator[Place]:
-    """Yield every combination of indices on the swept axes, except the axis `but`."""
+    """Yield every combination of indices on the swept axes of a run, except on the axis `but`."""
     swept = [a for a in run.axes if a.swept and a.name != but]
     for indices in itertools.product(*(range(len(a.values)) for a in swept)):
         yield {a.name: i for a, i in zip(swept, indices, strict=True)}
 
 
 def place_key(run: ExploredRun, at: Mapping[str, int], x: str = "") -> str:
-    """Return the text key of indices on the axes, such as ``frequency=3&amplitude=0``; the page's `placeKey` makes the
-    same.
+    """Return the key of a point on the axes, such as ``frequency=3&amplitude=0``; the page's script makes the same
+    keys.
     """
     parts = [f"{a.name}={at.get(a.name, 0)}" for a in run.axes if a.name != x]
     return "&".join([*([f"x={x}"] if x else []), *parts])
 
 
 def _answers(copied: Copied, kind: str, asked: Iterable[tuple[str, Callable[[], Any]]], alike: bool = False) -> None:
-    """Add the answers to all requests of one kind to an export, packed into objects of about equal size.
+    """Compute the answers to all requests of one kind that a page can make, and pack them into an export.
 
     If they are all alike, the first stands for all.
     """
@@ -181,7 +183,7 @@ def _answers(copied: Copied, kind: str, asked: Iterable[tuple[str, Callable[[], 
 
 
 def add_planes(copied: Copied, most_bytes: float) -> None:
-    """Add the labelled planes of initial states to an export, until a total size is reached."""
+    """Add the planes of initial states, coloured by outcome, to an export, up to a total size."""
     run, size, none = copied.run, 0, None
     objects: dict[str, str] = {}
     found = list(itertools.islice(places(run), MOST_PLACES + 1))
@@ -210,7 +212,7 @@ def _product(run: ExploredRun) -> int:
 
 @dataclass(frozen=True)
 class Column:
-    """Diagram points of one vertical axis: values, and the number of points of each cell.
+    """Points of a diagram for one vertical axis, and the number of points of each cell.
 
     Attributes
     ----------
@@ -223,7 +225,7 @@ class Column:
 
 
 def column(run: ExploredRun, x: str, y: str) -> tuple[Column, dict[str, np.ndarray]]:
-    """Read the points of a vertical axis, with status and colour codes, in cell order.
+    """Read the diagram points of one vertical axis, with the status and colour codes of the cells.
 
     Raises
     ------
@@ -252,7 +254,7 @@ def ranges(first: np.ndarray, count: np.ndarray) -> np.ndarray:
 
 
 def place_of(run: ExploredRun, vertical: Vertical) -> tuple[str, list[int | None]]:
-    """Return the cube variable that a vertical axis shows, and the index on each dim that does not number cells.
+    """Return the variable of the result cube that a vertical axis shows, and the index on each of its further dims.
 
     The index is None on the dim of sections.
     """

@@ -37,7 +37,7 @@ RESERVE = 10_000
 
 @dataclass(frozen=True)
 class Exported:
-    """Result of an export: its path, size, number of orbits, and notes.
+    """Result of an export: its path, its size, its number of orbits, and notes for the user.
 
     Attributes
     ----------
@@ -64,7 +64,7 @@ def export_page(
     most_orbits: int = MOST_ORBITS,
     most_bytes: int = MOST_BYTES,
 ) -> Exported:
-    """Write a run's interactive page as one HTML file.
+    """Write the interactive page of a run as one HTML file.
 
     Parameters
     ----------
@@ -111,13 +111,12 @@ def export_page(
 
 
 def _html(copied: Copied) -> bytes:
-    """Return the exported HTML page with the data added so far."""
     generator = f"magpend {copied.view['version']}"
     return inline_html(copied.run.info.title, generator, finished(copied)).encode()
 
 
 def _fitted(copied: Copied, columns: Mapping[str, Column], most_bytes: int) -> Fitted:
-    """Return the diagram data in as much detail as fits into the file beside the rest of the page."""
+    """Pack the diagram points in as much detail as fits into the file, beside the rest of the page."""
     # base64 makes four of three
     room = (most_bytes - len(_html(copied)) - RESERVE) * 3 / 4
     found = fit(columns, periods(copied.run), room) if room > 0 else None
@@ -130,7 +129,7 @@ def _fitted(copied: Copied, columns: Mapping[str, Column], most_bytes: int) -> F
 
 
 def check_place(out: Path, force: bool) -> None:
-    """Raise `RefusedError` if a path exists or is not writable, before anything is computed.
+    """Raise RefusedError if a file exists already or cannot be written, before anything is computed.
 
     Raises
     ------
@@ -149,7 +148,7 @@ def check_place(out: Path, force: bool) -> None:
 
 
 def read_columns(copied: Copied) -> tuple[dict[str, Column], dict[str, np.ndarray]]:
-    """Read all vertical axes, and status and colours by cell."""
+    """Read the diagram points of all vertical axes, and the status and colours of the cells."""
     columns: dict[str, Column] = {}
     layers: dict[str, np.ndarray] = {}
     names = [str(v["name"]) for v in copied.view["verticals"]]
@@ -159,12 +158,12 @@ def read_columns(copied: Copied) -> tuple[dict[str, Column], dict[str, np.ndarra
 
 
 def periods(run: ExploredRun) -> np.ndarray:
-    """Return the period of each cell's closed orbit; 0 where there is none."""
+    """Return the orbit period of each cell; 0 if the cell is not periodic."""
     return np.asarray(run.cube()["orbit_period"].values).ravel()
 
 
 def add_all_orbits(copied: Copied, columns: Mapping[str, Column], layers: Mapping[str, np.ndarray], room: Room) -> int:
-    """Integrate representative orbits and add them to an export; return their number."""
+    """Integrate one orbit per attractor and parameter point, and add it to an export. Return the number of orbits."""
     run = copied.run
     count = columns[next(iter(columns))].count
     known = {**layers, "orbit_period": periods(run)}
@@ -172,13 +171,13 @@ def add_all_orbits(copied: Copied, columns: Mapping[str, Column], layers: Mappin
 
 
 def finished(copied: Copied) -> dict[str, bytes]:
-    """Return all packed objects of an export by name, including the description of the run."""
+    """Return all packed data of an export by name, with the description of the run."""
     about = {**copied.about, "notice": notice(copied)}
     return {"view": packed_json({"view": copied.view, "about": about}), **copied.objects}
 
 
 def notice(copied: Copied) -> str:
-    """Return the notes shown to readers of an exported page."""
+    """Return the notes that an exported page shows to its reader."""
     view = copied.view
     first = (
         f"This is a copy of the run {view['name']} (digest {view['digest'][:12]}), made by "

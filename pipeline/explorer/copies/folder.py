@@ -1,4 +1,4 @@
-"""Export a run's interactive page as a folder for any static web host; the page loads its data on demand."""
+"""Export the interactive page of a run as a folder for any static web host; the page loads its data when needed."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ MOST_BYTES = 500_000_000
 def export_folder(
     source: Run, out: Path, *, force: bool = False, quantities: Sequence[str] = (), most_orbits: int = MOST_ORBITS
 ) -> Exported:
-    """Write a run's interactive page and data as a folder that any static web host can serve.
+    """Write the interactive page of a run, and its data, as a folder that any static web host can serve.
 
     In it are the page, the cube with its metadata in one file and its chunks cut by columns, and
     ``objects.json`` with the sha256 of every object, whose own sha256 stands in the page.
@@ -82,7 +82,7 @@ def export_folder(
 
 
 def check_folder(out: Path, force: bool) -> None:
-    """Raise `RefusedError` if a folder is taken or not writable, before any computation.
+    """Raise RefusedError if a folder exists already or cannot be written, before anything is computed.
 
     Raises
     ------
@@ -136,7 +136,9 @@ def _write(run: ExploredRun, folder: Path, quantities: Sequence[str], most_orbit
 
 
 def _quantity(run: ExploredRun, name: str, column: Column) -> Layer:
-    """Return a quantity at the section points of the diagram, in the shape of the cube; NaN elsewhere."""
+    """Return a quantity of the model at the section points of the diagram, in the shape of the result cube; NaN
+    elsewhere.
+    """
     values = np.full((run.plan.n_cells, run.n_keep), np.nan)
     values[np.arange(run.n_keep) < column.count[:, None]] = column.y
     quantity = run.model.quantity(name)
@@ -145,7 +147,7 @@ def _quantity(run: ExploredRun, name: str, column: Column) -> Layer:
 
 
 def _layers_of(copied: Copied, layers: dict[str, np.ndarray]) -> dict[str, Layer]:
-    """Return the colour codes of the cells as arrays in the shape of the cube, with the meaning of each code."""
+    """Return the colour codes of the cells in the shape of the result cube, with the meaning of each code."""
     shape = copied.run.plan.shape
     titles = {f"colour_{c['name']}": c for c in copied.view["colours"]}
     return {

@@ -1,4 +1,4 @@
-"""Write the HTML of exported pages, with the data inside or in a folder."""
+"""Write the HTML of exported pages, with the data in the page or in files of a folder."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ _DATA = '<script type="application/octet-stream;base64" id="data-{name}">{conten
 
 
 def static_text(name: str) -> str:
-    """Return the text of a file in ``static/``, where the built page lies."""
+    """Return the text of a file in ``static/``, which has the built scripts and styles of the page."""
     return resources.files("pipeline.explorer").joinpath("static", name).read_text("utf-8")
 
 
 def inline_html(title: str, generator: str, objects: Mapping[str, bytes]) -> str:
-    """Return a page that contains its data and makes no requests."""
+    """Return the HTML of a page that contains its data and makes no requests."""
     data = "".join(
         _DATA.format(name=escape(name), content=base64.b64encode(content).decode()) for name, content in objects.items()
     )
@@ -44,7 +44,7 @@ def inline_html(title: str, generator: str, objects: Mapping[str, bytes]) -> str
 
 
 def folder_html(title: str, generator: str, list_sha256: str) -> str:
-    """Return the HTML page of a folder export, with the digest of ``objects.json``, which lists the data's digests."""
+    """Return the HTML of the page of a folder export; it has the digest of ``objects.json``, the list of data files."""
     return _page("folder", title, generator, "explorer-folder.js", "'self'", f' data-objects="{list_sha256}"')
 
 
@@ -72,5 +72,5 @@ def _page(
 
 
 def _digest(text: str) -> str:
-    """Return the SHA-256 of a text in the form that a content security policy (HTTP) needs."""
+    """Return the SHA-256 of a text in the form that a page's content security policy needs."""
     return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"

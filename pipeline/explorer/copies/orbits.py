@@ -1,4 +1,4 @@
-"""Integrate orbits for an export: one for each attractor at each parameter point."""
+"""Integrate the orbits of an export: one for each attractor at each parameter point."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ SAMPLE = 6
 
 @dataclass(frozen=True)
 class Room:
-    """Limits for the exported orbits: number, bytes, and whether to shorten them.
+    """Limits of the exported orbits: their number, their bytes, and whether they are shortened.
 
     Attributes
     ----------
@@ -52,7 +52,7 @@ class Room:
 
 @dataclass(frozen=True)
 class Chosen:
-    """Cells whose orbits are exported, and the orbit shown for each cell.
+    """Cells whose orbits are exported, and the exported orbit that is shown for each cell.
 
     Attributes
     ----------
@@ -72,7 +72,7 @@ class Chosen:
 
 
 def choose(run: ExploredRun, layers: Mapping[str, np.ndarray], count: np.ndarray, most: int) -> Chosen:
-    """Choose the cells whose orbits are exported, and assign one of these orbits to every cell.
+    """Choose the cells whose orbits are exported, and the exported orbit that is shown for each cell.
 
     Parameters
     ----------
@@ -106,7 +106,7 @@ def choose(run: ExploredRun, layers: Mapping[str, np.ndarray], count: np.ndarray
 
 
 def _labels(layers: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Return a number for each cell that distinguishes the attractors (or motions) of one parameter point."""
+    """Return a number for each cell that distinguishes the attractors (or classes of motion) at one parameter point."""
     if "colour_attractor" in layers:
         return np.asarray(layers["colour_attractor"], np.int64)
     motion = layers.get("colour_motion", np.zeros_like(layers["status"])).astype(np.int64)
@@ -114,7 +114,7 @@ def _labels(layers: Mapping[str, np.ndarray]) -> np.ndarray:
 
 
 def _parameter_points(run: ExploredRun) -> tuple[np.ndarray, np.ndarray]:
-    """Return each cell's parameter point, and the points' coordinates, scaled to 0 to 1 on each axis."""
+    """Return the parameter point of each cell, and the coordinates of the points, scaled to 0 to 1 on each axis."""
     swept = [a.name for a in run.axes if a.swept]
     sizes = [run.plan.shape[run.plan.dims.index(d)] for d in swept]
     index = dict(zip(run.plan.dims, np.indices(run.plan.shape).reshape(len(run.plan.dims), -1), strict=True))
@@ -126,7 +126,9 @@ def _parameter_points(run: ExploredRun) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _nearest(groups: np.ndarray, taken: np.ndarray, axis: np.ndarray, same: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the orbit shown for each group of cells: its own or the nearest one, with the same label if possible."""
+    """Return the exported orbit that is shown for each group of cells: its own, or the nearest one, if possible of the
+    same attractor.
+    """
     number = np.full(len(groups), NONE, np.uint32)
     means = np.full(len(groups), NEAREST, np.uint8)
     number[taken], means[taken] = np.arange(len(taken)), same
@@ -140,7 +142,7 @@ def _nearest(groups: np.ndarray, taken: np.ndarray, axis: np.ndarray, same: int)
 
 
 def add_orbits(copied: Copied, choosing: Callable[[int], Chosen], count: np.ndarray, room: Room) -> int:
-    """Integrate orbits and add them to an export; return their number.
+    """Integrate the chosen orbits, and add them to an export. Return their number.
 
     Parameters
     ----------
@@ -186,7 +188,6 @@ def add_orbits(copied: Copied, choosing: Callable[[int], Chosen], count: np.ndar
 
 
 def _bytes_each(copied: Copied, chosen: Chosen, count: np.ndarray, room: Room) -> float:
-    """Estimate the bytes per orbit from a sample; at least 1."""
     some = chosen.cells[:: max(1, len(chosen.cells) // SAMPLE)][:SAMPLE]
     sizes = []
     for cell in some.tolist():
@@ -196,7 +197,7 @@ def _bytes_each(copied: Copied, chosen: Chosen, count: np.ndarray, room: Room) -
 
 
 def _orbit(run: ExploredRun, cell: int, count: np.ndarray, room: Room) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Integrate the orbit from a cell's last section point, and round it as the export's limits demand."""
+    """Integrate the orbit from the last section point of a cell, and round it to the precision of the export."""
     try:
         arrays, attrs = unpack_arrays(orbit(run, cell, int(count[cell]) - 1))
     except (ExplorerError, ArithmeticError) as error:  # of one cell: the page says so where it is asked for
@@ -210,7 +211,7 @@ def _orbit(run: ExploredRun, cell: int, count: np.ndarray, room: Room) -> tuple[
 
 
 def brief(arrays: Mapping[str, np.ndarray], closed: bool) -> dict[str, np.ndarray]:
-    """Shorten an orbit that does not close: keep its first periods, at every second instant."""
+    """Shorten an orbit that does not close to its first periods, at every second instant."""
     sections = arrays["section_times"][: BRIEF_PERIODS + 1]
     if closed or len(sections) <= BRIEF_PERIODS:
         return dict(arrays)
@@ -220,7 +221,7 @@ def brief(arrays: Mapping[str, np.ndarray], closed: bool) -> dict[str, np.ndarra
 
 
 def rounded(values: np.ndarray, short: bool) -> np.ndarray:
-    """Round numbers to 24 bits, or to 16 if `short`, so that gzip compresses them better."""
+    """Round numbers to 24 bits, or to 16 bits if `short`, so that they compress better."""
     single = np.ascontiguousarray(values, np.float32)
     if not short:
         return single

@@ -1,4 +1,4 @@
-"""Pack the data of an exported page: arrays or JSON, compressed by gzip.
+"""Pack the data of an exported page, arrays or JSON, and compress them by gzip.
 
 Bytes of numbers lie apart, all first bytes before all second ones, which gzip makes a third smaller.
 `page/src/export-data.js` is the other end.
@@ -20,7 +20,7 @@ LEVEL = 6
 
 
 def packed(arrays: Mapping[str, np.ndarray], attrs: Mapping[str, Any] | None = None) -> bytes:
-    """Return arrays and attributes as gzip bytes.
+    """Pack arrays and attributes into gzip-compressed bytes.
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ def packed(arrays: Mapping[str, np.ndarray], attrs: Mapping[str, Any] | None = N
 
 
 def packed_json(value: Any) -> bytes:
-    """Return a JSON value as gzip bytes; raise `ValueError` for NaN or infinity."""
+    """Pack a JSON value into gzip-compressed bytes; ValueError if it has NaN or infinity."""
     return _zipped(json.dumps(value, allow_nan=False, separators=(",", ":")).encode())
 
 

@@ -1,1 +1,1 @@
-"""Read from a run the data that the page shows: diagrams, planes, orbits, overlays, tables."""
+"""Read from a run what the explorer's page shows: diagrams, planes of initial states, orbits, tables."""

@@ -1,4 +1,4 @@
-"""Pack arrays into one byte string, which the page's script reads without copying.
+"""Pack arrays into one byte string that the script of the page reads without copying.
 
 A little-endian uint32 says how long the header is; the header is JSON in UTF-8, padded with spaces so that
 what follows begins at a multiple of 8; then come the arrays in C order, each padded to 8 bytes::
@@ -27,7 +27,7 @@ def _padding(length: int) -> int:
 
 
 def pack_arrays(arrays: Mapping[str, np.ndarray], attrs: Mapping[str, Any] | None = None) -> bytes:
-    """Return arrays and attributes as one byte string.
+    """Pack arrays and attributes into one byte string.
 
     Parameters
     ----------
@@ -58,7 +58,7 @@ def pack_arrays(arrays: Mapping[str, np.ndarray], attrs: Mapping[str, Any] | Non
 
 
 def unpack_arrays(data: bytes) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Unpack a byte string of `pack_arrays` into arrays by name and attributes."""
+    """Read the arrays and attributes from a byte string that `pack_arrays` made."""
     begin = 4 + int.from_bytes(data[:4], "little")
     header = json.loads(data[4:begin])
     arrays = {}

@@ -1,4 +1,4 @@
-"""Integrate the orbit behind a clicked point of the diagram, from its section point in the cube."""
+"""Integrate the orbit through a clicked point of the diagram."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ MOST_SEEDS = 200
 
 @dataclass(frozen=True)
 class Cell:
-    """A cell (trajectory) of the cube, with its parameters and initial state.
+    """A cell (trajectory) of a run's result cube, with its parameters and its initial state.
 
     Attributes
     ----------
@@ -65,18 +65,18 @@ class Cell:
 
     @property
     def section(self) -> np.ndarray:
-        """Stored section points, shape (n_keep, n_states); NaN where there are none."""
+        """Stored section points, shape (n_keep, n_states); NaN for missing points."""
         return np.asarray(self.data["section"].transpose("period_index", "state").values, np.float64)
 
     @property
     def period(self) -> int:
-        """Period in drive periods or returns; 0 if the stored section points do not close."""
+        """Period of the orbit [drive periods or returns to the section]; 0 if the cell is not periodic."""
         closed = self.status in (Status.PERIODIC, Status.INFERRED)
         return int(self.data["orbit_period"]) if closed else 0
 
 
 def cell_of(run: ExploredRun, number: int) -> Cell:
-    """Read a cell; raise `ExplorerError` if it does not exist."""
+    """Read a cell of the run by its number; raise ExplorerError if there is no such cell."""
     index = run.cell(number)
     cube = run.cube()
     names = [n for n in ("section", "turns", "status", "orbit_period", "lyapunov") if n in cube]
@@ -88,7 +88,7 @@ def cell_of(run: ExploredRun, number: int) -> Cell:
 
 
 def orbit(run: Run, cell: int, point: int, *, linearised: bool = True) -> bytes:
-    """Return the orbit behind a diagram point as arrays and attributes, packed for the page.
+    """Integrate the orbit through a point of the diagram; return arrays and attributes, packed for the page.
 
     Parameters
     ----------
@@ -139,8 +139,8 @@ def _no_point(cell: Cell, point: int, n_points: int) -> str:
 
 
 def _seconds(run: Run, cell: Cell, state: np.ndarray, n_periods: int) -> np.ndarray:
-    """Return the end time of each period from a section point [s]; integrate to find the returns if there is no
-    drive.
+    """Return the time at which each period after a section point ends [s]; without a drive, a period is a return to the
+    section.
     """
     if run.model.crossing is None:
         return np.asarray(np.arange(1, n_periods + 1) / cell.clock_hz)
@@ -204,14 +204,13 @@ _TOLD = ("attractor", "share", "low", "high", "kind", "stability", "evidence")
 
 
 def _is_stable(stability: str | None, multipliers: np.ndarray | None) -> bool | None:
-    """Return whether an orbit attracts, by the stored analysis, else by its multipliers; None if unknown."""
     if stability is not None:
         return {STABILITIES[ATTRACTS]: True, STABILITIES[UNSTABLE]: False}.get(stability)
     return None if multipliers is None else bool(np.abs(multipliers).max() < 1.0)
 
 
 def shown(one: xr.Dataset) -> dict[str, str | None]:
-    """Return kind and stability of an attractor or other limit set, with the evidence for its stability (or None)."""
+    """Return the kind, the stability and the evidence of an attractor or other set, as texts for the page."""
     evidence = int(one["evidence"])
     return {
         "kind": KINDS[int(one["kind"])].replace("_", " "),
@@ -221,7 +220,7 @@ def shown(one: xr.Dataset) -> dict[str, str | None]:
 
 
 def _attractor(run: ExploredRun, cell: Cell) -> dict[str, Any]:
-    """Return stored data on the attractor that a cell reaches: number, share, stability; None for unknown entries.
+    """Return the stored data of the attractor on which a cell ends, such as its number and stability.
 
     A cell whose sections do not close may be on its way to a closed orbit all the same.
     """
@@ -252,7 +251,7 @@ def _parameter_index(run: ExploredRun, cell: Cell) -> dict[str, int]:
 
 
 def linearise(cell: Cell) -> tuple[np.ndarray | None, float | None]:
-    """Return the Floquet multipliers and the period [s] of a cell's closed orbit.
+    """Return the Floquet multipliers and the period [s] of a periodic cell.
 
     Newton's method begins at the last kept section; None if it does not end on an orbit of the cell's period
     within the distance at which cells of one orbit lie.
@@ -275,7 +274,7 @@ def linearise(cell: Cell) -> tuple[np.ndarray | None, float | None]:
 def _exponents(
     cell: Cell, multipliers: np.ndarray | None, seconds: float | None
 ) -> tuple[list[float] | None, str | None]:
-    """Return Lyapunov exponents [1/s] from the cube, or from the multipliers of a closed orbit; and their source."""
+    """Return Lyapunov exponents [1/s] from the result cube or else from the multipliers, and which of the two."""
     if "lyapunov" in cell.data:
         own = cell.data["lyapunov"].values
         if np.isfinite(own).all():
@@ -293,7 +292,7 @@ def _exponents(
 
 
 def finite(value: Any) -> float | None:
-    """Return a number, or None if it is not finite, for JSON."""
+    """Convert a number to a float for JSON; None if it is not finite."""
     number = float(value)
     return number if math.isfinite(number) else None
 
@@ -303,7 +302,7 @@ def _state(run: ExploredRun, values: np.ndarray) -> dict[str, float]:
 
 
 def seeds(run: ExploredRun, cell: Cell) -> list[dict[str, Any]]:
-    """Return the initial states at the cell's parameter point that end on its attractor, the cell's own first.
+    """Return the initial states at a cell's parameter point that end on the same attractor as the cell.
 
     Without attractors it is the cell's own alone. Each has a value of every state, and a ``label``.
     """
@@ -324,7 +323,7 @@ def seeds(run: ExploredRun, cell: Cell) -> list[dict[str, Any]]:
 
 
 def _starts_of(run: ExploredRun, name: str) -> np.ndarray:
-    """Return the initial values of a state, as an array over the dims of the initial conditions."""
+    """Return the initial values of one state, as an array over the dims of the initial conditions."""
     coordinate = run.cube().coords[name]
     sizes = [run.plan.shape[run.plan.dims.index(d)] for d in run.start_dims]
     shaped = [n if d in coordinate.dims else 1 for d, n in zip(run.start_dims, sizes, strict=True)]

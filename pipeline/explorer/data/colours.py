@@ -1,4 +1,4 @@
-"""Define the colour schemes of a diagram: a code per cell, with labels and colours for codes."""
+"""Define the colour schemes of a diagram: a code for each cell, and a label and a colour for each code."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ _STATUS = {
 
 @dataclass(frozen=True)
 class Category:
-    """One code of a colour scheme, with its meaning and colour."""
+    """One code of a colour scheme, with its label and its colour."""
 
     number: int
     label: str
@@ -52,7 +52,7 @@ class Category:
 
 @dataclass(frozen=True)
 class Scheme:
-    """A scheme that colours cells: its codes, labels and colours.
+    """A colour scheme for cells: a function that computes their codes, and the labels and colours of the codes.
 
     Attributes
     ----------
@@ -72,7 +72,7 @@ class Scheme:
     needs: tuple[str, ...] = ()
 
     def describe(self) -> dict[str, Any]:
-        """Return the scheme as a dictionary for the page."""
+        """Return the colour scheme as a dictionary for the page."""
         return {
             "name": self.name,
             "title": self.title,
@@ -81,7 +81,7 @@ class Scheme:
 
 
 def schemes(run: ExploredRun) -> list[Scheme]:
-    """Return the colour schemes of a run, the default first."""
+    """Return the colour schemes that a run's diagram can have, the default first."""
     return run.remembered("schemes", lambda: list(_schemes(run)))
 
 
@@ -126,7 +126,7 @@ def _schemes(run: ExploredRun) -> Iterator[Scheme]:
 
 
 def _seeds(run: ExploredRun) -> Iterator[Scheme]:
-    """Yield the scheme that colours cells by their initial state, if there are few initial states."""
+    """Yield the colour scheme by initial state, if there are few initial states."""
     cube, dims = run.cube(), run.start_dims
     sizes = [run.plan.shape[run.plan.dims.index(d)] for d in dims]
     walked = BRANCH in dims
@@ -148,7 +148,8 @@ def _seeds(run: ExploredRun) -> Iterator[Scheme]:
 
 
 def _ends(found: xr.Dataset) -> tuple[xr.DataArray, tuple[Category, ...]]:
-    """Return the colour code of each cell (its attractor or a grey category), and the grey categories that occur.
+    """Return a colour code for each cell: its attractor, or a grey category such as an unstable set. Return also the
+    grey categories that occur.
 
     Cells that diverged, failed or are pending have none.
     """
@@ -165,7 +166,6 @@ def _ends(found: xr.Dataset) -> tuple[xr.DataArray, tuple[Category, ...]]:
 
 
 def _told(codes: xr.DataArray) -> xr.DataArray:
-    """Return classifier codes with -1 in place of unclassified cells."""
     return codes.where(codes > 0, -1)
 
 
@@ -174,7 +174,7 @@ def _directions(words: xr.DataArray) -> xr.DataArray:
 
 
 def rgb(colour: str) -> str:
-    """Convert a figure colour to ``#rrggbb``."""
+    """Convert a matplotlib colour to ``#rrggbb``."""
     from matplotlib.colors import to_hex
 
     return str(to_hex(colour))

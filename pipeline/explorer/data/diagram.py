@@ -1,4 +1,4 @@
-"""Read the points of a bifurcation diagram: the stored section points at fixed values of the other axes.
+"""Read the points of a bifurcation diagram: the section points of the cells along one axis.
 
 The cube is read block by block in the chunks of the store, each compared with its sha256; what stays in
 memory is one number per point. A diagram of more than `MOST_POINTS` shows the last sections of each cell, as
@@ -28,7 +28,7 @@ MOST_POINTS = 20_000_000
 
 @dataclass(frozen=True)
 class Points:
-    """The points of a diagram, cell by cell along the horizontal axis.
+    """Points of a diagram, cell by cell along the horizontal axis.
 
     Attributes
     ----------
@@ -103,7 +103,7 @@ def diagram(run: Run, x: str, y: str, at: Mapping[str, int]) -> bytes:
 
 
 def points(run: ExploredRun, x: str, y: str, at: Mapping[str, int]) -> Points:
-    """Read the points of a diagram; arguments as for `diagram`."""
+    """Read the points of a bifurcation diagram; the arguments are those of `diagram`."""
     axis, upwards, place = run.axis(x), vertical(run, y), run.place(at, but=x)
     ds = _numbered(run).isel({name: slice(i, i + 1) for name, i in place.items()})
     sizes = tuple(ds.sizes[d] for d in run.plan.dims)
@@ -121,20 +121,20 @@ def points(run: ExploredRun, x: str, y: str, at: Mapping[str, int]) -> Points:
 
 
 def _numbered(run: ExploredRun) -> xr.Dataset:
-    """Return the cube with the indices along every dim as coordinates named ``_DIM``."""
+    """Return the run's result cube with the indices along each dim as additional coordinates."""
     ds = run.cube()
     return ds.assign_coords({f"_{d}": (d, np.arange(n)) for d, n in zip(run.plan.dims, run.plan.shape, strict=True)})
 
 
 def _cell_numbers(run: ExploredRun, place: Mapping[str, int]) -> np.ndarray:
-    """Return the flat cube indices of the selected cells, in the shape of the selection."""
+    """Return the flat indices, in the run's result cube, of the cells at fixed indices on some axes."""
     dims, shape = run.plan.dims, run.plan.shape
     chosen = [np.array([place[d]]) if d in place else np.arange(n) for d, n in zip(dims, shape, strict=True)]
     return np.asarray(np.ravel_multi_index(np.ix_(*chosen), shape)).astype(np.uint32)
 
 
 class _Table:
-    """The values, status and codes of the selected cells, in the order of the cube's dims."""
+    """Values, status and colour codes of the selected cells, in the order of the cube's dims."""
 
     def __init__(self, run: ExploredRun, upwards: Vertical, sizes: tuple[int, ...], kept: int) -> None:
         self.dims, self.upwards, self.kept = run.plan.dims, upwards, kept
@@ -146,7 +146,6 @@ class _Table:
         self.codes = {s.name: np.full(sizes, NONE, np.uint16) for s in self.schemes}
 
     def read(self, ds: xr.Dataset, selection: Mapping[str, slice]) -> None:
-        """Read values, status and colour codes of a block of cells."""
         block = ds[self.names].isel(selection).load()
         where: Any = tuple(selection[d] for d in self.dims)
         status = block["status"].transpose(*self.dims)
@@ -160,7 +159,7 @@ class _Table:
             self.codes[scheme.name][where] = np.where(found.values < 0, NONE, found.values)
 
     def points(self, x: np.ndarray, cells: np.ndarray) -> Points:
-        """Return the points read so far that can be drawn, ordered along the horizontal axis."""
+        """Return all points that can be drawn, ordered along the horizontal axis."""
         n = self.status.size
 
         def ordered(array: np.ndarray) -> np.ndarray:

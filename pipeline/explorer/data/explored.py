@@ -1,4 +1,4 @@
-"""Open a run for the explorer; its cube and its stored analyses are each read once."""
+"""Open a run for the explorer, such that its result cube and its stored analyses are read only once."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ MOST_LARGE = 2
 
 
 class ExplorerError(ValueError):
-    """Raised for a request for something that does not exist; the message is shown on the page."""
+    """Raised if the page requests something that does not exist; the page shows the message."""
 
 
 @dataclass(frozen=True)
 class Axis:
-    """A possible horizontal axis of a diagram.
+    """Axis of a run that a diagram can have as its horizontal axis.
 
     Attributes
     ----------
@@ -58,7 +58,7 @@ class Axis:
 
 @dataclass(frozen=True)
 class ExploredRun(Run):
-    """An opened run that reads its cube and the stored results of analyses only once.
+    """A run opened for the explorer. It reads its result cube and its stored analyses only once.
 
     Reading never computes: what is not in the cube or in ``derived/`` is not there.
 
@@ -75,14 +75,14 @@ class ExploredRun(Run):
 
     @classmethod
     def of(cls, source: str | Path | Run) -> ExploredRun:
-        """Open a run directory for the explorer, or wrap an opened run."""
+        """Open a run directory for the explorer, or convert a run that is open already."""
         run = Run.open(source)
         if isinstance(run, cls):
             return run
         return cls(**{f.name: getattr(run, f.name) for f in fields(Run)})
 
     def cube(self, chunks: Any = None, *, check: bool | None = None) -> xr.Dataset:
-        """Return the cube as a lazy dataset; each chunk is verified when it is read."""
+        """Return the run's result cube as a lazy dataset; each chunk is verified when it is read."""
         if chunks is not None or check is not None:
             return super().cube(chunks, check=check)
         with self._lock:
@@ -94,7 +94,7 @@ class ExploredRun(Run):
             return found
 
     def kept(self, name: str) -> xr.Dataset | None:
-        """Return the stored result of an analysis from ``derived/``; None if there is none."""
+        """Return the stored result of an analysis; None if it has not been computed."""
         with self._lock:
             key = f"derived {name}"
             if key not in self._opened:
@@ -103,11 +103,13 @@ class ExploredRun(Run):
             return found
 
     def bifurcation_curves(self) -> xr.Dataset | None:
-        """Return the stored curves of `curves`, or of the run itself; None if there are none."""
+        """Return the stored bifurcation curves of this run, or of the other run named for them; None if there are
+        none.
+        """
         return self.kept("curves") if self.curves is None else ExploredRun.of(self.curves).kept("curves")
 
     def refreshed(self) -> ExploredRun:
-        """Return the run with cells and results added since it was opened."""
+        """Return the run as it is now, with the cells and results that were added since it was opened."""
         if not self.complete:
             return replace(ExploredRun.of(Run.open(self.info.files)), curves=self.curves)
         if self._derived_names() == self.remembered("derived names", self._derived_names):
@@ -122,7 +124,7 @@ class ExploredRun(Run):
         return sorted(place.name for place in products_in(self.info.files.below(DERIVED)))
 
     def remembered(self, key: str, make: Callable[[], T]) -> T:
-        """Return the cached value of a key; compute it once on the first request, also if requests are concurrent."""
+        """Return the cached value of a key; compute it at the first request only."""
         with self._lock:
             lock = self._opened.setdefault(f"lock {key}", threading.Lock())
         with lock:
@@ -132,9 +134,7 @@ class ExploredRun(Run):
             return found
 
     def large(self, key: str, make: Callable[[], T]) -> T:
-        """Return the value of a key, computed at first use, one at a time; only the last few large values stay in
-        memory.
-        """
+        """Return the cached value of a key, or compute it. Only the last few of these large values stay in memory."""
         with self._lock:
             last: list[str] = self._opened.setdefault("large", [])
             if key in last:
@@ -148,12 +148,14 @@ class ExploredRun(Run):
 
     @property
     def path(self) -> str | None:
-        """Name of the axis along which a continuation runs; None for a sweep."""
+        """Name of the axis along which the continuation runs; None if the run is a sweep."""
         return None if self.plan.path is None else self.plan.dims[self.plan.path]
 
     @property
     def axes(self) -> tuple[Axis, ...]:
-        """Possible horizontal axes: the swept parameters, or, if none is swept, the frequency or first parameter."""
+        """Axes that a diagram can have as its horizontal axis: the swept parameters or, if there are none, one fixed
+        parameter.
+        """
         swept = tuple(Axis(a.dim, a.parameter, a.values) for a in parameter_axes(self.spec))
         if swept:
             return swept
@@ -163,7 +165,7 @@ class ExploredRun(Run):
         return (Axis(first, first, np.array([self.parameters[first]]), False),)
 
     def axis(self, name: str) -> Axis:
-        """Return an axis by name; raise `ExplorerError` with the nearest names if there is none."""
+        """Return an axis by name; raise ExplorerError with similar names if there is none."""
         for axis in self.axes:
             if axis.name == name:
                 return axis
@@ -171,7 +173,7 @@ class ExploredRun(Run):
 
     @property
     def start_dims(self) -> tuple[str, ...]:
-        """Dims over initial conditions: they distinguish the cells at one parameter point."""
+        """Dims along which the cells of one parameter point differ, such as the initial condition."""
         return tuple(d for d in self.plan.dims if is_start_dim(d))
 
     @property
@@ -180,14 +182,14 @@ class ExploredRun(Run):
         return int(self.plan.sizes["period_index"])
 
     def check_axes(self, at: Mapping[str, int]) -> None:
-        """Raise `ExplorerError` if an axis name does not exist in the run."""
+        """Raise ExplorerError if the run has no axis of one of the given names."""
         known = [a.name for a in self.axes]
         for name in at:
             if name not in known:
                 raise ExplorerError(unknown_name("axis", name, known or ["none"]))
 
     def place(self, at: Mapping[str, int], *, but: str = "") -> dict[str, int]:
-        """Check the index on every swept axis except `but`, and return these indices by axis.
+        """Check an index on every swept axis except `but`, and return these indices by axis name.
 
         Parameters
         ----------
@@ -217,7 +219,7 @@ class ExploredRun(Run):
         return found
 
     def cell(self, number: int) -> dict[str, int]:
-        """Return a cell's index on each of the cube's dims, from its flat number.
+        """Convert the flat number of a cell to its index on each dim of the result cube.
 
         Raises
         ------
@@ -230,5 +232,5 @@ class ExploredRun(Run):
         return {dim: int(i) for dim, i in zip(self.plan.dims, index, strict=True)}
 
     def inputs(self, index: Mapping[str, int]) -> Inputs:
-        """Return the kernel's inputs for a cell: packed parameters, frequency, initial state."""
+        """Return the inputs of a cell's integration: packed parameters, frequency and initial state."""
         return CellMap(self.spec).inputs(tuple(slice(index[d], index[d] + 1) for d in self.plan.dims))

@@ -1,4 +1,4 @@
-"""Read the curves, orbit branches and attractors that are drawn with a diagram.
+"""Read the results that are drawn with a diagram: curves over the axis, branches of orbits, and attractors.
 
 All of it is read from the cube and from ``derived/``; what no analysis has found is not there.
 """
@@ -39,7 +39,7 @@ MOST_SECTION = 2000
 
 
 def curves(run: Run, x: str, at: Mapping[str, int]) -> dict[str, Any]:
-    """Return curves of Lyapunov exponents and basin fractions along the horizontal axis.
+    """Return the curves of Lyapunov exponents and basin fractions along the horizontal axis of a diagram.
 
     Parameters
     ----------
@@ -72,7 +72,9 @@ def curves(run: Run, x: str, at: Mapping[str, int]) -> dict[str, Any]:
 
 
 def _cube_exponents(run: ExploredRun, x: str, place: Mapping[str, int]) -> Iterator[dict[str, Any]]:
-    """Yield curves of the Lyapunov exponents: mean over the initial conditions, with minimum and maximum as a band."""
+    """Yield the curves of the Lyapunov exponents: the mean over initial conditions, and a band from minimum to
+    maximum.
+    """
     cube = run.cube()
     if "lyapunov" not in cube:
         return
@@ -102,9 +104,7 @@ def _size(array: xr.DataArray, dims: list[Any]) -> int:
 
 
 def _attractor_curves(run: ExploredRun, x: str, place: Mapping[str, int]) -> Iterator[dict[str, Any]]:
-    """Yield curves of each attractor's largest exponent and of its basin share; shares have gaps where it does not
-    attract.
-    """
+    """Yield the curves of each attractor's largest Lyapunov exponent and basin fraction."""
     found = run.kept("attractors")
     if found is None:
         return
@@ -151,7 +151,7 @@ def _attractor_curves(run: ExploredRun, x: str, place: Mapping[str, int]) -> Ite
 
 
 def branches(run: Run, x: str, y: str, at: Mapping[str, int]) -> dict[str, Any]:
-    """Return the branches of periodic orbits over a diagram, and their bifurcations.
+    """Return the branches of periodic orbits that are drawn over a diagram, and their bifurcations.
 
     Parameters
     ----------
@@ -204,7 +204,6 @@ def branches(run: Run, x: str, y: str, at: Mapping[str, int]) -> dict[str, Any]:
 
 
 def _is_at(run: ExploredRun, found: xr.Dataset, branch: int, place: Mapping[str, int]) -> bool:
-    """Return whether a branch was followed at the given values of the other axes."""
     for name, index in place.items():
         value = float(run.axis(name).values[index])
         there = float(found[name][branch]) if name in found else _base(run, name)
@@ -214,7 +213,6 @@ def _is_at(run: ExploredRun, found: xr.Dataset, branch: int, place: Mapping[str,
 
 
 def _base(run: ExploredRun, axis: str) -> float:
-    """Return the value of a swept parameter in the specification's base parameters."""
     if axis == FREQUENCY_DIM:
         own = run.spec.frequency_hz
         return math.nan if own is None else float(own)
@@ -222,7 +220,6 @@ def _base(run: ExploredRun, axis: str) -> float:
 
 
 def _segments(x: np.ndarray, y: np.ndarray, stable: bool) -> Iterator[dict[str, Any]]:
-    """Split a polyline at NaN."""
     gaps = np.flatnonzero(~np.isfinite(x))
     for first, stop in zip([0, *(gaps + 1)], [*gaps, len(x)], strict=True):
         if stop - first >= 2:
@@ -230,7 +227,6 @@ def _segments(x: np.ndarray, y: np.ndarray, stable: bool) -> Iterator[dict[str, 
 
 
 def _motion(found: xr.Dataset, branch: int) -> str | None:
-    """Return the model's label for the kind of motion along a branch; None if there is none."""
     classifier = model_of(found).classifier
     if classifier is None or "side" not in found:
         return None
@@ -239,7 +235,6 @@ def _motion(found: xr.Dataset, branch: int) -> str | None:
 
 
 def _event(found: xr.Dataset, k: int, y: str) -> dict[str, Any]:
-    """Return a located bifurcation as a dictionary for the page."""
     branch, kind = int(found["of_branch"][k]), KINDS[int(found["kind"][k])]
     period = int(found["orbit_period"][branch])
     criticality = CRITICALITIES[int(found["criticality"][k])]
@@ -261,7 +256,7 @@ def _event(found: xr.Dataset, k: int, y: str) -> dict[str, Any]:
 
 
 def attractors(run: Run, at: Mapping[str, int]) -> dict[str, Any]:
-    """Return the limit sets at a parameter point, the one with the largest basin share first.
+    """Return the attractors and other sets at a parameter point; the set with the largest basin fraction comes first.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Read bifurcation curves in the plane of two parameters over the map of regimes, and integrate an orbit on a curve."""
+"""Read bifurcation curves in the plane of two parameters, and integrate the orbit at a point of a curve."""
 
 from __future__ import annotations
 
@@ -26,7 +26,8 @@ NOTHING = "no bifurcation curves: compute them with magpend analyse curves, or n
 
 
 def parameter_plane(run: Run) -> dict[str, Any]:
-    """Return the bifurcation curves of a run, over its map of regimes if it sweeps the two parameters.
+    """Return the bifurcation curves of a run, with the number of attractors over the plane if the run sweeps both
+    parameters.
 
     Parameters
     ----------
@@ -81,7 +82,9 @@ def _special(found: xr.Dataset, k: int) -> dict[str, Any]:
 
 
 def _map(run: ExploredRun, names: list[str]) -> dict[str, Any] | None:
-    """Return the number of attractors over both parameters; None unless the run sweeps exactly these two."""
+    """Return the number of attractors at each point of the plane of two parameters; None unless the run sweeps just
+    these two.
+    """
     attractors = run.kept("attractors")
     if attractors is None:
         return None
@@ -102,7 +105,7 @@ def _map(run: ExploredRun, names: list[str]) -> dict[str, Any] | None:
 
 
 def curve_orbit(run: Run, curve: int, point: int) -> bytes:
-    """Return the orbit at a point of a bifurcation curve as arrays and attributes, packed for the page.
+    """Integrate the orbit at a point of a bifurcation curve; return arrays and attributes, packed for the page.
 
     Parameters
     ----------
@@ -140,7 +143,6 @@ def curve_orbit(run: Run, curve: int, point: int) -> bytes:
 
 
 def _parameters_at(run: ExploredRun, one: xr.Dataset) -> tuple[Parameters, float]:
-    """Return parameters and drive frequency [Hz] at a point of a bifurcation curve."""
     values = {str(one.attrs[f"{role}_parameter"]): float(one[role]) for role in ("first", "second")}
     base = {FREQUENCY_DIM: run.spec.frequency_hz} if run.spec.frequency_hz is not None else {}
     clock = frequency_of(run.model, base | values)
@@ -151,7 +153,7 @@ def _parameters_at(run: ExploredRun, one: xr.Dataset) -> tuple[Parameters, float
 def _attrs(
     run: ExploredRun, parameters: Parameters, clock_hz: float, period: int, multipliers: np.ndarray, kind: str
 ) -> dict[str, Any]:
-    """Return the attributes that the page shows beside an orbit on a bifurcation curve."""
+    """Return what the page shows beside the orbit at a point of a bifurcation curve."""
     unknown = dict.fromkeys(
         ("cell", "at", "motion", "attractor", "share", "low", "high", "stability", "evidence", "exponents", "start")
     )

@@ -1,4 +1,4 @@
-"""Write model symbols as plain text, for places that do not render LaTeX."""
+"""Write the symbols of a model as plain text, for places that cannot show LaTeX."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ _SUBSCRIPT = re.compile(r"_(?:\{([^{}]*)\}|(.))")
 
 
 def _letter(name: str) -> str:
-    """Return a Greek letter by its LaTeX name; keep any other word."""
     known = name.lower().removeprefix("var")
     case = "SMALL" if name[0].islower() else "CAPITAL"
     # Unicode spells lambda differently
@@ -27,7 +26,7 @@ def _letter(name: str) -> str:
 
 
 def plain(symbol: str, name: str) -> str:
-    r"""Write a symbol without LaTeX: Greek letters, accents and subscripts of Unicode.
+    r"""Convert a symbol from LaTeX to plain text, with Greek letters, accents and subscripts of Unicode.
 
     Parameters
     ----------
@@ -51,7 +50,9 @@ def plain(symbol: str, name: str) -> str:
 
 
 def _lowered(found: re.Match[str]) -> str:
-    """Return a subscript in Unicode subscript characters, or as ``_TEXT`` if a character has no such form."""
+    """Convert a subscript to Unicode's subscript characters, or to ``_TEXT`` if one of its characters has no such
+    form.
+    """
     text = (found[1] if found[1] is not None else found[2]).replace(" ", "")
     small = text.translate(_SUBSCRIPTS)
     return small if all(a != b for a, b in zip(text, small, strict=True)) else f"_{text}"

@@ -1,4 +1,4 @@
-"""Label the initial states of a plane, at one parameter point, by the attractor that each reaches in the cube."""
+"""Label the initial states in a plane of two states by the attractor that each of them reaches."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _DIVERGED = -2
 
 @dataclass(frozen=True)
 class Plane:
-    """Plane of initial states: two states across and upwards, and the label of each initial state.
+    """Plane of initial states: its two states, and the label of each initial state.
 
     Attributes
     ----------
@@ -89,7 +89,7 @@ def plane(run: Run, at: Mapping[str, int]) -> bytes:
 
 
 def plane_of(run: ExploredRun, at: Mapping[str, int]) -> Plane:
-    """Read the labelled plane of initial states at a parameter point; arguments as for `plane`.
+    """Read the labelled plane of initial states at a parameter point; the arguments are those of `plane`.
 
     For a grid of more than two states the first two are shown, at the middle of the others' ranges.
     """
@@ -102,7 +102,6 @@ def plane_of(run: ExploredRun, at: Mapping[str, int]) -> Plane:
 
 
 def _scheme(run: ExploredRun) -> Scheme:
-    """Return the colour scheme for planes of initial states: attractors if known, else motions, else status."""
     known = {s.name: s for s in schemes(run)}
     return next(known[name] for name in ("attractor", "motion", "status") if name in known)
 
@@ -131,7 +130,7 @@ def _of_grid(run: ExploredRun, place: Mapping[str, int], scheme: Scheme, dims: l
 
 
 def _of_starts(run: ExploredRun, place: Mapping[str, int], scheme: Scheme) -> Plane:
-    """Return the plane for initial states that form no grid, with one label each."""
+    """Return the plane of initial states if these form no grid, with one label for each."""
     from pipeline.explorer.data.view import planes
 
     pairs = planes(run)
@@ -156,7 +155,7 @@ def _of_starts(run: ExploredRun, place: Mapping[str, int], scheme: Scheme) -> Pl
 
 
 def _part(run: ExploredRun, scheme: Scheme, index: Mapping[str, int]) -> xr.Dataset:
-    """Load status and colour code of the cells at a parameter point."""
+    """Read the status and the colour code of the cells at a parameter point."""
     cube = run.cube()
     names = [n for n in cube.data_vars if n in {"status", *scheme.needs}]
     numbered = cube[names].assign_coords(
@@ -172,7 +171,6 @@ def _part(run: ExploredRun, scheme: Scheme, index: Mapping[str, int]) -> xr.Data
 
 
 def _labels(part: xr.Dataset, scheme: Scheme) -> xr.DataArray:
-    """Return the label of each initial state: its colour code, `_DIVERGED`, or `NONE`."""
     codes = part["_code"].values
     told = np.where(codes < 0, NONE, codes)
     if scheme.name != "status":
@@ -181,7 +179,6 @@ def _labels(part: xr.Dataset, scheme: Scheme) -> xr.DataArray:
 
 
 def _categories(scheme: Scheme, labels: np.ndarray) -> list[Category]:
-    """Return the labels that occur, each with its meaning and colour."""
     present = set(np.unique(labels).tolist())
     found = [c for c in scheme.categories if c.number in present]
     if _DIVERGED in present:
@@ -194,7 +191,7 @@ def _state_of(run: ExploredRun, dim: str) -> str:
 
 
 def _fixed(run: ExploredRun, part: xr.Dataset, states: tuple[str, str]) -> dict[str, float]:
-    """Return the values of the states outside the plane in which all initial states agree, by name."""
+    """Return the other states, outside the plane, that have the same value in all initial states, by name."""
     found = {}
     for state in run.model.states:
         values = np.unique(np.asarray(part.coords[grid_dim(state.name)].values, np.float64))

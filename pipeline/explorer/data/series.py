@@ -1,4 +1,4 @@
-"""Compute the time series of an orbit or a start, with the model's quantities and drawing."""
+"""Compute time series for the page: of an orbit or from an initial state, with the model's quantities and drawing."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ SAMPLES = 128
 
 
 def drawn_points(model: Model, parameters: Mapping[str, float], states: np.ndarray) -> np.ndarray | None:
-    """Return positions of the drawing's moving points, shape (n, n_points, 2), or None without a drawing.
+    """Return the positions of the moving points of the model's drawing, shape (n, n_points, 2); None if it has no
+    drawing.
 
     They are in the order in which `Drawing.points` names them.
     """
@@ -26,7 +27,7 @@ def drawn_points(model: Model, parameters: Mapping[str, float], states: np.ndarr
 
 
 def fixed_points(model: Model, parameters: Mapping[str, float]) -> dict[str, list[float]]:
-    """Return the positions of the drawing's fixed points, by name."""
+    """Return the positions of those points of the model's drawing that do not move, by name."""
     if model.drawing is None:
         return {}
     return {name: [float(x) for x in place] for name, place in model.drawing.fixed(parameters).items()}
@@ -42,7 +43,7 @@ def series(
     atol: float,
     with_quantities: bool = True,
 ) -> dict[str, np.ndarray]:
-    """Integrate the states over time from a section point, and compute the quantities and the drawing's points.
+    """Integrate from a section point; return the states over time, the quantities and the drawing's points.
 
     Parameters
     ----------
@@ -92,7 +93,7 @@ def orbit_series(
     rtol: float = 1e-9,
     atol: float = 1e-9,
 ) -> dict[str, np.ndarray]:
-    """Return `series` over the periods of an orbit, both ends included; `seconds` is their total time."""
+    """Integrate over the periods of an orbit, both ends included, and return what `series` returns."""
     n = max(1, min(n_periods * SAMPLES, 65_536))
     times = seconds * np.arange(n + 1) / n
     return series(parameters, clock_hz, state, times, rtol=rtol, atol=atol)

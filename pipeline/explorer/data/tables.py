@@ -1,4 +1,4 @@
-"""Export the numbers of a view (diagram, orbit, plane, ...) as CSV or as NetCDF with provenance."""
+"""Export the numbers that the page shows (diagram, orbit, plane, ...) as CSV or NetCDF."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ Asked = Mapping[str, Any]
 
 
 def table(run: Run, kind: str, asked: Asked, form: str = "csv") -> bytes:
-    """Return the numbers of a view (diagram, orbit, plane, ...) as the bytes of a CSV or NetCDF file.
+    """Return the numbers of what the page shows (diagram, orbit, plane, ...) as the bytes of a CSV or NetCDF file.
 
     Parameters
     ----------
@@ -89,7 +89,6 @@ def _diagram(run: ExploredRun, asked: Asked) -> xr.Dataset:
 
 
 def _words(scheme: Scheme) -> np.ndarray:
-    """Return an array with the label of each code of a colour scheme; empty for unused codes."""
     words = np.full(1 << 16, "", f"U{max((len(c.label) for c in scheme.categories), default=1)}")
     for category in scheme.categories:
         words[category.number] = category.label
@@ -200,12 +199,10 @@ def _unit(run: ExploredRun, axis: str) -> str:
 
 
 def _place(run: ExploredRun, x: str, at: Mapping[str, int]) -> dict[str, float]:
-    """Return the values of the fixed axes, as attributes ``at_NAME``."""
     return {f"at_{n}": float(run.axis(n).values[i]) for n, i in run.place(at, but=x).items()}
 
 
 def _of_rows(rows: list[tuple[Any, ...]], names: tuple[str, ...]) -> xr.Dataset:
-    """Return rows as a dataset; missing values are NaN or an empty text."""
     variables = {}
     for name, column in zip(names, zip(*rows, strict=True) if rows else [()] * len(names), strict=True):
         if any(isinstance(value, str) for value in column):
@@ -238,7 +235,7 @@ def _heading(ds: xr.Dataset, name: str) -> str:
 
 
 def _rows(columns: list[np.ndarray]) -> Iterator[tuple[Any, ...]]:
-    """Yield table rows as plain Python values; NaN becomes an empty text."""
+    """Yield the rows of a table as plain Python values, with an empty text for NaN."""
     n = len(columns[0]) if columns else 0
     for first in range(0, n, _ROWS_AT_ONCE):  # as objects, numbers take ten times their room
         yield from zip(*(_plain(c[first : first + _ROWS_AT_ONCE]) for c in columns), strict=True)
@@ -252,7 +249,7 @@ def _plain(column: np.ndarray) -> list[Any]:
 
 
 def _word(text: str) -> str:
-    """Escape a text that a spreadsheet would read as a formula."""
+    """Put a quote before a text that a spreadsheet program would read as a formula."""
     formula = text[:1] in ("=", "+", "-", "@", "\t")
     return f"'{text}" if formula else text
 

@@ -1,4 +1,4 @@
-"""List the possible vertical axes of a diagram: states, quantities, stored extremes."""
+"""List what a diagram can show on its vertical axis: states, quantities of the model, stored extremes."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _WORDS = {"min": "least", "max": "largest", "mean": "mean"}
 
 @dataclass(frozen=True)
 class Vertical:
-    """A possible vertical axis of a diagram.
+    """A number that a diagram can show on its vertical axis.
 
     Attributes
     ----------
@@ -44,12 +44,12 @@ class Vertical:
     values: Callable[[xr.Dataset], xr.DataArray]
 
     def describe(self) -> dict[str, Any]:
-        """Return the axis in the page's form."""
+        """Return the vertical axis as a dictionary for the page."""
         return {"name": self.name, "label": self.label, "unit": self.unit, "angle": self.angle}
 
 
 def verticals(run: ExploredRun) -> list[Vertical]:
-    """Return the quantities that a run's diagram can show on its vertical axis, the default first."""
+    """Return everything that the diagram of a run can show on its vertical axis, the default first."""
     return run.remembered("verticals", lambda: _verticals(run))
 
 
@@ -75,7 +75,7 @@ def _verticals(run: ExploredRun) -> list[Vertical]:
 
 
 def vertical(run: ExploredRun, name: str) -> Vertical:
-    """Return a vertical axis by name; raise `ExplorerError` with the nearest names if unknown."""
+    """Return a vertical axis by name; raise ExplorerError with similar names if there is none."""
     known = {v.name: v for v in verticals(run)}
     if name not in known:
         raise ExplorerError(unknown_name("vertical axis", name, list(known)))
@@ -87,7 +87,7 @@ def _state(name: str) -> Callable[[xr.Dataset], xr.DataArray]:
 
 
 def _quantity(run: ExploredRun, name: str) -> Callable[[xr.Dataset], xr.DataArray]:
-    """Return a function that evaluates a model quantity at the stored section points of a part of the cube."""
+    """Return a function that computes a quantity of the model at the stored section points of some cells."""
     model = run.model.flow
     column = [q.name for q in model.quantities].index(name)
 
@@ -115,7 +115,6 @@ def _quantity(run: ExploredRun, name: str) -> Callable[[xr.Dataset], xr.DataArra
 
 
 def _point(run: ExploredRun, values: Mapping[str, float]) -> tuple[np.ndarray, float]:
-    """Return the packed parameters of the flow and the frequency [Hz] at given values of the swept axes."""
     changed = {parameter_name(d): v for d, v in values.items() if d != FREQUENCY_DIM}
     own = run.parameters
     packed = np.array([changed.get(n, own[n]) for n in run.model.flow.parameter_names], np.float64)

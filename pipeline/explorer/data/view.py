@@ -1,4 +1,4 @@
-"""Describe a run for the page's start: content, names, drawing and colours."""
+"""Describe a run for the page when it loads: its content, names, drawing and colours."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _LOWEST = {POSITIVE: 0.0, NON_NEGATIVE: 0.0, FRACTION: 0.0}
 
 
 def describe_view(run: Run, live: bool) -> dict[str, Any]:
-    """Describe a run for the page: content, names, drawing and colours.
+    """Return a dictionary with all that the page needs to know about a run when it loads.
 
     Parameters
     ----------
@@ -73,7 +73,6 @@ def describe_view(run: Run, live: bool) -> dict[str, Any]:
 
 
 def _name(run: Run) -> str:
-    """Return the run directory's name without the path to it."""
     files = run.info.files
     return files.local.resolve().name if files.local else files.name.rstrip("/").rpartition("/")[2]
 
@@ -85,7 +84,6 @@ def _version() -> str:
 
 
 def _cells(run: ExploredRun) -> dict[str, int]:
-    """Count the cells: all, not yet computed, and failed or diverged."""
     committed = sum(run.plan.cells_in(task) for task in run.commits)
     counts = np.zeros(1 + max(DIVERGED, *FAILED, PENDING), np.int64)
     if committed:
@@ -148,13 +146,12 @@ def _state(state: Any) -> dict[str, Any]:
 
 
 def _section(model: Model) -> str:
-    """Return the name of the section and where it lies, as a text."""
     where = model.section if model.crossing is None else model.crossing.sentence
     return f"{section_name(model)} at {where}"
 
 
 def _parameter(run: ExploredRun, parameter: Parameter) -> dict[str, Any]:
-    """Return a parameter with its value (None if swept) and the range in which the page lets users change it.
+    """Return a parameter for the page, with its value (None if swept) and the range in which users can change it.
 
     This is the range of its axis; without an axis, 0.5 to 1.5 times its value, within its bounds.
     """
@@ -179,7 +176,6 @@ def _parameter(run: ExploredRun, parameter: Parameter) -> dict[str, Any]:
 
 
 def _drawing(run: ExploredRun) -> dict[str, Any] | None:
-    """Return the model's drawing; fixed points use the run's own parameters."""
     drawing, model = run.model.drawing, run.model
     if drawing is None:
         return None
@@ -221,7 +217,7 @@ def _axis(run: ExploredRun, axis: Axis) -> dict[str, Any]:
 
 
 def planes(run: ExploredRun) -> list[tuple[str, str]]:
-    """Return the pairs of states that are offered as a plane of initial states.
+    """Return the pairs of states that the page offers as planes of initial states.
 
     First that of the run's own grid, then pairs of angles, then what phase portraits show.
     """
@@ -244,13 +240,12 @@ def _has(run: ExploredRun) -> dict[str, bool]:
 
 
 def commands(run: ExploredRun, directory: str) -> dict[str, str]:
-    """Return the command line of each analysis that is missing and that the run's data allow."""
+    """Return the command for each analysis that is not yet stored and that the run allows."""
     wanted = [name for name in ("attractors", "branches", "basins") if run.kept(name) is None]
     return {name: f"magpend analyse {name} {shlex.quote(directory)}" for name in wanted if _can_have(run, name)}
 
 
 def _can_have(run: ExploredRun, name: str) -> bool:
-    """Return whether an analysis with default options can be computed from this run."""
     if run.spec.recorded is not None:
         return False
     analysis = ANALYSES[name]

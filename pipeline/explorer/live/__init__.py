@@ -1,1 +1,3 @@
-"""Compute while the user watches: trajectories, basin slices, orbits that follow a parameter, runs of a region."""
+"""Compute while the user watches: trajectories, slices of basins, orbits along a parameter, runs of a selected
+region.
+"""

@@ -1,4 +1,4 @@
-"""List the known attractors at a parameter point, and tell which one a live trajectory has reached.
+"""List the known attractors at a parameter point, and decide which of them a live trajectory has reached.
 
 Where the run's attractors are kept in ``derived/``, those of the point are taken from there with their ids,
 and a trajectory is matched as `pipeline.analysis.attractors` matches the cube's cells: closed or on its way
@@ -49,7 +49,7 @@ SAME_SECONDS = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Entry:
-    """Catalog entry: an attractor, or a class of cells that reached no known attractor.
+    """Entry of a catalog: an attractor, or a class of trajectories that reached no known attractor.
 
     Attributes
     ----------
@@ -86,7 +86,7 @@ class Entry:
 
 @dataclass(frozen=True, eq=False)
 class Known:
-    """Data of the run at one parameter point: its stored attractors and its cells, None where the run has none.
+    """What a run has stored for one parameter point: attractors and cells, each None if there are none.
 
     Attributes
     ----------
@@ -103,7 +103,7 @@ class Known:
     index: tuple[int, ...] | None = None
 
     def here(self) -> xr.Dataset | None:
-        """Return the stored attractors at the parameter point; None if there are none."""
+        """Return the stored attractors of this parameter point; None if there are none."""
         if self.attractors is None or self.index is None or self.cells is None:
             return None
         dims, _ = split_dims(self.attractors["attractor_id"])
@@ -111,7 +111,7 @@ class Known:
 
 
 class Catalog:
-    """Catalog of the attractors at a parameter point; safe for use by several threads.
+    """Catalog of the attractors at one parameter point, which grows as new ones are found. Threads can share it.
 
     Parameters
     ----------
@@ -142,7 +142,7 @@ class Catalog:
     # ---- what the run knows ------------------------------------------------------------------
 
     def _take(self, here: xr.Dataset, cells: xr.Dataset) -> None:
-        """Add the run's stored attractors at the parameter point to the catalog."""
+        """Add the run's stored attractors of this parameter point to the catalog."""
         present = np.flatnonzero(here["kind"].values != ABSENT)
         points = {int(i): _finite(here["attractor_points"].values[i]) for i in present}
         periods = here["orbit_period"].values
@@ -166,7 +166,7 @@ class Catalog:
                     self._sets.append((entry, cloud))
 
     def _cloud_of(self, here: xr.Dataset, cells: xr.Dataset, number: int) -> Cloud | None:
-        """Return the section points of the cube's cells on an aperiodic set, as a `Cloud`; None if there are no such
+        """Return the section points of the run's cells on a non-periodic set, in a search tree; None if it has no
         cells.
         """
         block = self._point(cells).whole()
@@ -195,7 +195,9 @@ class Catalog:
     # ---- where trajectories are ----------------------------------------------------------------
 
     def on_orbits(self, block: Block) -> np.ndarray:
-        """Return the entry number of the orbit that each cell has reached or is certain to reach; -1 for none."""
+        """Return the catalog number of the periodic orbit that each cell has reached or surely will reach; -1 for
+        none.
+        """
         with self._lock:
             orbits, numbers = list(self._orbits), np.array([*self._orbit_entries, -1])
         if not orbits:
@@ -204,7 +206,9 @@ class Catalog:
         return np.asarray(numbers[label])
 
     def unsure(self, block: Block, numbers: np.ndarray) -> np.ndarray:
-        """Return a mask of the undecided cells that nearly recur, so that integrating them further pays."""
+        """Return the undecided cells that nearly return to earlier section points, so that they are worth integrating
+        further.
+        """
         rows = np.flatnonzero(block.is_bounded & (numbers < 0))
         near = np.zeros(len(numbers), bool)
         longest = self.options.max_orbit_period
@@ -214,7 +218,8 @@ class Catalog:
         return near
 
     def conclude(self, block: Block, *, final: bool = True, strictly: bool = False) -> np.ndarray:
-        """Return the catalog entry of each cell's final motion; an unknown closed orbit gets a new entry.
+        """Return the catalog number of the attractor on which each cell ends. An unknown periodic orbit becomes a new
+        entry.
 
         Parameters
         ----------
@@ -238,7 +243,9 @@ class Catalog:
         return numbers
 
     def _rest(self, block: Block, numbers: np.ndarray) -> Block:
-        """Assign the cells of a flow that end at equilibria or on limit cycles to the catalogued attractors."""
+        """Decide which cells of a flow end at equilibria or on limit cycles, and write their catalog numbers into
+        `numbers`.
+        """
         point = self._point(_dataset_of(block, self.model))
         tell_rest([point], self.tolerance, self._geometry)
         for k, found in enumerate(point.equilibria):
@@ -261,7 +268,7 @@ class Catalog:
         return Block(block.cells, block.section, status, block.orbit_period, block.turns, block.rest)
 
     def _learn(self, block: Block, numbers: np.ndarray) -> None:
-        """Add the closed orbits of unassigned cells to the catalog, and write the new numbers into `numbers`."""
+        """Add the periodic orbits of undecided cells to the catalog, and write their catalog numbers into `numbers`."""
         for row in np.flatnonzero(block.is_closed & (numbers < 0)):
             if numbers[row] >= 0 or self._n_new >= MOST_ENTRIES:
                 continue
@@ -282,7 +289,9 @@ class Catalog:
                 self._add_orbit(orbit, entry)
 
     def _in_sets(self, block: Block, numbers: np.ndarray) -> None:
-        """Assign undecided bounded cells to the run's aperiodic attractors by their section points, in `numbers`."""
+        """Decide which cells are on the run's non-periodic attractors, and write their catalog numbers into
+        `numbers`.
+        """
         rows = np.flatnonzero(block.is_bounded & (numbers < 0))
         if not len(rows) or not self._sets:
             return
@@ -313,7 +322,7 @@ class Catalog:
             return entry
 
     def entry(self, number: int) -> Entry:
-        """Return the entry of a number."""
+        """Return the catalog entry with a given number."""
         return next(entry for entry in self.entries if entry.number == number)
 
     def _entry_near(self, kind: int, state: np.ndarray) -> Entry | None:
@@ -330,8 +339,8 @@ class Catalog:
         return None
 
     def _class_of(self, block: Block, row: int) -> Entry:
-        """Return the entry for cells of the same status, period and motion as a cell without an attractor; make it if
-        needed.
+        """Return the catalog entry for cells without an attractor that share status, period and motion with a given
+        cell.
         """
         status = int(block.status[row])
         alive = bool(block.is_bounded[row] or block.is_closed[row])
@@ -348,11 +357,10 @@ class Catalog:
     # ---- motions -------------------------------------------------------------------------------
 
     def motions(self, block: Block) -> np.ndarray:
-        """Return the motion code of each cell by the model's classifier."""
+        """Return the class of motion (a code) of each cell, by the model's classifier."""
         return features.sides_of(block.section, block.turns, self.place.frequency, self.place.parameters)
 
     def _motion_of(self, orbit: Orbit) -> int:
-        """Return the motion code of an orbit; its turns are counted over its period."""
         if self.model.classifier is None:
             return 0
         is_flow = self.model.crossing is not None
@@ -381,10 +389,9 @@ class Catalog:
 
 
 class _WholePoint(Point):
-    """Parameter point that holds all its cells (initial conditions) in one block."""
+    """A parameter point that holds all its cells in one block."""
 
     def whole(self) -> Block:
-        """Return all cells of the parameter point."""
         return next(self.blocks())
 
 
@@ -393,7 +400,6 @@ def _finite(points: np.ndarray) -> np.ndarray:
 
 
 def _options_of(here: xr.Dataset | None) -> IdentifyOptions:
-    """Return the options with which the run's attractors were found; without attractors the defaults."""
     attrs: Mapping[Any, Any] = {} if here is None else here.attrs
     given = {}
     for name, field in IdentifyOptions.model_fields.items():
@@ -404,13 +410,12 @@ def _options_of(here: xr.Dataset | None) -> IdentifyOptions:
 
 
 def _tolerance_of(here: xr.Dataset | None, closure_tolerance: float) -> float:
-    """Return the distance from an orbit within which a closed cell counts as on it; the same as in `identify`."""
+    """Return the distance within which a cell counts as on a known orbit, as in the run's stored analysis."""
     found = 0.0 if here is None else float(here.attrs.get("identify_tolerance", 0.0))
     return found or max(1e-4, 10.0 * closure_tolerance)
 
 
 def _dataset_of(block: Block, model: Model) -> xr.Dataset:
-    """Return cells as a dataset of one parameter point."""
     dims = "initial_condition"
     variables: dict[str, Any] = {
         "section": ((dims, "period_index", "state"), block.section),

@@ -1,4 +1,4 @@
-"""Map each kind of message to the function that handles it."""
+"""Choose the function that handles each kind of message from the page."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def works(live: LiveRun) -> Mapping[str, Work]:
-    """Return the function that handles each kind of job of a session."""
+    """Return the function that does each kind of live job, by the kind's name."""
     return {
         "start": partial(start, live),
         "slice": partial(slice_of, live),

@@ -1,4 +1,4 @@
-"""Run live jobs: one of each kind at a time; a newer job cancels the older one."""
+"""Run live jobs in threads: one of each kind at a time, and a newer job cancels the older one."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ Emit = Callable[[Answer], None]
 
 
 class Job:
-    """A live request in progress, with the functions that send its answers.
+    """A live job: a request of the page, with the functions that send its answers.
 
     Parameters
     ----------
@@ -44,31 +44,31 @@ class Job:
         self.began = time.perf_counter()
 
     def answers_to(self, emit: Emit) -> None:
-        """Set the function that sends the job's answers."""
+        """Set the function that sends the answers of this job to the page."""
         self._emit = emit
 
     def cancel(self) -> None:
-        """Ask the job to end at its next check."""
+        """Ask this job to end when it next checks."""
         self._cancelled.set()
 
     def check(self) -> None:
-        """Raise `CancelledError` if the job is cancelled."""
+        """Raise CancelledError if this job has been cancelled."""
         if self._cancelled.is_set():
             raise CancelledError
 
     def wait(self, seconds: float) -> None:
-        """Wait for some seconds; raise `CancelledError` as soon as the job is cancelled."""
+        """Wait for some seconds; raise CancelledError at once if the job is cancelled."""
         self._cancelled.wait(seconds)
         self.check()
 
     def tell(self, kind: str, **fields: Any) -> None:
-        """Send a JSON object as an answer."""
+        """Send an answer to the page as a JSON object."""
         if kind != "done" or not fields.get("cancelled"):
             self.check()
         self._emit({"id": self.id, "kind": kind, **fields})
 
     def show(self, kind: str, arrays: Mapping[str, np.ndarray], **attrs: Any) -> None:
-        """Send arrays as an answer."""
+        """Send an answer to the page as packed arrays."""
         self.check()
         self._emit(pack_arrays(arrays, {"id": self.id, "kind": kind, **attrs}))
 
@@ -81,7 +81,7 @@ Work = Callable[[Job], None]
 
 
 class Desk:
-    """Queue of jobs of one kind: one runs at a time, in a thread that exists only while there are jobs.
+    """Queue of live jobs of one kind. One job runs at a time, in a thread that exists only while there are jobs.
 
     Parameters
     ----------
@@ -100,7 +100,7 @@ class Desk:
         self._closed = False
 
     def put(self, job: Job) -> None:
-        """Queue a job; it cancels the running job and replaces the waiting one."""
+        """Add a job. It cancels the job that runs, and replaces the job that waits."""
         job.answers_to(self._emit)
         with self._lock:
             if self._closed:
@@ -115,7 +115,7 @@ class Desk:
             left.tell("done", cancelled=True)
 
     def cancel(self, number: int) -> None:
-        """Cancel the waiting or running job with a given number, if there is one."""
+        """Cancel the job with a given number, if it runs or waits."""
         left = None
         with self._lock:
             if self._waiting is not None and self._waiting.id == number:
@@ -126,7 +126,7 @@ class Desk:
             left.tell("done", cancelled=True)
 
     def close(self) -> None:
-        """Cancel all jobs, and accept no more."""
+        """Cancel all jobs of this queue, and accept no more."""
         with self._lock:
             self._closed, self._waiting = True, None
             if self._current is not None:
@@ -134,11 +134,11 @@ class Desk:
 
     @property
     def is_busy(self) -> bool:
-        """Whether a job is running or waiting."""
+        """Whether a job of this queue runs or waits."""
         return self._thread is not None
 
     def join(self, timeout: float) -> None:
-        """Wait until no job is running, at most `timeout` seconds."""
+        """Wait until no job of this queue runs, at most `timeout` seconds."""
         thread = self._thread
         if thread is not None:
             thread.join(timeout)
@@ -163,7 +163,7 @@ class Desk:
 
 
 def sentence_of_error(error: Exception) -> str:
-    """Return one sentence for the user; log unexpected errors."""
+    """Return a sentence about an error for the user; write unexpected errors to the log."""
     problems = getattr(error, "problems", None)
     if isinstance(error, SpecError | ParameterError) and problems:
         return str(problems[0])

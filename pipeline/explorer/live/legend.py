@@ -1,4 +1,4 @@
-"""Name and colour the attractors that live trajectories reach, as in the run's figures where possible."""
+"""Give names and colours to the attractors that live trajectories reach, if possible those of the run's figures."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from pipeline.plots.palette import COLOURS, GREY_OF, GREYS, OTHERS, cast_of
 
 
 class Legend:
-    """Names and colours of the entries of a catalog.
+    """Names and colours for the entries of a catalog of attractors.
 
     Parameters
     ----------
@@ -42,7 +42,7 @@ class Legend:
         self._free = [colour for colour in COLOURS if colour not in taken] or [OTHERS]
 
     def lines(self) -> list[dict[str, Any]]:
-        """Return the legend: number, label, colour and attractor id of every catalog entry, by number."""
+        """Return the number, label, colour and attractor id of every catalog entry, sorted by number."""
         new = 0
         found: list[dict[str, Any]] = []
         for entry in sorted(list(self._catalog.entries), key=lambda e: e.number):
@@ -61,7 +61,7 @@ class Legend:
         return found
 
     def line(self, entry: Entry) -> dict[str, Any]:
-        """Return the legend line of one catalog entry; see `lines`."""
+        """Return the number, label, colour and attractor id of one catalog entry."""
         return next(line for line in self.lines() if line["id"] == entry.number)
 
     def name(self, entry: Entry) -> str:
@@ -83,7 +83,7 @@ class Legend:
         return f"not among the run's: {text}" if self._known and entry.kind != ABSENT else text
 
     def motion(self, code: int) -> str:
-        """Return the classifier's label of a motion code; empty if there is none."""
+        """Return the name of a class of motion from its code; an empty text if it has none."""
         classifier = self._model.classifier
         if classifier is None or not code or code in classifier.neutral:
             return ""
@@ -110,7 +110,6 @@ def _status_word(status: int) -> str:
 
 
 def _shown(stability: int) -> str:
-    """Return the stability in words for a set that does not attract; empty for an attractor."""
     return "" if stability in (0, ATTRACTS) else STABILITIES[stability].replace("_", " ")
 
 

@@ -1,4 +1,4 @@
-"""Hold the parts of a run that all its live sessions share: compiled code, attractors, threads for the kernel."""
+"""Hold what all live sessions of a run share: compiled code, known attractors, opened data."""
 
 from __future__ import annotations
 
@@ -62,21 +62,21 @@ def live_problem(run: Run) -> str | None:
 
 
 class Session(Protocol):
-    """Methods of a live session (an open explorer page that computes) that the run behind it calls."""
+    """The methods that a run needs of its live sessions. A session is one open page that computes."""
 
     @property
     def is_over(self) -> bool:
-        """Whether the session is closed and no job is running."""
+        """Whether the session is closed and none of its jobs runs."""
 
     def close(self) -> None:
-        """Cancel all jobs."""
+        """Cancel all jobs of the session."""
 
     def join(self, timeout: float) -> None:
-        """Wait until no job is running, at most `timeout` seconds."""
+        """Wait until the session has no running job, at most `timeout` seconds."""
 
 
 class LiveRun:
-    """A run with the state that all its live sessions share.
+    """A run for live computation, with the state that all its sessions share.
 
     Parameters
     ----------
@@ -101,7 +101,7 @@ class LiveRun:
         self._warming = Warming(self)
 
     def close(self) -> None:
-        """End all sessions and their jobs, including runs of a region; wait until they have ended."""
+        """Cancel all jobs of all sessions, and wait until they have ended."""
         with self._lock:
             sessions = list(self._sessions)
         for session in sessions:
@@ -112,27 +112,27 @@ class LiveRun:
         self.pool.shutdown(wait=False, cancel_futures=True)
 
     def enter(self, session: Session) -> None:
-        """Register a session, so that closing the run closes it."""
+        """Add a session, so that it is closed with the run."""
         with self._lock:
             self._sessions.add(session)
 
     def leave(self, session: Session) -> None:
-        """Remove a session, and all others that are closed and have no running job."""
+        """Remove a session, and every other session that is over."""
         with self._lock:
             self._sessions = {s for s in self._sessions if s is not session and not s.is_over}
 
     def warm(self, tell: Callable[[int, int], None] | None = None) -> None:
-        """Compile the code for live jobs in a background thread; `tell` receives the progress."""
+        """Start to compile the code for live jobs in the background; `tell` is called with the progress."""
         self._warming.begin(tell)
 
     def is_warm(self, what: str) -> bool:
-        """Return whether a compilation step is done: ``series``, ``sections``, ``maps`` or ``attractors``."""
+        """Return whether a step of the compilation is done: ``series``, ``sections``, ``maps`` or ``attractors``."""
         return self._warming.has_done(what)
 
     # ---- parameter points --------------------------------------------------------------------
 
     def place(self, values: Mapping[str, float], frequency: float | None) -> Place:
-        """Return a parameter point; missing values are the run's own.
+        """Return the parameter point for given values; values that are not given are those of the run.
 
         Raises
         ------
@@ -185,7 +185,7 @@ class LiveRun:
         return tuple(found)
 
     def state(self, values: Mapping[str, float], place: Place) -> np.ndarray:
-        """Return an initial state by name; missing values are 0.
+        """Return an initial state from values by name; states that are not given are 0.
 
         Raises
         ------
@@ -202,7 +202,7 @@ class LiveRun:
         return state
 
     def check_states(self, states: np.ndarray, place: Place) -> None:
-        """Raise `SpecError` for states at which the model's equations are undefined."""
+        """Raise SpecError if the model's equations are undefined at a state."""
         point = {**place.parameters, FREQUENCY: place.frequency}
         check_states(self.model.flow, states, [point])
 
@@ -210,14 +210,14 @@ class LiveRun:
 
     @property
     def attractors(self) -> xr.Dataset | None:
-        """Attractors of the run stored in ``derived/``; None if they were not computed."""
+        """Attractors that an analysis of the run has stored; None if there are none."""
         with self._lock:
             if self._attractors is None:
                 self._attractors = stored(self.run, "attractors")
             return self._attractors
 
     def catalog(self, place: Place) -> Catalog:
-        """Return the catalog of known attractors at a parameter point; the same object for equal points."""
+        """Return the catalog of known attractors at a parameter point; each point has one catalog."""
         known = self._known(place)
         key = (float(known.attractors is not None), *place.key)
         with self._lock:
@@ -241,18 +241,18 @@ class LiveRun:
 
     @property
     def cube(self) -> xr.Dataset:
-        """Cube of the run, opened once."""
+        """Result cube of the run, opened once."""
         with self._lock:
             if self._cube is None:
                 self._cube = self.run.cube()
             return self._cube
 
     def legend(self, catalog: Catalog) -> Legend:
-        """Return the names and colours of the attractors in a catalog."""
+        """Return the names and colours of the attractors of a catalog."""
         return Legend(catalog, self.attractors)
 
     def first_start(self) -> tuple[Place, np.ndarray]:
-        """Return the first parameter point of the run, and its first initial state."""
+        """Return the parameter point and the initial state of the run's first cell."""
         cells = CellMap(self.spec)
         block = tuple(slice(0, 1) if i != cells.path else slice(0, n) for i, n in enumerate(cells.shape))
         inputs = cells.inputs(block)
@@ -266,7 +266,7 @@ def _same(a: float, b: float) -> bool:
 
 
 class Warming:
-    """Thread that compiles the code for live jobs once, so that the first job need not wait."""
+    """Thread that compiles the code for live jobs in advance, so that the first job need not wait."""
 
     def __init__(self, live: LiveRun) -> None:
         self._live, self._lock = live, threading.Lock()
@@ -276,7 +276,7 @@ class Warming:
         self._steps = (self._series, self._sections, self._maps, self._attractors)
 
     def begin(self, tell: Callable[[int, int], None] | None) -> None:
-        """Start the compilation unless it has begun; call `tell` after every step."""
+        """Start to compile, unless this has begun already; call `tell` after every step."""
         with self._lock:
             if tell is not None and self._done < len(self._steps):
                 self._listeners.append(tell)

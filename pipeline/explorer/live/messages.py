@@ -1,4 +1,4 @@
-"""Validate the live requests that the page sends; reject an invalid one with one sentence.
+"""Check the messages of the page that request live computations; reject an invalid one with a sentence.
 
 A message is a JSON object with an ``id`` of the page's choice and ``do``, the name of a job; see the classes
 here. No field of a message names a file.
@@ -26,7 +26,7 @@ Pair = tuple[float, float]
 
 
 class RequestError(ValueError):
-    """Raised for a message that is invalid or cannot be carried out.
+    """Raised if a message of the page is invalid or cannot be carried out.
 
     Attributes
     ----------
@@ -40,19 +40,19 @@ class RequestError(ValueError):
 
 
 class Message(BaseModel):
-    """The base of all messages: strict types, no unknown keys, no NaN and no infinity."""
+    """Base of all messages of the page: strict types, no unknown keys, no NaN, no infinity."""
 
     model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False, frozen=True)
 
 
 class Job(Message):
-    """Request for a job, with a number `id` chosen by the page."""
+    """Message that requests a job, with a number `id` that the page has chosen."""
 
     id: int = Field(ge=0, le=2**53)
 
 
 class StartRequest(Job):
-    """Request to integrate an initial state and report the attractor that it reaches."""
+    """Message that requests to integrate one initial state and to name the attractor that it reaches."""
 
     do: Literal["start"]
     parameters: Values = {}
@@ -62,7 +62,7 @@ class StartRequest(Job):
 
 
 class SliceRequest(Job):
-    """Request to compute which attractors the initial states of a plane reach."""
+    """Message that requests the attractors that the initial states of a plane reach."""
 
     do: Literal["slice"]
     parameters: Values = {}
@@ -74,20 +74,20 @@ class SliceRequest(Job):
 
 
 class CellPoint(Message):
-    """Reference to a stored section point of a cell of the cube."""
+    """Reference to a section point of a cell of the run."""
 
     cell: int = Field(ge=0, le=2**53)
     point: int = Field(0, ge=0, le=2**53)
 
 
 class KeptOrbit(Message):
-    """Reference to an orbit of an earlier answer, by its number."""
+    """Reference to an orbit that an earlier answer has sent."""
 
     orbit: int = Field(ge=0, le=2**53)
 
 
 class FollowRequest(Job):
-    """A request to follow a periodic orbit to another parameter value."""
+    """Message that requests to follow a periodic orbit to another parameter value."""
 
     do: Literal["follow"]
     origin: CellPoint | KeptOrbit = Field(alias="from")
@@ -96,7 +96,7 @@ class FollowRequest(Job):
 
 
 class Region(Message):
-    """Region selected on the page: intervals of parameters or initial states.
+    """Region that the user has selected on the page: intervals of parameters or of initial states.
 
     Attributes
     ----------
@@ -117,13 +117,13 @@ class Region(Message):
 
 
 class RunRequest(Job, Region):
-    """Request to compute the run of a region of parameters or initial states."""
+    """Message that requests a new run for a selected region."""
 
     do: Literal["run"]
 
 
 class CancelRequest(Job):
-    """A request to cancel a job."""
+    """Message that requests to cancel a job."""
 
     do: Literal["cancel"]
     job: int = Field(ge=0, le=2**53)
@@ -135,7 +135,7 @@ _READER: TypeAdapter[Request] = TypeAdapter(Annotated[Request, Field(discriminat
 
 
 def read_request(text: str | bytes) -> Request:
-    """Parse and validate a message; raise `RequestError` if it is invalid.
+    """Read and check a message of the page; raise RequestError if it is invalid.
 
     Raises
     ------
@@ -151,7 +151,7 @@ def read_request(text: str | bytes) -> Request:
 
 
 def sentence_of(error: ValidationError) -> str:
-    """Return one sentence about the first error of a validation."""
+    """Return one sentence about the first mistake in a message."""
     first = error.errors(include_url=False, include_context=False, include_input=False)[0]
     jobs = {"start", "slice", "follow", "run", "cancel"}
     if str(first["type"]).startswith("union_tag"):
@@ -162,7 +162,7 @@ def sentence_of(error: ValidationError) -> str:
 
 
 def number_in(text: str | bytes) -> int | None:
-    """Return the ``id`` of an invalid message; None if it has no valid one."""
+    """Return the ``id`` of an invalid message; None if it has no valid ``id``."""
     try:
         number = json.loads(text)["id"]
     except (ValueError, KeyError, TypeError, RecursionError):

@@ -1,4 +1,4 @@
-"""Follow periodic orbits, stable or not, while a parameter is dragged.
+"""Follow a periodic orbit, stable or not, while the user drags a parameter.
 
 The orbit is a fixed point of the stroboscopic or return map. From one value of the parameter to the next it
 is predicted along its tangent and corrected by Newton's method at that value
@@ -59,7 +59,7 @@ HALVED = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Held:
-    """A periodic orbit: parameter point, period and one section point.
+    """A periodic orbit that a page can refer to: its parameter point, its period and a section point.
 
     Attributes
     ----------
@@ -77,7 +77,7 @@ class Held:
 
 @dataclass(frozen=True, eq=False)
 class Reached:
-    """Result of following an orbit: the parameter value and orbit reached, and why it went no further.
+    """Result of following an orbit: the parameter value and the orbit that were reached, and why it went no further.
 
     Attributes
     ----------
@@ -98,7 +98,7 @@ class Reached:
 
 
 class Follower:
-    """Handler of the requests of a session to follow orbits; it remembers the orbits found.
+    """Handles a session's requests to follow orbits, and remembers the orbits it has found.
 
     Parameters
     ----------
@@ -112,7 +112,7 @@ class Follower:
         self._next = 0
 
     def follow(self, job: Job) -> None:
-        """Follow the orbit that a job names, and send the orbit that was reached."""
+        """Follow the orbit that a job names to another parameter value, and send the orbit that was reached."""
         request = job.request
         assert isinstance(request, FollowRequest)
         if self._live.model.autonomous and self._live.model.crossing is None:
@@ -197,7 +197,7 @@ def _value(place: Place, name: str) -> float:
 
 
 def cell_orbit(live: LiveRun, cell: int, point: int) -> Held:
-    """Return a cell's closed orbit: its parameter point, its period and one of its section points.
+    """Return the periodic orbit of a cell: its parameter point, its period and one of its section points.
 
     Parameters
     ----------
@@ -237,7 +237,7 @@ def cell_orbit(live: LiveRun, cell: int, point: int) -> Held:
 
 
 def _period_of_attractor(live: LiveRun, at: Mapping[str, int]) -> int:
-    """Return the period of the closed orbit that a cell reaches, by the stored attractors; 0 if there is none."""
+    """Return the period of the stored attractor on which a cell ends; 0 if that is no periodic orbit."""
     attractors = live.attractors
     if attractors is None:
         return 0
@@ -249,7 +249,7 @@ def _period_of_attractor(live: LiveRun, at: Mapping[str, int]) -> int:
 
 
 def _followed(family: Family, state: np.ndarray, begin: float, target: float, job: Job) -> Reached:
-    """Follow a periodic orbit from one parameter value to another, as far as it exists and time allows."""
+    """Follow a periodic orbit from one parameter value towards another, as far as the orbit exists and time allows."""
     problem, scale = OrbitProblem(family), family.scales[0]
     normal = np.zeros(problem.size)
     normal[-1] = 1.0
@@ -278,7 +278,7 @@ def _followed(family: Family, state: np.ndarray, begin: float, target: float, jo
 
 
 def _step(problem: OrbitProblem, here: Point, move: float, normal: np.ndarray) -> Point | None:
-    """Return the orbit after one step `move` of the parameter; None if it cannot be followed that far."""
+    """Follow an orbit over one step `move` of the parameter; None if it cannot be followed that far."""
     slope = here.tangent / here.tangent[-1] if abs(here.tangent[-1]) > 1e-6 else normal
     ahead = move * slope
     if np.abs(ahead[:-1]).max(initial=0.0) > LONGEST_MOVE:
@@ -294,7 +294,6 @@ def _step(problem: OrbitProblem, here: Point, move: float, normal: np.ndarray) -
 
 
 def _has_halved(family: Family, point: Point) -> bool:
-    """Return whether an orbit of even period already closes after half of its period."""
     if family.period % 2:
         return False
     half = family.mismatch(point.u, point.value.images[family.period // 2 - 1])
@@ -302,7 +301,6 @@ def _has_halved(family: Family, point: Point) -> bool:
 
 
 def _why(point: Point, family: Family, target: float) -> str:
-    """Explain why an orbit could not be followed beyond a point."""
     value = float(point.u[-1] * family.scales[0])
     multipliers = np.linalg.eigvals(point.value.monodromy)
     name = family.free[0]
@@ -318,7 +316,7 @@ def _why(point: Point, family: Family, target: float) -> str:
 def described(
     live: LiveRun, place: Place, family: Family, point: Point
 ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Return the followed orbit as arrays and attributes, with multipliers, stability and exponents."""
+    """Return a followed orbit for the page, with its multipliers, stability and exponents."""
     model, is_flow = live.model, live.model.crossing is not None
     seconds = point.value.seconds
     images = point.value.images

@@ -1,4 +1,4 @@
-"""Turn a region drawn on the page into a specification, and compute its run in a directory beside this one."""
+"""Make a specification from a region that the user has selected, and compute its run beside the present one."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ _PACKAGES = Path(__file__).parents[3]
 
 
 def zoomed(run: Run, region: Region) -> tuple[Spec, list[str]]:
-    """Return the specification of a region, and notes on parts that lie outside the run's ranges.
+    """Return the specification for a selected region, and notes on the parts of it that lie outside the run.
 
     Raises
     ------
@@ -57,14 +57,14 @@ def zoomed(run: Run, region: Region) -> tuple[Spec, list[str]]:
 
 
 def zoom_toml(run: Run, region: Region) -> str:
-    """Return the specification of a region as TOML, with comments on its origin."""
+    """Return the specification for a selected region as TOML, with comments on its origin."""
     spec, notes = zoomed(run, region)
     head = [f"# Zoom into a run, digest {run.info.digest}.", *(f"# note: {_one_line(note)}" for note in notes)]
     return "\n".join([*head, to_toml(spec)])
 
 
 def changes_of(run: Run, region: Region) -> Changes:
-    """Return the changes to a run's specification that restrict it to a region."""
+    """Return the changes that restrict the specification of a run to a selected region."""
     swept = {axis.parameter: axis for axis in parameter_axes(run.spec)}
     first, second = _names(run, region, list(swept))
     ranges = {}
@@ -84,9 +84,7 @@ def changes_of(run: Run, region: Region) -> Changes:
 
 
 def _names(run: Run, region: Region, swept: list[str]) -> tuple[str, str | None]:
-    """Return the specification keys of the region's two intervals; the second is None if the region restricts one key
-    only.
-    """
+    """Return the names of the one or two axes or states that a selected region restricts."""
     walk = run.spec.continuation
     if region.axes is None:
         if not swept:
@@ -111,7 +109,7 @@ def _key(name: str) -> str:
 
 
 def _rounded(name: str, low: float, high: float) -> tuple[float, float]:
-    """Round the ends of an interval to as many digits as a mouse drag can resolve."""
+    """Round the ends of an interval to the digits that a mouse can resolve."""
     if not low < high:
         raise RequestError(f"{name}: the interval {low:g} to {high:g} is empty; its end must be greater.")
     if not math.isfinite(high - low):
@@ -129,14 +127,14 @@ def _one_line(text: str) -> str:
 
 
 def region_name(run: Run, spec: Spec) -> str:
-    """Return the directory name for a region; equal specifications have equal names."""
+    """Return the name of the directory for the run of a region; equal specifications have equal names."""
     digest = hashlib.sha256(canonical(spec.as_dict()).encode()).hexdigest()[:8]
     base = re.sub(r"-zoom-[0-9a-f]{8}$", "", run.directory.resolve().name)
     return f"{base}-zoom-{digest}"
 
 
 class RegionRunner:
-    """Handler of requests to run a region; only one region runs at a time, for all users.
+    """Computes the runs of selected regions, one at a time for all users.
 
     Parameters
     ----------
@@ -148,7 +146,7 @@ class RegionRunner:
         self._live, self._busy = live, live.region_lock
 
     def run(self, job: Job) -> None:
-        """Run the region that a job describes, and report its progress."""
+        """Compute the run of the region that a job describes, and report its progress."""
         request = job.request
         assert isinstance(request, RunRequest)
         spec = self._checked(request)
@@ -184,7 +182,7 @@ class RegionRunner:
         return spec
 
     def _watch(self, job: Job, spec: Spec, path: Path, out: Path) -> None:
-        """Start the run of a region as a process, report its progress, and wait for its end."""
+        """Compute the run of a region in a process of its own, report its progress, and wait for its end."""
         plan = make_plan(spec)
         words = ["run", str(path), "--out", str(out), *(["--workers", "0"] if plan.n_tasks == 1 else [])]
         job.tell("progress", done=0, total=plan.n_cells, name=out.name)
@@ -206,7 +204,6 @@ class RegionRunner:
 
 
 def _committed(out: Path) -> int:
-    """Return the number of committed cells in a run directory; 0 if it holds no run yet."""
     with contextlib.suppress(StoreError, OSError):
         return state(out).n_committed
     return 0
@@ -214,7 +211,7 @@ def _committed(out: Path) -> int:
 
 @contextlib.contextmanager
 def _group(words: list[str], folder: Path, said: Any) -> Iterator[subprocess.Popen[bytes]]:
-    """Run a magpend command in its own process group, which is ended with the block."""
+    """Start a magpend command in a process group of its own, and end the group with the context."""
     path = os.pathsep.join([str(_PACKAGES), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep)
     process = subprocess.Popen(
         [sys.executable, "-m", "pipeline.cli.main", *words],
@@ -232,7 +229,6 @@ def _group(words: list[str], folder: Path, said: Any) -> Iterator[subprocess.Pop
 
 
 def _end_group(process: subprocess.Popen[bytes]) -> None:
-    """End a process group by SIGTERM, and by SIGKILL if it does not exit in time."""
     if process.poll() == 0:
         return
     if process.poll() is None:

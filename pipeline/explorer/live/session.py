@@ -1,4 +1,4 @@
-"""Receive a user's live requests, run them as jobs, and send the answers.
+"""Receive the messages of one page, run its jobs, and send the answers.
 
 A session takes messages (see `messages`) and passes its answers to a callback: dictionaries for JSON, and bytes of
 `arrays.pack_arrays`. One job of each kind runs at a time, and a newer one replaces it. A session does not know how
@@ -20,7 +20,7 @@ LOG = logging.getLogger(__name__)
 
 
 class LiveSession:
-    """Live session of one user: the queues of jobs and the callback for answers.
+    """Live session of one page: its queues of jobs, and the function that sends answers.
 
     Parameters
     ----------
@@ -45,7 +45,7 @@ class LiveSession:
             self._emit(answer)
 
     def receive(self, text: str | bytes) -> None:
-        """Handle a message; errors are answered, never raised."""
+        """Handle a message of the page. Errors are sent as answers, and never raised."""
         try:
             request: Request = read_request(text)
         except RequestError as error:
@@ -72,10 +72,10 @@ class LiveSession:
 
     @property
     def is_over(self) -> bool:
-        """Whether the session is closed and no job is running."""
+        """Whether the session is closed and none of its jobs runs."""
         return self._closed.is_set() and not any(desk.is_busy for desk in self._desks.values())
 
     def join(self, timeout: float = 30.0) -> None:
-        """Wait until no job is running."""
+        """Wait until no job of the session runs."""
         for desk in self._desks.values():
             desk.join(timeout)

@@ -1,4 +1,4 @@
-"""Integrate trajectories at a parameter point a few periods at a time, bit for bit like the run's cells."""
+"""Integrate trajectories at a parameter point a few periods at a time, with the same bits as the cells of a run."""
 
 from __future__ import annotations
 
@@ -33,22 +33,24 @@ LEG = 32
 
 
 class Ends(Protocol):
-    """Interface of the catalog of attractors at a parameter point; see `pipeline.explorer.live.catalog.Catalog`."""
+    """The methods of a catalog of attractors that an integration needs; see
+    `pipeline.explorer.live.catalog.Catalog`.
+    """
 
     model: Model
 
     def on_orbits(self, block: Block) -> np.ndarray:
-        """Return the entry of the orbit that each cell has reached, -1 for none."""
+        """Return the catalog number of the periodic orbit that each cell has reached; -1 for none."""
 
     def unsure(self, block: Block, numbers: np.ndarray) -> np.ndarray:
-        """Return which undecided cells are worth integrating further."""
+        """Return the undecided cells that are worth integrating further."""
 
     def conclude(self, block: Block, *, final: bool = True, strictly: bool = False) -> np.ndarray:
-        """Return the catalog entry of each cell's final motion."""
+        """Return the catalog number of the attractor on which each cell ends."""
 
 
 class CancelledError(Exception):
-    """Raised in a job that has been cancelled."""
+    """Raised inside a job that has been cancelled."""
 
 
 Check = Callable[[], None]
@@ -57,7 +59,7 @@ Check = Callable[[], None]
 
 @dataclass(frozen=True, eq=False)
 class Place:
-    """Parameter point: parameters, frequency, and its index in the cube if it has one.
+    """A parameter point: parameters, frequency and, if it is a point of the run, its index there.
 
     Attributes
     ----------
@@ -74,17 +76,17 @@ class Place:
 
     @property
     def key(self) -> tuple[float, ...]:
-        """Frequency and parameter values, as a dictionary key."""
+        """Frequency and parameter values, as a key for dictionaries."""
         return (self.frequency, *self.parameters.values())
 
 
 def system_at(place: Place, integration: Integration) -> System:
-    """Return the system of a parameter point, with the run's integration method."""
+    """Return the system at a parameter point, with the integration method of the run."""
     return replace(place.parameters.model.system, method=integration.method)
 
 
 class Flight:
-    """Trajectories at one parameter point that are integrated step by step.
+    """Trajectories at one parameter point that are integrated a few periods at a time.
 
     Parameters
     ----------
@@ -120,7 +122,8 @@ class Flight:
         self._seconds = 0.0
 
     def advance(self, rows: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
-        """Integrate the trajectories `rows` for `n` periods, in calls so short that a job can be cancelled in between.
+        """Integrate the trajectories `rows` over `n` periods, in short calls so that the job can be cancelled in
+        between.
 
         Returns
         -------
@@ -156,7 +159,9 @@ class Flight:
         return found.section[:, 0], found.turns[:, 0]
 
     def closed(self, section: np.ndarray, integration: Integration) -> np.ndarray:
-        """Return the orbit period of each trajectory from its last section points; 0 if it is not closed."""
+        """Return the orbit period of each trajectory, from its last section points; 0 if it has not closed on an
+        orbit.
+        """
         return orbit_periods(
             section,
             closure_tolerance=integration.closure_tolerance,
@@ -165,7 +170,7 @@ class Flight:
         )
 
     def block(self, rows: np.ndarray, section: np.ndarray, turns: np.ndarray, period: np.ndarray) -> Block:
-        """Return trajectories as a `Block` for the analyses, with the status that the cells of a run would have."""
+        """Return trajectories as a `Block` for the analyses, with the status that cells of a run would have."""
         status = self.status[rows].copy()
         kept = status == Status.BOUNDED
         status[kept & (period > 0)] = Status.PERIODIC
@@ -180,7 +185,7 @@ Tell = Callable[[np.ndarray, int], None]
 
 
 def run_start(flight: Flight, integration: Integration, tell: Tell, periods: int | None = None) -> Block:
-    """Integrate one initial state like the run's cells, and report its section points as they are computed.
+    """Integrate one initial state like a cell of the run, and report its section points as they are computed.
 
     Parameters
     ----------
@@ -226,7 +231,7 @@ def run_start(flight: Flight, integration: Integration, tell: Tell, periods: int
 
 
 def taken(block: Block, rows: np.ndarray) -> Block:
-    """Return a new block of the cells at the indices `rows`."""
+    """Select the cells at the indices `rows` of a block."""
     rest = None if block.rest is None else block.rest[rows]
     return Block(
         slice(0, len(rows)), block.section[rows], block.status[rows], block.orbit_period[rows], block.turns[rows], rest
@@ -249,7 +254,7 @@ def run_on(
     check: Check,
     tell: Tell | None = None,
 ) -> np.ndarray:
-    """Integrate undecided cells further until they reach an orbit; return their catalog entries, -1 if none is reached.
+    """Integrate undecided cells further until they reach a known orbit; return catalog numbers, -1 if they reach none.
 
     As long, and as exactly, as the analysis of attractors runs its spirals on.
 
@@ -289,7 +294,7 @@ def run_on(
 def _look(
     flight: Flight, rows: np.ndarray, last: np.ndarray, integration: Integration, ends: Ends, *, strictly: bool = False
 ) -> np.ndarray:
-    """Return the catalog entry of each trajectory; -1 until it is known to be on an orbit of the catalog."""
+    """Return the catalog number of the orbit that each trajectory has reached; -1 if it is not decided yet."""
     no_turns = np.zeros((len(rows), sum(ends.model.is_angle)), np.int64)
     period = np.zeros(len(rows), np.int16)
     alive = flight.status[rows] == Status.BOUNDED
@@ -301,7 +306,7 @@ def _look(
 
 
 def settle_cells(place: Place, integration: Integration, ends: Ends, starts: np.ndarray, check: Check) -> np.ndarray:
-    """Return the catalog entry (attractor or class of cells) that each initial state reaches.
+    """Return the catalog number of the attractor (or class of cells) that each initial state reaches.
 
     A cell is given up as soon as it is on an orbit that is known, or certain to end there; the others go on
     for as long as the run's own cells, and then on as the analysis of attractors runs them on.
@@ -356,7 +361,7 @@ def conclude(
     check: Check,
     tell: Tell | None = None,
 ) -> np.ndarray:
-    """Return the catalog entry of each cell; undecided cells that nearly recur are integrated further first."""
+    """Return the catalog number for each cell; undecided cells that may reach an orbit are integrated further first."""
     numbers = ends.conclude(block, final=False)
     unsure = np.flatnonzero(ends.unsure(block, numbers))
     if len(unsure):

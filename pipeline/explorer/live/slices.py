@@ -1,4 +1,4 @@
-"""Compute live which attractors the initial states of a plane reach, on grids from coarse to fine.
+"""Compute live on which attractors the initial states of a plane end, on grids from coarse to fine.
 
 The cells of the finest grid are squares of the plane, and the starts their centres. A coarser grid takes
 every second, fourth, ... of these starts, so that a finer one computes only what lies between. What a start
@@ -33,7 +33,7 @@ NOT_YET = -1
 
 
 def slice_of(live: LiveRun, job: Job) -> None:
-    """Compute the slice (labelled plane of initial states) of a job, and send its grids."""
+    """Compute for a job on which attractors the initial states of a plane end, and send one grid after another."""
     request = job.request
     assert isinstance(request, SliceRequest)
     place = live.place(request.parameters, request.frequency)
@@ -50,16 +50,10 @@ def slice_of(live: LiveRun, job: Job) -> None:
 
 
 class _Grid:
-    """Grid of initial states in a plane, with labels for the attractors that they reach.
+    """Grid of initial states in a plane, with the number of the attractor on which each of them ends.
 
-    Attributes
-    ----------
-    n : int
-        Cells along a side of the finest grid.
-    axes : tuple of ndarray
-        Values of the two states at the centres of its cells.
-    labels : ndarray, (n, n)
-        Number of the attractor that each cell reaches, rows by the second state; `NOT_YET` before it is known.
+    `axes` has the values of the two states at the centres of the finest grid's cells. In `labels`, rows run along the
+    second state, and cells not decided yet are `NOT_YET`.
     """
 
     def __init__(self, columns: tuple[int, int], base: np.ndarray, axes: tuple[np.ndarray, np.ndarray]) -> None:
@@ -69,7 +63,7 @@ class _Grid:
 
     @classmethod
     def of(cls, live: LiveRun, request: SliceRequest, place: Place) -> _Grid:
-        """Make the grid of a request; its resolution is raised to 16, 32, 64, ..."""
+        """Make the grid that a message of the page requests; its resolution is raised to 16, 32, 64, ..."""
         names = live.model.state_names
         known = ", ".join(names)
         for name in request.plane:
@@ -92,29 +86,25 @@ class _Grid:
         return grid
 
     def levels(self) -> Iterator[int]:
-        """Yield the number of cells along a side, from the coarsest grid to the finest."""
         n = LEAST_RESOLUTION
         while n <= self.n:
             yield n
             n *= 2
 
     def missing(self, n: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the initial states of the n x n grid that have no label yet, as row and column indices in the finest
-        grid.
-        """
+        """Return the cells of the n x n grid that have no label yet, as rows and columns of the finest grid."""
         step = self.n // n
         rows, columns = np.nonzero(self.labels[::step, ::step] == NOT_YET)
         return rows * step, columns * step
 
     def starts(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-        """Return the initial states at given rows and columns of the finest grid."""
         states = np.tile(self._base, (len(rows), 1))
         states[:, self._columns[0]] = self.axes[0][columns]
         states[:, self._columns[1]] = self.axes[1][rows]
         return states
 
     def image(self, n: int) -> np.ndarray:
-        """Return the labels of the grid of n x n cells. Missing labels are taken from the next coarser grid."""
+        """Return the labels of the n x n grid; a missing label is that of the next coarser grid."""
         step = self.n // n
         own = self.labels[::step, ::step].astype(np.int16)
         if n == LEAST_RESOLUTION:
@@ -124,15 +114,13 @@ class _Grid:
 
 
 class _Slice:
-    """Computation of a slice (labelled plane of initial states) in several threads, from the coarsest grid to the
-    finest.
-    """
+    """Computation of the labels of a grid of initial states, in several threads and from coarse to fine."""
 
     def __init__(self, live: LiveRun, job: Job, grid: _Grid, catalog: Catalog) -> None:
         self._live, self._job, self._grid, self._catalog = live, job, grid, catalog
 
     def compute(self, n: int) -> None:
-        """Compute a grid's missing labels, and send the unfinished grid at intervals."""
+        """Compute the labels that the n x n grid still lacks, and send the unfinished grid to the page now and then."""
         rows, columns = self._grid.missing(n)
         total, done, shown = len(rows), 0, time.perf_counter()
         size = FIRST_BATCH if n == LEAST_RESOLUTION else BATCH
@@ -170,7 +158,6 @@ class _Slice:
         self._grid.labels[rows[part], columns[part]] = labels
 
     def show(self, n: int, share: float) -> None:
-        """Send the current labels of a grid to the page."""
         step = self._grid.n // n
         own: dict[str, Any] = {
             "label": self._grid.image(n),

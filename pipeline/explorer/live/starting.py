@@ -1,4 +1,4 @@
-"""Integrate an initial state live: send its path, its section points, and the attractor that it reaches."""
+"""Integrate an initial state live, and send its trajectory, its section points and the attractor on which it ends."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ MOST_EVERY_S = 0.03
 
 
 def start(live: LiveRun, job: Job) -> None:
-    """Integrate the initial state of a job; send its path, section points and attractor."""
+    """Integrate the initial state that a job names; send its trajectory, its section points and its attractor."""
     request = job.request
     assert isinstance(request, StartRequest)
     place = live.place(request.parameters, request.frequency)
@@ -52,7 +52,7 @@ def start(live: LiveRun, job: Job) -> None:
 
 
 def _end(live: LiveRun, job: Job, place: Place, block: Block, number: int, periods: int) -> None:
-    """Send the name and colour of the attractor that an initial state has reached."""
+    """Send the name and the colour of the attractor on which an initial state has ended."""
     catalog = live.catalog(place)
     entry, legend = catalog.entry(number), live.legend(catalog)
     line = legend.line(entry)
@@ -72,7 +72,7 @@ def _end(live: LiveRun, job: Job, place: Place, block: Block, number: int, perio
 
 
 class _Path:
-    """Trajectory of an initial state over its first periods. It is sent to the page in parts."""
+    """Trajectory of an initial state over its first periods, which is sent to the page in parts."""
 
     def __init__(self, live: LiveRun, job: Job, place: Place, state: np.ndarray) -> None:
         self._live, self._job, self._place = live, job, place
@@ -80,9 +80,7 @@ class _Path:
         self._period = self._seconds()
 
     def _seconds(self) -> float:
-        """Return the drive period [s]. For a model with a Poincare section, return the mean of the first return times
-        [s].
-        """
+        """Return the drive period [s] or, for a model with a Poincare section, the mean of the first return times."""
         place = self._place
         if self._live.model.crossing is None:
             return 1.0 / place.frequency
@@ -102,7 +100,7 @@ class _Path:
         return float(times.mean()) if len(times) else 1.0 / place.frequency
 
     def show(self, n_periods: int) -> None:
-        """Integrate the next periods and send them; send nothing if the integration fails."""
+        """Integrate the first `n_periods` periods and send them; send nothing if the integration fails."""
         live, place = self._live, self._place
         times = self._period * np.arange(n_periods * SAMPLES + 1) / SAMPLES
         try:
@@ -124,7 +122,7 @@ class _Path:
 
 
 class _Sections:
-    """Buffer that collects section points and sends them to the page at intervals."""
+    """Buffer that collects section points, and sends them to the page at intervals."""
 
     def __init__(self, job: Job) -> None:
         self._job, self._told = job, time.perf_counter()
@@ -132,14 +130,13 @@ class _Sections:
         self.done = 0
 
     def take(self, section: np.ndarray, done: int) -> None:
-        """Add section points, shape (k, n_states). Send the buffer if enough time has passed since it was last sent."""
+        """Add section points (k, n_states) to the buffer, and send the buffer if it is time."""
         self._kept.append(section[np.isfinite(section).all(axis=1)])
         self.done = done
         if time.perf_counter() - self._told >= MOST_EVERY_S:
             self.flush()
 
     def flush(self) -> None:
-        """Send the buffered section points to the page."""
         section = np.concatenate(self._kept) if self._kept else np.zeros((0, 1))
         self._kept, self._told = [], time.perf_counter()
         if len(section):

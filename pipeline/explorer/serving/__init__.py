@@ -1,1 +1,1 @@
-"""Serve the explorer on this machine only: page, data requests, websocket, and access control by a token."""
+"""Serve the explorer's page on this machine only: page, data, websocket, and access by a secret token."""

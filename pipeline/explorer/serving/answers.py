@@ -1,4 +1,4 @@
-"""Define the data requests of the page: their names, arguments and answers."""
+"""Define which data the page can request, with the arguments and the answer of each request."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _AT = "at."
 
 @dataclass(frozen=True)
 class Query:
-    """The arguments and the body of a request.
+    """Arguments and body of a request from the page.
 
     Attributes
     ----------
@@ -46,14 +46,14 @@ class Query:
     body: bytes = b""
 
     def text(self, name: str, default: str | None = None) -> str:
-        """Return an argument; raise `ExplorerError` if it is missing and has no default."""
+        """Return an argument of the request; raise ExplorerError if it is missing and has no default."""
         found = self.words.get(name, default)
         if found is None:
             raise ExplorerError(f"{name} is missing.")
         return found
 
     def count(self, name: str, default: int | None = None) -> int:
-        """Return an argument as a whole number, 0 or more."""
+        """Return an argument of the request as a whole number, 0 or more."""
         text = self.text(name, None if default is None else str(default))
         if not (text.isascii() and text.isdigit() and len(text) < 16):
             raise ExplorerError(f"{name} = {text[:40]!r}: must be a whole number, 0 or more.")
@@ -61,14 +61,14 @@ class Query:
 
     @property
     def at(self) -> dict[str, int]:
-        """Return the index on each swept axis by axis name, from the arguments ``at.NAME``."""
+        """Return the index on each swept axis, from the arguments ``at.NAME`` of the request."""
         names = [name for name in self.words if name.startswith(_AT)]
         return {name.removeprefix(_AT): self.count(name) for name in names}
 
 
 @dataclass(frozen=True)
 class Reply:
-    """Reply to a request: bytes, their media type, and a file name if it is a download."""
+    """Reply to a request: its bytes, their media type and, for a download, a file name."""
 
     content: bytes
     kind: str
@@ -80,7 +80,7 @@ Give = Callable[[ExploredRun, Query, LiveRun | None], Reply]
 
 @dataclass(frozen=True)
 class Answer:
-    """A kind of data request, with the function that answers it.
+    """A kind of data that the page can request, with the function that computes it.
 
     Attributes
     ----------
@@ -102,7 +102,7 @@ class Answer:
 
 
 def json_reply(value: Any) -> Reply:
-    """Return a value as a JSON reply; raise `ValueError` for NaN or infinity."""
+    """Make a reply that holds a value as JSON; ValueError for NaN or infinity."""
     return Reply(json.dumps(value, allow_nan=False).encode(), JSON)
 
 
@@ -187,7 +187,7 @@ ANSWERS: dict[str, Answer] = {
 
 
 def first_answers(run: ExploredRun, live: LiveRun | None) -> None:
-    """Compute the answers to the page's first requests in advance: the run's description and the first diagram."""
+    """Compute in advance what the page requests first: the description of the run, and the first diagram."""
     try:
         _view(run, Query({}), live)
         axis = next((a for a in run.axes if a.name == run.path), run.axes[0])

@@ -1,6 +1,4 @@
-"""Open the page in a browser through a private redirect file. This keeps the secret token off command lines, which are
-public.
-"""
+"""Open the page in a browser by a private file that redirects to it, so that the secret token is on no command line."""
 
 from __future__ import annotations
 
@@ -28,7 +26,7 @@ _REDIRECT = """<!doctype html>
 
 
 def redirect_file(folder: Path, address: str) -> Path:
-    """Write a file, readable by this user alone, that redirects a browser to an address."""
+    """Write a file that redirects a browser to an address, and that only this user can read."""
     path = folder / "open.html"
     handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
     with os.fdopen(handle, "w", encoding="utf-8") as file:

@@ -1,4 +1,4 @@
-"""Write the HTML of the served page; script and style come from `static/`."""
+"""Write the HTML of the page that the explorer serves."""
 
 from __future__ import annotations
 
@@ -37,10 +37,10 @@ _NOTE = """<!doctype html>
 
 
 def page(title: str, token: str) -> str:
-    """Return the page of a run; its script sends the token with every request."""
+    """Return the HTML of a run's page, which sends the secret token with every request."""
     return _PAGE.format(title=escape(f"{title} - magpend"), token=escape(token))
 
 
 def note(sentence: str) -> str:
-    """Return an HTML page that shows one sentence."""
+    """Return the HTML of a page that shows one sentence."""
     return _NOTE.format(sentence=escape(sentence))

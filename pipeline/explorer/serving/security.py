@@ -1,4 +1,4 @@
-"""Decide which requests the explorer answers: those of its own page, with the secret token.
+"""Decide which requests the explorer answers: those from its own page, with the secret token.
 
 A server on loopback can be reached by every process of the machine and, through a browser, by every page
 that is open in it. So there is a random token in the address that is printed, and every request but those
@@ -25,13 +25,13 @@ FROM_HERE = ("same-origin", "none")
 
 
 def new_token() -> str:
-    """Return a random secret token for access to the page."""
+    """Return a new random token that gives access to the page."""
     return secrets.token_urlsafe(TOKEN_BYTES)
 
 
 @dataclass(frozen=True)
 class Guard:
-    """Check of a request's origin and token.
+    """Checks where a request comes from, and whether it has the secret token.
 
     Attributes
     ----------
@@ -44,13 +44,11 @@ class Guard:
 
     @property
     def hosts(self) -> tuple[str, ...]:
-        """Return the host names, with port, that requests may use for this server."""
+        """Names, with the port, by which requests may address this server."""
         return f"127.0.0.1:{self.port}", f"localhost:{self.port}"
 
     def foreign(self, headers: Mapping[str, str]) -> str | None:
-        """Return the reason to reject a request that comes from another page or names another host. Return None for
-        other requests.
-        """
+        """Return the reason to reject a request from another page or for another host; None if there is none."""
         if headers.get("Host", "").lower() not in self.hosts:
             return "this server answers to its own address alone; use the one that it printed"
         origin = headers.get("Origin")
@@ -61,11 +59,11 @@ class Guard:
         return None
 
     def knows(self, given: str) -> bool:
-        """Return whether a text equals the token. The comparison takes constant time."""
+        """Return whether a text is the secret token, in constant time."""
         return hmac.compare_digest(given.encode("utf-8", "replace"), self.token.encode())
 
     def authorised(self, headers: Mapping[str, str], argument: str = "") -> bool:
-        """Return whether a request carries the token, in a header or as the argument ``token``."""
+        """Return whether a request has the secret token, in a header or as an argument."""
         given = [headers.get(name, "") for name in TOKEN_HEADERS]
         bare = [g[len(_SCHEME) :] if g.lower().startswith(_SCHEME) else g for g in given]
         found = [self.knows(one) for one in (*bare, argument)]
@@ -73,9 +71,7 @@ class Guard:
 
 
 def content_policy(port: int) -> str:
-    """Return the content security policy (HTTP header) of the page. It allows only the page's own script, style, images
-    and connections.
-    """
+    """Return the content security policy of the page: it may use only its own script, style, images and connections."""
     sockets = f"ws://127.0.0.1:{port} ws://localhost:{port}"  # some browsers do not take 'self' for these
     return (
         "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; "
@@ -85,7 +81,7 @@ def content_policy(port: int) -> str:
 
 
 def headers_of(port: int) -> dict[str, str]:
-    """Return the HTTP headers that every answer carries."""
+    """Return the HTTP headers of every answer."""
     return {
         "Content-Security-Policy": content_policy(port),
         "X-Content-Type-Options": "nosniff",
@@ -99,7 +95,7 @@ def headers_of(port: int) -> dict[str, str]:
 
 
 class Rate:
-    """A rate limit with a mean rate per second and a burst.
+    """Limit on the rate of requests: a mean rate per second, and a larger number for a short time.
 
     Parameters
     ----------
@@ -112,7 +108,7 @@ class Rate:
         self._left, self._then = float(burst), time.monotonic()
 
     def allows(self) -> bool:
-        """Return whether another request is allowed now, and count it if it is."""
+        """Return whether one more request is allowed now; if so, count it."""
         now = time.monotonic()
         self._left = min(self._burst, self._left + (now - self._then) * self._per_second)
         self._then = now

@@ -68,13 +68,13 @@ STATIC = {
 
 
 def static_files() -> dict[str, tuple[bytes, str]]:
-    """Read the page's static files; return content and MIME type by file name."""
+    """Read the static files of the page; return their contents and media types by name."""
     folder = resources.files("pipeline.explorer") / "static"
     return {name: ((folder / name).read_bytes(), kind) for name, kind in STATIC.items() if (folder / name).is_file()}
 
 
 class Service:
-    """State shared by the HTTP request handlers: the run, its live computing, worker threads and rate limits.
+    """State that all request handlers share: the run, its live computation, worker threads and rate limits.
 
     Parameters
     ----------
@@ -100,11 +100,11 @@ class Service:
         self.compiled: asyncio.Event | None = None
 
     def refresh(self) -> None:
-        """Read the run directory again, for new cells and analyses."""
+        """Read the run again, for cells and analyses that were added."""
         self.run = self.run.refreshed()
 
     def warm(self) -> None:
-        """Compute the answers to the page's first requests while the browser starts, then compile the live kernels.
+        """Compute what the page requests first while the browser starts; then compile the code for live computation.
 
         Called in the loop that answers: those who wait for something to be compiled wait there.
         """
@@ -125,7 +125,7 @@ class Service:
         first.add_done_callback(lambda done: None if done.cancelled() else live.warm(tell))
 
     async def work(self, function: Callable[[], Any], *, integrates: bool = False) -> Any:
-        """Call a function in a worker thread and return its result. Raise `TooManyError` if too many requests wait.
+        """Call a function in a worker thread and return its result; raise TooManyError if too many requests wait.
 
         One that integrates waits until what it needs is compiled, once, and not in these threads.
         """
@@ -140,41 +140,39 @@ class Service:
             self.waiting -= 1
 
     def close(self) -> None:
-        """Cancel the waiting requests and close live computing."""
+        """Cancel the requests that wait, and end live computation."""
         self.pool.shutdown(wait=False, cancel_futures=True)
         if self.live is not None:
             self.live.close()
 
 
 class TooManyError(ValueError):
-    """Error raised if more requests wait than the server accepts."""
+    """Raised if more requests wait than the server accepts."""
 
 
 class Handler(web.RequestHandler):
-    """Base class of all HTTP handlers: it checks the token and the request rate, and sets headers."""
+    """Base of all request handlers: it checks the token and the rate of requests, and sets headers."""
 
     needs_token = True
     service: Service
 
     def initialize(self, service: Service) -> None:
-        """Store the service (run, guard and threads) that all handlers share."""
+        """Store the service, which all handlers share."""
         self.service = service
 
     def set_default_headers(self) -> None:
-        """Set the headers of every answer, errors included."""
+        """Set the headers of every answer, also of errors."""
         service: Service | None = getattr(self, "service", None) or self.application.settings.get("service")
         if service is not None:
             for name, value in headers_of(service.guard.port).items():
                 self.set_header(name, value)
 
     def compute_etag(self) -> str | None:
-        """Return no etag: browsers must not store answers, and hashing a large diagram would block the server."""
+        """Switch entity tags off: browsers must not store answers, and hashing a large diagram takes time."""
         return None
 
     def prepare(self) -> None:
-        """Reject a request whose origin or token is wrong, whose address is too long, or that exceeds the rate
-        limit.
-        """
+        """Reject a request with a wrong origin or token, too long an address, or above the rate limit."""
         guard, headers = self.service.guard, self.request.headers
         if len(self.request.uri or "") > MOST_ADDRESS:
             self.refuse(414, "the address is too long")
@@ -192,21 +190,21 @@ class Handler(web.RequestHandler):
             self.refuse(403, "the token is missing or wrong; use the address that magpend explore printed")
 
     def refuse(self, status: int, sentence: str) -> None:
-        """Send a sentence as JSON with an error status, and end the request."""
+        """Answer a request with an error status and a sentence, as JSON."""
         self.set_status(status)
         self.set_header("Content-Type", "application/json; charset=utf-8")
         self.finish(json.dumps({"error": sentence}))
 
     def write_error(self, status_code: int, **kwargs: Any) -> None:
-        """Report an error without internal details."""
+        """Answer a request that failed, without internal details."""
         self.refuse(status_code, self._reason)
 
 
 class PageHandler(Handler):
-    """The handler of the page itself."""
+    """Handler of requests for the page itself."""
 
     def refuse(self, status: int, sentence: str) -> None:
-        """Send an HTML page that shows one sentence, with an error status."""
+        """Answer a request with an error status and a sentence, as an HTML page."""
         self.set_status(status)
         self.set_header("Content-Type", "text/html; charset=utf-8")
         self.finish(page_html.note(sentence))
@@ -221,7 +219,7 @@ class PageHandler(Handler):
 
 
 class StaticHandler(Handler):
-    """The handler of the page's script and style, which are public."""
+    """Handler of requests for the script and the style of the page, which need no token."""
 
     needs_token = False
 
@@ -236,23 +234,23 @@ class StaticHandler(Handler):
 
 
 class ApiHandler(Handler):
-    """Handler of one kind of data request; see `answers`."""
+    """Handler of requests for one kind of data."""
 
     answer: Answer
 
     def initialize(self, service: Service, answer: Answer) -> None:  # type: ignore[override]
-        """Store the service and the kind of data request."""
+        """Store the service, and the kind of data that this handler answers with."""
         self.service, self.answer = service, answer
 
     async def get(self) -> None:
-        """Answer a GET request from the arguments of its address."""
+        """Answer a GET request, whose arguments are in its address."""
         if self.answer.method != "GET":
             self.refuse(405, f"api/{self.answer.name} takes {self.answer.method}")
             return
         await self._reply(b"")
 
     async def post(self) -> None:
-        """Answer a POST request from its body."""
+        """Answer a POST request, whose arguments are in its body."""
         if self.answer.method != "POST":
             self.refuse(405, f"api/{self.answer.name} takes {self.answer.method}")
             return
@@ -292,17 +290,17 @@ class ApiHandler(Handler):
 
 
 class NothingHandler(Handler):
-    """Handler of all addresses that do not exist."""
+    """Handler of requests for addresses that do not exist."""
 
     def prepare(self) -> None:
-        """Check the request like every handler, then answer it with status 404."""
+        """Check the request as usual, then answer it with status 404."""
         super().prepare()
         if not self._finished:
             self.refuse(404, "there is no such page")
 
 
 def application(service: Service) -> web.Application:
-    """Return the web application that answers requests for a run."""
+    """Make the web application that answers the requests for a run."""
     from pipeline.explorer.serving.answers import ANSWERS
 
     shared = {"service": service}
@@ -323,7 +321,6 @@ def application(service: Service) -> web.Application:
 
 
 def _live_routes(service: Service) -> list[Any]:
-    """Return the websocket route for live computing. Return an empty list if the run cannot be computed live."""
     if service.live is None:
         return []
 
@@ -338,7 +335,7 @@ def _live_routes(service: Service) -> list[Any]:
 
 
 def listening(port: int) -> socket.socket:
-    """Return a listening socket on the loopback address.
+    """Open a socket that listens on this machine only, at the given or a free port.
 
     Raises
     ------
@@ -368,7 +365,7 @@ def serve(
     opened: Callable[[str], None] | None = None,
     curves: str | Path | Run | None = None,
 ) -> None:
-    """Serve the page of a run until the process is stopped.
+    """Serve the interactive page of a run until the process is stopped.
 
     Parameters
     ----------

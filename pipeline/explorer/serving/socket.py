@@ -1,4 +1,4 @@
-"""Serve the websocket for live computing; see `messages` and `live`."""
+"""Serve the websocket through which a page computes live."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ Route = tuple[str, type[WebSocketHandler], dict[str, Any]]
 
 
 def socket_routes(live: LiveRun, authorised: Authorised, path: str = r"/ws") -> list[Route]:
-    """Return the tornado routes of the websocket for live computing.
+    """Return the tornado routes of the websocket for live computation.
 
     Parameters
     ----------
@@ -51,17 +51,17 @@ def socket_routes(live: LiveRun, authorised: Authorised, path: str = r"/ws") -> 
 
 
 class LiveSocket(WebSocketHandler):
-    """Websocket connection of one browser page for live computing."""
+    """Websocket connection of one page that computes live."""
 
     def initialize(self, live: LiveRun, authorised: Authorised, others: set[LiveSocket]) -> None:
-        """Store the live run, the function that authorises requests, and the set of open connections."""
+        """Store the run, the function that checks requests, and the set of open connections."""
         self._live, self._authorised, self._others = live, authorised, others
         self._session: LiveSession | None = None
         self._allowance, self._heard = MOST_AT_ONCE, time.monotonic()
         self._waiting = 0
 
     async def prepare(self) -> None:
-        """Refuse a connection that is not authorised, or that exceeds the largest number of open connections."""
+        """Refuse a connection without a valid token, or if too many are open."""
         if not self._authorised(self):
             self.set_status(403)
             await self.finish({"error": "this address has no valid token, or another page asks."})
@@ -70,7 +70,7 @@ class LiveSocket(WebSocketHandler):
             await self.finish({"error": f"{MOST_CONNECTIONS} pages watch already; close one."})
 
     def open(self, *args: str, **kwargs: str) -> None:
-        """Start a live session for a new connection."""
+        """Start a live session for the new connection."""
         self._others.add(self)
         self.set_nodelay(True)
         loop = IOLoop.current()
@@ -82,7 +82,7 @@ class LiveSocket(WebSocketHandler):
         self._session = LiveSession(self._live, emit)
 
     def on_message(self, message: str | bytes) -> None:
-        """Handle a websocket message; answer with an error if messages arrive too fast."""
+        """Handle a message of the page, or answer that messages come too fast."""
         now = time.monotonic()
         self._allowance = min(MOST_AT_ONCE, self._allowance + MOST_PER_SECOND * (now - self._heard)) - 1.0
         self._heard = now
@@ -113,14 +113,14 @@ class LiveSocket(WebSocketHandler):
             done.exception()  # a page that has gone is nobody's mistake
 
     def on_close(self) -> None:
-        """Cancel the connection's jobs."""
+        """Cancel all jobs of the connection."""
         self._others.discard(self)
         if self._session is not None:
             self._session.close()
 
     @property
     def max_message_size(self) -> int:
-        """Return the longest accepted message [bytes]."""
+        """Length of the longest message that is accepted [bytes]."""
         return MOST_BYTES
 
 

@@ -59,7 +59,7 @@ _HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
 
 
 def _analysis(name: str) -> Callable[..., Any]:
-    """Return the function that runs the analysis of a given name. Its docstring lists the analysis's options."""
+    """Make the public function for an analysis, with a docstring that lists its options."""
     from pipeline.products.product import default_of
     from pipeline.products.registry import ANALYSES
     from pipeline.runs.derive import derive

@@ -39,7 +39,7 @@ SAMPLES = 256
 
 @dataclass
 class Cells:
-    """Statistics of the trajectories (cells) on one attractor, accumulated block by block in any order.
+    """Statistics of the trajectories (cells) on one attractor, collected from one block of cells after another.
 
     Attributes
     ----------
@@ -70,8 +70,8 @@ class Cells:
     seconds: list[np.ndarray] = field(default_factory=list)
 
     def add(self, block: Block, cells: np.ndarray, labels: np.ndarray, geometry: Geometry) -> None:
-        """Add the given cells of a block to the statistics; `labels` has the class of motion (a code) of every cell of
-        the block.
+        """Add some cells of a block to the statistics; `labels` has the class of motion (a code) of every cell of the
+        block.
         """
         section = block.section[cells]
         self.n += len(cells)
@@ -90,18 +90,16 @@ class Cells:
 
     @property
     def mean_rotation(self) -> np.ndarray:
-        """Mean rotation of the cells, summed in rising order so that the order of cells does not change the last
-        bit.
-        """
+        """Mean rotation of the cells [turns per drive period]. Its bits do not depend on the order of the cells."""
         return np.asarray(np.sort(np.concatenate(self.rotations), axis=0).mean(axis=0))
 
     @property
     def mean_seconds(self) -> float:
-        """Mean time between two successive section points of the cells [s]; NaN if it is not known."""
+        """Mean time between two successive section points of the cells [s]; NaN if no times are known."""
         return float(np.sort(np.concatenate(self.seconds)).mean()) if self.seconds else np.nan
 
     def side(self, parameters: Parameters, frequency: float) -> int:
-        """Return the class of motion (a code) of the attractor: that of all its cells or, if they differ, of their
+        """Return the attractor's class of motion (a code): the class of all its cells or, if they differ, of their
         pooled points.
 
         The pooled points are classified with the median of the cells' turns.
@@ -116,7 +114,7 @@ class Cells:
 
 @dataclass
 class Features:
-    """Features of one attractor at one parameter point; ``None`` and NaN mean not known.
+    """Features of one attractor at one parameter point; ``None`` and NaN mean "not known".
 
     The attributes become variables of the same name; see `pipeline.analysis.attractors.attractors`.
     """
@@ -166,8 +164,8 @@ def mean_rotation(section: np.ndarray, turns: np.ndarray, geometry: Geometry) ->
 
 
 def sides_of(section: np.ndarray, turns: np.ndarray, frequency: float, parameters: Parameters | None) -> np.ndarray:
-    """Classify trajectories by the model's classifier, from their section points; "unknown" without a classifier or for
-    NaN points.
+    """Return the class of motion of each trajectory from its section points, by the model's classifier. It is "unknown"
+    if the model has no classifier or a point is NaN.
     """
     classifier = parameters.model.classifier if parameters is not None else None
     if classifier is None or parameters is None:
@@ -177,7 +175,8 @@ def sides_of(section: np.ndarray, turns: np.ndarray, frequency: float, parameter
 
 
 def follow_orbit(found: Features, parameters: Parameters, frequency: float, geometry: Geometry) -> None:
-    """Integrate a periodic orbit over its period and fill in its ranges, exact rotation, energy range and mirror image.
+    """Integrate a periodic orbit over its period, and store its ranges, exact rotation, energy range and mirror image
+    in `found`.
 
     `frequency` is the drive frequency, or the mean frequency of the returns [Hz].
     """
@@ -197,7 +196,7 @@ def follow_orbit(found: Features, parameters: Parameters, frequency: float, geom
 
 
 def fill_cycle(found: Features, cycle: Cycle) -> None:
-    """Fill in the features of a limit cycle of an autonomous flow that is sampled at equal times."""
+    """Store the features of a limit cycle, for an autonomous flow that is sampled at equal times."""
     found.kind, found.period_s, found.residual = PERIODIC_ORBIT, cycle.seconds, cycle.residual
     found.stability, found.evidence = ATTRACTS, BY_MULTIPLIERS
     found.multipliers, found.lyapunov_max = cycle.multipliers, 0.0
@@ -205,7 +204,7 @@ def fill_cycle(found: Features, cycle: Cycle) -> None:
 
 
 def of_equilibrium(found: Equilibrium, parameters: Parameters | None, n_angles: int) -> Features:
-    """Return the features of an equilibrium; its largest Lyapunov exponent is the largest real part of the
+    """Return the features of an equilibrium. Its largest Lyapunov exponent is the largest real part of the
     eigenvalues.
     """
     x = Features(
@@ -231,7 +230,7 @@ def of_equilibrium(found: Equilibrium, parameters: Parameters | None, n_angles: 
 
 
 def follow_points(found: Features, parameters: Parameters, frequency: float) -> None:
-    """Fill in the energy range and the mirror image of an attractor or other set, from its stored section points."""
+    """Compute the energy range and the mirror image of an attractor or other set from its stored section points."""
     _fill_energy(found, np.zeros(len(found.points)), found.points, of_flow(parameters), frequency)
     mirror = parameters.model.mirror
     if mirror is None:
@@ -268,7 +267,7 @@ def _fill_energy(
 
 
 def pair_mirrors(found: list[Features], mirror: Mirror, threshold: float, geometry: Geometry) -> None:
-    """Find each attractor's mirror partner: the attractor nearest to its image under the model's symmetry, if within
+    """Find each attractor's mirror partner: the attractor nearest to its mirror image, if the two are within
     `threshold`.
     """
     turned = np.array(mirror.signs)[list(geometry.is_angle)]
@@ -286,6 +285,6 @@ def pair_mirrors(found: list[Features], mirror: Mirror, threshold: float, geomet
 
 
 def sorted_points(points: np.ndarray, geometry: Geometry) -> np.ndarray:
-    """Sort points (n, state) in lexicographic order of their rounded, scaled values."""
+    """Sort section points (n, state) in lexicographic order of their scaled and rounded values."""
     rounded = rounded_points(points, geometry)
     return np.asarray(points[np.lexsort(rounded.T[::-1])])

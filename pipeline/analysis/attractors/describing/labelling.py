@@ -47,7 +47,7 @@ MOST_PROBES = 8
 
 @dataclass
 class Found:
-    """Result of one parameter point: the sets on which its cells end, and the set of each cell.
+    """Result of `analyse` at one parameter point: the sets on which its cells end, and the set of each cell.
 
     Attributes
     ----------
@@ -72,7 +72,7 @@ class Found:
 
 @dataclass
 class _Labels:
-    """Set of each cell at one parameter point, as a provisional number, and the evidence for this assignment
+    """Number of the set on which each cell of one parameter point ends, and the evidence for this assignment
     (`decision`).
     """
 
@@ -110,7 +110,7 @@ def analyse(point: Point, search: Search) -> Work[Found]:
 
 
 def _is_elsewhere(point: Point) -> np.ndarray:
-    """Return a mask of the cells at an equilibrium, or on a limit cycle of a flow sampled at equal times."""
+    """Return which cells are at an equilibrium, or on a limit cycle of a flow sampled at equal times."""
     found = np.zeros(point.n_cells, bool)
     for told in (point.at_rest, point.on_cycle):
         if told is not None:
@@ -122,7 +122,7 @@ def _is_elsewhere(point: Point) -> np.ndarray:
 
 
 def _preserves_volume(point: Point, search: Search) -> Work[bool]:
-    """Return whether the flow or the section map preserves volumes at a sample of points."""
+    """Return whether the flow (or its section map) preserves volumes, tested at a sample of points."""
     before = _some_points(point)
     if not len(before):
         return False
@@ -134,7 +134,7 @@ def _preserves_volume(point: Point, search: Search) -> Work[bool]:
 
 
 def _some_points(point: Point, n: int = 16) -> np.ndarray:
-    """Return the last section points of `n` cells chosen reproducibly by their hash, shape (n, state)."""
+    """Return the last section points of `n` cells, shape (n, state); the choice of cells is reproducible."""
     found = np.zeros((0, 1, point.n_states))
     for block in point.blocks():
         more = np.concatenate([found, block.section[block.is_closed | block.is_bounded, -1:]])
@@ -143,7 +143,6 @@ def _some_points(point: Point, n: int = 16) -> np.ndarray:
 
 
 def _conservative(point: Point, labels: _Labels) -> BoundedSet:
-    """Label all cells of a volume-preserving flow as one neutral set."""
     for block in point.blocks():
         own = np.flatnonzero(block.is_closed | block.is_bounded)
         labels.put(own + block.cells.start, 0, SAME_SET)
@@ -154,8 +153,8 @@ def _conservative(point: Point, labels: _Labels) -> BoundedSet:
 
 
 def _label_orbits(point: Point, state: State, labels: _Labels, search: Search) -> np.ndarray:
-    """Label the cells on known orbits. Return the group number of each remaining closed cell, and -1 for every other
-    cell.
+    """Label the cells on known orbits. Return the group number of each other cell that has closed on a periodic orbit,
+    and -1 for the rest.
     """
     groups = np.full(point.n_cells, -1, np.int64)
     for block in point.blocks():
@@ -170,9 +169,6 @@ def _label_orbits(point: Point, state: State, labels: _Labels, search: Search) -
 
 
 def _probe(point: Point, state: State, labels: _Labels, search: Search) -> Work[None]:
-    """Test whether degenerate orbits and equilibria attract nearby trajectories, and label the cells that approach
-    them.
-    """
     neutral = [i for i, orbit in enumerate(state.orbits) if orbit.is_polished and orbit.stability == NEUTRAL]
     for i in neutral[:MOST_PROBES]:
         within = yield from probe_orbit(state.orbits[i], search.geometry)
@@ -192,7 +188,9 @@ def _probe(point: Point, state: State, labels: _Labels, search: Search) -> Work[
 
 
 def _label_courses(point: Point, found: Outcome, labels: _Labels, groups: np.ndarray, search: Search) -> None:
-    """Label cells whose neighbour (same box or group) was integrated further, by where this neighbour ended."""
+    """Label cells by the end of a similar cell that was integrated further. Cells are similar if they share a box or a
+    group of section points.
+    """
     ends = {course.key: course.end for course in found.courses if not course.goes_on}
     if not ends:
         return
@@ -214,8 +212,8 @@ def _label_courses(point: Point, found: Outcome, labels: _Labels, groups: np.nda
 
 
 def _label_raw(point: Point, state: State, groups: np.ndarray, labels: _Labels, search: Search) -> list[Orbit]:
-    """Label the closed cells that are on no polished orbit, and return an unpolished orbit for each group of these
-    cells.
+    """Label the closed (periodic) cells that are on no refined orbit, and return an unrefined orbit for each group of
+    them.
     """
     left = np.where((labels.label < 0) & (labels.decision != DIVERGES) & ~_is_elsewhere(point), groups, -1)
     best: dict[int, tuple[float, int, np.ndarray]] = {}
@@ -229,7 +227,9 @@ def _label_raw(point: Point, state: State, groups: np.ndarray, labels: _Labels, 
 def _label_sets(
     point: Point, first: int, sets: Sequence[BoundedSet], labels: _Labels, groups: np.ndarray, search: Search
 ) -> None:
-    """Label the cells on each non-periodic set: its integrated samples, and cells whose section points lie on it."""
+    """Label the cells on each non-periodic set: the sampled cells by which it was found, and all cells whose section
+    points lie on it.
+    """
     for i, one in enumerate(sets):
         own = one.cells[labels.label[one.cells] < 0]
         labels.put(own, first + i, SAME_SET)
@@ -244,7 +244,7 @@ def _label_sets(
 
 
 def _label_ends(block: Block, ends: Mapping[int, int], label: np.ndarray, decision: np.ndarray) -> None:
-    """Label closed cells by the orbit that each reached in a longer integration; `label` and `decision` change in
+    """Label each closed (periodic) cell whose orbit was found by a longer integration; change `label` and `decision` in
     place.
     """
     rest = np.flatnonzero(block.is_closed & (label[block.cells] < 0))
@@ -256,8 +256,8 @@ def _label_ends(block: Block, ends: Mapping[int, int], label: np.ndarray, decisi
 def _representatives(
     block: Block, group: np.ndarray, best: dict[int, tuple[float, int, np.ndarray]], geometry: Geometry
 ) -> None:
-    """Store one cell per group of closed cells in `best`: the cell whose orbit closes most exactly, with its last
-    period.
+    """Find one representative cell for each group of closed (periodic) cells: the cell whose orbit closes most
+    exactly.
     """
     rows = np.flatnonzero(group >= 0)
     if not len(rows):
@@ -309,7 +309,6 @@ def _describe(
 
 
 def _label_elsewhere(point: Point, first: int, labels: _Labels) -> None:
-    """Label the cells at equilibria, then the cells on limit cycles (of a flow sampled at equal times)."""
     for told, known, code in ((point.at_rest, point.equilibria, AT_REST), (point.on_cycle, point.cycles, CLOSED)):
         if told is not None:
             own = told >= 0
@@ -325,7 +324,7 @@ def _number_ends(
     resting: int,
     table: np.ndarray,
 ) -> None:
-    """For each transient set, count the sampled cells that left it by the set on which they ended (in `n_to`)."""
+    """Count where the trajectories that left each transient set ended; store the counts in the set's feature `n_to`."""
     for features, number in zip(ranked, order, strict=True):
         if first <= number < resting:
             ended = np.zeros(len(order), np.int64)
@@ -340,7 +339,6 @@ def _number_ends(
 def _features_of(
     number: int, cells: Cells, orbits: Sequence[Orbit], sets: Sequence[BoundedSet], point: Point, search: Search
 ) -> Features:
-    """Return the features of the set with a provisional number: an orbit, bounded set, equilibrium or limit cycle."""
     resting = len(orbits) + len(sets)
     if number < len(orbits):
         return _of_orbit(cells, orbits[number], point, search)
@@ -355,7 +353,6 @@ def _features_of(
 
 
 def _of_points(cells: Cells, kind: int, period: int, point: Point, search: Search) -> Features:
-    """Return the features of a set that follow from the section points of its cells."""
     assert cells.points is not None
     points = feature.sorted_points(cells.points, search.geometry)
     found = Features(points, kind, period, cells.mean_rotation, UNKNOWN, cells.low, cells.high)

@@ -1,4 +1,4 @@
-"""Integrate the motion on each attractor of one parameter point, for phase portraits."""
+"""Integrate the motion on each attractor of one parameter point, to draw phase portraits."""
 
 from __future__ import annotations
 
@@ -25,7 +25,8 @@ def portraits(
     n_samples: int = 256,
     n_periods: int = 20,
 ) -> xr.Dataset:
-    """Integrate a trajectory on each set of a parameter point: one period of an orbit, `n_periods` of any other set.
+    """Integrate one trajectory on each attractor of a parameter point: one period of a periodic orbit, `n_periods`
+    drive periods of any other set.
 
     Parameters
     ----------
@@ -92,7 +93,7 @@ def _step(here: xr.Dataset, parameters: Parameters, frequency: float, n_samples:
 
 
 def _mean_return(starts: np.ndarray, parameters: Parameters, frequency: float) -> float:
-    """Integrate 16 returns to the Poincare section and return the mean time between them [s]."""
+    """Return the mean time between successive points on the Poincare section [s], over 16 returns."""
     result = run_branches(
         parameters.pack()[None, None],
         np.full((1, 1), frequency),
@@ -142,9 +143,7 @@ def _dataset(here: xr.Dataset, orbits: list[np.ndarray], parameters: Parameters,
 
 
 def _drawn(result: xr.Dataset, table: np.ndarray, parameters: Parameters) -> xr.Dataset:
-    """Add how the points of the model's drawing move during the motion on each attractor, if the model has a
-    drawing.
-    """
+    """Add the moving points of the model's drawing on each attractor, if the model has a drawing."""
     drawing = parameters.model.drawing
     if drawing is None:
         return result

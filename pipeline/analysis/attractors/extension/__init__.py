@@ -1,1 +1,1 @@
-"""Extend the integration of trajectories without a known attractor, and describe the sets on which they stay."""
+"""Integrate trajectories without a known attractor further, and describe the sets on which they stay."""

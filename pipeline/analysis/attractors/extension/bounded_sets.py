@@ -1,4 +1,4 @@
-"""Describe non-periodic sets from the trajectories that were integrated further on them."""
+"""Describe non-periodic sets by the trajectories that stay on them."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ MOST_SHAPED = 1024
 
 @dataclass(frozen=True, eq=False)
 class BoundedSet:
-    """Non-periodic set: its kind (chaotic, torus or other bounded set), stability and evidence.
+    """A non-periodic set: its kind (chaotic, torus or other bounded set), its stability and the evidence for it.
 
     Attributes
     ----------
@@ -64,7 +64,7 @@ class BoundedSet:
 
     @classmethod
     def neutral(cls) -> BoundedSet:
-        """Return the neutral set that holds all cells of a volume-preserving flow."""
+        """Return the set that holds all cells of a volume-preserving flow; its stability is neutral."""
         none = np.zeros(0, np.int64)
         evidence = stability.BY_VOLUME
         return cls(none, None, none, BOUNDED_SET, NEUTRAL, evidence, None, 0, 0, 0, 0.0, {})
@@ -73,7 +73,8 @@ class BoundedSet:
 def describe(
     own: Sequence[Course], left: Sequence[Course], point: Point, settings: Settings, has_stayed: bool
 ) -> Work[BoundedSet]:
-    """Return the kind, stability and lifetimes of a non-periodic set, from the cells that stayed and those that left.
+    """Return the kind, stability and lifetimes of a non-periodic set, from the trajectories that stayed on it and those
+    that left it.
 
     Parameters
     ----------
@@ -117,7 +118,7 @@ def describe(
 
 
 def left_behind(left: Sequence[Course], settings: Settings) -> BoundedSet:
-    """Describe a transient set that every sampled trajectory has left, from the section points before they left."""
+    """Describe a transient set that every sampled trajectory has left, from the section points before they left it."""
     paths = [course.stayed for course in left]
     return BoundedSet(
         np.zeros(0, np.int64),
@@ -136,7 +137,7 @@ def left_behind(left: Sequence[Course], settings: Settings) -> BoundedSet:
 
 
 def ends_of(left: Iterable[Course]) -> dict[int, int]:
-    """Count trajectories by the orbit, equilibrium or failure in which each of them ended."""
+    """Count how many trajectories ended on each orbit, at each equilibrium, or by each kind of failure."""
     ended: dict[int, int] = {}
     for course in left:
         ended[course.end] = ended.get(course.end, 0) + 1
@@ -144,7 +145,7 @@ def ends_of(left: Iterable[Course]) -> dict[int, int]:
 
 
 def were_on(course: Course, own: Sequence[Course], settings: Settings) -> bool:
-    """Return whether a finished trajectory, before it left its set, was on the same set as the trajectories `own`."""
+    """Return whether a trajectory that has left a set was on the same set as the trajectories `own`."""
     points = np.concatenate([other.stayed for other in own])
     return bool(mixing(course.stayed, points, settings.geometry, settings.closure) >= OTHER)
 
@@ -152,7 +153,6 @@ def were_on(course: Course, own: Sequence[Course], settings: Settings) -> bool:
 def _verdict(
     own: Sequence[Course], left: Sequence[Course], growth: Growth | None, has_stayed: bool, settings: Settings
 ) -> tuple[int, int]:
-    """Return the stability code of a set and the code of the evidence for it."""
     if growth is not None and growth.preserves_volume:
         return NEUTRAL, stability.BY_VOLUME
     if left:
@@ -189,7 +189,9 @@ def _growth(own: Sequence[Course], point: Point, settings: Settings, most: int) 
 
 
 def _closes_above(own: Sequence[Course], growth: Growth | None, settings: Settings) -> int:
-    """Return the period with which trajectories close above the longest period searched for; 0 if none is seen."""
+    """Return an orbit period above the longest one searched for, if the trajectories close with it; 0 if they do
+    not.
+    """
     if growth is None or not growth.contracts:
         return 0
     path = min((c.extension for c in own), key=len)

@@ -33,7 +33,7 @@ INSIDE, REACHED = 0.9, 3.0
 
 
 def thinned(points: np.ndarray, n: int) -> np.ndarray:
-    """Return at most `n` randomly drawn points of a sample (m, state), in the order of time.
+    """Draw at most `n` points of a sample (m, state) at random, and keep their order in time.
 
     Points are drawn at random with a fixed seed. A regular stride would be wrong: on a set of two pieces that
     alternate, every second point lies on one piece.
@@ -45,7 +45,8 @@ def thinned(points: np.ndarray, n: int) -> np.ndarray:
 
 
 def mixing(a: np.ndarray, b: np.ndarray, geometry: Geometry, least: float = 0.0) -> float:
-    """Compute how well two samples of section points mix: about 0.5 for samples of one set, 0 for distant sets.
+    """Compute how well two samples of section points mix: about 0.5 if both lie on one set, 0 if they lie on distant
+    sets.
 
     Parameters
     ----------
@@ -69,9 +70,6 @@ def mixing(a: np.ndarray, b: np.ndarray, geometry: Geometry, least: float = 0.0)
 
 
 def _crossing(own: np.ndarray, other: np.ndarray, n: int, geometry: Geometry, least: float) -> float:
-    """Compute the share of points in the later half of sample `own` that are nearer to `other` than to the earlier
-    half.
-    """
     # take points from the whole duration of the other sample
     trees = [geometry.tree(points) for points in (own[:n], thinned(other, n))]
     near = [np.maximum(tree.query(geometry.scaled(own[n : 2 * n]), p=np.inf)[0], least) for tree in trees]
@@ -87,7 +85,7 @@ def is_stationary(path: np.ndarray, geometry: Geometry, least: float = 0.0) -> b
 
 
 def group(samples: Sequence[np.ndarray], geometry: Geometry, least: float = 0.0) -> tuple[np.ndarray, bool]:
-    """Group samples of section points by the set on which they lie.
+    """Group trajectories by the set on which their section points lie.
 
     Parameters
     ----------
@@ -125,7 +123,6 @@ def group(samples: Sequence[np.ndarray], geometry: Geometry, least: float = 0.0)
 
 
 def _pooled(samples: Sequence[np.ndarray]) -> np.ndarray:
-    """Merge samples of section points into one sample: equally many points of each, interleaved in time."""
     each = max(4, MOST_POINTS // len(samples))
     parts = [thinned(sample, each) for sample in samples]
     n = min(len(part) for part in parts)
@@ -134,7 +131,7 @@ def _pooled(samples: Sequence[np.ndarray]) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Cloud:
-    """Section points of one set in a search tree, to test whether other trajectories lie on this set.
+    """Section points of one set in a search tree, to test whether other trajectories lie on the same set.
 
     Attributes
     ----------
@@ -149,8 +146,8 @@ class Cloud:
 
     @classmethod
     def of(cls, samples: Sequence[np.ndarray], geometry: Geometry, least: float) -> Cloud:
-        """Build the search tree of a set from section points of its trajectories; the point spacing is at least
-        `least`.
+        """Build the search tree of a set from section points of its trajectories. `least` is the smallest point spacing
+        to assume.
         """
         points = _pooled(samples)
         # distances from one half to the other: a safe spacing, since the whole is twice as dense
@@ -160,13 +157,15 @@ class Cloud:
         return cls(geometry.tree(points), max(float(np.quantile(away, 0.99)), least))
 
     def distances(self, section: np.ndarray, geometry: Geometry) -> np.ndarray:
-        """Return the distance of each section point (..., state) from the set, in units of the set's point spacing."""
+        """Return the distance of each section point (..., state) from the set, in units of the spacing of the set's
+        points.
+        """
         away = self.tree.query(geometry.scaled(section), p=np.inf)[0]
         return np.asarray(away / self.spacing)
 
 
 def members(section: np.ndarray, clouds: Sequence[Cloud], geometry: Geometry) -> np.ndarray:
-    """Return the number of the set on which each cell's section points (cell, period_index, state) lie; -1 for none."""
+    """Return the index of the set (in `clouds`) on which each cell's section points lie; -1 for none."""
     if not clouds or not len(section):
         return np.full(len(section), -1, np.int64)
     away = np.stack([cloud.distances(section, geometry) for cloud in clouds])

@@ -1,4 +1,4 @@
-"""Record how sampled trajectories go on after the last section point of the run, until they end."""
+"""Record the further integration of sampled trajectories after the run, until each of them ends."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ ON_SET, FAILED, DIVERGED, AT_REST = -1, -2, -3, -4
 
 @dataclass
 class Course:
-    """Sampled trajectory of the run and its extension by further integration.
+    """A trajectory of the run that is integrated further, with its old and its new section points.
 
     Attributes
     ----------
@@ -49,34 +49,32 @@ class Course:
 
     @property
     def goes_on(self) -> bool:
-        """Whether the trajectory has not ended yet (on an orbit, at an equilibrium, diverged or failed)."""
+        """Whether the trajectory is still to be integrated, because no orbit, equilibrium or failure has ended it."""
         return self.end == ON_SET
 
     @property
     def extension(self) -> np.ndarray:
-        """All section points of the extension, shape (n, state)."""
+        """Section points that the further integration has added to those of the run, shape (n, state)."""
         return np.concatenate([self.kept[:0], *self.legs])
 
     @property
     def stayed(self) -> np.ndarray:
-        """Section points on the set: the whole extension, or the part before the trajectory left."""
+        """Section points on the set that the trajectory stays on, or that it was on before it left."""
         if self.goes_on:
             return self.extension if self.legs else self.kept
         return np.asarray(self.extension[: int(self.periods)])
 
     @property
     def has_left(self) -> bool:
-        """Whether the trajectory stayed on a set for at least `LEAST_SEEN` section points before it ended elsewhere."""
+        """Whether the trajectory has left a set after at least `LEAST_SEEN` section points on it."""
         return not self.goes_on and not self.is_leaving and len(self.stayed) >= LEAST_SEEN
 
     @property
     def length(self) -> int:
-        """Number of section points in the extension."""
+        """Number of section points that the further integration has added."""
         return sum(len(leg) for leg in self.legs)
 
 
 def rest_number(end: int) -> int | None:
-    """Return the number of the equilibrium at which a trajectory ended, from its end code; None for another kind of
-    end.
-    """
+    """Return the index of the equilibrium at which a trajectory ended, from its end code; None for any other end."""
     return AT_REST - end if end <= AT_REST else None

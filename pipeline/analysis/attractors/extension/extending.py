@@ -1,5 +1,4 @@
-"""Extend the integration of trajectories that are on no known orbit or equilibrium, until the set on which they end is
-known.
+"""Integrate trajectories that are on no known orbit or equilibrium further, until the set on which they end is known.
 
 A sample of these cells is integrated further from the last section, leg by leg. After each leg, cells that
 reached an orbit or an equilibrium, known or new, leave the sample. The others are grouped into sets
@@ -58,7 +57,7 @@ LOOK_BACK = 4
 
 @dataclass
 class Outcome:
-    """Result of integrating the trajectories of one parameter point further.
+    """Result of the further integration of the trajectories of one parameter point.
 
     Attributes
     ----------
@@ -84,7 +83,8 @@ class Outcome:
 def extend(
     point: Point, orbits: Sequence[Orbit], label: np.ndarray, settings: Settings, budget: float, n_sample: int
 ) -> Work[Outcome]:
-    """Integrate samples of the cells without a known attractor (label -1) further, and find the sets on which they end.
+    """Integrate a sample of the cells without a known attractor (label -1) further, and find the sets on which they
+    end.
 
     Parameters
     ----------
@@ -122,7 +122,7 @@ def extend(
 
 
 class _Extension:
-    """State of the further integration at one parameter point: sampled trajectories, orbits and sets found so far."""
+    """Further integration at one parameter point: the sampled trajectories, and the orbits and sets found so far."""
 
     def __init__(self, point: Point, orbits: list[Orbit], settings: Settings, budget: float) -> None:
         self.point, self.orbits, self.settings = point, orbits, settings
@@ -136,14 +136,13 @@ class _Extension:
 
     @property
     def has_budget(self) -> bool:
-        """Whether periods are left in the integration budget."""
         return self.spent < self.budget
 
     # ---- samples -------------------------------------------------------------------------------
 
     def sample(self, loose: np.ndarray, n: int) -> list[Course]:
-        """Choose at most `n` unassigned cells to integrate further, reproducibly, and no two from one box of section
-        points.
+        """Choose at most `n` unassigned cells to integrate further. The choice is reproducible, and takes one cell from
+        each box of section points.
         """
         known = {course.key for course in self.courses}
         best: dict[int, tuple[int, int, np.ndarray, float]] = {}
@@ -163,8 +162,8 @@ class _Extension:
         return [Course(cell, key, kept, kept[-1], step) for key, (_, cell, kept, step) in chosen]
 
     def left_of(self, loose: np.ndarray) -> np.ndarray:
-        """Return the unassigned cells (of `loose`) that were not integrated further and lie on no set of decided
-        stability.
+        """Return the cells of `loose` whose end is still open: not integrated further, and on no set whose stability is
+        decided.
         """
         done = np.zeros(self.point.n_cells, bool)
         done[self.told(loose)[0]] = True
@@ -172,9 +171,7 @@ class _Extension:
         return np.asarray(loose[~done[loose]])
 
     def told(self, loose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the unassigned cells (of `loose`) that lie on sets of decided stability, and the number of each cell's
-        set.
-        """
+        """Return the cells of `loose` that lie on sets whose stability is decided, and the index of each cell's set."""
         final = [i for i, one in enumerate(self.sets) if one.stability in (ATTRACTS, NEUTRAL) or not self.budget]
         clouds = [one for i in final if (one := self.sets[i].cloud) is not None]
         is_loose = np.zeros(self.point.n_cells, bool)
@@ -188,8 +185,8 @@ class _Extension:
         return np.concatenate(cells), np.concatenate(numbers)
 
     def add_transient(self) -> None:
-        """Add the set that trajectories have left to the list of sets, as a transient set, unless the list already has
-        one.
+        """Describe the set that trajectories have left, and store it as a transient set, unless one is stored
+        already.
         """
         left = [course for course in self.courses if course.has_left]
         if left and not any(one.n_left for one in self.sets):
@@ -198,9 +195,7 @@ class _Extension:
     # ---- legs ----------------------------------------------------------------------------------
 
     def run(self) -> Work[None]:
-        """Integrate trajectories without a known attractor further, until it is decided for each whether its set
-        attracts.
-        """
+        """Integrate the sampled trajectories further, until it is decided for each of them whether its set attracts."""
         target = LEAST_STAY
         for _ in range(DOUBLINGS + 1):
             yield from self._extend(target)
@@ -213,9 +208,7 @@ class _Extension:
             target = 2 * max(c.length for c in self.courses if c.goes_on)
 
     def conclude(self) -> Work[None]:
-        """Describe the sets of unfinished trajectories if these have grown since the last description; integrate
-        nothing.
-        """
+        """Describe the sets again if their trajectories were integrated further since the last description."""
         if self._told != self._lengths():
             yield from self._tell_sets()
 
@@ -238,9 +231,7 @@ class _Extension:
             yield from self._take(going, leg)
 
     def _has_stayed(self, going: Sequence[Course], target: int) -> bool:
-        """Return whether the unfinished trajectories stayed on their set so long that the set can be called an
-        attractor.
-        """
+        """Return whether the unfinished trajectories stayed on their set long enough to call the set an attractor."""
         least = min(course.length for course in going)
         if least < target:
             return False
@@ -249,13 +240,12 @@ class _Extension:
         return least >= longest or lifetime_interval(0, at_risk)[0] >= longest
 
     def _longest_transient(self) -> float:
-        """Return the longest transient seen at this parameter point [drive periods, or returns to the section]."""
         left = [c.periods for c in self.courses if not c.goes_on and not c.is_leaving]
         return self.settings.seen + max(left, default=0.0)
 
     def _take(self, going: Sequence[Course], leg: Extended) -> Work[None]:
-        """Record the newly integrated section points of each trajectory, and end those that reached an orbit or an
-        equilibrium.
+        """Record the newly integrated section points of each trajectory. Finish the trajectories that reached an orbit
+        or an equilibrium.
         """
         computed = np.isin(leg.status, (Status.PERIODIC, Status.BOUNDED))
         for course, state, step, section, ok in zip(going, leg.state, leg.step, leg.section, computed, strict=True):
@@ -280,7 +270,6 @@ class _Extension:
         self._leap(own, leg.section[rows])
 
     def _fail(self, course: Course, status: int) -> None:
-        """End the extension of a trajectory whose integration stopped early: at rest, diverged or failed."""
         course.periods = float(course.length)
         course.is_leaving = not course.length
         course.end = DIVERGED if status == Status.DIVERGED else FAILED
@@ -290,7 +279,7 @@ class _Extension:
                 course.end = AT_REST - number
 
     def _search(self, own: Sequence[Course], block: Block) -> Work[None]:
-        """Find closed orbits by Newton's method, from trajectories that close or nearly close."""
+        """Find closed orbits by Newton's method, started from trajectories that close or nearly close."""
         label, _ = decide(block, self.orbits, 10.0 * self.settings.closure, self.geometry)
         rest = np.flatnonzero(label < 0).tolist()
         closed = ClosedCells(self.geometry, 10.0 * self.settings.closure, Guesses.none(block.section.shape[2]))
@@ -314,13 +303,10 @@ class _Extension:
                 self.orbits.append(orbit)
 
     def _rests(self, orbit: Orbit) -> bool:
-        """Return whether a closed orbit is in fact an equilibrium that lies on the section."""
         return self.point.can_rest and rest_of_orbit(self.point, orbit.points[0], self.geometry) is not None
 
     def _leave(self, course: Course, number: int) -> None:
-        """End the extension of a trajectory that has reached an orbit, and record when it came near the orbit and
-        stayed near.
-        """
+        """Finish a trajectory that has reached an orbit, and record from when on it stayed near the orbit."""
         orbit, states = self.orbits[number], np.concatenate([course.kept, course.extension])
         phase = int(np.argmin(self.geometry.distance(orbit.points, states[-1])))
         back = np.arange(len(states))
@@ -331,7 +317,6 @@ class _Extension:
         course.is_leaving = entered <= len(course.kept)
 
     def _rest(self, own: Sequence[Course], section: np.ndarray, seconds: np.ndarray) -> None:
-        """End the extension of trajectories that approach a stable equilibrium."""
         if not self.point.can_rest:
             return
         going = [i for i, course in enumerate(own) if course.goes_on]
@@ -344,7 +329,7 @@ class _Extension:
                 own[i].is_leaving = len(own[i].legs) <= 1
 
     def _leap(self, own: Sequence[Course], section: np.ndarray) -> None:
-        """Move trajectories that slowly leave an unstable orbit farther out along their predicted path."""
+        """Advance trajectories that slowly leave an unstable orbit to a predicted later state, without integration."""
         rows = [i for i, course in enumerate(own) if course.goes_on]
         if not rows:
             return
@@ -356,8 +341,8 @@ class _Extension:
     # ---- sets ----------------------------------------------------------------------------------
 
     def _tell_sets(self) -> Work[bool]:
-        """Group the unfinished trajectories by set, and describe each set; return whether a grouping or a stability is
-        uncertain.
+        """Group the unfinished trajectories by set, and describe each set. Return whether any grouping or stability is
+        still uncertain.
         """
         going = [course for course in self.courses if course.goes_on]
         has_stayed = bool(going[0].legs) and self._has_stayed(going, LEAST_STAY)
@@ -376,7 +361,9 @@ class _Extension:
     def _with_those_left(
         self, groups: Sequence[list[Course]], gone: Sequence[Course]
     ) -> list[tuple[list[Course], list[Course]]]:
-        """Pair each group of unfinished trajectories with those that left its set; merge groups whose set was left."""
+        """Pair each group of unfinished trajectories with the trajectories that left the same set. Merge all groups
+        whose set was left.
+        """
         left = [[course for course in gone if were_on(course, own, self.settings)] for own in groups]
         joined = [course for own, some in zip(groups, left, strict=True) if some for course in own]
         found = [(own, some) for own, some in zip(groups, left, strict=True) if not some]

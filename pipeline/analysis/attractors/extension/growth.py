@@ -50,7 +50,7 @@ an interval around 0 counts as 0."""
 
 @dataclass(frozen=True)
 class Growth:
-    """Lyapunov exponents of the section map on a set, per iteration of the map.
+    """Lyapunov exponents of the section map on a set, per iteration of this map.
 
     Attributes
     ----------
@@ -77,8 +77,8 @@ class Growth:
 
     @property
     def is_chaotic(self) -> bool:
-        """Whether small distances grow: the exponent's confidence interval lies above 0, and the total growth is large
-        enough.
+        """Whether small distances grow: the confidence interval of the exponent is above 0, and the total growth is
+        large enough.
         """
         return bool(self.low > 0.0 and self.rate * self.length >= GROWN)
 
@@ -95,13 +95,15 @@ class Growth:
 
     @property
     def preserves_volume(self) -> bool:
-        """Whether the section map preserves phase volume: the mean logarithm of its change is 0 within the error."""
+        """Whether the section map preserves phase volume: the mean logarithm of the volume's change is 0 within its
+        error.
+        """
         near = abs(self.volume) <= N_SIGMA * self.volume_error and self.volume_error <= LOST_ERROR
         return bool(near or abs(self.volume) <= LOST)
 
 
 def growth_of(derivatives: np.ndarray, n_known: int, volumes: np.ndarray) -> Growth:
-    """Compute the Lyapunov exponents of the section map from its derivatives along some trajectories.
+    """Compute the Lyapunov exponents of the section map from the map's derivatives along some trajectories.
 
     Parameters
     ----------
@@ -138,7 +140,7 @@ def growth_of(derivatives: np.ndarray, n_known: int, volumes: np.ndarray) -> Gro
 
 
 def _mean(values: np.ndarray) -> tuple[float, float]:
-    """Compute the mean of values (cell, section) and its standard error from block means.
+    """Compute the mean of values (cell, section), and its standard error from the means of blocks.
 
     The error of few blocks is itself uncertain. Student's distribution widens it, so that `N_SIGMA` errors
     keep the confidence that they have for a normal distribution.
@@ -180,9 +182,7 @@ def volumes_of(
 
 
 def _logarithms(derivatives: np.ndarray) -> np.ndarray:
-    """Compute the logarithmic growth of orthonormal directions at each section point by QR; very negative for a lost
-    direction.
-    """
+    """Compute by QR the logarithmic growth of orthonormal directions at each section point."""
     basis = np.broadcast_to(np.eye(derivatives.shape[-1]), derivatives[:, 0].shape)
     grown = np.empty(derivatives.shape[:-1])
     for i in range(derivatives.shape[1]):
@@ -193,7 +193,6 @@ def _logarithms(derivatives: np.ndarray) -> np.ndarray:
 
 
 def _weighted(values: np.ndarray) -> np.ndarray:
-    """Compute the weighted Birkhoff average of values (cell, section) over the sections."""
     t = (np.arange(values.shape[1]) + 1.0) / (values.shape[1] + 1.0)
     weight = np.exp(-1.0 / (t * (1.0 - t)))
     return np.asarray(values @ (weight / weight.sum()))
@@ -224,8 +223,8 @@ def on_closed_curves(points: np.ndarray, geometry: Geometry) -> bool:
 
 
 def kind_of(growth: Growth, points: np.ndarray, geometry: Geometry) -> int:
-    """Return the kind of a set (chaotic, torus or other) from its Lyapunov exponents and its section points (n,
-    state).
+    """Decide from Lyapunov exponents and section points (n, state) whether a set is chaotic, a torus or another bounded
+    set.
     """
     if growth.is_chaotic:
         return CHAOTIC_SET

@@ -15,7 +15,8 @@ from scipy.stats import chi2
 
 
 def lifetime_interval(n_left: int, time_at_risk: float, confidence: float = 0.95) -> tuple[float, float]:
-    """Compute the confidence interval of the mean lifetime from the number of escapes and the total time at risk.
+    """Compute the confidence interval of the mean lifetime on a transient set, from the number of escapes and the total
+    time that trajectories spent on it.
 
     Parameters
     ----------

@@ -17,7 +17,7 @@ from pipeline.layout.vocabulary import APPROACHING, CERTAIN, CLOSED, UNDECIDED
 
 @dataclass(frozen=True)
 class _Metric:
-    """A norm of scaled states in which the linearised return map contracts: ``|x| = sqrt(x' S x)``."""
+    """Norm of scaled states in which the linearised return map of an orbit contracts: ``|x| = sqrt(x' S x)``."""
 
     root: np.ndarray
     matrix: np.ndarray
@@ -25,8 +25,8 @@ class _Metric:
 
     @classmethod
     def of(cls, orbit: Orbit, geometry: Geometry) -> _Metric | None:
-        """Return a norm in which the return map of an orbit contracts; None if the orbit attracts too weakly or not at
-        all.
+        """Return a norm in which the return map of an orbit contracts; None if the orbit does not attract, or too
+        weakly.
         """
         matrix = scaled_derivative(orbit, geometry)
         slow = 0.5 * (1.0 + float(np.abs(orbit.multipliers).max()))
@@ -43,7 +43,7 @@ class _Metric:
 
     @property
     def factor(self) -> float:
-        """Largest value that this norm can take for a vector whose scaled components are at most 1."""
+        """Largest norm of a vector whose scaled components are at most 1."""
         return float(np.linalg.norm(self.root, 2) * np.sqrt(len(self.root)))
 
 
@@ -100,7 +100,7 @@ def decide(
 def _nearest(
     section: np.ndarray, cells: np.ndarray, orbits: Sequence[Orbit], geometry: Geometry
 ) -> Iterator[tuple[np.ndarray, int, int]]:
-    """Yield cells near an orbit, grouped by the nearest orbit point: cells, index of the orbit, index of the point."""
+    """Yield the cells near each point of the orbits, with the index of the orbit and of the orbit point."""
     if not orbits or not len(cells):
         return
     owner = np.repeat(np.arange(len(orbits)), [o.period for o in orbits])
@@ -118,7 +118,9 @@ def _on_orbit(section: np.ndarray, orbit: Orbit, phase: int, tolerance: float, g
 
 
 def _approach(section: np.ndarray, orbit: Orbit, phase: int, tolerance: float, geometry: Geometry) -> np.ndarray:
-    """Return for each cell near an orbit whether it converges to it, as a code: certain, approaching or undecided."""
+    """Return for each cell near an orbit whether it surely converges to the orbit, approaches it, or is undecided (a
+    code).
+    """
     code = np.zeros(len(section), np.int8)
     last = section.shape[1] - 1 - phase
     if not orbit.is_stable or last < 2 * orbit.period:

@@ -40,15 +40,15 @@ class Block:
     step: np.ndarray | None = None
 
     def take(self, rows: np.ndarray) -> Block:
-        """Return a block of the cells at the given indices of this block. Its attribute `cells` still covers the old
+        """Return a block of the cells at the given indices. Its attribute `cells` is still the range of the whole
         block.
         """
         return Block(self.cells, self.section[rows], self.status[rows], self.orbit_period[rows], self.turns[rows])
 
     @cached_property
     def is_closed(self) -> np.ndarray:
-        """Whether each cell's section points repeat with a period, or its period was inferred from neighbouring
-        cells.
+        """Whether each cell is on a periodic orbit: its section points repeat, or its period was inferred from
+        neighbouring cells.
         """
         closed = np.isin(self.status, (Status.PERIODIC, Status.INFERRED))
         return np.asarray(closed & (self.orbit_period > 0) & self._finite)
@@ -66,7 +66,7 @@ class Block:
 
 @dataclass(frozen=True)
 class Guesses:
-    """Starting guesses for closed orbits: the best cell of each box of section points.
+    """Starting guesses for closed orbits, each from the best cell of one box of section points.
 
     Attributes
     ----------
@@ -100,7 +100,7 @@ class Guesses:
         return Guesses(self.key[rows], self.score[rows], self.mark[rows], self.point[rows], self.period[rows])
 
     def best(self, key: np.ndarray | None = None) -> Guesses:
-        """Return the best guess for each key, sorted by key; the default key is the box of the guess."""
+        """Return the best guess for each key, sorted by key. By default, a guess's key is its box of section points."""
         keys = self.key if key is None else key
         order = np.lexsort((self.mark, self.score, keys))
         first = np.ones(len(order), bool)
@@ -108,27 +108,27 @@ class Guesses:
         return self.take(order[first])
 
     def least(self, n: int) -> Guesses:
-        """Return the `n` guesses with the lowest score, sorted by their cells' hashes."""
+        """Return the `n` guesses with the lowest score, sorted by the hashes of their cells."""
         least = np.lexsort((self.mark, self.score))[:n]
         return self.take(least[np.argsort(self.mark[least], kind="stable")])
 
     def without_period(self) -> Guesses:
-        """Return the same guesses with unknown periods."""
+        """Return the same guesses with all periods set to unknown."""
         return Guesses(self.key, self.score, self.mark, self.point, np.zeros_like(self.period))
 
     def joined(self, other: Guesses) -> Guesses:
-        """Return the best guess per box from this collection and another."""
+        """Merge two collections of guesses, and keep the best guess of each box."""
         return self.followed_by(other).best()
 
     def followed_by(self, other: Guesses) -> Guesses:
-        """Return these guesses followed by those of another collection."""
+        """Append the guesses of another collection to these guesses."""
         names = ("key", "score", "mark", "point", "period")
         return Guesses(*(np.concatenate([getattr(self, n), getattr(other, n)]) for n in names))
 
 
 @dataclass
 class ClosedCells:
-    """Groups of closed (periodic) cells, by the boxes into which their last section points fall.
+    """Groups of closed (periodic) cells, formed by the boxes that hold their last section points.
 
     A cell of period p contributes the boxes of its last p sections, whose order does not matter.
     Boxes of side `tolerance` that touch are connected, and so are all boxes of one cell. Cells of
@@ -170,7 +170,9 @@ class ClosedCells:
         self._keys.append(unique)
 
     def close(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the sorted keys (hashes) of the occupied boxes, and the number of each box's group of cells."""
+        """Form the groups. Return the sorted keys (hashes) of the occupied boxes, and the number of each box's
+        group.
+        """
         if not self._keys:
             return np.zeros(0, np.uint64), np.zeros(0, np.int64)
         keys, first = np.unique(np.concatenate(self._keys), return_index=True)
@@ -182,7 +184,7 @@ class ClosedCells:
         return keys, groups(len(keys), np.concatenate(pairs))
 
     def group_of(self, block: Block, keys: np.ndarray, group: np.ndarray) -> np.ndarray:
-        """Return the group of each cell of a block; -1 for cells that are not closed."""
+        """Return the group number of each cell of a block; -1 for cells that are not closed (periodic)."""
         found = np.full(len(block.status), -1, np.int64)
         for p in np.unique(block.orbit_period[block.is_closed]):
             cells = np.flatnonzero(block.is_closed & (block.orbit_period == p))
@@ -192,12 +194,11 @@ class ClosedCells:
 
 
 def _rows_of(points: np.ndarray, p: int, geometry: Geometry, side: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return for each section point the integers (orbit period, box indices), and a hash of these integers."""
     boxes = geometry.boxes(points, side)
     rows = np.concatenate([np.full((*boxes.shape[:-1], 1), p, np.int64), boxes], axis=-1)
     return rows, hashes(rows)
 
 
 def marks_of(section: np.ndarray) -> np.ndarray:
-    """Hash the section points (cell, period_index, state) of each cell to one number."""
+    """Compute a hash of each cell's section points (cell, period_index, state)."""
     return hashes(section.reshape(len(section), section.shape[1] * section.shape[2]))

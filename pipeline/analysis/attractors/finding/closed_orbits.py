@@ -1,4 +1,4 @@
-"""Polish (refine) closed orbits by Newton's method, integrate guesses until they close, and compare orbits.
+"""Refine closed orbits by Newton's method, integrate guesses until they close, and compare orbits.
 
 `polish` runs Newton's method of the core, and `run_on` runs the engine. Both take one section point per
 guess.
@@ -38,7 +38,7 @@ RUN_ON_PERIODS = 2000
 
 @dataclass(frozen=True)
 class Orbit:
-    """A closed orbit at one parameter point.
+    """A closed orbit at one parameter point, by its section points and its multipliers.
 
     Attributes
     ----------
@@ -75,7 +75,7 @@ class Orbit:
 
     @cached_property
     def multiplier_error(self) -> float:
-        """Error of the largest modulus of the multipliers.
+        """Estimated error of the largest modulus of the multipliers.
 
         It adds the error of the monodromy matrix and the error of the orbit's place: near a fold the
         multiplier changes with the square root of the residual.
@@ -85,8 +85,8 @@ class Orbit:
 
     @cached_property
     def stability(self) -> int:
-        """Stability from the multipliers and their error or, if these do not decide, from trajectories on both
-        sides.
+        """Stability of the orbit, decided by its multipliers and their error or, if these do not decide, by nearby
+        trajectories.
         """
         if not self.is_polished:
             return NOT_SETTLED
@@ -100,18 +100,18 @@ class Orbit:
 
     @property
     def error(self) -> float:
-        """Estimate of the distance from the true orbit, from the residual of Newton's method."""
+        """Estimated distance from the true orbit, from the residual of Newton's method."""
         return float(10.0 * self.residual / max(np.abs(1.0 - self.multipliers).min(), 1e-6))
 
 
 def scaled_derivative(orbit: Orbit, geometry: Geometry) -> np.ndarray:
-    """Return the orbit's monodromy matrix for states in units of their scales."""
+    """Return the orbit's monodromy matrix for states that are divided by their scales."""
     scales = np.asarray(geometry.scales)
     return np.asarray(orbit.derivative * scales[None, :] / scales[:, None])
 
 
 def raw_orbit(points: np.ndarray, geometry: Geometry) -> Orbit:
-    """Make an orbit from its section points (period, state), without polishing it by Newton's method."""
+    """Make an orbit from its section points (period, state), without refining it by Newton's method."""
     n = points.shape[1]
     return Orbit(_rolled(points, geometry), np.full(n, np.nan + 0j), np.nan, np.full((n, n), np.nan))
 
@@ -131,7 +131,7 @@ def polish(
     system: System,
     tolerance: float,
 ) -> list[Orbit | None]:
-    """Polish guesses of closed orbits, at any parameter points, by Newton's method in one call.
+    """Refine many guesses of closed orbits by Newton's method in one call; each guess can have its own parameters.
 
     Parameters
     ----------
@@ -195,7 +195,9 @@ def _polished(
     system: System,
     tolerance: float,
 ) -> list[Orbit | None]:
-    """Refine guesses of orbits by Newton's method, each from the orbit's canonical (least) section point."""
+    """Refine guesses of orbits by Newton's method, and then once more from the first section point in canonical
+    order.
+    """
     found = polish_orbits(packed, frequency, points, period, tolerance=tolerance, system=system)
     orbits = [_orbit_of(found, row) if found.converged[row] else None for row in range(len(points))]
     least = {row: _rolled(one.points, geometry)[0] for row, one in enumerate(orbits) if one is not None}
@@ -223,7 +225,7 @@ def _orbit_of(found: PeriodicOrbits, row: int) -> Orbit:
 def run_on(
     packed: np.ndarray, frequency: np.ndarray, points: np.ndarray, max_orbit_period: int, system: System
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Integrate on from section points (n, state) until each trajectory closes on a periodic orbit within a tolerance.
+    """Integrate from section points (n, state) until each trajectory closes on a periodic orbit within a tolerance.
 
     Returns
     -------
@@ -251,7 +253,7 @@ def run_on(
 
 
 def distinct(orbits: Sequence[Orbit], geometry: Geometry) -> list[Orbit]:
-    """Merge orbits that coincide and return them sorted, independent of the order in which they were given."""
+    """Merge orbits that coincide, and sort them. The result does not depend on the order in which they were given."""
 
     def key(orbit: Orbit) -> tuple[int, tuple[float, ...], bytes]:
         least = rounded_points(orbit.points[:1], geometry)[0]
@@ -265,7 +267,7 @@ def distinct(orbits: Sequence[Orbit], geometry: Geometry) -> list[Orbit]:
 
 
 def number_of(orbit: Orbit, orbits: Sequence[Orbit], geometry: Geometry) -> int:
-    """Return the index of an orbit in a list, or the length of the list if it is not there."""
+    """Return the index of an orbit in a list of orbits, or the length of the list if the orbit is not in it."""
     return next((i for i, other in enumerate(orbits) if _coincide(orbit, other, geometry)), len(orbits))
 
 

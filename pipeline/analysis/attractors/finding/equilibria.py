@@ -36,7 +36,7 @@ GUESSES, GUESS_BOX = 64, 0.1
 
 
 def tell_rest(points: Iterable[Point], tolerance: float, geometry: Geometry) -> None:
-    """Find the equilibria of each parameter point, and the cells that are at one; store both in the points.
+    """Find the equilibria of each parameter point and the cells that are at one; store both in the point.
 
     Parameters
     ----------
@@ -56,7 +56,9 @@ def tell_rest(points: Iterable[Point], tolerance: float, geometry: Geometry) -> 
 
 
 def _ends(point: Point, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return each cell's last state (NaN if none), and the distance within which it counts as at an equilibrium."""
+    """Return each cell's last state (NaN if none), and the distance within which the cell counts as at an
+    equilibrium.
+    """
     states = np.full((point.n_cells, point.n_states), np.nan)
     reach = np.full(point.n_cells, tolerance)
     for block in point.blocks():
@@ -70,8 +72,8 @@ def _ends(point: Point, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _waited(point: Point, states: np.ndarray) -> np.ndarray:
-    """Integrate states outside the section until they are near an equilibrium; NaN for those that return to the
-    section.
+    """Integrate trajectories that no longer cross the section until they are near an equilibrium; NaN if they cross it
+    again.
     """
     states, system = states.copy(), point.integrates
     far = np.flatnonzero(np.isfinite(states).all(axis=1))
@@ -98,7 +100,7 @@ def _waited(point: Point, states: np.ndarray) -> np.ndarray:
 
 
 def _found(point: Point, states: np.ndarray, reach: np.ndarray, geometry: Geometry) -> list[Equilibrium]:
-    """Find the equilibria near the cells' last states by Newton's method, sorted in canonical order."""
+    """Find the equilibria near the cells' last states by Newton's method, in canonical order."""
     if not len(states):
         return []
     steps, _ = newton_steps(point.integrates, states, point.packed)
@@ -112,7 +114,9 @@ def _found(point: Point, states: np.ndarray, reach: np.ndarray, geometry: Geomet
 
 
 def equilibria_near(point: Point, states: np.ndarray, geometry: Geometry) -> list[Equilibrium]:
-    """Return the distinct equilibria that Newton's method finds from start states (n, state), up to a fixed number."""
+    """Find the distinct equilibria to which Newton's method converges from given states (n, state), up to a fixed
+    number.
+    """
     found = find_equilibria(point.integrates, states, point.packed, max_iterations=ITERATIONS)
     scales = np.asarray(geometry.scales)
     kept: list[Equilibrium] = []
@@ -129,7 +133,6 @@ def equilibria_near(point: Point, states: np.ndarray, geometry: Geometry) -> lis
 
 
 def _settled(point: Point, states: np.ndarray, reach: np.ndarray, geometry: Geometry) -> np.ndarray:
-    """Return the index of the equilibrium that each cell is at; -1 for none."""
     at_rest = np.full(len(states), -1, np.int64)
     rows = np.flatnonzero(np.isfinite(states).all(axis=1))
     for k, one in enumerate(point.equilibria):
@@ -139,7 +142,9 @@ def _settled(point: Point, states: np.ndarray, reach: np.ndarray, geometry: Geom
 
 
 def put_at_rest(point: Point, tolerance: float, geometry: Geometry) -> None:
-    """Mark the cells near an attracting degenerate equilibrium as at rest there; changes `point.at_rest`."""
+    """Mark cells near a degenerate equilibrium as at rest there, if that equilibrium attracts; changes
+    `point.at_rest`.
+    """
     states, _ = _ends(point, tolerance)
     assert point.at_rest is not None
     for k, one in enumerate(point.equilibria):
@@ -149,7 +154,6 @@ def put_at_rest(point: Point, tolerance: float, geometry: Geometry) -> None:
 
 
 def _label_approaching(point: Point, tolerance: float, geometry: Geometry) -> None:
-    """Label the cells that approach a stable equilibrium, in place."""
     assert point.at_rest is not None
     for block in point.blocks():
         rows = np.flatnonzero(block.is_closed | block.is_bounded)
@@ -185,8 +189,8 @@ def approaching(
 
 
 def rest_near(point: Point, state: np.ndarray, geometry: Geometry) -> int | None:
-    """Return the index of the stable equilibrium that a trajectory without returns ends at; add the equilibrium if it
-    is new.
+    """Find the stable equilibrium at which a trajectory ends that no longer crosses the section. Return its index, and
+    add it if it is new.
     """
     if not np.isfinite(state).all():
         return None
@@ -198,7 +202,7 @@ def rest_near(point: Point, state: np.ndarray, geometry: Geometry) -> int | None
 
 
 def number_of(one: Equilibrium, point: Point, geometry: Geometry) -> int:
-    """Return the index of an equilibrium among those of a parameter point; append it if it is new."""
+    """Return the index of an equilibrium in the list of a parameter point; append it to the list if it is new."""
     for k, other in enumerate(point.equilibria):
         if geometry.distance(one.state, other.state) <= SAME_EQUILIBRIUM:
             return k
@@ -207,7 +211,9 @@ def number_of(one: Equilibrium, point: Point, geometry: Geometry) -> int:
 
 
 def rest_of_orbit(point: Point, state: np.ndarray, geometry: Geometry) -> int | None:
-    """Return the index of the equilibrium to which a polished orbit has shrunk; None if the orbit is no equilibrium."""
+    """Return the index of the equilibrium to which a refined orbit has shrunk; None if the orbit has not shrunk to a
+    point.
+    """
     steps, _ = newton_steps(point.integrates, state[None], point.packed)
     if not np.abs(steps / np.asarray(geometry.scales)).max() <= 10.0 * SAME_EQUILIBRIUM:
         return None

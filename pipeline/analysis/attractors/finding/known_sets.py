@@ -1,4 +1,4 @@
-"""Define the equilibria and limit cycles that cells of a parameter point can be on."""
+"""Represent the equilibria and limit cycles on which the cells of a parameter point can end."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from pipeline.layout.vocabulary import ATTRACTS, NEUTRAL
 
 @dataclass(frozen=True)
 class Equilibrium:
-    """A state at which the rate is zero.
+    """An equilibrium of a flow: a state at which the rate of change is zero.
 
     Attributes
     ----------
@@ -39,15 +39,15 @@ class Equilibrium:
 
     @cached_property
     def eigenvalue_error(self) -> float:
-        """Error of the largest real part of the eigenvalues [1/s]."""
+        """Estimated error of the largest real part of the eigenvalues [1/s]."""
         # the error of the state is its residual, or more if degenerate, and carries over to the Jacobian
         size = max(RATE_ERROR, 1e-4 * float(np.sqrt(self.residual))) * float(np.abs(self.jacobian).max(initial=1.0))
         return largest_error(self.jacobian, size, real=True)
 
     @cached_property
     def stability(self) -> int:
-        """Stability from the real parts of the eigenvalues and their error or, if these do not decide, from nearby
-        trajectories.
+        """Stability of the equilibrium, decided by the eigenvalues and their error or, if these do not decide, by
+        nearby trajectories.
         """
         found = by_margin(float(self.eigenvalues.real[0]), 0.0, self.eigenvalue_error)
         return ATTRACTS if found == NEUTRAL and self.approached_within > 0.0 else found
@@ -59,8 +59,8 @@ class Equilibrium:
 
     @cached_property
     def _norm(self) -> tuple[np.ndarray, float] | None:
-        """Matrix S and rate such that |S x| decays at least as exp(-rate t) along the linear flow; None if S does not
-        exist.
+        """Matrix S and rate such that |S x| decays as exp(-rate t) or faster along the linear flow; None if there is no
+        such matrix.
         """
         rate = -0.5 * float(self.eigenvalues.real[0])
         shifted = self.jacobian + rate * np.eye(len(self.jacobian))
@@ -103,7 +103,6 @@ class Equilibrium:
         return np.asarray((error <= allowed + known).all(axis=1) & (size[:, -1] <= size[:, 0] + known))
 
     def _flow(self, times: np.ndarray) -> np.ndarray:
-        """Return the matrix exponential of the Jacobian over each time, shape (..., state, state)."""
         values, vectors = np.linalg.eig(self.jacobian)
         if np.linalg.cond(vectors) > 1e8:  # nearly defective: the eigenvectors are no basis
             return np.asarray(expm(self.jacobian * times[..., None, None]))
@@ -113,7 +112,7 @@ class Equilibrium:
 
 @dataclass(frozen=True)
 class Cycle:
-    """A stable limit cycle.
+    """A stable limit cycle: its period [s], its multipliers and the residual of Newton's method.
 
     Attributes
     ----------

@@ -30,17 +30,7 @@ TRIES = 3
 
 
 class _Crossings:
-    """Upward crossings of a fixed level by one state variable, for cells of a parameter point.
-
-    Parameters
-    ----------
-    point
-        Parameter point of the cells.
-    state
-        Index of the state that crosses.
-    longest_s
-        Longest wait for a crossing [s].
-    """
+    """Upward crossings of a fixed level by one state variable, for the trajectories of one parameter point."""
 
     def __init__(self, point: Point, state: int, longest_s: float) -> None:
         self._packed, self._rate = point.packed, 1.0 / longest_s
@@ -48,8 +38,8 @@ class _Crossings:
         self.state = state
 
     def of(self, states: np.ndarray, level: float) -> np.ndarray:
-        """Return a fixed number of successive crossings of the level from each start state (cell, crossing, state),
-        padded with NaN.
+        """Integrate each start state over a fixed number of upward crossings; return (cell, crossing, state), padded
+        with NaN.
         """
         n = len(states)
         found = run_branches(
@@ -65,7 +55,7 @@ class _Crossings:
         return np.asarray(found.section[:, 0])
 
     def cycle_of(self, start: np.ndarray, geometry: Geometry, residual: float) -> tuple[Cycle, np.ndarray] | None:
-        """Return the stable limit cycle that a state lies on, with the cycle's crossings of the level; None if there is
+        """Return the stable limit cycle that passes through a state, with its crossings of the level; None if there is
         none.
         """
         level = float(start[self.state])
@@ -84,7 +74,7 @@ class _Crossings:
 
 
 def tell_cycles(points: Iterable[Point], tolerance: float, longest: int, residual: float, geometry: Geometry) -> None:
-    """Find the limit cycles at each parameter point, and the cells that are on one; store both in the points.
+    """Find the limit cycles of each parameter point and the cells that are on one; store both in the point.
 
     Parameters
     ----------
@@ -134,7 +124,7 @@ def _tell(point: Point, tolerance: float, longest: int, residual: float, geometr
 
 
 def _ends(point: Point) -> tuple[np.ndarray, np.ndarray]:
-    """Return the last state of each cell (NaN if the cell is not bounded), and whether the cell is closed."""
+    """Return the last state of each cell (NaN if it has none), and whether the cell is on a periodic orbit."""
     states = np.full((point.n_cells, point.n_states), np.nan)
     is_closed = np.zeros(point.n_cells, bool)
     for block in point.blocks():

@@ -1,4 +1,4 @@
-"""Read the parameter points of a cube: their cells in blocks, their parameters and their system."""
+"""Read the parameter points of a run's result cube: their cells in blocks, their parameters and their system."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ BUDGET = 256 * 2**20
 
 @dataclass(frozen=True)
 class Dynamics:
-    """The model, parameters and system of a cube's cells.
+    """Model, parameters and compiled system of the cells of a run's result cube.
 
     Attributes
     ----------
@@ -59,7 +59,8 @@ class Dynamics:
         *,
         needed: bool = True,
     ) -> Dynamics:
-        """Collect model, parameters and system from the arguments; missing ones are taken from the run's attributes.
+        """Collect the model, the parameters and the system from the arguments. Missing ones are read from the
+        attributes of the run.
 
         Raises
         ------
@@ -75,13 +76,13 @@ class Dynamics:
 
     @property
     def integrates(self) -> System:
-        """System of equations to integrate; AssertionError if the analysis was given none."""
+        """System to integrate; AssertionError if the analysis was given no system."""
         assert self.system is not None
         return self.system
 
     @property
     def can_rest(self) -> bool:
-        """Whether equilibria are searched for: only for autonomous models whose equations are integrated."""
+        """Whether to search for equilibria: the model is autonomous, and its equations may be integrated."""
         return self.model is not None and self.model.autonomous and self.system is not None
 
     @property
@@ -97,7 +98,7 @@ class Dynamics:
 
 @dataclass
 class Point:
-    """One parameter point: its cells, parameters and system.
+    """One parameter point: its cells (trajectories), its parameters and its system.
 
     Attributes
     ----------
@@ -146,12 +147,14 @@ class Point:
 
     @property
     def n_neutral(self) -> int:
-        """Number of Lyapunov exponents that are 0 for any flow: 1 if the flow is sampled at equal times, else 0."""
+        """Number of Lyapunov exponents that are 0 because the flow is autonomous: 1 if it is sampled at equal times,
+        else 0.
+        """
         return int(self.can_rest and not self.is_flow)
 
     def volumes(self, derivatives: np.ndarray, before: np.ndarray, after: np.ndarray) -> np.ndarray:
-        """Compute the logarithm of a phase volume's change along the flow over each step of the section map, shape
-        (n,).
+        """Compute the logarithm of the factor by which the flow changes phase volume from each section point to the
+        next, shape (n,).
         """
 
         def flow(states: np.ndarray) -> np.ndarray:
@@ -161,22 +164,22 @@ class Point:
 
     @property
     def integrates(self) -> System:
-        """System of equations to integrate; AssertionError if the analysis was given none."""
+        """System to integrate; AssertionError if the analysis was given no system."""
         assert self.system is not None
         return self.system
 
     @property
     def n_cells(self) -> int:
-        """Number of cells."""
+        """Number of cells (trajectories) of this parameter point."""
         return math.prod(self.cube.sizes[d] for d in self.start_dims)
 
     @property
     def n_states(self) -> int:
-        """Number of states."""
+        """Number of state variables."""
         return int(self.cube.sizes["state"])
 
     def blocks(self) -> Iterator[Block]:
-        """Yield all cells in blocks, in the order of the dims of their starts (initial conditions or branches)."""
+        """Yield all cells in blocks, in the order of their initial conditions (or branches, in a continuation)."""
         first = self.start_dims[0] if self.start_dims else None
         length = self.cube.sizes[first] if first else 1
         inner = self.n_cells // max(length, 1)
@@ -191,7 +194,9 @@ class Point:
             yield self._known(self._read(part, slice(begin * inner, begin * inner + n), n))
 
     def _known(self, block: Block) -> Block:
-        """Return the block with the status ``NO_RETURN`` for cells at an equilibrium or on a limit cycle."""
+        """Set the status of cells at an equilibrium or on a limit cycle to ``NO_RETURN``, so that the search for orbits
+        skips them.
+        """
         for told in (self.at_rest, self.on_cycle):
             if told is not None:
                 status = np.where(told[block.cells] >= 0, np.int8(Status.NO_RETURN), block.status)
@@ -215,8 +220,8 @@ class Point:
 
 
 def slabs(ds: xr.Dataset, dynamics: Dynamics, budget: int) -> Iterator[dict[tuple[int, ...], Point]]:
-    """Yield groups of parameter points, by index in the cube; a group that fits the memory budget is loaded in one
-    read.
+    """Yield parameter points in groups, by their indices in the result cube. A group that fits the memory budget is
+    read at once.
     """
     names = [name for name in _READ if name in ds]
     cube = ds[names].reset_coords(drop=True) if FREQUENCY_DIM in ds.dims else ds[names]
@@ -240,7 +245,6 @@ def slabs(ds: xr.Dataset, dynamics: Dynamics, budget: int) -> Iterator[dict[tupl
 
 
 def _fixed(ds: xr.Dataset) -> dict[str, float]:
-    """Return the dataset's scalar coordinates: parameters that are not swept, by name."""
     return {str(name): float(c) for name, c in ds.coords.items() if not c.ndim and c.dtype.kind in "fiu"}
 
 

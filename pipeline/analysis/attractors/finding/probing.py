@@ -1,4 +1,4 @@
-"""Test whether degenerate orbits and equilibria attract, by trajectories started beside them.
+"""Test whether degenerate orbits and equilibria attract, by trajectories that start beside them.
 
 If a multiplier lies on the unit circle within its error, the linear map does not decide stability.
 Trajectories start on both sides along the critical directions. If all come nearer, the orbit attracts, as for
@@ -23,7 +23,9 @@ LEGS, FALL = 32, 0.7
 
 
 def probe_orbit(orbit: Orbit, geometry: Geometry) -> Work[float]:
-    """Return the scaled distance from which trajectories on both sides approach an orbit; 0 if they do not."""
+    """Find the scaled distance from which trajectories on both sides approach an orbit; 0 if they do not approach
+    it.
+    """
     matrix = scaled_derivative(orbit, geometry)
     values, vectors = np.linalg.eig(matrix)
     critical = vectors[:, np.abs(np.abs(values) - 1.0) <= orbit.multiplier_error]
@@ -31,7 +33,9 @@ def probe_orbit(orbit: Orbit, geometry: Geometry) -> Work[float]:
 
 
 def probe_equilibrium(one: Equilibrium, geometry: Geometry) -> Work[float]:
-    """Return the scaled distance from which trajectories on both sides approach an equilibrium; 0 if they do not."""
+    """Find the scaled distance from which trajectories on both sides approach an equilibrium; 0 if they do not approach
+    it.
+    """
     values, vectors = np.linalg.eig(one.jacobian)
     critical = vectors[:, np.abs(values.real) <= one.eigenvalue_error]
     return (yield from _probe(one.state[None], critical, geometry))
@@ -51,8 +55,8 @@ def _probe(points: np.ndarray, critical: np.ndarray, geometry: Geometry) -> Work
 
 
 def _falls(state: np.ndarray, points: np.ndarray, size: float, geometry: Geometry) -> Work[bool]:
-    """Return whether trajectories from `state`, at the distance `size` from an orbit or equilibrium, keep coming
-    nearer.
+    """Return whether trajectories that start at the distance `size` from an orbit or equilibrium come steadily nearer
+    to it.
     """
     step, before = np.zeros(len(state)), np.full(len(state), np.inf)
     for _ in range(LEGS):
@@ -70,13 +74,13 @@ def _falls(state: np.ndarray, points: np.ndarray, size: float, geometry: Geometr
 
 
 def _distance(section: np.ndarray, points: np.ndarray, geometry: Geometry) -> np.ndarray:
-    """Return the largest distance of each trajectory's section points from the nearest of the given points."""
+    """Return each trajectory's largest distance from the given points, over its section points."""
     away = np.stack([geometry.distance(section, point) for point in points])
     return np.asarray(away.min(axis=0).max(axis=1))
 
 
 def is_approaching(section: np.ndarray, orbit: Orbit, geometry: Geometry) -> np.ndarray:
-    """Return for each cell's section points (cell, period_index, state) whether they approach a probed orbit."""
+    """Return for each cell whether its section points (cell, period_index, state) approach an orbit that was probed."""
     half = section.shape[1] // 2
     early = _distance(section[:, :half], orbit.points, geometry) if half else np.full(len(section), np.inf)
     late = _distance(section[:, half:], orbit.points, geometry)

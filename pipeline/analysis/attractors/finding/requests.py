@@ -1,5 +1,4 @@
-"""Collect the integrations that the analyses of all parameter points request, and run them in common calls of the
-engine.
+"""Collect the integrations that the analyses of all parameter points request, and run them together in the engine.
 
 The work on a point is a generator: it yields a request and receives the answer. All points advance in step,
 so that their trajectories fill the engine's lanes together.
@@ -31,8 +30,7 @@ LEG = 64
 
 @dataclass(frozen=True)
 class Leg:
-    """Request to integrate trajectories further over a fixed number of sections, from states (n, state) with step sizes
-    (n,).
+    """Request to integrate trajectories over some more sections, from states (n, state) with step sizes (n,).
 
     With a step size of 0 the engine chooses the step.
     """
@@ -43,7 +41,7 @@ class Leg:
 
 @dataclass(frozen=True)
 class Extended:
-    """Answer to a request to integrate further (`Leg`): section points, status and final states of the trajectories.
+    """Answer to a `Leg` request: section points, status and final states of the trajectories.
 
     Attributes
     ----------
@@ -67,7 +65,7 @@ class Extended:
 
 @dataclass(frozen=True)
 class Polish:
-    """Request to polish guesses of closed orbits; the answer is a list of `Orbit` or None, one per guess.
+    """Request to refine guesses of closed orbits by Newton's method. The answer has an `Orbit` or None for each guess.
 
     Guesses without a period are first integrated until they close.
     """
@@ -77,7 +75,7 @@ class Polish:
 
 @dataclass(frozen=True)
 class Slopes:
-    """A request for the images of points (n, state) under the section map, and its derivatives there.
+    """Request to map points (n, state) by the section map once, and to compute the map's derivatives there.
 
     The answer is a pair of arrays, shapes (n, state) and (n, state, state).
     """
@@ -94,7 +92,7 @@ Work = Generator[Request, Any, T]
 
 @dataclass(frozen=True)
 class Settings:
-    """Settings for integrating trajectories of a run further: tolerances, limits, system and method.
+    """Settings with which trajectories of a run are integrated further: tolerances, limits, system and method.
 
     Attributes
     ----------
@@ -131,7 +129,7 @@ class Settings:
 
     @classmethod
     def of(cls, ds: xr.Dataset, system: System | None, geometry: Geometry, **asked: Any) -> Settings:
-        """Read the settings of the run from a cube's attributes."""
+        """Read the settings of the run from the attributes of its result cube."""
         given = ds.attrs
         method = str(given.get("method", system.method if system is not None else ""))
         seen = int(given.get("n_transient", 0)) + int(given.get("n_keep", ds.sizes["period_index"]))
@@ -150,7 +148,9 @@ class Settings:
 def answer_all(
     works: Mapping[tuple[int, ...], Work[T]], points: Mapping[tuple[int, ...], Point], settings: Settings, what: str
 ) -> dict[tuple[int, ...], T]:
-    """Run the analyses (generators) of all parameter points in step, and return the result of each point."""
+    """Run the analyses of all parameter points side by side, and answer their requests together. Return the result of
+    each point.
+    """
     answers: dict[tuple[int, ...], Any] = dict.fromkeys(works)
     results: dict[tuple[int, ...], T] = {}
     while answers:
@@ -174,7 +174,6 @@ def answer_all(
 def _gathered(
     sizes: Sequence[int], asked: Mapping[tuple[int, ...], Any], points: Mapping[tuple[int, ...], Point]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the packed parameters and frequency of every requested trajectory, and the running total of `sizes`."""
     packed = np.repeat([points[i].packed for i in asked], sizes, axis=0)
     frequency = np.repeat([points[i].frequency for i in asked], sizes)
     return packed, frequency, np.cumsum(sizes)
@@ -254,7 +253,8 @@ def _polished(
 def _each_once(
     search: np.ndarray, start: np.ndarray, period: np.ndarray, mark: np.ndarray, ended: np.ndarray, geometry: Geometry
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Choose the guesses to polish, without duplicates; return them, and for each guess the position of its duplicate.
+    """Drop duplicates from guesses of orbits. Return the guesses to refine, and for each given guess the one that
+    stands for it.
 
     Rows that were integrated further and ended in one box are on one orbit; the row of least hash represents
     them. Rows without a period have no representative.

@@ -1,4 +1,4 @@
-"""Search for the closed orbits of a parameter point, block by block.
+"""Search for the closed orbits of a parameter point, one block of cells after another.
 
 Cells are read in blocks, several times. The data kept between blocks (boxes, best guesses, least hashes,
 sums) do not depend on how the cells were cut into blocks.
@@ -28,7 +28,7 @@ ROUNDS, ROUNDS_LOOSE = 3, 6
 
 @dataclass(frozen=True)
 class Search:
-    """Options of the search for attractors, with the run's dynamics and settings.
+    """Options of the search for attractors, with the dynamics and the settings of the run.
 
     Attributes
     ----------
@@ -49,22 +49,22 @@ class Search:
 
     @property
     def geometry(self) -> Geometry:
-        """Geometry of the states: which of them are angles, and their scales."""
+        """Geometry of the state space: which states are angles, and the scale of each state."""
         return self.dynamics.geometry
 
     @property
     def longest(self) -> int:
-        """Longest orbit period that the search looks for."""
+        """Longest orbit period to search for [drive periods, or returns to the section]."""
         return self.options.max_orbit_period
 
     @property
     def is_loose(self) -> bool:
-        """Whether cells can count as closed without lying on an orbit, so that Newton's method must find the orbit."""
+        """Whether the closure tolerance is so large that a cell can count as closed without being on an orbit."""
         return self.options.polish and self.tolerance > STRICT
 
     @property
     def box(self) -> float:
-        """Side length of the boxes by which closed cells are grouped."""
+        """Side of the boxes of section points by which closed (periodic) cells are grouped."""
         return LOOSE_SHARE * self.tolerance if self.is_loose else self.tolerance
 
 
@@ -128,14 +128,14 @@ def search_orbits(point: Point, search: Search) -> Work[State]:
 
 
 def moving(orbits: Sequence[Orbit | None], point: Point, geometry: Geometry) -> list[Orbit | None]:
-    """Replace each orbit that is in fact an equilibrium by None, and add the equilibrium to the parameter point."""
+    """Replace each orbit that is really an equilibrium by None, and add the equilibrium to the parameter point."""
     if not point.can_rest:
         return list(orbits)
     return [None if o is None or rest_of_orbit(point, o.points[0], geometry) is not None else o for o in orbits]
 
 
 def _closed_undecided(point: Point, orbits: Sequence[Orbit], search: Search) -> Guesses:
-    """Return guesses of orbits from the closed cells that are on no known orbit; the guesses' periods are unknown."""
+    """Make guesses of orbits, without periods, from the closed (periodic) cells that are on no known orbit."""
     found = Guesses.none(len(search.geometry.scales))
     for block in point.blocks():
         label, _ = decide(block, orbits, search.tolerance, search.geometry)
@@ -149,7 +149,7 @@ def _closed_undecided(point: Point, orbits: Sequence[Orbit], search: Search) -> 
 
 
 def _undecided(point: Point, orbits: Sequence[Orbit], search: Search) -> Guesses:
-    """Make guesses of closed orbits from the cells that are on no known orbit."""
+    """Make guesses of closed orbits from all cells that are on no known orbit."""
     closed = ClosedCells(search.geometry, search.box, Guesses.none(len(search.geometry.scales)))
     near = Guesses.none(len(search.geometry.scales))
     for block in point.blocks():

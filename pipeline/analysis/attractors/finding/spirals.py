@@ -1,4 +1,4 @@
-"""Guess the orbits that slowly spiralling cells approach.
+"""Guess the orbits that cells approach on slow spirals.
 
 A slow spiral looks like a bounded set: near a bifurcation of its orbit a motion takes thousands of periods
 to close. Its sections show the spiral in two ways. They recur: sections p apart lie close together, whether
@@ -52,7 +52,7 @@ map that allows it, in units of the growth."""
 
 @dataclass(frozen=True)
 class Recurrence:
-    """Recurrence of the section points of cells: period, distance and centre.
+    """Recurrence of each cell's section points: after how many periods, how closely, and about which centre.
 
     Attributes
     ----------
@@ -73,14 +73,14 @@ class Recurrence:
 
     @classmethod
     def of(cls, section: np.ndarray, max_period: int, geometry: Geometry) -> Recurrence:
-        """Compute the recurrence of section points (cell, period_index, state)."""
+        """Measure how the section points (cell, period_index, state) of each cell recur."""
         period, lag = _recurring(section, max_period, geometry)
         centred, centre = _contracting(section, max_period, geometry)
         return cls(period, lag, centred, centre)
 
     @property
     def is_near(self) -> np.ndarray:
-        """Whether each cell may approach an orbit."""
+        """Whether each cell's section points recur or contract about a centre, so that it may approach an orbit."""
         return np.asarray((self.period > 0) | (self.centred > 0))
 
 
@@ -117,7 +117,8 @@ def _contracting(section: np.ndarray, max_period: int, geometry: Geometry) -> tu
 
 
 def near_closed(section: np.ndarray, max_period: int, geometry: Geometry, closing_only: bool = False) -> Guesses:
-    """Return guesses of orbits from cells whose section points recur without closing; one guess per box.
+    """Make guesses of orbits from cells whose section points recur without closing; keep one guess per box of the
+    section.
 
     Each cell gives its last section with the period of recurrence and, if its sections contract, the mean of
     the last section's phase. Cells whose sections recur at falling distances guess at every period, unlike
@@ -137,7 +138,7 @@ def near_closed(section: np.ndarray, max_period: int, geometry: Geometry, closin
 
 
 def _closes_in(section: np.ndarray, found: Recurrence, geometry: Geometry) -> np.ndarray:
-    """Return for each cell whether its section points recur more and more closely."""
+    """Return for each cell whether its section points recur ever more closely."""
     closes = found.centred > 0
     half = section.shape[1] // 2
     for p in np.unique(found.period[found.period > 0]).tolist():
@@ -156,7 +157,7 @@ def _guesses(period: np.ndarray, score: np.ndarray, mark: np.ndarray, point: np.
 
 
 def beside(orbits: Sequence[Orbit], max_period: int, geometry: Geometry) -> Guesses:
-    """Guess the orbits that replaced slightly unstable orbits at a bifurcation, along the unstable directions.
+    """Guess the orbits that branch off from slightly unstable orbits, along their unstable directions.
 
     Cells that leave an orbit shortly after it lost stability go to the orbit that replaced it. That orbit has
     twice the period if the multiplier is below -1, and the same period if it is above 1.
@@ -180,12 +181,12 @@ def beside(orbits: Sequence[Orbit], max_period: int, geometry: Geometry) -> Gues
 
 
 def keys_of(section: np.ndarray, side: float, geometry: Geometry) -> np.ndarray:
-    """Return a hash of the box that holds the last section point of each cell."""
+    """Return a hash of the box of the section that holds the last section point of each cell."""
     return hashes(geometry.boxes(section[:, -1], side))
 
 
 def leap(section: np.ndarray, orbits: Sequence[Orbit], geometry: Geometry) -> np.ndarray:
-    """Predict states of trajectories that slowly leave an unstable orbit, once they are `LEAP` times as far from it.
+    """Predict where trajectories that slowly leave an unstable orbit will be when they are `LEAP` times as far from it.
 
     Near a bifurcation leaving takes thousands of periods, in which the motion follows the orbit's monodromy
     matrix. Let u be the components of a cell's distance along the unstable eigenvectors, at the sections that

@@ -1,4 +1,4 @@
-"""Decide the stability of a set, and name the evidence for it.
+"""Decide whether a set attracts, from eigenvalues and their errors, and name the evidence.
 
 ==============  ======================================================================================
 stability       evidence
@@ -35,7 +35,7 @@ _TRIALS = 8
 
 
 def largest_error(matrix: np.ndarray, size: float, *, real: bool = False) -> float:
-    """Estimate the error of the leading eigenvalue of a matrix whose entries err by `size` at most.
+    """Estimate the error of the leading eigenvalue of a matrix whose entries have errors up to `size`.
 
     The matrix is perturbed a few times. So a multiple eigenvalue, which moves by a root of the perturbation,
     gets its larger error.
@@ -63,7 +63,8 @@ def largest_error(matrix: np.ndarray, size: float, *, real: bool = False) -> flo
 
 
 def by_margin(leading: float, bound: float, error: float) -> int:
-    """Return the stability code for a leading eigenvalue or multiplier: attracting below the bound, unstable above it.
+    """Return a stability code: attracting if the leading eigenvalue is below the bound, unstable if above, neutral if
+    within its error.
 
     Within the error of the bound, return `NEUTRAL`.
     """

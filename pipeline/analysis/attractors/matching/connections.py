@@ -19,7 +19,7 @@ Place = tuple[tuple[int, ...], int]
 
 @dataclass(frozen=True, eq=False)
 class Connections:
-    """Connections between attractors at different parameter points, found by following orbits; attractors are numbered.
+    """Record of which attractors at different parameter points lie on one branch, found by following their orbits.
 
     Attributes
     ----------
@@ -41,12 +41,12 @@ class Connections:
 
     @classmethod
     def none(cls, n: int) -> Connections:
-        """Return the connections of `n` attractors that were not followed: none is connected to another."""
+        """Return connections that connect none of `n` attractors, for attractors that were not followed."""
         return cls(np.arange(n), np.arange(n), np.zeros(n, bool))
 
     def may_be_one(self, axis: int, first: tuple[int, int], second: tuple[int, int]) -> bool:
-        """Return whether two attractors may be matched by distance: following their orbits neither linked nor separated
-        them.
+        """Return whether two attractors may be matched by distance. They may if following their orbits has not shown
+        that they differ.
 
         Parameters
         ----------
@@ -63,7 +63,9 @@ class Connections:
 
 
 def followable(attractors: xr.Dataset, at: Place) -> bool:
-    """Return whether an attractor at one parameter point is a closed orbit on which Newton's method converged."""
+    """Return whether an attractor is a closed orbit on which Newton's method converged, so that its branch can be
+    followed.
+    """
     index, row = at
     if "is_polished" not in attractors:
         return False
@@ -79,7 +81,7 @@ def connections(
     frequency: float,
     system: System,
 ) -> Connections:
-    """Follow all closed orbits along every swept parameter.
+    """Follow all closed orbits along each swept parameter, and record which of them lie on one branch.
 
     Parameters
     ----------

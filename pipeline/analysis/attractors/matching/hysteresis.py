@@ -1,4 +1,4 @@
-"""Find hysteresis: attractors that a continuation meets in one direction only, and jumps of its branches.
+"""Find hysteresis: attractors that a continuation meets in one direction only, and its jumps between attractors.
 
 The functions read attractor ids and integrate nothing.
 """
@@ -15,7 +15,7 @@ from pipeline.analysis.outcomes import outcomes
 
 
 def hysteresis(ds: xr.Dataset, ids: xr.Dataset) -> xr.Dataset:
-    """Find where a continuation meets different attractors going up and going down.
+    """Find where a continuation meets different attractors on its way up and on its way down.
 
     Parameters
     ----------
@@ -84,7 +84,7 @@ def hysteresis(ds: xr.Dataset, ids: xr.Dataset) -> xr.Dataset:
 
 
 def check_directions(ds: xr.Dataset) -> None:
-    """Raise ValueError unless the cube has branches in both directions."""
+    """Raise ValueError unless the result cube is of a continuation both up and down its parameter."""
     if "branch" not in ds["status"].dims or set(ds["direction"].values) != {"up", "down"}:
         raise ValueError('hysteresis needs a continuation with direction = "both".')
 

@@ -1,4 +1,4 @@
-"""Give attractors ids that follow them along the swept parameters.
+"""Give attractors ids that stay the same along the swept parameters.
 
 Meaning of an id
 ----------------
@@ -44,7 +44,7 @@ _, _FIRST, _BRANCH, _DOUBLING, _DISTANCE = range(len(BASES))
 
 @dataclass(frozen=True, eq=False)
 class _Seen:
-    """Attractor at one parameter point, from one row of the stored features."""
+    """An attractor at one parameter point, with the features by which it is matched."""
 
     number: int
     kind: int
@@ -55,13 +55,15 @@ class _Seen:
 
     @property
     def family(self) -> int:
-        """Odd part of the period, equal for all orbits of one doubling cascade; 0 for bounded sets."""
+        """Odd part of the orbit period. All orbits of one period-doubling cascade share it; it is 0 for bounded
+        sets.
+        """
         return self.period // (self.period & -self.period) if self.period else 0
 
 
 @dataclass(frozen=True, eq=False)
 class _Rule:
-    """Rule for matching attractors at different parameter points by distance."""
+    """Rule that decides by distance whether attractors at different parameter points are the same."""
 
     threshold: float
     geometry: Geometry
@@ -69,7 +71,9 @@ class _Rule:
     known: Connections
 
     def distance(self, axis: int, before: _Seen, here: _Seen) -> float:
-        """Return the distance of an attractor from an earlier one along an axis; infinite if they may not match."""
+        """Return the distance between attractors at two parameter points along an axis; infinite if they must not be
+        matched.
+        """
         ends = (before.number, before.period), (here.number, here.period)
         if not self._alike(before, here) or not self.known.may_be_one(axis, *ends):
             return np.inf
@@ -90,7 +94,7 @@ def match(
     parameters: Parameters | np.ndarray | None = None,
     system: System | None = None,
 ) -> xr.Dataset:
-    """Give each attractor an id that stays the same along the sweep; the text of this module defines an id.
+    """Give each attractor an id that stays the same along the sweep; the docstring of this module defines ids.
 
     Closed orbits are first connected by continuation (`pipeline.analysis.branches.connecting`). Then the
     parameter points are visited in the order of their axes. An appearance that is connected with an earlier
@@ -167,7 +171,6 @@ def _connections(
     parameters: Parameters | np.ndarray | None,
     system: System | None,
 ) -> Connections:
-    """Follow the closed orbits along the parameter axes, if at least two can be followed."""
     if not dims or sum(followable(attractors, place) for place in places) < 2:
         return Connections.none(len(places))
     base = parameters_of(attractors) if parameters is None else parameters
@@ -182,26 +185,21 @@ def _connections(
 
 
 def _geometry(attractors: xr.Dataset, system: System | None) -> Geometry:
-    """Return the geometry of the states, from the given system or else from the model."""
     told: Any = system or model_of(attractors)
     return Geometry(told.is_angle, told.scales)
 
 
 def _neutral(attractors: xr.Dataset) -> frozenset[int]:
-    """Return the class-of-motion codes that are compatible with every other code."""
+    """Return the codes of the classes of motion that may be matched with any other class."""
     classifier = model_of(attractors).classifier
     return frozenset(classifier.neutral if classifier else ())
 
 
 class _Ids:
-    """Attractor ids given so far, parameter point by parameter point.
+    """Ids given to attractors so far; the parameter points are visited one by one.
 
-    Attributes
-    ----------
-    ids, basis : ndarray, (*parameter dims, row)
-        Id and basis of each appearance; -1 and 0 where there is none.
-    taken : list of set
-        For each id, the parameter points at which it is, or will be, listed.
+    `ids` and `basis` (one axis per parameter, then row) have each appearance's id and the basis for it, -1 and 0 where
+    there is none. `taken` has the parameter points at which each id is, or will be, used.
     """
 
     def __init__(self, shape: tuple[int, ...], n_rows: int, places: Sequence[Place], rule: _Rule) -> None:
@@ -218,7 +216,7 @@ class _Ids:
         self._met: set[int] = set()
 
     def at(self, here: Sequence[_Seen], known: Mapping[int, list[tuple[int, _Seen]]]) -> dict[int, _Seen]:
-        """Give ids to the attractors at the next parameter point; return the attractors by id."""
+        """Give ids to the attractors of the next parameter point. Return the attractors by id."""
         free = [one for one in here if self._group[one.number] not in self._by_group]
         for one in here:
             if one not in free:
@@ -236,9 +234,7 @@ class _Ids:
         return {self._by_group[self._group[one.number]]: one for one in here}
 
     def _has_room(self, one: _Seen, identity: int) -> bool:
-        """Return whether an id is unused at every parameter point at which an orbit connected with this attractor
-        occurs.
-        """
+        """Return whether an id is still free at all parameter points at which an attractor's branch occurs."""
         return not self._where[self._group[one.number]] & self.taken[identity]
 
     def _give(self, one: _Seen, identity: int) -> None:
@@ -266,7 +262,7 @@ def _seen(attractors: xr.Dataset, number: int, place: Place) -> _Seen:
 def _known(
     seen: dict[tuple[int, ...], dict[int, _Seen]], index: tuple[int, ...], look_back: int
 ) -> dict[int, list[tuple[int, _Seen]]]:
-    """Return, for each id, the nearest earlier attractor along each parameter axis, as pairs (axis, attractor)."""
+    """Return for each id its nearest earlier attractor along each parameter axis, as pairs (axis, attractor)."""
     known: dict[int, list[tuple[int, _Seen]]] = {}
     for axis in range(len(index)):
         along: dict[int, _Seen] = {}
@@ -285,7 +281,7 @@ def _assign(
     rule: _Rule,
     is_free: Callable[[_Seen, int], bool],
 ) -> list[int | None]:
-    """Assign each attractor of a parameter point to an existing id by distance; None for a new attractor."""
+    """Choose for each attractor the existing id of the nearest earlier attractor; None for a new attractor."""
     given: list[int | None] = [None] * len(here)
     if not here or not known:
         return given
@@ -305,9 +301,7 @@ def _assign(
 
 
 def _renumbered(attractors: xr.Dataset, ids: np.ndarray, n_ids: int, dims: tuple[str, ...]) -> xr.Dataset:
-    """Return the dataset with attractors ordered by id along ``attractor``, and with ids instead of indices in the
-    cells.
-    """
+    """Reorder the dataset's attractors by id, and replace the indices of attractors in its cells by ids."""
     present = np.nonzero(ids >= 0)
     target = (*present[:-1], ids[present])
     variables: dict[str, Any] = {}
@@ -340,13 +334,12 @@ def _fill(name: str, dtype: np.dtype[Any]) -> float:
 
 
 def _lookup(ids: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Return the ids of attractors at one parameter point from their indices there; -1 stays -1 (no attractor)."""
     table = np.append(ids, -1)
     return np.asarray(table[rows])
 
 
 def _destinations(values: np.ndarray, ids: np.ndarray, n_ids: int) -> np.ndarray:
-    """Convert counts of cells that left a set: from the reached set's index at its parameter point to the set's id."""
+    """Replace indices by ids in the counts that say on which set the cells of a transient set ended."""
     moved = np.zeros((*values.shape[:-1], n_ids), values.dtype)
     for *index, row in np.argwhere(ids >= 0).tolist():
         point = tuple(index)
