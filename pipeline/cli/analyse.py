@@ -32,7 +32,7 @@ def _make(name: str) -> Any:
         ds = derive(directory, name, options, echo=console.note)
         table = function_of(analysis.table)(ds)
         if table.nothing:
-            raise SpecError([f"{directory}: {table.nothing}"])
+            raise SpecError(f"{directory}: {table.nothing}")
         tell(table, csv, json)
         if "source" in ds.encoding:
             console.note(f"stored: {ds.encoding['source']}")

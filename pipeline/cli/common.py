@@ -52,7 +52,7 @@ def check_csv(path: str | None) -> None:
     from pipeline.specification.problems import SpecError
 
     if path not in (None, "-") and (Path(str(path)).is_dir() or not Path(str(path)).parent.is_dir()):
-        raise SpecError([f"--csv {path}: must be a file in a folder that exists."])
+        raise SpecError(f"--csv {path}: must be a file in a folder that exists.")
     if path not in (None, "-"):
         check_file(Path(str(path)), "--csv")
 

@@ -97,7 +97,7 @@ def configure(quiet: bool, verbose: bool, log: Path | None) -> None:
         except OSError as error:
             from pipeline.specification.problems import SpecError
 
-            raise SpecError([f"--log {log}: cannot be written to ({error.strerror})."]) from None
+            raise SpecError(f"--log {log}: cannot be written to ({error.strerror}).") from None
         file.setFormatter(_Visible("%(asctime)s %(levelname)s %(message)s"))
         LOG.addHandler(file)
         LOG.debug("command: %s", " ".join(sys.argv))

@@ -45,9 +45,9 @@ def export(
     from pipeline.store.run import Run
 
     if page is not None and folder is not None:
-        raise SpecError(["--page and --folder: give one of them."])
+        raise SpecError("--page and --folder: give one of them.")
     if page is not None and page.suffix.lower() not in (".html", ".htm"):
-        raise SpecError([f"--page {page}: the suffix must be .html."])
+        raise SpecError(f"--page {page}: the suffix must be .html.")
     run, wanted = Run.open(directory), quantity or []
     with console.progress("exporting"):
         if folder is not None:

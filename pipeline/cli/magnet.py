@@ -63,8 +63,8 @@ def _folder(path: Path) -> Path:
     from pipeline.specification.problems import SpecError
 
     if path.exists() and not path.is_dir():
-        raise SpecError([f"--out {path}: is a file; give a folder."])
+        raise SpecError(f"--out {path}: is a file; give a folder.")
     if not path.parent.is_dir():
-        raise SpecError([f"{path.parent}: no such folder; make it first."])
+        raise SpecError(f"{path.parent}: no such folder; make it first.")
     check_place(path)
     return path

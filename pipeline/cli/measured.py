@@ -40,12 +40,12 @@ def _load(paths: list[Path], mappings: list[Path]) -> list[Mapping]:
     from pipeline.specification.problems import SpecError
 
     if len(mappings) not in (1, len(paths)):
-        raise SpecError([f"--mapping: {len(mappings)} for {len(paths)} recordings; give one for all, or one for each."])
+        raise SpecError(f"--mapping: {len(mappings)} for {len(paths)} recordings; give one for all, or one for each.")
     loaded = [load_mapping(m) for m in mappings] * (len(paths) if len(mappings) == 1 else 1)
     models = sorted({m.system for m in loaded}, key=lambda model: model.name)
     if len(models) > 1:
         raise SpecError(
-            [f"--mapping: the mappings name several models ({', '.join(m.name for m in models)}); a diagram has one."]
+            f"--mapping: the mappings name several models ({', '.join(m.name for m in models)}); a diagram has one."
         )
     return loaded
 

@@ -109,7 +109,7 @@ def _latex(model: Model, found: Description) -> None:
 
     if not found.latex:
         raise SpecError(
-            [f"--latex: {model.name} is not a text model, so its equations cannot be written; drop the option."]
+            f"--latex: {model.name} is not a text model, so its equations cannot be written; drop the option."
         )
     console.result("\\begin{align}")
     console.result(" \\\\\n".join(f"  {line}" for line in found.latex))

@@ -92,7 +92,7 @@ def _refuse(path: Path, option: str) -> None:
 
     if not _forced:
         raise SpecError(
-            [f"{option} {path}: exists, and magpend did not write it; give another name, or --force to replace it."]
+            f"{option} {path}: exists, and magpend did not write it; give another name, or --force to replace it."
         )
 
 

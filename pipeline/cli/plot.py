@@ -90,8 +90,8 @@ def check_figure_path(path: Path, within: str = "") -> None:
 
     suffixes = [f".{name}" for name in FORMATS]
     if path.suffix.lower() not in suffixes:
-        raise SpecError([f"{path}: the suffix must be one of {', '.join(suffixes)}."])
+        raise SpecError(f"{path}: the suffix must be one of {', '.join(suffixes)}.")
     if not path.parent.is_dir():
-        raise SpecError([f"{path.parent}: no such folder; make it first."])
+        raise SpecError(f"{path.parent}: no such folder; make it first.")
     for file in (path, path.with_suffix(".nc")):
         check_file(file, within=within)

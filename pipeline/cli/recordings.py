@@ -57,7 +57,7 @@ def show(
         check_figure_path(out)
     if mapping is None:
         if out is not None or window is not None or smooth:
-            raise SpecError(["--mapping: missing; the figure shows states, and a mapping assigns channels to them."])
+            raise SpecError("--mapping: missing; the figure shows states, and a mapping assigns channels to them.")
         tell(describe_file(read_raw(file)), None, as_json)
         return
     ds = _read(file, mapping, window)
@@ -108,7 +108,7 @@ def simulate(
     _check_recording(out)
     beside = out.with_suffix(".toml")
     if beside.resolve() == spec.resolve():
-        raise SpecError([f"--out {out}: its mapping would replace {spec}; give another name."])
+        raise SpecError(f"--out {out}: its mapping would replace {spec}; give another name.")
     raw, mapping = simulated(load_rig(spec), is_csv=out.suffix.lower() == ".csv")
     beside = _beside(out, mapping.toml())
     console.result(f"recording: {write_raw(raw, out)}")
@@ -157,7 +157,7 @@ def _keep(file: Path, out: Path) -> None:
     from pipeline.specification.problems import SpecError
 
     if out.exists() and file.exists() and out.samefile(file):
-        raise SpecError([f"--out {out}: is the input file; give another name."])
+        raise SpecError(f"--out {out}: is the input file; give another name.")
 
 
 def _check_recording(out: Path) -> None:
@@ -176,10 +176,8 @@ def _beside(out: Path, text: str) -> Path:
     path = out.with_suffix(".toml")
     if path.exists() and path.read_bytes() != text.encode():
         raise SpecError(
-            [
-                f"--out {out}: its mapping would replace {path}, which holds something else; give another "
-                "name, or move that file away."
-            ]
+            f"--out {out}: its mapping would replace {path}, which holds something else; give another "
+            "name, or move that file away."
         )
     return path
 

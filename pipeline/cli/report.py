@@ -46,9 +46,9 @@ def check_page(path: Path) -> None:
     from pipeline.store.local import unwritable
 
     if path.suffix.lower() not in (".html", ".htm"):
-        raise SpecError([f"--out {path}: the suffix must be .html."])
+        raise SpecError(f"--out {path}: the suffix must be .html.")
     if path.is_dir() or not path.parent.is_dir():
-        raise SpecError([f"--out {path}: must be a file in a folder that exists."])
+        raise SpecError(f"--out {path}: must be a file in a folder that exists.")
     check_file(path)
     if problem := unwritable(path.parent):
         raise RefusedError(f"{problem}; give another place for the page: --out FILE.")

@@ -78,7 +78,7 @@ def _check_folder(folder: Path) -> None:
     from pipeline.store.local import unwritable
 
     if folder.exists() and not folder.is_dir():
-        raise SpecError([f"--out {folder}: is a file; give a folder."])
+        raise SpecError(f"--out {folder}: is a file; give a folder.")
     check_place(folder)
     there = next(place for place in (folder, *folder.absolute().parents) if place.is_dir())
     if problem := unwritable(there):

@@ -292,9 +292,9 @@ def _problems(series: Series) -> list[str]:
 def check_output(path: Path) -> None:
     """Raise `SpecError` if a time series cannot be written to a path."""
     if path.suffix.lower() not in SUFFIXES:
-        raise SpecError([f"{path}: the suffix must be one of {', '.join(SUFFIXES)}."])
+        raise SpecError(f"{path}: the suffix must be one of {', '.join(SUFFIXES)}.")
     if not path.parent.is_dir():
-        raise SpecError([f"{path.parent}: no such folder; make it first."])
+        raise SpecError(f"{path.parent}: no such folder; make it first.")
 
 
 def write_series(ds: xr.Dataset, path: Path) -> Path:

@@ -155,7 +155,7 @@ def judge(results: Results, figure: str, claim: ClaimTable) -> Judgement:
     try:
         found = MEASURES[claim.measure](results, claim.of, claim.options)
     except KeyError as error:
-        raise SpecError([f"figure {figure}: {claim.measure} lacks the option {error}."]) from None
+        raise SpecError(f"figure {figure}: {claim.measure} lacks the option {error}.") from None
     plain, reason = judged(found.low, found.high, claim.least, claim.most), ""
     if found.missing:
         plain, reason = Verdict.UNDECIDED, f"Not measured: {found.missing}.{_decides(claim)}"

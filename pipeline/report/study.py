@@ -158,7 +158,7 @@ def load_study(name: str | Path) -> Study:
     if not path.suffix and str(name) in shipped:
         path = shipped[str(name)]
     elif not path.suffix:
-        raise SpecError([unknown_name("study", str(name), shipped)])
+        raise SpecError(unknown_name("study", str(name), shipped))
     try:
         table = StudyTable.model_validate(read_toml(path))
     except ValidationError as error:

@@ -221,10 +221,7 @@ def _push(still: Parameters, one: Parameters, frequency_hz: float) -> np.ndarray
     expected = np.cos(2.0 * np.pi * shares)[:, None, None] * push
     if not push.any() or np.abs(found - expected).max() > 1e-9 * np.abs(push).max():
         raise SpecError(
-            [
-                "drive: does not act as amplitude times cos(2 pi f t) in one direction; control acts through "
-                "such a drive."
-            ]
+            "drive: does not act as amplitude times cos(2 pi f t) in one direction; control acts through such a drive."
         )
     return np.asarray(push)
 

@@ -136,9 +136,7 @@ def plan_extension(
 def _wide(run: Run, spec: str | Path | None, widening: Widening) -> tuple[Spec, str]:
     """Return the wider specification, parsed and as text."""
     if spec is None and not widening:
-        raise SpecError(
-            ["extend: nothing to change; give a wider SPEC, or an option such as --axis NAME=LOW:HIGH:NUM."]
-        )
+        raise SpecError("extend: nothing to change; give a wider SPEC, or an option such as --axis NAME=LOW:HIGH:NUM.")
     if spec is not None:
         path = find_spec(spec)
         parsed = load_spec(path)

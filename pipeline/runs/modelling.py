@@ -98,13 +98,13 @@ def write_template(path: Path | None) -> str:
     if path is None:
         return text
     if path.suffix != ".toml":
-        raise SpecError([f"{path}: the suffix must be .toml."])
+        raise SpecError(f"{path}: the suffix must be .toml.")
     if not path.parent.is_dir():
-        raise SpecError([f"{path.parent}: no such folder; make it first."])
+        raise SpecError(f"{path.parent}: no such folder; make it first.")
     refuse_place(path)
     try:
         with path.open("x", encoding="utf-8") as file:
             file.write(text)
     except FileExistsError:
-        raise SpecError([f"{path}: exists already and is not overwritten; give another FILE."]) from None
+        raise SpecError(f"{path}: exists already and is not overwritten; give another FILE.") from None
     return text

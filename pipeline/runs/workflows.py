@@ -29,7 +29,7 @@ def find_spec(name: str | Path) -> Path:
     shipped = {**shipped_workflows(), **shipped_identifications()}
     if str(name) in shipped:
         return shipped[str(name)]
-    raise SpecError([f"{name}: no such file; {unknown_name('workflow', str(name), shipped)}"])
+    raise SpecError(f"{name}: no such file; {unknown_name('workflow', str(name), shipped)}")
 
 
 def read_given(spec: str | Path | Mapping[str, Any], *, smoke: bool = False) -> tuple[Spec, str, Path]:

@@ -125,9 +125,9 @@ def write_zoom(source: Source, changes: Changes, out: Path) -> list[str]:
         See `zoom`; also if `out` exists or cannot be written to. Nothing is written then.
     """
     if out.suffix != ".toml":
-        raise SpecError([f"{out}: the suffix must be .toml."])
+        raise SpecError(f"{out}: the suffix must be .toml.")
     if not out.parent.is_dir():
-        raise SpecError([f"{out.parent}: no such folder; make it first."])
+        raise SpecError(f"{out.parent}: no such folder; make it first.")
     refuse_place(out, "--out")
     spec, notes = zoom(source.spec, changes)
     text = f"# Zoom. Derived from {_one_line(source.origin)}.\n{to_toml(spec)}"
@@ -137,7 +137,7 @@ def write_zoom(source: Source, changes: Changes, out: Path) -> list[str]:
         with out.open("x", encoding="utf-8") as file:
             file.write(text)
     except FileExistsError:
-        raise SpecError([f"{out}: exists already and is not overwritten; give another --out."]) from None
+        raise SpecError(f"{out}: exists already and is not overwritten; give another --out.") from None
     return notes
 
 

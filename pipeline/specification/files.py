@@ -30,7 +30,7 @@ def read_toml(path: str | Path) -> dict[str, Any]:
         with open(path, "rb") as file:
             content = file.read(MOST_BYTES + 1)
     except OSError as error:
-        raise SpecError([f"{path}: {_unreadable(error)}"]) from None
+        raise SpecError(f"{path}: {_unreadable(error)}") from None
     return toml_tables(content, str(path))
 
 
@@ -45,16 +45,14 @@ def toml_tables(content: bytes, name: str) -> dict[str, Any]:
     try:
         if len(content) > MOST_BYTES:
             raise SpecError(
-                [
-                    f"{name}: has more than {MOST_BYTES // 1_000_000} MB, the limit of a specification; "
-                    "give ranges, or random starts with a seed, instead of lists."
-                ]
+                f"{name}: has more than {MOST_BYTES // 1_000_000} MB, the limit of a specification; "
+                "give ranges, or random starts with a seed, instead of lists."
             )
         data = tomllib.loads(content.decode("utf-8"))
     except (ValueError, RecursionError) as error:
         if isinstance(error, SpecError):
             raise
-        raise SpecError([f"{name}: {_unreadable(error)}"]) from None
+        raise SpecError(f"{name}: {_unreadable(error)}") from None
     problems = odd_data(data)
     if problems:
         raise SpecError([f"{name}: {problem}" for problem in problems])

@@ -51,11 +51,9 @@ def find_model(reference: Any, folder: str | Path | None = ".", at: str = "model
             return load_model(reference)
         if not isinstance(reference, str):
             raise SpecError(
-                [
-                    f"{at} = {shown(reference)}: must be a name in quotes, such as {model_names()[0]!r}, a file "
-                    '"FILE.toml", a Python object "package.module:NAME", or a table [model] with states, '
-                    "parameters and equations."
-                ]
+                f"{at} = {shown(reference)}: must be a name in quotes, such as {model_names()[0]!r}, a file "
+                '"FILE.toml", a Python object "package.module:NAME", or a table [model] with states, '
+                "parameters and equations."
             )
         if folder is not None and is_object_path(reference):
             return import_model(reference, folder)
@@ -140,7 +138,7 @@ def read_model_file(path: str | Path) -> dict[str, Any]:
 
 def _of_file(name: str, folder: str | Path | None, at: str) -> Model:
     if folder is None:
-        raise SpecError([f"{at} = {name!r}: a run keeps the text of a model, not the name of its file."])
+        raise SpecError(f"{at} = {name!r}: a run keeps the text of a model, not the name of its file.")
     path = Path(folder) / name
     try:
         inner = read_toml(path).get("model")

@@ -169,11 +169,11 @@ def _with_smoke(data: dict[str, Any], smoke: bool, folder: Path) -> dict[str, An
     plain = {key: value for key, value in data.items() if key != "smoke"}
     if "smoke" not in data:
         if smoke:
-            raise SpecError(["smoke: this specification has no [smoke] table; add one or run it in full."])
+            raise SpecError("smoke: this specification has no [smoke] table; add one or run it in full.")
         return plain
     table = data["smoke"]
     if not isinstance(table, dict):
-        raise SpecError([f"smoke = {shown(table)}: must be a table of keys to replace."])
+        raise SpecError(f"smoke = {shown(table)}: must be a table of keys to replace.")
     changes = nested(table)
     base = with_model_table(plain, folder) if isinstance(changes.get("model"), dict) else plain
     small = merged(base, changes)
@@ -219,9 +219,9 @@ def parse_spec(data: Mapping[str, Any], folder: str | Path | None = ".") -> Spec
     if odd := odd_data(data):
         raise SpecError(odd)
     if data.get("kind") == IDENTIFICATION:
-        raise SpecError([f'kind = "{IDENTIFICATION}": is not a run; use magpend identify SPEC --out DIR.'])
+        raise SpecError(f'kind = "{IDENTIFICATION}": is not a run; use magpend identify SPEC --out DIR.')
     if "kind" not in data and "equations" in data:
-        raise SpecError([A_MODEL])
+        raise SpecError(A_MODEL)
     problems = [unknown_key(key, key, _KEYS) for key in data if key not in _KEYS]
     data = _with_preset(data, folder, problems)
     data = data if folder is None else with_drive(data, folder, problems)

@@ -23,8 +23,8 @@ class SpecError(ValueError):
         A sentence for each problem: the dotted key path, the value, the bound and what to do.
     """
 
-    def __init__(self, problems: Sequence[str]) -> None:
-        self.problems = list(problems)
+    def __init__(self, problems: str | Sequence[str]) -> None:
+        self.problems = [problems] if isinstance(problems, str) else list(problems)
         super().__init__("\n".join(self.problems))
 
 

@@ -52,10 +52,10 @@ def check(directory: str | Path, recording: str | Path, *, like: int = 0) -> dic
     """
     info, result = read_info(directory), read_result(directory)
     if not result["recordings"]:
-        raise SpecError([f"{recording}: {directory} was fitted to orbits alone; give a table of orbits."])
+        raise SpecError(f"{recording}: {directory} was fitted to orbits alone; give a table of orbits.")
     tables = info.identity["spec"]["recordings"]
     if not 0 <= like < len(tables):
-        raise SpecError([f"like = {like}: there are recordings 0 to {len(tables) - 1}."])
+        raise SpecError(f"like = {like}: there are recordings 0 to {len(tables) - 1}.")
     table = RecordingTable.model_validate(
         {
             "file": str(recording),

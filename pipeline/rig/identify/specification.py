@@ -219,7 +219,7 @@ def parse_identification(data: Mapping[str, Any], folder: Path) -> Identificatio
     """
     kind = data.get("kind")
     if kind in ("sweep", "continuation"):
-        raise SpecError([f'kind = "{kind}": is a run, not an identification; use magpend run.'])
+        raise SpecError(f'kind = "{kind}": is a run, not an identification; use magpend run.')
     problems = [unknown_key(key, key, _KEYS) for key in data if key not in _KEYS]
     if kind != IDENTIFICATION:
         missing = f'kind: missing; add kind = "{IDENTIFICATION}".'

@@ -245,7 +245,7 @@ def find_measurement(name: str | Path) -> Path:
     shipped = {p.stem: p for p in sorted(Path(str(resources.files("workflows"))).glob("magnet/*.toml"))}
     if str(name) in shipped:
         return shipped[str(name)]
-    raise SpecError([f"{name}: no such file; {unknown_name('measurement', str(name), shipped)}"])
+    raise SpecError(f"{name}: no such file; {unknown_name('measurement', str(name), shipped)}")
 
 
 def read_measurement(path: str | Path) -> Measurement:

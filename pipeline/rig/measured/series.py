@@ -71,13 +71,11 @@ def series_of(
     model = parameters.model
     if model_of(recording) is not model:
         raise SpecError(
-            [
-                f"{name_of(recording)}: mapped to the model {model_of(recording).name}, while {model.name} is to "
-                "be computed: choose one of them."
-            ]
+            f"{name_of(recording)}: mapped to the model {model_of(recording).name}, while {model.name} is to "
+            "be computed: choose one of them."
         )
     if n_periods < 1:
-        raise SpecError([f"periods = {n_periods}: must be at least 1."])
+        raise SpecError(f"periods = {n_periods}: must be at least 1.")
     edges = edges_of(recording, hysteresis=hysteresis)
     timing = _first_timing(edges)
     later = section_phase(parameters, timing) / timing
@@ -86,10 +84,8 @@ def series_of(
     missing = [n for n in model.state_names if n not in sections["state"].values]
     if missing:
         raise SpecError(
-            [
-                f"{name_of(recording)}: {', '.join(missing)} at the start is not known: map its channel, or that "
-                "of the angle whose rate it is."
-            ]
+            f"{name_of(recording)}: {', '.join(missing)} at the start is not known: map its channel, or that "
+            "of the angle whose rate it is."
         )
     first, last = _part(recording, edges, sections, start_s, n_periods)
     own = _fitted(edges, first, last)
@@ -115,18 +111,16 @@ def _part(
             if a <= first < b and b - a >= _LEAST:
                 return first, min(b, first + n_periods)
     raise SpecError(
-        [
-            f"start_s = {begin:g}: {name_of(recording)} has no rising edge with samples around it and {_LEAST} "
-            f"periods of one frequency after it; edges lie from {edges.rising[0]:.3f} to "
-            f"{edges.rising[-1]:.3f} s."
-        ]
+        f"start_s = {begin:g}: {name_of(recording)} has no rising edge with samples around it and {_LEAST} "
+        f"periods of one frequency after it; edges lie from {edges.rising[0]:.3f} to "
+        f"{edges.rising[-1]:.3f} s."
     )
 
 
 def _first_timing(edges: Edges) -> float:
     """Return a rough drive frequency [Hz]: the inverse of the median time between rising edges."""
     if edges.rising.size < _LEAST:
-        raise SpecError([f"drive: {edges.rising.size} rising edges; a series needs {_LEAST} of them."])
+        raise SpecError(f"drive: {edges.rising.size} rising edges; a series needs {_LEAST} of them.")
     return 1 / float(np.median(np.diff(edges.rising)))
 
 

@@ -96,7 +96,7 @@ def _from_recordings(path: Path) -> xr.Dataset:
     tables = read_toml(path)
     table = tables.get("measured", {}).get("branch") if isinstance(tables.get("measured"), dict) else None
     if table is None:
-        raise SpecError([f"{path}: has no table [measured.branch]; give one, or a CSV file of orbits."])
+        raise SpecError(f"{path}: has no table [measured.branch]; give one, or a CSV file of orbits.")
     from pydantic import ValidationError
 
     try:
@@ -106,7 +106,7 @@ def _from_recordings(path: Path) -> xr.Dataset:
     problems: list[str] = []
     reference = spec.model or tables.get("model")
     if not reference:
-        raise SpecError([f"{path}: measured.branch.model: missing; name the model whose orbits were measured."])
+        raise SpecError(f"{path}: measured.branch.model: missing; name the model whose orbits were measured.")
     model = add_model(reference, path.parent, problems)
     if model is not None:
         problems += _name_problems(model, spec.parameter, spec.state)
@@ -134,7 +134,7 @@ def _recorded(path: Path, spec: MeasuredBranch, reference: Any, one: RecordedOrb
     try:
         return cycles_of(recording["time"].values, recording[spec.state].values)
     except CyclesError as error:
-        raise SpecError([f"{path}: measured.branch.orbits: {one.name!r}: {error}"]) from None
+        raise SpecError(f"{path}: measured.branch.orbits: {one.name!r}: {error}") from None
 
 
 def _columns_of(cycles: Cycles) -> dict[str, float]:
@@ -147,19 +147,17 @@ def _columns_of(cycles: Cycles) -> dict[str, float]:
 def _from_csv(path: Path, model: Model | None, state: str) -> xr.Dataset:
     if model is None:
         raise SpecError(
-            [
-                f"{path}: a table of orbits names no model; name it with --model, or give the run that it is compared "
-                "with: --over RUN."
-            ]
+            f"{path}: a table of orbits names no model; name it with --model, or give the run that it is compared "
+            "with: --over RUN."
         )
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             header, *lines = list(csv.reader(file)) or [[]]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise SpecError([f"{path}: cannot be read as a CSV table ({error})."]) from None
+        raise SpecError(f"{path}: cannot be read as a CSV table ({error}).") from None
     lines = [line for line in lines if any(field.strip() for field in line)]
     if not header or not lines:
-        raise SpecError([f"{path}: has no rows; give a header and a row for each orbit."])
+        raise SpecError(f"{path}: has no rows; give a header and a row for each orbit.")
     # by position, since the parameter may have the name of another column
     parameter, *others = (name.strip() for name in header)
     chosen = state or model.section_states[0]

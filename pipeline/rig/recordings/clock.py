@@ -161,10 +161,8 @@ def _common_step(stretches: Sequence[Mapping[str, Channel]], stated: float | Non
     unknown = [name for name, s in steps.items() if not (math.isfinite(s) and s > 0.0)]
     if unknown:
         raise SpecError(
-            [
-                f"{source}: the sampling interval of {', '.join(unknown)} is not known; add to the mapping "
-                'time = { channel = "NAME" } if there are time stamps, or sampling_rate_hz = NUMBER.'
-            ]
+            f"{source}: the sampling interval of {', '.join(unknown)} is not known; add to the mapping "
+            'time = { channel = "NAME" } if there are time stamps, or sampling_rate_hz = NUMBER.'
         )
     _refuse_mixed(steps, source)
     return stated if stated is not None else float(np.median(list(steps.values())))
@@ -174,10 +172,8 @@ def _refuse_mixed(steps: Mapping[str, float], source: str) -> None:
     if steps and max(steps.values()) > (1.0 + MIXED) * min(steps.values()):
         told = ", ".join(f"{name} {1.0 / s:.6g} Hz" for name, s in steps.items())
         raise SpecError(
-            [
-                f"{source}: the mapped channels have different sampling rates ({told}); map channels of one "
-                "rate, or resample the file to one before it is read."
-            ]
+            f"{source}: the mapped channels have different sampling rates ({told}); map channels of one "
+            "rate, or resample the file to one before it is read."
         )
 
 
@@ -212,7 +208,7 @@ def _aligned(
     n_common = min(len(c) - begins[n] for n, c in channels.items())
     if n_common < 2:
         told = ", ".join(f"{n} has {len(c)} samples from {starts[n]:.6g} s" for n, c in channels.items())
-        raise SpecError([f"{source}: the mapped channels have no stretch in common ({told})."])
+        raise SpecError(f"{source}: the mapped channels have no stretch in common ({told}).")
     findings = _start_findings(late, step, len(known) == len(channels))
     findings += _length_findings({n: len(c) - begins[n] for n, c in channels.items()}, n_common, step)
     return {n: (b, b + n_common) for n, b in begins.items()}, findings
@@ -280,7 +276,7 @@ def _checked_stamps(stamps: list[np.ndarray], step: float, source: str) -> list[
     for s in stamps:
         bad = np.flatnonzero(~np.isfinite(s))
         if bad.size:
-            raise SpecError([f"{source}: time stamp {bad[0]} is no number; give sampling_rate_hz instead of time."])
+            raise SpecError(f"{source}: time stamp {bad[0]} is no number; give sampling_rate_hz instead of time.")
     _refuse_backwards(stamps, source)
     return stamps
 
@@ -355,11 +351,9 @@ def _refuse_backwards(stamps: list[np.ndarray], source: str) -> None:
         if falling.size:
             i = int(falling[0])
             raise SpecError(
-                [
-                    f"{source}: time goes backwards after sample {i} ({s[i]:.9g} s, then {s[i + 1]:.9g} s; "
-                    f"{falling.size} times in all); give sampling_rate_hz instead of time if the "
-                    "samples are even, or cut the file there."
-                ]
+                f"{source}: time goes backwards after sample {i} ({s[i]:.9g} s, then {s[i + 1]:.9g} s; "
+                f"{falling.size} times in all); give sampling_rate_hz instead of time if the "
+                "samples are even, or cut the file there."
             )
 
 

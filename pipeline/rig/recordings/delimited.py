@@ -125,10 +125,8 @@ def _form(path: Path, rows: list[str], stated: CsvMap) -> _Form:
                 found.append(form)
     if not found:
         raise SpecError(
-            [
-                f"{path}: is not a table of numbers with one of the delimiters ; , tab or blank; state "
-                "[csv] delimiter, decimal, header or skip_rows in the mapping."
-            ]
+            f"{path}: is not a table of numbers with one of the delimiters ; , tab or blank; state "
+            "[csv] delimiter, decimal, header or skip_rows in the mapping."
         )
     fewest = min(len(f.texts) for f in found)
     found = [f for f in found if len(f.texts) == fewest]
@@ -139,10 +137,8 @@ def _form(path: Path, rows: list[str], stated: CsvMap) -> _Form:
     ambiguous = {f.decimal for f in found if "," in (f.delimiter, f.decimal)} == {".", ","} and not named
     if ambiguous and any("," in row for row in rows[-2:]):
         raise SpecError(
-            [
-                f"{path}: a comma may be between fields or in numbers ({rows[-1]!r}); state [csv] decimal = "
-                '"," or delimiter = "," in the mapping.'
-            ]
+            f"{path}: a comma may be between fields or in numbers ({rows[-1]!r}); state [csv] decimal = "
+            '"," or delimiter = "," in the mapping.'
         )
     return chosen[0]
 

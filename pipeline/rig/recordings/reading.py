@@ -122,10 +122,8 @@ def window(ds: xr.Dataset, window_s: tuple[float, float]) -> xr.Dataset:
     inside = (time >= low - slack) & (time <= high + slack)
     if int(inside.sum()) < 2:
         raise SpecError(
-            [
-                f"window_s = [{low:g}, {high:g}]: holds {int(inside.sum())} samples; the recording "
-                f"{Path(str(ds.attrs.get('file', ''))).name} goes from {time[0]:g} to {time[-1]:g} s."
-            ]
+            f"window_s = [{low:g}, {high:g}]: holds {int(inside.sum())} samples; the recording "
+            f"{Path(str(ds.attrs.get('file', ''))).name} goes from {time[0]:g} to {time[-1]:g} s."
         )
     kept = [f for f in findings_of(ds) if not (f.end_s < low - slack or f.start_s > high + slack)]
     return ds.isel({DIM: np.flatnonzero(inside)}).assign_attrs(findings=to_json(kept))

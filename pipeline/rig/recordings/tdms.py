@@ -46,7 +46,7 @@ def read_tdms(path: Path) -> Raw:
             file = TdmsFile.read(str(path), raw_timestamps=True)
         except Exception as error:  # npTDMS raises what its parser meets: struct.error, KeyError, ...
             raise SpecError(
-                [f"{path}: is not a TDMS file that can be read ({error}); write it anew, or export it as CSV."]
+                f"{path}: is not a TDMS file that can be read ({error}); write it anew, or export it as CSV."
             ) from None
     found = {}
     zero = _earliest(file)

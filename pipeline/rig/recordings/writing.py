@@ -107,9 +107,9 @@ def check_target(path: str | Path, suffixes: Sequence[str] = SUFFIXES) -> Path:
     """
     target = Path(path)
     if target.suffix.lower() not in suffixes:
-        raise SpecError([f"{path}: the suffix must be one of {', '.join(suffixes)}."])
+        raise SpecError(f"{path}: the suffix must be one of {', '.join(suffixes)}.")
     if not target.parent.is_dir():
-        raise SpecError([f"{path}: there is no folder {target.parent}; make it first."])
+        raise SpecError(f"{path}: there is no folder {target.parent}; make it first.")
     return target
 
 
