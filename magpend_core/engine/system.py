@@ -59,7 +59,6 @@ class System:
     ----------
     name : str
         One name, one set of functions: it names the compiled code.
-    state_names : tuple of str
     parameter_names : tuple of str
         Order of the packed parameter vector.
     n_constants : int
@@ -157,7 +156,6 @@ class System:
     section : (int, int) or None
         Number of the state at whose crossing of a level a period ends, and the direction, +1 rising or
         -1 falling; the level is the last parameter. See `crossing.with_section`.
-    quantity_names : tuple of str
     quantities : callable or None
         ``quantities(t, y, dy, u, c)``: a tuple of the named quantities at time `t` [s] since the last
         section, from the states, their rates, the forcing and the constants.

@@ -37,8 +37,6 @@ class Address:
 
     Attributes
     ----------
-    scheme, host : str
-    port : int
     source : str
         Source of the address, for messages: the option, a variable, or a file.
     """

@@ -162,7 +162,6 @@ class Scene:
 
     Attributes
     ----------
-    drawing : Drawing
     low, high : ndarray
         Corners that hold everything at all times.
     """

@@ -62,15 +62,12 @@ class View:
 
     Attributes
     ----------
-    ds : Dataset
     names : tuple of str
         Variables that are read.
-    coordinates : callable
     n_points : int
         Number of points if no cell is absent.
     layers : tuple of str
         Directions that lie on one another; a single empty one where there are none.
-    motions : Motions
     """
 
     ds: xr.Dataset

@@ -28,7 +28,6 @@ class Motion:
         Values of each state along the motion, angles not wrapped.
     section : dict of ndarray
         The same at the stroboscopic section; may be empty arrays.
-    colour : str
     gid : str
         Ends the identifiers of what is drawn.
     """

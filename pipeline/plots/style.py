@@ -93,8 +93,6 @@ class DataFigure(Figure):
     ----------
     data : Dataset
         The numbers drawn, after every selection.
-    frame : Frame
-    look : Look
     notes : list of str
         What whoever asked for the figure must know beside it.
     """

@@ -59,7 +59,6 @@ class Controlled:
         Standard deviation of the measured state; that of its rate is larger by the angular frequency.
     n_settle, n_measure : int
         Drive periods for which the rig settles after each change of the target, and that are then measured.
-    seed : int
     """
 
     parameters: Parameters

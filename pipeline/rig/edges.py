@@ -39,7 +39,6 @@ class Timing(NamedTuple):
 
     Attributes
     ----------
-    frequency_hz, frequency_error_hz : float
     jitter_s : float
         Root mean square distance of the edges from the line [s].
     duty_cycle, duty_cycle_error : float

@@ -19,12 +19,7 @@ NUMBERS = tuple(getattr(signal, n) for n in ("SIGINT", "SIGTERM", "SIGHUP") if h
 
 
 class Stopped(KeyboardInterrupt):
-    """Exception that a received signal raises; a subclass of `KeyboardInterrupt`.
-
-    Attributes
-    ----------
-    number : int
-    """
+    """Exception that a received signal raises; a subclass of `KeyboardInterrupt`."""
 
     def __init__(self, number: int) -> None:
         self.number = number
@@ -32,12 +27,7 @@ class Stopped(KeyboardInterrupt):
 
 
 class InterruptedRunError(Exception):
-    """An error for a run that a signal stopped; results of finished tasks stay.
-
-    Attributes
-    ----------
-    signal_number : int
-    """
+    """An error for a run that a signal stopped; results of finished tasks stay."""
 
     def __init__(self, signal_number: int, message: str) -> None:
         self.signal_number = signal_number

@@ -27,7 +27,6 @@ class Sliding:
 
     Attributes
     ----------
-    graph : Graph
     effective : dict
         What stands for each side, by its leaf.
     slides : tuple of bool

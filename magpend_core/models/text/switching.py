@@ -80,10 +80,8 @@ class Sides:
 
     Attributes
     ----------
-    graph : Graph
     smoothed : set of int
         Numbers of nodes whose corner lies in a layer of the same argument: they stay as they are.
-    switches, instants : list
     left : list of Node
         Jumps in time that were neither: steps do not end on them.
     """

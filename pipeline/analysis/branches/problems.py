@@ -127,7 +127,6 @@ class Family:
 
     Attributes
     ----------
-    system : System
     period : int
         In drive periods or returns; 0 for equilibria.
     frequency_hz : float

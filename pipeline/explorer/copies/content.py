@@ -44,7 +44,6 @@ class Copied:
 
     Attributes
     ----------
-    run : ExploredRun
     view : dict
         As `describe_view` gives it.
     about : dict

@@ -41,10 +41,8 @@ class Exported:
 
     Attributes
     ----------
-    path : Path
     size : int
         Of all that was written [bytes].
-    orbits : int
     sentences : list of str
         What the copy says of itself.
     """

@@ -38,7 +38,6 @@ class Cell:
 
     Attributes
     ----------
-    number : int
     index : dict
         Index on each of the cube's dims.
     data : Dataset

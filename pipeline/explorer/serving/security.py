@@ -31,13 +31,7 @@ def new_token() -> str:
 
 @dataclass(frozen=True)
 class Guard:
-    """Check of a request's origin and token.
-
-    Attributes
-    ----------
-    token : str
-    port : int
-    """
+    """Check of a request's origin and token."""
 
     token: str = field(repr=False)
     port: int

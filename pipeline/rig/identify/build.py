@@ -39,7 +39,6 @@ class Built:
 
     Attributes
     ----------
-    problem : Problem
     held_out : tuple of Piece
         Pieces that are judged afterwards; only their starts are fitted.
     tables : tuple of MeasuredTable

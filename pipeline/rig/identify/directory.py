@@ -69,7 +69,6 @@ class Source:
     ----------
     file : str
         Name of the file.
-    sha256 : str
     mapping : str
         Text of the mapping file.
     """

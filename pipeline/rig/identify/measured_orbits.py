@@ -53,7 +53,6 @@ class MeasuredTable:
         Model, parameter and interval.
     state : str
         Measured state; empty if there are bifurcations alone.
-    fitted, held_out : tuple of Datum
     measured : Dataset or None
         Orbits as of `read_branch`; None if there are bifurcations alone.
     settings : dict

@@ -34,13 +34,8 @@ class Finding:
 
     Attributes
     ----------
-    problem : Problem
     starts : dict of Fit
         Outcome of each start by its number.
-    best : Fit
-    covariance : Covariance
-    directions : list of Direction
-    profiles : dict of Profile
     fitted, held_out : Judgement
         Judgements of the fitted pieces, and of the held-out ones if there are any.
     n_effective : dict
@@ -49,7 +44,6 @@ class Finding:
         For each unknown, the bound at which its estimate lies: ``lower``, ``upper`` or an empty text.
     orbits : list of Dataset
         Judged orbits and bifurcations, one dataset per table.
-    warnings : list of str
     """
 
     problem: Problem

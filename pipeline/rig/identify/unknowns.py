@@ -48,10 +48,8 @@ class Unknown:
 
     Attributes
     ----------
-    name : str
     start, lower, upper : float
         In the parameter's unit.
-    prior : Prior, optional
     """
 
     name: str

@@ -37,10 +37,8 @@ class CurveFit:
 
     Attributes
     ----------
-    curve : Curve
     values, errors : dict
         By ``A`` [N m], ``b``, ``c`` [rad].
-    quality : Quality
     """
 
     curve: Curve
@@ -81,7 +79,6 @@ class JointFit:
         latter are NaN if one curve alone determines a parameter.
     correlation : ndarray
         Correlation matrix of `free`.
-    quality : Quality
     residuals : ndarray
         Measured minus computed [N m].
     neighbours : float
@@ -109,7 +106,6 @@ class DipoleFit:
     ----------
     values : dict
         ``pole1`` and ``pole2``, which are equal since only their product matters, and the place ``h`` [m].
-    quality : Quality
     residuals : ndarray
         Measured minus computed [N m].
     """
@@ -393,9 +389,6 @@ class Outcome:
 
     Attributes
     ----------
-    measured : Measurement
-    curves : tuple of CurveFit
-    laws : Laws
     joint : JointFit
         Joint fit with the parameters held that the header names.
     unheld : JointFit or None

@@ -177,7 +177,6 @@ class Measurement:
 
     Attributes
     ----------
-    header : Header
     path : Path
         Path of the header.
     digest : str
