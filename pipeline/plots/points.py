@@ -215,11 +215,11 @@ def _count_absent(view: View, block: xr.Dataset, found: Survey) -> None:
         found.absent[name] += np.bincount(where[chosen], minlength=size).reshape(found.cells.shape)
 
 
-def selections(array: xr.DataArray, inner: tuple[str, ...] = ()) -> Iterator[dict[str, slice]]:
+def selections(array: xr.DataArray) -> Iterator[dict[str, slice]]:
     """Yield selections (one slice per dim) that together cover the cells of an array once. They follow the array's
     chunks if it has any.
     """
-    own = inner or tuple(str(d) for d in array.dims if d in _OWN_DIMS)
+    own = [str(d) for d in array.dims if d in _OWN_DIMS]
     dims = [str(dim) for dim in array.dims if dim not in own]
     each = math.prod(array.sizes[dim] for dim in own)
     chunks = _chunk_sizes(array)

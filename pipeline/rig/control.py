@@ -79,7 +79,7 @@ class TracedOrbits:
 
     Attributes
     ----------
-    drive, drive_sd : ndarray, (target,)
+    drive : ndarray, (target,)
         Amplitude of the drive.
     amplitude, amplitude_sd : ndarray, (target,)
         Half of the peak-to-peak value of the state.
@@ -90,7 +90,6 @@ class TracedOrbits:
     """
 
     drive: np.ndarray
-    drive_sd: np.ndarray
     amplitude: np.ndarray
     amplitude_sd: np.ndarray
     residue: np.ndarray
@@ -130,7 +129,7 @@ def trace(rig: Controlled, targets: Sequence[float] | np.ndarray) -> TracedOrbit
     drives = np.abs([_harmonics(part)[:, 1] for part in np.split(output, rig.n_measure)])
     drive, scatter = np.median(drives, axis=0), np.std(drives, axis=0)
     return TracedOrbits(
-        drive, scatter, np.median(peaks, axis=0), np.std(peaks, axis=0), residue, _stabilities(sizes, drive, scatter)
+        drive, np.median(peaks, axis=0), np.std(peaks, axis=0), residue, _stabilities(sizes, drive, scatter)
     )
 
 

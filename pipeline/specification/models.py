@@ -72,10 +72,10 @@ def _placed(problem: str, at: str, reference: Any) -> str:
     return f"{at}.{problem.removeprefix(head)}" if problem.startswith(head) else f"{at}: {problem}"
 
 
-def add_model(reference: Any, folder: str | Path | None, problems: list[str], at: str = "model") -> Model | None:
+def add_model(reference: Any, folder: str | Path | None, problems: list[str]) -> Model | None:
     """Return the model that `find_model` finds, or None after adding its problems to `problems`."""
     try:
-        return find_model(reference, folder, at)
+        return find_model(reference, folder)
     except SpecError as error:
         problems += error.problems
         return None

@@ -32,9 +32,6 @@ MOST_PLACES = 4000
 BLOCK_BYTES = 1_000_000
 """Answers lie together in objects of about so many bytes before compression."""
 
-PLANE_BYTES = 3_000_000
-"""What the planes of initial states may take of a copy in one file."""
-
 Place = dict[str, int]
 
 

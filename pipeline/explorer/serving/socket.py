@@ -34,7 +34,7 @@ Authorised = Callable[[RequestHandler], bool]
 Route = tuple[str, type[WebSocketHandler], dict[str, Any]]
 
 
-def socket_routes(live: LiveRun, authorised: Authorised, path: str = r"/ws") -> list[Route]:
+def socket_routes(live: LiveRun, authorised: Authorised) -> list[Route]:
     """Return the tornado routes of the websocket for live computing.
 
     Parameters
@@ -44,10 +44,8 @@ def socket_routes(live: LiveRun, authorised: Authorised, path: str = r"/ws") -> 
     authorised
         Says whether a request may connect, by its token and its host; that its origin is this server is
         looked at besides.
-    path
-        Pattern of the address.
     """
-    return [(path, LiveSocket, {"live": live, "authorised": authorised, "others": set()})]
+    return [("/ws", LiveSocket, {"live": live, "authorised": authorised, "others": set()})]
 
 
 class LiveSocket(WebSocketHandler):

@@ -13,7 +13,7 @@ from pipeline.layout.vocabulary import model_attribute, model_of
 from pipeline.products.measured import WINDOW_S
 from pipeline.rig.edges import DRIVE, Edges, edges_of
 from pipeline.rig.measured.phase import section_phase
-from pipeline.rig.measured.recorded_sections import ORDER, find_sections, name_of
+from pipeline.rig.measured.recorded_sections import find_sections, name_of
 from pipeline.rig.measured.steps import constant_spans
 from pipeline.specification.problems import SpecError
 
@@ -30,7 +30,6 @@ def series_of(
     start_s: float | None = None,
     n_periods: int = PERIODS,
     window_s: float = WINDOW_S,
-    order: int = ORDER,
     hysteresis: float | None = None,
 ) -> xr.Dataset:
     """Return part of a recording that begins at a rising edge of the drive, with the model's trajectory from the same
@@ -50,7 +49,7 @@ def series_of(
         Time from which on the first rising edge is taken [s]; by default the recording's begin.
     n_periods
         Drive periods of the part; it ends earlier if the drive frequency changes.
-    window_s, order, hysteresis
+    window_s, hysteresis
         See `pipeline.rig.measured.recorded_sections.find_sections` and `pipeline.rig.edges.find_edges`.
 
     Returns
@@ -80,7 +79,7 @@ def series_of(
     timing = _first_timing(edges)
     later = section_phase(parameters, timing) / timing
     at = Edges(edges.rising + later, edges.falling, edges.resolution_s) if later else edges
-    sections = find_sections(recording, at, window_s=window_s, order=order)
+    sections = find_sections(recording, at, window_s=window_s)
     missing = [n for n in model.state_names if n not in sections["state"].values]
     if missing:
         raise SpecError(
