@@ -187,10 +187,10 @@ def _rate_findings(stretches: Sequence[Mapping[str, Channel]], stated: float | N
         if math.isfinite(step) and abs(step / stated - 1.0) > 1e-6:
             rates = f"the file says {1.0 / step:.8g} Hz, the mapping {1.0 / stated:.8g} Hz"
             text = f"{rates}; the mapping's is used."
-            findings.append(Finding("rate", name, math.nan, math.nan, "warning", text))
+            findings.append(Finding("rate", name, text=text))
         if channel.time is not None:
             text = "the file's time stamps are not used, nor gaps in them seen: the mapping states a rate."
-            findings.append(Finding("rate", name, math.nan, math.nan, "note", text))
+            findings.append(Finding("rate", name, severity="note", text=text))
     return findings
 
 
@@ -225,8 +225,7 @@ def _start_findings(late: Mapping[str, float], step: float, all_known: bool) -> 
                     name,
                     0.0,
                     0.0,
-                    "warning",
-                    f"begins {whole * step:.6g} s before the last channel to begin; its first {whole} "
+                    text=f"begins {whole * step:.6g} s before the last channel to begin; its first {whole} "
                     "samples are left out.",
                 )
             )
@@ -237,16 +236,13 @@ def _start_findings(late: Mapping[str, float], step: float, all_known: bool) -> 
                     name,
                     0.0,
                     0.0,
-                    "warning",
-                    f"is sampled {abs(rest) * step:.3g} s {'after' if rest < 0.0 else 'before'} the others; "
+                    text=f"is sampled {abs(rest) * step:.3g} s {'after' if rest < 0.0 else 'before'} the others; "
                     "it is laid on their instants as it is.",
                 )
             )
     if not all_known and any(late.values()):
         findings.append(
-            Finding(
-                "start", "", 0.0, 0.0, "warning", "some channels do not say when they begin; with the last is assumed."
-            )
+            Finding("start", "", 0.0, 0.0, text="some channels do not say when they begin; with the last is assumed.")
         )
     return findings
 
@@ -259,8 +255,8 @@ def _length_findings(lengths: Mapping[str, int], n_common: int, step: float) -> 
             name,
             n_common * step,
             length * step,
-            "warning",
-            f"has {length} samples, {', '.join(short)} only {n_common}; the last {length - n_common} are left out.",
+            text=f"has {length} samples, {', '.join(short)} only {n_common}; "
+            f"the last {length - n_common} are left out.",
         )
         for name, length in lengths.items()
         if length > n_common
@@ -296,8 +292,7 @@ def _cut(
             "",
             float(time[i - 1]),
             float(time[i]),
-            "warning",
-            f"{round((even[i] - even[i - 1]) / own_step) - 1} samples are missing; a new piece begins.",
+            text=f"{round((even[i] - even[i - 1]) / own_step) - 1} samples are missing; a new piece begins.",
         )
         for i in np.flatnonzero(is_gap)
     ]
@@ -372,11 +367,8 @@ def _one_after_another(stamps: list[np.ndarray], step: float, findings: list[Fin
         findings.append(
             Finding(
                 "pieces",
-                "",
-                math.nan,
-                math.nan,
-                "note",
-                f"the clock begins anew in {moved} of {len(stamps)} stretches; they are laid one after another, "
+                severity="note",
+                text=f"the clock begins anew in {moved} of {len(stamps)} stretches; they are laid one after another, "
                 "a sampling interval apart. How far apart they were is not known.",
             )
         )
@@ -419,7 +411,11 @@ def _jitter_findings(time: np.ndarray, residual: np.ndarray, step: float) -> lis
         f"{worst:.3g} s at most"
     )
     if worst < UNEVEN * step:
-        return [Finding("jitter", "", float(time[0]), float(time[-1]), "note", f"{text}; even steps are used.")]
+        return [
+            Finding(
+                "jitter", "", float(time[0]), float(time[-1]), severity="note", text=f"{text}; even steps are used."
+            )
+        ]
     far = runs(np.abs(residual) >= UNEVEN * step)
     return [
         Finding(
@@ -427,7 +423,7 @@ def _jitter_findings(time: np.ndarray, residual: np.ndarray, step: float) -> lis
             "",
             float(time[far[0, 0]]),
             float(time[far[-1, 1] - 1]),
-            "warning",
-            f"{text}; even steps are used. If the sampling itself was uneven, resample the file before it is read.",
+            text=f"{text}; even steps are used. If the sampling itself was uneven, resample the file before it is "
+            "read.",
         )
     ]

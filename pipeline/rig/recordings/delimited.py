@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import math
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -81,14 +80,7 @@ def read_csv(path: Path, stated: CsvMap) -> Raw:
     if len(body) > 1 and len(last) < len(split(body[-2], form.delimiter)):
         body = body[:-1]
         findings.append(
-            Finding(
-                "truncated",
-                "",
-                math.nan,
-                math.nan,
-                "warning",
-                f"the last row has {len(last)} of {form.n_columns} fields; it is left out.",
-            )
+            Finding("truncated", text=f"the last row has {len(last)} of {form.n_columns} fields; it is left out.")
         )
     found = {}
     for j, values in _columns(body, form).items():

@@ -200,22 +200,12 @@ def _truncations(segment: _Segment, channels: dict[str, Channel], style: _Style)
                 Finding(
                     "truncated",
                     channel.name,
-                    math.nan,
-                    math.nan,
-                    "warning",
-                    f"the segment from line {segment.first_line} has {len(channel)} of the {stated:.0f} samples "
+                    text=f"the segment from line {segment.first_line} has {len(channel)} of the {stated:.0f} samples "
                     "that its header states.",
                 )
             )
     if "_cut" in segment.keys:
         findings.append(
-            Finding(
-                "truncated",
-                "",
-                math.nan,
-                math.nan,
-                "warning",
-                f"the file ends within the header that begins in line {segment.keys['_cut'][0]}.",
-            )
+            Finding("truncated", text=f"the file ends within the header that begins in line {segment.keys['_cut'][0]}.")
         )
     return findings
