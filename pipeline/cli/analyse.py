@@ -7,8 +7,8 @@ from typing import Annotated, Any
 import typer
 
 from pipeline.cli.common import Csv, Directory, Json, check_csv, tell
-from pipeline.cli.groups import SETTINGS, made, registry_group
-from pipeline.cli.options import speaking, taking
+from pipeline.cli.groups import add_command, command_group, made, registry_group
+from pipeline.cli.options import taking
 
 
 def _names() -> list[str]:
@@ -41,12 +41,9 @@ def _make(name: str) -> Any:
     return made(name, taking(analysis.options, command), analysis.help)
 
 
-analyse_app = typer.Typer(
-    cls=registry_group("analyse", _names, _make),
-    help="Find attractors, basins, chaos and branches in a stored cube; results are kept in DIR/derived.",
-    no_args_is_help=True,
-    rich_markup_mode=None,
-    context_settings=SETTINGS,
+analyse_app = command_group(
+    "Find attractors, basins, chaos and branches in a stored cube; results are kept in DIR/derived.",
+    registry_group("analyse", _names, _make),
 )
 
 
@@ -65,4 +62,4 @@ def prune(
         console.result("nothing to remove")
 
 
-analyse_app.command()(speaking(prune))
+add_command(analyse_app, prune)

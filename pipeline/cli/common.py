@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -61,13 +62,10 @@ def tell(table: Table, csv: str | None, as_json: bool) -> None:
     """Print a table: its text lines, its rows as JSON with `as_json`, or its rows as CSV if `csv` is ``-``."""
     from pipeline.cli import console
 
-    if as_json:
-        console.result(json.dumps(json_rows(table), indent=1))
-    elif csv == "-":
+    if csv == "-" and not as_json:
         console.result(table.csv().rstrip("\n"))
     else:
-        for line in table.lines:
-            console.result(line)
+        tell_data(json_rows(table), table.lines, as_json)
     if csv not in (None, "-"):
         from pipeline.cli.outputs import check_table
         from pipeline.layout.writing import write_atomically
@@ -76,6 +74,16 @@ def tell(table: Table, csv: str | None, as_json: bool) -> None:
         check_table(Path(str(csv)), text.partition("\n")[0])
         write_atomically(Path(str(csv)), text)
         console.note(f"table: {csv}")
+
+
+def tell_data(data: Any, lines: Iterable[str], as_json: bool) -> None:
+    """Print a result: as lines, or as JSON with `as_json`."""
+    from pipeline.cli import console
+
+    if as_json:
+        console.result(json.dumps(data, indent=1))
+    else:
+        console.result(*lines)
 
 
 def json_rows(table: Table) -> list[dict[str, Any]]:

@@ -40,24 +40,26 @@ class _Visible(logging.Formatter):
         return visible(super().format(record))
 
 
-def note(line: str) -> None:
-    """Print a note, unless ``--quiet`` is given."""
-    LOG.info(line)
+def note(*lines: str) -> None:
+    """Print notes, unless ``--quiet`` is given."""
+    for line in lines:
+        LOG.info(line)
 
 
-def result(line: str) -> None:
-    """Print one line of a command's result to the standard output.
+def result(*lines: str) -> None:
+    """Print lines of a command's result to the standard output.
 
     Raises
     ------
     EnoughError
         If the reader has closed the standard output.
     """
-    try:
-        sys.stdout.write(f"{visible(line)}\n")
-        sys.stdout.flush()
-    except BrokenPipeError:
-        raise EnoughError from None
+    for line in lines:
+        try:
+            sys.stdout.write(f"{visible(line)}\n")
+            sys.stdout.flush()
+        except BrokenPipeError:
+            raise EnoughError from None
 
 
 def is_shown() -> bool:

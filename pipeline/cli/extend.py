@@ -62,8 +62,7 @@ def extend(
     }
     if dry_run:
         found = extending.plan_extension((directory, *(also or ())), spec, Widening(**changes))
-        for line in extending.describe_extension(found, workers=workers):
-            console.result(line)
+        console.result(*extending.describe_extension(found, workers=workers))
         return
     state = extending.extend(
         directory,

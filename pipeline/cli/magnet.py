@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from pipeline.cli.common import Json
+from pipeline.cli.common import Json, tell_data
 
 
 def fit_magnet(
@@ -28,8 +28,6 @@ def fit_magnet(
     The command fits single curves, then all curves at once, and point dipoles for comparison. If a fit does
     not converge, nothing is written.
     """
-    import json as formats
-
     from pipeline.cli import console
     from pipeline.rig.magnet.fitting import fit_measurement
     from pipeline.rig.magnet.measurement import find_measurement, read_measurement
@@ -46,13 +44,8 @@ def fit_magnet(
         written += write_figures(outcome, folder)
     for warning in warnings_of(outcome):
         console.LOG.warning(warning)
-    if json:
-        console.result(formats.dumps(report_of(outcome), indent=1))
-    else:
-        for line in summary_of(outcome):
-            console.result(line)
-    for path in written:
-        console.note(f"written: {path}")
+    tell_data(report_of(outcome), summary_of(outcome), json)
+    console.note(*(f"written: {path}" for path in written))
     preset = folder / "preset.toml"
     console.note(f'use it with preset = "{preset}" in a specification, or magpend simulate --preset {preset}')
 

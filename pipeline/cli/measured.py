@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pipeline.cli.common import Csv, Directory, Json, check_csv, json_rows, read_pairs, tell
-from pipeline.cli.groups import SETTINGS, made, registry_group
+from pipeline.cli.common import Csv, Directory, Json, check_csv, json_rows, read_pairs, tell, tell_data
+from pipeline.cli.groups import command_group, made, registry_group
 from pipeline.cli.options import taking
 from pipeline.cli.outputs import check_file, check_place
 from pipeline.layout.writing import write_atomically
@@ -173,15 +173,13 @@ def compare(
         )
     steps_of, ends = steps_table(compared), edges_table(compared)
     if as_json:
-        console.result(json.dumps({"steps": json_rows(steps_of), "edges": json_rows(ends)}, indent=1))
+        tell_data({"steps": json_rows(steps_of), "edges": json_rows(ends)}, (), as_json)
         return
     tell(steps_of, csv, as_json=False)
     if csv == "-":
         return
-    for line in (*ends.lines, *summary_lines(compared)):
-        console.result(line)
-    for path in written:
-        console.note(f"written: {path}")
+    console.result(*ends.lines, *summary_lines(compared))
+    console.note(*(f"written: {path}" for path in written))
 
 
 def series(
@@ -309,10 +307,7 @@ def _make(name: str) -> Any:
     return made(name, command, str(function.__doc__))
 
 
-measured_app = typer.Typer(
-    cls=registry_group("measured", lambda: list(_COMMANDS), _make),
-    help="Diagrams and branches of recorded motions, beside and over computed ones.",
-    no_args_is_help=True,
-    rich_markup_mode=None,
-    context_settings=SETTINGS,
+measured_app = command_group(
+    "Diagrams and branches of recorded motions, beside and over computed ones.",
+    registry_group("measured", lambda: list(_COMMANDS), _make),
 )

@@ -8,20 +8,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pipeline.cli.common import EXIT_HELP
-from pipeline.cli.groups import SETTINGS
-from pipeline.cli.options import completing, speaking
+from pipeline.cli.groups import add_command, command_group
+from pipeline.cli.options import completing
 
 if TYPE_CHECKING:
     from magpend_core.models.model import Model
     from magpend_core.models.summary import Description
 
-model_app = typer.Typer(
-    help="Your own system as text: begin one, and check how magpend reads it.",
-    no_args_is_help=True,
-    rich_markup_mode=None,
-    context_settings=SETTINGS,
-)
+model_app = command_group("Your own system as text: begin one, and check how magpend reads it.")
 
 
 def _names() -> list[str]:
@@ -57,8 +51,7 @@ def show(
     elif latex:
         _latex(model, found)
     else:
-        for line in _lines(model, found):
-            console.result(line)
+        console.result(*_lines(model, found))
     if found.problems:
         raise typer.Exit(Exit.REFUSED)
 
@@ -81,7 +74,7 @@ def new(
 
 
 for _command in (show, new):
-    model_app.command(epilog=EXIT_HELP, context_settings=SETTINGS)(speaking(_command))
+    add_command(model_app, _command)
 
 
 def _lines(model: Model, found: Description) -> list[str]:

@@ -119,5 +119,4 @@ def presets(
     found = find_preset(name) if name else None
     chosen = find_model(model if model != DEFAULT else getattr(found, "model", "") or model, at="--model")
     for preset in [found] if found else chosen.preset_names:
-        for line in _preset(chosen, preset):
-            console.result(line)
+        console.result(*_preset(chosen, preset))

@@ -5,10 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import typer
-
 from pipeline.cli.common import Directory
-from pipeline.cli.groups import SETTINGS, made, registry_group
+from pipeline.cli.groups import command_group, made, registry_group
 from pipeline.cli.options import taking
 
 if TYPE_CHECKING:
@@ -35,12 +33,8 @@ def _make(name: str) -> Any:
     return made(name, taking(figure.options, command), figure.help)
 
 
-plot_app = typer.Typer(
-    cls=registry_group("plot", _names, _make),
-    help="Draw figures from a stored cube; no cell is computed again.",
-    no_args_is_help=True,
-    rich_markup_mode=None,
-    context_settings=SETTINGS,
+plot_app = command_group(
+    "Draw figures from a stored cube; no cell is computed again.", registry_group("plot", _names, _make)
 )
 
 

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from pipeline.cli.common import EXIT_HELP, Json, tell
-from pipeline.cli.groups import SETTINGS
-from pipeline.cli.options import speaking
+from pipeline.cli.common import Json, json_rows, tell, tell_data
+from pipeline.cli.groups import add_command, command_group
 from pipeline.cli.outputs import check_file, check_place
 from pipeline.cli.plot import check_figure_path
 from pipeline.layout.writing import write_atomically
@@ -24,12 +22,7 @@ Window = Annotated[
     typer.Option(metavar="FROM TO", help="Part of the recording [s since its first sample]."),
 ]
 
-recordings_app = typer.Typer(
-    help="Recordings of a rig: show a file's content and findings, convert it, simulate one.",
-    no_args_is_help=True,
-    rich_markup_mode=None,
-    context_settings=SETTINGS,
-)
+recordings_app = command_group("Recordings of a rig: show a file's content and findings, convert it, simulate one.")
 
 
 def show(
@@ -196,20 +189,14 @@ def _smoothed(ds: xr.Dataset, wanted: bool, window_s: float | None) -> xr.Datase
 
 def _tell(ds: xr.Dataset, as_json: bool) -> None:
     """Print the quantities of a recording and the problems found in it, as lines or as one JSON object."""
-    from pipeline.cli import console
-    from pipeline.cli.common import json_rows
     from pipeline.rig.recordings.overview import describe_recording
 
     quantities, findings = describe_recording(ds)
-    if not as_json:
-        for line in (*quantities.lines, *findings.lines):
-            console.result(line)
-        return
     keys = ("file", "sha256", "format", "model", "sampling_rate_hz", "simulated")
     about: dict[str, Any] = {key: ds.attrs[key] for key in keys if key in ds.attrs}
     about |= {"samples": ds.sizes["sample"], "pieces": len(set(ds["piece"].values.tolist()))}
     told = {**about, "quantities": json_rows(quantities), "findings": json_rows(findings)}
-    console.result(json.dumps(told, indent=1))
+    tell_data(told, [*quantities.lines, *findings.lines], as_json)
 
 
 def _draw(ds: xr.Dataset, out: Path, as_json: bool) -> None:
@@ -222,4 +209,4 @@ def _draw(ds: xr.Dataset, out: Path, as_json: bool) -> None:
 
 
 for _command in (show, convert, drive, simulate):
-    recordings_app.command(epilog=EXIT_HELP, context_settings=SETTINGS)(speaking(_command))
+    add_command(recordings_app, _command)

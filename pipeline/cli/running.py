@@ -88,8 +88,7 @@ def run(
         _run_posterior(spec, posterior, n_draws, out, smoke=smoke, workers=workers)
         return
     if dry_run:
-        for line in preview.describe_plan(spec, out, workers=workers, smoke=smoke):
-            console.result(line)
+        console.result(*preview.describe_plan(spec, out, workers=workers, smoke=smoke))
         return
     state = runs.run(
         spec,
@@ -103,8 +102,7 @@ def run(
     )
     done = Run.open(state.files)
     console.result(f"cube: {state.files.below('cube.zarr').name}")
-    for line in outcome.summary(done):
-        console.result(line)
+    console.result(*outcome.summary(done))
     if text := outcome.warning(done):
         console.LOG.warning(text)
     if plot:
@@ -116,8 +114,7 @@ def _run_posterior(spec: str, directory: Path, n: int, out: str | None, *, smoke
     from pipeline.rig.identify.posterior_runs import run_posterior, spread
 
     folder = run_posterior(spec, directory, n, out, smoke=smoke, workers=workers, echo=console.note)
-    for line in spread(folder, echo=console.note).lines:
-        console.result(line)
+    console.result(*spread(folder, echo=console.note).lines)
     console.result(f"runs: {folder}; their bifurcations: magpend identify spread {folder} --branches")
 
 
@@ -176,7 +173,6 @@ def verify(
     from pipeline.runs import verify as verification
 
     found = verification.verify_run(directory, repair=repair)
-    for line in verification.describe(found, directory, repaired=repair):
-        console.result(line)
+    console.result(*verification.describe(found, directory, repaired=repair))
     if not (found.sound or (repair and not found.skeleton)):
         raise typer.Exit(Exit.DAMAGED)

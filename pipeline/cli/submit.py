@@ -35,5 +35,4 @@ def submit(
     elif prepared.complete:
         console.result(f"{prepared.name} is complete; nothing to send.")
     else:
-        for line in send(prepared).lines():
-            console.result(line)
+        console.result(*send(prepared).lines())
