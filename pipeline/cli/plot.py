@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from pipeline.products.product import FigureOptions
     from pipeline.store.files import Files
 
-FORMATS = ("png", "pdf", "svg")
+SUFFIXES = (".png", ".pdf", ".svg")
 
 
 def _names() -> list[str]:
@@ -80,12 +80,8 @@ def _in_run(files: Files, name: str, options: FigureOptions) -> Path:
 def check_figure_path(path: Path, within: str = "") -> None:
     """Raise an error if a figure file cannot be written, before anything is computed; see `check_file`."""
     from pipeline.cli.outputs import check_file
-    from pipeline.specification.problems import SpecError
+    from pipeline.specification.files import check_new_file
 
-    suffixes = [f".{name}" for name in FORMATS]
-    if path.suffix.lower() not in suffixes:
-        raise SpecError(f"{path}: the suffix must be one of {', '.join(suffixes)}.")
-    if not path.parent.is_dir():
-        raise SpecError(f"{path.parent}: no such folder; make it first.")
+    check_new_file(path, SUFFIXES)
     for file in (path, path.with_suffix(".nc")):
         check_file(file, within=within)

@@ -72,9 +72,10 @@ def convert(
     """Convert a recording to SI units and another file format; for TDMS and CSV also write its mapping file."""
     from pipeline.cli import console
     from pipeline.rig.recordings import mapping_for, write_recording
-    from pipeline.rig.recordings.writing import check_target
+    from pipeline.rig.recordings.writing import SUFFIXES
+    from pipeline.specification.files import check_new_file
 
-    check_target(out)
+    check_new_file(out, SUFFIXES)
     _check_recording(out)
     _keep(file, out)
     ds = _smoothed(_read(file, mapping, window), smooth, smoothing_window)
@@ -93,11 +94,12 @@ def simulate(
 ) -> None:
     """Simulate a recording of an experiment, and write it with the mapping file that reads it."""
     from pipeline.cli import console
-    from pipeline.rig.recordings.writing import SUFFIXES, check_target, write_raw
+    from pipeline.rig.recordings.writing import SUFFIXES, write_raw
     from pipeline.rig.simulation import load_rig, simulated
+    from pipeline.specification.files import check_new_file
     from pipeline.specification.problems import SpecError
 
-    check_target(out, SUFFIXES[:2])
+    check_new_file(out, SUFFIXES[:2])
     _check_recording(out)
     beside = out.with_suffix(".toml")
     if beside.resolve() == spec.resolve():
@@ -127,9 +129,9 @@ def drive(
     """
     from pipeline.cli import console
     from pipeline.rig.driving import drive_file
-    from pipeline.rig.recordings.writing import check_target
+    from pipeline.specification.files import check_new_file
 
-    check_target(out, (".csv",))
+    check_new_file(out, (".csv",))
     check_file(out)
     made = drive_file(_read(file, mapping, window), kind, tolerance=tolerance)
     write_atomically(out, made.text)

@@ -72,11 +72,12 @@ def simulate(
     from pipeline.cli import console
     from pipeline.cli.outputs import check_file
     from pipeline.compute import simulate as simulation
+    from pipeline.specification.files import check_new_file
     from pipeline.specification.models import find_model
     from pipeline.store.provenance import provenance, versions
 
     chosen = find_model(model, at="--model")
-    simulation.check_output(out)
+    check_new_file(out, simulation.SUFFIXES)
     check_file(out)
     target = figure or out.with_suffix(".png")
     if not no_figure:

@@ -14,13 +14,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 from magpend_core import rates
 from magpend_core.models.model import Parameters
 from pipeline.rig.simulation import rig_parameters
 from pipeline.specification.files import read_toml
-from pipeline.specification.problems import SpecError, problems_of, unknown_key, unknown_name
+from pipeline.specification.problems import SpecError, checked, unknown_key, unknown_name
 from pipeline.specification.tables import Table
 
 SAMPLES = 128
@@ -282,11 +282,8 @@ def load_control(path: str | Path) -> tuple[Controlled, np.ndarray]:
     known = ("model", "preset", "parameters", "control")
     problems += [unknown_key(key, key, known) for key in data if key not in known]
     parameters = rig_parameters(data, path.parent, problems)
-    try:
-        table = ControlTable.model_validate(data.get("control", {}))
-    except ValidationError as error:
-        problems += problems_of(error, ControlTable, "control")
-    if problems or parameters is None:
+    table = checked(ControlTable, data.get("control", {}), "control", problems)
+    if problems or parameters is None or table is None:
         raise SpecError([f"{path}: {p}" for p in problems])
     gains, times = (table.gain, table.gain_of_rate), (table.settle, table.measure)
     rig = Controlled(

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 
@@ -208,8 +208,25 @@ class _Segments:
         return np.asarray(self.points + self.slopes @ (u - self.u))
 
 
+class FamilyProblem:
+    """Base of the equations for orbits of one family: the unknowns are the states and the free parameters."""
+
+    n_free: ClassVar[int] = 1
+    family: Family
+
+    @property
+    def size(self) -> int:
+        """Number of unknowns."""
+        return self.family.system.n_states + self.n_free
+
+    @property
+    def system(self) -> System:
+        """System of the family."""
+        return self.family.system
+
+
 @dataclass(eq=False)
-class OrbitProblem:
+class OrbitProblem(FamilyProblem):
     """Equations for fixed points of the p-fold stroboscopic or return map, with one free parameter.
 
     An orbit of several periods is evaluated by multiple shooting: all its periods are integrated side by side,
@@ -221,16 +238,6 @@ class OrbitProblem:
     family: Family
     _known: _Segments | None = field(default=None, init=False, repr=False)
     _tries: int = field(default=0, init=False, repr=False)
-
-    @property
-    def size(self) -> int:
-        """Number of unknowns."""
-        return self.family.system.n_states + 1
-
-    @property
-    def system(self) -> System:
-        """System of equations to integrate."""
-        return self.family.system
 
     def rows(self, u: np.ndarray) -> Rows:
         """Return the trajectories to integrate: the orbit or each of its periods, each also at a slightly changed
@@ -349,21 +356,12 @@ TESTS: dict[str, Callable[[np.ndarray], float]] = {
 
 
 @dataclass(frozen=True, eq=False)
-class BifurcationProblem:
+class BifurcationProblem(FamilyProblem):
     """Equations for orbits at a bifurcation, with two free parameters: the equations of the orbit and ``test = 0``."""
 
+    n_free = 2
     family: Family
     kind: str
-
-    @property
-    def size(self) -> int:
-        """Number of unknowns: the states and two free parameters."""
-        return self.family.system.n_states + 2
-
-    @property
-    def system(self) -> System:
-        """System of equations to integrate."""
-        return self.family.system
 
     @property
     def _steps(self) -> np.ndarray:

@@ -35,6 +35,14 @@ class Motion(IntEnum):
     HYPERCHAOTIC = 4
 
 
+def check_exponents(ds: xr.Dataset) -> None:
+    """Raise ValueError if a cube has no Lyapunov exponents."""
+    if "lyapunov" not in ds:
+        raise ValueError(
+            "the cube has no Lyapunov exponents; run it with [products] lyapunov = {} in its specification"
+        )
+
+
 def summarise(ds: xr.Dataset, *, n_sigma: float = 3.0, least: float = 0.005) -> xr.Dataset:
     """Classify the motion of each cell by its Lyapunov exponents, with errors, drift and consistency checks.
 
@@ -79,10 +87,7 @@ def summarise(ds: xr.Dataset, *, n_sigma: float = 3.0, least: float = 0.005) -> 
     ValueError
         If the cube has no exponents.
     """
-    if "lyapunov" not in ds:
-        raise ValueError(
-            "the cube has no Lyapunov exponents; run it with [products] lyapunov = {} in its specification"
-        )
+    check_exponents(ds)
     rate, error = ds["lyapunov"], ds["lyapunov_stderr"]
     seconds = period_seconds(ds)
     result = xr.Dataset(
