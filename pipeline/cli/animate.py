@@ -10,7 +10,7 @@ import typer
 from pipeline.cli.common import read_pairs
 from pipeline.cli.models import DEFAULT, names
 from pipeline.cli.options import completing
-from pipeline.cli.simulate import read_named
+from pipeline.cli.simulate import read_states
 
 if TYPE_CHECKING:
     from pipeline.runs.filming import Start
@@ -131,7 +131,7 @@ def _start(
     from pipeline.runs.filming import Start
     from pipeline.specification.problems import SpecError
 
-    states = {name: values[0] for name, values in read_named(words, 1).items()}
+    states = read_states(words)
     given = {"--model": model, "--frequency": frequency_hz, "--preset": preset, "--set": settings}
     if not alone and any(given.values()):
         raise SpecError([f"{k}: the run sets this; drop the option, or the directory." for k, v in given.items() if v])

@@ -88,7 +88,7 @@ def simulate(
         frequency = DEFAULT_HZ
     ds = simulation.simulate(
         frequency,
-        simulation.start_of(chosen, _states(context.args)),
+        simulation.start_of(chosen, read_states(context.args)),
         drive=drive,
         model=chosen,
         preset=preset,
@@ -118,7 +118,7 @@ def _draw(ds: xr.Dataset, target: Path, series: Path) -> None:
         console.result(f"data: {save_data(figure, target)}")
 
 
-def _states(words: list[str]) -> dict[str, float]:
+def read_states(words: list[str]) -> dict[str, float]:
     """Parse ``--NAME VALUE`` pairs into the values of states by name."""
     return {name: values[0] for name, values in read_named(words, 1).items()}
 

@@ -128,7 +128,7 @@ def write_zoom(source: Source, changes: Changes, out: Path) -> list[str]:
     check_new_file(out, [".toml"])
     refuse_place(out, "--out")
     spec, notes = zoom(source.spec, changes)
-    text = f"# Zoom. Derived from {_one_line(source.origin)}.\n{to_toml(spec)}"
+    text = derived_toml("Zoom", source.origin, spec)
     if isinstance(spec.reference, Mapping) and (place := spec.reference.get(KEY)):
         notes = [*notes, f"model: running {out} imports the Python object {place}; read its code first."]
     write_new(out, text, "--out")
@@ -244,6 +244,12 @@ def put_value(spec: Spec, data: dict[str, Any], key: str, value: Any) -> None:
 # ---- TOML --------------------------------------------------------------------------------------
 
 
+def derived_toml(how: str, origin: str, spec: Spec) -> str:
+    """Return a derived specification as TOML, below a comment that names its origin."""
+    printable = "".join(c if c.isprintable() else "?" for c in origin)
+    return f"# {how}. Derived from {printable}.\n{to_toml(spec)}"
+
+
 def to_toml(spec: Spec) -> str:
     """Return a specification as TOML text that reads back as the same specification.
 
@@ -265,7 +271,3 @@ def to_toml(spec: Spec) -> str:
     assert is_line or read["model"] == spec.reference
     assert kept_spec({**read, "model": spec.reference}) == spec
     return text
-
-
-def _one_line(text: str) -> str:
-    return "".join(c if c.isprintable() else "?" for c in text)
