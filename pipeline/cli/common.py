@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -88,10 +87,6 @@ def tell_data(data: Any, lines: Iterable[str], as_json: bool) -> None:
 
 def json_rows(table: Table) -> list[dict[str, Any]]:
     """Return the rows of a table in types that JSON can hold."""
-    return [{name: _json(value) for name, value in row.items()} for row in table.rows]
+    from pipeline.layout.writing import json_value
 
-
-def _json(value: Any) -> Any:
-    """Convert numpy numbers to Python's, and NaN and infinity, which JSON lacks, to None."""
-    plain = value.item() if hasattr(value, "item") else value
-    return None if isinstance(plain, float) and not math.isfinite(plain) else plain
+    return [json_value(row) for row in table.rows]
