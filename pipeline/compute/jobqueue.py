@@ -89,14 +89,6 @@ def settings(cluster: Cluster, folder: Path) -> dict[str, Any]:
     return {name: value for name, value in found.items() if value is not None}
 
 
-def worker_script(cluster: Cluster, folder: Path) -> str:
-    """Return the batch script of a job, with placeholders for the scheduler's address and the worker's name."""
-    import dask_jobqueue
-
-    job = getattr(dask_jobqueue, _CLASSES[cluster.kind]).job_cls
-    return str(job("tls://SCHEDULER:PORT", name="NAME", **settings(cluster, folder)).job_script())
-
-
 def _keys(folder: Path) -> Any:
     """Write TLS keys to a folder that the jobs read; scheduler, workers and client share them."""
     from distributed import Security

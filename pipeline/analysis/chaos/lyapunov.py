@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
+from pipeline.layout.attributes import code_flags
 from pipeline.layout.vocabulary import PERIODIC
 from pipeline.products.lyapunov import LyapunovFlag
 
@@ -143,7 +144,7 @@ def _motion(ds: xr.Dataset, n_sigma: float, least: float) -> dict[str, xr.DataAr
     about = {"units": "1", "long_name": "closed, and yet with a positive exponent"}
     return {
         "motion": motion.assign_attrs(motion_attrs()),
-        "contradicts": contradicts.assign_attrs(about, flag_values=np.arange(2, dtype=np.int8), flag_meanings="no yes"),
+        "contradicts": contradicts.assign_attrs(about | code_flags(["no", "yes"])),
     }
 
 
@@ -152,8 +153,7 @@ def motion_attrs() -> dict[str, Any]:
     return {
         "units": "1",
         "long_name": "kind of motion by its exponents",
-        "flag_values": np.array(list(Motion), np.int8),
-        "flag_meanings": " ".join(m.name.lower() for m in Motion),
+        **code_flags([motion.name.lower() for motion in Motion]),
     }
 
 

@@ -15,6 +15,7 @@ from pydantic import Field
 from magpend_core.models.model import Model
 from magpend_core.models.parameters import near_names
 from pipeline.analysis.branches.units import parameter_units
+from pipeline.layout.attributes import code_flags
 from pipeline.layout.vocabulary import FREQUENCY_DIM, axis_name, model_attribute
 from pipeline.rig.measured_branch.cycles import N_HARMONICS, Cycles, CyclesError, cycles_of
 from pipeline.rig.recordings import parse_mapping, read_recording
@@ -220,7 +221,7 @@ def _dataset(
         "stability": (
             "orbit",
             np.array([STABILITIES.index(_YES[str(row["stable"])]) for row in rows], np.int8),
-            {"flag_values": np.arange(3, dtype=np.int8), "flag_meanings": " ".join(STABILITIES), "units": "1"},
+            {**code_flags(STABILITIES), "units": "1"},
         ),
         "n_cycles": ("orbit", np.array([c["n_cycles"] for c in columns], np.int32), {"units": "1"}),
     }

@@ -18,7 +18,6 @@ from pipeline.specification.problems import SpecError, checked, unknown_key
 from pipeline.specification.tables import Table
 from pipeline.specification.toml import toml_key, toml_value
 
-FORMATS = ("tdms", "lvm", "csv", "matlab")
 DRIVE = "drive"
 """Name of the drive in a recording's dataset."""
 
