@@ -6,6 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
+from pipeline.cli import console
 from pipeline.cli.common import Csv, Directory, Json, check_csv, tell
 from pipeline.cli.groups import add_command, command_group, made, registry_group
 from pipeline.cli.options import taking
@@ -23,7 +24,6 @@ def _make(name: str) -> Any:
     analysis = ANALYSES[name]
 
     def command(directory: Directory, options: Any, csv: Csv = None, json: Json = False) -> None:
-        from pipeline.cli import console
         from pipeline.products.product import function_of
         from pipeline.runs.derive import derive
         from pipeline.specification.problems import SpecError
@@ -52,7 +52,6 @@ def prune(
     dry_run: Annotated[bool, typer.Option("--dry-run", help="List the results; remove nothing.")] = False,
 ) -> None:
     """Remove results that belong to an earlier state of the cube or an earlier version of magpend."""
-    from pipeline.cli import console
     from pipeline.runs import derive
 
     found = (derive.stale if dry_run else derive.prune)(directory)

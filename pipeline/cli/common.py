@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from pipeline.cli import console
 from pipeline.cli.exits import Exit
+from pipeline.cli.outputs import check_file, check_table
 
 if TYPE_CHECKING:
     from pipeline.products.product import Table
@@ -48,7 +50,6 @@ def read_pairs(option: str, texts: list[str], example: str) -> dict[str, float]:
 
 def check_csv(path: str | None) -> None:
     """Raise SpecError if a CSV file cannot be written, before anything is computed."""
-    from pipeline.cli.outputs import check_file
     from pipeline.specification.problems import SpecError
 
     if path not in (None, "-") and (Path(str(path)).is_dir() or not Path(str(path)).parent.is_dir()):
@@ -59,14 +60,11 @@ def check_csv(path: str | None) -> None:
 
 def tell(table: Table, csv: str | None, as_json: bool) -> None:
     """Print a table: its text lines, its rows as JSON with `as_json`, or its rows as CSV if `csv` is ``-``."""
-    from pipeline.cli import console
-
     if csv == "-" and not as_json:
         console.result(table.csv().rstrip("\n"))
     else:
         tell_data(json_rows(table), table.lines, as_json)
     if csv not in (None, "-"):
-        from pipeline.cli.outputs import check_table
         from pipeline.layout.writing import write_atomically
 
         text = table.csv()
@@ -77,8 +75,6 @@ def tell(table: Table, csv: str | None, as_json: bool) -> None:
 
 def tell_data(data: Any, lines: Iterable[str], as_json: bool) -> None:
     """Print a result: as lines, or as JSON with `as_json`."""
-    from pipeline.cli import console
-
     if as_json:
         console.result(json.dumps(data, indent=1))
     else:

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from pipeline.cli import console
 from pipeline.cli.common import Directory
 
 
@@ -38,7 +39,6 @@ def export(
     The files hold the diagram, its overlays and the orbits of attractors, but no live integration. Parts that
     do not fit into one file are left out, and the page names them.
     """
-    from pipeline.cli import console
     from pipeline.explorer.copies.export import export_page
     from pipeline.explorer.copies.folder import export_folder
     from pipeline.specification.problems import SpecError

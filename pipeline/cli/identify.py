@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
+from pipeline.cli import console
 from pipeline.cli.common import Csv, Json, check_csv, json_rows, tell, tell_data
 from pipeline.cli.groups import add_command, command_group
 from pipeline.cli.options import completing
@@ -60,7 +61,6 @@ def identify(
 
     You can stop the command at any time: the same command continues, and the finished files are the same.
     """
-    from pipeline.cli import console
     from pipeline.rig.identify import identification
     from pipeline.rig.identify.directory import PRESET
     from pipeline.rig.identify.reports import lines_of
@@ -116,7 +116,6 @@ def posterior(
     intervals of folds, doublings and Hopf points, and bands about the branches, in DIR/bands-N.nc and
     DIR/figures/bands-N.png.
     """
-    from pipeline.cli import console
     from pipeline.rig.identify.posterior_files import write_posterior
 
     parameters, bifurcations, written = write_posterior(directory, n, seed, figures=not no_figures)
@@ -134,7 +133,6 @@ def spread(
     csv: Csv = None,
 ) -> None:
     """List how fractions of cells and bifurcations are distributed over the runs of a posterior."""
-    from pipeline.cli import console
     from pipeline.rig.identify.posterior_runs import spread as spreading
 
     check_csv(csv)

@@ -7,7 +7,9 @@ from typing import Annotated
 
 import typer
 
+from pipeline.cli import console
 from pipeline.cli.common import Json, tell_data
+from pipeline.cli.outputs import check_place
 
 
 def fit_magnet(
@@ -28,7 +30,6 @@ def fit_magnet(
     The command fits single curves, then all curves at once, and point dipoles for comparison. If a fit does
     not converge, nothing is written.
     """
-    from pipeline.cli import console
     from pipeline.rig.magnet.fitting import fit_measurement
     from pipeline.rig.magnet.measurement import find_measurement, read_measurement
     from pipeline.rig.magnet.results import report_of, summary_of, warnings_of, write_results
@@ -52,7 +53,6 @@ def fit_magnet(
 
 def _folder(path: Path) -> Path:
     """Return the folder of the results; raise an error if it cannot be written to."""
-    from pipeline.cli.outputs import check_place
     from pipeline.specification.problems import SpecError
 
     if path.exists() and not path.is_dir():

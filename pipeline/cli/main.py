@@ -6,6 +6,7 @@ import os
 import sys
 from typing import Annotated, Any
 
+from pipeline.cli.console import LOG
 from pipeline.runs import stopping
 
 if __name__ == "__main__":
@@ -104,8 +105,6 @@ def _codes() -> list[tuple[tuple[type[BaseException], ...], Exit]]:
 
 def _complain(error: BaseException) -> None:
     """Print an error: one line per problem."""
-    from pipeline.cli.console import LOG
-
     lines: list[Any] = getattr(error, "problems", None) or [str(error)]
     head = "magpend: " if len(lines) == 1 else f"magpend: {len(lines)} problems\n  "
     text = _short(head + "\n  ".join(map(str, lines)))

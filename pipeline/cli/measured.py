@@ -12,10 +12,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from pipeline.cli import console
 from pipeline.cli.common import Csv, Directory, Json, check_csv, json_rows, read_pairs, tell, tell_data
 from pipeline.cli.groups import command_group, made, registry_group
 from pipeline.cli.options import taking
 from pipeline.cli.outputs import check_file, check_place
+from pipeline.cli.plot import check_figure_path
 from pipeline.layout.writing import write_atomically
 
 if TYPE_CHECKING:
@@ -52,7 +54,6 @@ def _load(paths: list[Path], mappings: list[Path]) -> list[Mapping]:
 
 def _read(paths: list[Path], mappings: list[Mapping]) -> list[xr.Dataset]:
     """Read recordings, and print the problems found in them."""
-    from pipeline.cli import console
     from pipeline.rig.recordings import findings_of, read_recording, summary
 
     found = [read_recording(p, m) for p, m in zip(paths, mappings, strict=True)]
@@ -67,15 +68,12 @@ def _loaded(model: Model, preset: str | None, settings: list[str] | None) -> Par
 
 
 def _check_targets(out: Path | None, csv: str | None = None) -> None:
-    from pipeline.cli.plot import check_figure_path
-
     check_csv(csv)
     if out is not None:
         check_figure_path(out)
 
 
 def _save(figure: Any, target: Path) -> None:
-    from pipeline.cli import console
     from pipeline.plots import save_data, save_figure
 
     console.result(f"figure: {save_figure(figure, target)}")
@@ -150,7 +148,6 @@ def compare(
     and side agree. For each window edge it lists the shift from the model's edge [Hz]. It writes
     comparison.png, beside.png, over.png, steps.csv, edges.csv and comparison.nc to FOLDER.
     """
-    from pipeline.cli import console
     from pipeline.plots import Frame
     from pipeline.rig.measured.compare import compare_with
     from pipeline.rig.measured.computed import Computed, cube_and_parameters
@@ -191,7 +188,6 @@ def series(
     settings: Set = None,
 ) -> None:
     """Draw a recording and the model from the same state: time series and phase portraits."""
-    from pipeline.cli import console
     from pipeline.plots import Frame
     from pipeline.rig.measured.overlays import plot_series
     from pipeline.rig.measured.series import series_of
@@ -273,7 +269,6 @@ def trace(
     A controller keeps the rig near each target until its output is one cosine: the response is then an orbit of
     the rig under this drive. The table is what measured branch reads.
     """
-    from pipeline.cli import console
     from pipeline.rig import control
 
     check_file(out)

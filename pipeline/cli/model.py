@@ -8,7 +8,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from pipeline.cli import console
+from pipeline.cli.exits import Exit
 from pipeline.cli.groups import add_command, command_group
+from pipeline.cli.models import all_of, described
 from pipeline.cli.options import completing
 
 if TYPE_CHECKING:
@@ -41,8 +44,6 @@ def show(
     Integration steps are adapted to the detected edges of the drive, steep layers, switches and impacts. The
     checks evaluate the equations at the starts of a specification, or near 0, and compile nothing.
     """
-    from pipeline.cli import console
-    from pipeline.cli.exits import Exit
     from pipeline.runs.modelling import examine
 
     model, found = examine(name)
@@ -62,7 +63,6 @@ def new(
     ] = None,
 ) -> None:
     """Write a commented specification with a model of your own as a template; it runs unchanged."""
-    from pipeline.cli import console
     from pipeline.runs.modelling import write_template
 
     if file is None:
@@ -79,7 +79,6 @@ for _command in (show, new):
 
 def _lines(model: Model, found: Description) -> list[str]:
     from magpend_core.models.summary import checks_of
-    from pipeline.cli.models import all_of
 
     lines = all_of(model)
     if found.equations:
@@ -97,7 +96,6 @@ def _lines(model: Model, found: Description) -> list[str]:
 
 
 def _latex(model: Model, found: Description) -> None:
-    from pipeline.cli import console
     from pipeline.specification.problems import SpecError
 
     if not found.latex:
@@ -110,8 +108,6 @@ def _latex(model: Model, found: Description) -> None:
 
 
 def _as_dict(model: Model, found: Description) -> dict[str, Any]:
-    from pipeline.cli.models import described
-
     return {
         **described(model),
         "autonomous": model.autonomous,

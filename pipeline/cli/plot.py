@@ -5,9 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pipeline.cli import console
 from pipeline.cli.common import Directory
 from pipeline.cli.groups import command_group, made, registry_group
 from pipeline.cli.options import taking
+from pipeline.cli.outputs import check_file
 
 if TYPE_CHECKING:
     from pipeline.products.product import FigureOptions
@@ -40,7 +42,6 @@ plot_app = command_group(
 
 def draw(directory: str, name: str, options: FigureOptions) -> None:
     """Draw a figure of a run, write it with its data, and print their places."""
-    from pipeline.cli import console
     from pipeline.runs.drawing import drawn, ready
     from pipeline.store.errors import RefusedError
     from pipeline.store.files import FIGURES
@@ -79,7 +80,6 @@ def _in_run(files: Files, name: str, options: FigureOptions) -> Path:
 
 def check_figure_path(path: Path, within: str = "") -> None:
     """Raise an error if a figure file cannot be written, before anything is computed; see `check_file`."""
-    from pipeline.cli.outputs import check_file
     from pipeline.specification.files import check_new_file
 
     check_new_file(path, SUFFIXES)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from pipeline.cli import console
 from pipeline.cli.common import Json, json_rows, tell, tell_data
 from pipeline.cli.groups import add_command, command_group
 from pipeline.cli.outputs import check_file, check_place
@@ -70,7 +71,6 @@ def convert(
     ] = None,
 ) -> None:
     """Convert a recording to SI units and another file format; for TDMS and CSV also write its mapping file."""
-    from pipeline.cli import console
     from pipeline.rig.recordings import mapping_for, write_recording
     from pipeline.rig.recordings.writing import SUFFIXES
     from pipeline.specification.files import check_new_file
@@ -93,7 +93,6 @@ def simulate(
     out: Annotated[Path, typer.Option(help="File to write: .tdms or .csv; the mapping goes beside it.")],
 ) -> None:
     """Simulate a recording of an experiment, and write it with the mapping file that reads it."""
-    from pipeline.cli import console
     from pipeline.rig.recordings.writing import SUFFIXES, write_raw
     from pipeline.rig.simulation import load_rig, simulated
     from pipeline.specification.files import check_new_file
@@ -127,7 +126,6 @@ def drive(
 
     The command prints frequency, jitter and duty cycle. With edges, the model gives shape and amplitude.
     """
-    from pipeline.cli import console
     from pipeline.rig.driving import drive_file
     from pipeline.specification.files import check_new_file
 
@@ -202,7 +200,6 @@ def _tell(ds: xr.Dataset, as_json: bool) -> None:
 
 
 def _draw(ds: xr.Dataset, out: Path, as_json: bool) -> None:
-    from pipeline.cli import console
     from pipeline.plots import save_figure
     from pipeline.rig.recordings.figure import plot_recording
 

@@ -7,6 +7,9 @@ from typing import Annotated
 
 import typer
 
+from pipeline.cli import console
+from pipeline.cli.outputs import check_file
+
 
 def report(
     directories: Annotated[list[str], typer.Argument(metavar="DIR...", help="Run directories, or s3://BUCKET/PREFIX.")],
@@ -28,7 +31,6 @@ def report(
     the hysteresis of a continuation are computed if they are missing. For other missing results the page
     names the command.
     """
-    from pipeline.cli import console
     from pipeline.report.page import write
     from pipeline.report.report import report as make
 
@@ -40,7 +42,6 @@ def report(
 
 def check_page(path: Path) -> None:
     """Raise an error if the HTML page cannot be written, before anything is computed."""
-    from pipeline.cli.outputs import check_file
     from pipeline.specification.problems import SpecError
     from pipeline.store.errors import RefusedError
     from pipeline.store.local import unwritable

@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pipeline.cli.common import Directory, Json
+from pipeline.cli import console
+from pipeline.cli.common import Directory, Json, tell
 from pipeline.cli.exits import Exit
 from pipeline.cli.options import completing
+from pipeline.cli.plot import draw
 
 if TYPE_CHECKING:
     from pipeline.store.run import Run
@@ -79,7 +81,6 @@ def run(
     the end it counts the cells by status. Cells that diverged or failed are results, and the exit code is 0;
     above 1 % a warning reports them.
     """
-    from pipeline.cli import console
     from pipeline.runs import outcome, preview
     from pipeline.runs import run as runs
     from pipeline.store.run import Run
@@ -110,7 +111,6 @@ def run(
 
 
 def _run_posterior(spec: str, directory: Path, n: int, out: str | None, *, smoke: bool, workers: int | None) -> None:
-    from pipeline.cli import console
     from pipeline.rig.identify.posterior_runs import run_posterior, spread
 
     folder = run_posterior(spec, directory, n, out, smoke=smoke, workers=workers, echo=console.note)
@@ -120,8 +120,6 @@ def _run_posterior(spec: str, directory: Path, n: int, out: str | None, *, smoke
 
 def _plot(run: Run) -> None:
     """Draw the figure that gives the best overview of a finished run; if drawing fails, print the reason."""
-    from pipeline.cli import console
-    from pipeline.cli.plot import draw
     from pipeline.products.registry import FIGURES
     from pipeline.runs.preview import figure_command, shown
     from pipeline.specification.problems import SpecError
@@ -140,7 +138,6 @@ def _plot(run: Run) -> None:
 
 def status(directory: Directory, json: Json = False) -> None:
     """Print how much of a run is computed and stored, and how many cells have each status."""
-    from pipeline.cli.common import tell
     from pipeline.products.product import Table
     from pipeline.runs.status import describe_state, state
 
@@ -169,7 +166,6 @@ def verify(
     ] = False,
 ) -> None:
     """Check a run for damage: stored bytes against the commit records, metadata and coordinates against run.json."""
-    from pipeline.cli import console
     from pipeline.runs import verify as verification
 
     found = verification.verify_run(directory, repair=repair)

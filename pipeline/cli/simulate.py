@@ -9,9 +9,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from magpend_core.defaults import ATOL, RTOL
+from pipeline.cli import console
 from pipeline.cli.common import read_pairs
 from pipeline.cli.models import DEFAULT, names
 from pipeline.cli.options import completing
+from pipeline.cli.outputs import check_file
 from pipeline.cli.plot import check_figure_path
 
 if TYPE_CHECKING:
@@ -69,8 +71,6 @@ def simulate(
     periodic orbit, or how long a transient it would need. With --drive the initial state is that at the start
     of the recording, and time is the recording's.
     """
-    from pipeline.cli import console
-    from pipeline.cli.outputs import check_file
     from pipeline.compute import simulate as simulation
     from pipeline.specification.files import check_new_file
     from pipeline.specification.models import find_model
@@ -109,7 +109,6 @@ def simulate(
 
 def _draw(ds: xr.Dataset, target: Path, series: Path) -> None:
     """Write the figure of a time series, and its data unless the series file already holds them."""
-    from pipeline.cli import console
     from pipeline.plots import plot_trajectory, save_data, save_figure
 
     figure = plot_trajectory(ds)

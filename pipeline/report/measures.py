@@ -18,7 +18,7 @@ import numpy as np
 from pipeline.analysis.intervals import binomial_interval
 from pipeline.analysis.selection import place
 from pipeline.analysis.sides import classify
-from pipeline.layout.vocabulary import split_dims
+from pipeline.layout.vocabulary import parameter_name, split_dims
 from pipeline.report.estimates import Estimate, Results, absent
 from pipeline.specification.problems import SpecError
 
@@ -233,7 +233,6 @@ def located_bifurcation(results: Results, of: Sequence[str], options: Options) -
     independent of the step of the run's axis.
     """
     from pipeline.analysis.branches.table import table_of
-    from pipeline.layout.vocabulary import parameter_name
 
     given = {name: options[name] for name in ("low", "high", "max_period")}
     found = results.run(of[0]).derive("branches", **given, generations=1)

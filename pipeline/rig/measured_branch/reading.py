@@ -21,7 +21,7 @@ from pipeline.rig.measured_branch.cycles import N_HARMONICS, Cycles, CyclesError
 from pipeline.rig.recordings import parse_mapping, read_recording
 from pipeline.specification.files import read_toml
 from pipeline.specification.models import add_model
-from pipeline.specification.problems import SpecError, problems_of, unknown_name
+from pipeline.specification.problems import SpecError, checked, unknown_name
 from pipeline.specification.tables import Table
 
 STABILITIES = ("unknown", "stable", "unstable")
@@ -98,13 +98,10 @@ def _from_recordings(path: Path) -> xr.Dataset:
     table = tables.get("measured", {}).get("branch") if isinstance(tables.get("measured"), dict) else None
     if table is None:
         raise SpecError(f"{path}: has no table [measured.branch]; give one, or a CSV file of orbits.")
-    from pydantic import ValidationError
-
-    try:
-        spec = MeasuredBranch.model_validate(table)
-    except ValidationError as error:
-        raise SpecError([f"{path}: {p}" for p in problems_of(error, MeasuredBranch, "measured.branch")]) from None
     problems: list[str] = []
+    spec = checked(MeasuredBranch, table, "measured.branch", problems)
+    if spec is None:
+        raise SpecError([f"{path}: {p}" for p in problems])
     reference = spec.model or tables.get("model")
     if not reference:
         raise SpecError(f"{path}: measured.branch.model: missing; name the model whose orbits were measured.")
