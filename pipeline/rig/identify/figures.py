@@ -162,9 +162,7 @@ def _draw_piece(above: Axes, below: Axes, own: xr.Dataset, channel: str) -> None
     time = own["time"].values
     measured, left = own[f"{channel}_measured"].values, own[f"{channel}_residual"].values
     step = max(1, len(time) // 300)
-    above.plot(
-        time[::step], measured[::step], linestyle="none", marker="o", markersize=1.6, color="0.65", markeredgewidth=0.0
-    )
+    style.points(above, time[::step], measured[::step], 1.6, "0.65")
     above.plot(time, measured - left, color=FITTED, linewidth=0.8)
     below.axhline(0.0, color="0.7", linewidth=0.5)
     below.plot(time, _milli(own, channel)[1] * left, color="0.15", linewidth=0.5)
@@ -263,16 +261,7 @@ def _draw_pieces(ax: Axes, ds: xr.Dataset, channel: str, factor: float) -> None:
 def _draw_against_rate(ax: Axes, ds: xr.Dataset, views: xr.Dataset, channel: str, factor: float) -> None:
     rate, left = rate_of(ds, channel)
     step = max(1, len(rate) // MOST_DOTS)
-    ax.plot(
-        rate[::step],
-        factor * left[::step],
-        linestyle="none",
-        marker=".",
-        markersize=1.5,
-        color="0.72",
-        markeredgewidth=0.0,
-        rasterized=True,
-    )
+    style.points(ax, rate[::step], factor * left[::step], 1.5, "0.72", marker=".", rasterized=True)
     ax.axhline(0.0, color="0.5", linewidth=0.5)
     ax.plot(
         views[f"{channel}_rate"],
