@@ -73,8 +73,21 @@ _ANY_OPTION = (zoom, simulate, animate)
 """Commands whose options include a model's states by name."""
 
 for _command in (
-    *(run, submit, status, verify, extend, zoom, simulate, explore, export, animate),
-    *(report, reproduce, models, presets, fit_magnet),
+    run,
+    submit,
+    status,
+    verify,
+    extend,
+    zoom,
+    simulate,
+    explore,
+    export,
+    animate,
+    report,
+    reproduce,
+    models,
+    presets,
+    fit_magnet,
 ):
     add_command(app, _command, settings=EXTRA if _command in _ANY_OPTION else {})
 app.add_typer(analyse_app, name="analyse")
