@@ -85,7 +85,9 @@ def __dir__() -> list[str]:
 
 
 class _Package(ModuleType):
-    """A package in which `sections` and `trajectory` stay functions when the modules of these names are imported."""
+    """Module type of the package. It keeps the functions `sections` and `trajectory` when submodules of the same names
+    are imported.
+    """
 
     def __setattr__(self, name: str, value: Any) -> None:
         if not (name in _HOME_OF and isinstance(value, ModuleType)):

@@ -1,4 +1,4 @@
-"""Call a listener when functions are compiled, so that a command can say what it waits for."""
+"""Call a listener at the start and end of each compilation, so that a command can show "compiling" while it waits."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _listener: ContextVar[Callable[[bool], None] | None] = ContextVar("listener", de
 
 @contextlib.contextmanager
 def heard_by(listener: Callable[[bool], None]) -> Iterator[None]:
-    """Call a listener with True when a compilation begins inside this context, and with False at its end."""
+    """Call a listener when a compilation in this context begins (argument True) and when it ends (False)."""
     token = _listener.set(listener)
     try:
         yield
@@ -21,7 +21,7 @@ def heard_by(listener: Callable[[bool], None]) -> Iterator[None]:
 
 @contextlib.contextmanager
 def compiling() -> Iterator[None]:
-    """Report to the listener, if there is one, that a compilation runs inside this context."""
+    """Tell the listener, if there is one, that code is being compiled while this context is open."""
     listener = _listener.get()
     if listener is None:
         yield

@@ -1,4 +1,4 @@
-"""Define a Poincare section of a flow without a drive: where a state crosses a level."""
+"""Define the Poincare section of a system without a drive: the points where a state crosses a level."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ DIRECTIONS = {"up": 1, "down": -1}
 
 @dataclass(frozen=True)
 class Crossing:
-    """A Poincare section of a flow without forcing: where a state crosses a level.
+    """A Poincare section of a system without forcing: the points where one state crosses a level.
 
     A period is then the time from one crossing to the next, a *return*. Crossings are steps of the
     integration that end on the level (see `engine.events`, which says what can be missed). An angle crosses
@@ -61,7 +61,7 @@ class Crossing:
 
     @property
     def frequency_hz(self) -> float:
-        """Value passed to the engine as the drive frequency: one over the longest wait for a crossing [Hz]."""
+        """Value passed to the engine as the drive frequency [Hz]: 1 over the longest time to wait for a crossing."""
         return 1.0 / float(self.longest)
 
     @property
@@ -70,8 +70,8 @@ class Crossing:
         return f"{self.of} = {self.value:g} going {self.direction}"
 
     def applied(self, parameters: np.ndarray, system: System) -> tuple[System, np.ndarray, np.ndarray]:
-        """Return the system with this Poincare section, its parameters with the level appended, and the frequency to
-        pass to the engine.
+        """Add this Poincare section to a system. Return the new system, its parameters with the level appended, and the
+        frequency [Hz] to give to the engine.
 
         Parameters
         ----------

@@ -1,4 +1,4 @@
-"""Continue trajectories from their last stored section, with the same bits as one longer run."""
+"""Continue trajectories from their last stored section point, with the same bits as one longer run."""
 
 from __future__ import annotations
 
@@ -29,7 +29,8 @@ def more_sections(
     system: System,
     quantities: Sequence[str] | None = None,
 ) -> Sections:
-    """Continue trajectories from their last section, and return the sections of the drive periods that follow.
+    """Continue trajectories from their last section point, and return the section points of the drive periods that
+    follow.
 
     Parameters
     ----------
@@ -85,18 +86,17 @@ def more_sections(
 def orbit_periods(
     sections: np.ndarray, *, closure_tolerance: float, max_orbit_period: int, system: System
 ) -> np.ndarray:
-    """Return the orbit period that each trajectory's section points show, or 0 where they show none, by the rule of
-    `run_branches`.
+    """Return the orbit period found in each trajectory's section points, by the rule of `run_branches`; 0 if aperiodic.
 
     Parameters
     ----------
     sections
-        The last ones of each cell, shape (cell, n, n_states): `observers.window_of` of them, or as many as
-        there have been drive periods.
+        Last section points of each cell, shape (cell, n, n_states); n is `observers.window_of`, or the number of drive
+        periods if that is smaller.
     closure_tolerance, max_orbit_period
         As for `run_branches`.
     system
-        What was integrated.
+        System that was integrated.
 
     Returns
     -------
@@ -113,14 +113,14 @@ def orbit_periods(
 
 
 def judge(rings: Any, last: int, settings: Settings, found: Any) -> None:
-    """Write to `found` the orbit period that each trajectory's last section points show, or 0 where they show none."""
+    """Write the orbit period of each row of section points to `found`; 0 if the points show no period."""
     for i in range(len(rings)):
         found[i] = closed_period(rings[i], last, settings)
 
 
 @cache
 def judge_of(system: System) -> Callable[..., None]:
-    """Compile `judge` for a system, with its angles and scales."""
+    """Compile `judge`, the test for periodic orbits, for a system with its angles and scales."""
     bindings: dict[str, Any] = {
         "N": system.n_states,
         "IS_ANGLE": np.array(system.is_angle, np.int64),

@@ -102,7 +102,7 @@ class _Settings(NamedTuple):
 
 
 def _orthonormalise(state: Any, memory: Any, settings: Any) -> None:
-    """Make the tangent vectors orthonormal, and add the logarithms of their former lengths to the memory."""
+    """Make the tangent vectors orthonormal, and add the logarithms of their former lengths to the observer's memory."""
     n_vectors = N_TANGENTS // N_BASE
     for k in range(n_vectors):
         own = N_BASE * (1 + k)
@@ -130,9 +130,7 @@ def _orthonormalise(state: Any, memory: Any, settings: Any) -> None:
 
 
 def _average(section: Any, turns: Any, i_period: int, memory: Any, record: Any, measures: Any, settings: Any) -> int:
-    """Add the growth rates of a drive period to the sums of its block of periods, and to the weighted sums over all
-    periods.
-    """
+    """Add the growth rates of one drive period to the sums for its block, and to the weighted sums over all periods."""
     n_vectors = N_TANGENTS // N_BASE
     i = i_period - settings.n_transient
     n_periods = settings.n_blocks * settings.periods_per_block
@@ -290,7 +288,9 @@ def lyapunov_exponents(
 
 
 def _parts(n_cells: int, per_cell: int, n_lanes: int) -> list[slice]:
-    """Return slices that split many trajectories into parts of limited memory, to be integrated one after the other."""
+    """Return slices that split the trajectories into groups small enough for memory, to be integrated one after the
+    other.
+    """
     most = max(n_lanes, MOST_NUMBERS // per_cell // n_lanes * n_lanes)
     return [slice(i, i + most) for i in range(0, max(n_cells, 1), most)]
 
@@ -308,7 +308,7 @@ def _settings(n_exponents: int, n_transient: int, n_periods: int, n_blocks: int,
 
 
 def _with_vectors(states: np.ndarray, n_vectors: int) -> np.ndarray:
-    """Append the first unit vectors as tangent vectors, and a 0 for the integral of the divergence, to each state."""
+    """Append to each state the first unit vectors as tangent vectors, and a 0 for the integral of the divergence."""
     n = states.shape[1]
     vectors = np.broadcast_to(LENGTH * np.eye(n)[:n_vectors].ravel(), (len(states), n * n_vectors))
     return np.concatenate([states, vectors, np.zeros((len(states), 1))], axis=1)

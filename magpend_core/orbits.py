@@ -105,22 +105,23 @@ def section_map(
     rtol: float = RTOL,
     system: System = PENDULUM_FITTED,
 ) -> Returns:
-    """Map section points through a number of periods, and compute the derivative of the last image by the point.
+    """Iterate the section map from given points; return all images, and the derivative of each last image with respect
+    to its starting point.
 
     Parameters
     ----------
     parameters
         Packed parameters, shape (n, n_parameters) [SI].
     frequency_hz
-        Shape (n,) [Hz]; with a section by crossing one over the longest wait.
+        Drive frequencies, shape (n,) [Hz]; with a section by level crossing, 1 over the longest time to wait.
     points
-        Shape (n, n_states); the state that crosses is put at the level. Rows that are not finite give NaN.
+        Shape (n, n_states); the state that defines the section is set to its level. Rows that are not finite give NaN.
     n_periods
-        Periods of the drive, or returns: a number, or one per row, whose derivative is that after its own.
+        Number of drive periods or returns: one number, or one per row; the derivative is that of the row's last image.
     rtol
         Relative and absolute tolerance.
     system
-        What is integrated.
+        System to integrate.
 
     Raises
     ------
@@ -184,7 +185,8 @@ def crossed_state(system: System) -> int | None:
 
 
 def on_section(points: np.ndarray, parameters: np.ndarray, system: System) -> np.ndarray:
-    """Return points with the state that defines the Poincare section set to its level; unchanged for a driven system.
+    """Move points onto the Poincare section: set the state that defines it to its level. Points of a driven system stay
+    unchanged.
 
     Parameters
     ----------
@@ -330,8 +332,7 @@ def polish_orbits(
 def _take(
     found: PeriodicOrbits, rows: np.ndarray, ends: Returns, tolerance: float, least_period: bool, system: System
 ) -> np.ndarray:
-    """Store the residuals of some guesses and the orbits that have converged; return which guesses need more
-    iterations.
+    """Store residuals and converged orbits after a Newton iteration; return a mask of the guesses to iterate further.
 
     A row that closes after a divisor of its period gets this period, and -1 iterations.
     """

@@ -33,7 +33,7 @@ def _named(t: Any, y: Any, c: Any) -> Any:
 
 
 def _set_modes(t: float, y: Any, rows: Any, lane: int, edge_times: Any) -> None:
-    """Set the switch modes of one SIMD lane from its state and time, without sliding."""
+    """Set the modes of the switches of a SIMD lane from the signs of the event functions; no switch slides."""
     for k in range(N_OWN, NC):
         rows[k * WIDTH + lane] = 1.0
     if HAS_SWITCHES:
@@ -71,8 +71,8 @@ def _desk_for(system: System, n_out: int) -> _Desk:
 
 
 def _evaluate(desk: _Desk, t: Any, states: Any, frequency: float, p: Any, out: Any) -> None:
-    """Fill `out` (n, n_out) with the rates, Jacobian or quantities at times `t` (n,) and `states` (n, N); which of them
-    is fixed at compilation.
+    """Evaluate the rates, Jacobian or quantities (fixed at compilation) at times (n,) and states (n, N); write them to
+    `out`.
     """
     c, rows, time, y, values, edge_table = desk
     constants(frequency, p, c)
@@ -132,9 +132,7 @@ def _evaluator(system: System, kind: str) -> Any:
 
 
 def _at(kind: str, n_out: int, t: Any, state: Any, parameters: Parameters, frequency_hz: float) -> np.ndarray:
-    """Evaluate rates, Jacobian, quantities or forcing; the result has the leading shape of `state` and one last
-    dimension.
-    """
+    """Evaluate rates, Jacobian, quantities or forcing (`kind`) at states (..., n_states); return shape (..., n_out)."""
     system = parameters.model.system
     frequency = check_frequency(frequency_hz, ndim=0)
     states = check_states(state, tuple(range(1, np.ndim(state) + 1)), system.n_states)
@@ -175,7 +173,7 @@ def evaluate_packed(
 
 
 def rates_at(system: System, states: np.ndarray, packed: np.ndarray) -> np.ndarray:
-    """Return the rates of a system without drive at many finite states with common, already checked parameters.
+    """Return the rates of an autonomous system at many states, for one parameter vector. Nothing is checked.
 
     Parameters
     ----------
@@ -194,7 +192,9 @@ def rates_at(system: System, states: np.ndarray, packed: np.ndarray) -> np.ndarr
 
 
 def jacobian_at(system: System, states: np.ndarray, packed: np.ndarray) -> np.ndarray:
-    """Return the Jacobians of `rates_at`, shape (n, n_states, n_states)."""
+    """Return the Jacobians of the rates of an autonomous system at many states, shape (n, n_states, n_states). Nothing
+    is checked.
+    """
     return whole_jacobian(system, _flow_at("jacobian", len(places_of(system)), system, states, packed))
 
 
@@ -207,7 +207,7 @@ def _flow_at(kind: str, n_out: int, system: System, states: np.ndarray, packed: 
 
 
 def rates_packed(system: System, states: np.ndarray, packed: np.ndarray, frequency_hz: np.ndarray) -> np.ndarray:
-    """Return the rates of a system without drive at many states, each with its own, already checked parameters.
+    """Return the rates of an autonomous system at many states, each with its own parameters. Nothing is checked.
 
     Parameters
     ----------

@@ -1,9 +1,9 @@
-"""Compute sections and quantities under a recorded drive, whose intervals the engine treats as points of a branch.
+"""Compute section points and quantities of trajectories under a recorded drive, interval by interval.
 
-A branch of `engine.entry.integrate` goes from point to point with its state and its step, and each point has
-a drive frequency and parameters of its own. That is a recorded drive: an interval is a period of its own
-length, with its own duty cycle or its own line of torque. So equal intervals give the numbers of an ordinary
-run.
+A branch of `engine.entry.integrate` is a sequence of points, each with its drive frequency and parameters; state and
+step size pass from one point to the next. A recorded drive is integrated as such a branch: each interval is a point
+whose drive period is the interval's length, with its own duty cycle or linear torque. So a recorded drive with equal
+intervals gives the same numbers as an ordinary run.
 """
 
 from __future__ import annotations
@@ -31,12 +31,11 @@ CHUNK_NUMBERS = 4_000_000
 
 
 def driven_system(system: System, drive: Drive) -> System:
-    """Return the system for a drive: unchanged, or with its forcing replaced by the recorded one."""
+    """Return the system to integrate under a drive: unchanged, or with its forcing replaced by a recorded torque."""
     return with_recorded_drive(system) if LEVEL in drive.names else system
 
 
 def _padded(packed: np.ndarray, system: System) -> np.ndarray:
-    """Append zeros to packed parameters, as places for the parameters that the recorded drive sets."""
     more = len(system.parameter_names) - packed.shape[-1]
     return np.pad(packed, [(0, 0)] * (packed.ndim - 1) + [(0, more)])
 
@@ -59,7 +58,7 @@ def recorded_sections(
     quantities: Sequence[str] | None = None,
     n_points: int | None = None,
 ) -> Sections:
-    """Return the sections of many trajectories under one recorded drive, from its start.
+    """Return the section points of many trajectories under one recorded drive, from its start.
 
     Parameters
     ----------
@@ -150,16 +149,14 @@ def _check_marks(marks: np.ndarray, total: int, n_intervals: int, start_s: float
 
 
 def _chunks(first_kept: int, last: int, most: int) -> Iterator[tuple[int, int]]:
-    """Split a drive's intervals into ranges of limited length; one range ends at the first section point to be
-    stored.
-    """
+    """Split the intervals of a drive into ranges of limited length, with a cut at the first section point to store."""
     for begin, end in ((0, first_kept), (first_kept, last)):
         for first in range(begin, end, most):
             yield first, min(first + most, end)
 
 
 def _points(system: System, drive: Drive, packed: np.ndarray, part: slice) -> tuple[np.ndarray, np.ndarray]:
-    """Return the parameter vector and frequency that each trajectory has in each interval of the drive."""
+    """Return parameter vectors and frequencies, shape (trajectory, interval, ...), for the intervals of a drive."""
     durations = drive.durations_s[part]
     shape = (len(packed), len(durations))
     points = np.repeat(packed[:, None], len(durations), axis=1)
@@ -218,7 +215,6 @@ class _Walk:
         self.alive = alive[~failed]
 
     def outcome(self, with_extremes: bool) -> Sections:
-        """Return the results of all trajectories as `Sections`."""
         failed = self.status != Status.BOUNDED
         self.seen[failed], self.watched[failed], self.turns[failed] = np.nan, np.nan, 0
         period = np.zeros(len(failed), np.int64)
@@ -243,16 +239,16 @@ class _Walk:
 
 
 def closed_periods(sections: np.ndarray, settings: Settings, system: System) -> np.ndarray:
-    """Return the period at which each trajectory's sections close, 0 if they do not; see `observers.closed_period`.
+    """Return the period of each trajectory's section points, or 0 if aperiodic; see `observers.closed_period`.
 
     Parameters
     ----------
     sections
         Shape (cell, section, n_states).
     settings
-        Of which `window` is the number of sections.
+        Settings of the observer; `window` is the number of sections.
     system
-        Says which states are angles, and their scales.
+        System that was integrated.
     """
     out = np.zeros(len(sections), np.int64)
     flat = np.ascontiguousarray(sections.reshape(len(sections), -1))
@@ -318,7 +314,7 @@ def recorded_trajectory(
 def evaluate_recorded(
     names: Sequence[str], t: np.ndarray, state: np.ndarray, parameters: Parameters, drive: Drive
 ) -> np.ndarray:
-    """Compute named quantities under a recorded drive, at instants that each lie in one interval of the drive.
+    """Compute named quantities of a model under a recorded drive, at given times and states.
 
     Parameters
     ----------

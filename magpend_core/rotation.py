@@ -39,16 +39,16 @@ CLOSED_TURNS = 0.05
 
 @dataclass(frozen=True)
 class TurningState:
-    """What turns: an angle, or the direction of a point of a plane of two states as seen from a centre.
+    """Angle whose turns are counted: an angle of the model, or the polar angle of two states about a centre.
 
     Attributes
     ----------
     states : tuple of int
-        Number of the angle, or of the two states of the plane.
+        Index of the angle, or of the two states of the plane.
     center : tuple of float
         Centre in the plane [the states' units].
     of_section : bool
-        Turns of the section points about their mean in place of turns of the trajectory about `center`.
+        Whether to count turns of the section points about their mean, not of the trajectory about `center`.
     """
 
     states: tuple[int, ...]
@@ -151,7 +151,6 @@ def rotation_numbers(
 
 
 def _batches(lengths: np.ndarray, turning: TurningState) -> list[np.ndarray]:
-    """Split the cells into batches of equal numbers of periods, small enough for the memory."""
     batches: list[np.ndarray] = []
     for length in np.unique(lengths):
         cells = np.flatnonzero(lengths == length)
@@ -231,7 +230,6 @@ def _wrapped(angle: np.ndarray) -> np.ndarray:
 
 
 def _averaged(turns: np.ndarray, turning: TurningState, is_closed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mean of the turns per period and its error, for each cell."""
     n = turns.shape[1]
     if is_closed.all():
         total = turns.sum(axis=1)

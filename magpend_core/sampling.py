@@ -1,4 +1,4 @@
-"""Sample many trajectories at the instants of recordings, under recorded drives, for fits."""
+"""Sample many trajectories under recorded drives, at the sampling instants of the recordings to be fitted."""
 
 from __future__ import annotations
 
@@ -20,22 +20,22 @@ __all__ = ["Drive", "Samples", "sample", "with_recorded_drive"]
 
 @dataclass(frozen=True)
 class Drive:
-    """A drive in consecutive intervals, each with its own length and its own values of some parameters.
+    """Recorded drive: consecutive time intervals, each with its duration and its values of some parameters.
 
-    The periods between measured rising edges, each with its duty cycle; or the intervals between the samples
-    of a measured torque, for `with_recorded_drive`. Within an interval the system's forcing is that of a
-    drive of the interval's length as its period.
+    An interval is the period between two measured rising edges, with its duty cycle, or the time between two samples of
+    a measured torque (for `with_recorded_drive`). Within an interval, the system's forcing is that of a drive whose
+    period is the interval's length.
 
     Attributes
     ----------
     durations_s : ndarray, (interval,)
-        Above 0 [s].
+        Lengths of the intervals, above 0 [s].
     names : tuple of str
-        Parameters that change with the interval.
+        Names of the parameters that change with the interval.
     values : ndarray, (interval, name)
-        NaN leaves what the trajectory has.
+        Their values; NaN: the parameter keeps the trajectory's value.
     start_s : float
-        Where in the first interval the trajectory starts [s].
+        Start of the trajectory within the first interval [s].
     """
 
     durations_s: np.ndarray
@@ -157,7 +157,7 @@ def sample(
     limits_first_step: bool = True,
     n_lanes: int = N_LANES,
 ) -> Samples:
-    """Return the states of many trajectories at the instants of recordings.
+    """Return the states of many trajectories at the sampling instants of recordings.
 
     Parameters
     ----------
@@ -250,8 +250,8 @@ def _offsets(parts: Sequence[np.ndarray]) -> np.ndarray:
 def _drive_table(
     system: System, grids: list[np.ndarray], drives: Sequence[Drive | None] | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the drives as arrays for the engine: durations, values, each drive's first interval, the parameters
-    changed, and start times.
+    """Return the drives as flat arrays for the engine: durations, values, first intervals, changed parameters, start
+    times.
     """
     given = [None] * len(grids) if drives is None else list(drives)
     if len(given) != len(grids):
@@ -278,7 +278,6 @@ def _drive_table(
 
 
 def _check_drive(number: int, drive: Drive, names: tuple[str, ...], end_s: float) -> np.ndarray:
-    """Return the durations of a drive's intervals, after checking that the drive lasts until the last sample."""
     durations = check_array(f"drives[{number}].durations_s", drive.durations_s, 1)
     if drive.names != names or (names and np.shape(drive.values) != (len(durations), len(names))):
         raise ValueError(

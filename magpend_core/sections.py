@@ -206,7 +206,7 @@ def sections(
     atol: float = ATOL,
     **options: Any,
 ) -> Sections:
-    """Return stroboscopic sections of many independent trajectories of one model.
+    """Return the stroboscopic section points of many independent trajectories of one model.
 
     Parameters
     ----------

@@ -58,7 +58,7 @@ def _python_meaning(source: bytes) -> bytes:
 
 @cache
 def kernel_version() -> str:
-    """Return the digest of the numerical core without its models, stored as ``kernel_version``.
+    """Return a digest of the sources of the numerical core, models excluded; a run stores it as ``kernel_version``.
 
     It follows the meaning of the sources (see `meaning_digest`): an edited sentence bars nobody from
     completing a run.
@@ -103,7 +103,6 @@ def _write(node: object, out: list[str]) -> None:
 
 
 def _is_remark(node: object) -> bool:
-    """Return whether a statement does nothing: a docstring, another bare string, ``pass`` or ``...``."""
     if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
         return isinstance(node.value.value, str) or node.value.value is ...
     return isinstance(node, ast.Pass)

@@ -30,7 +30,6 @@ def check_array(name: str, values: Any, ndim: int | tuple[int, ...]) -> np.ndarr
 
 
 def _refuse_masks(name: str, values: Any) -> None:
-    """Raise for masked entries: a float64 array cannot mark them as missing."""
     parts = values if isinstance(values, (list, tuple)) else [values]
     n_masked = sum(int(np.ma.getmaskarray(p).sum()) for p in parts if isinstance(p, np.ma.MaskedArray))
     if n_masked:

@@ -1,8 +1,12 @@
 """Check the functions of a system against its declaration, in plain Python, before they are compiled.
 
-The engine trusts its functions. One that returns a number too few reads what lies beside it; a wrong Jacobian
-gives wrong exponents, whose audit it passes; an edge outside of the period never comes. So the functions are
-first run as plain Python (every primitive of `simd` has that form) at a few states and instants.
+The engine does not check what the functions of a system return. A tuple that is too short would make it read other
+memory; a wrong Jacobian would give wrong exponents without a warning; an edge outside the period would never occur. So
+the functions are first run as plain Python (every primitive of `simd` has that form) at a few states and instants.
+
+Reading order: `check_system` is called before each integration. `_Functions` calls the functions and collects
+problems; `_Motion` holds the checks of `rhs`, `jacobian`, `forcing` and `layers`. Checks of switches and impacts are in
+`event_checks`.
 """
 
 from __future__ import annotations
@@ -22,17 +26,17 @@ N_SAMPLES = 16
 """States and instants at which the functions are run."""
 
 STEP = 1e-4
-"""Largest step of the differences, in units of a state's scale."""
+"""Largest step of the finite differences, in units of a state's scale."""
 
 LEAST_MISTAKE = 1e-3
-"""Smallest relative error of the Jacobian that counts.
+"""Smallest relative error of the Jacobian that is reported.
 
-That of an implicit equation, which the rates solve by a fixed number of iterations, may be off by a tenth of
-it where these converge slowly.
+If the rates solve an implicit equation by a fixed number of iterations, the Jacobian may differ by a tenth of this
+where the iterations converge slowly.
 """
 
 TWICE = 2
-"""A difference counts if it is seen at this many samples: one may lie within a layer."""
+"""An error is reported if it occurs at this many samples; a single sample may lie within a layer."""
 
 _NOT_RUN = object()
 
@@ -53,7 +57,7 @@ class SystemCheckError(ValueError):
 
 @dataclass
 class _Checked:
-    """Ranges of the parameters and, as the last entry, of the frequency, over which a system has been checked."""
+    """Range over which each parameter of a system has been checked; the last entry is the drive frequency."""
 
     low: np.ndarray
     high: np.ndarray
@@ -72,11 +76,10 @@ def check_system(
 ) -> None:
     """Check a system before it is integrated; raise `SystemCheckError` if its functions contradict its declaration.
 
-    The lengths of what the functions return, the edges' times and widths, that constants are finite, that
-    the forcing has the drive's period and that nothing changes as an angle goes round once; and the Jacobian
-    against differences, if it is asked for or tangent vectors are carried along. All of it once for each
-    system; constants and edges again where a parameter goes beyond the range in which they were looked at.
-    Functions without a form in plain Python (numba's intrinsics, say) are passed over.
+    The checks are: the lengths of the returned tuples; times and widths of the edges; finite constants; a forcing with
+    the drive's period; equal rates after a full turn of an angle; and, if the Jacobian is used, the Jacobian against
+    finite differences. They are made once for each system. Constants and edges are checked again if a parameter leaves
+    the range that was checked. Functions that cannot run as plain Python (such as intrinsics of numba) are skipped.
 
     Parameters
     ----------
@@ -97,7 +100,7 @@ def check_system(
         With all problems by name.
     """
     subject = system if system.tangents_of is None else system.tangents_of
-    if subject.recorded_for is not None:  # a recording has no period; all else is the system's own
+    if subject.recorded_for is not None:  # a recorded drive has no period: check the original system
         subject = subject.recorded_for
     parameters = parameters[..., : len(subject.parameter_names)]
     key = (subject, jacobian or system.tangents_of is not None)
@@ -126,8 +129,8 @@ def _problems(
     frequency: np.ndarray,
     states: np.ndarray,
 ) -> list[str]:
-    """Check the declaration, the constants at extreme parameters, and the motion from a few states; return the
-    problems.
+    """Return the problems of a system: in its declaration, in its constants at extreme parameters, and in its functions
+    at sample states.
     """
     if checked is None:
         problems = list(_declaration(system, linearised))
@@ -143,11 +146,11 @@ def _problems(
     for i in np.unique(np.linspace(0, len(packed) - 1, N_SAMPLES).astype(int)):
         if functions.has_values(f := np.float64(frequency[i]), packed[i]):
             return _Motion(system, functions, packed[i], f, states).problems(linearised)
-    return []  # every cell lies at a pole
+    return []  # the constants are not finite at any of the parameter sets
 
 
 def _declaration(system: System, linearised: bool) -> Iterator[str]:
-    """Yield the problems of a system's fields that are not functions, such as names, scales and counts."""
+    """Yield the problems in a system's plain fields, such as names, scales and counts."""
     n, names = system.n_states, ", ".join(system.state_names)
     if not n:
         yield "state_names is empty; a system has one state at least."
@@ -179,9 +182,7 @@ def _declaration(system: System, linearised: bool) -> Iterator[str]:
 
 
 def _extremes(packed: np.ndarray, frequency: np.ndarray, checked: _Checked | None) -> list[int]:
-    """Return the indices of the parameter sets in which a parameter or the frequency is extreme and outside the ranges
-    already checked.
-    """
+    """Return the indices of the cells to check: those with a parameter outside the range checked so far."""
     cells = {0} if checked is None else set()
     for i, column in enumerate((*packed.T, frequency)):
         for cell in (int(column.argmin()), int(column.argmax())):
@@ -191,7 +192,7 @@ def _extremes(packed: np.ndarray, frequency: np.ndarray, checked: _Checked | Non
 
 
 class _Functions:
-    """The functions of a system as plain Python; problems in their calls are collected."""
+    """A system's functions as plain Python. Problems in calls are collected in a list."""
 
     def __init__(self, system: System) -> None:
         self.system = system
@@ -209,8 +210,8 @@ class _Functions:
             return _NOT_RUN
 
     def numbers(self, name: str, wanted: int, what: str, *arguments: Any) -> tuple[np.ndarray, ...] | None:
-        """Call a function of the system that must return a tuple of `wanted` numbers; if it does not, report a problem
-        and return None.
+        """Call a function that must return a tuple of `wanted` numbers. If it does not, report a problem and return
+        None.
         """
         values = self.call(name, *arguments)
         if values is _NOT_RUN:
@@ -223,27 +224,22 @@ class _Functions:
         return None
 
     def constants(self, frequency: np.float64, p: np.ndarray) -> tuple[np.float64, ...]:
-        """Return the constants that the system computes from the frequency and the parameters."""
         out = np.full(self.system.n_constants, np.nan)
         self.call("constants", frequency, p, out)
         return tuple(out)
 
     def has_values(self, frequency: np.float64, p: np.ndarray) -> bool:
-        """Return whether the constants are finite at one frequency and parameter vector; always True if the system
-        declares no poles.
+        """Return whether the constants are finite for a frequency and parameters. Always True if the system declares no
+        poles.
         """
         return not self.system.has_poles or bool(np.isfinite(self.constants(frequency, p)).all())
 
     def edges(self, frequency: np.float64, p: np.ndarray) -> np.ndarray:
-        """Return times, half-widths and jumps of the forcing's edges, shape (3, n_edges)."""
         table = np.full((3, self.system.n_edges), np.nan)
         self.call("edges", frequency, p, *table)
         return table
 
     def cell_problems(self, frequency: np.float64, p: np.ndarray) -> list[str]:
-        """Check the constants and the edges of the forcing at one frequency and parameter vector; return the
-        problems.
-        """
         self.problems = []
         at = f"at frequency_hz = {frequency:g}"
         values = self.constants(frequency, p)
@@ -279,7 +275,9 @@ def _edge_problems(table: np.ndarray, period: float, at: str) -> Iterator[str]:
 
 
 class _Motion:
-    """Checks of the functions that are called at every step, on sample states and times like those of a run."""
+    """Checks of the functions that the engine calls at every step. They run on sample states and times like those of a
+    run.
+    """
 
     def __init__(
         self, system: System, functions: _Functions, p: np.ndarray, frequency: np.float64, states: np.ndarray
@@ -297,9 +295,6 @@ class _Motion:
         self.u: Any = 0.0
 
     def _constants_at(self, times: np.ndarray) -> tuple[Any, ...]:
-        """Return the arguments of a check at given times: the system's constants, then the modes of its switches,
-        contacts and time segments.
-        """
         return (*self.own, *event_checks.modes_at(self.system, times, self.edges))
 
     def _states(self, states: np.ndarray) -> np.ndarray:
@@ -363,7 +358,7 @@ class _Motion:
             )
 
     def _check_period(self) -> None:
-        """Check that the rates are equal at both ends of a drive period, with time itself passed as the forcing."""
+        """Check that the rates repeat after one drive period, for a system whose `forcing` returns the time itself."""
         ends = []
         for time in (0.0, self.period):
             self.u = np.full(N_SAMPLES, time)
@@ -403,8 +398,8 @@ class _Motion:
                 )
 
     def _check_jacobian(self, rates: np.ndarray) -> None:
-        """Compare the Jacobian with finite differences of the rates; two step sizes give a bound of the differences'
-        own error.
+        """Compare the Jacobian with finite differences of the rates. Differences with two step sizes bound their own
+        error.
         """
         n, names = self.system.n_states, self.system.state_names
         what = "the derivatives of each rate by each state, row by row"
@@ -432,7 +427,6 @@ class _Motion:
                 )
 
     def _slopes(self, j: int, step: float) -> np.ndarray:
-        """Return central differences of the rates with respect to state `j`, shape (n_states, sample)."""
         right, left = self.y.copy(), self.y.copy()
         right[j] += step
         left[j] -= step

@@ -1,10 +1,11 @@
-"""Cache machine code on disk; use a cache file only if it is undamaged, of this code, and written by this user.
+"""Cache machine code on disk. Use a cache file only if it is intact, fits the present code, and was written by this
+user.
 
-numba unpickles what it finds in its cache and jumps into the machine code in there. So an entry here is one
-file that begins with the sha256 of the rest, and the rest begins with what it was compiled from: one that is
-empty, cut, changed or another's is compiled again and written anew. A checksum is no signature: who can write
-to the folder decides what is executed. Folders are made for their owner alone, and one that others can write
-to or own is not used.
+numba unpickles a cache file and executes the machine code in it. So a cache file here begins with the sha256 of its
+content, and the content begins with the key and the digest of the source. A file that is empty, cut short, changed
+or made for another function is not used: the function is compiled again and the file written anew. A checksum is
+no signature: whoever can write to the folder decides what is executed. So folders are created for their owner
+alone, and a folder that others own or can write to is not used.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ _DIGEST = hashlib.sha256
 _LENGTH = _DIGEST().digest_size
 
 _PICKING = threading.Lock()
-"""One thread at a time changes numba's settings: another would be given the folder of neither."""
+"""Lock for changes of numba's settings, which all threads share: two threads at once would mix up their folders."""
 
 
 @cache
@@ -47,14 +48,14 @@ def keep(dispatcher: Any, home: Path, folder: Path) -> Any:
     Parameters
     ----------
     dispatcher
-        What numba's decorator returned.
+        Object returned by numba's decorator.
     home, folder
-        The folder of all caches, and the one in there for this function.
+        The folder of all caches, and the subfolder for this function.
 
     Returns
     -------
     dispatcher
-        The same one; without a cache where the folder cannot be used, which is said.
+        The given dispatcher. If the folder cannot be used, it has no cache and a warning is logged.
     """
     if not hasattr(dispatcher, "py_func"):  # NUMBA_DISABLE_JIT
         return dispatcher
@@ -65,7 +66,7 @@ def keep(dispatcher: Any, home: Path, folder: Path) -> Any:
     if not problem:
         try:
             dispatcher._cache = KeptCode(function, folder)
-        except RuntimeError as error:  # the folder has gone since it was looked at
+        except RuntimeError as error:  # the folder was removed after the check
             problem = f"{error};"
     if problem:
         say(
@@ -77,8 +78,8 @@ def keep(dispatcher: Any, home: Path, folder: Path) -> Any:
 
 @cache
 def _made(home: Path, folder: Path) -> str:
-    """Create a cache folder that only its owner can write to; return why it cannot be used, or an empty text if it
-    can.
+    """Create a cache folder that only its owner can write to. Return the reason if it cannot be used, else an empty
+    text.
     """
     try:
         home.parent.mkdir(parents=True, exist_ok=True)
@@ -101,7 +102,7 @@ def _below(home: Path, folder: Path) -> list[Path]:
 
 
 def _exposed(found: os.stat_result) -> str:
-    """Describe who else can write to a file or folder; empty if nobody can, or if the system has no file owners."""
+    """Return, as text, who else can write to a file or folder; empty if only the owner can."""
     if not hasattr(os, "geteuid"):
         return ""
     mode = f"mode {stat.S_IMODE(found.st_mode):04o}"
@@ -122,7 +123,7 @@ class KeptCode(FunctionCache):
     _impl_class = _InItsFolder
 
     def __init__(self, function: Callable[..., Any], folder: Path) -> None:
-        # numba picks its folder from settings, which are put back for other users of numba
+        # numba takes its folder from global settings; restore them for other users of numba
         settings: Any = numba.config
         with _PICKING:
             before = settings.CACHE_DIR, settings.CACHE_LOCATOR_CLASSES
@@ -139,7 +140,7 @@ class KeptCode(FunctionCache):
         try:
             return super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
         except Exception as error:
-            # what is whole and cannot be read was written by another Python or numpy than it says
+            # intact but unreadable: written by another version of Python or numpy than the cache key says
             say(f"a compiled kernel in {self._cache_path} cannot be used ({error!r}); it is compiled again.")
             return None
 
@@ -188,9 +189,7 @@ def _for_the_owner(path: str, flags: int) -> int:
 
 
 def _read_sealed(path: str) -> bytes | None:
-    """Return the content of a cache file if its checksum fits and nobody else can write to it; else return None and
-    warn.
-    """
+    """Read a cache file. If its checksum is wrong or others can write to it, warn and return None."""
     try:
         with open(path, "rb") as file:
             problem = _exposed(os.fstat(file.fileno()))
@@ -198,7 +197,7 @@ def _read_sealed(path: str) -> bytes | None:
     except FileNotFoundError:
         return None
     content = sealed[_LENGTH:]
-    # the digest of nothing does not begin an empty file
+    # an empty file fails here, too: it does not begin with the digest of an empty content
     if not problem and _DIGEST(content).digest() == sealed[:_LENGTH]:
         return content
     say(f"a compiled kernel is not used: {path} {problem or 'is damaged'}; it is compiled again.")

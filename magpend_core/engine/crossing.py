@@ -14,23 +14,23 @@ from magpend_core.sizes import LEVEL
 def with_section(system: System, of: str, direction: int) -> System:
     """Return `system` with a Poincare section: its periods end where a state crosses a level.
 
-    The reciprocal of the drive frequency is then the longest wait for a crossing [s]; a cell that has none
-    within it ends as `Status.NO_RETURN`. An angle crosses its level modulo 2 pi. The crossing that a
-    trajectory starts on does not count.
+    One over the drive frequency is then the longest time to wait for a crossing [s]; a trajectory without a crossing
+    in this time ends as `Status.NO_RETURN`. An angle crosses its level modulo 2 pi. If a trajectory starts on the
+    section, this does not count as a crossing.
 
     Parameters
     ----------
     system
-        One without explicit time dependence.
+        System without explicit time dependence.
     of
         Name of a state.
     direction
-        +1 for crossings at which it rises, -1 where it falls.
+        +1 for crossings with rising state, -1 with falling state.
 
     Returns
     -------
     System
-        With one parameter more, the last: ``section_value``, the level.
+        System with one more parameter at the end: the level, ``section_value``.
 
     Raises
     ------

@@ -1,7 +1,8 @@
-"""Compute digests of compiled functions defined outside the package, with everything that decides their machine code.
+"""Compute digests of compiled functions outside the package; a digest covers all that determines their machine code.
 
-Machine code may be kept for such functions only under a digest of everything that they reach, since
-`jit.source_digest` does not change with them. What cannot be followed to its end has none, and is not kept.
+`jit.source_digest` does not change with such functions. So their machine code may be cached only under a digest of
+everything that they use, directly or through other functions. A function that uses an object whose code is not
+known has no digest, and is not cached.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ import numpy as np
 PACKAGE = __name__.partition(".")[0]
 
 _COMPILERS_OWN = ("math", "cmath", "numpy", "operator", "builtins")
-"""Modules whose functions mean to numba what its version says; that version names the cache folder."""
+"""Modules whose functions numba implements itself. Its version, part of the cache folder's name, covers them."""
 
 _GLOBALS, _ATTRIBUTES = ("LOAD_GLOBAL", "LOAD_NAME"), ("LOAD_ATTR", "LOAD_METHOD")
 
@@ -37,20 +38,20 @@ def code_length(function: Callable[..., Any]) -> int:
 
 
 class _UnknownError(Exception):
-    """An error for a function that depends on an object whose code is unknown, so that it has no digest."""
+    """Error: a function uses an object whose code is unknown, so the function has no digest."""
 
 
 def functions_digest(*functions: Callable[..., Any]) -> str | None:
     """Return a digest of compiled functions and of everything they refer to.
 
-    It covers the bytecode, its constants, the compiler's options, default values, and each global and
-    closed-over value that is looked up: other compiled functions in the same way; numbers, strings, tuples
-    and arrays by value; functions of this package, of numpy and of the standard library's arithmetic by name.
+    It covers the bytecode, its constants, the compiler options, default values, and each global or closed-over
+    value that the code looks up: other compiled functions in the same way; numbers, strings, tuples and arrays by
+    value; functions of this package, of numpy and of the modules of arithmetic by name.
 
     Parameters
     ----------
     functions
-        Dispatchers of numba's.
+        Dispatchers of numba.
 
     Returns
     -------
@@ -76,7 +77,7 @@ def _parts(value: Any, seen: dict[int, int]) -> Iterator[bytes]:
     source = getattr(value, "py_func", None)
     if isinstance(source, FunctionType):
         if source.__module__ not in sys.modules:
-            # machine code from the cache asks for its functions' modules
+            # loading cached machine code imports the modules of its functions
             raise _UnknownError
         seen[id(value)] = len(seen)
         yield _options(value)
@@ -92,7 +93,7 @@ def _parts(value: Any, seen: dict[int, int]) -> Iterator[bytes]:
 
 
 def _plain(value: Any) -> bytes:
-    """Return bytes that identify a number or text by its value, or a function that the compiler knows by its name."""
+    """Return bytes that identify a plain value by its text, or a function of numba, numpy or magpend by its name."""
     if value is None or isinstance(value, bool | int | float | complex | str | bytes | np.generic):
         return f"{type(value).__name__} {value!r}".encode()
     module = getattr(value, "__module__", None) or ""
@@ -104,7 +105,6 @@ def _plain(value: Any) -> bytes:
 
 
 def _options(dispatcher: Any) -> bytes:
-    """Return the compiler options of a numba function as bytes, in a fixed order."""
     options = {**dispatcher.targetoptions, "locals": dispatcher.locals}
     rows = []
     for name, option in sorted(options.items()):
@@ -138,7 +138,9 @@ def reached(function: Any, path: tuple[str, ...]) -> Any:
 
 
 def _found(value: Any, attributes: tuple[str, ...]) -> Any:
-    """Return the object that a dotted path of attributes leads to; only attributes of modules are followed."""
+    """Follow a dotted path such as ``module.submodule.NAME`` from module to module, up to the first object that is no
+    module.
+    """
     for name in attributes:
         if not isinstance(value, ModuleType):
             break
@@ -170,7 +172,9 @@ def _code(code: CodeType, seen: dict[int, int]) -> Iterator[bytes]:
 
 
 def lookups(code: CodeType) -> list[tuple[str, ...]]:
-    """Return the global names that a function and its inner functions look up, with the attributes read of each."""
+    """Return the global names that a function and its inner functions look up, each with the attributes
+    read from it.
+    """
     found: set[tuple[str, ...]] = set()
     path: tuple[str, ...] = ()
     for instruction in dis.get_instructions(code):

@@ -20,7 +20,7 @@ LEVEL, SLOPE = "recorded_drive", "recorded_drive_slope"
 
 
 def _wrapped(source: str, module: str, **bindings: Any) -> Any:
-    """Compile a function given as source text, as if it were defined in `module` (see `jit.keeping`)."""
+    """Compile a function from source text. numba's cache treats it as part of `module` (see `jit.keeping`)."""
     scope: dict[str, Any] = {"__name__": module, **bindings}
     exec(source, scope)
     return inline(scope["function"])
@@ -31,17 +31,17 @@ def with_recorded_drive(system: System) -> System:
     """Return `system` with its forcing replaced by a recorded drive, which is linear in time on each interval.
 
     The forcing is ``recorded_drive + recorded_drive_slope * t`` at time `t` [s] since the interval's start,
-    in the unit of the system's own forcing; so measured values are joined by lines, or held between switches.
+    in the unit of the system's own forcing. So it can interpolate measured values linearly, or hold them constant.
 
     Parameters
     ----------
     system
-        Any system; one without forcing has nothing that a drive could act on.
+        A system with forcing.
 
     Returns
     -------
     System
-        With two parameters more, the last ones.
+        System with two more parameters at the end: ``recorded_drive`` and ``recorded_drive_slope``.
 
     Raises
     ------
@@ -53,7 +53,7 @@ def with_recorded_drive(system: System) -> System:
     if system.forcing_is_time or system.timed_layers:
         raise ValueError(f"{system.name}: time enters by more than one number; a recording cannot take its place.")
     n, m, module = system.n_constants, len(system.parameter_names), system.rhs.__module__
-    # modes stay behind all constants
+    # the functions of the system expect the modes right after its own constants, without the two new ones
     own = f"c[:{n}]" if not system.n_modes else f"c[:{n}] + c[{n + 2}:]"
     bindings = {
         "_constants": system.constants,
@@ -103,8 +103,8 @@ def with_recorded_drive(system: System) -> System:
 def drive_parameters(system: System, packed: np.ndarray) -> tuple[str, ...]:
     """Return the parameters that affect a system's forcing and nothing else, such as its amplitude.
 
-    They have no effect once a recording takes the forcing's place. Found by changing each by itself, in plain
-    Python at a few instants and states; nothing is compiled.
+    They have no effect once a recorded drive replaces the forcing. To find them, each parameter is changed in turn, in
+    plain Python at a few instants and states; nothing is compiled.
 
     Parameters
     ----------
@@ -116,7 +116,7 @@ def drive_parameters(system: System, packed: np.ndarray) -> tuple[str, ...]:
     Returns
     -------
     tuple of str
-        None of them if a function of the system cannot be run in plain Python.
+        Names of the parameters; empty if a function of the system cannot run in plain Python.
     """
     constants, forcing, rhs = (plain(f) for f in (system.constants, system.forcing, system.rhs))
     states = np.random.default_rng(0).uniform(-1.0, 1.0, (4, system.n_states))

@@ -15,28 +15,28 @@ from magpend_core.engine.system import System
 from magpend_core.validation import check_array, check_count, check_frequency, check_states, check_tolerance
 
 N_LANES = 64
-"""Lanes in flight: four groups, whose numbers just fit the first-level caches."""
+"""Number of lanes computed at the same time: four groups, whose numbers just fit into the first-level cache."""
 
 SLACK = 1e4
 """Product of slack and tolerance in the step limiter (see `lanes.step_ratio`), chosen on the pendulum.
 
-Over 2 to 2.8 Hz and tolerances from 1e-6 to 1e-11 it needs the fewest steps for the error reached, or
-nearly so, with at most 6 % of the attempts rejected; ten times more or less costs 10 to 20 %.
+For 2 to 2.8 Hz and tolerances from 1e-6 to 1e-11, this value needs nearly the fewest steps for a given error, and at
+most 6 % of the attempts are rejected. A value ten times larger or smaller costs 10 to 20 % more.
 """
 
 LOOSE = 2e-6
-"""Sum of the tolerances above which the slack rises faster than they do.
+"""Sum of the tolerances above which the slack grows with their third power.
 
-A step that is large beside a layer's width does not follow its shape, and the error control alone finds the
-step. With the third power of the tolerances 10 to 18 % fewer attempts reach a median error of 1e-4.
+At loose tolerances a step is much longer than a layer is wide and does not resolve it; error control alone then
+chooses the step. With the third power, a median error of 1e-4 needs 10 to 18 % fewer attempts.
 """
 
 LEAST_RTOL = 1e-13
-"""Below this, rounding errors decide and the step size collapses."""
+"""Smallest relative tolerance; below it, rounding errors dominate and the step size becomes too small."""
 
 
 def slack_of(rtol: float, atol: float) -> float:
-    """Return the constant that limits the step size near steep layers and forcing edges, for given tolerances."""
+    """Return the slack for given tolerances: the constant that limits steps near boundary layers and forcing edges."""
     tolerance = rtol + atol
     return SLACK * tolerance * max(1.0, tolerance / LOOSE) ** 2
 
@@ -91,16 +91,15 @@ def integrate(
     quantities: Sequence[str] | None = None,
     measures: np.ndarray | None = None,
 ) -> Cells:
-    """Integrate branches (sequences of parameter points, each started from the last state of the one before) and let an
-    observer record.
+    """Integrate branches and let an observer record them. A branch is a sequence of parameter points, each started from
+    the last state of the previous one.
 
     Parameters
     ----------
     system
-        What is integrated.
+        System to integrate.
     observer, settings
-        What is done at each completed period, and what the observer needs to know for it; the latter is a
-        named tuple of numbers.
+        Observer to call after each period, and its settings, a named tuple of numbers.
     parameters
         Shape (branch, point, len(system.parameter_names)).
     frequency_hz
@@ -108,26 +107,25 @@ def integrate(
     initial_states
         Shape (branch, n_states).
     n_keep
-        Rows of n_states numbers that the observer may write per cell; NaN before.
+        Number of rows (of n_states numbers) that the observer may write per cell; unwritten rows are NaN.
     n_measures
-        Numbers that the observer may write per cell.
+        Number of further numbers that the observer may write per cell.
     rtol, atol, max_steps_per_period, step_size, n_lanes, quantities
         As for `magpend_core.sections.run_branches`.
     measures
-        Numbers that the observer finds in its measures at first, shape (branch, point, n_measures); 0 by
-        default.
+        Initial values of the observer's `measures`, shape (branch, point, n_measures); 0 by default.
 
     Returns
     -------
     Cells
-        All arrays, filled.
+        Input and output arrays, with the outputs filled.
 
     Raises
     ------
     ValueError
         If an argument has the wrong shape or is out of bounds.
     SystemCheckError
-        If the system is not what it says (see `check_system`).
+        If the functions of the system contradict its declaration (see `check_system`).
     """
     rtol, atol = check_tolerances(rtol, atol)
     watched = check_quantities(quantities, system)
@@ -145,7 +143,7 @@ def integrate(
         )
     initial = check_states(initial_states, 2, system.n_states, "initial_states")
     n_branches = len(frequency)
-    # memory that may not be written to is a type of its own to numba, and would compile the engine once more
+    # numba has another type for read-only arrays and would compile the engine again
     frequency, packed = (np.require(a, requirements="W") for a in (frequency, packed))
     first_step = np.zeros(n_branches) if step_size is None else check_array("step_size", step_size, 1)
     for name, array in (("initial_states", initial), ("step_size", first_step)):

@@ -10,14 +10,14 @@ import numpy as np
 from magpend_core.engine.system import System
 
 STEP = 1e-5
-"""Step of the differences of values along the motion, in periods or in units of its shortest time."""
+"""Time step of the finite differences along the motion, in periods or in units of its shortest time scale."""
 
 WRONG = 1e-3
-"""Smallest relative error of a rate that counts."""
+"""Smallest relative error of a rate that is reported."""
 
 
 def declaration(system: System) -> Iterator[str]:
-    """Yield the problems of a system's fields for switches and impacts that are not functions."""
+    """Yield the problems in a system's plain fields for switches and impacts."""
     least = system.n_switches + system.n_contacts + system.has_segments
     if system.n_modes != least:
         yield (
@@ -44,7 +44,7 @@ def declaration(system: System) -> Iterator[str]:
 
 
 def modes_at(system: System, times: np.ndarray, edges: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Return the modes used for a check at given times: all switches at 1, no contact, and the number of forcing edges
+    """Return the modes used in checks at given times: switches at +1, no contact, and the number of forcing edges
     passed.
     """
     modes = [np.ones(len(times))] * (system.n_switches + system.n_contacts)

@@ -1,21 +1,25 @@
 """Detect events, the zeros of functions along a trajectory, and let a step end at each.
 
-Templates for the engine, see `lanes`. An attempted step that ends beyond a zero is taken back; the next
-attempt ends where the cubic through values and rates at both ends has its zero, and so on until an attempt
-ends beyond the zero by no more than the resolution: `NARROW` times the first attempt's length, and four
-times as much with each further attempt, so that some 25 attempts are the most that there can be. An attempt
-that ends before the zero is an ordinary step. So a state at an event is one of the integration's own, of its
-accuracy; nothing is interpolated.
+These functions are templates for the engine, see `lanes`. An attempted step that ends beyond a zero is taken
+back. The next attempt ends at the zero of the cubic through values and rates at both ends, and so on, until an
+attempt ends beyond the zero by no more than the resolution. The resolution is `NARROW` times the first
+attempt's length; it grows by `WIDEN` with each further attempt, so that there are at most about 25 attempts. An
+attempt that ends before the zero is an ordinary step. So the state at an event is computed by a step of the
+integrator, with its accuracy, and not interpolated.
 
-A pair of zeros within a step, at whose ends the signs are the same, is looked for where the rates make it
-possible: an attempt then ends in the cubic's extremum. A surface can move faster than the states: a ball
-flies along a parabola, which a step of any length follows, above a table that shakes. So the value in the
-middle of an attempt is compared with the cubic's, and where the difference is so large that a pair may be
-hidden, the attempt is repeated with half the step. What can be missed is a pair that neither shows: an
-excursion beyond zero that is shorter than a step and not seen at its middle.
+An event function can pass zero twice within a step, so that it has the same sign at both ends. Where the rates
+at the ends allow this, the next attempt ends at the minimum of the cubic. But a surface can move faster than
+the states: a ball flies along a parabola, which a step of any length follows, above a table that shakes. So the
+value in the middle of an attempt is compared with the cubic there. Where the difference is so large that two
+zeros may be hidden, the attempt is repeated with half the step. The check misses two zeros only if the
+excursion beyond zero is shorter than a step and does not include the step's middle.
 
-An event has a side, +1 or -1: the sign of its value as of the last step, turned over where a step ends beyond
-zero. After an event it is the side that the trajectory goes to, whatever the last digit of the value says.
+Each event function has a stored sign, its *side*: +1 or -1 as of the last step, reversed where a step ends
+beyond zero. Right after an event the side, not the computed value (which is zero up to rounding), says where
+the trajectory goes.
+
+Reading order: `lanes.finish_step` calls `hides_events`, then `judge_events`. Most steps end there. If a zero is
+possible, `settle_events` accepts the step or takes it back, and `aim` sets the length of the next attempt.
 """
 
 from __future__ import annotations
@@ -51,10 +55,10 @@ WIDEN = 4.0
 """Growth of the resolution with each attempt: rounding can hide a zero at which the rate is small."""
 
 ROOT_STEPS = 4
-"""Steps of Newton's method for the zero of a cubic; what they leave, the next attempt finds."""
+"""Number of Newton steps for the zero of a cubic; the next attempt corrects the remaining error."""
 
 SAME = 1e-9
-"""A start so near to a section, in units of the state's scale, is on it: no crossing."""
+"""A start closer to the section than this, in units of the state's scale, lies on the section and is no crossing."""
 
 ACCEPT, TAKE_BACK, LANDED = 0.0, 1.0, 2.0
 
@@ -62,13 +66,13 @@ RESOLVED = 1e-4
 """An attempt shorter than this [periods] is not halved in search of a pair of zeros."""
 
 ROUNDED = 1e-12
-"""Difference from a cubic, relative to the numbers that make it, that is rounding."""
+"""Relative difference from a cubic that counts as rounding."""
 
 
 def _events_of(system: System) -> Callable[..., Any]:
     """Return a function that gives values and time derivatives of all event functions as one flat tuple.
 
-    Switches first, then impacts, then the section. It passes for one of the system's module.
+    The order is: switches, impacts, section. The cache treats the function as part of the system's module.
     """
     lines, parts = ["def event_values(t, y, dy, c, level):"], []
     for name, n in (("switches", system.n_switches), ("impacts", system.n_impacts)):
@@ -78,7 +82,7 @@ def _events_of(system: System) -> Callable[..., Any]:
     if system.section is not None:
         i = system.section[0]
         if system.is_angle[i]:
-            # the sine has a second zero, half a turn away, which the scalar pass tells apart
+            # the sine has a second zero half a turn away; `section_counts` excludes it
             lines.append(f"s, k = sincos(y[{i}] - level)")
             parts += ["s", f"k * dy[{i}]"]
         else:
@@ -95,7 +99,7 @@ def _events_of(system: System) -> Callable[..., Any]:
 
 
 def _middle_of(n: int) -> Callable[..., Any]:
-    """Return a function that gives the states in the middle of a step by cubic Hermite interpolation."""
+    """Return a function that computes the states in the middle of a step by cubic Hermite interpolation."""
     lines = ["def middle_of(y0, dy0, y1, dy1, h):", "eighth = 0.125 * h"]
     parts = [f"multiply_add(eighth, dy0[{i}] - dy1[{i}], 0.5 * (y0[{i}] + y1[{i}]))" for i in range(n)]
     lines.append(f"return ({', '.join(parts)},)")
@@ -105,9 +109,7 @@ def _middle_of(n: int) -> Callable[..., Any]:
 
 
 def event_bindings(system: System) -> dict[str, Any]:
-    """Return the values, for a given system, of the global names that the function templates of this module leave
-    open.
-    """
+    """Return the values of this module's free global names (such as ``N_EVENTS``) for a system."""
     of, direction = system.section or (0, 0)
     directions = [0.0] * system.n_switches + [float(d) for d in system.impact_directions]
     starts = [1.0] * system.n_switches + [-float(d) for d in system.impact_directions]
@@ -132,8 +134,8 @@ def event_bindings(system: System) -> dict[str, Any]:
 
 
 def cubic_dip(a: Any, da: Any, b: Any, db: Any) -> Any:
-    """Return the position in (0, 1) of a cubic's negative minimum, or 2 if it has none; `a`, `b` are its end values,
-    `da`, `db` its slopes.
+    """Return where in (0, 1) a cubic has a negative minimum, or 2 if it has none. The cubic has end values `a`, `b` and
+    end slopes `da`, `db`.
     """
     c3 = 2.0 * (a - b) + (da + db)
     c2 = multiply_add(3.0, b - a, -(da + da) - db)
@@ -147,9 +149,7 @@ def cubic_dip(a: Any, da: Any, b: Any, db: Any) -> Any:
 
 
 def may_dip(a: Any, da: Any, b: Any, db: Any) -> Any:
-    """Return 1 where a quick bound on a cubic (see `cubic_dip`) does not exclude a value below 0 between its ends, else
-    0.
-    """
+    """Return 1 where a cubic may fall below 0 between its ends, else 0. This is the fast test before `cubic_dip`."""
     least = minimum(multiply_add(1.0 / 3.0, da, a), multiply_add(-1.0 / 3.0, db, b))
     steepest = maximum(maximum(da, db), multiply_add(3.0, b - a, -(da + db)))
     return where_less(least, 0.0, where_less(0.0, steepest, 1.0, 0.0), 0.0)
@@ -160,7 +160,7 @@ def cubic_root(a: Any, da: Any, b: Any, db: Any, right: Any) -> Any:
     c3 = 2.0 * (a - b) + (da + db)
     c2 = multiply_add(3.0, b - a, -(da + da) - db)
     left = 0.0 * right
-    # from the end that is nearer to zero; from the left one only if Newton's first step goes right
+    # begin at the end whose value is nearer to zero; at the left end only if its slope leads to the right
     x = where_less(a, -b, where_less(da, 0.0, left, right), right)
     for _ in range(ROOT_STEPS):
         value = multiply_add(multiply_add(multiply_add(c3, x, c2), x, da), x, a)
@@ -169,18 +169,18 @@ def cubic_root(a: Any, da: Any, b: Any, db: Any, right: Any) -> Any:
         right = where_less(0.0, value, right, x)
         newton = x - value / slope
         middle, half = 0.5 * (left + right), 0.5 * (right - left)
-        # a little beyond the ends is allowed: at the zero a step of Newton's goes nowhere
+        # bisect if Newton's step leaves the bracket; the margin admits the end itself, if it is the zero
         x = where_less(absolute(newton - middle), 1.000001 * half, newton, middle)
-    # already at zero and on its way beyond it
+    # at the left end the value is 0 and falls: the zero is there
     return where_less(0.0, a, x, where_less(da, 0.0, 0.0 * x, x))
 
 
 def margin(w: Any, base: int, k: int, near: Any, far: Any) -> Any:
-    """Return value and rate of event function `k` at both ends of a step, with the sign chosen so that it is positive
-    before the event.
+    """Return value and rate of event function `k` at both ends of a step, multiplied by its sign before the event.
 
-    `near` and `far` are pairs of value and rate. A value at the near end that is beyond zero, by rounding
-    or after an event, counts as zero.
+    Before the event both values are thus positive. `near` and `far` are pairs of value and rate at the start and
+    the end of the step. A start value that is slightly beyond zero (rounding, or just after an event) is set to
+    zero, and the end value is shifted by the same amount.
     """
     side = load(w, base + ROWS.side + k * WIDTH)
     value = side * near[0]
@@ -194,13 +194,13 @@ def pair(w: Any, row: int, k: int) -> Any:
 
 
 def fires(w: Any, base: int, k: int) -> Any:
-    """Return 1 where a sign change of event function `k` from its present side is an event, else 0."""
+    """Return 1 where a zero of event function `k` is an event (a sign change in the declared direction), else 0."""
     return where_less(DIRECTIONS[k] * load(w, base + ROWS.side + k * WIDTH), 0.5, 1.0, 0.0)
 
 
 def hides_events(w: Any, base: int) -> Any:
-    """Return 1 where an event function may have two hidden zeros: at mid-step it is far from the cubic through the
-    step's ends.
+    """Return 1 where an event function may pass zero twice within a step, since its mid-step value differs from the
+    cubic interpolant; else 0.
     """
     h, t, level = load(w, base + ROWS.step), load(w, base + ROWS.time), load(w, base + ROWS.level)
     y0, y1 = load_rows(w, base + ROWS.state, N_KNOWN), load_rows(w, base + ROWS.trial, N_KNOWN)
@@ -220,17 +220,17 @@ def hides_events(w: Any, base: int) -> Any:
         off = absolute(value - multiply_add(0.125, da - db, 0.5 * (a + b)))
         least = minimum(multiply_add(1.0 / 3.0, da, a), multiply_add(-1.0 / 3.0, db, b))
         size = ROUNDED * (absolute(a) + absolute(b) + absolute(da) + absolute(db))
-        # a step that ends beyond zero is taken back anyway
+        # a step that ends beyond zero is taken back anyway, so look only at the others
         may = where_less(b, 0.0, 0.0, fires(w, base, k))
         hides = maximum(hides, where_less(least, off + off, where_less(size, off, may, 0.0), 0.0))
     return where_less(RESOLVED * load(w, base + ROWS.period), h, hides, 0.0)
 
 
 def judge_events(w: Any, base: int, failed: Any) -> Any:
-    """Return for each SIMD lane whether a step is accepted, taken back or ends on an event; `failed` is 1 where its
-    error is too large.
+    """Return for each SIMD lane a verdict on the attempted step: accept it, take it back, or end on an event.
 
-    ACCEPT, TAKE_BACK or LANDED; in the last case `fired` tells on which.
+    The verdict is ACCEPT, TAKE_BACK or LANDED (on an event). After LANDED, the rows `fired` mark the events.
+    `failed` is 1 for a step that error control rejects.
     """
     h = load(w, base + ROWS.step)
     y = load_rows(w, base + ROWS.trial, N_KNOWN)
@@ -238,6 +238,7 @@ def judge_events(w: Any, base: int, failed: Any) -> Any:
     c = load_rows(w, base + ROWS.constants, NC)
     found = event_values(load(w, base + ROWS.time) + h, y, dy, c, load(w, base + ROWS.level))
     store_rows(w, base + ROWS.found, found)
+    # cheap test for all lanes; the expensive `settle_events` runs only if a lane of the group needs it
     doubt = where_less(0.0, load(w, base + ROWS.resolution), 1.0, 0.0 * h)
     for k in range(N_EVENTS):
         value = load(w, base + ROWS.found + 2 * k * WIDTH)
@@ -269,7 +270,7 @@ def settle_events(w: Any, base: int, failed: Any) -> Any:
         crossed = where_less(b, 0.0, fires(w, base, k), 0.0)
         passed = maximum(passed, crossed)
         beyond = maximum(beyond, where_less(narrow * absolute(db), -b, crossed, 0.0))
-        # a dip is looked for once in a step, so that each step comes to an end
+        # look for a dip in the first attempt of a step only, so that the attempts come to an end
         may, dip = first * may_dip(a, h * da, b, h * db), 2.0 + 0.0 * h
         if any_nonzero(may):
             dip = where_less(0.5, may, cubic_dip(a, h * da, b, h * db), dip)
@@ -284,9 +285,7 @@ def settle_events(w: Any, base: int, failed: Any) -> Any:
 
 
 def turn_sides(w: Any, base: int, accepted: Any, lands: Any) -> None:
-    """After an accepted step, reverse the stored sign of each event function that has passed zero; mark the events as
-    fired.
-    """
+    """Flip the stored sign of each event function that passed zero in an accepted step, and mark its event as fired."""
     for k in range(N_EVENTS):
         row = base + k * WIDTH
         _, _, b, _ = margin(w, base, k, pair(w, base + ROWS.known, k), pair(w, base + ROWS.found, k))
@@ -297,11 +296,10 @@ def turn_sides(w: Any, base: int, accepted: Any, lands: Any) -> None:
 
 
 def aim(w: Any, base: int, takes: Any, goes_on: Any, narrow: Any) -> None:
-    """Set the length of the next attempted step to end at the nearest zero of an event function that an attempt has
-    passed.
+    """Set the length of the next step so that it ends at the nearest zero of the event functions.
 
-    After an attempt that is taken back, that is within its length; after a step that ended before the
-    zero, within what is left of an earlier one.
+    If the attempt is taken back (`takes`), the zero lies within its length. If the step ended before the zero
+    (`goes_on`), the zero lies within the rest of an earlier attempt.
     """
     h = load(w, base + ROWS.step)
     length = where_less(0.5, takes, h, load(w, base + ROWS.ahead) - h)
@@ -328,13 +326,13 @@ def aim(w: Any, base: int, takes: Any, goes_on: Any, narrow: Any) -> None:
     narrow = WIDEN * narrow
     store(w, base + ROWS.resolution, where_less(0.5, on, narrow, 0.0 * h))
     store(w, base + ROWS.ahead, where_less(0.5, on, length, 0.0 * h))
-    # a little further, so that rounding does not leave it on the near side
+    # end slightly beyond the zero, so that rounding does not leave the step before it
     store(w, base + ROWS.aimed, where_less(0.5, on, multiply_add(0.125, narrow, nearest), 0.0 * h))
 
 
 def section_counts(w: Any, base: int, lane: int) -> bool:
-    """Return whether the last step ended on the Poincare section; for an angle, exclude the zero of its sine half a
-    turn away.
+    """Return whether the last step ended on the Poincare section. For an angle, exclude the point half a turn away,
+    where the sine is also zero.
     """
     if w[base + ROWS.fired + (N_EVENTS - 1) * WIDTH + lane] < 0.5:
         return False
@@ -345,7 +343,7 @@ def section_counts(w: Any, base: int, lane: int) -> bool:
 
 
 INLINE = ("cubic_dip", "may_dip", "cubic_root", "margin", "pair", "fires", "section_counts")
-"""Templates here that dissolve into their callers, callees first; they come before those of `CALLED`."""
+"""Templates of this module that are inlined into their callers. Callees come first; `CALLED` follows after them."""
 
 CALLED = ("turn_sides", "aim", "settle_events", "hides_events", "judge_events")
-"""The others."""
+"""Templates of this module that are compiled as functions of their own."""

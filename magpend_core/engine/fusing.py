@@ -1,18 +1,17 @@
-"""Fuse products with sums (multiply-add) by a fixed rule instead of the compiler's, so that results are the same bits
-everywhere.
+"""Fuse products with sums (multiply-add) by a fixed rule, so that results have the same bits on every CPU.
 
-A fused product and sum, ``a * b + c`` rounded once, costs half as much as the two apart, so that every
-compiler wants to fuse. Left to it, what is fused depends on the CPU, on its version and on what was inlined
-where, and with that the last bits of a result. Here it depends on the function's source alone:
+A fused multiply-add, ``a * b + c`` rounded once, costs half as much as a product and a sum, so compilers like to fuse.
+But which operations a compiler fuses depends on the CPU, on the compiler's version and on inlining; so the last bits
+of a result would depend on them, too. Here fusing depends only on the source of the function:
 
-- a sum or difference is fused with a product that is one of its two terms, written there or named before, or
-  with that product's negative;
-- if both terms are products, with the one on the left;
-- nothing else is: neither what another function returns, nor a named product that is used in another branch
-  or on the other side of a loop's begin or end.
+- A sum or difference is fused with a product that is one of its two terms (or the negative of one). The product may
+  be written in the sum, or assigned to a name before.
+- If both terms are products, the left one is fused.
+- Nothing else is fused: not the result of another function, and not a named product from another branch or from
+  outside the present loop body.
 
-The rule is applied to numba's intermediate code of a function, before LLVM sees any of it; LLVM may fuse
-nothing on its own then. A CPU without such an operation calls its C library's, for the same bits.
+The rule is applied to numba's LLVM code of each function, before LLVM optimises it; LLVM itself is not allowed to
+fuse. On a CPU without a multiply-add instruction, the function ``fma`` of the C library gives the same bits.
 """
 
 from __future__ import annotations
@@ -49,7 +48,7 @@ def _fuse_in(function: ir.Function) -> None:
                 fused = _fused(instruction)
                 if fused is not None:
                     replaced[instruction] = fused
-                    # a product that nothing else needs is left for LLVM to drop
+                    # the product stays; LLVM removes it if nothing else uses it
                     block.instructions.remove(instruction)
     if not replaced:
         return
@@ -57,7 +56,7 @@ def _fuse_in(function: ir.Function) -> None:
         for instruction in block.instructions:
             for operand in {x for x in instruction.operands if x in replaced}:
                 instruction.replace_usage(operand, replaced[operand])
-                if isinstance(instruction, InsertValue):  # llvmlite prints a second reference
+                if isinstance(instruction, InsertValue):  # llvmlite stores this operand twice and prints the copy
                     instruction.value = instruction.operands[1]
 
 
@@ -81,7 +80,7 @@ def _fused(instruction: ir.Instruction) -> Any:
 
 
 def _is_negation(value: Any) -> bool:
-    """Return whether an instruction negates a value, which numba also writes as a difference from minus zero."""
+    """Return whether an LLVM instruction negates a value, written as ``fneg`` or as a difference -0.0 - x."""
     opname = getattr(value, "opname", None)
     if opname != "fsub":
         return bool(opname == "fneg")
@@ -91,7 +90,9 @@ def _is_negation(value: Any) -> bool:
 
 
 def _factors(builder: ir.IRBuilder, value: Any) -> tuple[Any, Any] | None:
-    """Return the factors of a product, also of a scalar product spread over SIMD lanes; None for anything else."""
+    """Return the two factors of a product, or of a scalar product copied to all SIMD lanes; None for any other LLVM
+    value.
+    """
     opname = getattr(value, "opname", None)
     if opname == "fmul":
         return tuple(value.operands)
@@ -105,7 +106,7 @@ def _factors(builder: ir.IRBuilder, value: Any) -> tuple[Any, Any] | None:
 
 
 def _like(builder: ir.IRBuilder, spread: Any, scalar: Any) -> Any:
-    """Spread a scalar over the SIMD lanes by the same instructions with which another value was spread."""
+    """Copy a scalar to all SIMD lanes, by instructions like those that made `spread`."""
     inserted, undefined, mask = spread.operands
     first = builder.insert_element(inserted.operands[0], scalar, inserted.operands[2])
     return builder.shuffle_vector(first, undefined, mask)

@@ -15,7 +15,7 @@ def places_of(system: System) -> Sequence[int]:
 
 
 def rows_of_entries(system: System) -> list[dict[int, int]]:
-    """Return for each row of the Jacobian a dict: from the column of an entry to its index in the tuple of
+    """Return one dict per row of the Jacobian. It maps the column of an entry to the entry's index in the tuple from
     `system.jacobian`.
     """
     n = system.n_states
@@ -36,7 +36,7 @@ def whole_jacobian(system: System, entries: np.ndarray) -> np.ndarray:
 
 
 def declaration_problems(system: System) -> Iterator[str]:
-    """Yield a problem if a system's `jacobian_entries` are not rising, valid indices."""
+    """Yield a problem if a system's `jacobian_entries` are not valid indices in rising order."""
     most, entries = system.n_states**2 - 1, system.jacobian_entries
     good = sorted({i for i in entries or () if 0 <= i <= most})
     if entries is not None and (not entries or list(entries) != good):

@@ -1,20 +1,23 @@
 """Compile functions with numba, with an on-disk cache that never returns outdated code.
 
-numba's own ``cache=True`` watches the file of the cached function alone: after an edit of a callee
-in another file the cached caller goes on returning the old result. Here the cache folder is named
-by a digest of all sources of ``magpend_core`` with the versions of numba and llvmlite, so that any
-edit starts an empty folder. What calls functions from outside the package has a folder of its own in
-there, named by a digest of those functions and of all that they reach (see `digests`). numba itself
-separates CPU models inside it. The digest is of bytes, not of meaning like `kernel_version`: no rule about
-what matters can then let an old answer through, and one compilation is all that a needless change costs.
+numba's own ``cache=True`` watches only the file of the cached function: after an edit of a callee in another file
+the cached caller still returns the old result. Here the name of the cache folder contains a digest of all sources
+of ``magpend_core`` and the versions of numba and llvmlite, so that any edit starts an empty folder. Code that calls
+functions from outside the package has a subfolder, named by a digest of these functions and of all that they use
+(see `digests`). numba itself separates CPU models inside a folder. The digest is one of bytes, unlike
+`kernel_version`, which ignores comments: so no rule about what matters can let an old result through. The price is
+one compilation after an edit of a comment.
+
+Reading order: `inline` compiles helpers and the functions of a system. `bound_part` and `entry` compile the templates
+of the engine, with values for their free names. `keeping` says under which key the code may be cached.
 
 Environment variables, read once at import:
 
 ``MAGPEND_CACHE``
     ``0`` compiles in every process and writes nothing.
 ``MAGPEND_CACHE_DIR``
-    The folder that holds the caches; unset or empty, ``magpend`` in the user's cache folder. What is in it is
-    executed: it must be the user's own, see `code_cache`.
+    The folder of all caches; if unset or empty, ``magpend`` in the user's cache folder. Its content is executed, so
+    it must belong to the user, see `code_cache`.
 """
 
 from __future__ import annotations
@@ -40,15 +43,15 @@ from magpend_core.engine.digests import PACKAGE, code_digest, functions_digest
 from magpend_core.engine.linking import placeholder, placeholder_of_array
 from magpend_core.engine.precompiled import EntryCompiler, PartDispatcher
 
-# No fast math: which products are fused is said by `fusing`, and wider flags would turn isnan(nan) into
-# False. The default error model would add a branch to every division.
+# No fast math: `fusing` decides which products are fused, and further flags would make isnan(nan) False. The error
+# model "numpy" avoids a test for 0 at every division.
 F = TypeVar("F", bound=Callable[..., Any])
 
 OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "pipeline_class": EntryCompiler}
 
-# A function that allocates nothing needs no reference counts, and each is an atomic operation: passing
-# a tuple of a dozen arrays to a callee costs a microsecond. Parts have no wrappers for Python and C: those
-# take half of the time to compile.
+# Parts allocate nothing, so they need no reference counts (_nrt). Each count is an atomic operation: passing a tuple
+# of a dozen arrays to a callee would cost a microsecond. Parts have no wrappers for Python and C, which would take
+# half of the compilation time.
 _OF_PARTS: dict[str, Any] = {
     "nogil": True,
     "error_model": "numpy",
@@ -57,7 +60,7 @@ _OF_PARTS: dict[str, Any] = {
     "no_cpython_wrapper": True,
 }
 
-# numba makes a wrapper for C of every function that has none forbidden, though nothing here is called from C.
+# numba makes a wrapper for calls from C unless it is told not to; nothing here is called from C
 WITHOUT_C: dict[str, Any] = {"no_cfunc_wrapper": True}
 
 _SETTINGS: Any = numba.config
@@ -80,11 +83,11 @@ def _cache_folder() -> Path | None:
     home = os.environ.get("MAGPEND_CACHE_DIR")
     try:
         folder = Path(home or os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    except RuntimeError:  # nobody's home
+    except RuntimeError:  # the user has no home folder
         return None
     folder = folder if home else folder / "magpend"
     versions = f"numba-{numba.__version__}-llvmlite-{llvmlite.__version__}"
-    # absolute, so that it stays where it is when the process goes elsewhere
+    # absolute, since the process may change its working directory
     return folder.absolute() / f"{source_digest()}-{versions}"
 
 
@@ -92,7 +95,7 @@ CACHE_FOLDER = _cache_folder()
 
 
 PARTS = PartFolder(CACHE_FOLDER) if CACHE_FOLDER is not None else None
-"""Where the code of parts is kept."""
+"""Folder with the cached code of parts; None without a cache."""
 
 
 def inline(function: F) -> F:
@@ -110,14 +113,13 @@ def inline(function: F) -> F:
 class _Uncollected(event.Listener):
     """Listener that turns the garbage collector off while numba compiles, which saves time.
 
-    A tenth of the time went into looking at them again and again.
+    The collector would take a tenth of the compilation time, to scan numba's many objects again and again.
     """
 
     def __init__(self) -> None:
         self._lock, self._depth, self._resumes = threading.Lock(), 0, False
 
     def on_start(self, event: Any) -> None:
-        """Turn the garbage collector off when the compilation of a function begins."""
         with self._lock:
             if self._depth == 0:
                 self._resumes = gc.isenabled()
@@ -125,7 +127,6 @@ class _Uncollected(event.Listener):
             self._depth += 1
 
     def on_end(self, event: Any) -> None:
-        """Turn the garbage collector on again when the outermost compilation has ended."""
         with self._lock:
             self._depth -= 1
             if self._depth == 0 and self._resumes:
@@ -135,7 +136,7 @@ class _Uncollected(event.Listener):
 event.register("numba:compiler_lock", _Uncollected())
 
 _PARTS: dict[Any, tuple[Any, Any]] = {}
-"""Parts by what they are made of, each with what must live as long: identities are in its key."""
+"""Compiled parts by template and values. The values are stored as well, since the keys contain their `id`."""
 
 _SIZES = frozenset(
     (
@@ -154,30 +155,30 @@ _SIZES = frozenset(
         "SECTION_OF",
     )
 )
-"""Free names that stand for sizes of a system: a part is compiled once for all values above 0."""
+"""Free names that are sizes of a system: a part is compiled once for all values above 0 (see `linking`)."""
 
 _ARRAYS = frozenset(("IS_ANGLE", "SCALES", "ESCAPE", "DIRECTIONS", "STARTS", "SAME_VALUE"))
-"""Free names that stand for arrays with an entry for each state or event: likewise."""
+"""Free names that are arrays with an entry per state or event: a part is compiled once for all arrays."""
 
 
 def bound_part(template: Callable[..., Any], bindings: Mapping[str, Any], dissolves: bool) -> Any:
-    """Bind the free names of a template and compile it for use by other compiled functions; equal bindings give the
+    """Compile a template, with values for its free names, as a function for compiled callers. Equal values give the
     same function.
 
     Parameters
     ----------
     template
-        A plain function; its free names in `bindings` are bound, the others are its module's. It allocates
-        nothing.
+        A plain function that allocates nothing. Its free names get the values in `bindings`; all others keep those
+        of its module.
     bindings
-        More than it uses may be in there.
+        Values by name; names that the template does not use are ignored.
     dissolves
-        Whether it becomes a part of its callers.
+        Whether the function is inlined into its callers.
 
     Returns
     -------
     PartDispatcher
-        What only compiled functions may call; the plain function where numba is switched off.
+        Function for calls from compiled code; the plain function if numba is switched off.
     """
     names = _names_in(template.__code__)
     used = {name: bindings[name] for name in sorted(names) if name in bindings}
@@ -192,7 +193,7 @@ def _part(template: Callable[..., Any], used: Mapping[str, Any], dissolves: bool
     if _SETTINGS.DISABLE_JIT:
         return specialise(template, "part", **used)
     sizes: dict[str, Any] = {}
-    # how many rows are loaded at once is a type, so that these templates are compiled for each size
+    # the length of the tuple that `load_rows` returns is part of its type: compile these templates for each size
     general = used if "load_rows" in names else {k: _without_size(k, v, names, sizes) for k, v in used.items()}
     digest = _template_digest(template, general, dissolves, names)
     function = specialise(template, digest[:16] if digest else "unkept", **general)
@@ -201,8 +202,8 @@ def _part(template: Callable[..., Any], used: Mapping[str, Any], dissolves: bool
 
 
 def _without_size(name: str, value: Any, names: set[str], sizes: dict[str, Any]) -> Any:
-    """Replace a system size, such as the number of states, by a placeholder and note it in `sizes`; return other values
-    unchanged.
+    """Replace a system size, such as the number of states, by a placeholder and note it in `sizes`; return any other
+    value unchanged.
     """
     if type(value) is int and value > 0 and name in _SIZES:
         sizes[name] = value
@@ -211,7 +212,7 @@ def _without_size(name: str, value: Any, names: set[str], sizes: dict[str, Any])
         sizes[name] = value
         return placeholder_of_array(name, value)
     if name == "ROWS":
-        # of the fields only those that are used: systems that agree in them share the part
+        # only the fields that the template uses: systems with other values in other fields share the part
         fields = [field for field in value._fields if field in names]
         sizes |= {f"{name}.{field}": getattr(value, field) for field in fields}
         return value._replace(**{field: placeholder(f"{name}.{field}") for field in fields})
@@ -224,7 +225,7 @@ def _template_digest(
     """Return a digest of everything that determines the code of a bound template; None for a template from outside the
     package.
 
-    Compiled functions count as where they are found: they are linked, whatever they are.
+    A compiled function that the template calls counts by its name only, since it is linked later.
     """
     if template.__module__.partition(".")[0] != PACKAGE:
         return None
@@ -241,15 +242,14 @@ def _template_digest(
 
 
 def _names_in(code: CodeType) -> set[str]:
-    """Return the global names that a function and its inner functions use."""
     within = (_names_in(c) for c in code.co_consts if isinstance(c, CodeType))
     return set(code.co_names).union(*within)
 
 
 def _identity(value: Any, names: set[str]) -> Any:
-    """Return a hashable key of a value bound to a template; values with equal keys compile to the same code.
+    """Return a hashable key for the value of a template's free name. Values with equal keys compile to the same code.
 
-    Of a tuple with named fields it is the fields that are in `names`: they are looked up by name alone.
+    A named tuple counts by its fields in `names`, the only ones that the code reads.
     """
     if isinstance(value, np.ndarray):
         return value.dtype.str, value.shape, value.tobytes()
@@ -263,18 +263,18 @@ def _identity(value: Any, names: set[str]) -> Any:
 
 
 def is_covered(*functions: Callable[..., Any]) -> bool:
-    """Return whether all functions are defined in ``magpend_core``, so that `source_digest` covers them."""
+    """Return whether all functions are defined in ``magpend_core``, whose sources `source_digest` covers."""
     return all(f.__module__.partition(".")[0] == PACKAGE for f in functions)
 
 
 def keeping(*functions: Callable[..., Any]) -> str | None:
-    """Return the cache key of the machine code that calls `functions`; None if the code must not be cached.
+    """Return the cache key for machine code that calls `functions`; None if the code must not be cached.
 
     Returns
     -------
     str or None
-        Empty if `source_digest` covers them; else a digest of the functions and of all that they reach; None
-        if that cannot be found out: then the code is not kept, since a kept answer could be an old one.
+        Empty if `source_digest` covers the functions; else a digest of the functions and of all that they use. None
+        if this cannot be found out: the code is then not cached, since a cached result could be outdated.
     """
     return "" if is_covered(*functions) else functions_digest(*functions)
 
@@ -282,22 +282,21 @@ def keeping(*functions: Callable[..., Any]) -> str | None:
 def entry(
     template: Callable[..., Any], name: str, bindings: Mapping[str, Any], kept: str | None = ""
 ) -> Callable[..., Any]:
-    """Bind the free names of a template and compile it as a function that Python calls; keep its machine code in the
-    cache.
+    """Fill in a template's free names and compile it as a function that Python can call, with its machine code cached.
 
-    The template becomes a part. What Python calls is one line around it, since numba takes long over code
-    that is reached from Python.
+    The template becomes a part. Python calls a function of one line that calls the part, because numba takes long to
+    compile code that Python can call.
 
     Parameters
     ----------
     template
-        A plain function that allocates nothing; its free names in `bindings` are bound.
+        A plain function that allocates nothing; its free names get the values in `bindings`.
     name
-        Of the system and what is done with it: one name, one content.
+        Name of the system and of the computation; equal names must mean equal code.
     bindings
-        More than the template uses may be in there.
+        Values by name; names that the template does not use are ignored.
     kept
-        See `keeping`; by default the folder that `source_digest` names.
+        Cache key from `keeping`; by default the folder of `source_digest`.
     """
     code = template.__code__
     arguments = ", ".join(code.co_varnames[: code.co_argcount])
@@ -310,7 +309,7 @@ def entry(
 def kernel(function: F, kept: str | None = "") -> F:
     """Compile a function that Python calls, and keep its machine code in the cache folder.
 
-    Pass what `keeping` says of the functions that it calls if some may be from outside the package.
+    If the function calls functions from outside the package, pass the result of `keeping` as `kept`.
     """
     if CACHE_FOLDER is None or kept is None:
         return njit(**OPTIONS, **WITHOUT_C)(function)
@@ -321,16 +320,16 @@ def kernel(function: F, kept: str | None = "") -> F:
 def specialise(template: Callable[..., Any], name: str, **bindings: Any) -> Callable[..., Any]:
     """Return a copy of the function `template` with given values for global names; it is not compiled yet.
 
-    numba inlines jitted functions that it finds as globals, but a function that closes over them
-    can never be found again in the compile cache. So the engine is written once as plain
-    functions with free names, and bound to a system here.
+    numba can inline jitted functions that are globals of their caller. A closure over them would work, too, but numba
+    could not find its code again in the cache. So the engine is written once as plain functions with free names; a
+    copy with other globals is made here for each system.
 
     Parameters
     ----------
     template
         A plain Python function.
     name
-        Suffix that makes the result's qualified name, hence its cache entry, its own.
+        Suffix that makes the qualified name of the copy unique, and so its cache entry.
     bindings
         Values for global names used in `template`.
     """

@@ -1,17 +1,20 @@
 """Integrate many trajectories at once in SIMD lanes, each with its own time, step size and parameters.
 
-Dormand and Prince's methods of order 5 or 8, with error control. Every trajectory owns a lane; `simd.WIDTH`
-lanes form a group, whose numbers lie row by row in one flat array (see `Rows`). One attempted step advances
-all groups; accept or reject is a choice per lane, never a branch. Afterwards a short scalar pass serves
-the lanes at which something happened: the end of a segment between two edges of the forcing, the end
-of a period (then the observer is called), the end of a cell (then the lane is refilled).
+The methods are those of Dormand and Prince, of order 5 or 8, with error control. Every trajectory has a lane;
+`simd.WIDTH` lanes form a group, whose numbers lie row by row in one flat array (see `Rows`). Each pass attempts
+one step in all groups; a step is accepted or rejected lane by lane, by `where_less` and not by a branch. Then a
+short scalar pass serves the lanes in which something happened: the end of a time segment between two forcing
+edges, the end of a period (the observer is called), or the end of a trajectory (the lane gets the next one).
 
-What a lane computes depends on its own inputs alone. Nothing crosses lanes, and no operation's result
-depends on the vector width, so results are the same bits alone or among others, in any order and on
-any CPU.
+The results of a lane depend only on its own inputs. Nothing is exchanged between lanes, and no operation
+depends on the vector width. So a trajectory has the same bits alone or among others, in any order, on any CPU.
 
-The functions here are templates: names in capitals and the system's functions are bound by
-`engine_of`, then compiled.
+The functions here are templates: their free names (names in capitals, functions of the system) get values in
+`engine_bindings`, then `engine_of` compiles them.
+
+Words: a *branch* is a sequence of parameter points, computed one after the other from the last state; a *cell* is
+one parameter point of a branch; an *edge* is an instant at which the forcing switches; a *layer* is a narrow
+region of states in which the right-hand side changes quickly.
 
 Reading order, from the bottom of the file: `advance` is the main loop. `attempt` makes one step of all groups
 (`run_stages`, `choose_step`, `finish_step`). `serve` is the scalar pass over lanes with an event. `start_branch`,
@@ -62,28 +65,28 @@ from magpend_core.engine.watching import (
 )
 from magpend_core.status import Status
 
-ZERO: Any = np.int64(0)  # a plain 0 is a type of its own to numba and compiles every callee once more
+ZERO: Any = np.int64(0)  # numba types a plain 0 as a literal and would compile every callee once more
 
 UNROLLED_STATES = 3
-"""Systems of so many states at most have their stages written out (see `unrolled_stages`)."""
+"""Systems with at most this many states have their stages unrolled (see `unrolled_stages`)."""
 UNROLLED_LENGTH = 3000
-"""So have those of one state more if their right-hand side has at most so many bytes of bytecode."""
+"""So have systems with one state more, if their right-hand side has at most this many bytes of bytecode."""
 
 FADED = 5.1
-"""Distance in half-widths at which a layer that fades is not felt any more, at a `step_ratio` of 1.
+"""Distance [half-widths] beyond which a layer with exponential tails needs no short steps, at a `step_ratio` of 1.
 
-Of a jump J exp(-pi m) is left at m half-widths d. A step of 1000 d that ends there errs by some 1000 J d
-exp(-pi m), which equals slack/1e4, the tolerance, at m = 5.1 - log(slack/(J d))/pi.
+At m half-widths d from the layer, J exp(-pi m) remains of the jump J. A step of length 1000 d that ends there has
+an error of about 1000 J d exp(-pi m). This equals slack/1e4, the tolerance, at m = 5.1 - log(slack/(J d))/pi.
 """
 FIRST_STEP = 1e-3
-"""First step of a branch in drive periods; error control finds the right size within a few steps."""
+"""First step of a branch [drive periods]; error control finds the right size within a few steps."""
 FARTHEST = 1e15
-"""Largest angle [rad]: beyond, neighbouring numbers are so far apart that they are no angle any more."""
+"""Largest angle [rad]; beyond it, float64 numbers are too far apart to be angles."""
 SAFETY = 0.85
 SHRINK = 0.2
 GROW = 5.0
 
-# events that the vector part leaves for the scalar pass
+# codes of the events that the vector part reports to the scalar pass
 NOTHING, REACHED, TOO_MANY_STEPS, UNDERFLOW, DUE, CROSSED = 0.0, 1.0, 2.0, 3.0, 4.0, 5.0
 PENDING, DIVERGED = int(Status.PENDING), int(Status.DIVERGED)
 STEP_LIMIT, STEP_UNDERFLOW = int(Status.STEP_LIMIT), int(Status.STEP_UNDERFLOW)
@@ -92,11 +95,11 @@ ENDS_IN_CHATTER = int(Status.CHATTER)
 
 
 class Rows(NamedTuple):
-    """Offsets of the rows in the work array of a group of SIMD lanes, in float64 numbers from the group's first."""
+    """Offsets of the rows in the work array of one group of SIMD lanes, in float64 numbers from the group's start."""
 
     state: int
     slopes: int  # N_STAGES * n_states rows
-    trial: int  # the stage's state, at the end the new state
+    trial: int  # state at the present stage; after the last stage the new state
     forcing: int  # at the last stage's time
     time: int  # s, since the last section
     wish: int  # s, step size that the error control wants
@@ -115,8 +118,8 @@ class Rows(NamedTuple):
     rejected: int  # rejected attempts in this cell
     attempts: int  # in this period
     event: int
-    halfway: int  # state in the middle of a step, if something is watched
-    begin: int  # watched quantities at the begin of the step, a row each; so below
+    halfway: int  # state in the middle of a step, if quantities are tracked (watched)
+    begin: int  # tracked quantities at the begin of the step, one row each; likewise the next five
     middle: int
     end: int
     lowest: int  # in this period
@@ -128,13 +131,13 @@ class Rows(NamedTuple):
     halfway_events: int  # in the middle of the attempt, if there are surfaces
     side: int  # of each event
     fired: int  # 1 if it happened at the end of the last step
-    dip: int  # share of the attempt at which it may have gone beyond zero and come back, or 2
-    aimed: int  # s, length of the next attempt, if an event decides it
-    ahead: int  # s, from the begin of the step to where `passed` is of
-    resolution: int  # s, of the instant that is looked for; 0 if none is
+    dip: int  # position (0 to 1) in the attempt at which the event function may be below zero, or 2
+    aimed: int  # s, length of the next attempt, if an event determines it
+    ahead: int  # s, from the begin of the step to the end of the attempt in `passed`
+    resolution: int  # s, of the event's instant; 0 if no event is being located
     level: int  # of the section
-    entries: int  # of the Jacobian at each stage but the first, where the engine carries tangent vectors
-    constants: int  # last and in fours, so that systems with few and with some more agree in all other rows
+    entries: int  # Jacobian entries at each stage but the first, if the engine integrates the tangent vectors
+    constants: int  # last, and padded to a multiple of four: more systems then agree in all other offsets
     size: int
 
 
@@ -160,8 +163,8 @@ def rows_of(system: System, n_watched: int = 0) -> Rows:
 
 
 def step_ratio(room: Any) -> Any:
-    """Return the largest step near a layer or forcing edge, relative to the distance from the singularity in the
-    complex plane.
+    """Return the largest safe step near a boundary layer or forcing edge, as a multiple of the distance to the complex
+    singularity.
 
     The right-hand side near a layer behaves like (J/pi) atan(t/d), whose derivatives at a distance R
     from the poles at +-i d grow like J d n!/R^(n+1): a step h = c R leaves an error in proportion to
@@ -171,14 +174,14 @@ def step_ratio(room: Any) -> Any:
 
 
 def choose_step(w: Any, base: int, slack: float) -> None:
-    """Set the size of the next attempted step from error control, layers, forcing edges and events.
+    """Set the size of the next attempted step from error control, boundary layers, forcing edges and events.
 
-    The step is the least of what error control wants and, for each layer and edge, what keeps it in
-    proportion to the distance from the nearest complex singularity: with D the distance in time to
-    the crossing, d the half-width in time and c the layer's `step_ratio`, at most
-    max(c D/(1 + c), c d) towards the crossing and, to 2 %, c sqrt(D^2 + d^2) away from it. Layers that
-    fade are not felt from further away than `FADED`: a step may lead to there, or to a tenth of D. A step
-    ends on the segment's end exactly, and the last two steps before that share the rest.
+    The step is the smallest of several bounds. One is the size that error control allows. Each layer and each edge
+    gives another, in proportion to the distance from its complex singularity. Let D be the time until the state
+    crosses the layer, d its half-width in time, and c its `step_ratio`. Towards the crossing the bound is
+    max(c D/(1 + c), c d), away from it c sqrt(D^2 + d^2), to 2 %. A layer with exponential tails (LAYERS_FADE)
+    matters only within `FADED`: a step may lead up to there, or to a tenth of D. A step ends exactly at the end of
+    its time segment; the last two steps before that are equal.
     """
     t = load(w, base + ROWS.time)
     remaining = load(w, base + ROWS.target) - t
@@ -201,20 +204,20 @@ def choose_step(w: Any, base: int, slack: float) -> None:
 
 
 def limited_by_layers(w: Any, base: int, slack: float, t: Any, h: Any) -> Any:
-    """Return the step size `h`, reduced where the state is near a layer in which the right-hand side changes
-    quickly.
+    """Return the step size `h`, reduced near a boundary layer (a narrow region where the right-hand side changes
+    quickly).
     """
     y = load_rows(w, base + ROWS.state, N_KNOWN)
     dy = load_rows(w, base + ROWS.slopes, N_KNOWN)
     c = load_rows(w, base + ROWS.constants, NC)
-    # the least quotient, kept as one until the end: one division for all layers
+    # the smallest bound is kept as a fraction h/speed_h until the end: one division for all layers
     speed_h = 1.0 + 0.0 * h
     for value, rate, half_width, per_strength in layers_at(t, y, dy, c):
         speed = absolute(rate)
         ratio = step_ratio(slack * speed * per_strength)
         distance = absolute(value)
         nearing = value * rate
-        # the two bounds of the docstring over one common division
+        # the two bounds in the docstring of `choose_step`, as states (not times): `speed` divides at the end
         towards = ratio * maximum(distance, (1.0 + ratio) * half_width)
         away = ratio * hypot_rough(distance, half_width)
         if LAYERS_FADE:
@@ -235,7 +238,7 @@ def run_stage(w: Any, base: int, s: int) -> None:
     h = load(w, base + ROWS.step)
     for i in range(N_KNOWN):
         row = base + i * WIDTH
-        # named: written out, the first sum has a product on either side, in a loop on one
+        # the first product has a variable of its own: `fusing` then fuses the same products as in the unrolled form
         total = STAGES[s, 0] * load(w, row + ROWS.slopes)
         for j in range(1, s):
             total = multiply_add(STAGES[s, j], load(w, row + ROWS.slopes + j * N * WIDTH), total)
@@ -243,12 +246,12 @@ def run_stage(w: Any, base: int, s: int) -> None:
     if NODES[s] != NODES[s - 1]:
         c = load_rows(w, base + ROWS.constants, NC)
         store(w, base + ROWS.forcing, forcing(load(w, base + ROWS.time) + NODES[s] * h, c))
-    # read after the last store, so that they can be operands in memory instead of spilled registers
+    # load the constants after the last store: LLVM can then use them from memory instead of spilling registers
     c = load_rows(w, base + ROWS.constants, NC)
     y, u = load_rows(w, base + ROWS.trial, N_KNOWN), load(w, base + ROWS.forcing)
     slopes = rhs(y, u, c)
     if CARRIES:
-        # before the store, so that both share what they compute
+        # before the store of the slopes, so that LLVM can share subexpressions of `rhs` and the Jacobian
         entries = tangent_entries(y, u, c)
         store_rows(w, base + ROWS.entries + (s - 1) * N_ENTRIES * WIDTH, entries)
     store_rows(w, base + ROWS.slopes + s * N * WIDTH, slopes)
@@ -263,8 +266,8 @@ def run_stages(w: Any, base: int) -> None:
 def unrolled_stages(system: System) -> Callable[..., None]:
     """Return `run_stages` for a small system, with its loops written out.
 
-    The slopes stay in registers, the tableau's zeros cost nothing. Not for larger systems: many
-    copies of a long right-hand side compile for long and gain little.
+    The slopes stay in registers, and zeros of the tableau cost nothing. For larger systems, many copies of a long
+    right-hand side would take long to compile and gain little.
     """
     n, tableau = system.n_states, system.tableau
     nodes, stages = tableau.nodes, tableau.stages
@@ -314,8 +317,8 @@ def squared_error(w: Any, base: int, rtol: float, atol: float) -> Any:
 def squared_error_of_two(w: Any, base: int, rtol: float, atol: float) -> Any:
     """Return the mean square of the scaled error of an attempted step, from estimates of two orders.
 
-    With mean squares E and F of the higher and the lower, E**2/(E + F/100): Hairer, Norsett and Wanner,
-    Solving Ordinary Differential Equations I, section II.10.
+    With the mean squares E (higher order) and F (lower order), the result is E**2/(E + F/100): Hairer, Norsett and
+    Wanner, Solving Ordinary Differential Equations I, section II.10.
     """
     total, other_total = 0.0 * load(w, base + ROWS.step), 0.0 * load(w, base + ROWS.step)
     for i in range(N_CONTROLLED):
@@ -337,7 +340,8 @@ def squared_error_of_two(w: Any, base: int, rtol: float, atol: float) -> Any:
 
 
 def finish_step(w: Any, base: int, rtol: float, atol: float, max_attempts: float) -> bool:
-    """Accept or reject the attempted step lane by lane, and set the next step size and the event of each lane.
+    """Accept or reject the attempted step in each SIMD lane. Set the next step size and the code of the event, if any,
+    at the step's end.
 
     Return whether a lane of the group has an event.
     """
@@ -350,8 +354,8 @@ def finish_step(w: Any, base: int, rtol: float, atol: float, max_attempts: float
     t = load(w, base + ROWS.time)
     target = load(w, base + ROWS.target)
     rejected = where_less(1.0, e2, 1.0, 0.0)
-    # an attempt cut short by a layer or a target: the old wish stands unless the error says that
-    # it is too much, or allows more
+    # a step shorter than error control allowed (`wish`), because of a layer or a segment's end: keep the wish,
+    # unless the error shows that it is too long or could be longer
     next_wish = where_less(h, wish, minimum(h * factor, maximum(wish, h * bounded)), h * bounded)
     next_wish = where_less(0.5, rejected, h * bounded, next_wish)
     stepped = where_less(0.0, h, 1.0, 0.0)
@@ -364,7 +368,7 @@ def finish_step(w: Any, base: int, rtol: float, atol: float, max_attempts: float
             rejected = maximum(rejected, hides)
         verdict = judge_events(w, base, rejected)
         taken_back = where_less(absolute(verdict - TAKE_BACK), 0.5, 1.0, 0.0)
-        # the length of an attempt to an event says nothing of what error control allows
+        # the length of an attempt that ends at an event does not tell which length error control allows
         as_before = maximum(taken_back, where_less(0.0, aimed, 1.0 - rejected, 0.0))
         next_wish = where_less(0.5, as_before, wish, next_wish)
         rejected = maximum(rejected, taken_back)
@@ -379,7 +383,7 @@ def finish_step(w: Any, base: int, rtol: float, atol: float, max_attempts: float
     arrived = where_less(h, target - t, 0.0, 1.0 - rejected)
     t_new = where_less(0.5, arrived, target, t + h)
     store(w, base + ROWS.time, where_less(0.5, rejected, t, t_new))
-    # an attempt too short to be one counts, or a lane that cannot move would stay for ever
+    # count attempts of length 0, too; otherwise a lane whose time does not advance would never end
     attempts = load(w, base + ROWS.attempts) + (1.0 - load(w, base + ROWS.fresh))
     store(w, base + ROWS.attempts, attempts)
     store(w, base + ROWS.steps, load(w, base + ROWS.steps) + stepped * (1.0 - rejected))
@@ -405,8 +409,8 @@ def attempt(
 ) -> None:
     """Attempt one step in all groups of SIMD lanes.
 
-    `events` says afterwards which have a lane with an event; `n_watching` holds the number of lanes
-    of each that are in a period whose extremes are wanted.
+    Write to `events`, per group, whether one of its lanes has an event. `n_watching` holds, per group, the number of
+    lanes whose quantities are tracked in the present period.
     """
     for group in range(n_groups):
         base = group * ROWS.size
@@ -422,7 +426,7 @@ def attempt(
 def load_cell(
     w: Any, base: int, lane: int, frequency: float, p: Any, slack: float, scratch: Any, edge_table: Any
 ) -> None:
-    """Load the constants and forcing edges of a parameter point into a SIMD lane; the state stays."""
+    """Load the constants and forcing edges of a parameter point into a SIMD lane; leave the lane's state unchanged."""
     constants(frequency, p, scratch)
     for i in range(N_OWN):
         w[base + ROWS.constants + i * WIDTH + lane] = scratch[i]
@@ -439,14 +443,14 @@ def load_cell(
 
 
 def begin_period(w: Any, base: int, lane: int, edge_table: Any) -> int:
-    """Set a lane's time to the start of a drive period; return the number of the forcing edge that ends its first
-    segment.
+    """Set the time of a SIMD lane to 0, the start of a drive period; return the index of the forcing edge to integrate
+    to.
     """
     w[base + ROWS.time + lane] = 0.0
     w[base + ROWS.attempts + lane] = 0.0
-    # the last slope belongs to time `period`, where the forcing can differ from that at time 0 by its
-    # rounding: a branch continued from here by a later call starts from the latter. After a crossing it is
-    # that of the same state; but a watch that begins now needs values there
+    # The last slope was computed at time `period`, where the forcing differs by rounding from time 0. Compute it
+    # again, so that a later call that continues this branch has the same bits. After a level crossing the slope
+    # does not change; then it is computed again only if quantities are tracked, which need values here.
     if WATCHES or not HAS_SECTION:
         w[base + ROWS.fresh + lane] = 1.0
     if NE > 0 and edge_table[0, 0] == 0.0:
@@ -457,8 +461,8 @@ def begin_period(w: Any, base: int, lane: int, edge_table: Any) -> int:
 
 
 def set_target(w: Any, base: int, lane: int, time: float, edge_table: Any, edge: int) -> None:
-    """Let a SIMD lane's time segment end at `time`, at the forcing edge number `edge`; ``edge = n_edges`` stands for no
-    edge.
+    """Set the end of a SIMD lane's present time segment: forcing edge `edge` at `time`, or no edge if ``edge =
+    n_edges``.
     """
     w[base + ROWS.target + lane] = time
     w[base + ROWS.target_width + lane] = edge_table[1, edge] if edge < NE else np.inf
@@ -468,8 +472,8 @@ def set_target(w: Any, base: int, lane: int, time: float, edge_table: Any, edge:
 
 
 def begin_segment(w: Any, base: int, lane: int, edge_table: Any, edge: int) -> int:
-    """Let a SIMD lane integrate on, from the end of its last time segment to forcing edge number `edge` or to the end
-    of the period.
+    """Begin the next time segment of a SIMD lane, up to forcing edge `edge` or, with ``edge = n_edges``, the period's
+    end.
     """
     w[base + ROWS.start + lane] = w[base + ROWS.target + lane]
     w[base + ROWS.start_width + lane] = w[base + ROWS.target_width + lane]
@@ -484,7 +488,7 @@ def begin_segment(w: Any, base: int, lane: int, edge_table: Any, edge: int) -> i
     if edge < NE:
         set_target(w, base, lane, edge_table[0, edge], edge_table, edge)
         return edge
-    # the next period starts with edge 0 if that is at time 0
+    # the segment ends with the period; at this instant edge 0 follows, if that is at time 0
     first = ZERO if NE > 0 and edge_table[0, 0] == 0.0 else ZERO + NE
     set_target(w, base, lane, w[base + ROWS.period + lane], edge_table, first)
     return NE
@@ -509,7 +513,7 @@ def take_section(w: Any, base: int, lane: int, section: Any, turns: Any) -> bool
         if good and IS_ANGLE[i] == 1 and not (-math.pi < x <= math.pi):
             n = math.ceil((x - math.pi) / TWO_PI)
             x -= n * TWO_PI
-            # rounding can leave x on the wrong side of the cut
+            # rounding can leave x at or below -pi
             if x <= -math.pi:
                 x = math.pi
             turns[i] += n
@@ -564,16 +568,16 @@ class Cells(NamedTuple):
     state: Any  # (branch, n_states): initial, at the end final
     step_size: Any  # (branch,): initial [s] or 0, at the end the next
     turns: Any  # int64 (branch, n_states): at the end the turns since the start
-    final_state: Any  # (..., n_states), in which a cell ended; NaN where none began
-    next_step: Any  # s, step size with which the branch goes on from there; NaN where it does not
+    final_state: Any  # (..., n_states), last state of each cell; NaN for a cell that was not reached
+    next_step: Any  # s, step size to continue with from there; NaN after a failure
     section: Any  # (..., n_keep, n_states)
     measures: Any  # (..., n_measures)
     status: Any  # int64
     n_periods: Any  # int64
     n_steps: Any  # int64, accepted
     n_rejected: Any  # int64
-    watched: Any  # (..., n_keep, n_watched, 3), see `watching`; no numbers where nothing is watched
-    return_times: Any  # (..., n_keep), s, of a kept section since the last; no numbers without crossings
+    watched: Any  # (..., n_keep, n_watched, 3), see `watching`; size 0 if nothing is tracked
+    return_times: Any  # (..., n_keep), s, time since the previous section; size 0 for a stroboscopic section
 
 
 def start_branch(cells: Cells, work: Work, lane: int, branch: int, settings: Any, scratch: Any) -> None:
@@ -585,7 +589,7 @@ def start_branch(cells: Cells, work: Work, lane: int, branch: int, settings: Any
         work.turns[lane, i] = 0
     work.branch[lane] = branch
     start_point(cells, work, lane, ZERO, settings, scratch)
-    # angles come in as given; from here on they are in (-pi, pi] at every section
+    # the given angles are not wrapped; from here on they lie in (-pi, pi] at every section
     take_section(work.lanes, base, column, scratch, work.turns[lane])
     given = cells.step_size[branch]
     cautious = FIRST_STEP * work.lanes[base + ROWS.period + column]
@@ -614,12 +618,12 @@ def start_point(cells: Cells, work: Work, lane: int, point: int, settings: Any, 
 
 
 def has_failed(status: int) -> bool:
-    """Return whether a status means that the trajectory failed and its sections must not be used."""
+    """Return whether a status means that the trajectory failed and its section points must not be used."""
     return status == DIVERGED or status == STEP_LIMIT or status == STEP_UNDERFLOW or status == ENDS_IN_CHATTER
 
 
 def forget(cells: Cells, branch: int, point: int) -> None:
-    """Set the recorded sections of a failed trajectory to NaN."""
+    """Set the recorded section points of a failed trajectory to NaN."""
     for i in range(cells.section.shape[2]):
         for k in range(N):
             cells.section[branch, point, i, k] = np.nan
@@ -659,9 +663,7 @@ def end_branch(cells: Cells, work: Work, lane: int, status: int) -> None:
 
 
 def serve(cells: Cells, work: Work, lane: int, settings: Any, section: Any, scratch: Any) -> bool:
-    """Handle what ended a SIMD lane's integration (end of a segment or period, or a failure); return whether its branch
-    has ended.
-    """
+    """Handle the end of a SIMD lane's segment or period, or its failure. Return whether the lane's branch has ended."""
     w, base, column = work.lanes, (lane // WIDTH) * ROWS.size, lane % WIDTH
     event = w[base + ROWS.event + column]
     w[base + ROWS.event + column] = NOTHING
@@ -706,7 +708,7 @@ def serve(cells: Cells, work: Work, lane: int, settings: Any, section: Any, scra
                 begin_watch(work, lane, keeps_next(work.i_period[lane], work.memory[lane], settings))
             return False
     elif not in_bounds(w, base, column):
-        # a blow-up within a period shrinks the step before a section could show it
+        # a divergent trajectory ends with too short steps, before a section could show the divergence
         status = DIVERGED
     elif event == REACHED:
         status = NO_RETURN
@@ -765,10 +767,10 @@ def advance(
     `cells`.
     """
     n_branches = cells.frequency.shape[0]
-    # a field of a tuple is counted by an atomic operation at every use: too slow per lane
+    # local names: numba counts references of a tuple's field atomically at every use, too slow per lane
     rows, events, scratch, section = work.lanes, work.events, work.scratch, work.section
     for lane in range(len(work.branch)):
-        # lanes beyond the last branch repeat it, so that they hold ordinary numbers; no one looks
+        # spare lanes of the last group repeat the last branch, so that they hold valid numbers; nothing reads them
         branch = lane if lane < n_branches else n_branches - 1
         start_branch(cells, work, lane, branch, settings, scratch)
     next_branch = active
@@ -789,7 +791,7 @@ def advance(
                     next_branch += 1
                     lane += 1
                 else:
-                    # the last lane moves here, with its event if it has one
+                    # no branch is left for this lane: move the last active lane here and serve it next
                     active -= 1
                     copy_lane(work, active, lane)
                     last = last if last < active else active
@@ -855,7 +857,7 @@ def _name(system: System, observer: Observer, watched: tuple[int, ...]) -> str:
 
 
 def _layers_at(system: System) -> Callable[..., Any]:
-    """Return ``system.layers`` as a function that also takes the time, as its first argument."""
+    """Return ``system.layers`` with the time as an additional first argument."""
     rates = "dy + (t,)" if system.timed_layers else "dy"
     scope: dict[str, Any] = {"__name__": system.rhs.__module__, "_layers": system.layers}
     exec(f"def layers_at(t, y, dy, c):\n    return _layers(y, {rates}, c)\n", scope)
@@ -863,9 +865,7 @@ def _layers_at(system: System) -> Callable[..., Any]:
 
 
 def engine_bindings(system: System, observer: Observer, watched: tuple[int, ...] = ()) -> dict[str, Any]:
-    """Return the values, for a given system and observer, of the global names that the function templates of this
-    module leave open.
-    """
+    """Return the values of this module's free global names (such as ``N``, ``rhs``) for a system and an observer."""
     bindings: dict[str, Any] = {
         "ROWS": rows_of(system, len(watched)),
         "WATCHES": len(watched) > 0,
@@ -929,7 +929,7 @@ def engine_bindings(system: System, observer: Observer, watched: tuple[int, ...]
 def engine_of(system: System, observer: Observer, watched: tuple[int, ...] = ()) -> Callable[..., None]:
     """Compile `advance` for a system, an observer, and the quantities whose minimum, maximum and mean are recorded.
 
-    Those are given by their numbers in ``system.state_names + system.quantity_names``.
+    `watched` holds their indices in ``system.state_names + system.quantity_names``.
     """
     return _engine_of(system, observer, watched)
 

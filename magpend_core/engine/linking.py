@@ -1,9 +1,9 @@
-"""Link the LLVM code of an engine's precompiled functions (parts); system sizes get their values at link time.
+"""Link the precompiled functions (parts) of an engine as LLVM code, and set system sizes such as the number of states.
 
-A *size* of a system, such as the number of its states, is a constant without a value in the code of a part.
-While numba compiles the part, an integer that occurs nowhere else stands for it (`placeholder`). In the LLVM
-code that becomes a load from a constant with a name (`sizes_as_loads`). The engine's library defines the
-constants, and LLVM folds them as if the numbers had been written in the source.
+A *size* of a system, such as the number of its states, is a constant whose value the code of a part does not contain.
+While numba compiles the part, a unique integer stands for it (`placeholder`). In the LLVM code this integer is
+replaced by a load from a named constant (`sizes_as_loads`). The engine's library defines the constants, and LLVM then
+optimises the code as if the numbers stood in the source.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from magpend_core.engine.fusing import FusedLibrary, fuse_products
 _PLACEHOLDER = 0x6D61_6770_0000_0000
 """Placeholders are integers from here on; no template contains numbers of this size."""
 _PLACEHOLDER_BYTES = "pgam" if sys.byteorder == "little" else "magp"
-"""What tells a placeholder among the bytes of an array."""
+"""Bytes by which a placeholder is recognised in the LLVM text of an array."""
 _ARRAY = re.compile(r'(?m)^((@"\.const\.array\.data[^"]*") = internal constant \[8 x i8\] c"([^"]*)".*$)')
 _NAMES: dict[str, int] = {}
 _SYMBOL = "magpend.size."
@@ -60,12 +60,12 @@ class PartLibrary(FusedLibrary):
         self.add_llvm_module(module)
 
     def finalize(self) -> None:
-        """Link in the libraries that are not engine parts, such as numba's ``max``; the engine's library links the
-        parts later.
+        """Link numba's own libraries (such as that of ``max``) into this part. Other parts are linked later, into the
+        engine's library.
         """
         own = _defined(self._final_module)
         for library in dict.fromkeys(self._linking_libraries):
-            # the other library that is no part counts references, of which there are none here
+            # "nrt" is numba's library for reference counts, which parts do not use
             if not isinstance(library, PartLibrary) and library.name != "nrt":
                 self._final_module.link_in(library._get_module_for_linking(), preserve=True)
         _hide_others(self._final_module, own)
@@ -73,7 +73,7 @@ class PartLibrary(FusedLibrary):
         self._finalized = True
 
     def get_pointer_to_function(self, name: str) -> int:
-        """Return 0 for every name: a part has no machine code to point to."""
+        """Return 0 as the address of every function, because a part has no machine code."""
         self._ensure_finalized()
         return 0
 
@@ -91,7 +91,9 @@ class PartLibrary(FusedLibrary):
 
 
 class _NoMachineCode:
-    """Wrapper of numba's code generator for LLVM code that is not machine code yet: it forwards all but `set_env`."""
+    """Wrapper of numba's code generator for LLVM code that is not machine code yet. It forwards all calls but
+    `set_env`.
+    """
 
     def __init__(self, codegen: Any) -> None:
         self._codegen = codegen
@@ -112,7 +114,8 @@ class EntryLibrary(FusedLibrary):
         """Link the precompiled functions (parts), define the size constants, optimise, and generate machine code."""
         own = _defined(self._final_module)
         _link(self._final_module, self)
-        # Parts of two engines have the same names, and other contents. The JIT would take the first for both.
+        # Parts of two engines have equal names but different code. If they were public, the JIT would use the first
+        # part for both engines.
         _hide_others(self._final_module, own)
         self._linking_libraries = []
         super().finalize()
@@ -121,8 +124,8 @@ class EntryLibrary(FusedLibrary):
         """Skip the optimisation of single functions: the later pass over the whole module does it all."""
 
     def _optimize_final_module(self) -> None:
-        # Lanes are vectors already, and loops over states are short. numba's two rounds at level 3 with a
-        # search for vectors take three times as long, and gain nothing (`tests/bench/kernel.py`).
+        # The code consists of vector operations already, and loops over states are short. numba's two rounds at
+        # level 3 with vectorisation take three times as long and gain nothing (`tests/bench/kernel.py`).
         options = {"opt": 1, "loop_vectorize": False, "slp_vectorize": False}
         passes, builder = self._codegen._module_pass_manager(**options)
         passes.run(self._final_module, builder)
@@ -141,7 +144,7 @@ def _hide_others(module: Any, own: set[str]) -> None:
 
 
 def _link(module: Any, library: Any) -> None:
-    """Link an LLVM module with all libraries that it depends on, and define the size constants that these use."""
+    """Link an LLVM module with all libraries that it uses, and add the size constants of its system."""
     sizes: dict[str, Any] = dict(library.dispatcher.sizes) if isinstance(library, PartLibrary) else {}
     for reached_one in _reached_libraries(library):
         if isinstance(reached_one, PartLibrary):
@@ -190,8 +193,8 @@ def placeholder_of_array(name: str, array: np.ndarray) -> np.ndarray:
 
 
 def sizes_as_loads(module: ir.Module) -> None:
-    """Replace placeholders of system sizes in an LLVM module by loads from named constants, defined when it is
-    linked.
+    """Replace each placeholder integer in an LLVM module by a load from a named constant, which the linker defines
+    later.
     """
     names = {value: name for name, value in _NAMES.items()}
     for function in module.functions:
@@ -200,9 +203,7 @@ def sizes_as_loads(module: ir.Module) -> None:
 
 
 def _arrays_by_name(text: str) -> str:
-    """Replace the arrays that serve as placeholders in LLVM text by references to named constants, defined when the
-    code is linked.
-    """
+    """Replace placeholder arrays in LLVM text by references to named constants, which the linker defines later."""
     names = {number: name for name, number in _NAMES.items()}
     used: set[str] = set()
     for definition, symbol, content in _ARRAY.findall(text):
@@ -233,7 +234,7 @@ def _load_sizes(module: ir.Module, function: ir.Function, names: Mapping[int, st
             if known is None:
                 known = ir.GlobalVariable(module, ir.IntType(64), symbol)
                 known.global_constant = True
-            # at the function's begin, where it comes before each use
+            # load at the start of the function, before every use
             builder = ir.IRBuilder(function.entry_basic_block)
             builder.position_at_start(function.entry_basic_block)
             loads[name] = builder.load(known)

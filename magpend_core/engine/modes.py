@@ -1,13 +1,14 @@
 """Apply events to a trajectory: change the modes of switches, apply impact maps to states and tangent vectors.
 
-Templates for the engine's scalar pass, see `lanes`; they run once per event, on plain numbers of one lane.
+These templates belong to the engine's scalar pass, see `lanes`: they run once per event, on plain numbers of one
+lane.
 
-At a switch the right-hand side changes from f- to f+. If both sides point to the surface, the trajectory
-slides along it (Filippov): the mode is 0 until the equivalent control leaves its bounds. A tangent vector v
-changes by the saltation matrix, v + (f+ - f-) (grad g . v)/(dg/dt-), where g is the event's function; at an
-impact with the map R it becomes R'(v + f- s) - f+ s with s = -(grad g . v)/(dg/dt-), the shift of the
-impact's time (di Bernardo et al., Piecewise-smooth Dynamical Systems, Springer 2008, section 2.5). R' is a
-difference of order four, exact for maps up to the fourth power.
+At a switch the right-hand side changes from f- to f+. If f on both sides points to the surface, the trajectory
+slides along it (Filippov): the mode is 0 until the equivalent control leaves its bounds. With the event function
+g, a tangent vector v becomes v + (f+ - f-) (grad g . v)/(dg/dt-) (saltation matrix). At an impact with the map R
+it becomes R'(v + f- s) - f+ s, where s = -(grad g . v)/(dg/dt-) is the shift of the impact time (di Bernardo et
+al., Piecewise-smooth Dynamical Systems, Springer 2008, section 2.5). R' is a finite difference of order four,
+exact for polynomial maps up to degree four.
 
 Reading order: `act_on_events` is called by `lanes.serve`. It finds the event that happened, then switches a mode or
 applies an impact, and corrects the tangent vectors.
@@ -25,35 +26,35 @@ from magpend_core.engine.tangents import DIVERGENCE
 from magpend_core.engine.vecmath import log
 
 STEP = 1e-3
-"""Step of the differences of an impact's map, in units of the states' scales."""
+"""Step of the finite differences of an impact map, in units of the states' scales."""
 
 NEAR = 1e-12
-"""An impact that leaves its function within this distance of zero, in units of rate and period, leaves it at zero."""
+"""After an impact, an event function closer to zero than this (times rate and period) counts as zero."""
 
 AWAY = 1e-7
-"""A switch further from zero after an edge, in units of its rate and the period, is not on its surface."""
+"""After a forcing edge, a switch further from zero than this (times rate and period) has left its surface."""
 
 CHATTERED = 6.0
-"""Code of an event, like `lanes.NOTHING`: the impacts chatter, and the lane's cell ends."""
+"""Event code, like `lanes.NOTHING`: the impacts chatter, and the trajectory ends."""
 
 CHATTER, LEAST_LOSS = 1e-6, 0.3
-"""A flight between impacts that is shorter than the product of both numbers [periods] counts as the last of
-infinitely many. If an impact takes a larger share of the speed than `LEAST_LOSS`, its own share is the factor.
+"""Chatter begins at a flight between impacts shorter than ``CHATTER * max(loss, LEAST_LOSS)`` [periods].
 
-The rest of the series then lasts for 1e-6 periods, or longer if less speed is lost.
+The loss is the fraction of the speed that an impact takes. All later flights together then last for about
+1e-6 periods, or longer if the loss is below `LEAST_LOSS`.
 """
 
 ELASTIC = 1e-9
-"""An impact that takes less than this share of the speed counts as elastic."""
+"""An impact that takes less than this fraction of the speed counts as elastic."""
 
 LOOK = 1e-6
-"""Step of the difference that gives a second derivative [periods]."""
+"""Time step of the finite difference for a second derivative [periods]."""
 
 AT_REST = 1e-5
-"""A state begins at rest on a surface that it would fall on within this time [periods]."""
+"""A state rests on a surface at the start if it would fall onto it within this time [periods]."""
 
 LEAST_VOLUME = 1e-300
-"""Factor by which volumes count as changed where they vanish: where a trajectory begins to slide."""
+"""Least change of a volume, so that its logarithm is finite where it vanishes: where a trajectory begins to slide."""
 
 
 def _numbers(n: int) -> Callable[..., Any]:
@@ -65,7 +66,7 @@ def _numbers(n: int) -> Callable[..., Any]:
 
 
 def _reset_along(system: System, n: int) -> Callable[..., Any]:
-    """Return a function that applies an impact map at a point on a line through a state and a time."""
+    """Return a function that applies the impact maps to the state ``y + s*dy`` at the time ``t + s*dt``."""
     line = "".join(f"y[{i}] + s * dy[{i}], " for i in range(n))
     scope: dict[str, Any] = {"__name__": system.rhs.__module__, "_reset": system.reset}
     exec(f"def reset_along(k, t, y, c, dt, dy, s):\n    return _reset(k, t + s * dt, ({line}), c)\n", scope)
@@ -73,9 +74,7 @@ def _reset_along(system: System, n: int) -> Callable[..., Any]:
 
 
 def mode_bindings(system: System) -> dict[str, Any]:
-    """Return the values, for a given system, of the global names that the function templates of this module leave
-    open.
-    """
+    """Return the values of this module's free global names (such as ``N_VECTORS``) for a system."""
     base = system.tangents_of or system
     has_divergence = system.tangents_of is not None and system.state_names[-1] == DIVERGENCE
     n_vectors = (system.n_states - has_divergence) // base.n_states - 1
@@ -96,7 +95,7 @@ def mode_bindings(system: System) -> dict[str, Any]:
         "ZEROS": (0.0,) * system.known,
         "N_BASE": base.n_states,
         "N_VECTORS": n_vectors,
-        # with unit vectors, where the change of volumes is wanted
+        # the unit vectors are needed only for the change of volumes
         "N_THROUGH": n_vectors + (base.n_states if has_divergence else 0),
         "HAS_DIVERGENCE": has_divergence,
         "lane_states": _numbers(system.known),
@@ -124,8 +123,8 @@ def lane_rates(w: Any, base: int, lane: int) -> Any:
 
 
 def seat_switches(w: Any, base: int, lane: int, given: bool) -> None:
-    """Set each switch mode by the side of the surface on which the state lies; on the surface itself it becomes 1, or
-    stays if `given`.
+    """Set the mode of each switch to the sign of its event function, +1 or -1. Where the sign is 0, set +1, or keep the
+    mode if `given`.
     """
     for k in range(N_SWITCHES):
         mode = base + ROWS.constants + (N_OWN + k) * WIDTH + lane
@@ -140,7 +139,7 @@ def seat_switches(w: Any, base: int, lane: int, given: bool) -> None:
 
 
 def gradient_along(w: Any, base: int, lane: int, k: int, vector: Any) -> float:
-    """Return the derivative of event function `k` along a change `vector` of the states."""
+    """Return the derivative of event function `k` in the direction `vector` of state space."""
     at_rest = lane_pairs(w, base, lane, ZEROS)
     return lane_pairs(w, base, lane, vector)[2 * k + 1] - at_rest[2 * k + 1]
 
@@ -152,7 +151,9 @@ def switch_rate(w: Any, base: int, lane: int, k: int, side: float) -> float:
 
 
 def next_mode(w: Any, base: int, lane: int, k: int, mode: float) -> float:
-    """Return the mode of switch `k` after its event: 1, -1, or 0 while it slides."""
+    """Return the mode of switch `k` after its event: +1 or -1 for the side of the switching surface, 0 for sliding
+    along it.
+    """
     if not SLIDES[k]:
         return -mode
     above, below = switch_rate(w, base, lane, k, 1.0), switch_rate(w, base, lane, k, -1.0)
@@ -168,7 +169,7 @@ def next_mode(w: Any, base: int, lane: int, k: int, mode: float) -> float:
 
 
 def keep_switches(w: Any, base: int, lane: int) -> None:
-    """Correct the switch modes after an edge of the forcing, where event values and forces can jump."""
+    """Correct the modes of all switches after a forcing edge, where event functions and their rates can jump."""
     pairs = lane_pairs(w, base, lane, lane_states(w, base + ROWS.state + lane))
     for k in range(N_SWITCHES):
         own = base + ROWS.constants + (N_OWN + k) * WIDTH + lane
@@ -189,7 +190,7 @@ def keep_switches(w: Any, base: int, lane: int) -> None:
 
 
 def begin_events(w: Any, base: int, lane: int) -> None:
-    """Clear the event data of a SIMD lane, set its switch modes from its states, and find the surfaces it rests on."""
+    """Reset the event data of a SIMD lane; set the modes of its switches and its resting contacts from its state."""
     for k in range(N_EVENTS):
         w[base + ROWS.side + k * WIDTH + lane] = 0.0
         w[base + ROWS.fired + k * WIDTH + lane] = 0.0
@@ -204,7 +205,9 @@ def begin_events(w: Any, base: int, lane: int) -> None:
 
 
 def contact_row(base: int, lane: int, k: int) -> int:
-    """Return the index of the contact mode (0 at rest, else 1) of impact `k` in the engine's work array."""
+    """Return the work-array index of the contact mode of impact `k`. The mode is 0 while the state rests on the impact
+    surface, else 1.
+    """
     return base + ROWS.constants + (N_OWN + N_SWITCHES + k) * WIDTH + lane
 
 
@@ -225,19 +228,21 @@ def bend(w: Any, base: int, lane: int, event: int) -> float:
 
 
 def is_chatter(w: Any, base: int, lane: int, k: int, arriving: float) -> bool:
-    """Return whether an impact at speed `arriving` starts an infinite sequence of impacts that ends almost at once."""
+    """Return whether an impact at speed `arriving` begins chatter: ever smaller bounces that soon end."""
     event = N_SWITCHES + k
     leaving = -DIRECTIONS[event] * lane_pairs(w, base, lane, lane_rates(w, base, lane))[2 * event + 1]
     if not (abs(leaving) < arriving and leaving > -ELASTIC * arriving):
         return False
     lost = 1.0 - max(leaving, 0.0) / arriving
     pushes = DIRECTIONS[event] * bend(w, base, lane, event)
-    flight = 2.0 * max(leaving, 0.0)  # times what pushes
+    flight = 2.0 * max(leaving, 0.0)  # flight time, multiplied by the acceleration `pushes`
     return lost > ELASTIC and flight < CHATTER * max(lost, LEAST_LOSS) * w[base + ROWS.period + lane] * pushes
 
 
 def rest_on(w: Any, base: int, lane: int, k: int) -> None:
-    """Put a trajectory at rest on the surface of impact `k`; end it if it rests on another that excludes this one."""
+    """Bring a trajectory to rest on the surface of impact `k`. End it if it already rests on a surface that excludes
+    this one.
+    """
     for i in range(N_IMPACTS):
         if i != k and STICKS[k] == 2 and STICKS[i] == 2 and w[contact_row(base, lane, i)] == 0.0:
             w[base + ROWS.event + lane] = CHATTERED
@@ -263,19 +268,16 @@ def hold_on(w: Any, base: int, lane: int, k: int) -> None:
 
 
 def hold_contacts(w: Any, base: int, lane: int) -> None:
-    """Move the states of a resting trajectory back onto the surfaces that rounding and step errors have moved them
-    off.
-    """
+    """Move a resting state back onto its contact surfaces, to remove the drift from rounding and step errors."""
     for k in range(N_IMPACTS):
         if STICKS[k] > 0 and w[contact_row(base, lane, k)] == 0.0:
             hold_on(w, base, lane, k)
 
 
 def seat_contacts(w: Any, base: int, lane: int, begins: bool) -> None:
-    """Let a trajectory rest on each impact surface that it is pressed against without moving and where it rested
-    before.
+    """Test for each impact surface whether the trajectory rests on it, and set the contact mode.
 
-    At the begin of a cell, `begins`, on any.
+    With `begins` (start of a parameter point), test every surface, else only those of earlier rest.
     """
     for k in range(N_IMPACTS):
         mode, event = contact_row(base, lane, k), N_SWITCHES + k
@@ -312,7 +314,7 @@ def turn_switch(w: Any, base: int, lane: int, k: int) -> None:
             for i in range(N_BASE):
                 w[base + ROWS.state + (N_BASE * (1 + j) + i) * WIDTH + lane] += (after[i] - before[i]) * share
         if HAS_DIVERGENCE:
-            # the determinant of the saltation matrix is the quotient of the rates of the same function
+            # the determinant of the saltation matrix is the ratio of the event function's rates after and before
             w[own] = mode
             quotient = lane_pairs(w, base, lane, after)[2 * k + 1] / rate if rate != 0.0 else 1.0
             w[own] = new
@@ -321,7 +323,7 @@ def turn_switch(w: Any, base: int, lane: int, k: int) -> None:
 
 
 def vector_row(base: int, lane: int, j: int) -> int:
-    """Return the work array's first row of vector `j` of those mapped at an impact: tangent vectors first, then unit
+    """Return the work-array index of vector `j` to be mapped at an impact: first the tangent vectors, then unit
     vectors.
     """
     if j < N_VECTORS:
@@ -330,8 +332,8 @@ def vector_row(base: int, lane: int, j: int) -> int:
 
 
 def map_vector(w: Any, base: int, lane: int, k: int, at: int, shift: float, t: float, y: Any) -> None:
-    """Replace the vector stored from row `at` by its image under the linearised map `k` (an impact, or coming to rest);
-    `shift` is its time shift.
+    """Replace a tangent vector (stored at `at`) by its image under the linearised impact map `k`, by finite
+    differences.
     """
     c, size = lane_constants(w, base + ROWS.constants + lane), 0.0
     for i in range(N_BASE):
@@ -345,7 +347,7 @@ def map_vector(w: Any, base: int, lane: int, k: int, at: int, shift: float, t: f
 
 
 def jump_vectors(w: Any, base: int, lane: int, k: int) -> None:
-    """Map all tangent and unit vectors through impact `k`, and store how much each shifts the time of the impact."""
+    """Map all tangent and unit vectors through impact `k`; store each vector's shift of the impact time."""
     t, y = w[base + ROWS.time + lane], lane_base(w, base + ROWS.state + lane)
     before = lane_rates(w, base, lane)
     rate = lane_pairs(w, base, lane, before)[2 * (N_SWITCHES + k) + 1]
@@ -360,18 +362,14 @@ def jump_vectors(w: Any, base: int, lane: int, k: int) -> None:
 
 
 def set_units(w: Any, base: int, lane: int) -> None:
-    """Write unit vectors to the work array; mapped at an impact together with the tangent vectors, they give the change
-    of volume.
-    """
+    """Write unit vectors to the work array. Mapped through an impact, they give the determinant of its Jacobian."""
     for j in range(N_VECTORS, N_THROUGH):
         for i in range(N_BASE):
             w[vector_row(base, lane, j) + i * WIDTH] = 1.0 if i == j - N_VECTORS else 0.0
 
 
 def log_volume(w: Any, at: int) -> float:
-    """Return log |det| of the matrix whose vectors are stored in the work array from row `at` on; the matrix is
-    overwritten.
-    """
+    """Return log |det| of the matrix stored in the work array from index `at` on; overwrite the matrix."""
     total, n = 0.0, N_BASE
     for j in range(n):
         best = j
@@ -413,7 +411,7 @@ def jump(w: Any, base: int, lane: int, k: int) -> None:
         if HAS_DIVERGENCE:
             volume = log_volume(w, base + ROWS.slopes + lane)
             w[base + ROWS.state + (N - 1) * WIDTH + lane] += volume
-    # it comes back to the side that it came from, unless the map has put it elsewhere
+    # after the impact the state is on the side from which it came, unless the map puts it beyond the surface
     side = -w[base + ROWS.side + event * WIDTH + lane]
     moved = side * lane_pairs(w, base, lane, ZEROS)[2 * event]
     bound = 4.0 * abs(value) + NEAR * abs(rate) * w[base + ROWS.period + lane]
@@ -430,7 +428,9 @@ def jump(w: Any, base: int, lane: int, k: int) -> None:
 
 
 def act_on_events(w: Any, base: int, lane: int) -> bool:
-    """Apply the events at which the last step of a SIMD lane ended; return whether it ended on the Poincare section."""
+    """Carry out the events at which a SIMD lane's last step ended; return whether the step ended on the Poincare
+    section.
+    """
     on_section = False
     if HAS_SECTION:
         on_section = section_counts(w, base, lane)
@@ -444,7 +444,7 @@ def act_on_events(w: Any, base: int, lane: int) -> bool:
         for k in range(N_IMPACTS):
             if w[fired + (N_SWITCHES + k) * WIDTH] > 0.5:
                 if HAS_CONTACTS and STICKS[k] > 0 and w[contact_row(base, lane, k)] == 0.0:
-                    # pulled off: neither states nor rates jump
+                    # a resting state lifts off: neither states nor rates jump
                     w[contact_row(base, lane, k)] = 1.0
                     w[base + ROWS.side + (N_SWITCHES + k) * WIDTH + lane] = STARTS[N_SWITCHES + k]
                 else:
@@ -456,7 +456,7 @@ def act_on_events(w: Any, base: int, lane: int) -> bool:
 
 
 INLINE = ("lane_pairs", "lane_rates", "gradient_along", "switch_rate", "vector_row", "contact_row")
-"""Templates here that dissolve into their callers, callees first; they come before those of `CALLED`."""
+"""Templates of this module that are inlined into their callers. Callees come first; `CALLED` follows after them."""
 
 CALLED = (
     "seat_switches",
@@ -477,4 +477,4 @@ CALLED = (
     "jump",
     "act_on_events",
 )
-"""The others."""
+"""Templates of this module that are compiled as functions of their own."""

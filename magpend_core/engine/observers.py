@@ -1,23 +1,22 @@
-"""Define observers: functions called after each period that record the section, measure, and can end the trajectory.
+"""Define observers: functions that run after each period, record section points, and can end a trajectory.
 
-An observer is a pair of functions bound at compile time.
+An observer consists of the following functions, which get values for their free names at compile time. (A *cell* is
+one trajectory at one parameter point.)
 
 ``observe(section, turns, i_period, memory, record, measures, settings) -> status``
-    Called after period number `i_period` (1, 2, ...) of a cell. `section` is the state, angles in
-    (-pi, pi]; `turns` counts the full turns of each angle since the branch's start; `memory` is the
-    cell's own scratch vector, zero at the start (with a section by crossing it has one entry more, the
-    last: the time since the section before [s]); `record` (n_keep, n_states) and `measures` are the
-    cell's outputs; `measures` holds what the caller put there, or zeros. Returns ``PENDING`` to go on, any
-    other status to end the cell.
+    Called after period number `i_period` (1, 2, ...) of a cell. `section` is the state, with angles in
+    (-pi, pi]; `turns` counts the full turns of each angle since the branch's start. `memory` is a scratch
+    vector of the cell, zero at the start; with a section by level crossing it has one more entry at the end, the
+    time since the previous section [s]. The outputs of the cell are `record` (n_keep, n_states) and `measures`,
+    which holds zeros or values from the caller at first. Return ``PENDING`` to go on, any other status to end.
 ``memory_size(settings, n_states) -> int``
     Length of `memory`.
-``n_kept(memory) -> int`` and ``keeps_next(i_period, memory, settings) -> bool``, only where it keeps sections
-    How many sections of this cell are kept, and whether the one at the end of the period that follows
-    period number `i_period` will be: then the engine watches that period if it is asked to.
-``renew(state, memory, settings)``, only where an observer rewrites states
-    Called at each edge of the forcing within a period, after a step that leaves the last state below
-    `renew_below`, and before `observe` at the period's end; the trajectory goes on from what it makes
-    of `state`.
+``n_kept(memory) -> int`` and ``keeps_next(i_period, memory, settings) -> bool``, only if sections are recorded
+    Number of sections recorded so far, and whether the section after the next period (number `i_period` + 1) will be
+    recorded. The engine tracks minimum, maximum and mean of quantities over such periods.
+``renew(state, memory, settings)``, only if the observer changes states
+    Called at each forcing edge within a period, after a step that leaves the last state below `renew_below`, and before
+    `observe` at the end of a period. It changes `state` in place, and the trajectory goes on from there.
 """
 
 from __future__ import annotations
@@ -73,16 +72,16 @@ def _keeps_none(i_period: int, memory: Any, settings: Any) -> bool:
 
 @dataclass(frozen=True)
 class Observer:
-    """Functions that the engine calls after each period of a trajectory, with the values of their free names.
+    """Functions that the engine calls after each period of a trajectory, to record or to end it.
 
-    They are plain Python functions, compiled when they are bound to a system: inside, `N` is the number of
-    states, `IS_ANGLE` (0 or 1) and `SCALES` are arrays of the system's, and further free names are those of
-    `bindings`. They run once per cell and period, not per step, on plain numbers and arrays.
+    They are plain Python functions, compiled for each system. In them, `N` is the number of states, `IS_ANGLE` (0 or
+    1) and `SCALES` are arrays of the system, and `bindings` defines further free names. They run once per period of a
+    trajectory, not per step, on plain numbers and arrays.
 
     Attributes
     ----------
     name : str
-        One name, one set of functions and bindings: it names the compiled code.
+        Name of the compiled code; equal names must mean equal functions and bindings.
     observe, memory_size, renew : callable
         See the text of this module.
     bindings : mapping
@@ -118,20 +117,20 @@ class Observer:
 
     @property
     def rewrites(self) -> bool:
-        """Whether `renew` is able to change the states."""
+        """Whether this observer has a `renew` that can change the states."""
         return self.renew is not _leave
 
 
 HELPERS = ("_lag_distance", "_largest_lag", "_smallest_divisor", "closed_period")
-"""Templates here that an observer calls, callees first."""
+"""Templates of this module that an observer may call; callees come first."""
 
 # layout of an observer's memory: three numbers, then a ring of the last `window` sections
 _SETTLED, _PERIOD, _KEPT, _RING = 0, 1, 2, 3
 
 
 def _lag_distance(ring: Any, i: int, j: int, window: int) -> float:
-    """Return the largest scaled difference between the states at sections `i` and `j` (1, 2, ...), angles on the
-    circle.
+    """Return the largest scaled difference between the states at section points number `i` and `j` (1, 2, ...); angles
+    mod 2 pi.
     """
     a, b = ((i - 1) % window) * N, ((j - 1) % window) * N
     largest = 0.0
@@ -146,21 +145,21 @@ def _lag_distance(ring: Any, i: int, j: int, window: int) -> float:
 def closed_period(ring: Any, last: int, settings: Settings) -> int:
     """Return the period of the periodic orbit that the last section points approach, or 0.
 
-    For each candidate period p, the distances between sections p apart are split into an older and
-    a younger half, with largest values D1 and D2. If they go on shrinking by r = D2/D1 per half
-    window, the sum of all that follow bounds the distance of the last section from the orbit:
+    For each candidate period p, the distances between sections p periods apart are split into an older and a younger
+    half of the window, with largest values D1 and D2. If the distances continue to shrink by r = D2/D1 per half
+    window, their sum bounds the distance of the last section from the orbit:
 
         D2 + m D2 r/(1 - r),   m = ceil(half window/p).
 
-    The orbit counts as closed if this bound is at most `tolerance`, or if D1 and D2 both are below a
-    hundredth of it (then integration error hides the decay). So a slow spiral is not mistaken for
-    the orbit that it approaches: at multipliers of modulus 0.96, the distance to the orbit is some
-    20 times that between successive sections.
+    The orbit counts as periodic if this bound is at most `tolerance`, or if D1 and D2 are both below a hundredth of
+    `tolerance` (then integration error hides the decay). So a slow spiral is not mistaken for the orbit that it
+    approaches: with multipliers of modulus 0.96, the distance to the orbit is about 20 times the distance between
+    successive sections.
 
-    What this does not exclude: a trajectory that passes an unstable orbit at a distance far below
-    the tolerance; a decay that becomes slower later on; and an approach along a stretched spiral that
-    turns by less than 0.05 rad per period, where the distance can exceed the tolerance twofold at
-    moduli of 0.96 to 0.99 and eightfold above.
+    The rule fails in three cases: a trajectory passes an unstable orbit at a distance far below the tolerance; the
+    decay becomes slower later; or the trajectory approaches along a stretched spiral that turns by less than 0.05 rad
+    per period. In the last case the distance can be twice the tolerance at moduli of 0.96 to 0.99, and eight times the
+    tolerance above.
     """
     n = min(last, settings.window)
     for p in range(1, min(settings.max_orbit_period, n // 4) + 1):
@@ -178,8 +177,8 @@ def closed_period(ring: Any, last: int, settings: Settings) -> int:
 
 
 def _largest_lag(ring: Any, first: int, last: int, p: int, settings: Settings) -> float:
-    """Return the largest distance of a section point from that `p` periods before, for the points after number `first`
-    up to `last`.
+    """Return the largest distance between section points `p` periods apart, where the later point is one of `first` + 1
+    to `last`.
     """
     largest = 0.0
     for i in range(first + 1, last + 1):
@@ -188,10 +187,10 @@ def _largest_lag(ring: Any, first: int, last: int, p: int, settings: Settings) -
 
 
 def _smallest_divisor(ring: Any, last: int, half: int, p: int, settings: Settings) -> int:
-    """Return the smallest divisor of the period `p` that is a period of the orbit, too.
+    """Return the smallest divisor of the period `p` that is also a period of the orbit.
 
-    Near a slow spiral, sections p apart can settle before successive ones do. All of the younger
-    half lie within a few tolerances of the orbit, so ten of them tell the periods apart.
+    Along a slow spiral, sections p periods apart can converge before sections q apart do. All points of the younger
+    half lie within a few tolerances of the orbit, so a limit of ten tolerances distinguishes the periods.
     """
     for q in range(1, p):
         if p % q == 0 and _largest_lag(ring, last - half, last, q, settings) <= 10.0 * settings.tolerance:
@@ -204,8 +203,8 @@ def _record(
 ) -> int:
     """Record `n_keep` section points after the transient, then find whether the orbit is periodic.
 
-    The transient lasts `n_transient` periods or, with `stops_early`, until the orbit has closed (see
-    `closed_period`; looked at every quarter window), if that comes first.
+    The transient lasts `n_transient` periods. With `stops_early` it ends earlier if the orbit becomes periodic, which
+    `closed_period` tests after every quarter of the window.
     """
     ring = memory[_RING:]
     slot = ((i_period - 1) % settings.window) * N
@@ -248,11 +247,11 @@ def _keeps_next(i_period: int, memory: Any, settings: Settings) -> bool:
 
 
 RECORD = Observer("record", _record, _memory_size, n_kept=_n_kept, keeps_next=_keeps_next)
-"""Keep `n_keep` sections after the transient, see `_record`."""
+"""Observer that records `n_keep` sections after the transient, see `_record`."""
 
 
 class MapSettings(NamedTuple):
-    """Settings of the observer `MAP`: only its memory size, since each trajectory has its own number of periods."""
+    """Settings of the observer `MAP`. The number of periods is not among them, because each trajectory has its own."""
 
     n_memory: int = 1
 
@@ -260,9 +259,7 @@ class MapSettings(NamedTuple):
 def _keep_all(
     section: Any, turns: Any, i_period: int, memory: Any, record: Any, measures: Any, settings: MapSettings
 ) -> int:
-    """Record the section of each period, and end the trajectory after as many periods as the first of `measures` asks
-    for.
-    """
+    """Record the section point of every period; end the trajectory after ``measures[0]`` periods."""
     for k in range(N):
         record[i_period - 1, k] = section[k]
     memory[0] = float(i_period)
@@ -285,4 +282,4 @@ def _keeps_every(i_period: int, memory: Any, settings: MapSettings) -> bool:
 
 
 MAP = Observer("map", _keep_all, _map_memory, n_kept=_n_mapped, keeps_next=_keeps_every)
-"""Keep every section for as many periods as the cell's first measure says: each cell has its own number."""
+"""Observer that records every section; each cell ends after the number of periods in its ``measures[0]``."""

@@ -15,10 +15,10 @@ def no_forcing(t: Any, c: Any) -> Any:
 
 @inline
 def no_edges(frequency: Any, p: Any, times: Any, half_widths: Any, jumps: Any) -> None:
-    """Do nothing: the forcing has no instants at which it switches."""
+    """Set no forcing edges: the forcing of this system never switches."""
 
 
 @inline
 def no_layers(y: Any, dy: Any, c: Any) -> Any:
-    """Return an empty tuple: the right-hand side has no layer in which it changes quickly."""
+    """Return no boundary layers: the right-hand side of this system has no region in which it changes quickly."""
     return ()

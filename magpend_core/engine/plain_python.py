@@ -1,6 +1,6 @@
 """Turn a compiled function, and all functions that it calls, back into the plain Python they were compiled from.
 
-`function.py_func` alone would still call compiled functions, and compile them for the types that it meets.
+The attribute ``py_func`` of a compiled function is plain Python, but still calls compiled functions.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def plain(function: Callable[..., Any]) -> Callable[..., Any]:
     Parameters
     ----------
     function
-        A dispatcher of numba's, found by its attribute ``py_func``; anything else is returned as it is.
+        Dispatcher of numba, recognised by its attribute ``py_func``; any other object is returned unchanged.
     """
     found: Callable[..., Any] = _replaced(function, {})
     return found
@@ -48,7 +48,7 @@ def _rebuilt(dispatcher: Any, source: FunctionType, known: dict[int, Any]) -> Fu
     scope = dict(source.__globals__)
     function = FunctionType(source.__code__, scope, source.__name__, source.__defaults__, cells)
     function.__kwdefaults__ = source.__kwdefaults__
-    known[id(dispatcher)] = function  # before what it calls, which may be itself
+    known[id(dispatcher)] = function  # before its callees are replaced, since it may call itself
     for name in set(_names(source.__code__)):
         if name in scope:
             scope[name] = _replaced(scope[name], known)
@@ -58,7 +58,6 @@ def _rebuilt(dispatcher: Any, source: FunctionType, known: dict[int, Any]) -> Fu
 
 
 def _names(code: CodeType) -> Iterator[str]:
-    """Yield the names that the code of a function, and of functions nested in it, looks up."""
     yield from code.co_names
     for constant in code.co_consts:
         if isinstance(constant, CodeType):

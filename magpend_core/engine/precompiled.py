@@ -1,13 +1,13 @@
 """Compile the shared functions (parts) of an engine, and cache their code for other engines and processes.
 
-numba types and lowers every function before LLVM sees it; this is nine tenths of the time that an engine
-takes to compile. Most functions of an engine know no equations. Here such a function, a *part*, is compiled
-once, to LLVM code in which nothing of a system is left:
+numba infers the types of every function and translates it before LLVM sees it; this takes nine tenths of the time to
+compile an engine. But most functions of an engine contain no equations of the system. Here such a function, a
+*part*, is compiled once, to LLVM code that does not depend on the system:
 
-- Another part that it calls is a declaration. Which function that is, is decided when an engine is linked.
-- A size of the system, such as the number of its states, has a name and no value (see `linking`).
+- Another part that it calls is only declared. The function is chosen when an engine is linked.
+- A size of the system, such as the number of its states, has a name but no value (see `linking`).
 
-So a new system compiles its own equations alone, and links them to parts from the cache.
+So for a new system only its own equations are compiled, and linked to parts from the cache.
 
 Read in this order: `PartDispatcher` (a function that only compiled functions call), `linking.PartLibrary`
 (its LLVM code), `PartCache` (its code on disk), `linking.EntryLibrary` (an engine's machine code).
@@ -55,9 +55,9 @@ from magpend_core.engine.linking import EntryLibrary, PartLibrary
 
 @register_pass(mutates_CFG=False, analysis_only=False)
 class _NameFields(FunctionPass):
-    """Compiler pass that replaces a field of a named tuple of integers by that integer.
+    """Compiler pass that replaces each field access of a global named tuple (such as ``ROWS.state``) by its integer.
 
-    numba would make a constant of the whole tuple at each place where one of its fields is read.
+    numba would put the whole tuple into the code as a constant wherever a field is read.
     """
 
     _name = "magpend_name_fields"
@@ -66,10 +66,9 @@ class _NameFields(FunctionPass):
         FunctionPass.__init__(self)
 
     def run_pass(self, state: Any) -> bool:
-        """Replace fields of global named tuples by their integers; return whether there were any."""
         found = [block for block in state.func_ir.blocks.values() if _name_fields(block)]
         if found:
-            # where they are defined has changed
+            # update numba's table of definitions after the change
             state.func_ir._definitions = build_definitions(state.func_ir.blocks)
         return bool(found)
 
@@ -87,7 +86,7 @@ def _name_fields(block: Any) -> bool:
             number = getattr(whole.value, value.attr)
             statement.value = numba_ir.Global(f"{whole.name}.{value.attr}", number, value.loc)
         else:
-            # used in another way: as it was
+            # the tuple is used in another way here: put its definition back
             names = {v.name for v in statement.list_vars()}
             body += [tuples.pop(name) for name in names & set(tuples)]
         body.append(statement)
@@ -122,7 +121,7 @@ class _GivePartLibrary(FunctionPass):
         FunctionPass.__init__(self)
 
     def run_pass(self, state: Any) -> bool:
-        """Give a part its code library, and an identifier that makes its symbol the same in all processes."""
+        """Give a part its code library, and a symbol that is the same in all processes."""
         dispatcher = _COMPILED_NOW[-1]
         state.library = PartLibrary(state.targetctx.codegen(), state.func_id.func_qualname)
         state.library.dispatcher = dispatcher
@@ -143,7 +142,9 @@ class EntryCompiler(CompilerBase):
             return super().compile_extra(func)
 
     def define_pipelines(self) -> list[Any]:
-        """Return numba's own compiler passes, with two of magpend's added."""
+        """Return numba's standard compiler passes and two of magpend's: one replaces named-tuple fields, one sets the
+        code library.
+        """
         passes = DefaultPassBuilder.define_nopython_pipeline(self.state)
         passes.add_pass_after(_NameFields, IRProcessing)
         passes.add_pass_after(self._gives, NopythonTypeInference)
@@ -182,25 +183,26 @@ class PartCompiler(EntryCompiler):
 
 
 _COMPILED_NOW: list[Any] = []
-"""Parts that are being compiled, under numba's lock; the last is in progress."""
+"""Stack of the parts being compiled (under numba's lock): each has been interrupted by the compilation of the next."""
 
 
 class PartDispatcher(CPUDispatcher):
-    """Numba dispatcher of an engine part, for calls from compiled code; a call from Python compiles a copy of it first.
+    """Numba dispatcher of an engine part (a function called from compiled code). For calls from Python it compiles a
+    copy.
 
     Parameters
     ----------
     function
         A plain function.
     options
-        numba's.
+        Options of numba.
     sizes
-        Values of the placeholders that it was bound to.
+        Values of the placeholders in the function, by name.
     identity
-        Returns a digest of all that its code depends on but the functions that it calls and the sizes; None
-        if that cannot be found out. Its code is then not kept.
+        Function that returns a digest of everything that the code depends on, except called functions and sizes; None
+        if the digest is not known. The code is then not cached.
     folder
-        Where code is kept; None to keep it in this process alone.
+        Folder of the cached code; None to cache it only in this process.
     """
 
     def __init__(
@@ -241,7 +243,7 @@ class PartDispatcher(CPUDispatcher):
                 _COMPILED_NOW.pop()
 
     def add_overload(self, cres: Any) -> None:
-        """Register the code compiled for a signature, without an entry point for Python."""
+        """Register the compiled code of one signature, without the wrapper that lets Python call it."""
         self.overloads[tuple(cres.signature.args)] = cres
         cres.library.symbol = cres.fndesc.mangled_name
         _OWNERS[cres.library] = tuple(cres.signature.args)
@@ -255,13 +257,13 @@ class PartDispatcher(CPUDispatcher):
 
 _UNKEPT = count(1)
 _OWNERS: WeakKeyDictionary[Any, tuple[Any, ...]] = WeakKeyDictionary()
-"""Of each part's library the argument types."""
+"""Argument types of each compiled part, by its code library."""
 
 
-# ---- code that is kept ---------------------------------------------------------------------------------
+# ---- cached code ---------------------------------------------------------------------------------------
 
 _MEMORY: dict[str, bytes] = {}
-"""Records of this process."""
+"""Cached records of this process, by name."""
 
 
 class PartCache:
@@ -286,7 +288,7 @@ class PartCache:
         try:
             whose, *content = pickle.loads(record)
         except Exception as error:
-            # what is whole and cannot be read was written by another Python than it says
+            # intact but unreadable: written by another version of Python than the cache key says
             say(f"a compiled part of a kernel, {name}, cannot be used ({error!r}); it is compiled again.")
             return None
         found = self._rebuilt(content, target_context) if whose == name else None
@@ -318,7 +320,9 @@ class PartCache:
         return f"{self._dispatcher.py_func.__name__[:40]}-{hashlib.sha256(text.encode()).hexdigest()[:24]}"
 
     def _callees(self, library: PartLibrary) -> list[Any] | None:
-        """Return each part that the function calls and where it refers to it; None if it calls something else."""
+        """Return the engine parts that a function calls, each with its dotted name in the function's source. None if it
+        calls anything else.
+        """
         source = self._dispatcher.py_func
         paths = {id(reached(source, path)): path for path in lookups(source.__code__)}
         declared = {function.name for function in library._final_module.functions}
@@ -326,12 +330,12 @@ class PartCache:
         for callee in dict.fromkeys(library._linking_libraries):
             if callee not in _OWNERS or id(callee.dispatcher) not in paths:
                 return None
-            if callee.symbol not in declared:  # LLVM has seen that the call is never reached
+            if callee.symbol not in declared:  # LLVM removed the call, as it is never reached
                 continue
             args = _OWNERS[callee]
             returns = callee.dispatcher.overloads[args].signature.return_type
             rows.append((paths[id(callee.dispatcher)], args, callee.symbol, returns))
-        # two functions of one content have one symbol; those of another system need not
+        # two callees with equal code share a symbol here, but perhaps not in another system: do not cache this part
         return rows if len({row[2] for row in rows}) == len(rows) else None
 
     def _rebuilt(self, record: Any, target_context: Any) -> Any:
@@ -350,7 +354,7 @@ class PartCache:
             declared.append((module.get_function(symbol), compiled.library.symbol))
         if len({symbol for _, symbol in declared}) < len(declared):
             return None
-        # all lose their names before one takes another's
+        # clear all names first, since a new name may be the old name of another function
         for function, _ in declared:
             function.name = ""
         for function, symbol in declared:
@@ -371,6 +375,4 @@ class PartCache:
 
 
 class _Key:
-    """Stand-in for the entry point from Python that cached code lacks; numba needs an object as key to find the
-    code.
-    """
+    """Dummy for the entry point from Python, which cached code lacks; numba uses it as a dictionary key."""

@@ -1,11 +1,12 @@
-"""Integrate many trajectories in SIMD lanes, and sample each at its own instants by the engine's dense output.
+"""Integrate many trajectories in SIMD lanes, and sample each at its own times by the engine's dense output.
 
-Where `lanes.advance` sees a trajectory once a period, this loop writes states at given times, by the
-continuous extension of the Dormand-Prince pair, and lets the drive change from interval to interval: each has
-its own length and its own values of some parameters. So a recording's instants and a recorded drive are
-followed as they are. A trajectory's numbers depend on its own inputs alone, as everywhere in the engine.
+`lanes.advance` records a trajectory once per period. This loop instead writes the states at given times, by the
+continuous extension of the Dormand-Prince pair. And the drive may change from interval to interval: each interval has
+its own length and its own values of some parameters. So a trajectory can be compared with a recording sample by sample.
+As everywhere in the engine, its numbers depend only on its own inputs.
 
-The functions here are templates, bound to a system by `sampler_of` (see `lanes`).
+The functions here are templates, compiled for a system by `sampler_of` (see `lanes`). A *piece* is the time grid and
+the drive of one recording; several trajectories may share it.
 """
 
 from __future__ import annotations
@@ -43,13 +44,11 @@ from magpend_core.status import Status
 BOUNDED = int(Status.BOUNDED)
 
 COINCIDENT_S = 1e-9
-"""Times that differ by less are one: sums of a drive's intervals round."""
+"""Times that differ by less count as equal, since sums of drive intervals have rounding errors."""
 
 
 class Samples(NamedTuple):
-    """Input and output arrays of `follow_all`; the time grids and drives of all recordings stand one after the
-    other.
-    """
+    """Input and output arrays of `follow_all`; the time grids and drives of all recordings are concatenated."""
 
     parameters: Any  # (trajectory, n_parameters)
     initial: Any  # (trajectory, n_states)
@@ -57,12 +56,12 @@ class Samples(NamedTuple):
     times: Any  # (time,) s since the piece's start, rising within a piece
     first_time: Any  # int64 (piece + 1,)
     durations: Any  # (interval,) s
-    values: Any  # (interval, n_changed); NaN leaves what the trajectory has
+    values: Any  # (interval, n_changed); NaN: the parameter keeps the trajectory's value
     first_interval: Any  # int64 (piece + 1,)
-    changed: Any  # int64 (n_changed,): the parameters that `values` are of
-    start: Any  # (piece,) s, of a piece within its first interval
-    first_step: Any  # (piece,) s: bound of the first step
-    columns: Any  # int64: the states that are written
+    changed: Any  # int64 (n_changed,): indices of the parameters in `values`
+    start: Any  # (piece,) s, start of a piece within its first interval
+    first_step: Any  # (piece,) s: upper bound of the first step
+    columns: Any  # int64: indices of the states to write
     slack: float
     out: Any  # (trajectory, longest, n_columns)
     status: Any  # int64 (trajectory,)
@@ -70,11 +69,11 @@ class Samples(NamedTuple):
 
 
 class Seats(NamedTuple):
-    """Arrays with the state of the sampling loop: trajectory, next sample and drive interval of each SIMD lane."""
+    """Working arrays of the sampling loop: which trajectory, sample and drive interval each SIMD lane is at."""
 
     lanes: Any  # float64, the groups' rows
-    before: Any  # float64: rows of each group's written states, then their first slopes, before the attempt
-    clock: Any  # float64 (lanes, 2): time before the attempt [s], interval's begin since the piece's [s]
+    before: Any  # float64: per group, the written states before the attempt, then their slopes
+    clock: Any  # float64 (lanes, 2): time before the attempt, and start of the interval since that of the piece [s]
     trajectory: Any  # int64
     interval: Any  # int64
     done: Any  # int64, times written
@@ -179,9 +178,7 @@ def write_due(samples: Samples, seats: Seats, lane: int, until: float) -> None:
 
 
 def go_on(samples: Samples, seats: Seats, lane: int, scratch: Any) -> int:
-    """Handle the step that a SIMD lane has attempted; return the trajectory's final status, or PENDING while it goes
-    on.
-    """
+    """Process the last attempted step of a SIMD lane; return the final status of its trajectory, or PENDING."""
     base, column = (lane // WIDTH) * ROWS.size, lane % WIDTH
     w = seats.lanes
     event = w[base + ROWS.event + column]
@@ -273,7 +270,7 @@ def follow_all(samples: Samples, seats: Seats, active: int, rtol: float, atol: f
     """Integrate all trajectories, `active` at a time, and fill the output arrays of `samples`."""
     n, scratch = len(samples.piece), seats.scratch
     for lane in range(len(seats.trajectory)):
-        # lanes beyond the last trajectory repeat it, so that they hold ordinary numbers; no one looks
+        # spare lanes of the last group repeat the last trajectory, so that they hold valid numbers; nothing reads them
         begin_trajectory(samples, seats, lane, lane if lane < n else n - 1, scratch)
     following = active
     rows, before, clock = seats.lanes, seats.before, seats.clock
@@ -295,7 +292,7 @@ def follow_all(samples: Samples, seats: Seats, active: int, rtol: float, atol: f
                 following += 1
                 lane += 1
             else:
-                # the last lane moves here, with what its attempt left to do
+                # no trajectory is left for this lane: move the last active lane here and process it next
                 active -= 1
                 copy_seat(seats, active, lane)
 

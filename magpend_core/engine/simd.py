@@ -1,12 +1,12 @@
-"""Define a numba type for a group of SIMD lanes: WIDTH float64 numbers on which every operation acts at once.
+"""Define a numba type for a group of SIMD lanes: WIDTH float64 numbers that each operation processes together.
 
-The kernels advance many trajectories in step. Instead of hoping that the compiler turns a loop over
-trajectories into vector instructions, they compute with values of the type `Lanes`, a vector of
-LLVM's: each operation becomes one (or, where the CPU's registers are narrower, a few) vector
-instructions by construction. The same source also compiles for a single float64, and runs as plain
-Python on numpy arrays when numba is switched off, because each primitive here has all three forms.
+The kernels advance many trajectories at the same time. They do not rely on the compiler to turn a loop over
+trajectories into vector instructions. Instead they compute with values of the type `Lanes`, a vector type of LLVM: each
+operation becomes one vector instruction, or a few where the CPU's registers are narrower. The same source also compiles
+for a single float64, and runs as plain Python on numpy arrays if numba is switched off, because each primitive here
+has all three forms.
 
-There is no branch on a lane's value anywhere: a choice is `where_less`.
+No code branches on the value of a lane; a choice between two values is `where_less`.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from numba.extending import lower_builtin, models, register_model, type_callable
 WIDTH = 16
 """Lanes in a group."""
 
-# halves and negates the exponent of a number whose bits are halved and taken from it (Lomont 2003)
+# the difference of this constant and half of a number's bits approximates its inverse square root (Lomont 2003)
 _INVERSE_ROOT = 0x5FE6EB50C7B537A9
 
 _DOUBLE = ir.DoubleType()
@@ -61,7 +61,6 @@ def _splat(builder: Any, scalar: Any) -> Any:
 
 
 def _as(builder: Any, value: Any, numba_type: Any, target: Any) -> Any:
-    """Broadcast a scalar over the lanes if the result type is a group of lanes."""
     if isinstance(target, LanesType) and not isinstance(numba_type, LanesType):
         return _splat(builder, value)
     return value
@@ -121,7 +120,7 @@ def _common(*numba_types: Any) -> Any:
     return lanes_type if any(isinstance(t, LanesType) for t in numba_types) else types.float64
 
 
-# numba reads a typer's signature, so each number of arguments needs its own
+# numba inspects the signature of a typer, so each number of arguments needs its own typer
 _TYPERS: dict[int, Callable[..., Any]] = {
     1: lambda a: _common(a),
     2: lambda a, b: _common(a, b),
@@ -190,7 +189,7 @@ def floor(x: Any) -> Any:
 
 
 def upper(x: Any) -> Any:
-    """Return `x` cut off after 26 binary digits: products of two such numbers are exact."""
+    """Return `x` with its last 27 mantissa bits set to 0, so that products of two such numbers are exact."""
     bits = np.asarray(x, np.float64).view(np.int64) & np.int64(-(2**27))
     return bits.view(np.float64)[()]
 

@@ -1,4 +1,4 @@
-"""Describe a dynamical system for the engine."""
+"""Define `System`, the description of a dynamical system that the engine integrates."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ if TYPE_CHECKING:
 def positions(names: Iterable[str]) -> Any:
     """Return the index of each name, as a named tuple of the integers 0, 1, 2, ...
 
-    Compiled functions read it as a global, so that they say ``p[AT.q]`` and not ``p[16]``; the number
-    is a constant of the machine code.
+    Compiled functions can then write ``p[AT.q]`` instead of ``p[16]``, where ``AT`` is a global variable; the index is
+    a constant in the machine code.
 
     Parameters
     ----------
@@ -46,127 +46,124 @@ def positions(names: Iterable[str]) -> Any:
 class System:
     """A periodically forced system of ordinary differential equations, as compiled functions.
 
-    The functions of the hot path (`forcing`, `rhs`, `layers`, `jacobian`, `quantities`) are decorated with
-    `jit.inline` and use arithmetic, `simd` and `vecmath` only: they are compiled for groups of lanes, so that
-    a choice is `simd.where_less`, never an ``if``, and powers are products. They return tuples of fixed
-    length, of which each entry is a number per lane: what does not depend on the state is ``0.0 * x + 1.0``,
-    say. `constants` and `edges` run once per cell on plain numbers, where anything goes that numba compiles.
+    The functions called at every step (`forcing`, `rhs`, `layers`, `jacobian`, `quantities`) are decorated with
+    `jit.inline` and use only arithmetic, `simd` and `vecmath`. They are compiled for groups of lanes: write
+    `simd.where_less` for a choice, never ``if``, and products for powers. They return tuples of fixed length; each
+    entry must be one number per lane, so write a constant 1 as ``0.0 * x + 1.0``. `constants` and `edges` run once per
+    cell (parameter point) on plain numbers and may use anything that numba compiles.
 
-    Before its first run a system is checked on plain numbers (see `checks.check_system`), so that what is
-    declared wrongly is an error by name and not a wrong number.
+    Before its first run a system is checked on plain numbers (see `checks.check_system`), so that a wrong declaration
+    gives an error message and not a wrong result.
 
     Attributes
     ----------
     name : str
-        One name, one set of functions: it names the compiled code.
+        Name of the compiled code; equal names must mean equal functions.
     parameter_names : tuple of str
         Order of the packed parameter vector.
     n_constants : int
         Length of the vector that `constants` fills.
     constants : callable
-        ``constants(frequency, p, out)``: from the drive frequency [Hz] and the packed parameters
-        `p` to what `forcing`, `rhs` and `layers` use; fills all of `out` with finite numbers.
+        ``constants(frequency, p, out)``: computes, from the drive frequency [Hz] and the packed parameters `p`, the
+        constants that `forcing`, `rhs` and `layers` use; fills all of `out` with finite numbers.
     has_poles : bool
-        Whether constants need not be finite: cells that use one that is not end with a status.
+        Whether constants may be infinite or NaN; trajectories that use such a constant end with a failure status.
     forcing : callable
-        ``forcing(t, c)``: the explicit time dependence, a number, at time `t` [s] since the last
-        section; `c` is the tuple of constants. It has the period 1/frequency. None for none: the system is
-        autonomous, and the period is the time between two looks at it.
+        ``forcing(t, c)``: the explicit time dependence, a number, at time `t` [s] since the last section; `c` is
+        the tuple of constants. It has the period 1/frequency. None for an autonomous system; 1/frequency is then
+        the time between two recorded states.
     forcing_is_time : bool
-        Whether `forcing` returns `t` itself, because time enters `rhs` by more than one number; then `rhs`
-        has the period 1/frequency in it.
+        Whether `forcing` returns `t` itself, because `rhs` depends on time by more than one number; `rhs` must then
+        have the period 1/frequency in `t`.
     rhs : callable
         ``rhs(y, u, c)``: time derivatives as a tuple, from the states `y` and the forcing `u`.
     jacobian : callable
-        ``jacobian(y, u, c)``: derivatives of `rhs` by the states, as one flat tuple, row by row. None if
-        neither exponents nor multipliers nor orbits are asked for.
+        ``jacobian(y, u, c)``: derivatives of `rhs` by the states, as one flat tuple, row by row. Only Lyapunov
+        exponents, multipliers and periodic orbits need it; may be None.
     jacobian_entries : tuple of int or None
-        Places of the entries that `jacobian` returns, in the flat tuple of all and in rising order; the
-        others are 0 everywhere. None if it returns all. Declare it for a large system with many zeros.
+        Flat indices (row by row) of the entries that `jacobian` returns, in rising order; all other entries are
+        always 0. None if it returns all entries. Declare it for a large system with many zeros.
     is_angle : tuple of bool
-        Which states live on a circle of 2 pi; empty for none. They are brought back to (-pi, pi] at every
-        section, their full turns counted apart; `rhs` must not change under such a shift.
+        Which states are angles modulo 2 pi; empty for none. They are wrapped to (-pi, pi] at every section, and
+        their full turns are counted; `rhs` must not change when 2 pi is added.
     scales : tuple of float
-        Size of each state that counts as 1 when sections are compared; empty for 1.
+        Typical size of each state, the unit in which sections are compared; empty for 1.
     escape : tuple of float
         Bound on the absolute value of each state at a section; beyond it a trajectory has diverged. Empty
         for none.
     n_edges : int
         Number of known instants per period at which the forcing switches.
     edges : callable
-        ``edges(frequency, p, times, half_widths, jumps)``: fills the instants [s] in
-        [0, 1/frequency), in rising order; for each the distance in time of the forcing's nearest
-        complex singularity [s], above 0; and the change of the right-hand side across the edge.
+        ``edges(frequency, p, times, half_widths, jumps)`` fills three arrays: the instants [s] in [0, 1/frequency) in
+        rising order; for each instant the distance in time to the forcing's nearest complex singularity [s], above
+        0; and the change of the right-hand side across the edge.
     layers : callable
-        ``layers(y, dy, c)``: a tuple of ``(value, rate, half_width, per_strength)``. Where `value`,
-        which moves at `rate`, passes zero, the right-hand side changes quickly, and has its nearest
-        complex singularity at an imaginary part `half_width` of `value`, above 0. `per_strength` is
-        1/(half_width * jump), with the change of the right-hand side across the layer. None for none.
+        ``layers(y, dy, c)``: a tuple of ``(value, rate, half_width, per_strength)`` for each layer. The right-hand side
+        changes quickly where `value`, with the time derivative `rate`, passes zero. As a function of `value` it has
+        its nearest complex singularity at the imaginary part `half_width`, above 0. `per_strength` is
+        1/(half_width * jump), where jump is the change of the right-hand side across the layer. None for none.
     has_layers : bool
-        False if there are none; then `layers` is never called.
+        False if there are none; `layers` is then never called.
     layers_fade : bool
-        Whether every layer falls off exponentially, like tanh and unlike atan: exp(-pi m) of its change
-        is left at m half-widths.
+        Whether every layer has exponential tails, like tanh and unlike atan: at m half-widths, exp(-pi m) of its
+        change remains.
     timed_layers : bool
-        Whether `layers` needs the time [s since the last section]; it then finds it behind the rates, as
+        Whether `layers` needs the time [s since the last section]; it is then appended to the rates, as
         ``dy[n_states]``.
     n_controlled : int or None
-        How many of the states, from the first, enter the error control; None for all.
+        Number of leading states that enter the error control; None for all.
     n_known : int or None
-        How many of the states, from the first, the functions know and take; None for all. The states behind
-        them are tangent vectors, which the engine carries along (see `tangents`).
+        Number of leading states that the functions take; None for all. The remaining states are tangent vectors, which
+        the engine integrates by itself (see `tangents`).
     n_modes : int
-        Numbers that `rhs`, `jacobian` and `quantities` find behind the constants, ``c[n_constants + k]``,
-        and that change at events and edges alone: each stage of a step sees the same. First one for each
-        switch, then one for each impact if any of them sticks, last the segment if `has_segments`.
+        Number of modes. Modes are numbers that `rhs`, `jacobian` and `quantities` find after the constants, as
+        ``c[n_constants + k]``. They change only at events and edges and are equal at all stages of a step. First comes
+        one for each switch, then one for each impact if any impact sticks, last the segment if `has_segments`.
     n_switches : int
-        Number of surfaces at which the right-hand side jumps. Mode k is the side on which switch k is,
-        -1.0 or +1.0; `rhs` uses it where it says ``sign(value)``. A step ends on the surface, and the mode
-        changes.
+        Number of surfaces at which the right-hand side jumps. Mode k is the sign of switch k, -1.0 or +1.0; `rhs` must
+        use it in place of ``sign(value)``. A step ends on the surface, then the mode changes.
     switches : callable
-        ``switches(t, y, dy, c)``: a tuple of ``(value, rate)``, a function of time and state and its time
-        derivative, which is linear in `dy`. While mode k is 0 (see `slides`), pair k is instead
-        ``1 - sigma**2`` and its rate, where sigma in [-1, 1] is what stands for the mode in the equivalent
-        control.
+        ``switches(t, y, dy, c)``: a tuple of ``(value, rate)`` for each switch, where `value` is a function of time and
+        state, and `rate` its time derivative, linear in `dy`. While mode k is 0 (see `slides`), pair k must be
+        ``1 - sigma**2`` and its rate instead, where sigma in [-1, 1] is the equivalent control.
     slides : tuple of bool
-        For which switches sliding is looked for; empty for none. Where the right-hand sides of both sides
-        point to the surface, the mode becomes 0.0, and `rhs` is to give the motion along it (Filippov's
-        equivalent control). It ends where sigma leaves [-1, 1].
+        On which switches the state may slide; empty for none. If the rates on both sides point to the surface, the mode
+        becomes 0.0, and `rhs` must return the motion along the surface (Filippov's equivalent control). Sliding ends
+        where sigma leaves [-1, 1].
     has_segments : bool
-        Whether the last mode, ``c[n_constants + n_modes - 1]``, is the number of edges passed in this period:
-        0.0 before the first, and so on. A forcing with true jumps is then on the right side of an edge at all
-        stages; its half-width may be infinite.
+        Whether the last mode, ``c[n_constants + n_modes - 1]``, is the number of edges passed in this period: 0.0
+        before the first, and so on. A forcing with true jumps can then use the same side of an edge at all stages; its
+        half-width may be infinite.
     n_impacts : int
         Number of surfaces at which the state jumps.
     impacts : callable
         ``impacts(t, y, dy, c)``: a tuple of ``(value, rate)``, as for `switches`.
     impact_directions : tuple of int
-        +1 where an impact happens as its value rises through zero, -1 as it falls.
+        +1 if an impact happens where its value rises through zero, -1 where it falls.
     sticks : tuple of int
-        For each impact, whether the state rests on its surface after infinitely many impacts in a finite
-        time: 0 for no, 1 for yes, 2 for yes unless it rests on another; empty for none. There is then a mode
-        for each impact, behind those of the switches: 1.0, and 0.0 at rest. At rest, `rhs` is to keep value
-        and rate of the impact at 0, and its pair in `impacts` is the negative second derivative that the
-        value would have without the contact, and its rate: where that changes its sign the state is pulled
-        off.
+        For each impact, whether the state rests on its surface after infinitely many impacts in a finite time: 0 no,
+        1 yes, 2 yes unless it rests on another surface; empty for none. Each impact then has a mode, after those of
+        the switches: 0.0 at rest, else 1.0. At rest, `rhs` must keep value and rate of the impact at 0. Its pair in
+        `impacts` is then the negative second derivative that the value would have without the contact, and the rate
+        of this number; where it changes its sign, the state lifts off.
     reset : callable
-        ``reset(k, t, y, c)``: the states after impact number `k` as a tuple, from those before. Runs on plain
-        numbers, so that ``if k == 0`` is allowed. For ``k = n_impacts + i`` the states at rest on the surface
-        of impact `i`, from those nearby, if it sticks.
+        ``reset(k, t, y, c)``: the states after impact number `k` as a tuple, from the states before. Runs on plain
+        numbers, so that ``if k == 0`` is allowed. If impact `i` sticks, ``k = n_impacts + i`` must return the states
+        moved to rest on its surface.
     section : (int, int) or None
-        Number of the state at whose crossing of a level a period ends, and the direction, +1 rising or
-        -1 falling; the level is the last parameter. See `crossing.with_section`.
+        Index of the state that defines the Poincare section, and the direction of its crossing, +1 rising or -1
+        falling; a period ends there. The level is the last parameter. See `crossing.with_section`.
     quantities : callable or None
         ``quantities(t, y, dy, u, c)``: a tuple of the named quantities at time `t` [s] since the last
         section, from the states, their rates, the forcing and the constants.
     method : str
-        Of `tableau.METHODS`: ``"dopri5"`` of order 5, or ``"dop853"`` of order 8, which needs a half or a
-        quarter of the time for smooth equations at tolerances below 1e-6. Where layers decide the steps it
-        gains nothing. Quantities are watched, and trajectories sampled, with the first alone.
+        Key of `tableau.METHODS`: ``"dopri5"`` of order 5, or ``"dop853"`` of order 8, which needs a half or a quarter
+        of the time for smooth equations at tolerances below 1e-6, but gains nothing if layers limit the steps. Only
+        ``"dopri5"`` can track quantities and sample trajectories.
     tangents_of : System or None
-        The system whose tangent vectors this one carries along (see `variational.with_tangents`).
+        The original system, if this one has tangent vectors added (see `variational.with_tangents`).
     recorded_for : System or None
-        The system of which this one follows a recorded drive (see `driven.with_recorded_drive`).
+        The original system, if this one has a recorded drive instead of its forcing (see `driven.with_recorded_drive`).
 
     Examples
     --------
@@ -198,7 +195,7 @@ class System:
     n_constants: int
     constants: Callable[..., Any]
     rhs: Callable[..., Any]
-    # None stands for a function that does nothing, put in place below: what is read is never None
+    # `__post_init__` replaces None by a function that does nothing, so that these fields are never None
     forcing: Callable[..., Any] = None  # type: ignore[assignment]
     forcing_is_time: bool = False
     jacobian: Callable[..., Any] | None = None
@@ -257,7 +254,7 @@ class System:
             "impact_directions": int,
             "sticks": int,
         }
-        for name, kind in kinds.items():  # lists cannot be hashed, integers among numbers not be looped over
+        for name, kind in kinds.items():  # tuples of one type: lists have no hash, numba needs equal types in loops
             object.__setattr__(self, name, tuple(kind(value) for value in getattr(self, name)))
         object.__setattr__(self, "has_layers", self.has_layers and self.layers is not None)
         for name, value in absent.items():
@@ -321,7 +318,7 @@ class System:
 
     @property
     def n_contacts(self) -> int:
-        """Number of modes that say whether the state rests on an impact surface: one per impact, or 0."""
+        """Number of contact modes, which say whether the state rests on an impact surface: one per impact, or 0."""
         return self.n_impacts if any(self.sticks) else 0
 
     @property
@@ -331,8 +328,8 @@ class System:
 
     @property
     def known(self) -> int:
-        """Number of states that the system's own functions take, without tangent vectors that the engine integrates by
-        itself.
+        """Number of states passed to `rhs` and the other functions. The tangent vectors of a large system are not
+        passed.
         """
         return self.n_states if self.n_known is None else self.n_known
 

@@ -65,12 +65,12 @@ class Tableau(NamedTuple):
 
     @property
     def n_stages(self) -> int:
-        """Number of stages, the new state among them."""
+        """Number of stages of the method; the last stage is the new state."""
         return len(self.nodes)
 
     @property
     def has_two_errors(self) -> bool:
-        """Whether the method has a second estimate of the error."""
+        """Whether the method combines error estimates of two orders."""
         return bool(self.other_error.any())
 
 
@@ -189,4 +189,4 @@ METHODS = {
     "dopri5": Tableau(NODES, STAGES, ERROR, np.zeros(N_STAGES), 5),
     "dop853": Tableau(np.array(_NODES_8), _filled(_STAGES_8, 12), _ERRORS_8[0], _ERRORS_8[1], 8),
 }
-"""By the names that their authors gave them."""
+"""Methods by name, as given by their authors."""

@@ -1,10 +1,10 @@
 """Integrate the tangent vectors of large systems, by loops over the stages of a Runge-Kutta step.
 
-Templates for the engine, see `lanes`. For a small system the products of the Jacobian J and tangent vectors
-are written out in the right-hand side (see `variational.with_tangents`). For a large one the right-hand side
-knows the states alone. The engine computes all stages of the states first, and keeps the entries of J at each
-stage. Then it takes the vectors through all stages one by one, so that the rows of a vector stay in the
-first-level cache. No vector acts on the states, so this order changes no number.
+These functions are templates for the engine, see `lanes`. For a small system the products of the Jacobian J and the
+tangent vectors are written out in the right-hand side (see `variational.with_tangents`). For a large one the
+right-hand side computes only the rates of the states. The engine computes all stages of the states first, and stores
+the entries of J at each stage. Then it computes all stages of the first vector, of the second, and so on, so that the
+rows of a vector stay in the first-level cache. The states do not depend on the vectors, so this order changes no bit.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ DIVERGENCE = "divergence"
 
 
 def order_of(row: dict[int, int]) -> list[int]:
-    """Return the columns of a row of the Jacobian in the order in which their products are summed.
+    """Return the columns of one Jacobian row in the order in which a matrix-vector product adds them.
 
-    The first product is rounded by itself, the others are fused with the sum. Where neither of the first two
-    columns is 0, the second comes first, as in a written-out sum (see `fusing`). So leaving out the zeros of a
-    row changes no bit of the sum.
+    The first product is rounded; the others are fused with the sum. If the row has entries in columns 0 and 1, column 1
+    comes first, as in a sum written out in source code (see `fusing`). So the sum has the same bits with and without
+    the zeros of the row.
     """
     columns = sorted(row)
     return [1, 0, *columns[2:]] if columns[:2] == [0, 1] else columns
@@ -40,8 +40,8 @@ def trace_of(rows: list[dict[int, int]], name: str) -> str:
 
 
 def n_entries(system: System) -> int:
-    """Return how many numbers of the Jacobian are stored at each Runge-Kutta stage; 0 if the engine integrates no
-    tangent vectors.
+    """Return the number of Jacobian entries stored per Runge-Kutta stage; 0 if `rhs` itself computes the tangent
+    vectors.
     """
     if system.known == system.n_states or system.tangents_of is None:
         return 0
@@ -49,14 +49,11 @@ def n_entries(system: System) -> int:
 
 
 def _has_trace(system: System) -> bool:
-    """Return whether the last state integrates the trace of the Jacobian."""
     return system.state_names[-1] == DIVERGENCE
 
 
 def tangent_bindings(system: System) -> dict[str, Any]:
-    """Return the values, for a given system, of the global names that the function templates of this module leave
-    open.
-    """
+    """Return the values of this module's free global names (such as ``N_ENTRIES``) for a system."""
     known, base = system.known, system.tangents_of
     names = {"N_KNOWN": known, "N_ENTRIES": n_entries(system), "CARRIES": n_entries(system) > 0}
     if base is None or not names["CARRIES"]:
@@ -78,8 +75,8 @@ def tangent_bindings(system: System) -> dict[str, Any]:
 
 
 def _tangent_entries(base: System, order: list[int], has_trace: bool) -> Callable[..., Any]:
-    """Return a function that computes the Jacobian's entries, in the order in which products with vectors sum them, and
-    the trace.
+    """Return a function that computes the Jacobian's entries in the order of summation (see `order_of`), then its
+    trace.
     """
     parts = [f"entries[{k}]" for k in order]
     if has_trace:
@@ -91,7 +88,7 @@ def _tangent_entries(base: System, order: list[int], has_trace: bool) -> Callabl
 
 
 def stage_row(w: Any, row: int, s: int, h: Any) -> None:
-    """Compute one component of the state at Runge-Kutta stage `s`."""
+    """Compute one component of the state at Runge-Kutta stage `s` from the slopes of earlier stages."""
     total = STAGES[s, 0] * load(w, row + ROWS.slopes)
     for j in range(1, s):
         # half of the eighth-order method's coefficients are 0, and add nothing
@@ -143,7 +140,7 @@ def run_stages_and_vectors(w: Any, base: int) -> None:
 
 
 INLINE = ("stage_row",)
-"""Templates here that dissolve into their callers, callees first."""
+"""Templates of this module that are inlined into their callers; callees come first."""
 
 CALLED = ("carry_vector", "carry_trace")
-"""The others, but for `run_stages_and_vectors`, which stands for `lanes.run_stages`."""
+"""Templates compiled as functions of their own; `run_stages_and_vectors` takes the place of `lanes.run_stages`."""

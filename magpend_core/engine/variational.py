@@ -1,11 +1,10 @@
 """Extend a system by its variational equations, which integrate tangent vectors beside the trajectory.
 
-`with_tangents` is for changes of the start, `with_parameter_tangent` for those of the parameters, too.
+`with_tangents` is for derivatives by the initial state, `with_parameter_tangent` for those by parameters as well.
 
-The engine integrates the extended system like any other: the states of the system, then the tangent
-vectors one after the other, each driven by the analytic Jacobian along the trajectory. Only the
-system's own states enter the error control, so that the trajectory is, step by step, the one that it
-is without tangents.
+The engine integrates the extended system like any other: first the states of the system, then the tangent vectors one
+after the other, each with the analytic Jacobian along the trajectory. Only the system's own states enter the error
+control, so the trajectory has the same steps and the same bits as without tangent vectors.
 """
 
 from __future__ import annotations
@@ -28,12 +27,12 @@ def _first(n: int) -> str:
 
 
 def _products(system: System, n_vectors: int) -> list[str]:
-    """Return source code for the entries of J v for each tangent vector v, one vector after the other."""
+    """Return source code for the components of J v, for each tangent vector v in turn."""
     n, found = system.n_states, []
     for k in range(n_vectors):
         for row in rows_of_entries(system):
             first, second = order_of(row)[:1], order_of(row)[1:2]
-            # of two products the one on the left is fused
+            # of two products the left one is fused (see `fusing`); so the product to be rounded goes to the right
             columns = [*second, *first, *order_of(row)[2:]]
             terms = [f"jacobian[{row[j]}] * y[{n * (1 + k) + j}]" for j in columns]
             found.append(" + ".join(terms) or "0.0 * y[0]")
@@ -41,9 +40,9 @@ def _products(system: System, n_vectors: int) -> list[str]:
 
 
 def _compile(source: str, name: str, wrapped: Callable[..., Any], bindings: dict[str, Any]) -> Any:
-    """Compile a function from its source, for example one that returns a tuple of given length.
+    """Compile a function from source text. numba's cache treats it as part of the module of `wrapped`.
 
-    It passes for a function of the module of `wrapped`, which it calls (see `jit.keeping`).
+    See `jit.keeping` for the reason. The function calls `wrapped`.
     """
     scope: dict[str, Any] = {"__name__": wrapped.__module__, **bindings}
     exec(source, scope)
@@ -60,9 +59,9 @@ def with_tangents(system: System, n_vectors: int, divergence: bool = False, writ
     Parameters
     ----------
     system
-        What is linearised; needs its `jacobian`.
+        System to linearise; must have a `jacobian`.
     n_vectors
-        1 to ``system.n_states``.
+        Number of tangent vectors, 1 to ``system.n_states``.
     divergence
         Whether one more state, the last, integrates the trace of the Jacobian: the logarithm of the
         factor by which the flow changes volumes.
@@ -126,7 +125,7 @@ def _extended_functions(system: System, n_vectors: int, divergence: bool) -> dic
         system.rhs,
         bindings,
     )
-    behind = [n * (1 + n_vectors) + divergence] if system.timed_layers else []  # where the time is
+    behind = [n * (1 + n_vectors) + divergence] if system.timed_layers else []  # index of the time
     rates = ", ".join(f"dy[{i}]" for i in (*range(n), *behind))
     layers = _compile(
         f"def layers(y, dy, c):\n    return _layers(({_first(n)},), ({rates},), c)\n", "layers", system.layers, bindings
@@ -145,28 +144,27 @@ def _extended_functions(system: System, n_vectors: int, divergence: bool) -> dic
 
 
 PLUS, MINUS, PER_STEP = "_plus", "_minus", "per_step"
-"""Endings of the names of parameters a step to either side, and the name of 1/(their difference)."""
+"""Suffixes of the increased and the decreased parameters, and the name of the parameter 1/(their difference)."""
 
 
 @cache
 def with_parameter_tangent(system: System) -> System:
-    """Return `system` extended by the tangent vector of a parameter change: its equation has a source term.
+    """Extend a system by one tangent vector: the derivative of the trajectory with respect to a parameter.
 
-    The vector v obeys v' = J v + (f(c_plus) - f(c_minus)) per_step: the Jacobian J is analytic, the direct
-    effect of the parameters on the right-hand side f, and on the forcing, a central difference at each stage.
-    For a change of the start alone, all three sets of parameters are the same and the vector begins as that
-    change.
+    The vector v obeys v' = J v + (f(c_plus) - f(c_minus)) per_step. The Jacobian J is analytic; the direct effect of
+    the parameters on the right-hand side f and on the forcing is a central difference at each stage. For a derivative
+    by the initial state, set all three sets of parameters equal, and let the vector begin as the change of the state.
 
     Parameters
     ----------
     system
-        What is linearised; needs its `jacobian`.
+        System to linearise; must have a `jacobian`.
 
     Returns
     -------
     System
-        With 2 n_states states, and three sets of parameters followed by ``per_step``: the system's own, then
-        those ending on ``_plus`` and ``_minus``.
+        System with 2 n_states states. Its parameters are those of `system`, then a copy with the suffix ``_plus``, a
+        copy with ``_minus``, and ``per_step``.
 
     Raises
     ------
@@ -210,7 +208,7 @@ def with_parameter_tangent(system: System) -> System:
         escape=(*system.escape, *[math.inf] * n),
         n_controlled=system.controlled,
         constants=compiled("frequency, p, out", *blocks, f"out[{3 * nc}] = p[{3 * m}]"),
-        # the time itself: each set of parameters has a forcing of its own
+        # `forcing` returns the time, since `rhs` needs three values of the forcing, one for each set of parameters
         forcing=compiled("t, c", "return 1.0 * t"),
         rhs=compiled(
             "y, t, c",

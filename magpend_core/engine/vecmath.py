@@ -1,17 +1,17 @@
 """Branch-free elementary functions, with the same bits on every CPU.
 
-numba has no vector math library, so ``math.exp`` in a kernel is a call into libm for each number,
-and its last bit depends on the machine. The functions here are made of additions, products, at most
-one division and selects; they take a float64 or a group of lanes (see `simd`).
+numba has no vector math library, so ``math.exp`` in a kernel calls libm for each number, and its last bit depends on
+the machine. The functions here consist of sums, products, `where_less` and at most one division; their arguments are
+float64 numbers or groups of lanes (see `simd`).
 
 Accuracy: the largest errors, in units in the last place, are below 1 for `exp`, `exp2_falling` and
 `log`, 1.5 for `cosh`, `acos` and
 `inverse_sqrt`, 1.6 for `sincos`, 2 for `sin`, `cos` and `expm1`, 2.5 for `asin` and
 `sinh`, 3 for `tan` and `atan2`, 3.5 for `atan` (between 0.41 and 0.55; 1.6 elsewhere), 4 for `tanh`. That
 of ``power(x, y)`` grows with y: 1 for y = 1.5 and 2.5 for y = 17.3, at any x. Measured against 40-digit
-arithmetic in ``tests/core/engine/test_vecmath.py``. Next to their zeros beyond the first the sines are off
-by up to 3e-27 times the argument, which there is more. The polynomials interpolate in Chebyshev nodes,
-with errors below 2e-17, or are fdlibm's. A NaN stays one.
+arithmetic in ``tests/core/engine/test_vecmath.py``. Near a zero at x = k pi (k not 0), the sines have an absolute error
+of up to 3e-27 |x|, which may be larger than these limits. The polynomials interpolate in Chebyshev nodes, with errors
+below 2e-17, or come from fdlibm. NaN gives NaN.
 """
 
 from __future__ import annotations
@@ -150,8 +150,8 @@ def exp2_falling(x: Any) -> Any:
 
 @inline
 def _quarter_turns(x: Any) -> Any:
-    """Return sine and cosine of what is left of `x` after whole quarter turns, and the number of these turns in the low
-    bits of a float.
+    """Reduce an angle `x` by quarter turns: return sine and cosine of the rest, and a float that holds the number of
+    turns.
     """
     shifted = x * TWO_OVER_PI + _ROUND
     n = shifted - _ROUND
@@ -331,7 +331,7 @@ def _artanh_rest(u: Any) -> Any:
 
 @inline
 def log(x: Any) -> Any:
-    """Compute the natural logarithm; minus infinity of 0, NaN of a negative number."""
+    """Compute the natural logarithm: minus infinity for 0, NaN for a negative number."""
     f, k = _fraction_and_exponent(x)
     s = f / (2.0 + f)
     u = s * s
@@ -344,7 +344,7 @@ def log(x: Any) -> Any:
 
 @inline
 def power(x: Any, y: Any) -> Any:
-    """Compute `x` to the real power `y`: NaN of a negative `x`, 0 of 0 to a positive power.
+    """Compute `x` to the real power `y`. A negative `x` gives NaN; 0 to a positive power gives 0.
 
     Results beyond exp(+-700) count as these. For whole powers products are better.
     """
@@ -380,7 +380,7 @@ def power(x: Any, y: Any) -> Any:
 
 @inline
 def inverse_sqrt(x: Any) -> Any:
-    """Compute the inverse square root; NaN below 2.2e-308, 0 included; not finite for infinity.
+    """Compute the inverse square root. The result is NaN below 2.2e-308, also for 0, and not finite for infinity.
 
     A dozen products, where a root and a division keep the dividers busy for several times as long.
     """
@@ -397,7 +397,7 @@ def inverse_sqrt(x: Any) -> Any:
 
 @inline
 def sign(x: Any) -> Any:
-    """Return the sign of `x`: -1, 0 or 1; NaN of NaN."""
+    """Return the sign of `x`: -1, 0 or 1; NaN for NaN."""
     return where_less(0.0, x, 1.0, where_less(x, 0.0, -1.0, x))
 
 
@@ -429,7 +429,7 @@ def exp2_rough(x: Any) -> Any:
 
 @inline
 def hypot_rough(x: Any, y: Any) -> Any:
-    """Compute sqrt(a**2 + b**2) for sides of at least 0, to 2.2 %: for step sizes, not for physics."""
+    """Compute sqrt(x**2 + y**2) for non-negative `x` and `y`, to 2.2 %: for step sizes, not for physics."""
     longer = maximum(x, y)
     return maximum(longer, multiply_add(0.898, longer, 0.486 * minimum(x, y)))
 

@@ -1,14 +1,14 @@
-"""Track minimum, maximum and mean of named quantities over those drive periods whose end is recorded.
+"""Track minimum, maximum and mean of named quantities over each drive period that ends with a recorded section point.
 
-Templates for the engine, see `lanes`. After an accepted step each quantity is known at its begin, its
-middle (from the pair's continuous extension) and its end: the parabola through the three gives the
-extremes within the step, Simpson's rule the integral. With a step h the error of an extreme is of
-order h^3, of order h^4 where the quantity is even about it; that of the mean is of order h^4. On the
-pendulum at a tolerance of 1e-9, in units of a quantity's range: 2e-5 and 1e-7, but 2e-4 for the peaks of
-friction torques, which are hardly wider than a step; at 1e-5 a hundred times as much.
+These functions are templates for the engine, see `lanes`; "watched" means tracked. After an accepted step each quantity
+is known at the start, in the middle (from the method's continuous extension) and at the end of the step. The parabola
+through the three values gives the extremes within the step, Simpson's rule gives the integral. With a step h the error
+of an extreme is of order h^3, or h^4 where the quantity is even about it; the error of the mean is of order h^4. On
+the pendulum at a tolerance of 1e-9, the errors are 2e-5 (extremes) and 1e-7 (means) of a quantity's range, but 2e-4
+for the peaks of friction torques, which are hardly wider than a step. At a tolerance of 1e-5 they are 100 times larger.
 
-States, steps and sections are the same, to the last bit, whether something is watched or not. A
-group of lanes of which none is in such a period evaluates nothing.
+States, steps and sections have the same bits whether quantities are tracked or not. Nothing is evaluated in a group of
+lanes without a lane in such a period.
 """
 
 from __future__ import annotations
@@ -38,11 +38,10 @@ LOWEST, HIGHEST, MEAN = 0, 1, 2
 
 
 def watched_function(system: System, watched: tuple[int, ...]) -> Callable[..., Any]:
-    """Return a compiled function with the arguments of ``system.quantities`` that returns only the values to be
-    tracked.
+    """Compile a function like ``system.quantities`` that returns only the quantities to be tracked.
 
-    `watched` are numbers in ``system.state_names + system.quantity_names``. numba cannot pick entries of
-    a tuple by numbers known at run time only, so the function is written out. It passes for one of the
+    `watched` holds indices into ``system.state_names + system.quantity_names``. numba cannot select tuple entries by
+    indices that it learns at run time, so the source of the function is generated. The cache treats it as part of the
     system's module (see `jit.keeping`).
     """
     n = system.n_states
@@ -80,7 +79,7 @@ def evaluate_watched(w: Any, base: int) -> None:
 def update_extremes(w: Any, base: int) -> None:
     """Update the extremes and integrals of the current period with an accepted step.
 
-    A step of size 0, the first of every period, leaves the values at its begin behind.
+    The first step of every period has size 0; it stores the values at the start of the period.
     """
     h = load(w, base + ROWS.step)
     rejected = load(w, base + ROWS.after_rejection)
@@ -122,8 +121,8 @@ def set_watching(work: Any, lane: int, watching: int) -> None:
 
 
 def begin_watch(work: Any, lane: int, wanted: bool) -> None:
-    """Begin a period of a SIMD lane: reset extremes and integrals, and note whether the quantities are to be
-    tracked.
+    """Reset minimum, maximum and integral of the tracked quantities at the start of a period; note whether to track
+    them.
     """
     set_watching(work, lane, 1 if wanted else 0)
     base, column = (lane // WIDTH) * ROWS.size, lane % WIDTH

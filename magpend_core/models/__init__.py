@@ -49,8 +49,7 @@ def model_names() -> tuple[str, ...]:
 
 
 def load_model(reference: str | Mapping[str, Any] | Model = DEFAULT) -> Model:
-    """Return a model by its name or from its text, without importing or executing anything; equal texts give one
-    object.
+    """Return a model by its name or from its text. No code from the text is executed; equal texts give the same object.
 
     Parameters
     ----------
@@ -90,7 +89,7 @@ def load_model(reference: str | Mapping[str, Any] | Model = DEFAULT) -> Model:
 
 
 def _of_table(table: Mapping[str, Any]) -> Model:
-    """Return the model that a table defines; tables with the same meaning give the same object."""
+    """Return the model that a table defines. Tables with the same meaning give the same object."""
     try:
         # not sorted: the order of the states is the model's
         text = json.dumps(table)
@@ -171,7 +170,6 @@ def _reduced(parameters: Parameters) -> tuple[Any, ...]:
 def _again(
     reference: str | Mapping[str, Any], values: dict[str, float], crossing: Crossing | None = None
 ) -> Parameters:
-    """Restore pickled parameters from the model's reference, the values, and the Poincare section if there is one."""
     found = load_model(reference)
     return Parameters(found if crossing is None else sectioned(found, crossing), values)
 

@@ -1,4 +1,4 @@
-"""Import models that are Python objects if the user names one; otherwise use a stored description of them.
+"""Import a model that is a Python object if the user names it; otherwise use the description stored in a run.
 
 A run keeps a description: names, units, bounds, presets, and the digest of the files that decide the
 equations. Opening or drawing needs no more, and imports nothing. What integrates needs the object itself,
@@ -40,8 +40,8 @@ def is_object_path(text: str) -> bool:
 
 
 def import_model(path: str, folder: str | Path | None = None) -> Model:
-    """Import a model from ``package.module:NAME``, which runs the module's code: call it only if the user named the
-    object.
+    """Import a model from ``package.module:NAME``. This runs the module's code: call it only for an object that the
+    user named.
 
     Parameters
     ----------
@@ -96,7 +96,6 @@ def import_model(path: str, folder: str | Path | None = None) -> Model:
 
 
 def _description(path: str, model: Model) -> dict[str, Any]:
-    """Return a model's description as plain data, as a run stores it."""
     table: dict[str, Any] = {KEY: path, "digest": model.digest}
     table |= {name: getattr(model, name) for name in ("name", "title", "section", "angle_dim")}
     table["autonomous"] = model.autonomous
@@ -111,7 +110,6 @@ def _description(path: str, model: Model) -> dict[str, Any]:
 
 
 def _plain(one: Any) -> dict[str, Any]:
-    """Return the fields of a dataclass as a dict, without its name and without fields that have their default value."""
     values = {f.name: (getattr(one, f.name), f.default) for f in fields(one) if f.name != "name"}
     return {name: value for name, (value, default) in values.items() if value != default}
 
@@ -143,7 +141,7 @@ class DescribedModel(Model):
 
 
 def origin(model: Model) -> tuple[str, str] | None:
-    """Return the arguments with which another process can call `import_model`; None if the model was not imported."""
+    """Return the object path and the folder from which another process can import the model; None if not imported."""
     path = "" if model.text is None else str(model.text.get(KEY, ""))
     known = _imported.get(path)
     if known is None or known.text != model.text:
@@ -155,7 +153,7 @@ def origin(model: Model) -> tuple[str, str] | None:
 
 
 def known_model(table: Mapping[str, Any]) -> Model | None:
-    """Return the model already imported in this process that a description or an object path belongs to, or None."""
+    """Return the model that this process has imported for a description or an object path, or None."""
     known = _imported.get(str(table[KEY]))
     return known if known is not None and (len(table) == 1 or known.text == table) else None
 
@@ -197,7 +195,6 @@ def described_model(table: Mapping[str, Any]) -> Model:
 
 
 def _outer_problems(table: Mapping[str, Any]) -> list[str]:
-    """Return a sentence for each key of a description that is missing, unknown or of the wrong type."""
     known = (KEY, *_TEXTS, *_TABLES, "autonomous", "mirror")
     problems = [f"{key}: no part of a model's description." for key in table if key not in known]
     problems += [f"{key}: must be a text." for key in _TEXTS if not isinstance(table.get(key), str)]

@@ -87,7 +87,7 @@ class Quantity:
 
 @dataclass(frozen=True)
 class Classifier:
-    """Classification of a model's motions into named classes, computed from stored sections.
+    """Classification of a model's motions into named classes, computed from stored section points.
 
     Attributes
     ----------
@@ -112,8 +112,8 @@ class Classifier:
 
 @dataclass(frozen=True)
 class Mirror:
-    """A symmetry of a model: multiplying the states by `signs`, perhaps half a drive period later, gives a solution
-    again.
+    """A symmetry of a model: solutions with states multiplied by `signs`, perhaps shifted by half a drive period, are
+    solutions again.
 
     Attributes
     ----------
@@ -129,7 +129,7 @@ class Mirror:
 
 @dataclass(frozen=True)
 class Drawing:
-    """Geometry of a model for portraits and animations: moving and fixed points, and the lines between them.
+    """Geometry of a model for portraits and animations: moving points, anchor points, and the lines between them.
 
     Attributes
     ----------
@@ -208,7 +208,7 @@ class Model:
 
     @property
     def reference(self) -> str | Mapping[str, Any]:
-        """Return the model's reference, as stored and as `load_model` reads it: its name, or its text as a table."""
+        """Return the reference that a run stores and `load_model` reads: the model's name, or its text as a table."""
         return self.name if self.text is None else self.text
 
     @property
@@ -253,7 +253,7 @@ class Model:
 
     @property
     def scales(self) -> tuple[float, ...]:
-        """Return for each state the size that counts as 1 when states are compared."""
+        """Return the typical size of each state, by which differences between states are divided."""
         return tuple(s.scale for s in self.states)
 
     @property
@@ -263,8 +263,8 @@ class Model:
 
     @property
     def portraits(self) -> tuple[tuple[str, str], ...]:
-        """Return the pairs of states for phase portraits: each state with its time derivative, else neighbouring
-        states.
+        """Return the pairs of states for phase portraits: each state with its time derivative, or else each state with
+        the next.
         """
         pairs = tuple((s.name, s.rate) for s in self.states if s.rate)
         names = self.state_names

@@ -111,25 +111,25 @@ def is_file(name: str | Path) -> bool:
 
 
 def find_preset(name: str | Path, folder: str | Path = ".") -> str | Preset:
-    """Return a preset read from its file, or the name of one that ships unchanged, as `Model.load` accepts it.
+    """Return the preset in a file, or the name of a shipped preset unchanged; `Model.load` accepts both.
 
     Parameters
     ----------
     name
-        Of one that ships, or of a file: a path, or a text that ends in ``.toml``.
+        Name of a shipped preset, or a file: a path, or a text that ends in ``.toml``.
     folder
-        From where the path of a file counts.
+        Folder to which the path of a file is relative.
 
     Raises
     ------
     ParameterError
-        If it is a file that cannot be read or is no preset.
+        If the file cannot be read or is no preset.
     """
     return Preset.read(Path(folder) / name) if is_file(name) else str(name)
 
 
 class Owner(Protocol):
-    """Protocol with the attributes of a `Model` that its presets need."""
+    """Protocol of a model with presets: the attributes of `Model` that this module uses."""
 
     @property
     def name(self) -> str:
@@ -155,13 +155,13 @@ class Owner(Protocol):
 
 
 def completed(preset: Preset, model: Owner, model_named: Callable[[str], Owner]) -> Preset:
-    """Return a preset filled up with the values of its base preset, checked against the model that is to use it.
+    """Return a preset with missing values taken from its base preset, checked against a model.
 
     Raises
     ------
     ParameterError
-        If it is of a model that shares no presets with this one, lacks a phrase of provenance, or has an
-        unknown name, a value out of bounds or an unknown base; all problems at once.
+        If the preset is for a model with other presets, a value has no provenance or is out of bounds, or a name or
+        the base is unknown; lists all problems.
     """
     where = f"{preset.name}{SUFFIX}"
     if not preset.model:

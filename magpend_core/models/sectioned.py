@@ -50,8 +50,8 @@ class SectionedModel(Model):
 
     @property
     def section_states(self) -> tuple[str, ...]:
-        """Names of the states except the one that defines the section; of a one-dimensional flow the name of its only
-        state.
+        """Return the names of the states that vary on the Poincare section; for a one-dimensional flow, the name of its
+        only state.
         """
         return tuple(name for name in self.state_names if name != self.through.of) or self.state_names
 

@@ -1,4 +1,4 @@
-"""Describe a model: its equations, the features by which steps are chosen, and the results of the checks."""
+"""Describe a model: its equations, the features that limit the integrator's steps, and the results of the checks."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from magpend_core.models.model import Model, Parameters
 
 
 def checks_of(model: Model) -> list[str]:
-    """Return the names of the checks that `describe` makes."""
+    """Return the names of the checks that `describe` makes for a model."""
     return [
         "finite at the starts",
         "Jacobian equal to differences",
@@ -22,7 +22,7 @@ def checks_of(model: Model) -> list[str]:
 
 @dataclass(frozen=True)
 class Description:
-    """Description of a model: equations, features by which steps are chosen, and problems found by the checks.
+    """Description of a model: equations, features that limit the integrator's steps, and problems found by the checks.
 
     Attributes
     ----------
@@ -84,7 +84,9 @@ def _written(model: Model) -> tuple[dict[str, str], dict[str, str], list[str]]:
 
 
 def _found(parameters: Parameters, frequency_hz: float, states: np.ndarray) -> Iterator[str]:
-    """Yield a sentence on each edge, layer, switch and impact of the equations that steps are adapted to."""
+    """Yield a sentence for each forcing edge, boundary layer, switch and impact at which the integrator adapts its
+    steps.
+    """
     from magpend_core.engine.plain_python import plain
     from magpend_core.models.text.model import TextModel
 

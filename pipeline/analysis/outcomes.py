@@ -37,7 +37,7 @@ _BY_STATUS = {
 
 
 def outcomes(ids: xr.Dataset) -> xr.DataArray:
-    """Label each cell by the attractor that it ends on, by -2 (`DIVERGED`), or by -1 for all others.
+    """Return the outcome of each cell: the id of its attractor, -2 (`DIVERGED`), or -1 if it ends on no attractor.
 
     Parameters
     ----------
@@ -63,7 +63,7 @@ def stability_of_cells(ids: xr.Dataset) -> np.ndarray:
 
 
 def other_cells(ids: xr.Dataset) -> Mapping[str, np.ndarray]:
-    """Group the cells that do not end on an attractor by their fate.
+    """Group the cells that do not end on an attractor, by the reason.
 
     Returns
     -------
@@ -85,7 +85,7 @@ def other_cells(ids: xr.Dataset) -> Mapping[str, np.ndarray]:
 
 
 def share_interval(count: np.ndarray, share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Compute the 95 % Wilson interval of basin shares from numbers of cells; NaN where the share is 0.
+    """Compute the 95 % Wilson interval of basin fractions from cell counts; NaN where the fraction is 0.
 
     Parameters
     ----------

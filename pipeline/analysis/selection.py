@@ -81,7 +81,7 @@ def place(axis: xr.DataArray, value: float) -> int:
 
 
 def _slack(values: Floats, index: int) -> float:
-    """Return how far a number may lie from an axis value and still count as equal to it."""
+    """Return the tolerance for matching a number to an axis value: 1e-6 of the spacing to the nearest other value."""
     apart = np.abs(values - values[index])
     spacing = apart[apart > 0].min() if (apart > 0).any() else abs(values[index])
     return float(1e-6 * spacing)

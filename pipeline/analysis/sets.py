@@ -164,6 +164,6 @@ def order_by_points(points: list[np.ndarray], geometry: Geometry) -> list[int]:
 
 
 def rounded_points(points: np.ndarray, geometry: Geometry) -> np.ndarray:
-    """Scale points, wrap angles to (-pi, pi], and round to 1e-6, so that all processors sort them alike."""
+    """Return scaled points, angles wrapped to (-pi, pi], rounded to 1e-6 so that their sort order is reproducible."""
     centred = geometry.difference(points, np.zeros(points.shape[-1]))
     return np.asarray(np.round(centred, 6) + 0.0)

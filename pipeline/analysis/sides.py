@@ -23,7 +23,7 @@ _COMPUTED = (PERIODIC, BOUNDED, INFERRED)
 
 
 def classify(ds: xr.Dataset, *, parameters: Parameters | None = None) -> xr.DataArray | None:
-    """Label each cell by the classifier of the model; lazy if `ds` is lazy.
+    """Return the class of motion of each cell by the model's classifier, as codes; lazy if `ds` is lazy.
 
     Parameters
     ----------
@@ -94,9 +94,7 @@ def _label(
     swept: list[str],
     n_angles: int,
 ) -> np.ndarray:
-    """Return the classifier code of each cell of a block; the last dims of `section` are period and state, others
-    broadcast.
-    """
+    """Return the class of motion (a code) of each cell of a block; `section` ends with the dims period and state."""
     values = {**fixed, **dict(zip(swept, rest, strict=False))}
     turns = rest[len(swept)] if len(rest) > len(swept) else np.zeros((1,) * status.ndim + (n_angles,), int)
     known = np.isfinite(section).all(axis=(-2, -1)) & np.isin(status, _COMPUTED)

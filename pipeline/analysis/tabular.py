@@ -86,7 +86,7 @@ def number(value: float, spec: str) -> str:
 
 
 def plain(label: str) -> str:
-    """Return a label with blanks instead of underscores."""
+    """Replace underscores by spaces in a label."""
     return label.replace("_", " ")
 
 
@@ -102,7 +102,7 @@ def distinct(values: Iterable[Any]) -> str:
 
 
 def ranges(ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str]) -> dict[str, str]:
-    """Return the table columns that summarise some rows: the range of each axis, and the number of parameter points."""
+    """Return the columns that summarise table rows: the range on each axis, and the number of parameter points."""
     words = {}
     for d in dims:
         values = [row[d] for row in rows]

@@ -33,7 +33,7 @@ Json = Annotated[bool, typer.Option("--json", help="Write the table as JSON to t
 
 
 def read_pairs(option: str, texts: list[str], example: str) -> dict[str, float]:
-    """Read ``NAME=VALUE`` pairs with numbers; raise `SpecError` with all that are wrong."""
+    """Parse ``NAME=VALUE`` texts into numbers by name; raise `SpecError` that lists every invalid text."""
     from pipeline.specification.problems import SpecError
 
     found, problems = {}, []

@@ -43,7 +43,7 @@ def check_place(path: Path, option: str = "--out", within: str = "") -> None:
 
 
 def check_file(path: Path, option: str = "--out", within: str = "") -> None:
-    """Refuse a place that cannot be written to, and an existing file that magpend did not write.
+    """Raise an error for a path that cannot be written to, or for an existing file that magpend did not write.
 
     Raises
     ------

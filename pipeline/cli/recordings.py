@@ -146,7 +146,7 @@ def drive(
 
 
 def _keep(file: Path, out: Path) -> None:
-    """Raise `SpecError` if the output file is the recording that is read."""
+    """Raise `SpecError` if the output file would overwrite the input file."""
     from pipeline.specification.problems import SpecError
 
     if out.exists() and file.exists() and out.samefile(file):

@@ -31,7 +31,7 @@ _SAY_EVERY_S, _CONNECT_S = 30.0, 10.0
 
 @dataclass(frozen=True)
 class Where:
-    """The user's choice of where tasks run: this process, local processes, a dask scheduler or a batch system.
+    """Choice of where tasks run: in this process, in local processes, on a dask scheduler or in a batch system.
 
     Attributes
     ----------
@@ -123,9 +123,9 @@ def connected(where: Where, n_workers: int, echo: Echo = print) -> Iterator[Any]
     Parameters
     ----------
     where
-        Where tasks are computed; not ``none``.
+        Choice of where tasks run; not ``none``.
     n_workers
-        Processes of a local cluster.
+        Number of processes of a local cluster.
     echo
         Function that prints a line.
 

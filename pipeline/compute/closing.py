@@ -49,7 +49,7 @@ class Closing(NamedTuple):
         return self.to_go == 0.0
 
     def sentence(self, n_transient: int) -> str:
-        """Return a sentence on the result, with the ``--transient`` that suffices if `n_transient` periods did not."""
+        """Return a sentence on the result; for a motion not closed yet it suggests a sufficient ``--transient``."""
         periods = f"{self.period} drive period{'s' if self.period > 1 else ''}"
         if self.is_closed:
             return f"closed: the motion repeats after {periods} (distance {self.distance:.1e})"
@@ -121,9 +121,7 @@ def _late(distances: np.ndarray) -> float:
 
 
 def _judged(p: int, distances: np.ndarray) -> Closing:
-    """Estimate the distance from an orbit of period `p` and the time to converge, from distances of points `p` periods
-    apart.
-    """
+    """Judge whether a trajectory closes with period `p`, from distances of points `p` periods apart along its end."""
     quarter = len(distances) // 4
     last = distances[len(distances) - 4 * quarter :].reshape(4, quarter).max(axis=1)
     if last[2:].max() <= 0.01 * TOLERANCE:  # errors of integration hide what shrinks

@@ -22,25 +22,25 @@ from pipeline.compute.limits import SILENT_S, Limits
 from pipeline.compute.order import Order, why
 
 WINDOW = 3
-"""Tasks in flight per worker thread."""
+"""Tasks in flight (submitted, not finished) per worker thread."""
 
 TICK_S = 1.0
 """Time between two checks of the workers [s]."""
 
 MOST_LOOKED_AT = 100
-"""Workers that are looked at in a second: more of them are looked at less often."""
+"""Workers checked per second; if there are more, each is checked less often."""
 
 ANSWER_S = 30.0
-"""A scheduler that does not answer for so long is taken for gone [s]."""
+"""Longest wait for an answer of the scheduler [s]; after it the scheduler counts as gone."""
 
 MOST_PATIENCE = 8
-"""How much longer silence may last in the end."""
+"""Largest factor by which the limit for silent workers grows."""
 
 WAITING_S = 30.0
-"""Without workers for so long, a line says so [s]."""
+"""Time without workers after which a line is printed [s]."""
 
 MOST_HANGS = 2
-"""A task that hung so often is set aside, to be tried again alone."""
+"""Number of hangs after which a task is set aside; it is tried again alone, after all others."""
 
 Task = Callable[[int], dict[str, Any]]
 Echo = Callable[[str], None]
@@ -71,15 +71,15 @@ class Window:
     Parameters
     ----------
     client
-        Of dask.
+        Dask client.
     task
-        Takes an index; must be importable on the workers.
+        Function that computes the task with a given index; it must be importable on the workers.
     order
-        Hands out the tasks.
+        Queue of the tasks, which says when each may start.
     seconds
-        Estimated time of a task on one core [s].
+        Function that returns the estimated time of a task on one core [s], from its index.
     echo
-        Takes a line when something goes wrong and is dealt with.
+        Function that prints a line on a problem that the window has dealt with.
     """
 
     def __init__(
@@ -108,7 +108,7 @@ class Window:
         Raises
         ------
         TaskFailedError
-            At once, if so many tasks fail that it is not the tasks.
+            As soon as so many tasks have failed that the cause cannot lie in single tasks.
         SchedulerError
             If the scheduler is gone.
         """
@@ -152,7 +152,7 @@ class Window:
         if future.status in ("error", "cancelled"):
             error = future.exception() if future.status == "error" else asyncio.CancelledError()
             self._news.put(("end", ticket, (None, error)))
-        else:  # finished; or lost since, with the worker that had it: then it is computed again
+        else:  # finished; if its worker has died since, the fetch makes dask compute the task again
             fetch = asyncio.run_coroutine_threadsafe(_fetched(self._client, future), self._client.loop.asyncio_loop)
             fetch.add_done_callback(lambda fetched: self._news.put(("end", ticket, fetched.result())))
 
@@ -166,7 +166,7 @@ class Window:
     def _take(self, kind: str, ticket: int, value: Any) -> Iterator[dict[str, Any]]:
         flight = self._flights.get(ticket)
         if flight is None:
-            return  # of a task that was given up
+            return  # the event belongs to a task that was given up
         if kind == "start":
             flight.started, flight.worker = self._watch.now, value
             return
@@ -240,8 +240,8 @@ class Window:
 class Watch:
     """Record of when each dask worker last reported, to find workers that hang.
 
-    Its clock goes on only while it is looked at: time in which this process was itself stopped, by Ctrl-Z
-    or a closed lid, blames nobody.
+    Its clock stops while this process is suspended, by Ctrl-Z or a closed lid: no worker is blamed for that
+    time.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
@@ -257,14 +257,15 @@ class Watch:
     def limit_s(self) -> float:
         """Time after which a silent worker counts as hung [s].
 
-        It doubles with those that were found: on a machine that is far too busy all are slow to answer.
+        It doubles with each check that finds silent workers, since all workers of an overloaded machine
+        answer slowly.
         """
-        least = max(SILENT_S, len(self._heard) / 50)  # many workers are asked to report less often
+        least = max(SILENT_S, len(self._heard) / 50)  # dask asks many workers to report less often
         return least * min(self._patience, MOST_PATIENCE)
 
     @property
     def now(self) -> float:
-        """Time of the record's own clock [s], which does not advance while this process is suspended."""
+        """Time [s] on a clock that stops while this process is suspended."""
         now = self._clock()
         self._time += min(now - self._last, 5 * TICK_S)
         self._last = now
@@ -295,7 +296,7 @@ class Watch:
 
 
 async def _fetched(client: Any, future: Any) -> tuple[Any, BaseException | None]:
-    """Fetch the result of a dask future; return (result, None), or (None, error) if it failed."""
+    """Fetch the result of a dask future as (result, None), or its error as (None, error)."""
     try:
         return await client.gather(future, asynchronous=True), None
     except (Exception, asyncio.CancelledError) as error:

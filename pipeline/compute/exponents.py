@@ -1,6 +1,4 @@
-"""Compute the product ``lyapunov``: Lyapunov exponents of each cell of a task, starting at the cell's last section
-point.
-"""
+"""Compute the product ``lyapunov``: the Lyapunov exponents of each cell, from its last section point on."""
 
 from __future__ import annotations
 
@@ -27,7 +25,7 @@ def exponents(job: Job, options: LyapunovOptions) -> dict[str, np.ndarray]:
     job
         The cells as they were integrated.
     options
-        What is asked for.
+        Options of the product.
 
     Returns
     -------

@@ -24,9 +24,7 @@ PER_SECTION = ("section", "extremes")
 
 
 def obstacle(old: Spec, new: Spec) -> str:
-    """Return why the stored cells of a run cannot get as many section points as another run keeps; empty if they
-    can.
-    """
+    """Return why stored cells cannot be integrated further to keep more section points; empty if they can."""
     had, wanted = old.integration.n_keep, new.integration.n_keep
     if had == wanted:
         return ""
@@ -44,13 +42,13 @@ def obstacle(old: Spec, new: Spec) -> str:
 
 
 def _judged(spec: Spec) -> int:
-    """Return the number of last section points that decide whether a cell's orbit has closed."""
+    """Return the number of last section points that are checked to decide whether an orbit has closed."""
     n_periods = spec.integration.n_transient + spec.integration.n_keep
     return min(n_periods, window_of(spec.integration.max_orbit_period))
 
 
 def kept_on(spec: Spec, inputs: Inputs, stored: Mapping[str, np.ndarray], n_old: int) -> tuple[Any, Values]:
-    """Integrate stored cells of an earlier run further, until they have as many section points as the new run keeps.
+    """Integrate stored cells of an earlier run further, to as many section points as the new run keeps.
 
     A cell is left out if its outcome could differ from that of a longer run: if the moment at which its orbit
     closed is not known, or if it fails later.
@@ -69,7 +67,7 @@ def kept_on(spec: Spec, inputs: Inputs, stored: Mapping[str, np.ndarray], n_old:
     Returns
     -------
     is_exact : ndarray of bool, (branch,)
-        Which cells have the values of a longer run.
+        Mask of the cells that have the values of a longer run.
     values : dict
         Variables of these cells.
     """

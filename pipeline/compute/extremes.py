@@ -16,7 +16,7 @@ def extremes(job: Job, options: ExtremesOptions) -> dict[str, np.ndarray]:
     job
         The cells as they were integrated; the quantities were watched on the way.
     options
-        What is asked for.
+        Options of the product.
 
     Returns
     -------

@@ -28,7 +28,7 @@ class Job:
     inputs : Inputs
         What `run_branches` took.
     cells : Sections
-        What it returned, with leading dims (branch, point).
+        Result of the integration, with leading dims (branch, point).
     """
 
     spec: Spec
@@ -65,7 +65,7 @@ def walk(inputs: Inputs, system: System, integration: Integration, quantities: S
     inputs
         The branches.
     system
-        What is integrated.
+        System of equations to integrate.
     integration
         The table ``[integration]``.
     quantities
@@ -96,7 +96,7 @@ def walk(inputs: Inputs, system: System, integration: Integration, quantities: S
 
 
 def _spread(name: str, found: Any, alive: np.ndarray) -> Any:
-    """Copy the results of the integrated branches into arrays over all branches; branches not integrated get fill
+    """Copy the results of the integrated branches into arrays for all branches; branches not integrated get fill
     values.
     """
     if found is None:

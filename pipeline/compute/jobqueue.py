@@ -110,7 +110,7 @@ def _keys(folder: Path) -> Any:
 
 @contextlib.contextmanager
 def job_cluster(cluster: Cluster, folder: Path, *, dashboard: bool, echo: Callable[[str], None]) -> Iterator[Any]:
-    """Start a dask cluster whose workers are batch jobs, yield it, and end it with the block.
+    """Start a dask cluster whose workers are batch jobs, yield it, and stop it at the end of the context.
 
     Scheduler and workers identify each other by keys made for this cluster. The keys lie in `folder`,
     readable by their owner alone, until the cluster ends. Others on the network can neither read nor send

@@ -199,8 +199,8 @@ def _sweep() -> None:
 def _start_tracker() -> None:
     """Start the process that removes semaphores of killed processes, without its warnings.
 
-    What it removes is what it is there for; nobody can do anything about the warning. It must outlive a
-    terminal that closes, as it does Ctrl-C.
+    Its purpose is to remove semaphores, so its warning about them helps nobody. The process must outlive a
+    closing terminal, as it outlives Ctrl-C.
     """
     name, before = "PYTHONWARNINGS", os.environ.get("PYTHONWARNINGS")
     quiet = "ignore::UserWarning:multiprocessing.resource_tracker"
@@ -237,7 +237,7 @@ def _signals_put_off() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _blocked(numbers: set[signal.Signals]) -> Iterator[None]:
-    """Block signals in this thread while the context lasts, and in threads and processes that it starts meanwhile."""
+    """Block signals for this thread, and for threads and processes started inside the context."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
     try:
         yield
@@ -247,7 +247,7 @@ def _blocked(numbers: set[signal.Signals]) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _hushed() -> Iterator[None]:
-    """Silence dask's log messages about connections; after an exception they stay silent.
+    """Silence dask's log messages about connections inside the context. They stay silent if the code inside raises.
 
     dask logs some connections only after a cluster has closed.
     """

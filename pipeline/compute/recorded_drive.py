@@ -23,7 +23,7 @@ def under_recording(
     inputs
         Cells: branches of one point.
     system
-        What is integrated.
+        System of equations to integrate.
     integration
         The table ``[integration]``; the specification refuses another method and early stops.
     quantities

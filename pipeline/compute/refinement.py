@@ -66,8 +66,8 @@ class Orbits:
     _known: list[tuple[np.ndarray, np.ndarray]] = field(default_factory=list)
 
     def classes(self, cells: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Return the number of each cell's orbit; -1 (`NO_ORBIT`) if it is not closed or longer than the kept section
-        points.
+        """Return the number of each cell's closed orbit; -1 (`NO_ORBIT`) if it is not closed or its period exceeds the
+        kept points.
 
         Parameters
         ----------
@@ -107,7 +107,7 @@ class Orbits:
 def infer(
     shape: tuple[int, ...], stride: int, integrate: Integrate, *, closure_tolerance: float, system: System
 ) -> dict[str, np.ndarray]:
-    """Return all variables of a tile (block of initial conditions), integrated where necessary, else inferred.
+    """Return all variables of a block of initial conditions; integrate cells near basin boundaries, infer the others.
 
     Parameters
     ----------
@@ -204,7 +204,7 @@ def _corners(boxes: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def _halves(boxes: np.ndarray) -> np.ndarray:
-    """Halve each box of cells along each dim in which it has inner cells; both halves include the cells of the cut."""
+    """Halve each box of cells along every dim in which it has inner cells; both halves contain the cells on the cut."""
     for i in range(boxes.shape[2]):
         wide = boxes[:, 1, i] - boxes[:, 0, i] > 1
         lower, upper = boxes[wide].copy(), boxes[wide].copy()
@@ -226,9 +226,7 @@ def _by_extent(boxes: np.ndarray, shape: tuple[int, ...]) -> Iterator[tuple[np.n
 
 
 def _uniform(boxes: np.ndarray, known: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Return for each box of cells whether all integrated cells in and next to it end on one orbit, so that it stays
-    whole.
-    """
+    """Return for each box whether all integrated cells in and beside it end on one orbit, so that it is not halved."""
     own = known[np.ravel_multi_index(tuple(boxes[:, 0].T), shape)]
     padded = np.pad(known.reshape(shape), 1, constant_values=NOT_COMPUTED)
     classes = padded.ravel()
@@ -240,9 +238,7 @@ def _uniform(boxes: np.ndarray, known: np.ndarray, shape: tuple[int, ...]) -> np
 
 
 def _sources(boxes: np.ndarray, known: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Return for each cell the cell whose result it takes: itself if integrated, else the lowest first corner of the
-    boxes around it.
-    """
+    """Return for each cell the cell whose result it takes: itself if it was integrated, else a corner of its box."""
     source = np.arange(len(known))
     rest = known == NOT_COMPUTED
     source[rest] = len(known)

@@ -81,9 +81,7 @@ class Source:
         return np.where(self._is_committed[self._task(place)], place, NOWHERE)
 
     def take(self, place: np.ndarray) -> tuple[np.ndarray, Values]:
-        """Read cells of the run; return for each whether it can be used (integrated, undamaged), and the variables of
-        these.
-        """
+        """Read stored cells of the run; return a mask of the usable ones (integrated, intact) and their variables."""
         taken = np.zeros(len(place), bool)
         values: Values = {}
         tasks = self._task(place)
@@ -120,9 +118,7 @@ class Source:
 
 
 def same_products(run: Run, wanted: Spec) -> list[str]:
-    """Return those products of a wanted specification that a run has computed with the same options and the same
-    code.
-    """
+    """Return the products of a specification that a run has already computed with the same options and code."""
     code = run.info.identity["code"]
     return [
         name
@@ -142,9 +138,9 @@ def obstacles(run: Run, wanted: Spec, identity: Mapping[str, Any]) -> list[str]:
     Parameters
     ----------
     run
-        That has cells.
+        Run whose cells may be copied.
     wanted, identity
-        Specification and identity of the run that would take them.
+        Specification and identity of the run that would copy them.
     """
     lines = unlike(run.info.identity, identity)
     if line := obstacle(run.spec, wanted):
@@ -186,8 +182,7 @@ class Pool:
         return counts
 
     def integrator(self, cells: CellMap, block: tuple[slice, ...], tally: list[int]) -> Integrate:
-        """Return a function that computes a block's cells, copying known ones from other runs; results are the same bit
-        for bit.
+        """Return a function that computes the cells of a block and copies known ones from other runs, bit for bit.
 
         The numbers of cells that were taken are appended to `tally`.
         """
@@ -197,7 +192,7 @@ class Pool:
         return lambda spec, inputs: self._give(spec, inputs, cells.inputs(block), way, tally)
 
     def _give(self, spec: Spec, inputs: Inputs, begin: Inputs, way: Way | None, tally: list[int]) -> Values:
-        """Return the variables of branches: copied where possible, continued from copied cells, else integrated."""
+        """Return the variables of branches: copied cells first, the rest of each branch continued or integrated."""
         values: Values = {}
         n_branches, n_points = inputs.frequency_hz.shape
         rest = np.arange(n_branches)
@@ -227,8 +222,8 @@ class Pool:
     def _go_on(
         self, spec: Spec, inputs: Inputs, source: Source, taken: np.ndarray, stored: Values
     ) -> tuple[np.ndarray, Values]:
-        """Integrate copied cells of a sweep further to get more section points; return for which it succeeded, and
-        their variables.
+        """Integrate copied cells of a sweep further for more section points; return a mask of successes and the
+        variables.
         """
         rows = np.flatnonzero(taken)
         points = {name: array[:, None] for name, array in stored.items()}
@@ -239,7 +234,7 @@ class Pool:
 
 
 def _leading(taken: np.ndarray) -> np.ndarray:
-    """Count the copied cells at the start of each branch; cells after the first one that is missing cannot be used."""
+    """Count the copied cells at the start of each branch, up to its first missing cell."""
     return np.asarray(np.cumprod(taken, axis=1).sum(axis=1))
 
 

@@ -18,7 +18,7 @@ def rotation(job: Job, options: RotationOptions) -> dict[str, np.ndarray]:
     job
         The cells as they were integrated.
     options
-        What is asked for, completed for the model.
+        Options of the product, completed for the model.
 
     Returns
     -------

@@ -41,9 +41,7 @@ CLOCK_HZ, FLOW_PERIODS = 1.0, 50
 
 @dataclass(frozen=True)
 class Series:
-    """Settings of a time series: drive periods before it, its own (None: the default), samples per period,
-    tolerances.
-    """
+    """Settings of a time series: transient and shown drive periods, samples per period, tolerances."""
 
     n_transient: int
     n_periods: int | None
@@ -239,7 +237,7 @@ def start_of(model: str | Model, given: Mapping[str, float]) -> tuple[float, ...
     model
         The model, or its name.
     given
-        By name: ``x``, or ``x_deg`` of a state in rad or rad/s; the others are 0.
+        Values by name: ``x``, or ``x_deg`` for a state in rad or rad/s; the other states are 0.
 
     Raises
     ------

@@ -62,11 +62,11 @@ def compute(
     Parameters
     ----------
     spec, cells, block
-        Which cells.
+        Specification, map of its cells, and the block to compute.
     before
-        Variables of the cells in which its branches were left, where they do not begin in the block.
+        Variables of the last computed cells of branches that began in an earlier block.
     integrate
-        What gives the cells.
+        Function that computes the cells.
     """
     inputs = cells.inputs(block)
     if before is not None:
@@ -99,11 +99,11 @@ def run_task(
     Parameters
     ----------
     directory, digest, index
-        Which one.
+        Run directory, digest of its identity, and number of the task.
     origin
-        Where the model is a Python object: its place and folder, as the person who began the run named them.
+        For a model given as a Python object: its place and folder, as named by the user who began the run.
     sources
-        Directories and digests of runs from which cells that they hold are taken; see `compute.reuse`.
+        Directories and digests of runs from which cells are copied; see `compute.reuse`.
 
     Returns
     -------
@@ -150,9 +150,7 @@ def _taking(
     block: tuple[slice, ...],
     taken: list[int],
 ) -> dict[str, Any]:
-    """Return a keyword argument with the integrator that copies cells from other runs; empty if there are no other
-    runs.
-    """
+    """Return ``{"integrate": ...}``, a function that copies cells from other runs; an empty dict without such runs."""
     if not sources:
         return {}
     from pipeline.compute.reuse import pool_of

@@ -1,4 +1,4 @@
-"""Turn a run's specification into numbers: dims and coordinates of the cube, and input arrays of each task."""
+"""Turn a run's specification into numbers: dims and coordinates of the result cube, and input arrays of each task."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ DIRECTION_CODES = {"up": 1, "down": -1}
 
 @dataclass(frozen=True)
 class Coordinate:
-    """A coordinate of the cube: name, dims, values and attributes."""
+    """A coordinate of the result cube: name, dims, values and attributes."""
 
     name: str
     dims: tuple[str, ...]
@@ -30,7 +30,7 @@ class Coordinate:
 
 @dataclass(frozen=True)
 class ParameterAxis:
-    """A swept parameter: its name, its values, and its dim in the cube."""
+    """A swept parameter: its name, its values, and its dim in the result cube."""
 
     dim: str
     parameter: str
@@ -75,7 +75,7 @@ class InitialStates:
 
 
 def parameter_axes(spec: Spec) -> tuple[ParameterAxis, ...]:
-    """Return the swept parameters in the order of the cube's dims."""
+    """Return the swept parameters in the order of the result cube's dims."""
     return tuple(
         ParameterAxis(FREQUENCY_DIM if name == FREQUENCY else name, name, axis.array())
         for name, axis in spec.axes.items()
@@ -92,7 +92,7 @@ def _state_value(table: Any, state: str) -> tuple[Any, float]:
 
 
 def initial_states(starts: Starts) -> InitialStates:
-    """Return the initial states that a specification lists, samples or spans as a grid."""
+    """Return the initial states that a specification gives: as a list, as random samples, or as a grid."""
     if isinstance(starts, GridStarts):
         return _grid(starts)
     columns = _rows(starts) if isinstance(starts, ListStarts) else _samples(starts)
@@ -139,7 +139,7 @@ def _samples(starts: RandomStarts) -> list[np.ndarray]:
 
 
 def coordinates(spec: Spec) -> tuple[Coordinate, ...]:
-    """Return the cube's coordinates, with numeric values only.
+    """Return the coordinates of the result cube, with numeric values only.
 
     ``direction`` is +1 (up) or -1 (down) here; `open_run` returns it as text.
     """
@@ -224,7 +224,8 @@ class Inputs:
 
 
 class CellMap:
-    """Map between a block of cells of the cube and the kernel's arrays, which have the dims (branch, parameter point).
+    """Conversion between a block of cells of the result cube and the kernel's arrays with the dims (branch, parameter
+    point).
 
     In a sweep each cell is a branch with one point. In a continuation the branches of a block walk the
     block's part of the path: upward ones from its first point, downward ones from its last.
@@ -272,7 +273,6 @@ class CellMap:
         return tuple(last if i == self.path else s for i, s in enumerate(block))
 
     def _start_of(self, index: np.ndarray) -> np.ndarray:
-        """Return the flat index of each branch's initial state."""
         own = index[len(self._axes) :]
         if self._walk is not None:
             return np.asarray(own[0] % len(self._states))

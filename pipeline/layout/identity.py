@@ -53,7 +53,6 @@ def identity_of(spec: Spec, plan: Plan, kernel_version: str) -> dict[str, Any]:
 
 
 def _coordinates_digest(spec: Spec) -> str:
-    """Return a digest of the names, dims, types and bytes of the cube's coordinates."""
     digest = hashlib.sha256()
     for coordinate in coordinates(spec):
         values = np.asarray(coordinate.values)

@@ -117,13 +117,11 @@ def check_space(plan: Plan, folder: Path | None, n_cells: int | None = None) -> 
 
 
 def _nearest(folder: Path) -> Path:
-    """Return a folder if it exists, else its nearest parent that exists."""
     absolute = folder.absolute()
     return next(place for place in (absolute, *absolute.parents) if place.exists())
 
 
 def _free_files(place: Path) -> int | None:
-    """Return the number of files that the disk has room for; None if unlimited or unknown."""
     if not hasattr(os, "statvfs"):
         return None
     found = os.statvfs(place)

@@ -25,7 +25,7 @@ _CODE = (*CODE, "compute.continuation", "compute.recorded_drive", "specification
 
 
 def deciding(identity: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the part of a run's identity that determines how each cell is integrated.
+    """Return the part of a run's identity that affects how a cell is integrated.
 
     It leaves out the cells themselves (axes, starts, parameters), their layout, the rules of inference
     between them, the number of kept sections, and the products, which have their own conditions.
@@ -42,8 +42,8 @@ def deciding(identity: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def unlike(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
-    """Return a line of text for each difference in integration settings between two runs. Runs with such a difference
-    share no cells.
+    """Return a line of text for each integration setting that differs between two runs; if any differs, no cell is
+    shared.
     """
     return differences(deciding(old), deciding(new))
 
@@ -82,7 +82,9 @@ def way_of(spec: Spec, block: tuple[slice, ...]) -> Way | None:
 
 
 def _path_of(spec: Spec) -> tuple[int, np.ndarray]:
-    """Return the continuation parameter's axis: its index among the cube's parameter axes, and its values."""
+    """Return the continuation parameter's axis: its index among the parameter axes of the result cube, and
+    its values.
+    """
     assert spec.continuation is not None
     axes = parameter_axes(spec)
     path = [a.parameter for a in axes].index(spec.continuation.path)
@@ -117,8 +119,8 @@ class Finder:
         self.shape = (*(len(a.values) for a in self._axes), *n_last)
 
     def find(self, inputs: Inputs, way: Way | None = None) -> np.ndarray:
-        """Return the flat index in this run of each given cell, shape (branch, point). The index is `NOWHERE` for cells
-        that this run lacks.
+        """Return the flat index in this run of each given cell, shape (branch, point); `NOWHERE` for a cell not in this
+        run.
 
         Parameters
         ----------
@@ -187,7 +189,6 @@ class _Grid:
         return len(self._states)
 
     def find(self, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the flat index of each state in the grid, and whether the grid contains the state."""
         assert self._states.grid is not None
         here = np.ones(len(wanted), bool)
         place = np.zeros(len(wanted), np.int64)
@@ -214,7 +215,6 @@ class _Rows:
         return len(self._table)
 
     def find(self, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the index of the first row equal to each state, and whether such a row exists."""
         place = np.searchsorted(self._marks, _marks(wanted))
         row = self._order[np.minimum(place, len(self._order) - 1)]
         # if two different states share a mark, the second one is not found; a wrong one is never returned
@@ -229,7 +229,6 @@ def _bits(values: Any) -> np.ndarray:
 
 
 def _on_axis(axis: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the index of each value on an increasing axis, and whether the axis contains the value."""
     step = np.minimum(np.searchsorted(axis, values), len(axis) - 1)
     return step, _bits(axis[step]) == _bits(values)
 

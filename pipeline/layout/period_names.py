@@ -1,4 +1,4 @@
-"""Name a model's periods and sections (stroboscopic or Poincare) alike in cubes, tables and figures."""
+"""Return the words for a model's periods and sections, the same in cubes, tables and figures."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def section_name(model: Model | None) -> str:
 
 
 def once(model: Model | None) -> str:
-    """Return the words for when a section point is recorded, such as "once per drive period"."""
+    """Return the phrase for the instants of section points, such as "once per drive period"."""
     if model is None or model.crossing is None:
         return f"once per {period_of(model)}"
     return f"crossing of {model.crossing.sentence}"

@@ -97,7 +97,7 @@ class Plan:
 
     @property
     def n_cells(self) -> int:
-        """Number of cells of the cube."""
+        """Number of cells of the result cube."""
         return math.prod(self.shape)
 
     @property
@@ -112,12 +112,12 @@ class Plan:
 
     @property
     def task_grid(self) -> tuple[int, ...]:
-        """Number of tasks along each dim of the cube."""
+        """Number of tasks along each dim of the result cube."""
         return tuple(-(-n // b) for n, b in zip(self.shape, self.block, strict=True))
 
     @property
     def n_bytes(self) -> int:
-        """Size of the cube before compression [bytes]."""
+        """Size of the result cube before compression [bytes]."""
         return self.n_cells * sum(v.itemsize(self.sizes) for v in self.variables)
 
     @property
@@ -133,7 +133,7 @@ class Plan:
         return seconds * self.cells_in(index)
 
     def task(self, index: int) -> tuple[slice, ...]:
-        """Return the block of cells of a task, as slices of the cube."""
+        """Return the block of cells of a task, as slices of the result cube."""
         places = zip(self._place(index), self.block, self.shape, strict=True)
         return tuple(slice(p * b, min((p + 1) * b, n)) for p, b, n in places)
 
@@ -263,7 +263,6 @@ def _seconds_at(spec: Spec) -> np.ndarray | None:
 
 
 def _seconds_per_cell(spec: Spec) -> float:
-    """Return the estimated mean computing time of a cell [s]."""
     periods = sum(periods_per_cell(spec))
     seconds = periods * mean_seconds_per_period(spec)
     if spec.recorded is not None and spec.recorded.kind == TORQUE:
@@ -273,7 +272,6 @@ def _seconds_per_cell(spec: Spec) -> float:
 
 
 def _trajectories(spec: Spec, n_cells: int, n_points: int, seconds_per_cell: float) -> int:
-    """Return the number of trajectories per task."""
     wanted_seconds = _wanted_seconds(n_cells * seconds_per_cell)
     per_cell = _bytes_per_cell(spec)
     limit = CHUNK_BYTES if n_points == 1 else TASK_BYTES
@@ -284,7 +282,6 @@ def _trajectories(spec: Spec, n_cells: int, n_points: int, seconds_per_cell: flo
 
 
 def _wanted_seconds(core_seconds: float) -> float:
-    """Return the time that one task should take [s], given the run's total time on one core."""
     return min(max(core_seconds / WANTED_TASKS, LEAST_SECONDS), MOST_SECONDS)
 
 
@@ -324,7 +321,7 @@ def _group(n_seeds: int, wanted: int, most: int) -> int:
 
 
 def _share(n: int, most: int) -> int:
-    """Return the size of the parts if `n` is split into the fewest about equal parts of at most `most` each."""
+    """Return the part size for splitting `n` into the fewest, about equal parts of at most `most` each."""
     return -(-n // -(-n // most))
 
 
@@ -334,7 +331,6 @@ def _part(n: int, most: int) -> int:
 
 
 def _bytes_per_cell(spec: Spec) -> int:
-    """Return the uncompressed size of a cell's variables [bytes]."""
     sizes = sizes_of(spec.model, spec.products, spec.integration.n_keep)
     return sum(v.itemsize(sizes) for v in variables_of(spec.model, spec.products))
 
@@ -354,8 +350,8 @@ def _block(shape: tuple[int, ...], path: int | None, wanted: int) -> tuple[int, 
 
 
 def _tile(shape: tuple[int, ...], stride: int, wanted: int) -> tuple[int, ...]:
-    """Return the side lengths of a task's tile of a refined grid, as multiples of the stride. The tile has at most
-    `wanted` cells if possible.
+    """Return the side lengths of a tile, which is a task's block of cells in a refined grid. Each side is a multiple of
+    `stride`, and the tile has at most `wanted` cells if possible.
 
     A side may also be a whole axis. The shortest side that can grow is enlarged first. Then the tiles along
     an axis are made about equal.

@@ -1,4 +1,4 @@
-"""Define the variables of a cube: those of every cube, and those that its products add.
+"""Define the variables of a run's result cube: those of every cube, and those that the run's products add.
 
 Every variable has the cell dims of the run first (swept parameters, initial conditions or branches), then its
 own dims. `pipeline.products` declares the variables of products.
@@ -25,7 +25,7 @@ REFINEMENT = 1
 
 
 def base_variables(model: Model) -> tuple[Variable, ...]:
-    """Return the variables that every cube of a model has, in order."""
+    """Return the variables that every result cube of a model has, in order."""
     wrapped = ", angles wrapped to (-pi, pi]" if model.angles else ""
     units = {"comment": "units of the components: see state_units"}
     section = Variable(
@@ -44,7 +44,6 @@ REST_STATE = Variable(
 
 
 def _counts(periods: str) -> tuple[Variable, ...]:
-    """Return the variables for a cell's status, period and counts; `periods` is the model's word for periods."""
     codes = flag_attrs(Status)
     return (
         Variable("status", (), "int8", int(Status.PENDING), "1", "what became of the cell", codes),
@@ -57,7 +56,7 @@ def _counts(periods: str) -> tuple[Variable, ...]:
 
 
 def variables_of(model: Model, products: Mapping[str, Options]) -> tuple[Variable, ...]:
-    """Return the variables of a cube with given products."""
+    """Return the variables of the result cube for a model and given products."""
     own = (CELL_PRODUCTS[name].variables(options, model) for name, options in products.items())
     return (*base_variables(model), *(variable for variables in own for variable in variables))
 

@@ -55,22 +55,22 @@ _GRID_SUFFIX = "_0"
 
 
 def grid_dim(state: str) -> str:
-    """Return the name of the dim for a grid of initial values of a state."""
+    """Return the name of the dim of the result cube that runs over the initial values of a state."""
     return f"{state}{_GRID_SUFFIX}"
 
 
 def is_grid_dim(dim: str) -> bool:
-    """Return whether a cube's dim belongs to a grid of initial states."""
+    """Return whether a dim of the result cube belongs to a grid of initial states."""
     return dim.endswith(_GRID_SUFFIX)
 
 
 def is_start_dim(dim: str) -> bool:
-    """Return whether a cube's dim runs over initial conditions or branches, not over a parameter."""
+    """Return whether a dim of the result cube runs over initial conditions or branches, not over a parameter."""
     return dim in (BRANCH, START) or is_grid_dim(dim)
 
 
 def start_dims(dims: Iterable[object]) -> tuple[str, ...]:
-    """Return the dims of a cube that run over initial conditions or branches, not over parameters."""
+    """Return those dims of the result cube that run over initial conditions or branches, not over parameters."""
     return tuple(str(d) for d in dims if is_start_dim(str(d)))
 
 
@@ -81,14 +81,14 @@ def split_dims(cells: xr.DataArray) -> tuple[tuple[str, ...], tuple[str, ...]]:
 
 
 def axis_name(parameter: str) -> str:
-    """Return the name of a parameter's dim in the cube. The drive frequency may be given as ``frequency`` or
+    """Return the name of a parameter's dim in the result cube. The drive frequency may be given as ``frequency`` or
     ``frequency_hz``.
     """
     return FREQUENCY_DIM if parameter in (FREQUENCY, FREQUENCY_DIM) else parameter
 
 
 def parameter_name(axis: str) -> str:
-    """Return the name that the specification uses for the parameter of a cube's axis."""
+    """Return the name that the specification uses for the parameter of an axis of the result cube."""
     return FREQUENCY if axis in (FREQUENCY, FREQUENCY_DIM) else axis
 
 
@@ -99,7 +99,7 @@ def model_attribute(model: Model) -> str:
 
 
 def model_of(ds: xr.Dataset) -> Model:
-    """Return the model of a cube or of a dataset derived from it, by its attribute ``model``.
+    """Return the model of a result cube, or of a dataset derived from it, from the attribute ``model``.
 
     If the attributes ``section_...`` name a section by crossing, the model has that section.
 

@@ -128,9 +128,7 @@ def _axes(attractors: xr.Dataset, at: Mapping[str, float] | None) -> tuple[str, 
 def _codes(
     data: xr.Dataset, part: xr.Dataset, axes: tuple[str, str], cast: palette.Cast
 ) -> tuple[np.ndarray, dict[int, int]]:
-    """Return each cell's colour code (attractor id, `_OTHERS`, or a grey from `_FIRST_GREY` down), and the number of
-    cells per code.
-    """
+    """Return the colour code of each cell (an attractor id or a negative code), and the number of cells per code."""
     ids, dims = np.maximum(data["outcome"].values, -1), part["attractor_id"].dims
     table = np.full(len(cast.names) + 1, _OTHERS, np.int32)
     table[list(cast.main)] = cast.main
@@ -167,14 +165,14 @@ def _painted(
 
 
 def _timed(data: xr.Dataset, part: xr.Dataset) -> np.ndarray:
-    """Return a mask of the cells that were integrated and ended on a periodic orbit."""
+    """Return a mask of the cells whose convergence time is known: integrated, and ended on a periodic orbit."""
     closed = np.append(part["kind"].values == PERIODIC_ORBIT, False)
     ids = np.maximum(data["outcome"].values, -1)
     return np.asarray(closed[ids] & (data["status"].values != INFERRED))
 
 
 def _scale(data: xr.Dataset, part: xr.Dataset) -> LogNorm | None:
-    """Return the shading scale: the 1st to 99th percentile of convergence times of cells on periodic orbits."""
+    """Return the logarithmic scale of convergence times (1st to 99th percentile); None if there are no times."""
     if "n_periods" not in data:
         return None
     times = data["n_periods"].values[_timed(data, part)]

@@ -149,7 +149,7 @@ class Diagram:
 
     @property
     def with_strip(self) -> bool:
-        """Return whether there are absent cells, which need a strip below the diagram."""
+        """Return whether some cells have no points to draw; a strip below the diagram then shows their share."""
         return any(counts.any() for counts in self.survey.absent.values())
 
     def dress(self, ax: Axes) -> None:
@@ -211,7 +211,7 @@ def with_diagram(data: xr.Dataset, drawn: xr.Dataset) -> xr.Dataset:
 
 
 def fixed_of(ds: xr.Dataset) -> dict[str, Any]:
-    """Return the scalar coordinates of a dataset, which are fixed for all its data."""
+    """Return the scalar coordinates of a dataset with floating-point values, by name."""
     return {str(k): v.variable for k, v in ds.coords.items() if not v.ndim and v.dtype.kind == "f"}
 
 
@@ -221,9 +221,7 @@ def _section(ds: xr.Dataset, state: str, degrees: bool) -> tuple[Measure, Any]:
 
 
 def _extreme(ds: xr.Dataset, quantity: str, degrees: bool) -> tuple[Measure, Any]:
-    """Return the axis measure of a quantity's extreme, and the function that reads its values from a block of the
-    cube.
-    """
+    """Return the label data (`Measure`) for an extreme such as ``NAME.max``, and a function that reads its values."""
     if "extremes" not in ds:
         wanted = quantity.rpartition(".")[0] or quantity
         raise ValueError(

@@ -175,9 +175,7 @@ class _Name:
 
 
 def _mark(ax: Axes, ds: xr.Dataset, chosen: list[int], measure: Measure, scale: bool) -> list[_Name]:
-    """Draw markers at the bifurcations of chosen branches. Return labels for the bifurcations at which a stable orbit
-    appears or disappears.
-    """
+    """Draw markers at bifurcations. Return labels for those at which a stable orbit appears or disappears."""
     names = []
     size = 3.4 if style.figure_of(ax).frame.compact else 4.5
     for k in range(ds.sizes["bifurcation"]):
@@ -245,9 +243,7 @@ def _name(ax: Axes, names: list[_Name]) -> None:
 
 
 def _ink(drawn: Line2D, points: float) -> np.ndarray:
-    """Return positions [pt] about every 3 pt along a plotted line. If only markers are drawn, return the positions of
-    the markers.
-    """
+    """Return positions [pt] spaced about 3 pt along a plotted line, or the marker positions if no line is drawn."""
     line = drawn.get_transform().transform(np.asarray(drawn.get_xydata(), dtype=np.float64)) * points
     line = line[np.isfinite(line).all(axis=1)]
     if len(line) < 2 or drawn.get_linestyle() == "None":

@@ -137,9 +137,7 @@ def _loops(found: xr.Dataset, part: xr.Dataset, parameter: str) -> list[tuple[fl
 
 
 def _spread(one: xr.Dataset, parameter: str, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return three arrays for an attractor's points at the chosen parameter values: parameter value, plotted value and
-    parameter index.
-    """
+    """Return an attractor's points as three arrays: parameter value, plotted value, index of the parameter value."""
     values = one["value"].transpose(parameter, "point").values
     row, column = np.nonzero(np.isfinite(values) & chosen[:, None])
     return one[parameter].values[row].astype(np.float64), values[row, column], row

@@ -95,7 +95,7 @@ def _of_one_attractor(ds: xr.Dataset) -> xr.Dataset:
 
 
 def _scales(ds: xr.Dataset) -> str:
-    """Describe in text the scale by which states of each unit are divided, for example ``1 for 1 rad, 10 rad/s``."""
+    """Return a text with the scale of each unit's states, for example ``1 for 1 rad, 10 rad/s``."""
     model = model_of(ds)
     units = {s.unit: s.scale for s in model.states}
     return "1 for " + ", ".join(f"{scale:g}" + (f" {unit}" if unit != "1" else "") for unit, scale in units.items())

@@ -98,8 +98,8 @@ def _draw_map(fig: style.DataFigure, ax: Axes, data: xr.Dataset, part: xr.Datase
 
 
 def _scale(grid: np.ndarray) -> tuple[Normalize, str]:
-    """Return a colour scale symmetric about 0, and the ends of the scale that values exceed: ``neither``, ``min``,
-    ``max`` or ``both``.
+    """Return a colour scale symmetric about 0, and the ends at which it cuts values off: ``neither``, ``min``, ``max``,
+    ``both``.
     """
     known = grid[np.isfinite(grid)]
     most = float(np.abs(known).max(initial=0.0))

@@ -78,7 +78,7 @@ def draw_figure(run: Run, name: str, options: FigureOptions) -> DataFigure:
 
 
 def request(name: str, options: Options) -> dict[str, Any]:
-    """Return the name of a figure and the options that differ from their defaults."""
+    """Return the request stored with a figure: its name, and the options that differ from their defaults."""
     wanted = {key: value for key, value in options.changed().items() if key not in ("out", "format")}
     return {"figure": name, "options": wanted}
 

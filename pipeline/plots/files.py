@@ -34,7 +34,7 @@ def save_figure(fig: Figure, path: str | Path) -> Path:
     fig
         The figure. The attributes of the data of a `DataFigure` go into the file's metadata.
     path
-        Where to write; the folder must exist. An existing file is replaced.
+        File to write; the folder must exist. An existing file is replaced.
 
     Returns
     -------

@@ -49,7 +49,7 @@ def save_animation(film: Animation, path: str | Path) -> Path:
     film
         The film.
     path
-        Where to write; the folder must exist.
+        File to write; the folder must exist.
 
     Returns
     -------
@@ -86,7 +86,7 @@ def _about(film: Animation) -> str:
 
 
 def durations(n: int, fps: float, grain_ms: int) -> list[int]:
-    """Return the duration of each frame [ms], in multiples of `grain_ms` that add up to the film's length."""
+    """Return the duration of each frame [ms]: multiples of `grain_ms` whose sum is the film's length."""
     ends = np.round(np.arange(n + 1) * (1000.0 / fps / grain_ms)).astype(int)
     return [int(d) * grain_ms for d in np.diff(ends)]
 

@@ -94,9 +94,7 @@ def swept_parameter(attractors: xr.Dataset, at: Mapping[str, float] | None, what
 
 
 def _fractions(part: xr.Dataset, parameter: str, cast: palette.Cast) -> xr.Dataset:
-    """Return, for each parameter value, the share of cells on each attractor and the share of each kind of cell without
-    an attractor.
-    """
+    """Return, per parameter value, the basin fraction of each attractor and the share of cells without an attractor."""
     n = part.sizes[parameter]
     ids = outcomes(part).transpose(parameter, ...).values.reshape(n, -1)
     kinds, others = list(palette.GREYS), palette.other_cells(part)
@@ -189,9 +187,7 @@ def _write_letters(ax: Axes, data: xr.Dataset, parameter: str, bands: Sequence[_
 
 
 def _draw_intervals(ax: Axes, data: xr.Dataset, parameter: str, bands: Sequence[_Band]) -> None:
-    """Draw the binomial interval of each band's upper edge, which is a sum of shares. The intervals of a parameter
-    value stand side by side in its column.
-    """
+    """Draw the binomial interval of the upper edge of each band. Intervals of one column stand side by side."""
     limits = style.edges(data[parameter].values.astype(np.float64))
     n = data["n_cells"].values
     floor = np.zeros(n.size)
@@ -209,9 +205,7 @@ def _draw_intervals(ax: Axes, data: xr.Dataset, parameter: str, bands: Sequence[
 def _raster(
     edges: np.ndarray, codes: np.ndarray, heights: np.ndarray, xlim: tuple[float, float], ylim: tuple[float, float]
 ) -> np.ndarray:
-    """Return the attractor id of the band at each pixel of a 300 x 300 raster, from the bottom row up. The id is -1 for
-    no attractor.
-    """
+    """Return the attractor id at each pixel of a 300 x 300 image of the bands, bottom row first; -1 for none."""
     place = (np.arange(300) + 0.5) / 300
     x, y = (low + place * (high - low) for low, high in (xlim, ylim))
     column = np.clip(np.searchsorted(edges, x) - 1, 0, heights.shape[1] - 1)

@@ -188,7 +188,7 @@ def _parameters(one: xr.Dataset) -> dict[str, float]:
 
 
 def _told(data: xr.Dataset, portraits: xr.Dataset, here: xr.Dataset) -> str:
-    """Describe the parameter point in text, with the number of attractors and cells that are not drawn."""
+    """Return a text with the parameter values of the gallery, and the number of attractors and cells not drawn."""
     text = labels.caption(portraits.assign_attrs(data.attrs), with_start=False)
     if (rest := portraits.sizes["attractor"] - data.sizes["attractor"]) > 0:
         share = palette.percent(float(portraits["share"].sum() - data["share"].sum()))

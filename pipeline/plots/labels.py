@@ -60,7 +60,7 @@ class Measure:
         return math.pi * self.factor
 
     def shown(self, values: np.ndarray, *, wrap: bool = False) -> np.ndarray:
-        """Convert values to the drawn unit. If `wrap` is set, first wrap angles to the range from -pi to pi."""
+        """Convert values to the drawn unit; with `wrap`, wrap angles to [-pi, pi) first."""
         folded = wrapped(values) if wrap and self.on_circle else values
         return np.asarray(folded * self.factor if self.factor != 1.0 else folded)
 
@@ -81,9 +81,9 @@ def state_measure(ds: xr.Dataset, state: str = "", degrees: bool = False) -> Mea
     Parameters
     ----------
     ds
-        Of a run, so that its model is known.
+        Dataset of a run, from which the model is read.
     state
-        Name; by default the model's first that differs from section to section.
+        Name of the state; by default the first one whose values differ between section points.
     degrees
         Degrees for angles and their rates.
 
@@ -135,7 +135,7 @@ def start_measure(ds: xr.Dataset, dim: str, degrees: bool = False) -> Measure:
 
 
 def some_angle(model: Model, degrees: bool, what: str) -> None:
-    """Raise ValueError if degrees are requested and no state is an angle."""
+    """Raise ValueError if `degrees` is set for a model without angles."""
     if degrees and not any(s.unit.startswith("rad") for s in model.states):
         raise ValueError(f"{what} of {model.name} have no angle; draw them without degrees")
 
@@ -146,9 +146,7 @@ def wrapped(angle: np.ndarray) -> np.ndarray:
 
 
 def on_circle(angle: np.ndarray, *others: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Wrap an angle to [-pi, pi). Insert NaN into the angle and into other arrays where the angle jumps across the
-    edge.
-    """
+    """Wrap an angle to [-pi, pi). NaN is inserted at each jump, in the angle and in the other arrays."""
     folded = wrapped(angle)
     jumps = np.flatnonzero(np.abs(np.diff(folded)) > math.pi) + 1
     return tuple(np.insert(values, jumps, np.nan) for values in (folded, *others))
@@ -212,7 +210,7 @@ def caption(ds: xr.Dataset, *, drop: Iterable[str] = (), with_start: bool = True
     Parameters
     ----------
     ds
-        What is drawn: its scalar coordinates and its dims of size 1 are fixed.
+        Drawn data; scalar coordinates and dims of size 1 are the fixed values.
     drop
         Dims that the figure shows on its axes.
     with_start

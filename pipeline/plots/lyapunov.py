@@ -49,7 +49,7 @@ def plot_lyapunov(
     per
         ``s``: per unit time [1/s]; ``period``: per drive period or return.
     state, degrees
-        Of the diagram, as for `plot_bifurcation`.
+        State and unit of the diagram, as for `plot_bifurcation`.
     at
         Values of further swept parameters.
     frame
@@ -98,7 +98,7 @@ def plot_lyapunov(
 
 
 def _lost(diagram: Diagram, data: xr.Dataset) -> Survey:
-    """Return the diagram's survey, with the count of cells that have points but no exponent added."""
+    """Return the diagram's counts of absent cells, extended by the cells that have points but no Lyapunov exponent."""
     found = diagram.survey
     value = data["exponent_value"].isel(exponent=0)
     others = [d for d in value.dims if d != diagram.parameter]
@@ -109,9 +109,7 @@ def _lost(diagram: Diagram, data: xr.Dataset) -> Survey:
 
 
 def _draw_lost(top: Axes, bottom: Axes, strip: Axes, diagram: Diagram, lost: Survey) -> None:
-    """Draw the share of cells without an exponent in a strip. Shade the diagram where all cells lack points, and the
-    lower panel where all lack an exponent.
-    """
+    """Draw the share of cells without an exponent as a strip; shade parameter values without points or exponents."""
     style.style_axes(strip, minor=False)
     shade_blank(top, diagram.x, diagram.survey, diagram.layers)
     draw_absent(bottom, strip, diagram.x, lost, diagram.layers)

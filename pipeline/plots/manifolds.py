@@ -60,7 +60,7 @@ def plot_manifolds(
 
 
 def _shade(colour: str) -> str:
-    """Return a line's colour in the legend. A white line is grey there, because white would be invisible."""
+    """Return the colour for a line's legend entry: the line's own, but grey for a white line."""
     return "0.75" if colour == "white" else colour
 
 

@@ -29,8 +29,7 @@ Floats = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Trail:
-    """Fading trail behind a moving point, counted in samples. In a film that repeats, the trail continues across the
-    film's end.
+    """Fading trail behind a moving point, measured in samples. In a looping film the trail continues from the end.
 
     Attributes
     ----------
@@ -142,9 +141,7 @@ def moving_portrait(ax: Axes, one: xr.Dataset, pair: tuple[str, str], trail: Tra
 
 
 def _path(measures: Sequence[Measure], values: Sequence[Floats]) -> tuple[Floats, float]:
-    """Return the polyline of a phase portrait in the units of the axes, and the distance from which a step counts as a
-    jump of a wrapped angle.
-    """
+    """Return the polyline of a phase portrait in axis units, and the length above which a step is an angle's jump."""
     columns, jumps = [], math.inf
     for measure, column in zip(measures, values, strict=True):
         turning = measure.on_circle and np.ptp(column) >= 2.0 * np.pi

@@ -125,7 +125,7 @@ def cast_of(attractors: xr.Dataset, part: xr.Dataset | None = None) -> Cast:
         Result of `pipeline.analysis.attractors.attractors.match` for the whole run, so that a colour does not
         change with what is selected of it.
     part
-        What the names are to describe; by default all of it.
+        Part of the dataset that the names describe; by default all of it.
     """
     dims = [d for d in attractors["n_cells"].dims if d != "attractor"]
     attracts = attractors["stability"] == ATTRACTS
@@ -240,7 +240,7 @@ def new_panel(
     Parameters
     ----------
     data
-        What is drawn.
+        Data to draw.
     entries
         Lines of the legend.
     frame

@@ -69,17 +69,17 @@ def draw_points(panels: Sequence[Panel], view: View, diameter: float) -> xr.Data
     Parameters
     ----------
     panels
-        Of equal size and limits.
+        Panels of equal size and limits.
     view
         The points.
     diameter
-        Of a single layer's marker [pt].
+        Diameter of the marker of a single layer [pt].
 
     Returns
     -------
     Dataset
-        What is drawn, with the dim ``point``: ``x``, ``y``, the codes ``motion`` and ``direction``; of an
-        image the centres of the pixels that hold points, and their ``count``.
+        Drawn data on the dim ``point``: ``x``, ``y``, and the codes ``motion`` and ``direction``; for an
+        image, the centres of the pixels that hold points, and the ``count`` of points in each.
     """
     ax = panels[0].ax
     x, y = _sorted(ax.get_xlim()), _sorted(ax.get_ylim())
@@ -204,9 +204,7 @@ def _draw_images(
 
 
 def _spread(counts: Counts, looks: Mapping[int, Look]) -> dict[int, dict[int, np.ndarray]]:
-    """Return for each pixel the largest count of points on any pixel within a dot around it, by layer and class of
-    motion.
-    """
+    """Spread each pixel's count over the disc of a marker, by the maximum, for every layer and class of motion."""
     return {
         i: {
             code: _dilate(grid, _disc(look.diameter / 72.0 * style.DPI * SUPERSAMPLING))
@@ -229,11 +227,11 @@ def paint(
     spread
         Counts by code of motion.
     look
-        Of the layer.
+        Marker style of the layer.
     colours
-        By code.
+        Colours by code.
     reference
-        Count of a pixel that is quite dark.
+        Count of points at which a pixel is fully dark.
     """
     if not spread:
         return

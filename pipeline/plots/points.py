@@ -176,11 +176,11 @@ def survey(view: View, *, along: str = "", xlim: Range | None = None, ylim: Rang
     Parameters
     ----------
     view
-        What is drawn.
+        Points to draw.
     along
         Dim along which absent cells are counted; by default all in one.
     xlim, ylim
-        What is shown.
+        Ranges of the axes.
     """
     size = view.ds.sizes[along] if along else 1
     shape = (len(view.layers), size)

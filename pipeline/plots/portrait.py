@@ -46,11 +46,11 @@ def draw_portrait(ax: Axes, ds: xr.Dataset, pair: tuple[str, str], motion: Motio
     ax
         The panel.
     ds
-        Of the run, so that its model is known.
+        Dataset of the run, from which the model is read.
     pair
         States to the right and upwards.
     motion
-        What is drawn.
+        Motion to draw.
     degrees
         Degrees for angles and their rates.
     """
@@ -103,19 +103,18 @@ def _dress(ax: Axes, measures: list[Measure], turning: list[bool]) -> None:
 
 
 def draw_path(ax: Axes, drawing: Drawing, parameters: Mapping[str, float], motion: Motion) -> list[str]:
-    """Draw the path of the point that a model's mechanical drawing traces, and the nearby points of the drawing that do
-    not move.
+    """Draw the path of the traced point of a mechanical drawing, and the drawing's fixed points near it.
 
     Parameters
     ----------
     ax
         The panel.
     drawing
-        Of the model.
+        Mechanical drawing of the model.
     parameters
-        Values of its parameters.
+        Parameter values of the model.
     motion
-        What is drawn.
+        Motion to draw.
 
     Returns
     -------
@@ -152,9 +151,7 @@ def fixed_handles(drawing: Drawing, parameters: Mapping[str, float], shown: Coll
 
 
 def _near(fixed: Mapping[str, np.ndarray], place: np.ndarray) -> list[str]:
-    """Return the names of the unmoving points of a mechanical drawing that are near enough to a path to be drawn with
-    the path.
-    """
+    """Return the names of the fixed points of a mechanical drawing that are near enough to a path to be shown."""
     if not place.size:
         return list(fixed)
     size = max(float(np.ptp(place, axis=0).max()), 1e-12)

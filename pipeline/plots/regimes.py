@@ -189,7 +189,7 @@ def _member_colour(member: str, show: str, cast: palette.Cast) -> str:
 
 
 def _dress(ax: Axes, data: xr.Dataset, x: str, y: str, frame: style.Frame) -> None:
-    """Mark the parameter points at which many cells have no attractor, and set the axis ranges."""
+    """Cross out parameter points at which many cells have no attractor, and set the axis ranges."""
     row, column = np.nonzero(data["share_without"].values > SHARE_LIMIT)
     if row.size:
         ax.plot(data[x].values[column], data[y].values[row], gid="without", **_CROSS)
@@ -257,9 +257,7 @@ def _members(present: np.ndarray, periods: np.ndarray, share: np.ndarray, x: str
 
 
 def _numbers(part: xr.Dataset, x: str, y: str) -> dict[str, Any]:
-    """Return each attractor's basin share with its 95 % interval, and an upper bound on the share of a basin that no
-    cell revealed.
-    """
+    """Return the variables of basin fractions with 95 % intervals, and the bound on the size of an undetected basin."""
     dims = (y, x, "attractor")
     share = part["share"].transpose(*dims).values
     numbers: dict[str, Any] = {
@@ -337,8 +335,6 @@ def _curves_of(run: Run, attractors: xr.Dataset, at: Mapping[str, float]) -> xr.
 
 
 def _swept_of(run: Run, x: str, y: str) -> str:
-    """Return the parameter along which a run's branches are continued. It is the only one of the map's two parameters
-    that the run sweeps, else ``x``.
-    """
+    """Return the parameter along which branches are continued: the one of `x` and `y` that the run sweeps, else `x`."""
     swept = [name for name in (x, y) if run.cube().sizes.get(name, 1) > 1]
     return swept[0] if len(swept) == 1 else x

@@ -94,7 +94,7 @@ class DataFigure(Figure):
     data : Dataset
         The numbers drawn, after every selection.
     notes : list of str
-        What whoever asked for the figure must know beside it.
+        Notes for the user who asked for the figure.
     """
 
     data: xr.Dataset
@@ -113,9 +113,9 @@ def new_figure(
     height
         [in] of a figure of full width; narrow ones are lower, but not in proportion.
     data
-        What will be drawn.
+        Data that will be drawn.
     frame
-        Its width.
+        Width of the figure and ranges of its axes.
     arranged
         Whether `finish` finds the places of axes, labels and legends.
     exact

@@ -36,15 +36,13 @@ class IdentifyOptions(Options):
 
     @property
     def effort(self) -> tuple[float, int]:
-        """Return the time budget and sample size for integrating cells on no known attractor further. Both are 0 if
-        these cells are not integrated.
+        """Return the limits for extending the integration of undecided cells: `budget` and `n_sample`; both 0 if turned
+        off.
         """
         return (self.budget, self.n_sample) if self.extend and self.budget else (0.0, 0)
 
     def with_effort(self, effort: tuple[float, int]) -> Self:
-        """Return a copy of the options with another time budget and sample size for integrating cells on no known
-        attractor further.
-        """
+        """Return the options with other values of `budget` and `n_sample`, given as from `effort`."""
         budget, n_sample = effort
         if not budget:
             return self.model_copy(update={"extend": False})

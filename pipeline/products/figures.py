@@ -15,7 +15,6 @@ Per = Literal["s", "period"]
 
 
 def _without(options: FigureOptions, name: str) -> str:
-    """Return the part of a figure's file name that lists the options, without the option `name`."""
     return FigureOptions.label(options.model_copy(update={name: ""}))
 
 
@@ -67,15 +66,15 @@ class RegimeOptions(AttractorFigureOptions):
 
 
 class LyapunovFigureOptions(StateOptions):
-    """Options of a figure of Lyapunov exponents over one parameter, or as a map over two."""
+    """Options of a figure of Lyapunov exponents over one parameter, or in the plane of two."""
 
     spectrum: bool = option(False, "Draw all stored exponents, not only the largest.")
     as_map: bool = option(False, "Draw a map over two parameters instead of a diagram over one.", flag="--map")
     per: Per = option("s", "Exponents per second, or per drive period or return.")
 
     def label(self) -> str:
-        """Return the part of the figure's file name that lists the options. It omits the state if the figure is
-        a map.
+        """Return the part of the figure's file name that lists the options. It omits the state if the figure shows a
+        plane of two parameters.
         """
         return _without(self, "state") if self.as_map else super().label()
 
@@ -122,7 +121,7 @@ class CurveFigureOptions(CurveOptions, _AlongOptions):
 
 
 class RotationFigureOptions(FigureOptions):
-    """Options of a figure of rotation numbers over one parameter, or as a map over two."""
+    """Options of a figure of rotation numbers over one parameter, or in the plane of two."""
 
 
 class TongueFigureOptions(TongueOptions, FigureOptions):

@@ -1,4 +1,4 @@
-"""Define products of a run: results per cell, analyses of its cube, and figures.
+"""Define products of a run: results per cell, analyses of its result cube, and figures.
 
 A product is a declaration: a model of its options, a line of help, and the names of its functions as
 ``"module:function"``. A function is imported when it is called. The command line, the specification and the
@@ -154,7 +154,8 @@ class CellProduct:
 
 @dataclass(frozen=True)
 class Analysis:
-    """Declaration of an analysis of a cube: ``magpend analyse NAME DIR``; results are stored in ``DIR/derived``.
+    """Declaration of an analysis of a result cube: ``magpend analyse NAME DIR``; its results are stored in
+    ``DIR/derived``.
 
     Attributes
     ----------

@@ -80,8 +80,8 @@ ROTATION_VARIABLES = (
 
 
 def _settled(options: RotationOptions, model: Any) -> RotationOptions:
-    """Fill in the angle or plane in which turns are counted, if the model determines it. Raise ValueError if the
-    options do not fit the model.
+    """Fill in the default angle or plane in which turns are counted; raise ValueError if the options do not fit the
+    model.
     """
     from magpend_core.models.parameters import near_names
 

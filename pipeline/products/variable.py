@@ -1,4 +1,4 @@
-"""Define the class for a variable of a cube; `pipeline.layout.schema` lists the variables of every cube."""
+"""Define the class for a variable of a result cube; `pipeline.layout.schema` lists the variables of every cube."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Variable:
-    """Declaration of a variable of a cube: name, dims, data type, fill value, units.
+    """Declaration of a variable of a result cube: name, dims, data type, fill value, units.
 
     Attributes
     ----------

@@ -49,7 +49,7 @@ def _cells(results: Results, name: str) -> tuple[xr.Dataset, str]:
 
 
 def _within(ds: xr.Dataset, axis: str, options: Options) -> xr.Dataset:
-    """Select the cells at one axis value, ``at``, or between the axis values ``low`` and ``high``."""
+    """Select the cells at the axis value ``at``, or those between the axis values ``low`` and ``high``."""
     values = ds[axis].values
     if "at" in options:
         at = _index(ds, axis, float(options["at"]))
@@ -139,9 +139,7 @@ def _asked(options: Options) -> str:
 
 
 def window(results: Results, of: Sequence[str], options: Options) -> tuple[Estimate, int, int, xr.Dataset, str]:
-    """Return the width of the periodic window about an axis value, the indices of its first and last axis values, the
-    cells, and the axis name.
-    """
+    """Measure the periodic window around an axis value: width, first and last index, selected cells, axis name."""
     ds, axis = _cells(results, of[0])
     here = _within(ds, axis, {k: v for k, v in options.items() if k in ("low", "high")})
     values, n = here[axis].values, here.sizes["cell"]
@@ -178,8 +176,7 @@ def window_width(results: Results, of: Sequence[str], options: Options) -> Estim
 
 
 def beside_window(results: Results, of: Sequence[str], options: Options) -> Estimate:
-    """Return the fraction of cells just outside both ends of a periodic window that have one of the given other
-    periods.
+    """Return the fraction of cells just outside a periodic window that have one of the orbit periods in ``other``.
 
     Options: those of `window_width`; ``other``, the periods that count; ``within``, the largest distance from
     the window's ends.
@@ -247,8 +244,7 @@ def located_bifurcation(results: Results, of: Sequence[str], options: Options) -
 
 
 def rarest_motion(results: Results, of: Sequence[str], options: Options) -> Estimate:
-    """Return the smallest of the fractions of cells in the given classes of motion at one axis value. If it exceeds 0,
-    all these classes coexist.
+    """Return the smallest fraction of cells among the given classes of motion. They coexist if it exceeds 0.
 
     Options: ``at``, ``motions``, ``period``.
     """
@@ -310,8 +306,7 @@ def agreement(results: Results, of: Sequence[str], options: Options) -> Estimate
 
 
 def share_above(results: Results, of: Sequence[str], options: Options) -> Estimate:
-    """Return the fraction of a drive period, counted from its start, during which a model quantity is positive while
-    the model is at rest.
+    """Return the fraction of a drive period in which a model quantity is positive; the model's states are all 0.
 
     Options: ``quantity``, ``frequency_hz``. The time of the sign change is found by bisection. The quantity
     must be positive at the start and change sign once.

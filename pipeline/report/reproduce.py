@@ -56,9 +56,7 @@ class Judgement:
 
     @property
     def fails(self) -> bool:
-        """Return whether the claim is required and contradicted. A claim on which parameters were calibrated can fail
-        too.
-        """
+        """Return whether the claim is required and contradicted; claims used for calibration are judged as well."""
         return self.claim.required and self.plain is Verdict.NOT_MET
 
 
@@ -172,7 +170,7 @@ def judge(results: Results, figure: str, claim: ClaimTable) -> Judgement:
 
 
 def _decides(claim: ClaimTable) -> str:
-    """Return a sentence that states the axis step and the number of cells needed to decide a claim."""
+    """Return a sentence with the axis step and the number of cells that a claim needs to be decided."""
     steps = f"steps of at most {claim.step:g}" if claim.step else ""
     cells = f"at least {claim.n} cells" if claim.n else ""
     both = " and ".join(part for part in (steps, cells) if part)
@@ -279,9 +277,7 @@ def headline(judgements: Sequence[Judgement], smoke: bool) -> str:
 
 
 def decided_first(judgements: Sequence[Judgement]) -> list[Judgement]:
-    """Return the claims that test the model, with the decided claims first. Claims on which parameters were calibrated
-    are left out.
-    """
+    """Return the claims that test the model, decided ones first. Claims used for calibration are omitted."""
     tests = [j for j in judgements if j.verdict is not Verdict.CALIBRATED]
     return sorted(tests, key=lambda j: j.verdict is Verdict.UNDECIDED)
 

@@ -97,9 +97,7 @@ class Shown:
         return shlex.quote(self.run.name)
 
     def options_of(self, name: str) -> list[dict[str, Any]]:
-        """Return the options of the stored results of an analysis. If none is stored and the analysis may be computed,
-        return the default options.
-        """
+        """Return the options of each stored result of an analysis, or default options if it may be computed."""
         known = stored_options(self.run, name)
         return known or ([{}] if name in self.computed else [])
 
@@ -197,7 +195,7 @@ def _diagram(shown: Shown) -> Iterator[Block]:
 
 
 def _first_of_others(shown: Shown) -> dict[str, float]:
-    """Return the first value of each axis that a bifurcation diagram does not show."""
+    """Return the first value on each axis other than the diagram's horizontal axis, by axis."""
     continuation = shown.run.spec.continuation
     path = next((d for d in shown.axes if continuation and parameter_name(d) == continuation.path), shown.axes[0])
     return {d: float(shown.cube[d].values[0]) for d in shown.axes if d != path}
@@ -358,9 +356,7 @@ _OF_ATTRACTORS = {
 
 
 def _with_letters(row: Mapping[str, Any], path: str) -> dict[str, Any]:
-    """Return a table row with letters instead of attractor ids. The names of the columns ``from`` and ``to`` get the
-    axis name.
-    """
+    """Return a table row with letters for attractor ids, and the parameter's name added to the headings from and to."""
     found: dict[str, Any] = {}
     for name, value in row.items():
         if name in _OF_ATTRACTORS:

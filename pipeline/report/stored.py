@@ -16,8 +16,7 @@ from pipeline.store.run import Run
 
 
 def stored_options(run: Run, name: str) -> list[dict[str, Any]]:
-    """Return the options of each stored result of an analysis, if `pipeline.runs.derive.derive` would still use this
-    result.
+    """Return the options of each stored result of an analysis that is still valid.
 
     Parameters
     ----------

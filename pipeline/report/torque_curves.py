@@ -55,8 +55,7 @@ def curves_described(outcome: Outcome, options: Mapping[str, Any]) -> Estimate:
 
 
 def gain_over_dipoles(outcome: Outcome, options: Mapping[str, Any]) -> Estimate:
-    """Return the fraction by which the sum of squared residuals of the joint fit is smaller than that of the point-
-    dipole fit.
+    """Return the relative reduction of squared residuals by the joint fit, compared with the fit of point dipoles.
 
     The interval is a bootstrap over whole curves, so residuals within a curve may be correlated.
     """
@@ -103,9 +102,7 @@ def _width(values: Mapping[str, float]) -> float:
 
 
 def signs_apart(outcome: Outcome, options: Mapping[str, Any]) -> Estimate:
-    """Return the fraction of readings whose torque has the same sign as the angle's signed distance from the transition
-    line.
-    """
+    """Return the fraction of readings in which torque and distance from the transition angle have the same sign."""
     from magpend_core.models.pendulum import magnet_torque as laws
     from pipeline.analysis.intervals import binomial_interval
 

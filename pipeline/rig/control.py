@@ -1,4 +1,4 @@
-"""Trace a branch of a virtual rig by control-based continuation: stable and unstable orbits of a driven oscillator.
+"""Trace a branch of stable and unstable orbits of a virtual rig, a driven oscillator, by control-based continuation.
 
 A proportional and derivative controller acts through the rig's drive and keeps a state near a periodic target. Its
 output is the whole drive. Harmonics of the target other than the first are replaced by those of the response
@@ -74,8 +74,7 @@ class Controlled:
 
 @dataclass(frozen=True)
 class TracedOrbits:
-    """Orbits of the rig, one for each target: medians over the measured drive periods, and standard deviations between
-    the periods.
+    """Traced orbits of the rig, one per target: median and standard deviation over the measured drive periods.
 
     Attributes
     ----------
@@ -135,9 +134,7 @@ def trace(rig: Controlled, targets: Sequence[float] | np.ndarray) -> TracedOrbit
 
 @dataclass(frozen=True)
 class _Plant:
-    """Virtual rigs, one for each target: the model with its drive amplitude set to 0, and the direction in state space
-    in which the drive acts.
-    """
+    """Virtual rigs, one per target: the model without its drive, and the direction in which the control force acts."""
 
     rig: Controlled
     parameters: Parameters
@@ -146,9 +143,6 @@ class _Plant:
 
     @classmethod
     def of(cls, rig: Controlled, targets: np.ndarray) -> _Plant:
-        """Check the settings of a virtual rig and the targets, and return the rigs. Raise SpecError if the settings are
-        not valid.
-        """
         model, problems = rig.parameters.model, []
         if rig.state not in model.state_names or not model.state(rig.state).rate:
             known = [s.name for s in model.states if s.rate]
@@ -203,8 +197,8 @@ class _Plant:
 
 
 def _push(still: Parameters, one: Parameters, frequency_hz: float) -> np.ndarray:
-    """Return the change of the rates under a drive of amplitude 1 at phase 0. Raise SpecError unless the drive acts as
-    a cosine in one fixed direction.
+    """Return the change of the rates under a drive of amplitude 1 at phase 0; raise SpecError unless the drive is a
+    cosine.
     """
     shares = np.array([0.0, 0.125, 0.25, 0.5])
     states = np.stack([np.zeros(len(still.model.state_names)), 0.3 * np.asarray(still.model.scales)])

@@ -99,7 +99,6 @@ def _problems(recording: xr.Dataset, kind: str, tolerance: float) -> list[str]:
 
 
 def _head(recording: xr.Dataset, what: str, kind: str) -> list[str]:
-    """Return the first lines of a drive file: a comment that names the recording, and the table's header."""
     attrs = recording.attrs
     simulated = " (simulated)" if attrs.get("simulated") else ""
     source = f"{attrs.get('file', 'a recording')}{simulated}, sha256 {attrs.get('sha256', 'not known')}"

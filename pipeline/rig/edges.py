@@ -134,8 +134,7 @@ class Edges:
         return mean / period, math.hypot(*errors) / period
 
     def common_error(self, fitted: Floats, scatter: float) -> float:
-        """Return the standard error [s] of the offset of a line fitted through the edges. It is common to all times on
-        the line.
+        """Return the standard error [s] of the time offset of a line fitted through the edges.
 
         Parameters
         ----------
@@ -147,7 +146,7 @@ class Edges:
         return self._error(fitted, np.full(fitted.size, 1 / fitted.size), scatter, drifts=1)
 
     def _error(self, fitted: Floats, weights: Floats, scatter: float, drifts: int = _DRIFTS) -> float:
-        """Return the standard error [s] of a weighted sum of edge times.
+        """Return the standard error [s] of a weighted sum of edge times, with correlated rounding errors.
 
         A time known to one sample is rounded to the middle of the interval. The rounding error is a sawtooth
         in the time, so it is not independent from edge to edge. Its harmonics have unknown phase; their
@@ -316,14 +315,15 @@ def _crossing(t: Floats, above: Floats) -> float:
 
 
 def _numbers(rising: Floats) -> Floats:
-    """Return the number of each rising edge, counted in drive periods from the first; missing edges are counted too."""
+    """Return the number of each rising edge, counted in drive periods from the first. Missing edges are counted as
+    well.
+    """
     gaps = np.diff(rising)
     steps = np.maximum(np.rint(gaps / np.median(gaps)), 1.0)
     return np.concatenate([[0.0], np.cumsum(steps)])
 
 
 def _line(number: Floats, rising: Floats) -> tuple[float, float]:
-    """Fit a line by centred least squares; return intercept and slope."""
     centred = number - number.mean()
     slope = float(centred @ (rising - rising.mean()) / (centred @ centred))
     return float(rising.mean() - slope * number.mean()), slope

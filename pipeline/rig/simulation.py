@@ -166,7 +166,8 @@ def parse_rig(data: AnyMapping[str, Any], folder: str | Path = ".") -> Rig:
 
 
 def simulated(rig: Rig, *, is_csv: bool = False) -> tuple[Raw, Mapping]:
-    """Simulate a virtual rig; return its readings, and the mapping for the file that they are written to.
+    """Simulate a virtual rig. Return its readings, and the mapping (description of the channels) for the file that they
+    are written to.
 
     Parameters
     ----------
@@ -208,7 +209,6 @@ def rig_parameters(data: AnyMapping[str, Any], folder: str | Path, problems: lis
 
 
 def _start(given: AnyMapping[str, Any], model: Model, problems: list[str]) -> tuple[float, ...]:
-    """Return the initial state from values by name; angles and rates may be in degrees."""
     values = dict.fromkeys(model.state_names, 0.0)
     for key, value in given.items():
         name = state_of_key(key, model)

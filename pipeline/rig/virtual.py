@@ -166,7 +166,8 @@ def readings(
     sensors: Sensors,
     seed: int,
 ) -> tuple[Raw, Mapping]:
-    """Simulate the sensors' readings, and return them with the mapping that converts them to states.
+    """Simulate the sensors' readings. Return them with the mapping (description of the channels) that converts them to
+    states.
 
     Returns
     -------
@@ -294,7 +295,6 @@ def _intervals(parameters: Parameters, drive: Sequence[Step], end_s: float) -> A
 def _potentiometer(
     channel: str, angle: np.ndarray, unit: str, sensor: Sensor, rng: np.random.Generator
 ) -> tuple[np.ndarray, ChannelMap, str]:
-    """Simulate a potentiometer; return its voltages, the mapping back to the angle, and the unit."""
     low, high = TRACK_V
     middle, per_rad = 0.5 * (low + high), (high - low) / (TURN - sensor.dead_band)
     folded = np.mod(angle + math.pi, TURN) - math.pi
@@ -320,9 +320,6 @@ def _potentiometer(
 def _encoder(
     channel: str, state: np.ndarray, unit: str, sensor: Sensor, rng: np.random.Generator
 ) -> tuple[np.ndarray, ChannelMap, str]:
-    """Simulate an encoder; return its readings (counts, or the state's unit), the mapping back to the state, and the
-    unit.
-    """
     noisy = state + sensor.noise * rng.standard_normal(len(state))
     if sensor.bits is None:
         return noisy, ChannelMap(channel=channel, unit=unit), unit
@@ -338,7 +335,6 @@ def _drive_channel(
     rng: np.random.Generator,
     step_s: float,
 ) -> tuple[Channel, DriveMap]:
-    """Return the simulated channel of the drive, and its mapping."""
     from magpend_core.pointwise import drive_level
 
     level = np.zeros(len(times))

@@ -211,8 +211,7 @@ def _refuse_recorded(run: Run, name: str) -> None:
 
 
 def prepared(run: AnalysedRun, product: Any, options: Options) -> Options:
-    """Complete the options of an analysis or figure, with names as in the run's cube. Raise `SpecError` if the run does
-    not suit the analysis or figure.
+    """Return the options of an analysis or figure with names and missing values filled in from the run.
 
     Raises
     ------
@@ -229,8 +228,7 @@ def prepared(run: AnalysedRun, product: Any, options: Options) -> Options:
 
 
 def most_evidence(run: Run, options: Options) -> Options:
-    """Increase the options that extend the integration of trajectories to the largest values in any stored search for
-    attractors with equal other options.
+    """Return options with the largest effort of any stored search for attractors whose other options are equal.
 
     Options without an effort are returned unchanged.
     """
@@ -242,9 +240,7 @@ def most_evidence(run: Run, options: Options) -> Options:
 
 
 def _kept_efforts(run: Run) -> list[tuple[dict[str, Any], tuple[float, int]]]:
-    """Return the options of each up-to-date stored search for attractors, and separately its effort, which tells by how
-    much the integration of trajectories was extended.
-    """
+    """Return the options of each valid stored search for attractors, as pairs: all other options, and the effort."""
     try:
         kept_here = products_in(run.info.files.below(DERIVED))
     except NotADirectoryError:
@@ -264,17 +260,13 @@ def _kept_efforts(run: Run) -> list[tuple[dict[str, Any], tuple[float, int]]]:
 
 
 def _aside(options: IdentifyOptions) -> dict[str, Any]:
-    """Return the options for identifying attractors, except those that set how far trajectories are integrated
-    further.
-    """
+    """Return the options of a search for attractors without its effort (how far trajectories are integrated)."""
     effort = ("extend", "budget", "n_sample")
     return {name: value for name, value in options.plain().items() if name not in effort}
 
 
 def is_outdone(run: Run, attrs: Mapping[str, Any]) -> bool:
-    """Return whether a stored result is superseded by another result that identified the attractors with a longer
-    integration of trajectories.
-    """
+    """Return whether another stored result found the attractors with longer integrations than this one."""
     name, given = str(attrs.get("derived_product")), _options_of(attrs)
     if name not in ANALYSES or not issubclass(ANALYSES[name].options, IdentifyOptions):
         return False

@@ -56,9 +56,7 @@ def figure(
 
 
 def ready(source: Source, name: str, options: FigureOptions, echo: Echo | None) -> tuple[AnalysedRun, FigureOptions]:
-    """Open a run. Return it with the figure's options, in which missing values are filled in and names are translated
-    to those of the run's cube.
-    """
+    """Open a run. Return it with the figure's options, in which names and missing values are filled in."""
     run = AnalysedRun.of(source, echo)
     settled: Any = prepared(run, FIGURES[name], options)
     return run, settled

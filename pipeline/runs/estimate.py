@@ -171,9 +171,7 @@ def _sample(spec: Spec, plan: Plan, rng: np.random.Generator, n_branches: int, *
 
 
 def _points(n_points: int, rng: np.random.Generator, *, pairs: bool) -> np.ndarray:
-    """Return random indices along a continuation path: one point, or two adjacent points, from each of several equal
-    parts of the path.
-    """
+    """Return random indices along a continuation path, one or two adjacent points from each of several equal parts."""
     n_parts = min(POINTS, n_points // 2 if pairs and n_points > 1 else n_points)
     edges = np.linspace(0, n_points, n_parts + 1)
     first = np.array([rng.integers(math.ceil(a), math.ceil(b)) for a, b in itertools.pairwise(edges)])
@@ -184,8 +182,7 @@ def _points(n_points: int, rng: np.random.Generator, *, pairs: bool) -> np.ndarr
 
 
 def _speed(spec: Spec, inputs: Inputs, most: float) -> tuple[float, int, float]:
-    """Measure the integration speed; return the ratio of measured to rule-of-thumb time, the periods integrated per
-    cell, and the seconds spent.
+    """Time the integration of sampled cells: ratio to the rule-of-thumb time, periods per cell, seconds spent.
 
     Two stretches are measured: one from the initial states, and one from the end of the first, which
     represents the rest of the cell.
@@ -202,8 +199,7 @@ def _speed(spec: Spec, inputs: Inputs, most: float) -> tuple[float, int, float]:
 
 
 def _stretch(spec: Spec, inputs: Inputs, n_periods: int) -> tuple[np.ndarray, float, float]:
-    """Integrate the sampled cells; return their final states, the ratio of the processor time to a rule-of-thumb
-    estimate, and that time [s].
+    """Integrate sampled cells and time it: final states, ratio to the rule-of-thumb time, processor time [s].
 
     The time is processor time, so that other programs do not count.
     """
@@ -223,7 +219,7 @@ def _stretch(spec: Spec, inputs: Inputs, n_periods: int) -> tuple[np.ndarray, fl
 
 
 def _periods_until_closed(spec: Spec, plan: Plan, most: float, ratio: float) -> float:
-    """Return the mean number of periods that a trajectory needs if each one stops once its orbit has closed.
+    """Estimate the mean number of periods per cell if integration stops once an orbit has closed, from a sample.
 
     A first sample gives the number of cells for which there is time.
     """
@@ -250,8 +246,7 @@ def _periods_until_closed(spec: Spec, plan: Plan, most: float, ratio: float) -> 
 
 
 def mean_with_tail(periods: np.ndarray, cap: float, most: float) -> float:
-    """Return the mean number of periods per trajectory; those stopped at `cap` periods are extrapolated to a limit of
-    `most` periods.
+    """Return the mean number of periods per trajectory, with an estimate for those still running after `cap` periods.
 
     These cells are assumed to end at the rate at which cells ended in the second half of the observed
     periods.

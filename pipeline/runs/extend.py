@@ -72,15 +72,13 @@ class Extension:
 
     @property
     def share(self) -> float:
-        """Drive periods left to integrate, as a fraction of the periods that the wider run would need without reused
-        cells.
-        """
+        """Fraction of the wider run's integration that is left after reusing cells."""
         counts = zip(self.runs, self.counts, strict=True)
         left = self.plan.n_cells - self.reused + sum(count * self._more(run) for run, count in counts)
         return left / self.plan.n_cells
 
     def _more(self, run: Run) -> float:
-        """Return the fraction of its periods that a cell taken over from another run must still be integrated."""
+        """Return the fraction of its drive periods for which a reused cell must still be integrated."""
         integration = self.spec.integration
         n_more = integration.n_keep - run.spec.integration.n_keep
         return n_more / (integration.n_transient + integration.n_keep)
@@ -169,7 +167,7 @@ def _fitting(runs: Sequence[Run], wide: Spec, identity: Mapping[str, Any]) -> tu
 
 
 def _census(wide: Spec, plan: Plan, runs: Sequence[Run]) -> list[int]:
-    """Return how many cells of the wider run each old run can supply; a cell is counted for one run only."""
+    """Count the cells of the wider run that each old run supplies. No cell is counted twice."""
     from pipeline.compute.reuse import Pool
 
     pool, cells = Pool(wide, runs), CellMap(wide)
@@ -345,7 +343,7 @@ def _as_it_is(run: Run, echo: Echo) -> State:
 
 
 def _refuse_loss(run: Run, wide: Spec) -> None:
-    """Raise `RefusedError` if replacing a run by the wider one would lose some of its cells or products."""
+    """Raise `RefusedError` if the wider run lacks cells or products of the run that it would replace."""
     cells, finder, lost = CellMap(run.spec), Finder(wide), 0
     for index in run.commits:
         block = run.plan.task(index)
@@ -371,9 +369,7 @@ def _exchange(directory: Path, built: Path, echo: Echo) -> None:
 
 
 def _finish_exchange(directory: Path, echo: Echo) -> None:
-    """Complete an interrupted `extend` whose old run was already renamed: give the finished wider run the original name
-    of that run.
-    """
+    """Complete an interrupted replacement: give the finished wider run the name of the old run."""
     built = _beside(directory)
     if directory.exists() or not is_run(open_files(built)):
         return

@@ -133,7 +133,7 @@ def schedule(moving: Sequence[Moving], options: AnimationOptions) -> Schedule:
 
 
 def _cycle(one: Moving) -> float:
-    """Return the length of one visible period [s]: the drive period, or for an autonomous model that of the orbit."""
+    """Return the unit in which a film is timed [s]: the drive period, or the orbit's period of an autonomous model."""
     if not one.parameters.model.autonomous:
         return 1.0 / one.frequency_hz
     return one.period_s if one.period_s > 0.0 else 2.0
@@ -146,9 +146,7 @@ def _nice(value: float) -> float:
 
 
 def _common(periods: Sequence[float], cycle: float) -> float | None:
-    """Return the least common multiple of the motions' periods [s]; None if they have none, 0 if all motions are at
-    rest.
-    """
+    """Return the time [s] after which all motions repeat together; None if there is none, 0 if `periods` is empty."""
     if any(math.isnan(p) for p in periods):
         return None
     if not periods:

@@ -80,9 +80,7 @@ def of_attractors(
 
 
 def _chosen(name: str, here: xr.Dataset, letters: Sequence[str]) -> tuple[list[int], list[str]]:
-    """Choose the attractors to show: those of the given letters, else those of largest basin fraction; return ids, and
-    notes on those left out.
-    """
+    """Choose attractors by letter or else by largest basin fraction; return their ids, and notes on those left out."""
     there = [int(i) for i in here["attractor"].values]
     if not there:
         raise SpecError(f"{name}: no attractor was found at this point; look with magpend analyse attractors.")

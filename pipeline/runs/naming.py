@@ -60,7 +60,7 @@ def named(run: Run, options: Options) -> Options:
 
 
 def _swept(run: Run, others: Iterable[str]) -> str:
-    """Return the name of the parameter that a run sweeps besides `others`, or of the drive frequency if it sweeps none.
+    """Return the parameter that a run sweeps besides `others`; the drive frequency if it sweeps no other parameter.
 
     Raises
     ------

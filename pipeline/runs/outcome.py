@@ -106,7 +106,7 @@ def summary(run: Run) -> list[str]:
 
 
 def lost_cells(found: Iterable[Outcome]) -> list[Outcome]:
-    """Return, from `Outcome` objects (one per status of cells), those of the statuses diverged and failed."""
+    """Return the outcomes whose status is diverged or failed."""
     return [o for o in found if o.status in (DIVERGED, *FAILED)]
 
 

@@ -52,9 +52,7 @@ def figure_command(plan: Plan, directory: str | Path) -> str:
 
 
 def _long(plan: Plan) -> tuple[int, int]:
-    """Return two counts, each of axes with more than one value: swept parameters, and axes of the grid of initial
-    conditions.
-    """
+    """Count the axes with more than one value: first the swept parameters, then the axes of initial conditions."""
     long = [d for d, n in zip(plan.dims, plan.shape, strict=True) if n > 1]
     return sum(not is_start_dim(d) for d in long), sum(is_grid_dim(d) for d in long)
 

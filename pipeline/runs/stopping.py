@@ -124,9 +124,7 @@ def stoppable(directory: str | Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _raising() -> Iterator[None]:
-    """Let those of SIGINT, SIGTERM and SIGHUP that have the system's default action raise `Stopped` inside this
-    context.
-    """
+    """Make SIGINT, SIGTERM and SIGHUP raise `Stopped` inside the context, unless they have another handler."""
 
     def stop(number: int, frame: Any) -> None:
         raise Stopped(number)

@@ -1,6 +1,4 @@
-"""Compute versions of analyses as digests of their code; stored results stay valid when only other analyses are
-edited.
-"""
+"""Compute the version of an analysis as a digest of the code that it uses, so that other edits keep results valid."""
 
 from __future__ import annotations
 
@@ -49,7 +47,7 @@ def modules_of(name: str) -> set[str]:
 
 @cache
 def _imports(module: str) -> tuple[str, ...]:
-    """Return the modules of `pipeline.analysis` (and `pipeline.layout.vocabulary`) that a module imports."""
+    """Return the modules that a module imports, as far as they affect the version of an analysis."""
     names: list[str] = []
     for node in ast.walk(ast.parse(_file(module).read_bytes())):
         if isinstance(node, ast.ImportFrom) and node.module and not node.level:

@@ -190,8 +190,8 @@ def _points(spec: Spec, key: str, changes: Changes) -> int:
 
 
 def _old(spec: Spec, key: str) -> tuple[Any, float]:
-    """Return the value or range of a state or parameter in the old specification, and the factor that converts it to
-    the unit of its new value.
+    """Return the old value or range of a state or parameter, and the factor that converts it to the unit of the new
+    value.
     """
     state = _state(spec, key)
     if state is None:
@@ -210,9 +210,7 @@ def _old_range(spec: Spec, key: str) -> Range | None:
 
 
 def _extent(spec: Spec, key: str) -> tuple[float, float] | None:
-    """Return the ends of the range that a state or parameter had in the old specification, in the unit of its new
-    value; None without a range.
-    """
+    """Return both ends of a state's or parameter's old range in the unit of the new value; None without a range."""
     value, factor = _old(spec, key)
     if isinstance(value, Range):
         array = value.array()

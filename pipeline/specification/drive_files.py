@@ -226,7 +226,6 @@ def rising_edges(time: np.ndarray, level: np.ndarray) -> np.ndarray:
 
 
 def _rows(text: str, file: str) -> tuple[str, list[tuple[int, list[str]]]]:
-    """Return the kind of a drive file (edges or torque) by its header, and its rows with their line numbers."""
     lines = [(i, line.strip()) for i, line in enumerate(text.splitlines(), 1)]
     lines = [(i, line) for i, line in lines if line and not line.startswith("#")]
     header = tuple(word.strip().lstrip("\ufeff") for word in lines[0][1].split(",")) if lines else ()

@@ -115,7 +115,6 @@ def toml_tables(content: bytes, name: str) -> dict[str, Any]:
 
 
 def _unreadable(error: Exception) -> str:
-    """Return a phrase that says why a file cannot be read as TOML."""
     if isinstance(error, OSError):
         return f"cannot be read ({error.strerror or error})."
     if isinstance(error, UnicodeDecodeError):

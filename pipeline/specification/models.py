@@ -65,7 +65,6 @@ def find_model(reference: Any, folder: str | Path | None = ".", at: str = "model
 
 
 def _placed(problem: str, at: str, reference: Any) -> str:
-    """Prefix a problem message with the key path of the model in the specification, unless it has one."""
     if not isinstance(reference, Mapping) or KEY in reference:
         return f"{at}: {problem}"
     head = "model."

@@ -311,7 +311,6 @@ def _declared(data: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def _valid_keys(model: type[ParametersTable], table: Any) -> ParametersTable:
-    """Return the table ``[parameters]`` without its invalid keys, so that the others can be checked further."""
     valid: dict[str, Any] = {}
     for key, value in table.items() if isinstance(table, dict) else ():
         if checked(model, {key: value}, "", []) is not None:
@@ -351,7 +350,6 @@ def _table(data: Mapping[str, Any], name: str, model: type[Table], problems: lis
 
 
 def _axes(data: Mapping[str, Any], problems: list[str]) -> dict[str, Range]:
-    """Return the valid axes in the order of the file; add the problems of the other axes to `problems`."""
     if not _is_table(data, "axes", problems):
         return {}
     axes = {n: checked(Range, value, f"axes.{n}", problems) for n, value in data.get("axes", {}).items()}
@@ -387,7 +385,6 @@ def _starts(data: Mapping[str, Any], model: Model, problems: list[str]) -> Start
 def _walk(
     kind: str, data: Mapping[str, Any], walk: Continuation | None, axes: dict[str, Range], problems: list[str]
 ) -> Continuation | None:
-    """Check ``[continuation]`` against the kind of run and the axes; return it for a continuation, else None."""
     if kind != "continuation":
         if kind == "sweep" and "continuation" in data:
             problems.append('continuation: a sweep has no such table; set kind = "continuation" or drop the table.')

@@ -184,7 +184,6 @@ def _sentence(item: dict[str, Any], model: type[BaseModel], prefix: str) -> str:
 
 
 def _known_keys(model: type[BaseModel], location: Sequence[int | str]) -> list[str]:
-    """Return the keys that are valid in the table where an unknown key was found."""
     if len([part for part in location if not str(part).startswith(_TAG)]) == 1:
         return list(model.model_fields)
     nested = getattr(model, "nested_model", None)

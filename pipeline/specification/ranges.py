@@ -30,7 +30,7 @@ def size_problems(axes: dict[str, Range], starts: Starts | None) -> list[str]:
 
 
 def corner_problems(base: Parameters, swept: dict[str, np.ndarray]) -> list[str]:
-    """Check relations between parameters at the corners of the box of swept values; return the problems.
+    """Check the model's relations between parameters at all corners of the swept ranges; return the problems.
 
     Bounds are intervals, so the corners decide. Only the axes of parameters that the model's relations read
     are varied. They are found by asking the model, again whenever its answer has read further parameters.

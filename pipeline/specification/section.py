@@ -38,7 +38,9 @@ class SectionTable(Table):
 
 
 def seen_through(model: Model, section: SectionTable | None) -> Model:
-    """Return the model with the Poincare section of a table ``[section]``; without a table, the model unchanged."""
+    """Return the model with the Poincare section of a table ``[section]``. Without such a table, return the model
+    unchanged.
+    """
     return model if section is None else sectioned(model, section.crossing)
 
 
@@ -95,9 +97,6 @@ def _found(table: SectionTable, model: Model, problems: list[str]) -> SectionTab
 
 
 def _missing(model: Model, data: Mapping[str, Any]) -> list[str]:
-    """Return a problem if the specification of an autonomous model has neither a ``[section]`` table nor a
-    frequency.
-    """
     if FREQUENCY in _keys(data, "parameters") or FREQUENCY in _keys(data, "axes") or "drive" in data:
         return []
     return [

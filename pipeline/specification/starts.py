@@ -136,7 +136,9 @@ class ListStarts(Table):
 
 
 def positions(model: Model) -> tuple[str, ...]:
-    """Return the states before the velocities; a row in a list of initial conditions may give these only."""
+    """Return the names of the states before the velocities. A row in a list of initial conditions may give these states
+    only.
+    """
     rates = {s.rate for s in model.states if s.rate}
     names = model.state_names
     first = next((i for i, name in enumerate(names) if name in rates), len(names))

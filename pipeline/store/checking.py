@@ -52,13 +52,13 @@ class Verification:
 
     @property
     def sound(self) -> bool:
-        """Whether nothing is damaged: committed tasks, metadata, coordinates and products."""
+        """Whether nothing is damaged: neither committed tasks nor metadata, coordinates and stored analysis results."""
         return not (self.damaged or self.skeleton or self.derived or self.odd)
 
 
 def verify(info: RunInfo, plan: Plan) -> Verification:
-    """Read every stored file of a run and compare its sha256 with the recorded one; return what is damaged or left
-    over.
+    """Read every stored file of a run and compare its sha256 with the recorded one; return which files are damaged or
+    left over.
 
     Raises
     ------
@@ -103,7 +103,7 @@ def name_of(index: int) -> str:
 
 
 def damaged_records(info: RunInfo, plan: Plan, *, contents: bool) -> tuple[Records, dict[str, str]]:
-    """Return the valid commit records, and the problems of damaged ones by file name.
+    """Return the valid commit records of a run's tasks, and the problems of the damaged records by file name.
 
     A record is damaged, too, if a file that it lists is missing or has changed.
 
@@ -121,7 +121,6 @@ def damaged_records(info: RunInfo, plan: Plan, *, contents: bool) -> tuple[Recor
 
 
 def _changed_objects(info: RunInfo, records: Records) -> dict[int, str]:
-    """Compare every file of the committed tasks with its recorded sha256; return the problems by task."""
     cube, found = info.files.below(CUBE), {}
     for n, index in enumerate(records):
         if n % _TASKS_PER_REPORT == 0:

@@ -1,8 +1,10 @@
 """Write tasks with their commit records, read the records, and remove files that belong to no record.
 
 A commit record is the only proof that a task is done. A task without a valid record is pending: its files are
-swept and it is computed again. Time, workers and order leave no trace in ``cube.zarr`` and ``commits``: an
-interrupted run ends with the same bytes as an uninterrupted one.
+removed (`sweep`) and it is computed again. The bytes in ``cube.zarr`` and ``commits`` do not depend on time, on the
+workers or on the order of tasks: an interrupted run ends with the same bytes as an uninterrupted one.
+
+A *record* lies in a file of its own until all tasks of its block have one; then they are merged into a *pack*.
 
 Reading order: `write_task` (how a task is committed), `read_commits` and `scan` (which records are valid),
 `_Scan` (records and packs in one folder), `sweep` (what is removed). Texts of records and packs are in
@@ -43,7 +45,7 @@ from pipeline.store.runfile import RunInfo
 Echo = Callable[[str], None]
 
 _MOST_SCANS = 100
-"""Times that the folder is read again because another process packed records meanwhile."""
+"""Largest number of attempts to read the folder while another process packs records."""
 
 
 # ---- writing -----------------------------------------------------------------------------------
@@ -79,20 +81,20 @@ def write_task(
     _require_metadata(info, plan)
     objects = [key for v in plan.variables for key in write_block(cube, plan, index, v.name, values[v.name])]
     cube.sync(objects)  # the chunks are durable before their record exists
-    # no time and no host: the record's bytes are the same whoever computes the task
+    # the record holds no time and no host name: its bytes do not depend on who computes the task
     record = {"digest": info.digest, "task": index, "status": dict(counts), "objects": entries_of(cube, objects)}
-    # not asked in an object store: it has no folder to remove, and each question is a request
+    # check for a removed run, but not in an object store: there a run is no folder, and the check costs a request
     if info.files.local is not None and not info.files.is_there(RUN_FILE):
         cube.remove(objects)
         raise RefusedError(f"{info.name}: was removed while it was computed; give the command again.")
-    # two workers may compute one task: a pack then holds this record, with the same bytes
+    # if another worker has computed the same task, the record (with equal bytes) may already be in a pack
     if not is_packed(info, index):
-        # temporary name, sync, rename, sync of the folder: the record is there whole or not at all
+        # `write_once` is atomic (temporary name, sync, rename, sync of the folder): no partial record can appear
         info.files.write_once(marker_key(index), record_text(record).encode())
 
 
 def _require_metadata(info: RunInfo, plan: Plan) -> None:
-    """Raise `DamagedError` if the metadata of a variable have changed; chunks would be encoded wrongly."""
+    """Raise `DamagedError` if the metadata of a variable have changed: with them, chunks would be encoded wrongly."""
     own = {key: info.skeleton[key] for key in (f"{v.name}/zarr.json" for v in plan.variables)}
     problems = problems_of(info.files.below(CUBE), own)
     if problems:
@@ -113,7 +115,7 @@ def is_packed(info: RunInfo, index: int) -> bool:
 def write_block(cube: Files, plan: Plan, index: int, name: str, values: np.ndarray) -> list[str]:
     """Write the values of one variable for the cells of a task as chunks; return the keys of the chunks."""
     array = zarr.open_array(cube.zarr(read_only=False), path=name, mode="r+", zarr_format=3)
-    # zarr does not store this setting; without it a block of fill values would leave no file
+    # without this setting, which zarr does not store, a block of fill values would write no file
     array = array.with_config({"write_empty_chunks": True})
     block = plan.task(index)
     own = array.shape[len(block) :]
@@ -139,9 +141,9 @@ def log_timing(info: RunInfo, entry: Mapping[str, Any]) -> None:
 def read_commits(info: RunInfo, plan: Plan, echo: Echo | None = None) -> Records:
     """Return the valid commit records by task: undamaged, of this run, and of a task in its plan.
 
-    If no record is packed, a record counts only if all its files exist with the right sizes. Larger runs
-    leave this check to the reading of chunks, to `verify` and to `pipeline.runs.run`, since it takes as long
-    as reading.
+    If no record is packed, a record counts only if all its files exist with the right sizes. In larger runs this
+    check would take as long as reading all records; there it is left to `verify`, `pipeline.runs.run` and the
+    reading of chunks.
 
     Parameters
     ----------
@@ -252,7 +254,7 @@ class _Scan:
     def read(self, folder: Files, names: list[str]) -> bool:
         """Read all packs, then all files with one commit record; return whether a file disappeared meanwhile."""
         vanished = False
-        # packs first: they tell which single records are only leftovers of a packing
+        # packs first: a single record that is also in a pack is a leftover of packing and is not read
         blocks = {name: block_of_pack(name) for name in _packs(names)}
         for name, content in folder.read_each(n for n, block in blocks.items() if self._asked(block)):
             vanished |= self._take(name, content, self._pack)
@@ -264,18 +266,20 @@ class _Scan:
         return block is not None and (self._blocks is None or block in self._blocks)
 
     def _alone(self, name: str) -> bool:
-        """Return whether a file with one commit record must be read because no valid pack holds its record."""
+        """Return whether a file with one commit record must be read because no valid pack (file of many records) holds
+        its record.
+        """
         stem = name.removesuffix(".json")
         if not stem.isdecimal():
-            return self._blocks is None  # no record's name: read in a full scan, to be reported
+            return self._blocks is None  # not the name of a record: read it in a full scan, to report it
         pack = self.packs.get(int(stem) // BLOCK)
         return self._asked(int(stem) // BLOCK) and (pack is None or int(stem) in pack.without)
 
     def _take(self, name: str, content: bytes | FileNotFoundError, read: Callable[[str, bytes], str]) -> bool:
-        if isinstance(content, NoFileError):  # a folder or a link stands there
+        if isinstance(content, NoFileError):  # a folder or a link instead of a file
             self.rejected[name] = str(content)
         elif isinstance(content, FileNotFoundError):
-            return True  # removed since the folder was listed: packed, or withdrawn
+            return True  # removed after the folder was listed: its record was packed or withdrawn
         elif problem := read(name, content):
             self.rejected[name] = problem
         return False
@@ -287,7 +291,7 @@ class _Scan:
         if isinstance(found, Pack) and is_inside:
             self.packs[block] = found
             return ""
-        # a damaged pack loses only its damaged lines
+        # use the undamaged records of a damaged pack
         saved = salvage(content, self._info.digest, block) if is_inside else {}
         self.singles |= saved
         problem = found if isinstance(found, str) else "of no tasks of this run"
@@ -297,7 +301,7 @@ class _Scan:
         found = read_record(content, self._info.digest)
         if isinstance(found, str):
             return found
-        # a record under another task's name would prove the wrong task
+        # a file named after one task must not hold the record of another
         if not 0 <= found.task < self._plan.n_tasks or marker_key(found.task) != f"{COMMITS}/{name}":
             return "torn or damaged"
         self.singles[found.task] = found

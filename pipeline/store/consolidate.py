@@ -1,4 +1,5 @@
-"""Rewrite the cube for browsers, which read it over HTTP: small chunks, and one file that describes all arrays.
+"""Rewrite a run's result cube for browsers, which read it over HTTP: small chunks, and one file that describes all
+arrays.
 
 A browser can decompress gzip but not blosc. It cannot list a folder. It asks for one state at a few values
 of the horizontal axis. A chunk here therefore holds one state of all cells at some values of that axis,
@@ -41,7 +42,7 @@ PRIVATE = ("host",)
 
 @dataclass(frozen=True)
 class Layer:
-    """An additional array that is stored with the cube: one value, or an array of values, for each cell.
+    """An additional array that is stored with the result cube: one value, or an array of values, for each cell.
 
     Attributes
     ----------
@@ -96,8 +97,8 @@ def write_cube(run: Run, folder: Path, along: str | None, layers: Layers) -> dic
 
 
 class _Columns:
-    """Chunk layout of the rewritten cube: a chunk holds one state for all initial conditions at several values of one
-    swept parameter.
+    """Chunk layout of the rewritten result cube: a chunk holds one state for all initial conditions at several values
+    of one swept parameter.
     """
 
     def __init__(self, run: Run, along: str | None) -> None:
@@ -195,13 +196,11 @@ def _create(
 
 
 def _plain(attrs: Mapping[Any, Any]) -> dict[str, Any]:
-    """Convert attributes to values that JSON can hold."""
     return {str(k): v.tolist() if isinstance(v, (np.ndarray, np.generic)) else v for k, v in attrs.items()}
 
 
 @contextlib.contextmanager
 def _unwarned() -> Iterator[None]:
-    """Silence zarr's warnings about codecs and metadata that are not in version 3 of its format."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Consolidated metadata")
         warnings.filterwarnings("ignore", message="Numcodecs codecs are not")

@@ -1,4 +1,4 @@
-"""Check the sizes and codecs that a cube's files declare, before anything is decompressed or allocated.
+"""Check the sizes and codecs that the files of a result cube declare, before anything is decompressed or allocated.
 
 A run directory may come from a stranger, with digests that fit. A few bytes can declare gigabytes of zeros,
 and metadata can name other codecs or shapes. Both are refused.
@@ -39,7 +39,7 @@ def declared_bytes(chunk: Any) -> int:
 
 
 class Declared:
-    """Checks of a cube's files: the sizes, shapes and codecs that they declare must fit the run's plan."""
+    """Checks of a result cube's files: the sizes, shapes and codecs that they declare must fit the run's plan."""
 
     def __init__(self, plan: Plan) -> None:
         self._sizes: Mapping[str, int] = {**dict(zip(plan.dims, plan.shape, strict=True)), **plan.sizes}
@@ -71,7 +71,9 @@ class Declared:
         return None if number <= most else f"declares {number} texts, and may have {most}"
 
     def _most(self, name: str) -> int:
-        """Return the uncompressed size of a chunk [bytes]: exact for a variable, an upper bound for a coordinate."""
+        """Return the allowed uncompressed size of a chunk [bytes]: exact for a variable, an upper bound for a
+        coordinate.
+        """
         if name in self._variables:
             _, chunk, dtype = self._variables[name]
             return math.prod(chunk) * np.dtype(dtype).itemsize

@@ -1,4 +1,4 @@
-"""Map tasks to the keys of their chunks, such as ``section/c.0.3.0.0``, and keys back to tasks."""
+"""Convert between tasks and the keys (relative paths) of their chunks, such as ``section/c.0.3.0.0``."""
 
 from __future__ import annotations
 

@@ -176,7 +176,6 @@ def _found(files: Leased) -> tuple[bytes, str, float] | None:
 
 
 def _replace(files: Leased, content: bytes, tag: str) -> str:
-    """Replace the lease object if it still has the given entity tag; return its new tag."""
     import obstore
 
     try:

@@ -83,7 +83,7 @@ class LocalFiles:
         write_atomically(path, content)
 
     def write_once(self, key: str, content: bytes) -> None:
-        """Write a file atomically; if two processes write the same content at once, one of the two files stays."""
+        """Write a file atomically. If two processes write the same content at once, one of the two files stays."""
         self.write(key, content)
 
     def append(self, key: str, line: str) -> None:
@@ -117,7 +117,7 @@ class LocalFiles:
                 sync_folder(folder)
 
     def sync(self, keys: Iterable[str]) -> None:
-        """Make files durable, then their folders, from the innermost up to this one."""
+        """Make files durable on disk, then their folders, from the innermost folder up to this one."""
         sync((self.root / key for key in keys), self.root)
 
     def prepare(self, prefix: str) -> None:

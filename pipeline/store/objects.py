@@ -189,7 +189,7 @@ class ObjectFiles:
         self._ask(key, lambda: obstore.put(self.store, key, content, use_multipart=False), writing=True)
 
     def write_once(self, key: str, content: bytes) -> None:
-        """Put an object unless it exists; an existing one must have the same content.
+        """Write an object unless it exists. An existing object must have the same content.
 
         Raises
         ------
@@ -256,21 +256,23 @@ class ObjectFiles:
             self._ask("", lambda: obstore.delete(self.store, gone), writing=True)
 
     def sync(self, keys: Iterable[str]) -> None:
-        """Do nothing: an object is durable once the store has answered."""
+        """Make files durable: there is nothing to do, since an object is durable once the store has answered."""
 
     def prepare(self, prefix: str) -> None:
-        """Do nothing: an object store has no folders."""
+        """Create a folder: there is nothing to do, since an object store has no folders."""
 
     def odd(self, folders: Iterable[str]) -> list[str]:
-        """Return an empty list: an object store has no folders."""
+        """Return the keys of folders found where files should be: there are none, since an object store has
+        no folders.
+        """
         return []
 
     def move_aside(self, key: str) -> str:
-        """Return the key unchanged: an object store has no folders that could be in the way."""
+        """Move a file or folder out of the way: return the key unchanged, since an object store has no folders."""
         return key
 
     def refuse_links(self, *prefixes: str) -> None:
-        """Do nothing: an object store has no symbolic links."""
+        """Refuse symbolic links: there is nothing to do, since an object store has none."""
 
     def zarr(self, *, read_only: bool) -> Store:
         """Return the objects below the prefix as a zarr store."""

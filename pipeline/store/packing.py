@@ -17,7 +17,8 @@ from pipeline.store.runfile import RunInfo
 
 
 class Packer:
-    """Counter of committed tasks that merges the records of each complete block of tasks into one file (a pack).
+    """Merger of commit records: it counts committed tasks, and merges the records of each complete block of tasks into
+    one file (a pack).
 
     Parameters
     ----------

@@ -45,12 +45,10 @@ class QuickPipeline(_Registered):  # type: ignore[misc]
 
 
 def _codecs_of(pipeline: Any) -> tuple[type, ...]:
-    """Return the types of a codec pipeline's codecs in order; empty if the pipeline does not list them."""
     return tuple(type(codec) for codec in pipeline) if isinstance(pipeline, Iterable) else ()
 
 
 def _put_all(items: list[Any], target: np.ndarray) -> list[Any]:
-    """Decode chunks into an array where possible; return the chunks that zarr has to decode."""
     return [item for item in items if not _put(item, target)]
 
 

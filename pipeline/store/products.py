@@ -131,7 +131,7 @@ def open_product(place: Place) -> xr.Dataset:
 
 
 def read_product_attrs(place: Place) -> dict[str, Any]:
-    """Return the attributes of a product after comparing the digest in them with its files.
+    """Compare the files of a product (stored analysis result) with the digest in its attributes; return the attributes.
 
     Raises
     ------
@@ -158,13 +158,11 @@ def read_product_attrs(place: Place) -> dict[str, Any]:
 
 
 def _refuse_declared(files: Files, contents: Iterable[tuple[str, bytes | FileNotFoundError]]) -> None:
-    """Raise `DamagedError` if a product's files declare other codecs or sizes than they should."""
     if problem := product_problem((key, value) for key, value in contents if isinstance(value, bytes)):
         raise DamagedError(f"{files.name}: {problem}")
 
 
 def _sealed_attrs(files: Files, group: bytes | FileNotFoundError | None, digests: Digests) -> dict[str, Any]:
-    """Return the attributes of a product; raise `DamagedError` if the digest in them does not fit its files."""
     if not isinstance(group, bytes):
         if digests:
             raise DamagedError(f"{files.name}: it has no {_GROUP}")
@@ -278,7 +276,6 @@ def _seal(attrs: Mapping[str, Any], digests: Digests) -> str:
 
 
 def _digests(files: Files) -> Digests:
-    """Return the key and sha256 of each file of a product except ``zarr.json``."""
     return _digests_of(files.read_each(key for key in files.everything() if key != _GROUP))
 
 
@@ -291,9 +288,7 @@ def _sha256(content: bytes) -> str:
 
 
 def _product_chunks(values: np.ndarray) -> tuple[int, ...]:
-    """Return the chunk shape of an array: the whole array if it is small, else pieces of some megabytes along the first
-    dims.
-    """
+    """Return the chunk shape of an array: the whole array, or pieces of some megabytes along its first dimensions."""
     chunks = [max(n, 1) for n in values.shape]
     for i, n in enumerate(chunks):
         rest = values.itemsize * int(np.prod(chunks[i + 1 :]))
@@ -317,7 +312,6 @@ def _coded(name: str, variable: xr.Variable) -> tuple[np.ndarray, dict[str, Any]
 
 
 def _with_words(ds: xr.Dataset) -> dict[str, Any]:
-    """Return the variables that hold integer codes of text labels, with the labels restored."""
     found = {}
     for name, variable in ds.variables.items():
         if _WORDS in variable.attrs:
@@ -328,7 +322,6 @@ def _with_words(ds: xr.Dataset) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:
-    """Convert attributes to values that JSON can hold."""
     if isinstance(value, Mapping):
         return {str(k): _plain(v) for k, v in value.items()}
     if isinstance(value, (list, tuple)):

@@ -51,7 +51,6 @@ def git_commit() -> str:
 
 
 def _git(*arguments: str) -> str | None:
-    """Run a git command in the folder of magpend's sources and return its output; None if it fails."""
     try:
         done = subprocess.run(
             ["git", "-C", str(_ROOT), *arguments], capture_output=True, text=True, check=True, timeout=_GIT_SECONDS

@@ -1,4 +1,4 @@
-"""Open the cube of a run as a labelled xarray dataset."""
+"""Open a run's result cube as a labelled xarray dataset."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 class OpenedRun(Protocol):
-    """Interface to the parts of a run from which its cube is made; see `pipeline.store.run.Run`."""
+    """Interface to the parts of a run from which its result cube is made; see `pipeline.store.run.Run`."""
 
     @property
     def info(self) -> RunInfo: ...  # noqa: D102
@@ -38,7 +38,7 @@ class OpenedRun(Protocol):
 
 
 def cube_of(run: OpenedRun, *, chunks: Any = None, check: bool | None = None) -> xr.Dataset:
-    """Return the cube of an opened run as a dataset; cells without a commit record read as pending."""
+    """Return the result cube of an opened run as a dataset; cells without a commit record read as pending."""
     import xarray as xr
 
     view: Any = committed_view(run.info, run.plan, run.commits, check=check)
@@ -53,7 +53,7 @@ def cube_of(run: OpenedRun, *, chunks: Any = None, check: bool | None = None) ->
 
 
 def _attributes(run: OpenedRun) -> dict[str, Any]:
-    """Return the attributes of a run's cube: title, model, specification, settings and provenance."""
+    """Return the attributes of a run's result cube: title, model, specification, settings and provenance."""
     info = run.info
     attrs: dict[str, Any] = {
         "title": info.title,

@@ -1,4 +1,4 @@
-"""Open a run directory: its specification, plan, commit records and cube."""
+"""Open a run directory: its specification, plan, commit records and result cube."""
 
 from __future__ import annotations
 
@@ -149,14 +149,14 @@ class Run:
         return cube_digest(self.info, self.commits)
 
     def cube(self, chunks: Any = None, *, check: bool | None = None) -> xr.Dataset:
-        """Open the cube of the run as an xarray dataset; see `pipeline.open_run`."""
+        """Open the run's result cube as an xarray dataset; see `pipeline.open_run`."""
         from pipeline.store.reading import cube_of
 
         return cube_of(self, chunks=chunks, check=check)
 
 
 def open_run(path: str | Path | Run, *, chunks: Any = None, check: bool | None = None) -> xr.Dataset:
-    """Open the cube of a run directory as a dataset; only coordinates are read until variables are used.
+    """Open the result cube of a run directory as a dataset; only coordinates are read until variables are used.
 
     Cells that are not committed read as pending: ``status`` 0, ``section`` NaN. Open the run again to see
     cells that were committed later.

@@ -1,4 +1,6 @@
-"""Read and write ``run.json``: the specification, the run's digest, and sha256 digests of metadata and coordinates."""
+"""Read and write ``run.json``: the specification, the run's digest, and sha256 digests of the result cube's metadata
+and coordinates.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Create a run directory, or rebuild its damaged metadata and coordinates from the specification."""
+"""Create a run directory, or rebuild damaged metadata and coordinates of its result cube from the specification."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ Echo = Callable[[str], None]
 
 
 def check(place: str | Path | Files, identity: Mapping[str, Any]) -> RunInfo | None:
-    """Check whether a run can be started or continued in a directory; change nothing.
+    """Check whether a run can be started or continued in a directory, without changing anything there.
 
     Returns
     -------
@@ -69,7 +69,6 @@ def check(place: str | Path | Files, identity: Mapping[str, Any]) -> RunInfo | N
 
 
 def _refuse_place(folder: Path) -> None:
-    """Raise `RefusedError` for a broken symbolic link, or a place inside another run directory."""
     if folder.is_symlink() and not folder.exists():
         raise RefusedError(f"{folder}: is a link that leads nowhere; remove it, or give another --out.")
     outer = run_around(folder.absolute().resolve().parent)
@@ -105,7 +104,6 @@ def _refuse_foreign(files: Files, names: list[str], digest: str) -> None:
 
 
 def _refuse_notes(files: Files) -> None:
-    """Raise `RefusedError` if the directory has a ``lock.json`` or ``timings.jsonl`` that no run wrote."""
     for name, is_own in ((HOLDER, is_note), (TIMINGS, _is_timings)):
         for _, content in files.read_each([name]):
             if isinstance(content, bytes) and not is_own(content):
@@ -113,7 +111,6 @@ def _refuse_notes(files: Files) -> None:
 
 
 def _is_timings(content: bytes) -> bool:
-    """Return whether a file's content is empty or begins as that of ``timings.jsonl`` does."""
     try:
         first = json.loads(content.split(b"\n")[0] or b'{"task": 0}')
     except (ValueError, RecursionError):
@@ -144,7 +141,7 @@ def _holds_something(files: Files, name: str) -> bool:
 
 
 def _digests(files: Files) -> set[str]:
-    """Return the digests of runs that the cube's metadata and the commit records name."""
+    """Return the digests of runs that the result cube's metadata and the commit records name."""
     records = [f"{COMMITS}/{key}" for key in files.below(COMMITS).everything() if key.endswith((".json", ".jsonl"))]
     # a pack names the digest in its first record
     found = {_text_in(content, "digest") for _, content in files.read_each(records)}
@@ -154,7 +151,6 @@ def _digests(files: Files) -> set[str]:
 
 
 def _text_in(content: bytes | FileNotFoundError, *keys: str) -> str | None:
-    """Return the text at nested keys of a JSON file; None if the file or the text is missing or damaged."""
     if isinstance(content, FileNotFoundError):
         return None
     try:
@@ -167,7 +163,7 @@ def _text_in(content: bytes | FileNotFoundError, *keys: str) -> str | None:
 
 
 def create(place: str | Path | Files, spec: Spec, plan: Plan, identity: Mapping[str, Any], spec_text: str) -> RunInfo:
-    """Create a run directory: an empty cube (metadata and coordinates), then ``run.json``.
+    """Create a run directory: an empty result cube (metadata and coordinates), then ``run.json``.
 
     Call `check` first: files with the same names are replaced.
     """
@@ -188,7 +184,7 @@ def establish(
     *,
     alone: bool = True,
 ) -> RunInfo:
-    """Create a run directory or, if it exists, open it and rebuild its damaged metadata and coordinates.
+    """Create a run directory or, if it exists, open it and rebuild damaged metadata and coordinates of its result cube.
 
     Only the holder of the lock may call this.
 
@@ -234,7 +230,7 @@ def establish(
 
 
 def rebuild_skeleton(info: RunInfo, spec: Spec, plan: Plan) -> list[str]:
-    """Rebuild damaged metadata and coordinates of the cube; return the problems that remain.
+    """Rebuild damaged metadata and coordinates of the result cube; return the problems that remain.
 
     A file is written only if its digest is the one in ``run.json``. Another version of zarr or of magpend may
     write other bytes.

@@ -1,4 +1,4 @@
-"""Make the files of an empty cube: the metadata of all variables, and the coordinates.
+"""Make the files of an empty result cube: the metadata of all variables, and the coordinates.
 
 Their bytes follow from the specification, the plan, the identity and the text alone, so that a damaged file
 can be rebuilt.
@@ -29,8 +29,8 @@ GROUP_KEY = "zarr.json"
 
 
 def skeleton_files(spec: Spec, plan: Plan, identity: Mapping[str, Any], spec_text: str, title: str) -> dict[str, bytes]:
-    """Return the contents of all files of an empty cube (metadata and coordinates) by key; those of the group come
-    first.
+    """Return the contents of all files of an empty result cube (metadata and coordinates) by key; those of the group
+    come first.
     """
     attrs = {
         "kind": plan.kind,
@@ -67,13 +67,12 @@ def skeleton_files(spec: Spec, plan: Plan, identity: Mapping[str, Any], spec_tex
 
 
 def skeleton_keys(spec: Spec, plan: Plan) -> list[str]:
-    """Return the keys of the metadata files of all variables and coordinates."""
+    """Return the keys of the metadata files of all variables and coordinates of the result cube."""
     names = [v.name for v in plan.variables] + [c.name for c in (*coordinates(spec), *_labels(spec))]
     return [f"{name}/{GROUP_KEY}" for name in names]
 
 
 def _labels(spec: Spec) -> list[Coordinate]:
-    """Return the coordinates along dims other than those of the cells, such as the names of the states."""
     model = spec.model
     found = [
         Coordinate("state", ("state",), _values(model.state_names), {"long_name": "component of the state"}),
@@ -89,7 +88,6 @@ def _labels(spec: Spec) -> list[Coordinate]:
 
 
 def _values(labels: Iterable[Any]) -> np.ndarray:
-    """Convert coordinate labels to a numpy array: of objects for texts, of int32 for numbers."""
     values = list(labels)
     return np.array(values, dtype=object if isinstance(values[0], str) else np.int32)
 
@@ -100,7 +98,7 @@ def entries_of(files: Mapping[str, bytes]) -> dict[str, dict[str, Any]]:
 
 
 def write_skeleton(files: Files, contents: Mapping[str, bytes], keys: Iterable[str]) -> None:
-    """Write some of the metadata and coordinate files of a cube, each atomically, in the given order."""
+    """Write some of the metadata and coordinate files of a result cube, each atomically, in the given order."""
     files.prepare(CUBE)
     written = [f"{CUBE}/{key}" for key in keys]
     for key in written:
@@ -109,14 +107,15 @@ def write_skeleton(files: Files, contents: Mapping[str, bytes], keys: Iterable[s
 
 
 def skeleton_problems(info: RunInfo) -> list[str]:
-    """Return a line for each metadata or coordinate file that is missing or has changed."""
+    """Return a line for each metadata or coordinate file of the result cube that is missing or has changed."""
     folders = {key.partition("/")[0] for key in info.skeleton if "/" in key}
     info.files.refuse_links(CUBE, *(f"{CUBE}/{folder}" for folder in folders))
     return problems_of(info.files.below(CUBE), info.skeleton)
 
 
 def check_skeleton(info: RunInfo) -> None:
-    """Compare metadata and coordinates with their digests in ``run.json``; raise `DamagedError` if one differs.
+    """Compare the result cube's metadata and coordinates with their digests in ``run.json``; raise `DamagedError` if
+    one differs.
 
     Raises
     ------

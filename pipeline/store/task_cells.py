@@ -56,7 +56,7 @@ def read_cells(
 
 
 def read_block(run: Run, index: int, names: Iterable[str]) -> dict[str, np.ndarray]:
-    """Read variables of one committed task of an open run; the dims of the task's block of cells come first, then those
+    """Read variables of one committed task of an open run. The dims of the task's block of cells come first, then those
     of the variable.
 
     Raises

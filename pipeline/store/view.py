@@ -1,4 +1,5 @@
-"""Define a view of the cube that shows only committed cells: others read as pending, changed chunks raise an error.
+"""Define a view of a result cube that shows only committed cells: others read as pending, changed chunks raise an
+error.
 
 Every chunk is compared with the sha256 in its commit record when it is read; metadata and coordinates are
 compared with ``run.json``. ``MAGPEND_VERIFY=0`` in the environment turns this off. The chunk's own crc32c
@@ -41,7 +42,7 @@ def checks_chunks() -> bool:
 
 
 class Shown:
-    """Files of the cube that readers see (metadata, coordinates and committed chunks), with size and sha256."""
+    """Files of the result cube that readers see (metadata, coordinates and committed chunks), with size and sha256."""
 
     def __init__(self, info: RunInfo, plan: Plan, commits: Mapping[int, Commit]) -> None:
         self._skeleton = info.skeleton
@@ -50,7 +51,7 @@ class Shown:
         self._commits = commits
 
     def arrays(self) -> list[str]:
-        """Return the names of the arrays in the cube."""
+        """Return the names of the arrays in the result cube."""
         return sorted({key.partition("/")[0] for key in self._skeleton})
 
     def entry(self, key: str) -> Mapping[str, Any] | None:
@@ -64,7 +65,7 @@ class Shown:
 
 
 class CommittedStore(WrapperStore[Store]):
-    """A read-only zarr store of the cube, in which chunks without a valid commit record do not exist.
+    """A read-only zarr store of the result cube, in which chunks without a valid commit record do not exist.
 
     zarr then reads the fill value, which means pending. A chunk that has a record but is missing or has
     changed raises `DamagedError`.
@@ -91,7 +92,7 @@ class CommittedStore(WrapperStore[Store]):
         return type(self)(store, self._files, self._shown, self._checks)
 
     async def get(self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None) -> Buffer | None:
-        """Return the content of a file of the cube for zarr; None if readers must not see the file.
+        """Return the content of a file of the result cube for zarr; None if readers must not see the file.
 
         Raises
         ------
@@ -156,11 +157,11 @@ class CommittedStore(WrapperStore[Store]):
         )
 
     async def exists(self, key: str) -> bool:
-        """Return whether a key belongs to the metadata, the coordinates or a committed chunk."""
+        """Return whether a key belongs to the metadata, the coordinates or a committed chunk of the result cube."""
         return self._shown.entry(key) is not None
 
     async def list_dir(self, prefix: str) -> AsyncIterator[str]:
-        """Yield the names in a folder of the cube; at its top level, the names of its arrays."""
+        """Yield the names in a folder of the result cube; at its top level, the names of its arrays."""
         if prefix.strip("/"):
             async for name in self._store.list_dir(prefix):
                 yield name
@@ -171,7 +172,7 @@ class CommittedStore(WrapperStore[Store]):
     async def get_partial_values(
         self, prototype: BufferPrototype, key_ranges: Iterable[tuple[str, ByteRequest | None]]
     ) -> list[Buffer | None]:
-        """Return the requested byte ranges of several files of the cube, for zarr."""
+        """Return the requested byte ranges of several files of the result cube, for zarr."""
         return [await self.get(key, prototype, byte_range) for key, byte_range in key_ranges]
 
     async def _get_many(
@@ -196,7 +197,8 @@ def _slice(byte_range: ByteRequest, size: int) -> slice:
 def committed_view(
     info: RunInfo, plan: Plan, commits: Mapping[int, Commit], *, check: bool | None = None
 ) -> CommittedStore:
-    """Return a read-only zarr store that shows the metadata, the coordinates and the committed chunks of a run's cube.
+    """Return a read-only zarr store that shows the metadata, the coordinates and the committed chunks of a run's result
+    cube.
 
     Parameters
     ----------

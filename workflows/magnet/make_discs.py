@@ -31,7 +31,7 @@ RINGS, SPOKES = 8, 24
 
 
 def face(radius: float, rings: int, spokes: int) -> tuple[np.ndarray, np.ndarray]:
-    """Points (n, 2) [m] of a disc's face and the area of each (n,) [m2]."""
+    """Return points on a disc's face [m], shape (n, 2), and the area of each [m2], shape (n,)."""
     nodes, weights = np.polynomial.legendre.leggauss(rings)
     r = radius * np.sqrt(0.5 * (nodes + 1.0))
     angle = 2.0 * np.pi * (np.arange(spokes) + 0.5) / spokes
@@ -48,7 +48,8 @@ def loads(
     rings: int = RINGS,
     spokes: int = SPOKES,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Force (n, 2) [N], to the right and upwards, and its moment about joint 1 (n,) [N m].
+    """Compute the force (rightward, upward) on the moving disc [N], shape (n, 2), and its moment about joint 1 [N m],
+    shape (n,).
 
     Parameters
     ----------
@@ -83,7 +84,7 @@ def loads(
 
 
 def read(header: Mapping[str, Any]) -> list[tuple[float, float, str, float]]:
-    """Readings: psi1, psi_rel [deg], side, torque [N m]."""
+    """Compute the synthetic readings as rows (psi1 [deg], psi_rel [deg], side, torque [N m])."""
     p = load_model(header["model"]).load(header["preset"], **header["parameters"])
     made, tie = header["synthesis"], header["correction"]["tie"]
     noise = np.random.default_rng(made["seed"])
@@ -104,7 +105,7 @@ def read(header: Mapping[str, Any]) -> list[tuple[float, float, str, float]]:
 
 
 def main() -> None:
-    """Write the file that the header beside this script names."""
+    """Write the readings to the CSV file that the header beside this script names."""
     header = tomllib.loads((HERE / "discs.toml").read_text("utf-8"))
     with (HERE / header["file"]).open("w", newline="", encoding="utf-8") as file:
         file.write("# SYNTHETIC: computed by make_discs.py, see discs.toml; no measurement of a rig\n")

@@ -77,8 +77,8 @@ def _forcing(t: Any, c: Any) -> Any:
 
 @inline
 def _dry(v: Any, c: Any) -> Any:
-    """Compute the dry friction at relative velocity `v`, as a multiple of its amplitude, and the derivative of this
-    factor by `v`.
+    """Compute the dry friction at relative velocity `v` as a fraction of its amplitude, and the derivative of this
+    fraction with respect to `v`.
     """
     fading = c[C.drop] * exp2_falling(-(c[C.c0] * absolute(v)))
     size = fading + c[C.floor]
@@ -92,8 +92,8 @@ def _dry(v: Any, c: Any) -> Any:
 
 @inline
 def _air(c12: Any, w1: Any, w2: Any, c: Any) -> Any:
-    """Return the air drag force on link 2 and its moment by Gauss quadrature, with three sums from which their
-    derivatives follow.
+    """Integrate the air drag on link 2 by Gauss quadrature: force, moment, and three sums that give their
+    derivatives.
     """
     across = c[C.l1] * (w1 * c12)
     near, middle, far = c[C.near], c[C.middle], c[C.far]
@@ -111,7 +111,6 @@ def _air(c12: Any, w1: Any, w2: Any, c: Any) -> Any:
 
 @inline
 def _torques(y: Any, c: Any) -> Any:
-    """Compute the friction torques of both joints and the torques of the air's drag: F1, F2, A1, A2 [N m]."""
     w1, w2 = y[2], y[3]
     c12 = sincos(y[0] - y[1])[1]
     v = w2 - w1
@@ -150,7 +149,7 @@ def _rhs(y: Any, u: Any, c: Any) -> Any:
 
 @inline
 def _solved(d1: Any, d2: Any, cross: Any, per_det: Any, c: Any) -> Any:
-    """Compute the changes of both accelerations that changes of the torques cause."""
+    """Compute how both accelerations change if the torques change by `d1` and `d2`."""
     return (multiply_add(c[C.B2], d1, -(cross * d2)) * per_det, multiply_add(c[C.B1], d2, -(cross * d1)) * per_det)
 
 
@@ -214,7 +213,9 @@ def _quantities(t: Any, y: Any, dy: Any, u: Any, c: Any) -> Any:
 
 @inline
 def _layers(y: Any, dy: Any, c: Any) -> Any:
-    """Return the layers at velocity reversals in the joints: atan(eps v) has its poles at v = +-i/eps."""
+    """Return the boundary layers of the friction at velocity reversals in the joints: atan(eps v) has its poles at v =
+    +-i/eps.
+    """
     return (
         (y[2], dy[2], c[C.per_eps], c[C.per_reversal1]),
         (y[3] - y[2], dy[3] - dy[2], c[C.per_eps], c[C.per_reversal2]),

@@ -50,7 +50,7 @@ def _quantities(t: Any, y: Any, dy: Any, u: Any, c: Any) -> Any:
 
 @inline
 def _no_edges(frequency: Any, p: Any, times: Any, half_widths: Any, jumps: Any) -> None:
-    """Set no edges: the drive is smooth."""
+    """Set no forcing edges: the drive is smooth."""
 
 
 @inline

@@ -32,7 +32,7 @@ VACUUM_PERMEABILITY = 1.25663706212e-6  # N/A2, CODATA 2018
 
 
 class LinkConstants(NamedTuple):
-    """Constants of motion, friction and drive, derived from the parameters."""
+    """Constants of motion, friction and drive that follow from the parameters."""
 
     B1: Any  # kg m2, J1 + e1^2 m1 + l1^2 m2
     B2: Any  # kg m2, J2 + e2^2 m2
@@ -67,7 +67,7 @@ class LinkConstants(NamedTuple):
 
 
 class FittedConstants(NamedTuple):
-    """Constants of the fitted magnet torque (Eq. 18-20)."""
+    """Constants of the fitted magnet torque (Wojna et al. 2018, Eq. 18-20)."""
 
     half_alpha1: Any  # N m
     half_alpha2: Any
@@ -96,7 +96,7 @@ class FittedConstants(NamedTuple):
 
 
 class DipoleConstants(NamedTuple):
-    """Constants of the point-dipole torque (Eq. 16)."""
+    """Constants of the point-dipole torque (Wojna et al. 2018, Eq. 16)."""
 
     strength: Any  # N m2, mu_0 pole1 pole2/(4 pi)
     l1: Any  # m
@@ -158,8 +158,8 @@ def link_constants(frequency: Any, p: Any) -> Any:
 
 
 def square_wave_constants(p: Any) -> Any:
-    """Return the constants of a square-wave drive: phase and offset (Eq. 13, 14, corrected), amplitude over pi/2, and
-    steepness.
+    """Return the constants of a square-wave drive: phase and offset (Wojna et al. 2018, Eq. 13, 14, corrected),
+    amplitude over pi/2, and steepness.
     """
     phase = (math.pi - TWO_PI * p[AT.duty_cycle]) / 2.0
     return phase, -sin(phase), TWO_OVER_PI * p[AT.q], p[AT.eps_drive]
@@ -172,27 +172,29 @@ def sine_constants(p: Any) -> Any:
 
 @inline
 def sine_drive(t: Any, k: Any) -> Any:
-    """Compute the driving torque [N m] of a sine drive (in place of Eq. 12) at time `t` [s] after a zero with rising
-    torque.
+    """Compute the driving torque [N m] of a sine drive at time `t` [s] after a zero with rising torque (in place of Eq.
+    12 of Wojna et al. 2018).
     """
     return k.drive_amplitude * sin(k.omega * t)
 
 
 @inline
 def drive(t: Any, k: Any) -> Any:
-    """Compute the driving torque M_e [N m] at time `t` [s] after a rising edge (Eq. 12-15)."""
+    """Compute the driving torque M_e [N m] at time `t` [s] after a rising edge (Wojna et al. 2018, Eq. 12-15)."""
     return k.drive_amplitude * atan(k.eps_drive * (sin(k.omega * t + k.phase) + k.offset))
 
 
 @inline
 def stribeck(v: Any, k: Any) -> Any:
-    """Compute the factor of the dry friction at relative velocity `v` [rad/s], in (-1, 1) (Eq. 7-8)."""
+    """Compute the factor of the dry friction at relative velocity `v` [rad/s], in (-1, 1) (Wojna et al.
+    2018, Eq. 7-8).
+    """
     return atan(k.eps * v) * (k.stribeck_drop * exp2_falling(-(k.c0 * absolute(v))) + k.stribeck_floor)
 
 
 @inline
 def magnet_moment(psi1: Any, psi_rel: Any, k: Any) -> Any:
-    """Compute the fitted torque M_M of the magnets about joint 1 [N m] (Eq. 18-19)."""
+    """Compute the fitted torque M_M of the magnets about joint 1 [N m] (Wojna et al. 2018, Eq. 18-19)."""
     psi1 = wrapped(psi1)
     psi_rel = wrapped(psi_rel)
     u1 = (psi_rel + k.beta1) * k.per_gamma1
@@ -208,7 +210,7 @@ def magnet_moment(psi1: Any, psi_rel: Any, k: Any) -> Any:
 
 @inline
 def fitted_torques(psi1: Any, psi2: Any, s1: Any, c1: Any, s2: Any, c2: Any, k: Any) -> Any:
-    """Compute the generalised torques (Q1, Q2) [N m] of the fitted magnet force (Eq. 20)."""
+    """Compute the generalised torques (Q1, Q2) [N m] of the fitted magnet force (Wojna et al. 2018, Eq. 20)."""
     dx = multiply_add(k.l1, s1, k.l2 * s2)
     dy = k.h - k.l1 * c1 - k.l2 * c2
     moment = magnet_moment(psi1, psi2 - psi1, k)
@@ -218,7 +220,7 @@ def fitted_torques(psi1: Any, psi2: Any, s1: Any, c1: Any, s2: Any, c2: Any, k: 
 
 @inline
 def dipole_torques(psi1: Any, psi2: Any, s1: Any, c1: Any, s2: Any, c2: Any, k: Any) -> Any:
-    """Compute the generalised torques (Q1, Q2) [N m] of the point-dipole force (Eq. 16)."""
+    """Compute the generalised torques (Q1, Q2) [N m] of the point-dipole force (Wojna et al. 2018, Eq. 16)."""
     dx = multiply_add(k.l1, s1, k.l2 * s2)
     dy = k.h - k.l1 * c1 - k.l2 * c2
     r2 = dx * dx + dy * dy
@@ -230,7 +232,7 @@ def dipole_torques(psi1: Any, psi2: Any, s1: Any, c1: Any, s2: Any, c2: Any, k: 
 
 @inline
 def loads(s1: Any, c1: Any, s12: Any, c12: Any, w1: Any, w2: Any, a1: Any, a2: Any, k: Any) -> Any:
-    """Compute the bearing loads (N1, N2) [N] (Eq. 9-11).
+    """Compute the bearing loads (N1, N2) [N] (Wojna et al. 2018, Eq. 9-11).
 
     The force that link 2 puts on joint 2 is written in the frame of link 1, along and across it:
     there N1 and N2 share most of their terms, and the acceleration of link 1 leaves the first.
@@ -275,7 +277,7 @@ def _loads_and_components(a1: Any, a2: Any, f: Any, k: Any) -> Any:
 
 @inline
 def _newton_change(r1: Any, r2: Any, loads_there: Any, effect: Any, f: Any, k: Any) -> Any:
-    """Compute the change of (a1, a2) by a Newton step, for the residual (r1, r2) of a = a_free + P N(a).
+    """Compute one Newton step for (a1, a2), given the residual (r1, r2) of the equation a = a_free + P N(a).
 
     With K = P dN/da, about 2e-3 in size, the inverse of 1 - K is taken as 1 + K.
     """
@@ -311,7 +313,8 @@ def _solve_implicit(a1_free: Any, a2_free: Any, effect: Any, f: Any, k: Any) -> 
 def solve_accelerations(
     s1: Any, c1: Any, s2: Any, c2: Any, w1: Any, w2: Any, torque1: Any, torque2: Any, k: Any
 ) -> Any:
-    """Solve Eq. 1-11 for the accelerations (a1, a2) [rad/s2]; the equations are implicit in the bearing loads.
+    """Solve the equations of motion (Wojna et al. 2018, Eq. 1-11), implicit in the bearing loads, for the accelerations
+    (a1, a2) [rad/s2].
 
     `torque1` and `torque2` [N m] are the drive plus Q1, and Q2.
     """

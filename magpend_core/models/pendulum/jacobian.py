@@ -26,7 +26,9 @@ def stribeck_slope(v: Any, k: Any) -> Any:
 
 @inline
 def magnet_moment_slopes(psi1: Any, psi_rel: Any, k: Any) -> Any:
-    """Compute the derivatives of `equations.magnet_moment` by psi1 and by psi_rel [N m/rad] (Eq. 18-19)."""
+    """Compute the derivatives of `equations.magnet_moment` by psi1 and by psi_rel [N m/rad] (Wojna et al. 2018, Eq.
+    18-19).
+    """
     psi1 = wrapped(psi1)
     psi_rel = wrapped(psi_rel)
     u1 = (psi_rel + k.beta1) * k.per_gamma1
@@ -52,7 +54,9 @@ def magnet_moment_slopes(psi1: Any, psi_rel: Any, k: Any) -> Any:
 def _torque_slopes(
     fx: Any, fy: Any, fx1: Any, fx2: Any, fy1: Any, fy2: Any, s1: Any, c1: Any, s2: Any, c2: Any, k: Any
 ) -> Any:
-    """Compute the derivatives of Q1, then of Q2, by psi1 and psi2, from the force and its derivatives."""
+    """Compute the derivatives of the generalised torques Q1, then Q2, by psi1 and psi2, from the magnet force and its
+    derivatives.
+    """
     return (
         k.l1 * (fx1 * c1 - fx * s1 + fy1 * s1 + fy * c1),
         k.l1 * (fx2 * c1 + fy2 * s1),
@@ -63,7 +67,9 @@ def _torque_slopes(
 
 @inline
 def fitted_torque_slopes(psi1: Any, psi2: Any, s1: Any, c1: Any, s2: Any, c2: Any, k: Any) -> Any:
-    """Compute the derivatives of `equations.fitted_torques`: of Q1 by psi1 and psi2, then of Q2 (Eq. 20)."""
+    """Compute the derivatives of `equations.fitted_torques`: of Q1 by psi1 and psi2, then of Q2 (Wojna et al. 2018, Eq.
+    20).
+    """
     dx = k.l1 * s1 + k.l2 * s2
     dy = k.h - k.l1 * c1 - k.l2 * c2
     fx = magnet_moment(psi1, psi2 - psi1, k) * k.per_h
@@ -81,7 +87,9 @@ def fitted_torque_slopes(psi1: Any, psi2: Any, s1: Any, c1: Any, s2: Any, c2: An
 
 @inline
 def dipole_torque_slopes(psi1: Any, psi2: Any, s1: Any, c1: Any, s2: Any, c2: Any, k: Any) -> Any:
-    """Compute the derivatives of `equations.dipole_torques`: of Q1 by psi1 and psi2, then of Q2 (Eq. 16)."""
+    """Compute the derivatives of `equations.dipole_torques`: of Q1 by psi1 and psi2, then of Q2 (Wojna et al. 2018, Eq.
+    16).
+    """
     dx = k.l1 * s1 + k.l2 * s2
     dy = k.h - k.l1 * c1 - k.l2 * c2
     r2 = dx * dx + dy * dy
@@ -100,8 +108,7 @@ def dipole_torque_slopes(psi1: Any, psi2: Any, s1: Any, c1: Any, s2: Any, c2: An
 def acceleration_slopes(
     s1: Any, c1: Any, s2: Any, c2: Any, w1: Any, w2: Any, a1: Any, a2: Any, torque_slopes: Any, k: Any
 ) -> Any:
-    """Compute the derivatives of the accelerations by (psi1, psi2, psi1_dot, psi2_dot): the four of a1, then those of
-    a2.
+    """Compute the derivatives of the accelerations a1, then a2, by the four states (psi1, psi2, psi1_dot, psi2_dot).
 
     `a1` and `a2` are the accelerations at the state (see `equations.solve_accelerations`) and
     `torque_slopes` the derivatives of Q1 and Q2 by psi1 and psi2.

@@ -51,7 +51,9 @@ def _wrapped(angle: np.ndarray) -> np.ndarray:
 
 
 def bump(psi1: np.ndarray, height: float, position: float, width: float) -> np.ndarray:
-    """Compute one bump of the torque curve, ``height*exp(-((psi1 + position)/width)**2)`` [N m] (Eq. 17)."""
+    """Compute one bump of the torque curve, ``height*exp(-((psi1 + position)/width)**2)`` [N m] (Wojna et al. 2018, Eq.
+    17).
+    """
     return np.asarray(height * np.exp(-(((psi1 + position) / width) ** 2)))
 
 
@@ -63,7 +65,9 @@ def bump_slopes(psi1: np.ndarray, height: float, position: float, width: float) 
 
 
 def transition(p: Mapping[str, float]) -> Line:
-    """Return the line in the plane of psi_rel and psi1 that lies midway between the two torque peaks (Eq. 19)."""
+    """Return the line in the plane of psi_rel and psi1 that lies midway between the two torque peaks (Wojna et al.
+    2018, Eq. 19).
+    """
     return Line(-0.5 * (p["p1"] + p["p2"]), -0.5 * (p["r1"] + p["r2"]))
 
 
@@ -91,7 +95,7 @@ def _parts(psi1: np.ndarray, psi_rel: np.ndarray, p: Mapping[str, float]) -> _Pa
 
 
 def magnet_moment(psi1: np.ndarray, psi_rel: np.ndarray, p: Mapping[str, float]) -> np.ndarray:
-    """Compute the fitted torque M_M of the magnets about joint 1 [N m] (Eq. 18-19).
+    """Compute the fitted torque M_M of the magnets about joint 1 [N m] (Wojna et al. 2018, Eq. 18-19).
 
     Parameters
     ----------
@@ -123,8 +127,8 @@ def moment_slopes(psi1: np.ndarray, psi_rel: np.ndarray, p: Mapping[str, float])
 
 
 def weight_torque(psi1: np.ndarray, psi_rel: np.ndarray, p: Mapping[str, float]) -> np.ndarray:
-    """Compute the torque of the links' weight about joint 1 with link 2 locked [N m]: the sum of the weight terms of
-    Eq. 1.
+    """Compute the torque of the links' weight about joint 1 with link 2 locked [N m]: the weight terms of Eq. 1 of
+    Wojna et al. (2018).
 
     Parameters
     ----------
@@ -139,7 +143,7 @@ def weight_torque(psi1: np.ndarray, psi_rel: np.ndarray, p: Mapping[str, float])
 
 
 def dipole_moment(psi1: np.ndarray, psi_rel: np.ndarray, p: Mapping[str, float]) -> np.ndarray:
-    """Compute the torque of point dipoles about joint 1 [N m] (Eq. 16).
+    """Compute the torque of point dipoles about joint 1 [N m] (Wojna et al. 2018, Eq. 16).
 
     The force mu_0 pole1 pole2/(4 pi r**2) acts along the line between the magnets, which meets the fixed
     one; its moment about joint 1 is that of its horizontal part there, h below the joint.

@@ -70,7 +70,6 @@ def _fitted_magnet(p: Any, values: Any, out: Any) -> None:
 
 
 def _dipole_magnet(p: Any, values: Any, out: Any) -> None:
-    """Fill `out` with the constants of the point dipoles, `DipoleConstants`."""
     out[N_LINK] = VACUUM_PERMEABILITY * p[AT.pole1] * p[AT.pole2] / (4.0 * math.pi)
     out[N_LINK + 1] = p[AT.l1]
     out[N_LINK + 2] = p[AT.l2]
@@ -98,13 +97,15 @@ def _no_magnet_torques(y: Any, s1: Any, c1: Any, s2: Any, c2: Any, c: Any) -> An
 
 @inline
 def _friction_layers(y: Any, dy: Any, k: Any) -> Any:
-    """Return the layers at velocity reversals in the joints: atan(eps v) has its poles at v = +-i/eps."""
+    """Return the boundary layers of the friction at velocity reversals in the joints: atan(eps v) has its poles at v =
+    +-i/eps.
+    """
     return ((y[2], dy[2], k.per_eps, k.per_reversal1), (y[3] - y[2], dy[3] - dy[2], k.per_eps, k.per_reversal2))
 
 
 @inline
 def _fitted_layers(y: Any, dy: Any, c: Any) -> Any:
-    """Return the layers of the friction, and that of the fitted magnet torque between its two bumps.
+    """Return the boundary layers of the friction, and that of the fitted magnet torque between its two bumps.
 
     The zero of dx, the regularised other singularity of Eq. 20, is so near that of x, and as wide,
     that one layer serves for both.
@@ -120,7 +121,6 @@ def _fitted_layers(y: Any, dy: Any, c: Any) -> Any:
 
 @inline
 def _plain_layers(y: Any, dy: Any, c: Any) -> Any:
-    """Return the layers of the friction alone; the field of the dipoles has no layer."""
     return _friction_layers(y, dy, LinkConstants(*c[:N_LINK]))
 
 
@@ -144,7 +144,6 @@ def _no_slopes(y: Any, s1: Any, c1: Any, s2: Any, c2: Any, c: Any) -> Any:
 
 
 def _constants(frequency: Any, p: Any, out: Any) -> None:
-    """Fill `out` with `LinkConstants`, then the constants of the magnets."""
     values = all_link_constants(frequency, p)
     for i in range(N_LINK):
         out[i] = values[i]
@@ -192,7 +191,7 @@ def _square_wave_edges(frequency: Any, p: Any, times: Any, half_widths: Any, jum
 
 
 def _no_edges(frequency: Any, p: Any, times: Any, half_widths: Any, jumps: Any) -> None:
-    """Set no edges: the sine drive is smooth."""
+    """Set no forcing edges: the sine drive is smooth."""
 
 
 _MAGNETS: dict[str, tuple[int, Any, Any, Any, Any]] = {
@@ -207,7 +206,7 @@ _DRIVES: dict[str, tuple[int, Any, Any, Any]] = {
 
 
 def _system(model: Model, magnets: str, driven: str) -> System:
-    """Build the system for one kind of magnets and drive from the function templates here."""
+    """Build the system for one kind of magnets and drive from the function templates of this module."""
     n_magnet, fill, torques, layers, slopes = _MAGNETS[magnets]
     n_edges, drive_constants, drive_torque, edges = _DRIVES[driven]
     name = "pendulum_" + (magnets if driven == "square" else f"{magnets}_{driven}")

@@ -15,7 +15,7 @@ __all__ = ["TextModel", "read_model"]
 
 
 def read_model(table: Mapping[str, Any], place: str = "model") -> TextModel:
-    """Return the model that a table of text defines; derives and compiles nothing yet.
+    """Return the model that a table of text defines. Nothing is derived or compiled yet.
 
     Parameters
     ----------
@@ -36,8 +36,7 @@ def read_model(table: Mapping[str, Any], place: str = "model") -> TextModel:
 
 
 def read_shipped(path: Path) -> TextModel:
-    """Read a shipped model from its TOML file, which has the model's table at its top level; the file's name is the
-    model's.
+    """Read a shipped model from its TOML file. The file is the model's table, and the file's name is the model's name.
 
     Raises
     ------

@@ -69,9 +69,7 @@ def system_of(definition: Definition, derived: Derived, source: Source) -> Syste
 
 
 def _compiled(source: str) -> dict[str, Any]:
-    """Execute generated source and return its functions, compiled; the source has only numbers and names of
-    arithmetic.
-    """
+    """Execute generated source and return its compiled functions. The source can only do arithmetic."""
     scope: dict[str, Any] = {"__name__": _MODULE, "math_inf": math.inf}
     for name in (*SIMD, *vecmath_names()):
         scope[name] = getattr(simd if name in SIMD else vecmath, name)

@@ -1,4 +1,4 @@
-"""Derive the motion in contact: at rest on the surface of an impact, after infinitely many impacts in a finite time.
+"""Derive the motion of a state that rests on the surface of an impact after infinitely many bounces in a finite time.
 
 The surface pushes along the direction n in which an impact changes the states. While a state rests on it,
 the impact's value g and its rate stay 0: the rates f become f - n a/b, where a is the second derivative that
@@ -17,8 +17,8 @@ from magpend_core.models.text.graph import Graph, GraphError, Node, in_order, su
 
 @dataclass(frozen=True)
 class Jump:
-    """An impact: its event function and rate, the states after it, and the states at rest on its surface if it
-    sticks.
+    """Impact as expressions: event function and its rate, the states after the impact, and, if it sticks, the states at
+    rest.
     """
 
     value: Node
@@ -30,24 +30,12 @@ class Jump:
 
 @dataclass(frozen=True)
 class _Contact:
-    """Expressions for the contact of a state with the surface it rests on: push, reaction and direction.
+    """Contact of a resting state with the surface of an impact, as expressions: push, reaction and direction."""
 
-    Attributes
-    ----------
-    push : Node
-        Second derivative of the impact's value without the contact.
-    reaction : tuple of Node
-        What the contact adds to each rate.
-    direction : tuple of Node
-        In which it pushes.
-    slopes : list of Node
-        Derivatives of the value's rate by the states.
-    """
-
-    push: Node
-    reaction: tuple[Node, ...]
-    direction: tuple[Node, ...]
-    slopes: list[Node]
+    push: Node  # second derivative of the impact's value without the contact
+    reaction: tuple[Node, ...]  # term that the contact adds to each rate
+    direction: tuple[Node, ...]  # direction in state space in which the surface pushes
+    slopes: list[Node]  # derivatives of the value's rate by the states
 
 
 def with_contacts(
@@ -99,7 +87,7 @@ def with_contacts(
 
 
 def along(graph: Graph, nodes: tuple[Node, ...]) -> list[Node]:
-    """Return the time derivatives of expressions along a motion; symbols stand for the rates of the states."""
+    """Return the time derivatives of expressions along a motion. The states' own derivatives enter as symbols."""
     states = {n: graph.leaf("rate", int(n.value)) for n in in_order(nodes) if n.op == "state"}
     return derivatives(graph, nodes, {**states, graph.leaf("time"): graph.one})
 
@@ -120,9 +108,7 @@ def _contact(graph: Graph, free: tuple[Node, ...], jump: Jump, place: str) -> _C
 
 
 def _pushed(graph: Graph, states: Sequence[Node], slopes: Sequence[Node]) -> tuple[Node, ...] | None:
-    """Return the direction in which an impact changes the states, from the derivative of its map; None if none is
-    found.
-    """
+    """Return the direction in state space in which an impact changes the states; None if there is none."""
     own = [graph.leaf("state", i) for i in range(len(states))]
     changes = tuple(graph.sub(new, old) for new, old in zip(states, own, strict=True))
     for i, slope in enumerate(slopes):
@@ -134,9 +120,7 @@ def _pushed(graph: Graph, states: Sequence[Node], slopes: Sequence[Node]) -> tup
 
 
 def _resting(graph: Graph, free: tuple[Node, ...], jump: Jump, contact: _Contact) -> tuple[Node, ...]:
-    """Return expressions for the state moved onto the surface of an impact and brought to rest there, as an impact
-    would move it.
-    """
+    """Return expressions for the state projected onto the surface of an impact, with no speed relative to it."""
     own = [graph.leaf("state", i) for i in range(len(free))]
     moved = derivatives(graph, free, dict(zip(own, contact.direction, strict=True)))
     away = graph.div(jump.value, _change(graph, _slopes(graph, jump.value, len(free)), moved))
@@ -147,25 +131,19 @@ def _resting(graph: Graph, free: tuple[Node, ...], jump: Jump, contact: _Contact
 
 
 def _of_motion(graph: Graph, node: Node, free: tuple[Node, ...]) -> Node:
-    """Return an expression in which the equations of motion without contact replace the symbols for the states'
-    rates.
-    """
+    """Return an expression with the symbols for rates replaced by the equations of motion without contact."""
     (found,) = substituted(graph, [node], {graph.leaf("rate", i): rate for i, rate in enumerate(free)})
     return found
 
 
 def _slopes(graph: Graph, node: Node, n: int) -> list[Node]:
-    """Return the derivatives of an expression by all states."""
     return [derivatives(graph, (node,), {graph.leaf("state", i): graph.one})[0] for i in range(n)]
 
 
 def _change(graph: Graph, slopes: Sequence[Node], direction: Sequence[Node]) -> Node:
-    """Return an expression's directional derivative, given its derivatives by the states and a direction of the
-    states.
-    """
+    """Return a directional derivative: the scalar product of a gradient (`slopes`) and a direction in state space."""
     return graph.add(graph.zero, *(graph.mul(a, b) for a, b in zip(slopes, direction, strict=True)))
 
 
 def _at_rest(graph: Graph, mode: Node, yes: Node, no: Node) -> Node:
-    """Return an expression that equals `yes` while the state rests on the surface of an impact, else `no`."""
     return graph.where_less(mode, graph.number(0.5), yes, no)

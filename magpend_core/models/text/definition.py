@@ -36,7 +36,7 @@ class Impact:
 
 @dataclass(frozen=True)
 class DrawingText:
-    """Drawing of a model given as text: positions of points as expressions, see `magpend_core.models.model.Drawing`."""
+    """Drawing of a model given as text, with the positions of its points as expressions."""
 
     points: Mapping[str, tuple[Tree, Tree]]
     fixed: Mapping[str, tuple[Tree, Tree]]
@@ -47,7 +47,9 @@ class DrawingText:
 
 @dataclass(frozen=True)
 class ClassifierText:
-    """Classes of motion, each with a condition on the states that all stored sections of a motion must meet."""
+    """Classes of motion. A motion is in a class if all its stored section points meet the class's condition on the
+    states.
+    """
 
     meaning: str
     words: Mapping[str, Tree]
@@ -87,8 +89,8 @@ class Definition:
     table: Mapping[str, Any] = field(repr=False)
 
     def used(self, trees: Iterable[Tree]) -> tuple[str, ...]:
-        """Return all names that expressions need, also through definitions; each definition after those that it
-        needs.
+        """Return all names that expressions use, directly or through definitions, each after the names that
+        it needs.
         """
         found: dict[str, None] = {}
         pending = [(name, False) for tree in trees for name, _ in names(tree)][::-1]
@@ -130,7 +132,7 @@ class Definition:
         ]
 
     def meaning(self) -> str:
-        """Return a standard form of all that determines the model's numbers: equal for texts that differ in layout or
+        """Return the model's equations, impacts and bounds as JSON; equal for texts that differ only in layout or
         wording.
         """
         bounds = [[p.name, p.bound] for p in self.parameters]
@@ -154,7 +156,6 @@ class Definition:
 
 
 def _suggestion(name: str, table: str, used: Iterable[str]) -> str:
-    """Return a remedy for a name that nothing uses, as the end of a sentence."""
     near = difflib.get_close_matches(name, sorted(used), n=1, cutoff=0.6)
     meant = f"did you mean it where an expression has {near[0]}? Else" if near else ""
     effect = " (to sweep it would change nothing)" if table == "parameters" else ""

@@ -92,9 +92,7 @@ def _minimum(g: Graph, node: Node, d: list[Node]) -> Node:
 
 
 def _slope(slope: Callable[[Graph, Node, Node], Node]) -> Rule:
-    """Return the differentiation rule of a function of one argument, given its derivative in terms of argument and
-    value.
-    """
+    """Return the chain rule for a function f(x), where `slope` gives f' from x and f(x)."""
     return lambda g, node, d: g.mul(slope(g, node.args[0], node), d[0])
 
 

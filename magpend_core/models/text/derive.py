@@ -27,8 +27,8 @@ SCANNED = 256
 
 @dataclass(frozen=True)
 class Layer:
-    """Expressions that `System.layers` returns for one layer, a narrow region where the right-hand side changes
-    quickly.
+    """Expressions that `System.layers` returns for one boundary layer (a narrow region where the right-hand side
+    changes quickly).
     """
 
     value: Node
@@ -40,7 +40,7 @@ class Layer:
 
 @dataclass(frozen=True)
 class Wave:
-    """Edges of the forcing: the `count` instants in a drive period at which a smooth function of time passes zero."""
+    """Forcing edges at the zeros of a smooth function of time, which has `count` zeros per drive period."""
 
     value: Node
     slope: Node
@@ -52,7 +52,7 @@ class Wave:
 
 @dataclass(frozen=True)
 class Derived:
-    """Expressions derived from a model given as text: rates, Jacobian, layers, edges, switches, impacts.
+    """Expressions derived from a model given as text: rates, Jacobian, boundary layers, edges, switches, impacts.
 
     Attributes
     ----------
@@ -89,7 +89,7 @@ class Derived:
 
     @property
     def timed_layers(self) -> bool:
-        """Whether the layers depend on time."""
+        """Whether the boundary layers depend on time."""
         nodes = [n for la in self.layers for n in (la.value, la.rate, la.half_width, la.per_strength)]
         return any(n.op == "time" for n in in_order(nodes))
 
@@ -100,7 +100,7 @@ class Derived:
 
 
 def derive(definition: Definition) -> Derived:
-    """Derive rates, Jacobian, layers, edges, switches and impacts of a model given as text.
+    """Derive rates, Jacobian, boundary layers, edges, switches and impacts of a model given as text.
 
     Raises
     ------
@@ -162,9 +162,7 @@ def _breaks(graph: Graph, rates: tuple[Node, ...], presets: Sequence[Mapping[int
 def _smoothed(
     graph: Graph, rates: tuple[Node, ...], scales: tuple[float, ...], values: Mapping[int, float]
 ) -> frozenset[int]:
-    """Return the node numbers of those corners (of ``abs``) that coincide with a narrow steep layer, where steps are
-    short anyway.
-    """
+    """Return the graph node numbers of ``abs`` corners inside a narrow boundary layer, where steps are short anyway."""
     cores = set()
     for node in in_order(rates):
         place = place_of(graph, node)
@@ -179,7 +177,9 @@ def _smoothed(
 
 
 def _is_layer(steep: Steep) -> bool:
-    """Return whether a steep place of the equations depends on the state, and on no sign that only time changes."""
+    """Return whether a steep function makes a boundary layer: it depends on the state, and on no sign that changes with
+    time alone.
+    """
     return steep.value.kind == STATED and not any(n.op == "clock" for n in in_order([steep.value]))
 
 
@@ -224,7 +224,7 @@ MOST_LOOKED_AT = 100
 
 
 def forcing_of(graph: Graph, roots: tuple[Node, ...], preferred: Node | None) -> Node | None:
-    """Return the largest expression without states through which alone time enters; None if time does not enter."""
+    """Return the largest state-free expression that contains every occurrence of time; None if time does not occur."""
     if preferred is not None and preferred.kind == TIMED and not _reaches_time(roots, preferred):
         return preferred
     order = in_order(roots)
@@ -267,12 +267,12 @@ class Builder:
         graph.positive = frozenset(i for i, p in enumerate(definition.parameters) if p.bound == POSITIVE)
 
     def leaf_values(self, parameters: Mapping[str, float]) -> dict[int, float]:
-        """Return the values of parameters by the number of their graph node, with the drive frequency 1 Hz."""
+        """Return parameter values by graph node number, with a drive frequency of 1 Hz."""
         own = {self.names[name].number: value for name, value in parameters.items()}
         return {**own, self.graph.leaf("frequency").number: 1.0}
 
     def node(self, tree: Tree) -> Node:
-        """Return the graph node of a parsed expression; adds the definitions that it needs first."""
+        """Return the graph node of a parsed expression; first add the definitions used in it."""
         for name in self.definition.used([tree]):
             if name not in self.names:
                 node = self._node(self.definition.define[name])

@@ -22,18 +22,19 @@ _LEAVES = {"time": "t", "frequency": "f"}
 def found_in(
     model: TextModel, parameters: Mapping[str, float], frequency_hz: float, state: Sequence[float]
 ) -> Iterator[str]:
-    """Yield a sentence on each layer, switch and impact, and on each steep place that the steps do not follow.
+    """Yield a sentence for each boundary layer, switch and impact, and for each steep function that step control
+    ignores.
 
     Parameters
     ----------
     model
-        Read from text.
+        Model given as text.
     parameters
-        For half-widths and jumps.
+        Parameters for which half-widths and jumps are computed.
     frequency_hz
-        Of the drive [Hz].
+        Drive frequency [Hz].
     state
-        Where half-widths and jumps are told, if they change with it.
+        State for which half-widths and jumps are computed, if they depend on the state.
     """
     derived, own = model.derived, model.definition
     for layer in derived.layers:

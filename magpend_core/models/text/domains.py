@@ -1,4 +1,4 @@
-"""Find the parts of an expression that have no finite value, and the numbers for which that happens.
+"""Find the parts of a model's expressions that have no finite value, and the arguments for which that happens.
 
 Looked for before anything is derived or compiled, by numpy on the text as it was written.
 """
@@ -101,7 +101,7 @@ def _is_constant(tree: Tree, known: Mapping[str, Any]) -> bool:
 def _look_at_constants(
     tree: Tree, place: str, known: Mapping[str, Any], rows: np.ndarray, found: list[Fault], *, guards: bool
 ) -> None:
-    """Append a fault for each part of an expression that has only known names and no finite value.
+    """Append a fault for each part of an expression that uses only known names and has no finite value.
 
     With `guards` a branch of `where` counts where a condition of known names takes it.
     """
@@ -145,8 +145,8 @@ def _start_faults(definition: Definition, values: Mapping[str, Any]) -> list[Fau
 
 
 def _look(tree: Tree, place: str, known: Mapping[str, Any], rows: np.ndarray, found: list[Fault]) -> np.ndarray:
-    """Append a `Fault` for each innermost part of an expression without a finite value; return at which sample points
-    it has none.
+    """Append a `Fault` for each innermost part of an expression that is not finite; return a mask of the sample points
+    concerned.
     """
     if tree.kind == "inverse":  # told with its product
         return _look(tree.args[0], place, known, rows, found)
@@ -169,8 +169,8 @@ def _look(tree: Tree, place: str, known: Mapping[str, Any], rows: np.ndarray, fo
 
 
 def _taken(tree: Tree, known: Mapping[str, Any], rows: np.ndarray) -> list[np.ndarray]:
-    """Return for each argument of an expression the sample points at which its value is used; ``where`` uses only the
-    one that it chooses.
+    """Return, for each argument of an expression, a mask of the sample points at which its value is used. `where` uses
+    one branch per point.
     """
     if tree.kind == "call" and tree.value == "where":
         chosen = np.broadcast_to(value_of(tree.args[0], known), rows.shape).astype(bool)
@@ -209,7 +209,7 @@ _BINDING = {"or": 0, "and": 1, "compare": 3, "sum": 4, "negative": 4, "product":
 
 
 def readable(tree: Tree) -> str:
-    """Write an expression as readable text: brackets only where needed, numbers short."""
+    """Write an expression as readable text, with brackets only where needed and with short numbers."""
     return _readable(tree, 0)
 
 
@@ -230,7 +230,6 @@ def _readable(tree: Tree, least: int) -> str:
 
 
 def _joined(tree: Tree, own: int) -> str:
-    """Return the text of an expression's operands with the operators between them."""
     if tree.kind == "negative":
         return f"-{_readable(tree.args[0], 5)}"
     if tree.kind == "power":

@@ -35,7 +35,9 @@ class Writer:
         self.inverse_roots: set[int] = set()
 
     def write(self, roots: Iterable[Node]) -> list[str]:
-        """Write the lines that compute some nodes; return the names of their values in the code."""
+        """Write the lines that compute the given graph nodes; return the names of their values in the
+        generated code.
+        """
         roots = list(roots)
         wanted = self._wanted(roots)
         for node in in_order(wanted.values()):
@@ -44,7 +46,7 @@ class Writer:
         return [self.name(root) for root in roots]
 
     def _wanted(self, roots: list[Node]) -> dict[int, Node]:
-        """Return the nodes that need a variable of their own; products within sums do not."""
+        """Return the graph nodes that get a variable in the generated code; a product inside a sum gets none."""
         wanted: dict[int, Node] = {}
         pending = list(roots)
         while pending:
@@ -66,7 +68,7 @@ class Writer:
         return wanted
 
     def name(self, node: Node) -> str:
-        """Return the name of a node's value in the generated code."""
+        """Return what stands for a graph node's value in the generated code: a variable or a number."""
         if node.number in self.leaves:
             return self.leaves[node.number]
         if node.op == "number":
@@ -90,8 +92,8 @@ class Writer:
         self.lines.append(f"{target} = {self._value(node)}")
 
     def _by_root(self, above: Node, x: Node, n: int) -> str:
-        """Return source code for a number divided by x**(n/2), by an inverse square root and products that the compiler
-        cannot fuse with sums.
+        """Return source code for a / x**(n/2), from an inverse square root and products. The products are never fused
+        with sums.
         """
         root = f"w{x.number}"
         if x.number not in self.inverse_roots:
@@ -141,7 +143,9 @@ class Writer:
 
 
 def root_under(node: Node) -> tuple[Node, int] | None:
-    """Return x and n if a node is a quotient by x**(n/2) with n = 1, 3 or 5 that depends on the state, else None."""
+    """Return x and n if a graph node has the form a / x**(n/2) with n = 1, 3 or 5 and depends on the state;
+    else None.
+    """
     if node.op != "div" or node.args[1].kind != STATED:
         return None
     below = node.args[1]
@@ -160,9 +164,7 @@ def root_under(node: Node) -> tuple[Node, int] | None:
 
 
 def _twin(node: Node, wanted: Mapping[int, Node]) -> Node | None:
-    """Return the node of the cosine (for a sine) or sine (for a cosine) of the same argument, if the code needs
-    both.
-    """
+    """For a sine, return the node of the cosine of the same argument if the code needs both; likewise for a cosine."""
     other = "cos" if node.op == "sin" else "sin"
     for candidate in wanted.values():
         if candidate.op == other and candidate.args[0] is node.args[0]:
@@ -171,7 +173,7 @@ def _twin(node: Node, wanted: Mapping[int, Node]) -> Node | None:
 
 
 def constants_of(roots: Iterable[Node]) -> list[Node]:
-    """Return the subexpressions without time and state that the others use: they are computed once per trajectory."""
+    """Return the largest subexpressions without time and state; they are computed once per trajectory."""
     roots = list(roots)
     found = {root.number: root for root in roots if root.kind == CONSTANT}
     for node in in_order(roots):
@@ -182,14 +184,14 @@ def constants_of(roots: Iterable[Node]) -> list[Node]:
 
 @dataclass(frozen=True)
 class Source:
-    """Source of a system's functions, and the numbers of constants, modes and edges that they use.
+    """Generated source of a system's functions, with the number of constants, modes and edges in it.
 
     Attributes
     ----------
     text : str
         Python source.
     n_constants, n_modes, n_edges : int
-        Numbers of what they use and fill.
+        Number of constants, modes and edges.
     jacobian_entries : tuple of int or None
         See `System.jacobian_entries`.
     """
@@ -235,7 +237,7 @@ def source_of(derived: Derived) -> Source:
 
 
 def _entries(derived: Derived) -> tuple[int, ...] | None:
-    """Return the positions of the entries of a large Jacobian that are not always 0; None for a small Jacobian."""
+    """Return the positions of those entries of a large Jacobian that can differ from 0; None for a small Jacobian."""
     if len(derived.rates) <= WRITTEN_OUT:
         return None
     found = tuple(i for i, node in enumerate(derived.jacobian) if not node.is_number(0.0))
@@ -257,8 +259,8 @@ def _leaves(derived: Derived, constants: list[Node], n_constants: int, n_modes: 
 
 
 def _cell(roots: Iterable[Node]) -> dict[int, str]:
-    """Return what parameters, frequency, time and the ranks of edges are called in generated code, by the number of
-    their node.
+    """Return how generated code writes each parameter, the frequency, the time and the rank of a forcing edge, by graph
+    node number.
     """
     names = {}
     for node in in_order(roots):
@@ -287,9 +289,7 @@ def _constants(constants: list[Node]) -> str:
 
 
 def _scalar(name: str, arguments: str, roots: list[Node]) -> str:
-    """Return source code of a function of plain numbers (frequency, parameters and perhaps time) that returns
-    expressions' values.
-    """
+    """Return source code of a function of plain numbers (frequency, parameters, time) that computes expressions."""
     writer = Writer(_cell(roots))
     names = [f"{name} + 0.0" for name in writer.write(roots)]
     return _function(name, arguments, [*writer.lines, f"return {', '.join(names)}" + "," * (len(names) > 1)])

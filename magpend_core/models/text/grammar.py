@@ -189,7 +189,6 @@ def _parse(text: object) -> Tree:
 
 
 def _unknown_functions(tokens: list[_Token]) -> Iterator[str]:
-    """Yield an error sentence for each call of an unknown function among the tokens of an unparsable text."""
     for token, after in itertools.pairwise(tokens):
         is_call = token.kind == "name" and after.text == "(" and token.text not in ("and", "or", "not")
         if is_call and token.text not in FUNCTIONS:
@@ -197,7 +196,6 @@ def _unknown_functions(tokens: list[_Token]) -> Iterator[str]:
 
 
 def _names_among(tokens: list[_Token]) -> Iterator[tuple[str, int]]:
-    """Yield each name among the tokens of an unparsable text with its character position, except names of functions."""
     for token, after in itertools.pairwise(tokens):
         if token.kind == "name" and after.text != "(" and token.text not in ("and", "or", "not"):
             yield token.text, token.at
@@ -238,7 +236,6 @@ class _Token:
 
 
 def _tokens(text: str) -> tuple[list[_Token], list[str]]:
-    """Split a text into tokens; report each bad character once."""
     found: list[_Token] = []
     odd: dict[str, int] = {}
     place = 0
@@ -258,7 +255,7 @@ def _tokens(text: str) -> tuple[list[_Token], list[str]]:
 
 
 class _Parser:
-    """Parser of expressions by precedence climbing; makes two nested calls for each level of nesting."""
+    """Parser of expressions by precedence climbing; each level of brackets takes two nested calls."""
 
     def __init__(self, tokens: list[_Token]) -> None:
         self.tokens = tokens
@@ -271,20 +268,17 @@ class _Parser:
         return self.tokens[self.next]
 
     def take(self) -> _Token:
-        """Return the current token and advance to the next."""
         token = self.token
         self.next += token.kind != "end"
         return token
 
     def whole(self) -> Tree:
-        """Parse the whole text as one expression; raise `GrammarError` if anything is left over."""
         tree = self.expression(_OR)
         if self.token.kind != "end":
             raise self.unexpected(self.token)
         return tree
 
     def unexpected(self, token: _Token) -> GrammarError:
-        """Return an error for a token that cannot follow here, with a remedy if one is known."""
         hints = {
             "==": "; compare with < or >",
             "!=": "; compare with < or >",
@@ -392,7 +386,6 @@ class _Parser:
         )
 
     def close(self, opened: _Token) -> None:
-        """Read the closing bracket of an opening one; raise `GrammarError` if it is missing."""
         if self.token.text == ")":
             self.take()
         elif self.token.kind == "end":
@@ -401,7 +394,6 @@ class _Parser:
             raise self.unexpected(self.token)
 
     def call(self, name: _Token) -> Tree:
-        """Parse the arguments of a function call."""
         opened = self.take()
         if name.text not in FUNCTIONS:
             self.problems.append(unknown(name.text, name.at, FUNCTIONS, "function"))
@@ -416,7 +408,6 @@ class _Parser:
         return Tree("call", name.at, name.text, tuple(args))
 
     def check_arguments(self, name: _Token, args: list[Tree]) -> None:
-        """Report a wrong number of function arguments, and conditions given as arguments in place of numbers."""
         least, most = FUNCTIONS.get(name.text, (0, len(args)))
         if not least <= len(args) <= most:
             wanted = f"{least}" if least == most else f"{least} to {most}"
@@ -431,7 +422,6 @@ class _Parser:
             self.numbers(tuple(args), name)
 
     def numbers(self, parts: tuple[Tree, ...], token: _Token) -> tuple[Tree, ...]:
-        """Return the operands of an arithmetic operation; report those that are conditions instead of numbers."""
         self.problems += [
             f"a condition stands at character {part.at} where {token.text!r} needs a number; use where(condition, a, b)"
             for part in parts
@@ -440,7 +430,6 @@ class _Parser:
         return parts
 
     def conditions(self, parts: tuple[Tree, ...], token: _Token) -> None:
-        """Report operands that are numbers where conditions are needed."""
         self.problems += [
             f"a number stands at character {part.at} where {token.text!r} needs a condition (x < 0, say)"
             for part in parts
@@ -463,6 +452,6 @@ def _name(token: _Token) -> Tree:
 
 
 def _flat(kind: str, left: Tree, right: Tree) -> Tree:
-    """Append an operand to a sum, product, ``and`` or ``or`` of the same kind, so that long ones do not nest deeply."""
+    """Append an operand to a sum, product, ``and`` or ``or`` of the same kind, without a further level of nesting."""
     args = left.args if left.kind == kind else (left,)
     return Tree(kind, left.at, "", (*args, right))

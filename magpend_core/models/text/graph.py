@@ -1,4 +1,4 @@
-"""Hold expressions as a graph in which equal parts are one node, with simplifications that are exact or nearly so.
+"""Represent expressions as a graph: equal subexpressions share one node, and simplifications change at most rounding.
 
 A graph belongs to one model and grows in an order that the model's meaning decides alone, so that the code
 generated from it is the same in every process. Sums and products are brought into a form in which what needs
@@ -47,7 +47,7 @@ class Node:
         self.op, self.args, self.value, self.kind, self.number = op, args, value, kind, number
 
     def is_number(self, value: float) -> bool:
-        """Return whether the node is this number."""
+        """Return whether the node is a number with this value."""
         return self.op == "number" and self.value == value
 
 
@@ -84,7 +84,6 @@ _AT_ZERO = {
 
 
 def _finite(function: Callable[[float, float], float], a: float, b: float) -> float:
-    """Return the value of a function of two numbers; raise `GraphError` if it is too large."""
     try:
         value = function(a, b)
     except OverflowError:
@@ -130,7 +129,9 @@ class Graph:
     # ---- sums ------------------------------------------------------------------------------------
 
     def add(self, *terms: Node) -> Node:
-        """Add nodes: first the terms without state and time, then those that depend on time alone, then the rest."""
+        """Return the sum of nodes. Terms without the state form one node, and terms without state and time form
+        another.
+        """
         groups: tuple[list[Node], ...] = ([], [], [])
         for term in self._collected(terms):
             groups[term.kind].append(term)
@@ -140,9 +141,7 @@ class Graph:
         return self._sum(groups[STATED]) if groups[STATED] else self.zero
 
     def _collected(self, terms: Iterable[Node]) -> list[Node]:
-        """Combine the terms of a sum: add up numbers, and the coefficients of terms that differ only by a numerical
-        factor.
-        """
+        """Simplify the terms of a sum: add numbers, and merge terms that differ only by a numerical factor."""
         total, factors = 0.0, {}  # type: ignore[var-annotated]
         for term in terms:
             factor, core = 1.0, term
@@ -166,20 +165,20 @@ class Graph:
         return self.node("add", *terms)
 
     def neg(self, x: Node) -> Node:
-        """Return the negative of a node."""
+        """Return the graph node of an expression's negative."""
         if x.op == "number":
             return self.number(-x.value)
         return x.args[0] if x.op == "neg" else self.node("neg", x)
 
     def sub(self, a: Node, b: Node) -> Node:
-        """Return the difference of two nodes."""
+        """Return the graph node of a difference."""
         return self.add(a, self.neg(b))
 
     # ---- products --------------------------------------------------------------------------------
 
     def mul(self, *factors: Node) -> Node:
-        """Multiply nodes: first the factors without state and time, then those that depend on time alone, then the
-        rest.
+        """Return the graph node of a product: first the factors without state and time, then those that depend on time
+        alone, then the rest.
         """
         total, negative, groups = 1.0, False, ([], [], [])  # type: ignore[var-annotated]
         pending = list(factors)[::-1]
@@ -205,8 +204,8 @@ class Graph:
         return self.neg(found) if negative else found
 
     def _chain(self, factors: list[Node]) -> Node:
-        """Return the product of factors, joined from the left; factors of one kind are sorted, so that x*y and y*x are
-        one node.
+        """Return the product of factors, multiplied from left to right; sort factors so that x*y and y*x share one
+        node.
         """
         if len({f.kind for f in factors}) == 1:
             factors = sorted(factors, key=lambda f: (f.op != "number", f.number))
@@ -216,7 +215,9 @@ class Graph:
         return found
 
     def div(self, a: Node, b: Node) -> Node:
-        """Divide nodes; a divisor that depends on neither state nor time becomes a factor, its inverse."""
+        """Return the graph node of a quotient. A divisor that depends on neither state nor time is replaced by a
+        factor, its inverse.
+        """
         if a.is_number(0.0) or b.is_number(1.0):
             return a
         if a.op == "number" and b.op == "number" and b.value != 0.0 and math.isfinite(a.value / b.value):
@@ -311,7 +312,7 @@ class Graph:
 
 
 def in_order(roots: Iterable[Node]) -> list[Node]:
-    """Return the nodes of some expressions with all their arguments, each after its own arguments."""
+    """Return all graph nodes that expressions consist of, each after its arguments."""
     found: dict[int, Node] = {}
     pending = list(roots)
     while pending:

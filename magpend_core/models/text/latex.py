@@ -93,7 +93,7 @@ def equations_of(definition: Definition) -> list[str]:
 
 
 def symbol_of(name: str, symbols: Mapping[str, str]) -> str:
-    """Return the LaTeX of a name: its own symbol, a Greek letter, one letter or an upright word, with an index."""
+    """Return the LaTeX symbol of a name: the user's own symbol, or a Greek letter or word with a subscript."""
     if name in symbols:
         return symbols[name]
     head, _, index = name.partition("_")
@@ -104,7 +104,6 @@ def symbol_of(name: str, symbols: Mapping[str, str]) -> str:
 
 
 def _upright(word: str) -> str:
-    """Return the LaTeX of a word: several letters upright, one letter as a variable."""
     return word if len(word) == 1 else rf"\mathrm{{{word}}}"
 
 

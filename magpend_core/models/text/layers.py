@@ -30,20 +30,20 @@ GENERIC = (0.37, -0.59, 0.83, -0.21, 0.67, -0.43)
 
 @dataclass(frozen=True)
 class Steep:
-    """A place at which a model's equations are steep, with its half-width and the jump of the rates across it.
+    """Steep place of a model's equations, with its half-width and the jump of the rates across it.
 
     Attributes
     ----------
     node : Node
         The steep function.
     value : Node
-        Passes zero there.
+        Expression that passes zero at the steep place.
     half_width : Node
-        Imaginary part of the singularity of `value`; changes with the cell alone.
+        Imaginary part of the nearest singularity, in terms of `value`; depends on parameters and frequency only.
     jump : Node
-        Change of the fastest changing rate across.
+        Change across the place of the rate that changes most.
     form : str
-        What was recognised, for people.
+        Description of the steep function, for messages.
     """
 
     node: Node
@@ -55,9 +55,7 @@ class Steep:
 
 @dataclass(frozen=True)
 class Place:
-    """A steep function: its argument, the distance of its nearest complex singularity, and its change across the steep
-    part.
-    """
+    """Steep function such as tanh: its argument, distance to its nearest complex singularity, and total change."""
 
     argument: Node
     distance: Node
@@ -66,16 +64,16 @@ class Place:
 
 
 def steep_places(graph: Graph, rates: tuple[Node, ...], scales: tuple[float, ...]) -> list[Steep]:
-    """Find the steep functions in the rates, each once, with half-width and jump.
+    """Find all steep functions in the rates; return each with its half-width and the jump of the rates.
 
     Parameters
     ----------
     graph
-        To which `rates` belong.
+        Expression graph that contains `rates`.
     rates
         Time derivatives of the states.
     scales
-        Of the states.
+        Scales of the states.
     """
     found: list[Steep] = []
     for node in in_order(rates):
@@ -107,7 +105,6 @@ def place_of(graph: Graph, node: Node) -> Place | None:
 
 
 def _logistic(graph: Graph, node: Node) -> Place | None:
-    """Return the `Place` (nearest singularity and change) of a quotient by 1 + exp(w); None for another quotient."""
     above, below = node.args
     if below.op != "add" or len(below.args) != 2 or not any(a.is_number(1.0) for a in below.args):
         return None
@@ -116,9 +113,6 @@ def _logistic(graph: Graph, node: Node) -> Place | None:
 
 
 def _smoothed_sign(graph: Graph, node: Node) -> Place | None:
-    """Return the `Place` (nearest singularity and change) of a quotient u/sqrt(u**2 + e**2); None for another
-    quotient.
-    """
     above, below = node.args
     if below.op != "sqrt" or below.args[0].op != "add" or len(below.args[0].args) != 2:
         return None
@@ -139,8 +133,8 @@ def core_of(graph: Graph, node: Node) -> tuple[Node, Node]:
 
 
 def _jump(graph: Graph, changes: list[Node], scales: tuple[float, ...]) -> Node | None:
-    """Return an expression for the largest absolute value of given changes; long ones are replaced by their values at
-    two sample states.
+    """Return an expression for the largest absolute change. A long expression is replaced by its values at two sample
+    states.
     """
     changes = [graph.call("absolute", c) for c in changes if not c.is_number(0.0)]
     if not changes:

@@ -63,7 +63,7 @@ class TextModel(Model):
 
     @cached_property
     def derived(self) -> Derived:
-        """Expressions derived from the text: rates, Jacobian, layers, edges, switches. Needs no compiler.
+        """Expressions derived from the text: rates, Jacobian, boundary layers, edges, switches. Needs no compiler.
 
         Raises
         ------

@@ -144,9 +144,7 @@ class _Reading(ViewsReader):
         return True
 
     def _entry(self, value: Any, place: str, keys: tuple[str, ...], short: str) -> dict[str, Any]:
-        """Return an entry as a table; an entry that is a plain value becomes a table with this value under the key
-        `short`.
-        """
+        """Return a table entry as a dict; a plain value ``v`` becomes ``{short: v}``."""
         if not isinstance(value, Mapping):
             return {short: value}
         entry = self.table(value, place, 20, "keys")
@@ -297,14 +295,13 @@ def _circle(define: Mapping[str, Tree]) -> list[str]:
 
 
 def _with_rate(state: State, tree: Tree | None, states: Iterable[str]) -> State:
-    """Return a state; if its equation is just the name of another state, that state is noted as its `rate`."""
+    """Set the `rate` of a state whose equation is just the name of another state; return any other state unchanged."""
     if tree is None or tree.kind != "name" or str(tree.value) not in states or tree.value == state.name:
         return state
     return State(**{**vars(state), "rate": str(tree.value)})
 
 
 def _plain(value: Any) -> Any:
-    """Return nested tables and lists as plain dicts with text keys and lists, as in JSON."""
     if isinstance(value, Mapping):
         return {str(key): _plain(inner) for key, inner in value.items()}
     if isinstance(value, (list, tuple)):

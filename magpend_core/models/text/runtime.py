@@ -1,4 +1,4 @@
-"""Sort the edge times of a drive period; functions of plain numbers that generated code calls."""
+"""Sort the forcing edges of a drive period by time. Generated code calls these functions."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from magpend_core.engine.jit import inline
 
 @inline
 def rank(at: Any, i: int) -> int:
-    """Return the rank in time, from 0, of instant number `i` among all instants of a period; of two equal ones the
-    first comes first.
+    """Return the rank (0, 1, ...) of switching instant `i` when the instants of a drive period are sorted by time; ties
+    keep their order.
     """
     place = 0
     for j in range(len(at)):
@@ -21,7 +21,9 @@ def rank(at: Any, i: int) -> int:
 
 @inline
 def set_times(at: Any, period: float, times: Any) -> None:
-    """Write the instants of a period to `times` in rising order, each at least a little after the one before."""
+    """Write the switching instants of a drive period to `times` in rising order, each at least a little after the one
+    before.
+    """
     for i in range(len(at)):
         times[rank(at, i)] = at[i]
     gap = 1e-12 * period
@@ -35,6 +37,8 @@ def set_times(at: Any, period: float, times: Any) -> None:
 
 @inline
 def within(time: float, period: float) -> float:
-    """Return an instant of a drive period unchanged, or 0 if it coincides with the start or the end of the period."""
+    """Return a switching instant of a drive period unchanged, or 0 if it coincides with the start or the end of the
+    period.
+    """
     near = 1e-9 * period
     return 0.0 if time < near or time > period - near else time

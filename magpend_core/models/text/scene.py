@@ -51,7 +51,7 @@ def by_name(definition: Definition, states: Any, parameters: Mapping[str, Any]) 
 
 
 def drawing_of(definition: Definition) -> Drawing | None:
-    """Return a text's drawing as functions of states and parameters; None if the text has no drawing."""
+    """Return a text model's drawing as functions of states and parameters; None if the text has no drawing."""
     text = definition.drawing
     if text is None:
         return None
@@ -78,7 +78,7 @@ def _places(
 
 
 def classifier_of(definition: Definition) -> Classifier | None:
-    """Return a text's classifier of motions: a motion gets the first word whose condition all stored sections meet."""
+    """Return a text model's classifier: a motion gets the first label that holds at all its section points."""
     text = definition.classifier
     if text is None:
         return None
@@ -100,8 +100,8 @@ def classifier_of(definition: Definition) -> Classifier | None:
 
 
 def mirror_problem(definition: Definition) -> str | None:
-    """Return a sentence on an equation that lacks the symmetry declared in the text, at the default parameters, or
-    None.
+    """Return an error sentence if an equation lacks the mirror symmetry declared in the text, at the default
+    parameters; else None.
 
     Rates at a few states are compared with those at their images; a symmetry may hold nearly, as that of a
     square wave with a duty cycle next to one half does.

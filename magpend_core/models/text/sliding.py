@@ -1,8 +1,8 @@
-"""Derive sliding on switching surfaces: on a surface, Filippov's equivalent control replaces the sign of its side.
+"""Derive sliding motion on switching surfaces, with Filippov's equivalent control in place of the sign of the side.
 
-Where the motions of both sides point to the surface, the state stays on it. What then stands for the side is
-the number sigma in [-1, 1] for which the surface's value does not change: with the rate of that value, r(s),
-linear in the sides s, the solution of r(sigma) = 0.
+Where the motions on both sides point to the surface, the state stays on it. The sign s of the side is then replaced by
+a number sigma in [-1, 1] such that the surface's function stays 0. Its time derivative r(s) is linear in s, so sigma
+solves r(sigma) = 0.
 """
 
 from __future__ import annotations
@@ -23,16 +23,18 @@ MAX_JOINT = 3
 
 @dataclass(frozen=True)
 class Sliding:
-    """Expressions that replace the sides of switching surfaces in the engine's functions, including sliding.
+    """Sliding motion as expressions: for each switching surface, the expression that replaces the sign of its side.
 
     Attributes
     ----------
+    graph : Graph
+        Expression graph of the model.
     effective : dict
-        What stands for each side, by its leaf.
+        Expression that replaces the sign of each side, by the leaf of the sign.
     slides : tuple of bool
-        For which switches sliding is looked for.
+        On which switches the state can slide.
     pairs : tuple of (Node, Node)
-        Value and rate of each switch, as `System.switches` has them.
+        Value and rate of each switch, as `System.switches` returns them.
     """
 
     graph: Graph
@@ -41,26 +43,26 @@ class Sliding:
     pairs: tuple[tuple[Node, Node], ...]
 
     def lowered(self, roots: Iterable[Node]) -> list[Node]:
-        """Return expressions in which the sign of each surface's side is replaced by the switch mode or, while sliding,
+        """Replace the sign of each switching surface in expressions: by the mode of its switch or, during sliding, by
         the equivalent control.
         """
         return _spelled(self.graph, substituted(self.graph, list(roots), self.effective))
 
 
 def sliding_of(graph: Graph, rates: Sequence[Node], switches: Sequence[Switch]) -> Sliding:
-    """Find the switching surfaces on which a state can slide, and what replaces the sign of the side while it does.
+    """Find the switching surfaces on which a state can slide, and the equivalent control on each.
 
     Parameters
     ----------
     graph
-        To which all belong.
+        Expression graph of the model.
     rates
-        Time derivatives of the states, with sides.
+        Time derivatives of the states, written with the signs of the sides.
     switches
-        All of them.
+        All switching surfaces of the model.
     """
     speeds = [_speed(graph, s.value, rates) for s in switches]
-    # on the surface, where all of this is used
+    # these rates are used only on the surface of the switch, where its mode is 0
     speeds = [substituted(graph, [v], {s.mode: graph.zero})[0] for v, s in zip(speeds, switches, strict=True)]
     pulls = [[_pull(graph, speed, s.side) for s in switches] for speed in speeds]
     slides = [s.jumps and not pulls[k][k].is_number(0.0) for k, s in enumerate(switches)]
@@ -82,8 +84,8 @@ def sliding_of(graph: Graph, rates: Sequence[Node], switches: Sequence[Switch]) 
 
 
 def _spelled(graph: Graph, roots: list[Node]) -> list[Node]:
-    """Rewrite `choice` nodes as comparisons of their side with 0; keep the interpolation only where sliding puts the
-    side between -1 and 1.
+    """Rewrite `choice` nodes of the expression graph as comparisons with 0; interpolate only where a sliding mode lies
+    between -1 and 1.
     """
     known: dict[int, Node] = {}
     for node in in_order(roots):
@@ -119,14 +121,14 @@ def _speed(graph: Graph, value: Node, rates: Sequence[Node]) -> Node:
 
 
 def _along(graph: Graph, value: Node) -> Node:
-    """Return the time derivative of an expression, in terms of the states' time derivatives as symbols."""
+    """Return the time derivative of an expression, in terms of symbols for the states' time derivatives."""
     seeds = {n: graph.leaf("rate", int(n.value)) for n in in_order([value]) if n.op == "state"}
     (found,) = derivatives(graph, (value,), {**seeds, graph.leaf("time"): graph.one})
     return found
 
 
 def _pull(graph: Graph, speed: Node, side: Node) -> Node:
-    """Return half the difference of `speed`, the rate of a surface's value, between the two sides of a surface."""
+    """Return half the jump of `speed` (time derivative of a surface function) between the two sides of a surface."""
     (slope,) = derivatives(graph, (speed,), {side: graph.one})
     if side not in in_order([slope]):
         return slope
@@ -142,7 +144,7 @@ def _solved(
     switches: Sequence[Switch],
     modes: Sequence[Node],
 ) -> list[Node]:
-    """Return for each switching surface its equivalent control, or its mode if no state can slide on it."""
+    """Return the equivalent control on each switching surface, or the mode of the switch where no state can slide."""
     zeros = {s.side: graph.zero for s in switches}
     found = []
     for k in range(len(switches)):
@@ -164,7 +166,7 @@ def _solved(
 
 
 def _quotient(graph: Graph, top: Node, bottom: Node) -> Node:
-    """Return a quotient, with 1 as divisor where the given divisor is 0.
+    """Return a quotient whose divisor is replaced by 1 where it is 0.
 
     Where that is 0, as of friction without a coefficient, no state stays on the surface: any number will do.
     """

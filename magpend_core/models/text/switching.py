@@ -75,15 +75,17 @@ class Instant:
 
 @dataclass
 class Sides:
-    """Rewriter that splits expressions at their corners and jumps into smooth parts, and collects the surfaces between
-    these.
+    """Rewriter of expressions: it replaces corners and jumps by signs of smooth expressions, and collects their zero
+    surfaces.
 
     Attributes
     ----------
     smoothed : set of int
-        Numbers of nodes whose corner lies in a layer of the same argument: they stay as they are.
+        Numbers of nodes that are not rewritten, since their corner lies in a steep layer.
+    switches, instants : list
+        Switching surfaces and instants found so far.
     left : list of Node
-        Jumps in time that were neither: steps do not end on them.
+        Jumps in time for which neither a switch nor an instant was found: steps do not end on them.
     """
 
     graph: Graph
@@ -95,14 +97,14 @@ class Sides:
     _surface: dict[int, Node] = field(default_factory=dict)
 
     def rewritten(self, roots: Iterable[Node], *, more: bool = True) -> list[Node]:
-        """Return expressions in which the signs of other expressions replace corners and jumps.
+        """Return expressions in which corners and jumps are written with the signs of smooth expressions.
 
         Parameters
         ----------
         roots
-            Expressions.
+            Expressions to rewrite.
         more
-            Whether new places may be found; if not, what is not known yet stays as it is.
+            Whether new switches and instants may be added; if not, corners and jumps not known yet stay unchanged.
         """
         roots = list(roots)
         known = self._known if more else dict(self._known)
@@ -115,10 +117,10 @@ class Sides:
         return [known[root.number] for root in roots]
 
     def _as_surface(self, node: Node, rewritten: Node) -> Node:
-        """Return an expression in the form that defines a switching surface: it must not depend on the modes of other
+        """Return an expression in the form in which it may define a switching surface: without the modes of other
         switches.
 
-        Engines find out on which sides a start is one after the other, so that none may need another.
+        The engine sets the modes of an initial state one after the other, so no surface may depend on another's mode.
         """
         free = not any(n.op in ("clock", "mode_clock") for n in in_order([rewritten]))
         if node.kind == TIMED and free:
@@ -128,8 +130,8 @@ class Sides:
         return node if same else made_again(self.graph, node, args)
 
     def _smooth(self, node: Node, args: tuple[Node, ...], more: bool) -> Node:
-        """Return a node with rewritten arguments; if it has a corner or a jump, write it with the sign of a switching
-        surface.
+        """Rebuild a graph node with rewritten arguments; write a corner or jump with the sign of a
+        switching surface.
         """
         g = self.graph
         same = all(a is b for a, b in zip(args, node.args, strict=True))
@@ -147,7 +149,7 @@ class Sides:
         yes, no = args[-2:] if node.op != "maximum" else args[::-1]
         a, b = (self._surface[arg.number] for arg in node.args[:2])
         if node.op == "less" and not _moves(g.sub(args[1], args[0])):
-            return plain  # of sides alone: they may be equal for a while, and then neither is less
+            return plain  # both depend on signs only, so they may stay equal for a while: no crossing to detect
         value, written = g.sub(b, a), g.sub(node.args[1], node.args[0])
         side = self.side(value, g.sub(args[1], args[0]), node.op == "less", more, _plain(value, written))
         return plain if side is None else g.choice(side, yes, no)
@@ -155,18 +157,18 @@ class Sides:
     def side(
         self, value: Node, rewritten: Node, jumps: bool, more: bool = True, written: Node | None = None
     ) -> Node | None:
-        """Return a node for the sign of an expression, of a new switch if need be; None if the sign is to be computed
-        as it stands.
+        """Return a graph node for the sign of an expression, adding a switch if necessary; None if no switch can stand
+        for the sign.
         """
         g = self.graph
         if value.op == "neg":
             inner = self.side(value.args[0], g.neg(rewritten), jumps, more, written)
             return None if inner is None else g.neg(inner)
-        if value.op == "mul" and value.args[0].op == "number":  # above 0; it does not matter to `rewritten`
+        if value.op == "mul" and value.args[0].op == "number":  # a positive factor, which does not change the sign
             return self.side(value.args[1], rewritten, jumps, more, written)
         if keeps_sign(g, value):
             return g.one
-        if not _moves(rewritten):  # of sides alone: it may be 0 for a while
+        if not _moves(rewritten):  # depends on signs only, so it may be 0 for a while: no crossing to detect
             below = g.where_less(rewritten, g.zero, g.number(-1.0), g.zero)
             return g.where_less(g.zero, rewritten, g.one, below)
         for switch in self.switches:
@@ -188,9 +190,7 @@ class Sides:
         return switch.side if jumps else switch.mode
 
     def _in_time(self, value: Node) -> Node | None:
-        """Return the sign of a + b t, with constant a and b, as a jump at a known instant; None for another
-        expression.
-        """
+        """Return the sign of a + b t (a, b constant) as a jump at a computed instant; None for any other expression."""
         g, time = self.graph, self.graph.leaf("time")
         if any(n.op in CORNERED or n.op == "segment" for n in in_order([value])):
             return None
@@ -213,7 +213,7 @@ class Sides:
         return self._after(instant, inside(g.neg(after), middle), inside(after, middle))
 
     def break_at_start(self) -> None:
-        """Add the start of the period to the instants at which the right-hand side may jump."""
+        """Register time 0 of the drive period as an instant at which the right-hand side may jump."""
         self._instant(self.graph.zero)
 
     def _instant(self, time: Node) -> Instant:
@@ -233,9 +233,7 @@ class Sides:
         return g.where_less(g.leaf("segment"), g.sub(instant.rank, g.number(0.5)), before, after)
 
     def _square(self, node: Node, more: bool) -> Node | None:
-        """Return a square wave whose phase is n t f + a (n whole) as jumps at known instants of the drive period; None
-        if it has another form.
-        """
+        """Return a square wave as jumps at computed instants; None unless its phase is n f t + a, n integer."""
         g = self.graph
         phase, duty = node.args
         (slope,) = derivatives(g, (phase,), {g.leaf("time"): g.one})
@@ -278,9 +276,7 @@ def _moves(rewritten: Node) -> bool:
 
 
 def _plain(value: Node, written: Node) -> Node | None:
-    """Return the expression as the user wrote it if the expression of the switching surface differs from it, else
-    None.
-    """
+    """Return the user's form of an expression if it differs from that of the switching surface; else None."""
     return None if value is written else written
 
 
@@ -289,7 +285,6 @@ def _at_time_zero(graph: Graph, node: Node) -> list[Node]:
 
 
 def _multiple_of(slope: Node, frequency: Node) -> int | None:
-    """Return the whole number n if the slope of a square wave's phase is n times the drive frequency, else None."""
     if slope is frequency:
         return 1
     if slope.op == "mul" and slope.args[0].op == "number" and slope.args[1] is frequency:

@@ -16,7 +16,7 @@ SHOWN = 60
 
 
 def shown(value: object, around: int = 1) -> str:
-    """Return a value as an error message quotes it: of a long one only the part around one character."""
+    """Format a value for an error message; of a long value, show only the text near one character."""
     text = " ".join(value.split()) if isinstance(value, str) else repr(value)
     if len(text) > SHOWN:
         begin = max(0, min(around - 1 - SHOWN // 2, len(text) - SHOWN))
@@ -40,9 +40,7 @@ class Reader:
         self.problems.append(f"{place}: {sentence}")
 
     def table(self, value: Any, place: str, most: int, what: str = "entries") -> dict[str, Any]:
-        """Return a value that is a table, without those keys that are not text; report any other value and return
-        {}.
-        """
+        """Return a value if it is a table, with its text keys only; else report the value and return {}."""
         if not isinstance(value, Mapping):
             self.report(place, f"{shown(value)} must be a table; write {place.rpartition('.')[2]} = {{ ... }}.")
             return {}
@@ -101,9 +99,7 @@ class Reader:
         return number
 
     def name(self, value: Any, place: str, taken: Mapping[str, str]) -> bool:
-        """Return whether a new name is allowed; report the problem if not. `taken` maps the names in use to their
-        meaning.
-        """
+        """Return whether a name may be defined; report the problem if not. `taken` maps used names to meanings."""
         problem = name_problem(value)
         if problem is None and value in taken:
             problem = f"is the name of a {taken[value]} already; choose another"

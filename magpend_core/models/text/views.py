@@ -17,9 +17,7 @@ DEFAULT_PRESET = "default"
 
 
 class ViewsReader(Reader):
-    """Reader of the optional tables; `place` is the path at which they begin, `known` says what each name in use stands
-    for.
-    """
+    """Reader of the optional tables; `place` is their key path, and `known` maps each defined name to its kind."""
 
     def __init__(self, place: str) -> None:
         super().__init__()
@@ -31,8 +29,8 @@ class ViewsReader(Reader):
         return ".".join((self.place, *(k[:60] for k in keys)))
 
     def _timeless(self, tree: Tree | None, place: str, define: dict[str, Tree], only: set[str] | None = None) -> bool:
-        """Return whether an expression uses no time and, if `only` is given, no state outside it; report a name that it
-        must not use.
+        """Return whether an expression is free of time and, if `only` is given, of all states not in `only`; report
+        offenders.
         """
         if tree is None:
             return False

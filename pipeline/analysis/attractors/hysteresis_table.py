@@ -10,9 +10,7 @@ from pipeline.products.product import Table
 
 
 def hysteresis_table(ds: xr.Dataset) -> Table:
-    """Return a row per kind of jump: attractor ids and parameter values before and after; text lines also describe the
-    loops.
-    """
+    """Return the table of hysteresis: a row per kind of jump between two attractors, and text lines on the loops."""
     names = ("jump_from", "jump_to", "jump_from_id", "jump_to_id", "jump_count")
     jumps = [ds.isel(jump=i) for i in range(ds.sizes["jump"])]
     rows = [

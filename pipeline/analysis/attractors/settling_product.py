@@ -1,6 +1,4 @@
-"""Select the data that show whether a run's non-periodic sets are transient, as an analysis
-(`pipeline.products.attractors`).
-"""
+"""Define the analysis ``settling``: the evidence on whether each non-periodic set is transient or attracts."""
 
 from __future__ import annotations
 

@@ -13,9 +13,7 @@ from pipeline.products.product import Table
 
 
 def settling_table(ds: xr.Dataset) -> Table:
-    """Return a row per parameter point and non-periodic set: how many of its extended cells stayed, left, and reached
-    other sets.
-    """
+    """Return the table of non-periodic sets: how many of the cells integrated further stayed on the set or left it."""
     dims = [str(d) for d in ds["kind"].dims if d != "attractor"]
     found = sets_of(ds, ds["kind"].isin(APERIODIC), dims)
     rows = [{**where, "attractor_id": int(one["attractor"]), **_row(one)} for where, one in found]

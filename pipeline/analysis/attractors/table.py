@@ -164,7 +164,7 @@ _SHOWN_BY = {
 
 
 def _shown_by(row: Row) -> str:
-    """Format the evidence for the stability of a set."""
+    """Format the evidence for the stability of a set, such as how many trajectories stayed and the lifetime."""
     low = number(row["lifetime_low"], ".0f")
     if row["evidence"] == "stayed":
         return f"{row['n_sampled']} stayed, lifetime above {low}"
@@ -203,14 +203,12 @@ def _id_summary(ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str]) -> Wor
 
 
 def _known(*ids: int) -> str:
-    """Format the distinct ids of sets that are not negative; a dash if there is none."""
+    """Format the distinct non-negative ids; a dash if there is none."""
     return distinct(i for i in ids if i >= 0) or "-"
 
 
 def _evidence(bases: Sequence[str]) -> str:
-    """Summarise the evidence for an attractor's id: followed branches, period doublings, or points matched by distance
-    alone.
-    """
+    """Summarise how an attractor got its id: by followed branches, by period doublings, or by distance alone."""
     evidence = [basis for basis in bases if basis != "first_appearance"]
     told = [name for name in ("branch", "doubling") if name in evidence]
     n = evidence.count("distance")

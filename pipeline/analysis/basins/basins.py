@@ -105,8 +105,8 @@ def check_starts(ds: xr.Dataset) -> None:
 
 
 def _unfinished(ids: xr.Dataset, dims: tuple[str, ...]) -> dict[str, xr.DataArray]:
-    """Count the cells without an outcome per parameter point, by reason (not computed, not settled, failed and
-    others).
+    """Count the cells without an outcome at each parameter point, by reason: not computed, not settled, failed and
+    others.
     """
     others = other_cells(ids)
     shape = outcomes(ids).transpose(*dims, ...).shape

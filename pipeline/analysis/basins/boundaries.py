@@ -293,8 +293,8 @@ def _pool(values: npt.NDArray[np.generic], block: int) -> Floats:
 
 
 def _entropies(sums: Floats) -> Floats:
-    """Compute the mean entropy over all boxes and over boundary boxes, from the summed entropy and the two numbers of
-    boxes.
+    """Compute the mean entropy over all boxes and over boundary boxes; `sums` has the total entropy and both box
+    counts.
     """
     return _ratio(np.array([sums[0], sums[0]]), sums[1:])
 
@@ -340,8 +340,7 @@ def _epsilons(epsilons: Sequence[int] | None, shape: tuple[int, ...], method: Sc
 
 
 def _perturbed(codes: Codes, eps: Ints) -> tuple[Floats, Floats]:
-    """Count, per perturbation epsilon and tile of the grid, the cells tested and those whose label changes within
-    epsilon.
+    """Count the tested cells, and those whose label changes within the distance epsilon, for each epsilon and tile.
 
     Every epsilon has the same trials: the cells that have room for the largest epsilon. Otherwise f would not
     be a straight line even for a straight boundary.
@@ -363,8 +362,8 @@ def _perturbed(codes: Codes, eps: Ints) -> tuple[Floats, Floats]:
 
 
 def _boxed(codes: Codes, eps: Ints, method: Scaling) -> tuple[Floats, Floats]:
-    """Count, per box side epsilon and tile of the grid, all boxes and those with several labels (or sum the boxes'
-    entropies).
+    """Count the boxes of side epsilon, and those with several labels (or sum their entropies), for each epsilon and
+    tile.
     """
     n_tiles = tiles_per_side(codes.shape) ** codes.ndim
     trials, hits = np.zeros((eps.size, n_tiles)), np.zeros((eps.size, n_tiles))

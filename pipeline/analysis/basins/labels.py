@@ -118,8 +118,7 @@ def tiles_per_side(shape: tuple[int, ...]) -> int:
 def tile_numbers(
     shape: tuple[int, ...], grid: tuple[int, ...], step: int = 1, margin: tuple[int, ...] | None = None
 ) -> Ints:
-    """Return for each element of an array laid over the grid of cells the number of the tile that holds the element's
-    centre.
+    """Return for each element of an array the number of the tile, a part of the grid of cells, that holds its centre.
 
     Parameters
     ----------

@@ -191,7 +191,7 @@ def tipping_probabilities(
 def _kept_dims(
     labels: npt.ArrayLike | xr.DataArray, dims: Sequence[str] | None
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the names of the dims of the labels that stay in the result, and of those over which cells are counted."""
+    """Return the dims of the labels that stay in the result, and the dims over which cells are counted."""
     if dims is None:
         over = tuple(str(dim) for dim in labels.dims) if isinstance(labels, xr.DataArray) else ()
         return (), over
@@ -261,9 +261,7 @@ def _upper_bound(count: npt.NDArray[np.int64], n: npt.NDArray[np.int64], confide
 
 
 def _same_cells(before: xr.DataArray, after: xr.DataArray) -> xr.DataArray:
-    """Check that the labels before and after a change are of the same cells, and return those after with the dims of
-    those before.
-    """
+    """Return the labels after a change with dims in the old order; raise ValueError unless the cells are the same."""
     if set(before.dims) != set(after.dims):
         raise ValueError(
             f"labels before have the dims {before.dims}, after {after.dims}: select one parameter value from each"

@@ -147,8 +147,7 @@ def _boundary_cells(codes: Codes, code: int) -> Ints:
 
 
 def _distances(shape: tuple[int, ...], boundaries: list[Ints], radii: Ints, metric: Metric) -> tuple[Floats, Floats]:
-    """Compute each basin boundary's largest distance from every other boundary, and count its cells beyond each radius
-    per tile.
+    """Compute the largest distance of each basin boundary from each other one; count boundary cells beyond each radius.
 
     There is one distance transform per label, which is read at the boundary cells of each pair.
     """

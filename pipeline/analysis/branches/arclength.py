@@ -69,7 +69,7 @@ class Trace:
 def correct(
     problem: Problem, guess: np.ndarray, normal: np.ndarray, settings: Settings, along: np.ndarray | None = None
 ) -> Steps[Point | None]:
-    """Correct a guess by Newton's method to a solution in the plane through it with this normal; None if that fails.
+    """Refine a guess by Newton's method within the plane through it normal to `normal`; None if the method fails.
 
     The point's tangent goes along `along`, by default along the normal.
     """
@@ -154,9 +154,7 @@ def trace(problem: Problem, start: Point, settings: Settings, stop: Stop, betwee
 
 
 def cubic(a: Point, b: Point, share: float) -> np.ndarray:
-    """Evaluate the cubic through two points and their tangents at a share of the chord (above 1: beyond the second
-    point).
-    """
+    """Return the point at a share of the chord on the cubic through two points; shares above 1 extrapolate."""
     length = float(np.linalg.norm(b.u - a.u))
     s, rest = share, 1.0 - share
     middle = rest**2 * (1.0 + 2.0 * s) * a.u + s**2 * (3.0 - 2.0 * s) * b.u
@@ -164,7 +162,7 @@ def cubic(a: Point, b: Point, share: float) -> np.ndarray:
 
 
 def _ahead(points: list[Point], step: float) -> np.ndarray:
-    """Predict the next point of the curve a step ahead, in the plane normal to the present tangent."""
+    """Predict the next point of the curve at distance `step`, in the plane normal to the tangent there."""
     here = points[-1]
     straight = here.u + step * here.tangent
     if len(points) < 2:

@@ -54,7 +54,7 @@ def _branching_test(point: Point) -> float:
 
 
 def _of_orbits(test: Callable[[np.ndarray], float]) -> Test:
-    """Turn a test function of the monodromy matrix into one of a branch's points that is always 1 at equilibria."""
+    """Extend a test function of the monodromy matrix to points of a branch; at equilibria its value is always 1."""
     return lambda point: 1.0 if point.value.is_rest else test(point.value.monodromy)
 
 
@@ -115,7 +115,7 @@ class Bifurcation:
     def critical_multiplier(self) -> complex:
         """The multiplier on the unit circle, or the eigenvalue on the imaginary axis [1/s].
 
-        Of a complex pair it is the one with positive imaginary part.
+        For a complex pair it is the one with positive imaginary part.
         """
         if self.point.value.is_rest:
             values = eigenvalues_of(self.point)
@@ -143,7 +143,9 @@ class Watch:
     n_steps: int = 0
 
     def between(self, a: Point, b: Point) -> Steps[bool]:
-        """Locate the bifurcations between two points; return False if they do not explain the change of stability."""
+        """Locate the bifurcations between two points; return False if a shorter step is needed to explain the stability
+        change.
+        """
         if self.skip_first and self.n_steps == 0:
             self.n_steps += 1
             return True
@@ -165,7 +167,7 @@ class Watch:
 
 
 def _explains(kinds: list[str], change: int) -> bool:
-    """Return whether bifurcations of these kinds can change the number of unstable multipliers by `change`."""
+    """Return whether bifurcations of the given kinds can change the number of unstable multipliers by `change`."""
     reachable = {0}
     for kind in kinds:
         step = _CHANGES[kind]
@@ -201,9 +203,7 @@ Tested = tuple[Point, float]
 def find_root(
     problem: Problem, a: Tested, b: Tested, test: Callable[[Point], Steps[float]], settings: Settings
 ) -> Steps[tuple[Tested, Tested] | None]:
-    """Narrow the bracket of a test function's zero between two points of a curve to `WIDTH`; None if Newton's method
-    fails between.
-    """
+    """Bracket a zero of a test function between two points of a curve to `WIDTH`; None if Newton's method fails."""
     (first, at_first), (last_point, at_last) = a, b
     chord = last_point.u - first.u
     length = float(np.linalg.norm(chord))
@@ -244,18 +244,14 @@ def _root(known: list[tuple[float, float]]) -> float:
 
 
 def _between(a: Point, b: Point, share: float) -> np.ndarray:
-    """Interpolate a guess of the orbit between two points, at a share of the chord and in the plane normal to the
-    chord.
-    """
+    """Interpolate between two points at a share of the chord, in the plane normal to the chord."""
     chord = b.u - a.u
     bent = cubic(a, b, share)
     return np.asarray(bent + (share - (bent - a.u) @ chord / (chord @ chord)) * chord)
 
 
 def tell_apart(located: list[Bifurcation], a: Point) -> list[Bifurcation]:
-    """Drop neutral saddles and folds that are branch points from located bifurcations, and sort the rest along the
-    branch.
-    """
+    """Keep the true bifurcations, sorted along the branch: drop neutral saddles, and folds that are branch points."""
     branching = [one.point.u for one in located if one.kind == BRANCHING]
     kept = []
     for one in located:
@@ -268,16 +264,14 @@ def tell_apart(located: list[Bifurcation], a: Point) -> list[Bifurcation]:
 
 
 def _is_torus(one: Bifurcation) -> bool:
-    """Return whether the multiplier pair with product 1 is complex (a torus bifurcation) and not real (a neutral
-    saddle).
-    """
+    """Return whether the multipliers with product 1 are complex (torus bifurcation), not real (neutral saddle)."""
     multipliers = multipliers_of(one.point)
     complex_pairs = multipliers[multipliers.imag > 0.0]
     return bool(len(complex_pairs)) and bool(np.abs(np.abs(complex_pairs) - 1.0).min() < 1e-4)
 
 
 def _is_pair(one: Bifurcation) -> bool:
-    """Return whether the eigenvalues with the sum 0 are a complex pair; a real pair is only a neutral saddle."""
+    """Return whether the eigenvalues with sum 0 are complex (Hopf point), not real (neutral saddle)."""
     values = eigenvalues_of(one.point)
     upper = values[values.imag > 0.0]
     return bool(len(upper)) and bool(np.abs(upper.real / np.abs(upper)).min() < 1e-4)

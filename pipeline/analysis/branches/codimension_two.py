@@ -66,9 +66,9 @@ class SpecialPoint:
     kind : str
         One of `POINT_KINDS`.
     family : Family
-        Of the orbit.
+        Family of the orbit.
     point : Point
-        The orbit there.
+        The orbit at the point.
     bracket : ndarray, (2,)
         Distance of the values of both parameters between which the test function changes its sign.
     curve : int
@@ -105,7 +105,7 @@ class Detector:
     _last: tuple[Point, _Frame, dict[str, float]] | None = None
 
     def between(self, a: Point, b: Point) -> Steps[bool]:
-        """Locate the points of codimension two between two neighbouring points of the curve; always return True."""
+        """Locate the points of codimension two between two neighbouring points of the curve; always accept the step."""
         if self._last is None or self._last[0] is not a:
             first = yield from self._tests(a, None)
             self._last = a, *first
@@ -142,8 +142,8 @@ class Detector:
         return float(value.residual[0])
 
     def _locate(self, kind: str, a: Tested, b: Tested, frame: _Frame) -> Steps[None]:
-        """Locate the zero of a test function between two curve points and store this point of codimension two; count a
-        failure as missed.
+        """Locate and store the point of codimension two where a test function vanishes between two points; count
+        failures.
         """
 
         def test(point: Point) -> Steps[float]:
@@ -192,8 +192,8 @@ class _Frame:
 
     @classmethod
     def of(cls, case: Case, before: _Frame | None) -> _Frame:
-        """Return the critical eigenvector and plane at a point of a curve; the plane's basis is the nearest to that of
-        the point before.
+        """Return the critical eigenvector and plane at a point of a curve, with the plane's basis turned close to
+        `before`.
         """
         if case.kind != TORUS:
             return cls(case.q, None)
@@ -264,9 +264,7 @@ def _cosine(values: np.ndarray) -> float:
 
 
 def merged(points: Mapping[int, list[SpecialPoint]]) -> list[SpecialPoint]:
-    """Collect the points of codimension two of all curves, each point once; `points` maps the number of a curve to its
-    points.
-    """
+    """Collect the points of codimension two of all curves without duplicates; `points` maps curve numbers to points."""
     found: list[SpecialPoint] = []
     for number, ones in points.items():
         for one in ones:

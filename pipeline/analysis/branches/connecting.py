@@ -70,8 +70,8 @@ class Found:
         return self.family.period
 
     def distance(self, u: np.ndarray) -> tuple[float, int]:
-        """Return the scaled distance of a point of a branch from the orbit's nearest section point, and the index of
-        the latter.
+        """Return the scaled distance from a branch point `u` to the nearest section point of the orbit, and this
+        point's index.
         """
         away = [float(np.linalg.norm(self.family.mismatch(u, point))) for point in self.points]
         nearest = int(np.argmin(away))
@@ -111,7 +111,7 @@ def connect(lines: Sequence[Sequence[Found]], settings: Settings = CONNECT) -> l
     lines
         Orbits along one parameter each, all others fixed; numbers are unique within a line.
     settings
-        How to trace; arclengths are in units of the families' scales.
+        Settings of the trace; arclengths are in units of the families' scales.
 
     Returns
     -------
@@ -166,9 +166,7 @@ def _neighbours(line: Sequence[Found], start: dict[int, Point | None]) -> Links:
 
 
 def _is_one_step(a: Found, b: Found, start: dict[int, Point | None]) -> bool:
-    """Return whether the tangent at each of two orbits leads to the other one, with the section points in the same
-    order.
-    """
+    """Return whether a tangent step from each of two orbits leads to the other, with matching section points."""
     phases = [_leads_to(start[a.number], b), _leads_to(start[b.number], a)]
     return all(p is not None for p in phases) and sum(p for p in phases if p is not None) % a.period == 0
 
@@ -190,9 +188,7 @@ def _leads_to(point: Point | None, other: Found) -> int | None:
 
 
 def _targets(one: Found, line: Sequence[Found], way: int, known: Links) -> list[Found]:
-    """Return the orbits that one orbit's branch can meet: of half, quarter, ... of its period or, only upwards, of
-    equal period.
-    """
+    """Return the orbits that a branch can meet: of half, quarter, ... its period and, going up, of equal period."""
     if one.number in (known.up if way > 0 else known.down):
         return []
     halves = {one.period // 2**k for k in range(1, one.period.bit_length()) if one.period % 2**k == 0}
@@ -216,9 +212,7 @@ class _Meeting:
     met: Found | None = None
 
     def between(self, a: Point, b: Point) -> Steps[bool]:
-        """Compare the branch with each target orbit whose parameter value the last step passed; always accept the
-        step.
-        """
+        """Record the target orbit that the branch met during the last step, if any; always accept the step."""
         chord = b.u - a.u
         for target in self.targets:
             value = target.value / self.family.scales[0]
@@ -278,7 +272,7 @@ def _follow(
 
 
 def grouped(places: Sequence[Hashable], links: Iterable[Link]) -> tuple[np.ndarray, list[Link]]:
-    """Group linked orbits, links without period doublings first; a group never has two orbits at one parameter point.
+    """Group orbits by their links, at most one orbit per parameter point; links without period doublings come first.
 
     Parameters
     ----------

@@ -62,7 +62,7 @@ class Curve:
     Attributes
     ----------
     family : Family
-        Of the orbits, with two free parameters.
+        Family of the curve's orbits, with two free parameters.
     kind : str
         Kind of bifurcation.
     points : list of Point
@@ -187,7 +187,7 @@ def _follow_all(ready: Sequence[Ready], curves: list[Curve], bounds: Bounds, set
 
 
 def _sprung(problem: BifurcationProblem, at: SpecialPoint) -> Steps[tuple[BifurcationProblem, Point] | None]:
-    """Find the first orbit of a curve that starts at a point of codimension two; None if there is no such curve."""
+    """Find a first orbit on the bifurcation curve that starts at a point of codimension two; None if none starts."""
     if problem.family.period == at.family.period:
         found = yield from _first(problem, at.point.u, CURVE)
         return None if found is None else (problem, found)
@@ -201,7 +201,7 @@ def _sprung(problem: BifurcationProblem, at: SpecialPoint) -> Steps[tuple[Bifurc
 
 
 def _starts(ds: xr.Dataset, parameters: Parameters, second: str, bounds: Bounds, max_period: int) -> list[CurveStart]:
-    """Return the located bifurcations to continue, each with its two-parameter family of orbits and its unknowns."""
+    """Return the located bifurcations to continue, each with its family of orbits and its start in scaled unknowns."""
     first = str(ds.attrs["parameter"])
     scales = tuple(high - low for low, high in bounds)
     found = []
@@ -231,7 +231,7 @@ def _first(problem: BifurcationProblem, u: np.ndarray, settings: Settings) -> St
 def _follow(
     problem: BifurcationProblem, start: Point, bounds: Bounds, settings: Settings
 ) -> Steps[tuple[Trace, list[SpecialPoint], int]]:
-    """Follow a curve one way, locate its points of codimension two, and drop the point beyond a bound.
+    """Follow a bifurcation curve in one direction, and locate its points of codimension two; stay within the bounds.
 
     A Neimark-Sacker curve ends at the resonance R1 or R2 where its pair of multipliers becomes real.
     """

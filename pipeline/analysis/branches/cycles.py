@@ -31,10 +31,10 @@ SAME_TIME = 1e-6
 
 
 def cycle_family(equilibria: Family, at: Bifurcation) -> Family | None:
-    """Return the family of limit cycles around a Hopf point, with a Poincare section through it; None if they do not
-    cross this section.
+    """Return the family of limit cycles near a Hopf point, on a Poincare section through this point; None if it has
+    none.
 
-    That is so for a system without a section by crossing, and if the crossing state does not oscillate.
+    There is none if the system has no section by crossing, or if the crossing state does not oscillate.
     """
     crossed = crossed_state(equilibria.system)
     if crossed is None or _direction(equilibria, at) is None:
@@ -62,8 +62,7 @@ def cycles_from(family: Family, at: Bifurcation, low: float, high: float, settin
 
 
 def _direction(family: Family, at: Bifurcation) -> np.ndarray | None:
-    """Return the scaled direction from an equilibrium to where small cycles around it cross the section; None if they
-    do not.
+    """Return the scaled direction from an equilibrium to the point where small limit cycles cross the section, or None.
 
     It is the real part of the critical eigenvector at the phase at which the crossing state passes its level in
     the section's direction; its largest component is 1.

@@ -106,9 +106,7 @@ def _side_variables(
 
 
 def _settle_origin(counts: np.ndarray, branch: Branch) -> None:
-    """Replace, in place, the number of unstable multipliers at a branch's origin (a bifurcation) by that of the next
-    point.
-    """
+    """Take the number of unstable multipliers at a branch's starting bifurcation from the next point, in place."""
     for j, point in enumerate(branch.points):
         if branch.origin is not None and point.u is branch.origin.point.u:
             counts[j] = counts[j + 1] if j + 1 < len(branch.points) else counts[j - 1]
@@ -182,7 +180,9 @@ class _Arrays:
 
 
 def _orbit(branch: Branch, point: Any) -> np.ndarray:
-    """Return the section points of an orbit (period, state), the point itself first; the state of an equilibrium."""
+    """Return the section points of an orbit (period, state), beginning with the given point; for an equilibrium its
+    state.
+    """
     images = np.asarray(point.value.images)
     return np.concatenate([branch.family.state(point.u)[None], images[: max(branch.family.period, 1) - 1]])
 

@@ -73,7 +73,7 @@ class FoundOrbit:
         return found[np.argsort(-np.abs(found), kind="stable")]
 
     def index(self, times: int = 1) -> int:
-        """Return the index of the orbit, the sign of det(1 - M^times), for the orbit repeated `times` times."""
+        """Return the fixed-point index of the orbit repeated `times` times: the sign of det(1 - M^times)."""
         power = np.linalg.matrix_power(self.monodromy, times)
         return int(np.sign(np.linalg.det(np.eye(len(power)) - power)))
 
@@ -100,14 +100,14 @@ def search_orbits(
     packed
         Packed parameters.
     system
-        What is integrated.
+        System of equations to integrate.
     rounds
-        Most rounds with deflation.
+        Largest number of rounds with deflation.
 
     Returns
     -------
     list of FoundOrbit
-        By rising period, then by falling number of hits.
+        Orbits found, sorted by rising period, then by falling number of hits.
     """
     found: list[FoundOrbit] = []
     generator, spread = np.random.default_rng(0), ELSEWHERE * starts.std(axis=0)
@@ -169,9 +169,7 @@ def _newton(matrices: np.ndarray, mismatch: np.ndarray) -> np.ndarray:
 def _stretch(
     states: np.ndarray, periods: np.ndarray, steps: np.ndarray, known: Sequence[FoundOrbit], system: System
 ) -> np.ndarray:
-    """Return the factors by which deflation stretches Newton steps: 1/(1 - grad(log m) . step), m = product of 1 +
-    1/(distance from a known orbit)^2.
-    """
+    """Return the factor by which deflation stretches each Newton step, from the distances to the known orbits."""
     scales, along = np.asarray(system.scales), np.zeros(len(states))
     for one in known:
         own = np.flatnonzero(periods % one.period == 0)
@@ -192,9 +190,7 @@ def _add(
     packed: np.ndarray,
     system: System,
 ) -> None:
-    """Add the new orbits among those through some section points, and count how often the first round of the search met
-    each orbit.
-    """
+    """Polish the converged section points, add orbits not yet in `found`, and count hits of the first round."""
     if not len(states):
         return
     n = len(states)
@@ -230,5 +226,5 @@ def index_sums(found: Sequence[FoundOrbit], longest: int) -> dict[int, int]:
 
 
 def expected_index(system: System) -> int:
-    """Return the sum that the indices of all fixed points should have: 0 if a state is an angle, else 1."""
+    """Return the sum of the indices of all fixed points if none is missing: 0 if a state is an angle, else 1."""
     return 0 if any(system.is_angle) else 1

@@ -31,7 +31,7 @@ class EquilibriumProblem(FamilyProblem):
         return self.family.rows(u[None][:0])
 
     def value(self, u: np.ndarray, ends: Ends) -> Value:
-        """Compute the scaled rates at a state and their derivatives by the state and the parameter."""
+        """Compute the scaled rates at a state, and their derivatives with respect to the state and the parameter."""
         step = np.zeros(self.size)
         step[-1] = PARAMETER_STEP
         rows, scales = self.family.rows(np.stack([u, u + step, u - step])), np.asarray(self.system.scales)
@@ -43,7 +43,9 @@ class EquilibriumProblem(FamilyProblem):
         return Value(rates[0] * unit, derivative, rows.states[:1], jacobian, is_rest=True)
 
     def _unit_of(self, jacobian: np.ndarray) -> float:
-        """Return the unit of time of the equations [s]: the inverse of the Jacobian's norm at the first evaluation."""
+        """Return the unit of time [s] that scales the rates: the inverse of the Jacobian's norm at the first
+        evaluation.
+        """
         if not self._unit:
             norm = float(np.linalg.norm(self.family.scaled(jacobian)))
             self._unit = 1.0 / norm if norm > 0.0 and np.isfinite(norm) else 1.0

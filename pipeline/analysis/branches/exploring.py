@@ -127,8 +127,8 @@ def _follow_starts(starts: Sequence[Start], branches: list[Branch], scope: Scope
 
 
 def _first_of_each(starts: Sequence[Start], followed: set[int]) -> list[int]:
-    """Return the first starting orbit of each pair (attractor, period), without pairs of which an orbit was followed
-    already.
+    """Return one starting orbit for each attractor and period, if no orbit of this attractor and period was followed
+    yet.
     """
     kinds = [(start.attractor, start.family.period) for start in starts]
     done = {kinds[i] for i in followed}
@@ -173,7 +173,7 @@ def _at_value(family: Family, guess: np.ndarray, settings: Settings) -> Steps[Po
 
 
 def _near(start: Start, branch: Branch) -> Iterator[np.ndarray]:
-    """Yield the points of a branch, interpolated at a starting orbit's parameter value, that are near this orbit."""
+    """Yield guesses, interpolated from a branch at a starting orbit's parameter value, that lie near this orbit."""
     family = branch.family
     if family.period != start.family.period or not _same_others(family, start.family):
         return
@@ -193,7 +193,7 @@ def _near(start: Start, branch: Branch) -> Iterator[np.ndarray]:
 
 
 def _same_others(a: Family, b: Family) -> bool:
-    """Return whether two families of orbits have equal parameters apart from the free one."""
+    """Return whether two families have the same free parameter and equal values of all others."""
     return a.free == b.free and np.array_equal(_fixed(a), _fixed(b))
 
 
@@ -260,9 +260,7 @@ def _half_orbit(branch: Branch, which: int) -> Start:
 
 
 def _criticality(at: Bifurcation, child: Branch, end: int) -> str:
-    """Decide criticality of a period doubling: supercritical if the doubled branch lies where the parent branch is less
-    stable.
-    """
+    """Decide the criticality of a period doubling from the side on which the doubled branch lies."""
     rising = at.point.tangent[-1] > 0.0
     worse_above = (at.n_unstable_after > at.n_unstable_before) == rising
     inner = child.points[end + 3 if end == 0 else end - 3]
@@ -330,9 +328,7 @@ def _direction(branch: Branch, at: Bifurcation) -> np.ndarray:
 
 
 def _is_crossing(parent: Branch, one: Bifurcation, branches: Sequence[Branch]) -> bool:
-    """Return whether the other branch at a branch point is known: a known branch has a branch point at the same
-    orbit.
-    """
+    """Find a known branch that crosses at a branch point, and link both to it; return whether there is one."""
     for branch in branches:
         for other in branch.bifurcations if branch.family.period == parent.family.period else ():
             same = _gap(branch.family, one.point, other) < 1e-4 and abs(one.point.u[-1] - other.point.u[-1]) < 1e-4
@@ -389,8 +385,7 @@ def _leave_equilibria(branches: list[Branch], scope: Scope) -> None:
 
 
 def _without_known(cycles: Branch, own: Family, branches: list[Branch], scope: Scope) -> list[Branch]:
-    """Return the parts of a branch of cycles from a Hopf point that are not on a known branch on another Poincare
-    section.
+    """Return the parts of a branch of limit cycles that are not already known on another Poincare section.
 
     Diagrams show the section of the run, `own`. So cycles that cross it are followed there, unless they have
     been, and are left out here.
@@ -417,7 +412,7 @@ def _equal_runs(periods: np.ndarray) -> list[tuple[int, int]]:
 
 
 def _other_sections(cycles: Branch, own: Family, branches: Sequence[Branch]) -> list[Family]:
-    """Return a family of orbits for each Poincare section of the known branches, the run's own first, without that of
+    """Return one family of orbits per Poincare section of the known branches, the run's own first, except that of
     `cycles`.
     """
     families = [own, *(b.family for b in branches if b.family.period and b.family.free == own.free)]
@@ -427,7 +422,7 @@ def _other_sections(cycles: Branch, own: Family, branches: Sequence[Branch]) -> 
 
 
 def _parts(cycles: Branch, wanted: np.ndarray) -> list[Branch]:
-    """Cut a branch of limit cycles into the stretches of wanted points, each with one more point at both ends."""
+    """Cut a branch of limit cycles into its stretches of wanted points, extended by one point at each end."""
     n, parts = len(wanted), []
     for first, last in [(max(a - 1, 0), min(b + 1, n - 1)) for a, b in _equal_runs(wanted.astype(int))]:
         ends = cycles.ends[0] if first == 0 else "other_section", cycles.ends[1] if last == n - 1 else "other_section"

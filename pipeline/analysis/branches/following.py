@@ -74,7 +74,7 @@ class Half:
 
 @dataclass(frozen=True, eq=False)
 class _Stop:
-    """Rule that ends the trace of a branch: at a bound, a closed branch, an equilibrium or a period halving."""
+    """Rule that ends the trace of a branch at a bound, on closing, at an equilibrium or at a period halving."""
 
     family: Family
     low: float
@@ -107,12 +107,12 @@ class _Stop:
         return False
 
     def _difference(self, state: np.ndarray, parameter: float, u: np.ndarray) -> np.ndarray:
-        """Return the scaled difference between a state with its parameter value and the point `u` of a branch."""
+        """Return the scaled difference between a state with a parameter value and a branch point `u`."""
         return np.append(self.family.mismatch(u, state), parameter - u[-1])
 
 
 def end_of_crossings(family: Family, point: Point) -> str:
-    """Return ``tangent`` or ``equilibrium`` if a limit cycle hardly crosses its section, else an empty text."""
+    """Return why a limit cycle cannot be followed on its section: ``tangent`` or ``equilibrium``; empty if it can."""
     crossed = crossed_state(family.system)
     if crossed is None:
         return ""
@@ -125,9 +125,7 @@ def end_of_crossings(family: Family, point: Point) -> str:
 
 
 def has_halved(family: Family, points: list[Point]) -> bool:
-    """Return whether the trace passed an orbit of half the period: the two halves of the orbit's period changed
-    places.
-    """
+    """Return whether the last step passed an orbit of half the period, where the orbit's two halves change places."""
     if not family.period or family.period % 2 or len(points) < 2:
         return False
     before, here = (_half_way(family, p) for p in points[-2:])
@@ -139,9 +137,7 @@ def _half_way(family: Family, point: Point) -> np.ndarray:
 
 
 def half_orbit(family: Family, point: Point) -> tuple[np.ndarray, float]:
-    """Return the mean of an orbit and itself half a period later, a guess of the orbit of half the period, and the
-    parameter value.
-    """
+    """Return a section point and the parameter value of the orbit of half the period, where a trace nearly meets it."""
     u = point.u.copy()
     u[:-1] += 0.5 * _half_way(family, point)
     return family.state(u), float(family.values(u)[0])
@@ -210,7 +206,7 @@ def _cut(problem: OneParameter, found: Trace, low: float, high: float, settings:
 
 
 def joined(family: Family, backward: Half, forward: Half) -> Branch:
-    """Join two traces from the same start to a branch: the backward trace reversed, then the forward one."""
+    """Join the two directions of a branch, traced from one start, to a `Branch`."""
     if forward.trace.end == "closed":
         return Branch(family, forward.trace.points, forward.bifurcations, ("closed", "closed"))
     back = [Point(p.u, -p.tangent, p.value, p.n_iterations) for p in reversed(backward.trace.points)]

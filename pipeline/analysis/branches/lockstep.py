@@ -64,9 +64,7 @@ def run_together(computations: Sequence[Steps[T]], what: str = "") -> list[T]:
 def _report(
     what: str, queries: Mapping[int, Query], waiting: Iterable[int], seen: dict[int, tuple[float, float]], n: int
 ) -> None:
-    """Report the progress of computations; `seen` has the range that the last unknown (a parameter) of each has covered
-    so far.
-    """
+    """Report the progress of running computations; `seen` has the parameter range that each one has covered so far."""
     for i, query in queries.items():
         last = float(query.u[-1])
         low, high = seen.get(i, (last, last))

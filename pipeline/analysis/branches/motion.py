@@ -65,7 +65,7 @@ def _sides(branch: Branch, base: Parameters, classifier: Classifier) -> np.ndarr
 
 
 def _rest_sides(branch: Branch, base: Parameters, classifier: Classifier) -> np.ndarray:
-    """Classify equilibria, whose states stay where they are."""
+    """Return the class of motion (a code) at each equilibrium of a branch, from the state at rest."""
     name, n_angles = branch.family.free[0], sum(branch.family.system.is_angle)
     own = base.replace(**dict(zip(base.names, map(float, branch.family.parameters), strict=True)))
     codes = []

@@ -1,4 +1,4 @@
-"""Compute the normal form coefficients of located bifurcations, which decide what leaves them.
+"""Compute normal form coefficients of located bifurcations, whose signs tell whether the bifurcating orbits are stable.
 
 The coefficients need the second and third derivatives B and C of the section map (of the rates, for equilibria)
 along the critical eigenvectors. They are differences of its exact first derivative A at neighbours of the orbit.
@@ -98,7 +98,7 @@ class Case:
         return np.asarray(self.u + np.pad(shifts, ((0, 0), (0, len(self.u) - len(self.q)))))
 
     def coefficients(self, form: Form, neighbours: np.ndarray) -> np.ndarray:
-        """Compute a normal form coefficient by finite differences, for each step size but the largest.
+        """Compute a normal form coefficient by finite differences, one value for each step size except the largest.
 
         `neighbours` are the derivatives of the map, or Jacobians, at `self.neighbours()`, unscaled.
         """
@@ -225,9 +225,7 @@ def _bend(middle: np.ndarray, ahead: np.ndarray, behind: np.ndarray, steps: np.n
 
 
 def settled(values: np.ndarray) -> tuple[float, float, int]:
-    """Return, of a coefficient's values for successive step sizes, the one that changes least, its change as error, and
-    its index.
-    """
+    """Return the value of a coefficient that depends least on the step size, with its error and its index."""
     changes = np.abs(np.diff(values))
     errors = np.maximum(changes[:-1], changes[1:])
     if np.isnan(errors).all():
@@ -256,7 +254,7 @@ def _quadratic(case: Case, bends: Sequence[Bend]) -> float:
 
 
 def _size(case: Case, bends: Sequence[Bend]) -> float:
-    """Compute an upper bound of the quadratic normal form coefficient, as a scale to compare the coefficient with."""
+    """Compute an upper bound of the quadratic normal form coefficient, the scale against which its size is judged."""
     (bend,) = bends
     return float(0.5 * np.linalg.norm(case.p) * np.linalg.norm(bend.first))
 
@@ -276,9 +274,7 @@ def _cubic(case: Case, bends: Sequence[Bend]) -> float:
 
 
 def _complex_parts(case: Case, bends: Sequence[Bend]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return derivatives of the map along the eigenvector q: second ones as matrices B(q, .), B(conj(q), .), third as
-    C(q, q, conj(q)).
-    """
+    """Return the derivatives B(q, .), B(conj(q), .) and C(q, q, conj(q)) of the map for a complex eigenvector q."""
     real, imag = bends
     along, against = real.first + 1j * imag.first, real.first - 1j * imag.first
     return along, against, (real.second + imag.second) @ case.q

@@ -54,9 +54,7 @@ def orbits(run: Run, options: OrbitOptions) -> xr.Dataset:
 
 
 def _starts(point: xr.Dataset, system: System, options: OrbitOptions) -> np.ndarray:
-    """Return the initial states of the search: half drawn from the cells' section points, half random in a wider
-    box.
-    """
+    """Return start states for the search: half drawn from stored section points, half random in a wider box."""
     generator = np.random.default_rng(options.seed)
     section = point["section"].transpose(..., "state").values.reshape(-1, system.n_states)
     section = section[np.isfinite(section).all(axis=1)]
@@ -122,7 +120,7 @@ def orbits_table(ds: xr.Dataset) -> Table:
 
 
 def _index_lines(ds: xr.Dataset, expected: int) -> list[str]:
-    """Return table lines on the periods for which the indices of the orbits do not have the expected sum."""
+    """Return text lines that tell by the sums of fixed-point indices for which periods orbits are missing."""
     sums = {int(p): int(total) for p, total in zip(ds["times"].values, ds["index_sum"].values, strict=True)}
     wrong = [f"{p}: {total}" for p, total in sums.items() if total != expected]
     if not wrong:

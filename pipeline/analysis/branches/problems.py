@@ -55,13 +55,13 @@ class Ends:
     Attributes
     ----------
     starts : ndarray, (m, n_states)
-        Where they began.
+        Start states of the trajectories.
     images : ndarray, (m, period, n_states)
         Sections after 1, 2, ... drive periods or returns.
     monodromy : ndarray, (m, n_states, n_states)
         Derivative of the last image by the start.
     times : ndarray, (m, period)
-        How long each took [s].
+        Duration of each drive period or return [s].
     """
 
     starts: np.ndarray
@@ -116,9 +116,7 @@ class Problem(Protocol):
         """Return the trajectories to integrate for the value of F at `u`."""
 
     def value(self, u: np.ndarray, ends: Ends) -> Value | None:
-        """Compute F and its derivative from the end points of trajectories; None if further trajectories must be
-        integrated first.
-        """
+        """Compute F and its derivative from the trajectories that `rows` requested; None if it has to request more."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,9 +200,7 @@ class _Segments:
     slopes: np.ndarray
 
     def at(self, u: np.ndarray) -> np.ndarray:
-        """Estimate the orbit's section points at other values of the unknowns to first order; the first point is
-        exact.
-        """
+        """Estimate the orbit's section points at unknowns `u` to first order in the change of the unknowns."""
         return np.asarray(self.points + self.slopes @ (u - self.u))
 
 
@@ -252,8 +248,8 @@ class OrbitProblem(FamilyProblem):
         return replace(self.family.rows(np.concatenate([own, own + step])), period=1)
 
     def value(self, u: np.ndarray, ends: Ends) -> Value | None:
-        """Compute the orbit's mismatch after its period, and its derivative; None if trajectories from other starts are
-        needed first.
+        """Compute the orbit's mismatch after one period and its derivative; None to request trajectories from better
+        starts.
         """
         is_whole = ends.images.shape[1] == self.family.period
         return self._of_whole(u, ends) if is_whole else self._of_segments(u, ends)
@@ -273,8 +269,8 @@ class OrbitProblem(FamilyProblem):
         return None
 
     def _of_segments(self, u: np.ndarray, ends: Ends) -> Value | None:
-        """Combine an orbit's separately integrated periods into section points, mismatch and derivative; None if the
-        gaps are too wide.
+        """Compute mismatch and derivative from separately integrated drive periods; None if the gaps between them are
+        too wide.
         """
         n, scales = self.size - 1, np.asarray(self.system.scales)
         starts = np.split(ends.starts / scales, 2)[0]
@@ -310,8 +306,7 @@ class OrbitProblem(FamilyProblem):
 
 
 def _is_joined(gap: float, residual: float) -> bool:
-    """Return whether the gaps between an orbit's separately integrated periods are small enough for the present
-    residual.
+    """Return whether the gaps between separately integrated periods are small enough for the next Newton step.
 
     F errs by the square of the gap, the derivative by the gap. Far from the solution Newton's method needs
     neither to be exact.

@@ -34,18 +34,18 @@ class Listed:
 
 
 def listed(attractors: xr.Dataset, parameters: Parameters, parameter: str, scale: float) -> Iterator[Listed]:
-    """Yield all attractors of a run; those whose closed orbit Newton's method found have a starting orbit for a branch.
+    """Yield the attractors of a run; one that Newton's method refined comes with a starting orbit for a branch.
 
     Parameters
     ----------
     attractors
         From `pipeline.analysis.attractors.attractors`.
     parameters
-        What was integrated, axes of the cube aside.
+        Parameters of the run, apart from those on the cube's axes.
     parameter
-        What is to be continued.
+        Parameter to continue.
     scale
-        Change of it that counts as 1.
+        Change of the parameter that counts as 1.
     """
     for point in _points(attractors):
         frequency, packed = parameters_at(point, parameters)
@@ -63,19 +63,18 @@ def listed(attractors: xr.Dataset, parameters: Parameters, parameter: str, scale
 def attracting(
     attractors: xr.Dataset, parameters: Parameters, parameter: str, interval: tuple[float, float], max_period: int = 0
 ) -> tuple[list[Start], list[str]]:
-    """Return starting orbits from a run's attractors whose closed orbit Newton's method found, and a line on each
-    attractor left out.
+    """Return starting orbits from the refined attractors of a run, and a text line for each attractor left out.
 
     Parameters
     ----------
     attractors
         From `pipeline.analysis.attractors.attractors`.
     parameters
-        What was integrated, axes of the cube aside.
+        Parameters of the run, apart from those on the cube's axes.
     parameter
-        What is to be continued.
+        Parameter to continue.
     interval
-        Where; its length counts as 1.
+        Interval of the parameter; its length counts as 1.
     max_period
         Longest period taken [drive periods]; 0 takes all.
 
@@ -163,7 +162,7 @@ def parameters_at(point: xr.Dataset, base: Parameters) -> tuple[float, np.ndarra
 def recurrent(cube: xr.Dataset, parameters: Parameters, parameter: str, scale: float, max_period: int) -> list[Start]:
     """Find the orbits, mostly unstable, that bounded trajectories of a cube come near.
 
-    Where two sections of a trajectory are close, p periods apart, Newton's method from the first often
+    Where two section points of a trajectory, p periods apart, are close, Newton's method from the first often
     leads to an orbit of period p (Auerbach et al., Phys. Rev. Lett. 58, 1987, 2387).
 
     Parameters
@@ -209,7 +208,7 @@ def orbits_near(
     max_period
         Longest period [drive periods].
     system
-        What is integrated.
+        System of equations to integrate.
 
     Returns
     -------
@@ -232,9 +231,7 @@ def orbits_near(
 def _spread(
     section: np.ndarray, places: Sequence[tuple[np.intp, ...]], distance: np.ndarray, system: System
 ) -> list[np.ndarray]:
-    """Choose starting points where trajectories recur most closely, skipping points within `RECURRENCE` of a chosen
-    one.
-    """
+    """Choose section points of close recurrence, closest first, that lie more than `RECURRENCE` apart."""
     chosen: list[np.ndarray] = []
     for place in places:
         if len(chosen) == TRIES or not distance[place] <= RECURRENCE:

@@ -125,7 +125,7 @@ def _at(ds: xr.Dataset, branch: int) -> str:
 
 
 def _with_error(value: float, error: float) -> str:
-    """Format a coefficient by the digits that its error leaves, at most four; ``?`` if it leaves none."""
+    """Format a coefficient with as many digits as its error allows (1 to 4); ``?`` if the error exceeds the value."""
     if not abs(value) > error:
         return "?"
     digits = int(np.clip(np.floor(np.log10(abs(value) / max(error, 1e-300))), 1, 4))

@@ -1,4 +1,4 @@
-"""Find orbits locked to the drive, p turns in q periods, along a row of trajectories with rotation numbers."""
+"""Find phase-locked orbits with rotation number p/q along a row of cells with rotation numbers."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class Row:
 
 @dataclass(frozen=True, eq=False)
 class Search:
-    """Setting of a search: orbits with one free parameter, what turns, and over how many periods it is averaged."""
+    """Settings of the search for locked orbits: family of orbits, rotating state, number of averaged periods."""
 
     family: Family
     turning: TurningState
@@ -126,7 +126,7 @@ def locked_orbits(row: Row, search: Search, most: int) -> dict[Fraction, Start |
     Returns
     -------
     dict
-        By rising fraction; None where no closed cell has it and the search between two cells failed as well.
+        Starting orbit by fraction, in rising order; None where no closed cell has it and the search failed.
     """
     known = row.rotation[np.isfinite(row.rotation)]
     if not known.size:
@@ -153,7 +153,9 @@ def _of_cells(row: Row, search: Search, fraction: Fraction) -> Start | None:
 
 
 def _passed(row: Row, fraction: Fraction) -> tuple[int, int] | None:
-    """Return the first index and the start of two neighbouring cells between which a rotation number is passed."""
+    """Return indices (value, start) of the cell after which the rotation number passes a fraction; None if it never
+    does.
+    """
     off = row.rotation - float(fraction)
     places = np.argwhere(off[:-1] * off[1:] < 0.0)
     if not len(places):
@@ -164,7 +166,7 @@ def _passed(row: Row, fraction: Fraction) -> tuple[int, int] | None:
 
 
 def _between_cells(row: Row, search: Search, gaps: dict[Fraction, tuple[int, int]]) -> dict[Fraction, Start | None]:
-    """Find orbits between neighbouring cells by halving the interval of the parameter, all fractions side by side."""
+    """Find locked orbits between neighbouring cells by bisection in the parameter, for all fractions together."""
     if not gaps:
         return {}
     targets = np.array([float(f) for f in gaps])
@@ -200,7 +202,7 @@ def _closest_return(family: Family, points: np.ndarray, value: float) -> Start |
 
 
 def _corrected(start: Start, number: int) -> Steps[Start | None]:
-    """Polish an orbit together with the parameter, since a thin tongue has orbits at one value only."""
+    """Refine an orbit and its parameter value together; in a thin tongue the orbit exists near one value only."""
     problem, u = problem_of(start.family), start.family.unknowns(start.state, [start.value])
     value = yield Query(problem, u)
     found = (yield from correct(problem, u, kernel_of(value), Settings())) if value.is_finite else None

@@ -99,7 +99,7 @@ def _row_of(run: Run, options: TongueOptions) -> xr.Dataset:
 
 
 def _turning(run: Run) -> tuple[TurningState, int]:
-    """Return what turns, and over how many periods it is averaged, from the run's product ``rotation``."""
+    """Return the rotating state, and the number of periods of the average, from the run's product ``rotation``."""
     options: Any = run.spec.products["rotation"]
     names = run.model.state_names
     return TurningState(tuple(map(names.index, options.of)), options.center, options.section), options.n_periods
@@ -122,7 +122,7 @@ def cells_of(point: xr.Dataset, first: str) -> Row:
 
 
 def _parts(fractions: Sequence[Fraction | None]) -> dict[str, np.ndarray]:
-    """Return numerators and denominators; 0 / 0 where a rotation number is unknown."""
+    """Return numerators and denominators of fractions, shape (n,); 0 / 0 for an unknown fraction."""
     pairs = [(0, 0) if f is None else (f.numerator, f.denominator) for f in fractions]
     columns = np.array(pairs, np.int32).reshape(-1, 2)
     return {"numerator": columns[:, 0], "denominator": columns[:, 1]}
@@ -130,7 +130,7 @@ def _parts(fractions: Sequence[Fraction | None]) -> dict[str, np.ndarray]:
 
 @dataclass(eq=False)
 class _Tongue:
-    """A tongue on the row: p/q, number of its branches, where its stable orbits begin and end, and its outer folds."""
+    """A tongue p/q on the row of cells: number of branches, bounds of its stable orbits, outermost folds."""
 
     fraction: Fraction
     n_branches: int
@@ -143,7 +143,7 @@ class _Tongue:
 def _on_row(
     fractions: Sequence[Fraction], numbers: Sequence[Fraction | None], located: xr.Dataset, least: float
 ) -> list[_Tongue]:
-    """Describe each tongue on the row by the stable segments of its branches; `least` is the least error."""
+    """Describe each tongue on the row by the stable segments of its branches; errors are at least `least`."""
     windows, found = windows_of(located), []
     is_fold = located["kind"].values == KINDS.index(FOLD)
     for fraction in fractions:

@@ -101,7 +101,7 @@ def kaplan_yorke_dimension(
 
 
 def _without_zero(values: np.ndarray, rates: np.ndarray) -> np.ndarray:
-    """Drop from the last axis of `values` the entry whose rate is nearest to 0."""
+    """Drop the exponent of the flow direction: the entry of `values` whose rate is nearest to 0, on the last axis."""
     nearest = np.argmin(np.abs(np.nan_to_num(rates, nan=np.inf)), axis=-1)
     kept = np.arange(rates.shape[-1]) != nearest[..., None]
     return np.asarray(values[kept].reshape(*rates.shape[:-1], rates.shape[-1] - 1))
@@ -332,7 +332,7 @@ class _Pairs:
         return np.asarray(self.by_part.sum(axis=0))
 
     def without(self, part: int) -> npt.NDArray[np.int64]:
-        """Return the numbers of pairs that remain if one part of the sample's points is left out, shape (radius,)."""
+        """Return the numbers of point pairs without the points of one part of the sample, shape (radius,)."""
         return np.asarray(self.all - 2 * self.by_part[part] + self.within[part])
 
 

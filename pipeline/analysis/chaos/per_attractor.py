@@ -287,9 +287,7 @@ class _Curves:
         self._n_max = options.n_max
 
     def of(self, point: xr.Dataset, starts: Sequence[str], cells: _Cells, number: int) -> dict[str, float]:
-        """Compute the correlation dimension of one attractor from its cells; return an empty dict if there are too few
-        points.
-        """
+        """Compute the correlation dimension of one attractor from its cells; an empty dict means too few points."""
         lasting = (cells.values["attractor_id"] == number) & (cells.values["is_transient"] != 1)
         n_keep = point.sizes["period_index"]
         if min(int(lasting.sum()) * n_keep, self._n_max) < FEWEST_POINTS:

@@ -26,16 +26,14 @@ def chaos(run: Run, options: ChaosOptions) -> xr.Dataset:
 
 
 def needs_dimension(run: Run, options: DimensionOptions) -> None:
-    """Raise ValueError if the options select an axis or a value that the cube does not have."""
+    """Raise ValueError if the options select an axis or an axis value that the cube lacks."""
     from pipeline.analysis.selection import select_points
 
     select_points(run.cube(), options.at)
 
 
 def settle_dimension(run: Run, options: DimensionOptions) -> DimensionOptions:
-    """Replace selected parameter values by the exact axis values, so that rounded values find the same stored
-    result.
-    """
+    """Replace selected parameter values by the nearest values on the cube's axes, so that stored results are found."""
     from pipeline.analysis.selection import select_points
 
     part = select_points(run.cube(), options.at)

@@ -184,8 +184,7 @@ def _growth(phi: Floats, c: Floats) -> Floats:
 
 
 def _displacement(walk: npt.NDArray[np.complex128], n_cut: int) -> Floats:
-    """Compute the mean square displacement ``|z(j + lag) - z(j)|**2`` of a walk z over the first n - n_cut j, lags 1 to
-    `n_cut`.
+    """Compute the mean square displacement of a walk z in the complex plane, for each lag from 1 to `n_cut`.
 
     The lags are on the last axis. The expanded square gives sums of squares and a correlation, which is
     computed by Fourier transform.

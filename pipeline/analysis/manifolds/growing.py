@@ -51,7 +51,7 @@ class Saddle:
     Attributes
     ----------
     system : System
-        What is integrated.
+        System of equations to integrate.
     frequency_hz : float
         Drive frequency [Hz].
     packed : ndarray
@@ -248,7 +248,7 @@ class _Curve:
         """Compute the preimages of a stable manifold's latest points one by one, each starting from its neighbour's
         preimage.
 
-        Where the step to the next one is long, or Newton's method fails, a place is inserted between them.
+        If the step to the next point is long, or Newton's method fails, a position is inserted between them.
         """
         saddle, longest = self.saddle, 2.0 * self.resolution.chord
         found, length = [self.generations[-1][-1]], 0.0  # a generation begins where the one before ends

@@ -208,9 +208,7 @@ def _followed(saddle: Saddle, base: Parameters, parameter: str, options: Tangenc
 
 
 def tangency_table(ds: xr.Dataset) -> Table:
-    """Return a row per located tangency, and for each pair of an unstable and a stable side without one a line that
-    says why.
-    """
+    """Return the table of first homoclinic tangencies, and a line for each pair of sides without a tangency."""
     name = parameter_name(str(ds.attrs["parameter"]))
     every = [
         {

@@ -77,9 +77,7 @@ def gap(saddle: Saddle, sides: tuple[float, float], resolution: Resolution = FIN
 
 
 def _oriented(saddle: Saddle, side: float, stable: bool) -> float:
-    """Return the sign that orients a saddle's eigenvector, so that side 1 begins towards larger values of the first
-    state.
-    """
+    """Return the sign for a saddle's eigenvector such that side 1 points to larger values of the first state."""
     _, vector = saddle.direction(stable)
     return side * float(np.sign(vector[0]))
 

@@ -19,10 +19,10 @@ class Level:
     Attributes
     ----------
     dtype : str
-        Of the values.
+        Type of the values.
     each : int
-        Of cells on no closed orbit every so many sections; 0 keeps all sections of all cells, and any other
-        number one period of those on closed orbits.
+        Step between kept section points of cells on no closed orbit; 0 keeps all points of all cells. With any
+        other number, cells on closed orbits keep one period.
     """
 
     dtype: str
@@ -85,11 +85,11 @@ def fit(columns: Mapping[str, Column], period: np.ndarray, most_bytes: float) ->
     Parameters
     ----------
     columns
-        By vertical axis, all over the same cells.
+        Columns by vertical axis, all for the same cells.
     period
-        Of each cell's closed orbit; 0 where there is none.
+        Period of each cell's closed orbit; 0 where there is none.
     most_bytes
-        For all of them.
+        Size limit for all columns together [bytes].
     """
     longest = max((int(c.count.max(initial=0)) for c in columns.values()), default=0)
     first = next(iter(columns.values()))

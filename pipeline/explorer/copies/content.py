@@ -44,11 +44,11 @@ class Copied:
     view : dict
         As `describe_view` gives it.
     about : dict
-        What the page must know of the copy.
+        Facts on the export for the page's script.
     objects : dict
         Data by name.
     sentences : list of str
-        What a reader must know of the copy.
+        Notes on the export for its readers.
     """
 
     run: ExploredRun
@@ -121,7 +121,7 @@ def gather(run: ExploredRun, quantities: Sequence[str] = ()) -> Copied:
 
 
 def _view(run: ExploredRun, quantities: Sequence[str]) -> tuple[dict[str, Any], int]:
-    """Return the description of a run with only these quantities, and the number of quantities omitted."""
+    """Return the description of a run restricted to the given quantities, and the number of axes left out."""
     known = [q.name for q in run.model.quantities]
     if problems := [unknown_name("--quantity", name, known) for name in quantities if name not in known]:
         raise SpecError(problems)
@@ -140,13 +140,15 @@ def places(run: ExploredRun, but: str = "") -> Iterator[Place]:
 
 
 def place_key(run: ExploredRun, at: Mapping[str, int], x: str = "") -> str:
-    """Return the key of an answer at given axis indices; the page's script builds the same key (`placeKey`)."""
+    """Return the text key of indices on the axes, such as ``frequency=3&amplitude=0``; the page's `placeKey` makes the
+    same.
+    """
     parts = [f"{a.name}={at.get(a.name, 0)}" for a in run.axes if a.name != x]
     return "&".join([*([f"x={x}"] if x else []), *parts])
 
 
 def _answers(copied: Copied, kind: str, asked: Iterable[tuple[str, Callable[[], Any]]], alike: bool = False) -> None:
-    """Pack the answers to all requests of a kind into objects of about equal size; pack none if there are too many.
+    """Add the answers to all requests of one kind to an export, packed into objects of about equal size.
 
     If they are all alike, the first stands for all.
     """
@@ -243,7 +245,7 @@ def ranges(first: np.ndarray, count: np.ndarray) -> np.ndarray:
 
 
 def place_of(run: ExploredRun, vertical: Vertical) -> tuple[str, list[int | None]]:
-    """Return where the cube stores a vertical axis: the variable, and an index for each dim that is not a cell dim.
+    """Return the cube variable that a vertical axis shows, and the index on each dim that does not number cells.
 
     The index is None on the dim of sections.
     """

@@ -42,9 +42,9 @@ class Exported:
     Attributes
     ----------
     size : int
-        Of all that was written [bytes].
+        Size of everything written [bytes].
     sentences : list of str
-        What the copy says of itself.
+        Notes that the export shows to its readers.
     """
 
     path: Path
@@ -109,7 +109,7 @@ def export_page(
 
 
 def _html(copied: Copied) -> bytes:
-    """Return the page with the objects copied so far."""
+    """Return the exported HTML page with the data added so far."""
     generator = f"magpend {copied.view['version']}"
     return inline_html(copied.run.info.title, generator, finished(copied)).encode()
 
@@ -170,7 +170,7 @@ def add_all_orbits(copied: Copied, columns: Mapping[str, Column], layers: Mappin
 
 
 def finished(copied: Copied) -> dict[str, bytes]:
-    """Return all packed objects of an export, the description of the run first."""
+    """Return all packed objects of an export by name, including the description of the run."""
     about = {**copied.about, "notice": notice(copied)}
     return {"view": packed_json({"view": copied.view, "about": about}), **copied.objects}
 

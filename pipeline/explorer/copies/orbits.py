@@ -105,7 +105,7 @@ def choose(run: ExploredRun, layers: Mapping[str, np.ndarray], count: np.ndarray
 
 
 def _labels(layers: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Return a label for each cell that distinguishes the attractors (or motions) at a parameter point."""
+    """Return a number for each cell that distinguishes the attractors (or motions) of one parameter point."""
     if "colour_attractor" in layers:
         return np.asarray(layers["colour_attractor"], np.int64)
     motion = layers.get("colour_motion", np.zeros_like(layers["status"])).astype(np.int64)
@@ -125,9 +125,7 @@ def _parameter_points(run: ExploredRun) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _nearest(groups: np.ndarray, taken: np.ndarray, axis: np.ndarray, same: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the orbit of each group of cells: its own, else the nearest along the axes, with the same label if
-    possible.
-    """
+    """Return the orbit shown for each group of cells: its own or the nearest one, with the same label if possible."""
     number = np.full(len(groups), NONE, np.uint32)
     means = np.full(len(groups), NEAREST, np.uint8)
     number[taken], means[taken] = np.arange(len(taken)), same
@@ -141,18 +139,18 @@ def _nearest(groups: np.ndarray, taken: np.ndarray, axis: np.ndarray, same: int)
 
 
 def add_orbits(copied: Copied, choosing: Callable[[int], Chosen], count: np.ndarray, room: Room) -> int:
-    """Integrate orbits and add them to a copy; return their number.
+    """Integrate orbits and add them to an export; return their number.
 
     Parameters
     ----------
     copied
-        What they are added to.
+        Export to which the orbits are added.
     choosing
-        Gives the choice for a number of orbits at most.
+        Function that chooses at most a given number of orbits.
     count
         Number of each cell's points; an orbit starts from the last.
     room
-        What they may take.
+        Limits on number and size of the orbits.
     """
     if copied.run.spec.recorded is not None:
         missing = "This copy has no orbits: the drive of the run is a recording, which does not repeat."

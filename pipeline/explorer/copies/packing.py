@@ -25,9 +25,9 @@ def packed(arrays: Mapping[str, np.ndarray], attrs: Mapping[str, Any] | None = N
     Parameters
     ----------
     arrays
-        By name, of a type in `pipeline.explorer.data.arrays.DTYPES`.
+        Arrays by name, of a type in `pipeline.explorer.data.arrays.DTYPES`.
     attrs
-        What JSON can say.
+        Values that JSON can store.
 
     Raises
     ------

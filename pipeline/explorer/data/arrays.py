@@ -1,4 +1,4 @@
-"""Pack arrays for the page into one byte string that it reads without copying.
+"""Pack arrays into one byte string, which the page's script reads without copying.
 
 A little-endian uint32 says how long the header is; the header is JSON in UTF-8, padded with spaces so that
 what follows begins at a multiple of 8; then come the arrays in C order, each padded to 8 bytes::
@@ -32,7 +32,7 @@ def pack_arrays(arrays: Mapping[str, np.ndarray], attrs: Mapping[str, Any] | Non
     Parameters
     ----------
     arrays
-        By name, of a type in `DTYPES`.
+        Arrays by name, of a type in `DTYPES`.
     attrs
         Values that JSON can store. NaN and infinity are not allowed; None stands for a missing value.
 

@@ -146,7 +146,7 @@ def _seeds(run: ExploredRun) -> Iterator[Scheme]:
 
 
 def _ends(found: xr.Dataset) -> tuple[xr.DataArray, tuple[Category, ...]]:
-    """Return for each cell the number of its attractor or of its grey category, and the grey categories.
+    """Return the colour code of each cell (its attractor or a grey category), and the grey categories that occur.
 
     Cells that diverged, failed or are pending have none.
     """
@@ -163,7 +163,7 @@ def _ends(found: xr.Dataset) -> tuple[xr.DataArray, tuple[Category, ...]]:
 
 
 def _told(codes: xr.DataArray) -> xr.DataArray:
-    """Return motion codes with -1 for cells that were not classified."""
+    """Return classifier codes with -1 in place of unclassified cells."""
     return codes.where(codes > 0, -1)
 
 

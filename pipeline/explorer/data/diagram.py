@@ -43,9 +43,9 @@ class Points:
     y : ndarray, (n,)
     status : ndarray of int8, (m,)
     codes : dict
-        Of each scheme of colours, uint16 (m,).
+        Colour codes by scheme, uint16 (m,).
     kept : int
-        Sections that are shown of each cell, the last ones.
+        Number of section points shown per cell, the last ones.
     """
 
     x: np.ndarray

@@ -41,7 +41,7 @@ class Axis:
     Attributes
     ----------
     name : str
-        Of the cube's dim; of a run that sweeps nothing, of the one value that it has.
+        Name of the cube's dim; in a run that sweeps nothing, name of the one value that it has.
     parameter : str
         Its name in a specification.
     values : ndarray
@@ -122,7 +122,7 @@ class ExploredRun(Run):
         return sorted(place.name for place in products_in(self.info.files.below(DERIVED)))
 
     def remembered(self, key: str, make: Callable[[], T]) -> T:
-        """Return the value of a key, computed once, even under concurrent requests."""
+        """Return the cached value of a key; compute it once on the first request, also if requests are concurrent."""
         with self._lock:
             lock = self._opened.setdefault(f"lock {key}", threading.Lock())
         with lock:

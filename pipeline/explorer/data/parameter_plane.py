@@ -140,7 +140,7 @@ def curve_orbit(run: Run, curve: int, point: int) -> bytes:
 
 
 def _parameters_at(run: ExploredRun, one: xr.Dataset) -> tuple[Parameters, float]:
-    """Return the parameters at a point of a curve and the drive frequency [Hz]; of a flow what stands for it."""
+    """Return parameters and drive frequency [Hz] at a point of a bifurcation curve."""
     values = {str(one.attrs[f"{role}_parameter"]): float(one[role]) for role in ("first", "second")}
     base = {FREQUENCY_DIM: run.spec.frequency_hz} if run.spec.frequency_hz is not None else {}
     clock = frequency_of(run.model, base | values)
@@ -151,7 +151,7 @@ def _parameters_at(run: ExploredRun, one: xr.Dataset) -> tuple[Parameters, float
 def _attrs(
     run: ExploredRun, parameters: Parameters, clock_hz: float, period: int, multipliers: np.ndarray, kind: str
 ) -> dict[str, Any]:
-    """Return what the page shows of an orbit on a curve; it belongs to no cell of the run."""
+    """Return the attributes that the page shows beside an orbit on a bifurcation curve."""
     unknown = dict.fromkeys(
         ("cell", "at", "motion", "attractor", "share", "low", "high", "stability", "evidence", "exponents", "start")
     )

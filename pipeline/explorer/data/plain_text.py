@@ -34,7 +34,7 @@ def plain(symbol: str, name: str) -> str:
     symbol
         LaTeX without dollar signs; may be empty.
     name
-        What stands there without a symbol.
+        Name to use if there is no symbol.
 
     Examples
     --------
@@ -51,7 +51,7 @@ def plain(symbol: str, name: str) -> str:
 
 
 def _lowered(found: re.Match[str]) -> str:
-    """Return a subscript in Unicode, or ``_TEXT`` unless every character has a subscript form."""
+    """Return a subscript in Unicode subscript characters, or as ``_TEXT`` if a character has no such form."""
     text = (found[1] if found[1] is not None else found[2]).replace(" ", "")
     small = text.translate(_SUBSCRIPTS)
     return small if all(a != b for a, b in zip(text, small, strict=True)) else f"_{text}"

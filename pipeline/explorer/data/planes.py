@@ -90,7 +90,7 @@ def plane(run: Run, at: Mapping[str, int]) -> bytes:
 def plane_of(run: ExploredRun, at: Mapping[str, int]) -> Plane:
     """Read the labelled plane of initial states at a parameter point; arguments as for `plane`.
 
-    Of a grid of more than two states the first two are shown, at the middle of the others.
+    For a grid of more than two states the first two are shown, at the middle of the others' ranges.
     """
     place = run.place(at)
     scheme = _scheme(run)
@@ -101,7 +101,7 @@ def plane_of(run: ExploredRun, at: Mapping[str, int]) -> Plane:
 
 
 def _scheme(run: ExploredRun) -> Scheme:
-    """Return the scheme for starts: attractors if known, else motions, else status."""
+    """Return the colour scheme for planes of initial states: attractors if known, else motions, else status."""
     known = {s.name: s for s in schemes(run)}
     return next(known[name] for name in ("attractor", "motion", "status") if name in known)
 
@@ -171,7 +171,7 @@ def _part(run: ExploredRun, scheme: Scheme, index: Mapping[str, int]) -> xr.Data
 
 
 def _labels(part: xr.Dataset, scheme: Scheme) -> xr.DataArray:
-    """Return the label of each initial state: a code of the scheme, diverged or none."""
+    """Return the label of each initial state: its colour code, `_DIVERGED`, or `NONE`."""
     codes = part["_code"].values
     told = np.where(codes < 0, NONE, codes)
     if scheme.name != "status":
@@ -193,7 +193,7 @@ def _state_of(run: ExploredRun, dim: str) -> str:
 
 
 def _fixed(run: ExploredRun, part: xr.Dataset, states: tuple[str, str]) -> dict[str, float]:
-    """Return the values of the states that are not shown and that all initial states share."""
+    """Return the values of the states outside the plane in which all initial states agree, by name."""
     found = {}
     for state in run.model.states:
         values = np.unique(np.asarray(part.coords[grid_dim(state.name)].values, np.float64))
@@ -203,7 +203,7 @@ def _fixed(run: ExploredRun, part: xr.Dataset, states: tuple[str, str]) -> dict[
 
 
 def _spread(part: xr.Dataset, name: str, like: xr.DataArray) -> np.ndarray:
-    """Return the values of a coordinate of the initial states, one for each cell."""
+    """Return a coordinate of the initial states as one value per cell."""
     coordinate = part.coords[name]
     values = xr.DataArray(coordinate.values.astype(np.float64), dims=coordinate.dims)
     plain = xr.DataArray(np.zeros(like.shape), dims=like.dims)

@@ -47,9 +47,9 @@ def series(
     Parameters
     ----------
     parameters
-        Of the model, seen through its section or not.
+        Parameters of the model, with or without its Poincare section.
     clock_hz
-        Drive frequency; of a flow any frequency, by which only the limit on steps counts [Hz].
+        Drive frequency [Hz]; for a flow any frequency, which affects only the limit on steps.
     state
         At time 0, shape (n_states,).
     times

@@ -45,7 +45,7 @@ def table(run: Run, kind: str, asked: Asked, form: str = "csv") -> bytes:
     kind
         ``diagram``, ``curves``, ``branches``, ``orbit``, ``plane`` or ``attractors``.
     asked
-        What the view shows: ``x``, ``y``, ``at``, ``cell``, ``point``, as far as it takes them.
+        Arguments of the view: ``x``, ``y``, ``at``, ``cell``, ``point``, if the view takes them.
     form
         One of `FORMATS`.
 

@@ -30,9 +30,9 @@ class Vertical:
     angle : bool
         Whether full turns do not matter.
     variable : str
-        Of the cube.
+        Name of the cube's variable.
     values : callable
-        ``values(part)``: of a part of the cube, on the dims of its cells and ``period_index``.
+        ``values(part)`` returns the values in a part of the cube, on the dims of its cells and ``period_index``.
     """
 
     name: str

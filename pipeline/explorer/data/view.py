@@ -73,7 +73,7 @@ def describe_view(run: Run, live: bool) -> dict[str, Any]:
 
 
 def _name(run: Run) -> str:
-    """Return the directory's name without its path."""
+    """Return the run directory's name without the path to it."""
     files = run.info.files
     return files.local.resolve().name if files.local else files.name.rstrip("/").rpartition("/")[2]
 
@@ -156,7 +156,7 @@ def _section(model: Model) -> str:
 def _parameter(run: ExploredRun, parameter: Parameter) -> dict[str, Any]:
     """Return a parameter with its value (None if swept) and the range in which the page lets users change it.
 
-    That is the range of its axis; else from half to one and a half times its value, within its bound.
+    This is the range of its axis; without an axis, 0.5 to 1.5 times its value, within its bounds.
     """
     swept = {a.parameter: a.values for a in run.axes if a.swept}
     if parameter.name in swept:
@@ -250,7 +250,7 @@ def commands(run: ExploredRun, directory: str) -> dict[str, str]:
 
 
 def _can_have(run: ExploredRun, name: str) -> bool:
-    """Return whether the run has the input that an analysis with default options needs."""
+    """Return whether an analysis with default options can be computed from this run."""
     if run.spec.recorded is not None:
         return False
     analysis = ANALYSES[name]

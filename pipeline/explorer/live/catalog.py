@@ -49,12 +49,12 @@ SAME_SECONDS = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Entry:
-    """Entry of a catalog: an attractor, or a class of cells that reached no known one.
+    """Catalog entry: an attractor, or a class of cells that reached no known attractor.
 
     Attributes
     ----------
     number : int
-        By which slices name it: the run's id of an attractor, and larger numbers for everything else.
+        Number of the entry in slices: the run's id of an attractor, or a larger number for any other entry.
     attractor : int or None
         The run's id.
     kind : int
@@ -86,16 +86,16 @@ class Entry:
 
 @dataclass(frozen=True, eq=False)
 class Known:
-    """Stored attractors and cells of the run at a parameter point, as far as they exist.
+    """Data of the run at one parameter point: its stored attractors and its cells, None where the run has none.
 
     Attributes
     ----------
     attractors : Dataset or None
-        Of all points of the run.
+        Attractors of all parameter points of the run.
     cells : Dataset or None
         The cube at the point; None where it has no such point.
     index : tuple of int or None
-        Of the point.
+        Index of the point in the cube.
     """
 
     attractors: xr.Dataset | None = None
@@ -118,9 +118,9 @@ class Catalog:
     place
         The point.
     known
-        What the run's analysis says of it.
+        Stored attractors and cells of the run at the point.
     closure_tolerance
-        Of the run.
+        Closure tolerance of the run.
     """
 
     def __init__(self, place: Place, known: Known, closure_tolerance: float) -> None:
@@ -204,7 +204,7 @@ class Catalog:
         return np.asarray(numbers[label])
 
     def unsure(self, block: Block, numbers: np.ndarray) -> np.ndarray:
-        """Return which undecided cells come back so near that they are worth integrating further."""
+        """Return a mask of the undecided cells that nearly recur, so that integrating them further pays."""
         rows = np.flatnonzero(block.is_bounded & (numbers < 0))
         near = np.zeros(len(numbers), bool)
         longest = self.options.max_orbit_period
@@ -261,9 +261,7 @@ class Catalog:
         return Block(block.cells, block.section, status, block.orbit_period, block.turns, block.rest)
 
     def _learn(self, block: Block, numbers: np.ndarray) -> None:
-        """Refine new closed orbits by Newton's method, add them to the catalog, and assign cells to them; change
-        `numbers`.
-        """
+        """Add the closed orbits of unassigned cells to the catalog, and write the new numbers into `numbers`."""
         for row in np.flatnonzero(block.is_closed & (numbers < 0)):
             if numbers[row] >= 0 or self._n_new >= MOST_ENTRIES:
                 continue
@@ -284,9 +282,7 @@ class Catalog:
                 self._add_orbit(orbit, entry)
 
     def _in_sets(self, block: Block, numbers: np.ndarray) -> None:
-        """Assign undecided bounded cells to the run's aperiodic attractors, by comparing section points; change
-        `numbers`.
-        """
+        """Assign undecided bounded cells to the run's aperiodic attractors by their section points, in `numbers`."""
         rows = np.flatnonzero(block.is_bounded & (numbers < 0))
         if not len(rows) or not self._sets:
             return
@@ -334,8 +330,8 @@ class Catalog:
         return None
 
     def _class_of(self, block: Block, row: int) -> Entry:
-        """Return the entry of the class of cells (status, period, motion) to which a cell without an attractor
-        belongs.
+        """Return the entry for cells of the same status, period and motion as a cell without an attractor; make it if
+        needed.
         """
         status = int(block.status[row])
         alive = bool(block.is_bounded[row] or block.is_closed[row])
@@ -385,7 +381,7 @@ class Catalog:
 
 
 class _WholePoint(Point):
-    """A parameter point whose cells (initial conditions) are handled as one block."""
+    """Parameter point that holds all its cells (initial conditions) in one block."""
 
     def whole(self) -> Block:
         """Return all cells of the parameter point."""
@@ -408,7 +404,7 @@ def _options_of(here: xr.Dataset | None) -> IdentifyOptions:
 
 
 def _tolerance_of(here: xr.Dataset | None, closure_tolerance: float) -> float:
-    """Return the largest distance between a closed cell and its orbit, the same as in `identify`."""
+    """Return the distance from an orbit within which a closed cell counts as on it; the same as in `identify`."""
     found = 0.0 if here is None else float(here.attrs.get("identify_tolerance", 0.0))
     return found or max(1e-4, 10.0 * closure_tolerance)
 

@@ -33,7 +33,7 @@ class Job:
     Parameters
     ----------
     request
-        What is asked for.
+        Request that the job answers.
     """
 
     def __init__(self, request: Request) -> None:
@@ -42,7 +42,7 @@ class Job:
         self._emit: Emit = _nowhere
 
     def answers_to(self, emit: Emit) -> None:
-        """Set the function that receives the job's answers."""
+        """Set the function that sends the job's answers."""
         self._emit = emit
 
     def cancel(self) -> None:

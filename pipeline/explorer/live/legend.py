@@ -23,7 +23,7 @@ class Legend:
     catalog
         The entries.
     attractors
-        Of the run, None if they are not known.
+        Attractors of the run; None if they are not known.
     """
 
     def __init__(self, catalog: Catalog, attractors: xr.Dataset | None) -> None:

@@ -48,7 +48,7 @@ CLOSING_S = PATIENCE_S + 2.0
 
 
 def live_problem(run: Run) -> str | None:
-    """Return the reason why a run allows no live computing; None if it does."""
+    """Return the reason why trajectories of a run cannot be computed live; None if they can."""
     if run.spec.recorded is not None:
         return (
             f"the drive of {run.name} is the recording {run.spec.recorded.file}, and a live trajectory would "

@@ -81,9 +81,9 @@ class Reached:
     Attributes
     ----------
     value : float
-        Of the parameter.
+        Parameter value that was reached.
     point : Point
-        The orbit there.
+        The orbit at this value.
     sentence : str
         Why no farther; empty if it was followed to the value wanted.
     lost : bool
@@ -205,7 +205,7 @@ def cell_orbit(live: LiveRun, cell: int, point: int) -> Held:
     cell
         Number of the cell in C order.
     point
-        Which of its kept sections.
+        Number of one of its stored section points.
 
     Raises
     ------
@@ -277,7 +277,7 @@ def _followed(family: Family, state: np.ndarray, begin: float, target: float, jo
 
 
 def _step(problem: OrbitProblem, here: Point, move: float, normal: np.ndarray) -> Point | None:
-    """Return the orbit after one step of the parameter; None if Newton's method finds none nearby."""
+    """Return the orbit after one step `move` of the parameter; None if it cannot be followed that far."""
     slope = here.tangent / here.tangent[-1] if abs(here.tangent[-1]) > 1e-6 else normal
     ahead = move * slope
     if np.abs(ahead[:-1]).max(initial=0.0) > LONGEST_MOVE:

@@ -84,8 +84,8 @@ def changes_of(run: Run, region: Region) -> Changes:
 
 
 def _names(run: Run, region: Region, swept: list[str]) -> tuple[str, str | None]:
-    """Return the specification keys of the region's intervals; None for an interval of neither parameter nor initial
-    state.
+    """Return the specification keys of the region's two intervals; the second is None if the region restricts one key
+    only.
     """
     walk = run.spec.continuation
     if region.axes is None:

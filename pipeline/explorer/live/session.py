@@ -25,9 +25,9 @@ class LiveSession:
     Parameters
     ----------
     live
-        What is shared with others.
+        Run with the state that all sessions share.
     emit
-        Takes an answer; called from threads of jobs, one call at a time for a kind of job.
+        Function that sends an answer; called from threads of jobs, one call at a time for each kind of job.
     """
 
     def __init__(self, live: LiveRun, emit: Callable[[Answer], None]) -> None:

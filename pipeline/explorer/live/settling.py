@@ -101,7 +101,7 @@ class Flight:
     status : ndarray of int8, (n,)
         ``BOUNDED`` for those that go on, else what ended them.
     state : ndarray, (n, n_states)
-        Where each is.
+        Current state of each trajectory.
     """
 
     def __init__(self, place: Place, integration: Integration, starts: np.ndarray, check: Check) -> None:
@@ -155,9 +155,7 @@ class Flight:
         return found.section[:, 0], found.turns[:, 0]
 
     def closed(self, section: np.ndarray, integration: Integration) -> np.ndarray:
-        """Return the period on which each cell's last section points close, by the run's tolerance; 0 if they do
-        not.
-        """
+        """Return the orbit period of each trajectory from its last section points; 0 if it is not closed."""
         return orbit_periods(
             section,
             closure_tolerance=integration.closure_tolerance,
@@ -166,7 +164,7 @@ class Flight:
         )
 
     def block(self, rows: np.ndarray, section: np.ndarray, turns: np.ndarray, period: np.ndarray) -> Block:
-        """Return cells as a block, the input of the analyses; ended cells have the status that the cube would give."""
+        """Return trajectories as a `Block` for the analyses, with the status that the cells of a run would have."""
         status = self.status[rows].copy()
         kept = status == Status.BOUNDED
         status[kept & (period > 0)] = Status.PERIODIC
@@ -186,7 +184,7 @@ def run_start(flight: Flight, integration: Integration, tell: Tell, periods: int
     Parameters
     ----------
     flight
-        Of one cell.
+        Integration of one cell.
     integration
         The run's settings.
     tell
@@ -227,7 +225,7 @@ def run_start(flight: Flight, integration: Integration, tell: Tell, periods: int
 
 
 def taken(block: Block, rows: np.ndarray) -> Block:
-    """Return the cells `rows` of a block as a new block."""
+    """Return a new block of the cells at the indices `rows`."""
     rest = None if block.rest is None else block.rest[rows]
     return Block(
         slice(0, len(rows)), block.section[rows], block.status[rows], block.orbit_period[rows], block.turns[rows], rest
@@ -259,9 +257,9 @@ def run_on(
     place, integration
         Where, and the run's settings.
     ends
-        What is known there.
+        Catalog of the attractors at the parameter point.
     block
-        The cells, undecided.
+        The undecided cells.
     states
         Their last sections.
     check, tell
@@ -290,7 +288,7 @@ def run_on(
 def _look(
     flight: Flight, rows: np.ndarray, last: np.ndarray, integration: Integration, ends: Ends, *, strictly: bool = False
 ) -> np.ndarray:
-    """Return the catalog entry of each moving cell; -1 for cells not yet on a known orbit."""
+    """Return the catalog entry of each trajectory; -1 until it is known to be on an orbit of the catalog."""
     no_turns = np.zeros((len(rows), sum(ends.model.is_angle)), np.int64)
     period = np.zeros(len(rows), np.int16)
     alive = flight.status[rows] == Status.BOUNDED
@@ -312,7 +310,7 @@ def settle_cells(place: Place, integration: Integration, ends: Ends, starts: np.
     place, integration
         Where, and the run's settings.
     ends
-        What is known there; it learns.
+        Catalog of the attractors at the parameter point; new ones are added.
     starts
         Initial states, shape (n, n_states).
     check
@@ -357,7 +355,7 @@ def conclude(
     check: Check,
     tell: Tell | None = None,
 ) -> np.ndarray:
-    """Return the catalog entry of each cell, after integrating undecided cells further that come back near."""
+    """Return the catalog entry of each cell; undecided cells that nearly recur are integrated further first."""
     numbers = ends.conclude(block, final=False)
     unsure = np.flatnonzero(ends.unsure(block, numbers))
     if len(unsure):

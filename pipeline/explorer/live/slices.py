@@ -50,7 +50,7 @@ def slice_of(live: LiveRun, job: Job) -> None:
 
 
 class _Grid:
-    """Grid of initial states in a plane, and the labels (attractors) found so far.
+    """Grid of initial states in a plane, with labels for the attractors that they reach.
 
     Attributes
     ----------
@@ -59,7 +59,7 @@ class _Grid:
     axes : tuple of ndarray
         Values of the two states at the centres of its cells.
     labels : ndarray, (n, n)
-        What each ends on, rows by the second state; `NOT_YET` before.
+        Number of the attractor that each cell reaches, rows by the second state; `NOT_YET` before it is known.
     """
 
     def __init__(self, columns: tuple[int, int], base: np.ndarray, axes: tuple[np.ndarray, np.ndarray]) -> None:
@@ -99,7 +99,7 @@ class _Grid:
             n *= 2
 
     def missing(self, n: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the initial states of a coarser grid that have no label yet, as row and column indices of the finest
+        """Return the initial states of the n x n grid that have no label yet, as row and column indices in the finest
         grid.
         """
         step = self.n // n

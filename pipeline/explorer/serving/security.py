@@ -98,7 +98,7 @@ class Rate:
     Parameters
     ----------
     per_second, burst
-        How many.
+        Mean rate [1/s], and number of requests allowed at once.
     """
 
     def __init__(self, per_second: float, burst: int) -> None:

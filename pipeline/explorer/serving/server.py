@@ -79,9 +79,9 @@ class Service:
     Parameters
     ----------
     run
-        What is looked at.
+        Run to show.
     guard
-        Who is answered.
+        Check of a request's origin and token.
     """
 
     def __init__(self, run: Run, guard: Guard) -> None:

@@ -1,4 +1,6 @@
-"""Carry draws of the parameters through a diagram: intervals of its bifurcations, bands about its branches."""
+"""Compute 95 % bands of the amplitude along branches, and 95 % intervals of bifurcation values, from draws of the
+posterior.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +35,7 @@ FOLLOWED = (FOLD, DOUBLING, TORUS, HOPF)
 
 
 def stored_tables(directory: str | Path) -> list[MeasuredTable]:
-    """Return the measured orbits of a finished identification."""
+    """Return the measured orbits of a finished identification, one `MeasuredTable` per table ``[[orbits]]``."""
     info, result = read_info(directory), read_result(directory)
     model = load_model(result["model"])
     found = []
@@ -46,7 +48,7 @@ def stored_tables(directory: str | Path) -> list[MeasuredTable]:
 
 
 def bands(table: MeasuredTable, best: dict[str, float], drawn: xr.Dataset) -> xr.Dataset:
-    """Carry draws of the parameters through the branches and bifurcations of the best parameters.
+    """Compute amplitudes on the branches and values of the bifurcations for each draw of the posterior.
 
     Each orbit and each bifurcation is carried from the best parameters to those of a draw by Newton's method, in
     steps where this is necessary. No branch is computed again.
@@ -101,7 +103,7 @@ def _own(table: MeasuredTable, values: dict[str, float]) -> dict[str, float]:
 
 
 def _bifurcations(branches: xr.Dataset) -> tuple[list[Datum], list[np.ndarray]]:
-    """Return the located bifurcations of computed branches as data to be carried, with their orbits."""
+    """Return the bifurcations of computed branches as `Datum` objects, each with a first guess (state, parameter)."""
     if "kind" not in branches:
         return [], []
     words, periods = words_of(branches["kind"]), branches["orbit_period"].values[branches["of_branch"].values]
@@ -119,7 +121,7 @@ def _bifurcations(branches: xr.Dataset) -> tuple[list[Datum], list[np.ndarray]]:
 def _orbits(
     table: MeasuredTable, branches: xr.Dataset, computed: np.ndarray
 ) -> tuple[list[tuple[Datum, int]], list[np.ndarray]]:
-    """Return orbits of computed branches at even values of the parameter as data to be carried, with guesses."""
+    """Return orbits of computed branches at evenly spaced parameter values as `Datum` objects, with first guesses."""
     found, guesses = [], []
     grid = np.linspace(table.along.low, table.along.high, GRID)
     for i in range(branches.sizes["branch"]):
@@ -141,7 +143,9 @@ def _orbits(
 
 
 def _solvable(table: OrbitData) -> OrbitData:
-    """Return the table without data whose equations cannot be solved at the best parameters; the others solved."""
+    """Return the table of orbits with each orbit solved at the best parameters; drop orbits for which Newton's method
+    fails.
+    """
     whole = settled(table)
     if whole is not None:
         return whole
@@ -156,7 +160,9 @@ def _solvable(table: OrbitData) -> OrbitData:
 
 
 def _carried(table: OrbitData, drawn: xr.Dataset) -> np.ndarray:
-    """Return the first quantity of each datum for each draw, (draw, datum); NaN where it is lost."""
+    """Return amplitude or bifurcation value for each measured orbit or bifurcation, shape (draw, datum); NaN where none
+    is found.
+    """
     names = [str(name) for name in drawn["parameter"].values]
     packed = np.array([table.packed(dict(zip(names, row, strict=True))) for row in drawn["value"].values])
     found = []
@@ -168,7 +174,7 @@ def _carried(table: OrbitData, drawn: xr.Dataset) -> np.ndarray:
 
 
 def bands_table(found: Sequence[xr.Dataset]) -> Table:
-    """Return a table of the bifurcations: best value, median and 95 % interval over the draws that have them."""
+    """Return a table of the bifurcations: best value, median and 95 % interval over the draws with this bifurcation."""
     rows, lines = [], []
     for ds in found:
         for b in range(ds.sizes["bifurcation"]):
@@ -186,8 +192,7 @@ def bands_table(found: Sequence[xr.Dataset]) -> Table:
 
 
 def tubes(found: xr.Dataset) -> list[dict[str, np.ndarray]]:
-    """Return the 95 % bands of the branches: values of the parameter, lower and upper amplitude, one per branch and
-    stability.
+    """Return the 95 % amplitude bands, one per branch and stability: parameter values with lower and upper amplitude.
 
     A band is there where at least half of the draws have the orbit.
     """

@@ -58,7 +58,7 @@ class Built:
 
 @dataclass(frozen=True)
 class Stretch:
-    """Range of samples of a recording that is to become one piece of the fit."""
+    """Range of samples of a recording that is fitted as one piece, with its own initial state."""
 
     recording: int
     number: int
@@ -406,8 +406,7 @@ def _drive_of(table: RecordingTable, ds: xr.Dataset) -> _Driven | None:
 
 
 def _steadied(edges: Edges) -> Edges:
-    """Replace the edges of a drive by evenly spaced ones on a fitted line, if rounding to samples explains their
-    scatter about the line.
+    """Replace the edges of a drive by evenly spaced ones if their scatter is only rounding to the sampling interval.
 
     A single edge is known to half a sampling interval; a line through many edges is known far better.
     """

@@ -31,7 +31,7 @@ def is_table(path: str | Path) -> bool:
 
 
 def check_orbits(directory: str | Path, table: str | Path) -> dict[str, Any]:
-    """Compare the orbits of a table with the branches of an identified model.
+    """Compare the orbits of a measured table with the branches of an identified model.
 
     Parameters
     ----------
@@ -61,7 +61,9 @@ def check_orbits(directory: str | Path, table: str | Path) -> dict[str, Any]:
 
 
 def _stored(spec: dict[str, Any], result: dict[str, Any]) -> IdentificationSpec:
-    """Return a specification with the identified model, for files that are named from the working directory."""
+    """Return a specification with the identified model and no orbits; its file paths are relative to the working
+    directory.
+    """
     first = next(iter(spec["identify"]))
     tables = {
         "kind": "identification",

@@ -80,7 +80,7 @@ def _orbits(result: Any) -> list[tuple[str, bool]]:
 
 
 def _orbit_error(result: Any, is_held_out: bool) -> float:
-    """Return the root mean square of the relative errors of the amplitudes; infinite if an orbit is not there."""
+    """Return the rms of the relative amplitude errors; infinite if a measured orbit has no computed counterpart."""
     errors = [
         math.inf if o["relative_error"] is None else o["relative_error"]
         for table in result["orbits"]

@@ -135,9 +135,7 @@ def sources_of(spec: IdentificationSpec) -> list[Source]:
 
 
 def _kept(path: Path) -> str:
-    """Return the text of a mapping file. If its model is a model file or a Python object, return the mapping as TOML
-    that contains the model.
-    """
+    """Return the text of a mapping file, with the model written into it if the model comes from another file."""
     text = path.read_text("utf-8")
     model = tomllib.loads(text).get("model")
     is_whole = isinstance(model, str) and not is_model_file(model) and not is_object_path(model)
@@ -250,7 +248,6 @@ def check(directory: Path, identity: Mapping[str, Any]) -> Info | None:
 
 
 def _short(line: str) -> str:
-    """Shorten a line of a message to 400 characters."""
     flat = " ".join(line.split())
     return flat if len(flat) <= 400 else f"{flat[:197]} ... {flat[-197:]}"
 

@@ -85,7 +85,6 @@ def _title(attrs: Mapping[Any, Any], what: str) -> str:
 
 
 def _finish(fig: style.DataFigure) -> None:
-    """Write "simulated recording" on a figure if its data are simulated, and finish its layout."""
     if fig.data.attrs.get("simulated"):
         fig.text(0.012, 0.992, "simulated recording", ha="left", va="top", fontsize=fig.look.legend)
     style.finish(fig)

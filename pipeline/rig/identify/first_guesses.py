@@ -1,6 +1,4 @@
-"""Fit the initial states of the pieces of recordings for given parameters, or eliminate these states from the least-
-squares problem.
-"""
+"""Fit the initial states of the pieces of recordings for given parameters, or eliminate these states from the fit."""
 
 from __future__ import annotations
 
@@ -37,6 +35,7 @@ def fit_starts(problem: Problem, theta: Array, starts: Array) -> Starts:
     Parameters
     ----------
     problem
+        Least-squares problem of the identification.
     theta
         Unknowns, (n_free,).
     starts
@@ -72,7 +71,7 @@ def fit_starts(problem: Problem, theta: Array, starts: Array) -> Starts:
 
 
 def block_rows(problem: Problem) -> list[slice]:
-    """Return, for each piece of a recording, the range of its rows in the compressed residual vector."""
+    """Return which rows of the compressed residual vector belong to each piece of the recordings, as slices."""
     n_own = len(problem.free) + len(problem.model.states)
     sizes = [min(int(np.isfinite(p.measured).sum()), n_own + 1) for p in problem.pieces]
     ends = np.cumsum([0, *sizes])
@@ -80,7 +79,9 @@ def block_rows(problem: Problem) -> list[slice]:
 
 
 class _Block(NamedTuple):
-    """Residuals of a piece and their derivatives by its initial state, compressed to few rows by a QR decomposition."""
+    """Residuals of one piece of a recording and their derivatives by its initial state, compressed to few rows by a QR
+    decomposition.
+    """
 
     jacobian: Array
     rows: Array
@@ -115,7 +116,7 @@ def _own(problem: Problem, evaluation: Evaluation, k: int, here: slice) -> Array
 
 
 def carry_starts(problem: Problem, evaluation: Evaluation, starts: Array, change: Array) -> Array:
-    """Return the optimal initial states after a change of the unknowns, to first order, (n_piece, n_states)."""
+    """Return the optimal initial states after a small change of the unknowns, by linearisation, (n_piece, n_states)."""
     found, n_free = np.array(starts), len(problem.free)
     for k, here in enumerate(block_rows(problem)):
         wanted = evaluation.rows[here] + evaluation.jacobian[here, :n_free] @ change
@@ -129,6 +130,7 @@ def project_starts_out(problem: Problem, evaluation: Evaluation) -> tuple[Array,
     Parameters
     ----------
     problem
+        Least-squares problem of the identification.
     evaluation
         Evaluation with slopes, at starts that are optimal for its unknowns.
 

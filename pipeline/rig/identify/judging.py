@@ -90,7 +90,7 @@ def _pearson(x: np.ndarray, y: np.ndarray) -> float:
 
 
 def judge_fit(problem: Problem, fit: Fit) -> Judgement:
-    """Judge a fit on the pieces that it was fitted to. Return the residuals, with root mean squares and
+    """Compute the residuals of a fit on the pieces that it was fitted to, with their root mean squares and
     correlations.
     """
     return Judgement(problem.channels, problem.pieces, fit.residuals)
@@ -99,7 +99,7 @@ def judge_fit(problem: Problem, fit: Fit) -> Judgement:
 def known_problem(
     problem: Problem, values: Mapping[str, float], zeros: Mapping[str, float], pieces: Sequence[Piece]
 ) -> Problem:
-    """Return the problem in which only the initial states of the given pieces are unknown.
+    """Return a least-squares problem in which only the initial states of the given pieces are unknown.
 
     Parameters
     ----------
@@ -128,7 +128,8 @@ def known_problem(
 def judge(
     problem: Problem, values: Mapping[str, float], zeros: Mapping[str, float], pieces: Sequence[Piece]
 ) -> tuple[Judgement, Fit]:
-    """Judge known parameters on pieces that they were not fitted to; only the initial states are fitted.
+    """Judge known parameters on pieces that they were not fitted to. Only the initial states of these pieces are
+    fitted.
 
     Parameters
     ----------
@@ -153,7 +154,6 @@ def judge(
 
 
 def _beginning(problem: Problem, length_s: float) -> Problem:
-    """Return the problem with each piece cut to its first `length_s` seconds."""
     fewest = 4 * len(problem.model.states)
     pieces = []
     for p in problem.pieces:

@@ -25,7 +25,8 @@ MAD = 1.4826
 
 
 def linearise(problem: Problem, fit: Fit) -> Linearised:
-    """Return residuals and their derivatives by the parameters at a fit's optimum, with the initial states eliminated.
+    """Return the residuals at a fit's optimum and their derivatives by the parameters, with the initial states
+    eliminated.
 
     The fit's own slopes are compressed piece by piece. Statistics of autocorrelated residuals need them along
     time.
@@ -64,7 +65,6 @@ def linearise(problem: Problem, fit: Fit) -> Linearised:
 
 
 def _at_orbits(problem: Problem, fit: Fit) -> OrbitRows | None:
-    """Return residuals and slopes of the measured orbits at a fit; None without any."""
     if not problem.orbits:
         return None
     return orbit_rows(problem.with_orbits(fit.known), fit.theta[None], slopes=True)[0]
@@ -78,8 +78,8 @@ def _information(
     prior: np.ndarray,
     scale: float,
 ) -> np.ndarray:
-    """Return the information matrix of the unknowns. It is a sum over samples, or comes from the whole Jacobian if a
-    continuity weight ties the pieces.
+    """Return the information matrix of the unknowns, summed over samples, or from the whole Jacobian if pieces are
+    coupled.
     """
     if problem.continuity is not None:
         return eliminate_starts(fit.jacobian, len(problem.free))[0]

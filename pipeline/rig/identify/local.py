@@ -61,7 +61,7 @@ class Fit:
 
 
 class _Search:
-    """Residual function that `least_squares` minimises; it stores its last and its best evaluation.
+    """Residual function for `least_squares`. It stores its last and its best evaluation.
 
     The vector holds the unknowns in units of their sizes. With a weight on the gaps it also holds all starts.
     Without a weight each start depends on its own piece alone. It is then fitted for the unknowns of each
@@ -156,6 +156,7 @@ def fit_local(
     Parameters
     ----------
     problem
+        Least-squares problem of the identification.
     theta0
         First guess of the unknowns, (n_free,); clipped to the bounds.
     starts
@@ -233,7 +234,6 @@ def _least_squares(walk: _Search, x: Array, ending: _Ending) -> tuple[Array, boo
 
 
 def _starts_alone(walk: _Search) -> Fit:
-    """Fit the initial states of the pieces if there are no other unknowns."""
     problem, nothing = walk.problem, np.zeros(0)
     starts, settled = fit_starts(problem, nothing, walk.starts)
     n = int(np.count_nonzero(~settled))

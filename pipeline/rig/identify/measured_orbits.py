@@ -68,12 +68,12 @@ class MeasuredTable:
 
     @property
     def data(self) -> tuple[Datum, ...]:
-        """All orbits and bifurcations, the fitted ones first."""
+        """All measured orbits and bifurcations: first those that are fitted, then those held out."""
         return (*self.fitted, *self.held_out)
 
     def branches(self, values: Mapping[str, float]) -> tuple[xr.Dataset, Array]:
-        """Compute the branches along the parameter, and the amplitudes of their orbits, for values of all
-        parameters.
+        """Compute the model's branches along the measured parameter, and the amplitudes of their orbits, for values of
+        all parameters.
         """
         parameters = _parameters(self.along.model, {**values, **self.settings})
         state = self.state or self.along.model.section_states[0]
@@ -88,7 +88,7 @@ class MeasuredTable:
         return found, amplitudes(found, parameters, state)
 
     def as_dict(self) -> dict[str, Any]:
-        """Return everything that decides the numbers as plain data."""
+        """Return the measured orbits and settings as plain data, to be stored and compared."""
         crossing = self.along.model.crossing
         return {
             "section": None if crossing is None else vars(crossing),
@@ -107,7 +107,7 @@ def _plain(datum: Datum) -> dict[str, Any]:
 
 
 def measured_table(spec: IdentificationSpec, table: OrbitsTable, where: str) -> MeasuredTable:
-    """Read and check one table ``[[orbits]]``.
+    """Read and check one table ``[[orbits]]``: measured orbits and bifurcations.
 
     Raises
     ------
@@ -143,7 +143,7 @@ def measured_table(spec: IdentificationSpec, table: OrbitsTable, where: str) -> 
 
 
 def stored_table(data: Mapping[str, Any], model: Model, measured: xr.Dataset | None) -> MeasuredTable:
-    """Restore a table from the plain data of `MeasuredTable.as_dict`, the model, and its measured orbits."""
+    """Restore a `MeasuredTable` from the plain data of its `as_dict`, the model, and its measured orbits."""
     section = data["section"]
     whole = model if section is None else sectioned(model, Crossing(**section))
     fitted, held_out = (tuple(_datum(d) for d in data[key]) for key in ("fitted", "held_out"))
@@ -160,7 +160,7 @@ def _datum(data: Mapping[str, Any]) -> Datum:
 
 
 def read_orbits(spec: IdentificationSpec) -> list[MeasuredTable]:
-    """Read all tables ``[[orbits]]`` of a specification.
+    """Read all tables ``[[orbits]]`` (measured orbits and bifurcations) of a specification.
 
     Raises
     ------
@@ -190,7 +190,7 @@ def _read(spec: IdentificationSpec, table: OrbitsTable, where: str) -> xr.Datase
 
 
 def _model(spec: IdentificationSpec, table: OrbitsTable, where: str) -> Model:
-    """Return the model that is fitted, with the Poincare section of the table or of its file if it has no drive."""
+    """Return the fitted model. A model without a drive gets the Poincare section that the table or its file gives."""
     model, section = spec.model, table.section
     if not model.autonomous:
         if section is not None:
@@ -242,9 +242,7 @@ def _parameter_problems(
 def _orbits(
     table: OrbitsTable, measured: xr.Dataset | None, model: Model, where: str, problems: list[str]
 ) -> list[Datum]:
-    """Return the measured orbits with the standard deviations of their quantities; add what is missing to
-    `problems`.
-    """
+    """Return the measured orbits as `Datum` objects; add missing quantities and standard deviations to `problems`."""
     found: list[Datum] = []
     if measured is None:
         return found
@@ -281,7 +279,6 @@ def _orbits(
 
 
 def _measured_quantity(one: xr.Dataset, quantity: str, allowed: float) -> list[tuple[str, float, float]]:
-    """Return names, values and standard deviations of a measured quantity; harmonics have several."""
     if quantity == "harmonics":
         if "harmonic" not in one:
             return []
@@ -295,8 +292,8 @@ def _measured_quantity(one: xr.Dataset, quantity: str, allowed: float) -> list[t
 
 
 def _error(scatter: float, n_cycles: int) -> float:
-    """Return the standard error of the median over the cycles; without a number of cycles the scatter counts as the
-    error.
+    """Return the standard error of a median over cycles, from the scatter of the cycles. For fewer than two cycles
+    return the scatter itself.
     """
     if not math.isfinite(scatter):
         return 0.0
@@ -335,7 +332,7 @@ def _parameters(model: Model, values: Mapping[str, float]) -> Parameters:
 
 
 def first_orbits(tables: Sequence[MeasuredTable], values: Mapping[str, float]) -> tuple[OrbitData, ...]:
-    """Find the computed counterparts of the fitted orbits and bifurcations for first values of all parameters.
+    """Find the computed orbit or bifurcation for each fitted measurement, at the first guess of the parameters.
 
     Raises
     ------
@@ -395,7 +392,9 @@ def _first_orbit(table: MeasuredTable, datum: Datum, branches: xr.Dataset, compu
 
 
 def _first_point(datum: Datum, branches: xr.Dataset) -> Array | None:
-    """Return section point and parameter value of the computed bifurcation of a kind nearest to the measured one."""
+    """Return section point and parameter value of the computed bifurcation that is nearest to a measured one of the
+    same kind.
+    """
     words = words_of(branches["kind"]) if "kind" in branches else KINDS
     periods = branches["orbit_period"].values[branches["of_branch"].values]
     fits = [
@@ -414,7 +413,7 @@ def _first_point(datum: Datum, branches: xr.Dataset) -> Array | None:
 
 
 def judge_orbits(table: MeasuredTable, values: Mapping[str, float]) -> xr.Dataset:
-    """Compare the measured orbits of a table with branches that are computed afresh, for values of all parameters.
+    """Compare the orbits and bifurcations of a measured table with newly computed branches.
 
     Returns
     -------

@@ -73,11 +73,12 @@ class _Motions(NamedTuple):
 
 
 def evaluate(problem: Problem, thetas: Array, starts: Array, *, slopes: bool) -> list[Evaluation]:
-    """Compute residuals, and on request their derivatives, for each row of a matrix of unknowns.
+    """Compute the residuals of a fit, and on request their derivatives, for each row of a matrix of unknowns.
 
     Parameters
     ----------
     problem
+        Least-squares problem of the identification.
     thetas
         Unknowns, shape (n, n_free) [SI].
     starts
@@ -139,7 +140,7 @@ def _steps(problem: Problem, thetas: Array) -> Array:
 
 
 def _changed(problem: Problem, thetas: Array, steps: Array) -> Array:
-    """Return the packed model parameters for each set of unknowns, with one unknown changed at a time."""
+    """Return packed model parameters for finite differences: each set of unknowns with one changed at a time."""
     members = []
     for theta, own in zip(thetas, steps, strict=True):
         rows = np.tile(theta, (len(own), 1))
@@ -215,8 +216,8 @@ def _integrate(
 
 
 def _thrice(drive: Drive | None) -> Drive | None:
-    """Return a drive with its parameter values given three times: for the unchanged, the increased and the decreased
-    parameters of a finite-difference tangent.
+    """Return a drive with three copies of its parameter values: plain, increased and decreased (for
+    `with_parameter_tangent`).
     """
     if drive is None or not drive.names:
         return drive
@@ -242,7 +243,7 @@ def _read(problem: Problem, k: int, states: Array) -> Array:
 
 
 def _block(problem: Problem, k: int, theta: Array, member: _Motions, slopes: bool) -> tuple[int, Array, Array]:
-    """Return a piece's number, its compressed residuals, and their derivatives by the unknowns and its own initial
+    """Return the number of a piece, its compressed residuals, and their derivatives by the unknowns and its own initial
     state.
     """
     piece, n_free = problem.pieces[k], len(problem.free)

@@ -16,7 +16,8 @@ GROUPS = ("fitted", "held_out")
 
 
 def orbits_result(judged: Sequence[xr.Dataset]) -> list[dict[str, Any]]:
-    """Return the judged orbits and bifurcations of all tables as plain data.
+    """Return the comparison of measured and computed orbits and bifurcations as plain data, one entry per table
+    ``[[orbits]]``.
 
     Parameters
     ----------
@@ -62,8 +63,8 @@ def _bifurcation_rows(ds: xr.Dataset) -> list[dict[str, Any]]:
 
 
 def _rms(ds: xr.Dataset) -> dict[str, dict[str, dict[str, Any]]]:
-    """Return root mean squares of relative errors by group, stability and quantity; None where an orbit is not
-    there.
+    """Return the rms of the relative errors by group (fitted, held out), stability and quantity; None if an orbit was
+    not found.
     """
     found: dict[str, dict[str, dict[str, Any]]] = {group: {} for group in GROUPS}
     if "orbit" not in ds.sizes:
@@ -80,7 +81,7 @@ def _rms(ds: xr.Dataset) -> dict[str, dict[str, dict[str, Any]]]:
 
 
 def orbit_lines(result: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return the judged orbits of ``result.json`` as printed lines."""
+    """Return the comparison of measured and computed orbits in ``result.json`` as printed lines."""
     lines = []
     for table in result:
         for group in GROUPS:

@@ -84,15 +84,17 @@ def _table_rows(problem: Problem, table: OrbitData, thetas: Array, slopes: bool)
 
 
 def _residuals(table: OrbitData, values: Sequence[Array]) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the residuals of a table in standard deviations, and which of them belong to orbits that were lost."""
+    """Return the residuals of a table of orbits in standard deviations, and a mask of the residuals of orbits that were
+    not found.
+    """
     rows = np.concatenate([(d.measured - v) / d.sd for d, v in zip(table.data, values, strict=True)])
     is_lost = ~np.isfinite(rows)
     return np.where(is_lost, LOST, rows), is_lost
 
 
 def _slopes(problem: Problem, table: OrbitData, theta: Array, values: Sequence[Array]) -> tuple[Array, OrbitData]:
-    """Return the derivatives of a table's residuals by the unknowns, and the table with the derivatives of its
-    orbits.
+    """Return the derivatives by the unknowns of a table's residuals, and the table of orbits with the derivatives of
+    its orbits added.
     """
     jacobian = np.zeros((sum(len(d.measured) for d in table.data), len(problem.free)))
     ends, widths = _ends(problem, theta)
@@ -112,7 +114,7 @@ def _slopes(problem: Problem, table: OrbitData, theta: Array, values: Sequence[A
 
 
 def _ends(problem: Problem, theta: Array) -> tuple[Array, list[Array]]:
-    """Return the unknowns displaced to either side, one at a time, and the two displacements of each."""
+    """Return the unknowns for central differences, with one unknown moved up or down in turn, and all displacements."""
     ends, widths = [], []
     for i in problem.moving:
         free = problem.free[i]
@@ -125,9 +127,7 @@ def _ends(problem: Problem, theta: Array) -> tuple[Array, list[Array]]:
 
 
 def _difference(here: Array, there: Sequence[Array], widths: Array) -> Array:
-    """Return the derivative from values at two neighbours, central where both are known, else from one; 0 if neither
-    is.
-    """
+    """Return a central difference, or a one-sided one where only one of the two values is finite; 0 where none is."""
     with np.errstate(invalid="ignore", divide="ignore"):
         central = (there[0] - there[1]) / (widths[0] - widths[1])
         sides = [(one - here) / width for one, width in zip(there, widths, strict=True)]
@@ -136,7 +136,7 @@ def _difference(here: Array, there: Sequence[Array], widths: Array) -> Array:
 
 
 def _along_removed(table: OrbitData, packed: Array, points: Sequence[Point | None], jacobian: Array) -> Array:
-    """Project the direction along the branch out of the derivatives of each orbit whose parameter has an error.
+    """Remove the component along the branch from the derivatives of those orbits whose parameter value is uncertain.
 
     Its place on the branch is fitted for every set of unknowns (variable projection; see ``local``).
     """

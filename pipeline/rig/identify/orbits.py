@@ -1,4 +1,4 @@
-"""Take measured orbits and bifurcations as data of a fit: residuals of the computed ones, and their derivatives.
+"""Find the computed counterparts of measured orbits and bifurcations for any parameters, by Newton's method.
 
 The computed orbit at a measured value of the parameter is found by Newton's method from the orbit of the last
 accepted parameters. Where this fails, the way there is made in smaller steps. So no trajectory settles, and unstable
@@ -50,7 +50,7 @@ LOCATED = Settings(tolerance=1e-8, max_iterations=12)
 
 @dataclass(frozen=True)
 class Datum:
-    """Measured orbit or bifurcation.
+    """One measured orbit or bifurcation.
 
     Attributes
     ----------
@@ -82,13 +82,13 @@ class Datum:
 
     @property
     def is_free(self) -> bool:
-        """Whether the orbit's parameter has an error, so that the nearest orbit of the branch is taken."""
+        """Whether the orbit's parameter value is uncertain; the fit then uses the nearest orbit of the branch."""
         return self.kind == ORBIT and PARAMETER in self.quantities
 
 
 @dataclass(frozen=True)
 class Solution:
-    """Computed orbits of a table's data for one set of parameters.
+    """Computed orbits and bifurcations at one set of parameters, one for each measured orbit or bifurcation of a table.
 
     Attributes
     ----------
@@ -110,7 +110,7 @@ class Solution:
 
 @dataclass(frozen=True)
 class OrbitData:
-    """Measured orbits and bifurcations of one table, with the computed orbits from which Newton's method starts.
+    """Measured orbits and bifurcations of a table ``[[orbits]]``, with computed ones from which Newton's method starts.
 
     Attributes
     ----------
@@ -133,14 +133,15 @@ class OrbitData:
     settings: Mapping[str, float] = field(default_factory=dict)
 
     def packed(self, values: Mapping[str, float]) -> Array:
-        """Return packed parameters for the values of the fit, with the table's own settings."""
+        """Return packed parameters from values by name. Settings of the table of orbits replace values of the fit."""
         merged = {**values, **self.settings}
         names = self.along.model.parameter_names
         return np.array([merged.get(name, self.known.packed[i]) for i, name in enumerate(names)])
 
 
 def nearest(table: OrbitData, packed: Array) -> list[list[Point | None]]:
-    """Find the orbits and bifurcations of a table for each row of packed parameters; None where one is lost.
+    """Return the computed orbit or bifurcation nearest to each measured one, for each row of parameters; None where
+    none is found.
 
     An orbit whose parameter has an error is moved along its branch to where it is nearest to the measured one.
     """
@@ -171,7 +172,9 @@ def nearest(table: OrbitData, packed: Array) -> list[list[Point | None]]:
 def slopes_along(
     table: OrbitData, packed: Array, places: Sequence[tuple[int, int]], points: Sequence[Sequence[Point | None]]
 ) -> list[Array]:
-    """Return the derivatives along the branch of each orbit's quantities, in standard deviations; NaN if unknown."""
+    """Return each orbit's derivatives of its quantities by arclength along the branch, divided by their standard
+    deviations.
+    """
     beside = [
         run_together([_moved(table, k, packed[i], points[i][k], side) for i, k in places]) for side in (BESIDE, -BESIDE)
     ]
@@ -190,7 +193,9 @@ def _steps_along(
     points: Sequence[Sequence[Point | None]],
     slopes: Sequence[Array],
 ) -> list[float]:
-    """Return the Gauss-Newton steps along the branches towards the measured orbits."""
+    """Return the arclength step along the branch that brings each computed orbit nearest to the measured one
+    (Gauss-Newton).
+    """
     found = []
     for (i, k), slope in zip(places, slopes, strict=True):
         datum = table.data[k]
@@ -202,7 +207,7 @@ def _steps_along(
 
 
 def _moved(table: OrbitData, k: int, packed: Array, point: Point | None, step: float) -> Steps[Point | None]:
-    """Find the orbit at an arclength from another one on its branch; None if that fails."""
+    """Return the orbit at the arclength `step` from another orbit on its branch; None if Newton's method fails."""
     assert point is not None
     problem = problem_of(table.along.family(table.data[k].period, packed))
     found = yield from correct(problem, point.u + step * point.tangent, point.tangent, NEWTON)
@@ -210,7 +215,8 @@ def _moved(table: OrbitData, k: int, packed: Array, point: Point | None, step: f
 
 
 def solve(table: OrbitData, packed: Array) -> list[list[Point | None]]:
-    """Carry the known orbits and bifurcations of a table to each row of packed parameters; None where one is lost.
+    """Compute a table's orbits and bifurcations at each row of packed parameters, starting from those at the last
+    accepted parameters; None for those not found.
 
     Orbits stay at the value of the parameter, or if it has an error in the plane normal to the branch.
     """
@@ -220,7 +226,9 @@ def solve(table: OrbitData, packed: Array) -> list[list[Point | None]]:
 
 
 def _carried(table: OrbitData, k: int, packed: Array) -> Steps[Point | None]:
-    """Carry one orbit from the known parameters to others, in one step or several; None if it is lost."""
+    """Follow one orbit from the last accepted parameters to others, in as few steps as possible; None if the orbit
+    cannot be followed.
+    """
     known, datum = table.known, table.data[k]
     if not np.isfinite(known.unknowns[k]).all():
         return None
@@ -246,7 +254,7 @@ def _carried(table: OrbitData, k: int, packed: Array) -> Steps[Point | None]:
 
 
 def _solved(table: OrbitData, datum: Datum, packed: Array, guess: Array, tangent: Array) -> Steps[Point | None]:
-    """Solve the equations of one orbit or bifurcation for packed parameters, from a guess of its unknowns."""
+    """Solve the equations of one orbit or bifurcation at given parameters by Newton's method, from a guess."""
     along = table.along
     family = along.family(datum.period, packed)
     if datum.kind == ORBIT:
@@ -265,9 +273,7 @@ def _solved(table: OrbitData, datum: Datum, packed: Array, guess: Array, tangent
 
 
 def _is_wanted(table: OrbitData, datum: Datum, point: Point) -> bool:
-    """Return whether a solution is an orbit, not the equilibrium that it has shrunk to, and as stable as the measured
-    one.
-    """
+    """Return whether a solution is still an orbit (not an equilibrium) and has the measured stability."""
     if datum.kind != ORBIT:
         return True
     if end_of_crossings(table.along.family(datum.period, table.known.packed), point):
@@ -276,14 +282,18 @@ def _is_wanted(table: OrbitData, datum: Datum, point: Point) -> bool:
 
 
 def _raw(table: OrbitData, datum: Datum, point: Point) -> Array:
-    """Return section point and parameter value of a solution [SI]."""
+    """Return section point and parameter value of a computed orbit in SI units, from the scaled unknowns of Newton's
+    method.
+    """
     scales = np.asarray(table.along.model.system.scales)
     n = len(scales)
     return np.append(point.u[:n] * scales, point.u[n] * (table.along.high - table.along.low))
 
 
 def solution_of(table: OrbitData, packed: Array, points: Sequence[Point | None]) -> Solution:
-    """Return section points, parameter values and tangents of all orbits of a table; NaN for lost ones."""
+    """Return section points, parameter values and tangents of all orbits of a table; NaN for orbits that were not
+    found.
+    """
     unknowns = np.full(table.known.unknowns.shape, np.nan)
     tangents = unknowns.copy()
     for k, (datum, point) in enumerate(zip(table.data, points, strict=True)):
@@ -294,7 +304,9 @@ def solution_of(table: OrbitData, packed: Array, points: Sequence[Point | None])
 
 
 def settled(table: OrbitData) -> OrbitData | None:
-    """Solve the equations of all first guesses of a table at the values of the parameter; None if one fails."""
+    """Solve all orbits of a table at their measured parameter values, starting from its first guesses; None if one
+    fails.
+    """
     plain = tuple(
         replace(d, quantities=tuple(q for q in d.quantities if q != PARAMETER or d.kind != ORBIT)) for d in table.data
     )
@@ -310,7 +322,8 @@ def settled(table: OrbitData) -> OrbitData | None:
 
 
 def quantities_of(table: OrbitData, packed: Array, points: Sequence[Sequence[Point | None]]) -> list[list[Array]]:
-    """Return the computed values of the measured quantities, for each row of packed parameters and each datum.
+    """Return the computed values of the measured quantities, for each row of packed parameters and each measured orbit
+    or bifurcation.
 
     NaN where an orbit is lost.
     """

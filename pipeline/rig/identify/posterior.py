@@ -22,7 +22,7 @@ LEVELS = (0.025, 0.5, 0.975)
 
 
 def draw_posterior(directory: str | Path, n: int, seed: int = 1) -> xr.Dataset:
-    """Draw parameter sets from the Gaussian that the estimates and their covariance define, within the bounds.
+    """Draw parameter sets from the Gaussian that the estimates and their covariance define, truncated to the bounds.
 
     Parameters
     ----------
@@ -76,7 +76,7 @@ def _refuse_undetermined(names: list[str], matrix: np.ndarray) -> None:
 def _within_bounds(
     result: dict[str, Any], names: list[str], matrix: np.ndarray, n: int, seed: int
 ) -> tuple[np.ndarray, float]:
-    """Draw from the Gaussian until `n` draws lie within the bounds; return them and the share that did not."""
+    """Draw from the Gaussian until `n` draws lie within the bounds; return them and the fraction that was rejected."""
     estimates = [result["estimates"][name] for name in names]
     mean = np.array([e["value"] for e in estimates])
     low = np.array([-np.inf if e["bounds"][0] is None else e["bounds"][0] for e in estimates])

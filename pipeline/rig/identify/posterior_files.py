@@ -25,7 +25,8 @@ SHORT = {"period_doubling": "doubling", "neimark_sacker": "torus", "hopf": "Hopf
 def write_posterior(
     directory: str | Path, n: int, seed: int = 1, *, figures: bool = True
 ) -> tuple[Table, Table, list[Path]]:
-    """Draw the posterior, carry it through the diagrams of the measured orbits, and write both.
+    """Draw the posterior, compute the 95 % bands of branches and bifurcations, and write both to the identification's
+    directory.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Run a specification once for each draw of a posterior, and collect the distribution of what the runs show."""
+"""Run a specification once for each draw of a posterior, and collect statistics of the results."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ def run_posterior(
 
 
 def _silent(line: str) -> None:
-    """Print nothing."""
+    """Ignore a line of text: the output function of a silent run."""
 
 
 def _refuse_other_model(reference: Any, result: Mapping[str, Any], axes: list[str], names: list[str]) -> None:
@@ -111,7 +111,6 @@ def _refuse_other_model(reference: Any, result: Mapping[str, Any], axes: list[st
 
 
 def _establish(folder: Path, tables: Mapping[str, Any], values: np.ndarray, names: list[str], smoke: bool) -> None:
-    """Write what the folder holds, or raise unless it holds the same."""
     content = {"specification": digest_of(dict(tables)), "draws": values.tolist(), "names": names, "smoke": smoke}
     path = folder / STUDY
     if path.is_file():
@@ -133,7 +132,7 @@ def _establish(folder: Path, tables: Mapping[str, Any], values: np.ndarray, name
 
 
 def spread(folder: str | Path, *, branches: bool = False, echo: Echo = print) -> Table:
-    """Collect the distribution of fractions of cells, and of bifurcations, over the runs of `run_posterior`.
+    """Return median and 95 % interval of cell fractions and bifurcation values over the runs of `run_posterior`.
 
     Parameters
     ----------
@@ -171,7 +170,6 @@ def spread(folder: str | Path, *, branches: bool = False, echo: Echo = print) ->
 
 
 def _fractions(one: AnalysedRun) -> dict[str, float]:
-    """Return the fraction of a run's cells of each status; of periodic ones by their period."""
     cube = one.cube()
     words = words_of(cube["status"])
     status, period = cube["status"].values.ravel(), cube["orbit_period"].values.ravel()
@@ -191,7 +189,7 @@ def _fraction_rows(found: list[dict[str, float]]) -> list[dict[str, Any]]:
 
 
 def _bifurcations(one: AnalysedRun) -> list[tuple[str, float]]:
-    """Return kind with period, and parameter value, of all bifurcations of a run's branches."""
+    """Return a name (kind and period) and the parameter value of each bifurcation on a run's branches."""
     branches = one.derive("branches")
     if "kind" not in branches:
         return []
@@ -201,7 +199,7 @@ def _bifurcations(one: AnalysedRun) -> list[tuple[str, float]]:
 
 
 def _bifurcation_rows(found: list[list[tuple[str, float]]]) -> list[dict[str, Any]]:
-    """Match each bifurcation of the best run with the nearest one of its kind and period in each draw; none twice."""
+    """Pair each bifurcation of the best run with the nearest of its kind in each draw; return rows of a table."""
     matched: list[list[float]] = [[] for _ in found[0]]
     for own in found[1:]:
         left = list(own)

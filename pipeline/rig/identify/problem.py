@@ -48,7 +48,7 @@ class Free:
 
     @property
     def size(self) -> float:
-        """Typical size of the unknown; steps of finite differences and of the search are fractions of it."""
+        """Typical size of the unknown. Steps of finite differences and of the search are fractions of this size."""
         width = self.upper - self.lower
         least = 1e-2 * width if math.isfinite(width) else 0.0
         return max(abs(self.start), least) or 1.0
@@ -184,9 +184,7 @@ class Problem:
 
     @cached_property
     def zeros(self) -> np.ndarray:
-        """Derivative of the sensor offset in each channel by the unknowns, (recording, n_channels, n_free); entries are
-        0 or 1.
-        """
+        """Derivatives of each channel's offset by the unknowns (0 or 1), shape (recording, n_channels, n_free)."""
         n = 1 + max((p.recording for p in self.pieces), default=0)
         found = np.zeros((n, len(self.channels), len(self.free)))
         for i, f in enumerate(self.free):
@@ -230,12 +228,14 @@ class Problem:
         return np.hstack([packed, np.zeros((len(thetas), more))])
 
     def with_orbits(self, known: Sequence[Solution]) -> Problem:
-        """Return the problem with other computed orbits from which Newton's method starts, one solution per table."""
+        """Return a copy of the least-squares problem with new computed orbits to start Newton's method, one `Solution`
+        per table.
+        """
         orbits = tuple(replace(table, known=own) for table, own in zip(self.orbits, known, strict=True))
         return replace(self, orbits=orbits)
 
     def without(self, fixed: Mapping[str, float]) -> Problem:
-        """Return the problem with some unknowns fixed at given values.
+        """Return the least-squares problem with some unknowns fixed at given values.
 
         A sensor's zero that is held is subtracted from the measured values.
         """

@@ -162,7 +162,6 @@ def _sureness(found: Finding) -> dict[str, Any]:
 
 
 def _errors(sources: Sequence[Source], findings: Sequence[Sequence[str]]) -> list[str]:
-    """Return a warning for each fault of severity "error" that was found in the recordings."""
     return [
         f"{s.file} has an {line}"
         for s, said in zip(sources, findings, strict=True)
@@ -200,7 +199,7 @@ def interval_of(found: Finding, i: int) -> tuple[float, float]:
 
 
 def write_values(path: Path, spec: IdentificationSpec, found: Finding, sources: Sequence[Source]) -> None:
-    """Write the identified, tied and fixed parameters as a preset, each with its origin."""
+    """Write the identified, tied and fixed parameters as a preset file, each with its origin."""
     files = ", ".join(f"{s.file} (sha256 {s.sha256[:12]})" for s in sources) or "measured orbits"
     phrases = {}
     for i, free in enumerate(found.problem.free):

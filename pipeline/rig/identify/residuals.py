@@ -21,7 +21,8 @@ BINS = 30
 
 @dataclass(frozen=True)
 class Series:
-    """Piece in a dataset of residuals: indices of recording and piece, range of samples, and size of the residuals.
+    """Piece of a recording within a dataset of residuals: its indices, its range of samples, and the size of its
+    residuals.
 
     Attributes
     ----------
@@ -42,7 +43,7 @@ class Series:
     worst: float
 
     def of(self, ds: xr.Dataset) -> xr.Dataset:
-        """Return the samples of the piece from the dataset."""
+        """Return the samples of this piece from the dataset of residuals."""
         return ds.isel(sample=slice(*self.samples))
 
 

@@ -56,11 +56,12 @@ def search(
     keep: Keep | None = None,
     tell: Callable[[str], None] = lambda line: None,
 ) -> list[Fit]:
-    """Fit from many first guesses; return the fits in the order of their cost, converged ones first.
+    """Fit from many first guesses. Return the fits sorted by cost, converged ones first.
 
     Parameters
     ----------
     problem
+        Least-squares problem of the identification.
     n_starts
         Number of first guesses that are followed to an optimum; the first is the problem's own.
     seed
@@ -102,7 +103,6 @@ def _kept(
     keep: Keep | None,
     tell: Callable[[str], None],
 ) -> Fit:
-    """Return the fit from first guess `k`: the stored one, or a new one, which is then stored."""
     fit = keep.recall(k) if keep is not None else None
     if fit is None:
         fit = refine(
@@ -118,7 +118,9 @@ def _kept(
 def guess(
     problem: Problem, n_starts: int, seed: int, spread: float, method: str, n_samples: int, shortest: Problem
 ) -> list[Array]:
-    """Return first guesses of the unknowns: the problem's own, then the best Sobol points or results of CMA-ES."""
+    """Return first guesses of the unknowns: that of the specification, then the best Sobol points or
+    results of CMA-ES.
+    """
     if n_starts == 1:
         return [problem.start]
     if method == "cma":
@@ -131,7 +133,7 @@ def guess(
 
 
 def sobol(problem: Problem, n: int, seed: int, spread: float) -> Array:
-    """Return scrambled Sobol points around the problem's first guess of the unknowns, (n, n_free)."""
+    """Return scrambled Sobol points around the specification's first guess of the unknowns, (n, n_free)."""
     from scipy.stats import qmc
 
     if n < 1 or not problem.free:
@@ -201,8 +203,8 @@ def refine(problem: Problem, theta: Array, *, stages: Sequence[Problem] | None =
 
 
 def _stages(problem: Problem) -> list[Problem]:
-    """Return versions of the problem with short, longer and still longer stretches. Their initial states are estimated
-    from the recordings.
+    """Return versions of the least-squares problem with short, longer and still longer stretches of the recordings.
+    Their initial states are estimated from the recordings.
     """
     if not problem.pieces:
         return [problem]
@@ -232,8 +234,8 @@ def slowest_period(problem: Problem) -> float:
 
 
 def cut(problem: Problem, length_s: float) -> Problem:
-    """Return the problem with its pieces cut into stretches of about `length_s` seconds, with fewer samples. The
-    initial states are estimated from the data.
+    """Return the least-squares problem with its pieces cut into stretches of about `length_s` seconds, with fewer
+    samples. The initial states are estimated from the data.
 
     Local cubic polynomials through a sixth of a stretch on either side give the rates at the starts.
     """
@@ -261,7 +263,7 @@ def _stretches(problem: Problem, piece: Piece, length_s: float) -> list[Piece]:
 
 
 def _read_off(problem: Problem, piece: Piece, at: int, half: int) -> Array:
-    """Estimate the state at a sample: the values and slopes of local cubic polynomials fitted to the channels."""
+    """Estimate the state at a sample from the data: value and slope of a cubic polynomial fitted to each channel."""
     window = slice(max(at - half, 0), at + half + 1)
     t = piece.time[window] - piece.time[at]
     state = np.array(piece.start)

@@ -1,4 +1,4 @@
-"""Apply values of parameters that hold in single recordings only, such as a drive amplitude of 0."""
+"""Apply parameter values that hold for a single recording, such as a drive amplitude of 0."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def setting_problems(model: Model, values: Mapping[str, float], where: str) -> l
 
 
 def apply_settings(pieces: Sequence[Piece], settings: Mapping[int, Mapping[str, float]]) -> list[Piece]:
-    """Store the parameter values that hold in one recording only in the drives of that recording's pieces.
+    """Attach parameter values that hold for a single recording to the drives of that recording's pieces.
 
     Parameters
     ----------

@@ -35,8 +35,8 @@ class SensorsTable(Table):
 
 
 class RecordingTable(Table):
-    """Table ``[[recordings]]``: file of a recording, mapping of its channels to states, kind of its drive, time window
-    and held-out pieces.
+    """Table ``[[recordings]]``: file of a recording, mapping file of its channels, kind of its drive, time window and
+    held-out pieces.
     """
 
     file: str = Field(description="Recording, relative to the specification")
@@ -187,7 +187,6 @@ class IdentificationSpec:
 
 
 def _plain(bound: float) -> float | str:
-    """Return a finite bound as a number and an infinite bound as text, for JSON."""
     return bound if math.isfinite(bound) else str(bound)
 
 
@@ -266,9 +265,6 @@ def _text(data: Mapping[str, Any], key: str, problems: list[str]) -> str | None:
 
 
 def _found(preset: str | None, folder: Path) -> str | Path | None:
-    """Return the name of a preset unchanged; if it is the name of a file, return its path in the specification's
-    folder.
-    """
     return folder / preset if preset is not None and is_file(preset) else preset
 
 
@@ -284,7 +280,6 @@ def _table(data: Mapping[str, Any], key: str, model: type[Table], problems: list
 
 
 def _recordings(data: Mapping[str, Any], folder: Path, problems: list[str]) -> tuple[RecordingTable, ...]:
-    """Validate the tables ``[[recordings]]``, and return those that are valid."""
     tables = data.get("recordings", [] if data.get("orbits") else None)
     if not isinstance(tables, list) or (not tables and not data.get("orbits")):
         problems.append(
@@ -315,7 +310,6 @@ def _recordings(data: Mapping[str, Any], folder: Path, problems: list[str]) -> t
 
 
 def _orbits(data: Mapping[str, Any], folder: Path, problems: list[str]) -> tuple[OrbitsTable, ...]:
-    """Validate the tables ``[[orbits]]``, and return those that are valid."""
     tables = data.get("orbits", [])
     if not isinstance(tables, list):
         problems.append("orbits: must be a list of tables; write [[orbits]].")

@@ -88,7 +88,9 @@ class Linearised:
 
     @property
     def stated(self) -> np.ndarray:
-        """Information of data with a stated error, priors and measured orbits, (n_free, n_free)."""
+        """Information matrix of priors and measured orbits, whose errors are stated rather than estimated, (n_free,
+        n_free).
+        """
         own = np.diag(self.prior).astype(float)
         return own if self.orbits is None else own + self.orbits.T @ self.orbits
 
@@ -287,7 +289,9 @@ def robust_weights(residuals: np.ndarray, loss: str) -> tuple[np.ndarray, np.nda
 
 @dataclass(frozen=True)
 class _Scores:
-    """Scores (gradients of the cost by the parameters) at each time, and information matrices, for each piece."""
+    """Scores (gradients of the cost by the parameters) at each sample time, and information matrices, for
+    each piece.
+    """
 
     scores: list[np.ndarray]
     information: list[np.ndarray]
@@ -357,7 +361,7 @@ def covariance_of(fit: Linearised, scale: np.ndarray, estimator: Estimator | Non
 
 
 def _of_orbits(fit: Linearised, scale: np.ndarray) -> Covariance:
-    """Return the covariance of a fit to measured orbits alone; errors stated too small are raised to the scatter."""
+    """Return the covariance of a fit to orbits alone, increased if the residuals exceed their stated errors."""
     assert fit.orbit_residuals is not None
     residuals, n_free = fit.orbit_residuals, len(fit.prior)
     degrees = len(residuals) + int((fit.prior > 0.0).sum()) - n_free

@@ -171,9 +171,6 @@ class ParameterTables:
         return None
 
     def _check_together(self) -> None:
-        """Check the first guesses, fixed values and tied values together against the model's relations between its
-        parameters.
-        """
         assert self.values is not None
         starts = {u.name: u.start for u in self.unknowns}
         tied = {name: factor * starts[other] for name, (factor, other) in self.tied.items()}
@@ -184,7 +181,6 @@ class ParameterTables:
 
 
 def _number(text: str | None) -> float:
-    """Return the factor in a tie such as ``-1.0*NAME``, or NaN if its text is not a number."""
     try:
         return 1.0 if text is None else float(text.replace(" ", ""))
     except ValueError:

@@ -46,7 +46,8 @@ _MODELS: dict[str, tuple[str, Any, str]] = {"fit": ("black", "-", "o"), "dipoles
 
 
 def draw_curves(outcome: Outcome, frame: style.Frame = style.WIDE) -> style.DataFigure:
-    """Draw the measured torque curves of some locked angles, each with its fitted bump (Fig. 6).
+    """Draw the measured torque curves of some locked angles, each with its fitted bump (as Fig. 6 of Wojna et al.
+    2018).
 
     Filled points are right of the fixed magnet, open ones left of it.
     """
@@ -80,7 +81,7 @@ def draw_curves(outcome: Outcome, frame: style.Frame = style.WIDE) -> style.Data
 
 def draw_numbers(outcome: Outcome, frame: style.Frame = style.WIDE) -> style.DataFigure:
     """Draw height, position and width of the fitted bumps against the locked angle, with the laws fitted to these
-    values (Fig. 7).
+    values (as Fig. 7 of Wojna et al. 2018).
 
     Bars are standard errors. Full lines are the laws through the points; dashed lines are the joint fit's.
     """
@@ -124,7 +125,9 @@ def draw_numbers(outcome: Outcome, frame: style.Frame = style.WIDE) -> style.Dat
 
 
 def draw_map(outcome: Outcome, frame: style.Frame = style.WIDE) -> style.DataFigure:
-    """Draw the fitted torque as a map over both angles, with the line of zero torque and the readings (Fig. 8)."""
+    """Draw the fitted torque in the plane of both angles, with the line of zero torque and the readings (as Fig. 8 of
+    Wojna et al. 2018).
+    """
     m, values = outcome.measured, outcome.joint.values
     angle, locked = (np.linspace(a.min() - _EDGE, a.max() + _EDGE, FINE) for a in (m.angle, m.locked))
     torque = laws.magnet_moment(angle, locked[:, None], values)
@@ -151,8 +154,8 @@ def draw_map(outcome: Outcome, frame: style.Frame = style.WIDE) -> style.DataFig
 
 
 def draw_comparison(outcome: Outcome, frame: style.Frame = style.WIDE) -> style.DataFigure:
-    """Draw the torques of the joint fit and of point dipoles together with the readings, and the residuals of both
-    (Fig. 9).
+    """Draw the torques of the joint fit and of point dipoles together with the readings, and the residuals of both (as
+    Fig. 9 of Wojna et al. 2018).
     """
     shown = _spread(outcome, COMPARED)
     figure = style.new_figure(4.4, _comparison(outcome, shown), frame)
@@ -216,14 +219,12 @@ def write_figures(outcome: Outcome, folder: Path) -> list[Path]:
 
 
 def _spread(outcome: Outcome, n: int) -> list[float]:
-    """Return up to `n` of the measured locked angles, evenly spread from the least to the largest."""
     every = sorted(fit.curve.locked for fit in outcome.curves)
     angles = [a for a, b in zip(every, [*every[1:], np.inf], strict=True) if b - a > SAME_ANGLE]
     return [angles[i] for i in np.unique(np.linspace(0, len(angles) - 1, n).round().astype(int))]
 
 
 def _place(shown: Sequence[float], locked: float) -> int | None:
-    """Return the index of a locked angle among those that are drawn (`shown`), or None if it is not drawn."""
     near = np.flatnonzero(np.abs(np.array(shown) - locked) < SAME_ANGLE)
     return int(near[0]) if near.size else None
 
@@ -324,7 +325,6 @@ def _points(ax: Axes, angle: np.ndarray, torque: np.ndarray, place: int, side: i
 def _done(
     figure: style.DataFigure, ax: Axes, outcome: Outcome, handles: list[Any], *, short: bool = False
 ) -> style.DataFigure:
-    """Add a figure's title and legend, and finish its layout."""
     text = outcome.measured.label
     if short:
         figure.suptitle(

@@ -33,7 +33,7 @@ FARTHEST_DIPOLES = 3.0
 
 @dataclass(frozen=True)
 class CurveFit:
-    """Fit of one Gaussian bump to one torque curve (Eq. 17), with standard errors and quality.
+    """Fit of one Gaussian bump to one torque curve (Wojna et al. 2018, Eq. 17), with standard errors and quality.
 
     Attributes
     ----------
@@ -49,7 +49,7 @@ class CurveFit:
 
 @dataclass(frozen=True)
 class Laws:
-    """Fitted height, position and width of the bumps as functions of the locked angle (Eq. 18).
+    """Fitted height, position and width of the bumps as functions of the locked angle (Wojna et al. 2018, Eq. 18).
 
     Attributes
     ----------
@@ -66,7 +66,8 @@ class Laws:
 
 @dataclass(frozen=True)
 class JointFit:
-    """Joint fit to all readings (Eq. 18-19), with standard errors and correlations of its parameters.
+    """Joint fit to all readings (Wojna et al. 2018, Eq. 18-19), with standard errors and correlations of its
+    parameters.
 
     Attributes
     ----------
@@ -100,7 +101,7 @@ class JointFit:
 
 @dataclass(frozen=True)
 class DipoleFit:
-    """Fit of two point dipoles to the readings (Eq. 16).
+    """Fit of two point dipoles to the readings (Wojna et al. 2018, Eq. 16).
 
     Attributes
     ----------
@@ -119,7 +120,7 @@ class DipoleFit:
 
 
 def fit_curve(angle: np.ndarray, torque: np.ndarray, curve: Curve) -> CurveFit:
-    """Fit the bump of Eq. 17 to one torque curve.
+    """Fit a Gaussian bump (Wojna et al. 2018, Eq. 17) to one torque curve.
 
     Parameters
     ----------
@@ -177,7 +178,7 @@ def fit_curves(measured: Measurement) -> tuple[CurveFit, ...]:
 
 def fit_laws(curves: Sequence[CurveFit]) -> Laws:
     """Fit the bumps' height by a Gaussian, their position by a line and their width by a constant, as functions of the
-    locked angle (Eq. 18).
+    locked angle (Wojna et al. 2018, Eq. 18).
 
     Each value is weighted by its standard error. The laws' own errors come from the scatter about them.
 
@@ -245,7 +246,7 @@ def _constant(x: np.ndarray, y: np.ndarray, weight: np.ndarray, what: str) -> La
 
 
 def fit_jointly(measured: Measurement, start: Mapping[str, float], hold: Mapping[str, float] | None = None) -> JointFit:
-    """Fit the law of the torque (Eqs. 18-19) to all readings at once.
+    """Fit the law of the torque (Wojna et al. 2018, Eq. 18-19) to all readings at once.
 
     Parameters
     ----------
@@ -332,7 +333,7 @@ def _scale(name: str, values: Mapping[str, float]) -> float:
 
 
 def _neighbours(measured: Measurement, residuals: np.ndarray) -> float:
-    """Return the correlation between the residuals of neighbouring readings on a torque curve, over all curves."""
+    """Return the correlation between the residuals of successive readings on a torque curve, over all curves."""
     products = squares = 0.0
     for curve in measured.curves:
         own = residuals[curve.rows[np.argsort(measured.angle[curve.rows])]]
@@ -345,7 +346,8 @@ def _neighbours(measured: Measurement, residuals: np.ndarray) -> float:
 
 
 def fit_dipoles(measured: Measurement, *, place: bool = False) -> DipoleFit:
-    """Fit the strength of two point dipoles (Eq. 16); with `place`, fit the position of the fixed dipole too.
+    """Fit the strength of two point dipoles (Wojna et al. 2018, Eq. 16). With `place`, fit the position of the fixed
+    dipole as well.
 
     The torque is linear in the strength. The place is sought below the end of the stretched pendulum.
 

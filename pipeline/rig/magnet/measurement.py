@@ -79,7 +79,7 @@ class TorqueColumn(Table):
 
 
 class SideColumn(Table):
-    """Column of the table that gives the side of the fixed magnet on which the pendulum was."""
+    """Column of the measurement's CSV table that gives the side of the fixed magnet on which the pendulum was."""
 
     column: str = Field(description="Its name in the table's first row.")
     right: str = Field("right", description="Entry for the right side, where torques are positive.")
@@ -344,7 +344,6 @@ def _table(path: Path, header: Header) -> tuple[dict[str, list[str]], bytes, lis
 
 
 def _wanted(header: Header) -> dict[str, str]:
-    """Return, for each quantity (angle, torque, ...), the name of its column in the CSV table."""
     found = {name: getattr(header.columns, name).column for name in type(header.columns).model_fields}
     if header.correction.without is not None:
         found["without"] = header.correction.without

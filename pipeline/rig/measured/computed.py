@@ -26,7 +26,7 @@ Floats = npt.NDArray[np.float64]
 def cube_and_parameters(
     run: AnalysedRun, model: str | Model, at: Mapping[str, float] | None = None
 ) -> tuple[xr.Dataset, Parameters]:
-    """Return a run's cube over the drive frequency, with one value chosen on every other axis, and the model's
+    """Return a run's result cube over the drive frequency, with one value chosen on every other axis, and the model's
     parameters at the chosen values.
 
     Raises

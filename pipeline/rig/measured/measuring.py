@@ -120,9 +120,6 @@ def _instants(edges: Edges, stretches: Sequence[Stretch], phase: float) -> Edges
 
 
 def _in_place(sections: xr.Dataset, name: str, n: int) -> np.ndarray:
-    """Place section points at the indices of the drive edges where they were taken; edges without a point become
-    NaN.
-    """
     values = np.full((n, sections.sizes["state"]), np.nan)
     values[sections["number"].values] = sections[name].values
     return values
@@ -162,7 +159,6 @@ def _shaken(
 
 
 def _check(steps: Sequence[_Step], recordings: Sequence[xr.Dataset]) -> None:
-    """Raise `SpecError` if the recordings give no section points, or have different states."""
     if not steps:
         names = ", ".join(name_of(r) for r in recordings)
         raise SpecError(

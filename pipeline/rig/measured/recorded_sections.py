@@ -154,7 +154,6 @@ def find_sections(recording: xr.Dataset, edges: Edges, *, window_s: float = WIND
 
 
 def _check(recording: xr.Dataset, window_s: float, order: int) -> None:
-    """Raise `SpecError` if the window has too few samples for the polynomial, or the polynomial's order is below 2."""
     if order < 2:
         raise SpecError(f"order = {order}: must be at least 2, so that the curvature can differ.")
     step = float(np.median(np.diff(recording["time"].values)))

@@ -117,7 +117,6 @@ def _part(
 
 
 def _first_timing(edges: Edges) -> float:
-    """Return a rough drive frequency [Hz]: the inverse of the median time between rising edges."""
     if edges.rising.size < _LEAST:
         raise SpecError(f"drive: {edges.rising.size} rising edges; a series needs {_LEAST} of them.")
     return 1 / float(np.median(np.diff(edges.rising)))

@@ -137,8 +137,8 @@ def _bend(rising: Floats, noise: float) -> float:
 
 
 def constant_spans(edges: Edges) -> list[tuple[int, int]]:
-    """Return the first and last rising edge of each stretch of constant frequency; neighbouring stretches share an
-    edge.
+    """Return the first and last rising edge of each stretch of constant frequency; successive stretches
+    share an edge.
     """
     t = edges.rising
     noise = _noise(edges)
@@ -164,9 +164,7 @@ def _noise(edges: Edges) -> float:
 
 
 def _reach(t: Floats, first: int, noise: float) -> int:
-    """Return the index of the last edge before the drive frequency changes. From edge `first` up to it, the edge times
-    lie on a line.
-    """
+    """Return the index of the last edge before the frequency changes; up to there, edge times lie on a line."""
     if first + 2 >= t.size:
         return int(t.size - 1)
     period = t[first + 1] - t[first]
@@ -192,9 +190,7 @@ def _reach(t: Floats, first: int, noise: float) -> int:
 
 
 def _placed(t: Floats, first: int, last: int) -> int:
-    """Return the index of the edge at which the frequency steps. It gives the best fit of two lines, one through the
-    edges before it and one through the edges after it.
-    """
+    """Return the index of the edge at which the frequency steps, by the best fit of two lines to the edge times."""
     low, high = max(first, last - _AROUND), min(t.size - 1, last + _AROUND)
     choices = range(max(low + 2, first + 1), min(last + 2, high - 1))
     costs = {k: _misfit(t[low : k + 1]) + _misfit(t[k : high + 1]) for k in choices}
@@ -202,7 +198,6 @@ def _placed(t: Floats, first: int, last: int) -> int:
 
 
 def _misfit(t: Floats) -> float:
-    """Return the sum of squared residuals of a line through edge times."""
     n = np.arange(t.size) - 0.5 * (t.size - 1)
     x = t - t.mean()
     return float(((x - n * (n @ x) / (n @ n)) ** 2).sum())

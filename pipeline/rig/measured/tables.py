@@ -69,7 +69,9 @@ def _words(row: Row) -> Words:
 
 
 def edges_table(compared: xr.Dataset) -> Table:
-    """Return a table of the frequencies at which regimes end on the rig and in the model."""
+    """Return a table of the frequencies at which regimes (period and class of motion) end on the rig and in
+    the model.
+    """
     words = words_of(compared)
     rows: list[Row] = []
     for k in range(compared.sizes.get("edge", 0)):

@@ -103,7 +103,6 @@ def compare(measured: xr.Dataset, branches: xr.Dataset, computed: np.ndarray) ->
 
 
 def _nearest(one: xr.Dataset, branches: xr.Dataset, computed: np.ndarray) -> tuple[int, float, float] | None:
-    """Return branch, amplitude and frequency of the computed orbit whose amplitude is nearest to a measured one."""
     place = nearest_orbit(branches, computed, float(one["value"]), int(one["stability"]), float(one["amplitude"]))
     if place is None:
         return None

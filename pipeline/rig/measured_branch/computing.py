@@ -1,6 +1,4 @@
-"""Compute the branches of orbits along a parameter without a run: from orbits that trajectories settle on, and from
-equilibria.
-"""
+"""Compute branches of orbits along a parameter without a run, from attracting orbits and from equilibria."""
 
 from __future__ import annotations
 
@@ -26,7 +24,7 @@ TOLERANCE = 1e-8
 
 @dataclass(frozen=True)
 class Along:
-    """Parameter interval of branches.
+    """Model, parameter and parameter interval of the branches to compute.
 
     Attributes
     ----------
@@ -50,12 +48,12 @@ class Along:
     max_period: int = 2
 
     def family(self, period: int, packed: np.ndarray) -> Family:
-        """Return the family of the orbits of one period, or with period 0 of the equilibria, along the parameter."""
+        """Return the continuation problem of orbits with a given period along the parameter (period 0: equilibria)."""
         scale = self.high - self.low
         return Family(self.model.system, period, self.frequency_hz, packed, (self.parameter,), (scale,))
 
     def rows(self, packed: np.ndarray, values: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
-        """Return packed parameters (n, n_parameters) and drive frequencies (n,) at values of the parameter."""
+        """Return packed parameters (n, n_parameters) and drive frequencies (n,) for n values of the parameter."""
         rows, frequency = np.tile(packed, (len(values), 1)), np.full(len(values), self.frequency_hz)
         if self.parameter == FREQUENCY_DIM:
             frequency = np.array(values, float)
@@ -65,7 +63,7 @@ class Along:
 
 
 def branches_along(along: Along, parameters: Parameters, values: Sequence[float], states: np.ndarray) -> xr.Dataset:
-    """Compute the branches that are connected with settled orbits and equilibria.
+    """Compute all branches connected to the orbits that trajectories converge to and, without a drive, to equilibria.
 
     Parameters
     ----------

@@ -91,7 +91,6 @@ def _upward_crossings(time: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 def _cycle(time: np.ndarray, values: np.ndarray, begin: float, end: float) -> np.ndarray:
-    """Return amplitude, mean, frequency and harmonics of one cycle."""
     inside = (time > begin) & (time < end)
     n = max(64, int(inside.sum()))
     even = np.interp(begin + (end - begin) * np.arange(n) / n, time, values)

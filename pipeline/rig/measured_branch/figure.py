@@ -18,7 +18,7 @@ from pipeline.rig.measured_branch.reading import STABILITIES
 
 @dataclass(frozen=True)
 class Bands:
-    """95 % bands of a diagram: of branches (``x``, ``low``, ``high`` each) and of bifurcations (name, low, high)."""
+    """Data of the 95 % bands in a figure: (``x``, ``low``, ``high``) per branch, (name, low, high) per bifurcation."""
 
     tubes: Sequence[Mapping[str, np.ndarray]]
     intervals: Sequence[tuple[str, float, float]]
@@ -112,9 +112,6 @@ def plot_branch(
 
 
 def _draw_bands(ax: Axes, bands: Bands) -> list[Any]:
-    """Shade the bands and draw the intervals of the bifurcations near the bottom; return their entries of the
-    legend.
-    """
     entries: list[Any] = []
     for tube in bands.tubes:
         shade = ax.fill_between(
@@ -145,6 +142,5 @@ def _draw_computed(ax: Axes, branches: xr.Dataset, computed: np.ndarray) -> None
 
 
 def _computed_entries(ax: Axes) -> list[object]:
-    """Return the legend entries of the computed orbits: one line for each label."""
     found = {str(line.get_label()): line for line in ax.lines if str(line.get_label()).startswith("computed")}
     return [found[name] for name in sorted(found)]

@@ -185,9 +185,6 @@ def _from_csv(path: Path, model: Model | None, state: str) -> xr.Dataset:
 
 
 def _number(text: str | None, where: str, problems: list[str]) -> float:
-    """Return the number in a field of a CSV table. Return NaN if the field is empty, or, with an entry in `problems`,
-    if it is not a number.
-    """
     if text is None or not text.strip():
         return math.nan
     try:

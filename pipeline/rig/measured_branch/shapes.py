@@ -1,4 +1,4 @@
-"""Compute amplitude, mean, frequency and harmonics of computed orbits, as they are measured on recorded ones."""
+"""Compute amplitude, mean, frequency and harmonics of computed orbits, for comparison with measured ones."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ RTOL = 1e-10
 
 @dataclass(frozen=True)
 class Shapes:
-    """Sizes of one state on computed orbits, one entry per orbit; NaN where the integration failed.
+    """Amplitude, mean, frequency and harmonics of one state, one entry per orbit; NaN where the integration failed.
 
     Attributes
     ----------
@@ -40,7 +40,7 @@ class Shapes:
     harmonics: np.ndarray
 
     def columns(self) -> dict[str, np.ndarray]:
-        """Return each quantity by its name in a measured branch; harmonics are ``harmonic_1``, ``harmonic_2``, ..."""
+        """Return amplitude, mean, frequency and harmonics by name, as in the columns of a measured branch."""
         named = {"amplitude": self.amplitude, "mean": self.mean, "frequency": self.frequency}
         return named | {f"harmonic_{k + 1}": self.harmonics[:, k] for k in range(N_HARMONICS)}
 
@@ -48,7 +48,7 @@ class Shapes:
 def shapes_of(
     model: Model, packed: np.ndarray, states: np.ndarray, seconds: np.ndarray, period: int, state: str
 ) -> Shapes:
-    """Integrate orbits of one period once round, and measure a state on them.
+    """Integrate periodic orbits over one period, and return the shape (amplitude, mean, ...) of one state.
 
     Parameters
     ----------
@@ -94,7 +94,7 @@ def shapes_of(
 
 
 def _peak(values: np.ndarray) -> np.ndarray:
-    """Return the maximum of periodic samples (n, m), between samples by the parabola through the three highest."""
+    """Return the maximum of sampled periodic signals (n, m), refined by a parabola through three samples."""
     rows = np.arange(len(values))
     top = np.argmax(np.nan_to_num(values, nan=-np.inf), axis=1)
     here = values[rows, top]

@@ -26,7 +26,7 @@ LEAP_AROUND = 9
 
 
 class Signal:
-    """Readings of one channel, with the time and the piece number of each sample.
+    """Readings of one channel, with the time of each sample and the number of its piece (part without a gap).
 
     Parameters
     ----------
@@ -92,7 +92,6 @@ def saturated(signal: Signal, entry: ChannelMap) -> list[Finding]:
 
 
 def _beside_wraps(signal: Signal, least: float) -> np.ndarray:
-    """Return a mask of the samples next to a jump (wrap of an angle) that is larger than `least`."""
     jump = np.abs(np.diff(signal.raw)) > least
     beside = np.zeros(len(signal.raw), dtype=bool)
     beside[1:] |= jump
@@ -157,7 +156,8 @@ def in_dead_band(signal: Signal, entry: ChannelMap) -> tuple[np.ndarray, list[Fi
 
 
 def unwrapped(signal: Signal, angle: np.ndarray, wraps: bool) -> tuple[np.ndarray, list[Finding]]:
-    """Unwrap an angle within each piece if the mapping says that it wraps; otherwise report jumps by a full turn.
+    """Unwrap an angle within each piece if the recording's mapping file says that it wraps; otherwise report jumps by a
+    full turn.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Give all channels of a file the same sample times, evenly spaced within each piece between gaps."""
+"""Give all channels of a file the same sample times, evenly spaced within each piece (part without a gap)."""
 
 from __future__ import annotations
 
@@ -130,7 +130,6 @@ def _changes(
 
 
 def _stamps(channel: Channel, stated: float | None) -> np.ndarray:
-    """Return the sample times of a channel [s]; they are NaN if the file does not state the start."""
     if channel.time is not None and stated is None:
         return channel.time
     step = channel.step_s if stated is None else stated
@@ -178,7 +177,6 @@ def _refuse_mixed(steps: Mapping[str, float], source: str) -> None:
 
 
 def _rate_findings(stretches: Sequence[Mapping[str, Channel]], stated: float | None) -> list[Finding]:
-    """Report channels whose sampling rate in the file differs from that of the mapping."""
     if stated is None:
         return []
     findings = []
@@ -264,9 +262,6 @@ def _length_findings(lengths: Mapping[str, int], n_common: int, step: float) -> 
 
 
 def _checked_stamps(stamps: list[np.ndarray], step: float, source: str) -> list[np.ndarray]:
-    """Check that time stamps are finite and do not decrease. If the file states no start, return times that
-    begin at 0.
-    """
     if all(np.isnan(s).all() for s in stamps):
         return [step * np.arange(len(s)) for s in stamps]
     for s in stamps:
@@ -320,7 +315,7 @@ def _missing(time: np.ndarray, step: float) -> np.ndarray:
 
 
 def _skipped(time: np.ndarray, step: float, late: np.ndarray, is_sure: np.ndarray) -> np.ndarray:
-    """Return the number of samples missing before each late time stamp, from the delay of the stamps after it.
+    """Return the number of samples lost before each late time stamp, from the shift of the stamps around it.
 
     Stamps beyond another gap are not used. Of neighbouring doubtful stamps the one with the largest shift
     counts.
@@ -353,8 +348,8 @@ def _refuse_backwards(stamps: list[np.ndarray], source: str) -> None:
 
 
 def _one_after_another(stamps: list[np.ndarray], step: float, findings: list[Finding]) -> tuple[list[np.ndarray], bool]:
-    """Shift stretches whose time restarts so that they follow the previous stretch. Return the time stamps, and whether
-    any stretch was shifted.
+    """Shift those stretches of a file whose time restarts, so that they follow the previous stretch. Return the time
+    stamps, and whether any stretch was shifted.
     """
     placed = [stamps[0]]
     moved = 0

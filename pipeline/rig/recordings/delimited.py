@@ -1,4 +1,4 @@
-"""Read CSV files. Delimiter, header and decimal sign are stated in the mapping or detected."""
+"""Read CSV files. The mapping file states delimiter, header and decimal sign; otherwise they are detected."""
 
 from __future__ import annotations
 
@@ -27,25 +27,13 @@ _BRACKETS = re.compile(r"[\[(]([^\])]*)[\])]\s*$")
 
 @dataclass(frozen=True)
 class _Form:
-    """Form of a CSV text: delimiter, decimal sign, number of header rows, and columns.
-
-    Attributes
-    ----------
-    delimiter, decimal : str
-        Separator of fields, and decimal sign.
-    n_columns : int
-        Number of columns.
-    n_head : int
-        Number of rows before the numbers.
-    texts : tuple of int
-        Indices of columns without numbers.
-    """
+    """Form of a CSV text: delimiter, decimal sign, number of header rows, and columns."""
 
     delimiter: str
     decimal: str
     n_columns: int
-    n_head: int
-    texts: tuple[int, ...]
+    n_head: int  # rows before the numbers
+    texts: tuple[int, ...]  # indices of columns without numbers
 
 
 def read_csv(path: Path, stated: CsvMap) -> Raw:
@@ -106,7 +94,6 @@ def _columns(body: list[str], form: _Form) -> dict[int, np.ndarray]:
 
 
 def _form(path: Path, rows: list[str], stated: CsvMap) -> _Form:
-    """Detect delimiter, decimal sign and header of a CSV text."""
     delimiters = (stated.delimiter,) if stated.delimiter else DELIMITERS
     decimals = (stated.decimal,) if stated.decimal else (".", ",")
     found = []
@@ -167,7 +154,6 @@ def _try(rows: list[str], delimiter: str, decimal: str, header: bool | None) -> 
 
 
 def _names(head: list[list[str]], n_columns: int) -> tuple[list[str], list[str]]:
-    """Return names and units of the columns from the header rows."""
     whole = [[part.strip().strip('"').strip() for part in row] for row in head if len(row) == n_columns]
     if not whole:
         return [str(j + 1) for j in range(n_columns)], [""] * n_columns

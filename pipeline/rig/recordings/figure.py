@@ -78,7 +78,6 @@ def plot_recording(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.
 
 
 def _rows(ds: xr.Dataset) -> list[tuple[str, ...]]:
-    """Return the quantities of each panel: one panel per unit, and one for the drive."""
     units: dict[str, tuple[str, ...]] = {}
     for name in map(str, ds.data_vars):
         if name != DRIVE:
@@ -100,7 +99,6 @@ def _label(ds: xr.Dataset, names: Sequence[str]) -> str:
 
 
 def _draw(ax: Axes, ds: xr.Dataset, name: str, span: tuple[float, float], colour: str) -> None:
-    """Draw a quantity against time as a line with gaps between the pieces of the recording."""
     time, values, piece = ds["time"].values, ds[name].values, ds["piece"].values
     inside = (time >= span[0]) & (time <= span[1])
     time, values, piece = time[inside], values[inside].astype(np.float64), piece[inside]
@@ -159,7 +157,6 @@ def _mark_handle(kind: str) -> Any:
 
 
 def _line_handles(ds: xr.Dataset, rows: Sequence[Sequence[str]]) -> list[Any]:
-    """Return the legend entries of panels with more than one line."""
     return [
         Line2D([], [], color=colour, linewidth=1.2, label=_symbol(ds, name))
         for names in rows
@@ -169,7 +166,6 @@ def _line_handles(ds: xr.Dataset, rows: Sequence[Sequence[str]]) -> list[Any]:
 
 
 def _caption(ds: xr.Dataset) -> str:
-    """Return the caption of the figure: file, sampling rate, number of pieces, and faults without a known time."""
     n_pieces = len(np.unique(ds["piece"].values))
     parts = [
         Path(str(ds.attrs.get("file", ""))).name,

@@ -91,9 +91,6 @@ def summary(findings: Iterable[Finding]) -> list[str]:
 
 
 def _group_line(severity: str, kind: str, channel: str, own: Sequence[Finding]) -> str:
-    """Return one printed line for findings of the same kind and channel: their number, and time and text of the
-    first.
-    """
     first = own[0]
     where = "" if math.isnan(first.start_s) else f" at {first.start_s:.6g} s"
     often = f" ({len(own)} times, first{where})" if len(own) > 1 else where

@@ -70,7 +70,6 @@ def read_lvm(path: Path) -> Raw:
 
 
 def _file_header(path: Path, lines: list[str]) -> tuple[_Style, int]:
-    """Read the file header; return its settings and the index of the line after it."""
     keys: dict[str, str] = {}
     for i, line in enumerate(lines[1:], 1):
         if line.strip().startswith(END):
@@ -113,7 +112,6 @@ def _segments(path: Path, lines: list[str], at: int, style: _Style) -> list[_Seg
 
 
 def _skip(lines: list[str], i: int) -> int:
-    """Return the index of the next line after empty lines and special blocks."""
     while i < len(lines):
         if lines[i].startswith(SPECIAL):
             while i < len(lines) and not lines[i].startswith(END_SPECIAL):
@@ -191,7 +189,6 @@ def _channels(segment: _Segment, style: _Style, zero: float) -> dict[str, Channe
 
 
 def _truncations(segment: _Segment, channels: dict[str, Channel], style: _Style) -> list[Finding]:
-    """Report segments that have fewer samples than their header states."""
     findings = []
     for j, channel in zip(_columns(segment), channels.values(), strict=True):
         stated = _number(segment, "Samples", j, style)

@@ -1,4 +1,4 @@
-"""Define the mapping of a recording: which channel holds which quantity, and how it is converted to SI units."""
+"""Define a recording's mapping file: which channel holds which quantity, and how it is converted to SI units."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ class CsvMap(Table):
 
 
 class Mapping(Table):
-    """Mapping of a recording: the model's quantity, unit and scale of each channel, as in its TOML file.
+    """A recording's mapping file: which quantity of the model each channel holds, with unit and scale.
 
     The keys are those of the TOML file; `load_mapping` reads and checks one.
     """
@@ -123,7 +123,7 @@ class Mapping(Table):
 
     @property
     def drive_map(self) -> DriveMap | None:
-        """Mapping of the drive's channel; None if the recording has none."""
+        """Part of the mapping file that describes the drive's channel; None if the recording has no such channel."""
         return None if isinstance(self.drive, str) else self.drive
 
     def unit_of(self, name: str) -> str:
@@ -139,7 +139,7 @@ class Mapping(Table):
         return entry.sign * (1.0 if entry.scale is None else entry.scale) * (1.0 if known is None else known)
 
     def toml(self) -> str:
-        """Return the mapping as the text of a TOML file."""
+        """Return the recording's mapping as the text of a TOML file."""
         plain = self.model_dump(mode="json", exclude_none=True, exclude_defaults=True)
         tables = {key: plain.pop(key) for key in ("csv", "channels", "drive") if isinstance(plain.get(key), dict)}
         model = model_toml(plain.pop("model")).rstrip("\n")
@@ -154,7 +154,7 @@ class Mapping(Table):
 
 
 def load_mapping(path: str | Path) -> Mapping:
-    """Read and validate the mapping of a recording from a TOML file.
+    """Read and validate a recording's mapping file (TOML).
 
     Parameters
     ----------
@@ -170,7 +170,7 @@ def load_mapping(path: str | Path) -> Mapping:
 
 
 def parse_mapping(data: AnyMapping[str, Any] | str, source: str = "", folder: str | Path | None = KEPT) -> Mapping:
-    """Validate a mapping given as tables or as the text of a TOML file.
+    """Validate a recording's mapping, given as tables or as the text of a TOML file.
 
     Parameters
     ----------
@@ -206,7 +206,7 @@ def parse_mapping(data: AnyMapping[str, Any] | str, source: str = "", folder: st
 
 
 def _rest(rest: dict[str, Any], problems: list[str]) -> dict[str, Any]:
-    """Validate the keys of a mapping other than model, channels and drive, one by one so that all problems are
+    """Validate the keys of a mapping file other than model, channels and drive, one by one so that all problems are
     reported.
     """
     found = {}
@@ -257,7 +257,6 @@ def _units(model: Model) -> dict[str, str]:
 
 
 def _quantity_problems(model: Model, channels: dict[str, ChannelMap], drive: DriveMap | None) -> list[str]:
-    """Return problems with the mapped channels: unknown quantities, unsuitable units or scales."""
     problems = []
     known = _units(model)
     for name, entry in channels.items():

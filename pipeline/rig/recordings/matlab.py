@@ -83,7 +83,6 @@ def _gather(name: str, value: Any, leaves: dict[str, list[np.ndarray]]) -> None:
 
 
 def _cell(value: Any) -> Any:
-    """Return the content of a MATLAB cell. Nested cells of one element are unpacked completely."""
     while isinstance(value, np.ndarray) and value.dtype == object and value.size == 1:
         value = value.flat[0]
     return value
@@ -98,9 +97,6 @@ def _plain(value: np.ndarray) -> np.ndarray:
 
 
 def _step(leaves: dict[str, list[np.ndarray]]) -> float:
-    """Return the sampling interval [s] from the variable ``dt`` of the file. Return NaN if there is no such
-    variable.
-    """
     for name, arrays in leaves.items():
         if name.rpartition(".")[2] == STEP and all(a.size == 1 for a in arrays):
             return float(arrays[0].flat[0])

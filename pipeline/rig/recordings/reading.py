@@ -1,4 +1,4 @@
-"""Read a recording's file through its mapping into a dataset with names and SI units."""
+"""Read a recording into a dataset with names and SI units, by means of its mapping file."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ DIM = "sample"
 def read_recording(
     path: str | Path, mapping: Mapping | str | Path, *, window_s: tuple[float, float] | None = None
 ) -> xr.Dataset:
-    """Read a recording through its mapping, and check its channels for faults.
+    """Read a recording by means of its mapping file, and check its channels for faults.
 
     Parameters
     ----------
@@ -168,8 +168,8 @@ def _name_of(channel: str | int, names: Sequence[str]) -> str | None:
 
 
 def _name_but_for_unit(entry: Scaled | TimeMap | PieceMap, names: Sequence[str]) -> str | None:
-    """Return the channel name in the file that consists of the mapping's name and a unit in brackets. Return None
-    unless there is exactly one.
+    """Return the one channel in the file whose name is that in the mapping file followed by a unit in brackets, else
+    None.
     """
     near = _names_with_unit(entry.channel, names)
     if len(near) != 1 or isinstance(entry, PieceMap) or not entry.unit:
@@ -182,14 +182,10 @@ def _name_but_for_unit(entry: Scaled | TimeMap | PieceMap, names: Sequence[str])
 
 
 def _names_with_unit(channel: str | int, names: Sequence[str]) -> list[tuple[str, str]]:
-    """Return the channel names that consist of the given name and a unit in brackets, each with the unit."""
     return units.names_with_unit(channel, names) if isinstance(channel, str) else []
 
 
 def _unit_hint(entry: Scaled | TimeMap | PieceMap, names: Sequence[str]) -> str:
-    """Return a hint for an error message if a channel in the file differs from the mapping's only by a unit in
-    brackets.
-    """
     near = _names_with_unit(entry.channel, names)
     if len(near) != 1 or isinstance(entry, PieceMap):
         return ""
@@ -197,7 +193,6 @@ def _unit_hint(entry: Scaled | TimeMap | PieceMap, names: Sequence[str]) -> str:
 
 
 def _name_findings(mapping: Mapping, columns: dict[str, str]) -> list[Finding]:
-    """Report channels that were accepted although their name in the file has an additional unit."""
     given: dict[str, str | int] = {name: entry.channel for name, entry in _entries(mapping).items()}
     if mapping.time is not None:
         given["time"] = mapping.time.channel
@@ -240,7 +235,6 @@ def _timed(
 
 
 def _joined(stretches: Sequence[AnyMapping[str, Channel]], name: str, clock: Clock) -> np.ndarray:
-    """Return the used readings of a channel, joined over all stretches."""
     return np.concatenate(
         [s[name].values[slice(*taken[name])] for s, taken in zip(stretches, clock.taken, strict=True)]
     )
@@ -275,7 +269,6 @@ def _make_absolute(variables: dict[str, np.ndarray], mapping: Mapping) -> None:
 
 
 def _unit_findings(raw: Raw, mapping: Mapping, columns: dict[str, str]) -> list[Finding]:
-    """Report channels whose unit in the file differs from that in the mapping."""
     findings = []
     for name, entry in _entries(mapping).items():
         stated = units.spelled(raw.stretches[0][columns[name]].unit)
@@ -290,7 +283,6 @@ def _unit_findings(raw: Raw, mapping: Mapping, columns: dict[str, str]) -> list[
 def _labelled(
     variables: AnyMapping[str, np.ndarray], clock: Clock, raw: Raw, mapping: Mapping, findings: list[Finding]
 ) -> xr.Dataset:
-    """Return the dataset of a recording with names, units and provenance."""
     model = mapping.system
     meanings = {s.name: s.meaning for s in model.states} | {q.name: q.meaning for q in model.quantities}
     data: dict[str, Any] = {}

@@ -106,9 +106,6 @@ def _least(order: int) -> int:
 
 
 def _checked(window_s: float | None, order: int, step: float) -> int | None:
-    """Return the requested window length as an odd number of samples; raise `SpecError` if it or the order is too
-    small.
-    """
     problems = []
     if order < 1:
         problems.append(f"order = {order}: must be 1 or more, so that there is a rate.")
@@ -162,19 +159,11 @@ def _parts(ds: xr.Dataset, name: str, edges: np.ndarray) -> np.ndarray:
 
 
 class _Basis(NamedTuple):
-    """Polynomials on a window, orthonormal over its samples, with their slopes.
+    """Polynomials on a window, orthonormal over its samples, with their slopes."""
 
-    Attributes
-    ----------
-    values, slopes : ndarray
-        Values, and slopes per sample, (width, order + 1).
-    leverage : ndarray
-        Weight of a sample in its own fitted value, (width,).
-    """
-
-    values: np.ndarray
-    slopes: np.ndarray
-    leverage: np.ndarray
+    values: np.ndarray  # (width, order + 1)
+    slopes: np.ndarray  # per sample, (width, order + 1)
+    leverage: np.ndarray  # weight of a sample in its own fitted value, (width,)
 
 
 @lru_cache(64)
@@ -195,7 +184,6 @@ class _Fit:
         self.values, self.rates, self.noise, self.width, self.score = values, rates, noise, width, score
 
     def attrs(self, order: int, step: float, derivative: int) -> dict[str, Any]:
-        """Return the attributes of the smoothed values or rates: noise and window length."""
         gain = _gain(self.width, order, derivative, step)
         raw = {"noise": self.noise} if derivative == 0 else {}
         return {**raw, "noise_smoothed": self.noise * gain, "window_s": self.width * step}
@@ -304,7 +292,6 @@ def _fit_middles(values: np.ndarray, parts: np.ndarray, width: int, order: int, 
 
 
 def _convolved(y: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Return the weighted sum of samples about each sample; long windows use Fourier transforms."""
     from scipy.ndimage import correlate1d
     from scipy.signal import oaconvolve
 

@@ -56,7 +56,9 @@ def write_recording(ds: xr.Dataset, path: str | Path) -> Path:
 
 
 def mapping_for(ds: xr.Dataset, path: str | Path) -> Mapping:
-    """Return the mapping for reading a file that `write_recording` wrote."""
+    """Return the mapping (description of the channels) with which `read_recording` reads a file that `write_recording`
+    wrote.
+    """
     is_tdms = Path(path).suffix.lower() == ".tdms"
 
     def own(name: str) -> str:
@@ -122,7 +124,6 @@ def _write_tdms(channels: Sequence[Channel], path: Path, is_simulated: bool) -> 
 
 
 def _write_csv(channels: Sequence[Channel], path: Path, is_simulated: bool) -> None:
-    """Write a CSV file with one column for each channel. Numbers are written with all digits."""
     columns = [(c.name, c.values) for c in channels]
     step = channels[0].step_s
     if not any(name == "time" for name, _ in columns) and math.isfinite(step):

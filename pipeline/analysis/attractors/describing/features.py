@@ -1,4 +1,4 @@
-"""Compute the features of an attractor: ranges, rotation, classifier code, energy, mirror image.
+"""Compute the features of an attractor: ranges, rotation, class of motion, energy, mirror image.
 
 Half a drive period
 -------------------
@@ -70,8 +70,8 @@ class Cells:
     seconds: list[np.ndarray] = field(default_factory=list)
 
     def add(self, block: Block, cells: np.ndarray, labels: np.ndarray, geometry: Geometry) -> None:
-        """Add the statistics of some cells of a block of trajectories; `labels` has the classifier code of every cell
-        of the block.
+        """Add the given cells of a block to the statistics; `labels` has the class of motion (a code) of every cell of
+        the block.
         """
         section = block.section[cells]
         self.n += len(cells)
@@ -101,8 +101,8 @@ class Cells:
         return float(np.sort(np.concatenate(self.seconds)).mean()) if self.seconds else np.nan
 
     def side(self, parameters: Parameters, frequency: float) -> int:
-        """Return the attractor's classifier code: the common code of its cells, or else the code of their pooled
-        section points.
+        """Return the class of motion (a code) of the attractor: that of all its cells or, if they differ, of their
+        pooled points.
 
         The pooled points are classified with the median of the cells' turns.
         """

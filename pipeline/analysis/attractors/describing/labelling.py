@@ -72,8 +72,8 @@ class Found:
 
 @dataclass
 class _Labels:
-    """Provisional number of each cell's set; the numbers run over polished orbits, unpolished orbits, bounded sets,
-    equilibria, limit cycles.
+    """Set of each cell at one parameter point, as a provisional number, and the evidence for this assignment
+    (`decision`).
     """
 
     label: np.ndarray
@@ -110,7 +110,7 @@ def analyse(point: Point, search: Search) -> Work[Found]:
 
 
 def _is_elsewhere(point: Point) -> np.ndarray:
-    """Return for each cell whether it is at an equilibrium, or on a limit cycle of a flow sampled at equal times."""
+    """Return a mask of the cells at an equilibrium, or on a limit cycle of a flow sampled at equal times."""
     found = np.zeros(point.n_cells, bool)
     for told in (point.at_rest, point.on_cycle):
         if told is not None:
@@ -134,9 +134,7 @@ def _preserves_volume(point: Point, search: Search) -> Work[bool]:
 
 
 def _some_points(point: Point, n: int = 16) -> np.ndarray:
-    """Return the last section points of `n` arbitrary but reproducible bounded cells (those of least hash), shape (n,
-    state).
-    """
+    """Return the last section points of `n` cells chosen reproducibly by their hash, shape (n, state)."""
     found = np.zeros((0, 1, point.n_states))
     for block in point.blocks():
         more = np.concatenate([found, block.section[block.is_closed | block.is_bounded, -1:]])
@@ -156,8 +154,8 @@ def _conservative(point: Point, labels: _Labels) -> BoundedSet:
 
 
 def _label_orbits(point: Point, state: State, labels: _Labels, search: Search) -> np.ndarray:
-    """Label the cells on known orbits; return the group number of each closed cell that is on none of them, -1 for all
-    other cells.
+    """Label the cells on known orbits. Return the group number of each remaining closed cell, and -1 for every other
+    cell.
     """
     groups = np.full(point.n_cells, -1, np.int64)
     for block in point.blocks():
@@ -194,9 +192,7 @@ def _probe(point: Point, state: State, labels: _Labels, search: Search) -> Work[
 
 
 def _label_courses(point: Point, found: Outcome, labels: _Labels, groups: np.ndarray, search: Search) -> None:
-    """Label cells by the end (attractor, equilibrium, divergence) of a cell of the same box or group that was
-    integrated further.
-    """
+    """Label cells whose neighbour (same box or group) was integrated further, by where this neighbour ended."""
     ends = {course.key: course.end for course in found.courses if not course.goes_on}
     if not ends:
         return
@@ -218,8 +214,8 @@ def _label_courses(point: Point, found: Outcome, labels: _Labels, groups: np.nda
 
 
 def _label_raw(point: Point, state: State, groups: np.ndarray, labels: _Labels, search: Search) -> list[Orbit]:
-    """Group the closed cells that are on no polished orbit, and make an unpolished orbit of each group from its section
-    points.
+    """Label the closed cells that are on no polished orbit, and return an unpolished orbit for each group of these
+    cells.
     """
     left = np.where((labels.label < 0) & (labels.decision != DIVERGES) & ~_is_elsewhere(point), groups, -1)
     best: dict[int, tuple[float, int, np.ndarray]] = {}
@@ -233,9 +229,7 @@ def _label_raw(point: Point, state: State, groups: np.ndarray, labels: _Labels, 
 def _label_sets(
     point: Point, first: int, sets: Sequence[BoundedSet], labels: _Labels, groups: np.ndarray, search: Search
 ) -> None:
-    """Label the cells on each non-periodic set: those integrated further on it, and all others whose section points lie
-    on it.
-    """
+    """Label the cells on each non-periodic set: its integrated samples, and cells whose section points lie on it."""
     for i, one in enumerate(sets):
         own = one.cells[labels.label[one.cells] < 0]
         labels.put(own, first + i, SAME_SET)
@@ -250,7 +244,9 @@ def _label_sets(
 
 
 def _label_ends(block: Block, ends: Mapping[int, int], label: np.ndarray, decision: np.ndarray) -> None:
-    """Label closed cells in place by the orbits that they reached when they were integrated further."""
+    """Label closed cells by the orbit that each reached in a longer integration; `label` and `decision` change in
+    place.
+    """
     rest = np.flatnonzero(block.is_closed & (label[block.cells] < 0))
     for row, mark in zip(rest, marks_of(block.section[rest]), strict=True):
         if int(mark) in ends:
@@ -260,7 +256,9 @@ def _label_ends(block: Block, ends: Mapping[int, int], label: np.ndarray, decisi
 def _representatives(
     block: Block, group: np.ndarray, best: dict[int, tuple[float, int, np.ndarray]], geometry: Geometry
 ) -> None:
-    """Store, for each group of closed cells on no polished orbit, the last period of the cell that closes best."""
+    """Store one cell per group of closed cells in `best`: the cell whose orbit closes most exactly, with its last
+    period.
+    """
     rows = np.flatnonzero(group >= 0)
     if not len(rows):
         return
@@ -311,7 +309,7 @@ def _describe(
 
 
 def _label_elsewhere(point: Point, first: int, labels: _Labels) -> None:
-    """Label the cells at equilibria, then those on limit cycles of a flow sampled at equal times."""
+    """Label the cells at equilibria, then the cells on limit cycles (of a flow sampled at equal times)."""
     for told, known, code in ((point.at_rest, point.equilibria, AT_REST), (point.on_cycle, point.cycles, CLOSED)):
         if told is not None:
             own = told >= 0
@@ -327,7 +325,7 @@ def _number_ends(
     resting: int,
     table: np.ndarray,
 ) -> None:
-    """Fill `n_to`: for each set, count the cells that left it by the number of the set on which they ended."""
+    """For each transient set, count the sampled cells that left it by the set on which they ended (in `n_to`)."""
     for features, number in zip(ranked, order, strict=True):
         if first <= number < resting:
             ended = np.zeros(len(order), np.int64)
@@ -342,9 +340,7 @@ def _number_ends(
 def _features_of(
     number: int, cells: Cells, orbits: Sequence[Orbit], sets: Sequence[BoundedSet], point: Point, search: Search
 ) -> Features:
-    """Return the features of the set (orbit, bounded set, equilibrium or limit cycle) that has this provisional
-    number.
-    """
+    """Return the features of the set with a provisional number: an orbit, bounded set, equilibrium or limit cycle."""
     resting = len(orbits) + len(sets)
     if number < len(orbits):
         return _of_orbit(cells, orbits[number], point, search)

@@ -1,1 +1,1 @@
-"""Integrate trajectories further whose attractor is not known yet, and describe the sets on which they stay."""
+"""Extend the integration of trajectories without a known attractor, and describe the sets on which they stay."""

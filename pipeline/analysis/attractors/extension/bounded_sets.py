@@ -1,4 +1,4 @@
-"""Describe non-periodic sets from trajectories on them that were integrated further."""
+"""Describe non-periodic sets from the trajectories that were integrated further on them."""
 
 from __future__ import annotations
 
@@ -117,9 +117,7 @@ def describe(
 
 
 def left_behind(left: Sequence[Course], settings: Settings) -> BoundedSet:
-    """Describe the transient set on which trajectories were before they left it, if no sampled trajectory stayed on
-    it.
-    """
+    """Describe a transient set that every sampled trajectory has left, from the section points before they left."""
     paths = [course.stayed for course in left]
     return BoundedSet(
         np.zeros(0, np.int64),
@@ -146,7 +144,7 @@ def ends_of(left: Iterable[Course]) -> dict[int, int]:
 
 
 def were_on(course: Course, own: Sequence[Course], settings: Settings) -> bool:
-    """Return whether a trajectory, before it left its set, was on the same set as the trajectories `own`."""
+    """Return whether a finished trajectory, before it left its set, was on the same set as the trajectories `own`."""
     points = np.concatenate([other.stayed for other in own])
     return bool(mixing(course.stayed, points, settings.geometry, settings.closure) >= OTHER)
 
@@ -191,9 +189,7 @@ def _growth(own: Sequence[Course], point: Point, settings: Settings, most: int) 
 
 
 def _closes_above(own: Sequence[Course], growth: Growth | None, settings: Settings) -> int:
-    """Return the smallest period above the search limit with which a contracting set repeats itself; 0 if none is
-    seen.
-    """
+    """Return the period with which trajectories close above the longest period searched for; 0 if none is seen."""
     if growth is None or not growth.contracts:
         return 0
     path = min((c.extension for c in own), key=len)

@@ -1,4 +1,4 @@
-"""Decide by nearest neighbours whether two samples of section points lie on one set, and on which set a trajectory is.
+"""Decide by nearest neighbours whether two samples of section points lie on the same set.
 
 Two trajectories on one ergodic set visit the same points equally often; two attractors are a distance
 apart. So each point of the later half of a sample looks for its nearest neighbour among equally many points
@@ -45,7 +45,7 @@ def thinned(points: np.ndarray, n: int) -> np.ndarray:
 
 
 def mixing(a: np.ndarray, b: np.ndarray, geometry: Geometry, least: float = 0.0) -> float:
-    """Compute the share of points whose nearest neighbour lies in the other sample, the smaller of both directions.
+    """Compute how well two samples of section points mix: about 0.5 for samples of one set, 0 for distant sets.
 
     Parameters
     ----------
@@ -69,8 +69,8 @@ def mixing(a: np.ndarray, b: np.ndarray, geometry: Geometry, least: float = 0.0)
 
 
 def _crossing(own: np.ndarray, other: np.ndarray, n: int, geometry: Geometry, least: float) -> float:
-    """Compute the share of a sample's later points that are nearer to another sample than to the sample's own earlier
-    points.
+    """Compute the share of points in the later half of sample `own` that are nearer to `other` than to the earlier
+    half.
     """
     # take points from the whole duration of the other sample
     trees = [geometry.tree(points) for points in (own[:n], thinned(other, n))]
@@ -149,8 +149,8 @@ class Cloud:
 
     @classmethod
     def of(cls, samples: Sequence[np.ndarray], geometry: Geometry, least: float) -> Cloud:
-        """Build the search tree from section points of some trajectories; `least` is the lower limit of its point
-        spacing.
+        """Build the search tree of a set from section points of its trajectories; the point spacing is at least
+        `least`.
         """
         points = _pooled(samples)
         # distances from one half to the other: a safe spacing, since the whole is twice as dense

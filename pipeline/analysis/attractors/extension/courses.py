@@ -76,7 +76,7 @@ class Course:
 
 
 def rest_number(end: int) -> int | None:
-    """Return the number of the equilibrium that a trajectory's end code stands for; None if the code stands for another
+    """Return the number of the equilibrium at which a trajectory ended, from its end code; None for another kind of
     end.
     """
     return AT_REST - end if end <= AT_REST else None

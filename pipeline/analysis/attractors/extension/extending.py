@@ -1,4 +1,5 @@
-"""Integrate trajectories further that are on no known orbit or equilibrium, until the set on which they end is known.
+"""Extend the integration of trajectories that are on no known orbit or equilibrium, until the set on which they end is
+known.
 
 A sample of these cells is integrated further from the last section, leg by leg. After each leg, cells that
 reached an orbit or an equilibrium, known or new, leave the sample. The others are grouped into sets
@@ -83,8 +84,7 @@ class Outcome:
 def extend(
     point: Point, orbits: Sequence[Orbit], label: np.ndarray, settings: Settings, budget: float, n_sample: int
 ) -> Work[Outcome]:
-    """Integrate samples of the cells without a known attractor (label -1) further, until the sets on which they end are
-    known.
+    """Integrate samples of the cells without a known attractor (label -1) further, and find the sets on which they end.
 
     Parameters
     ----------
@@ -142,8 +142,8 @@ class _Extension:
     # ---- samples -------------------------------------------------------------------------------
 
     def sample(self, loose: np.ndarray, n: int) -> list[Course]:
-        """Choose `n` more cells to integrate further: one from each box that last section points fall into, in
-        pseudorandom order.
+        """Choose at most `n` unassigned cells to integrate further, reproducibly, and no two from one box of section
+        points.
         """
         known = {course.key for course in self.courses}
         best: dict[int, tuple[int, int, np.ndarray, float]] = {}
@@ -163,8 +163,8 @@ class _Extension:
         return [Course(cell, key, kept, kept[-1], step) for key, (_, cell, kept, step) in chosen]
 
     def left_of(self, loose: np.ndarray) -> np.ndarray:
-        """Return the unassigned cells that were not integrated further and lie on no set whose stability is decided for
-        good.
+        """Return the unassigned cells (of `loose`) that were not integrated further and lie on no set of decided
+        stability.
         """
         done = np.zeros(self.point.n_cells, bool)
         done[self.told(loose)[0]] = True
@@ -172,8 +172,8 @@ class _Extension:
         return np.asarray(loose[~done[loose]])
 
     def told(self, loose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the unassigned cells that lie on sets whose stability is decided for good, and the numbers of these
-        sets.
+        """Return the unassigned cells (of `loose`) that lie on sets of decided stability, and the number of each cell's
+        set.
         """
         final = [i for i, one in enumerate(self.sets) if one.stability in (ATTRACTS, NEUTRAL) or not self.budget]
         clouds = [one for i in final if (one := self.sets[i].cloud) is not None]
@@ -188,7 +188,9 @@ class _Extension:
         return np.concatenate(cells), np.concatenate(numbers)
 
     def add_transient(self) -> None:
-        """Add the transient set that trajectories have left, unless other trajectories stayed on it."""
+        """Add the set that trajectories have left to the list of sets, as a transient set, unless the list already has
+        one.
+        """
         left = [course for course in self.courses if course.has_left]
         if left and not any(one.n_left for one in self.sets):
             self.sets.append(left_behind(left, self.settings))
@@ -211,8 +213,8 @@ class _Extension:
             target = 2 * max(c.length for c in self.courses if c.goes_on)
 
     def conclude(self) -> Work[None]:
-        """Describe the sets of unfinished trajectories, without further integration, if trajectories grew since the
-        last description.
+        """Describe the sets of unfinished trajectories if these have grown since the last description; integrate
+        nothing.
         """
         if self._told != self._lengths():
             yield from self._tell_sets()
@@ -236,7 +238,9 @@ class _Extension:
             yield from self._take(going, leg)
 
     def _has_stayed(self, going: Sequence[Course], target: int) -> bool:
-        """Return whether the unfinished trajectories have stayed long enough to decide that their set attracts."""
+        """Return whether the unfinished trajectories stayed on their set so long that the set can be called an
+        attractor.
+        """
         least = min(course.length for course in going)
         if least < target:
             return False
@@ -245,7 +249,7 @@ class _Extension:
         return least >= longest or lifetime_interval(0, at_risk)[0] >= longest
 
     def _longest_transient(self) -> float:
-        """Return the longest transient seen at the parameter point [drive periods or returns]."""
+        """Return the longest transient seen at this parameter point [drive periods, or returns to the section]."""
         left = [c.periods for c in self.courses if not c.goes_on and not c.is_leaving]
         return self.settings.seen + max(left, default=0.0)
 
@@ -314,7 +318,9 @@ class _Extension:
         return self.point.can_rest and rest_of_orbit(self.point, orbit.points[0], self.geometry) is not None
 
     def _leave(self, course: Course, number: int) -> None:
-        """End the extension of a trajectory on an orbit, and record when it came near the orbit for good."""
+        """End the extension of a trajectory that has reached an orbit, and record when it came near the orbit and
+        stayed near.
+        """
         orbit, states = self.orbits[number], np.concatenate([course.kept, course.extension])
         phase = int(np.argmin(self.geometry.distance(orbit.points, states[-1])))
         back = np.arange(len(states))
@@ -350,8 +356,8 @@ class _Extension:
     # ---- sets ----------------------------------------------------------------------------------
 
     def _tell_sets(self) -> Work[bool]:
-        """Group the unfinished trajectories by the sets they are on and describe these; return whether a set or its
-        stability is uncertain.
+        """Group the unfinished trajectories by set, and describe each set; return whether a grouping or a stability is
+        uncertain.
         """
         going = [course for course in self.courses if course.goes_on]
         has_stayed = bool(going[0].legs) and self._has_stayed(going, LEAST_STAY)
@@ -370,9 +376,7 @@ class _Extension:
     def _with_those_left(
         self, groups: Sequence[list[Course]], gone: Sequence[Course]
     ) -> list[tuple[list[Course], list[Course]]]:
-        """Pair each group of unfinished trajectories with those that left the same set; merge the groups whose sets
-        were left.
-        """
+        """Pair each group of unfinished trajectories with those that left its set; merge groups whose set was left."""
         left = [[course for course in gone if were_on(course, own, self.settings)] for own in groups]
         joined = [course for own, some in zip(groups, left, strict=True) if some for course in own]
         found = [(own, some) for own, some in zip(groups, left, strict=True) if not some]

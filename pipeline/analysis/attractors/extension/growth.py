@@ -84,7 +84,7 @@ class Growth:
 
     @property
     def contracts(self) -> bool:
-        """Whether small distances shrink, so that the trajectories are still closing."""
+        """Whether small distances shrink, so that the trajectories still converge to a periodic orbit."""
         shown = self.weighted < -max(ZERO, 3.0 * self.weighted_error)
         return bool(shown or (self.high < 0.0 and self.rate * self.length <= -GROWN))
 
@@ -95,7 +95,7 @@ class Growth:
 
     @property
     def preserves_volume(self) -> bool:
-        """Whether the mean change of phase volumes is 0 within its error."""
+        """Whether the section map preserves phase volume: the mean logarithm of its change is 0 within the error."""
         near = abs(self.volume) <= N_SIGMA * self.volume_error and self.volume_error <= LOST_ERROR
         return bool(near or abs(self.volume) <= LOST)
 
@@ -154,7 +154,8 @@ def _mean(values: np.ndarray) -> tuple[float, float]:
 def volumes_of(
     derivatives: np.ndarray, before: np.ndarray, after: np.ndarray, crossed: int | None, flow: Rates
 ) -> np.ndarray:
-    """Compute the logarithm of a phase volume's change along the flow over one period or return, shape (n,).
+    """Compute the logarithm of the factor by which the flow changes a phase volume over one period or return, shape
+    (n,).
 
     On a section of crossings the map's change of areas differs from the flow's change of volumes by the ratio
     of the crossing speeds.
@@ -179,8 +180,8 @@ def volumes_of(
 
 
 def _logarithms(derivatives: np.ndarray) -> np.ndarray:
-    """Compute by QR the logarithmic growth of orthonormal directions at each section; a large negative number if one
-    vanishes.
+    """Compute the logarithmic growth of orthonormal directions at each section point by QR; very negative for a lost
+    direction.
     """
     basis = np.broadcast_to(np.eye(derivatives.shape[-1]), derivatives[:, 0].shape)
     grown = np.empty(derivatives.shape[:-1])

@@ -25,7 +25,7 @@ class _Metric:
 
     @classmethod
     def of(cls, orbit: Orbit, geometry: Geometry) -> _Metric | None:
-        """Return a norm in which the return map of an orbit contracts; None if the orbit attracts too weakly, or not at
+        """Return a norm in which the return map of an orbit contracts; None if the orbit attracts too weakly or not at
         all.
         """
         matrix = scaled_derivative(orbit, geometry)
@@ -43,7 +43,7 @@ class _Metric:
 
     @property
     def factor(self) -> float:
-        """Upper bound of this norm for a vector of scaled length 1."""
+        """Largest value that this norm can take for a vector whose scaled components are at most 1."""
         return float(np.linalg.norm(self.root, 2) * np.sqrt(len(self.root)))
 
 
@@ -100,9 +100,7 @@ def decide(
 def _nearest(
     section: np.ndarray, cells: np.ndarray, orbits: Sequence[Orbit], geometry: Geometry
 ) -> Iterator[tuple[np.ndarray, int, int]]:
-    """Group cells by the orbit point near their last section point; yield each group with the orbit and the index of
-    this point.
-    """
+    """Yield cells near an orbit, grouped by the nearest orbit point: cells, index of the orbit, index of the point."""
     if not orbits or not len(cells):
         return
     owner = np.repeat(np.arange(len(orbits)), [o.period for o in orbits])
@@ -120,7 +118,7 @@ def _on_orbit(section: np.ndarray, orbit: Orbit, phase: int, tolerance: float, g
 
 
 def _approach(section: np.ndarray, orbit: Orbit, phase: int, tolerance: float, geometry: Geometry) -> np.ndarray:
-    """Return how sure it is that each cell near an orbit converges to the orbit: certain, approaching or undecided."""
+    """Return for each cell near an orbit whether it converges to it, as a code: certain, approaching or undecided."""
     code = np.zeros(len(section), np.int8)
     last = section.shape[1] - 1 - phase
     if not orbit.is_stable or last < 2 * orbit.period:

@@ -40,8 +40,8 @@ class Block:
     step: np.ndarray | None = None
 
     def take(self, rows: np.ndarray) -> Block:
-        """Return a block of the cells at the given indices; its attribute `cells` is not updated and no longer tells
-        where they lie.
+        """Return a block of the cells at the given indices of this block. Its attribute `cells` still covers the old
+        block.
         """
         return Block(self.cells, self.section[rows], self.status[rows], self.orbit_period[rows], self.turns[rows])
 
@@ -100,7 +100,7 @@ class Guesses:
         return Guesses(self.key[rows], self.score[rows], self.mark[rows], self.point[rows], self.period[rows])
 
     def best(self, key: np.ndarray | None = None) -> Guesses:
-        """Return the best guess of each key, by default the key of the guess's box, in rising order of the keys."""
+        """Return the best guess for each key, sorted by key; the default key is the box of the guess."""
         keys = self.key if key is None else key
         order = np.lexsort((self.mark, self.score, keys))
         first = np.ones(len(order), bool)
@@ -108,7 +108,7 @@ class Guesses:
         return self.take(order[first])
 
     def least(self, n: int) -> Guesses:
-        """Return the `n` guesses of least score, sorted by the hashes of their cells."""
+        """Return the `n` guesses with the lowest score, sorted by their cells' hashes."""
         least = np.lexsort((self.mark, self.score))[:n]
         return self.take(least[np.argsort(self.mark[least], kind="stable")])
 
@@ -170,9 +170,7 @@ class ClosedCells:
         self._keys.append(unique)
 
     def close(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the hash keys of all occupied boxes in rising order, and for each box the number of its group of
-        cells.
-        """
+        """Return the sorted keys (hashes) of the occupied boxes, and the number of each box's group of cells."""
         if not self._keys:
             return np.zeros(0, np.uint64), np.zeros(0, np.int64)
         keys, first = np.unique(np.concatenate(self._keys), return_index=True)
@@ -194,9 +192,7 @@ class ClosedCells:
 
 
 def _rows_of(points: np.ndarray, p: int, geometry: Geometry, side: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return, for each section point, its orbit period and the box that holds it as a row of integers, and a hash of
-    this row.
-    """
+    """Return for each section point the integers (orbit period, box indices), and a hash of these integers."""
     boxes = geometry.boxes(points, side)
     rows = np.concatenate([np.full((*boxes.shape[:-1], 1), p, np.int64), boxes], axis=-1)
     return rows, hashes(rows)

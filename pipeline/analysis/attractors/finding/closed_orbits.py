@@ -195,9 +195,7 @@ def _polished(
     system: System,
     tolerance: float,
 ) -> list[Orbit | None]:
-    """Refine guesses of orbits by Newton's method, and repeat this from an orbit's least section point if it started
-    from another.
-    """
+    """Refine guesses of orbits by Newton's method, each from the orbit's canonical (least) section point."""
     found = polish_orbits(packed, frequency, points, period, tolerance=tolerance, system=system)
     orbits = [_orbit_of(found, row) if found.converged[row] else None for row in range(len(points))]
     least = {row: _rolled(one.points, geometry)[0] for row, one in enumerate(orbits) if one is not None}

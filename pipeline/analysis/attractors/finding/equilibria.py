@@ -36,7 +36,7 @@ GUESSES, GUESS_BOX = 64, 0.1
 
 
 def tell_rest(points: Iterable[Point], tolerance: float, geometry: Geometry) -> None:
-    """Find the equilibria of some parameter points and the cells that are at them; store both in the points.
+    """Find the equilibria of each parameter point, and the cells that are at one; store both in the points.
 
     Parameters
     ----------
@@ -56,9 +56,7 @@ def tell_rest(points: Iterable[Point], tolerance: float, geometry: Geometry) -> 
 
 
 def _ends(point: Point, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return each cell's last state (NaN if it has none) and the distance within which it counts as at an
-    equilibrium.
-    """
+    """Return each cell's last state (NaN if none), and the distance within which it counts as at an equilibrium."""
     states = np.full((point.n_cells, point.n_states), np.nan)
     reach = np.full(point.n_cells, tolerance)
     for block in point.blocks():
@@ -72,8 +70,8 @@ def _ends(point: Point, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _waited(point: Point, states: np.ndarray) -> np.ndarray:
-    """Integrate trajectories that have not returned to the section until they are near an equilibrium; NaN for those
-    that return.
+    """Integrate states outside the section until they are near an equilibrium; NaN for those that return to the
+    section.
     """
     states, system = states.copy(), point.integrates
     far = np.flatnonzero(np.isfinite(states).all(axis=1))
@@ -100,9 +98,7 @@ def _waited(point: Point, states: np.ndarray) -> np.ndarray:
 
 
 def _found(point: Point, states: np.ndarray, reach: np.ndarray, geometry: Geometry) -> list[Equilibrium]:
-    """Find equilibria by Newton's method from last states close to them and a sample of other states, in canonical
-    order.
-    """
+    """Find the equilibria near the cells' last states by Newton's method, sorted in canonical order."""
     if not len(states):
         return []
     steps, _ = newton_steps(point.integrates, states, point.packed)
@@ -143,7 +139,7 @@ def _settled(point: Point, states: np.ndarray, reach: np.ndarray, geometry: Geom
 
 
 def put_at_rest(point: Point, tolerance: float, geometry: Geometry) -> None:
-    """Label in place the cells near degenerate equilibria that nearby trajectories were seen to approach."""
+    """Mark the cells near an attracting degenerate equilibrium as at rest there; changes `point.at_rest`."""
     states, _ = _ends(point, tolerance)
     assert point.at_rest is not None
     for k, one in enumerate(point.equilibria):
@@ -189,8 +185,8 @@ def approaching(
 
 
 def rest_near(point: Point, state: np.ndarray, geometry: Geometry) -> int | None:
-    """Return the index of the stable equilibrium near the last state of a trajectory that does not return; append it if
-    new.
+    """Return the index of the stable equilibrium that a trajectory without returns ends at; add the equilibrium if it
+    is new.
     """
     if not np.isfinite(state).all():
         return None

@@ -59,8 +59,8 @@ class Equilibrium:
 
     @cached_property
     def _norm(self) -> tuple[np.ndarray, float] | None:
-        """Matrix S and rate such that |S x| falls at least as exp(-rate t) along the linear flow; None if there are
-        none.
+        """Matrix S and rate such that |S x| decays at least as exp(-rate t) along the linear flow; None if S does not
+        exist.
         """
         rate = -0.5 * float(self.eigenvalues.real[0])
         shifted = self.jacobian + rate * np.eye(len(self.jacobian))

@@ -84,7 +84,7 @@ class _Crossings:
 
 
 def tell_cycles(points: Iterable[Point], tolerance: float, longest: int, residual: float, geometry: Geometry) -> None:
-    """Find the limit cycles that cells of some parameter points are on; store both in the points.
+    """Find the limit cycles at each parameter point, and the cells that are on one; store both in the points.
 
     Parameters
     ----------

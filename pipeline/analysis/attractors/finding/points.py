@@ -59,7 +59,7 @@ class Dynamics:
         *,
         needed: bool = True,
     ) -> Dynamics:
-        """Collect the model, parameters and system to use: those given or, where they are missing, those of the run.
+        """Collect model, parameters and system from the arguments; missing ones are taken from the run's attributes.
 
         Raises
         ------
@@ -75,7 +75,7 @@ class Dynamics:
 
     @property
     def integrates(self) -> System:
-        """System of equations to integrate; an error if none was given."""
+        """System of equations to integrate; AssertionError if the analysis was given none."""
         assert self.system is not None
         return self.system
 
@@ -146,9 +146,7 @@ class Point:
 
     @property
     def n_neutral(self) -> int:
-        """Number of Lyapunov exponents of the section map that are 0 by construction: 1 for a flow sampled at equal
-        times, else 0.
-        """
+        """Number of Lyapunov exponents that are 0 for any flow: 1 if the flow is sampled at equal times, else 0."""
         return int(self.can_rest and not self.is_flow)
 
     def volumes(self, derivatives: np.ndarray, before: np.ndarray, after: np.ndarray) -> np.ndarray:
@@ -163,7 +161,7 @@ class Point:
 
     @property
     def integrates(self) -> System:
-        """System of equations to integrate; an error if none was given."""
+        """System of equations to integrate; AssertionError if the analysis was given none."""
         assert self.system is not None
         return self.system
 
@@ -193,9 +191,7 @@ class Point:
             yield self._known(self._read(part, slice(begin * inner, begin * inner + n), n))
 
     def _known(self, block: Block) -> Block:
-        """Return the block with a changed status for cells at an equilibrium or on a limit cycle: neither closed nor
-        bounded.
-        """
+        """Return the block with the status ``NO_RETURN`` for cells at an equilibrium or on a limit cycle."""
         for told in (self.at_rest, self.on_cycle):
             if told is not None:
                 status = np.where(told[block.cells] >= 0, np.int8(Status.NO_RETURN), block.status)

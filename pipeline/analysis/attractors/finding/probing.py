@@ -51,8 +51,8 @@ def _probe(points: np.ndarray, critical: np.ndarray, geometry: Geometry) -> Work
 
 
 def _falls(state: np.ndarray, points: np.ndarray, size: float, geometry: Geometry) -> Work[bool]:
-    """Return whether all trajectories, started at the distance `size` from an orbit or equilibrium, keep coming nearer
-    to it.
+    """Return whether trajectories from `state`, at the distance `size` from an orbit or equilibrium, keep coming
+    nearer.
     """
     step, before = np.zeros(len(state)), np.full(len(state), np.inf)
     for _ in range(LEGS):

@@ -174,9 +174,7 @@ def answer_all(
 def _gathered(
     sizes: Sequence[int], asked: Mapping[tuple[int, ...], Any], points: Mapping[tuple[int, ...], Point]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return parameters and frequency of each requested trajectory, and where each parameter point's trajectories end
-    in the list.
-    """
+    """Return the packed parameters and frequency of every requested trajectory, and the running total of `sizes`."""
     packed = np.repeat([points[i].packed for i in asked], sizes, axis=0)
     frequency = np.repeat([points[i].frequency for i in asked], sizes)
     return packed, frequency, np.cumsum(sizes)
@@ -256,8 +254,7 @@ def _polished(
 def _each_once(
     search: np.ndarray, start: np.ndarray, period: np.ndarray, mark: np.ndarray, ended: np.ndarray, geometry: Geometry
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Choose guesses of orbits to polish, without duplicates; also return for each guess the index of its chosen
-    duplicate (-1: none).
+    """Choose the guesses to polish, without duplicates; return them, and for each guess the position of its duplicate.
 
     Rows that were integrated further and ended in one box are on one orbit; the row of least hash represents
     them. Rows without a period have no representative.

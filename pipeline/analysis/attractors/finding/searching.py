@@ -59,7 +59,7 @@ class Search:
 
     @property
     def is_loose(self) -> bool:
-        """Whether the tolerance is too loose for a closed cell to show an orbit without Newton's method."""
+        """Whether cells can count as closed without lying on an orbit, so that Newton's method must find the orbit."""
         return self.options.polish and self.tolerance > STRICT
 
     @property
@@ -128,14 +128,14 @@ def search_orbits(point: Point, search: Search) -> Work[State]:
 
 
 def moving(orbits: Sequence[Orbit | None], point: Point, geometry: Geometry) -> list[Orbit | None]:
-    """Replace orbits that are in fact equilibria by None, and add these equilibria to the parameter point, in place."""
+    """Replace each orbit that is in fact an equilibrium by None, and add the equilibrium to the parameter point."""
     if not point.can_rest:
         return list(orbits)
     return [None if o is None or rest_of_orbit(point, o.points[0], geometry) is not None else o for o in orbits]
 
 
 def _closed_undecided(point: Point, orbits: Sequence[Orbit], search: Search) -> Guesses:
-    """Return the last section points of closed cells on no known orbit, as guesses of orbits of unknown period."""
+    """Return guesses of orbits from the closed cells that are on no known orbit; the guesses' periods are unknown."""
     found = Guesses.none(len(search.geometry.scales))
     for block in point.blocks():
         label, _ = decide(block, orbits, search.tolerance, search.geometry)

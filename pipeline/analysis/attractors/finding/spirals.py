@@ -117,8 +117,7 @@ def _contracting(section: np.ndarray, max_period: int, geometry: Geometry) -> tu
 
 
 def near_closed(section: np.ndarray, max_period: int, geometry: Geometry, closing_only: bool = False) -> Guesses:
-    """Return guesses of orbits from cells that are not closed but whose section points recur, the best guess of each
-    box.
+    """Return guesses of orbits from cells whose section points recur without closing; one guess per box.
 
     Each cell gives its last section with the period of recurrence and, if its sections contract, the mean of
     the last section's phase. Cells whose sections recur at falling distances guess at every period, unlike
@@ -157,7 +156,7 @@ def _guesses(period: np.ndarray, score: np.ndarray, mark: np.ndarray, point: np.
 
 
 def beside(orbits: Sequence[Orbit], max_period: int, geometry: Geometry) -> Guesses:
-    """Guess the orbits that bifurcated from slightly unstable orbits, along their unstable directions.
+    """Guess the orbits that replaced slightly unstable orbits at a bifurcation, along the unstable directions.
 
     Cells that leave an orbit shortly after it lost stability go to the orbit that replaced it. That orbit has
     twice the period if the multiplier is below -1, and the same period if it is above 1.
@@ -186,7 +185,7 @@ def keys_of(section: np.ndarray, side: float, geometry: Geometry) -> np.ndarray:
 
 
 def leap(section: np.ndarray, orbits: Sequence[Orbit], geometry: Geometry) -> np.ndarray:
-    """Move trajectories that slowly leave an unstable orbit to a multiple (`LEAP`) of their distance from it.
+    """Predict states of trajectories that slowly leave an unstable orbit, once they are `LEAP` times as far from it.
 
     Near a bifurcation leaving takes thousands of periods, in which the motion follows the orbit's monodromy
     matrix. Let u be the components of a cell's distance along the unstable eigenvectors, at the sections that

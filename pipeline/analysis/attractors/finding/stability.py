@@ -63,8 +63,7 @@ def largest_error(matrix: np.ndarray, size: float, *, real: bool = False) -> flo
 
 
 def by_margin(leading: float, bound: float, error: float) -> int:
-    """Decide stability from a multiplier's modulus or an eigenvalue's real part: attracting below its bound, unstable
-    above it.
+    """Return the stability code for a leading eigenvalue or multiplier: attracting below the bound, unstable above it.
 
     Within the error of the bound, return `NEUTRAL`.
     """

@@ -19,7 +19,7 @@ Place = tuple[tuple[int, ...], int]
 
 @dataclass(frozen=True, eq=False)
 class Connections:
-    """Connections between attractors at different parameter points, numbered by their index in a list.
+    """Connections between attractors at different parameter points, found by following orbits; attractors are numbered.
 
     Attributes
     ----------
@@ -30,7 +30,7 @@ class Connections:
     followed : ndarray of bool
         Whether each was followed.
     outcomes : dict
-        How following ended, by axis, direction (1 or -1) and number; values as in
+        Reason why following an orbit ended, by axis, direction (1 or -1) and number; values as in
         `pipeline.analysis.branches.connecting.Links`.
     """
 
@@ -45,8 +45,8 @@ class Connections:
         return cls(np.arange(n), np.arange(n), np.zeros(n, bool))
 
     def may_be_one(self, axis: int, first: tuple[int, int], second: tuple[int, int]) -> bool:
-        """Return whether attractors at two parameter points may be matched by distance, as following their orbits
-        decided nothing.
+        """Return whether two attractors may be matched by distance: following their orbits neither linked nor separated
+        them.
 
         Parameters
         ----------

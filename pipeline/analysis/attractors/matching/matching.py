@@ -61,7 +61,7 @@ class _Seen:
 
 @dataclass(frozen=True, eq=False)
 class _Rule:
-    """Rule for matching attractors by distance: which of them may match, and up to which distance."""
+    """Rule for matching attractors at different parameter points by distance."""
 
     threshold: float
     geometry: Geometry
@@ -188,7 +188,7 @@ def _geometry(attractors: xr.Dataset, system: System | None) -> Geometry:
 
 
 def _neutral(attractors: xr.Dataset) -> frozenset[int]:
-    """Return the classifier codes that are compatible with every other code."""
+    """Return the class-of-motion codes that are compatible with every other code."""
     classifier = model_of(attractors).classifier
     return frozenset(classifier.neutral if classifier else ())
 
@@ -236,8 +236,8 @@ class _Ids:
         return {self._by_group[self._group[one.number]]: one for one in here}
 
     def _has_room(self, one: _Seen, identity: int) -> bool:
-        """Return whether an id is still free at all parameter points where orbits connected with this attractor
-        occur.
+        """Return whether an id is unused at every parameter point at which an orbit connected with this attractor
+        occurs.
         """
         return not self._where[self._group[one.number]] & self.taken[identity]
 
@@ -266,7 +266,7 @@ def _seen(attractors: xr.Dataset, number: int, place: Place) -> _Seen:
 def _known(
     seen: dict[tuple[int, ...], dict[int, _Seen]], index: tuple[int, ...], look_back: int
 ) -> dict[int, list[tuple[int, _Seen]]]:
-    """Return for each id the nearest earlier attractor with this id along each parameter axis, with the axis."""
+    """Return, for each id, the nearest earlier attractor along each parameter axis, as pairs (axis, attractor)."""
     known: dict[int, list[tuple[int, _Seen]]] = {}
     for axis in range(len(index)):
         along: dict[int, _Seen] = {}
@@ -305,8 +305,8 @@ def _assign(
 
 
 def _renumbered(attractors: xr.Dataset, ids: np.ndarray, n_ids: int, dims: tuple[str, ...]) -> xr.Dataset:
-    """Sort the arrays of attractors by id instead of by index at each parameter point, and replace the indices of the
-    cells by ids.
+    """Return the dataset with attractors ordered by id along ``attractor``, and with ids instead of indices in the
+    cells.
     """
     present = np.nonzero(ids >= 0)
     target = (*present[:-1], ids[present])
@@ -340,17 +340,13 @@ def _fill(name: str, dtype: np.dtype[Any]) -> float:
 
 
 def _lookup(ids: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Return the ids of the attractors with these indices at one parameter point; -1 for the index -1 (no
-    attractor).
-    """
+    """Return the ids of attractors at one parameter point from their indices there; -1 stays -1 (no attractor)."""
     table = np.append(ids, -1)
     return np.asarray(table[rows])
 
 
 def _destinations(values: np.ndarray, ids: np.ndarray, n_ids: int) -> np.ndarray:
-    """Convert counts of the cells that left a set: list them by the id of the set they reached, not by its index at the
-    point.
-    """
+    """Convert counts of cells that left a set: from the reached set's index at its parameter point to the set's id."""
     moved = np.zeros((*values.shape[:-1], n_ids), values.dtype)
     for *index, row in np.argwhere(ids >= 0).tolist():
         point = tuple(index)
