@@ -9,6 +9,9 @@ import numpy as np
 from magpend_core.engine.system import System
 from magpend_core.pointwise import jacobian_at, rates_at
 
+TOLERANCE = 1e-10
+"""Scaled length of a Newton step at which an equilibrium counts as found."""
+
 TRUST = 0.5
 """Longest Newton step in units of the system's scales."""
 
@@ -69,9 +72,7 @@ def newton_steps(system: System, states: np.ndarray, packed: np.ndarray) -> tupl
     return steps, jacobians
 
 
-def find_equilibria(
-    system: System, states: np.ndarray, packed: np.ndarray, *, tolerance: float = 1e-10, max_iterations: int = 30
-) -> Equilibria:
+def find_equilibria(system: System, states: np.ndarray, packed: np.ndarray, *, max_iterations: int = 30) -> Equilibria:
     """Find the equilibria near given states by Newton's method.
 
     Parameters
@@ -82,8 +83,6 @@ def find_equilibria(
         Guesses, shape (n, n_states).
     packed
         Parameters of all, shape (n_parameters,).
-    tolerance
-        Scaled length of a Newton step at which an equilibrium counts as found.
     max_iterations
         Limit on the steps.
     """
@@ -97,10 +96,10 @@ def find_equilibria(
             break
         steps, jacobians[rows] = newton_steps(system, found[rows], packed)
         residual[rows] = np.abs(steps / scales).max(axis=1)
-        going = residual[rows] > 0.01 * tolerance
+        going = residual[rows] > 0.01 * TOLERANCE
         rows, steps, lengths = rows[going], steps[going], residual[rows[going]]
         found[rows] += steps * np.minimum(1.0, TRUST / lengths)[:, None]
-    converged = residual <= tolerance
+    converged = residual <= TOLERANCE
     eigenvalues = np.full((len(found), system.n_states), np.nan, np.complex128)
     for row in np.flatnonzero(converged):
         values = np.linalg.eigvals(jacobians[row])

@@ -38,7 +38,7 @@ def _refuse_masks(name: str, values: Any) -> None:
         )
 
 
-def check_times(values: Any, shape: tuple[int, ...], name: str = "t") -> np.ndarray:
+def check_times(values: Any, shape: tuple[int, ...]) -> np.ndarray:
     """Return finite times as an array of a given shape; a single time is broadcast.
 
     Raises
@@ -46,11 +46,11 @@ def check_times(values: Any, shape: tuple[int, ...], name: str = "t") -> np.ndar
     ValueError
         See `check_array`; or if the shapes do not go together.
     """
-    array = check_array(name, values, tuple(range(len(shape) + 1)))
+    array = check_array("t", values, tuple(range(len(shape) + 1)))
     try:
         return np.broadcast_to(array, shape)
     except ValueError:
-        raise ValueError(f"{name} has shape {array.shape}; it must be one number, or one per state: {shape}.") from None
+        raise ValueError(f"t has shape {array.shape}; it must be one number, or one per state: {shape}.") from None
 
 
 def check_states(values: Any, ndim: int | tuple[int, ...], n_states: int, name: str = "state") -> np.ndarray:

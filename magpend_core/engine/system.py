@@ -59,7 +59,6 @@ class System:
     ----------
     name : str
         Name of the compiled code; equal names must mean equal functions.
-    state_names : tuple of str
     parameter_names : tuple of str
         Order of the packed parameter vector.
     n_constants : int
@@ -154,7 +153,6 @@ class System:
     section : (int, int) or None
         Index of the state that defines the Poincare section, and the direction of its crossing, +1 rising or -1
         falling; a period ends there. The level is the last parameter. See `crossing.with_section`.
-    quantity_names : tuple of str
     quantities : callable or None
         ``quantities(t, y, dy, u, c)``: a tuple of the named quantities at time `t` [s] since the last
         section, from the states, their rates, the forcing and the constants.

@@ -45,8 +45,6 @@ class State:
 
     Attributes
     ----------
-    name : str
-    unit : str
     meaning : str
         A short phrase for tables and axes.
     symbol : str
@@ -144,7 +142,6 @@ class Drawing:
         Names of points that are joined.
     trace : str
         The moving point whose path is worth drawing.
-    unit : str
     """
 
     points: Callable[[np.ndarray, Mapping[str, float]], dict[str, np.ndarray]]
@@ -168,7 +165,6 @@ class Model:
         By which specifications and cubes know it.
     title : str
         What it is, in a line.
-    states : tuple of State
     parameters : tuple of Parameter
         In the order in which they are packed.
     presets : tuple of Preset

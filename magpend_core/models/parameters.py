@@ -50,8 +50,6 @@ class Parameter:
 
     Attributes
     ----------
-    name : str
-    unit : str
     meaning : str
         A short phrase for tables and axes.
     bound : str

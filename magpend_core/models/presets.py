@@ -35,8 +35,6 @@ class Preset:
 
     Attributes
     ----------
-    name : str
-    values : dict
     provenance : dict
         A phrase by parameter name.
     model : str

@@ -13,6 +13,7 @@ import numpy as np
 import xarray as xr
 
 from magpend_core.models.model import Classifier, Parameters
+from pipeline.layout.attributes import code_flags
 from pipeline.layout.vocabulary import BOUNDED, FREQUENCY_DIM, INFERRED, PERIODIC, model_of, parameters_of
 
 UNKNOWN = 0
@@ -75,12 +76,7 @@ def classify(ds: xr.Dataset, *, parameters: Parameters | None = None) -> xr.Data
 
 def flags_of(classifier: Classifier) -> dict[str, Any]:
     """Return the xarray attributes of an array of classifier codes: unit, name, flag values and meanings."""
-    return {
-        "units": "1",
-        "long_name": classifier.meaning,
-        "flag_values": np.arange(len(classifier.words), dtype=np.int8),
-        "flag_meanings": " ".join(classifier.words),
-    }
+    return {"units": "1", "long_name": classifier.meaning, **code_flags(classifier.words)}
 
 
 def _frequency(ds: xr.Dataset) -> xr.DataArray:

@@ -6,9 +6,10 @@ from typing import Annotated, Any
 
 import typer
 
+from pipeline.cli import console
 from pipeline.cli.common import Csv, Directory, Json, check_csv, tell
-from pipeline.cli.groups import SETTINGS, made, registry_group
-from pipeline.cli.options import speaking, taking
+from pipeline.cli.groups import add_command, command_group, made, registry_group
+from pipeline.cli.options import taking
 
 
 def _names() -> list[str]:
@@ -23,7 +24,6 @@ def _make(name: str) -> Any:
     analysis = ANALYSES[name]
 
     def command(directory: Directory, options: Any, csv: Csv = None, json: Json = False) -> None:
-        from pipeline.cli import console
         from pipeline.products.product import function_of
         from pipeline.runs.derive import derive
         from pipeline.specification.problems import SpecError
@@ -32,7 +32,7 @@ def _make(name: str) -> Any:
         ds = derive(directory, name, options, echo=console.note)
         table = function_of(analysis.table)(ds)
         if table.nothing:
-            raise SpecError([f"{directory}: {table.nothing}"])
+            raise SpecError(f"{directory}: {table.nothing}")
         tell(table, csv, json)
         if "source" in ds.encoding:
             console.note(f"stored: {ds.encoding['source']}")
@@ -41,12 +41,9 @@ def _make(name: str) -> Any:
     return made(name, taking(analysis.options, command), analysis.help)
 
 
-analyse_app = typer.Typer(
-    cls=registry_group("analyse", _names, _make),
-    help="Find attractors, basins, chaos and branches in a stored cube; results are kept in DIR/derived.",
-    no_args_is_help=True,
-    rich_markup_mode=None,
-    context_settings=SETTINGS,
+analyse_app = command_group(
+    "Find attractors, basins, chaos and branches in a stored cube; results are kept in DIR/derived.",
+    registry_group("analyse", _names, _make),
 )
 
 
@@ -55,7 +52,6 @@ def prune(
     dry_run: Annotated[bool, typer.Option("--dry-run", help="List the results; remove nothing.")] = False,
 ) -> None:
     """Remove results that belong to an earlier state of the cube or an earlier version of magpend."""
-    from pipeline.cli import console
     from pipeline.runs import derive
 
     found = (derive.stale if dry_run else derive.prune)(directory)
@@ -65,4 +61,4 @@ def prune(
         console.result("nothing to remove")
 
 
-analyse_app.command()(speaking(prune))
+add_command(analyse_app, prune)

@@ -7,10 +7,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from pipeline.cli import console
 from pipeline.cli.common import read_pairs
 from pipeline.cli.models import DEFAULT, names
 from pipeline.cli.options import completing
-from pipeline.cli.simulate import read_named
+from pipeline.cli.outputs import check_file
+from pipeline.cli.simulate import read_states
 
 if TYPE_CHECKING:
     from pipeline.runs.filming import Start
@@ -74,8 +76,6 @@ def animate(
     by the model's names: --NAME VALUE, or --NAME-deg VALUE for an angle or its rate; other states are 0. A
     periodic motion gives a film without a jump. MP4 needs ffmpeg.
     """
-    from pipeline.cli import console
-    from pipeline.cli.outputs import check_file
     from pipeline.plots.files import save_data
     from pipeline.plots.films import film_problems, save_animation
     from pipeline.runs.filming import animation
@@ -131,7 +131,7 @@ def _start(
     from pipeline.runs.filming import Start
     from pipeline.specification.problems import SpecError
 
-    states = {name: values[0] for name, values in read_named(words, 1).items()}
+    states = read_states(words)
     given = {"--model": model, "--frequency": frequency_hz, "--preset": preset, "--set": settings}
     if not alone and any(given.values()):
         raise SpecError([f"{k}: the run sets this; drop the option, or the directory." for k, v in given.items() if v])

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import json
-import math
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from pipeline.cli import console
 from pipeline.cli.exits import Exit
+from pipeline.cli.outputs import check_file, check_table
 
 if TYPE_CHECKING:
     from pipeline.products.product import Table
@@ -48,28 +50,21 @@ def read_pairs(option: str, texts: list[str], example: str) -> dict[str, float]:
 
 def check_csv(path: str | None) -> None:
     """Raise an error if a CSV file cannot be written, before anything is computed."""
-    from pipeline.cli.outputs import check_file
     from pipeline.specification.problems import SpecError
 
     if path not in (None, "-") and (Path(str(path)).is_dir() or not Path(str(path)).parent.is_dir()):
-        raise SpecError([f"--csv {path}: must be a file in a folder that exists."])
+        raise SpecError(f"--csv {path}: must be a file in a folder that exists.")
     if path not in (None, "-"):
         check_file(Path(str(path)), "--csv")
 
 
 def tell(table: Table, csv: str | None, as_json: bool) -> None:
     """Print a table: its text lines, its rows as JSON with `as_json`, or its rows as CSV if `csv` is ``-``."""
-    from pipeline.cli import console
-
-    if as_json:
-        console.result(json.dumps(json_rows(table), indent=1))
-    elif csv == "-":
+    if csv == "-" and not as_json:
         console.result(table.csv().rstrip("\n"))
     else:
-        for line in table.lines:
-            console.result(line)
+        tell_data(json_rows(table), table.lines, as_json)
     if csv not in (None, "-"):
-        from pipeline.cli.outputs import check_table
         from pipeline.layout.writing import write_atomically
 
         text = table.csv()
@@ -78,12 +73,16 @@ def tell(table: Table, csv: str | None, as_json: bool) -> None:
         console.note(f"table: {csv}")
 
 
+def tell_data(data: Any, lines: Iterable[str], as_json: bool) -> None:
+    """Print a result: as lines, or as JSON with `as_json`."""
+    if as_json:
+        console.result(json.dumps(data, indent=1))
+    else:
+        console.result(*lines)
+
+
 def json_rows(table: Table) -> list[dict[str, Any]]:
     """Convert the rows of a table to types that JSON can hold."""
-    return [{name: _json(value) for name, value in row.items()} for row in table.rows]
+    from pipeline.layout.writing import json_value
 
-
-def _json(value: Any) -> Any:
-    """Convert a number to what JSON can hold: numpy numbers to Python's, NaN and infinity to None."""
-    plain = value.item() if hasattr(value, "item") else value
-    return None if isinstance(plain, float) and not math.isfinite(plain) else plain
+    return [json_value(row) for row in table.rows]

@@ -40,24 +40,26 @@ class _Visible(logging.Formatter):
         return visible(super().format(record))
 
 
-def note(line: str) -> None:
+def note(*lines: str) -> None:
     """Print a line for the user to the standard error, unless ``--quiet`` is given."""
-    LOG.info(line)
+    for line in lines:
+        LOG.info(line)
 
 
-def result(line: str) -> None:
-    """Print one line of a command's result to the standard output.
+def result(*lines: str) -> None:
+    """Print lines of a command's result to the standard output.
 
     Raises
     ------
     EnoughError
         If the reader has closed the standard output.
     """
-    try:
-        sys.stdout.write(f"{visible(line)}\n")
-        sys.stdout.flush()
-    except BrokenPipeError:
-        raise EnoughError from None
+    for line in lines:
+        try:
+            sys.stdout.write(f"{visible(line)}\n")
+            sys.stdout.flush()
+        except BrokenPipeError:
+            raise EnoughError from None
 
 
 def is_shown() -> bool:
@@ -97,7 +99,7 @@ def configure(quiet: bool, verbose: bool, log: Path | None) -> None:
         except OSError as error:
             from pipeline.specification.problems import SpecError
 
-            raise SpecError([f"--log {log}: cannot be written to ({error.strerror})."]) from None
+            raise SpecError(f"--log {log}: cannot be written to ({error.strerror}).") from None
         file.setFormatter(_Visible("%(asctime)s %(levelname)s %(message)s"))
         LOG.addHandler(file)
         LOG.debug("command: %s", " ".join(sys.argv))

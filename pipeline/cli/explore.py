@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from pipeline.cli import console
 from pipeline.cli.common import Directory
 
 
@@ -26,7 +27,6 @@ def explore(
     run and changes nothing. It shows the results of analyses that you have run. From another machine, tunnel
     the port: ssh -L PORT:127.0.0.1:PORT
     """
-    from pipeline.cli import console
     from pipeline.explorer.serving.browser import browser
     from pipeline.explorer.serving.server import serve
 

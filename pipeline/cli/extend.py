@@ -6,6 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
+from pipeline.cli import console
 from pipeline.cli.common import Directory
 from pipeline.cli.options import completing
 from pipeline.cli.running import ClusterFile, Dashboard, DryRun, Scheduler, Workers, workflow_names
@@ -50,7 +51,6 @@ def extend(
     The files are the same as those of a fresh run of the wider specification. You can stop the command at any
     time: the same command continues. Without --out the old run is kept as DIR.before.
     """
-    from pipeline.cli import console
     from pipeline.runs import extend as extending
     from pipeline.runs.widen import Widening
 
@@ -62,8 +62,7 @@ def extend(
     }
     if dry_run:
         found = extending.plan_extension((directory, *(also or ())), spec, Widening(**changes))
-        for line in extending.describe_extension(found, workers=workers):
-            console.result(line)
+        console.result(*extending.describe_extension(found, workers=workers))
         return
     state = extending.extend(
         directory,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import typer
@@ -22,40 +22,16 @@ def made(name: str, function: Command, help: str) -> Any:
     return get_command(app)
 
 
-class RegistryGroup(TyperGroup):
-    """Group of commands ``magpend VERB``: some are created from a registry, others are defined by functions."""
+def command_group(help: str, group: type[TyperGroup] = TyperGroup) -> typer.Typer:
+    """Create a command group, such as ``magpend plot``."""
+    return typer.Typer(cls=group, help=help, no_args_is_help=True, rich_markup_mode=None, context_settings=SETTINGS)
 
-    verb = ""
 
-    def names(self) -> list[str]:
-        """Return the names of the commands that the registry can create."""
-        raise NotImplementedError
-
-    def make(self, name: str) -> Any:
-        """Create one command from the registry, by name."""
-        raise NotImplementedError
-
-    def list_commands(self, ctx: Any) -> list[str]:
-        """Return the names of all commands of the group."""
-        return [*self.names(), *super().list_commands(ctx)]
-
-    def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        """Return a command of the group by name, and create it if it is in the registry."""
-        return self.make(cmd_name) if cmd_name in self.names() else super().get_command(ctx, cmd_name)
-
-    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """Find the command that is named first. If a directory comes first, raise an error that shows the right
-        order.
-        """
-        if args and args[0] not in self.list_commands(ctx):
-            later = [a for a in args[1:] if a in self.list_commands(ctx)]
-            if later:
-                rest = [a for a in args if a != later[0]]
-                raise UsageError(f"the directory comes last: magpend {self.verb} {later[0]} {' '.join(rest)}")
-            from pipeline.specification.problems import unknown_name
-
-            raise UsageError(unknown_name(f"magpend {self.verb}", args[0], self.list_commands(ctx)))
-        return super().resolve_command(ctx, args)
+def add_command(
+    app: typer.Typer, function: Command, name: str | None = None, settings: Mapping[str, Any] | None = None
+) -> None:
+    """Add a Python function to a command group, with the options that all commands share."""
+    app.command(name, epilog=EXIT_HELP, context_settings={**SETTINGS, **(settings or {})})(speaking(function))
 
 
 _MOVED = {"branches": "magpend analyse branches DIR", "analyze": "magpend analyse X DIR"}
@@ -78,12 +54,24 @@ class TopGroup(TyperGroup):
 def registry_group(verb: str, names: Callable[[], list[str]], make: Callable[[str], Any]) -> type[TyperGroup]:
     """Make a class of command groups, from a function that lists command names and one that creates a command."""
 
-    class Group(RegistryGroup):
-        def names(self) -> list[str]:
-            return names()
+    class Group(TyperGroup):
+        def list_commands(self, ctx: Any) -> list[str]:
+            return [*names(), *super().list_commands(ctx)]
 
-        def make(self, name: str) -> Any:
-            return make(name)
+        def get_command(self, ctx: Any, cmd_name: str) -> Any:
+            return make(cmd_name) if cmd_name in names() else super().get_command(ctx, cmd_name)
 
-    Group.verb = verb
+        def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+            """Find a command by name; raise an error with the right word order if the directory was given first."""
+            known = self.list_commands(ctx)
+            if args and args[0] not in known:
+                later = [a for a in args[1:] if a in known]
+                if later:
+                    rest = [a for a in args if a != later[0]]
+                    raise UsageError(f"the directory comes last: magpend {verb} {later[0]} {' '.join(rest)}")
+                from pipeline.specification.problems import unknown_name
+
+                raise UsageError(unknown_name(f"magpend {verb}", args[0], known))
+            return super().resolve_command(ctx, args)
+
     return Group

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any
@@ -10,9 +9,10 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from pipeline.cli.common import EXIT_HELP, Csv, Json, json_rows
-from pipeline.cli.groups import SETTINGS
-from pipeline.cli.options import completing, speaking
+from pipeline.cli import console
+from pipeline.cli.common import Csv, Json, check_csv, json_rows, tell, tell_data
+from pipeline.cli.groups import add_command, command_group
+from pipeline.cli.options import completing
 
 RUN = "spec"
 """Name of the command that ``magpend identify SPEC`` runs."""
@@ -30,14 +30,11 @@ class IdentifyGroup(TyperGroup):
         return list(super().parse_args(ctx, meant))
 
 
-identify_app = typer.Typer(
-    cls=IdentifyGroup,
-    help="Identify parameters from recordings: magpend identify SPEC --out DIR; judge a result on another "
+identify_app = command_group(
+    "Identify parameters from recordings: magpend identify SPEC --out DIR; judge a result on another "
     "recording: magpend identify check DIR RECORDING; compare results: magpend identify compare DIR DIR; say how sure "
     "they are: magpend identify posterior DIR.",
-    no_args_is_help=True,
-    rich_markup_mode=None,
-    context_settings=SETTINGS,
+    IdentifyGroup,
 )
 
 
@@ -64,18 +61,13 @@ def identify(
 
     You can stop the command at any time: the same command continues, and the finished files are the same.
     """
-    from pipeline.cli import console
     from pipeline.rig.identify import identification
     from pipeline.rig.identify.directory import PRESET
     from pipeline.rig.identify.reports import lines_of
 
     result = identification.identify(spec, out, figures=not no_figures, echo=console.note)
-    if as_json:
-        console.result(json.dumps(result, indent=1))
-        return
-    for line in lines_of(result):
-        console.result(line)
-    console.result(f"preset: {identification.directory_of(spec, out) / PRESET}")
+    preset = identification.directory_of(spec, out) / PRESET
+    tell_data(result, [*lines_of(result), f"preset: {preset}"], as_json)
 
 
 def check(
@@ -92,7 +84,6 @@ def check(
 
     Only the initial states of a recording's pieces are fitted. Orbits are compared with the computed branches.
     """
-    from pipeline.cli import console
     from pipeline.rig.identify.check_orbits import is_table
 
     if is_table(recording):
@@ -102,17 +93,14 @@ def check(
     from pipeline.rig.identify.reports import judgement_lines
 
     found = checking.check(directory, recording, like=like)
-    if as_json:
-        console.result(json.dumps(found, indent=1))
-        return
-    for line in judgement_lines(found, found["units"]):
-        console.result(line)
+    lines = judgement_lines(found, found["units"])
     for piece in found["pieces"]:
         values = ", ".join(
             f"{name} {'-' if rms is None else format(rms, '.4g')} {found['units'][name]}"
             for name, rms in piece["rms"].items()
         )
-        console.result(f"piece {piece['piece']}: {values}")
+        lines.append(f"piece {piece['piece']}: {values}")
+    tell_data(found, lines, as_json)
 
 
 def posterior(
@@ -128,18 +116,12 @@ def posterior(
     intervals of folds, doublings and Hopf points, and bands about the branches, in DIR/bands-N.nc and
     DIR/figures/bands-N.png.
     """
-    from pipeline.cli import console
     from pipeline.rig.identify.posterior_files import write_posterior
 
     parameters, bifurcations, written = write_posterior(directory, n, seed, figures=not no_figures)
-    if as_json:
-        rows = {"parameters": json_rows(parameters), "bifurcations": json_rows(bifurcations)}
-        console.result(json.dumps(rows, indent=1))
-        return
-    for line in (*parameters.lines, *bifurcations.lines):
-        console.result(line)
-    for path in written:
-        console.note(f"written: {path}")
+    rows = {"parameters": json_rows(parameters), "bifurcations": json_rows(bifurcations)}
+    tell_data(rows, [*parameters.lines, *bifurcations.lines], as_json)
+    console.note(*(f"written: {path}" for path in written))
 
 
 def spread(
@@ -151,8 +133,6 @@ def spread(
     csv: Csv = None,
 ) -> None:
     """List how fractions of cells and bifurcations are distributed over the runs of a posterior."""
-    from pipeline.cli import console
-    from pipeline.cli.common import check_csv, tell
     from pipeline.rig.identify.posterior_runs import spread as spreading
 
     check_csv(csv)
@@ -160,19 +140,16 @@ def spread(
 
 
 def _check_orbits(directory: Path, table: Path, as_json: bool) -> None:
-    from pipeline.cli import console
     from pipeline.rig.identify.check_orbits import check_orbits
     from pipeline.rig.identify.orbit_reports import orbit_lines
 
     found = check_orbits(directory, table)
-    if as_json:
-        console.result(json.dumps(found, indent=1))
-        return
+    lines = []
     for one in found["orbits"]:
         error = "lost" if one["relative_error"] is None else f"{100.0 * one['relative_error']:+.1f} %"
-        console.result(f"{one['name']} ({one['stability']}): amplitude {one['amplitude']:.4g}, error {error}")
-    for line in orbit_lines([found]):
-        console.result(line.removeprefix("fitted "))
+        lines.append(f"{one['name']} ({one['stability']}): amplitude {one['amplitude']:.4g}, error {error}")
+    lines += [line.removeprefix("fitted ") for line in orbit_lines([found])]
+    tell_data(found, lines, as_json)
 
 
 def compare(
@@ -181,15 +158,12 @@ def compare(
     csv: Csv = None,
 ) -> None:
     """Compare identifications by their errors on held-out pieces or orbits; the best one comes first."""
-    from pipeline.cli.common import check_csv, tell
     from pipeline.rig.identify.comparison import compare as comparing
 
     check_csv(csv)
     tell(comparing(directories), csv, as_json)
 
 
-identify_app.command(RUN, epilog=EXIT_HELP, context_settings=SETTINGS)(speaking(identify))
-identify_app.command("check", epilog=EXIT_HELP, context_settings=SETTINGS)(speaking(check))
-identify_app.command("posterior", epilog=EXIT_HELP, context_settings=SETTINGS)(speaking(posterior))
-identify_app.command("spread", epilog=EXIT_HELP, context_settings=SETTINGS)(speaking(spread))
-identify_app.command("compare", epilog=EXIT_HELP, context_settings=SETTINGS)(speaking(compare))
+add_command(identify_app, identify, RUN)
+for _command in (check, posterior, spread, compare):
+    add_command(identify_app, _command)

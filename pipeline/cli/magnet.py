@@ -7,7 +7,9 @@ from typing import Annotated
 
 import typer
 
-from pipeline.cli.common import Json
+from pipeline.cli import console
+from pipeline.cli.common import Json, tell_data
+from pipeline.cli.outputs import check_place
 
 
 def fit_magnet(
@@ -28,9 +30,6 @@ def fit_magnet(
     The command fits single curves, then all curves at once, and point dipoles for comparison. If a fit does
     not converge, nothing is written.
     """
-    import json as formats
-
-    from pipeline.cli import console
     from pipeline.rig.magnet.fitting import fit_measurement
     from pipeline.rig.magnet.measurement import find_measurement, read_measurement
     from pipeline.rig.magnet.results import report_of, summary_of, warnings_of, write_results
@@ -46,24 +45,18 @@ def fit_magnet(
         written += write_figures(outcome, folder)
     for warning in warnings_of(outcome):
         console.LOG.warning(warning)
-    if json:
-        console.result(formats.dumps(report_of(outcome), indent=1))
-    else:
-        for line in summary_of(outcome):
-            console.result(line)
-    for path in written:
-        console.note(f"written: {path}")
+    tell_data(report_of(outcome), summary_of(outcome), json)
+    console.note(*(f"written: {path}" for path in written))
     preset = folder / "preset.toml"
     console.note(f'use it with preset = "{preset}" in a specification, or magpend simulate --preset {preset}')
 
 
 def _folder(path: Path) -> Path:
-    from pipeline.cli.outputs import check_place
     from pipeline.specification.problems import SpecError
 
     if path.exists() and not path.is_dir():
-        raise SpecError([f"--out {path}: is a file; give a folder."])
+        raise SpecError(f"--out {path}: is a file; give a folder.")
     if not path.parent.is_dir():
-        raise SpecError([f"{path.parent}: no such folder; make it first."])
+        raise SpecError(f"{path.parent}: no such folder; make it first.")
     check_place(path)
     return path

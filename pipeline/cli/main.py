@@ -6,6 +6,7 @@ import os
 import sys
 from typing import Annotated, Any
 
+from pipeline.cli.console import LOG
 from pipeline.runs import stopping
 
 if __name__ == "__main__":
@@ -21,13 +22,12 @@ from pipeline.cli.exits import Exit
 from pipeline.cli.explore import explore
 from pipeline.cli.export import export
 from pipeline.cli.extend import extend
-from pipeline.cli.groups import SETTINGS, TopGroup
+from pipeline.cli.groups import SETTINGS, TopGroup, add_command
 from pipeline.cli.identify import identify_app
 from pipeline.cli.magnet import fit_magnet
 from pipeline.cli.measured import measured_app
 from pipeline.cli.model import model_app
 from pipeline.cli.models import models, presets
-from pipeline.cli.options import speaking
 from pipeline.cli.plot import plot_app
 from pipeline.cli.recordings import recordings_app
 from pipeline.cli.report import report
@@ -69,24 +69,27 @@ def _main(
     pass
 
 
-for _command, _settings in (
-    (run, {}),
-    (submit, {}),
-    (status, {}),
-    (verify, {}),
-    (extend, {}),
-    (zoom, EXTRA),
-    (simulate, EXTRA),
-    (explore, {}),
-    (export, {}),
-    (animate, EXTRA),
-    (report, {}),
-    (reproduce, {}),
-    (models, {}),
-    (presets, {}),
-    (fit_magnet, {}),
+_ANY_OPTION = (zoom, simulate, animate)
+"""Commands whose options include a model's states by name."""
+
+for _command in (
+    run,
+    submit,
+    status,
+    verify,
+    extend,
+    zoom,
+    simulate,
+    explore,
+    export,
+    animate,
+    report,
+    reproduce,
+    models,
+    presets,
+    fit_magnet,
 ):
-    app.command(epilog=EXIT_HELP, context_settings={**SETTINGS, **_settings})(speaking(_command))
+    add_command(app, _command, settings=EXTRA if _command in _ANY_OPTION else {})
 app.add_typer(analyse_app, name="analyse")
 app.add_typer(plot_app, name="plot")
 app.add_typer(model_app, name="model")
@@ -114,8 +117,6 @@ def _codes() -> list[tuple[tuple[type[BaseException], ...], Exit]]:
 
 
 def _complain(error: BaseException) -> None:
-    from pipeline.cli.console import LOG
-
     lines: list[Any] = getattr(error, "problems", None) or [str(error)]
     head = "magpend: " if len(lines) == 1 else f"magpend: {len(lines)} problems\n  "
     text = _short(head + "\n  ".join(map(str, lines)))

@@ -12,10 +12,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pipeline.cli.common import Csv, Directory, Json, check_csv, json_rows, read_pairs, tell
-from pipeline.cli.groups import SETTINGS, made, registry_group
+from pipeline.cli import console
+from pipeline.cli.common import Csv, Directory, Json, check_csv, json_rows, read_pairs, tell, tell_data
+from pipeline.cli.groups import command_group, made, registry_group
 from pipeline.cli.options import taking
 from pipeline.cli.outputs import check_file, check_place
+from pipeline.cli.plot import check_figure_path
 from pipeline.layout.writing import write_atomically
 
 if TYPE_CHECKING:
@@ -42,18 +44,17 @@ def _load(paths: list[Path], mappings: list[Path]) -> list[Mapping]:
     from pipeline.specification.problems import SpecError
 
     if len(mappings) not in (1, len(paths)):
-        raise SpecError([f"--mapping: {len(mappings)} for {len(paths)} recordings; give one for all, or one for each."])
+        raise SpecError(f"--mapping: {len(mappings)} for {len(paths)} recordings; give one for all, or one for each.")
     loaded = [load_mapping(m) for m in mappings] * (len(paths) if len(mappings) == 1 else 1)
     models = sorted({m.system for m in loaded}, key=lambda model: model.name)
     if len(models) > 1:
         raise SpecError(
-            [f"--mapping: the mappings name several models ({', '.join(m.name for m in models)}); a diagram has one."]
+            f"--mapping: the mappings name several models ({', '.join(m.name for m in models)}); a diagram has one."
         )
     return loaded
 
 
 def _read(paths: list[Path], mappings: list[Mapping]) -> list[xr.Dataset]:
-    from pipeline.cli import console
     from pipeline.rig.recordings import findings_of, read_recording, summary
 
     found = [read_recording(p, m) for p, m in zip(paths, mappings, strict=True)]
@@ -68,15 +69,12 @@ def _loaded(model: Model, preset: str | None, settings: list[str] | None) -> Par
 
 
 def _check_targets(out: Path | None, csv: str | None = None) -> None:
-    from pipeline.cli.plot import check_figure_path
-
     check_csv(csv)
     if out is not None:
         check_figure_path(out)
 
 
 def _save(figure: Any, target: Path) -> None:
-    from pipeline.cli import console
     from pipeline.plots import save_data, save_figure
 
     console.result(f"figure: {save_figure(figure, target)}")
@@ -151,7 +149,6 @@ def compare(
     and side agree. For each window edge it lists the shift from the model's edge [Hz]. It writes
     comparison.png, beside.png, over.png, steps.csv, edges.csv and comparison.nc to FOLDER.
     """
-    from pipeline.cli import console
     from pipeline.plots import Frame
     from pipeline.rig.measured.compare import compare_with
     from pipeline.rig.measured.computed import Computed, cube_and_parameters
@@ -174,15 +171,13 @@ def compare(
         )
     steps_of, ends = steps_table(compared), edges_table(compared)
     if as_json:
-        console.result(json.dumps({"steps": json_rows(steps_of), "edges": json_rows(ends)}, indent=1))
+        tell_data({"steps": json_rows(steps_of), "edges": json_rows(ends)}, (), as_json)
         return
     tell(steps_of, csv, as_json=False)
     if csv == "-":
         return
-    for line in (*ends.lines, *summary_lines(compared)):
-        console.result(line)
-    for path in written:
-        console.note(f"written: {path}")
+    console.result(*ends.lines, *summary_lines(compared))
+    console.note(*(f"written: {path}" for path in written))
 
 
 def series(
@@ -194,7 +189,6 @@ def series(
     settings: Set = None,
 ) -> None:
     """Draw a recording and the model from the same state: time series and phase portraits."""
-    from pipeline.cli import console
     from pipeline.plots import Frame
     from pipeline.rig.measured.overlays import plot_series
     from pipeline.rig.measured.series import series_of
@@ -276,7 +270,6 @@ def trace(
     A controller keeps the rig near each target until its output is one cosine: the response is then an orbit of
     the rig under this drive. The table is what measured branch reads.
     """
-    from pipeline.cli import console
     from pipeline.rig import control
 
     check_file(out)
@@ -310,10 +303,7 @@ def _make(name: str) -> Any:
     return made(name, command, str(function.__doc__))
 
 
-measured_app = typer.Typer(
-    cls=registry_group("measured", lambda: list(_COMMANDS), _make),
-    help="Diagrams and branches of recorded motions, beside and over computed ones.",
-    no_args_is_help=True,
-    rich_markup_mode=None,
-    context_settings=SETTINGS,
+measured_app = command_group(
+    "Diagrams and branches of recorded motions, beside and over computed ones.",
+    registry_group("measured", lambda: list(_COMMANDS), _make),
 )

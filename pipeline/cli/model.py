@@ -8,20 +8,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pipeline.cli.common import EXIT_HELP
-from pipeline.cli.groups import SETTINGS
-from pipeline.cli.options import completing, speaking
+from pipeline.cli import console
+from pipeline.cli.exits import Exit
+from pipeline.cli.groups import add_command, command_group
+from pipeline.cli.models import all_of, described
+from pipeline.cli.options import completing
 
 if TYPE_CHECKING:
     from magpend_core.models.model import Model
     from magpend_core.models.summary import Description
 
-model_app = typer.Typer(
-    help="Your own system as text: begin one, and check how magpend reads it.",
-    no_args_is_help=True,
-    rich_markup_mode=None,
-    context_settings=SETTINGS,
-)
+model_app = command_group("Your own system as text: begin one, and check how magpend reads it.")
 
 
 def _names() -> list[str]:
@@ -47,8 +44,6 @@ def show(
     Integration steps are adapted to the detected edges of the drive, steep layers, switches and impacts. The
     checks evaluate the equations at the starts of a specification, or near 0, and compile nothing.
     """
-    from pipeline.cli import console
-    from pipeline.cli.exits import Exit
     from pipeline.runs.modelling import examine
 
     model, found = examine(name)
@@ -57,8 +52,7 @@ def show(
     elif latex:
         _latex(model, found)
     else:
-        for line in _lines(model, found):
-            console.result(line)
+        console.result(*_lines(model, found))
     if found.problems:
         raise typer.Exit(Exit.REFUSED)
 
@@ -69,7 +63,6 @@ def new(
     ] = None,
 ) -> None:
     """Write a commented specification with a model of your own as a template; it runs unchanged."""
-    from pipeline.cli import console
     from pipeline.runs.modelling import write_template
 
     if file is None:
@@ -81,12 +74,11 @@ def new(
 
 
 for _command in (show, new):
-    model_app.command(epilog=EXIT_HELP, context_settings=SETTINGS)(speaking(_command))
+    add_command(model_app, _command)
 
 
 def _lines(model: Model, found: Description) -> list[str]:
     from magpend_core.models.summary import checks_of
-    from pipeline.cli.models import all_of
 
     lines = all_of(model)
     if found.equations:
@@ -104,12 +96,11 @@ def _lines(model: Model, found: Description) -> list[str]:
 
 
 def _latex(model: Model, found: Description) -> None:
-    from pipeline.cli import console
     from pipeline.specification.problems import SpecError
 
     if not found.latex:
         raise SpecError(
-            [f"--latex: {model.name} is not a text model, so its equations cannot be written; drop the option."]
+            f"--latex: {model.name} is not a text model, so its equations cannot be written; drop the option."
         )
     console.result("\\begin{align}")
     console.result(" \\\\\n".join(f"  {line}" for line in found.latex))
@@ -117,8 +108,6 @@ def _latex(model: Model, found: Description) -> None:
 
 
 def _as_dict(model: Model, found: Description) -> dict[str, Any]:
-    from pipeline.cli.models import described
-
     return {
         **described(model),
         "autonomous": model.autonomous,

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pipeline.cli.common import Json
+from pipeline.cli import console
+from pipeline.cli.common import Json, tell
 from pipeline.cli.options import completing
 
 if TYPE_CHECKING:
@@ -38,7 +39,6 @@ def models(
 ) -> None:
     """List the models: their states, parameters, quantities and presets."""
     from magpend_core.models import load_model, model_names
-    from pipeline.cli.common import tell
     from pipeline.products.product import Table
     from pipeline.specification.models import find_model
 
@@ -112,11 +112,9 @@ def presets(
 ) -> None:
     """List the presets of a model: values, units, and the origin of each value."""
     from magpend_core.models.presets import find_preset
-    from pipeline.cli import console
     from pipeline.specification.models import find_model
 
     found = find_preset(name) if name else None
     chosen = find_model(model if model != DEFAULT else getattr(found, "model", "") or model, at="--model")
     for preset in [found] if found else chosen.preset_names:
-        for line in _preset(chosen, preset):
-            console.result(line)
+        console.result(*_preset(chosen, preset))

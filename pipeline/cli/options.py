@@ -10,6 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Union, get_args, get_
 
 import typer
 
+from pipeline.cli import console, outputs
+from pipeline.cli.common import read_pairs
+
 if TYPE_CHECKING:
     from pydantic.fields import FieldInfo
 
@@ -41,8 +44,6 @@ def speaking(command: Command) -> Command:
     has_force = any(p.name == "force" for p in _own(command))
 
     def run(*args: Any, **given: Any) -> None:
-        from pipeline.cli import console, outputs
-
         outputs.allow(given["force"] if has_force else given.pop("force"))
         console.configure(**{name: given.pop(name) for name in _VOICES})
         if (path := given.pop(_IMPORTED)) is not None:
@@ -161,8 +162,6 @@ def _shown(default: Any) -> str:
 
 
 def _value(info: FieldInfo, flag: str, value: Any) -> Any:
-    from pipeline.cli.common import read_pairs
-
     if get_origin(kind_of(info)) is dict:
         return read_pairs(flag, value, "frequency=2.2")
     return value

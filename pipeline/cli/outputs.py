@@ -55,7 +55,7 @@ def check_file(path: Path, option: str = "--out", within: str = "") -> None:
         _refuse(path, option)
 
 
-def check_table(path: Path, header: str, option: str = "--csv") -> None:
+def check_table(path: Path, header: str) -> None:
     """Raise SpecError if a CSV file exists and has another header, since it may be another program's table.
 
     Raises
@@ -68,7 +68,7 @@ def check_table(path: Path, header: str, option: str = "--csv") -> None:
     with path.open("rb") as file:
         first = file.readline(_LOOKED_AT).rstrip(b"\r\n")
     if first and first != header.encode():
-        _refuse(path, option)
+        _refuse(path, "--csv")
 
 
 def check_log(path: Path) -> None:
@@ -92,7 +92,7 @@ def _refuse(path: Path, option: str) -> None:
 
     if not _forced:
         raise SpecError(
-            [f"{option} {path}: exists, and magpend did not write it; give another name, or --force to replace it."]
+            f"{option} {path}: exists, and magpend did not write it; give another name, or --force to replace it."
         )
 
 

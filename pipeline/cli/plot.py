@@ -5,17 +5,17 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import typer
-
+from pipeline.cli import console
 from pipeline.cli.common import Directory
-from pipeline.cli.groups import SETTINGS, made, registry_group
+from pipeline.cli.groups import command_group, made, registry_group
 from pipeline.cli.options import taking
+from pipeline.cli.outputs import check_file
 
 if TYPE_CHECKING:
     from pipeline.products.product import FigureOptions
     from pipeline.store.files import Files
 
-FORMATS = ("png", "pdf", "svg")
+SUFFIXES = (".png", ".pdf", ".svg")
 
 
 def _names() -> list[str]:
@@ -35,18 +35,13 @@ def _make(name: str) -> Any:
     return made(name, taking(figure.options, command), figure.help)
 
 
-plot_app = typer.Typer(
-    cls=registry_group("plot", _names, _make),
-    help="Draw figures from a stored cube; no cell is computed again.",
-    no_args_is_help=True,
-    rich_markup_mode=None,
-    context_settings=SETTINGS,
+plot_app = command_group(
+    "Draw figures from a stored cube; no cell is computed again.", registry_group("plot", _names, _make)
 )
 
 
 def draw(directory: str, name: str, options: FigureOptions) -> None:
     """Draw a figure of a run, write it with its data, and print where they are."""
-    from pipeline.cli import console
     from pipeline.runs.drawing import drawn, ready
     from pipeline.store.errors import RefusedError
     from pipeline.store.files import FIGURES
@@ -84,13 +79,8 @@ def _in_run(files: Files, name: str, options: FigureOptions) -> Path:
 
 def check_figure_path(path: Path, within: str = "") -> None:
     """Raise an error if a figure file cannot be written, before anything is computed; see `check_file`."""
-    from pipeline.cli.outputs import check_file
-    from pipeline.specification.problems import SpecError
+    from pipeline.specification.files import check_new_file
 
-    suffixes = [f".{name}" for name in FORMATS]
-    if path.suffix.lower() not in suffixes:
-        raise SpecError([f"{path}: the suffix must be one of {', '.join(suffixes)}."])
-    if not path.parent.is_dir():
-        raise SpecError([f"{path.parent}: no such folder; make it first."])
+    check_new_file(path, SUFFIXES)
     for file in (path, path.with_suffix(".nc")):
         check_file(file, within=within)

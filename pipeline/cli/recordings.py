@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from pipeline.cli.common import EXIT_HELP, Json, tell
-from pipeline.cli.groups import SETTINGS
-from pipeline.cli.options import speaking
+from pipeline.cli import console
+from pipeline.cli.common import Json, json_rows, tell, tell_data
+from pipeline.cli.groups import add_command, command_group
 from pipeline.cli.outputs import check_file, check_place
 from pipeline.cli.plot import check_figure_path
 from pipeline.layout.writing import write_atomically
@@ -24,12 +23,7 @@ Window = Annotated[
     typer.Option(metavar="FROM TO", help="Part of the recording [s since its first sample]."),
 ]
 
-recordings_app = typer.Typer(
-    help="Recordings of a rig: show a file's content and findings, convert it, simulate one.",
-    no_args_is_help=True,
-    rich_markup_mode=None,
-    context_settings=SETTINGS,
-)
+recordings_app = command_group("Recordings of a rig: show a file's content and findings, convert it, simulate one.")
 
 
 def show(
@@ -57,7 +51,7 @@ def show(
         check_figure_path(out)
     if mapping is None:
         if out is not None or window is not None or smooth:
-            raise SpecError(["--mapping: missing; the figure shows states, and a mapping assigns channels to them."])
+            raise SpecError("--mapping: missing; the figure shows states, and a mapping assigns channels to them.")
         tell(describe_file(read_raw(file)), None, as_json)
         return
     ds = _read(file, mapping, window)
@@ -77,11 +71,11 @@ def convert(
     ] = None,
 ) -> None:
     """Convert a recording to SI units and another file format; for TDMS and CSV also write its mapping file."""
-    from pipeline.cli import console
     from pipeline.rig.recordings import mapping_for, write_recording
-    from pipeline.rig.recordings.writing import check_target
+    from pipeline.rig.recordings.writing import SUFFIXES
+    from pipeline.specification.files import check_new_file
 
-    check_target(out)
+    check_new_file(out, SUFFIXES)
     _check_recording(out)
     _keep(file, out)
     ds = _smoothed(_read(file, mapping, window), smooth, smoothing_window)
@@ -99,16 +93,16 @@ def simulate(
     out: Annotated[Path, typer.Option(help="File to write: .tdms or .csv; the mapping goes beside it.")],
 ) -> None:
     """Simulate a recording of an experiment, and write it with the mapping file that reads it."""
-    from pipeline.cli import console
-    from pipeline.rig.recordings.writing import SUFFIXES, check_target, write_raw
+    from pipeline.rig.recordings.writing import SUFFIXES, write_raw
     from pipeline.rig.simulation import load_rig, simulated
+    from pipeline.specification.files import check_new_file
     from pipeline.specification.problems import SpecError
 
-    check_target(out, SUFFIXES[:2])
+    check_new_file(out, SUFFIXES[:2])
     _check_recording(out)
     beside = out.with_suffix(".toml")
     if beside.resolve() == spec.resolve():
-        raise SpecError([f"--out {out}: its mapping would replace {spec}; give another name."])
+        raise SpecError(f"--out {out}: its mapping would replace {spec}; give another name.")
     raw, mapping = simulated(load_rig(spec), is_csv=out.suffix.lower() == ".csv")
     beside = _beside(out, mapping.toml())
     console.result(f"recording: {write_raw(raw, out)}")
@@ -132,11 +126,10 @@ def drive(
 
     The command prints frequency, jitter and duty cycle. With edges, the model gives shape and amplitude.
     """
-    from pipeline.cli import console
     from pipeline.rig.driving import drive_file
-    from pipeline.rig.recordings.writing import check_target
+    from pipeline.specification.files import check_new_file
 
-    check_target(out, (".csv",))
+    check_new_file(out, (".csv",))
     check_file(out)
     made = drive_file(_read(file, mapping, window), kind, tolerance=tolerance)
     write_atomically(out, made.text)
@@ -156,7 +149,7 @@ def _keep(file: Path, out: Path) -> None:
     from pipeline.specification.problems import SpecError
 
     if out.exists() and file.exists() and out.samefile(file):
-        raise SpecError([f"--out {out}: is the input file; give another name."])
+        raise SpecError(f"--out {out}: is the input file; give another name.")
 
 
 def _check_recording(out: Path) -> None:
@@ -173,10 +166,8 @@ def _beside(out: Path, text: str) -> Path:
     path = out.with_suffix(".toml")
     if path.exists() and path.read_bytes() != text.encode():
         raise SpecError(
-            [
-                f"--out {out}: its mapping would replace {path}, which holds something else; give another "
-                "name, or move that file away."
-            ]
+            f"--out {out}: its mapping would replace {path}, which holds something else; give another "
+            "name, or move that file away."
         )
     return path
 
@@ -194,24 +185,17 @@ def _smoothed(ds: xr.Dataset, wanted: bool, window_s: float | None) -> xr.Datase
 
 
 def _tell(ds: xr.Dataset, as_json: bool) -> None:
-    from pipeline.cli import console
-    from pipeline.cli.common import json_rows
     from pipeline.rig.recordings.overview import describe_recording
 
     quantities, findings = describe_recording(ds)
-    if not as_json:
-        for line in (*quantities.lines, *findings.lines):
-            console.result(line)
-        return
     keys = ("file", "sha256", "format", "model", "sampling_rate_hz", "simulated")
     about: dict[str, Any] = {key: ds.attrs[key] for key in keys if key in ds.attrs}
     about |= {"samples": ds.sizes["sample"], "pieces": len(set(ds["piece"].values.tolist()))}
     told = {**about, "quantities": json_rows(quantities), "findings": json_rows(findings)}
-    console.result(json.dumps(told, indent=1))
+    tell_data(told, [*quantities.lines, *findings.lines], as_json)
 
 
 def _draw(ds: xr.Dataset, out: Path, as_json: bool) -> None:
-    from pipeline.cli import console
     from pipeline.plots import save_figure
     from pipeline.rig.recordings.figure import plot_recording
 
@@ -220,4 +204,4 @@ def _draw(ds: xr.Dataset, out: Path, as_json: bool) -> None:
 
 
 for _command in (show, convert, drive, simulate):
-    recordings_app.command(epilog=EXIT_HELP, context_settings=SETTINGS)(speaking(_command))
+    add_command(recordings_app, _command)

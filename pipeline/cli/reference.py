@@ -12,7 +12,7 @@ import sys
 import tomllib
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args, get_origin
 
 ROOT = Path(__file__).parents[2]
 _BLOCK = re.compile(r"(<!-- reference: ([\w ]+) -->\n).*?(<!-- /reference -->)", re.DOTALL)
@@ -290,8 +290,6 @@ def _default(info: Any) -> str:
 
 
 def _bounds(info: Any) -> str:
-    from typing import Literal, get_args, get_origin
-
     from pipeline.cli.options import bounds_of
 
     if get_origin(info.annotation) is Literal:

@@ -7,6 +7,9 @@ from typing import Annotated
 
 import typer
 
+from pipeline.cli import console
+from pipeline.cli.outputs import check_file
+
 
 def report(
     directories: Annotated[list[str], typer.Argument(metavar="DIR...", help="Run directories, or s3://BUCKET/PREFIX.")],
@@ -28,7 +31,6 @@ def report(
     the hysteresis of a continuation are computed if they are missing. For other missing results the page
     names the command.
     """
-    from pipeline.cli import console
     from pipeline.report.page import write
     from pipeline.report.report import report as make
 
@@ -40,15 +42,14 @@ def report(
 
 def check_page(path: Path) -> None:
     """Raise an error if the HTML page cannot be written, before anything is computed."""
-    from pipeline.cli.outputs import check_file
     from pipeline.specification.problems import SpecError
     from pipeline.store.errors import RefusedError
     from pipeline.store.local import unwritable
 
     if path.suffix.lower() not in (".html", ".htm"):
-        raise SpecError([f"--out {path}: the suffix must be .html."])
+        raise SpecError(f"--out {path}: the suffix must be .html.")
     if path.is_dir() or not path.parent.is_dir():
-        raise SpecError([f"--out {path}: must be a file in a folder that exists."])
+        raise SpecError(f"--out {path}: must be a file in a folder that exists.")
     check_file(path)
     if problem := unwritable(path.parent):
         raise RefusedError(f"{problem}; give another place for the page: --out FILE.")

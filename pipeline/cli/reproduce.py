@@ -8,8 +8,10 @@ from typing import Annotated
 
 import typer
 
+from pipeline.cli import console
 from pipeline.cli.exits import Exit
 from pipeline.cli.options import completing
+from pipeline.cli.outputs import check_place
 
 
 def studies() -> Iterable[str]:
@@ -45,7 +47,6 @@ def reproduce(
     Complete runs are used, other runs are continued. Every claim gets a measured value with its interval, and
     one of four verdicts. A coarse grid or a small sample leaves a claim undecided.
     """
-    from pipeline.cli import console
     from pipeline.report.reproduce import calibrated_on, decided_first, headline, spelled
     from pipeline.report.reproduce import reproduce as carry_out
     from pipeline.report.study import load_study
@@ -71,13 +72,12 @@ def reproduce(
 
 
 def _check_folder(folder: Path) -> None:
-    from pipeline.cli.outputs import check_place
     from pipeline.specification.problems import SpecError
     from pipeline.store.errors import RefusedError
     from pipeline.store.local import unwritable
 
     if folder.exists() and not folder.is_dir():
-        raise SpecError([f"--out {folder}: is a file; give a folder."])
+        raise SpecError(f"--out {folder}: is a file; give a folder.")
     check_place(folder)
     there = next(place for place in (folder, *folder.absolute().parents) if place.is_dir())
     if problem := unwritable(there):

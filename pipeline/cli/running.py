@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pipeline.cli.common import Directory, Json
+from pipeline.cli import console
+from pipeline.cli.common import Directory, Json, tell
 from pipeline.cli.exits import Exit
 from pipeline.cli.options import completing
+from pipeline.cli.plot import draw
 
 if TYPE_CHECKING:
     from pipeline.store.run import Run
@@ -79,7 +81,6 @@ def run(
     the end it counts the cells by status. Cells that diverged or failed are results, and the exit code is 0;
     above 1 % a warning reports them.
     """
-    from pipeline.cli import console
     from pipeline.runs import outcome, preview
     from pipeline.runs import run as runs
     from pipeline.store.run import Run
@@ -88,8 +89,7 @@ def run(
         _run_posterior(spec, posterior, n_draws, out, smoke=smoke, workers=workers)
         return
     if dry_run:
-        for line in preview.describe_plan(spec, out, workers=workers, smoke=smoke):
-            console.result(line)
+        console.result(*preview.describe_plan(spec, out, workers=workers, smoke=smoke))
         return
     state = runs.run(
         spec,
@@ -103,8 +103,7 @@ def run(
     )
     done = Run.open(state.files)
     console.result(f"cube: {state.files.below('cube.zarr').name}")
-    for line in outcome.summary(done):
-        console.result(line)
+    console.result(*outcome.summary(done))
     if text := outcome.warning(done):
         console.LOG.warning(text)
     if plot:
@@ -112,19 +111,15 @@ def run(
 
 
 def _run_posterior(spec: str, directory: Path, n: int, out: str | None, *, smoke: bool, workers: int | None) -> None:
-    from pipeline.cli import console
     from pipeline.rig.identify.posterior_runs import run_posterior, spread
 
     folder = run_posterior(spec, directory, n, out, smoke=smoke, workers=workers, echo=console.note)
-    for line in spread(folder, echo=console.note).lines:
-        console.result(line)
+    console.result(*spread(folder, echo=console.note).lines)
     console.result(f"runs: {folder}; their bifurcations: magpend identify spread {folder} --branches")
 
 
 def _plot(run: Run) -> None:
     """Draw the figure that shows a finished run best; if it cannot be drawn, print the reason."""
-    from pipeline.cli import console
-    from pipeline.cli.plot import draw
     from pipeline.products.registry import FIGURES
     from pipeline.runs.preview import figure_command, shown
     from pipeline.specification.problems import SpecError
@@ -143,7 +138,6 @@ def _plot(run: Run) -> None:
 
 def status(directory: Directory, json: Json = False) -> None:
     """Print how much of a run is computed and stored, and how many cells have each status."""
-    from pipeline.cli.common import tell
     from pipeline.products.product import Table
     from pipeline.runs.status import describe_state, state
 
@@ -172,11 +166,9 @@ def verify(
     ] = False,
 ) -> None:
     """Check a run for damage: stored bytes against the commit records, metadata and coordinates against run.json."""
-    from pipeline.cli import console
     from pipeline.runs import verify as verification
 
     found = verification.verify_run(directory, repair=repair)
-    for line in verification.describe(found, directory, repaired=repair):
-        console.result(line)
+    console.result(*verification.describe(found, directory, repaired=repair))
     if not (found.sound or (repair and not found.skeleton)):
         raise typer.Exit(Exit.DAMAGED)

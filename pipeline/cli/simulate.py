@@ -9,9 +9,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from magpend_core.defaults import ATOL, RTOL
+from pipeline.cli import console
 from pipeline.cli.common import read_pairs
 from pipeline.cli.models import DEFAULT, names
 from pipeline.cli.options import completing
+from pipeline.cli.outputs import check_file
 from pipeline.cli.plot import check_figure_path
 
 if TYPE_CHECKING:
@@ -69,14 +71,13 @@ def simulate(
     periodic orbit, or how long a transient it would need. With --drive the initial state is that at the start
     of the recording, and time is the recording's.
     """
-    from pipeline.cli import console
-    from pipeline.cli.outputs import check_file
     from pipeline.compute import simulate as simulation
+    from pipeline.specification.files import check_new_file
     from pipeline.specification.models import find_model
     from pipeline.store.provenance import provenance, versions
 
     chosen = find_model(model, at="--model")
-    simulation.check_output(out)
+    check_new_file(out, simulation.SUFFIXES)
     check_file(out)
     target = figure or out.with_suffix(".png")
     if not no_figure:
@@ -87,7 +88,7 @@ def simulate(
         frequency = DEFAULT_HZ
     ds = simulation.simulate(
         frequency,
-        simulation.start_of(chosen, _states(context.args)),
+        simulation.start_of(chosen, read_states(context.args)),
         drive=drive,
         model=chosen,
         preset=preset,
@@ -107,7 +108,6 @@ def simulate(
 
 
 def _draw(ds: xr.Dataset, target: Path, series: Path) -> None:
-    from pipeline.cli import console
     from pipeline.plots import plot_trajectory, save_data, save_figure
 
     figure = plot_trajectory(ds)
@@ -116,7 +116,8 @@ def _draw(ds: xr.Dataset, target: Path, series: Path) -> None:
         console.result(f"data: {save_data(figure, target)}")
 
 
-def _states(words: list[str]) -> dict[str, float]:
+def read_states(words: list[str]) -> dict[str, float]:
+    """Parse ``--NAME VALUE`` pairs into the values of states by name."""
     return {name: values[0] for name, values in read_named(words, 1).items()}
 
 

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from pipeline.cli import console
 from pipeline.cli.running import ClusterFile, Spec
 
 
@@ -26,7 +27,6 @@ def submit(
 
     The job continues where an earlier one was stopped.
     """
-    from pipeline.cli import console
     from pipeline.runs.submit import prepare, send
 
     prepared = prepare(spec, out, cluster, smoke=smoke)
@@ -35,5 +35,4 @@ def submit(
     elif prepared.complete:
         console.result(f"{prepared.name} is complete; nothing to send.")
     else:
-        for line in send(prepared).lines():
-            console.result(line)
+        console.result(*send(prepared).lines())

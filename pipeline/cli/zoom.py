@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
+from pipeline.cli import console
 from pipeline.cli.common import read_pairs
 from pipeline.cli.simulate import read_named
 
@@ -37,7 +38,6 @@ def zoom(
     parameter, --NAME-deg LOW HIGH for an angle. --num-NAME N gives a range its own number of points. The new
     specification is validated before it is written. Run it with: magpend run OUT
     """
-    from pipeline.cli import console
     from pipeline.layout.vocabulary import parameter_name
     from pipeline.runs.zoom import Changes, read_source, write_zoom
 

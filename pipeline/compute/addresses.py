@@ -37,8 +37,6 @@ class Address:
 
     Attributes
     ----------
-    scheme, host : str
-    port : int
     source : str
         Source of the address, for messages: the option, a variable, or a file.
     """
@@ -73,14 +71,12 @@ def read_address(text: str, source: str) -> Address:
     scheme = (match["scheme"] or "tcp").lower() if match else ""
     if match is None or not 0 < int(match["port"]) < 65536:
         raise SpecError(
-            [
-                f"{source}: {text!r} is no address of a scheduler; give tcp://HOST:PORT with a port from 1 to "
-                "65535, tls://HOST:PORT, the scheduler's FILE.json, slurm, pbs, sge, lsf, local or none."
-            ]
+            f"{source}: {text!r} is no address of a scheduler; give tcp://HOST:PORT with a port from 1 to "
+            "65535, tls://HOST:PORT, the scheduler's FILE.json, slurm, pbs, sge, lsf, local or none."
         )
     if scheme not in SCHEMES:
         hint = " A dashboard's address is another than its scheduler's." if scheme.startswith("http") else ""
-        raise SpecError([f"{source}: {text!r}: must begin with tcp:// or tls://.{hint}"])
+        raise SpecError(f"{source}: {text!r}: must begin with tcp:// or tls://.{hint}")
     return Address(scheme, match["host"], int(match["port"]), source)
 
 
@@ -90,20 +86,16 @@ def _from_file(path: Path) -> Address:
         address = content["address"]
     except OSError as error:
         raise SpecError(
-            [
-                f"{path}: cannot be read ({error.strerror or error}); dask scheduler --scheduler-file FILE "
-                "writes it when it starts."
-            ]
+            f"{path}: cannot be read ({error.strerror or error}); dask scheduler --scheduler-file FILE "
+            "writes it when it starts."
         ) from None
     except (ValueError, TypeError, KeyError, RecursionError):
         raise SpecError(
-            [
-                f"{path}: is no scheduler file, which is JSON with an 'address'; dask scheduler --scheduler-file "
-                "FILE writes one."
-            ]
+            f"{path}: is no scheduler file, which is JSON with an 'address'; dask scheduler --scheduler-file "
+            "FILE writes one."
         ) from None
     if not isinstance(address, str) or address.lower().endswith(".json"):
-        raise SpecError([f"{path}: its 'address' must be a text such as tcp://HOST:PORT."])
+        raise SpecError(f"{path}: its 'address' must be a text such as tcp://HOST:PORT.")
     return read_address(address, str(path))
 
 

@@ -67,7 +67,7 @@ class Where:
         """
         found = self._resolved()
         if self.dashboard and found != IN_PROCESS and not isinstance(found, Address) and not find_spec("bokeh"):
-            raise SpecError(["--dashboard: needs bokeh; install it: pip install 'magpend[dashboard]'."])
+            raise SpecError("--dashboard: needs bokeh; install it: pip install 'magpend[dashboard]'.")
         return found
 
     def _resolved(self) -> Address | Cluster | str:
@@ -76,10 +76,8 @@ class Where:
             return self._cluster(wanted.lower())
         if self.cluster_file is not None:
             raise SpecError(
-                [
-                    f"--cluster {self.cluster_file}: says what a job of a batch system is, and --scheduler "
-                    f"{wanted} asks for none; leave one of them out, or give --scheduler {' or '.join(QUEUES)}."
-                ]
+                f"--cluster {self.cluster_file}: says what a job of a batch system is, and --scheduler "
+                f"{wanted} asks for none; leave one of them out, or give --scheduler {' or '.join(QUEUES)}."
             )
         if wanted.lower() in (LOCAL, IN_PROCESS):
             return wanted.lower()
@@ -92,18 +90,14 @@ class Where:
         file = self.cluster_file or os.environ.get(CLUSTER_FILE)
         if not file:
             raise SpecError(
-                [
-                    f"--scheduler {kind}: what is a job? Say it in a file with a [cluster] table and give "
-                    f"--cluster FILE, or set {CLUSTER_FILE}; docs/clusters.md has an example."
-                ]
+                f"--scheduler {kind}: what is a job? Say it in a file with a [cluster] table and give "
+                f"--cluster FILE, or set {CLUSTER_FILE}; docs/clusters.md has an example."
             )
         cluster = load_cluster(file)
         if kind and cluster.kind != kind:
             raise SpecError(
-                [
-                    f"--scheduler {kind}: {file} describes jobs of {cluster.kind}; leave --scheduler out, or "
-                    "give another file."
-                ]
+                f"--scheduler {kind}: {file} describes jobs of {cluster.kind}; leave --scheduler out, or "
+                "give another file."
             )
         check_means(cluster)
         return cluster
@@ -178,7 +172,7 @@ def _patience() -> int:
     try:
         return seconds_of(text)
     except ValueError as error:
-        raise SpecError([f"{WAIT} = {error}"]) from None
+        raise SpecError(f"{WAIT} = {error}") from None
 
 
 def _wait(client: Any, name: str, patience_s: int, echo: Echo) -> None:

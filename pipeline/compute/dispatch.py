@@ -136,10 +136,10 @@ class Window:
         if chosen:
             self._submit(chosen)
 
-    def _submit(self, indices: list[int], elsewhere: list[str] | None = None) -> None:
+    def _submit(self, indices: list[int]) -> None:
         tickets = range(self._ticket, self._ticket + len(indices))
         self._ticket = tickets.stop
-        futures = self._client.map(self._task, tickets, indices, pure=False, workers=elsewhere)
+        futures = self._client.map(self._task, tickets, indices, pure=False)
         for ticket, index, future in zip(tickets, indices, futures, strict=True):
             self._flights[ticket] = _Flight(index, future)
             future.add_done_callback(partial(self._on_end, ticket))

@@ -46,8 +46,9 @@ def exponents(job: Job, options: LyapunovOptions) -> dict[str, np.ndarray]:
         **options.model_dump(),
     )
     is_closed = cells.status[branch, point] == Status.PERIODIC
+    falling = np.sort(found.weighted, axis=1)[:, ::-1]
     values = {
-        "lyapunov": np.where(is_closed[:, None], _falling(found.weighted), found.exponents),
+        "lyapunov": np.where(is_closed[:, None], falling, found.exponents),
         "lyapunov_stderr": found.stderr,
         "lyapunov_blocks": found.blocks,
         "divergence": found.divergence,
@@ -59,10 +60,6 @@ def exponents(job: Job, options: LyapunovOptions) -> dict[str, np.ndarray]:
         filled[variable.name] = np.full((*cells.status.shape, *own), variable.fill, variable.dtype)
         filled[variable.name][branch, point] = values[variable.name]
     return filled
-
-
-def _falling(rates: np.ndarray) -> np.ndarray:
-    return np.sort(rates, axis=1)[:, ::-1]
 
 
 def flags(found: LyapunovExponents, *, is_flow: bool = False) -> np.ndarray:

@@ -25,7 +25,6 @@ class Job:
 
     Attributes
     ----------
-    spec : Spec
     inputs : Inputs
         What `run_branches` took.
     cells : Sections

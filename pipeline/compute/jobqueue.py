@@ -89,16 +89,6 @@ def settings(cluster: Cluster, folder: Path) -> dict[str, Any]:
     return {name: value for name, value in found.items() if value is not None}
 
 
-def worker_script(cluster: Cluster, folder: Path) -> str:
-    """Return the batch script of one worker's job, with placeholders for the scheduler's address and the worker's
-    name.
-    """
-    import dask_jobqueue
-
-    job = getattr(dask_jobqueue, _CLASSES[cluster.kind]).job_cls
-    return str(job("tls://SCHEDULER:PORT", name="NAME", **settings(cluster, folder)).job_script())
-
-
 def _keys(folder: Path) -> Any:
     """Write new TLS keys, shared by scheduler, workers and client, to a folder that the jobs can read."""
     from distributed import Security

@@ -21,6 +21,7 @@ from pipeline.layout.domains import check_states
 from pipeline.layout.vocabulary import model_attribute
 from pipeline.layout.writing import write_atomically, write_netcdf
 from pipeline.specification.drive_files import RecordedDrive, load_drive
+from pipeline.specification.files import check_new_file
 from pipeline.specification.problems import SpecError, unknown_name, validated
 from pipeline.specification.recorded_drive import model_problems
 from pipeline.specification.tables import FREQUENCY, Integration
@@ -283,17 +284,9 @@ def _problems(series: Series) -> list[str]:
     return found
 
 
-def check_output(path: Path) -> None:
-    """Raise SpecError if a time series cannot be written to a path."""
-    if path.suffix.lower() not in SUFFIXES:
-        raise SpecError([f"{path}: the suffix must be one of {', '.join(SUFFIXES)}."])
-    if not path.parent.is_dir():
-        raise SpecError([f"{path.parent}: no such folder; make it first."])
-
-
 def write_series(ds: xr.Dataset, path: Path) -> Path:
     """Write a time series as CSV or NetCDF; the suffix of the file decides."""
-    check_output(path)
+    check_new_file(path, SUFFIXES)
     if path.suffix.lower() == ".nc":
         write_netcdf(path, ds)
         return path

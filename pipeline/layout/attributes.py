@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 if TYPE_CHECKING:
     import xarray as xr
+
+
+def code_flags(words: Sequence[str]) -> dict[str, Any]:
+    """Return the CF flag attributes of a variable with the codes 0, 1, ...: its values, and their labels `words`."""
+    return {"flag_values": np.arange(len(words), dtype=np.int8), "flag_meanings": " ".join(words)}
 
 
 def netcdf_safe(ds: xr.Dataset) -> xr.Dataset:

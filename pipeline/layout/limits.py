@@ -111,10 +111,8 @@ def check_space(plan: Plan, folder: Path | None, n_cells: int | None = None) -> 
         lacking.append(f"{n_files} files, and there is room for {files}")
     if lacking:
         raise SpecError(
-            [
-                f"{folder}: the run needs {' and '.join(lacking)}; make room, give another --out, ask for less "
-                f"(cells, integration.n_keep), or set {GO_ON}=0 to go on as far as there is room."
-            ]
+            f"{folder}: the run needs {' and '.join(lacking)}; make room, give another --out, ask for less "
+            f"(cells, integration.n_keep), or set {GO_ON}=0 to go on as far as there is room."
         )
 
 

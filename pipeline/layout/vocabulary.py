@@ -21,7 +21,6 @@ from pipeline.specification.tables import FREQUENCY
 if TYPE_CHECKING:
     import xarray as xr
 
-    from magpend_core.engine.system import System
 
 FREQUENCY_DIM = "frequency"
 """Dim of the drive frequency in a cube [Hz]."""
@@ -168,8 +167,3 @@ def parameters_of(ds: xr.Dataset) -> Parameters:
     if not values:
         raise ValueError("The dataset has no attribute 'parameters'; it tells what was integrated.")
     return Parameters(model_of(ds), values)
-
-
-def system_of(ds: xr.Dataset) -> System:
-    """Return the dynamical system that the engine integrated for a dataset; this imports the compiler."""
-    return model_of(ds).system

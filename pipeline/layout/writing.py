@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import math
 import os
 import stat
 import uuid
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
@@ -157,6 +158,16 @@ def sync_folder(path: Path) -> None:
 def write_netcdf(path: Path, ds: xr.Dataset) -> None:
     """Write a dataset as a NetCDF file atomically: complete or not at all."""
     write_atomically(path, netcdf_bytes(ds))
+
+
+def json_value(value: Any) -> Any:
+    """Return data in types that JSON has: numpy's become Python's, and numbers that are not finite become None."""
+    if isinstance(value, Mapping):
+        return {key: json_value(inner) for key, inner in value.items()}
+    plain = value.tolist() if hasattr(value, "tolist") else value
+    if isinstance(plain, list | tuple):
+        return [json_value(inner) for inner in plain]
+    return None if isinstance(plain, float) and not math.isfinite(plain) else plain
 
 
 def netcdf_bytes(ds: xr.Dataset) -> bytes:

@@ -90,12 +90,8 @@ class Diagram:
 
     Attributes
     ----------
-    view : View
-    survey : Survey
     measure : Measure
         The vertical axis.
-    parameter : str
-    frame : Frame
     """
 
     view: View

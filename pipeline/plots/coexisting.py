@@ -158,18 +158,7 @@ def _draw_others(ax: Axes, data: xr.Dataset, parameter: str) -> None:
         row, *_ = np.nonzero(chosen)
         if row.size:
             x, y = data[parameter].values[row].astype(np.float64), data["value"].values[chosen]
-            ax.plot(
-                x,
-                y,
-                linestyle="none",
-                marker="o",
-                markersize=_UP_PT,
-                markeredgewidth=0.0,
-                color=grey,
-                zorder=1.5,
-                rasterized=True,
-                gid=f"points:{_word(code)}",
-            )
+            style.points(ax, x, y, _UP_PT, grey, zorder=1.5, rasterized=True, gid=f"points:{_word(code)}")
 
 
 def _word(stability: int) -> str:
@@ -187,18 +176,9 @@ def _draw_directions(ax: Axes, one: xr.Dataset, parameter: str, cast: palette.Ca
         chosen = (one["present"].sel(direction=word).values > 0) & (one["stability"].values == ATTRACTS)
         x, y, _ = _spread(one, parameter, chosen)
         up = word == "up"
-        ax.plot(
-            x,
-            y,
-            linestyle="none",
-            marker="o",
-            markersize=_UP_PT if up else _DOWN_PT,
-            markeredgewidth=0.0,
-            color=style.tinted(cast.colours[number], 0.0 if up else _TINT),
-            zorder=2.2 if up else 2.0,
-            rasterized=True,
-            gid=f"points:{word}:{letter(number)}",
-        )
+        size, colour = _UP_PT if up else _DOWN_PT, style.tinted(cast.colours[number], 0.0 if up else _TINT)
+        gid = f"points:{word}:{letter(number)}"
+        style.points(ax, x, y, size, colour, zorder=2.2 if up else 2.0, rasterized=True, gid=gid)
 
 
 def _entries(data: xr.Dataset, cast: palette.Cast, both: bool, loops: bool) -> list[palette.Entry]:

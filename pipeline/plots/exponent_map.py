@@ -12,9 +12,10 @@ from matplotlib.colors import Normalize
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
+from pipeline.analysis.chaos.lyapunov import check_exponents
 from pipeline.plots import labels, style
 from pipeline.plots.bifurcation import swept_parameters
-from pipeline.plots.exponents import UNITS, demand, exponent_values, left_out, rate_unit
+from pipeline.plots.exponents import UNITS, exponent_values, left_out, rate_unit
 from pipeline.plots.selection import at_points
 
 _NO_EXPONENT = "0.8"
@@ -53,7 +54,7 @@ def plot_lyapunov_map(
         If there are no exponents, if an option is unknown, or if not exactly two parameters are left.
     """
     style.check_choice("unit (per)", per, UNITS)
-    demand(ds)
+    check_exponents(ds)
     part = at_points(ds, at)
     swept = [d for d in swept_parameters(part) if part.sizes[d] > 1]
     if len(swept) != 2:

@@ -25,14 +25,6 @@ def left_out(part: xr.Dataset) -> str:
     return f"left out of {status.size} cells: {listed}" if listed else ""
 
 
-def demand(ds: xr.Dataset) -> None:
-    """Raise ValueError if a result cube has no Lyapunov exponents."""
-    if "lyapunov" not in ds:
-        raise ValueError(
-            "the cube has no Lyapunov exponents; run it with [products] lyapunov = {} in its specification"
-        )
-
-
 def exponent_values(part: xr.Dataset, per: str, spectrum: bool) -> xr.Dataset:
     """Return the Lyapunov exponents and their errors per second or per period, with flags and classes of motion."""
     scale = period_seconds(part) if per == "period" else xr.DataArray(1.0)

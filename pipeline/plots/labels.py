@@ -32,7 +32,6 @@ class Measure:
 
     Attributes
     ----------
-    name : str
     symbol : str
         For an axis: between dollar signs, or the plain name.
     unit : str

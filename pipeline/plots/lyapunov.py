@@ -11,11 +11,11 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 
-from pipeline.analysis.chaos.lyapunov import GOOD
+from pipeline.analysis.chaos.lyapunov import GOOD, check_exponents
 from pipeline.plots import labels, pixels, style
 from pipeline.plots.bifurcation import Diagram, with_diagram
 from pipeline.plots.exponent_map import plot_lyapunov_map
-from pipeline.plots.exponents import UNITS, demand, exponent_values, rate_unit
+from pipeline.plots.exponents import UNITS, exponent_values, rate_unit
 from pipeline.plots.figure import Run, frame_of, noted, values_of
 from pipeline.plots.missing_cells import absent_handles, draw_absent, shade_blank
 from pipeline.plots.motions import motions_of
@@ -70,7 +70,7 @@ def plot_lyapunov(
         If there are no exponents, if an option is unknown, or if more than one parameter is left.
     """
     style.check_choice("unit (per)", per, UNITS)
-    demand(ds)
+    check_exponents(ds)
     diagram = Diagram.of(ds, state=state, degrees=degrees, at=at, frame=replace(frame, ylim=None))
     part = diagram.view.ds
     part = part.squeeze([d for d in part["status"].dims if d != diagram.parameter and part.sizes[d] == 1])

@@ -24,7 +24,6 @@ class Motions:
 
     Attributes
     ----------
-    words, colours : tuple of str
     drawn : tuple of int
         Codes in the order of legends: motions, then what is neutral.
     """

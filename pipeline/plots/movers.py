@@ -155,7 +155,6 @@ class Scene:
 
     Attributes
     ----------
-    drawing : Drawing
     low, high : ndarray
         Corners that hold everything at all times.
     """
@@ -235,16 +234,8 @@ def _fix(ax: Axes, still: dict[str, Floats], scene: Scene, named: bool) -> None:
     ends = {name for names in scene.drawing.lines for name in names}
     for name, place in still.items():
         held = name in ends
-        ax.plot(
-            *place[:, None],
-            linestyle="none",
-            marker="^" if held else "s",
-            markersize=8.0 if held else 6.0,
-            color="0.6" if held else "0.15",
-            markeredgewidth=0.0,
-            zorder=1.5,
-            gid=f"fixed:{name}",
-        )
+        size, colour, marker = (8.0, "0.6", "^") if held else (6.0, "0.15", "s")
+        style.points(ax, place[:1], place[1:], size, colour, marker=marker, zorder=1.5, gid=f"fixed:{name}")
         if not named:
             continue
         ax.annotate(

@@ -14,6 +14,7 @@ import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 
+from pipeline.layout.attributes import code_flags
 from pipeline.plots import style
 from pipeline.plots.motions import Motions
 from pipeline.plots.points import Points, Range, View
@@ -138,15 +139,10 @@ def _table(x: np.ndarray, y: np.ndarray, motion: np.ndarray, layer: np.ndarray, 
     variables = {"x": ("point", x), "y": ("point", y)}
     ds = xr.Dataset(variables)
     if view.motions.told:
-        words = view.motions.words
-        attrs = {
-            "flag_values": np.arange(len(words), dtype=np.int8),
-            "flag_meanings": " ".join(w.replace(" ", "_") for w in words),
-        }
+        attrs = code_flags([word.replace(" ", "_") for word in view.motions.words])
         ds["motion"] = ("point", motion.astype(np.int8), attrs)
     if view.layers != ("",):
-        attrs = {"flag_values": np.arange(len(view.layers), dtype=np.int8), "flag_meanings": " ".join(view.layers)}
-        ds["direction"] = ("point", layer.astype(np.int8), attrs)
+        ds["direction"] = ("point", layer.astype(np.int8), code_flags(view.layers))
     return ds
 
 

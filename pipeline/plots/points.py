@@ -216,9 +216,9 @@ def _count_absent(view: View, block: xr.Dataset, found: Survey) -> None:
         found.absent[name] += np.bincount(where[chosen], minlength=size).reshape(found.cells.shape)
 
 
-def selections(array: xr.DataArray, inner: tuple[str, ...] = ()) -> Iterator[dict[str, slice]]:
+def selections(array: xr.DataArray) -> Iterator[dict[str, slice]]:
     """Yield selections of an array (a slice for each dim) that together cover all its cells once, chunk by chunk."""
-    own = inner or tuple(str(d) for d in array.dims if d in _OWN_DIMS)
+    own = [str(d) for d in array.dims if d in _OWN_DIMS]
     dims = [str(dim) for dim in array.dims if dim not in own]
     each = math.prod(array.sizes[dim] for dim in own)
     chunks = _chunk_sizes(array)

@@ -28,7 +28,6 @@ class Motion:
         Values of each state along the motion, angles not wrapped.
     section : dict of ndarray
         The same at the stroboscopic section; may be empty arrays.
-    colour : str
     gid : str
         Ends the identifiers of what is drawn.
     """
@@ -131,16 +130,8 @@ def draw_path(ax: Axes, drawing: Drawing, parameters: Mapping[str, float], motio
     ax.plot(place[:, 0], place[:, 1], color=motion.colour, linewidth=0.7, gid=gid)
     shown = _near(fixed, place)
     for name in shown:
-        ax.plot(
-            *fixed[name][:, None],
-            linestyle="none",
-            marker=_marker(fixed, name),
-            markersize=4.0,
-            color="0.2",
-            markeredgewidth=0.0,
-            gid=f"fixed:{name}",
-            zorder=2.5,
-        )
+        marker, at = _marker(fixed, name), fixed[name]
+        style.points(ax, at[:1], at[1:], 4.0, "0.2", marker=marker, zorder=2.5, gid=f"fixed:{name}")
     style.few_ticks(ax)
     style.label_axes(ax, f"$x$ [{drawing.unit}]", f"$y$ [{drawing.unit}]")
     return shown

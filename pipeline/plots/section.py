@@ -22,7 +22,6 @@ from pipeline.plots.points import View, make_view, survey
 from pipeline.plots.selection import at_points
 from pipeline.products.figures import SectionOptions
 
-COLOURS_BY = ("motion", "attractor")
 _MOST_PT, _LEAST_PT = 1.7, 0.45
 
 

@@ -247,22 +247,28 @@ def _width(text: str, size: float) -> float:
 
 def legend_above(figure: DataFigure, handles: Sequence[Any], *, size: float | None = None) -> None:
     """Place a legend at the top right of a figure, in as few rows as fit."""
-    if not handles:
-        return
     size = figure.look.legend if size is None else size
-    texts = [str(h.get_label()) for h in handles]
-    figure.legend(
-        handles=list(handles),
-        loc="outside upper right",
-        ncols=columns(figure.frame, texts, size),
-        frameon=False,
-        fontsize=size,
-        handletextpad=0.35,
-        columnspacing=1.1,
-        borderpad=0.1,
-        handlelength=1.4,
-        borderaxespad=0.1,
-    )
+    _legend(figure, handles, "outside upper right", size, handletextpad=0.35, handlelength=1.4)
+
+
+def legend_below(figure: DataFigure, handles: Sequence[Any]) -> None:
+    """Place a legend at the bottom left of a figure."""
+    _legend(figure, handles, "outside lower left", figure.look.legend, handletextpad=0.4, handlelength=1.2)
+
+
+def _legend(figure: DataFigure, handles: Sequence[Any], place: Any, size: float, **spaces: float) -> None:
+    if handles:
+        figure.legend(
+            handles=list(handles),
+            loc=place,
+            ncols=columns(figure.frame, [str(h.get_label()) for h in handles], size),
+            frameon=False,
+            fontsize=size,
+            columnspacing=1.1,
+            borderpad=0.1,
+            borderaxespad=0.1,
+            **spaces,
+        )
 
 
 def complete(figure: DataFigure, ax: Axes, text: str, handles: Sequence[Any] = ()) -> None:
@@ -270,25 +276,6 @@ def complete(figure: DataFigure, ax: Axes, text: str, handles: Sequence[Any] = (
     caption(ax, text)
     legend_above(figure, handles)
     finish(figure)
-
-
-def legend_below(figure: DataFigure, handles: Sequence[Any]) -> None:
-    """Place a legend at the bottom left of a figure."""
-    if handles:
-        size = figure.look.legend
-        texts = [str(h.get_label()) for h in handles]
-        figure.legend(
-            handles=list(handles),
-            loc="outside lower left",
-            ncols=columns(figure.frame, texts, size),
-            frameon=False,
-            fontsize=size,
-            handletextpad=0.4,
-            columnspacing=1.1,
-            borderpad=0.1,
-            handlelength=1.2,
-            borderaxespad=0.1,
-        )
 
 
 def columns(frame: Frame, texts: Sequence[str], size: float) -> int:
@@ -314,6 +301,33 @@ def dot(label: str, colour: Any, size: float = 5.0, *, face: Any = None, marker:
         color=colour,
         markerfacecolor=colour if face is None else face,
         label=label,
+    )
+
+
+def points(
+    ax: Axes,
+    x: Any,
+    y: Any,
+    size: float,
+    colour: Any,
+    *,
+    marker: str = "o",
+    zorder: float = 2.0,
+    rasterized: bool = False,
+    gid: str | None = None,
+) -> None:
+    """Draw points without lines and edges; `size` is their diameter [pt]."""
+    ax.plot(
+        x,
+        y,
+        linestyle="none",
+        marker=marker,
+        markersize=size,
+        markeredgewidth=0.0,
+        color=colour,
+        zorder=zorder,
+        rasterized=rasterized,
+        gid=gid,
     )
 
 

@@ -21,10 +21,6 @@ from pydantic_core import PydanticUndefined
 
 from pipeline.products.variable import Variable
 
-FILE_FORMATS = ("png", "pdf", "svg")
-COLUMN_MM = 85.0
-"""Width of a journal's column [mm]."""
-
 
 def option(default: Any = ..., help: str = "", *, unit: str = "", flag: str = "", **bounds: Any) -> Any:
     """Return a pydantic field for an `Options` model, with help, unit and bounds.
@@ -271,9 +267,6 @@ class Figure:
     options: type[FigureOptions]
     draw: str
     needs: str = ""
-
-
-Product = CellProduct | Analysis | Figure
 
 
 def function_of(name: str) -> Callable[..., Any]:

@@ -12,7 +12,7 @@ Without a listener nothing is shown, and reporting takes almost no time. Results
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Sequence
 from contextvars import ContextVar
 from typing import Protocol, TypeVar
 
@@ -56,7 +56,7 @@ def is_heard() -> bool:
     return _listener.get() is not None
 
 
-def track(items: Iterable[T], what: str, total: int | None = None) -> Iterator[T]:
+def track(items: Sequence[T], what: str) -> Iterator[T]:
     """Yield items, and report the number of finished items as progress.
 
     Parameters
@@ -65,10 +65,8 @@ def track(items: Iterable[T], what: str, total: int | None = None) -> Iterator[T
         The parts of the work.
     what
         Name of the work, see `report`.
-    total
-        Number of items; by default their length.
     """
-    n = len(items) if total is None else total  # type: ignore[arg-type]
+    n = len(items)
     report(what, 0, n)
     for i, item in enumerate(items):
         yield item

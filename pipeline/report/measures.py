@@ -18,7 +18,7 @@ import numpy as np
 from pipeline.analysis.intervals import binomial_interval
 from pipeline.analysis.selection import place
 from pipeline.analysis.sides import classify
-from pipeline.layout.vocabulary import split_dims
+from pipeline.layout.vocabulary import parameter_name, split_dims
 from pipeline.report.estimates import Estimate, Results, absent
 from pipeline.specification.problems import SpecError
 
@@ -35,7 +35,7 @@ def _cells(results: Results, name: str) -> tuple[xr.Dataset, str]:
     axes, starts = split_dims(cube["status"])
     wide = [d for d in axes if cube.sizes[d] > 1] or list(axes[:1])
     if len(wide) != 1:
-        raise SpecError([f"{name}: is measured along one axis, and the run has {', '.join(axes) or 'none'}."])
+        raise SpecError(f"{name}: is measured along one axis, and the run has {', '.join(axes) or 'none'}.")
     keep = ["orbit_period", "status", *(n for n in ("lyapunov", "lyapunov_flag") if n in cube)]
     found = cube[keep]
     words = classify(cube)
@@ -76,10 +76,10 @@ def _matches(ds: xr.Dataset, options: Options) -> np.ndarray:
         found &= np.isin(periods, np.atleast_1d(wanted))
     if "motion" in options:
         if "motion" not in ds:
-            raise SpecError([f"motion = {options['motion']!r}: the model of this run has no labels for motions."])
+            raise SpecError(f"motion = {options['motion']!r}: the model of this run has no labels for motions.")
         words = str(ds["motion"].attrs["flag_meanings"]).split()
         if options["motion"] not in words:
-            raise SpecError([f"motion = {options['motion']!r}: must be one of {', '.join(words)}."])
+            raise SpecError(f"motion = {options['motion']!r}: must be one of {', '.join(words)}.")
         found &= ds["motion"].values == words.index(options["motion"])
     return found
 
@@ -226,7 +226,6 @@ def located_bifurcation(results: Results, of: Sequence[str], options: Options) -
     independent of the step of the run's axis.
     """
     from pipeline.analysis.branches.table import table_of
-    from pipeline.layout.vocabulary import parameter_name
 
     given = {name: options[name] for name in ("low", "high", "max_period")}
     found = results.run(of[0]).derive("branches", **given, generations=1)
@@ -265,7 +264,7 @@ def largest_exponent(results: Results, of: Sequence[str], options: Options) -> E
     """
     ds, axis = _cells(results, of[0])
     if "lyapunov" not in ds:
-        raise SpecError([f"{of[0]}: has no exponents; add [products] lyapunov = {{}} to its specification."])
+        raise SpecError(f"{of[0]}: has no exponents; add [products] lyapunov = {{}} to its specification.")
     here = _within(ds, axis, options)
     if not here.sizes[axis]:
         return absent(f"the axis has no value {_asked(options)}", _step(ds[axis].values))

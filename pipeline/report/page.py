@@ -238,14 +238,14 @@ def picture_of(figure: Figure, alt: str, caption: str = "", command: str = "") -
     return Picture(buffer.getvalue(), width, height, plain(alt), caption, command)
 
 
-def grid_of(rows: Sequence[Mapping[str, Any]], caption: str = "", command: str = "", most: int = MOST_ROWS) -> Grid:
+def grid_of(rows: Sequence[Mapping[str, Any]], caption: str = "", command: str = "") -> Grid:
     """Make a table block from rows of values; empty columns are left out."""
     names = list(dict.fromkeys(name for row in rows for name in row))
-    cells = [[text_of(row.get(name)) for name in names] for row in rows[:most]]
+    cells = [[text_of(row.get(name)) for name in names] for row in rows[:MOST_ROWS]]
     kept = [k for k in range(len(names)) if any(line[k] not in ("", "-") for line in cells)]
     shown = [[line[k] for k in kept] for line in cells]
     heads = [names[k].replace("_", " ") for k in kept]
-    return Grid(heads, shown, caption, command, max(0, len(rows) - most))
+    return Grid(heads, shown, caption, command, max(0, len(rows) - MOST_ROWS))
 
 
 def text_of(value: Any) -> str:

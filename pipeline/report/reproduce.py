@@ -8,9 +8,8 @@ import shlex
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-from pipeline.layout.writing import write_atomically
+from pipeline.layout.writing import json_value, write_atomically
 from pipeline.report.estimates import Estimate
 from pipeline.report.measures import MEASURES
 from pipeline.report.page import Block, Facts, Grid, Note, Outcome, Page, Part, Text, write
@@ -153,7 +152,7 @@ def judge(results: Results, figure: str, claim: ClaimTable) -> Judgement:
     try:
         found = MEASURES[claim.measure](results, claim.of, claim.options)
     except KeyError as error:
-        raise SpecError([f"figure {figure}: {claim.measure} lacks the option {error}."]) from None
+        raise SpecError(f"figure {figure}: {claim.measure} lacks the option {error}.") from None
     plain, reason = judged(found.low, found.high, claim.least, claim.most), ""
     if found.missing:
         plain, reason = Verdict.UNDECIDED, f"Not measured: {found.missing}.{_decides(claim)}"
@@ -319,12 +318,12 @@ def _rows(judgements: Sequence[Judgement]) -> str:
             "source": j.claim.source,
             "measure": j.claim.measure,
             "of": list(j.claim.of),
-            "least": _plain(j.claim.least),
-            "most": _plain(j.claim.most),
+            "least": json_value(j.claim.least),
+            "most": json_value(j.claim.most),
             "unit": j.claim.unit,
-            "value": _plain(j.estimate.value),
-            "low": _plain(j.estimate.low),
-            "high": _plain(j.estimate.high),
+            "value": json_value(j.estimate.value),
+            "low": json_value(j.estimate.low),
+            "high": json_value(j.estimate.high),
             "text": j.estimate.text or j.estimate.missing,
             "verdict": j.verdict.words,
             "reason": j.reason,
@@ -334,7 +333,3 @@ def _rows(judgements: Sequence[Judgement]) -> str:
         for j in judgements
     ]
     return json.dumps(rows, indent=1, ensure_ascii=False) + "\n"
-
-
-def _plain(value: float) -> Any:
-    return value if math.isfinite(value) else None

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, ValidationError
 
 from pipeline.products.registry import FIGURES
-from pipeline.specification.files import read_toml
+from pipeline.specification.files import read_toml, shipped_files
 from pipeline.specification.problems import SpecError, problems_of, unknown_name, validated
 from pipeline.specification.tables import Table
 
@@ -141,11 +140,7 @@ class Study:
 
 def shipped_studies() -> dict[str, Path]:
     """Return the paths of the studies that ship with the package, by name."""
-    try:
-        folder = Path(str(resources.files("workflows")))
-    except ModuleNotFoundError:
-        return {}
-    return {path.parent.name: path for path in sorted(folder.glob(f"*/{STUDY}"))}
+    return {path.parent.name: path for path in shipped_files(f"*/{STUDY}")}
 
 
 def load_study(name: str | Path) -> Study:
@@ -160,7 +155,7 @@ def load_study(name: str | Path) -> Study:
     if not path.suffix and str(name) in shipped:
         path = shipped[str(name)]
     elif not path.suffix:
-        raise SpecError([unknown_name("study", str(name), shipped)])
+        raise SpecError(unknown_name("study", str(name), shipped))
     try:
         table = StudyTable.model_validate(read_toml(path))
     except ValidationError as error:

@@ -39,7 +39,7 @@ def drawn(outcome: Outcome, name: str) -> DataFigure:
     from pipeline.rig.magnet.figures import FIGURES
 
     if name not in FIGURES:
-        raise SpecError([unknown_name("figure of torque readings", name, FIGURES)])
+        raise SpecError(unknown_name("figure of torque readings", name, FIGURES))
     return FIGURES[name](outcome)
 
 

@@ -14,13 +14,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 from magpend_core import rates
 from magpend_core.models.model import Parameters
 from pipeline.rig.simulation import rig_parameters
 from pipeline.specification.files import read_toml
-from pipeline.specification.problems import SpecError, problems_of, unknown_key, unknown_name
+from pipeline.specification.problems import SpecError, checked, unknown_key, unknown_name
 from pipeline.specification.tables import Table
 
 SAMPLES = 128
@@ -59,7 +59,6 @@ class Controlled:
         Standard deviation of the measured state; that of its rate is larger by the angular frequency.
     n_settle, n_measure : int
         Drive periods for which the rig settles after each change of the target, and that are then measured.
-    seed : int
     """
 
     parameters: Parameters
@@ -79,7 +78,7 @@ class TracedOrbits:
 
     Attributes
     ----------
-    drive, drive_sd : ndarray, (target,)
+    drive : ndarray, (target,)
         Amplitude of the drive.
     amplitude, amplitude_sd : ndarray, (target,)
         Half of the peak-to-peak value of the state.
@@ -90,7 +89,6 @@ class TracedOrbits:
     """
 
     drive: np.ndarray
-    drive_sd: np.ndarray
     amplitude: np.ndarray
     amplitude_sd: np.ndarray
     residue: np.ndarray
@@ -130,7 +128,7 @@ def trace(rig: Controlled, targets: Sequence[float] | np.ndarray) -> TracedOrbit
     drives = np.abs([_harmonics(part)[:, 1] for part in np.split(output, rig.n_measure)])
     drive, scatter = np.median(drives, axis=0), np.std(drives, axis=0)
     return TracedOrbits(
-        drive, scatter, np.median(peaks, axis=0), np.std(peaks, axis=0), residue, _stabilities(sizes, drive, scatter)
+        drive, np.median(peaks, axis=0), np.std(peaks, axis=0), residue, _stabilities(sizes, drive, scatter)
     )
 
 
@@ -215,10 +213,7 @@ def _push(still: Parameters, one: Parameters, frequency_hz: float) -> np.ndarray
     expected = np.cos(2.0 * np.pi * shares)[:, None, None] * push
     if not push.any() or np.abs(found - expected).max() > 1e-9 * np.abs(push).max():
         raise SpecError(
-            [
-                "drive: does not act as amplitude times cos(2 pi f t) in one direction; control acts through "
-                "such a drive."
-            ]
+            "drive: does not act as amplitude times cos(2 pi f t) in one direction; control acts through such a drive."
         )
     return np.asarray(push)
 
@@ -281,11 +276,8 @@ def load_control(path: str | Path) -> tuple[Controlled, np.ndarray]:
     known = ("model", "preset", "parameters", "control")
     problems += [unknown_key(key, key, known) for key in data if key not in known]
     parameters = rig_parameters(data, path.parent, problems)
-    try:
-        table = ControlTable.model_validate(data.get("control", {}))
-    except ValidationError as error:
-        problems += problems_of(error, ControlTable, "control")
-    if problems or parameters is None:
+    table = checked(ControlTable, data.get("control", {}), "control", problems)
+    if problems or parameters is None or table is None:
         raise SpecError([f"{path}: {p}" for p in problems])
     gains, times = (table.gain, table.gain_of_rate), (table.settle, table.measure)
     rig = Controlled(

@@ -114,11 +114,9 @@ def _edges(recording: xr.Dataset) -> DriveFile:
     if (between != 1).any():
         wrong = int(np.flatnonzero(between != 1)[0])
         raise SpecError(
-            [
-                f"drive: {int(between[wrong])} falling edges between the rising ones at {rising[wrong]:.6g} s "
-                f"and {rising[wrong + 1]:.6g} s, and a period has one; choose a window without this, or look at "
-                "it with: magpend recordings show."
-            ]
+            f"drive: {int(between[wrong])} falling edges between the rising ones at {rising[wrong]:.6g} s "
+            f"and {rising[wrong + 1]:.6g} s, and a period has one; choose a window without this, or look at "
+            "it with: magpend recordings show."
         )
     falling = edges.falling[after]
     rows = [f"{a!r},{b!r}" for a, b in zip(rising[:-1].tolist(), falling.tolist(), strict=True)]
@@ -137,12 +135,12 @@ def _edges(recording: xr.Dataset) -> DriveFile:
 def _torque(recording: xr.Dataset, tolerance: float) -> DriveFile:
     known = np.isfinite(recording[DRIVE].values)
     if not known.any():
-        raise SpecError(["drive: its channel has no finite value; map another channel."])
+        raise SpecError("drive: its channel has no finite value; map another channel.")
     inside = slice(int(known.argmax()), len(known) - int(known[::-1].argmax()))
     time, level = recording["time"].values[inside], recording[DRIVE].values[inside]
     if not known[inside].all():
         gap = time[int((~known[inside]).argmax())]
-        raise SpecError([f"drive: has no value at {gap:.6g} s; choose a window without gaps."])
+        raise SpecError(f"drive: has no value at {gap:.6g} s; choose a window without gaps.")
     kept = thinned(time, level, tolerance)
     try:
         timing: Timing | None = edges_of(recording.isel(sample=inside)).frequency()

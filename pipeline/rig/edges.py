@@ -39,7 +39,6 @@ class Timing(NamedTuple):
 
     Attributes
     ----------
-    frequency_hz, frequency_error_hz : float
     jitter_s : float
         Root mean square distance of the edges from the line [s].
     duty_cycle, duty_cycle_error : float
@@ -103,7 +102,7 @@ class Edges:
         """
         rising = self.rising
         if rising.size < 3:
-            raise SpecError([f"drive: {rising.size} rising edges; a frequency needs 3: choose a longer window."])
+            raise SpecError(f"drive: {rising.size} rising edges; a frequency needs 3: choose a longer window.")
         number = _numbers(rising)
         start, period = _line(number, rising)
         fitted = start + period * number
@@ -111,10 +110,8 @@ class Edges:
         jitter = math.sqrt(float(residual @ residual) / (rising.size - 2))
         if jitter > _MOST_JITTER * period:
             raise SpecError(
-                [
-                    f"drive: its rising edges scatter by {jitter:.3g} s about a period of {period:.3g} s, so it "
-                    "is not periodic here: choose a window of one frequency, or a larger hysteresis."
-                ]
+                f"drive: its rising edges scatter by {jitter:.3g} s about a period of {period:.3g} s, so it "
+                "is not periodic here: choose a window of one frequency, or a larger hysteresis."
             )
         spread = number - number.mean()
         error = self._error(fitted, spread / (spread @ spread), jitter)
@@ -219,10 +216,8 @@ def edges_of(recording: xr.Dataset, *, hysteresis: float | None = None) -> Edges
     if DRIVE not in recording:
         name = recording.attrs.get("file", "the recording")
         raise SpecError(
-            [
-                f"{name}: no drive channel, so neither its frequency nor its sections are known: add [drive] to "
-                'the mapping, as in drive = { channel = "rig/motor", kind = "signal" }.'
-            ]
+            f"{name}: no drive channel, so neither its frequency nor its sections are known: add [drive] to "
+            'the mapping, as in drive = { channel = "rig/motor", kind = "signal" }.'
         )
     time, drive = recording["time"].values, recording[DRIVE].values
     piece = recording["piece"].values if "piece" in recording.coords else np.zeros(time.size, np.int64)
@@ -251,16 +246,12 @@ def _switch(x: Floats, hysteresis: float | None) -> _Switch:
     span = high - low
     if span <= _LEAST_CONTRAST * noise or span <= 0:
         raise SpecError(
-            [
-                f"drive: no edges; its levels {low:.4g} and {high:.4g} are within noise, {noise:.2g}: "
-                'map the channel that switches, choose a window in which it runs, or say drive = "none".'
-            ]
+            f"drive: no edges; its levels {low:.4g} and {high:.4g} are within noise, {noise:.2g}: "
+            'map the channel that switches, choose a window in which it runs, or say drive = "none".'
         )
     band = 0.5 * span if hysteresis is None else hysteresis
     if not 0 < band < span:
-        raise SpecError(
-            [f"hysteresis = {band:g}: must be greater than 0 and less than the levels' distance, {span:g}."]
-        )
+        raise SpecError(f"hysteresis = {band:g}: must be greater than 0 and less than the levels' distance, {span:g}.")
     return _Switch(0.5 * (low + high), span, band, noise)
 
 
@@ -292,14 +283,14 @@ def _found(parts: Sequence[tuple[Floats, Floats]], switch: _Switch) -> Edges:
 def _checked(time: npt.ArrayLike, drive: npt.ArrayLike) -> tuple[Floats, Floats]:
     t, x = np.asarray(time, np.float64), np.asarray(drive, np.float64)
     if t.ndim != 1 or t.shape != x.shape:
-        raise SpecError([f"drive: shape {x.shape}, time {t.shape}; both must be (samples,), equally many."])
+        raise SpecError(f"drive: shape {x.shape}, time {t.shape}; both must be (samples,), equally many.")
     if t.size < 2:
-        raise SpecError([f"drive: {t.size} samples hold no edge; choose a longer window."])
+        raise SpecError(f"drive: {t.size} samples hold no edge; choose a longer window.")
     bad = int((~np.isfinite(x)).sum() + (~np.isfinite(t)).sum())
     if bad:
-        raise SpecError([f"drive: {bad} values are not finite; choose a window without them."])
+        raise SpecError(f"drive: {bad} values are not finite; choose a window without them.")
     if not (np.diff(t) > 0).all():
-        raise SpecError(["drive: time does not rise from sample to sample; sort or repair the recording."])
+        raise SpecError("drive: time does not rise from sample to sample; sort or repair the recording.")
     return t, x
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, Field, ValidationError, model_validator
+from pydantic import Field, model_validator
 
 from magpend_core.models.model import Model, Parameters
 from magpend_core.models.parameters import ParameterError
@@ -19,7 +19,7 @@ from pipeline.rig.recordings.raw import Raw
 from pipeline.rig.virtual import DriveSensor, Sensor, Step, readings
 from pipeline.specification.files import read_toml
 from pipeline.specification.models import add_model
-from pipeline.specification.problems import SpecError, problems_of, unknown_key, unknown_name
+from pipeline.specification.problems import SpecError, checked, table_at, unknown_key, unknown_name
 from pipeline.specification.starts import degrees_key, state_keys, state_of_key
 from pipeline.specification.tables import Table
 
@@ -138,18 +138,18 @@ def parse_rig(data: AnyMapping[str, Any], folder: str | Path = ".") -> Rig:
     """
     keys = tuple(RigTable.model_fields)
     problems = [unknown_key(key, key, keys) for key in data if key not in keys]
-    numbers = _checked(RigTable, {"model": "-", **{k: data[k] for k in NUMBERS if k in data}}, "", problems)
+    numbers = checked(RigTable, {"model": "-", **{k: data[k] for k in NUMBERS if k in data}}, "", problems)
     drive = None
     if data.get("drive", "none") != "none":
-        drive = _checked(DriveTable, data["drive"], DRIVE, problems)
+        drive = checked(DriveTable, data["drive"], DRIVE, problems)
     sensors = {
-        name: _checked(SensorTable, table, f"sensors.{name}", problems)
-        for name, table in _table(data, "sensors", problems).items()
+        name: checked(SensorTable, table, f"sensors.{name}", problems)
+        for name, table in table_at(data, "sensors", problems).items()
     }
     parameters = rig_parameters(data, folder, problems)
     if parameters is None:
         raise SpecError(problems)
-    start = _start(_table(data, "initial_state", problems), parameters.model, problems)
+    start = _start(table_at(data, "initial_state", problems), parameters.model, problems)
     steps = _steps(drive, parameters, problems)
     if numbers is not None and drive is None and numbers.duration_s is None:
         problems.append("duration_s: missing; without drive nothing else says how long to record [s].")
@@ -189,22 +189,6 @@ def simulated(rig: Rig, *, is_csv: bool = False) -> tuple[Raw, Mapping]:
     return replace(raw, path=Path("simulated")), mapping
 
 
-def _checked(model: type[BaseModel], value: Any, path: str, problems: list[str]) -> Any:
-    try:
-        return model.model_validate(value)
-    except ValidationError as error:
-        problems += problems_of(error, model, path)
-        return None
-
-
-def _table(data: AnyMapping[str, Any], name: str, problems: list[str]) -> dict[str, Any]:
-    value = data.get(name, {})
-    if not isinstance(value, dict):
-        problems.append(f"{name} = {value!r}: must be a table; write [{name}].")
-        return {}
-    return value
-
-
 def rig_parameters(data: AnyMapping[str, Any], folder: str | Path, problems: list[str]) -> Parameters | None:
     """Return the parameters of a virtual rig from its tables. If they are not valid, add the errors to `problems` and
     return None.
@@ -215,7 +199,7 @@ def rig_parameters(data: AnyMapping[str, Any], folder: str | Path, problems: lis
     model = add_model(data["model"], folder, problems)
     if model is None:
         return None
-    overrides = _table(data, "parameters", problems)
+    overrides = table_at(data, "parameters", problems)
     preset = data.get("preset")
     try:
         return model.load(None if preset is None else find_preset(preset, folder), **overrides)

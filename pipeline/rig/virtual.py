@@ -153,7 +153,8 @@ def record(
         If the trajectory diverges or meets the step limit.
     """
     raw, mapping = readings(parameters, drive, initial_state, times, sensors=sensors, seed=seed)
-    return recording_of(raw, mapping).assign_attrs(parameters=_lines(parameters))
+    lines = [f"{name} = {value!r}" for name, value in parameters.as_dict().items()]
+    return recording_of(raw, mapping).assign_attrs(parameters="\n".join(lines))
 
 
 def readings(
@@ -350,7 +351,3 @@ def _drive_channel(
     name, unit = f"{GROUP}/{DRIVE}", "V" if sensor.kind == "signal" else "N m"
     values = level + sensor.noise * rng.standard_normal(len(level))
     return Channel(name, values, unit, 0.0, step_s), DriveMap(channel=name, unit=unit, kind=sensor.kind)
-
-
-def _lines(parameters: Parameters) -> str:
-    return "\n".join(f"{name} = {value!r}" for name, value in parameters.as_dict().items())

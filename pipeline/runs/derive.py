@@ -116,7 +116,7 @@ def derive(
         If a chunk of the cube is damaged.
     """
     if name not in ANALYSES:
-        raise SpecError([unknown_name("analysis", name, ANALYSES)])
+        raise SpecError(unknown_name("analysis", name, ANALYSES))
     analysis = ANALYSES[name]
     wanted = options if isinstance(options, Options) else validated(analysis.options, options or {})
     run = AnalysedRun.of(source, echo)
@@ -195,12 +195,10 @@ def _refuse_recorded(run: Run, name: str) -> None:
     """Raise SpecError if the drive of a run is a recording, since analyses would integrate beyond its end."""
     if run.spec.recorded is not None:
         raise SpecError(
-            [
-                f"{run.name}: its drive is the recording {run.spec.recorded.file}, which ends, but {name} "
-                "integrates further. Make a run at its mean frequency instead (frequency_hz = "
-                f"{run.spec.frequency_hz:.6g} instead of [drive]). You can draw this run's sections: magpend "
-                "plot bifurcation, or section."
-            ]
+            f"{run.name}: its drive is the recording {run.spec.recorded.file}, which ends, but {name} "
+            "integrates further. Make a run at its mean frequency instead (frequency_hz = "
+            f"{run.spec.frequency_hz:.6g} instead of [drive]). You can draw this run's sections: magpend "
+            "plot bifurcation, or section."
         )
 
 
@@ -281,7 +279,7 @@ def refused(directory: str | Path) -> Iterator[None]:
             raise DamagedError(f"{directory}: a chunk is damaged; check with: magpend verify {directory}") from None
         if hasattr(error, "problems"):  # parameters out of bounds say enough themselves
             raise
-        raise SpecError([f"{directory}: {error}"]) from None
+        raise SpecError(f"{directory}: {error}") from None
 
 
 def _key(run: Run, analysis: Analysis, options: Options) -> dict[str, str]:

@@ -46,7 +46,7 @@ def figure(
         If the figure or an option is unknown or out of bounds, or if the run does not suit the figure.
     """
     if name not in FIGURES:
-        raise SpecError([unknown_name("figure", name, FIGURES)])
+        raise SpecError(unknown_name("figure", name, FIGURES))
     if isinstance(options, FigureOptions):
         wanted = options
     else:

@@ -26,7 +26,7 @@ from pipeline.runs.run import Echo, carry_out, identity_here
 from pipeline.runs.status import State, state
 from pipeline.runs.widen import Widening, widened
 from pipeline.runs.workflows import find_spec
-from pipeline.runs.zoom import to_toml
+from pipeline.runs.zoom import derived_toml
 from pipeline.specification.parsing import Spec, load_spec
 from pipeline.specification.problems import SpecError
 from pipeline.store.errors import RefusedError
@@ -134,9 +134,7 @@ def plan_extension(
 def _wide(run: Run, spec: str | Path | None, widening: Widening) -> tuple[Spec, str]:
     """Return the specification of the wider run, as an object and as text."""
     if spec is None and not widening:
-        raise SpecError(
-            ["extend: nothing to change; give a wider SPEC, or an option such as --axis NAME=LOW:HIGH:NUM."]
-        )
+        raise SpecError("extend: nothing to change; give a wider SPEC, or an option such as --axis NAME=LOW:HIGH:NUM.")
     if spec is not None:
         path = find_spec(spec)
         parsed = load_spec(path)
@@ -146,11 +144,7 @@ def _wide(run: Run, spec: str | Path | None, widening: Widening) -> tuple[Spec, 
     else:
         wide = widened(run.spec, widening)
         origin = f"run {Path(run.info.files.place).name}, digest {run.info.digest}"
-    return wide, f"# Extended. Derived from {_printable(origin)}.\n{to_toml(wide)}"
-
-
-def _printable(text: str) -> str:
-    return "".join(c if c.isprintable() else "?" for c in text)
+    return wide, derived_toml("Extended", origin, wide)
 
 
 def _fitting(runs: Sequence[Run], wide: Spec, identity: Mapping[str, Any]) -> tuple[list[Run], list[str]]:

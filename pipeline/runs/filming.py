@@ -105,7 +105,7 @@ def animation(
     try:
         portraits_of(shown[0].parameters.model, wanted.portrait, len(shown), wanted.degrees)
     except ValueError as error:
-        raise SpecError([str(error)]) from None
+        raise SpecError(str(error)) from None
     plan = instants.schedule(shown, wanted)
     for line in notes:
         (echo or _silent)(line)

@@ -17,7 +17,7 @@ from pipeline.specification.problems import SpecError
 if TYPE_CHECKING:
     import xarray as xr
 
-    from magpend_core.models.model import Model, Parameters
+    from magpend_core.models.model import Parameters
 
 RTOL = 1e-9
 PERIOD_IN_FILM_S = 2.0
@@ -241,7 +241,7 @@ def _told(moving: Sequence[Moving]) -> dict[str, Any]:
 
 def _drawn(ds: xr.Dataset, moving: Sequence[Moving], orbits: np.ndarray) -> xr.Dataset:
     """Add the positions of the points of the model's drawing over time, if the model has a drawing."""
-    drawing = _model(moving).drawing
+    drawing = moving[0].parameters.model.drawing
     if drawing is None:
         return ds
     about = {"units": drawing.unit, "long_name": "place, to the right and upwards"}
@@ -255,7 +255,3 @@ def _drawn(ds: xr.Dataset, moving: Sequence[Moving], orbits: np.ndarray) -> xr.D
         ds = ds.assign(fixed=(("motion", "fixed_place", "axis"), fixed, about))
         ds = ds.assign_coords(fixed_place=list(still[0]))
     return ds
-
-
-def _model(moving: Sequence[Moving]) -> Model:
-    return moving[0].parameters.model

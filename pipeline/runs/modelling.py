@@ -11,7 +11,7 @@ from magpend_core.models.model import Model, Parameters
 from pipeline.layout.cells import CellMap
 from pipeline.layout.domains import check_starts, check_states
 from pipeline.runs.workflows import find_spec
-from pipeline.specification.files import read_toml
+from pipeline.specification.files import check_new_file, read_toml, write_new
 from pipeline.specification.models import find_model, is_model_file
 from pipeline.specification.parsing import KINDS, Spec, load_spec
 from pipeline.specification.problems import SpecError
@@ -96,14 +96,7 @@ def write_template(path: Path | None) -> str:
     text = TEMPLATE.read_text("utf-8")
     if path is None:
         return text
-    if path.suffix != ".toml":
-        raise SpecError([f"{path}: the suffix must be .toml."])
-    if not path.parent.is_dir():
-        raise SpecError([f"{path.parent}: no such folder; make it first."])
+    check_new_file(path, [".toml"])
     refuse_place(path)
-    try:
-        with path.open("x", encoding="utf-8") as file:
-            file.write(text)
-    except FileExistsError:
-        raise SpecError([f"{path}: exists already and is not overwritten; give another FILE."]) from None
+    write_new(path, text, "FILE")
     return text

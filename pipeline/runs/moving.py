@@ -85,7 +85,7 @@ def _chosen(name: str, here: xr.Dataset, letters: Sequence[str]) -> tuple[list[i
     """
     there = [int(i) for i in here["attractor"].values]
     if not there:
-        raise SpecError([f"{name}: no attractor was found at this point; look with magpend analyse attractors."])
+        raise SpecError(f"{name}: no attractor was found at this point; look with magpend analyse attractors.")
     by_letter = {letter(i): i for i in there}
     if wrong := [text for text in letters if text.upper() not in by_letter]:
         raise SpecError(
@@ -94,7 +94,7 @@ def _chosen(name: str, here: xr.Dataset, letters: Sequence[str]) -> tuple[list[i
     if letters:
         chosen = list(dict.fromkeys(by_letter[text.upper()] for text in letters))
         if len(chosen) > MOST_MOTIONS:
-            raise SpecError([f"--attractor: {len(chosen)} are requested; at most {MOST_MOTIONS} fit a frame."])
+            raise SpecError(f"--attractor: {len(chosen)} are requested; at most {MOST_MOTIONS} fit a frame.")
         return chosen, []
     attract = here["stability"].values == ATTRACTS
     wanted = attract if attract.any() else ~attract
@@ -196,10 +196,8 @@ def _where(one: xr.Dataset) -> str:
 def _refuse_recorded(run: AnalysedRun) -> None:
     if run.spec.recorded is not None:
         raise SpecError(
-            [
-                f"{run.name}: its drive is the recording {run.spec.recorded.file}; an animation needs a "
-                "run at a fixed frequency. To draw this run's sections: magpend plot section."
-            ]
+            f"{run.name}: its drive is the recording {run.spec.recorded.file}; an animation needs a "
+            "run at a fixed frequency. To draw this run's sections: magpend plot section."
         )
 
 
@@ -228,7 +226,7 @@ def of_start(parameters: Parameters, frequency_hz: float, state: Sequence[float]
     from pipeline.plots.palette import COLOURS
 
     if n_transient < 0:
-        raise SpecError([f"--transient {n_transient}: must be at least 0."])
+        raise SpecError(f"--transient {n_transient}: must be at least 0.")
     start = np.asarray(state, dtype=np.float64)
     if n_transient:
         begin = np.array([n_transient / frequency_hz])

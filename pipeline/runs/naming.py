@@ -67,20 +67,16 @@ def _swept(run: Run, others: Iterable[str]) -> str:
     swept = [name for name in swept if axis_name(name) not in map(axis_name, others)]
     if len(swept) > 1:
         raise SpecError(
-            [
-                f"{run.name} sweeps {', '.join(swept)}; say which of them to follow: "
-                + " or ".join(f"--parameter {name}" for name in swept)
-                + "."
-            ]
+            f"{run.name} sweeps {', '.join(swept)}; say which of them to follow: "
+            + " or ".join(f"--parameter {name}" for name in swept)
+            + "."
         )
     if swept or run.model.crossing is None:
         return swept[0] if swept else FREQUENCY
     known = ", ".join(run.model.parameter_names)
     raise SpecError(
-        [
-            f"{run.name} sweeps no parameter, and {run.model.name} has no drive frequency to follow; give "
-            f"--parameter: {known}."
-        ]
+        f"{run.name} sweeps no parameter, and {run.model.name} has no drive frequency to follow; give "
+        f"--parameter: {known}."
     )
 
 
@@ -113,4 +109,4 @@ def place(cube: xr.Dataset, name: str, value: float, degrees: bool = False) -> t
             turned = axis in cube.coords and str(cube[axis].attrs.get("units", "")).startswith("rad")
             in_degrees = is_grid_dim(axis) and turned and (degrees or name != plain)
             return axis, math.radians(value) if in_degrees else value
-    raise SpecError([unknown_name("axis", name, [d for d in dims if d in cube.coords] or dims)])
+    raise SpecError(unknown_name("axis", name, [d for d in dims if d in cube.coords] or dims))

@@ -102,20 +102,16 @@ def prepare(
     file = cluster_file or os.environ.get(CLUSTER_FILE)
     if not file:
         raise SpecError(
-            [
-                f"a job is not described; write a file with a [cluster] table and give --cluster FILE, or set "
-                f"{CLUSTER_FILE}; docs/clusters.md has an example."
-            ]
+            f"a job is not described; write a file with a [cluster] table and give --cluster FILE, or set "
+            f"{CLUSTER_FILE}; docs/clusters.md has an example."
         )
     cluster = load_cluster(file)
     files = open_files(out if out is not None else default_directory(path, smoke))
     folder = jobs_folder(files.place)
     if _AWKWARD.search(str(folder)):
         raise SpecError(
-            [
-                f"{folder}: batch systems do not accept this path for a job's output; give an --out with only letters, "
-                "digits, and . _ - + , : = @."
-            ]
+            f"{folder}: batch systems do not accept this path for a job's output; give an --out with only letters, "
+            "digits, and . _ - + , : = @."
         )
     check_starts(parsed)
     plan = make_plan(parsed)
@@ -161,10 +157,8 @@ def send(submission: Submission) -> Submission:
     words = WORDS[kind]
     if not shutil.which(words.send[0]):
         raise SpecError(
-            [
-                f"{kind}: there is no command {words.send[0]!r} here; use a machine that sends "
-                "jobs, such as the login node, or use --dry-run to see the script."
-            ]
+            f"{kind}: there is no command {words.send[0]!r} here; use a machine that sends "
+            "jobs, such as the login node, or use --dry-run to see the script."
         )
     _refuse_second(submission)
     submission.folder.mkdir(parents=True, exist_ok=True)

@@ -5,14 +5,12 @@ from __future__ import annotations
 import hashlib
 import tomllib
 from collections.abc import Mapping
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from pipeline.specification.files import toml_tables
+from pipeline.specification.files import find_file, shipped_files, toml_tables
 from pipeline.specification.inputs import is_toml_text, toml_of
 from pipeline.specification.parsing import IDENTIFICATION, Spec, load_spec, spec_of_tables
-from pipeline.specification.problems import SpecError, unknown_name
 
 
 def find_spec(name: str | Path) -> Path:
@@ -23,13 +21,7 @@ def find_spec(name: str | Path) -> Path:
     SpecError
         If neither a file nor a workflow has the name.
     """
-    path = Path(name)
-    if path.exists() or path.suffix or len(path.parts) > 1:
-        return path
-    shipped = {**shipped_workflows(), **shipped_identifications()}
-    if str(name) in shipped:
-        return shipped[str(name)]
-    raise SpecError([f"{name}: no such file; {unknown_name('workflow', str(name), shipped)}"])
+    return find_file("workflow", name, _shipped())
 
 
 def read_given(spec: str | Path | Mapping[str, Any], *, smoke: bool = False) -> tuple[Spec, str, Path]:
@@ -80,11 +72,7 @@ def _identifies(path: Path) -> bool:
 
 
 def _shipped() -> dict[str, Path]:
-    try:
-        folder = Path(str(resources.files("workflows")))
-    except ModuleNotFoundError:
-        return {}
-    return {p.stem: p for p in sorted(folder.glob("*.toml"))}
+    return {path.stem: path for path in shipped_files("*.toml")}
 
 
 def default_directory(spec_path: Path, smoke: bool) -> Path:

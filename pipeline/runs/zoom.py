@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from magpend_core.models.imported import KEY
+from pipeline.specification.files import check_new_file, write_new
 from pipeline.specification.models import model_toml
 from pipeline.specification.parsing import Spec, kept_spec, load_spec
 from pipeline.specification.problems import SpecError, unknown_name
@@ -124,20 +125,13 @@ def write_zoom(source: Source, changes: Changes, out: Path) -> list[str]:
     SpecError
         See `zoom`; also if `out` exists or cannot be written to. Nothing is written then.
     """
-    if out.suffix != ".toml":
-        raise SpecError([f"{out}: the suffix must be .toml."])
-    if not out.parent.is_dir():
-        raise SpecError([f"{out.parent}: no such folder; make it first."])
+    check_new_file(out, [".toml"])
     refuse_place(out, "--out")
     spec, notes = zoom(source.spec, changes)
-    text = f"# Zoom. Derived from {_one_line(source.origin)}.\n{to_toml(spec)}"
+    text = derived_toml("Zoom", source.origin, spec)
     if isinstance(spec.reference, Mapping) and (place := spec.reference.get(KEY)):
         notes = [*notes, f"model: running {out} imports the Python object {place}; read its code first."]
-    try:
-        with out.open("x", encoding="utf-8") as file:
-            file.write(text)
-    except FileExistsError:
-        raise SpecError([f"{out}: exists already and is not overwritten; give another --out."]) from None
+    write_new(out, text, "--out")
     return notes
 
 
@@ -243,6 +237,12 @@ def put_value(spec: Spec, data: dict[str, Any], key: str, value: Any) -> None:
 # ---- TOML --------------------------------------------------------------------------------------
 
 
+def derived_toml(how: str, origin: str, spec: Spec) -> str:
+    """Return a derived specification as TOML, below a comment that names its origin."""
+    printable = "".join(c if c.isprintable() else "?" for c in origin)
+    return f"# {how}. Derived from {printable}.\n{to_toml(spec)}"
+
+
 def to_toml(spec: Spec) -> str:
     """Return a specification as TOML text, from which the same specification is read.
 
@@ -264,7 +264,3 @@ def to_toml(spec: Spec) -> str:
     assert is_line or read["model"] == spec.reference
     assert kept_spec({**read, "model": spec.reference}) == spec
     return text
-
-
-def _one_line(text: str) -> str:
-    return "".join(c if c.isprintable() else "?" for c in text)

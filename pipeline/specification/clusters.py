@@ -174,7 +174,7 @@ def load_cluster(path: str | Path) -> Cluster:
     """
     tables = read_toml(path)
     if not isinstance(tables.get("cluster"), dict):
-        raise SpecError([f"{path}: has no table [cluster]; docs/clusters.md has an example."])
+        raise SpecError(f"{path}: has no table [cluster]; docs/clusters.md has an example.")
     problems = [f"{path}: {unknown_key(name, name, ['cluster'])}" for name in tables if name != "cluster"]
     try:
         found = Cluster.model_validate(tables["cluster"])

@@ -134,19 +134,17 @@ def read_drive(path: str | Path) -> tuple[str, str]:
         content = Path(path).read_bytes()
     except OSError as error:
         raise SpecError(
-            [f"{path}: cannot be read ({error.strerror or error}); make one with: magpend recordings drive."]
+            f"{path}: cannot be read ({error.strerror or error}); make one with: magpend recordings drive."
         ) from None
     if len(content) > MOST_BYTES:
         raise SpecError(
-            [
-                f"{path}: has {len(content)} bytes; a drive file has at most {MOST_BYTES}: choose a part of the "
-                "recording, or thin it (magpend recordings drive --window, --tolerance)."
-            ]
+            f"{path}: has {len(content)} bytes; a drive file has at most {MOST_BYTES}: choose a part of the "
+            "recording, or thin it (magpend recordings drive --window, --tolerance)."
         )
     try:
         return content.decode("utf-8"), hashlib.sha256(content).hexdigest()
     except UnicodeDecodeError:
-        raise SpecError([f"{path}: is not text in UTF-8; a drive file is CSV."]) from None
+        raise SpecError(f"{path}: is not text in UTF-8; a drive file is CSV.") from None
 
 
 def load_drive(path: str | Path, *, section_hz: float | None = None) -> RecordedDrive:
@@ -235,7 +233,7 @@ def _rows(text: str, file: str) -> tuple[str, list[tuple[int, list[str]]]]:
         if header == names:
             return kind, [(i, [field.strip() for field in line.split(",")]) for i, line in lines[1:]]
     wanted = " or ".join(repr(",".join(names)) for names in HEADERS.values())
-    raise SpecError([f"{file}: its columns are {','.join(header)[:80]!r}; a drive file begins with the line {wanted}."])
+    raise SpecError(f"{file}: its columns are {','.join(header)[:80]!r}; a drive file begins with the line {wanted}.")
 
 
 def _columns(kind: str, rows: list[tuple[int, list[str]]], file: str) -> tuple[np.ndarray, np.ndarray]:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from pipeline.specification.problems import SpecError
+from pipeline.specification.problems import SpecError, unknown_name
 
 MOST_BYTES = 1_000_000
 MOST_ELEMENTS = 100_000
@@ -30,8 +31,62 @@ def read_toml(path: str | Path) -> dict[str, Any]:
         with open(path, "rb") as file:
             content = file.read(MOST_BYTES + 1)
     except OSError as error:
-        raise SpecError([f"{path}: {_unreadable(error)}"]) from None
+        raise SpecError(f"{path}: {_unreadable(error)}") from None
     return toml_tables(content, str(path))
+
+
+def shipped_files(pattern: str) -> list[Path]:
+    """Return the files of the package ``workflows`` that match a pattern, sorted; empty if it is not installed."""
+    try:
+        return sorted(Path(str(resources.files("workflows"))).glob(pattern))
+    except ModuleNotFoundError:
+        return []
+
+
+def find_file(what: str, name: str | Path, shipped: Mapping[str, Path]) -> Path:
+    """Return the path of a file, given as a path or as the name of a shipped one.
+
+    Parameters
+    ----------
+    what
+        Kind of the file, for the message.
+    name
+        Path or name.
+    shipped
+        Shipped files by name.
+
+    Raises
+    ------
+    SpecError
+        If neither a file nor a shipped one has the name.
+    """
+    path = Path(name)
+    if path.exists() or path.suffix or len(path.parts) > 1:
+        return path
+    if str(name) in shipped:
+        return shipped[str(name)]
+    raise SpecError(f"{name}: no such file; {unknown_name(what, str(name), shipped)}")
+
+
+def check_new_file(path: str | Path, suffixes: Sequence[str]) -> Path:
+    """Return the path of a file to write; raise `SpecError` if its suffix is not one of `suffixes`, or its folder does
+    not exist.
+    """
+    target = Path(path)
+    if target.suffix.lower() not in suffixes:
+        raise SpecError(f"{path}: the suffix must be {'one of ' if len(suffixes) > 1 else ''}{', '.join(suffixes)}.")
+    if not target.parent.is_dir():
+        raise SpecError(f"{target.parent}: no such folder; make it first.")
+    return target
+
+
+def write_new(path: Path, text: str, option: str) -> None:
+    """Write a text to a file; raise `SpecError` if the file exists, naming the option that gives another one."""
+    try:
+        with path.open("x", encoding="utf-8") as file:
+            file.write(text)
+    except FileExistsError:
+        raise SpecError(f"{path}: exists already and is not overwritten; give another {option}.") from None
 
 
 def toml_tables(content: bytes, name: str) -> dict[str, Any]:
@@ -45,16 +100,14 @@ def toml_tables(content: bytes, name: str) -> dict[str, Any]:
     try:
         if len(content) > MOST_BYTES:
             raise SpecError(
-                [
-                    f"{name}: has more than {MOST_BYTES // 1_000_000} MB, the limit of a specification; "
-                    "give ranges, or random starts with a seed, instead of lists."
-                ]
+                f"{name}: has more than {MOST_BYTES // 1_000_000} MB, the limit of a specification; "
+                "give ranges, or random starts with a seed, instead of lists."
             )
         data = tomllib.loads(content.decode("utf-8"))
     except (ValueError, RecursionError) as error:
         if isinstance(error, SpecError):
             raise
-        raise SpecError([f"{name}: {_unreadable(error)}"]) from None
+        raise SpecError(f"{name}: {_unreadable(error)}") from None
     problems = odd_data(data)
     if problems:
         raise SpecError([f"{name}: {problem}" for problem in problems])

@@ -51,11 +51,9 @@ def find_model(reference: Any, folder: str | Path | None = ".", at: str = "model
             return load_model(reference)
         if not isinstance(reference, str):
             raise SpecError(
-                [
-                    f"{at} = {shown(reference)}: must be a name in quotes, such as {model_names()[0]!r}, a file "
-                    '"FILE.toml", a Python object "package.module:NAME", or a table [model] with states, '
-                    "parameters and equations."
-                ]
+                f"{at} = {shown(reference)}: must be a name in quotes, such as {model_names()[0]!r}, a file "
+                '"FILE.toml", a Python object "package.module:NAME", or a table [model] with states, '
+                "parameters and equations."
             )
         if folder is not None and is_object_path(reference):
             return import_model(reference, folder)
@@ -73,10 +71,10 @@ def _placed(problem: str, at: str, reference: Any) -> str:
     return f"{at}.{problem.removeprefix(head)}" if problem.startswith(head) else f"{at}: {problem}"
 
 
-def add_model(reference: Any, folder: str | Path | None, problems: list[str], at: str = "model") -> Model | None:
+def add_model(reference: Any, folder: str | Path | None, problems: list[str]) -> Model | None:
     """Return the model that `find_model` finds, or None after adding its problems to `problems`."""
     try:
-        return find_model(reference, folder, at)
+        return find_model(reference, folder)
     except SpecError as error:
         problems += error.problems
         return None
@@ -139,7 +137,7 @@ def read_model_file(path: str | Path) -> dict[str, Any]:
 
 def _of_file(name: str, folder: str | Path | None, at: str) -> Model:
     if folder is None:
-        raise SpecError([f"{at} = {name!r}: a run keeps the text of a model, not the name of its file."])
+        raise SpecError(f"{at} = {name!r}: a run keeps the text of a model, not the name of its file.")
     path = Path(folder) / name
     try:
         inner = read_toml(path).get("model")

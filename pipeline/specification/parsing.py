@@ -15,7 +15,6 @@ from typing import Any
 from unicodedata import category
 
 import numpy as np
-from pydantic import BaseModel, ValidationError
 
 from magpend_core.models import DEFAULT, load_model
 from magpend_core.models.model import Model, Parameters
@@ -27,7 +26,7 @@ from pipeline.specification.drive_files import RecordedDrive
 from pipeline.specification.files import merged, nested, odd_data, read_toml
 from pipeline.specification.methods import method_problems
 from pipeline.specification.models import A_MODEL, KEPT, add_model, stand_in, with_model_table
-from pipeline.specification.problems import SpecError, problems_of, shown, unknown_choice, unknown_key
+from pipeline.specification.problems import SpecError, checked, shown, unknown_choice, unknown_key
 from pipeline.specification.ranges import corner_problems, size_problems
 from pipeline.specification.recorded_drive import DriveTable, recorded, run_problems, with_drive
 from pipeline.specification.section import SectionTable, section_of, seen_through
@@ -169,11 +168,11 @@ def _with_smoke(data: dict[str, Any], smoke: bool, folder: Path) -> dict[str, An
     plain = {key: value for key, value in data.items() if key != "smoke"}
     if "smoke" not in data:
         if smoke:
-            raise SpecError(["smoke: this specification has no [smoke] table; add one or run it in full."])
+            raise SpecError("smoke: this specification has no [smoke] table; add one or run it in full.")
         return plain
     table = data["smoke"]
     if not isinstance(table, dict):
-        raise SpecError([f"smoke = {shown(table)}: must be a table of keys to replace."])
+        raise SpecError(f"smoke = {shown(table)}: must be a table of keys to replace.")
     changes = nested(table)
     base = with_model_table(plain, folder) if isinstance(changes.get("model"), dict) else plain
     small = merged(base, changes)
@@ -219,9 +218,9 @@ def parse_spec(data: Mapping[str, Any], folder: str | Path | None = ".") -> Spec
     if odd := odd_data(data):
         raise SpecError(odd)
     if data.get("kind") == IDENTIFICATION:
-        raise SpecError([f'kind = "{IDENTIFICATION}": is not a run; use magpend identify SPEC --out DIR.'])
+        raise SpecError(f'kind = "{IDENTIFICATION}": is not a run; use magpend identify SPEC --out DIR.')
     if "kind" not in data and "equations" in data:
-        raise SpecError([A_MODEL])
+        raise SpecError(A_MODEL)
     problems = [unknown_key(key, key, _KEYS) for key in data if key not in _KEYS]
     data = _with_preset(data, folder, problems)
     data = data if folder is None else with_drive(data, folder, problems)
@@ -294,7 +293,7 @@ def _products(data: Mapping[str, Any], model: Model, problems: list[str]) -> dic
             problems.append(unknown_key(path, name, CELL_PRODUCTS))
             continue
         product = CELL_PRODUCTS[name]
-        options = _validate(product.options, table, path, problems)
+        options = checked(product.options, table, path, problems)
         if options is None:
             continue
         try:
@@ -314,7 +313,7 @@ def _declared(data: Mapping[str, Any]) -> tuple[str, ...]:
 def _valid_keys(model: type[ParametersTable], table: Any) -> ParametersTable:
     valid: dict[str, Any] = {}
     for key, value in table.items() if isinstance(table, dict) else ():
-        if _validate(model, {key: value}, "", []) is not None:
+        if checked(model, {key: value}, "", []) is not None:
             valid[key] = value
     return model.model_validate(valid)
 
@@ -344,24 +343,16 @@ def _is_table(data: Mapping[str, Any], name: str, problems: list[str]) -> bool:
     return False
 
 
-def _validate(model: type[BaseModel], value: Any, path: str, problems: list[str]) -> Any:
-    try:
-        return model.model_validate(value)
-    except ValidationError as error:
-        problems += problems_of(error, model, path)
-        return None
-
-
 def _table(data: Mapping[str, Any], name: str, model: type[Table], problems: list[str]) -> Any:
     if not _is_table(data, name, problems) or (name not in data and name in _OPTIONAL):
         return None
-    return _validate(model, data.get(name, {}), name, problems)
+    return checked(model, data.get(name, {}), name, problems)
 
 
 def _axes(data: Mapping[str, Any], problems: list[str]) -> dict[str, Range]:
     if not _is_table(data, "axes", problems):
         return {}
-    axes = {n: _validate(Range, value, f"axes.{n}", problems) for n, value in data.get("axes", {}).items()}
+    axes = {n: checked(Range, value, f"axes.{n}", problems) for n, value in data.get("axes", {}).items()}
     return {name: axis for name, axis in axes.items() if axis is not None}
 
 
@@ -387,7 +378,7 @@ def _starts(data: Mapping[str, Any], model: Model, problems: list[str]) -> Start
             f"instead of {kind!r}."
         )
         table = {key: value for key, value in table.items() if key != "refine"}
-    starts: Starts | None = _validate(starts_model(kind, model), table, "initial_conditions", problems)
+    starts: Starts | None = checked(starts_model(kind, model), table, "initial_conditions", problems)
     return starts
 
 

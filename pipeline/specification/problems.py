@@ -23,8 +23,8 @@ class SpecError(ValueError):
         A sentence for each problem: the dotted key path, the value, the bound and what to do.
     """
 
-    def __init__(self, problems: Sequence[str]) -> None:
-        self.problems = list(problems)
+    def __init__(self, problems: str | Sequence[str]) -> None:
+        self.problems = [problems] if isinstance(problems, str) else list(problems)
         super().__init__("\n".join(self.problems))
 
 
@@ -85,6 +85,28 @@ def validated(model: type[M], values: Mapping[str, Any], prefix: str = "") -> M:
         return model.model_validate({name: _exact(model, name, value) for name, value in values.items()})
     except ValidationError as error:
         raise SpecError(problems_of(error, model, prefix)) from None
+
+
+def checked(model: type[BaseModel], value: Any, path: str, problems: list[str]) -> Any:
+    """Return a table validated by a pydantic model; if it is invalid, add its problems to `problems` and return
+    None.
+    """
+    try:
+        return model.model_validate(value)
+    except ValidationError as error:
+        problems += problems_of(error, model, path)
+        return None
+
+
+def table_at(data: Mapping[str, Any], key: str, problems: list[str]) -> dict[str, Any]:
+    """Return the table under a TOML key, or an empty table if the key is missing. If the value is no table, add a
+    problem and return an empty table.
+    """
+    table = data.get(key, {})
+    if isinstance(table, dict):
+        return table
+    problems.append(f"{key} = {shown(table)}: must be a table; write [{key}].")
+    return {}
 
 
 def _exact(model: type[BaseModel], name: str, value: Any) -> Any:

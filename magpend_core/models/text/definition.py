@@ -20,7 +20,6 @@ class Impact:
 
     Attributes
     ----------
-    of : Tree
     direction : int
         +1 for rising through zero, -1 for falling.
     set : dict
@@ -62,8 +61,6 @@ class Definition:
 
     Attributes
     ----------
-    name, title, source, section : str
-    states, parameters : tuple
     define, equations, quantities : mapping of str to Tree
         Equations in the order of the states.
     described : tuple of Quantity

@@ -56,23 +56,17 @@ class Derived:
 
     Attributes
     ----------
-    graph : Graph
     rates : tuple of Node
         Time derivative of each state.
     jacobian : tuple of Node
         Derivatives of the rates by the states, row by row.
-    quantities : tuple of Node
     forcing : Node or None
         The one number by which time enters `rates` and `jacobian`; the time itself if there is no other, None
         if there is none.
-    layers : tuple of Layer
-    waves : tuple of Wave
     instants : tuple of Instant
         At which something jumps in time; before those of `waves` among the edges.
-    switches : tuple of Switch
     sliding : Sliding
         Value and rate of each switch, and which of them slide.
-    impacts : tuple of Jump
     sticks : tuple of int
         See `System.sticks`.
     missed : tuple of str

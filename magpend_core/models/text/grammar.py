@@ -115,7 +115,6 @@ class Tree:
         Character of the text, from 1.
     value : float or str
         Of a number; the name of a name or function; the sign of a comparison.
-    args : tuple of Tree
     """
 
     kind: str

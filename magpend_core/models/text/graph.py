@@ -33,7 +33,6 @@ class Node:
         ``number``; the leaves of `_LEAVES`; ``add`` (of two or more), ``mul``, ``div``, ``neg``, ``less``
         (``where_less(a, b, yes, no)``), ``choice`` (see `Graph.choice`), ``held`` (its argument alone) and
         functions.
-    args : tuple of Node
     value : float or int
         Of a number; position of a leaf.
     kind : int

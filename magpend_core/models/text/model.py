@@ -44,7 +44,6 @@ class TextModel(Model):
 
     Attributes
     ----------
-    definition : Definition
     shipped : bool
         Whether `load_model` finds it by name.
     """

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -75,9 +75,6 @@ def _places(
         x, y = values_of(definition, pair, given)
         found[name] = np.stack([np.broadcast_to(np.asarray(v, np.float64), shape) for v in (x, y)], axis=-1)
     return found
-
-
-Classify = Callable[[np.ndarray, np.ndarray, np.ndarray, Mapping[str, Any]], np.ndarray]
 
 
 def classifier_of(definition: Definition) -> Classifier | None:

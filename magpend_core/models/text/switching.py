@@ -80,7 +80,6 @@ class Sides:
 
     Attributes
     ----------
-    graph : Graph
     smoothed : set of int
         Numbers of nodes that are not rewritten, since their corner lies in a steep layer.
     switches, instants : list

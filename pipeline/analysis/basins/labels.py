@@ -110,9 +110,9 @@ def spread(resampled: Floats, confidence: float) -> tuple[Floats, Floats, Floats
     return np.asarray(resampled.std(axis=0, ddof=1)), np.asarray(low), np.asarray(high)
 
 
-def tiles_per_side(shape: tuple[int, ...], total: int = 64) -> int:
+def tiles_per_side(shape: tuple[int, ...]) -> int:
     """Return how many tiles to cut a grid into along each axis (at least 2), for about `total` tiles in all."""
-    return max(2, int(np.rint(total ** (1.0 / len(shape)))))
+    return max(2, int(np.rint(64 ** (1.0 / len(shape)))))
 
 
 def tile_numbers(

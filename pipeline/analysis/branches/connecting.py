@@ -93,7 +93,6 @@ class Links:
 
     Attributes
     ----------
-    links : list of Link
     up, down : dict
         Outcome by number: ``linked``, ``apart`` (followed to a fold, or past all orbits that it could meet)
         or ``open`` (no answer); no entry if there was no orbit to meet.

@@ -97,7 +97,6 @@ def curves_from(
     second: str,
     bounds: Bounds,
     max_period: int,
-    settings: Settings = CURVE,
     generations: int = GENERATIONS,
 ) -> list[Curve]:
     """Continue the bifurcations located on branches as curves in the plane of the branches' parameter and a second one.
@@ -114,8 +113,6 @@ def curves_from(
         Interval of the branches' parameter, and that of the second.
     max_period
         Longest period of the orbits; 0 takes the longest of the branches.
-    settings
-        Settings of the traces; arclengths are in units of the intervals.
     generations
         Number of generations of curves that spring from points of codimension two.
 
@@ -126,7 +123,7 @@ def curves_from(
     """
     longest = max_period or int(branches["orbit_period"].values.max(initial=0))
     starts = _starts(branches, parameters, second, bounds, longest)
-    return continue_curves(starts, bounds, settings, longest, generations)
+    return continue_curves(starts, bounds, CURVE, longest, generations)
 
 
 CurveStart = tuple[int, Family, str, np.ndarray]

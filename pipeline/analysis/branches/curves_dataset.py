@@ -12,6 +12,7 @@ from pipeline.analysis.branches.bifurcations import KINDS
 from pipeline.analysis.branches.codimension_two import POINT_KINDS, merged
 from pipeline.analysis.branches.curves import CURVE_ENDS, Curve
 from pipeline.analysis.branches.units import parameter_units, state_units
+from pipeline.layout.attributes import code_flags
 
 
 def curves_dataset(curves: Sequence[Curve], first: str, second: str, model: Model | None = None) -> xr.Dataset:
@@ -39,8 +40,6 @@ def curves_dataset(curves: Sequence[Curve], first: str, second: str, model: Mode
         values[i, : len(curve.points)] = curve.values
         section[i, : len(curve.points)] = [curve.family.state(p.u) for p in curve.points]
         residual[i, : len(curve.points)] = [p.residual for p in curve.points]
-    kinds = {"flag_values": np.arange(len(KINDS), dtype=np.int8), "flag_meanings": " ".join(KINDS)}
-    ends = {"flag_values": np.arange(len(CURVE_ENDS), dtype=np.int8), "flag_meanings": " ".join(CURVE_ENDS)}
     dims = ("curve", "point")
     one, units = {"units": "1"}, state_units(model)
 
@@ -56,7 +55,7 @@ def curves_dataset(curves: Sequence[Curve], first: str, second: str, model: Mode
             "second": (dims, values[..., 1], {"units": parameter_units(second, model), "long_name": second}),
             "section": ((*dims, "state"), section, {"units": units, "long_name": "a section point"}),
             "residual": (dims, residual, {**one, "long_name": "largest residual, test function included"}),
-            "kind": ("curve", np.array([KINDS.index(c.kind) for c in curves], np.int8), {**one, **kinds}),
+            "kind": ("curve", np.array([KINDS.index(c.kind) for c in curves], np.int8), {**one, **code_flags(KINDS)}),
             "orbit_period": ("curve", numbers([c.family.period for c in curves]), one),
             "start": ("curve", numbers([c.start for c in curves]), {**one, "long_name": "located point"}),
             "n_missed": (
@@ -65,8 +64,8 @@ def curves_dataset(curves: Sequence[Curve], first: str, second: str, model: Mode
                 {**one, "long_name": "sign changes that could not be located"},
             ),
             "n_points": ("curve", numbers([len(c.points) for c in curves]), one),
-            "first_end": ("curve", codes(0), {**one, **ends}),
-            "last_end": ("curve", codes(1), {**one, **ends}),
+            "first_end": ("curve", codes(0), {**one, **code_flags(CURVE_ENDS)}),
+            "last_end": ("curve", codes(1), {**one, **code_flags(CURVE_ENDS)}),
             **_special_points(curves, first, second, model, len(names)),
         },
         coords={"state": list(names)},
@@ -82,8 +81,7 @@ def _special_points(
     values = np.array([one.values for one in found]).reshape(-1, 2)
     brackets = np.array([one.bracket for one in found]).reshape(-1, 2)
     section = np.array([one.family.state(one.point.u) for one in found]).reshape(-1, n_states)
-    kinds = {"flag_values": np.arange(len(POINT_KINDS), dtype=np.int8), "flag_meanings": " ".join(POINT_KINDS)}
-    one = {"units": "1"}
+    one, kinds = {"units": "1"}, code_flags(POINT_KINDS)
     variables: dict[str, tuple[object, ...]] = {
         "special_kind": ("special", np.array([POINT_KINDS.index(p.kind) for p in found], np.int8), {**one, **kinds}),
         "special_curve": ("special", np.array([p.curve for p in found], np.int32), one),

@@ -22,6 +22,7 @@ from pipeline.analysis.branches.following import ENDS, Branch
 from pipeline.analysis.branches.motion import rotation_of, sides_of
 from pipeline.analysis.branches.problems import FREQUENCY
 from pipeline.analysis.branches.units import parameter_units, state_units
+from pipeline.layout.attributes import code_flags
 from pipeline.layout.period_names import period_of, periods_of
 from pipeline.layout.vocabulary import model_attribute, section_attributes
 
@@ -96,7 +97,7 @@ def _fixed(branches: Sequence[Branch], parameter: str, parameters: Parameters | 
 def _side_variables(
     side: np.ndarray, events: Sequence[tuple[int, Bifurcation]], words: Sequence[str]
 ) -> dict[str, Any]:
-    about = {"units": "1", **_flags(words)}
+    about = {"units": "1", **code_flags(words)}
     there = np.array([side[i, max(b.after, 0)] for i, b in events], np.int8)
     return {
         "side": (("branch", "point"), side, {**about, "long_name": "class of the whole orbit"}),
@@ -184,10 +185,6 @@ def _orbit(branch: Branch, point: Any) -> np.ndarray:
     return np.concatenate([branch.family.state(point.u)[None], images[: max(branch.family.period, 1) - 1]])
 
 
-def _flags(words: Sequence[str]) -> dict[str, Any]:
-    return {"flag_values": np.arange(len(words), dtype=np.int8), "flag_meanings": " ".join(words)}
-
-
 def _column(values: Any, dtype: str, long_name: str, **attrs: Any) -> tuple[np.ndarray, dict[str, Any]]:
     return np.asarray(values, dtype), {"units": "1", "long_name": long_name, **attrs}
 
@@ -205,8 +202,8 @@ def _per_branch(
         "origin": _column(
             [numbers.get(id(b.origin), -1) for b in branches], "int32", "bifurcation it sprang from, -1 none"
         ),
-        "first_end": _column(first, "int8", "why it begins", **_flags(ENDS)),
-        "last_end": _column(last, "int8", "why it ends", **_flags(ENDS)),
+        "first_end": _column(first, "int8", "why it begins", **code_flags(ENDS)),
+        "last_end": _column(last, "int8", "why it ends", **code_flags(ENDS)),
     }
     if model is None or model.crossing is None:
         about = "drive frequency, NaN if it varies"
@@ -245,7 +242,7 @@ def _per_event(
     values = [branches[i].family.values(b.point.u)[0] for i, b in events]
     children = [numbers.get(id(b.child), -1) for b in ones]
     columns = {
-        "kind": _column(kinds, "int8", "kind of bifurcation", **_flags(KINDS)),
+        "kind": _column(kinds, "int8", "kind of bifurcation", **code_flags(KINDS)),
         "value": _column(values, "float64", "parameter value of the bifurcation"),
         "bifurcation_period_s": _column(
             [_seconds(b) for b in ones], "float64", "period of the orbit, or of a Hopf point's cycles", units="s"
@@ -263,7 +260,7 @@ def _per_event(
         "rises_before": _column(
             [b.rises_before for b in ones], "int8", "1 if the parameter rises along the branch before"
         ),
-        "criticality": _column(degrees, "int8", "criticality", **_flags(["unknown", *CRITICALITIES[1:]])),
+        "criticality": _column(degrees, "int8", "criticality", **code_flags(["unknown", *CRITICALITIES[1:]])),
         "critical_real": _column(critical.real, "float64", "critical multiplier or eigenvalue [1/s], real part"),
         "critical_imag": _column(critical.imag, "float64", "critical multiplier or eigenvalue [1/s], imaginary part"),
         "normal_form": _column(

@@ -6,27 +6,25 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from magpend_core.engine.system import System
 from magpend_core.pointwise import jacobian_at, rates_at
-from pipeline.analysis.branches.problems import PARAMETER_STEP, STATE_STEP, Ends, Family, OrbitProblem, Rows, Value
+from pipeline.analysis.branches.problems import (
+    PARAMETER_STEP,
+    STATE_STEP,
+    Ends,
+    Family,
+    FamilyProblem,
+    OrbitProblem,
+    Rows,
+    Value,
+)
 
 
 @dataclass(eq=False)
-class EquilibriumProblem:
+class EquilibriumProblem(FamilyProblem):
     """Equations for the equilibria of a flow along one free parameter. Their value needs no integration."""
 
     family: Family
     _unit: float = field(default=0.0, init=False, repr=False)
-
-    @property
-    def size(self) -> int:
-        """Number of unknowns: the states and the free parameter."""
-        return self.family.system.n_states + 1
-
-    @property
-    def system(self) -> System:
-        """System whose equilibria are to be found."""
-        return self.family.system
 
     def rows(self, u: np.ndarray) -> Rows:
         """Return no trajectories to integrate: the equations for equilibria need none."""
@@ -55,20 +53,11 @@ class EquilibriumProblem:
 
 
 @dataclass(frozen=True, eq=False)
-class HopfProblem:
+class HopfProblem(FamilyProblem):
     """Equations for equilibria at a Hopf point, with two free parameters: the rates and `hopf_test` are zero."""
 
+    n_free = 2
     family: Family
-
-    @property
-    def size(self) -> int:
-        """Number of unknowns: the states and two free parameters."""
-        return self.family.system.n_states + 2
-
-    @property
-    def system(self) -> System:
-        """System whose Hopf points are to be found."""
-        return self.family.system
 
     def rows(self, u: np.ndarray) -> Rows:
         """Return no trajectories to integrate: the equations for equilibria need none."""

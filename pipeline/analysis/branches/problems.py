@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 
@@ -207,8 +207,25 @@ class _Segments:
         return np.asarray(self.points + self.slopes @ (u - self.u))
 
 
+class FamilyProblem:
+    """Base of the equations for orbits of one family: the unknowns are the states and the free parameters."""
+
+    n_free: ClassVar[int] = 1
+    family: Family
+
+    @property
+    def size(self) -> int:
+        """Number of unknowns."""
+        return self.family.system.n_states + self.n_free
+
+    @property
+    def system(self) -> System:
+        """System of the family."""
+        return self.family.system
+
+
 @dataclass(eq=False)
-class OrbitProblem:
+class OrbitProblem(FamilyProblem):
     """Equations for periodic orbits along one free parameter: fixed points of the p-fold stroboscopic or return map.
 
     An orbit of several periods is evaluated by multiple shooting: all its periods are integrated side by side,
@@ -220,16 +237,6 @@ class OrbitProblem:
     family: Family
     _known: _Segments | None = field(default=None, init=False, repr=False)
     _tries: int = field(default=0, init=False, repr=False)
-
-    @property
-    def size(self) -> int:
-        """Number of unknowns: the states and the free parameter."""
-        return self.family.system.n_states + 1
-
-    @property
-    def system(self) -> System:
-        """System whose periodic orbits are to be found."""
-        return self.family.system
 
     def rows(self, u: np.ndarray) -> Rows:
         """Return the trajectories to integrate: the orbit, whole or period by period, also at a slightly changed
@@ -349,23 +356,14 @@ TESTS: dict[str, Callable[[np.ndarray], float]] = {
 
 
 @dataclass(frozen=True, eq=False)
-class BifurcationProblem:
+class BifurcationProblem(FamilyProblem):
     """Equations for orbits at a bifurcation, with two free parameters: the orbit closes, and a test function is
     zero.
     """
 
+    n_free = 2
     family: Family
     kind: str
-
-    @property
-    def size(self) -> int:
-        """Number of unknowns: the states and two free parameters."""
-        return self.family.system.n_states + 2
-
-    @property
-    def system(self) -> System:
-        """System whose bifurcations are to be found."""
-        return self.family.system
 
     @property
     def _steps(self) -> np.ndarray:

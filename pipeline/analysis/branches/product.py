@@ -27,7 +27,7 @@ def _refuse_frequency_of_flow(run: Run, parameter: str) -> None:
     if axis_name(parameter) == FREQUENCY_DIM and run.model.crossing is not None:
         swept = [name for name in run.spec.axes if swept_axis(run, name) is not None]
         known = ", ".join(swept or run.model.parameter_names)
-        raise SpecError([f"{run.model.name} has no drive frequency to follow; give --parameter: {known}."])
+        raise SpecError(f"{run.model.name} has no drive frequency to follow; give --parameter: {known}.")
 
 
 def branches(run: Run, options: BranchOptions) -> xr.Dataset:
@@ -65,10 +65,10 @@ def settle_curves(run: Run, options: CurveOptions) -> CurveOptions:
     settled = options.model_copy(update=settle_branches(run, options).part(BranchOptions))
     second = options.second
     if axis_name(second) == axis_name(settled.parameter):
-        raise SpecError([f"{second} is the branches' own parameter; give another one."])
+        raise SpecError(f"{second} is the branches' own parameter; give another one.")
     if swept_axis(run, second) is not None:
         raise SpecError(
-            [f"the run sweeps {second}, so that its branches lie at several values; use a run that does not."]
+            f"the run sweeps {second}, so that its branches lie at several values; use a run that does not."
         )
     interval_of(run, second, options.second_low, options.second_high)
     return settled
@@ -99,21 +99,21 @@ def interval_of(run: Run, parameter: str, low: float | None, high: float | None)
     base = parameters_of(run.cube())
     is_frequency = axis_name(parameter) == FREQUENCY_DIM
     if not is_frequency and parameter not in base.names:
-        raise SpecError([unknown_name("parameter", parameter, (*base.names, FREQUENCY_DIM))])
+        raise SpecError(unknown_name("parameter", parameter, (*base.names, FREQUENCY_DIM)))
     axis = swept_axis(run, parameter)
     if axis is not None:
         ends = float(axis.min()), float(axis.max())
     elif low is None or high is None:
-        raise SpecError([f"the run does not sweep {parameter}; give the interval with --from and --to."])
+        raise SpecError(f"the run does not sweep {parameter}; give the interval with --from and --to.")
     else:
         ends = low, high
     chosen = (ends[0] if low is None else float(low), ends[1] if high is None else float(high))
     if not chosen[0] < chosen[1]:
         raise SpecError(
-            [f"the interval {chosen[0]} to {chosen[1]} of {parameter} is empty; --from must be less than --to."]
+            f"the interval {chosen[0]} to {chosen[1]} of {parameter} is empty; --from must be less than --to."
         )
     if is_frequency and chosen[0] <= 0.0:
-        raise SpecError([f"--from {chosen[0]}: a drive frequency must be greater than 0."])
+        raise SpecError(f"--from {chosen[0]}: a drive frequency must be greater than 0.")
     for value in () if is_frequency else chosen:
         base.replace(**{parameter: value})
     return chosen

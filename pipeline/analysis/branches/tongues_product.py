@@ -53,7 +53,7 @@ def settle_tongues(run: Run, options: TongueOptions) -> TongueOptions:
 
     parameter = options.parameter
     if axis_name(options.second) == axis_name(parameter):
-        raise SpecError([f"{options.second} is swept already; give another second parameter, or --parameter."])
+        raise SpecError(f"{options.second} is swept already; give another second parameter, or --parameter.")
     low, high = interval_of(run, parameter, options.low, options.high)
     interval_of(run, options.second, options.second_low, options.second_high)
     return options.model_copy(update={"parameter": parameter, "low": low, "high": high})

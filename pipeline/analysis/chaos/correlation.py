@@ -11,6 +11,7 @@ from pipeline.analysis.chaos.dimensions import correlation_dimension
 from pipeline.analysis.chaos.per_attractor import pooled
 from pipeline.analysis.chaos.section_samples import geometry_of
 from pipeline.analysis.selection import select_points
+from pipeline.layout.attributes import code_flags
 from pipeline.layout.vocabulary import APERIODIC, ATTRACTS, split_dims
 from pipeline.products.chaos import DimensionOptions
 
@@ -98,11 +99,6 @@ def _dataset(found: xr.Dataset, curves: list[xr.Dataset], reason: np.ndarray, di
         values = np.stack([one[name].values for one in curves])
         tail = tuple(map(str, curves[0][name].dims))
         variables[str(name)] = ((*own, *tail), values.reshape(*reason.shape, *values.shape[1:]), curves[0][name].attrs)
-    about = {
-        "units": "1",
-        "long_name": "why there is no dimension",
-        "flag_values": np.arange(len(REASONS), dtype=np.int8),
-        "flag_meanings": " ".join(REASONS),
-    }
+    about = {"units": "1", "long_name": "why there is no dimension", **code_flags(REASONS)}
     copied = ["n_cells", "share", "kind", "stability", "n_sampled", "n_left", "lifetime_low"]
     return found[copied].transpose(*own).assign(variables).assign(reason=(own, reason, about))

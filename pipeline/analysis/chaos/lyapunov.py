@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
+from pipeline.layout.attributes import code_flags
 from pipeline.layout.vocabulary import PERIODIC
 from pipeline.products.lyapunov import LyapunovFlag
 
@@ -33,6 +34,14 @@ class Motion(IntEnum):
     UNDECIDED = 2
     CHAOTIC = 3
     HYPERCHAOTIC = 4
+
+
+def check_exponents(ds: xr.Dataset) -> None:
+    """Raise ValueError if a cube has no Lyapunov exponents."""
+    if "lyapunov" not in ds:
+        raise ValueError(
+            "the cube has no Lyapunov exponents; run it with [products] lyapunov = {} in its specification"
+        )
 
 
 def summarise(ds: xr.Dataset, *, n_sigma: float = 3.0, least: float = 0.005) -> xr.Dataset:
@@ -79,10 +88,7 @@ def summarise(ds: xr.Dataset, *, n_sigma: float = 3.0, least: float = 0.005) -> 
     ValueError
         If the cube has no exponents.
     """
-    if "lyapunov" not in ds:
-        raise ValueError(
-            "the cube has no Lyapunov exponents; run it with [products] lyapunov = {} in its specification"
-        )
+    check_exponents(ds)
     rate, error = ds["lyapunov"], ds["lyapunov_stderr"]
     seconds = period_seconds(ds)
     result = xr.Dataset(
@@ -138,7 +144,7 @@ def _motion(ds: xr.Dataset, n_sigma: float, least: float) -> dict[str, xr.DataAr
     about = {"units": "1", "long_name": "closed, and yet with a positive exponent"}
     return {
         "motion": motion.assign_attrs(motion_attrs()),
-        "contradicts": contradicts.assign_attrs(about, flag_values=np.arange(2, dtype=np.int8), flag_meanings="no yes"),
+        "contradicts": contradicts.assign_attrs(about | code_flags(["no", "yes"])),
     }
 
 
@@ -147,8 +153,7 @@ def motion_attrs() -> dict[str, Any]:
     return {
         "units": "1",
         "long_name": "kind of motion by its exponents",
-        "flag_values": np.array(list(Motion), np.int8),
-        "flag_meanings": " ".join(m.name.lower() for m in Motion),
+        **code_flags([motion.name.lower() for motion in Motion]),
     }
 
 

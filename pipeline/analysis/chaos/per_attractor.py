@@ -51,6 +51,7 @@ from magpend_core.multipliers import orbit_exponents
 from pipeline.analysis.chaos.dimensions import correlation_dimension, kaplan_yorke_dimension
 from pipeline.analysis.chaos.lyapunov import GOOD, UNRESOLVED, pooled_mean
 from pipeline.analysis.chaos.section_samples import Floats, geometry_of
+from pipeline.layout.attributes import code_flags
 from pipeline.layout.vocabulary import (
     APERIODIC,
     CHAOTIC_SET,
@@ -175,18 +176,10 @@ def chaos_per_attractor(ds: xr.Dataset, cells: xr.Dataset, attractors: xr.Datase
         for name, (rank, _, _, units, text) in _TABLE.items()
     }
     result = cells.assign(own.data_vars).assign(variables)
-    natures = " ".join(n.name.lower() for n in Nature)
-    result["nature"].attrs |= {"flag_values": np.arange(len(Nature), dtype=np.int8), "flag_meanings": natures}
-    result["exponents_from"].attrs |= {
-        "flag_values": np.arange(len(_FROM), dtype=np.int8),
-        "flag_meanings": " ".join(_FROM),
-    }
+    result["nature"].attrs |= code_flags([nature.name.lower() for nature in Nature])
+    result["exponents_from"].attrs |= code_flags(_FROM)
     rank = ("rank", np.arange(1, n_states + 1), {"units": "1", "long_name": "exponents in falling order"})
     return _with_kaplan_yorke(result.assign_coords(rank=rank))
-
-
-def _flags(words: Sequence[str]) -> dict[str, Any]:
-    return {"flag_values": np.arange(len(words), dtype=np.int8), "flag_meanings": " ".join(words)}
 
 
 def _of_attractor(one: xr.Dataset, cells: _Cells, number: int, n_states: int, options: ChaosOptions) -> dict[str, Any]:

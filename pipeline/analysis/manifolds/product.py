@@ -18,6 +18,7 @@ from pipeline.analysis.manifolds.growing import Manifold, Resolution, Saddle, st
 from pipeline.analysis.manifolds.tangency import first_tangency
 from pipeline.analysis.run import Run
 from pipeline.analysis.tabular import Row, aligned, counted
+from pipeline.layout.attributes import code_flags
 from pipeline.layout.vocabulary import (
     FREQUENCY_DIM,
     axis_name,
@@ -90,7 +91,6 @@ def _dataset(curves: list[tuple[int, Saddle, float, Manifold]], base: Parameters
     points, times = np.full((len(curves), n, system.n_states), np.nan), np.full((len(curves), n), np.nan)
     for i, (*_, curve) in enumerate(curves):
         points[i, : len(curve.points)], times[i, : len(curve.points)] = curve.points, curve.time
-    flags = {"flag_values": np.arange(len(ENDS), dtype=np.int8), "flag_meanings": " ".join(ENDS)}
 
     def column(values: list[Any], dtype: str, long_name: str, **attrs: Any) -> tuple[str, Any, dict[str, Any]]:
         return "curve", np.array(values, dtype), {"units": "1", "long_name": long_name, **attrs}
@@ -104,7 +104,7 @@ def _dataset(curves: list[tuple[int, Saddle, float, Manifold]], base: Parameters
             "direction": column([side for _, _, side, _ in curves], "int8", "side of the orbit, 1 or -1"),
             "orbit": column([number for number, *_ in curves], "int32", "number of the orbit"),
             "orbit_period": column([saddle.period for _, saddle, *_ in curves], "int32", "its period"),
-            "end": column([ENDS.index(c.end) for *_, c in curves], "int8", "why the curve ends", **flags),
+            "end": column([ENDS.index(c.end) for *_, c in curves], "int8", "why the curve ends", **code_flags(ENDS)),
         },
         coords={"state": list(system.state_names)},
         attrs={"model": model_attribute(model), **section_attributes(model.crossing)},

@@ -37,7 +37,6 @@ class Fitted:
     ----------
     objects : dict
         Data by name of the vertical axis.
-    level : Level
     kept, total : int
         Points of the first vertical axis, here and in the run.
     closed, others : int

@@ -32,9 +32,6 @@ MOST_PLACES = 4000
 BLOCK_BYTES = 1_000_000
 """Answers lie together in objects of about so many bytes before compression."""
 
-PLANE_BYTES = 3_000_000
-"""What the planes of initial states may take of a copy in one file."""
-
 Place = dict[str, int]
 
 
@@ -44,7 +41,6 @@ class Copied:
 
     Attributes
     ----------
-    run : ExploredRun
     view : dict
         As `describe_view` gives it.
     about : dict
@@ -200,14 +196,11 @@ def add_planes(copied: Copied, most_bytes: float) -> None:
         objects[place_key(run, at)] = name
         copied.objects[name] = content
     left = size > most_bytes or len(found) > MOST_PLACES
-    missing = f"Of the planes of initial states this copy has {len(objects):,} of {_product(run):,}." if left else ""
+    n_planes = math.prod(len(axis.values) for axis in run.axes if axis.swept)
+    missing = f"Of the planes of initial states this copy has {len(objects):,} of {n_planes:,}." if left else ""
     if left:
         copied.sentences.append(missing)
     copied.about["planes"] = {"objects": objects, "missing": missing, "none": none or {"source": None}}
-
-
-def _product(run: ExploredRun) -> int:
-    return math.prod(len(a.values) for a in run.axes if a.swept)
 
 
 @dataclass(frozen=True)

@@ -41,10 +41,8 @@ class Exported:
 
     Attributes
     ----------
-    path : Path
     size : int
         Size of everything written [bytes].
-    orbits : int
     sentences : list of str
         Notes that the export shows to its readers.
     """

@@ -38,7 +38,6 @@ class Room:
 
     Attributes
     ----------
-    orbits : int
     n_bytes : float
         Before they are written as text.
     brief : bool

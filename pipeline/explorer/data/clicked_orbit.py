@@ -38,7 +38,6 @@ class Cell:
 
     Attributes
     ----------
-    number : int
     index : dict
         Index on each of the cube's dims.
     data : Dataset
@@ -192,7 +191,7 @@ def _attrs(run: ExploredRun, cell: Cell, told: dict[str, Any], linearised: bool)
         "note": "its multipliers are not ready yet: choose it again in a moment" if awaited else None,
         "exponents": exponents,
         "exponents_from": source,
-        "start": _state(run, cell.start),
+        "start": {s.name: float(v) for s, v in zip(run.model.states, cell.start, strict=True)},
         "seeds": seeds(run, cell),
         "fixed": fixed_points(run.model, cell.parameters),
         "quantities": [q.name for q in run.model.quantities],
@@ -295,10 +294,6 @@ def finite(value: Any) -> float | None:
     """Convert a number to a float for JSON; None if it is not finite."""
     number = float(value)
     return number if math.isfinite(number) else None
-
-
-def _state(run: ExploredRun, values: np.ndarray) -> dict[str, float]:
-    return {s.name: float(v) for s, v in zip(run.model.states, values, strict=True)}
 
 
 def seeds(run: ExploredRun, cell: Cell) -> list[dict[str, Any]]:

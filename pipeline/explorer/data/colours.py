@@ -56,8 +56,6 @@ class Scheme:
 
     Attributes
     ----------
-    name, title : str
-    categories : tuple of Category
     codes : callable
         ``codes(block)``: code of each cell of a loaded part of the cube, an array that broadcasts to those
         of ``status``; negative for none.

@@ -81,7 +81,8 @@ def _cube_exponents(run: ExploredRun, x: str, place: Mapping[str, int]) -> Itera
     part = cube["lyapunov"].isel(place).load()
     axes = [d for d in part.dims if d not in (x, "exponent")]
     values = part.transpose(*(d for d in (x, "exponent") if d in part.dims), *axes).values
-    values = values.reshape(-1 if x in part.dims else 1, part.sizes["exponent"], max(1, _size(part, axes)))
+    n_others = math.prod(part.sizes[d] for d in axes)
+    values = values.reshape(-1 if x in part.dims else 1, part.sizes["exponent"], max(1, n_others))
     for k in range(values.shape[1]):
         own = values[:, k]
         known = np.isfinite(own).any(axis=1)
@@ -97,10 +98,6 @@ def _cube_exponents(run: ExploredRun, x: str, place: Mapping[str, int]) -> Itera
                 for key, function in (("y", np.nanmean), ("low", np.nanmin), ("high", np.nanmax))
             },
         }
-
-
-def _size(array: xr.DataArray, dims: list[Any]) -> int:
-    return math.prod(array.sizes[d] for d in dims)
 
 
 def _attractor_curves(run: ExploredRun, x: str, place: Mapping[str, int]) -> Iterator[dict[str, Any]]:

@@ -34,7 +34,6 @@ class Plane:
     label : ndarray of int16, (v, u)
     fixed : dict
         Values of the other states, those that all starts share.
-    categories : list of Category
     source : str or None
         ``basins`` where labels are attractors, ``starts`` where they say what the cells themselves tell; None
         where there is no grid.

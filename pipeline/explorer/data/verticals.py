@@ -27,7 +27,6 @@ class Vertical:
 
     Attributes
     ----------
-    name, label, unit : str
     angle : bool
         Whether full turns do not matter.
     variable : str

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import threading
-import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -41,7 +40,6 @@ class Job:
         self.request, self.id = request, request.id
         self._cancelled = threading.Event()
         self._emit: Emit = _nowhere
-        self.began = time.perf_counter()
 
     def answers_to(self, emit: Emit) -> None:
         """Set the function that sends the answers of this job to the page."""

@@ -63,7 +63,6 @@ class Held:
 
     Attributes
     ----------
-    place : Place
     period : int
         Drive periods or returns.
     state : ndarray

@@ -90,7 +90,8 @@ def _names(run: Run, region: Region, swept: list[str]) -> tuple[str, str | None]
         if not swept:
             raise RequestError("the run sweeps no parameter; name the states of the starts in axes.")
         return (walk.path if walk is not None else swept[0]), None
-    given = [_key(name) for name in region.axes if name is not None]
+    names = [name for name in region.axes if name is not None]
+    given = [name.removesuffix("_0") if is_grid_dim(name) else parameter_name(name) for name in names]
     states = run.model.state_names
     has_ranges = isinstance(run.spec.initial_conditions, GridStarts | RandomStarts)
     known = [*swept, *(states if has_ranges else ())]
@@ -102,10 +103,6 @@ def _names(run: Run, region: Region, swept: list[str]) -> tuple[str, str | None]
     # a state over a parameter is the diagram's vertical axis, not a range of starts
     fits = given[1] in known and (given[1] in swept or first in states)
     return first, given[1] if fits else None
-
-
-def _key(name: str) -> str:
-    return name.removesuffix("_0") if is_grid_dim(name) else parameter_name(name)
 
 
 def _rounded(name: str, low: float, high: float) -> tuple[float, float]:

@@ -63,7 +63,6 @@ class Place:
 
     Attributes
     ----------
-    parameters : Parameters
     frequency : float
         As the engine takes it [Hz]: of the drive; of a flow seen at crossings one over the longest wait.
     index : tuple of int or None

@@ -39,7 +39,6 @@ class Query:
     ----------
     words : mapping
         Arguments of the address by name.
-    body : bytes
     """
 
     words: Mapping[str, str]
@@ -84,10 +83,8 @@ class Answer:
 
     Attributes
     ----------
-    name : str
     give : callable
         ``give(run, query, live)``.
-    method : str
     fresh : bool
         Whether the directory is read again first.
     integrates : bool

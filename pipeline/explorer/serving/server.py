@@ -343,7 +343,7 @@ def listening(port: int) -> socket.socket:
         If the port is taken or not ours to take.
     """
     if not 0 <= port <= 65535:
-        raise SpecError([f"--port {port}: must be 0 to 65535; 0 takes a free one."])
+        raise SpecError(f"--port {port}: must be 0 to 65535; 0 takes a free one.")
     found = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     try:
         found.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -353,7 +353,7 @@ def listening(port: int) -> socket.socket:
     except OSError as error:
         found.close()
         reason = "is taken" if error.errno == errno.EADDRINUSE else f"cannot be used ({error.strerror})"
-        raise SpecError([f"--port {port}: {reason}; give another one, or none for a free one."]) from None
+        raise SpecError(f"--port {port}: {reason}; give another one, or none for a free one.") from None
     return found
 
 

@@ -34,7 +34,7 @@ Authorised = Callable[[RequestHandler], bool]
 Route = tuple[str, type[WebSocketHandler], dict[str, Any]]
 
 
-def socket_routes(live: LiveRun, authorised: Authorised, path: str = r"/ws") -> list[Route]:
+def socket_routes(live: LiveRun, authorised: Authorised) -> list[Route]:
     """Return the tornado routes of the websocket for live computation.
 
     Parameters
@@ -47,7 +47,7 @@ def socket_routes(live: LiveRun, authorised: Authorised, path: str = r"/ws") -> 
     path
         Pattern of the address.
     """
-    return [(path, LiveSocket, {"live": live, "authorised": authorised, "others": set()})]
+    return [("/ws", LiveSocket, {"live": live, "authorised": authorised, "others": set()})]
 
 
 class LiveSocket(WebSocketHandler):

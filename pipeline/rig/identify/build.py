@@ -39,7 +39,6 @@ class Built:
 
     Attributes
     ----------
-    problem : Problem
     held_out : tuple of Piece
         Pieces that are judged afterwards; only their starts are fitted.
     tables : tuple of MeasuredTable
@@ -117,7 +116,7 @@ def build(spec: IdentificationSpec, recordings: Sequence[xr.Dataset], tables: Se
     if problems:
         raise SpecError(problems)
     if recordings and not kept:
-        raise SpecError(["recordings: all pieces are held out; leave some to be fitted."])
+        raise SpecError("recordings: all pieces are held out; leave some to be fitted.")
     both = apply_settings([*kept, *held], {i: t.parameters for i, t in enumerate(spec.recordings)})
     kept, held = both[: len(kept)], both[len(kept) :]
     problem = Problem(
@@ -392,17 +391,15 @@ def _drive_of(table: RecordingTable, ds: xr.Dataset) -> _Driven | None:
         known = np.isfinite(level)
         covered = time[known]
         if len(covered) < 2:
-            raise SpecError(["its drive channel has no values; map another channel."])
+            raise SpecError("its drive channel has no values; map another channel.")
         return _Driven(Drive.from_torque(covered, level[known]), float(covered[0]), float(covered[-1]))
     edges = _steadied(find_edges(time, level))
     rising = edges.rising
     falling = np.array([edges.falling[edges.falling > r][:1] for r in rising[:-1]], dtype=object)
     if len(rising) < 2 or any(len(f) != 1 or f[0] >= r for f, r in zip(falling, rising[1:], strict=True)):
         raise SpecError(
-            [
-                "its drive has no two rising edges with a falling one between each two; look at it with "
-                "magpend recordings show, and choose a window in which it switches."
-            ]
+            "its drive has no two rising edges with a falling one between each two; look at it with "
+            "magpend recordings show, and choose a window in which it switches."
         )
     flat = np.array([float(f[0]) for f in falling])
     return _Driven(Drive.from_edges(rising, flat, name=DUTY), float(rising[0]), float(rising[-1]))

@@ -10,7 +10,7 @@ import numpy as np
 from magpend_core.models import load_model
 from magpend_core.models.model import Parameters
 from pipeline.rig.identify.build import drive_problems, pieces_of
-from pipeline.rig.identify.directory import Info, read_info, read_result
+from pipeline.rig.identify.directory import read_info, read_result
 from pipeline.rig.identify.identification import require_starts
 from pipeline.rig.identify.judging import judge
 from pipeline.rig.identify.problem import Free, Problem
@@ -52,10 +52,10 @@ def check(directory: str | Path, recording: str | Path, *, like: int = 0) -> dic
     """
     info, result = read_info(directory), read_result(directory)
     if not result["recordings"]:
-        raise SpecError([f"{recording}: {directory} was fitted to orbits alone; give a table of orbits."])
+        raise SpecError(f"{recording}: {directory} was fitted to orbits alone; give a table of orbits.")
     tables = info.identity["spec"]["recordings"]
     if not 0 <= like < len(tables):
-        raise SpecError([f"like = {like}: there are recordings 0 to {len(tables) - 1}."])
+        raise SpecError(f"like = {like}: there are recordings 0 to {len(tables) - 1}.")
     table = RecordingTable.model_validate(
         {
             "file": str(recording),
@@ -83,7 +83,7 @@ def check(directory: str | Path, recording: str | Path, *, like: int = 0) -> dic
         channels=channels,
         pieces=tuple(pieces),
         noise=np.array([result["noise"][c] for c in channels]),
-        rtol=_rtol(info),
+        rtol=float(info.identity["spec"]["fit"]["rtol"]),
         recorded=table.drive == "recorded",
     )
     judgement, fit = judge(problem, result["values"], zeros, pieces)
@@ -95,7 +95,3 @@ def check(directory: str | Path, recording: str | Path, *, like: int = 0) -> dic
         "units": {c: model.state(c).unit for c in channels},
         **judgement.as_dict(),
     }
-
-
-def _rtol(info: Info) -> float:
-    return float(info.identity["spec"]["fit"]["rtol"])

@@ -76,7 +76,7 @@ def _stored(spec: dict[str, Any], result: dict[str, Any]) -> IdentificationSpec:
 
 def _table(spec: dict[str, Any], path: Path) -> OrbitsTable:
     if not path.is_file():
-        raise SpecError([f"{path}: no such file."])
+        raise SpecError(f"{path}: no such file.")
     first = spec["orbits"][0]["data"] if spec["orbits"] else {}
     crossing = first.get("section")
     has_own = path.suffix.lower() == ".toml" and "section" in read_toml(path)

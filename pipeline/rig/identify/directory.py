@@ -32,7 +32,7 @@ from pipeline.rig.identify.specification import IdentificationSpec
 from pipeline.rig.recordings import load_mapping
 from pipeline.specification.models import is_model_file
 from pipeline.store.errors import DamagedError, RefusedError
-from pipeline.store.files import FIGURES, HOLDER, LOCK, RUN_FILE, entry_of, is_temporary, local_path, problems_of
+from pipeline.store.files import HOLDER, LOCK, RUN_FILE, entry_of, is_temporary, local_path, problems_of
 from pipeline.store.local import is_there, refuse_place, unreadable
 from pipeline.store.places import open_files
 from pipeline.store.provenance import provenance, versions
@@ -52,7 +52,6 @@ ORBITS = "orbits-{}.nc"
 
 POSTERIOR = "posterior.nc"
 
-_OWN = frozenset({IDENTIFICATION, RESULT, RESIDUALS, PRESET, OUTCOMES, FIGURES, LOCK, HOLDER})
 _ROOM = Path(__file__).parent
 _NOT_NUMBERS = (
     "bands.py", "check.py", "check_orbits.py", "comparison.py", "directory.py", "figures.py", "orbit_reports.py",
@@ -69,7 +68,6 @@ class Source:
     ----------
     file : str
         Name of the file.
-    sha256 : str
     mapping : str
         Text of the mapping file.
     """

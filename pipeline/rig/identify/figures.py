@@ -99,15 +99,13 @@ def _milli(ds: xr.Dataset, channel: str) -> tuple[str, float]:
     return MILLI.get(unit, (unit, 1.0))
 
 
-def plot_fit(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.DataFigure:
+def plot_fit(ds: xr.Dataset) -> style.DataFigure:
     """Draw measured and computed values of up to four pieces, with their residuals.
 
     Parameters
     ----------
     ds
         See `pipeline.rig.identify.reports.residuals_of`.
-    frame
-        Width of the figure.
 
     Returns
     -------
@@ -117,7 +115,7 @@ def plot_fit(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.DataFi
     chosen = _chosen(pieces_in(ds))
     channels = str(ds.attrs["channels"]).split()
     part = xr.concat([s.of(ds) for s in chosen], "sample", join="override", combine_attrs="override")
-    fig = style.new_figure(1.0 + 2.3 * len(channels), part.assign_attrs(title=_title(ds.attrs, "fit")), frame)
+    fig = style.new_figure(1.0 + 2.3 * len(channels), part.assign_attrs(title=_title(ds.attrs, "fit")), style.WIDE)
     grid = fig.add_gridspec(2 * len(channels), len(chosen), height_ratios=[1.7, 1.0] * len(channels))
     axes = [[fig.add_subplot(grid[row, k]) for k in range(len(chosen))] for row in range(2 * len(channels))]
     for k, series in enumerate(chosen):
@@ -163,9 +161,7 @@ def _draw_piece(above: Axes, below: Axes, own: xr.Dataset, channel: str) -> None
     time = own["time"].values
     measured, left = own[f"{channel}_measured"].values, own[f"{channel}_residual"].values
     step = max(1, len(time) // 300)
-    above.plot(
-        time[::step], measured[::step], linestyle="none", marker="o", markersize=1.6, color="0.65", markeredgewidth=0.0
-    )
+    style.points(above, time[::step], measured[::step], 1.6, "0.65")
     above.plot(time, measured - left, color=FITTED, linewidth=0.8)
     below.axhline(0.0, color="0.7", linewidth=0.5)
     below.plot(time, _milli(own, channel)[1] * left, color="0.15", linewidth=0.5)
@@ -184,7 +180,7 @@ def _share_range(row: list[Axes]) -> None:
         ax.tick_params(labelleft=False)
 
 
-def plot_residuals(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.DataFigure:
+def plot_residuals(ds: xr.Dataset) -> style.DataFigure:
     """Draw the residuals of each channel: autocorrelation, rms by piece, residuals against the channel's rate of
     change, and histogram.
 
@@ -192,8 +188,6 @@ def plot_residuals(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.
     ----------
     ds
         See `pipeline.rig.identify.reports.residuals_of`.
-    frame
-        Width of the figure.
 
     Returns
     -------
@@ -205,7 +199,7 @@ def plot_residuals(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.
     channels = str(ds.attrs["channels"]).split()
     views = residual_views(ds, channels)
     title = _title(ds.attrs, "residuals")
-    fig = style.new_figure(8.2, views.assign_attrs({**ds.attrs, "title": title}), frame)
+    fig = style.new_figure(8.2, views.assign_attrs({**ds.attrs, "title": title}), style.WIDE)
     grid = fig.add_gridspec(VIEWS, len(channels))
     for c, channel in enumerate(channels):
         column = [fig.add_subplot(grid[row, c]) for row in range(VIEWS)]
@@ -266,16 +260,7 @@ def _draw_pieces(ax: Axes, ds: xr.Dataset, channel: str, factor: float) -> None:
 def _draw_against_rate(ax: Axes, ds: xr.Dataset, views: xr.Dataset, channel: str, factor: float) -> None:
     rate, left = rate_of(ds, channel)
     step = max(1, len(rate) // MOST_DOTS)
-    ax.plot(
-        rate[::step],
-        factor * left[::step],
-        linestyle="none",
-        marker=".",
-        markersize=1.5,
-        color="0.72",
-        markeredgewidth=0.0,
-        rasterized=True,
-    )
+    style.points(ax, rate[::step], factor * left[::step], 1.5, "0.72", marker=".", rasterized=True)
     ax.axhline(0.0, color="0.5", linewidth=0.5)
     ax.plot(
         views[f"{channel}_rate"],
@@ -306,9 +291,7 @@ def _draw_histogram(ax: Axes, views: xr.Dataset, channel: str, factor: float) ->
     ax.set_ylim(0.0, None)
 
 
-def plot_profiles(
-    attrs: Mapping[Any, Any], result: Mapping[str, Any], *, frame: style.Frame = style.WIDE
-) -> style.DataFigure:
+def plot_profiles(attrs: Mapping[Any, Any], result: Mapping[str, Any]) -> style.DataFigure:
     """Draw the profile likelihood of each unknown, with the parabola that its standard error predicts.
 
     Parameters
@@ -317,8 +300,6 @@ def plot_profiles(
         Of the residuals.
     result
         What ``result.json`` holds.
-    frame
-        Width of the figure.
 
     Returns
     -------
@@ -335,7 +316,7 @@ def plot_profiles(
             values = np.array([np.nan if v is None else v for v in p[key]], np.float64)
             data[f"{name}_{key}"] = (f"{name}_point", values)
     title = _title(attrs, "profiles")
-    fig = style.new_figure(0.7 + 1.75 * n_rows, xr.Dataset(data, attrs={**attrs, "title": title}), frame)
+    fig = style.new_figure(0.7 + 1.75 * n_rows, xr.Dataset(data, attrs={**attrs, "title": title}), style.WIDE)
     critical = float(result["covariance"]["critical"])
     for k, name in enumerate(names):
         ax = fig.add_subplot(n_rows, n_columns, k + 1)
@@ -390,9 +371,7 @@ def _engineering(size: float) -> tuple[float, int]:
     return 10.0**-exponent, exponent
 
 
-def plot_correlations(
-    attrs: Mapping[Any, Any], result: Mapping[str, Any], *, frame: style.Frame = SQUARE
-) -> style.DataFigure:
+def plot_correlations(attrs: Mapping[Any, Any], result: Mapping[str, Any]) -> style.DataFigure:
     """Draw the correlation matrix of the estimates; entries of parameters that the data do not determine stay empty.
 
     Parameters
@@ -401,8 +380,6 @@ def plot_correlations(
         Of the residuals.
     result
         What ``result.json`` holds.
-    frame
-        Width of the figure.
 
     Returns
     -------
@@ -417,7 +394,7 @@ def plot_correlations(
         attrs={**attrs, "title": _title(attrs, "correlations")},
     )
     n = len(names)
-    fig = style.new_figure(min(1.4 + 0.42 * n, 7.2), data, frame)
+    fig = style.new_figure(min(1.4 + 0.42 * n, 7.2), data, SQUARE)
     ax = fig.add_subplot()
     style.style_axes(ax, inside=False, minor=False)
     image = ax.imshow(matrix, cmap="PuOr", vmin=-1.0, vmax=1.0)

@@ -149,17 +149,13 @@ def refuse_invisible(problem: Problem) -> None:
     first = evaluate(problem, problem.start[None], problem.starts[None], slopes=True)[0]
     if _is_driven(problem):
         raise SpecError(
-            [
-                'recordings: drive = "none", but the model is driven with these parameters; set the amplitude of '
-                "its drive to 0 under [parameters]."
-            ]
+            'recordings: drive = "none", but the model is driven with these parameters; set the amplitude of '
+            "its drive to 0 under [parameters]."
         )
     if first.failed:
         raise SpecError(
-            [
-                f"identify: at the start, {first.failed} trajectories of pieces or measured orbits are lost; give "
-                "starts that are nearer."
-            ]
+            f"identify: at the start, {first.failed} trajectories of pieces or measured orbits are lost; give "
+            "starts that are nearer."
         )
     columns = first.jacobian[:, : len(problem.free)]
     n_priors = sum(f.has_prior for f in problem.free)

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.layout.writing import json_value
 from pipeline.rig.identify.first_guesses import fit_starts
 from pipeline.rig.identify.local import Fit, fit_local
 from pipeline.rig.identify.problem import Piece, Problem
@@ -70,17 +71,13 @@ class Judgement:
         None.
         """
         return {
-            "rms": _known(self.rms),
-            "correlation": _known(self.correlation),
+            "rms": json_value(self.rms),
+            "correlation": json_value(self.correlation),
             "pieces": [
-                {"recording": p.recording, "piece": p.number, "rms": _known(self.rms_of(k))}
+                {"recording": p.recording, "piece": p.number, "rms": json_value(self.rms_of(k))}
                 for k, p in enumerate(self.pieces)
             ],
         }
-
-
-def _known(values: Mapping[str, float]) -> dict[str, float | None]:
-    return {name: value if np.isfinite(value) else None for name, value in values.items()}
 
 
 def _pearson(x: np.ndarray, y: np.ndarray) -> float:

@@ -37,9 +37,6 @@ class Fit:
         Starts of the pieces [SI].
     cost : float
         Half the sum of squares in units of the noise.
-    converged : bool
-    message : str
-    n_evaluations : int
     residuals, rows, jacobian
         See `Evaluation`.
     known : tuple of Solution

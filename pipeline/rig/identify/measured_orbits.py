@@ -53,7 +53,6 @@ class MeasuredTable:
         Model, parameter and interval.
     state : str
         Measured state; empty if there are bifurcations alone.
-    fitted, held_out : tuple of Datum
     measured : Dataset or None
         Orbits as of `read_branch`; None if there are bifurcations alone.
     settings : dict
@@ -187,7 +186,7 @@ def _read(spec: IdentificationSpec, table: OrbitsTable, where: str) -> xr.Datase
     except SpecError as error:
         raise SpecError([f"{where}: {p}" for p in error.problems]) from None
     except OSError as error:
-        raise SpecError([f"{where}.file = {table.file!r}: cannot be read ({error})."]) from None
+        raise SpecError(f"{where}.file = {table.file!r}: cannot be read ({error}).") from None
 
 
 def _model(spec: IdentificationSpec, table: OrbitsTable, where: str) -> Model:
@@ -195,16 +194,16 @@ def _model(spec: IdentificationSpec, table: OrbitsTable, where: str) -> Model:
     model, section = spec.model, table.section
     if not model.autonomous:
         if section is not None:
-            raise SpecError([f"{where}.section: {model.name} has a drive; its sections are once per drive period."])
+            raise SpecError(f"{where}.section: {model.name} has a drive; its sections are once per drive period.")
         return model
     if section is None and table.file.endswith(".toml"):
         section = _section_of(spec, table)
     if section is None:
         raise SpecError(
-            [f"{where}.section: missing; {model.name} has no drive: give section = {{ of = ..., value = ... }}."]
+            f"{where}.section: missing; {model.name} has no drive: give section = {{ of = ..., value = ... }}."
         )
     if section.of not in model.state_names:
-        raise SpecError([f"{where}.section.of = {section.of!r}: is not a state of {model.name}."])
+        raise SpecError(f"{where}.section.of = {section.of!r}: is not a state of {model.name}.")
     return sectioned(model, section.crossing)
 
 

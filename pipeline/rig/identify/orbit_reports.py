@@ -9,6 +9,7 @@ import numpy as np
 import xarray as xr
 
 from pipeline.analysis.tabular import words_of
+from pipeline.layout.writing import json_value
 from pipeline.rig.measured_branch.comparison import branch_table
 
 GROUPS = ("fitted", "held_out")
@@ -45,7 +46,7 @@ def _orbit_rows(ds: xr.Dataset) -> list[dict[str, Any]]:
         return []
     rows = branch_table(ds).rows
     held = ds["held_out"].values
-    return [{k: _known(v) for k, v in row.items()} | {"held_out": bool(h)} for row, h in zip(rows, held, strict=True)]
+    return [json_value(row) | {"held_out": bool(h)} for row, h in zip(rows, held, strict=True)]
 
 
 def _bifurcation_rows(ds: xr.Dataset) -> list[dict[str, Any]]:
@@ -54,7 +55,7 @@ def _bifurcation_rows(ds: xr.Dataset) -> list[dict[str, Any]]:
             "name": str(one["bifurcation"].item()),
             "measured": float(one["measured_value"]),
             "measured_sd": float(one["measured_value_sd"]),
-            "computed": _known(float(one["computed_value"])),
+            "computed": json_value(float(one["computed_value"])),
             "held_out": bool(one["bifurcation_held_out"]),
         }
         for one in (ds.isel(bifurcation=k) for k in range(ds.sizes["bifurcation"]))
@@ -75,12 +76,8 @@ def _rms(ds: xr.Dataset) -> dict[str, dict[str, dict[str, Any]]]:
             if not chosen.any():
                 continue
             own = {"amplitude": ds["relative_error"].values[chosen], "frequency": ds["frequency_error"].values[chosen]}
-            found[group][word] = {name: _known(float(np.sqrt(np.mean(e**2)))) for name, e in own.items()}
+            found[group][word] = {name: json_value(float(np.sqrt(np.mean(e**2)))) for name, e in own.items()}
     return found
-
-
-def _known(value: Any) -> Any:
-    return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
 def orbit_lines(result: Sequence[Mapping[str, Any]]) -> list[str]:

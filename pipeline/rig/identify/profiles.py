@@ -34,7 +34,6 @@ class Profile:
 
     Attributes
     ----------
-    name : str
     values : ndarray (n,)
         Rising, in the parameter's unit; the estimate is among them.
     growth : ndarray (n,)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,6 +12,7 @@ import xarray as xr
 
 from magpend_core.models.preset_writing import write_preset
 from pipeline.layout.vocabulary import model_attribute
+from pipeline.layout.writing import json_value
 from pipeline.rig.identify.directory import Source
 from pipeline.rig.identify.identifiability import Direction
 from pipeline.rig.identify.judging import Judgement
@@ -34,13 +34,8 @@ class Finding:
 
     Attributes
     ----------
-    problem : Problem
     starts : dict of Fit
         Outcome of each start by its number.
-    best : Fit
-    covariance : Covariance
-    directions : list of Direction
-    profiles : dict of Profile
     fitted, held_out : Judgement
         Judgements of the fitted pieces, and of the held-out ones if there are any.
     n_effective : dict
@@ -49,7 +44,6 @@ class Finding:
         For each unknown, the bound at which its estimate lies: ``lower``, ``upper`` or an empty text.
     orbits : list of Dataset
         Judged orbits and bifurcations, one dataset per table.
-    warnings : list of str
     """
 
     problem: Problem
@@ -117,7 +111,7 @@ def result_of(
         "starts": [
             {
                 "number": k,
-                "cost": _number(fit.cost),
+                "cost": json_value(fit.cost),
                 "converged": fit.converged,
                 "best": found.is_same(fit),
                 "message": fit.message,
@@ -146,22 +140,22 @@ def _sureness(found: Finding) -> dict[str, Any]:
             "inflation": found.covariance.inflation,
             "n_samples": int(sum(np.isfinite(r).sum() for r in found.best.residuals)),
             "n_effective": dict(found.n_effective),
-            "matrix": _plain(found.covariance.matrix),
+            "matrix": json_value(found.covariance.matrix),
         },
         "correlations": {
             name: dict(zip(names, row, strict=True))
-            for name, row in zip(names, _plain(found.covariance.correlations), strict=True)
+            for name, row in zip(names, json_value(found.covariance.correlations), strict=True)
         },
         "singular_values": [
             {
                 "value": d.singular_value,
-                "error": _number(d.error),
+                "error": json_value(d.error),
                 "vector": dict(zip(names, d.vector.tolist(), strict=True)),
             }
             for d in found.directions
         ],
         "profiles": {
-            name: {"values": _plain(p.values), "growth": _plain(p.growth), "interval": _plain(p.interval)}
+            name: {"values": json_value(p.values), "growth": json_value(p.growth), "interval": json_value(p.interval)}
             for name, p in found.profiles.items()
         },
     }
@@ -184,16 +178,16 @@ def _estimate(found: Finding, i: int) -> dict[str, Any]:
         "value": value,
         "unit": free.unit,
         "meaning": free.meaning,
-        "error": _number(error),
-        "interval": [_number(low), _number(high)],
+        "error": json_value(error),
+        "interval": [json_value(low), json_value(high)],
         "start": free.start,
-        "bounds": [_number(free.lower), _number(free.upper)],
+        "bounds": [json_value(free.lower), json_value(free.upper)],
         "at_bound": found.at_bound[i],
     }
     if free.has_prior:
         entry["prior"] = {"mean": free.prior_mean, "sd": free.prior_sd}
     if free.name in found.profiles:
-        entry["profile_interval"] = _plain(found.profiles[free.name].interval)
+        entry["profile_interval"] = json_value(found.profiles[free.name].interval)
     return entry
 
 
@@ -202,16 +196,6 @@ def interval_of(found: Finding, i: int) -> tuple[float, float]:
     free, value = found.problem.free[i], float(found.best.theta[i])
     half = found.covariance.critical * float(found.covariance.errors[i])
     return max(value - half, free.lower), min(value + half, free.upper)
-
-
-def _number(value: float) -> float | None:
-    return float(value) if math.isfinite(value) else None
-
-
-def _plain(values: Any) -> Any:
-    if isinstance(values, np.ndarray | list | tuple):
-        return [_plain(v) for v in values]
-    return _number(float(values))
 
 
 def write_values(path: Path, spec: IdentificationSpec, found: Finding, sources: Sequence[Source]) -> None:

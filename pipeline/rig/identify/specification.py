@@ -18,11 +18,11 @@ from magpend_core.models.parameters import near_names
 from magpend_core.models.presets import is_file
 from pipeline.rig.identify.orbit_tables import OrbitsTable
 from pipeline.rig.identify.settings import setting_problems
-from pipeline.rig.identify.unknowns import Pair, ParameterTables, Unknown, table_at, validate
+from pipeline.rig.identify.unknowns import Pair, ParameterTables, Unknown
 from pipeline.specification.files import read_toml
 from pipeline.specification.models import add_model
 from pipeline.specification.parsing import IDENTIFICATION
-from pipeline.specification.problems import SpecError, unknown_choice, unknown_key
+from pipeline.specification.problems import SpecError, checked, table_at, unknown_choice, unknown_key
 from pipeline.specification.tables import Table
 
 
@@ -218,7 +218,7 @@ def parse_identification(data: Mapping[str, Any], folder: Path) -> Identificatio
     """
     kind = data.get("kind")
     if kind in ("sweep", "continuation"):
-        raise SpecError([f'kind = "{kind}": is a run, not an identification; use magpend run.'])
+        raise SpecError(f'kind = "{kind}": is a run, not an identification; use magpend run.')
     problems = [unknown_key(key, key, _KEYS) for key in data if key not in _KEYS]
     if kind != IDENTIFICATION:
         missing = f'kind: missing; add kind = "{IDENTIFICATION}".'
@@ -276,7 +276,7 @@ def _model(data: Mapping[str, Any], folder: Path, problems: list[str]) -> Model 
 
 
 def _table(data: Mapping[str, Any], key: str, model: type[Table], problems: list[str]) -> Any:
-    return validate(model, table_at(data, key, problems), key, problems)
+    return checked(model, table_at(data, key, problems), key, problems)
 
 
 def _recordings(data: Mapping[str, Any], folder: Path, problems: list[str]) -> tuple[RecordingTable, ...]:
@@ -289,7 +289,7 @@ def _recordings(data: Mapping[str, Any], folder: Path, problems: list[str]) -> t
         return ()
     found = []
     for i, table in enumerate(tables):
-        one = validate(RecordingTable, table, f"recordings[{i}]", problems)
+        one = checked(RecordingTable, table, f"recordings[{i}]", problems)
         if one is None:
             continue
         found.append(one)
@@ -314,7 +314,7 @@ def _orbits(data: Mapping[str, Any], folder: Path, problems: list[str]) -> tuple
     if not isinstance(tables, list):
         problems.append("orbits: must be a list of tables; write [[orbits]].")
         return ()
-    found = [validate(OrbitsTable, table, f"orbits[{i}]", problems) for i, table in enumerate(tables)]
+    found = [checked(OrbitsTable, table, f"orbits[{i}]", problems) for i, table in enumerate(tables)]
     problems += [
         f"orbits[{i}].file = {one.file!r}: no such file ({folder / one.file}); paths count from the specification's "
         "folder."

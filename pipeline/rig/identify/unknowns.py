@@ -9,11 +9,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BaseModel, Field, ValidationError
+from pydantic import Field
 
 from magpend_core.models.model import Model, Parameters
 from magpend_core.models.parameters import FRACTION, NON_NEGATIVE, POSITIVE, ParameterError, unknown_name_problem
-from pipeline.specification.problems import problems_of
+from pipeline.specification.problems import checked, table_at
 from pipeline.specification.tables import Table
 
 _LEAST = 1e-9
@@ -48,10 +48,8 @@ class Unknown:
 
     Attributes
     ----------
-    name : str
     start, lower, upper : float
         In the parameter's unit.
-    prior : Prior, optional
     """
 
     name: str
@@ -59,28 +57,6 @@ class Unknown:
     lower: float
     upper: float
     prior: Prior | None
-
-
-def validate(model: type[BaseModel], value: Any, path: str, problems: list[str]) -> Any:
-    """Return a table validated by a pydantic model; if it is invalid, add the problems to `problems` and return
-    None.
-    """
-    try:
-        return model.model_validate(value)
-    except ValidationError as error:
-        problems += problems_of(error, model, path)
-        return None
-
-
-def table_at(data: Mapping[str, Any], key: str, problems: list[str]) -> Mapping[str, Any]:
-    """Return the table under a TOML key, or an empty table if the key is missing. If the value is no table, add a
-    problem and return an empty table.
-    """
-    table = data.get(key, {})
-    if isinstance(table, dict):
-        return table
-    problems.append(f"{key} = {table!r}: must be a table; write [{key}].")
-    return {}
 
 
 _TIE = re.compile(r"\s*(?:([+-]?\s*[0-9.]+(?:[eE][+-]?[0-9]+)?)\s*\*\s*|(-)\s*)?([A-Za-z_]\w*)\s*")
@@ -124,7 +100,7 @@ class ParameterTables:
         if name not in self._model.parameter_names:
             self._problems.append(f"identify.{name}: {unknown_name_problem(name, self._model.parameter_names)}")
             return None
-        one = validate(Identified, table, f"identify.{name}", self._problems)
+        one = checked(Identified, table, f"identify.{name}", self._problems)
         if one is None or (self.values is None and one.start is None):
             return None
         start = one.start if one.start is not None else self.values[name]  # type: ignore[index]

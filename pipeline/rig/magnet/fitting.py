@@ -37,10 +37,8 @@ class CurveFit:
 
     Attributes
     ----------
-    curve : Curve
     values, errors : dict
         By ``A`` [N m], ``b``, ``c`` [rad].
-    quality : Quality
     """
 
     curve: Curve
@@ -82,7 +80,6 @@ class JointFit:
         latter are NaN if one curve alone determines a parameter.
     correlation : ndarray
         Correlation matrix of `free`.
-    quality : Quality
     residuals : ndarray
         Measured minus computed [N m].
     neighbours : float
@@ -110,7 +107,6 @@ class DipoleFit:
     ----------
     values : dict
         ``pole1`` and ``pole2``, which are equal since only their product matters, and the place ``h`` [m].
-    quality : Quality
     residuals : ndarray
         Measured minus computed [N m].
     """
@@ -395,9 +391,6 @@ class Outcome:
 
     Attributes
     ----------
-    measured : Measurement
-    curves : tuple of CurveFit
-    laws : Laws
     joint : JointFit
         Joint fit with the parameters held that the header names.
     unheld : JointFit or None

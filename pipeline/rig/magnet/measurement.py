@@ -12,7 +12,6 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -25,8 +24,8 @@ from magpend_core.models.parameters import ParameterError
 from magpend_core.models.pendulum import magnet_torque as laws
 from magpend_core.models.presets import find_preset
 from pipeline.rig.recordings import units
-from pipeline.specification.files import read_toml
-from pipeline.specification.problems import SpecError, unknown_choice, unknown_name, validated
+from pipeline.specification.files import find_file, read_toml, shipped_files
+from pipeline.specification.problems import SpecError, unknown_choice, validated
 from pipeline.specification.tables import Table
 
 MIN_READINGS = 5
@@ -177,7 +176,6 @@ class Measurement:
 
     Attributes
     ----------
-    header : Header
     path : Path
         Path of the header.
     digest : str
@@ -239,13 +237,7 @@ def find_measurement(name: str | Path) -> Path:
     SpecError
         If there is neither.
     """
-    path = Path(name)
-    if path.exists() or path.suffix or len(path.parts) > 1:
-        return path
-    shipped = {p.stem: p for p in sorted(Path(str(resources.files("workflows"))).glob("magnet/*.toml"))}
-    if str(name) in shipped:
-        return shipped[str(name)]
-    raise SpecError([f"{name}: no such file; {unknown_name('measurement', str(name), shipped)}"])
+    return find_file("measurement", name, {path.stem: path for path in shipped_files("magnet/*.toml")})
 
 
 def read_measurement(path: str | Path) -> Measurement:

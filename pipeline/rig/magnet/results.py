@@ -14,7 +14,7 @@ from magpend_core.models import load_model
 from magpend_core.models.pendulum import magnet_torque as laws
 from magpend_core.models.preset_writing import write_preset
 from magpend_core.models.presets import Preset, find_preset
-from pipeline.layout.writing import write_atomically
+from pipeline.layout.writing import json_value, write_atomically
 from pipeline.products.product import padded
 from pipeline.rig.magnet.fitting import DipoleFit, JointFit, Outcome
 from pipeline.rig.magnet.measurement import Measurement
@@ -68,12 +68,11 @@ def report_of(outcome: Outcome) -> dict[str, Any]:
 
 def _joint(fit: JointFit) -> dict[str, Any]:
     line = laws.transition(fit.values)
-    by_curve = {n: e if math.isfinite(e) else None for n, e in fit.errors_by_curve.items()}
     return {
         "values": {name: fit.values[name] for name in laws.FITTED},
         "held": [name for name in laws.FITTED if name not in fit.free],
         "standard_errors": fit.errors,
-        "standard_errors_by_curve": by_curve,
+        "standard_errors_by_curve": json_value(fit.errors_by_curve),
         "correlation": {"names": list(fit.free), "matrix": fit.correlation.tolist()},
         "transition": {"slope": line.slope, "offset_rad": line.offset},
         "r2": fit.quality.r2,

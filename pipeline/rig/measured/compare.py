@@ -69,10 +69,8 @@ def compare_with(measured: xr.Dataset, computed: Computed, *, seed: int = 0) -> 
     if not any(computed.place(float(x)) >= 0 for x in f):
         own = computed.frequencies
         raise SpecError(
-            [
-                f"frequency: measured from {f.min():.4g} to {f.max():.4g} Hz, computed from {own.min():.4g} to "
-                f"{own.max():.4g} Hz; the ranges do not overlap: run the model over the measured range."
-            ]
+            f"frequency: measured from {f.min():.4g} to {f.max():.4g} Hz, computed from {own.min():.4g} to "
+            f"{own.max():.4g} Hz; the ranges do not overlap: run the model over the measured range."
         )
     ids = computed.attractors["attractor"].values
     distances = np.full((f.size, ids.size), np.nan)

@@ -38,18 +38,14 @@ def cube_and_parameters(
     model = load_model(model)
     if run.model is not model:
         raise SpecError(
-            [
-                f"{where}: a run of the model {run.model.name}, while the recordings' mapping says {model.name}: "
-                "give a run of that model, or correct model in the mapping."
-            ]
+            f"{where}: a run of the model {run.model.name}, while the recordings' mapping says {model.name}: "
+            "give a run of that model, or correct model in the mapping."
         )
     cube = run.cube()
     if FREQUENCY_DIM not in cube["status"].dims:
         raise SpecError(
-            [
-                f"{where}: sweeps no drive frequency, so there is nothing to hold a measured sweep against: run "
-                "a specification with axes.frequency_hz."
-            ]
+            f"{where}: sweeps no drive frequency, so there is nothing to hold a measured sweep against: run "
+            "a specification with axes.frequency_hz."
         )
     with refused(where):
         part = select_points(cube, at)

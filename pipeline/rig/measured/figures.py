@@ -288,15 +288,13 @@ def _draw_attractors(ax: Axes, computed: Computed, measure: labels.Measure, met:
         kept = np.isfinite(values[:, i])
         if kept.any():
             own = number in met.colours
-            ax.plot(
+            style.points(
+                ax,
                 x[kept],
                 values[:, i][kept],
-                linestyle="none",
-                marker="o",
-                markersize=1.6 if own else 1.2,
+                1.6 if own else 1.2,
+                met.colours.get(number, UNMET),
                 zorder=2.0 if own else 1.8,
-                markeredgewidth=0.0,
-                color=met.colours.get(number, UNMET),
                 rasterized=True,
                 gid=f"points:{letter(number)}",
             )

@@ -75,10 +75,8 @@ def measure(
     models = sorted({model_of(r) for r in recordings}, key=lambda model: model.name)
     if len(models) != 1:
         raise SpecError(
-            [
-                f"recordings: their models are {', '.join(m.name for m in models) or 'none'}; a diagram is drawn of "
-                "one: give recordings whose mappings name the same model."
-            ]
+            f"recordings: their models are {', '.join(m.name for m in models) or 'none'}; a diagram is drawn of "
+            "one: give recordings whose mappings name the same model."
         )
     (model,) = models
     known = model.load() if parameters is None else parameters
@@ -164,16 +162,12 @@ def _check(steps: Sequence[_Step], recordings: Sequence[xr.Dataset]) -> None:
     if not steps:
         names = ", ".join(name_of(r) for r in recordings)
         raise SpecError(
-            [
-                f"{names}: no stretch of one frequency holds {LEAST} sections; choose longer recordings, a "
-                "smaller transient, or a window of a slow sweep."
-            ]
+            f"{names}: no stretch of one frequency holds {LEAST} sections; choose longer recordings, a "
+            "smaller transient, or a window of a slow sweep."
         )
     states = sorted({", ".join(s.state) for s in steps})
     if len(states) > 1:
-        raise SpecError(
-            [f"recordings: they hold different states ({'; '.join(states)}); map the same channels of all."]
-        )
+        raise SpecError(f"recordings: they hold different states ({'; '.join(states)}); map the same channels of all.")
 
 
 def _dataset(steps: Sequence[_Step], model: Model, recordings: Sequence[xr.Dataset]) -> xr.Dataset:

@@ -70,10 +70,8 @@ def channels_of(recording: xr.Dataset, model: Model) -> list[Channel]:
     found = [channel(i, s) for i, s in enumerate(model.states) if s.name in recording]
     if not found:
         raise SpecError(
-            [
-                f"{name_of(recording)}: none of the states of {model.name} ({', '.join(names)}) is measured: "
-                "name at least one under [channels] of the mapping."
-            ]
+            f"{name_of(recording)}: none of the states of {model.name} ({', '.join(names)}) is measured: "
+            "name at least one under [channels] of the mapping."
         )
     return found
 
@@ -118,10 +116,8 @@ def find_sections(recording: xr.Dataset, edges: Edges, *, window_s: float = WIND
     fits = _fits(recording, edges, channels, window_s, order)
     if not fits:
         raise SpecError(
-            [
-                f"{name_of(recording)}: no rising edge of the drive has samples on either side; choose a longer "
-                "stretch of the recording, or a shorter window_s."
-            ]
+            f"{name_of(recording)}: no rising edge of the drive has samples on either side; choose a longer "
+            "stretch of the recording, or a shorter window_s."
         )
     kept, values, spread, variance, jumps = (np.array(part) for part in zip(*fits, strict=True))
     noise = np.sqrt(np.median(variance, axis=0))
@@ -159,15 +155,13 @@ def find_sections(recording: xr.Dataset, edges: Edges, *, window_s: float = WIND
 
 def _check(recording: xr.Dataset, window_s: float, order: int) -> None:
     if order < 2:
-        raise SpecError([f"order = {order}: must be at least 2, so that the curvature can differ."])
+        raise SpecError(f"order = {order}: must be at least 2, so that the curvature can differ.")
     step = float(np.median(np.diff(recording["time"].values)))
     least = 2 * (order + _LEAST_SPARE) * step
     if not window_s >= least:
         raise SpecError(
-            [
-                f"window_s = {window_s:g}: must be at least {least:.3g} at {1 / step:g} samples per second and "
-                f"order {order}."
-            ]
+            f"window_s = {window_s:g}: must be at least {least:.3g} at {1 / step:g} samples per second and "
+            f"order {order}."
         )
 
 

@@ -13,7 +13,7 @@ from pipeline.layout.vocabulary import model_attribute, model_of
 from pipeline.products.measured import WINDOW_S
 from pipeline.rig.edges import DRIVE, Edges, edges_of
 from pipeline.rig.measured.phase import section_phase
-from pipeline.rig.measured.recorded_sections import ORDER, find_sections, name_of
+from pipeline.rig.measured.recorded_sections import find_sections, name_of
 from pipeline.rig.measured.steps import constant_spans
 from pipeline.specification.problems import SpecError
 
@@ -30,7 +30,6 @@ def series_of(
     start_s: float | None = None,
     n_periods: int = PERIODS,
     window_s: float = WINDOW_S,
-    order: int = ORDER,
     hysteresis: float | None = None,
 ) -> xr.Dataset:
     """Return part of a recording that begins at a rising edge of the drive, with the model's trajectory from the same
@@ -50,7 +49,7 @@ def series_of(
         Time from which on the first rising edge is taken [s]; by default the recording's begin.
     n_periods
         Drive periods of the part; it ends earlier if the drive frequency changes.
-    window_s, order, hysteresis
+    window_s, hysteresis
         See `pipeline.rig.measured.recorded_sections.find_sections` and `pipeline.rig.edges.find_edges`.
 
     Returns
@@ -71,25 +70,21 @@ def series_of(
     model = parameters.model
     if model_of(recording) is not model:
         raise SpecError(
-            [
-                f"{name_of(recording)}: mapped to the model {model_of(recording).name}, while {model.name} is to "
-                "be computed: choose one of them."
-            ]
+            f"{name_of(recording)}: mapped to the model {model_of(recording).name}, while {model.name} is to "
+            "be computed: choose one of them."
         )
     if n_periods < 1:
-        raise SpecError([f"periods = {n_periods}: must be at least 1."])
+        raise SpecError(f"periods = {n_periods}: must be at least 1.")
     edges = edges_of(recording, hysteresis=hysteresis)
     timing = _first_timing(edges)
     later = section_phase(parameters, timing) / timing
     at = Edges(edges.rising + later, edges.falling, edges.resolution_s) if later else edges
-    sections = find_sections(recording, at, window_s=window_s, order=order)
+    sections = find_sections(recording, at, window_s=window_s)
     missing = [n for n in model.state_names if n not in sections["state"].values]
     if missing:
         raise SpecError(
-            [
-                f"{name_of(recording)}: {', '.join(missing)} at the start is not known: map its channel, or that "
-                "of the angle whose rate it is."
-            ]
+            f"{name_of(recording)}: {', '.join(missing)} at the start is not known: map its channel, or that "
+            "of the angle whose rate it is."
         )
     first, last = _part(recording, edges, sections, start_s, n_periods)
     own = _fitted(edges, first, last)
@@ -115,17 +110,15 @@ def _part(
             if a <= first < b and b - a >= _LEAST:
                 return first, min(b, first + n_periods)
     raise SpecError(
-        [
-            f"start_s = {begin:g}: {name_of(recording)} has no rising edge with samples around it and {_LEAST} "
-            f"periods of one frequency after it; edges lie from {edges.rising[0]:.3f} to "
-            f"{edges.rising[-1]:.3f} s."
-        ]
+        f"start_s = {begin:g}: {name_of(recording)} has no rising edge with samples around it and {_LEAST} "
+        f"periods of one frequency after it; edges lie from {edges.rising[0]:.3f} to "
+        f"{edges.rising[-1]:.3f} s."
     )
 
 
 def _first_timing(edges: Edges) -> float:
     if edges.rising.size < _LEAST:
-        raise SpecError([f"drive: {edges.rising.size} rising edges; a series needs {_LEAST} of them."])
+        raise SpecError(f"drive: {edges.rising.size} rising edges; a series needs {_LEAST} of them.")
     return 1 / float(np.median(np.diff(edges.rising)))
 
 

@@ -97,10 +97,8 @@ def cut(edges: Edges, *, transient: int = TRANSIENT, window: int | None = None) 
         raise SpecError(problems)
     if edges.rising.size <= LEAST:
         raise SpecError(
-            [
-                f"drive: {edges.rising.size} rising edges; a stretch needs more than {LEAST}: choose a longer "
-                "recording, or look at the drive's channel."
-            ]
+            f"drive: {edges.rising.size} rising edges; a stretch needs more than {LEAST}: choose a longer "
+            "recording, or look at the drive's channel."
         )
     if window:
         return _directed(_windows(edges, window))
@@ -111,11 +109,9 @@ def cut(edges: Edges, *, transient: int = TRANSIENT, window: int | None = None) 
     if not kept:
         longest = max(b - a for a, b in spans)
         raise SpecError(
-            [
-                f"drive: the longest stretch of one frequency has {longest} periods, and {transient} of "
-                f"transient and {LEAST} of sections are wanted: lower transient, or give window for a drive that "
-                "is swept slowly."
-            ]
+            f"drive: the longest stretch of one frequency has {longest} periods, and {transient} of "
+            f"transient and {LEAST} of sections are wanted: lower transient, or give window for a drive that "
+            "is swept slowly."
         )
     return _directed([_constant(edges, a, b, transient) for a, b in kept])
 
@@ -228,10 +224,8 @@ def _windows(edges: Edges, window: int) -> list[Stretch]:
         found.append(_stretch(own, curve, 0))
     if not found:
         raise SpecError(
-            [
-                f"window = {window}: the recording has {edges.rising.size - 1} periods without a gap at most; "
-                "choose a shorter window."
-            ]
+            f"window = {window}: the recording has {edges.rising.size - 1} periods without a gap at most; "
+            "choose a shorter window."
         )
     return found
 

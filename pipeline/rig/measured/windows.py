@@ -85,19 +85,17 @@ def words_for(regime: Regime, words: tuple[str, ...]) -> str:
     return f"{period}, {words[regime[1]]}" if regime[1] and words else period
 
 
-def windows_of(measured: xr.Dataset, *, confident: float = CONFIDENT) -> list[Window]:
+def windows_of(measured: xr.Dataset) -> list[Window]:
     """Return the windows of all recordings. A window is a run of consecutive frequency steps with the same regime
     (period and class of motion).
     """
     keys = list(zip(measured["recording"].values.tolist(), measured["direction"].values.tolist(), strict=True))
-    sure = [i for i in range(len(keys)) if measured["confidence"].values[i] >= confident]
+    sure = [i for i in range(len(keys)) if measured["confidence"].values[i] >= CONFIDENT]
     labelled = itertools.groupby(sure, key=lambda i: (keys[i], regime_of(measured, i)))
     return [Window(regime, tuple(steps), *key) for (key, regime), steps in labelled]
 
 
-def window_edges(
-    measured: xr.Dataset, winners: np.ndarray, computed: Computed, *, confident: float = CONFIDENT
-) -> list[WindowEdge]:
+def window_edges(measured: xr.Dataset, winners: np.ndarray, computed: Computed) -> list[WindowEdge]:
     """Return the ends of the measured windows, each with the frequency at which the same regime ends in the model.
 
     Parameters
@@ -108,10 +106,8 @@ def window_edges(
         Id of the nearest attractor of each step, -1 for none.
     computed
         Attractors of the model.
-    confident
-        Least confidence of a step's period.
     """
-    windows = windows_of(measured, confident=confident)
+    windows = windows_of(measured)
     found = []
     for one, two in itertools.pairwise(windows):
         if (one.recording, one.direction) != (two.recording, two.direction):

@@ -79,10 +79,8 @@ def compare(measured: xr.Dataset, branches: xr.Dataset, computed: np.ndarray) ->
     """
     if str(branches.attrs["parameter"]) != str(measured.attrs["parameter"]):
         raise SpecError(
-            [
-                f"the orbits were measured along {measured.attrs['parameter']}, and the branches of the run follow "
-                f"{branches.attrs['parameter']}; give a run that sweeps {measured.attrs['parameter']}."
-            ]
+            f"the orbits were measured along {measured.attrs['parameter']}, and the branches of the run follow "
+            f"{branches.attrs['parameter']}; give a run that sweeps {measured.attrs['parameter']}."
         )
     n = measured.sizes["orbit"]
     amplitude, frequency = np.full(n, np.nan), np.full(n, np.nan)

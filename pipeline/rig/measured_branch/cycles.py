@@ -34,7 +34,7 @@ class Cycles:
         Mean over a cycle.
     frequency, frequency_sd : float
         [Hz].
-    harmonics, harmonics_sd : ndarray, (N_HARMONICS,)
+    harmonics : ndarray, (N_HARMONICS,)
         Amplitudes of the Fourier components of a cycle, the first at the frequency itself.
     """
 
@@ -46,7 +46,6 @@ class Cycles:
     frequency: float
     frequency_sd: float
     harmonics: np.ndarray
-    harmonics_sd: np.ndarray
 
 
 def cycles_of(time: np.ndarray, values: np.ndarray) -> Cycles:
@@ -71,9 +70,7 @@ def cycles_of(time: np.ndarray, values: np.ndarray) -> Cycles:
         raise CyclesError(f"the signal has {max(len(starts) - 1, 0)} whole cycles; at least {LEAST_CYCLES} are needed.")
     found = np.array([_cycle(time, values, a, b) for a, b in itertools.pairwise(starts)])
     middle, scatter = np.median(found, axis=0), np.std(found, axis=0, ddof=1)
-    return Cycles(
-        len(found), middle[0], scatter[0], middle[1], scatter[1], middle[2], scatter[2], middle[3:], scatter[3:]
-    )
+    return Cycles(len(found), middle[0], scatter[0], middle[1], scatter[1], middle[2], scatter[2], middle[3:])
 
 
 def _upward_crossings(time: np.ndarray, values: np.ndarray) -> np.ndarray:

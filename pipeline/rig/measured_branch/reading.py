@@ -15,12 +15,13 @@ from pydantic import Field
 from magpend_core.models.model import Model
 from magpend_core.models.parameters import near_names
 from pipeline.analysis.branches.units import parameter_units
+from pipeline.layout.attributes import code_flags
 from pipeline.layout.vocabulary import FREQUENCY_DIM, axis_name, model_attribute
 from pipeline.rig.measured_branch.cycles import N_HARMONICS, Cycles, CyclesError, cycles_of
 from pipeline.rig.recordings import parse_mapping, read_recording
 from pipeline.specification.files import read_toml
 from pipeline.specification.models import add_model
-from pipeline.specification.problems import SpecError, problems_of, unknown_name
+from pipeline.specification.problems import SpecError, checked, unknown_name
 from pipeline.specification.tables import Table
 
 STABILITIES = ("unknown", "stable", "unstable")
@@ -96,17 +97,14 @@ def _from_recordings(path: Path) -> xr.Dataset:
     tables = read_toml(path)
     table = tables.get("measured", {}).get("branch") if isinstance(tables.get("measured"), dict) else None
     if table is None:
-        raise SpecError([f"{path}: has no table [measured.branch]; give one, or a CSV file of orbits."])
-    from pydantic import ValidationError
-
-    try:
-        spec = MeasuredBranch.model_validate(table)
-    except ValidationError as error:
-        raise SpecError([f"{path}: {p}" for p in problems_of(error, MeasuredBranch, "measured.branch")]) from None
+        raise SpecError(f"{path}: has no table [measured.branch]; give one, or a CSV file of orbits.")
     problems: list[str] = []
+    spec = checked(MeasuredBranch, table, "measured.branch", problems)
+    if spec is None:
+        raise SpecError([f"{path}: {p}" for p in problems])
     reference = spec.model or tables.get("model")
     if not reference:
-        raise SpecError([f"{path}: measured.branch.model: missing; name the model whose orbits were measured."])
+        raise SpecError(f"{path}: measured.branch.model: missing; name the model whose orbits were measured.")
     model = add_model(reference, path.parent, problems)
     if model is not None:
         problems += _name_problems(model, spec.parameter, spec.state)
@@ -134,7 +132,7 @@ def _recorded(path: Path, spec: MeasuredBranch, reference: Any, one: RecordedOrb
     try:
         return cycles_of(recording["time"].values, recording[spec.state].values)
     except CyclesError as error:
-        raise SpecError([f"{path}: measured.branch.orbits: {one.name!r}: {error}"]) from None
+        raise SpecError(f"{path}: measured.branch.orbits: {one.name!r}: {error}") from None
 
 
 def _columns_of(cycles: Cycles) -> dict[str, float]:
@@ -147,19 +145,17 @@ def _columns_of(cycles: Cycles) -> dict[str, float]:
 def _from_csv(path: Path, model: Model | None, state: str) -> xr.Dataset:
     if model is None:
         raise SpecError(
-            [
-                f"{path}: a table of orbits names no model; name it with --model, or give the run that it is compared "
-                "with: --over RUN."
-            ]
+            f"{path}: a table of orbits names no model; name it with --model, or give the run that it is compared "
+            "with: --over RUN."
         )
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             header, *lines = list(csv.reader(file)) or [[]]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise SpecError([f"{path}: cannot be read as a CSV table ({error})."]) from None
+        raise SpecError(f"{path}: cannot be read as a CSV table ({error}).") from None
     lines = [line for line in lines if any(field.strip() for field in line)]
     if not header or not lines:
-        raise SpecError([f"{path}: has no rows; give a header and a row for each orbit."])
+        raise SpecError(f"{path}: has no rows; give a header and a row for each orbit.")
     # by position, since the parameter may have the name of another column
     parameter, *others = (name.strip() for name in header)
     chosen = state or model.section_states[0]
@@ -219,7 +215,7 @@ def _dataset(
         "stability": (
             "orbit",
             np.array([STABILITIES.index(_YES[str(row["stable"])]) for row in rows], np.int8),
-            {"flag_values": np.arange(3, dtype=np.int8), "flag_meanings": " ".join(STABILITIES), "units": "1"},
+            {**code_flags(STABILITIES), "units": "1"},
         ),
         "n_cycles": ("orbit", np.array([c["n_cycles"] for c in columns], np.int32), {"units": "1"}),
     }

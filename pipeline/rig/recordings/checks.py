@@ -46,7 +46,7 @@ class Signal:
     def found(self, kind: str, start: int, end: int, severity: str, text: str) -> Finding:
         """Return a finding (fault report) about the samples from index `start` up to, not including, `end`."""
         first, last = float(self.time[start]), float(self.time[end - 1])
-        return Finding(kind, self.name, first, last, severity, text)  # type: ignore[arg-type]
+        return Finding(kind, self.name, first, last, severity=severity, text=text)  # type: ignore[arg-type]
 
 
 def missing(signal: Signal) -> list[Finding]:

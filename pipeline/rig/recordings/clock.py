@@ -160,10 +160,8 @@ def _common_step(stretches: Sequence[Mapping[str, Channel]], stated: float | Non
     unknown = [name for name, s in steps.items() if not (math.isfinite(s) and s > 0.0)]
     if unknown:
         raise SpecError(
-            [
-                f"{source}: the sampling interval of {', '.join(unknown)} is not known; add to the mapping "
-                'time = { channel = "NAME" } if there are time stamps, or sampling_rate_hz = NUMBER.'
-            ]
+            f"{source}: the sampling interval of {', '.join(unknown)} is not known; add to the mapping "
+            'time = { channel = "NAME" } if there are time stamps, or sampling_rate_hz = NUMBER.'
         )
     _refuse_mixed(steps, source)
     return stated if stated is not None else float(np.median(list(steps.values())))
@@ -173,10 +171,8 @@ def _refuse_mixed(steps: Mapping[str, float], source: str) -> None:
     if steps and max(steps.values()) > (1.0 + MIXED) * min(steps.values()):
         told = ", ".join(f"{name} {1.0 / s:.6g} Hz" for name, s in steps.items())
         raise SpecError(
-            [
-                f"{source}: the mapped channels have different sampling rates ({told}); map channels of one "
-                "rate, or resample the file to one before it is read."
-            ]
+            f"{source}: the mapped channels have different sampling rates ({told}); map channels of one "
+            "rate, or resample the file to one before it is read."
         )
 
 
@@ -189,10 +185,10 @@ def _rate_findings(stretches: Sequence[Mapping[str, Channel]], stated: float | N
         if math.isfinite(step) and abs(step / stated - 1.0) > 1e-6:
             rates = f"the file says {1.0 / step:.8g} Hz, the mapping {1.0 / stated:.8g} Hz"
             text = f"{rates}; the mapping's is used."
-            findings.append(Finding("rate", name, math.nan, math.nan, "warning", text))
+            findings.append(Finding("rate", name, text=text))
         if channel.time is not None:
             text = "the file's time stamps are not used, nor gaps in them seen: the mapping states a rate."
-            findings.append(Finding("rate", name, math.nan, math.nan, "note", text))
+            findings.append(Finding("rate", name, severity="note", text=text))
     return findings
 
 
@@ -210,7 +206,7 @@ def _aligned(
     n_common = min(len(c) - begins[n] for n, c in channels.items())
     if n_common < 2:
         told = ", ".join(f"{n} has {len(c)} samples from {starts[n]:.6g} s" for n, c in channels.items())
-        raise SpecError([f"{source}: the mapped channels have no stretch in common ({told})."])
+        raise SpecError(f"{source}: the mapped channels have no stretch in common ({told}).")
     findings = _start_findings(late, step, len(known) == len(channels))
     findings += _length_findings({n: len(c) - begins[n] for n, c in channels.items()}, n_common, step)
     return {n: (b, b + n_common) for n, b in begins.items()}, findings
@@ -227,8 +223,7 @@ def _start_findings(late: Mapping[str, float], step: float, all_known: bool) -> 
                     name,
                     0.0,
                     0.0,
-                    "warning",
-                    f"begins {whole * step:.6g} s before the last channel to begin; its first {whole} "
+                    text=f"begins {whole * step:.6g} s before the last channel to begin; its first {whole} "
                     "samples are left out.",
                 )
             )
@@ -239,16 +234,13 @@ def _start_findings(late: Mapping[str, float], step: float, all_known: bool) -> 
                     name,
                     0.0,
                     0.0,
-                    "warning",
-                    f"is sampled {abs(rest) * step:.3g} s {'after' if rest < 0.0 else 'before'} the others; "
+                    text=f"is sampled {abs(rest) * step:.3g} s {'after' if rest < 0.0 else 'before'} the others; "
                     "it is laid on their instants as it is.",
                 )
             )
     if not all_known and any(late.values()):
         findings.append(
-            Finding(
-                "start", "", 0.0, 0.0, "warning", "some channels do not say when they begin; with the last is assumed."
-            )
+            Finding("start", "", 0.0, 0.0, text="some channels do not say when they begin; with the last is assumed.")
         )
     return findings
 
@@ -261,8 +253,8 @@ def _length_findings(lengths: Mapping[str, int], n_common: int, step: float) -> 
             name,
             n_common * step,
             length * step,
-            "warning",
-            f"has {length} samples, {', '.join(short)} only {n_common}; the last {length - n_common} are left out.",
+            text=f"has {length} samples, {', '.join(short)} only {n_common}; "
+            f"the last {length - n_common} are left out.",
         )
         for name, length in lengths.items()
         if length > n_common
@@ -275,7 +267,7 @@ def _checked_stamps(stamps: list[np.ndarray], step: float, source: str) -> list[
     for s in stamps:
         bad = np.flatnonzero(~np.isfinite(s))
         if bad.size:
-            raise SpecError([f"{source}: time stamp {bad[0]} is no number; give sampling_rate_hz instead of time."])
+            raise SpecError(f"{source}: time stamp {bad[0]} is no number; give sampling_rate_hz instead of time.")
     _refuse_backwards(stamps, source)
     return stamps
 
@@ -295,8 +287,7 @@ def _cut(
             "",
             float(time[i - 1]),
             float(time[i]),
-            "warning",
-            f"{round((even[i] - even[i - 1]) / own_step) - 1} samples are missing; a new piece begins.",
+            text=f"{round((even[i] - even[i - 1]) / own_step) - 1} samples are missing; a new piece begins.",
         )
         for i in np.flatnonzero(is_gap)
     ]
@@ -350,11 +341,9 @@ def _refuse_backwards(stamps: list[np.ndarray], source: str) -> None:
         if falling.size:
             i = int(falling[0])
             raise SpecError(
-                [
-                    f"{source}: time goes backwards after sample {i} ({s[i]:.9g} s, then {s[i + 1]:.9g} s; "
-                    f"{falling.size} times in all); give sampling_rate_hz instead of time if the "
-                    "samples are even, or cut the file there."
-                ]
+                f"{source}: time goes backwards after sample {i} ({s[i]:.9g} s, then {s[i + 1]:.9g} s; "
+                f"{falling.size} times in all); give sampling_rate_hz instead of time if the "
+                "samples are even, or cut the file there."
             )
 
 
@@ -373,11 +362,8 @@ def _one_after_another(stamps: list[np.ndarray], step: float, findings: list[Fin
         findings.append(
             Finding(
                 "pieces",
-                "",
-                math.nan,
-                math.nan,
-                "note",
-                f"the clock begins anew in {moved} of {len(stamps)} stretches; they are laid one after another, "
+                severity="note",
+                text=f"the clock begins anew in {moved} of {len(stamps)} stretches; they are laid one after another, "
                 "a sampling interval apart. How far apart they were is not known.",
             )
         )
@@ -420,7 +406,11 @@ def _jitter_findings(time: np.ndarray, residual: np.ndarray, step: float) -> lis
         f"{worst:.3g} s at most"
     )
     if worst < UNEVEN * step:
-        return [Finding("jitter", "", float(time[0]), float(time[-1]), "note", f"{text}; even steps are used.")]
+        return [
+            Finding(
+                "jitter", "", float(time[0]), float(time[-1]), severity="note", text=f"{text}; even steps are used."
+            )
+        ]
     far = runs(np.abs(residual) >= UNEVEN * step)
     return [
         Finding(
@@ -428,7 +418,7 @@ def _jitter_findings(time: np.ndarray, residual: np.ndarray, step: float) -> lis
             "",
             float(time[far[0, 0]]),
             float(time[far[-1, 1] - 1]),
-            "warning",
-            f"{text}; even steps are used. If the sampling itself was uneven, resample the file before it is read.",
+            text=f"{text}; even steps are used. If the sampling itself was uneven, resample the file before it is "
+            "read.",
         )
     ]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import math
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -69,14 +68,7 @@ def read_csv(path: Path, stated: CsvMap) -> Raw:
     if len(body) > 1 and len(last) < len(split(body[-2], form.delimiter)):
         body = body[:-1]
         findings.append(
-            Finding(
-                "truncated",
-                "",
-                math.nan,
-                math.nan,
-                "warning",
-                f"the last row has {len(last)} of {form.n_columns} fields; it is left out.",
-            )
+            Finding("truncated", text=f"the last row has {len(last)} of {form.n_columns} fields; it is left out.")
         )
     found = {}
     for j, values in _columns(body, form).items():
@@ -112,10 +104,8 @@ def _form(path: Path, rows: list[str], stated: CsvMap) -> _Form:
                 found.append(form)
     if not found:
         raise SpecError(
-            [
-                f"{path}: is not a table of numbers with one of the delimiters ; , tab or blank; state "
-                "[csv] delimiter, decimal, header or skip_rows in the mapping."
-            ]
+            f"{path}: is not a table of numbers with one of the delimiters ; , tab or blank; state "
+            "[csv] delimiter, decimal, header or skip_rows in the mapping."
         )
     fewest = min(len(f.texts) for f in found)
     found = [f for f in found if len(f.texts) == fewest]
@@ -126,10 +116,8 @@ def _form(path: Path, rows: list[str], stated: CsvMap) -> _Form:
     ambiguous = {f.decimal for f in found if "," in (f.delimiter, f.decimal)} == {".", ","} and not named
     if ambiguous and any("," in row for row in rows[-2:]):
         raise SpecError(
-            [
-                f"{path}: a comma may be between fields or in numbers ({rows[-1]!r}); state [csv] decimal = "
-                '"," or delimiter = "," in the mapping.'
-            ]
+            f"{path}: a comma may be between fields or in numbers ({rows[-1]!r}); state [csv] decimal = "
+            '"," or delimiter = "," in the mapping.'
         )
     return chosen[0]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -35,11 +35,11 @@ class Finding:
     """
 
     kind: str
-    channel: str
-    start_s: float
-    end_s: float
-    severity: Severity
-    text: str
+    channel: str = ""
+    start_s: float = math.nan
+    end_s: float = math.nan
+    severity: Severity = "warning"
+    text: str = field(kw_only=True)
 
 
 KINDS = {

@@ -33,10 +33,8 @@ def format_of(path: Path, stated: str | None = None) -> str:
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         raise SpecError(
-            [
-                f"{path}: the suffix {path.suffix!r} is none of {', '.join(SUFFIXES)}; "
-                'add format = "tdms", "lvm", "csv" or "matlab" to the mapping.'
-            ]
+            f"{path}: the suffix {path.suffix!r} is none of {', '.join(SUFFIXES)}; "
+            'add format = "tdms", "lvm", "csv" or "matlab" to the mapping.'
         )
     return SUFFIXES[suffix]
 
@@ -60,7 +58,7 @@ def read_raw(path: Path, stated: str | None = None, csv: CsvMap | None = None) -
     """
     name = format_of(path, stated)
     if not path.is_file():
-        raise SpecError([f"{path}: there is no such file."])
+        raise SpecError(f"{path}: there is no such file.")
     if name == "matlab":
         from pipeline.rig.recordings.matlab import read_matlab
 
@@ -78,5 +76,5 @@ def read_raw(path: Path, stated: str | None = None, csv: CsvMap | None = None) -
 
         raw = read_csv(path, csv or CsvMap())
     if not raw.names:
-        raise SpecError([f"{path}: holds no channel of numbers."])
+        raise SpecError(f"{path}: holds no channel of numbers.")
     return raw

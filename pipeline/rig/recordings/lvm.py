@@ -57,7 +57,7 @@ def read_lvm(path: Path) -> Raw:
     """
     lines = read_text(path).splitlines()
     if not lines or not lines[0].strip().startswith(MAGIC):
-        raise SpecError([f"{path}: does not begin with {MAGIC!r}, as an LVM file does; is it a CSV file?"])
+        raise SpecError(f"{path}: does not begin with {MAGIC!r}, as an LVM file does; is it a CSV file?")
     style, at = _file_header(path, lines)
     segments = _segments(path, lines, at, style)
     zero = min((t for s in segments for t in _instants(s, style).values()), default=0.0)
@@ -76,11 +76,11 @@ def _file_header(path: Path, lines: list[str]) -> tuple[_Style, int]:
             separator = SEPARATORS.get(keys.get("Separator", "Tab"), "\t")
             decimal = keys.get("Decimal_Separator") or "."
             if decimal not in ".,":
-                raise SpecError([f"{path}: Decimal_Separator is {decimal!r}; it must be a point or a comma."])
+                raise SpecError(f"{path}: Decimal_Separator is {decimal!r}; it must be a point or a comma.")
             return _Style(separator, decimal, keys.get("X_Columns", "One")), i + 1
         name, _, value = line.strip().partition("\t" if "\t" in line else ",")
         keys[name.strip()] = value.strip()
-    raise SpecError([f"{path}: the header does not end: there is no line {END}; is the file complete?"])
+    raise SpecError(f"{path}: the header does not end: there is no line {END}; is the file complete?")
 
 
 def _segments(path: Path, lines: list[str], at: int, style: _Style) -> list[_Segment]:
@@ -100,14 +100,14 @@ def _segments(path: Path, lines: list[str], at: int, style: _Style) -> list[_Seg
             if found:  # a header that was begun when the file ended
                 found[-1].keys["_cut"] = [str(begin + 1)]
                 break
-            raise SpecError([f"{path}: no data after line {begin + 1}; is the file complete?"])
+            raise SpecError(f"{path}: no data after line {begin + 1}; is the file complete?")
         names = [part.strip() for part in split(lines[i + 1], style.separator)]
         i, first = i + 2, i + 2
         while i < len(lines) and lines[i].strip() and not lines[i].startswith(("***", "Channels")):
             i += 1
         found.append(_Segment(keys, names, lines[first:i], first + 1))
     if not found:
-        raise SpecError([f"{path}: has a header and no data."])
+        raise SpecError(f"{path}: has a header and no data.")
     return found
 
 
@@ -197,22 +197,12 @@ def _truncations(segment: _Segment, channels: dict[str, Channel], style: _Style)
                 Finding(
                     "truncated",
                     channel.name,
-                    math.nan,
-                    math.nan,
-                    "warning",
-                    f"the segment from line {segment.first_line} has {len(channel)} of the {stated:.0f} samples "
+                    text=f"the segment from line {segment.first_line} has {len(channel)} of the {stated:.0f} samples "
                     "that its header states.",
                 )
             )
     if "_cut" in segment.keys:
         findings.append(
-            Finding(
-                "truncated",
-                "",
-                math.nan,
-                math.nan,
-                "warning",
-                f"the file ends within the header that begins in line {segment.keys['_cut'][0]}.",
-            )
+            Finding("truncated", text=f"the file ends within the header that begins in line {segment.keys['_cut'][0]}.")
         )
     return findings

@@ -7,18 +7,17 @@ from collections.abc import Mapping as AnyMapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, Field, ValidationError, model_validator
+from pydantic import BaseModel, Field, model_validator
 
 from magpend_core.models import load_model
 from magpend_core.models.model import Model
 from pipeline.rig.recordings import units
 from pipeline.specification.files import read_toml
 from pipeline.specification.models import KEPT, add_model, kept_reference, model_toml
-from pipeline.specification.problems import SpecError, problems_of, unknown_key
+from pipeline.specification.problems import SpecError, checked, unknown_key
 from pipeline.specification.tables import Table
 from pipeline.specification.toml import toml_key, toml_value
 
-FORMATS = ("tdms", "lvm", "csv", "matlab")
 DRIVE = "drive"
 """Name of the drive in a recording's dataset."""
 
@@ -193,7 +192,7 @@ def parse_mapping(data: AnyMapping[str, Any] | str, source: str = "", folder: st
     channels = _entries(tables, problems)
     drive = tables.get("drive", "none")
     if isinstance(drive, dict):
-        drive = _checked(DriveMap, drive, "drive", problems)
+        drive = checked(DriveMap, drive, "drive", problems)
     elif drive != "none":
         problems.append(f'drive = {drive!r}: must be "none", or a table [drive] with channel and kind.')
     rest = {key: value for key, value in tables.items() if key not in ("model", "channels", "drive")}
@@ -218,10 +217,10 @@ def _rest(rest: dict[str, Any], problems: list[str]) -> dict[str, Any]:
         kinds: dict[str, type[BaseModel]] = {"time": TimeMap, "piece": PieceMap, "csv": CsvMap}
         kind = kinds.get(key)
         if kind is not None:
-            found[key] = _checked(kind, value, key, problems)
+            found[key] = checked(kind, value, key, problems)
             continue
         probe = {"model": "-", "channels": {"-": {"channel": "-"}}, key: value}
-        if _checked(Mapping, probe, "", problems) is not None:
+        if checked(Mapping, probe, "", problems) is not None:
             found[key] = tuple(value) if isinstance(value, list) else value
     if found.get("time") is not None and "sampling_rate_hz" in found:
         problems.append("sampling_rate_hz: the time channel gives it; keep time or sampling_rate_hz.")
@@ -247,18 +246,10 @@ def _entries(tables: AnyMapping[str, Any], problems: list[str]) -> dict[str, Cha
         return {}
     found = {}
     for name, entry in channels.items():
-        checked = _checked(ChannelMap, entry, f"channels.{name}", problems)
-        if checked is not None:
-            found[name] = checked
+        own = checked(ChannelMap, entry, f"channels.{name}", problems)
+        if own is not None:
+            found[name] = own
     return found
-
-
-def _checked(model: type[BaseModel], value: Any, path: str, problems: list[str]) -> Any:
-    try:
-        return model.model_validate(value)
-    except ValidationError as error:
-        problems += problems_of(error, model, path)
-        return None
 
 
 def _units(model: Model) -> dict[str, str]:

@@ -38,7 +38,7 @@ def read_matlab(path: Path) -> Raw:
     try:
         found = loadmat(path, squeeze_me=False, struct_as_record=True)
     except Exception as error:  # scipy raises what its parser meets: zlib.error, OSError, ValueError, ...
-        raise SpecError([f"{path}: is not a MATLAB file that can be read ({error}); save it with -v7."]) from None
+        raise SpecError(f"{path}: is not a MATLAB file that can be read ({error}); save it with -v7.") from None
     leaves: dict[str, list[np.ndarray]] = {}
     for name, value in found.items():
         if not name.startswith(_PRIVATE):
@@ -53,10 +53,8 @@ def _refuse_hdf5(path: Path) -> None:
         head = file.read(520)
     if head.startswith(_HDF5) or head[512:].startswith(_HDF5) or head.startswith(b"MATLAB 7.3"):
         raise SpecError(
-            [
-                f"{path}: is a MATLAB file of version 7.3 (HDF5), which is not read; "
-                "save it again in MATLAB with save(FILE, '-v7'), or write the channels as CSV."
-            ]
+            f"{path}: is a MATLAB file of version 7.3 (HDF5), which is not read; "
+            "save it again in MATLAB with save(FILE, '-v7'), or write the channels as CSV."
         )
 
 
@@ -109,7 +107,7 @@ def _stretches(path: Path, leaves: dict[str, list[np.ndarray]], step: float) -> 
     counts = {name: len(arrays) for name, arrays in leaves.items() if len(arrays) > 1}
     if len(set(counts.values())) > 1:
         told = ", ".join(f"{name} has {n}" for name, n in counts.items())
-        raise SpecError([f"{path}: cells are the pieces of one recording, but {told}; save equally many of each."])
+        raise SpecError(f"{path}: cells are the pieces of one recording, but {told}; save equally many of each.")
     n = max(counts.values(), default=1)
     return tuple(
         {

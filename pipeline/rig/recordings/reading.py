@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping as AnyMapping
 from collections.abc import Sequence
 from dataclasses import replace
@@ -122,10 +121,8 @@ def window(ds: xr.Dataset, window_s: tuple[float, float]) -> xr.Dataset:
     inside = (time >= low - slack) & (time <= high + slack)
     if int(inside.sum()) < 2:
         raise SpecError(
-            [
-                f"window_s = [{low:g}, {high:g}]: holds {int(inside.sum())} samples; the recording "
-                f"{Path(str(ds.attrs.get('file', ''))).name} goes from {time[0]:g} to {time[-1]:g} s."
-            ]
+            f"window_s = [{low:g}, {high:g}]: holds {int(inside.sum())} samples; the recording "
+            f"{Path(str(ds.attrs.get('file', ''))).name} goes from {time[0]:g} to {time[-1]:g} s."
         )
     kept = [f for f in findings_of(ds) if not (f.end_s < low - slack or f.start_s > high + slack)]
     return ds.isel({DIM: np.flatnonzero(inside)}).assign_attrs(findings=to_json(kept))
@@ -203,10 +200,7 @@ def _name_findings(mapping: Mapping, columns: dict[str, str]) -> list[Finding]:
         Finding(
             "name",
             name,
-            math.nan,
-            math.nan,
-            "warning",
-            f"the file's channel is {columns[name]!r}, the mapping's {channel!r}; it is taken for the same.",
+            text=f"the file's channel is {columns[name]!r}, the mapping's {channel!r}; it is taken for the same.",
         )
         for name, channel in given.items()
         if isinstance(channel, str) and channel.strip() != columns[name].strip()
@@ -227,12 +221,12 @@ def _timed(
         for own, channel in chosen.items():
             if len(channel) > len(values):
                 text = f"has {len(channel)} samples, the channel of {name} {len(values)}; the last are left out."
-                findings.append(Finding("length", own, math.nan, math.nan, "warning", text))
+                findings.append(Finding("length", own, text=text))
                 chosen[own] = replace(channel, values=channel.values[: len(values)])
         longest = max(map(len, chosen.values()))
         if len(values) > longest:
             text = f"has {len(values)} samples, the longest channel {longest}; the last are left out."
-            findings.append(Finding("length", name, math.nan, math.nan, "warning", text))
+            findings.append(Finding("length", name, text=text))
     if mapping.time is not None:
         stamps = (units.factor(mapping.time.unit, "s") or 1.0) * axes["time"]
         chosen = {name: replace(c, time=stamps[: len(c)]) for name, c in chosen.items()}
@@ -281,14 +275,7 @@ def _unit_findings(raw: Raw, mapping: Mapping, columns: dict[str, str]) -> list[
         own = units.spelled(entry.unit or mapping.unit_of(name))
         if stated and not units.same(stated, own):
             findings.append(
-                Finding(
-                    "unit",
-                    name,
-                    math.nan,
-                    math.nan,
-                    "warning",
-                    f"the file says {stated!r}, the mapping {own!r}; the mapping's is used.",
-                )
+                Finding("unit", name, text=f"the file says {stated!r}, the mapping {own!r}; the mapping's is used.")
             )
     return findings
 

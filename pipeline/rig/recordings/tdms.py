@@ -46,7 +46,7 @@ def read_tdms(path: Path) -> Raw:
             file = TdmsFile.read(str(path), raw_timestamps=True)
         except Exception as error:  # npTDMS raises what its parser meets: struct.error, KeyError, ...
             raise SpecError(
-                [f"{path}: is not a TDMS file that can be read ({error}); write it anew, or export it as CSV."]
+                f"{path}: is not a TDMS file that can be read ({error}); write it anew, or export it as CSV."
             ) from None
     found = {}
     zero = _earliest(file)
@@ -104,13 +104,9 @@ def _truncations(path: Path, file: Any, warnings: list[str]) -> list[Finding]:
     remedy = "copy the file again, or take care that the writing program closes it"
     if status.channel_statuses:
         return [
-            Finding(
-                "truncated",
-                name.replace("'", "").strip("/"),
-                math.nan,
-                math.nan,
-                "warning",
+            _truncated(
                 f"the last segment holds {s.read_length} of the {s.expected_length} samples that it states; {remedy}.",
+                name.replace("'", "").strip("/"),
             )
             for name, s in status.channel_statuses.items()
             if s.read_length < s.expected_length
@@ -137,8 +133,8 @@ def _bytes_after_last_segment(path: Path) -> int:
     return max(size - place, 0)
 
 
-def _truncated(text: str) -> Finding:
-    return Finding("truncated", "", math.nan, math.nan, "warning", text)
+def _truncated(text: str, channel: str = "") -> Finding:
+    return Finding("truncated", channel, text=text)
 
 
 @contextlib.contextmanager

@@ -26,7 +26,7 @@ def read_text(path: Path) -> str:
     """
     data = path.read_bytes()
     if b"\x00" in data[:4096]:
-        raise SpecError([f"{path}: is not a text; state its format in the mapping if the suffix misleads."])
+        raise SpecError(f"{path}: is not a text; state its format in the mapping if the suffix misleads.")
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError:

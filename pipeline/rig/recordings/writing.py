@@ -17,8 +17,8 @@ from pipeline.rig.recordings.delimited import SIMULATED as SIMULATED_LINE
 from pipeline.rig.recordings.mapping import DRIVE, ChannelMap, DriveMap, Mapping, PieceMap, TimeMap
 from pipeline.rig.recordings.raw import Channel, Raw
 from pipeline.rig.recordings.tdms import SIMULATED
+from pipeline.specification.files import check_new_file
 from pipeline.specification.models import kept_reference
-from pipeline.specification.problems import SpecError
 
 SUFFIXES = (".tdms", ".csv", ".nc")
 GROUP = "recording"
@@ -41,7 +41,7 @@ def write_recording(ds: xr.Dataset, path: str | Path) -> Path:
     SpecError
         If the suffix is another one, or the folder does not exist.
     """
-    target = check_target(path)
+    target = check_new_file(path, SUFFIXES)
     if target.suffix.lower() == ".nc":
         write_netcdf(target, ds)
         return target
@@ -96,22 +96,10 @@ def write_raw(raw: Raw, path: str | Path) -> Path:
     SpecError
         If the suffix is another one, or the folder does not exist.
     """
-    target = check_target(path, SUFFIXES[:2])
+    target = check_new_file(path, SUFFIXES[:2])
     (channels,) = raw.stretches
     write = _write_tdms if target.suffix.lower() == ".tdms" else _write_csv
     write(list(channels.values()), target, raw.simulated)
-    return target
-
-
-def check_target(path: str | Path, suffixes: Sequence[str] = SUFFIXES) -> Path:
-    """Return the path of a file to write; raise `SpecError` if its suffix is not supported or its folder does not
-    exist.
-    """
-    target = Path(path)
-    if target.suffix.lower() not in suffixes:
-        raise SpecError([f"{path}: the suffix must be one of {', '.join(suffixes)}."])
-    if not target.parent.is_dir():
-        raise SpecError([f"{path}: there is no folder {target.parent}; make it first."])
     return target
 
 

@@ -17,7 +17,7 @@ import pytest
 from pipeline.compute import probe
 from pipeline.compute.addresses import SchedulerError
 from pipeline.compute.clients import Where, connected
-from pipeline.compute.jobqueue import settings, worker_script
+from pipeline.compute.jobqueue import _CLASSES, settings
 from pipeline.runs.progress import Progress
 from pipeline.runs.run import run
 from pipeline.specification.clusters import load_cluster
@@ -299,9 +299,12 @@ HEADS = {
 
 @pytest.mark.parametrize("kind", HEADS)
 def test_worker_script(tmp_path, kind):
+    dask_jobqueue = pytest.importorskip("dask_jobqueue")
     path = tmp_path / "cluster.toml"
     path.write_text(CLUSTER.replace("KIND", kind))
-    script = worker_script(load_cluster(path), tmp_path / "logs")
+    job = getattr(dask_jobqueue, _CLASSES[kind]).job_cls
+    options = settings(load_cluster(path), tmp_path / "logs")
+    script = job("tls://SCHEDULER:PORT", name="NAME", **options).job_script()
     assert script.startswith("#!")
     for line in HEADS[kind]:
         assert line in script.splitlines(), script

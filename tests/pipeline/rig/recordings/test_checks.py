@@ -175,7 +175,7 @@ def test_relative_to__is_added(make):
 
 
 def test_findings__pass_through_json():
-    found = [Finding("gap", "", 1.0, 2.0, "warning", "x"), Finding("unit", "a", math.nan, math.nan, "note", "y")]
+    found = [Finding("gap", "", 1.0, 2.0, text="x"), Finding("unit", "a", severity="note", text="y")]
     import xarray as xr
 
     back = findings_of(xr.Dataset(attrs={"findings": to_json(found)}))
