@@ -8,21 +8,24 @@ degrees are converted once, in `pipeline.layout.cells`.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from unicodedata import category
 
 import numpy as np
 from pydantic import BaseModel, ValidationError
 
 from magpend_core.models import DEFAULT, load_model
+from magpend_core.models.drift.ramps import Ramp
 from magpend_core.models.model import Model, Parameters
 from magpend_core.models.parameters import ParameterError, unknown_name_problem
 from magpend_core.models.presets import Preset, is_file
 from pipeline.products.product import Options
 from pipeline.products.registry import CELL_PRODUCTS
+from pipeline.specification import drift as moving
+from pipeline.specification.drift import DriftTable
 from pipeline.specification.drive_files import RecordedDrive
 from pipeline.specification.files import merged, nested, odd_data, read_toml
 from pipeline.specification.methods import method_problems
@@ -33,6 +36,9 @@ from pipeline.specification.recorded_drive import DriveTable, recorded, run_prob
 from pipeline.specification.section import SectionTable, section_of, seen_through
 from pipeline.specification.starts import STARTS, GridStarts, Starts, refine_problems, starts_model
 from pipeline.specification.tables import FREQUENCY, Continuation, Execution, Integration, ParametersTable, Range, Table
+
+if TYPE_CHECKING:
+    from magpend_core.models.drift.sections import Drift
 
 KINDS = ("sweep", "continuation")
 IDENTIFICATION = "identification"
@@ -55,6 +61,27 @@ class Spec:
     execution: Execution
     drive: DriveTable | None = None
     section: SectionTable | None = None
+    drift: dict[str, DriftTable] = field(default_factory=dict)
+
+    @cached_property
+    def ramps(self) -> tuple[Ramp, ...]:
+        """Motions of the parameters that move while the run integrates; empty if none does."""
+        return moving.ramps_of(self.drift, self.axes)
+
+    @cached_property
+    def motion(self) -> Drift:
+        """How the parameters move, for the numerical core; this imports the compiler."""
+        from magpend_core.models.drift.sections import Drift
+
+        corners = moving.corners_of(self.values, self.axes, self.frequency_hz)
+        return Drift.of(self.model.system, self.ramps, self.values.names, *corners)
+
+    @property
+    def unsteady(self) -> str:
+        """What keeps the run's equations from staying the same for ever, as a clause; empty if nothing does."""
+        if self.recorded is not None:
+            return f"its drive is the recording {self.recorded.file}, which ends"
+        return f"its {' and '.join(self.drift)} moves ([drift])" if self.drift else ""
 
     @cached_property
     def recorded(self) -> RecordedDrive | None:
@@ -82,7 +109,7 @@ class Spec:
     @cached_property
     def model(self) -> Model:
         """Model that is integrated, with the Poincare section of the specification if it has one."""
-        return seen_through(load_model(self.reference), self.section)
+        return moving.moved(seen_through(load_model(self.reference), self.section), self.ramps, [])
 
     @cached_property
     def values(self) -> Parameters:
@@ -98,6 +125,8 @@ class Spec:
                 tables[name] = table.model_dump(mode="json", exclude_none=True)
         tables["initial_conditions"] = self.initial_conditions.model_dump(mode="json", exclude_none=True)
         tables["products"] = {name: options.plain() for name, options in self.products.items()}
+        if self.drift:
+            tables["drift"] = {name: table.plain() for name, table in self.drift.items()}
         tables["axes"] = {name: axis.model_dump(mode="json", exclude_none=True) for name, axis in self.axes.items()}
         return tables
 
@@ -124,6 +153,7 @@ _KEYS = (
     "execution",
     "drive",
     "section",
+    "drift",
     "measured",  # orbits of a rig, which magpend measured branch reads: no part of a run
 )
 
@@ -224,28 +254,32 @@ def parse_spec(data: Mapping[str, Any], folder: str | Path | None = ".") -> Spec
         raise SpecError([A_MODEL])
     problems = [unknown_key(key, key, _KEYS) for key in data if key not in _KEYS]
     data = _with_preset(data, folder, problems)
-    data = data if folder is None else with_drive(data, folder, problems)
+    data = data if folder is None else moving.with_files(with_drive(data, folder, problems), folder, problems)
     kind, title = _kind(data, problems), _title(data, problems)
     model = add_model(data.get("model", DEFAULT), folder, problems)
     tables = {name: _table(data, name, table, problems) for name, table in _TABLES.items()}
-    axes = _axes(data, problems)
+    axes, drift = _axes(data, problems), moving.drift_tables(data, problems)
     walk = _walk(kind, data, tables["continuation"], axes, problems)
     if model is None:  # the remaining checks need the model's states and parameters
         model = stand_in(data.get("model"), folder, forced="section" not in data)
     if model is None:
         raise SpecError(problems)
     section = section_of(tables["section"], model, data, problems)
-    seen = seen_through(model, section)
+    ramps = moving.checked_ramps(drift, model, axes, problems)
+    seen = moving.moved(seen_through(model, section), ramps, problems)
     starts = _starts(data, model, problems)
     problems += refine_problems(kind, starts, tables["integration"], model)
     products = _products(data, model, problems)
     problems += run_problems(recorded(tables["drive"], problems), model, data, tables["integration"], starts)
+    problems += moving.run_problems(drift, data, tables["integration"], starts)
     problems += size_problems(axes, starts)
     problems += method_problems(tables["integration"], products, "drive" in data)
     known = _valid_keys(ParametersTable, data.get("parameters", {}))
     has_periods = "drive" in data or "section" in data or model.autonomous
     complete = not has_periods and not any(p.startswith(("axes", "parameters")) for p in problems)
     problems += _parameter_problems(known, seen, _declared(data), axes, complete)
+    if ramps and not problems:
+        problems += _drift_problems(ramps, known, seen, axes, imports=folder is not None)
     if problems:
         raise SpecError(problems)
     assert starts is not None
@@ -262,6 +296,7 @@ def parse_spec(data: Mapping[str, Any], folder: str | Path | None = ".") -> Spec
         tables["execution"],
         tables["drive"],
         section,
+        drift,
     )
 
 
@@ -433,6 +468,17 @@ def _parameter_problems(
     for name, values in swept.items():
         problems += [f"axes.{name}: {p}" for p in _axis_problems(base, name, values)]
     return problems or [f"axes: {p}" for p in corner_problems(base, swept)]
+
+
+def _drift_problems(
+    ramps: tuple[Ramp, ...], table: ParametersTable, model: Model, axes: dict[str, Range], *, imports: bool
+) -> list[str]:
+    """Return the problems of moving parameters: their values, and what the model's equations do not allow."""
+    values = model.load(table.chosen, **table.overrides)
+    problems = moving.motion_problems(ramps, values, axes, table.frequency_hz)
+    if problems or not imports:
+        return problems
+    return moving.system_problems(model, ramps, values, axes, table.frequency_hz)
 
 
 def _frequency_problems(

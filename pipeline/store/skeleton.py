@@ -15,6 +15,7 @@ import zarr
 from zarr.storage import MemoryStore
 
 from pipeline.layout.cells import Coordinate, coordinates
+from pipeline.layout.moving import moving_coordinates
 from pipeline.layout.identity import digest_of
 from pipeline.layout.plan import Plan
 from pipeline.layout.vocabulary import model_attribute
@@ -85,7 +86,7 @@ def _labels(spec: Spec) -> list[Coordinate]:
     for name, options in spec.products.items():
         for dim, values in CELL_PRODUCTS[name].coordinates(options, model).items():
             found.append(Coordinate(dim, (dim,), _values(values)))
-    return found
+    return [*found, *moving_coordinates(spec)]
 
 
 def _values(labels: Iterable[Any]) -> np.ndarray:

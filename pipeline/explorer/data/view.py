@@ -251,7 +251,7 @@ def commands(run: ExploredRun, directory: str) -> dict[str, str]:
 
 def _can_have(run: ExploredRun, name: str) -> bool:
     """Return whether the run has the input that an analysis with default options needs."""
-    if run.spec.recorded is not None:
+    if run.spec.unsteady:
         return False
     analysis = ANALYSES[name]
     try:
