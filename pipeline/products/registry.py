@@ -61,6 +61,8 @@ ANALYSES: Registry[Analysis] = Registry(
         "tongues": "pipeline.products.tongues:TONGUES",
         "manifolds": "pipeline.products.manifolds:MANIFOLDS",
         "tangency": "pipeline.products.manifolds:TANGENCY",
+        "tipping": "pipeline.products.tipping:TIPPING",
+        "overlaps": "pipeline.products.tipping:OVERLAPS",
     },
 )
 

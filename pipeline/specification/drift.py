@@ -215,7 +215,9 @@ def read_table(text: str, file: str) -> tuple[tuple[float, ...], tuple[float, ..
     if len(steps):
         at = int(steps[0])
         raise SpecError(
-            [f"{file}: time_s = {table[at + 1, 0]:.9g} s follows {table[at, 0]:.9g} s; time must rise: sort or thin it."]
+            [
+                f"{file}: time_s = {table[at + 1, 0]:.9g} s follows {table[at, 0]:.9g} s; time must rise: sort or thin it."
+            ]
         )
     return tuple((table[:, 0] - table[0, 0]).tolist()), tuple(table[:, 1].tolist())
 
@@ -244,7 +246,9 @@ def corners_of(
     return np.array(packed, np.float64), np.array(frequency, np.float64)
 
 
-def motion_problems(ramps: Sequence[Ramp], values: Parameters, axes: Mapping[str, Range], hz: float | None) -> list[str]:
+def motion_problems(
+    ramps: Sequence[Ramp], values: Parameters, axes: Mapping[str, Range], hz: float | None
+) -> list[str]:
     """Return the problems of ramps with their numbers: durations, bounds of the parameters, relations between them."""
     packed, frequency = corners_of(values, axes, hz)
     motions = motions_of(ramps, values.names, packed, frequency)
@@ -273,9 +277,7 @@ def _problems_of_motion(motion: Motion, values: Parameters) -> Iterator[str]:
             yield f"drift.{name}: {problem}"
 
 
-def run_problems(
-    tables: Mapping[str, DriftTable], data: Mapping[str, Any], integration: Any, starts: Any
-) -> list[str]:
+def run_problems(tables: Mapping[str, DriftTable], data: Mapping[str, Any], integration: Any, starts: Any) -> list[str]:
     """Return the problems of a specification whose parameters move, beside those of the ramps."""
     if not tables:
         return []
@@ -307,7 +309,9 @@ def run_problems(
     return problems
 
 
-def system_problems(model: Model, ramps: Sequence[Ramp], values: Parameters, axes: Mapping[str, Range], hz: float | None) -> list[str]:
+def system_problems(
+    model: Model, ramps: Sequence[Ramp], values: Parameters, axes: Mapping[str, Range], hz: float | None
+) -> list[str]:
     """Return the reasons why a model's equations do not allow its parameters to move; this imports the compiler."""
     from magpend_core.models.drift.sections import Drift
     from magpend_core.models.drift.structure import DriftError

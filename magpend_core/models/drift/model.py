@@ -90,7 +90,9 @@ def drifting(model: Model, ramps: tuple[Ramp, ...]) -> DriftingModel:
     more = tuple(p for ramp in ramps for p in ramp_parameters(ramp, model.parameter(ramp.parameter).unit))
     for p in more:
         if p.name in (*model.parameter_names, *model.state_names):
-            raise ValueError(f"{model.name} has a parameter or state named {p.name}, a name that the drift needs; rename it.")
+            raise ValueError(
+                f"{model.name} has a parameter or state named {p.name}, a name that the drift needs; rename it."
+            )
     presets = tuple(with_numbers(p, ramps) for p in model.presets)
     changes: dict[str, Any] = {"parameters": (*model.parameters, *more), "presets": presets}
     return DriftingModel(**{**own, **changes}, still=model, ramps=ramps)

@@ -18,16 +18,7 @@ STEEPNESS = 5.0
 """Argument of the tanh at the end of a smooth ramp: its steepest slope is five times its mean slope."""
 
 PER_PERIOD, PERIODS = "_per_period", "_periods"
-NUMBERS = (
-    "from",
-    "to",
-    "rate_per_s",
-    "rate_per_period",
-    "start_s",
-    "start_periods",
-    "duration_s",
-    "duration_periods",
-)
+NUMBERS = ("from", "to", "rate_per_s", "rate_per_period", "start_s", "start_periods", "duration_s", "duration_periods")
 """Keys of a ramp's numbers, in the order of the run's parameters."""
 
 

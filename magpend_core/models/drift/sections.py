@@ -121,9 +121,7 @@ def drifting_sections(
 class _Timeline:
     """The intervals of one cell: its drive periods, divided at the corners of its ramps."""
 
-    def __init__(
-        self, motions: Sequence[Motion], pieces: Sequence[int], cell: int, hz: float, n_periods: int
-    ) -> None:
+    def __init__(self, motions: Sequence[Motion], pieces: Sequence[int], cell: int, hz: float, n_periods: int) -> None:
         cuts = np.concatenate([m.corners(cell, n) for m, n in zip(motions, pieces, strict=True)])
         cuts = np.unique(cuts[(cuts > 0.0) & (cuts * hz < n_periods)])
         near = np.abs(cuts * hz - np.round(cuts * hz)) <= NEAR * np.maximum(1.0, cuts * hz)
@@ -234,9 +232,7 @@ class _Walk:
             self.state[cell] = cells.final_state[row, min(mine - 1, int(np.append(good, False).argmin()))]
             self.step[cell] = cells.next_step[row, mine - 1]
 
-    def _describe(
-        self, cell: int, begin: int, points: np.ndarray, frequency: np.ndarray, ends: np.ndarray
-    ) -> None:
+    def _describe(self, cell: int, begin: int, points: np.ndarray, frequency: np.ndarray, ends: np.ndarray) -> None:
         """Fill in the parameters of a cell's intervals, their frequencies, and the sections at their ends, or -1."""
         line, hz, m = self.lines[cell], float(self.frequency_hz[cell]), len(self.system.parameter_names)
         first = line.first(begin)

@@ -101,9 +101,7 @@ class _Probe:
         return [[float(v) if i == which else x for i, x in enumerate(first)] for v in moved]
 
 
-def moving_of(
-    system: System, motions: Sequence[Motion], packed: np.ndarray, frequency_hz: np.ndarray
-) -> Moving:
+def moving_of(system: System, motions: Sequence[Motion], packed: np.ndarray, frequency_hz: np.ndarray) -> Moving:
     """Return what moves in a system.
 
     Parameters

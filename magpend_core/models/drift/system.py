@@ -80,7 +80,9 @@ def coefficients_of(degree: int) -> tuple[tuple[float, ...], ...]:
         for i, other in enumerate(nodes):
             if i != j:
                 shifted = [Fraction(0), *product]
-                product = [(a - other * b) / (node - other) for a, b in zip(shifted, [*product, Fraction(0)], strict=True)]
+                product = [
+                    (a - other * b) / (node - other) for a, b in zip(shifted, [*product, Fraction(0)], strict=True)
+                ]
         columns.append(product)
     return tuple(tuple(float(column[k]) for column in columns) for k in range(degree + 1))
 
@@ -211,7 +213,11 @@ class _Builder:
             lines += [f"_move(p, {0.5 + 0.5 * node!r})", f"_constants(p[{m}], p, out)"]
             for place, k in enumerate(self.moving.constants):
                 lines.append(f"out[{self.first + place * (degree + 1) + j}] = out[{k}]")
-        lines += [f"out[{self.offset}] = p[{m + 1}]", f"out[{self.rate}] = 2.0 * frequency", f"out[{self.passed}] = 0.0"]
+        lines += [
+            f"out[{self.offset}] = p[{m + 1}]",
+            f"out[{self.rate}] = 2.0 * frequency",
+            f"out[{self.passed}] = 0.0",
+        ]
         for place in range(len(self.moving.constants)):
             at = self.first + place * (degree + 1)
             lines += [f"v{j} = out[{at + j}]" for j in range(degree + 1)]
