@@ -62,6 +62,7 @@ ANALYSES: Registry[Analysis] = Registry(
         "manifolds": "pipeline.products.manifolds:MANIFOLDS",
         "tangency": "pipeline.products.manifolds:TANGENCY",
         "tipping": "pipeline.products.tipping:TIPPING",
+        "delay": "pipeline.products.tipping:DELAY",
         "overlaps": "pipeline.products.tipping:OVERLAPS",
     },
 )
@@ -90,6 +91,7 @@ FIGURES: Registry[Figure] = Registry(
             "rotation",
             "tongues",
             "manifolds",
+            "drift",
         )
     },
 )

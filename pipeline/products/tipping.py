@@ -28,6 +28,17 @@ class OverlapOptions(AttractorOptions):
     confidence: float = option(0.95, "Level of the intervals.", gt=0.0, lt=1.0)
 
 
+class DelayOptions(Options):
+    """Options for finding where trajectories leave an orbit while a parameter moves."""
+
+    moving: str = option("", "Moving parameter; by default the only one.")
+    period: int = option(1, "Period of the orbit that is left.", unit="drive periods", ge=1)
+    distance: float = option(
+        0.01, "Largest distance between sections one period of the orbit apart, in units of the states' scales.", gt=0.0
+    )
+    static: float | None = option(None, "Value of the bifurcation at a parameter that does not move.", unit="SI")
+
+
 TIPPING = Analysis(
     "tipping",
     """Find which attractor each trajectory reaches after its parameters have moved, and the critical rates.
@@ -53,4 +64,18 @@ OVERLAPS = Analysis(
     table=f"{_ROOM}.overlaps:overlaps_table",
     needs=f"{_ROOM}.overlaps:needs_basins",
     builds_on=("attractors",),
+)
+
+DELAY = Analysis(
+    "delay",
+    """Find the value of a moving parameter at which trajectories leave a periodic orbit, such as a delayed doubling.
+
+    A trajectory has left an orbit of period p when two of its sections p apart differ by more than a distance. With
+    --static the delay behind the bifurcation at a constant parameter is listed.""",
+    DelayOptions,
+    compute=f"{_ROOM}.delay:delay",
+    table=f"{_ROOM}.delay:delay_table",
+    needs=f"{_ROOM}.delay:needs_sections",
+    figure="drift",
+    for_drift=True,
 )

@@ -13,7 +13,7 @@ import numpy as np
 
 from magpend_core.engine.plain_python import plain
 from magpend_core.engine.system import System
-from magpend_core.models.drift.ramps import Motion, TABLE, value_at
+from magpend_core.models.drift.ramps import TABLE, Motion, value_at
 from magpend_core.models.drift.system import AFFINE, DEGREE, Moving, coefficients_of, nodes_of
 
 N_VALUES = 9

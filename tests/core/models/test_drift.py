@@ -127,7 +127,10 @@ def test_drifting_sections__against_another_integrator(name, shape):
 def test_drifting_sections__of_two_parameters_and_a_table():
     """Stiffness by lines between samples, damping by a ramp: both at once."""
     times, values = (0.0, 4.0, 9.0, 9.5, 30.0), (1.0, 2.0, 1.5, 3.0, 1.0)
-    ramps = [Ramp("k", TABLE, (("start_s", 3.0),), times, values), Ramp("d", "linear", (("to", 0.4), ("rate_per_s", 0.02)))]
+    ramps = [
+        Ramp("k", TABLE, (("start_s", 3.0),), times, values),
+        Ramp("d", "linear", (("to", 0.4), ("rate_per_s", 0.02))),
+    ]
     _, found = drifted(OSCILLATOR, ramps, [{}])
 
     def rhs(t, y, _):
@@ -162,7 +165,9 @@ def test_drifting_sections__of_a_switched_drive():
                 return [y[1], force - 0.1 * y[1] - y[0] - 0.2 * side]
 
             turning.terminal, turning.direction = True, -side
-            s = solve_ivp(smooth, (t, b), y, args=(0.5 * (t + b),), events=turning, method="DOP853", rtol=1e-12, atol=1e-13)
+            s = solve_ivp(
+                smooth, (t, b), y, args=(0.5 * (t + b),), events=turning, method="DOP853", rtol=1e-12, atol=1e-13
+            )
             t, y = s.t[-1], s.y[:, -1].copy()
             if s.status == 1:
                 y[1] = 0.0
@@ -196,7 +201,14 @@ def test_drifting_sections__of_a_ramp_to_the_same_value_are_those_of_an_ordinary
     _, found = drifted(OSCILLATOR, [ramp], [{}], n_transient=300, n_keep=80)
     packed = OSCILLATOR.load().pack()[None, None]
     plain = run_branches(
-        packed, np.full((1, 1), HZ), START[None], n_transient=300, n_keep=80, system=OSCILLATOR.system, rtol=1e-10, atol=1e-10
+        packed,
+        np.full((1, 1), HZ),
+        START[None],
+        n_transient=300,
+        n_keep=80,
+        system=OSCILLATOR.system,
+        rtol=1e-10,
+        atol=1e-10,
     )
     np.testing.assert_allclose(found.section, plain.section, atol=1e-9)
     assert found.status[0, 0] == plain.status[0, 0] == Status.PERIODIC
