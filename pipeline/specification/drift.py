@@ -215,9 +215,7 @@ def read_table(text: str, file: str) -> tuple[tuple[float, ...], tuple[float, ..
     if len(steps):
         at = int(steps[0])
         raise SpecError(
-            [
-                f"{file}: time_s = {table[at + 1, 0]:.9g} s follows {table[at, 0]:.9g} s; time must rise: sort or thin it."
-            ]
+            [f"{file}: time_s = {table[at + 1, 0]:.9g} s follows {table[at, 0]:.9g} s; time must rise: sort it."]
         )
     return tuple((table[:, 0] - table[0, 0]).tolist()), tuple(table[:, 1].tolist())
 

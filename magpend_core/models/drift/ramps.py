@@ -103,7 +103,7 @@ class Motion:
     @property
     def end_s(self) -> np.ndarray:
         """Time after which the parameter stays where it is, shape (cell,) [s]."""
-        return self.start_s + self.duration_s
+        return np.asarray(self.start_s + self.duration_s)
 
     def take(self, cells: Any) -> Motion:
         """Return the motion of some of the cells."""
@@ -112,14 +112,14 @@ class Motion:
 
     def share(self, cell: int, times: np.ndarray) -> np.ndarray:
         """Return how far the ramp of a cell has come at given times, from 0 to 1."""
-        return np.clip((times - self.start_s[cell]) / self.duration_s[cell], 0.0, 1.0)
+        return np.asarray(np.clip((times - self.start_s[cell]) / self.duration_s[cell], 0.0, 1.0))
 
     def at(self, cell: int, times: np.ndarray) -> np.ndarray:
         """Return the parameter's value of a cell at given times [s since the trajectory's start]."""
         if self.ramp.shape == TABLE:
             own = np.asarray(self.ramp.times_s) + self.start_s[cell]
-            return np.interp(times, own, self.ramp.values)
-        return value_at(self.ramp, self.begin[cell], self.end[cell], self.share(cell, times))
+            return np.asarray(np.interp(times, own, self.ramp.values))
+        return np.asarray(value_at(self.ramp, self.begin[cell], self.end[cell], self.share(cell, times)))
 
     def corners(self, cell: int, pieces: int) -> np.ndarray:
         """Return the times at which the parameter's motion has a corner or a new piece begins, rising [s].

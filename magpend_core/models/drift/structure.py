@@ -54,7 +54,7 @@ class _Probe:
 
     def parameters(self, cell: int, values: Sequence[float]) -> np.ndarray:
         """Return the parameters of a cell with given values of those that move."""
-        p = self.packed[cell].copy()
+        p = np.array(self.packed[cell])
         p[list(self.places)] = values
         return p
 
@@ -70,7 +70,7 @@ class _Probe:
         table = np.zeros((3, self.system.n_edges))
         with np.errstate(all="ignore"):
             self._edges(np.float64(self.hz[cell]), self.parameters(cell, values), *table)
-        return table[0]
+        return np.array(table[0])
 
     def surfaces(self, cell: int, values: Sequence[float]) -> np.ndarray:
         """Return the values of all switches and impacts at some states and times."""
@@ -124,7 +124,7 @@ def moving_of(system: System, motions: Sequence[Motion], packed: np.ndarray, fre
     cells = range(len(packed))
     shares = np.linspace(0.0, 1.0, N_VALUES)
     moved: set[int] = set()
-    for which, motion in enumerate(motions):
+    for which in range(len(motions)):
         own: set[int] = set()
         for cell in cells:
             first, *others = [probe.constants(cell, v) for v in probe.at_shares(cell, which, shares)]
@@ -205,7 +205,7 @@ def _pieces(probe: _Probe, which: int, cell: int, constants: Sequence[int]) -> i
 
     size = np.abs(along(np.linspace(0.0, 1.0, 33))).max(axis=0)
     for power in itertools.count():
-        n = 2**power
+        n = int(2**power)
         if n > MOST_PIECES:
             name = probe.motions[which].ramp.parameter
             raise DriftError(

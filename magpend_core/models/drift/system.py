@@ -194,7 +194,7 @@ class _Builder:
         return [*lines, f"return ({', '.join(names)},)"]
 
     def _moved_parameters(self) -> list[str]:
-        """Return the lines of the function that sets the moving parameters where the part `w` of the interval is over."""
+        """Return the lines that set the moving parameters where the part `w` of the interval is over."""
         lines, at = [], len(self.system.parameter_names) + 2
         for i, smooth in zip(self.moving.parameters, self.moving.smooth, strict=True):
             if smooth:

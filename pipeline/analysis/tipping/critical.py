@@ -152,7 +152,7 @@ class Bisection:
         return self._compared(finals, found.final_state[:, 0], found.status[:, 0])
 
     def _compared(self, finals: list[Final], states: np.ndarray, status: np.ndarray) -> np.ndarray:
-        """Return the known attractors on which cells end, by going on with cells of each known attractor beside them."""
+        """Return the known attractors on which cells end; cells of each known attractor go on beside them."""
         outcome = np.full(len(finals), NONE)
         outcome[status == Status.DIVERGED] = DIVERGED
         keys = [final.key for final in finals]

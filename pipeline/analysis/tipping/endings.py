@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -156,7 +157,7 @@ def _going_on(run: Run, final: Final, states: np.ndarray, options: TippingOption
         method=integration.method,
     )
     names = ("status", "orbit_period", "n_periods", "n_steps", "n_rejected", "step_size")
-    data = {name: ((START,), getattr(found, name)[:, 0]) for name in names}
+    data: dict[str, Any] = {name: ((START,), getattr(found, name)[:, 0]) for name in names}
     data["section"] = ((START, "period_index", "state"), found.section[:, 0])
     if model.angles:
         data["turns"] = ((START, model.angle_dim), found.turns[:, 0])

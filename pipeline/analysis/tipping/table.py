@@ -99,11 +99,11 @@ def _counts(ds: xr.Dataset) -> list[str]:
     rows: list[dict[str, Any]] = []
     for i, value in enumerate(values):
         here = outcome.isel({dim: i}).values
-        counts = {outcome_word(o): str(int((here == o).sum())) for o in seen}
-        if rows and [rows[-1][word] for word in counts] == list(counts.values()):
+        found = {outcome_word(o): str(int((here == o).sum())) for o in seen}
+        if rows and [rows[-1][word] for word in found] == list(found.values()):
             rows[-1]["to"] = value
             continue
-        rows.append({"from": value, **counts, "to": value})
+        rows.append({"from": value, **found, "to": value})
     head = f"{dim}{unit_of(ds, dim)}"
     words = []
     for row in rows:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -54,7 +56,7 @@ def by_scipy(rhs, marks, start, breaks, wanted):
     """States at the marks by DOP853, restarted at every break."""
     y, found = np.asarray(start, float), []
     times = sorted({0.0, *marks, *(b for b in breaks if 0.0 < b < marks[-1])})
-    for a, b in zip(times, times[1:], strict=False):
+    for a, b in itertools.pairwise(times):
         y = solve_ivp(rhs, (a, b), y, args=(0.5 * (a + b),), method="DOP853", rtol=wanted, atol=wanted).y[:, -1]
         if b in marks:
             found.append(y)
@@ -147,9 +149,8 @@ def test_drifting_sections__of_a_switched_drive():
     ramp = Ramp("A", "linear", (("from", 0.5), ("to", 2.0), ("start_periods", 1.0 + 0.3), ("duration_periods", 2.45)))
     _, found = drifted(SWITCHED, [ramp], [{}], n_keep=6)
 
-    def rhs(t, y, middle):
-        force = value(t, 0.5, 2.0, 1.3 / HZ, 2.45 / HZ, False) * (1.0 if (middle * HZ) % 1.0 < 0.3 else -1.0)
-        return [y[1], force - 0.1 * y[1] - y[0] - 0.2 * np.tanh(y[1] / 1e-9)]
+    def force(t, middle):
+        return value(t, 0.5, 2.0, 1.3 / HZ, 2.45 / HZ, False) * (1.0 if (middle * HZ) % 1.0 < 0.3 else -1.0)
 
     def turning(t, y, _):
         return y[1]
@@ -158,11 +159,10 @@ def test_drifting_sections__of_a_switched_drive():
     breaks = sorted({*np.arange(1, 7) / HZ, *(np.arange(0, 6) + 0.3) / HZ, 1.3 / HZ, 3.75 / HZ})
     for b in breaks:
         while t < b - 1e-12:
-            side = np.sign(y[1]) if abs(y[1]) > 1e-9 else np.sign(rhs(t, [y[0], 0.0], 0.5 * (t + b))[1])
+            side = np.sign(y[1]) if abs(y[1]) > 1e-9 else np.sign(force(t, 0.5 * (t + b)) - y[0])
 
             def smooth(t, y, middle, side=side):
-                force = value(t, 0.5, 2.0, 1.3 / HZ, 2.45 / HZ, False) * (1.0 if (middle * HZ) % 1.0 < 0.3 else -1.0)
-                return [y[1], force - 0.1 * y[1] - y[0] - 0.2 * side]
+                return [y[1], force(t, middle) - 0.1 * y[1] - y[0] - 0.2 * side]
 
             turning.terminal, turning.direction = True, -side
             s = solve_ivp(
