@@ -60,5 +60,5 @@ def test_overlaps__of_basins_whose_boundary_is_known(tmp_path, write_spec):
     table = overlaps_table(ds)
     assert len(table.rows) == 4
     assert any("0.2500" in line for line in table.lines)
-    with pytest.raises(SpecError, match="a = 0.7"):
+    with pytest.raises(SpecError, match=r"a = 0\.7"):
         derive(tmp_path / "run", "overlaps", {"parameter": "a", "before": 0.0, "after": 0.7})
