@@ -14,13 +14,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from unicodedata import category
 
-import numpy as np
 from pydantic import BaseModel, ValidationError
 
 from magpend_core.models import DEFAULT, load_model
 from magpend_core.models.drift.ramps import Ramp
 from magpend_core.models.model import Model, Parameters
-from magpend_core.models.parameters import ParameterError, unknown_name_problem
+from magpend_core.models.parameters import ParameterError
 from magpend_core.models.presets import Preset, is_file
 from pipeline.products.product import Options
 from pipeline.products.registry import CELL_PRODUCTS
@@ -30,12 +29,13 @@ from pipeline.specification.drive_files import RecordedDrive
 from pipeline.specification.files import merged, nested, odd_data, read_toml
 from pipeline.specification.methods import method_problems
 from pipeline.specification.models import A_MODEL, KEPT, add_model, stand_in, with_model_table
+from pipeline.specification.parameters import parameter_problems
 from pipeline.specification.problems import SpecError, problems_of, shown, unknown_choice, unknown_key
-from pipeline.specification.ranges import corner_problems, size_problems
+from pipeline.specification.ranges import size_problems
 from pipeline.specification.recorded_drive import DriveTable, recorded, run_problems, with_drive
 from pipeline.specification.section import SectionTable, section_of, seen_through
 from pipeline.specification.starts import STARTS, GridStarts, Starts, refine_problems, starts_model
-from pipeline.specification.tables import FREQUENCY, Continuation, Execution, Integration, ParametersTable, Range, Table
+from pipeline.specification.tables import Continuation, Execution, Integration, ParametersTable, Range, Table
 
 if TYPE_CHECKING:
     from magpend_core.models.drift.sections import Drift
@@ -277,7 +277,7 @@ def parse_spec(data: Mapping[str, Any], folder: str | Path | None = ".") -> Spec
     known = _valid_keys(ParametersTable, data.get("parameters", {}))
     has_periods = "drive" in data or "section" in data or model.autonomous
     complete = not has_periods and not any(p.startswith(("axes", "parameters")) for p in problems)
-    problems += _parameter_problems(known, seen, _declared(data), axes, complete)
+    problems += parameter_problems(known, seen, _declared(data), axes, complete)
     if ramps and not problems:
         problems += _drift_problems(ramps, known, seen, axes, imports=folder is not None)
     if problems:
@@ -446,30 +446,6 @@ def _walk(
     return walk
 
 
-def _parameter_problems(
-    table: ParametersTable, model: Model, declared: tuple[str, ...], axes: dict[str, Range], complete: bool
-) -> list[str]:
-    """Return the problems of the parameters: unknown names, values out of bounds, a missing or repeated frequency."""
-    problems = _frequency_problems(table, declared, axes, complete)
-    swept = {name: axis.array() for name, axis in axes.items() if name != FREQUENCY}
-    try:
-        base = model.load(table.chosen)
-    except ParameterError as error:
-        return problems + [f"parameters.preset: {p}" for p in error.problems]
-    try:
-        base = model.load(table.chosen, **table.overrides)
-    except ParameterError as error:
-        problems += [f"parameters.overrides: {p}" for p in error.problems]
-    known = (*base.names, FREQUENCY)
-    problems += [f"axes.{n}: {unknown_name_problem(n, known)}" for n in declared if n not in known]
-    for name in table.overrides:
-        if name in declared:
-            problems.append(f"axes.{name}: is also in parameters.overrides; keep one of the two.")
-    for name, values in swept.items():
-        problems += [f"axes.{name}: {p}" for p in _axis_problems(base, name, values)]
-    return problems or [f"axes: {p}" for p in corner_problems(base, swept)]
-
-
 def _drift_problems(
     ramps: tuple[Ramp, ...], table: ParametersTable, model: Model, axes: dict[str, Range], *, imports: bool
 ) -> list[str]:
@@ -479,30 +455,3 @@ def _drift_problems(
     if problems or not imports:
         return problems
     return moving.system_problems(model, ramps, values, axes, table.frequency_hz)
-
-
-def _frequency_problems(
-    table: ParametersTable, declared: tuple[str, ...], axes: dict[str, Range], complete: bool
-) -> list[str]:
-    problems = []
-    if FREQUENCY in declared and table.frequency_hz is not None:
-        problems.append("axes.frequency_hz: is also in parameters; keep one of the two.")
-    if FREQUENCY in axes:
-        least = float(axes[FREQUENCY].array()[0])
-        if least <= 0:
-            problems.append(f"axes.frequency_hz: its least value {least!r} must be greater than 0 Hz.")
-    if FREQUENCY not in declared and table.frequency_hz is None and complete:
-        return ["parameters.frequency_hz: missing; set it there, or sweep it as axes.frequency_hz."]
-    return problems
-
-
-def _axis_problems(base: Parameters, name: str, values: np.ndarray) -> list[str]:
-    if name not in base.names:
-        return []
-    problems: list[str] = []
-    for value in dict.fromkeys((float(values.min()), float(values.max()))):
-        try:
-            base.replace(**{name: value})
-        except ParameterError as error:
-            problems += [p for p in error.problems if p not in problems]
-    return problems
