@@ -166,8 +166,8 @@ def specification() -> str:
         (
             "[drift.NAME]",
             drift.DriftTable,
-            "NAME is a parameter of the model; see [Parameters that move](../drift.md). Each number is a parameter of the "
-            "run, `NAME_KEY`, and can be an axis.",
+            "NAME is a parameter of the model; see [Parameters that move](../drift.md). Each number is a parameter of "
+            "the run, `NAME_KEY`, and can be an axis.",
         ),
         ("[integration]", tables.Integration, ""),
         ("[execution]", tables.Execution, "Decides the layout of the store, never the numbers."),
