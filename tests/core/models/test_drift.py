@@ -267,13 +267,13 @@ def test_drifting_sections__turns_of_angles_with_corners_among_the_kept_sections
 
 def test_drifting_sections__extremes_of_a_moving_parameter():
     """The parameter itself, as a quantity: exact at both ends of each period and between."""
-    ramp = Ramp("A", "linear", (("from", 0.5), ("to", 2.0), ("start_s", 5.0), ("duration_s", 10.0)))
+    ramp = Ramp("A", "linear", (("from", 0.5), ("to", 2.0), ("start_s", 4.0), ("duration_s", 10.0)))
     _, found = drifted(OSCILLATOR, [ramp], [{}], n_keep=6, n_transient=1, quantities=["size"])
-    ends = [value(np.array([k, k + 1]) / HZ, 0.5, 2.0, 5.0, 10.0, False) for k in range(1, 7)]
+    ends = [value(np.array([k, k + 1]) / HZ, 0.5, 2.0, 4.0, 10.0, False) for k in range(1, 7)]
     np.testing.assert_allclose(found.extremes[0, 0, :, 0, 0], [e.min() for e in ends], atol=1e-12)
     np.testing.assert_allclose(found.extremes[0, 0, :, 0, 1], [e.max() for e in ends], atol=1e-12)
-    # of the period with the first corner: from 1/HZ to 5 s constant, then a line
-    length, up = 1.0 / HZ, 2.0 / HZ - 5.0
+    # of the period with the first corner: from 1/HZ to 4 s constant, then a line
+    length, up = 1.0 / HZ, 2.0 / HZ - 4.0
     mean = 0.5 + 0.5 * up * (ends[0][1] - 0.5) / length
     assert found.extremes[0, 0, 0, 0, 2] == pytest.approx(mean, abs=1e-12)
 
