@@ -81,7 +81,9 @@ class Spec:
         """What keeps the run's equations from staying the same for ever, as a clause; empty if nothing does."""
         if self.recorded is not None:
             return f"its drive is the recording {self.recorded.file}, which ends"
-        return f"its {' and '.join(self.drift)} moves ([drift])" if self.drift else ""
+        if len(self.drift) == 1:
+            return f"its parameter {next(iter(self.drift))} moves ([drift])"
+        return f"its parameters {' and '.join(self.drift)} move ([drift])" if self.drift else ""
 
     @cached_property
     def recorded(self) -> RecordedDrive | None:

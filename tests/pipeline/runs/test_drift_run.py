@@ -150,7 +150,7 @@ def test_delay__and_figure_of_a_run(moving_fold):
 
 def test_derive__refuses_analyses_that_take_parameters_as_constant(moving_fold):
     for name in ("attractors", "branches", "basins", "chaos"):
-        with pytest.raises(SpecError, match=r"its l moves .*takes the parameters as constant"):
+        with pytest.raises(SpecError, match=r"its parameter l moves .*takes the parameters as constant"):
             derive(moving_fold, name)
 
 
