@@ -206,25 +206,13 @@ def motions_of(
 
 
 def ramps_as_data(ramps: Sequence[Ramp]) -> list[dict[str, Any]]:
-    """Return ramps as plain data, from which `ramps_from_data` makes them again."""
-    found = []
-    for ramp in ramps:
-        one: dict[str, Any] = {"parameter": ramp.parameter, "shape": ramp.shape, "numbers": dict(ramp.numbers)}
-        if ramp.shape == TABLE:
-            one |= {"times_s": list(ramp.times_s), "values": list(ramp.values)}
-        found.append(one)
-    return found
+    """Return ramps as plain data for `ramps_from_data`, without the rows of tables, which can be many."""
+    return [{"parameter": ramp.parameter, "shape": ramp.shape, "numbers": dict(ramp.numbers)} for ramp in ramps]
 
 
 def ramps_from_data(data: Sequence[Mapping[str, Any]]) -> tuple[Ramp, ...]:
-    """Return the ramps that `ramps_as_data` has written as plain data."""
+    """Return the ramps that `ramps_as_data` has written as plain data; tables are without their rows."""
     return tuple(
-        Ramp(
-            str(one["parameter"]),
-            str(one["shape"]),
-            tuple((str(k), float(v)) for k, v in one["numbers"].items()),
-            tuple(map(float, one.get("times_s", ()))),
-            tuple(map(float, one.get("values", ()))),
-        )
+        Ramp(str(one["parameter"]), str(one["shape"]), tuple((str(k), float(v)) for k, v in one["numbers"].items()))
         for one in data
     )
