@@ -143,7 +143,7 @@ def workflows() -> str:
 
 def specification() -> str:
     """Return Markdown tables of the keys of a run's specification."""
-    from pipeline.specification import recorded_drive, section, starts, tables
+    from pipeline.specification import drift, recorded_drive, section, starts, tables
 
     parts = [
         ("[parameters]", tables.ParametersTable, ""),
@@ -161,6 +161,12 @@ def specification() -> str:
             "[drive]",
             recorded_drive.DriveTable,
             'For `kind = "sweep"` alone: see [Recorded drives](../rig.md#recorded-drives).',
+        ),
+        (
+            "[drift.NAME]",
+            drift.DriftTable,
+            "NAME is a parameter of the model; see [Parameters that move](../drift.md). Each number is a parameter of "
+            "the run, `NAME_KEY`, and can be an axis.",
         ),
         ("[integration]", tables.Integration, ""),
         ("[execution]", tables.Execution, "Decides the layout of the store, never the numbers."),
@@ -275,7 +281,9 @@ def _keys(head: str, model: Any, more: str, left_out: Sequence[str] = ("kind",))
             continue
         extra: Any = info.json_schema_extra or {}
         unit = f" [{extra['unit']}]" if extra.get("unit") else ""
-        rows.append((f"`{name}`", _default(info), _bounds(info), f"{(info.description or '').rstrip('.')}{unit}"))
+        rows.append(
+            (f"`{info.alias or name}`", _default(info), _bounds(info), f"{(info.description or '').rstrip('.')}{unit}")
+        )
     text = f"{more}\n\n" if more else ""
     return f"### `{head}`\n\n{text}{table(('key', 'default', 'bounds', 'meaning'), rows)}"
 

@@ -33,8 +33,10 @@ def obstacle(old: Spec, new: Spec) -> str:
         return f"{line}fewer sections are not taken out of more"
     if new.continuation is not None:
         return f"{line}each point of a walk begins where all kept sections of the one before end"
-    if new.recorded is not None or new.section is not None:
-        what = "under a recorded drive" if new.section is None else "with a section by crossing"
+    if new.unsteady or new.section is not None:
+        what = "with a section by crossing"
+        if new.unsteady:
+            what = "whose parameters move" if new.drift else "under a recorded drive"
         return f"{line}cells {what} do not go on"
     if not new.integration.stop_when_closed and wanted < _judged(new):
         return f"{line}what closes is judged by the last {_judged(new)} sections: keep as many"

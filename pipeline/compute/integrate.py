@@ -10,6 +10,7 @@ import numpy as np
 
 from magpend_core import Sections, Status, run_branches
 from magpend_core.engine.system import System
+from pipeline.compute.drift import while_drifting
 from pipeline.compute.recorded_drive import under_recording
 from pipeline.layout.cells import Inputs
 from pipeline.layout.schema import REST_STATE, base_variables
@@ -44,7 +45,10 @@ class Job:
 def integrate(spec: Spec, inputs: Inputs) -> dict[str, np.ndarray]:
     """Integrate branches, compute their products, and return all variables with the leading dims (branch, point)."""
     how = spec.model.system, spec.integration, watched_quantities(spec)
-    cells = walk(inputs, *how) if spec.recorded is None else under_recording(spec.recorded, inputs, *how)
+    if spec.drift:
+        cells = while_drifting(spec.motion, inputs, *how)
+    else:
+        cells = walk(inputs, *how) if spec.recorded is None else under_recording(spec.recorded, inputs, *how)
     own = {REST_STATE.name: rest_states(cells)} if spec.section is not None else {}
     values = {
         v.name: np.asarray(own.get(v.name, getattr(cells, v.name, None)), dtype=v.dtype)

@@ -39,6 +39,9 @@ def identity_of(spec: Spec, plan: Plan, kernel_version: str) -> dict[str, Any]:
     tables = {k: v for k, v in spec.as_dict().items() if k not in ("title", "execution")}
     if spec.drive is not None:  # the file's name does not matter, and its digest stands for its text
         tables["drive"] = {k: v for k, v in tables["drive"].items() if k not in ("file", "text")}
+    for table in tables.get("drift", {}).values():
+        for key in ("file", "text"):
+            table.pop(key, None)
     return {
         **({} if spec.refine is None else {"refinement": REFINEMENT}),
         "format": FORMAT,
@@ -68,6 +71,7 @@ def code_of(spec: Spec) -> list[str]:
     refined = ["compute.refinement"] if spec.refine is not None else []
     walked = ["compute.continuation"] if spec.continuation is not None else []
     driven = ["compute.recorded_drive", "specification.drive_files"] if spec.drive is not None else []
+    driven += ["compute.drift", "specification.drift"] if spec.drift else []
     return [*CODE, *refined, *walked, *driven, *(module.removeprefix("pipeline.") for module in products)]
 
 

@@ -21,7 +21,14 @@ from pipeline.specification.tables import FREQUENCY
 NOWHERE = -1
 """Index that stands for a cell that the run does not have."""
 
-_CODE = (*CODE, "compute.continuation", "compute.recorded_drive", "specification.drive_files")
+_CODE = (
+    *CODE,
+    "compute.continuation",
+    "compute.recorded_drive",
+    "specification.drive_files",
+    "compute.drift",
+    "specification.drift",
+)
 
 
 def deciding(identity: Mapping[str, Any]) -> dict[str, Any]:
@@ -35,7 +42,7 @@ def deciding(identity: Mapping[str, Any]) -> dict[str, Any]:
     return {
         **{key: identity[key] for key in ("format", "kernel_version", "model_digest")},
         "code": {name: version for name, version in identity["code"].items() if name in _CODE},
-        **{name: spec[name] for name in ("kind", "drive", "section") if name in spec},
+        **{name: spec[name] for name in ("kind", "drive", "section", "drift") if name in spec},
         "integration": integration,
         **({"path": spec["continuation"]["path"]} if "continuation" in spec else {}),
     }

@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 from magpend_core.crossing import Crossing
 from magpend_core.models import DEFAULT, load_model
+from magpend_core.models.drift.model import DriftingModel, drifting
+from magpend_core.models.drift.ramps import ramps_as_data, ramps_from_data
 from magpend_core.models.model import Model, Parameters
 from magpend_core.models.sectioned import sectioned
 from magpend_core.status import Status
@@ -101,7 +103,8 @@ def model_attribute(model: Model) -> str:
 def model_of(ds: xr.Dataset) -> Model:
     """Return the model of a result cube, or of a dataset derived from it, from the attribute ``model``.
 
-    If the attributes ``section_...`` name a section by crossing, the model has that section.
+    If the attributes ``section_...`` name a section by crossing, the model has that section. With the attribute
+    ``drift`` its parameters move.
 
     Raises
     ------
@@ -110,11 +113,16 @@ def model_of(ds: xr.Dataset) -> Model:
     """
     model = load_model(str(ds.attrs.get("model", DEFAULT)))
     of = ds.attrs.get(f"{_SECTION}of")
+    if DRIFT in ds.attrs:
+        return drifting(model, ramps_from_data(json.loads(str(ds.attrs[DRIFT]))))
     if of is None:
         return model
     value, longest = (float(ds.attrs[f"{_SECTION}{key}"]) for key in ("value", "longest"))
     return sectioned(model, Crossing(str(of), value, ds.attrs[f"{_SECTION}direction"], longest))
 
+
+DRIFT = "drift"
+"""Attribute that describes the motion of a model's parameters, as JSON."""
 
 _SECTION = "section_"
 """Prefix of the attributes that describe a section by crossing."""
@@ -127,12 +135,17 @@ def section_attributes(crossing: Crossing | None) -> dict[str, Any]:
     return {f"{_SECTION}{key}": value for key, value in asdict(crossing).items()}
 
 
+def drift_attributes(model: Model) -> dict[str, str]:
+    """Return the dataset attribute that describes how a model's parameters move; `model_of` reads it."""
+    return {DRIFT: json.dumps(ramps_as_data(model.ramps))} if isinstance(model, DriftingModel) else {}
+
+
 def told_by(attrs: Mapping[Any, Any]) -> dict[str, Any]:
     """Select the dataset attributes that describe the integration: model, parameters, section."""
     return {
         str(key): value
         for key, value in attrs.items()
-        if key in ("model", "parameters") or str(key).startswith(_SECTION)
+        if key in ("model", "parameters", DRIFT) or str(key).startswith(_SECTION)
     }
 
 

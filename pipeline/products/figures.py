@@ -138,6 +138,13 @@ class ManifoldFigureOptions(ManifoldOptions, FigureOptions):
     """Options of a figure of manifolds."""
 
 
+class DriftFigureOptions(StateOptions):
+    """Options of a figure of sections over a moving parameter."""
+
+    moving: str = option("", "Moving parameter; by default the only one.")
+    over: str = option("", "Run with constant parameters that sweeps the moving one; its diagram is drawn below.")
+
+
 BIFURCATION = Figure(
     "bifurcation",
     "Draw a bifurcation diagram: section points over the swept parameter, coloured by class of motion.",
@@ -253,4 +260,11 @@ MANIFOLDS = Figure(
     "Draw the stable and unstable manifolds of saddle orbits, over the basins of a run on a grid of two states.",
     ManifoldFigureOptions,
     "pipeline.plots.manifolds:draw",
+)
+
+DRIFT = Figure(
+    "drift",
+    "Draw sections over a parameter that moves, coloured by the swept number, over the diagram of another run.",
+    DriftFigureOptions,
+    "pipeline.plots.drift:draw",
 )

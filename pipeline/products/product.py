@@ -184,6 +184,8 @@ class Analysis:
         Name of the figure that shows the result best, or empty.
     ignores : tuple of str
         Options that do not change the result.
+    for_drift : bool
+        Whether it takes runs whose parameters move; the others assume that parameters are constant.
     """
 
     name: str
@@ -196,6 +198,7 @@ class Analysis:
     builds_on: tuple[str, ...] = ()
     figure: str = ""
     ignores: tuple[str, ...] = ()
+    for_drift: bool = False
 
 
 class FigureOptions(Options):

@@ -61,6 +61,9 @@ ANALYSES: Registry[Analysis] = Registry(
         "tongues": "pipeline.products.tongues:TONGUES",
         "manifolds": "pipeline.products.manifolds:MANIFOLDS",
         "tangency": "pipeline.products.manifolds:TANGENCY",
+        "tipping": "pipeline.products.tipping:TIPPING",
+        "delay": "pipeline.products.tipping:DELAY",
+        "overlaps": "pipeline.products.tipping:OVERLAPS",
     },
 )
 
@@ -88,6 +91,7 @@ FIGURES: Registry[Figure] = Registry(
             "rotation",
             "tongues",
             "manifolds",
+            "drift",
         )
     },
 )

@@ -120,7 +120,7 @@ def derive(
     analysis = ANALYSES[name]
     wanted = options if isinstance(options, Options) else validated(analysis.options, options or {})
     run = AnalysedRun.of(source, echo)
-    _refuse_recorded(run, name)
+    _refuse_unsteady(run, analysis)
     wanted = prepared(run, analysis, wanted)
     key = _key(run, analysis, wanted)
     place = run.info.files.below(DERIVED).below(f"{name}-{key['derived_key'][:8]}.zarr")
@@ -191,8 +191,17 @@ def _options_of(attrs: Mapping[str, Any]) -> dict[str, Any]:
     return given
 
 
-def _refuse_recorded(run: Run, name: str) -> None:
-    """Raise SpecError if the drive of a run is a recording, since analyses would integrate beyond its end."""
+def _refuse_unsteady(run: Run, analysis: Analysis) -> None:
+    """Raise `SpecError` for a run driven by a recording, or whose parameters move, unless the analysis is made for it.
+
+    Analyses would integrate beyond the end of the recording, and take the parameters as constant.
+    """
+    name = analysis.name
+    if run.spec.drift and not analysis.for_drift:
+        raise SpecError(
+            f"{run.name}: {run.spec.unsteady}, but {name} takes the parameters as constant. Make a run without "
+            "[drift] for it. Of this run: magpend analyse tipping, magpend plot drift, or plot section."
+        )
     if run.spec.recorded is not None:
         raise SpecError(
             f"{run.name}: its drive is the recording {run.spec.recorded.file}, which ends, but {name} "

@@ -194,6 +194,13 @@ def _where(one: xr.Dataset) -> str:
 
 
 def _refuse_recorded(run: AnalysedRun) -> None:
+    if run.spec.drift:
+        raise SpecError(
+            [
+                f"{run.name}: {run.spec.unsteady}; an animation needs a run with constant parameters. To draw this "
+                "run's sections: magpend plot drift."
+            ]
+        )
     if run.spec.recorded is not None:
         raise SpecError(
             f"{run.name}: its drive is the recording {run.spec.recorded.file}; an animation needs a "

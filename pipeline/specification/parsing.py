@@ -8,30 +8,35 @@ degrees are converted once, in `pipeline.layout.cells`.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from unicodedata import category
 
-import numpy as np
-
 from magpend_core.models import DEFAULT, load_model
+from magpend_core.models.drift.ramps import Ramp
 from magpend_core.models.model import Model, Parameters
-from magpend_core.models.parameters import ParameterError, unknown_name_problem
+from magpend_core.models.parameters import ParameterError
 from magpend_core.models.presets import Preset, is_file
 from pipeline.products.product import Options
 from pipeline.products.registry import CELL_PRODUCTS
+from pipeline.specification import drift as moving
+from pipeline.specification.drift import DriftTable
 from pipeline.specification.drive_files import RecordedDrive
 from pipeline.specification.files import merged, nested, odd_data, read_toml
 from pipeline.specification.methods import method_problems
 from pipeline.specification.models import A_MODEL, KEPT, add_model, stand_in, with_model_table
+from pipeline.specification.parameters import parameter_problems
 from pipeline.specification.problems import SpecError, checked, shown, unknown_choice, unknown_key
-from pipeline.specification.ranges import corner_problems, size_problems
+from pipeline.specification.ranges import size_problems
 from pipeline.specification.recorded_drive import DriveTable, recorded, run_problems, with_drive
 from pipeline.specification.section import SectionTable, section_of, seen_through
 from pipeline.specification.starts import STARTS, GridStarts, Starts, refine_problems, starts_model
-from pipeline.specification.tables import FREQUENCY, Continuation, Execution, Integration, ParametersTable, Range, Table
+from pipeline.specification.tables import Continuation, Execution, Integration, ParametersTable, Range, Table
+
+if TYPE_CHECKING:
+    from magpend_core.models.drift.sections import Drift
 
 KINDS = ("sweep", "continuation")
 IDENTIFICATION = "identification"
@@ -54,6 +59,29 @@ class Spec:
     execution: Execution
     drive: DriveTable | None = None
     section: SectionTable | None = None
+    drift: dict[str, DriftTable] = field(default_factory=dict)
+
+    @cached_property
+    def ramps(self) -> tuple[Ramp, ...]:
+        """Motions of the parameters that move while the run integrates; empty if none does."""
+        return moving.ramps_of(self.drift, self.axes)
+
+    @cached_property
+    def motion(self) -> Drift:
+        """How the parameters move, for the numerical core; this imports the compiler."""
+        from magpend_core.models.drift.sections import Drift
+
+        corners = moving.corners_of(self.values, self.axes, self.frequency_hz)
+        return Drift.of(self.model.system, self.ramps, self.values.names, *corners)
+
+    @property
+    def unsteady(self) -> str:
+        """What keeps the run's equations from staying the same for ever, as a clause; empty if nothing does."""
+        if self.recorded is not None:
+            return f"its drive is the recording {self.recorded.file}, which ends"
+        if len(self.drift) == 1:
+            return f"its parameter {next(iter(self.drift))} moves ([drift])"
+        return f"its parameters {' and '.join(self.drift)} move ([drift])" if self.drift else ""
 
     @cached_property
     def recorded(self) -> RecordedDrive | None:
@@ -81,7 +109,7 @@ class Spec:
     @cached_property
     def model(self) -> Model:
         """Model that is integrated, with the Poincare section of the specification if it has one."""
-        return seen_through(load_model(self.reference), self.section)
+        return moving.moved(seen_through(load_model(self.reference), self.section), self.ramps, [])
 
     @cached_property
     def values(self) -> Parameters:
@@ -97,6 +125,8 @@ class Spec:
                 tables[name] = table.model_dump(mode="json", exclude_none=True)
         tables["initial_conditions"] = self.initial_conditions.model_dump(mode="json", exclude_none=True)
         tables["products"] = {name: options.plain() for name, options in self.products.items()}
+        if self.drift:
+            tables["drift"] = {name: table.plain() for name, table in self.drift.items()}
         tables["axes"] = {name: axis.model_dump(mode="json", exclude_none=True) for name, axis in self.axes.items()}
         return tables
 
@@ -123,6 +153,7 @@ _KEYS = (
     "execution",
     "drive",
     "section",
+    "drift",
     "measured",  # orbits of a rig, which magpend measured branch reads: no part of a run
 )
 
@@ -223,28 +254,32 @@ def parse_spec(data: Mapping[str, Any], folder: str | Path | None = ".") -> Spec
         raise SpecError(A_MODEL)
     problems = [unknown_key(key, key, _KEYS) for key in data if key not in _KEYS]
     data = _with_preset(data, folder, problems)
-    data = data if folder is None else with_drive(data, folder, problems)
+    data = data if folder is None else moving.with_files(with_drive(data, folder, problems), folder, problems)
     kind, title = _kind(data, problems), _title(data, problems)
     model = add_model(data.get("model", DEFAULT), folder, problems)
     tables = {name: _table(data, name, table, problems) for name, table in _TABLES.items()}
-    axes = _axes(data, problems)
+    axes, drift = _axes(data, problems), moving.drift_tables(data, problems)
     walk = _walk(kind, data, tables["continuation"], axes, problems)
     if model is None:  # the remaining checks need the model's states and parameters
         model = stand_in(data.get("model"), folder, forced="section" not in data)
     if model is None:
         raise SpecError(problems)
     section = section_of(tables["section"], model, data, problems)
-    seen = seen_through(model, section)
+    ramps = moving.checked_ramps(drift, model, axes, problems)
+    seen = moving.moved(seen_through(model, section), ramps, problems)
     starts = _starts(data, model, problems)
     problems += refine_problems(kind, starts, tables["integration"], model)
     products = _products(data, model, problems)
     problems += run_problems(recorded(tables["drive"], problems), model, data, tables["integration"], starts)
+    problems += moving.run_problems(drift, data, tables["integration"], starts)
     problems += size_problems(axes, starts)
     problems += method_problems(tables["integration"], products, "drive" in data)
     known = _valid_keys(ParametersTable, data.get("parameters", {}))
     has_periods = "drive" in data or "section" in data or model.autonomous
     complete = not has_periods and not any(p.startswith(("axes", "parameters")) for p in problems)
-    problems += _parameter_problems(known, seen, _declared(data), axes, complete)
+    problems += parameter_problems(known, seen, _declared(data), axes, complete)
+    if ramps and not problems:
+        problems += _drift_problems(ramps, known, seen, axes, imports=folder is not None)
     if problems:
         raise SpecError(problems)
     assert starts is not None
@@ -261,6 +296,7 @@ def parse_spec(data: Mapping[str, Any], folder: str | Path | None = ".") -> Spec
         tables["execution"],
         tables["drive"],
         section,
+        drift,
     )
 
 
@@ -398,52 +434,12 @@ def _walk(
     return walk
 
 
-def _parameter_problems(
-    table: ParametersTable, model: Model, declared: tuple[str, ...], axes: dict[str, Range], complete: bool
+def _drift_problems(
+    ramps: tuple[Ramp, ...], table: ParametersTable, model: Model, axes: dict[str, Range], *, imports: bool
 ) -> list[str]:
-    """Return the problems of the parameters: unknown names, values out of bounds, a missing or repeated frequency."""
-    problems = _frequency_problems(table, declared, axes, complete)
-    swept = {name: axis.array() for name, axis in axes.items() if name != FREQUENCY}
-    try:
-        base = model.load(table.chosen)
-    except ParameterError as error:
-        return problems + [f"parameters.preset: {p}" for p in error.problems]
-    try:
-        base = model.load(table.chosen, **table.overrides)
-    except ParameterError as error:
-        problems += [f"parameters.overrides: {p}" for p in error.problems]
-    known = (*base.names, FREQUENCY)
-    problems += [f"axes.{n}: {unknown_name_problem(n, known)}" for n in declared if n not in known]
-    for name in table.overrides:
-        if name in declared:
-            problems.append(f"axes.{name}: is also in parameters.overrides; keep one of the two.")
-    for name, values in swept.items():
-        problems += [f"axes.{name}: {p}" for p in _axis_problems(base, name, values)]
-    return problems or [f"axes: {p}" for p in corner_problems(base, swept)]
-
-
-def _frequency_problems(
-    table: ParametersTable, declared: tuple[str, ...], axes: dict[str, Range], complete: bool
-) -> list[str]:
-    problems = []
-    if FREQUENCY in declared and table.frequency_hz is not None:
-        problems.append("axes.frequency_hz: is also in parameters; keep one of the two.")
-    if FREQUENCY in axes:
-        least = float(axes[FREQUENCY].array()[0])
-        if least <= 0:
-            problems.append(f"axes.frequency_hz: its least value {least!r} must be greater than 0 Hz.")
-    if FREQUENCY not in declared and table.frequency_hz is None and complete:
-        return ["parameters.frequency_hz: missing; set it there, or sweep it as axes.frequency_hz."]
-    return problems
-
-
-def _axis_problems(base: Parameters, name: str, values: np.ndarray) -> list[str]:
-    if name not in base.names:
-        return []
-    problems: list[str] = []
-    for value in dict.fromkeys((float(values.min()), float(values.max()))):
-        try:
-            base.replace(**{name: value})
-        except ParameterError as error:
-            problems += [p for p in error.problems if p not in problems]
-    return problems
+    """Return the problems of moving parameters: their values, and what the model's equations do not allow."""
+    values = model.load(table.chosen, **table.overrides)
+    problems = moving.motion_problems(ramps, values, axes, table.frequency_hz)
+    if problems or not imports:
+        return problems
+    return moving.system_problems(model, ramps, values, axes, table.frequency_hz)

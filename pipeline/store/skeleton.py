@@ -16,6 +16,7 @@ from zarr.storage import MemoryStore
 
 from pipeline.layout.cells import Coordinate, coordinates
 from pipeline.layout.identity import digest_of
+from pipeline.layout.moving import moving_coordinates
 from pipeline.layout.plan import Plan
 from pipeline.layout.vocabulary import model_attribute
 from pipeline.products.registry import CELL_PRODUCTS
@@ -84,7 +85,7 @@ def _labels(spec: Spec) -> list[Coordinate]:
     for name, options in spec.products.items():
         for dim, values in CELL_PRODUCTS[name].coordinates(options, model).items():
             found.append(Coordinate(dim, (dim,), _values(values)))
-    return found
+    return [*found, *moving_coordinates(spec)]
 
 
 def _values(labels: Iterable[Any]) -> np.ndarray:

@@ -154,8 +154,8 @@ def add_orbits(copied: Copied, choosing: Callable[[int], Chosen], count: np.ndar
     room
         Limits on number and size of the orbits.
     """
-    if copied.run.spec.recorded is not None:
-        missing = "This copy has no orbits: the drive of the run is a recording, which does not repeat."
+    if copied.run.spec.unsteady:
+        missing = f"This copy has no orbits: {copied.run.spec.unsteady}."
         copied.about["orbits"] = {"blocks": [], "missing": missing}
         copied.sentences.append(missing)
         return 0

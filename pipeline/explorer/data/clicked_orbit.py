@@ -112,6 +112,8 @@ def orbit(run: Run, cell: int, point: int, *, linearised: bool = True) -> bytes:
         raise ExplorerError(
             "the drive of this run is a recording, which does not repeat: no orbit is drawn from a section."
         )
+    if run.spec.drift:
+        raise ExplorerError("a parameter of this run moves: no orbit is drawn from a section.")
     found = cell_of(explored, cell)
     section = found.section
     kept = np.isfinite(section).all(axis=1)

@@ -98,7 +98,7 @@ class ExploredRun(Run):
         with self._lock:
             key = f"derived {name}"
             if key not in self._opened:
-                self._opened[key] = None if self.spec.recorded is not None else stored(self, name)
+                self._opened[key] = None if self.spec.unsteady else stored(self, name)
             found: xr.Dataset | None = self._opened[key]
             return found
 

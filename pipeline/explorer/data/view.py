@@ -246,7 +246,7 @@ def commands(run: ExploredRun, directory: str) -> dict[str, str]:
 
 
 def _can_have(run: ExploredRun, name: str) -> bool:
-    if run.spec.recorded is not None:
+    if run.spec.unsteady:
         return False
     analysis = ANALYSES[name]
     try:

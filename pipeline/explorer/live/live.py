@@ -54,6 +54,8 @@ def live_problem(run: Run) -> str | None:
             f"the drive of {run.name} is the recording {run.spec.recorded.file}, and a live trajectory would "
             "go on where it ends; make a run at its mean frequency."
         )
+    if run.spec.drift:
+        return f"{run.name}: {run.spec.unsteady}, and a live trajectory has constant parameters; make a run without it."
     try:
         run.model.flow.system  # noqa: B018
     except (ParameterError, ImportError) as error:

@@ -1,0 +1,1 @@
+"""Parameters that move while a model is integrated: ramps and recorded functions of time."""

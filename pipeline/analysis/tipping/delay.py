@@ -1,0 +1,164 @@
+"""Find the value of a moving parameter at which trajectories leave a periodic orbit: delayed bifurcations."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from magpend_core.models.model import Model
+from pipeline.analysis.run import Run
+from pipeline.analysis.tabular import Row, aligned, counted, number, unit_of
+from pipeline.layout.moving import at_section
+from pipeline.layout.vocabulary import drift_attributes, model_attribute, model_of, split_dims
+from pipeline.products.product import Table
+from pipeline.products.tipping import DelayOptions
+
+
+def lags(section: np.ndarray, period: int, model: Model) -> np.ndarray:
+    """Return the distance of each section from the one `period` sections before, in units of the states' scales.
+
+    Parameters
+    ----------
+    section
+        Shape (..., n_keep, n_states).
+    period
+        Lag [sections].
+    model
+        Says which states are angles, and their scales.
+
+    Returns
+    -------
+    ndarray, (..., n_keep)
+        NaN for the first `period` sections.
+    """
+    found = np.full(section.shape[:-1], np.nan)
+    step = np.abs(section[..., period:, :] - section[..., :-period, :])
+    angles = np.array(model.is_angle)
+    step = np.where(angles, np.minimum(step, np.abs(2.0 * np.pi - step)), step)
+    found[..., period:] = (step / np.array(model.scales)).max(axis=-1)
+    return found
+
+
+def left_at(lag: np.ndarray, distance: float) -> np.ndarray:
+    """Return the index at which a trajectory has left an orbit: the first lag above a distance after one below it.
+
+    Parameters
+    ----------
+    lag
+        See `lags`; shape (..., n_keep).
+    distance
+        Bound of the lags on the orbit.
+
+    Returns
+    -------
+    ndarray of int, (...)
+        -1 if the trajectory was never on such an orbit, or does not leave it.
+    """
+    with np.errstate(invalid="ignore"):
+        near, far = lag <= distance, lag > distance
+    been = np.maximum.accumulate(near, axis=-1)
+    leaves = far & been
+    return np.where(leaves.any(axis=-1), leaves.argmax(axis=-1), -1)
+
+
+def needs_sections(run: Run, options: DelayOptions) -> None:
+    """Raise ValueError unless the parameter moves and enough sections are kept."""
+    spec = run.spec
+    name = moving_parameter(tuple(spec.drift), options.moving)
+    ends = np.asarray(run.cube()[at_section(name)].values)
+    if spec.integration.n_keep <= 2 * options.period or not np.ptp(ends):
+        raise ValueError(
+            f"{name} does not move over the kept sections; lower integration.n_transient, and keep the sections "
+            "of the ramp (n_keep)."
+        )
+
+
+def moving_parameter(names: tuple[str, ...], wanted: str) -> str:
+    """Return the moving parameter that is meant: the one that is named, or the only one.
+
+    Raises
+    ------
+    ValueError
+        If it does not move, or several do.
+    """
+    if not names:
+        raise ValueError("no parameter moves in this run; give its specification a table [drift.NAME].")
+    if wanted and wanted not in names:
+        raise ValueError(f"{wanted} does not move in this run; moving: {', '.join(names)}.")
+    if not wanted and len(names) > 1:
+        raise ValueError(f"several parameters move: choose with --moving {' or '.join(names)}.")
+    return wanted or names[0]
+
+
+def delay(run: Run, options: DelayOptions) -> xr.Dataset:
+    """Find for each cell the value of the moving parameter at which it leaves an orbit of a given period."""
+    cube, model = run.cube(), model_of(run.cube())
+    name = moving_parameter(tuple(run.spec.drift), options.moving)
+    dims, starts = split_dims(cube["status"])
+    order = (*dims, *starts)
+    section = cube["section"].transpose(*order, "period_index", "state").values
+    at = left_at(lags(section, options.period, model), options.distance)
+    values = (
+        cube[at_section(name)].broadcast_like(cube["section"].isel(state=0)).transpose(*order, "period_index").values
+    )
+    left = np.take_along_axis(values, np.maximum(at, 0)[..., None], axis=-1)[..., 0]
+    unit = model.parameter(name).unit
+    result = xr.Dataset(
+        {
+            "left": (order, np.where(at >= 0, left, np.nan), {"units": unit, "long_name": f"{name} where it leaves"}),
+            "left_index": (
+                order,
+                at.astype(np.int32),
+                {"units": "1", "long_name": "section at which it leaves, or -1"},
+            ),
+        }
+    )
+    attrs: dict[str, Any] = {
+        "model": model_attribute(model),
+        **drift_attributes(model),
+        "moving": name,
+        "period": options.period,
+        "distance": options.distance,
+    }
+    if options.static is not None:
+        attrs["static"] = options.static
+        result["delay"] = (order, result["left"].values - options.static, {"units": unit, "long_name": "left - static"})
+    coords = {k: v for k, v in cube.coords.items() if set(v.dims) <= set(order)}
+    return result.assign_coords(coords).assign_attrs(attrs)
+
+
+def delay_table(ds: xr.Dataset) -> Table:
+    """Return a row per parameter point: the range of the values at which its cells leave the orbit."""
+    dims, _ = split_dims(ds["left"])
+    rows: list[Row] = []
+    for index in np.ndindex(*(ds.sizes[d] for d in dims)):
+        one = ds.isel(dict(zip(dims, index, strict=True)))
+        left = one["left"].values.ravel()
+        known = left[np.isfinite(left)]
+        row: Row = {d: float(ds[d].values[i]) for d, i in zip(dims, index, strict=True)}
+        row |= {"n_cells": left.size, "n_left": len(known)}
+        row |= {
+            k: float(f(known)) if len(known) else np.nan
+            for k, f in (("low", np.min), ("median", np.median), ("high", np.max))
+        }
+        if "static" in ds.attrs:
+            row["delay"] = row["median"] - float(ds.attrs["static"])
+        rows.append(row)
+    name = str(ds.attrs["moving"])
+    words = [
+        {
+            **{f"{d}{unit_of(ds, d)}": f"{row[d]:g}" for d in dims},
+            "cells": str(row["n_cells"]),
+            "leave": str(row["n_left"]),
+            f"at {name}": number(row["median"], ".6g"),
+            "from": number(row["low"], ".6g") if row["n_left"] > 1 else None,
+            "to": number(row["high"], ".6g") if row["n_left"] > 1 else None,
+            "delay": number(row["delay"], ".4g") if "delay" in row else None,
+        }
+        for row in rows
+    ]
+    period, distance = int(ds.attrs["period"]), float(ds.attrs["distance"])
+    head = f"where sections {counted(period, 'period')} apart first differ by more than {distance:g}"
+    return Table(rows, [head, *aligned(words)])

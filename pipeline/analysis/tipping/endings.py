@@ -1,0 +1,179 @@
+"""Integrate trajectories on after their parameters have moved, at the final parameters, and find their attractors."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from magpend_core import Status, run_branches
+from magpend_core.models.drift.ramps import motions_of
+from magpend_core.models.model import Parameters
+from pipeline.analysis.attractors.attractors import identify
+from pipeline.analysis.outcomes import DIVERGED, outcomes
+from pipeline.analysis.run import Run
+from pipeline.layout.vocabulary import FREQUENCY_DIM, START, model_attribute, parameters_of
+from pipeline.products.tipping import TippingOptions
+from pipeline.specification.parsing import Spec
+
+GOOD = (Status.PERIODIC, Status.BOUNDED)
+
+NONE = -1
+"""Outcome of a cell that ends on no known attractor."""
+
+
+@dataclass(frozen=True)
+class Final:
+    """The constant parameters at which trajectories go on after the drift.
+
+    Attributes
+    ----------
+    parameters : Parameters
+        Of the model whose parameters do not move.
+    frequency_hz : float
+    """
+
+    parameters: Parameters
+    frequency_hz: float
+
+    @property
+    def key(self) -> bytes:
+        """Bytes that are equal for equal parameters."""
+        return self.parameters.pack().tobytes() + np.float64(self.frequency_hz).tobytes()
+
+
+def finals_of(spec: Spec, packed: np.ndarray, frequency_hz: np.ndarray) -> list[Final]:
+    """Return the final parameters of cells.
+
+    Parameters
+    ----------
+    spec
+        Specification of a run whose parameters move.
+    packed
+        Parameters of the run, shape (cell, n_parameters).
+    frequency_hz
+        Shape (cell,).
+    """
+    names, still = spec.values.names, spec.model.still  # type: ignore[attr-defined]
+    motions = motions_of(spec.ramps, names, packed, frequency_hz)
+    known: dict[bytes, Final] = {}
+    found = []
+    for cell, row in enumerate(packed):
+        values = dict(zip(names, row.tolist(), strict=True))
+        values |= {m.ramp.parameter: float(m.end[cell]) for m in motions}
+        own = {name: values[name] for name in still.parameter_names}
+        key = np.array([*own.values(), frequency_hz[cell]]).tobytes()
+        if key not in known:
+            known[key] = Final(Parameters(still, own), float(frequency_hz[cell]))
+        found.append(known[key])
+    return found
+
+
+def ends_s(spec: Spec, packed: np.ndarray, frequency_hz: np.ndarray) -> np.ndarray:
+    """Return the times after which no parameter of cells moves, shape (cell,) [s]."""
+    motions = motions_of(spec.ramps, spec.values.names, packed, frequency_hz)
+    return np.asarray(np.max([m.end_s for m in motions], axis=0))
+
+
+@dataclass(frozen=True)
+class Group:
+    """Cells that go on at the same final parameters, with what became of them.
+
+    Attributes
+    ----------
+    final : Final
+    cells : ndarray of int
+        Their numbers.
+    ids : Dataset
+        Result of `identify`; its cells are those that were integrated on.
+    integrated : ndarray of int
+        Their numbers.
+    settled : ndarray, (len(integrated), n_states)
+        Their states after the integration.
+    outcome : ndarray of int, (len(cells),)
+        Attractors' ids in `ids`, `DIVERGED`, or `NONE`.
+    """
+
+    final: Final
+    cells: np.ndarray
+    ids: xr.Dataset | None
+    integrated: np.ndarray
+    settled: np.ndarray
+    outcome: np.ndarray
+
+
+def endings(
+    run: Run, finals: list[Final], states: np.ndarray, status: np.ndarray, options: TippingOptions
+) -> Iterator[Group]:
+    """Integrate cells on at their final parameters, and find the attractors on which they end.
+
+    Parameters
+    ----------
+    run
+        Run whose parameters move.
+    finals
+        Final parameters of each cell.
+    states
+        Last sections, shape (cell, n_states).
+    status
+        Codes of `Status`, shape (cell,).
+    options
+        Lengths of the integration.
+    """
+    keys = [final.key for final in finals]
+    for key in dict.fromkeys(keys):
+        cells = np.flatnonzero([k == key for k in keys])
+        final = finals[cells[0]]
+        going = cells[np.isin(status[cells], GOOD)]
+        outcome = np.where(status[cells] == Status.DIVERGED, DIVERGED, NONE)
+        ids, settled = None, np.zeros((0, states.shape[1]))
+        if len(going):
+            cube = _going_on(run, final, states[going], options)
+            ids = identify(cube, parameters=final.parameters)
+            settled = cube["section"].values[:, -1]
+            outcome[np.searchsorted(cells, going)] = outcomes(ids).values
+        yield Group(final, cells, ids, going, settled, outcome)
+
+
+def _going_on(run: Run, final: Final, states: np.ndarray, options: TippingOptions) -> xr.Dataset:
+    """Return a cube of trajectories that go on from given states at constant parameters, as of a sweep."""
+    integration, model = run.spec.integration, final.parameters.model
+    n = len(states)
+    found = run_branches(
+        np.tile(final.parameters.pack(), (n, 1, 1)),
+        np.full((n, 1), final.frequency_hz),
+        states,
+        n_transient=options.settle,
+        n_keep=options.keep,
+        rtol=integration.rtol,
+        atol=integration.atol,
+        max_steps_per_period=integration.max_steps_per_period,
+        closure_tolerance=integration.closure_tolerance,
+        max_orbit_period=integration.max_orbit_period,
+        system=model.system,
+        method=integration.method,
+    )
+    names = ("status", "orbit_period", "n_periods", "n_steps", "n_rejected", "step_size")
+    data: dict[str, Any] = {name: ((START,), getattr(found, name)[:, 0]) for name in names}
+    data["section"] = ((START, "period_index", "state"), found.section[:, 0])
+    if model.angles:
+        data["turns"] = ((START, model.angle_dim), found.turns[:, 0])
+    attrs = {
+        **integration.model_dump(),
+        "n_transient": options.settle,
+        "n_keep": options.keep,
+        "kind": "sweep",
+        "model": model_attribute(model),
+        "parameters": "\n".join(f"{k} = {v!r}" for k, v in final.parameters.items()),
+    }
+    coords = {
+        "state": list(model.state_names),
+        "state_units": ("state", list(model.state_units)),
+        FREQUENCY_DIM: final.frequency_hz,
+    }
+    ds = xr.Dataset(data, coords=coords, attrs=attrs)
+    assert parameters_of(ds) == final.parameters
+    return ds

@@ -1,0 +1,139 @@
+"""Compute tipping probabilities from the overlaps of basins at two parameter values."""
+
+from __future__ import annotations
+
+import numpy as np
+import xarray as xr
+
+from pipeline.analysis.basins.basins import check_starts
+from pipeline.analysis.intervals import binomial_interval
+from pipeline.analysis.outcomes import outcomes
+from pipeline.analysis.run import Run
+from pipeline.analysis.selection import choose, place
+from pipeline.analysis.tabular import Row, aligned, with_interval
+from pipeline.analysis.tipping.table import outcome_word
+from pipeline.layout.vocabulary import axis_name
+from pipeline.products.attractors import AttractorOptions
+from pipeline.products.product import Table
+from pipeline.products.tipping import OverlapOptions
+
+UNKNOWN = -1
+
+
+def overlap_counts(before: np.ndarray, after: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Count the initial states in the overlap of each basin before with each basin after a change.
+
+    Parameters
+    ----------
+    before, after
+        Labels of the same initial states, arrays of one shape; -1 for states without an outcome, which are left out.
+
+    Returns
+    -------
+    labels_before, labels_after : ndarray of int
+        The labels that occur, rising.
+    counts : ndarray of int, (len(labels_before), len(labels_after))
+
+    Raises
+    ------
+    ValueError
+        If the shapes differ.
+    """
+    if before.shape != after.shape:
+        raise ValueError(
+            f"basins of shapes {before.shape} and {after.shape} have no overlap; they need the same starts."
+        )
+    known = (before != UNKNOWN) & (after != UNKNOWN)
+    first, i = np.unique(before[known], return_inverse=True)
+    last, j = np.unique(after[known], return_inverse=True)
+    counts = np.zeros((len(first), len(last)), np.int64)
+    np.add.at(counts, (i, j), 1)
+    return first, last, counts
+
+
+def needs_basins(run: Run, options: OverlapOptions) -> None:
+    """Raise ValueError unless the run has basins at both values of the parameter."""
+    cube = run.cube()
+    check_starts(cube)
+    axis = axis_name(options.parameter)
+    if axis not in cube["status"].dims:
+        raise ValueError(f"{options.parameter} is not an axis of this run; sweep it over both values.")
+    for value in (options.before, options.after):
+        place(cube[axis], value)
+
+
+def overlaps(run: Run, options: OverlapOptions) -> xr.Dataset:
+    """Compute the probability of tipping from each attractor before to each attractor after a jump of a parameter.
+
+    The definition is that of Kaszas, Feudel and Tel (Sci. Rep. 9, 8654, 2019): the overlap of two basins over the
+    first one, with uniform weight on the starts of the run.
+    """
+    found = run.derive("attractors", **options.part(AttractorOptions))
+    axis = axis_name(options.parameter)
+    labels = outcomes(found)
+    whole = found.assign(outcome=labels)
+    part = choose(whole, options.at, (axis, *_start_dims(labels)), "overlaps are those of one parameter point")
+    before, after = (
+        part["outcome"].isel({axis: place(part[axis], value)}).values for value in (options.before, options.after)
+    )
+    first, last, counts = overlap_counts(before, after)
+    total = counts.sum(axis=1, keepdims=True)
+    low, high = binomial_interval(counts, np.broadcast_to(total, counts.shape), confidence=options.confidence)
+    dims = ("before", "after")
+    one = {"units": "1"}
+    return xr.Dataset(
+        {
+            "count": (dims, counts, {**one, "long_name": "starts in both basins"}),
+            "probability": (dims, counts / np.maximum(total, 1), {**one, "long_name": "tipping probability"}),
+            "low": (dims, low, {**one, "long_name": "lower end of the interval"}),
+            "high": (dims, high, {**one, "long_name": "upper end of the interval"}),
+            "n_unknown": ((), int(((before == UNKNOWN) | (after == UNKNOWN)).sum()), one),
+        },
+        coords={
+            "before": ("before", first, {**one, "long_name": "attractor before, -2 diverges"}),
+            "after": ("after", last, {**one, "long_name": "attractor after, -2 diverges"}),
+        },
+        attrs={
+            "parameter": axis,
+            "value_before": options.before,
+            "value_after": options.after,
+            "confidence": options.confidence,
+        },
+    )
+
+
+def _start_dims(labels: xr.DataArray) -> tuple[str, ...]:
+    from pipeline.layout.vocabulary import split_dims
+
+    return split_dims(labels)[1]
+
+
+def overlaps_table(ds: xr.Dataset) -> Table:
+    """Return a row per pair of attractors: starts in both basins, and the tipping probability with its interval."""
+    rows: list[Row] = []
+    for i, j in np.ndindex(ds["count"].shape):
+        one = ds.isel(before=i, after=j)
+        rows.append(
+            {
+                "before": outcome_word(int(one["before"])),
+                "after": outcome_word(int(one["after"])),
+                "count": int(one["count"]),
+                **{name: float(one[name]) for name in ("probability", "low", "high")},
+            }
+        )
+    words = [
+        {
+            "before": row["before"],
+            "after": row["after"],
+            "starts": str(row["count"]),
+            "probability": with_interval(row, ("probability", "low", "high"), ".4f"),
+        }
+        for row in rows
+        if row["count"]
+    ]
+    a = ds.attrs
+    head = f"{a['parameter']} from {a['value_before']:g} to {a['value_after']:g}: probabilities of tipping"
+    lines = [head, *aligned(words)]
+    if n := int(ds["n_unknown"]):
+        lines.append(f"{n} starts have no outcome at one of the two values and are left out")
+    return Table(rows, lines)

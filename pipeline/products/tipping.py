@@ -1,0 +1,81 @@
+"""Declare the analyses of tipping: after parameters have moved, and between two basins."""
+
+from __future__ import annotations
+
+from pipeline.products.attractors import AttractorOptions
+from pipeline.products.product import Analysis, Options, option
+
+_ROOM = "pipeline.analysis.tipping"
+
+
+class TippingOptions(Options):
+    """Options for finding which attractors are reached after parameters have moved."""
+
+    parameter: str = option("", "Swept number along which critical values are bisected; by default the only axis.")
+    settle: int = option(300, "Integration at the final parameters before attractors are told.", unit="periods", ge=1)
+    keep: int = option(64, "Sections kept after that.", ge=16)
+    width: float = option(1e-6, "Width of a critical value's interval, as a part of the axis' range.", gt=0.0, lt=1.0)
+    brackets: int = option(64, "Most critical values that are bisected.", ge=0)
+
+
+class OverlapOptions(AttractorOptions):
+    """Options for tipping probabilities from the overlaps of basins at two parameter values."""
+
+    parameter: str = option("", "Swept parameter; by default the only axis.")
+    before: float = option(..., "Value of the parameter before the change, on its axis.", flag="--from")
+    after: float = option(..., "Value of the parameter after the change, on its axis.", flag="--to")
+    at: dict[str, float] = option({}, "Value of another axis of the run.")
+    confidence: float = option(0.95, "Level of the intervals.", gt=0.0, lt=1.0)
+
+
+class DelayOptions(Options):
+    """Options for finding where trajectories leave an orbit while a parameter moves."""
+
+    moving: str = option("", "Moving parameter; by default the only one.")
+    period: int = option(1, "Period of the orbit that is left.", unit="drive periods", ge=1)
+    distance: float = option(
+        0.01, "Largest distance between sections one period of the orbit apart, in units of the states' scales.", gt=0.0
+    )
+    static: float | None = option(None, "Value of the bifurcation at a parameter that does not move.", unit="SI")
+
+
+TIPPING = Analysis(
+    "tipping",
+    """Find which attractor each trajectory reaches after its parameters have moved, and the critical rates.
+
+    For runs with a table [drift]. Every trajectory is integrated on at the final parameters, where attractors are found
+    as by `attractors`. Where neighbouring values of the swept number lead to different attractors, it is bisected.""",
+    TippingOptions,
+    compute=f"{_ROOM}.product:tipping",
+    table=f"{_ROOM}.table:tipping_table",
+    needs=f"{_ROOM}.product:needs_drift",
+    figure="drift",
+    for_drift=True,
+)
+
+OVERLAPS = Analysis(
+    "overlaps",
+    """Compute tipping probabilities between two parameter values from the overlaps of their basins.
+
+    If the parameter jumps from the first value to the second, a start of the basin i before ends on attractor j
+    after with the fraction of the basin that lies in basin j. Nothing is integrated for it.""",
+    OverlapOptions,
+    compute=f"{_ROOM}.overlaps:overlaps",
+    table=f"{_ROOM}.overlaps:overlaps_table",
+    needs=f"{_ROOM}.overlaps:needs_basins",
+    builds_on=("attractors",),
+)
+
+DELAY = Analysis(
+    "delay",
+    """Find the value of a moving parameter at which trajectories leave a periodic orbit, such as a delayed doubling.
+
+    A trajectory has left an orbit of period p when two of its sections p apart differ by more than a distance. With
+    --static the delay behind the bifurcation at a constant parameter is listed.""",
+    DelayOptions,
+    compute=f"{_ROOM}.delay:delay",
+    table=f"{_ROOM}.delay:delay_table",
+    needs=f"{_ROOM}.delay:needs_sections",
+    figure="drift",
+    for_drift=True,
+)

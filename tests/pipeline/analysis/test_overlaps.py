@@ -1,0 +1,64 @@
+"""Tipping probabilities from overlaps of basins: a toy case on paper, and basins known in closed form."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pipeline.analysis.tipping.overlaps import overlap_counts, overlaps_table
+from pipeline.runs.derive import derive
+from pipeline.runs.run import run
+from pipeline.specification.problems import SpecError
+
+SPEC = """
+kind = "sweep"
+[parameters]
+frequency_hz = 1.0
+[axes]
+a = { values = [0.0, 0.5] }
+[initial_conditions]
+kind = "grid"
+x = { start = -1.975, stop = 1.975, num = 80 }
+[integration]
+n_transient = 20
+n_keep = 20
+[model]
+name = "two-basins"
+states = { x = {} }
+parameters = { a = 0.0 }
+equations = { x = "(x - a)*(1 - x)*(1 + x)" }
+"""
+
+
+def test_overlap_counts__of_the_toy_case_of_attractors_jl():
+    """Attractors.jl, test/basins/tipping_points_tests.jl: a quarter of one basin, the rest another, cut in half."""
+    before = np.ones((20, 20), int)
+    before[:10, :10] = 0
+    after = np.ones((20, 20), int)
+    after[:, 10:] = 2
+    first, last, counts = overlap_counts(before, after)
+    probability = counts / counts.sum(axis=1, keepdims=True)
+    assert (first.tolist(), last.tolist()) == ([0, 1], [1, 2])
+    np.testing.assert_allclose(probability, [[1.0, 0.0], [1 / 3, 2 / 3]])
+
+
+def test_overlap_counts__leaves_out_what_is_not_known():
+    _, _, counts = overlap_counts(np.array([0, 0, -1, -2]), np.array([0, -1, 0, -2]))
+    np.testing.assert_array_equal(counts, [[1, 0], [0, 1]])
+    with pytest.raises(ValueError, match="same starts"):
+        overlap_counts(np.zeros(3), np.zeros(4))
+
+
+def test_overlaps__of_basins_whose_boundary_is_known(tmp_path, write_spec):
+    """x = -1 and x = 1 attract, and a lies between their basins: of the 40 starts above 0, 10 lie below 0.5."""
+    run(write_spec(SPEC), out=tmp_path / "run", workers=0, echo=lambda line: None)
+    ds = derive(tmp_path / "run", "overlaps", {"parameter": "a", "before": 0.0, "after": 0.5})
+    np.testing.assert_array_equal(ds["count"], [[40, 0], [10, 30]])
+    np.testing.assert_allclose(ds["probability"], [[1.0, 0.0], [0.25, 0.75]])
+    assert (ds["low"] <= ds["probability"]).all()
+    assert (ds["probability"] <= ds["high"]).all()
+    table = overlaps_table(ds)
+    assert len(table.rows) == 4
+    assert any("0.2500" in line for line in table.lines)
+    with pytest.raises(SpecError, match=r"a = 0\.7"):
+        derive(tmp_path / "run", "overlaps", {"parameter": "a", "before": 0.0, "after": 0.7})
