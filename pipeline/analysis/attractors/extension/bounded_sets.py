@@ -148,7 +148,7 @@ def ends_of(left: Iterable[Course]) -> dict[int, int]:
 def were_on(course: Course, own: Sequence[Course], settings: Settings) -> bool:
     """Return whether a trajectory, before it left its set, was on the same set as the trajectories `own`."""
     points = np.concatenate([other.stayed for other in own])
-    return bool(mixing(course.stayed, points, settings.geometry, settings.closure) >= OTHER)
+    return bool(mixing(course.stayed, points, settings.geometry, settings.closure, OTHER) >= OTHER)
 
 
 def _verdict(
