@@ -12,6 +12,9 @@ from __future__ import annotations
 BRANCH_RTOL = 1e-12
 """Orbits on branches: residuals go below 1e-10, and differences by a parameter keep six digits."""
 
+CONNECT_RTOL = 1e-10
+"""Orbits that are followed from one parameter value to the next only to see which others they meet."""
+
 VOLUME_RTOL = 1e-11
 """Volumes along the flow: their change must be known better than `PRESERVED_VOLUME`."""
 
@@ -62,6 +65,9 @@ SAME_ORBIT = 1e-7
 
 SAME_ON_BRANCH = 1e-6
 """Distance within which two orbits at one value of a branch's parameter are the same."""
+
+SAME_CONNECTED = 1e-5
+"""The same for branches that are followed at `CONNECT_RTOL`: the error of an orbit rises towards a fold."""
 
 SAME_RETURN = 1e-2
 """Distance within which a return is tried as the period of a limit cycle."""

@@ -88,10 +88,15 @@ def _recurring(section: np.ndarray, max_period: int, geometry: Geometry) -> tupl
     n, k = section.shape[:2]
     longest = min(max_period, k // 2)
     farthest, last = np.full((n, longest + 1), np.inf), np.full((n, longest + 1), np.inf)
+    if longest:
+        last[:, 1:] = geometry.distance(section[:, -1:], section[:, -2 : -2 - longest : -1])
     for p in range(1, longest + 1):
-        half = max((k - p) // 2, 1)
-        lag = geometry.distance(section[:, k - half :], section[:, k - half - p : k - p])
-        farthest[:, p], last[:, p] = lag.max(axis=1), lag[:, -1]
+        # if the last section is not near, the farthest is not
+        rows = np.flatnonzero(last[:, p] <= NEAR)
+        if len(rows):
+            half = max((k - p) // 2, 1)
+            lag = geometry.distance(section[rows, k - half :], section[rows, k - half - p : k - p])
+            farthest[rows, p] = lag.max(axis=1)
     near = farthest <= np.minimum(NEAR, SAME_LAG * farthest.min(axis=1))[:, None]
     period = near.argmax(axis=1)  # 0 where none is near
     return period, last[np.arange(n), period]
