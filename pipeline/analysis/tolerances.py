@@ -53,12 +53,15 @@ LOOSE_SHARE = 0.1
 REACH = 0.3
 """Distance from an orbit within which cells are tested for spiralling in."""
 
-NEAR_RESIDUAL, NEARLY_RESIDUAL = 1e-5, 1e-3
+NEAR_RESIDUAL, NEARLY_RESIDUAL = 1e-7, 1e-3
 """Residual that the first polish is to reach, and the largest with which an orbit is polished further.
 
 Many guesses lead to the same orbit, and only one of them is polished further. Very unstable orbits miss the first
 residual at a loose tolerance.
 """
+
+SAME_HALF = 1e-6
+"""Largest distance of an orbit's section points after a part of its period at which the part is the period."""
 
 SAME_ORBIT = 1e-7
 """Largest distance between two polished orbits that are one, on top of the errors from their residuals."""
