@@ -30,6 +30,9 @@ NEAR_RTOL = 1e-8
 SLOPE_RTOL = 1e-8
 """Derivatives along extended cells: sufficient for exponents."""
 
+ROUGH_SLOPE_RTOL = 1e-6
+"""The same where chaos is plain: sampling leaves a larger error in the exponents."""
+
 WAIT_RTOL = 1e-8
 """Cells that wait for a return: only whether they come near an equilibrium counts."""
 

@@ -42,6 +42,9 @@ NEIGHBOURS, THIN, ON_CURVE = 10, 0.2, 0.95
 GONE = -660.0
 """Logarithm of the growth of a direction or a volume that shrinks to zero."""
 
+CLEAR = 1e-2
+"""Smallest modulus of an exponent and of a change of volumes that an integration at a loose tolerance shows."""
+
 Rates = Callable[[np.ndarray], np.ndarray]
 
 LOST, LOST_ERROR = 1e-6, 1e-3
@@ -82,6 +85,13 @@ class Growth:
         enough.
         """
         return bool(self.low > 0.0 and self.rate * self.length >= GROWN)
+
+    @property
+    def is_clear(self) -> bool:
+        """Whether the set is chaotic and volumes change, both by far more than an integration at a loose tolerance can
+        err.
+        """
+        return bool(self.is_chaotic and self.low > CLEAR and abs(self.volume) > CLEAR)
 
     @property
     def contracts(self) -> bool:
