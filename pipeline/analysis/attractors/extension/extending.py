@@ -206,6 +206,8 @@ class _Extension:
                 self.sets = []
                 return
             in_doubt = yield from self._tell_sets()
+            if not in_doubt and all(one.stability in (ATTRACTS, NEUTRAL) for one in self.sets):
+                self.ran_out = False  # the budget ended, but it was enough
             if not in_doubt or not self.has_budget:
                 return
             target = 2 * max(c.length for c in self.courses if c.goes_on)
