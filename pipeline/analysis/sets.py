@@ -7,6 +7,7 @@ component. Results do not depend on the order of rows, and the work is not quadr
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -51,7 +52,7 @@ class Geometry:
         """Number of state variables."""
         return len(self.scales)
 
-    @property
+    @cached_property
     def circumference(self) -> np.ndarray:
         """Circumference of each angle's circle in units of its scale; 0 for states that are no angles."""
         return np.where(self.is_angle, TWO_PI / np.asarray(self.scales), 0.0)
@@ -79,7 +80,8 @@ class Geometry:
 
     def tree(self, points: np.ndarray) -> cKDTree:
         """Build a nearest-neighbour search tree of states (query it with `scaled` states and ``p=inf``)."""
-        return cKDTree(self.scaled(points), boxsize=self.circumference)
+        # sliding midpoints: trees are asked a few times each, and a balanced one costs more than it saves
+        return cKDTree(self.scaled(points), boxsize=self.circumference, balanced_tree=False, compact_nodes=False)
 
     def boxes(self, points: np.ndarray, side: float) -> np.ndarray:
         """Return the integer coordinates of the box that holds each state; boxes have the side `side` in scaled

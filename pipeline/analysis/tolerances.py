@@ -12,6 +12,9 @@ from __future__ import annotations
 BRANCH_RTOL = 1e-12
 """Orbits on branches: residuals go below 1e-10, and differences by a parameter keep six digits."""
 
+CONNECT_RTOL = 1e-10
+"""Orbits that are followed from one parameter value to the next only to see which others they meet."""
+
 VOLUME_RTOL = 1e-11
 """Volumes along the flow: their change must be known better than `PRESERVED_VOLUME`."""
 
@@ -26,6 +29,9 @@ NEAR_RTOL = 1e-8
 
 SLOPE_RTOL = 1e-8
 """Derivatives along extended cells: sufficient for exponents."""
+
+ROUGH_SLOPE_RTOL = 1e-6
+"""The same where chaos is plain: sampling leaves a larger error in the exponents."""
 
 WAIT_RTOL = 1e-8
 """Cells that wait for a return: only whether they come near an equilibrium counts."""
@@ -50,18 +56,24 @@ LOOSE_SHARE = 0.1
 REACH = 0.3
 """Distance from an orbit within which cells are tested for spiralling in."""
 
-NEAR_RESIDUAL, NEARLY_RESIDUAL = 1e-5, 1e-3
+NEAR_RESIDUAL, NEARLY_RESIDUAL = 1e-7, 1e-3
 """Residual that the first polish is to reach, and the largest with which an orbit is polished further.
 
 Many guesses lead to the same orbit, and only one of them is polished further. Very unstable orbits miss the first
 residual at a loose tolerance.
 """
 
+SAME_HALF = 1e-6
+"""Largest distance of an orbit's section points after a part of its period at which the part is the period."""
+
 SAME_ORBIT = 1e-7
 """Largest distance between two polished orbits that are one, on top of the errors from their residuals."""
 
 SAME_ON_BRANCH = 1e-6
 """Distance within which two orbits at one value of a branch's parameter are the same."""
+
+SAME_CONNECTED = 1e-5
+"""The same for branches that are followed at `CONNECT_RTOL`: the error of an orbit rises towards a fold."""
 
 SAME_RETURN = 1e-2
 """Distance within which a return is tried as the period of a limit cycle."""

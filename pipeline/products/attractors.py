@@ -31,7 +31,7 @@ class IdentifyOptions(Options):
     budget: float = option(
         1.0, "Longest extension at a parameter point, in units of the run's own integration there.", ge=0.0
     )
-    n_sample: int = option(32, "Number of cells in the first sample that is extended.", ge=1)
+    n_sample: int = option(24, "Number of cells in the first sample that is extended.", ge=1)
     lifetime_confidence: float = option(0.95, "Level of the intervals of lifetimes.", gt=0.0, lt=1.0)
 
     @property

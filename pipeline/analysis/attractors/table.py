@@ -23,7 +23,6 @@ from pipeline.analysis.tabular import (
     points_of,
     ranges,
     summary,
-    values,
     with_interval,
     words_of,
 )
@@ -65,14 +64,16 @@ def _rows(ds: xr.Dataset) -> list[Row]:
     fractions = None
     if start_dims and start_dims != ("branch",):
         fractions = basin_fractions(outcomes(ds), dims=start_dims, ids=ds["attractor"].values.tolist())
-    rows = []
+    rows, columns = [], _columns(ds, dims)
+    ids, decided = (ds[n].transpose(*dims, *start_dims).values for n in ("attractor_id", "decision"))
+    kind = ds["kind"].transpose(*dims, "attractor").values
     for at, where in points_of(ds, dims):
-        one = ds.isel(at)
-        cells = one["attractor_id"].values.ravel()
+        index = tuple(at.values())
+        cells = ids[index].ravel()
         decisions = np.zeros((len(words), ds.sizes["attractor"]), np.int64)
-        np.add.at(decisions, (one["decision"].values.ravel()[cells >= 0], cells[cells >= 0]), 1)
-        for i in np.flatnonzero(one["kind"].values > 0):
-            row = {**where, **_attractor(one.isel(attractor=i))}
+        np.add.at(decisions, (decided[index].ravel()[cells >= 0], cells[cells >= 0]), 1)
+        for i in np.flatnonzero(kind[index] > 0).tolist():
+            row = {**where, **{name: column[(*index, i)] for name, column in columns.items()}}
             if fractions is not None:
                 own = fractions.isel(at).sel(label=i)
                 counts = row["stability"] == STABILITIES[ATTRACTS]
@@ -81,20 +82,38 @@ def _rows(ds: xr.Dataset) -> list[Row]:
     return rows
 
 
-def _attractor(one: xr.Dataset) -> Row:
-    row: Row = {"attractor_id": int(one["attractor"])}
-    row |= values(one, "kind", "stability", "evidence", "orbit_period", "period_s", "side")
-    if "rotation" in one:
-        (dim,) = one["rotation"].dims
-        names = one[dim].values if dim in one.coords else range(one.sizes[dim])
-        row |= {f"rotation_{n}": float(v) for n, v in zip(names, one["rotation"].values, strict=True)}
-    largest = np.hypot(one["multiplier_real"].values, one["multiplier_imag"].values)
-    row["multiplier_modulus"] = float(largest[0]) if np.isfinite(largest).any() else np.nan
-    row |= values(one, "multiplier_error", *_NUMBERS, "n_sampled", "n_left", "closes_above")
-    if "eigenvalue_real" in one:
-        row["eigenvalue_real"] = float(one["eigenvalue_real"][0])
-        row["eigenvalue_imag"] = float(np.abs(one["eigenvalue_imag"][0]))
-    return row | values(one, "mirror_partner", "mirror_distance", "n_cells", "match_basis")
+def _columns(ds: xr.Dataset, dims: Sequence[str]) -> dict[str, np.ndarray]:
+    """Return the table's columns, Python objects of shape (*parameter dims, attractor), without the quantities that the
+    model lacks.
+    """
+    found: dict[str, np.ndarray] = {}
+
+    def array_of(name: str) -> np.ndarray:
+        return np.asarray(ds[name].transpose(*dims, "attractor", ...).values)
+
+    def add(*names: str) -> None:
+        for name in names:
+            if name in ds:
+                labelled = "flag_meanings" in ds[name].attrs
+                array = np.array(words_of(ds[name]), object)[array_of(name)] if labelled else array_of(name)
+                found[name] = array.astype(object)
+
+    found["attractor_id"] = np.broadcast_to(ds["attractor"].values.astype(object), array_of("kind").shape)
+    add("kind", "stability", "evidence", "orbit_period", "period_s", "side")
+    if "rotation" in ds:
+        dim = str(ds["rotation"].dims[-1])
+        names = ds[dim].values if dim in ds.coords else range(ds.sizes[dim])
+        parts = np.moveaxis(array_of("rotation").astype(object), -1, 0)
+        found |= {f"rotation_{n}": part for n, part in zip(names, parts, strict=True)}
+    size = np.hypot(array_of("multiplier_real"), array_of("multiplier_imag"))
+    largest = np.where(np.isfinite(size).any(axis=-1), size[..., 0], np.nan)
+    found["multiplier_modulus"] = largest.astype(object)
+    add("multiplier_error", *_NUMBERS, "n_sampled", "n_left", "closes_above")
+    if "eigenvalue_real" in ds:
+        found["eigenvalue_real"] = array_of("eigenvalue_real")[..., 0].astype(object)
+        found["eigenvalue_imag"] = np.abs(array_of("eigenvalue_imag")[..., 0]).astype(object)
+    add("mirror_partner", "mirror_distance", "n_cells", "match_basis")
+    return found
 
 
 def _remarks(ds: xr.Dataset, rows: Sequence[Row]) -> list[str]:

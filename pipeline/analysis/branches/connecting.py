@@ -26,9 +26,9 @@ from pipeline.analysis.branches.arclength import Point, Settings, correct, trace
 from pipeline.analysis.branches.following import first_point, half_orbit, has_halved, opposite
 from pipeline.analysis.branches.lockstep import Steps, run_together
 from pipeline.analysis.branches.problems import Family, OrbitProblem
-from pipeline.analysis.tolerances import SAME_ON_BRANCH
+from pipeline.analysis.tolerances import CONNECT_RTOL, SAME_CONNECTED
 
-CONNECT = Settings(first_step=2e-3, longest_step=0.05, shortest_step=1e-6, max_points=300)
+CONNECT = Settings(first_step=2e-3, longest_step=0.05, shortest_step=1e-6, max_points=300, tolerance=1e-9)
 """Settings with longer steps than for a branch, since no bifurcations are located."""
 
 NEAR = 0.1
@@ -119,7 +119,7 @@ def connect(lines: Sequence[Sequence[Found]], settings: Settings = CONNECT) -> l
         Per line.
     """
     everyone = [one for line in lines for one in line]
-    points = run_together([_tangent(one, settings) for one in everyone])
+    points = run_together([_tangent(one, settings) for one in everyone], rtol=CONNECT_RTOL)
     known = iter(points)
     result: list[Links] = []
     traces: list[tuple[Links, Found, int, Steps[tuple[str, Link | None]]]] = []
@@ -133,7 +133,7 @@ def connect(lines: Sequence[Sequence[Found]], settings: Settings = CONNECT) -> l
                 targets = [] if point is None else _targets(one, line, way, found)
                 if point is not None and targets:
                     traces.append((found, one, way, _follow(one, point, targets, way, settings)))
-    answers = run_together([steps for *_, steps in traces], "connecting orbits")
+    answers = run_together([steps for *_, steps in traces], "connecting orbits", rtol=CONNECT_RTOL)
     for (found, one, way, _), (outcome, link) in zip(traces, answers, strict=True):
         (found.up if way > 0 else found.down)[one.number] = outcome
         if link is not None:
@@ -227,7 +227,7 @@ class _Meeting:
             normal = np.zeros(len(guess))
             normal[-1] = 1.0
             there = yield from correct(OrbitProblem(self.family), guess, normal, self.settings)
-            if there is not None and target.distance(there.u)[0] <= SAME_ON_BRANCH:
+            if there is not None and target.distance(there.u)[0] <= SAME_CONNECTED:
                 self.met = target
                 break
         return True

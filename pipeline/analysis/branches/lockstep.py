@@ -34,11 +34,12 @@ Steps = Generator[Query, Value, T]
 """A computation that returns a `T`."""
 
 
-def run_together(computations: Sequence[Steps[T]], what: str = "") -> list[T]:
+def run_together(computations: Sequence[Steps[T]], what: str = "", rtol: float = BRANCH_RTOL) -> list[T]:
     """Run computations side by side to their ends, and return their results in the given order.
 
     If the work has a name, progress is reported. The length of a trace is unknown before its end, so it
-    counts by the part of the parameter's interval that it has covered, up to nine tenths.
+    counts by the part of the parameter's interval that it has covered, up to nine tenths. `rtol` is the
+    tolerance of the integrations.
     """
     results: list[T | None] = [None] * len(computations)
     waiting: dict[int, Query] = {}
@@ -54,7 +55,7 @@ def run_together(computations: Sequence[Steps[T]], what: str = "") -> list[T]:
         advance(i, None)
     while waiting:
         queries, waiting = waiting, {}
-        for i, value in zip(queries, _evaluate(list(queries.values())), strict=True):
+        for i, value in zip(queries, _evaluate(list(queries.values()), rtol), strict=True):
             advance(i, value)
         if what:
             _report(what, queries, waiting, seen, len(computations))
@@ -78,13 +79,13 @@ def run_alone(computation: Steps[T]) -> T:
     return run_together([computation])[0]
 
 
-def _evaluate(queries: Sequence[Query]) -> list[Value]:
+def _evaluate(queries: Sequence[Query], rtol: float) -> list[Value]:
     values: list[Value | None] = [None] * len(queries)
     while open_ones := [i for i, value in enumerate(values) if value is None]:
         rows = {i: queries[i].problem.rows(queries[i].u) for i in open_ones}
         for chosen in _calls([(i, queries[i].problem.system) for i in open_ones]):
             system = queries[chosen[0]].problem.system
-            for i, ends in zip(chosen, integrated([rows[i] for i in chosen], system), strict=True):
+            for i, ends in zip(chosen, integrated([rows[i] for i in chosen], system, rtol), strict=True):
                 values[i] = queries[i].problem.value(queries[i].u, ends)
     return [value for value in values if value is not None]
 
@@ -96,7 +97,7 @@ def _calls(systems: Sequence[tuple[int, System]]) -> list[list[int]]:
     return list(by_system.values())
 
 
-def integrated(rows: Sequence[Rows], system: System) -> list[Ends]:
+def integrated(rows: Sequence[Rows], system: System, rtol: float = BRANCH_RTOL) -> list[Ends]:
     """Integrate in one call of the engine the trajectories that several computations have requested."""
     if not any(len(r.states) for r in rows):  # equilibria alone
         n = system.n_states
@@ -107,7 +108,7 @@ def integrated(rows: Sequence[Rows], system: System) -> list[Ends]:
         np.concatenate([r.frequency_hz for r in rows]),
         np.concatenate([r.states for r in rows]),
         np.concatenate([np.full(len(r.states), r.period) for r in rows]),
-        rtol=BRANCH_RTOL,
+        rtol=rtol,
         system=system,
     )
     found, first = [], 0

@@ -47,6 +47,17 @@ def test_mixing__circles():
     assert mixing(circle(512, 0.0), circle(512, 0.3, radius=1.1), PLANE) < OTHER
 
 
+@pytest.mark.parametrize("enough", [OTHER, SAME])
+@pytest.mark.parametrize("gap", [0.0, 0.003, 0.01, 0.02, 0.05, 0.2, 5.0])
+def test_mixing__an_early_end_decides_alike(enough, gap):
+    for seed in range(6):
+        pair = henon(512, seed), henon(512, seed + 50, shift=[0.0, gap])
+        whole, early = mixing(*pair, PLANE), mixing(*pair, PLANE, enough=enough)
+        assert (early >= enough) == (whole >= enough)
+        assert early <= whole
+        assert early == whole or early >= enough
+
+
 def test_mixing__cells_that_close_on_one_orbit():
     """Their distances are those of the closing, and say nothing below the closure tolerance."""
     orbit = np.tile(np.array([[0.0, 1.0], [2.0, 3.0]]), (40, 1))

@@ -127,7 +127,7 @@ def test_connect__neighbours_take_no_walk(wells, monkeypatch):
     """Orbits near each other are held against each other's tangent: two evaluations at most for all."""
     calls = []
     evaluate = lockstep._evaluate
-    monkeypatch.setattr(lockstep, "_evaluate", lambda queries: calls.append(1) or evaluate(queries))
+    monkeypatch.setattr(lockstep, "_evaluate", lambda *asked: calls.append(1) or evaluate(*asked))
     values = 0.2 + 0.002 * np.arange(6)
     (found,) = connect([line(*((i, v, wells(1, v)) for i, v in enumerate(values)))])
     assert found.links == [Link(i, i + 1) for i in range(5)]

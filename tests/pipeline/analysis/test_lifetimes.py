@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from pipeline.analysis.attractors.extension.lifetimes import lifetime_interval
 
@@ -19,6 +20,12 @@ def test_lifetime_interval__published_poisson_limits():
     assert high == np.inf
     with pytest.raises(ValueError, match="confidence"):
         lifetime_interval(1, 1.0, 1.0)
+
+
+@pytest.mark.parametrize("n_left", [1, 2, 9, 300])
+def test_lifetime_interval__quantiles_of_chi_squared(n_left):
+    expected = 20.0 / chi2.isf(0.05, 2 * n_left + 2), 20.0 / chi2.ppf(0.05, 2 * n_left)
+    assert lifetime_interval(n_left, 10.0, 0.9) == pytest.approx(expected, rel=1e-12)
 
 
 @pytest.mark.parametrize("lifetime", [0.2, 1.0, 4.0, 20.0, 200.0])

@@ -68,6 +68,27 @@ def test_near_closed__the_period_at_which_sections_lie_nearest():
     assert near_closed(section, 8, PLANE).period.tolist() == [2]
 
 
+def test_recurrence__of_many_periods_as_by_definition():
+    """The shortest period within 1.5 times the least distance over the younger half, where that is below 0.05."""
+    rng, n = np.random.default_rng(3), np.arange(60)
+    turns = rng.choice([0.25, 1 / 3, 0.4, 0.5, 0.618, 1 / 7], (200, 1)) + rng.normal(0.0, 3e-4, (200, 1))
+    size = rng.uniform(0.02, 1.0, (200, 1)) * rng.uniform(0.97, 1.02, (200, 1)) ** n
+    section = np.stack([size * np.cos(2 * np.pi * turns * n), size * np.sin(2 * np.pi * turns * n)], axis=-1)
+    expected = []
+    for path in section:
+        far = []
+        for p in range(1, 17):
+            half = (60 - p) // 2
+            far.append(np.abs(path[60 - half :] - path[60 - half - p : 60 - p]).max())
+        near = [p for p, away in enumerate(far, 1) if away <= min(0.05, 1.5 * min(far))]
+        expected.append(near[0] if near else 0)
+    found = Recurrence.of(section, 16, PLANE)
+    assert found.period.tolist() == expected
+    assert len(set(expected)) >= 6
+    last = [np.abs(path[-1] - path[-1 - p]).max() if p else np.inf for path, p in zip(section, expected, strict=True)]
+    assert found.lag == pytest.approx(last)
+
+
 def test_recurrence__a_rotating_spiral_contracts_to_its_centre():
     """Sections turn by an angle that no short period divides; their mean shows the orbit."""
     n = np.arange(64)

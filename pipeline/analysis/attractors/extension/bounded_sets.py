@@ -13,6 +13,7 @@ from pipeline.analysis.attractors.extension.growth import Growth, growth_of, kin
 from pipeline.analysis.attractors.finding import stability
 from pipeline.analysis.attractors.finding.points import Point
 from pipeline.analysis.attractors.finding.requests import LEG, Settings, Slopes, Work
+from pipeline.analysis.tolerances import ROUGH_SLOPE_RTOL, SLOPE_RTOL
 from pipeline.layout.vocabulary import ATTRACTS, BOUNDED_SET, NEUTRAL, NOT_SETTLED, TRANSIENT
 
 SLOPES = (1024, 4096)
@@ -147,7 +148,7 @@ def ends_of(left: Iterable[Course]) -> dict[int, int]:
 def were_on(course: Course, own: Sequence[Course], settings: Settings) -> bool:
     """Return whether a trajectory that has left a set was on the same set as the trajectories `own`."""
     points = np.concatenate([other.stayed for other in own])
-    return bool(mixing(course.stayed, points, settings.geometry, settings.closure) >= OTHER)
+    return bool(mixing(course.stayed, points, settings.geometry, settings.closure, OTHER) >= OTHER)
 
 
 def _verdict(
@@ -177,15 +178,18 @@ def _growth(own: Sequence[Course], point: Point, settings: Settings, most: int) 
     n = min(n, most // n_cells)
     # use the last sections, when transients are over
     paths = np.stack([course.extension[-n:] for course in own[:n_cells]])
-    before = paths[:, :-1].reshape(-1, n_states)
-    after, slopes = yield Slopes(before)
-    volumes = point.volumes(slopes, before, after).reshape(n_cells, n - 1)
-    derivatives = slopes.reshape(n_cells, n - 1, n_states, n_states)
-    whole = np.isfinite(derivatives).all(axis=(1, 2, 3))
-    if not whole.any():
-        return None
-    scales = np.asarray(settings.geometry.scales)
-    return growth_of(derivatives[whole] * scales / scales[:, None], point.n_neutral, volumes[whole])
+    before, scales = paths[:, :-1].reshape(-1, n_states), np.asarray(settings.geometry.scales)
+    for rtol in (ROUGH_SLOPE_RTOL, SLOPE_RTOL):
+        after, slopes = yield Slopes(before, rtol)
+        volumes = point.volumes(slopes, before, after).reshape(n_cells, n - 1)
+        derivatives = slopes.reshape(n_cells, n - 1, n_states, n_states)
+        whole = np.isfinite(derivatives).all(axis=(1, 2, 3))
+        if not whole.any():
+            return None
+        growth = growth_of(derivatives[whole] * scales / scales[:, None], point.n_neutral, volumes[whole])
+        if growth.is_clear:
+            break
+    return growth
 
 
 def _closes_above(own: Sequence[Course], growth: Growth | None, settings: Settings) -> int:

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -28,6 +29,9 @@ SAME, OTHER = 0.25, 0.05
 MOST_POINTS = 4096
 """Most points per sample in a comparison."""
 
+PARTS = 8
+"""Parts in which points look for their neighbours: a share that is certain to be large enough ends the search."""
+
 INSIDE, REACHED = 0.9, 3.0
 """A cell is on a set if the share `INSIDE` of its points lies within `REACHED` times the set's spacing."""
 
@@ -38,13 +42,16 @@ def thinned(points: np.ndarray, n: int) -> np.ndarray:
     Points are drawn at random with a fixed seed. A regular stride would be wrong: on a set of two pieces that
     alternate, every second point lies on one piece.
     """
-    if len(points) <= n:
-        return points
-    drawn = np.random.default_rng(len(points)).choice(len(points), n, replace=False)
-    return np.asarray(points[np.sort(drawn)])
+    return points if len(points) <= n else np.asarray(points[_drawn(len(points), n)])
 
 
-def mixing(a: np.ndarray, b: np.ndarray, geometry: Geometry, least: float = 0.0) -> float:
+@lru_cache(maxsize=256)
+def _drawn(n_all: int, n: int) -> np.ndarray:
+    """Draw `n` of `n_all` indices with a fixed seed, in rising order."""
+    return np.sort(np.random.default_rng(n_all).choice(n_all, n, replace=False))
+
+
+def mixing(a: np.ndarray, b: np.ndarray, geometry: Geometry, least: float = 0.0, enough: float = np.inf) -> float:
     """Compute how well two samples of section points mix: about 0.5 if both lie on one set, 0 if they lie on distant
     sets.
 
@@ -56,6 +63,9 @@ def mixing(a: np.ndarray, b: np.ndarray, geometry: Geometry, least: float = 0.0)
         Geometry of the states.
     least
         Scaled distances up to this count as 0: two cells that close on one orbit are on one set.
+    enough
+        The count ends once the share is certain to be at least this. The result may then be smaller than the
+        share, but not smaller than `enough`.
 
     Returns
     -------
@@ -66,21 +76,26 @@ def mixing(a: np.ndarray, b: np.ndarray, geometry: Geometry, least: float = 0.0)
     if n < 2:
         return float("nan")
     a, b = thinned(a, 2 * n), thinned(b, 2 * n)
-    return min(_crossing(a, b, n, geometry, least), _crossing(b, a, n, geometry, least))
+    return min(_crossing(a, b, n, geometry, least, enough), _crossing(b, a, n, geometry, least, enough))
 
 
-def _crossing(own: np.ndarray, other: np.ndarray, n: int, geometry: Geometry, least: float) -> float:
+def _crossing(own: np.ndarray, other: np.ndarray, n: int, geometry: Geometry, least: float, enough: float) -> float:
     # take points from the whole duration of the other sample
     trees = [geometry.tree(points) for points in (own[:n], thinned(other, n))]
-    near = [np.maximum(tree.query(geometry.scaled(own[n : 2 * n]), p=np.inf)[0], least) for tree in trees]
-    # a point equally near to both counts half
-    return float((near[1] < near[0]).mean() + 0.5 * (near[1] == near[0]).mean())
+    later, crossed = geometry.scaled(own[n : 2 * n]), 0.0
+    for part in range(PARTS):
+        near = [np.maximum(tree.query(later[part::PARTS], p=np.inf)[0], least) for tree in trees]
+        # a point equally near to both counts half
+        crossed += float((near[1] < near[0]).sum() + 0.5 * (near[1] == near[0]).sum())
+        if crossed >= enough * n:
+            break
+    return crossed / n
 
 
 def is_stationary(path: np.ndarray, geometry: Geometry, least: float = 0.0) -> bool:
     """Return whether the first and the second half of a trajectory visit the same set."""
     half = len(path) // 2
-    share = mixing(path[:half], path[half:], geometry, least)
+    share = mixing(path[:half], path[half:], geometry, least, OTHER)
     return bool(share >= OTHER)
 
 
@@ -106,7 +121,7 @@ def group(samples: Sequence[np.ndarray], geometry: Geometry, least: float = 0.0)
     sets: list[list[int]] = []
     is_sure = True
     for i, sample in enumerate(samples):
-        shares = [mixing(sample, _pooled([samples[k] for k in own]), geometry, least) for own in sets]
+        shares = [mixing(sample, _pooled([samples[k] for k in own]), geometry, least, SAME) for own in sets]
         near = [k for k, share in enumerate(shares) if share >= OTHER]
         is_sure &= not any(OTHER <= share < SAME for share in shares)
         if not near:

@@ -26,7 +26,7 @@ from pipeline.analysis.attractors.extension.courses import AT_REST, DIVERGED, FA
 from pipeline.analysis.attractors.extension.lifetimes import lifetime_interval
 from pipeline.analysis.attractors.finding import stability
 from pipeline.analysis.attractors.finding.assigning import decide
-from pipeline.analysis.attractors.finding.cell_blocks import Block, ClosedCells, Guesses, marks_of
+from pipeline.analysis.attractors.finding.cell_blocks import Block, ClosedCells, Guesses
 from pipeline.analysis.attractors.finding.closed_orbits import Orbit, number_of
 from pipeline.analysis.attractors.finding.equilibria import approaching, rest_near, rest_of_orbit
 from pipeline.analysis.attractors.finding.points import Point
@@ -151,7 +151,7 @@ class _Extension:
         for block in self.point.blocks():
             rows = np.flatnonzero(is_loose[block.cells] & (block.is_bounded | block.is_closed))
             section = block.section[rows]
-            keys, marks = keys_of(section, self.settings.closure, self.geometry), marks_of(section)
+            keys, marks = keys_of(section, self.settings.closure, self.geometry), block.marks[rows]
             for row, key, mark in zip(rows, keys.tolist(), marks.tolist(), strict=True):
                 if key not in known and (key not in best or mark < best[key][0]):
                     step = 0.0 if block.step is None else float(np.nan_to_num(block.step[row]))
@@ -203,6 +203,8 @@ class _Extension:
                 self.sets = []
                 return
             in_doubt = yield from self._tell_sets()
+            if not in_doubt and all(one.stability in (ATTRACTS, NEUTRAL) for one in self.sets):
+                self.ran_out = False  # the budget ended, but it was enough
             if not in_doubt or not self.has_budget:
                 return
             target = 2 * max(c.length for c in self.courses if c.goes_on)

@@ -18,6 +18,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import lapack
 from scipy.special import ndtr, stdtrit
 
 from pipeline.analysis.sets import Geometry
@@ -40,6 +41,9 @@ NEIGHBOURS, THIN, ON_CURVE = 10, 0.2, 0.95
 
 GONE = -660.0
 """Logarithm of the growth of a direction or a volume that shrinks to zero."""
+
+CLEAR = 1e-2
+"""Smallest modulus of an exponent and of a change of volumes that an integration at a loose tolerance shows."""
 
 Rates = Callable[[np.ndarray], np.ndarray]
 
@@ -81,6 +85,13 @@ class Growth:
         large enough.
         """
         return bool(self.low > 0.0 and self.rate * self.length >= GROWN)
+
+    @property
+    def is_clear(self) -> bool:
+        """Whether the set is chaotic and volumes change, both by far more than an integration at a loose tolerance can
+        err.
+        """
+        return bool(self.is_chaotic and self.low > CLEAR and abs(self.volume) > CLEAR)
 
     @property
     def contracts(self) -> bool:
@@ -183,12 +194,17 @@ def volumes_of(
 
 def _logarithms(derivatives: np.ndarray) -> np.ndarray:
     """Compute by QR the logarithmic growth of orthonormal directions at each section point."""
-    basis = np.broadcast_to(np.eye(derivatives.shape[-1]), derivatives[:, 0].shape)
-    grown = np.empty(derivatives.shape[:-1])
-    for i in range(derivatives.shape[1]):
-        basis, r = np.linalg.qr(derivatives[:, i] @ basis)
-        factor = np.abs(np.diagonal(r, axis1=-2, axis2=-1))
-        grown[:, i] = np.log(factor, out=np.full(factor.shape, GONE), where=factor > 1e-286)
+    n_states = derivatives.shape[-1]
+    sizes = np.empty(derivatives.shape[:-1])
+    for path, own in zip(derivatives, sizes, strict=True):
+        basis = np.eye(n_states)
+        for derivative, size in zip(path, own, strict=True):
+            # LAPACK itself: the matrices are so small that a layer above it takes most of the time
+            factors, tau, _, _ = lapack.dgeqrf(derivative @ basis)
+            size[:] = np.diagonal(factors)
+            basis = lapack.dorgqr(factors, tau)[0]
+    sizes = np.abs(sizes)
+    grown = np.log(sizes, out=np.full(sizes.shape, GONE), where=sizes > 1e-286)
     return grown
 
 

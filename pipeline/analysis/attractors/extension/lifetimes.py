@@ -11,7 +11,7 @@ a given time). If none leaves, the one-sided bound is ``T/(-ln a)``, a third of 
 from __future__ import annotations
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri, gammaincinv
 
 
 def lifetime_interval(n_left: int, time_at_risk: float, confidence: float = 0.95) -> tuple[float, float]:
@@ -46,7 +46,15 @@ def lifetime_interval(n_left: int, time_at_risk: float, confidence: float = 0.95
     if not 0.0 < confidence < 1.0:
         raise ValueError(f"confidence = {confidence!r} is out of bounds: it must lie between 0 and 1.")
     if n_left == 0:
-        return 2.0 * time_at_risk / float(chi2.ppf(confidence, 2)), np.inf
+        return 2.0 * time_at_risk / _quantile(confidence, 2), np.inf
     tail = 0.5 * (1.0 - confidence)
-    low = 2.0 * time_at_risk / float(chi2.isf(tail, 2 * n_left + 2))
-    return low, 2.0 * time_at_risk / float(chi2.ppf(tail, 2 * n_left))
+    low = 2.0 * time_at_risk / float(chdtri(2 * n_left + 2, tail))
+    return low, 2.0 * time_at_risk / _quantile(tail, 2 * n_left)
+
+
+def _quantile(share: float, n: int) -> float:
+    """Return the quantile of the chi-squared distribution with `n` degrees of freedom.
+
+    `scipy.stats` has it as well, but its import takes a second.
+    """
+    return 2.0 * float(gammaincinv(0.5 * n, share))

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from scipy.linalg import solve_discrete_lyapunov
@@ -28,8 +30,16 @@ class _Metric:
         """Return a norm in which the return map of an orbit contracts; None if the orbit does not attract, or too
         weakly.
         """
-        matrix = scaled_derivative(orbit, geometry)
-        slow = 0.5 * (1.0 + float(np.abs(orbit.multipliers).max()))
+        return cls._of_matrix(scaled_derivative(orbit, geometry).tobytes(), float(np.abs(orbit.multipliers).max()))
+
+    @classmethod
+    @lru_cache(maxsize=4096)
+    def _of_matrix(cls, entries: bytes, largest: float) -> _Metric | None:
+        """Return the norm for a monodromy matrix with this largest modulus of its eigenvalues; each is asked for
+        often.
+        """
+        flat = np.frombuffer(entries)
+        matrix, slow = flat.reshape(math.isqrt(len(flat)), -1), 0.5 * (1.0 + largest)
         try:
             weight = solve_discrete_lyapunov((matrix / slow).T, np.eye(len(matrix)))
             root = np.linalg.cholesky(0.5 * (weight + weight.T)).T

@@ -28,6 +28,8 @@ class Block:
         Time from the previous section to each [s].
     step : ndarray, (cell,), or None
         Step size that continues each cell bit for bit from its last section [s].
+    known_marks : ndarray of uint64, (cell,), or None
+        Hashes of the cells' sections, if they were computed before.
     """
 
     cells: slice
@@ -38,12 +40,20 @@ class Block:
     rest: np.ndarray | None = None
     seconds: np.ndarray | None = None
     step: np.ndarray | None = None
+    known_marks: np.ndarray | None = None
 
     def take(self, rows: np.ndarray) -> Block:
         """Return a block of the cells at the given indices. Its attribute `cells` is still the range of the whole
         block.
         """
-        return Block(self.cells, self.section[rows], self.status[rows], self.orbit_period[rows], self.turns[rows])
+        marks = None if self.known_marks is None else self.known_marks[rows]
+        section, status, period = self.section[rows], self.status[rows], self.orbit_period[rows]
+        return Block(self.cells, section, status, period, self.turns[rows], known_marks=marks)
+
+    @cached_property
+    def marks(self) -> np.ndarray:
+        """Hash of each cell's section points."""
+        return marks_of(self.section) if self.known_marks is None else self.known_marks
 
     @cached_property
     def is_closed(self) -> np.ndarray:
@@ -158,7 +168,7 @@ class ClosedCells:
             found = Guesses(
                 keys[:, -1],
                 self.geometry.distance(last, back),
-                hashes(section.reshape(len(cells), -1)),
+                block.marks[cells],
                 last,
                 np.full(len(cells), int(p), np.int64),
             )

@@ -25,6 +25,7 @@ from pipeline.analysis.tolerances import (
     NEAR_RTOL,
     NEARLY_RESIDUAL,
     PLACE_ERROR,
+    SAME_HALF,
     SAME_ORBIT,
 )
 from pipeline.layout.vocabulary import ATTRACTS, NEUTRAL, NOT_SETTLED
@@ -130,6 +131,7 @@ def polish(
     geometry: Geometry,
     system: System,
     tolerance: float,
+    known: dict[bytes, Orbit | None] | None = None,
 ) -> list[Orbit | None]:
     """Refine many guesses of closed orbits by Newton's method in one call; each guess can have its own parameters.
 
@@ -141,6 +143,9 @@ def polish(
         Geometry of the states, and the system to integrate.
     tolerance
         Scaled residual to reach.
+    known
+        Results of earlier calls with the same system and tolerance; this call adds its own. Guesses that lead
+        to an orbit of an earlier call are not polished again.
 
     Returns
     -------
@@ -150,6 +155,7 @@ def polish(
     """
     if not len(points):
         return []
+    known = {} if known is None else known
     near = polish_orbits(
         packed,
         frequency,
@@ -161,29 +167,40 @@ def polish(
         least_period=False,
         system=system,
     )
-    first = near.section.copy()
+    first, periods = near.section.copy(), near.orbit_period.copy()
     for row in np.flatnonzero(near.converged):
-        first[row] = _rolled(near.points[row, : near.orbit_period[row]], geometry)[0]
+        own = near.points[row, : periods[row]]
+        periods[row] = _least_period(own, geometry)
+        first[row] = _rolled(own[: periods[row]], geometry)[0]
     # very unstable orbits miss NEAR_RESIDUAL at the loose tolerance: keep them up to NEARLY_RESIDUAL and polish on
     good = np.flatnonzero(near.residual <= NEARLY_RESIDUAL)
     rounded = rounded_points(first[good], geometry)
-    key = np.column_stack([packed[good], frequency[good], near.orbit_period[good], rounded])
-    _, once, place = np.unique(key, axis=0, return_index=True, return_inverse=True)
-    rows = good[once]
+    rows = np.column_stack([packed[good], frequency[good], periods[good], rounded])
+    keys = [row.tobytes() for row in rows]
+    new = {key: i for i, key in reversed(list(enumerate(keys))) if key not in known}
+    once = np.array(sorted(new.values()), np.int64)
     # start from the rounded point, so that an orbit does not depend on which guess came first
     orbits = _polished(
-        packed[rows],
-        frequency[rows],
+        packed[good[once]],
+        frequency[good[once]],
         rounded[once] * np.asarray(geometry.scales),
-        near.orbit_period[rows],
+        periods[good[once]],
         geometry,
         system,
         tolerance,
     )
+    known.update(zip([keys[i] for i in once], orbits, strict=True))
     found: list[Orbit | None] = [None] * len(points)
-    for i, k in zip(good, place.ravel(), strict=True):
-        found[i] = orbits[k]
+    for i, key in zip(good, keys, strict=True):
+        found[i] = known[key]
     return found
+
+
+def _least_period(points: np.ndarray, geometry: Geometry) -> int:
+    """Return the smallest divisor of an orbit's period after which its section points (period, state) repeat."""
+    period = len(points)
+    back = geometry.distance(points, points[0])
+    return next(q for q in range(1, period + 1) if period % q == 0 and (q == period or back[q] <= SAME_HALF))
 
 
 def _polished(

@@ -16,13 +16,16 @@ from magpend_core.orbits import crossed_state
 from magpend_core.pointwise import rates_at
 from magpend_core.status import Status
 from pipeline.analysis.attractors.extension.growth import volumes_of
-from pipeline.analysis.attractors.finding.cell_blocks import Block
+from pipeline.analysis.attractors.finding.cell_blocks import Block, marks_of
 from pipeline.analysis.attractors.finding.known_sets import Cycle, Equilibrium
 from pipeline.analysis.sets import Geometry
 from pipeline.layout.vocabulary import FREQUENCY_DIM, frequency_of, model_of, parameters_of, split_dims
 
 _READ = ("section", "status", "orbit_period", "turns", "rest_state", "return_time", "n_periods", "step_size")
 """Variables that are read from a cube."""
+
+_MARK = "mark"
+"""Hashes of the cells' sections beside these variables: many short rows are hashed at the price of a few."""
 
 BUDGET = 256 * 2**20
 """Most memory for sections held at once [bytes]."""
@@ -216,7 +219,8 @@ class Point:
         else:
             seconds = np.full(section.shape[:2], 1.0 / self.frequency)
         step = values("step_size") if "step_size" in part else None
-        return Block(cells, section, values("status"), values("orbit_period"), turns, rest, seconds, step)
+        marks = values(_MARK) if _MARK in part else None
+        return Block(cells, section, values("status"), values("orbit_period"), turns, rest, seconds, step, marks)
 
 
 def slabs(ds: xr.Dataset, dynamics: Dynamics, budget: int) -> Iterator[dict[tuple[int, ...], Point]]:
@@ -234,6 +238,10 @@ def slabs(ds: xr.Dataset, dynamics: Dynamics, budget: int) -> Iterator[dict[tupl
         slab = cube.isel({dims[0]: slice(begin, begin + rows)}) if dims else cube
         if slab["section"].size * 8 <= budget:
             slab = slab.load()
+            ordered = slab["section"].transpose(*dims, *start_dims, "period_index", "state")
+            flat = ordered.values.astype(np.float64, copy=False)
+            marks = marks_of(flat.reshape(-1, *flat.shape[-2:])).reshape(flat.shape[:-2])
+            slab = slab.assign({_MARK: ((*dims, *start_dims), marks)})
         points = {}
         for local in np.ndindex(*(slab.sizes[d] for d in dims)):
             index = (local[0] + begin, *local[1:]) if dims else ()

@@ -7,7 +7,7 @@ so that their trajectories fill the engine's lanes together.
 from __future__ import annotations
 
 from collections.abc import Generator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -114,6 +114,8 @@ class Settings:
         Integration method of the run, also used for legs.
     geometry : Geometry
         Geometry of the states.
+    known : dict
+        Orbits that were polished before, see `closed_orbits.polish`.
     """
 
     rtol: float
@@ -126,6 +128,7 @@ class Settings:
     system: System | None
     method: str
     geometry: Geometry
+    known: dict[bytes, Orbit | None] = field(default_factory=dict, compare=False, repr=False)
 
     @classmethod
     def of(cls, ds: xr.Dataset, system: System | None, geometry: Geometry, **asked: Any) -> Settings:
@@ -245,6 +248,7 @@ def _polished(
         geometry=settings.geometry,
         system=settings.system,
         tolerance=settings.residual,
+        known=settings.known,
     )
     found = [polished[i] if i >= 0 else None for i in place]
     return {index: found[own] for index, own in _slices(asked, sizes, ends)}

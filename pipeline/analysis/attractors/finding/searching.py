@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.analysis.attractors.finding.assigning import decide
-from pipeline.analysis.attractors.finding.cell_blocks import ClosedCells, Guesses, marks_of
+from pipeline.analysis.attractors.finding.cell_blocks import ClosedCells, Guesses
 from pipeline.analysis.attractors.finding.closed_orbits import Orbit, distinct, number_of
 from pipeline.analysis.attractors.finding.equilibria import rest_of_orbit
 from pipeline.analysis.attractors.finding.points import Dynamics, Point
@@ -140,10 +140,8 @@ def _closed_undecided(point: Point, orbits: Sequence[Orbit], search: Search) -> 
     for block in point.blocks():
         label, _ = decide(block, orbits, search.tolerance, search.geometry)
         rest = np.flatnonzero(block.is_closed & (label < 0))
-        section = block.section[rest]
-        marks = marks_of(section)
-        zero = np.zeros(len(rest))
-        own = Guesses(marks, zero, marks, section[:, -1], zero.astype(np.int64))
+        marks, zero = block.marks[rest], np.zeros(len(rest))
+        own = Guesses(marks, zero, marks, block.section[rest, -1], zero.astype(np.int64))
         found = found.joined(own)
     return found
 
@@ -157,7 +155,7 @@ def _undecided(point: Point, orbits: Sequence[Orbit], search: Search) -> Guesses
         rest = np.flatnonzero(label < 0)
         closed.add(block.take(rest))
         loose = rest[block.is_bounded[rest]]
-        near = near.joined(near_closed(block.section[loose], search.longest, search.geometry))
+        near = near.joined(near_closed(block.section[loose], search.longest, search.geometry, block.marks[loose]))
     keys, group = closed.close()
     own = closed.guesses.best(group[np.searchsorted(keys, closed.guesses.key)].astype(np.uint64))
     if search.is_loose:

@@ -88,10 +88,15 @@ def _recurring(section: np.ndarray, max_period: int, geometry: Geometry) -> tupl
     n, k = section.shape[:2]
     longest = min(max_period, k // 2)
     farthest, last = np.full((n, longest + 1), np.inf), np.full((n, longest + 1), np.inf)
+    if longest:
+        last[:, 1:] = geometry.distance(section[:, -1:], section[:, -2 : -2 - longest : -1])
     for p in range(1, longest + 1):
-        half = max((k - p) // 2, 1)
-        lag = geometry.distance(section[:, k - half :], section[:, k - half - p : k - p])
-        farthest[:, p], last[:, p] = lag.max(axis=1), lag[:, -1]
+        # if the last section is not near, the farthest is not
+        rows = np.flatnonzero(last[:, p] <= NEAR)
+        if len(rows):
+            half = max((k - p) // 2, 1)
+            lag = geometry.distance(section[rows, k - half :], section[rows, k - half - p : k - p])
+            farthest[rows, p] = lag.max(axis=1)
     near = farthest <= np.minimum(NEAR, SAME_LAG * farthest.min(axis=1))[:, None]
     period = near.argmax(axis=1)  # 0 where none is near
     return period, last[np.arange(n), period]
@@ -116,25 +121,37 @@ def _contracting(section: np.ndarray, max_period: int, geometry: Geometry) -> tu
     return period, centre
 
 
-def near_closed(section: np.ndarray, max_period: int, geometry: Geometry, closing_only: bool = False) -> Guesses:
+def near_closed(
+    section: np.ndarray,
+    max_period: int,
+    geometry: Geometry,
+    marks: np.ndarray | None = None,
+    *,
+    closing_only: bool = False,
+) -> Guesses:
     """Make guesses of orbits from cells whose section points recur without closing; keep one guess per box of the
     section.
 
     Each cell gives its last section with the period of recurrence and, if its sections contract, the mean of
     the last section's phase. Cells whose sections recur at falling distances guess at every period, unlike
-    chaos that merely passes an orbit; others up to the period `CHEAP`, unless `closing_only`.
+    chaos that merely passes an orbit; others up to the period `CHEAP`, unless `closing_only`. `marks` are the
+    hashes of the cells' sections, if they are known.
     """
     found = Recurrence.of(section, max_period, geometry)
     closes = _closes_in(section, found, geometry)
     worth = (found.period > 0) & (closes if closing_only else closes | (found.period <= CHEAP))
     recurring, contracting = np.flatnonzero(worth), np.flatnonzero(found.centred)
+    if marks is None:
+        marks = np.zeros(len(section), np.uint64)
+        either = np.flatnonzero(worth | (found.centred > 0))
+        marks[either] = marks_of(section[either])
     spirals = _guesses(
-        found.period[recurring], found.lag[recurring], marks_of(section[recurring]), section[recurring, -1], geometry
+        found.period[recurring], found.lag[recurring], marks[recurring], section[recurring, -1], geometry
     )
     # rank means after recurring sections, since a mean is not a section
-    centre, marks = found.centre[contracting], marks_of(section[contracting])
+    centre = found.centre[contracting]
     away = geometry.distance(centre, section[contracting, -1]) + NEAR
-    return spirals.joined(_guesses(found.centred[contracting], away, marks, centre, geometry))
+    return spirals.joined(_guesses(found.centred[contracting], away, marks[contracting], centre, geometry))
 
 
 def _closes_in(section: np.ndarray, found: Recurrence, geometry: Geometry) -> np.ndarray:
