@@ -36,9 +36,16 @@ class EdgeOptions(AttractorOptions):
     at: dict[str, float] = option({}, "Value of an axis of the run, for the parameter point.")
     between: tuple[str, str] = option(..., "The two attractors: their letters or ids in the table of attractors.")
     pairs: int = option(4, "Pairs of initial states that are tracked.", ge=1)
-    closest: float = option(1e-8, "Scaled distance to which a pair is bisected.", gt=0.0)
+    closest: float = option(1e-8, "Scaled distance to which a pair is bisected.", ge=1e-12)
     farthest: float = option(1e-4, "Scaled distance beyond which a pair is bisected again.", gt=0.0)
-    returns: int = option(400, "Most drive periods or returns for which a pair is tracked.", ge=16)
+    max_period: int = option(
+        1,
+        "Longest period of the orbits that are sought on a path that does not settle; 0 seeks none.",
+        unit="drive periods or returns",
+        ge=0,
+        flag="--period",
+    )
+    returns: int = option(200, "Most drive periods or returns for which a pair is tracked.", ge=16)
     seed: int = option(0, "Seed that chooses the pairs.", ge=0)
 
 

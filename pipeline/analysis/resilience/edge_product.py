@@ -13,7 +13,7 @@ variable                         meaning
 ``multiplier_real``, ``_imag``   Floquet multipliers of an orbit, by falling modulus
 ``eigenvalue_real``, ``_imag``   eigenvalues of an equilibrium [1/s], by falling real part
 ``residual``                     scaled residual of Newton's method; NaN of a bounded set
-``n_pairs``                      pairs that lead to it
+``n_pairs``                      pairs that lead to it; 0 of an orbit on a path that does not settle
 ``pair_edge``, ``pair_reason``   edge state of each pair, -1 none, and why it has none
 ``pair_start``                   the two initial states of each pair
 ``path``, ``n_steps``            middle of the pair at successive sections
@@ -36,6 +36,7 @@ from pipeline.analysis.attractors.finding.known_sets import Equilibrium
 from pipeline.analysis.attractors.finding.points import BUDGET, Dynamics, slabs
 from pipeline.analysis.basins.basins import check_starts
 from pipeline.analysis.outcomes import outcomes
+from pipeline.analysis.resilience.edge_orbits import orbits_on
 from pipeline.analysis.resilience.edge_tracking import REASONS, Limits, Pair, Tracking, nearest_pairs
 from pipeline.analysis.resilience.product import start_states
 from pipeline.analysis.run import Run
@@ -55,6 +56,9 @@ from pipeline.layout.vocabulary import (
 )
 from pipeline.products.attractors import AttractorOptions
 from pipeline.products.resilience import EdgeOptions
+
+CANDIDATES = 4
+"""Pairs that are bisected for each that is tracked: between some of them a third basin lies."""
 
 PURPOSE = "edge states are tracked at one parameter point"
 
@@ -94,11 +98,17 @@ def edge(run: Run, options: EdgeOptions) -> xr.Dataset:
     if untold:
         raise ValueError(f"trajectories cannot be told to end on attractor {untold[0]}; track between two others.")
     labels = outcomes(here).transpose(*starts).values.ravel()
-    pairs = nearest_pairs(start_states(cube, starts), labels, between, options.pairs, there, options.seed)
-    initial = np.array([pair.ends for pair in pairs]).reshape(len(pairs), 2, -1)
+    states = start_states(cube, starts)
+    candidates = nearest_pairs(states, labels, between, CANDIDATES * options.pairs, there, options.seed)
     limits = Limits(options.closest, options.farthest, options.returns, options.max_orbit_period)
-    Tracking(there, between, limits).run(pairs)
-    return _dataset(run, there, between, pairs, initial, here)
+    tracking = Tracking(there, between, limits)
+    pairs = tracking.choose(candidates, options.pairs)
+    initial = np.array([pair.start for pair in pairs]).reshape(len(pairs), 2, -1)
+    tracking.run(pairs)
+    settled = all(isinstance(pair.found, Orbit | Equilibrium) for pair in pairs)
+    paths = [np.array(pair.path) for pair in pairs if len(pair.path) > options.max_period]
+    on_paths = [] if settled else orbits_on(paths, there, between, options.max_period)
+    return _dataset(run, there, between, pairs, on_paths, initial, here)
 
 
 def _ids_of(here: xr.Dataset, names: tuple[str, str]) -> tuple[int, int]:
@@ -138,9 +148,17 @@ def _distinct(pairs: list[Pair], geometry: Geometry, least: float) -> tuple[list
 
 
 def _dataset(
-    run: Run, there: Destinations, between: tuple[int, int], pairs: list[Pair], initial: np.ndarray, here: xr.Dataset
+    run: Run,
+    there: Destinations,
+    between: tuple[int, int],
+    pairs: list[Pair],
+    on_paths: list[Orbit],
+    initial: np.ndarray,
+    here: xr.Dataset,
 ) -> xr.Dataset:
     found, edge_of = _distinct(pairs, there.geometry, there.settings.closure)
+    tracked = [one for one in found if isinstance(one, Orbit)]
+    found += [one for one in on_paths if number_of(one, tracked, there.geometry) == len(tracked)]
     n_states = there.geometry.n_states
     points = [_points_of(one) for one in found]
     section = np.full((len(found), max((len(p) for p in points), default=0), n_states), np.nan)

@@ -28,7 +28,7 @@ def edge_table(ds: xr.Dataset) -> Table:
 _SENTENCES = {
     "third_attractor": "another basin lies between the two; start closer to their common boundary with a finer grid",
     "undecided": "states between the two end on no known attractor; a larger --budget may decide",
-    "lost": "the pair diverged, or did not return to the section",
+    "lost": "the pair diverged, did not return to the section, or left the boundary; a smaller --farthest may help",
     "not_settled": "its path has not come to a set that repeats itself; give more --returns",
 }
 
@@ -65,7 +65,7 @@ def _words(one: xr.Dataset) -> Words:
     return {
         "kind": plain(words_of(one["kind"])[kind]),
         "period": str(int(one["orbit_period"])) if kind == PERIODIC_ORBIT else "-",
-        "pairs": str(int(one["n_pairs"])),
+        "found by": counted(int(one["n_pairs"]), "pair") if int(one["n_pairs"]) else "on a path",
         "first section point": point if kind != EQUILIBRIUM else f"at {point}",
         name or "multipliers": values or "-",
     }

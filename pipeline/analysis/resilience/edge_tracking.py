@@ -21,6 +21,7 @@ from pipeline.analysis.attractors.finding.closed_orbits import Orbit, polish
 from pipeline.analysis.attractors.finding.equilibria import equilibria_near
 from pipeline.analysis.attractors.finding.known_sets import Equilibrium
 from pipeline.analysis.attractors.finding.requests import LEG
+from pipeline.analysis.resilience.edge_orbits import n_unstable
 from pipeline.products.reporting import report
 
 REASONS = ("none", "third_attractor", "undecided", "lost", "not_settled")
@@ -63,8 +64,10 @@ class Pair:
 
     Attributes
     ----------
+    start : ndarray, (2, state)
+        The two initial states.
     ends : ndarray, (2, state)
-        The two states.
+        The two states now.
     path : list of ndarray
         Middle of the pair at each section after the first bisection.
     found : Orbit, Equilibrium, ndarray or None
@@ -73,6 +76,7 @@ class Pair:
         Index into `REASONS`.
     """
 
+    start: np.ndarray
     ends: np.ndarray
     path: list[np.ndarray] = field(default_factory=list)
     found: Orbit | Equilibrium | np.ndarray | None = None
@@ -101,12 +105,14 @@ class Tracking:
         self._there, self._between, self._limits = there, between, limits
         self._geometry = there.geometry
 
+    def choose(self, candidates: Sequence[Pair], n: int) -> list[Pair]:
+        """Bisect candidates; return `n` of them, those with a common boundary of the two basins first."""
+        self._bisect(candidates)
+        return sorted(candidates, key=lambda pair: not pair.goes_on)[:n]
+
     def run(self, pairs: Sequence[Pair]) -> None:
-        """Track pairs until each has an edge state, or a reason why it has none, in place."""
-        self._bisect(pairs)
-        for pair in pairs:
-            if pair.goes_on:
-                pair.path.append(self._middle(pair))
+        """Track bisected pairs until each has an edge state, or a reason why it has none, in place."""
+        self._note(pairs)
         for n in range(1, self._limits.returns + 1):
             going = [pair for pair in pairs if pair.goes_on]
             report("tracking edge states", n, self._limits.returns)
@@ -114,10 +120,8 @@ class Tracking:
                 break
             before = [self._width(pair) for pair in going]
             self._advance(going)
-            self._bisect([p for p, width in zip(going, before, strict=True) if p.goes_on and self._is_wide(p, width)])
-            for pair in going:
-                if pair.goes_on:
-                    pair.path.append(self._middle(pair))
+            self._bisect([p for p, width in zip(going, before, strict=True) if p.goes_on and self._is_due(p, width)])
+            self._note(going)
             for pair in going:
                 if pair.goes_on:
                     self._settle(pair)
@@ -125,18 +129,24 @@ class Tracking:
             if pair.goes_on:
                 self._as_set(pair)
 
+    def _note(self, pairs: Sequence[Pair]) -> None:
+        """Add the middle of each pair to its path."""
+        for pair in pairs:
+            if pair.goes_on:
+                pair.path.append(self._between_ends(pair, np.array([0.5]))[0])
+
     # ---- pairs ---------------------------------------------------------------------------------
 
     def _width(self, pair: Pair) -> float:
         return float(self._geometry.distance(pair.ends[0], pair.ends[1]))
 
-    def _is_wide(self, pair: Pair, before: float) -> bool:
-        """Return whether a pair would be too wide after one more section, if it grows as it did from `before`."""
+    def _is_due(self, pair: Pair, before: float) -> bool:
+        """Return whether a pair is to be bisected: too wide after one more section, if it grows as it did from
+        `before`, or so close that it lies in one basin.
+        """
         width = self._width(pair)
-        return width * max(width / before, 1.0) > self._limits.farthest
-
-    def _middle(self, pair: Pair) -> np.ndarray:
-        return self._between_ends(pair, np.array([0.5]))[0]
+        grown = width * max(width / before, 1.0)
+        return grown > self._limits.farthest or width < 1e-2 * self._limits.closest
 
     def _between_ends(self, pair: Pair, shares: np.ndarray) -> np.ndarray:
         """Return the states at shares of the segment from one end of a pair to the other."""
@@ -150,7 +160,7 @@ class Tracking:
         last = found.final_state[:, 0].reshape(len(pairs), 2, -1)
         status = found.status[:, 0].reshape(len(pairs), 2)
         for pair, own, end, codes in zip(pairs, states, last, status, strict=True):
-            if np.isin(codes, (Status.PERIODIC, Status.BOUNDED)).all():
+            if np.isin(codes, (Status.PERIODIC, Status.BOUNDED)).all() and (own[0] != own[1]).any():
                 pair.ends = own
                 continue
             pair.reason = LOST
@@ -162,36 +172,42 @@ class Tracking:
     def _bisect(self, pairs: Sequence[Pair]) -> None:
         """Divide the segments between pairs until their states are close, in place."""
         shares = np.arange(PARTS + 1) / PARTS
+        due = {id(pair) for pair in pairs}
         for _ in range(MOST_DIVISIONS):
-            going = [p for p in pairs if p.goes_on and self._width(p) > self._limits.closest]
+            going = [p for p in pairs if p.goes_on and (id(p) in due or self._width(p) > self._limits.closest)]
             if not going:
                 return
             states = np.stack([self._between_ends(pair, shares) for pair in going])
-            inner = states[:, 1:-1].reshape(-1, states.shape[2])
-            labels = self._there.follow(inner).label.reshape(len(going), PARTS - 1)
+            labels = self._there.follow(states.reshape(-1, states.shape[2])).label.reshape(len(going), -1)
             for pair, own, label in zip(going, states, labels, strict=True):
-                self._take(pair, own, np.array([self._between[0], *label, self._between[1]]))
+                if self._take(pair, own, label):
+                    due.discard(id(pair))
         for pair in pairs:
-            if pair.goes_on and self._width(pair) > self._limits.farthest:
+            if pair.goes_on and (id(pair) in due or self._width(pair) > self._limits.farthest):
                 pair.reason = UNKNOWN
 
-    def _take(self, pair: Pair, states: np.ndarray, label: np.ndarray) -> None:
-        """Replace a pair by the closest two states of the two basins that have no third attractor between them."""
-        known = np.flatnonzero(label != UNDECIDED)
-        steps = [
-            (int(j - i), int(i), int(j))
-            for i, j in zip(known[:-1], known[1:], strict=True)
-            if {int(label[i]), int(label[j])} == set(self._between)
-        ]
-        if not steps:
-            pair.reason = THIRD
-            return
-        length, i, j = min(steps)
+    def _take(self, pair: Pair, states: np.ndarray, label: np.ndarray) -> bool:
+        """Replace a pair by the two closest states of the two basins, with no third basin between them if possible.
+
+        A pair that has left one of the two basins is widened. Return whether it has both.
+        """
+        first, second = (np.flatnonzero(label == number) for number in self._between)
+        if not len(first) or not len(second):
+            pair.ends = self._between_ends(pair, np.array([-1.0, 2.0]))
+            if not self._width(pair) <= CLOSE * self._limits.farthest:
+                pair.reason = LOST
+            return False
+        steps = []
+        for i in first.tolist():
+            for j in second.tolist():
+                inside = label[min(i, j) + 1 : max(i, j)]
+                steps.append((bool((inside != UNDECIDED).any()), abs(i - j), i, j))
+        has_third, length, i, j = min(steps)
         if length == PARTS:
-            pair.reason = UNKNOWN
-            return
-        order = (i, j) if label[i] == self._between[0] else (j, i)
-        pair.ends = states[list(order)]
+            pair.reason = THIRD if has_third else UNKNOWN
+            return False
+        pair.ends = states[[i, j]]
+        return True
 
     # ---- edge states ---------------------------------------------------------------------------
 
@@ -219,7 +235,7 @@ class Tracking:
             system=point.integrates,
             tolerance=self._there.settings.residual,
         )[0]
-        if orbit is None or (np.abs(orbit.multipliers) > 1.0 + orbit.multiplier_error).sum() != 1:
+        if orbit is None or n_unstable(orbit) != 1:
             return
         if self._geometry.distance(orbit.points, path[-1]).min() <= near:
             pair.found = orbit
@@ -268,6 +284,7 @@ def nearest_pairs(
     away, nearest = geometry.tree(first).query(geometry.scaled(second), p=np.inf)
     closer = np.argsort(away, kind="stable")[: max(len(away) // 2, 1)]
     chosen = np.random.default_rng(seed).permutation(closer)[:n]
-    return [Pair(np.stack([first[nearest[k]], second[k]])) for k in np.sort(chosen)]
+    starts = [np.stack([first[nearest[k]], second[k]]) for k in chosen]
+    return [Pair(start, start) for start in starts]
 
 
