@@ -171,8 +171,9 @@ def answer(asked: Mapping[str, Asked], shocked: Shocked, scales: np.ndarray, wha
     """
     labels: dict[str, np.ndarray | None] = dict.fromkeys(asked)
     results: dict[str, F] = {}
+    n_followed = 0
     while labels:
-        report(what, len(results), len(asked))
+        report(what, n_followed, 0)
         trials: dict[str, Trials] = {}
         for key, label in labels.items():
             try:
@@ -183,9 +184,9 @@ def answer(asked: Mapping[str, Asked], shocked: Shocked, scales: np.ndarray, wha
             break
         states, phase = zip(*(_states(trial, asked[key], scales) for key, trial in trials.items()), strict=True)
         found = shocked.labels(np.concatenate(states), np.concatenate(phase))
+        n_followed += len(found)
         ends = np.cumsum([len(trial.base) for trial in trials.values()])[:-1]
         labels = dict(zip(trials, np.split(found, ends), strict=True))
-    report(what, len(results), len(asked))
     return results
 
 

@@ -138,7 +138,7 @@ class _Point:
             asked[f"{number} any"] = self._search(number, at_section, every, seeds)
             for i in every:
                 asked[f"{number} {i}"] = self._search(number, at_section, np.array([i]))
-        found = answer(asked, Shocked(self._there), self._scales, "searching critical shocks")
+        found = answer(asked, Shocked(self._there), self._scales, "trajectories after shocks")
         keys = {key: key.split() for key in found}
         return {(int(n), what): (found[key], asked[key].bases) for key, (n, what) in keys.items()}
 

@@ -129,8 +129,8 @@ class Found:
     Attributes
     ----------
     low, high : float
-        Scaled size: every smaller shock that was tried stayed below `low`, and the shock of size `high` leads
-        away; infinite if none was found.
+        Scaled sizes. Every shock smaller than `low` that was tried stayed. The shock of size `high` leads away;
+        infinite if none was found. The ends of some shocks between them are not known.
     shock : ndarray, (dim,)
         The shock of size `high`; NaN if none was found.
     base : int
@@ -368,7 +368,7 @@ class ShockSearch:
         size, code = self._tried()
         high = float(best.high[0])
         unknown = (code == -1) & (size < high)
-        low = min([float(best.low[0]), *size[unknown].tolist()])
+        low = float(size[unknown].min()) if unknown.any() else float(best.low[0])
         shock = high * best.unit[0]
         return self._found(low, high, shock, int(best.base[0]), int(best.label[0]))
 
