@@ -23,11 +23,7 @@ _LOOK: dict[str, Any] = {"linewidth": 0.9, "markersize": 4.0, "capsize": 2.0, "e
 
 
 def plot_resilience(
-    ds: xr.Dataset,
-    attractors: xr.Dataset,
-    *,
-    at: Mapping[str, float] | None = None,
-    frame: style.Frame = style.WIDE,
+    ds: xr.Dataset, attractors: xr.Dataset, *, at: Mapping[str, float] | None = None, frame: style.Frame = style.WIDE
 ) -> style.DataFigure:
     """Draw how attractors respond to shocks, in three panels: basin stability, smallest shocks, arrival times.
 

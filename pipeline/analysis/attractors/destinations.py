@@ -354,4 +354,3 @@ def destinations_at(
     for index, point in points.items():
         here = attractors.isel(dict(zip(dims, index, strict=True)))
         yield index, Destinations(point, here, settings, options)
-

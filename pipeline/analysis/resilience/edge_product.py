@@ -68,7 +68,8 @@ def needs_pair(run: Run, options: EdgeOptions) -> None:
     cube = run.cube()
     check_starts(cube)
     select_points(cube, options.at, purpose=PURPOSE)
-    if options.between[0] == options.between[1]:
+    first, second = _letters(options.between)
+    if first == second:
         raise ValueError(f"--between {' '.join(options.between)}: give two different attractors.")
     if not options.closest < options.farthest:
         raise ValueError(
@@ -79,9 +80,13 @@ def needs_pair(run: Run, options: EdgeOptions) -> None:
 
 def settle_edge(run: Run, options: EdgeOptions) -> EdgeOptions:
     """Replace ids of attractors by their letters, in rising order."""
-    named = (name if not name.isdigit() else letter(int(name)) for name in (n.strip().upper() for n in options.between))
-    first, second = sorted(named, key=lambda name: (len(name), name))
+    first, second = sorted(_letters(options.between), key=lambda name: (len(name), name))
     return options.model_copy(update={"between": (first, second)})
+
+
+def _letters(names: tuple[str, str]) -> list[str]:
+    """Return the letters of attractors that are named by letters or ids."""
+    return [letter(int(name)) if name.isdigit() else name for name in (n.strip().upper() for n in names)]
 
 
 def edge(run: Run, options: EdgeOptions) -> xr.Dataset:
@@ -179,7 +184,11 @@ def _dataset(
             "pair_reason": ("pair", np.array([p.reason for p in pairs], np.int8), {"long_name": "why none", **flags}),
             "pair_start": (("pair", "side", "state"), initial, {**units, "long_name": "initial states"}),
             "path": (("pair", "step", "state"), path, {**units, "long_name": "path along the boundary"}),
-            "n_steps": ("pair", np.array([len(p.path) for p in pairs], np.int32), {"long_name": "sections of the path"}),
+            "n_steps": (
+                "pair",
+                np.array([len(p.path) for p in pairs], np.int32),
+                {"long_name": "sections of the path"},
+            ),
         }
     )
     scalars = {str(k): v.variable for k, v in here.coords.items() if not v.ndim}
@@ -206,7 +215,9 @@ def _about(found: list[Any], n_states: int) -> dict[str, Any]:
     residual = [one.residual if isinstance(one, Orbit | Equilibrium) else np.nan for one in found]
     flags = {"flag_values": np.arange(len(KINDS), dtype=np.int8), "flag_meanings": " ".join(KINDS)}
 
-    def column(values: Any, dtype: str, text: str, units: str = "1", **attrs: Any) -> tuple[str, np.ndarray, dict[str, Any]]:
+    def column(
+        values: Any, dtype: str, text: str, units: str = "1", **attrs: Any
+    ) -> tuple[str, np.ndarray, dict[str, Any]]:
         return "edge", np.array(values, dtype), {"units": units, "long_name": text, **attrs}
 
     variables: dict[str, Any] = {

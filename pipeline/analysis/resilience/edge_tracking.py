@@ -286,5 +286,3 @@ def nearest_pairs(
     chosen = np.random.default_rng(seed).permutation(closer)[:n]
     starts = [np.stack([first[nearest[k]], second[k]]) for k in chosen]
     return [Pair(start, start) for start in starts]
-
-

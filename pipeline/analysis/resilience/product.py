@@ -201,9 +201,7 @@ class _Result:
         for end in ("", "_low", "_high"):
             self._new(f"arrived{end}", "float64", np.nan, "share of initial states that have arrived in time")
 
-    def _new(
-        self, name: str, dtype: str, fill: float, text: str, own: tuple[str, ...] = (), units: str = "1"
-    ) -> None:
+    def _new(self, name: str, dtype: str, fill: float, text: str, own: tuple[str, ...] = (), units: str = "1") -> None:
         values = np.full((*self._shape, *(self._n_states for _ in own)), fill, dtype)
         self.arrays[name] = ((*self._dims, "attractor", *own), values, {"units": units, "long_name": text})
 
@@ -279,12 +277,18 @@ class _Result:
             result[f"basin_stability{name}"].attrs = {"units": "1", "long_name": "share of the cells that end on it"}
         keep = ("kind", "stability", "orbit_period", "n_cells", "side")
         result = result.assign({name: found[name].variable for name in keep if name in found})
-        coords = {name: found[name].variable for name in (*self._dims, "attractor", "state", "state_units") if name in found.coords}
+        coords = {
+            name: found[name].variable
+            for name in (*self._dims, "attractor", "state", "state_units")
+            if name in found.coords
+        }
         scalars = {str(k): v.variable for k, v in found.coords.items() if not v.ndim}
         result = result.assign_coords({**coords, **scalars})
         scales = ("state", np.asarray(self._run.model.scales), {"long_name": "size that counts as 1"})
         attrs = {**told_by(found.attrs), **section_attributes(self._run.model.crossing), "title": "resilience"}
-        plain = {k: v for k, v in options.plain().items() if k in ("phases", "largest", "norm", "within", "near", "timed")}
+        plain = {
+            k: v for k, v in options.plain().items() if k in ("phases", "largest", "norm", "within", "near", "timed")
+        }
         attrs |= {f"resilience_{k}": v for k, v in plain.items()}
         attrs["resilience_states"] = ", ".join(_chosen(self._run, options))
         return result.assign_coords(state_scale=scales).assign_attrs(attrs)

@@ -7,7 +7,8 @@ trajectories at once:
 2. rays: the size at which those shocks begin to lead away, by dividing the interval of each;
 3. descent: nearby directions and base states at slightly smaller sizes, with steps that shrink where none leads
    away, from the best rays;
-4. confirmation: random smaller shocks; if one leads away, the descent goes on from it.
+4. confirmation: random smaller shocks, many of them near the best ray; if one leads away, the descent goes on
+   from it.
 
 The idea of the search from outside inwards is that of `minimal_critical_shock` of Attractors.jl (Datseris, Rossi
 and Wagemakers, Chaos 33, 073151, 2023), after Halekotte and Feudel (Sci. Rep. 10, 11783, 2020).
@@ -49,8 +50,11 @@ LAST_ANGLE = 2e-3
 MOST_STEPS, N_RANDOM = 80, 4
 """Most steps of a descent, and random directions in each."""
 
-ROUNDS = 4
+ROUNDS = 20
 """Most rounds of confirmation."""
+
+BESIDE = (-5.0, -0.3)
+"""Decimal logarithms of the least and largest relative distance from the best ray at which shocks are tried."""
 
 
 @dataclass(frozen=True)
@@ -102,9 +106,7 @@ class Settings:
 
     def size(self, shocks: np.ndarray) -> np.ndarray:
         """Return the scaled sizes of shocks (..., dim)."""
-        return np.asarray(
-            np.linalg.norm(shocks, axis=-1) if self.norm == "euclidean" else np.abs(shocks).max(axis=-1)
-        )
+        return np.asarray(np.linalg.norm(shocks, axis=-1) if self.norm == "euclidean" else np.abs(shocks).max(axis=-1))
 
     def unit(self, shocks: np.ndarray) -> np.ndarray:
         """Return shocks of size 1 in the same directions."""
@@ -210,9 +212,12 @@ class ShockSearch:
         if self._dim > 1 or self._n_bases > 1:
             yield from self._descend(best)
         for _ in range(ROUNDS):
+            best = best.take(np.argsort(best.high, kind="stable")[:1])
+            yield from self._narrow(best, self._settings.precision)
             worse = yield from self._contradictions(best)
             if not len(worse.base):
                 break
+            worse = worse.take(np.argsort(worse.high, kind="stable")[:MOST_RAYS])
             yield from self._narrow(worse, COARSE)
             best = self._best(worse)
             yield from self._descend(best)
@@ -292,8 +297,7 @@ class ShockSearch:
             near = [
                 k
                 for k in kept
-                if rays.base[k] == rays.base[row]
-                and np.linalg.norm(rays.unit[k] - rays.unit[row]) < 4.0 * self._angle
+                if rays.base[k] == rays.base[row] and np.linalg.norm(rays.unit[k] - rays.unit[row]) < 4.0 * self._angle
             ]
             if not near:
                 kept.append(row)
@@ -350,11 +354,23 @@ class ShockSearch:
         return np.tile(numbers, len(sizes)), shock.reshape(-1, self._dim)
 
     def _contradictions(self, best: _Rays) -> Generator[Trials, np.ndarray, _Rays]:
-        """Try random smaller shocks; return the rays of those that lead away."""
-        n, least = self._settings.confirmations, float(best.high.min())
-        base = self._rng.integers(self._n_bases, size=n)
-        unit = self._settings.unit(self._rng.standard_normal((n, self._dim)))
-        size = least * self._rng.uniform(0.25, 1.0 - self._settings.precision, n)
+        """Try random smaller shocks; return the rays of those that lead away.
+
+        Half of them have any direction and base state. The others are near the best ray at all distances below its
+        shock: where the boundary is fractal, thin parts of other basins lie there, which dividing a ray misses.
+        """
+        n, least, dim = self._settings.confirmations, float(best.high[0]), self._dim
+        base = np.concatenate([self._rng.integers(self._n_bases, size=n), np.full(n, best.base[0])])
+        drawn = self._rng.standard_normal((2 * n, dim))
+        if dim > 1:
+            turned = 10.0 ** self._rng.uniform(*BESIDE, n)
+            turned[: n // 2] = 0.0
+            drawn[n:] = best.unit[0] + turned[:, None] * drawn[n:]
+        else:
+            drawn[n:] = best.unit[0]
+        below = 10.0 ** self._rng.uniform(np.log10(self._settings.precision), BESIDE[1], n)
+        share = np.concatenate([self._rng.uniform(0.25, 1.0 - self._settings.precision, n), 1.0 - below])
+        unit, size = self._settings.unit(drawn), least * share
         label, code = yield from self._ask(base, size[:, None] * unit)
         away = np.flatnonzero(code == 1)
         return _Rays(base[away], unit[away], np.zeros(len(away)), size[away], label[away])

@@ -48,7 +48,9 @@ def resilience_table(ds: xr.Dataset) -> Table:
     else:
         for _, where in points_of(ds, dims):
             lines += point_table(ds, where, rows, _words)
-    lines.append("the largest shocks that never led away, and the numbers of smaller ones tried, are in --csv and --json")
+    lines.append(
+        "the largest shocks that never led away, and the numbers of smaller ones tried, are in --csv and --json"
+    )
     n_unknown = sum(row["shock_n_undecided"] + row["distance_n_undecided"] for row in rows)
     if n_unknown:
         lines.append(f"{n_unknown} smaller shocks end on no known attractor; sizes are intervals where that matters")
@@ -81,7 +83,10 @@ def _rows(ds: xr.Dataset, dims: Sequence[str]) -> list[Row]:
                 row |= {f"{what}_from_{name}": float(one[f"{what}_from"][k]) for k, name in enumerate(names)}
             for k, name in enumerate(names):
                 row |= {f"along_{name}_{end}": float(one[f"along_{end}"][k]) for end in ("low", "high")}
-                row |= {f"along_{name}": float(one["along"][k]), f"along_{name}_leads_to": end_of(int(one["along_to"][k]))}
+                row |= {
+                    f"along_{name}": float(one["along"][k]),
+                    f"along_{name}_leads_to": end_of(int(one["along_to"][k])),
+                }
             rows.append(row)
     return rows
 

@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
 from magpend_core.models import load_model
-from pipeline.analysis.attractors.destinations import UNDECIDED, destinations_at
+from pipeline.analysis.attractors.destinations import ELSEWHERE, UNDECIDED, destinations_at
 from pipeline.analysis.attractors.finding.points import BUDGET, Dynamics, slabs
 from pipeline.analysis.resilience.base_states import Asked, Bases, Shocked, answer
 from pipeline.analysis.resilience.edge_table import edge_table
@@ -29,6 +29,7 @@ kind = "sweep"
 model = "duffing"
 [parameters]
 frequency_hz = 0.15915494309189535
+[parameters.overrides]
 damping = {damping}
 linear = {linear}
 cubic = {cubic}
@@ -125,8 +126,8 @@ def flow(states, begin, end, amplitude=0.2, rtol=1e-9):
 
 
 def well_of(states, begin):
-    """Which of the two orbits trajectories are on after some forty periods; -1 for none yet."""
-    ends = flow(states, begin, 40 * 2.0 * np.pi)
+    """Which of the two orbits trajectories are on after some eighty periods; -1 for none yet."""
+    ends = flow(states, begin, 80 * 2.0 * np.pi)
     away = np.abs(ends[:, None] - WELL_POINTS).max(axis=-1)
     return np.where(away.min(axis=1) < 1e-2, away.argmin(axis=1), -1)
 
@@ -148,6 +149,16 @@ def exhaustive():
     return least
 
 
+def separates(well_at, well):
+    """Whether shares of a jump below 1 stay and some above 1 leave.
+
+    Beyond the boundary, which is fractal, both ends lie close together. The shares are 1e-5 and more away from 1:
+    scipy's tolerance and ours move the boundary by less.
+    """
+    off = 10.0 ** np.arange(-5.0, -2.0, 0.15)[:, None]
+    return bool((well_at(1.0 - off) == well).all() and (well_at(1.0 + off) == 1 - well).any())
+
+
 def test_resilience__critical_shock_of_duffing_by_exhaustion(found, exhaustive):
     """No smaller multiple of .004 leads away at any phase; the shock found does, a slightly smaller one does not."""
     for well in (0, 1):
@@ -161,9 +172,7 @@ def test_resilience__critical_shock_of_duffing_by_exhaustion(found, exhaustive):
         jump = one["shock"].values
         assert jump[0] == 0.0
         assert abs(jump[1]) == pytest.approx(size)
-        # 1e-4 of it: scipy's tolerance and ours move the boundary by less
-        ends = well_of(base + jump * np.array([[1.0 - 1e-4], [1.0 + 1e-4]]), begin)
-        assert ends.tolist() == [well, 1 - well]
+        assert separates(lambda share, base=base, jump=jump, begin=begin: well_of(base + share * jump, begin), well)
         assert int(one["shock_to"]) == 1 - well
         assert one["shock_high"] - one["shock_low"] <= 1.1e-6 * size
         assert float(one["shock_safe"]) < size
@@ -171,20 +180,20 @@ def test_resilience__critical_shock_of_duffing_by_exhaustion(found, exhaustive):
 
 def test_resilience__distances_of_duffing(found):
     """In any direction at the section, and along each state: smaller shocks stay, larger ones leave (DOP853)."""
-    turns = np.linspace(0.0, 2.0 * np.pi, 60, endpoint=False)
+    turns = np.linspace(0.0, 2.0 * np.pi, 30, endpoint=False)
     circle = np.column_stack([np.cos(turns), np.sin(turns)])
     for well, point in enumerate(WELL_POINTS):
         one = found.isel(attractor=well)
         size = float(one["distance_high"])
         assert np.hypot(*one["distance"].values) == pytest.approx(size)
-        inside = np.concatenate([share * size * circle for share in (0.4, 0.7, 0.9, 0.99, 0.9999)])
+        inside = np.concatenate([share * size * circle for share in (0.7, 0.99)])
         assert (well_of(point + inside, 0.0) == well).all()
-        assert well_of(point + one["distance"].values * [[1.0001]], 0.0)[0] == 1 - well
+        assert separates(lambda share, p=point, jump=one["distance"].values: well_of(p + share * jump, 0.0), well)
         for k in (0, 1):
             along = np.zeros(2)
             along[k] = float(one["along"][k])
-            ends = well_of(point + along * np.array([[-0.9999], [0.9999], [1.0001]]), 0.0)
-            assert ends.tolist() == [well, well, 1 - well]
+            assert separates(lambda share, p=point, jump=along: well_of(p + share * jump, 0.0), well)
+            assert well_of(point - 0.9999 * along[None], 0.0)[0] == well
             assert abs(along[k]) >= size
 
 
@@ -199,7 +208,7 @@ def test_resilience__basin_stability_and_table(found, wells):
     assert [row["shock_leads_to"] for row in table.rows] == ["B", "A"]
     assert table.rows[0]["shock_v"] == pytest.approx(float(found["shock"].isel(attractor=0, state=1)))
     json.dumps([dict(row) for row in table.rows])
-    assert "0.23603" in "\n".join(table.lines)
+    assert f"{float(found['shock_high'][0]):.5g}" in "\n".join(table.lines)
     figure = plot_resilience(found, wells.derive("attractors"))
     assert [ax.get_ylabel() for ax in figure.axes] == ["basin stability", "smallest shock", "arrival [drive periods]"]
     assert float(figure.data["shock_high"].isel(attractor=0)) == float(found["shock_high"].isel(attractor=0))
@@ -222,7 +231,7 @@ def linear(duffing):
 
 def test_resilience__of_a_linear_oscillator(linear):
     """No shock leads away; arrivals follow the matrix exponential (validation.md, 1)."""
-    one = linear.derive("resilience", within=18, largest=3.0).isel(attractor=0)
+    one = linear.derive("resilience", within=7, largest=3.0).isel(attractor=0)
     assert float(one["shock_low"]) == 3.0
     assert np.isinf(one["shock_high"])
     assert int(one["shock_to"]) == UNDECIDED
@@ -239,7 +248,7 @@ def test_resilience__of_a_linear_oscillator(linear):
     assert int(one["n_timed"]) == 25
     assert float(one["mean_time"]) == pytest.approx(entered.mean())
     assert float(one["longest_time"]) == entered.max()
-    assert float(one["arrived"]) == pytest.approx((entered <= 18).mean())
+    assert float(one["arrived"]) == pytest.approx((entered <= 7).mean())
     assert 0.0 < float(one["arrived_low"]) < float(one["arrived"]) < float(one["arrived_high"]) < 1.0
 
 
@@ -300,7 +309,8 @@ def test_edge__of_a_fractal_boundary(wells):
 
 def test_edge__of_a_smooth_boundary(duffing):
     """At F = .1 all pairs come to one saddle orbit: a fixed point by DOP853, between the two basins."""
-    found = duffing(amplitude=0.1).derive("edge", between=("1", "0"))
+    a_run = duffing(amplitude=0.1)
+    found = a_run.derive("edge", between=("1", "0"))
     assert found.sizes["edge"] == 1
     assert int(found["n_pairs"][0]) == 4
     assert int(found["orbit_period"][0]) == 1
@@ -308,19 +318,79 @@ def test_edge__of_a_smooth_boundary(duffing):
     assert flow(point[None], 0.0, 2.0 * np.pi, 0.1, 1e-13)[0] == pytest.approx(point, abs=1e-9)
     step = 1e-6
     columns = [
-        (flow(point[None] + h, 0, 2 * np.pi, 0.1, 1e-13) - flow(point[None] - h, 0, 2 * np.pi, 0.1, 1e-13))[0] / (2 * step)
+        (flow(point[None] + h, 0, 2 * np.pi, 0.1, 1e-13) - flow(point[None] - h, 0, 2 * np.pi, 0.1, 1e-13))[0]
+        / (2 * step)
         for h in step * np.eye(2)
     ]
     values, vectors = np.linalg.eig(np.column_stack(columns))
     assert np.sort(found["multiplier_real"].values[0]) == pytest.approx(np.sort(values), rel=1e-5)
     across = vectors[:, np.argmax(np.abs(values))].real
-    points = duffing_attractors(found)
+    stored = a_run.derive("attractors")["attractor_points"].values
+    points = stored[:, 0][[found.attrs["between"]]].reshape(2, 2)
     ends = flow(point + np.array([[1e-3], [-1e-3]]) * across, 0.0, 60 * 2.0 * np.pi, 0.1)
     nearest = np.abs(ends[:, None] - points).max(axis=-1)
     assert nearest.min(axis=1).max() < 1e-3
     assert set(nearest.argmin(axis=1).tolist()) == {0, 1}
 
 
-def duffing_attractors(found):
-    """Section points of the two orbits at F = .1, by long integration of scipy."""
-    return flow(np.array([[-1.0, 0.0], [1.0, 0.0]]), 0.0, 80 * 2.0 * np.pi, 0.1, 1e-11)
+def test_edge__of_two_magnets(magnets):
+    """On the line between two magnets' basins lies a rest: no force by its formula, one unstable eigenvalue."""
+    found = magnets.derive("edge", between=("A", "B"), pairs=8)
+    rests = np.flatnonzero(found["kind"].values == EQUILIBRIUM)
+    assert len(rests) == 1
+    assert found.sizes["edge"] == 1
+    x, y, vx, vy = found["section"].values[rests[0], 0]
+    assert (vx, vy) == pytest.approx((0.0, 0.0), abs=1e-12)
+    places = np.array([[1.0, 0.0], [-0.5, np.sqrt(0.75)], [-0.5, -np.sqrt(0.75)]])
+
+    def force(place):
+        away = place - places
+        return -0.64 * place - (away / (np.sum(away**2, axis=1) + 0.04)[:, None] ** 1.5).sum(axis=0)
+
+    assert force(np.array([x, y])) == pytest.approx([0.0, 0.0], abs=1e-10)
+    step = 1e-5
+    slopes = [(force(np.array([x, y]) + h) - force(np.array([x, y]) - h)) / (2 * step) for h in step * np.eye(2)]
+    matrix = np.block([[np.zeros((2, 2)), np.eye(2)], [np.column_stack(slopes), -0.2 * np.eye(2)]])
+    values = np.linalg.eigvals(matrix)
+    assert np.sort(found["eigenvalue_real"].values[0]) == pytest.approx(np.sort(values.real), abs=1e-6)
+    assert (values.real > 0.0).sum() == 1
+
+
+# ---- what does not suit ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "message"),
+    [
+        ("resilience", {"states": "x,w"}, "states = 'w' is no state of duffing; use x, v"),
+        ("resilience", {"at": {"damping": 0.1}}, "damping"),
+        ("edge", {"between": ("A", "a")}, "give two different attractors"),
+        ("edge", {"between": ("A", "0")}, "give two different attractors"),
+        ("edge", {"between": ("A", "Q")}, "attractor Q is not at the parameter point; it has A, B"),
+        ("edge", {"between": ("A", "B"), "closest": 1e-4}, "--closest 0.0001 must be less than --farthest 0.0001"),
+    ],
+)
+def test_resilience__refuses(wells, name, options, message):
+    with pytest.raises(SpecError, match=message):
+        wells.derive(name, **options)
+
+
+def test_edge__says_what_is_not_decided(wells):
+    """A path of 16 sections on a fractal boundary has not settled."""
+    found = wells.derive("edge", between=("A", "B"), seed=2, returns=16, max_period=0)
+    assert found.sizes["edge"] == 0
+    assert (found["pair_edge"] == -1).all()
+    assert "not decided, 4 pairs: its path has not come to a set that repeats itself" in "\n".join(
+        edge_table(found).lines
+    )
+
+
+def test_destinations__ends_of_trajectories(wells):
+    """Near an orbit they end on it; an orbit that is not known is elsewhere, and undecided without the extension."""
+    there = at_point(wells)
+    near = WELL_POINTS + 0.01
+    assert there.follow(near).label.tolist() == [0, 1]
+    there.orbits, there.orbit_ids = there.orbits[:1], there.orbit_ids[:1]
+    assert there.follow(near).label.tolist() == [0, ELSEWHERE]
+    there.options = there.options.model_copy(update={"extend": False})
+    assert there.follow(near).label.tolist() == [0, UNDECIDED]
