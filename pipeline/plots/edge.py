@@ -11,8 +11,8 @@ from matplotlib.axes import Axes
 from pipeline.layout.vocabulary import EQUILIBRIUM, PERIODIC_ORBIT, is_grid_dim, is_start_dim
 from pipeline.plots import labels, style
 from pipeline.plots.basins import plot_basins
-from pipeline.plots.figure import Run, attractors_of, frame_of, noted, values_of
 from pipeline.plots.bifurcation import with_diagram
+from pipeline.plots.figure import Run, attractors_of, frame_of, noted, values_of
 from pipeline.products.figures import EdgeFigureOptions
 from pipeline.products.resilience import EdgeOptions
 

@@ -41,9 +41,10 @@ def plot_resilience(
     Returns
     -------
     DataFigure
-        Bars are intervals. In the middle panel filled markers are the smallest critical shock of the chosen states, open
-        ones the distance to the boundary in any direction; arrows point up where no shock led away. In the lower panel
-        filled markers are means with standard errors, open ones the longest times. Its `data` are the numbers drawn.
+        Bars are intervals. In the middle panel filled markers are the smallest critical shock of the chosen states,
+        open ones the distance to the boundary in any direction; triangles stand for sizes up to which no shock led
+        away. In the lower panel filled markers are means with standard errors, open ones the longest times. Its
+        `data` are the numbers drawn.
 
     Raises
     ------
@@ -83,8 +84,8 @@ def _selected(ds: xr.Dataset, at: Mapping[str, float]) -> tuple[xr.Dataset, str]
     if len(left) > 1:
         value = float(ds[left[-1]].values[0])
         raise ValueError(
-            f"resilience is drawn over one swept parameter, and {', '.join(left)} are left; choose values of the others, "
-            f"such as {left[-1]}={value:g}"
+            f"resilience is drawn over one swept parameter, and {', '.join(left)} are left; choose values of the "
+            f"others, such as {left[-1]}={value:g}"
         )
     return ds.squeeze([d for d in dims if d in ds.dims and d not in left]), left[0] if left else ""
 
@@ -125,7 +126,7 @@ def _times(ax: Axes, one: xr.Dataset, x: np.ndarray, colour: str) -> None:
 
 
 def _keys() -> list[Line2D]:
-    grey = {"color": "0.35", "marker": "o", "markersize": 4.0, "linewidth": 0.9}
+    grey: dict[str, Any] = {"color": "0.35", "marker": "o", "markersize": 4.0, "linewidth": 0.9}
     return [
         Line2D([], [], label="shock of the chosen states; mean time", **grey),
         Line2D([], [], label="any direction; longest time", **grey, markerfacecolor="white", linestyle=":"),

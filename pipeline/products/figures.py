@@ -267,7 +267,7 @@ MANIFOLDS = Figure(
 
 RESILIENCE = Figure(
     "resilience",
-    """Draw basin stability, critical shocks and arrival times of the attractors, over the swept parameter if there is one.
+    """Draw basin stability, critical shocks and arrival times of attractors, over the swept parameter or side by side.
 
     Bars show intervals.""",
     ResilienceFigureOptions,

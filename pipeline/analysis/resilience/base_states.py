@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TypeVar
 
 import numpy as np
 import xarray as xr
@@ -15,15 +14,13 @@ from magpend_core.sampling import Drive, sample
 from magpend_core.status import Status
 from pipeline.analysis.attractors.destinations import UNDECIDED, Destinations
 from pipeline.analysis.outcomes import DIVERGED
-from pipeline.analysis.resilience.shocks import Trials
+from pipeline.analysis.resilience.shocks import Found, Search, Trials
 from pipeline.analysis.tolerances import PORTRAIT_RTOL
 from pipeline.layout.vocabulary import EQUILIBRIUM, PERIODIC_ORBIT
 from pipeline.products.reporting import report
 
 MOST_POINTS = 8
 """Most section points of a set that does not close from which shocks start."""
-
-F = TypeVar("F")
 
 
 @dataclass(frozen=True)
@@ -72,7 +69,8 @@ def bases_of(one: xr.Dataset, parameters: Parameters, frequency: float, n_phases
         if kind == PERIODIC_ORBIT:
             period = float(one["period_s"])
             return _sampled(of_flow(parameters), points[:1], period, n_phases)
-        return Bases(points[:MOST_POINTS], np.zeros(min(len(points), MOST_POINTS)), np.ones(len(points), bool))
+        points = points[:MOST_POINTS]
+        return Bases(points, np.zeros(len(points)), np.ones(len(points), bool))
     n = int(one["orbit_period"]) if kind == PERIODIC_ORBIT else MOST_POINTS
     return _sampled(parameters, points[:n], 1.0 / frequency, n_phases)
 
@@ -156,12 +154,12 @@ class Asked:
         Numbers of the shocked states.
     """
 
-    search: Generator[Trials, np.ndarray, F]
+    search: Search
     bases: Bases
     which: np.ndarray
 
 
-def answer(asked: Mapping[str, Asked], shocked: Shocked, scales: np.ndarray, what: str) -> dict[str, F]:
+def answer(asked: Mapping[str, Asked], shocked: Shocked, scales: np.ndarray, what: str) -> dict[str, Found]:
     """Run searches for shocks in step, so that their trajectories fill the engine's lanes together.
 
     Returns
@@ -170,7 +168,7 @@ def answer(asked: Mapping[str, Asked], shocked: Shocked, scales: np.ndarray, wha
         Result of each search.
     """
     labels: dict[str, np.ndarray | None] = dict.fromkeys(asked)
-    results: dict[str, F] = {}
+    results: dict[str, Found] = {}
     n_followed = 0
     while labels:
         report(what, n_followed, 0)

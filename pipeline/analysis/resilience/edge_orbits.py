@@ -12,15 +12,18 @@ from collections.abc import Sequence
 import numpy as np
 
 from pipeline.analysis.attractors.destinations import Destinations
-from pipeline.analysis.attractors.extension.clouds import thinned
 from pipeline.analysis.attractors.finding.closed_orbits import Orbit, distinct, polish
 from pipeline.analysis.branches.deflation import search_orbits
 from pipeline.analysis.sets import nearest_distances
 from pipeline.analysis.tolerances import RECURRENCE
 
-MOST_RECURRENCES, MOST_STARTS = 64, 192
-"""Most points of the paths from which Newton's method starts, for each period: those that recur most closely, and
-others drawn at random."""
+MOST_RECURRENCES, N_STARTS = 64, 336
+"""Points of the paths from which Newton's method starts, for each period: those that recur most closely, and others
+drawn at random."""
+
+BESIDE = 0.05
+"""Scaled standard deviation by which the random ones are moved: strongly unstable orbits attract Newton's method from a
+narrow strip, which few points of a path hit."""
 
 ROUNDS = 6
 """Most rounds of the search in which known orbits are deflated."""
@@ -79,11 +82,14 @@ def orbits_on(
 
 
 def _starts(paths: Sequence[np.ndarray], period: int, there: Destinations) -> np.ndarray:
-    """Return points of the paths that nearly recur after a period, and others."""
+    """Return points of the paths that nearly recur after a period, and states beside others."""
     lags = np.concatenate([there.geometry.distance(path[period:], path[:-period]) for path in paths])
     recurring = np.concatenate([path[:-period] for path in paths])
     closest = recurring[np.argsort(lags, kind="stable")[:MOST_RECURRENCES]]
-    return np.concatenate([closest, thinned(np.concatenate(paths), MOST_STARTS)])
+    every, rng = np.concatenate(paths), np.random.default_rng(0)
+    drawn = every[rng.integers(len(every), size=N_STARTS)]
+    moved = drawn + BESIDE * np.asarray(there.geometry.scales) * rng.standard_normal(drawn.shape)
+    return np.concatenate([closest, moved])
 
 
 def n_unstable(orbit: Orbit) -> int:

@@ -213,7 +213,7 @@ def _about(found: list[Any], n_states: int) -> dict[str, Any]:
     multipliers = np.array([none if o is None else o.multipliers for o in orbits]).reshape(len(found), n_states)
     eigenvalues = np.array([none if r is None else r.eigenvalues for r in rests]).reshape(len(found), n_states)
     residual = [one.residual if isinstance(one, Orbit | Equilibrium) else np.nan for one in found]
-    flags = {"flag_values": np.arange(len(KINDS), dtype=np.int8), "flag_meanings": " ".join(KINDS)}
+    flags: dict[str, Any] = {"flag_values": np.arange(len(KINDS), dtype=np.int8), "flag_meanings": " ".join(KINDS)}
 
     def column(
         values: Any, dtype: str, text: str, units: str = "1", **attrs: Any

@@ -63,8 +63,8 @@ def _head(ds: xr.Dataset) -> str:
     units = ", ".join(f"{name} {scale:g}" for name, scale in scales)
     periods = periods_of(model_of(ds))
     return (
-        f"shocks of {ds.attrs['resilience_states']} at {ds.attrs['resilience_phases']} phases, distances of all states; "
-        f"sizes: {norm} of the jumps over their scales ({units}); times in {periods}"
+        f"shocks of {ds.attrs['resilience_states']} at {ds.attrs['resilience_phases']} phases, distances of all "
+        f"states; sizes: {norm} of the jumps over their scales ({units}); times in {periods}"
     )
 
 

@@ -9,7 +9,6 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
-from magpend_core.models import load_model
 from pipeline.analysis.attractors.destinations import ELSEWHERE, UNDECIDED, destinations_at
 from pipeline.analysis.attractors.finding.points import BUDGET, Dynamics, slabs
 from pipeline.analysis.resilience.base_states import Asked, Bases, Shocked, answer
