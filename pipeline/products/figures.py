@@ -267,9 +267,9 @@ MANIFOLDS = Figure(
 
 RESILIENCE = Figure(
     "resilience",
-    """Draw basin stability, critical shocks and arrival times of attractors, over the swept parameter or side by side.
+    """Draw basin stability, critical shocks and arrival times of the attractors, over the swept parameter.
 
-    Bars show intervals.""",
+    Attractors stand side by side if nothing is swept. Bars show intervals.""",
     ResilienceFigureOptions,
     "pipeline.plots.resilience:draw",
     needs="pipeline.analysis.resilience.product:needs_sweep",
