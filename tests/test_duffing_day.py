@@ -64,7 +64,11 @@ n_transient = 60
 n_keep = 12
 """
 
-AT = {"point": ["--at", "frequency_hz=0.159154943", "--at", "amplitude=0.3"], "line": ["--at", "amplitude=0.15"]}
+AT = {
+    "point": ["--at", "frequency_hz=0.159154943", "--at", "amplitude=0.3"],
+    "wells": ["--at", "frequency_hz=0.159154943", "--at", "amplitude=0.15"],
+    "line": ["--at", "amplitude=0.15"],
+}
 
 ANALYSES = {
     "attractors": ("sweep", []),
@@ -97,6 +101,11 @@ ANALYSES = {
     ),
     "curves": ("walk", ["--period", "1", "--second", "amplitude", "--second-from", "0.25", "--second-to", "0.35"]),
     "orbits": ("sweep", [*AT["point"], "--period", "1", "--starts", "40"]),
+    "resilience": (
+        "sweep",
+        [*AT["line"], "--directions", "8", "--confirmations", "8", "--phases", "2", "--timed", "8"],
+    ),
+    "edge": ("sweep", [*AT["wells"], "--between", "A", "B", "--pairs", "1", "--returns", "16", "--period", "0"]),
 }
 
 FIGURES_OF = {
@@ -115,6 +124,8 @@ FIGURES_OF = {
     "manifolds": ANALYSES["manifolds"],
     "rotation": ("sweep", []),
     "tongues": ANALYSES["tongues"],
+    "resilience": ANALYSES["resilience"],
+    "edge": ANALYSES["edge"],
     "section": ("sweep", AT["point"]),
 }
 

@@ -147,7 +147,7 @@ def _parameter(model: type[Options], name: str) -> inspect.Parameter:
         declared |= {"metavar": "AXIS=VALUE"}
         kind = list[str]
     elif get_origin(kind) is tuple:
-        declared |= {"metavar": "LOW HIGH"}
+        declared |= {"metavar": "LOW HIGH" if float in get_args(kind) else "A B"}
     elif kind in _METAVARS:
         declared |= {"metavar": _METAVARS[kind]}
     return _keyword(

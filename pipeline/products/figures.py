@@ -9,6 +9,7 @@ from pipeline.products.branches import BranchOptions, CurveOptions
 from pipeline.products.chaos import DimensionOptions
 from pipeline.products.manifolds import ManifoldOptions
 from pipeline.products.product import Figure, FigureOptions, StateOptions, option
+from pipeline.products.resilience import EdgeOptions, ResilienceOptions
 from pipeline.products.tongues import TongueOptions
 
 Per = Literal["s", "period"]
@@ -145,6 +146,14 @@ class DriftFigureOptions(StateOptions):
     over: str = option("", "Run with constant parameters that sweeps the moving one; its diagram is drawn below.")
 
 
+class ResilienceFigureOptions(ResilienceOptions, FigureOptions):
+    """Options of a figure of critical shocks."""
+
+
+class EdgeFigureOptions(EdgeOptions, FigureOptions):
+    """Options of a figure of edge states."""
+
+
 BIFURCATION = Figure(
     "bifurcation",
     "Draw a bifurcation diagram: section points over the swept parameter, coloured by class of motion.",
@@ -267,4 +276,22 @@ DRIFT = Figure(
     "Draw sections over a parameter that moves, coloured by the swept number, over the diagram of another run.",
     DriftFigureOptions,
     "pipeline.plots.drift:draw",
+)
+
+RESILIENCE = Figure(
+    "resilience",
+    """Draw basin stability, critical shocks and arrival times of the attractors, over the swept parameter.
+
+    Attractors stand side by side if nothing is swept. Bars show intervals.""",
+    ResilienceFigureOptions,
+    "pipeline.plots.resilience:draw",
+    needs="pipeline.analysis.resilience.product:needs_sweep",
+)
+
+EDGE = Figure(
+    "edge",
+    "Draw the edge states between two attractors, over the basins of a run on a grid of two states.",
+    EdgeFigureOptions,
+    "pipeline.plots.edge:draw",
+    needs="pipeline.analysis.resilience.edge_product:needs_pair",
 )

@@ -64,6 +64,8 @@ ANALYSES: Registry[Analysis] = Registry(
         "tipping": "pipeline.products.tipping:TIPPING",
         "delay": "pipeline.products.tipping:DELAY",
         "overlaps": "pipeline.products.tipping:OVERLAPS",
+        "resilience": "pipeline.products.resilience:RESILIENCE",
+        "edge": "pipeline.products.resilience:EDGE",
     },
 )
 
@@ -92,6 +94,8 @@ FIGURES: Registry[Figure] = Registry(
             "tongues",
             "manifolds",
             "drift",
+            "resilience",
+            "edge",
         )
     },
 )

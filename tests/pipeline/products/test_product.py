@@ -36,7 +36,7 @@ def test_product__its_functions_are_there(product):
 @pytest.mark.parametrize("product", ALL, ids=NAMES)
 def test_options__each_has_its_sentence_and_its_default_is_in_bounds(product):
     fields = product.options.model_fields
-    example = {float: 1.0, str: "q", tuple[str, ...]: ("energy",)}
+    example = {float: 1.0, str: "q", tuple[str, ...]: ("energy",), tuple[str, str]: ("A", "B")}
     required = {name: example[i.annotation] for name, i in fields.items() if i.is_required()}
     for name, info in fields.items():
         assert info.description, name

@@ -1,0 +1,1 @@
+"""Measure how attractors respond to disturbances: arrival times, critical shocks, edge states."""

@@ -1,0 +1,301 @@
+"""Measure the response of a run's attractors to shocks, as an analysis (`pipeline.products.resilience`).
+
+The Dataset has the parameter dims of the run, ``attractor`` and ``state``. Sizes are in units of the states'
+scales (coordinate ``state_scale``), jumps of states in their own units.
+
+===============================  =============================================================================
+variable                         meaning
+===============================  =============================================================================
+``basin_stability``, ``_low``,   share of the cells that end on the attractor, with its interval
+``_high``, ``n_cells``
+``arrived``, ``_low``, ``_high``  share of timed initial states that have arrived within `within` periods
+``mean_time``, ``_stderr``,      time until arrival of the timed initial states [drive periods or returns]
+``longest_time``, ``n_timed``
+``shock_low``, ``shock_high``    interval of the smallest critical shock of the chosen states, at any phase
+``shock``                        its jump of each state
+``shock_phase``                  its phase: a share of the drive period, or of the period of a flow's orbit
+``shock_from``                   the state on the attractor at that phase
+``shock_to``                     id of the attractor where it leads, -1 nowhere, -2 diverges, -3 elsewhere
+``shock_safe``                   size of the largest shell of which all shocks stayed
+``shock_n_below``                smaller shocks that were tried, all of which stayed
+``shock_n_undecided``            smaller shocks whose end is not known
+``distance_...``                 the same for jumps of all states at the section
+``along_low``, ``along_high``,   the same for each state alone; ``along`` is its signed jump
+``along``, ``along_to``
+===============================  =============================================================================
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from pipeline.analysis.attractors.destinations import Destinations, destinations_at
+from pipeline.analysis.attractors.finding.points import BUDGET, Dynamics, slabs
+from pipeline.analysis.basins.basins import check_starts
+from pipeline.analysis.basins.numbers import basin_fractions
+from pipeline.analysis.intervals import binomial_interval
+from pipeline.analysis.outcomes import outcomes
+from pipeline.analysis.resilience.base_states import Asked, Bases, Shocked, answer, bases_of
+from pipeline.analysis.resilience.shocks import Found, Settings, ShockSearch, Trials
+from pipeline.analysis.run import Run
+from pipeline.analysis.selection import select_points
+from pipeline.layout.vocabulary import ATTRACTS, grid_dim, section_attributes, split_dims, told_by
+from pipeline.products.attractors import AttractorOptions
+from pipeline.products.resilience import ResilienceOptions
+
+PRECISION = 1e-6
+"""Relative length to which the last ray of a search is divided."""
+
+MOST_SEEDS = 8
+"""Cells of other basins that start a search of the distance in any direction, for each base state."""
+
+
+def needs_sweep(run: Run, options: ResilienceOptions) -> None:
+    """Raise ValueError unless the run has independent initial states and the options suit it."""
+    cube = run.cube()
+    check_starts(cube)
+    select_points(cube, options.at)
+    _chosen(run, options)
+
+
+def settle_resilience(run: Run, options: ResilienceOptions) -> ResilienceOptions:
+    """Complete the names of the shocked states."""
+    return options.model_copy(update={"states": ",".join(_chosen(run, options))})
+
+
+def _chosen(run: Run, options: ResilienceOptions) -> list[str]:
+    """Return the names of the shocked states: those given, or the rates of other states, or all states."""
+    model = run.model
+    given = [name.strip() for name in options.states.split(",") if name.strip()]
+    unknown = [name for name in given if name not in model.state_names]
+    if unknown:
+        raise ValueError(f"states = {unknown[0]!r} is no state of {model.name}; use {', '.join(model.state_names)}.")
+    rates = [state.rate for state in model.states if state.rate]
+    wanted = given or rates or list(model.state_names)
+    return [name for name in model.state_names if name in wanted]
+
+
+def resilience(run: Run, options: ResilienceOptions) -> xr.Dataset:
+    """Measure the response of the attractors at each parameter point to shocks."""
+    whole = run.derive("attractors", **options.part(AttractorOptions))
+    cube, attractors = select_points(run.cube(), options.at), select_points(whole, options.at)
+    dims, starts = split_dims(attractors["attractor_id"])
+    result = _Result(run, options, attractors)
+    labels = outcomes(attractors).transpose(*dims, *starts).values
+    states = start_states(cube, starts)
+    for points in slabs(cube, Dynamics.of(cube), BUDGET):
+        for index, there in destinations_at(cube, attractors, points, options):
+            work = _Point(there, attractors.isel(dict(zip(dims, index, strict=True))), options, run)
+            result.time(index, *work.times(states))
+            result.shocks(index, work.shocks(states, labels[index].ravel()))
+    return result.dataset()
+
+
+def start_states(cube: xr.Dataset, starts: tuple[str, ...]) -> np.ndarray:
+    """Return the initial states of the cells of a parameter point, shape (cell, state)."""
+    shape = tuple(cube.sizes[d] for d in starts)
+    columns = []
+    for name in cube["state"].values:
+        column = cube[grid_dim(str(name))]
+        own = xr.DataArray(np.ones(shape), dims=starts) * column.drop_vars(list(column.coords))
+        columns.append(own.transpose(*starts).values.ravel())
+    return np.column_stack(columns)
+
+
+class _Point:
+    """The attractors of one parameter point, with what is asked of them."""
+
+    def __init__(self, there: Destinations, here: xr.Dataset, options: ResilienceOptions, run: Run) -> None:
+        self._there, self._here, self._options = there, here, options
+        names = list(run.model.state_names)
+        self._which = np.array([names.index(name) for name in _chosen(run, options)])
+        self._scales = np.asarray(there.geometry.scales)
+        o = options
+        self._settings = Settings(o.largest, o.directions, o.norm, PRECISION, o.confirmations, o.seed)
+
+    def times(self, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Integrate some initial states anew; return the label and the arrival time of each."""
+        rng = np.random.default_rng(self._options.seed)
+        chosen = np.sort(rng.permutation(len(states))[: self._options.timed])
+        found = self._there.follow(states[chosen], self._options.near)
+        return found.label, found.entered
+
+    def shocks(self, states: np.ndarray, labels: np.ndarray) -> dict[tuple[int, str], tuple[Found, Bases]]:
+        """Search the shocks of each attractor: of the chosen states, of all states, and of each state alone."""
+        asked: dict[str, Asked] = {}
+        every = np.arange(states.shape[1])
+        parameters, frequency = self._there.point.parameters, self._there.point.frequency
+        assert parameters is not None
+        for number in sorted(self._there.told):
+            bases = bases_of(self._here.isel(attractor=number), parameters, frequency, self._options.phases)
+            asked[f"{number} shock"] = self._search(number, bases, self._which)
+            at_section = bases.sections
+            seeds = self._seeds(number, at_section, states, labels)
+            asked[f"{number} any"] = self._search(number, at_section, every, seeds)
+            for i in every:
+                asked[f"{number} {i}"] = self._search(number, at_section, np.array([i]))
+        found = answer(asked, Shocked(self._there), self._scales, "trajectories after shocks")
+        keys = {key: key.split() for key in found}
+        return {(int(n), what): (found[key], asked[key].bases) for key, (n, what) in keys.items()}
+
+    def _search(
+        self, number: int, bases: Bases, which: np.ndarray, seeds: tuple[Trials, np.ndarray] | None = None
+    ) -> Asked:
+        search = ShockSearch(number, len(bases.states), len(which), self._settings, seeds)
+        return Asked(search.run(), bases, which)
+
+    def _seeds(
+        self, number: int, bases: Bases, states: np.ndarray, labels: np.ndarray
+    ) -> tuple[Trials, np.ndarray] | None:
+        """Return the cells of other basins nearest to each base state, as shocks from it."""
+        away = np.flatnonzero((labels != number) & (labels != -1))
+        if not len(away):
+            return None
+        base, shock, label = [], [], []
+        for k, state in enumerate(bases.states):
+            jumps = self._there.geometry.difference(states[away], state)
+            nearest = np.argsort(self._settings.size(jumps), kind="stable")[:MOST_SEEDS]
+            base.append(np.full(len(nearest), k))
+            shock.append(jumps[nearest])
+            label.append(labels[away[nearest]])
+        return Trials(np.concatenate(base), np.concatenate(shock)), np.concatenate(label)
+
+
+_SEARCHED: dict[str, tuple[str, float, str]] = {
+    "low": ("float64", np.nan, "no smaller shock leads away, as far as tried"),
+    "high": ("float64", np.nan, "size of the smallest shock found that leads away"),
+    "phase": ("float64", np.nan, "share of the period at which it happens"),
+    "to": ("int32", -1, "attractor where it leads: -1 none, -2 diverges, -3 none of the run's"),
+    "safe": ("float64", np.nan, "largest size of which all directions stayed"),
+    "n_below": ("int64", 0, "smaller shocks that were tried and stayed"),
+    "n_undecided": ("int64", 0, "smaller shocks whose end is not known"),
+}
+
+
+class _Result:
+    """Arrays of the result, filled point by point."""
+
+    def __init__(self, run: Run, options: ResilienceOptions, attractors: xr.Dataset) -> None:
+        self._run, self._options, self._attractors = run, options, attractors
+        self._dims, self._starts = split_dims(attractors["attractor_id"])
+        self._shape = tuple(attractors.sizes[d] for d in (*self._dims, "attractor"))
+        self._n_states = attractors.sizes["state"]
+        self.arrays: dict[str, tuple[tuple[str, ...], np.ndarray, dict[str, Any]]] = {}
+        for what, text in (("shock", "smallest critical shock"), ("distance", "shortest way out of the basin")):
+            for name, (dtype, fill, meaning) in _SEARCHED.items():
+                self._new(f"{what}_{name}", dtype, fill, f"{text}: {meaning}")
+            self._new(what, "float64", np.nan, f"{text}: jump of each state", ("state",), "see state_units")
+            self._new(f"{what}_from", "float64", np.nan, f"{text}: state before it", ("state",), "see state_units")
+        for name, (dtype, fill, meaning) in _SEARCHED.items():
+            if name in ("low", "high", "to", "n_undecided"):
+                self._new(f"along_{name}", dtype, fill, f"boundary along a state: {meaning}", ("state",))
+        self._new("along", "float64", np.nan, "boundary along a state: jump", ("state",), "see state_units")
+        for name, text in (("mean_time", "mean time until arrival"), ("longest_time", "longest time until arrival")):
+            self._new(name, "float64", np.nan, f"{text}, drive periods or returns")
+        self._new("mean_time_stderr", "float64", np.nan, "standard error of the mean time")
+        self._new("n_timed", "int64", 0, "timed initial states that end on it")
+        for end in ("", "_low", "_high"):
+            self._new(f"arrived{end}", "float64", np.nan, "share of initial states that have arrived in time")
+
+    def _new(self, name: str, dtype: str, fill: float, text: str, own: tuple[str, ...] = (), units: str = "1") -> None:
+        values = np.full((*self._shape, *(self._n_states for _ in own)), fill, dtype)
+        self.arrays[name] = ((*self._dims, "attractor", *own), values, {"units": units, "long_name": text})
+
+    def _put(self, name: str, at: tuple[int, ...], value: Any) -> None:
+        self.arrays[name][1][at] = value
+
+    def time(self, index: tuple[int, ...], label: np.ndarray, entered: np.ndarray) -> None:
+        """Fill in the arrival times of initial states, by attractor."""
+        counted = int((label != -1).sum())
+        for i in np.unique(label[label >= 0]).tolist():
+            own, at = entered[(label == i) & np.isfinite(entered)], (*index, i)
+            in_time = int((own <= self._options.within).sum())
+            ends = binomial_interval(
+                in_time, counted, confidence=self._options.confidence, method=self._options.interval
+            )
+            self._put("n_timed", at, len(own))
+            self._put("arrived", at, in_time / counted)
+            for end, value in zip(("_low", "_high"), ends, strict=True):
+                self._put(f"arrived{end}", at, float(value))
+            if len(own):
+                self._put("mean_time", at, own.mean())
+                self._put("longest_time", at, own.max())
+            if len(own) > 1:
+                self._put("mean_time_stderr", at, own.std(ddof=1) / np.sqrt(len(own)))
+
+    def shocks(self, index: tuple[int, ...], found: dict[tuple[int, str], tuple[Found, Bases]]) -> None:
+        """Fill in the critical shocks of a parameter point."""
+        scales = np.asarray(self._run.model.scales)
+        names = list(self._run.model.state_names)
+        which = [names.index(name) for name in _chosen(self._run, self._options)]
+        for (number, what), (one, bases) in found.items():
+            at = (*index, number)
+            if what not in ("shock", "any"):
+                self._along(at, int(what), one, scales)
+                continue
+            name = "shock" if what == "shock" else "distance"
+            self._searched(name, at, one)
+            if one.base < 0:
+                continue
+            jump = np.zeros(self._n_states)
+            jump[which if what == "shock" else slice(None)] = one.shock
+            self._put(name, at, jump * scales)
+            self._put(f"{name}_phase", at, bases.phase[one.base])
+            self._put(f"{name}_from", at, bases.states[one.base])
+
+    def _searched(self, name: str, at: tuple[int, ...], one: Found) -> None:
+        values = {"low": one.low, "high": one.high, "to": one.leads_to, "safe": one.safe}
+        for key, value in {**values, "n_below": one.n_below, "n_undecided": one.n_undecided}.items():
+            self._put(f"{name}_{key}", at, value)
+
+    def _along(self, at: tuple[int, ...], state: int, one: Found, scales: np.ndarray) -> None:
+        values = {"low": one.low, "high": one.high, "to": one.leads_to, "n_undecided": one.n_undecided}
+        for key, value in values.items():
+            self._put(f"along_{key}", (*at, state), value)
+        self._put("along", (*at, state), one.shock[0] * scales[state])
+
+    def dataset(self) -> xr.Dataset:
+        """Return all arrays, with basin stability and the attractors' features."""
+        found, options = self._attractors, self._options
+        fractions = basin_fractions(
+            outcomes(found),
+            dims=self._starts,
+            ids=found["attractor"].values.tolist(),
+            confidence=options.confidence,
+            method=options.interval,
+        ).sel(label=found["attractor"].values)
+        attracts = found["stability"] == ATTRACTS
+        result = xr.Dataset(self.arrays)
+        for name, theirs in (("", "fraction"), ("_low", "low"), ("_high", "high")):
+            own = fractions[theirs].rename(label="attractor").drop_vars("attractor", errors="ignore")
+            values = own.transpose(*self._dims, "attractor").where(attracts.drop_vars("attractor"))
+            result[f"basin_stability{name}"] = values.variable.copy()
+            result[f"basin_stability{name}"].attrs = {"units": "1", "long_name": "share of the cells that end on it"}
+        keep = ("kind", "stability", "orbit_period", "n_cells", "side")
+        result = result.assign({name: found[name].variable for name in keep if name in found})
+        coords = {
+            name: found[name].variable
+            for name in (*self._dims, "attractor", "state", "state_units")
+            if name in found.coords
+        }
+        scalars = {str(k): v.variable for k, v in found.coords.items() if not v.ndim}
+        result = result.assign_coords({**coords, **scalars})
+        scales = ("state", np.asarray(self._run.model.scales), {"long_name": "size that counts as 1"})
+        attrs = {**told_by(found.attrs), **section_attributes(self._run.model.crossing), "title": "resilience"}
+        plain = {
+            k: v for k, v in options.plain().items() if k in ("phases", "largest", "norm", "within", "near", "timed")
+        }
+        attrs |= {f"resilience_{k}": v for k, v in plain.items()}
+        attrs["resilience_states"] = ", ".join(_chosen(self._run, options))
+        return result.assign_coords(state_scale=scales).assign_attrs(attrs)
+
+
+def points_of_result(ds: xr.Dataset) -> Iterator[tuple[tuple[int, ...], int]]:
+    """Yield the parameter point and the id of each attractor in a result."""
+    dims = [str(d) for d in ds["stability"].dims if d != "attractor"]
+    for *index, number in np.argwhere(ds["stability"].transpose(*dims, "attractor").values == ATTRACTS).tolist():
+        yield tuple(index), number

@@ -1,0 +1,401 @@
+"""Search the smallest shock that leads away from an attractor.
+
+A shock is a jump of some states, in units of their scales. The search has four stages, and each asks for many
+trajectories at once:
+
+1. shells: shocks in many directions, at every base state, of rising size, until one leads away;
+2. rays: the size at which those shocks begin to lead away, by dividing the interval of each;
+3. descent: nearby directions and base states at slightly smaller sizes, with steps that shrink where none leads
+   away, from the best rays;
+4. confirmation: random smaller shocks, many of them near the best ray; if one leads away, the descent goes on
+   from it.
+
+The idea of the search from outside inwards is that of `minimal_critical_shock` of Attractors.jl (Datseris, Rossi
+and Wagemakers, Chaos 33, 073151, 2023), after Halekotte and Feudel (Sci. Rep. 10, 11783, 2020).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from pipeline.analysis.attractors.destinations import UNDECIDED
+
+Norm = Literal["euclidean", "largest"]
+
+RATIO = 2.0 ** (1.0 / 3.0)
+"""Ratio of the sizes of neighbouring shells."""
+
+SHELLS = 25
+"""Number of shells: the least is 2**-8 of the largest."""
+
+PARTS = 8
+"""Parts into which a ray's interval is divided at once."""
+
+COARSE = 1e-2
+"""Relative length to which rays are divided before the best are chosen for the descent."""
+
+MOST_RAYS, MOST_DESCENTS = 64, 4
+"""Most rays that are divided, and most descents."""
+
+LADDER = ((0.5, 1), (0.1, 1), (1.0, 2), (0.1, 2))
+"""Relative decreases of the size that a descent tries: factors and powers of its angle."""
+
+LAST_ANGLE = 2e-3
+"""Angle [rad] at which a descent ends: its size is then within 1e-6 of a smooth minimum."""
+
+MOST_STEPS, N_RANDOM = 80, 4
+"""Most steps of a descent, and random directions in each."""
+
+ROUNDS = 20
+"""Most rounds of confirmation."""
+
+BESIDE = (-5.0, -0.3)
+"""Decimal logarithms of the least and largest relative distance from the best ray at which shocks are tried."""
+
+
+@dataclass(frozen=True)
+class Trials:
+    """Shocks whose ends are wanted.
+
+    Attributes
+    ----------
+    base : ndarray of int64, (n,)
+        Number of the base state.
+    shock : ndarray, (n, dim)
+        Scaled jump of each of the shocked states.
+    """
+
+    base: np.ndarray
+    shock: np.ndarray
+
+
+Search = Generator[Trials, np.ndarray, "Found"]
+"""A search: yields trials, receives their labels, returns what it found."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Settings of a search.
+
+    Attributes
+    ----------
+    largest : float
+        Largest scaled size of a shock.
+    directions : int
+        Number of directions of a shell, if more than one state is shocked.
+    norm : str
+        ``"euclidean"`` or ``"largest"``, of the scaled jumps.
+    precision : float
+        Relative length to which the last ray is divided.
+    confirmations : int
+        Random smaller shocks that are tried in a round of confirmation.
+    seed : int
+        Seed of directions and random shocks.
+    """
+
+    largest: float
+    directions: int
+    norm: Norm
+    precision: float
+    confirmations: int
+    seed: int
+
+    def size(self, shocks: np.ndarray) -> np.ndarray:
+        """Return the scaled sizes of shocks (..., dim)."""
+        return np.asarray(np.linalg.norm(shocks, axis=-1) if self.norm == "euclidean" else np.abs(shocks).max(axis=-1))
+
+    def unit(self, shocks: np.ndarray) -> np.ndarray:
+        """Return shocks of size 1 in the same directions."""
+        return np.asarray(shocks / self.size(shocks)[..., None])
+
+    def compass(self, dim: int, rng: np.random.Generator) -> np.ndarray:
+        """Return the directions of a shell, shape (n, dim): both axes of each state first."""
+        if dim == 1:
+            return np.array([[1.0], [-1.0]])
+        if dim == 2:
+            angles = 2.0 * np.pi * np.arange(self.directions) / self.directions
+            return self.unit(np.column_stack([np.cos(angles), np.sin(angles)]))
+        axes = np.concatenate([np.eye(dim), -np.eye(dim)])
+        drawn = rng.standard_normal((max(self.directions - len(axes), 0), dim))
+        return self.unit(np.concatenate([axes, drawn]))
+
+
+@dataclass(frozen=True)
+class Found:
+    """The smallest shock that leads away from an attractor.
+
+    Attributes
+    ----------
+    low, high : float
+        Scaled sizes. Every shock smaller than `low` that was tried stayed. The shock of size `high` leads away;
+        infinite if none was found. The ends of some shocks between them are not known.
+    shock : ndarray, (dim,)
+        The shock of size `high`; NaN if none was found.
+    base : int
+        Number of its base state, -1 if none was found.
+    leads_to : int
+        Label of the end, `UNDECIDED` if none was found.
+    safe : float
+        Size of the largest shell below `low` of which all shocks stayed; 0 if there is none.
+    n_below : int
+        Number of shocks smaller than `low` that were tried; all of them stayed.
+    n_undecided : int
+        Number of shocks smaller than `high` whose end is not known.
+    """
+
+    low: float
+    high: float
+    shock: np.ndarray
+    base: int
+    leads_to: int
+    safe: float
+    n_below: int
+    n_undecided: int
+
+
+@dataclass
+class _Rays:
+    """Rays from base states: on each, the interval in which shocks begin to lead away."""
+
+    base: np.ndarray
+    unit: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    label: np.ndarray
+
+    def take(self, rows: np.ndarray) -> _Rays:
+        return _Rays(self.base[rows], self.unit[rows], self.low[rows], self.high[rows], self.label[rows])
+
+    def joined(self, other: _Rays) -> _Rays:
+        pairs = ((getattr(self, n), getattr(other, n)) for n in ("base", "unit", "low", "high", "label"))
+        return _Rays(*(np.concatenate(pair) for pair in pairs))
+
+
+class ShockSearch:
+    """The search for the smallest shock that leads away from one attractor.
+
+    Parameters
+    ----------
+    own
+        Id of the attractor.
+    n_bases
+        Number of base states on the attractor, neighbours in time next to each other.
+    dim
+        Number of shocked states.
+    settings
+        Settings of the search.
+    seeds
+        Shocks that are known to lead away, with their labels.
+    """
+
+    def __init__(
+        self, own: int, n_bases: int, dim: int, settings: Settings, seeds: tuple[Trials, np.ndarray] | None = None
+    ) -> None:
+        self._own, self._n_bases, self._dim, self._settings = own, n_bases, dim, settings
+        self._rng = np.random.default_rng([settings.seed, dim])
+        self._seeds = seeds
+        self._sizes: list[np.ndarray] = []
+        self._codes: list[np.ndarray] = []
+        self._shells: list[tuple[float, bool]] = []
+
+    def run(self) -> Search:
+        """Search: a generator that yields trials, receives their labels and returns a `Found`."""
+        rays = yield from self._outer()
+        if not len(rays.base):
+            return self._nothing()
+        yield from self._narrow(rays, COARSE)
+        best = self._best(rays)
+        if self._dim > 1 or self._n_bases > 1:
+            yield from self._descend(best)
+        for _ in range(ROUNDS):
+            best = best.take(np.argsort(best.high, kind="stable")[:1])
+            yield from self._narrow(best, self._settings.precision)
+            worse = yield from self._contradictions(best)
+            if not len(worse.base):
+                break
+            worse = worse.take(np.argsort(worse.high, kind="stable")[:MOST_RAYS])
+            yield from self._narrow(worse, COARSE)
+            best = self._best(worse)
+            yield from self._descend(best)
+        best = best.take(np.argsort(best.high, kind="stable")[:1])
+        yield from self._narrow(best, self._settings.precision)
+        return self._result(best)
+
+    # ---- trials --------------------------------------------------------------------------------
+
+    def _ask(self, base: np.ndarray, shock: np.ndarray) -> Generator[Trials, np.ndarray, tuple[np.ndarray, np.ndarray]]:
+        """Return the label of each shock, and its code: 1 leads away, 0 stays, -1 not known."""
+        if not len(base):
+            return np.zeros(0, np.int64), np.zeros(0, np.int64)
+        label = yield Trials(base, shock)
+        code = np.where(label == UNDECIDED, -1, (label != self._own).astype(np.int64))
+        self._sizes.append(self._settings.size(shock))
+        self._codes.append(code)
+        return label, code
+
+    def _outer(self) -> Generator[Trials, np.ndarray, _Rays]:
+        """Try shells of rising size until a shock leads away; return the rays of the shocks that do."""
+        units = self._settings.compass(self._dim, self._rng)
+        base, unit = np.repeat(np.arange(self._n_bases), len(units)), np.tile(units, (self._n_bases, 1))
+        before, low = 0.0, np.zeros(len(base))
+        rays = _Rays(*(x[:0] for x in (base, unit, low, low, base)))
+        for size in self._settings.largest * RATIO ** np.arange(1.0 - SHELLS, 1.0):
+            label, code = yield from self._ask(base, size * unit)
+            self._shells.append((float(size), bool((code == 0).all())))
+            away = np.flatnonzero(code == 1)
+            if len(away):
+                order = self._rng.permutation(len(away))[:MOST_RAYS]
+                away = np.sort(away[order])
+                rays = _Rays(base[away], unit[away], low[away], np.full(len(away), size), label[away])
+                break
+            low = np.where(code == 0, size, low)
+            before = float(size)
+        return rays.joined(self._seeded(rays.high.min() if len(rays.high) else np.inf, before))
+
+    def _seeded(self, below: float, before: float) -> _Rays:
+        """Return the rays of known shocks that lead away and are smaller than those found."""
+        if self._seeds is None:
+            empty = np.zeros(0, np.int64)
+            return _Rays(empty, np.zeros((0, self._dim)), np.zeros(0), np.zeros(0), empty)
+        trials, label = self._seeds
+        size = self._settings.size(trials.shock)
+        rows = np.flatnonzero((size < below) & (size > 0.0))
+        units = self._settings.unit(trials.shock[rows])
+        return _Rays(trials.base[rows], units, np.zeros(len(rows)), size[rows], label[rows])
+
+    def _narrow(self, rays: _Rays, precision: float) -> Generator[Trials, np.ndarray, None]:
+        """Divide the interval of each ray until it is short or holds undecided shocks only, in place."""
+        going = np.arange(len(rays.base))
+        share = np.arange(1, PARTS) / PARTS
+        while True:
+            going = going[rays.high[going] - rays.low[going] > precision * rays.high[going]]
+            if not len(going):
+                return
+            low, high = rays.low[going], rays.high[going]
+            sizes = low[:, None] + (high - low)[:, None] * share
+            shock = sizes[..., None] * rays.unit[going][:, None]
+            label, code = yield from self._ask(np.repeat(rays.base[going], PARTS - 1), shock.reshape(-1, self._dim))
+            label, code = label.reshape(-1, PARTS - 1), code.reshape(-1, PARTS - 1)
+            for i, row in enumerate(going):
+                first = int(np.argmax(code[i] == 1)) if (code[i] == 1).any() else PARTS - 1
+                if first < PARTS - 1:
+                    rays.high[row], rays.label[row] = sizes[i, first], label[i, first]
+                stays = np.flatnonzero(code[i, :first] == 0)
+                if len(stays):
+                    rays.low[row] = sizes[i, stays[-1]]
+            # an interval that no longer halves holds undecided shocks
+            going = going[rays.high[going] - rays.low[going] <= 0.5 * (high - low)]
+
+    def _best(self, rays: _Rays) -> _Rays:
+        """Return the rays of the smallest shocks that are not neighbours of a smaller one."""
+        kept: list[int] = []
+        for row in np.argsort(rays.high, kind="stable").tolist():
+            near = [
+                k
+                for k in kept
+                if rays.base[k] == rays.base[row] and np.linalg.norm(rays.unit[k] - rays.unit[row]) < 4.0 * self._angle
+            ]
+            if not near:
+                kept.append(row)
+            if len(kept) == MOST_DESCENTS:
+                break
+        return rays.take(np.array(kept))
+
+    @property
+    def _angle(self) -> float:
+        """Typical angle between neighbouring directions of a shell [rad]."""
+        return 2.0 * np.pi / self._settings.directions if self._dim == 2 else 0.5
+
+    # ---- descent -------------------------------------------------------------------------------
+
+    def _descend(self, rays: _Rays) -> Generator[Trials, np.ndarray, None]:
+        """Move each ray, in place, to nearby directions and base states from which smaller shocks lead away."""
+        angle = np.full(len(rays.base), min(self._angle, 0.5))
+        for _ in range(MOST_STEPS):
+            going = np.flatnonzero(angle > LAST_ANGLE)
+            if not len(going):
+                return
+            asked = [self._near(rays, int(row), float(angle[row])) for row in going]
+            label, code = yield from self._ask(
+                np.concatenate([base for base, _ in asked]), np.concatenate([shock for _, shock in asked])
+            )
+            ends = np.cumsum([len(base) for base, _ in asked])
+            for row, (base, shock), end in zip(going.tolist(), asked, ends.tolist(), strict=True):
+                own = slice(end - len(base), end)
+                size = np.where(code[own] == 1, self._settings.size(shock), np.inf)
+                k = int(np.argmin(size))
+                if not size[k] < rays.high[row]:
+                    angle[row] /= 3.0
+                    continue
+                rays.base[row], rays.unit[row], rays.label[row] = base[k], shock[k] / size[k], label[own][k]
+                rays.high[row], rays.low[row] = size[k], 0.0
+
+    def _near(self, rays: _Rays, row: int, angle: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return trials in nearby directions and at neighbouring base states, slightly smaller than a ray's shock."""
+        unit, base = rays.unit[row], int(rays.base[row])
+        units, bases = [unit[None]], [np.array([base])]
+        if self._dim > 1:
+            plane = np.linalg.svd(unit[None])[2][1:]
+            drawn = self._rng.standard_normal((N_RANDOM, len(plane))) @ plane
+            drawn /= np.linalg.norm(drawn, axis=1, keepdims=True)
+            turned = unit / np.linalg.norm(unit) + angle * np.concatenate([plane, -plane, drawn])
+            units.append(self._settings.unit(turned))
+            bases.append(np.full(len(turned), base))
+        if self._n_bases > 1:
+            units.append(np.repeat(unit[None], 2, axis=0))
+            bases.append(np.array([base - 1, base + 1]) % self._n_bases)
+        every, numbers = np.concatenate(units), np.concatenate(bases)
+        sizes = rays.high[row] * (1.0 - np.array([factor * angle**power for factor, power in LADDER]))
+        shock = sizes[:, None, None] * every
+        return np.tile(numbers, len(sizes)), shock.reshape(-1, self._dim)
+
+    def _contradictions(self, best: _Rays) -> Generator[Trials, np.ndarray, _Rays]:
+        """Try random smaller shocks; return the rays of those that lead away.
+
+        Half of them have any direction and base state. The others are near the best ray at all distances below its
+        shock: where the boundary is fractal, thin parts of other basins lie there, which dividing a ray misses.
+        """
+        n, least, dim = self._settings.confirmations, float(best.high[0]), self._dim
+        base = np.concatenate([self._rng.integers(self._n_bases, size=n), np.full(n, best.base[0])])
+        drawn = self._rng.standard_normal((2 * n, dim))
+        if dim > 1:
+            turned = 10.0 ** self._rng.uniform(*BESIDE, n)
+            turned[: n // 2] = 0.0
+            drawn[n:] = best.unit[0] + turned[:, None] * drawn[n:]
+        else:
+            drawn[n:] = best.unit[0]
+        below = 10.0 ** self._rng.uniform(np.log10(self._settings.precision), BESIDE[1], n)
+        share = np.concatenate([self._rng.uniform(0.25, 1.0 - self._settings.precision, n), 1.0 - below])
+        unit, size = self._settings.unit(drawn), least * share
+        label, code = yield from self._ask(base, size[:, None] * unit)
+        away = np.flatnonzero(code == 1)
+        return _Rays(base[away], unit[away], np.zeros(len(away)), size[away], label[away])
+
+    # ---- result --------------------------------------------------------------------------------
+
+    def _tried(self) -> tuple[np.ndarray, np.ndarray]:
+        return np.concatenate([np.zeros(0), *self._sizes]), np.concatenate([np.zeros(0, np.int64), *self._codes])
+
+    def _result(self, best: _Rays) -> Found:
+        size, code = self._tried()
+        high = float(best.high[0])
+        unknown = (code == -1) & (size < high)
+        low = float(size[unknown].min()) if unknown.any() else float(best.low[0])
+        shock = high * best.unit[0]
+        return self._found(low, high, shock, int(best.base[0]), int(best.label[0]))
+
+    def _nothing(self) -> Found:
+        size, code = self._tried()
+        unknown = size[code == -1].tolist()
+        return self._found(min([self._settings.largest, *unknown]), np.inf, np.full(self._dim, np.nan), -1, UNDECIDED)
+
+    def _found(self, low: float, high: float, shock: np.ndarray, base: int, label: int) -> Found:
+        size, code = self._tried()
+        safe = max([0.0, *(shell for shell, stays in self._shells if stays and shell <= low)])
+        n_below = int(((size <= low) & (code == 0)).sum())
+        n_unknown = int(((size < high) & (code == -1)).sum())
+        return Found(low, high, shock, base, label, safe, n_below, n_unknown)

@@ -1,0 +1,395 @@
+"""Responses to shocks and edge states, against DOP853, closed forms and published numbers."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.linalg import expm
+
+from pipeline.analysis.attractors.destinations import ELSEWHERE, UNDECIDED, destinations_at
+from pipeline.analysis.attractors.finding.points import BUDGET, Dynamics, slabs
+from pipeline.analysis.resilience.base_states import Asked, Bases, Shocked, answer
+from pipeline.analysis.resilience.edge_table import edge_table
+from pipeline.analysis.resilience.shocks import Settings, ShockSearch
+from pipeline.analysis.resilience.table import resilience_table, size_of
+from pipeline.layout.vocabulary import BOUNDED_SET, EQUILIBRIUM, PERIODIC_ORBIT
+from pipeline.plots.edge import plot_edge
+from pipeline.plots.resilience import plot_resilience
+from pipeline.products.attractors import AttractorOptions
+from pipeline.runs.derive import AnalysedRun
+from pipeline.runs.run import run
+from pipeline.specification.problems import SpecError
+
+DUFFING = """
+kind = "sweep"
+model = "duffing"
+[parameters]
+frequency_hz = 0.15915494309189535
+[parameters.overrides]
+damping = {damping}
+linear = {linear}
+cubic = {cubic}
+amplitude = {amplitude}
+[initial_conditions]
+kind = "grid"
+x = {{ start = -2.0, stop = 2.0, num = {num} }}
+v = {{ start = -2.0, stop = 2.0, num = {num} }}
+[integration]
+rtol = 1e-9
+atol = 1e-9
+n_transient = 200
+n_keep = 8
+stop_when_closed = true
+closure_tolerance = 1e-6
+"""
+WELLS = {"damping": 0.15, "linear": -1.0, "cubic": 1.0, "amplitude": 0.2, "num": 21}
+
+MAGNETS = """
+kind = "sweep"
+model = "three-magnets"
+[parameters]
+frequency_hz = 0.5
+[initial_conditions]
+kind = "grid"
+x = { start = -1.4, stop = 1.4, num = 12 }
+y = { start = -1.4, stop = 1.4, num = 12 }
+[integration]
+rtol = 1e-8
+atol = 1e-8
+n_transient = 200
+n_keep = 8
+stop_when_closed = true
+closure_tolerance = 1e-4
+"""
+
+
+def computed(folder, text):
+    """Compute a run."""
+    (folder / "spec.toml").write_text(text)
+    run(folder / "spec.toml", folder / "run", workers=0, echo=lambda line: None)
+    return AnalysedRun.of(folder / "run")
+
+
+@pytest.fixture(scope="module")
+def duffing(tmp_path_factory):
+    """Make a run of the Duffing oscillator with some values of its own."""
+
+    def make(**values):
+        folder = tmp_path_factory.mktemp("duffing")
+        return computed(folder, DUFFING.format(**{**WELLS, **values}))
+
+    return make
+
+
+@pytest.fixture(scope="module")
+def wells(duffing):
+    return duffing()
+
+
+@pytest.fixture(scope="module")
+def found(wells):
+    return wells.derive("resilience")
+
+
+@pytest.fixture(scope="module")
+def magnets(tmp_path_factory):
+    return computed(tmp_path_factory.mktemp("magnets"), MAGNETS)
+
+
+def at_point(a_run):
+    """The only parameter point of a run, as ends of trajectories."""
+    cube, options = a_run.cube(), AttractorOptions()
+    (points,) = slabs(cube, Dynamics.of(cube), BUDGET)
+    ((_, there),) = destinations_at(cube, a_run.derive("attractors"), points, options)
+    return there
+
+
+# ---- by DOP853 ---------------------------------------------------------------------------------
+
+# section points of validation.md, 4
+WELL_POINTS = np.array([[-0.7790549287, 0.0274168155], [1.2100908241, 0.0552949542]])
+
+
+def flow(states, begin, end, amplitude=0.2, rtol=1e-9):
+    """States (n, 2) of x'' + .15 x' - x + x^3 = F cos t at the end, from those at the begin, by scipy."""
+
+    def rates(t, z):
+        x, v = z.reshape(2, -1)
+        return np.concatenate([v, amplitude * np.cos(t) - 0.15 * v + x - x**3])
+
+    steps = solve_ivp(rates, (begin, end), np.asarray(states).T.ravel(), method="DOP853", rtol=rtol, atol=rtol)
+    return steps.y[:, -1].reshape(2, -1).T
+
+
+def well_of(states, begin):
+    """Which of the two orbits trajectories are on after some eighty periods; -1 for none yet."""
+    ends = flow(states, begin, 80 * 2.0 * np.pi)
+    away = np.abs(ends[:, None] - WELL_POINTS).max(axis=-1)
+    return np.where(away.min(axis=1) < 1e-2, away.argmin(axis=1), -1)
+
+
+@pytest.fixture(scope="module")
+def exhaustive():
+    """Smallest shock of v from each orbit at each of eight phases, from all multiples of .004 up to .3 (DOP853)."""
+    sizes = np.arange(1, 76) * 0.004
+    least = np.full((2, 8), np.inf)
+    for k in range(8):
+        begin = 2.0 * np.pi * k / 8
+        for well, point in enumerate(WELL_POINTS):
+            base = flow(point[None], 0.0, begin, rtol=1e-12)[0] if k else point
+            for sign in (1.0, -1.0):
+                ends = well_of(base + sizes[:, None] * [0.0, sign], begin)
+                away = np.flatnonzero(ends == 1 - well)
+                if len(away):
+                    least[well, k] = min(least[well, k], sizes[away[0]])
+    return least
+
+
+def separates(well_at, well):
+    """Whether shares of a jump below 1 stay and some above 1 leave.
+
+    Beyond the boundary, which is fractal, both ends lie close together. The shares are 1e-5 and more away from 1:
+    scipy's tolerance and ours move the boundary by less.
+    """
+    off = 10.0 ** np.arange(-5.0, -2.0, 0.15)[:, None]
+    return bool((well_at(1.0 - off) == well).all() and (well_at(1.0 + off) == 1 - well).any())
+
+
+def test_resilience__critical_shock_of_duffing_by_exhaustion(found, exhaustive):
+    """No smaller multiple of .004 leads away at any phase; the shock found does, a slightly smaller one does not."""
+    for well in (0, 1):
+        one = found.isel(attractor=well)
+        size, phase = float(one["shock_high"]), float(one["shock_phase"])
+        assert exhaustive[well].min() - 0.004 <= size <= exhaustive[well].min()
+        assert exhaustive[well, round(8 * phase)] == exhaustive[well].min()
+        begin = 2.0 * np.pi * phase
+        base = flow(WELL_POINTS[[well]], 0.0, begin, rtol=1e-12)[0]
+        assert one["shock_from"].values == pytest.approx(base, abs=1e-8)
+        jump = one["shock"].values
+        assert jump[0] == 0.0
+        assert abs(jump[1]) == pytest.approx(size)
+        assert separates(lambda share, base=base, jump=jump, begin=begin: well_of(base + share * jump, begin), well)
+        assert int(one["shock_to"]) == 1 - well
+        assert one["shock_high"] - one["shock_low"] <= 1.1e-6 * size
+        assert float(one["shock_safe"]) < size
+
+
+def test_resilience__distances_of_duffing(found):
+    """In any direction at the section, and along each state: smaller shocks stay, larger ones leave (DOP853)."""
+    turns = np.linspace(0.0, 2.0 * np.pi, 30, endpoint=False)
+    circle = np.column_stack([np.cos(turns), np.sin(turns)])
+    for well, point in enumerate(WELL_POINTS):
+        one = found.isel(attractor=well)
+        size = float(one["distance_high"])
+        assert np.hypot(*one["distance"].values) == pytest.approx(size)
+        inside = np.concatenate([share * size * circle for share in (0.7, 0.99)])
+        assert (well_of(point + inside, 0.0) == well).all()
+        assert separates(lambda share, p=point, jump=one["distance"].values: well_of(p + share * jump, 0.0), well)
+        for k in (0, 1):
+            along = np.zeros(2)
+            along[k] = float(one["along"][k])
+            assert separates(lambda share, p=point, jump=along: well_of(p + share * jump, 0.0), well)
+            assert well_of(point - 0.9999 * along[None], 0.0)[0] == well
+            assert abs(along[k]) >= size
+
+
+def test_resilience__basin_stability_and_table(found, wells):
+    shares = found["basin_stability"].values
+    fractions = wells.derive("basins")["fraction"].sel(label=[0, 1]).values
+    assert shares == pytest.approx(fractions)
+    assert (found["basin_stability_low"] < shares).all()
+    assert (shares < found["basin_stability_high"]).all()
+    table = resilience_table(found)
+    assert [row["letter"] for row in table.rows] == ["A", "B"]
+    assert [row["shock_leads_to"] for row in table.rows] == ["B", "A"]
+    assert table.rows[0]["shock_v"] == pytest.approx(float(found["shock"].isel(attractor=0, state=1)))
+    json.dumps([dict(row) for row in table.rows])
+    assert f"{float(found['shock_high'][0]):.5g}" in "\n".join(table.lines)
+    figure = plot_resilience(found, wells.derive("attractors"))
+    assert [ax.get_ylabel() for ax in figure.axes] == ["basin stability", "smallest shock", "arrival [drive periods]"]
+    assert float(figure.data["shock_high"].isel(attractor=0)) == float(found["shock_high"].isel(attractor=0))
+
+
+def test_size_of():
+    assert size_of(0.2, 0.3) == "0.2 to 0.3"
+    assert size_of(0.23599999, 0.236) == "0.236"
+    assert size_of(2.0, np.inf) == "above 2"
+
+
+# ---- one attractor -----------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def linear(duffing):
+    """x'' + .2 x' + 2 x = cos t: one orbit, which attracts all states."""
+    return duffing(damping=0.2, linear=2.0, cubic=0.0, amplitude=1.0, num=5)
+
+
+def test_resilience__of_a_linear_oscillator(linear):
+    """No shock leads away; arrivals follow the matrix exponential (validation.md, 1)."""
+    one = linear.derive("resilience", within=7, largest=3.0).isel(attractor=0)
+    assert float(one["shock_low"]) == 3.0
+    assert np.isinf(one["shock_high"])
+    assert int(one["shock_to"]) == UNDECIDED
+    assert int(one["distance_n_below"]) > 1000
+    away = np.stack(np.meshgrid(*[np.linspace(-2.0, 2.0, 5)] * 2), -1).reshape(-1, 2) - [0.9615384615, 0.1923076923]
+    return_map = expm(2.0 * np.pi * np.array([[0.0, 1.0], [-2.0, -0.2]]))
+    inside, step = [], away.T
+    for _ in range(60):
+        inside.append(np.abs(step).max(axis=0) <= 0.01)
+        step = return_map @ step
+    inside = np.array(inside)
+    # the first section from which on all are inside
+    entered = len(inside) - np.argmin(inside[::-1], axis=0)
+    assert int(one["n_timed"]) == 25
+    assert float(one["mean_time"]) == pytest.approx(entered.mean())
+    assert float(one["longest_time"]) == entered.max()
+    assert float(one["arrived"]) == pytest.approx((entered <= 7).mean())
+    assert 0.0 < float(one["arrived_low"]) < float(one["arrived"]) < float(one["arrived_high"]) < 1.0
+
+
+# ---- magnets -----------------------------------------------------------------------------------
+
+
+def test_shocks__magnetic_pendulum_as_published(magnets):
+    """Test "Magnetic 2D" of Attractors.jl: .39 to .395 of place, in the Euclidean norm, from a magnet at rest.
+
+    Its value is .3923. A magnet is no rest of the bob: that is .0097 nearer to the middle.
+    """
+    there = at_point(magnets)
+    resting = np.array([one.state for one in there.point.equilibria])
+    place, own = np.array([1.0, 0.0, 0.0, 0.0]), int(np.argmax(resting[:, 0]))
+    settings = Settings(2.0, 64, "euclidean", 1e-6, 256, 0)
+    for state, least in ((place, 0.3923), (resting[own], 0.40204)):
+        bases, which = Bases(state[None], np.zeros(1), np.ones(1, bool)), np.array([0, 1])
+        search = ShockSearch(own, 1, 2, settings)
+        one = answer({"it": Asked(search.run(), bases, which)}, Shocked(there), np.ones(4), "")["it"]
+        assert one.high == pytest.approx(least, abs=1e-4)
+        assert one.leads_to in {0, 1, 2} - {own}
+
+
+def test_resilience__of_the_magnets(magnets):
+    """Bases of three equal magnets: the same sizes by symmetry, and jumps of place that agree with the search above."""
+    found = magnets.derive("resilience", states="x,y", timed=0)
+    assert found["shock_high"].values == pytest.approx(np.full(3, 0.40204), abs=1e-4)
+    assert (found["shock"].values[:, 2:] == 0.0).all()
+    assert (found["n_timed"] == 0).all()
+    assert found.attrs["resilience_states"] == "x, y"
+
+
+# ---- edge states -------------------------------------------------------------------------------
+
+HILLTOP, MULTIPLIERS = (-0.099835710177, 0.007534227463), (324.501702, 0.00120079844)
+
+
+def test_edge__of_a_fractal_boundary(wells):
+    """The boundary is fractal: its paths do not settle, and the orbit on the hilltop is one of those on it."""
+    found = wells.derive("edge", between=("A", "B"), seed=2)
+    points = found["section"].values[:, 0]
+    k = int(np.argmin(np.abs(points - HILLTOP).max(axis=1)))
+    assert points[k] == pytest.approx(HILLTOP, abs=1e-9)
+    assert found["multiplier_real"].values[k] == pytest.approx(MULTIPLIERS, rel=1e-7)
+    assert found["multiplier_imag"].values[k] == pytest.approx(0.0)
+    assert int(found["kind"][k]) == PERIODIC_ORBIT
+    assert int(found["n_pairs"][k]) == 0
+    assert (found["kind"] == BOUNDED_SET).any()
+    assert found.attrs["between"] == [0, 1]
+    lines = edge_table(found).lines
+    assert "on a path" in "\n".join(lines)
+    figure = plot_edge(found)
+    assert {line.get_gid().partition(":")[0] for line in figure.axes[0].lines if ":" in (line.get_gid() or "")} == {
+        "edge orbit",
+        "edge set",
+    }
+
+
+def test_edge__of_a_smooth_boundary(duffing):
+    """At F = .1 all pairs come to one saddle orbit: a fixed point by DOP853, between the two basins."""
+    a_run = duffing(amplitude=0.1)
+    found = a_run.derive("edge", between=("1", "0"))
+    assert found.sizes["edge"] == 1
+    assert int(found["n_pairs"][0]) == 4
+    assert int(found["orbit_period"][0]) == 1
+    point = found["section"].values[0, 0]
+    assert flow(point[None], 0.0, 2.0 * np.pi, 0.1, 1e-13)[0] == pytest.approx(point, abs=1e-9)
+    step = 1e-6
+    columns = [
+        (flow(point[None] + h, 0, 2 * np.pi, 0.1, 1e-13) - flow(point[None] - h, 0, 2 * np.pi, 0.1, 1e-13))[0]
+        / (2 * step)
+        for h in step * np.eye(2)
+    ]
+    values, vectors = np.linalg.eig(np.column_stack(columns))
+    assert np.sort(found["multiplier_real"].values[0]) == pytest.approx(np.sort(values), rel=1e-5)
+    across = vectors[:, np.argmax(np.abs(values))].real
+    stored = a_run.derive("attractors")["attractor_points"].values
+    points = stored[:, 0][[found.attrs["between"]]].reshape(2, 2)
+    ends = flow(point + np.array([[1e-3], [-1e-3]]) * across, 0.0, 60 * 2.0 * np.pi, 0.1)
+    nearest = np.abs(ends[:, None] - points).max(axis=-1)
+    assert nearest.min(axis=1).max() < 1e-3
+    assert set(nearest.argmin(axis=1).tolist()) == {0, 1}
+
+
+def test_edge__of_two_magnets(magnets):
+    """On the line between two magnets' basins lies a rest: no force by its formula, one unstable eigenvalue."""
+    found = magnets.derive("edge", between=("A", "B"), pairs=8)
+    rests = np.flatnonzero(found["kind"].values == EQUILIBRIUM)
+    assert len(rests) == 1
+    assert found.sizes["edge"] == 1
+    x, y, vx, vy = found["section"].values[rests[0], 0]
+    assert (vx, vy) == pytest.approx((0.0, 0.0), abs=1e-12)
+    places = np.array([[1.0, 0.0], [-0.5, np.sqrt(0.75)], [-0.5, -np.sqrt(0.75)]])
+
+    def force(place):
+        away = place - places
+        return -0.64 * place - (away / (np.sum(away**2, axis=1) + 0.04)[:, None] ** 1.5).sum(axis=0)
+
+    assert force(np.array([x, y])) == pytest.approx([0.0, 0.0], abs=1e-10)
+    step = 1e-5
+    slopes = [(force(np.array([x, y]) + h) - force(np.array([x, y]) - h)) / (2 * step) for h in step * np.eye(2)]
+    matrix = np.block([[np.zeros((2, 2)), np.eye(2)], [np.column_stack(slopes), -0.2 * np.eye(2)]])
+    values = np.linalg.eigvals(matrix)
+    assert np.sort(found["eigenvalue_real"].values[0]) == pytest.approx(np.sort(values.real), abs=1e-6)
+    assert (values.real > 0.0).sum() == 1
+
+
+# ---- what does not suit ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "message"),
+    [
+        ("resilience", {"states": "x,w"}, "states = 'w' is no state of duffing; use x, v"),
+        ("resilience", {"at": {"damping": 0.1}}, "damping"),
+        ("edge", {"between": ("A", "a")}, "give two different attractors"),
+        ("edge", {"between": ("A", "0")}, "give two different attractors"),
+        ("edge", {"between": ("A", "Q")}, "attractor Q is not at the parameter point; it has A, B"),
+        ("edge", {"between": ("A", "B"), "closest": 1e-4}, "--closest 0.0001 must be less than --farthest 0.0001"),
+    ],
+)
+def test_resilience__refuses(wells, name, options, message):
+    with pytest.raises(SpecError, match=message):
+        wells.derive(name, **options)
+
+
+def test_edge__says_what_is_not_decided(wells):
+    """A path of 16 sections on a fractal boundary has not settled."""
+    found = wells.derive("edge", between=("A", "B"), seed=2, returns=16, max_period=0)
+    assert found.sizes["edge"] == 0
+    assert (found["pair_edge"] == -1).all()
+    assert "not decided, 4 pairs: its path has not come to a set that repeats itself" in "\n".join(
+        edge_table(found).lines
+    )
+
+
+def test_destinations__ends_of_trajectories(wells):
+    """Near an orbit they end on it; an orbit that is not known is elsewhere, and undecided without the extension."""
+    there = at_point(wells)
+    near = WELL_POINTS + 0.01
+    assert there.follow(near).label.tolist() == [0, 1]
+    there.orbits, there.orbit_ids = there.orbits[:1], there.orbit_ids[:1]
+    assert there.follow(near).label.tolist() == [0, ELSEWHERE]
+    there.options = there.options.model_copy(update={"extend": False})
+    assert there.follow(near).label.tolist() == [0, UNDECIDED]
