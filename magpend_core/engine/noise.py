@@ -10,12 +10,9 @@ from typing import Any
 from magpend_core.engine.jit import inline
 from magpend_core.engine.random_numbers import MAX_SOURCES
 from magpend_core.engine.system import System
+from magpend_core.sizes import NOISE_PREFIX, REALIZATION
 
 ITO, STRATONOVICH = "ito", "stratonovich"
-PREFIX = "noise_"
-"""The strength of the noise on the state x is the parameter noise_x."""
-REALIZATION = "realization"
-"""Parameter without effect on the equations: cells that differ in it alone have independent noise."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,7 +56,7 @@ class Noise:
 
 def noise_parameters(system: System, noise: Noise) -> tuple[str, ...]:
     """Return the names of the parameters that noise adds to a system: the strengths, then the realization."""
-    return (*(PREFIX + system.state_names[i] for i in noise.states), REALIZATION)
+    return (*(NOISE_PREFIX + system.state_names[i] for i in noise.states), REALIZATION)
 
 
 def obstacles(system: System, noise: Noise) -> list[str]:

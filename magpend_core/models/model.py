@@ -25,6 +25,7 @@ from magpend_core.models.presets import completed, find_preset
 if TYPE_CHECKING:
     from magpend_core.crossing import Crossing
     from magpend_core.engine.system import System
+    from magpend_core.models.noisy import Disturbance
 
 
 class ModelError(ParameterError):
@@ -223,6 +224,11 @@ class Model:
     @property
     def crossing(self) -> Crossing | None:
         """Return the model's Poincare section at a level of a state; None if the section is stroboscopic."""
+        return None
+
+    @property
+    def disturbance(self) -> Disturbance | None:
+        """Return the white noise on the model's equations; None without noise."""
         return None
 
     @property
