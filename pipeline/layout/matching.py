@@ -15,13 +15,14 @@ import numpy as np
 
 from pipeline.layout.cells import InitialStates, Inputs, initial_states, parameter_axes
 from pipeline.layout.identity import CODE, differences
+from pipeline.specification.noise import NoiseTable
 from pipeline.specification.parsing import Spec
 from pipeline.specification.tables import FREQUENCY
 
 NOWHERE = -1
 """Index that stands for a cell that the run does not have."""
 
-_CODE = (*CODE, "compute.continuation", "compute.recorded_drive", "specification.drive_files")
+_CODE = (*CODE, "compute.continuation", "compute.recorded_drive", "specification.drive_files", "compute.noise")
 
 
 def deciding(identity: Mapping[str, Any]) -> dict[str, Any]:
@@ -37,6 +38,7 @@ def deciding(identity: Mapping[str, Any]) -> dict[str, Any]:
         "code": {name: version for name, version in identity["code"].items() if name in _CODE},
         **{name: spec[name] for name in ("kind", "drive", "section") if name in spec},
         "integration": integration,
+        **({"noise": NoiseTable.model_validate(spec["noise"]).deciding} if "noise" in spec else {}),
         **({"path": spec["continuation"]["path"]} if "continuation" in spec else {}),
     }
 

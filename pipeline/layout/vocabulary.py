@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from magpend_core.crossing import Crossing
 from magpend_core.models import DEFAULT, load_model
 from magpend_core.models.model import Model, Parameters
+from magpend_core.models.noisy import Disturbance, noisy
 from magpend_core.models.sectioned import sectioned
 from magpend_core.status import Status
 from pipeline.specification.tables import FREQUENCY
@@ -102,7 +103,8 @@ def model_attribute(model: Model) -> str:
 def model_of(ds: xr.Dataset) -> Model:
     """Return the model of a cube or of a dataset derived from it, by its attribute ``model``.
 
-    If the attributes ``section_...`` name a section by crossing, the model has that section.
+    If the attributes ``section_...`` name a section by crossing, the model has that section; if the attribute
+    ``noise`` describes noise, it has that noise.
 
     Raises
     ------
@@ -110,11 +112,25 @@ def model_of(ds: xr.Dataset) -> Model:
         If the attribute names no model. A Python object is not imported: its description suffices to draw.
     """
     model = load_model(str(ds.attrs.get("model", DEFAULT)))
+    if _NOISE in ds.attrs:
+        strengths, interpretation = json.loads(ds.attrs[_NOISE])
+        return noisy(model, Disturbance(tuple((name, value) for name, value in strengths), interpretation))
     of = ds.attrs.get(f"{_SECTION}of")
     if of is None:
         return model
     value, longest = (float(ds.attrs[f"{_SECTION}{key}"]) for key in ("value", "longest"))
     return sectioned(model, Crossing(str(of), value, ds.attrs[f"{_SECTION}direction"], longest))
+
+
+_NOISE = "noise"
+"""Attribute that describes the noise on the model's equations, as JSON."""
+
+
+def noise_attributes(disturbance: Disturbance | None) -> dict[str, Any]:
+    """Return the dataset attribute that describes noise; `model_of` reads it."""
+    if disturbance is None:
+        return {}
+    return {_NOISE: json.dumps([disturbance.strengths, disturbance.interpretation])}
 
 
 _SECTION = "section_"
@@ -133,7 +149,7 @@ def told_by(attrs: Mapping[Any, Any]) -> dict[str, Any]:
     return {
         str(key): value
         for key, value in attrs.items()
-        if key in ("model", "parameters") or str(key).startswith(_SECTION)
+        if key in ("model", "parameters", _NOISE) or str(key).startswith(_SECTION)
     }
 
 

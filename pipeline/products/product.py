@@ -187,6 +187,8 @@ class Analysis:
         Name of the figure that shows the result best, or empty.
     ignores : tuple of str
         Options that do not change the result.
+    noisy : bool
+        Whether it is of runs with noise; all others are of runs without.
     """
 
     name: str
@@ -199,6 +201,7 @@ class Analysis:
     builds_on: tuple[str, ...] = ()
     figure: str = ""
     ignores: tuple[str, ...] = ()
+    noisy: bool = False
 
 
 class FigureOptions(Options):

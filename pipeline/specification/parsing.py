@@ -27,6 +27,7 @@ from pipeline.specification.drive_files import RecordedDrive
 from pipeline.specification.files import merged, nested, odd_data, read_toml
 from pipeline.specification.methods import method_problems
 from pipeline.specification.models import A_MODEL, KEPT, add_model, stand_in, with_model_table
+from pipeline.specification.noise import NoiseTable, disturbed, follows, noise_of
 from pipeline.specification.problems import SpecError, problems_of, shown, unknown_choice, unknown_key
 from pipeline.specification.ranges import corner_problems, size_problems
 from pipeline.specification.recorded_drive import DriveTable, recorded, run_problems, with_drive
@@ -55,6 +56,7 @@ class Spec:
     execution: Execution
     drive: DriveTable | None = None
     section: SectionTable | None = None
+    noise: NoiseTable | None = None
 
     @cached_property
     def recorded(self) -> RecordedDrive | None:
@@ -81,8 +83,8 @@ class Spec:
 
     @cached_property
     def model(self) -> Model:
-        """Model that is integrated, with the Poincare section of the specification if it has one."""
-        return seen_through(load_model(self.reference), self.section)
+        """Model that is integrated, with the Poincare section or the noise of the specification if it has one."""
+        return disturbed(seen_through(load_model(self.reference), self.section), self.noise)
 
     @cached_property
     def values(self) -> Parameters:
@@ -109,8 +111,9 @@ _TABLES: dict[str, type[Table]] = {
     "execution": Execution,
     "drive": DriveTable,
     "section": SectionTable,
+    "noise": NoiseTable,
 }
-_OPTIONAL = ("drive", "section")
+_OPTIONAL = ("drive", "section", "noise")
 _KEYS = (
     "kind",
     "title",
@@ -124,6 +127,7 @@ _KEYS = (
     "execution",
     "drive",
     "section",
+    "noise",
     "measured",  # orbits of a rig, which magpend measured branch reads: no part of a run
 )
 
@@ -235,7 +239,8 @@ def parse_spec(data: Mapping[str, Any], folder: str | Path | None = ".") -> Spec
     if model is None:
         raise SpecError(problems)
     section = section_of(tables["section"], model, data, problems)
-    seen = seen_through(model, section)
+    noise = noise_of(tables["noise"], model, data, problems)
+    seen = disturbed(seen_through(model, section), noise)
     starts = _starts(data, model, problems)
     problems += refine_problems(kind, starts, tables["integration"], model)
     products = _products(data, model, problems)
@@ -245,7 +250,8 @@ def parse_spec(data: Mapping[str, Any], folder: str | Path | None = ".") -> Spec
     known = _valid_keys(ParametersTable, data.get("parameters", {}))
     has_periods = "drive" in data or "section" in data or model.autonomous
     complete = not has_periods and not any(p.startswith(("axes", "parameters")) for p in problems)
-    problems += _parameter_problems(known, seen, _declared(data), axes, complete)
+    own = _parameter_problems(known, seen, _declared(data), axes, complete)
+    problems += [p for p in own if not follows(p, data, noise)]
     if problems:
         raise SpecError(problems)
     assert starts is not None
@@ -262,6 +268,7 @@ def parse_spec(data: Mapping[str, Any], folder: str | Path | None = ".") -> Spec
         tables["execution"],
         tables["drive"],
         section,
+        noise,
     )
 
 
