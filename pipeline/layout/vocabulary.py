@@ -16,6 +16,7 @@ from magpend_core.models import DEFAULT, load_model
 from magpend_core.models.model import Model, Parameters
 from magpend_core.models.noisy import Disturbance, noisy
 from magpend_core.models.sectioned import sectioned
+from magpend_core.sizes import REALIZATION
 from magpend_core.status import Status
 from pipeline.specification.tables import FREQUENCY
 
@@ -67,8 +68,8 @@ def is_grid_dim(dim: str) -> bool:
 
 
 def is_start_dim(dim: str) -> bool:
-    """Return whether a cube's dim runs over initial conditions or branches, not over a parameter."""
-    return dim in (BRANCH, START) or is_grid_dim(dim)
+    """Return whether a cube's dim runs over initial conditions, branches or realizations, not over a parameter."""
+    return dim in (BRANCH, START, REALIZATION) or is_grid_dim(dim)
 
 
 def start_dims(dims: Iterable[object]) -> tuple[str, ...]:

@@ -61,6 +61,8 @@ ANALYSES: Registry[Analysis] = Registry(
         "tongues": "pipeline.products.tongues:TONGUES",
         "manifolds": "pipeline.products.manifolds:MANIFOLDS",
         "tangency": "pipeline.products.manifolds:TANGENCY",
+        "escapes": "pipeline.products.noise:ESCAPES",
+        "density": "pipeline.products.noise:DENSITY",
     },
 )
 
@@ -88,6 +90,8 @@ FIGURES: Registry[Figure] = Registry(
             "rotation",
             "tongues",
             "manifolds",
+            "escapes",
+            "density",
         )
     },
 )
