@@ -145,7 +145,7 @@ def noisy_sections(
     first = np.broadcast_to(np.asarray(first_period, np.int64), (n_cells,)).copy()
     settings = _settings(n_transient, n_keep)
     n_periods = settings.n_transient + settings.n_keep
-    if n_cells and not (1 <= steps.min() and steps.max() <= MOST_STEPS):
+    if n_cells and not (steps.min() >= 1 and steps.max() <= MOST_STEPS):
         raise ValueError(f"steps_per_period must be from 1 to {MOST_STEPS}.")
     if n_cells and int((first + n_periods).max()) * int(steps.max()) >= LARGEST_COUNT:
         raise ValueError(f"cells of more than {LARGEST_COUNT} steps in all are too long; take fewer.")
@@ -188,10 +188,18 @@ def _cells(
 ) -> NoisyCells:
     """Return the engine's input arrays with empty output arrays beside them."""
     n = len(frequency)
-    inputs: tuple[Any, ...] = (frequency, packed, initial, words, first, steps)
-    return NoisyCells(
+
+    def own(array: np.ndarray) -> np.ndarray:
         # memory that may not be written to is a type of its own to numba, and would compile the engine once more
-        *(np.require(a, requirements=["C", "W"]) for a in inputs),
+        return np.require(array, requirements=["C", "W"])
+
+    return NoisyCells(
+        frequency=own(frequency),
+        parameters=own(packed),
+        initial=own(initial),
+        words=own(words),
+        first_period=own(first),
+        n_steps=own(steps),
         section=np.full((n, n_keep, system.n_states), np.nan),
         measures=np.zeros((n, FIRST_TURN + system.n_states)),
         turns=np.zeros((n, system.n_states), np.int64),

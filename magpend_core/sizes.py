@@ -26,6 +26,7 @@ def too_many_states(name: str, n_states: int) -> str | None:
         f"{MAX_STATES}."
     )
 
+
 NOISE_PREFIX = "noise_"
 """The strength of white noise on the state x is the parameter noise_x."""
 

@@ -14,9 +14,7 @@ _NEWTON_STEPS = 4
 _DIFFERENCE = 1e-6
 
 
-def fastest_contraction(
-    system: System, parameters: np.ndarray, frequency_hz: np.ndarray, states: np.ndarray
-) -> float:
+def fastest_contraction(system: System, parameters: np.ndarray, frequency_hz: np.ndarray, states: np.ndarray) -> float:
     """Return the largest rate at which the linearised equations contract, at given states and in the layers nearby.
 
     A layer is where the right-hand side changes quickly (see `System.layers`); each state is also moved to the

@@ -66,7 +66,7 @@ class NoisyRows(NamedTuple):
     step: int  # s
     root: int  # square root of the step
     done: int  # steps since the begin of the period
-    count: int  # steps since the begin of the cell
+    total: int  # steps since the begin of the cell
     low: int  # words that identify the cell
     high: int
     fresh: int  # written by `lanes.take_section`, read by nobody
@@ -121,7 +121,8 @@ def slope(w: Any, base: int, state: int, time: Any, out: int) -> None:
 
 def strengths(w: Any, base: int, state: int, out: int) -> None:
     """Compute the strengths of the noises at the state in the rows that begin at `state`, and write them to those at
-    `out`."""
+    `out`.
+    """
     c = load_rows(w, base + ROWS.constants, NC)
     y = load_rows(w, state, N)
     store_rows(w, out, strengths_of(y, c))
@@ -129,7 +130,7 @@ def strengths(w: Any, base: int, state: int, out: int) -> None:
 
 def draw(w: Any, base: int, keys: Any) -> None:
     """Draw the increments W and H of all noises over a step."""
-    count, root = load(w, base + ROWS.count), load(w, base + ROWS.root)
+    count, root = load(w, base + ROWS.total), load(w, base + ROWS.root)
     low, high = load(w, base + ROWS.low), load(w, base + ROWS.high)
     for j in range(N_SOURCES):
         first, second = normal_pair(count, low, high, PATH_TAGS[j], keys)
@@ -139,7 +140,7 @@ def draw(w: Any, base: int, keys: Any) -> None:
 
 def split(w: Any, base: int, keys: Any) -> None:
     """Split the increments over a step into those over its two halves, on the same path."""
-    count, root = load(w, base + ROWS.count), load(w, base + ROWS.root)
+    count, root = load(w, base + ROWS.total), load(w, base + ROWS.root)
     low, high = load(w, base + ROWS.low), load(w, base + ROWS.high)
     for j in range(N_SOURCES):
         first, second = normal_pair(count, low, high, BRIDGE_TAGS[j], keys)
@@ -234,7 +235,7 @@ def make_steps(w: Any, base: int, n: int, keys: Any, halves: bool) -> None:
         else:
             step(w, base, time, h, root)
         store(w, base + ROWS.done, done + 1.0)
-        store(w, base + ROWS.count, load(w, base + ROWS.count) + 1.0)
+        store(w, base + ROWS.total, load(w, base + ROWS.total) + 1.0)
 
 
 def begin_cell(cells: NoisyCells, work: NoisyWork, lane: int, cell: int, scratch: Any) -> None:
@@ -248,7 +249,7 @@ def begin_cell(cells: NoisyCells, work: NoisyWork, lane: int, cell: int, scratch
     w[base + ROWS.step + column] = h
     w[base + ROWS.root + column] = math.sqrt(h)
     w[base + ROWS.done + column] = 0.0
-    w[base + ROWS.count + column] = float(cells.first_period[cell] * n)
+    w[base + ROWS.total + column] = float(cells.first_period[cell] * n)
     w[base + ROWS.low + column] = cells.words[cell, 0]
     w[base + ROWS.high + column] = cells.words[cell, 1]
     for i in range(N):

@@ -8,6 +8,7 @@ from pipeline.products.attractors import AttractorOptions
 from pipeline.products.branches import BranchOptions, CurveOptions
 from pipeline.products.chaos import DimensionOptions
 from pipeline.products.manifolds import ManifoldOptions
+from pipeline.products.noise import DensityOptions, EscapeOptions
 from pipeline.products.product import Figure, FigureOptions, StateOptions, option
 from pipeline.products.tongues import TongueOptions
 
@@ -139,6 +140,16 @@ class ManifoldFigureOptions(ManifoldOptions, FigureOptions):
     """Options of a figure of manifolds."""
 
 
+class EscapeFigureOptions(EscapeOptions, FigureOptions):
+    """Options of a figure of escapes."""
+
+    show: Literal["rates", "paths"] = option("rates", "Rates over the axis, or the last stretch before leaving.")
+
+
+class DensityFigureOptions(DensityOptions, FigureOptions):
+    """Options of a figure of the density of section points."""
+
+
 BIFURCATION = Figure(
     "bifurcation",
     "Draw a bifurcation diagram: section points over the swept parameter, coloured by class of motion.",
@@ -254,4 +265,21 @@ MANIFOLDS = Figure(
     "Draw the stable and unstable manifolds of saddle orbits, over the basins of a run on a grid of two states.",
     ManifoldFigureOptions,
     "pipeline.plots.manifolds:draw",
+)
+
+ESCAPES = Figure(
+    "escapes",
+    """Draw rates of escape with intervals, over a strength with Kramers' law, or the last stretch before leaving.
+
+    Over the strength σ of the noise, the horizontal axis is 1/σ².""",
+    EscapeFigureOptions,
+    "pipeline.plots.escapes:draw",
+    needs="pipeline.analysis.noise.escapes:needs_set",
+)
+
+DENSITY = Figure(
+    "density",
+    "Draw the density of noisy section points, over an axis with its peaks: a stochastic bifurcation diagram.",
+    DensityFigureOptions,
+    "pipeline.plots.density:draw",
 )

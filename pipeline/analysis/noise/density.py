@@ -50,7 +50,7 @@ def effective_number(values: np.ndarray) -> float:
     lagged = np.fft.irfft(np.abs(padded) ** 2, 2 * n, axis=1)[:, :n].sum(axis=0) / (n_cells * np.arange(n, 0, -1))
     rho = lagged / variance
     stop = int(np.argmax(rho < 0.0)) if (rho < 0.0).any() else n
-    return float(values.size / max(1.0 + 2.0 * rho[1:stop].sum(), 1.0))
+    return float(values.size) / max(1.0 + 2.0 * float(rho[1:stop].sum()), 1.0)
 
 
 def silverman_bandwidth(values: np.ndarray, n_effective: float) -> float:
@@ -61,7 +61,7 @@ def silverman_bandwidth(values: np.ndarray, n_effective: float) -> float:
     """
     q1, q3 = np.percentile(values, [25.0, 75.0])
     spreads = [s for s in (float(values.std()), float(q3 - q1) / 1.34) if s > 0.0]
-    return 0.9 * min(spreads, default=0.0) * n_effective**-0.2
+    return float(0.9 * min(spreads, default=0.0) * n_effective**-0.2)
 
 
 def find_density_peaks(

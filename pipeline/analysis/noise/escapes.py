@@ -281,7 +281,12 @@ def _dataset(
     options: EscapeOptions,
     model: Model,
 ) -> xr.Dataset:
-    own = {"n_to": ("to",), "exit_mean": ("state",), "exit_std": ("state",), "path_n": ("lag",)}
+    own: dict[str, tuple[str, ...]] = {
+        "n_to": ("to",),
+        "exit_mean": ("state",),
+        "exit_std": ("state",),
+        "path_n": ("lag",),
+    }
     own |= {"path_mean": ("lag", "state"), "path_std": ("lag", "state")}
     units = {"rate": "1/s", "rate_low": "1/s", "rate_high": "1/s", "interval": "s"}
     variables = {

@@ -68,7 +68,8 @@ class KramersFit(NamedTuple):
     misfit: float  # p-value of the deviance: small where the law does not hold
 
 
-NO_FIT = KramersFit(*[float("nan")] * 4, 0, float("nan"))
+_NAN = float("nan")
+NO_FIT = KramersFit(_NAN, _NAN, _NAN, _NAN, 0, _NAN)
 
 
 def fit_kramers(

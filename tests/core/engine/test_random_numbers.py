@@ -7,14 +7,7 @@ import pytest
 from scipy import stats
 
 from magpend_core.engine.plain_python import plain
-from magpend_core.engine.random_numbers import (
-    COUNT_OFFSET,
-    key_words,
-    normal_pair,
-    philox,
-    tag_word,
-    uniform,
-)
+from magpend_core.engine.random_numbers import COUNT_OFFSET, key_words, normal_pair, philox, tag_word, uniform
 from magpend_core.engine.words import word
 
 WORDS = 0xFFFFFFFF
