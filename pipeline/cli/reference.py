@@ -144,7 +144,7 @@ def workflows() -> str:
 
 def specification() -> str:
     """Return Markdown tables of the keys of a run's specification."""
-    from pipeline.specification import recorded_drive, section, starts, tables
+    from pipeline.specification import noise, recorded_drive, section, starts, tables
 
     parts = [
         ("[parameters]", tables.ParametersTable, ""),
@@ -162,6 +162,12 @@ def specification() -> str:
             "[drive]",
             recorded_drive.DriveTable,
             'For `kind = "sweep"` alone: see [Recorded drives](../rig.md#recorded-drives).',
+        ),
+        (
+            "[noise]",
+            noise.NoiseTable,
+            'For `kind = "sweep"` alone: see [Noise](../noise.md). Each strength is a parameter `noise_STATE`, and '
+            "`realization` is one, so that both can be axes.",
         ),
         ("[integration]", tables.Integration, ""),
         ("[execution]", tables.Execution, "Decides the layout of the store, never the numbers."),
@@ -308,7 +314,7 @@ def _bounds(info: Any) -> str:
 def variables() -> str:
     """Return the Markdown table of a data cube's variables, those of products last."""
     from magpend_core.models import load_model
-    from pipeline.layout.schema import REST_STATE, RETURN_TIME, base_variables
+    from pipeline.layout.schema import REST_STATE, RETURN_TIME, STRONG_ERROR, base_variables
     from pipeline.products.registry import CELL_PRODUCTS
 
     model = load_model()
@@ -318,6 +324,7 @@ def variables() -> str:
     }
     found = [("", variable) for variable in base_variables(model)]
     found += [("`[section]`", variable) for variable in (RETURN_TIME, REST_STATE)]
+    found.append(("`[noise]`", STRONG_ERROR))
     for name, product in CELL_PRODUCTS.items():
         options = product.settle(product.options(**examples.get(name, {})), model)
         found += [(name, variable) for variable in product.variables(options, model)]
