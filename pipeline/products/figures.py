@@ -145,6 +145,12 @@ class EscapeFigureOptions(EscapeOptions, FigureOptions):
 
     show: Literal["rates", "paths"] = option("rates", "Rates over the axis, or the last stretch before leaving.")
 
+    def label(self) -> str:
+        """Return the part of the figure's file name that lists the options, with the name of each bound of the set."""
+        sets = {"low": self.low, "high": self.high, "centre": self.centre}
+        bounds = "".join(f"_{name}_{s}_{value:.15g}" for name, given in sets.items() for s, value in given.items())
+        return FigureOptions.label(self.model_copy(update=dict.fromkeys(sets, {}))) + bounds
+
 
 class DensityFigureOptions(DensityOptions, FigureOptions):
     """Options of a figure of the density of section points."""
