@@ -14,11 +14,12 @@ from pathlib import Path
 from typing import Any
 
 from magpend_core.crossing import Crossing
+from magpend_core.disturbance import Disturbance
 from magpend_core.models import imported, model
 from magpend_core.models.imported import import_model as import_model
 from magpend_core.models.model import Model, Parameters
 from magpend_core.models.model import ModelError as ModelError
-from magpend_core.models.noisy import Disturbance, noisy
+from magpend_core.models.noisy import noisy
 from magpend_core.models.parameters import ParameterError, near_names
 from magpend_core.models.sectioned import sectioned
 

@@ -24,8 +24,8 @@ from magpend_core.models.presets import completed, find_preset
 
 if TYPE_CHECKING:
     from magpend_core.crossing import Crossing
+    from magpend_core.disturbance import Disturbance
     from magpend_core.engine.system import System
-    from magpend_core.models.noisy import Disturbance
 
 
 class ModelError(ParameterError):

@@ -10,6 +10,7 @@ from functools import cache, cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from magpend_core.disturbance import INTERPRETATIONS, Disturbance
 from magpend_core.models.model import Model
 from magpend_core.models.parameters import FINITE, NON_NEGATIVE, Parameter, ParameterError, near_names
 from magpend_core.models.presets import Preset
@@ -22,29 +23,6 @@ if TYPE_CHECKING:
 
 FACTOR = "noise_on_"
 """The factor of the noise on the state x is the quantity noise_on_x of the text."""
-INTERPRETATIONS = ("ito", "stratonovich")
-
-
-@dataclass(frozen=True)
-class Disturbance:
-    """White noise on equations of a model: strengths by state, and their interpretation.
-
-    Attributes
-    ----------
-    strengths : tuple of (str, float or str)
-        State, and a number or an expression of states and parameters. The noise's unit is that of the state
-        over the square root of a second.
-    interpretation : str
-        ``"ito"`` or ``"stratonovich"``; empty where no strength depends on a noisy state.
-    """
-
-    strengths: tuple[tuple[str, float | str], ...]
-    interpretation: str = ""
-
-    @property
-    def expressions(self) -> dict[str, str]:
-        """Strengths that are expressions, by state."""
-        return {name: value for name, value in self.strengths if isinstance(value, str)}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -12,9 +12,10 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from magpend_core.crossing import Crossing
+from magpend_core.disturbance import Disturbance
 from magpend_core.models import DEFAULT, load_model
 from magpend_core.models.model import Model, Parameters
-from magpend_core.models.noisy import Disturbance, noisy
+from magpend_core.models.noisy import noisy
 from magpend_core.models.sectioned import sectioned
 from magpend_core.sizes import REALIZATION
 from magpend_core.status import Status

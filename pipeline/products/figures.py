@@ -149,7 +149,7 @@ class EscapeFigureOptions(EscapeOptions, FigureOptions):
         """Return the part of the figure's file name that lists the options, with the name of each bound of the set."""
         sets = {"low": self.low, "high": self.high, "centre": self.centre}
         bounds = "".join(f"_{name}_{s}_{value:.15g}" for name, given in sets.items() for s, value in given.items())
-        return FigureOptions.label(self.model_copy(update=dict.fromkeys(sets, {}))) + bounds
+        return FigureOptions.label(self.model_copy(update={key: {} for key in sets})) + bounds
 
 
 class DensityFigureOptions(DensityOptions, FigureOptions):

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 from pydantic import Discriminator, Field, Tag, model_validator
 
-from magpend_core.models.noisy import Disturbance, noisy
+from magpend_core.disturbance import Disturbance
+from magpend_core.models.noisy import noisy
 from magpend_core.models.parameters import ParameterError
 from magpend_core.sizes import NOISE_PREFIX, REALIZATION
 from pipeline.specification.tables import Table

@@ -21,8 +21,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from magpend_core import load_model, run_branches
+from magpend_core.disturbance import Disturbance
 from magpend_core.models.model import Model
-from magpend_core.models.noisy import Disturbance, noisy
+from magpend_core.models.noisy import noisy
 from magpend_core.noisy import noisy_sections
 
 GOAL = 0.25

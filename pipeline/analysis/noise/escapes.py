@@ -11,6 +11,7 @@ import xarray as xr
 
 from magpend_core.engine.vecmath import TWO_PI
 from magpend_core.models.model import Model
+from magpend_core.models.text.scene import MIXED
 from magpend_core.sizes import NOISE_PREFIX
 from magpend_core.status import Status
 from pipeline.analysis.intervals import binomial_interval
@@ -139,6 +140,8 @@ def labels_of(model: Model, options: EscapeOptions, cube: xr.Dataset) -> tuple[L
     classifier = model.classifier
     assert classifier is not None
     fixed_values = dict(parameters_of(cube))
+    # one section that meets no condition of a text is between the classes, and no class of its own
+    undecided = [0, *classifier.neutral, *(k for k, word in enumerate(classifier.words) if word == MIXED)]
 
     def by_motion(section: np.ndarray, values: Mapping[str, float]) -> np.ndarray:
         one = section.reshape(-1, 1, section.shape[-1])
@@ -147,7 +150,7 @@ def labels_of(model: Model, options: EscapeOptions, cube: xr.Dataset) -> tuple[L
         no_turns = np.zeros((int(finite.sum()), len(model.angles)), np.int64)
         hz = np.full(int(finite.sum()), values[FREQUENCY_DIM])
         found = classifier.classify(one[finite], no_turns, hz, {**fixed_values, **values})
-        decided = ~np.isin(found, classifier.neutral) & (found > 0)
+        decided = ~np.isin(found, undecided)
         codes[finite] = np.where(decided, found, -1)
         return codes.reshape(section.shape[:-1])
 
