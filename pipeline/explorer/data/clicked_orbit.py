@@ -104,7 +104,8 @@ def orbit(run: Run, cell: int, point: int, *, linearised: bool = True) -> bytes:
     Raises
     ------
     ExplorerError
-        If there is no such section, or the drive is a recording, which no orbit can follow on.
+        If there is no such section, the drive is a recording, which no orbit can follow on, or the cells
+        have noise.
     ArithmeticError
         If the trajectory ends early.
     """
@@ -113,6 +114,8 @@ def orbit(run: Run, cell: int, point: int, *, linearised: bool = True) -> bytes:
         raise ExplorerError(
             "the drive of this run is a recording, which does not repeat: no orbit is drawn from a section."
         )
+    if run.spec.noise is not None:
+        raise ExplorerError("the cells of this run have noise: no orbit without it is drawn from a section.")
     found = cell_of(explored, cell)
     section = found.section
     kept = np.isfinite(section).all(axis=1)

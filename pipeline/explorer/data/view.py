@@ -251,9 +251,9 @@ def commands(run: ExploredRun, directory: str) -> dict[str, str]:
 
 def _can_have(run: ExploredRun, name: str) -> bool:
     """Return whether the run has the input that an analysis with default options needs."""
-    if run.spec.recorded is not None:
-        return False
     analysis = ANALYSES[name]
+    if run.spec.recorded is not None or analysis.noisy != (run.spec.noise is not None):
+        return False
     try:
         prepared(AnalysedRun.of(run), analysis, analysis.options())
     except SpecError:

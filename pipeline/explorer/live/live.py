@@ -54,6 +54,11 @@ def live_problem(run: Run) -> str | None:
             f"the drive of {run.name} is the recording {run.spec.recorded.file}, and a live trajectory would "
             "go on where it ends; make a run at its mean frequency."
         )
+    if run.spec.noise is not None:
+        return (
+            f"the cells of {run.name} have noise, and a live trajectory has none; make a run without [noise] to explore "
+            "its motions."
+        )
     try:
         run.model.flow.system  # noqa: B018
     except (ParameterError, ImportError) as error:
