@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 import os
+import pickle
 import platform
 import subprocess
 import sys
@@ -15,6 +16,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.linalg import expm
 
 from magpend_core import load_model
 from magpend_core.disturbance import Disturbance
@@ -41,6 +43,22 @@ def model(kind: str) -> NoisyModel:
     if kind in ("ito", "stratonovich"):
         table = {"name": "gbm", "states": {"x": {}}, "parameters": {"m": 0.4, "s": 0.8}, "equations": {"x": "m*x"}}
         return noisy(load_model(table), Disturbance((("x", "s*x"),), kind))
+    if kind == "well":  # as in tests/pipeline/runs/test_noisy_run.py, so it compiles once
+        table = {
+            "name": "well",
+            "states": {"x": {"meaning": "position"}},
+            "parameters": {"a": 1.0},
+            "equations": {"x": "a*x - x**3"},
+        }
+        return noisy(load_model(table), Disturbance((("x", 0.5),)))
+    if kind == "shaken":
+        table = {
+            "name": "shaken",
+            "states": {"x": {}, "v": {}},
+            "parameters": {"d": 0.3, "s": 0.8},
+            "equations": {"x": "v", "v": "-x - d*v"},
+        }
+        return noisy(load_model(table), Disturbance((("v", "s*x"),)))
     table = {
         "name": "oscillator",
         "states": {"x": {}, "v": {}},
@@ -131,6 +149,30 @@ def test_noisy_sections__halved_steps_follow_the_same_path() -> None:
     strong = float(np.abs(run("ou", 2000, 8, 1.0).section[:, 0, 0] - ou_reference(2000, 8, 1.0)).mean())
     halved = float(run("ou", 2000, 8, 1.0).strong_error.mean())
     assert strong / 2 < halved < 2 * strong
+
+
+def test_noisy_sections__order_holds_for_a_nonlinear_equation() -> None:
+    errors = [float(np.median(run("well", 2000, k, 0.5).strong_error)) for k in (4, 8, 16, 32)]
+    assert slope_of(errors) > 1.4
+
+
+def test_noisy_sections__strength_of_a_state_without_noise() -> None:
+    # dv = (-x - d v) dt + s x dW, dx = v dt: Ito and Stratonovich agree, and the order is that of additive noise
+    errors = [float(np.median(run("shaken", 2000, k, [1.0, 0.0]).strong_error)) for k in (4, 8, 16, 32)]
+    assert slope_of(errors) > 1.4
+    found = run("shaken", 40_000, 64, [1.0, 0.0], checks_step=False).section[:, 0]
+    # the second moments (xx, xv, vv) follow a linear equation of their own
+    d, s = 0.3, 0.8
+    rates = np.array([[0.0, 2.0, 0.0], [-1.0, -d, 1.0], [s * s, -2.0, -2.0 * d]])
+    exact = expm(rates) @ [1.0, 0.0, 0.0]
+    products = np.stack([found[:, 0] ** 2, found[:, 0] * found[:, 1], found[:, 1] ** 2])
+    error = products.std(axis=1) / math.sqrt(len(found))
+    assert (np.abs(products.mean(axis=1) - exact) < 4 * error).all()
+
+
+def test_parameters__with_noise_can_be_pickled() -> None:
+    parameters = model("ito").load(s=0.3)
+    assert pickle.loads(pickle.dumps(parameters)) == parameters
 
 
 def test_noisy_sections__oscillator_has_the_closed_covariance() -> None:

@@ -56,8 +56,8 @@ def live_problem(run: Run) -> str | None:
         )
     if run.spec.noise is not None:
         return (
-            f"the cells of {run.name} have noise, and a live trajectory has none; make a run without [noise] to explore "
-            "its motions."
+            f"the cells of {run.name} have noise, and a live trajectory has none; make a run without [noise] to "
+            "explore its motions."
         )
     try:
         run.model.flow.system  # noqa: B018

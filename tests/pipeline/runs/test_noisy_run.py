@@ -105,12 +105,13 @@ def test_escapes__kramers_fit_has_the_barrier(directory: Path) -> None:
     # U = -x^2/2 + x^4/4 has a barrier of 1/4, and the exponent is twice that; the prefactor's own change with the
     # strength, 1 - 3 s^2/4 to first order, tilts the line by some .06 between these strengths
     assert float(ds["barrier_low"]) - 0.08 < 0.5 < float(ds["barrier_high"]) + 0.08
-    # Kramers' formula with its next order, by an expansion of the passage time at small noise: T = T0 (1 + 3 s^2/4)
+    # Kramers' formula with its next order, a factor 1 + 3 s^2/4 of the time: Larson and Kostin, J. Chem. Phys. 69
+    # (1978) 4821
     s = 0.45
     corrected = math.pi * math.sqrt(2.0) * math.exp(0.5 / s**2) * (1.0 + 0.75 * s**2)
     one = ds.sel(noise_x=s)
     assert float(one["rate_low"]) < 1.0 / corrected < float(one["rate_high"])
-    assert passage_time(s, 0.8) == pytest.approx(corrected, rel=0.06)  # the orders beyond, 9 s^4/... of it
+    assert passage_time(s, 0.8) == pytest.approx(corrected, rel=0.06)  # what is beyond this order
 
 
 def test_escapes__path_climbs_to_the_saddle(directory: Path) -> None:
