@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from magpend_core.models.noisy import NoisyModel
 from pipeline.layout.cells import CellMap, Inputs
 from pipeline.specification.noise import STEPS
 from pipeline.specification.parsing import Spec
@@ -20,8 +21,8 @@ SAMPLE, PERIODS = 32, 4
 STABLE = 2.5
 """Largest step times rate of contraction at which the method is stable: 2.51 for its three stages of order 3."""
 
-ORDER = 1.5
-"""Strong order of the method, for the step that a message proposes; 1 where a strength depends on its own state."""
+ORDER, ORDER_OF_OWN = 1.5, 1.0
+"""Strong order of the method, and where a strength depends on its own state: for the step that a message proposes."""
 
 
 def check_steps(spec: Spec) -> None:
@@ -50,7 +51,10 @@ def check_steps(spec: Spec) -> None:
     error = under_noise(short, inputs)[1]
     largest = float(np.nanmax(error)) if np.isfinite(error).any() else 0.0
     if largest > spec.noise.tolerance:
-        factor = (1.2 * largest / spec.noise.tolerance) ** (1.0 / ORDER)
+        model = spec.model
+        assert isinstance(model, NoisyModel)
+        order = ORDER_OF_OWN if any(model.noise.own) else ORDER
+        factor = (1.2 * largest / spec.noise.tolerance) ** (1.0 / order)
         raise SpecError(
             [
                 f"noise.{_step_key(spec)}: halving the steps changes a state within a period by {largest:.2g} of its "

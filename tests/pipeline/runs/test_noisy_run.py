@@ -18,9 +18,11 @@ from pipeline.plots.figure import draw_figure
 from pipeline.products.figures import DensityFigureOptions, EscapeFigureOptions
 from pipeline.runs.derive import AnalysedRun, derive
 from pipeline.runs.extend import extend
+from pipeline.runs.noise import warn_of_steps
 from pipeline.runs.run import run
 from pipeline.specification.parsing import parse_spec
 from pipeline.specification.problems import SpecError
+from pipeline.store.places import open_files
 
 WELL = """
 kind = "sweep"
@@ -220,6 +222,14 @@ def test_run__refuses_steps_that_are_too_long(tmp_path: Path) -> None:
         run(spec(**SMALL, model=stiff), tmp_path / "b", workers=0)
     assert not (tmp_path / "a").exists()
     assert not (tmp_path / "b").exists()
+
+
+def test_warn_of_steps__counts_the_cells_above_the_tolerance(directory: Path) -> None:
+    lines: list[str] = []
+    for tolerance in (0.01, 1e-9):
+        warn_of_steps(parse_spec(spec(noise={"tolerance": tolerance})), open_files(directory), lines.append)
+    assert len(lines) == 1
+    assert lines[0].startswith("warning: in 600 of 600 cells the last period changes by more than noise.tolerance")
 
 
 PROBLEMS = [
