@@ -47,7 +47,7 @@ def escapes_table(ds: xr.Dataset) -> Table:
 
 def _escape_words(ds: xr.Dataset, row: Row, dims: list[str]) -> Words:
     to = ", ".join(f"{n} {key[3:]}" for key, n in row.items() if key.startswith("to_") and n)
-    mean = 1.0 / row["rate"] if row["rate"] > 0 else np.nan
+    mean = 1.0 / row["rate"] if 0.0 < row["rate"] < np.inf else np.nan
     interval = f"{number(row['rate_low'], '.3g')} to {number(row['rate_high'], '.3g')}"
     return {
         **at_point(ds, row, dims),
