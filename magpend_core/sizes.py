@@ -25,3 +25,10 @@ def too_many_states(name: str, n_states: int) -> str | None:
         f"{name} has {n_states} states; Lyapunov exponents, multipliers and orbits are computed for at most "
         f"{MAX_STATES}."
     )
+
+
+NOISE_PREFIX = "noise_"
+"""The strength of white noise on the state x is the parameter noise_x."""
+
+REALIZATION = "realization"
+"""Parameter without effect on the equations: cells that differ in it alone have independent noise."""

@@ -103,16 +103,19 @@ def _lower_neg(context: Any, builder: Any, sig: Any, values: Any) -> Any:
     return builder.fneg(values[0])
 
 
-def _ir_type(numba_type: Any) -> Any:
+def ir_type(numba_type: Any) -> Any:
+    """Return the LLVM type of a float64 or of a group of SIMD lanes."""
     return _VECTOR if isinstance(numba_type, LanesType) else _DOUBLE
 
 
-def _int_type(numba_type: Any) -> Any:
+def int_type(numba_type: Any) -> Any:
+    """Return the LLVM type of the bits of a float64, or of each float64 of a group, as integers."""
     return ir.VectorType(_INT64, WIDTH) if isinstance(numba_type, LanesType) else _INT64
 
 
-def _int_constant(numba_type: Any, value: int) -> Any:
-    kind = _int_type(numba_type)
+def int_constant(numba_type: Any, value: int) -> Any:
+    """Return an LLVM constant of `int_type`, the same integer in every lane."""
+    kind = int_type(numba_type)
     return ir.Constant(kind, [value] * WIDTH if isinstance(numba_type, LanesType) else value)
 
 
@@ -129,7 +132,7 @@ _TYPERS: dict[int, Callable[..., Any]] = {
 }
 
 
-def _primitive(python: Callable[..., Any], emit: Callable[..., Any]) -> None:
+def primitive(python: Callable[..., Any], emit: Callable[..., Any]) -> None:
     """Register the compiled form of a plain Python function of numbers, for float64 and for groups of SIMD lanes.
 
     `emit(builder, numba_type, *values)` returns the LLVM value; scalars among the arguments have
@@ -149,7 +152,7 @@ def _primitive(python: Callable[..., Any], emit: Callable[..., Any]) -> None:
 
 def _call(name: str) -> Callable[..., Any]:
     def emit(builder: Any, numba_type: Any, *values: Any) -> Any:
-        kind = _ir_type(numba_type)
+        kind = ir_type(numba_type)
         suffix = f"v{WIDTH}f64" if isinstance(numba_type, LanesType) else "f64"
         function = cgutils.get_or_insert_function(
             builder.module, ir.FunctionType(kind, [kind] * len(values)), f"llvm.{name}.{suffix}"
@@ -261,58 +264,58 @@ def _emit_maximum(builder: Any, numba_type: Any, a: Any, b: Any) -> Any:
 
 
 def _emit_power(builder: Any, numba_type: Any, x: Any, shifted: Any) -> Any:
-    kind = _int_type(numba_type)
-    shift = builder.shl(builder.bitcast(shifted, kind), _int_constant(numba_type, 52))
-    return builder.bitcast(builder.add(builder.bitcast(x, kind), shift), _ir_type(numba_type))
+    kind = int_type(numba_type)
+    shift = builder.shl(builder.bitcast(shifted, kind), int_constant(numba_type, 52))
+    return builder.bitcast(builder.add(builder.bitcast(x, kind), shift), ir_type(numba_type))
 
 
 def _emit_where_odd(builder: Any, numba_type: Any, shifted: Any, odd: Any, even: Any) -> Any:
-    low = builder.and_(builder.bitcast(shifted, _int_type(numba_type)), _int_constant(numba_type, 1))
-    return builder.select(builder.icmp_unsigned("!=", low, _int_constant(numba_type, 0)), odd, even)
+    low = builder.and_(builder.bitcast(shifted, int_type(numba_type)), int_constant(numba_type, 1))
+    return builder.select(builder.icmp_unsigned("!=", low, int_constant(numba_type, 0)), odd, even)
 
 
 def _emit_exponent(builder: Any, numba_type: Any, x: Any) -> Any:
     # 2**52 + biased exponent, read as a float, less 2**52 and the bias
-    bits = builder.bitcast(x, _int_type(numba_type))
-    exponent = builder.lshr(bits, _int_constant(numba_type, 52))
-    number = builder.or_(exponent, _int_constant(numba_type, 0x4330000000000000))
-    kind = _ir_type(numba_type)
+    bits = builder.bitcast(x, int_type(numba_type))
+    exponent = builder.lshr(bits, int_constant(numba_type, 52))
+    number = builder.or_(exponent, int_constant(numba_type, 0x4330000000000000))
+    kind = ir_type(numba_type)
     offset = 2.0**52 + 1023.0
     constant = ir.Constant(kind, [offset] * WIDTH if kind is _VECTOR else offset)
     return builder.fsub(builder.bitcast(number, kind), constant)
 
 
 def _emit_mantissa(builder: Any, numba_type: Any, x: Any) -> Any:
-    bits = builder.bitcast(x, _int_type(numba_type))
-    fraction = builder.and_(bits, _int_constant(numba_type, 0x000FFFFFFFFFFFFF))
-    number = builder.or_(fraction, _int_constant(numba_type, 0x3FF0000000000000))
-    return builder.bitcast(number, _ir_type(numba_type))
+    bits = builder.bitcast(x, int_type(numba_type))
+    fraction = builder.and_(bits, int_constant(numba_type, 0x000FFFFFFFFFFFFF))
+    number = builder.or_(fraction, int_constant(numba_type, 0x3FF0000000000000))
+    return builder.bitcast(number, ir_type(numba_type))
 
 
 def _emit_upper(builder: Any, numba_type: Any, x: Any) -> Any:
-    bits = builder.and_(builder.bitcast(x, _int_type(numba_type)), _int_constant(numba_type, -(2**27)))
-    return builder.bitcast(bits, _ir_type(numba_type))
+    bits = builder.and_(builder.bitcast(x, int_type(numba_type)), int_constant(numba_type, -(2**27)))
+    return builder.bitcast(bits, ir_type(numba_type))
 
 
 def _emit_inverse_sqrt_rough(builder: Any, numba_type: Any, x: Any) -> Any:
-    half = builder.ashr(builder.bitcast(x, _int_type(numba_type)), _int_constant(numba_type, 1))
-    return builder.bitcast(builder.sub(_int_constant(numba_type, _INVERSE_ROOT), half), _ir_type(numba_type))
+    half = builder.ashr(builder.bitcast(x, int_type(numba_type)), int_constant(numba_type, 1))
+    return builder.bitcast(builder.sub(int_constant(numba_type, _INVERSE_ROOT), half), ir_type(numba_type))
 
 
-_primitive(sqrt, _call("sqrt"))
-_primitive(inverse_sqrt_rough, _emit_inverse_sqrt_rough)
-_primitive(floor, _call("floor"))
-_primitive(upper, _emit_upper)
-_primitive(absolute, _call("fabs"))
-_primitive(multiply_add, _call("fma"))
-_primitive(copysign, _call("copysign"))
-_primitive(where_less, _emit_where_less)
-_primitive(minimum, _emit_minimum)
-_primitive(maximum, _emit_maximum)
-_primitive(times_power_of_two, _emit_power)
-_primitive(where_odd, _emit_where_odd)
-_primitive(binary_exponent, _emit_exponent)
-_primitive(mantissa, _emit_mantissa)
+primitive(sqrt, _call("sqrt"))
+primitive(inverse_sqrt_rough, _emit_inverse_sqrt_rough)
+primitive(floor, _call("floor"))
+primitive(upper, _emit_upper)
+primitive(absolute, _call("fabs"))
+primitive(multiply_add, _call("fma"))
+primitive(copysign, _call("copysign"))
+primitive(where_less, _emit_where_less)
+primitive(minimum, _emit_minimum)
+primitive(maximum, _emit_maximum)
+primitive(times_power_of_two, _emit_power)
+primitive(where_odd, _emit_where_odd)
+primitive(binary_exponent, _emit_exponent)
+primitive(mantissa, _emit_mantissa)
 
 
 @type_callable(any_nonzero)
@@ -322,7 +325,7 @@ def _type_any_nonzero(context: Any) -> Any:
 
 @lower_builtin(any_nonzero, types.Any)
 def _lower_any_nonzero(context: Any, builder: Any, sig: Any, values: Any) -> Any:
-    kind = _ir_type(sig.args[0])
+    kind = ir_type(sig.args[0])
     found = builder.fcmp_unordered("!=", values[0], ir.Constant(kind, None))
     if not isinstance(sig.args[0], LanesType):
         return found
@@ -337,12 +340,12 @@ def _type_negate_if_bit(context: Any) -> Any:
 
 @lower_builtin(negate_if_bit, types.Any, types.Any, types.IntegerLiteral)
 def _lower_negate_if_bit(context: Any, builder: Any, sig: Any, values: Any) -> Any:
-    kind = _int_type(sig.return_type)
-    shift = _int_constant(sig.return_type, 63 - sig.args[2].literal_value)
-    sign_bit = _int_constant(sig.return_type, -(2**63))
+    kind = int_type(sig.return_type)
+    shift = int_constant(sig.return_type, 63 - sig.args[2].literal_value)
+    sign_bit = int_constant(sig.return_type, -(2**63))
     sign = builder.and_(builder.shl(builder.bitcast(values[1], kind), shift), sign_bit)
     flipped = builder.xor(builder.bitcast(values[0], kind), sign)
-    return builder.bitcast(flipped, _ir_type(sig.return_type))
+    return builder.bitcast(flipped, ir_type(sig.return_type))
 
 
 def load(array: np.ndarray, offset: int) -> Any:

@@ -14,10 +14,12 @@ from pathlib import Path
 from typing import Any
 
 from magpend_core.crossing import Crossing
+from magpend_core.disturbance import Disturbance
 from magpend_core.models import imported, model
 from magpend_core.models.imported import import_model as import_model
 from magpend_core.models.model import Model, Parameters
 from magpend_core.models.model import ModelError as ModelError
+from magpend_core.models.noisy import noisy
 from magpend_core.models.parameters import ParameterError, near_names
 from magpend_core.models.sectioned import sectioned
 
@@ -164,13 +166,18 @@ def preset_provenance(name: str | None = None, model: str = DEFAULT) -> dict[str
 
 def _reduced(parameters: Parameters) -> tuple[Any, ...]:
     own = parameters.model
-    return _again, (own.reference, parameters.as_dict(), own.crossing)
+    return _again, (own.reference, parameters.as_dict(), own.crossing, own.disturbance)
 
 
 def _again(
-    reference: str | Mapping[str, Any], values: dict[str, float], crossing: Crossing | None = None
+    reference: str | Mapping[str, Any],
+    values: dict[str, float],
+    crossing: Crossing | None = None,
+    disturbance: Disturbance | None = None,
 ) -> Parameters:
     found = load_model(reference)
+    if disturbance is not None:
+        return Parameters(noisy(found, disturbance), values)
     return Parameters(found if crossing is None else sectioned(found, crossing), values)
 
 

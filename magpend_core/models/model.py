@@ -24,6 +24,7 @@ from magpend_core.models.presets import completed, find_preset
 
 if TYPE_CHECKING:
     from magpend_core.crossing import Crossing
+    from magpend_core.disturbance import Disturbance
     from magpend_core.engine.system import System
 
 
@@ -219,6 +220,11 @@ class Model:
     @property
     def crossing(self) -> Crossing | None:
         """Return the model's Poincare section at a level of a state; None if the section is stroboscopic."""
+        return None
+
+    @property
+    def disturbance(self) -> Disturbance | None:
+        """Return the white noise on the model's equations; None without noise."""
         return None
 
     @property

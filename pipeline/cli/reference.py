@@ -143,7 +143,7 @@ def workflows() -> str:
 
 def specification() -> str:
     """Return Markdown tables of the keys of a run's specification."""
-    from pipeline.specification import drift, recorded_drive, section, starts, tables
+    from pipeline.specification import drift, noise, recorded_drive, section, starts, tables
 
     parts = [
         ("[parameters]", tables.ParametersTable, ""),
@@ -167,6 +167,12 @@ def specification() -> str:
             drift.DriftTable,
             "NAME is a parameter of the model; see [Parameters that move](../drift.md). Each number is a parameter of "
             "the run, `NAME_KEY`, and can be an axis.",
+        ),
+        (
+            "[noise]",
+            noise.NoiseTable,
+            'For `kind = "sweep"` alone: see [Noise](../noise.md). Each strength is a parameter `noise_STATE`, and '
+            "`realization` is one, so that both can be axes.",
         ),
         ("[integration]", tables.Integration, ""),
         ("[execution]", tables.Execution, "Decides the layout of the store, never the numbers."),
@@ -313,7 +319,7 @@ def _bounds(info: Any) -> str:
 def variables() -> str:
     """Return the Markdown table of the variables of a run's result cube; those of products come last."""
     from magpend_core.models import load_model
-    from pipeline.layout.schema import REST_STATE, RETURN_TIME, base_variables
+    from pipeline.layout.schema import REST_STATE, RETURN_TIME, STRONG_ERROR, base_variables
     from pipeline.products.registry import CELL_PRODUCTS
 
     model = load_model()
@@ -323,6 +329,7 @@ def variables() -> str:
     }
     found = [("", variable) for variable in base_variables(model)]
     found += [("`[section]`", variable) for variable in (RETURN_TIME, REST_STATE)]
+    found.append(("`[noise]`", STRONG_ERROR))
     for name, product in CELL_PRODUCTS.items():
         options = product.settle(product.options(**examples.get(name, {})), model)
         found += [(name, variable) for variable in product.variables(options, model)]

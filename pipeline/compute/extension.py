@@ -12,6 +12,7 @@ from magpend_core import Status
 from magpend_core.engine.observers import window_of
 from magpend_core.extension import more_sections, orbit_periods
 from pipeline.compute.integrate import watched_quantities
+from pipeline.compute.noise import noisy_kept_on
 from pipeline.layout.cells import Inputs
 from pipeline.specification.parsing import Spec
 
@@ -38,7 +39,7 @@ def obstacle(old: Spec, new: Spec) -> str:
         if new.unsteady:
             what = "whose parameters move" if new.drift else "under a recorded drive"
         return f"{line}cells {what} do not go on"
-    if not new.integration.stop_when_closed and wanted < _judged(new):
+    if new.noise is None and not new.integration.stop_when_closed and wanted < _judged(new):
         return f"{line}what closes is judged by the last {_judged(new)} sections: keep as many"
     return ""
 
@@ -73,6 +74,8 @@ def kept_on(spec: Spec, inputs: Inputs, stored: Mapping[str, np.ndarray], n_old:
     values : dict
         Variables of these cells.
     """
+    if spec.noise is not None:
+        return noisy_kept_on(spec, inputs, stored, n_old)
     was_kept = np.isin(stored["status"][:, 0], (Status.PERIODIC, Status.BOUNDED))
     closed = was_kept & (stored["n_periods"][:, 0] < spec.integration.n_transient + n_old)
     is_exact = ~was_kept | closed

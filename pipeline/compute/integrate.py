@@ -11,9 +11,10 @@ import numpy as np
 from magpend_core import Sections, Status, run_branches
 from magpend_core.engine.system import System
 from pipeline.compute.drift import while_drifting
+from pipeline.compute.noise import under_noise
 from pipeline.compute.recorded_drive import under_recording
 from pipeline.layout.cells import Inputs
-from pipeline.layout.schema import REST_STATE, base_variables
+from pipeline.layout.schema import REST_STATE, STRONG_ERROR, base_variables
 from pipeline.products.product import function_of
 from pipeline.products.registry import CELL_PRODUCTS
 from pipeline.specification.parsing import Spec
@@ -44,12 +45,16 @@ class Job:
 
 def integrate(spec: Spec, inputs: Inputs) -> dict[str, np.ndarray]:
     """Integrate branches, compute their products, and return all variables with the leading dims (branch, point)."""
+    own: dict[str, np.ndarray] = {}
     how = spec.model.system, spec.integration, watched_quantities(spec)
-    if spec.drift:
+    if spec.noise is not None:
+        cells, own[STRONG_ERROR.name] = under_noise(spec, inputs)
+    elif spec.drift:
         cells = while_drifting(spec.motion, inputs, *how)
     else:
         cells = walk(inputs, *how) if spec.recorded is None else under_recording(spec.recorded, inputs, *how)
-    own = {REST_STATE.name: rest_states(cells)} if spec.section is not None else {}
+    if spec.section is not None:
+        own[REST_STATE.name] = rest_states(cells)
     values = {
         v.name: np.asarray(own.get(v.name, getattr(cells, v.name, None)), dtype=v.dtype)
         for v in base_variables(spec.model)

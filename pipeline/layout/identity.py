@@ -72,7 +72,8 @@ def code_of(spec: Spec) -> list[str]:
     walked = ["compute.continuation"] if spec.continuation is not None else []
     driven = ["compute.recorded_drive", "specification.drive_files"] if spec.drive is not None else []
     driven += ["compute.drift", "specification.drift"] if spec.drift else []
-    return [*CODE, *refined, *walked, *driven, *(module.removeprefix("pipeline.") for module in products)]
+    noisy = ["compute.noise"] if spec.noise is not None else []
+    return [*CODE, *refined, *walked, *driven, *noisy, *(module.removeprefix("pipeline.") for module in products)]
 
 
 @lru_cache

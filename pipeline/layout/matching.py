@@ -15,6 +15,7 @@ import numpy as np
 
 from pipeline.layout.cells import InitialStates, Inputs, initial_states, parameter_axes
 from pipeline.layout.identity import CODE, differences
+from pipeline.specification.noise import NoiseTable
 from pipeline.specification.parsing import Spec
 from pipeline.specification.tables import FREQUENCY
 
@@ -28,6 +29,7 @@ _CODE = (
     "specification.drive_files",
     "compute.drift",
     "specification.drift",
+    "compute.noise",
 )
 
 
@@ -44,6 +46,7 @@ def deciding(identity: Mapping[str, Any]) -> dict[str, Any]:
         "code": {name: version for name, version in identity["code"].items() if name in _CODE},
         **{name: spec[name] for name in ("kind", "drive", "section", "drift") if name in spec},
         "integration": integration,
+        **({"noise": NoiseTable.model_validate(spec["noise"]).deciding} if "noise" in spec else {}),
         **({"path": spec["continuation"]["path"]} if "continuation" in spec else {}),
     }
 

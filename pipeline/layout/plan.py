@@ -34,6 +34,9 @@ MICROSECONDS_PER_INTERVAL = 0.9
 """Additional time per trajectory for each interval of a recorded torque."""
 
 RTOL_OF_RULE = 1e-8
+MICROSECONDS_PER_NOISY_STEP = 0.25
+"""Time of a step with noise of one trajectory, a rule for the paper's pendulum."""
+
 ROOT = 6
 """The time is proportional to (1/rtol)^(1/6)."""
 
@@ -243,6 +246,8 @@ def seconds_per_period(frequency_hz: np.ndarray, rtol: float) -> np.ndarray:
 def mean_seconds_per_period(spec: Spec) -> float:
     """Return the mean computing time per drive period over the run's frequencies [s]."""
     frequency = spec.axes[FREQUENCY].array() if FREQUENCY in spec.axes else spec.frequency_hz
+    if spec.noise is not None:
+        return float(np.mean(spec.noise.steps_at(np.asarray(frequency)))) * MICROSECONDS_PER_NOISY_STEP * 1e-6
     return float(np.mean(seconds_per_period(np.asarray(frequency), spec.integration.rtol)))
 
 
@@ -259,6 +264,9 @@ def _seconds_at(spec: Spec) -> np.ndarray | None:
     if FREQUENCY not in spec.axes:
         return None
     frequency = spec.axes[FREQUENCY].array()
+    if spec.noise is not None:
+        steps = spec.noise.steps_at(frequency)
+        return np.asarray(sum(periods_per_cell(spec)) * steps * MICROSECONDS_PER_NOISY_STEP * 1e-6)
     return sum(periods_per_cell(spec)) * seconds_per_period(frequency, spec.integration.rtol)
 
 

@@ -33,7 +33,8 @@ def base_variables(model: Model) -> tuple[Variable, ...]:
     )
     turns = Variable("turns", (model.angle_dim,), "int32", 0, "1", f"full turns over the kept {periods_of(model)}")
     flow = (RETURN_TIME, replace(REST_STATE, attrs=units)) if model.crossing is not None else ()
-    return (section, *([turns] if model.angles else []), *_counts(periods_of(model)), *flow)
+    noise = (STRONG_ERROR,) if model.disturbance is not None else ()
+    return (section, *([turns] if model.angles else []), *_counts(periods_of(model)), *flow, *noise)
 
 
 RETURN_TIME = Variable("return_time", ("period_index",), "float64", math.nan, "s", "time since the crossing before")
@@ -41,6 +42,16 @@ REST_STATE = Variable(
     "rest_state", ("state",), "float64", math.nan, "", "state in which a cell that does not return was left"
 )
 """Additional variables of cubes whose sections are taken at crossings."""
+
+STRONG_ERROR = Variable(
+    "strong_error",
+    (),
+    "float64",
+    math.nan,
+    "1",
+    "largest change of the last period's end when its steps are halved on the same path, in units of the scales",
+)
+"""Additional variable of cubes with noise."""
 
 
 def _counts(periods: str) -> tuple[Variable, ...]:

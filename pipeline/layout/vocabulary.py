@@ -12,11 +12,14 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from magpend_core.crossing import Crossing
+from magpend_core.disturbance import Disturbance
 from magpend_core.models import DEFAULT, load_model
 from magpend_core.models.drift.model import DriftingModel, drifting
 from magpend_core.models.drift.ramps import ramps_as_data, ramps_from_data
 from magpend_core.models.model import Model, Parameters
+from magpend_core.models.noisy import noisy
 from magpend_core.models.sectioned import sectioned
+from magpend_core.sizes import REALIZATION
 from magpend_core.status import Status
 from pipeline.specification.tables import FREQUENCY
 
@@ -68,7 +71,7 @@ def is_grid_dim(dim: str) -> bool:
 
 def is_start_dim(dim: str) -> bool:
     """Return whether a dim of the result cube runs over initial conditions or branches, not over a parameter."""
-    return dim in (BRANCH, START) or is_grid_dim(dim)
+    return dim in (BRANCH, START, REALIZATION) or is_grid_dim(dim)
 
 
 def start_dims(dims: Iterable[object]) -> tuple[str, ...]:
@@ -112,6 +115,9 @@ def model_of(ds: xr.Dataset) -> Model:
         If the attribute names no model. A Python object is not imported: its description suffices to draw.
     """
     model = load_model(str(ds.attrs.get("model", DEFAULT)))
+    if _NOISE in ds.attrs:
+        strengths, interpretation = json.loads(ds.attrs[_NOISE])
+        return noisy(model, Disturbance(tuple((name, value) for name, value in strengths), interpretation))
     of = ds.attrs.get(f"{_SECTION}of")
     if DRIFT in ds.attrs:
         return drifting(model, ramps_from_data(json.loads(str(ds.attrs[DRIFT]))))
@@ -123,6 +129,17 @@ def model_of(ds: xr.Dataset) -> Model:
 
 DRIFT = "drift"
 """Attribute that describes the motion of a model's parameters, as JSON."""
+
+_NOISE = "noise"
+"""Attribute that describes the noise on the model's equations, as JSON."""
+
+
+def noise_attributes(disturbance: Disturbance | None) -> dict[str, Any]:
+    """Return the dataset attribute that describes noise; `model_of` reads it."""
+    if disturbance is None:
+        return {}
+    return {_NOISE: json.dumps([disturbance.strengths, disturbance.interpretation])}
+
 
 _SECTION = "section_"
 """Prefix of the attributes that describe a section by crossing."""
@@ -145,7 +162,7 @@ def told_by(attrs: Mapping[Any, Any]) -> dict[str, Any]:
     return {
         str(key): value
         for key, value in attrs.items()
-        if key in ("model", "parameters", DRIFT) or str(key).startswith(_SECTION)
+        if key in ("model", "parameters", DRIFT, _NOISE) or str(key).startswith(_SECTION)
     }
 
 

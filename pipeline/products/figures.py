@@ -8,6 +8,7 @@ from pipeline.products.attractors import AttractorOptions
 from pipeline.products.branches import BranchOptions, CurveOptions
 from pipeline.products.chaos import DimensionOptions
 from pipeline.products.manifolds import ManifoldOptions
+from pipeline.products.noise import DensityOptions, EscapeOptions
 from pipeline.products.product import Figure, FigureOptions, StateOptions, option
 from pipeline.products.resilience import EdgeOptions, ResilienceOptions
 from pipeline.products.tongues import TongueOptions
@@ -154,6 +155,22 @@ class EdgeFigureOptions(EdgeOptions, FigureOptions):
     """Options of a figure of edge states."""
 
 
+class EscapeFigureOptions(EscapeOptions, FigureOptions):
+    """Options of a figure of escapes."""
+
+    show: Literal["rates", "paths"] = option("rates", "Rates over the axis, or the last stretch before leaving.")
+
+    def label(self) -> str:
+        """Return the part of the figure's file name that lists the options, with the name of each bound of the set."""
+        sets = {"low": self.low, "high": self.high, "centre": self.centre}
+        bounds = "".join(f"_{name}_{s}_{value:.15g}" for name, given in sets.items() for s, value in given.items())
+        return FigureOptions.label(self.model_copy(update={key: {} for key in sets})) + bounds
+
+
+class DensityFigureOptions(DensityOptions, FigureOptions):
+    """Options of a figure of the density of section points."""
+
+
 BIFURCATION = Figure(
     "bifurcation",
     "Draw a bifurcation diagram: section points over the swept parameter, coloured by class of motion.",
@@ -294,4 +311,21 @@ EDGE = Figure(
     EdgeFigureOptions,
     "pipeline.plots.edge:draw",
     needs="pipeline.analysis.resilience.edge_product:needs_pair",
+)
+
+ESCAPES = Figure(
+    "escapes",
+    """Draw rates of escape with intervals, over a strength with Kramers' law, or the last stretch before leaving.
+
+    Over the strength σ of the noise, the horizontal axis is 1/σ².""",
+    EscapeFigureOptions,
+    "pipeline.plots.escapes:draw",
+    needs="pipeline.analysis.noise.escapes:needs_set",
+)
+
+DENSITY = Figure(
+    "density",
+    "Draw the density of noisy section points, over an axis with its peaks: a stochastic bifurcation diagram.",
+    DensityFigureOptions,
+    "pipeline.plots.density:draw",
 )

@@ -199,6 +199,7 @@ class Analysis:
     figure: str = ""
     ignores: tuple[str, ...] = ()
     for_drift: bool = False
+    noisy: bool = False
 
 
 class FigureOptions(Options):

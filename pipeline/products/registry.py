@@ -66,6 +66,8 @@ ANALYSES: Registry[Analysis] = Registry(
         "overlaps": "pipeline.products.tipping:OVERLAPS",
         "resilience": "pipeline.products.resilience:RESILIENCE",
         "edge": "pipeline.products.resilience:EDGE",
+        "escapes": "pipeline.products.noise:ESCAPES",
+        "density": "pipeline.products.noise:DENSITY",
     },
 )
 
@@ -96,6 +98,8 @@ FIGURES: Registry[Figure] = Registry(
             "drift",
             "resilience",
             "edge",
+            "escapes",
+            "density",
         )
     },
 )

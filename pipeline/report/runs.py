@@ -45,6 +45,8 @@ SHOWN = (
     "chaos",
     "dimension",
     "settling",
+    "escapes",
+    "density",
 )
 """Analyses in the order of a report."""
 
@@ -59,6 +61,8 @@ _HEADINGS = {
     "chaos": "Regular and chaotic",
     "dimension": "Dimensions",
     "settling": "Transient or attractor",
+    "escapes": "Escapes",
+    "density": "Densities",
 }
 
 _CAPTIONS = {
@@ -72,6 +76,8 @@ _CAPTIONS = {
     "chaos": "Kind of motion of each attractor",
     "dimension": "Correlation dimensions of the attractors that do not close",
     "settling": "Sets that do not close, and the results of extending their cells",
+    "escapes": "Rates at which cells with noise leave a set, and where they go",
+    "density": "Moments and peaks of the density of section points",
 }
 
 
@@ -200,6 +206,8 @@ def _first_of_others(shown: Shown) -> dict[str, float]:
 
 def _attractors(shown: Shown) -> Iterator[Block]:
     """Make the table of a run's attractors and the figures of these."""
+    if shown.run.spec.noise is not None:
+        return
     known = shown.options_of("attractors")
     if not known:
         yield _missing(shown, "attractors")
@@ -296,6 +304,8 @@ def _analyses(shown: Shown) -> Iterator[Part]:
 def _suits(shown: Shown, name: str) -> bool:
     if shown.run.spec.recorded is not None:  # the recording ends, so no cell can be integrated further
         return False
+    if ANALYSES[name].noisy != (shown.run.spec.noise is not None):
+        return False
     if name == "hysteresis":
         return shown.run.spec.continuation is not None and shown.run.spec.continuation.direction == "both"
     if name == "basins":
@@ -347,7 +357,7 @@ def _with_letters(row: Mapping[str, Any], path: str) -> dict[str, Any]:
 
 
 def _exponents(shown: Shown) -> Iterator[Block]:
-    if shown.run.spec.recorded is not None:
+    if shown.run.spec.recorded is not None or shown.run.spec.noise is not None:
         return
     if "lyapunov" not in shown.run.spec.products:
         yield Note(

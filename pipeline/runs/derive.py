@@ -121,6 +121,7 @@ def derive(
     wanted = options if isinstance(options, Options) else validated(analysis.options, options or {})
     run = AnalysedRun.of(source, echo)
     _refuse_unsteady(run, analysis)
+    _refuse_noise(run, analysis)
     wanted = prepared(run, analysis, wanted)
     key = _key(run, analysis, wanted)
     place = run.info.files.below(DERIVED).below(f"{name}-{key['derived_key'][:8]}.zarr")
@@ -209,6 +210,22 @@ def _refuse_unsteady(run: Run, analysis: Analysis) -> None:
             f"{run.spec.frequency_hz:.6g} instead of [drive]). You can draw this run's sections: magpend "
             "plot bifurcation, or section."
         )
+
+
+def _refuse_noise(run: Run, analysis: Analysis) -> None:
+    """Raise `SpecError` if an analysis of deterministic motions is asked of a noisy run, or the other way round."""
+    if analysis.noisy == (run.spec.noise is not None):
+        return
+    own = ", ".join(name for name, other in ANALYSES.items() if other.noisy)
+    if analysis.noisy:
+        problem = f"{run.name}: {analysis.name} needs a run with noise; add a table [noise] to its specification."
+    else:
+        problem = (
+            f"{run.name}: its cells have noise, and {analysis.name} assumes that the same state goes on in the same "
+            f"way. Analyses of noisy runs: {own}. For {analysis.name} make the run without [noise]. You can draw "
+            "this run's sections: magpend plot bifurcation, or section."
+        )
+    raise SpecError(problem)
 
 
 def prepared(run: AnalysedRun, product: Any, options: Options) -> Options:

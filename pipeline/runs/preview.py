@@ -11,6 +11,7 @@ from pipeline.layout.limits import check_space
 from pipeline.layout.plan import Plan, make_plan
 from pipeline.layout.vocabulary import is_grid_dim, is_start_dim
 from pipeline.runs.estimate import estimate, wall_seconds, writing_seconds
+from pipeline.runs.noise import check_steps
 from pipeline.runs.progress import duration, size
 from pipeline.runs.run import identity_here
 from pipeline.runs.workflows import default_directory, find_spec
@@ -104,6 +105,7 @@ def describe_plan(
     path = find_spec(spec)
     parsed = load_spec(path, smoke=smoke)
     check_starts(parsed)
+    check_steps(parsed)
     files = open_files(out if out is not None else default_directory(path, smoke))
     plan = make_plan(parsed)
     info = check(files, identity_here(parsed, plan))
@@ -137,7 +139,7 @@ def time_line(spec: Spec, plan: Plan, share: float, n_tasks: int, workers: int |
     compiled = f"; compiling its kernel took {duration(found.compiled_s)}" if found.compiled_s > 1 else ""
     whole = duration(found.core_seconds)
     rests = f"{found.how}; writing a task takes {1000 * writing_s:.0f} ms{compiled}"
-    return (
-        f"time: {bound} {duration(seconds)} of one core, {duration(by_clock)} on {cores} ({rests}); "
-        f"after it, analyse attractors may extend cells for up to {whole} of one core"
+    more = (
+        f"; after it, analyse attractors may extend cells for up to {whole} of one core" if spec.noise is None else ""
     )
+    return f"time: {bound} {duration(seconds)} of one core, {duration(by_clock)} on {cores} ({rests}){more}"

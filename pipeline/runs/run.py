@@ -15,6 +15,7 @@ from pipeline.layout.identity import identity_of
 from pipeline.layout.limits import check_plan, check_space
 from pipeline.layout.plan import Plan, make_plan
 from pipeline.runs.mending import sound_commits
+from pipeline.runs.noise import check_steps, warn_of_steps
 from pipeline.runs.progress import Progress, duration
 from pipeline.runs.status import State, state
 from pipeline.runs.stopping import InterruptedRunError, stoppable
@@ -100,9 +101,11 @@ def run(
     where = Where(scheduler, Path(cluster) if cluster is not None else None, dashboard, files.place)
     where.resolved()
     check_starts(parsed)
+    check_steps(parsed)
     for remark in parsed.model.flow.remarks:
         echo(f"warning: {remark}")
     carry_out(parsed, text, files, workers=workers, where=where, echo=echo)
+    warn_of_steps(parsed, files, echo)
     return state(files)
 
 

@@ -27,6 +27,7 @@ from pipeline.specification.drive_files import RecordedDrive
 from pipeline.specification.files import merged, nested, odd_data, read_toml
 from pipeline.specification.methods import method_problems
 from pipeline.specification.models import A_MODEL, KEPT, add_model, stand_in, with_model_table
+from pipeline.specification.noise import NoiseTable, disturbed, follows, noise_of
 from pipeline.specification.parameters import parameter_problems
 from pipeline.specification.problems import SpecError, checked, shown, unknown_choice, unknown_key
 from pipeline.specification.ranges import size_problems
@@ -60,6 +61,7 @@ class Spec:
     drive: DriveTable | None = None
     section: SectionTable | None = None
     drift: dict[str, DriftTable] = field(default_factory=dict)
+    noise: NoiseTable | None = None
 
     @cached_property
     def ramps(self) -> tuple[Ramp, ...]:
@@ -108,8 +110,9 @@ class Spec:
 
     @cached_property
     def model(self) -> Model:
-        """Model that is integrated, with the Poincare section of the specification if it has one."""
-        return moving.moved(seen_through(load_model(self.reference), self.section), self.ramps, [])
+        """Model that is integrated, with what the specification adds: a Poincare section, moving parameters, noise."""
+        model = moving.moved(seen_through(load_model(self.reference), self.section), self.ramps, [])
+        return disturbed(model, self.noise)
 
     @cached_property
     def values(self) -> Parameters:
@@ -138,8 +141,9 @@ _TABLES: dict[str, type[Table]] = {
     "execution": Execution,
     "drive": DriveTable,
     "section": SectionTable,
+    "noise": NoiseTable,
 }
-_OPTIONAL = ("drive", "section")
+_OPTIONAL = ("drive", "section", "noise")
 _KEYS = (
     "kind",
     "title",
@@ -154,6 +158,7 @@ _KEYS = (
     "drive",
     "section",
     "drift",
+    "noise",
     "measured",  # orbits of a rig, which magpend measured branch reads: no part of a run
 )
 
@@ -266,7 +271,8 @@ def parse_spec(data: Mapping[str, Any], folder: str | Path | None = ".") -> Spec
         raise SpecError(problems)
     section = section_of(tables["section"], model, data, problems)
     ramps = moving.checked_ramps(drift, model, axes, problems)
-    seen = moving.moved(seen_through(model, section), ramps, problems)
+    noise = noise_of(tables["noise"], model, data, problems)
+    seen = disturbed(moving.moved(seen_through(model, section), ramps, problems), noise)
     starts = _starts(data, model, problems)
     problems += refine_problems(kind, starts, tables["integration"], model)
     products = _products(data, model, problems)
@@ -277,7 +283,8 @@ def parse_spec(data: Mapping[str, Any], folder: str | Path | None = ".") -> Spec
     known = _valid_keys(ParametersTable, data.get("parameters", {}))
     has_periods = "drive" in data or "section" in data or model.autonomous
     complete = not has_periods and not any(p.startswith(("axes", "parameters")) for p in problems)
-    problems += parameter_problems(known, seen, _declared(data), axes, complete)
+    own = parameter_problems(known, seen, _declared(data), axes, complete)
+    problems += [p for p in own if not follows(p, data, noise)]
     if ramps and not problems:
         problems += _drift_problems(ramps, known, seen, axes, imports=folder is not None)
     if problems:
@@ -297,6 +304,7 @@ def parse_spec(data: Mapping[str, Any], folder: str | Path | None = ".") -> Spec
         tables["drive"],
         section,
         drift,
+        noise,
     )
 
 

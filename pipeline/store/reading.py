@@ -11,7 +11,7 @@ from magpend_core.models.model import Model
 from pipeline.layout.attributes import netcdf_safe
 from pipeline.layout.cells import DIRECTION_CODES
 from pipeline.layout.plan import Plan
-from pipeline.layout.vocabulary import drift_attributes, model_attribute, section_attributes
+from pipeline.layout.vocabulary import drift_attributes, model_attribute, noise_attributes, section_attributes
 from pipeline.specification.parsing import Spec
 from pipeline.store.parallel_reads import quick_reading
 from pipeline.store.records import Commit
@@ -67,6 +67,7 @@ def _attributes(run: OpenedRun) -> dict[str, Any]:
         "parameters": "\n".join(f"{k} = {v!r}" for k, v in info.identity["parameter_values"].items()),
         **section_attributes(run.model.crossing),
         **drift_attributes(run.model),
+        **noise_attributes(run.model.disturbance),
         **run.spec.integration.model_dump(),
         **{f"{name}_{k}": v for name, o in run.spec.products.items() for k, v in o.plain().items()},
     }

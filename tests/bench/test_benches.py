@@ -78,6 +78,13 @@ def test_cheap__prints_all_variants(bench, capsys):
 
 
 @pytest.mark.long
+def test_noisy__prints_the_ratio_of_each_case(bench, capsys):
+    noisy = bench("noisy")
+    noisy.main(["--trajectories", "16", "--periods", "1", "--steps", "8", "--rounds", "1", "--cases", "duffing"])
+    assert "steps per second with noise over without" in capsys.readouterr().out
+
+
+@pytest.mark.long
 def test_events__prints_both_tables(bench, capsys):
     bench("events").main([*TINY[:2], "--periods", "2", "--rounds", "1", "--flows", "lorenz"])
     printed = capsys.readouterr().out

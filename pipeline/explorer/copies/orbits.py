@@ -159,6 +159,11 @@ def add_orbits(copied: Copied, choosing: Callable[[int], Chosen], count: np.ndar
         copied.about["orbits"] = {"blocks": [], "missing": missing}
         copied.sentences.append(missing)
         return 0
+    if copied.run.spec.noise is not None:
+        missing = "This copy has no orbits: the cells of the run have noise."
+        copied.about["orbits"] = {"blocks": [], "missing": missing}
+        copied.sentences.append(missing)
+        return 0
     chosen = choosing(room.orbits)
     each = _bytes_each(copied, chosen, count, room)
     if each * len(chosen.cells) > room.n_bytes:

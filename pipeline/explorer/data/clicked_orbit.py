@@ -114,6 +114,8 @@ def orbit(run: Run, cell: int, point: int, *, linearised: bool = True) -> bytes:
         )
     if run.spec.drift:
         raise ExplorerError("a parameter of this run moves: no orbit is drawn from a section.")
+    if run.spec.noise is not None:
+        raise ExplorerError("the cells of this run have noise: no orbit without it is drawn from a section.")
     found = cell_of(explored, cell)
     section = found.section
     kept = np.isfinite(section).all(axis=1)

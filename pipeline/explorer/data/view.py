@@ -249,6 +249,8 @@ def _can_have(run: ExploredRun, name: str) -> bool:
     if run.spec.unsteady:
         return False
     analysis = ANALYSES[name]
+    if analysis.noisy != (run.spec.noise is not None):
+        return False
     try:
         prepared(AnalysedRun.of(run), analysis, analysis.options())
     except SpecError:

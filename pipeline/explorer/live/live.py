@@ -56,6 +56,11 @@ def live_problem(run: Run) -> str | None:
         )
     if run.spec.drift:
         return f"{run.name}: {run.spec.unsteady}, and a live trajectory has constant parameters; make a run without it."
+    if run.spec.noise is not None:
+        return (
+            f"the cells of {run.name} have noise, and a live trajectory has none; make a run without [noise] to "
+            "explore its motions."
+        )
     try:
         run.model.flow.system  # noqa: B018
     except (ParameterError, ImportError) as error:

@@ -70,6 +70,8 @@ def options_of(name, **given):
 def other_value(model, name):
     """A valid value of an option that is not its default."""
     default = default_of(model, name)
+    if isinstance(default, dict) and name != "at":
+        return {"psi1": 0.5}
     special = {
         "at": {"frequency": 2.05},
         "xlim": (2.0, 2.1),
@@ -89,6 +91,7 @@ def other_value(model, name):
         "low": 2.0,
         "high": 2.5,
         "shown": 2,
+        "radius": 0.5,
     }
     if name in special:
         return special[name]

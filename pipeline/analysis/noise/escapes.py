@@ -1,0 +1,332 @@
+"""Find when noisy cells leave a set, at which rate, where they go, and the stretch of sections before."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from magpend_core.engine.vecmath import TWO_PI
+from magpend_core.models.model import Model
+from magpend_core.models.text.scene import MIXED
+from magpend_core.sizes import NOISE_PREFIX
+from magpend_core.status import Status
+from pipeline.analysis.intervals import binomial_interval
+from pipeline.analysis.noise.cells import PointCells, cells_at_points, coordinates_of, point_dims
+from pipeline.analysis.noise.rates import NO_FIT, KramersFit, constancy, fit_kramers, rate_interval
+from pipeline.analysis.run import Run
+from pipeline.layout.vocabulary import FREQUENCY_DIM, parameters_of
+from pipeline.products.noise import EscapeOptions
+
+NOT_LEFT = -1
+_IN_AND_OUT = ("inside", "outside")
+
+Labels = Callable[[np.ndarray, Mapping[str, float]], np.ndarray]
+"""From sections (cell, section, state) and the values of a point to codes: 0 or more in a set, below 0 undecided."""
+
+
+def needs_set(run: Run, options: EscapeOptions) -> None:
+    """Raise ValueError unless the options say which set cells leave, in states of the model."""
+    model = run.model
+    for name, given in (("low", options.low), ("high", options.high), ("centre", options.centre)):
+        if unknown := [state for state in given if state not in model.state_names]:
+            raise ValueError(f"{name}: {unknown[0]!r} is not a state; states: {', '.join(model.state_names)}.")
+    box = bool(options.low or options.high)
+    if box and options.radius is not None:
+        raise ValueError("radius and low or high are given; cells leave a ball or a box: keep one.")
+    if options.centre and options.radius is None:
+        raise ValueError("centre is given without radius; add the radius of the ball.")
+    if empty := [s for s in options.low if options.low[s] >= options.high.get(s, np.inf)]:
+        raise ValueError(f"low and high of {empty[0]}: the box is empty; low must be below high.")
+    if not box and options.radius is None and model.classifier is None:
+        raise ValueError(
+            f"{model.name} has no classifier of motions, so say which set cells leave: a box (low, high) or a ball "
+            "(radius)."
+        )
+    if options.skip + 2 > run.spec.integration.n_keep:
+        raise ValueError(
+            f"skip = {options.skip} leaves less than two of {run.spec.integration.n_keep} sections; lower it."
+        )
+
+
+@dataclass(frozen=True)
+class Exits:
+    """Exits of the cells of a parameter point.
+
+    Attributes
+    ----------
+    counted : ndarray of bool, (cell,)
+        Cells that are in a set at the first counted section.
+    begin : ndarray of int, (cell,)
+        Code of the set in which a cell begins.
+    first_out : ndarray of int, (cell,)
+        Number of the first section outside, counted from the first counted one; `NOT_LEFT`.
+    end : ndarray of int, (cell,)
+        Code at that section; `NOT_LEFT` where a cell did not leave, or diverged.
+    at_risk : ndarray of int, (cell,)
+        Intervals between sections at whose begin a cell was in its set.
+    """
+
+    counted: np.ndarray
+    begin: np.ndarray
+    first_out: np.ndarray
+    end: np.ndarray
+    at_risk: np.ndarray
+
+
+def find_exits(codes: np.ndarray, cells: PointCells, skip: int, n_transient: int) -> Exits:
+    """Find the first section at which each cell is in another set than at the first.
+
+    Parameters
+    ----------
+    codes
+        Code of the set at each section, shape (cell, section); negative ones decide nothing.
+    cells
+        The cells; those that diverged leave in the period in which they did.
+    skip, n_transient
+        Sections that are not counted, and periods before the first section.
+    """
+    seen = codes[:, skip:]
+    begin = seen[:, 0]
+    outside = (seen != begin[:, None]) & (seen >= 0)
+    left = outside.any(axis=1)
+    first_out = np.where(left, outside.argmax(axis=1), NOT_LEFT)
+    end = np.where(left, np.take_along_axis(seen, np.maximum(first_out, 0)[:, None], axis=1)[:, 0], NOT_LEFT)
+    counted = begin >= 0
+    gone = cells.status == Status.DIVERGED
+    when = cells.n_periods - n_transient - 1 - skip
+    # a diverged cell has no sections: it was inside as long as it was there
+    first_out = np.where(gone, when, first_out)
+    counted = np.where(gone, when > 0, counted & (cells.status == Status.BOUNDED))
+    begin = np.where(gone, 0, begin)
+    end = np.where(gone, NOT_LEFT, end)
+    has_left = first_out > 0
+    at_risk = np.where(has_left, first_out, seen.shape[1] - 1)
+    return Exits(counted, begin, np.where(has_left, first_out, NOT_LEFT), end, np.where(counted, at_risk, 0))
+
+
+def labels_of(model: Model, options: EscapeOptions, cube: xr.Dataset) -> tuple[Labels, tuple[str, ...]]:
+    """Return the function that tells in which set a section point is, and the names of the sets."""
+    names = model.state_names
+    circle, scales = np.array(model.is_angle), np.array(model.scales)
+    if options.low or options.high:
+        low, high = (
+            np.array([given.get(name, ends) for name in names])
+            for given, ends in ((options.low, -np.inf), (options.high, np.inf))
+        )
+
+        def in_box(section: np.ndarray, values: Mapping[str, float]) -> np.ndarray:
+            inside = ((section >= low) & (section <= high)).all(axis=-1)
+            return np.where(inside, 0, 1)
+
+        return in_box, _IN_AND_OUT
+    if options.radius is not None:
+        fixed = np.array([options.centre.get(name, np.nan) for name in names])
+        radius = options.radius
+
+        def in_ball(section: np.ndarray, values: Mapping[str, float]) -> np.ndarray:
+            first = section[:, options.skip : options.skip + 1]
+            centre = np.where(np.isfinite(fixed), fixed, 0.0) if options.centre else first
+            distance = np.abs(section - centre)
+            distance = np.where(circle, np.minimum(distance % TWO_PI, TWO_PI - distance % TWO_PI), distance) / scales
+            if options.centre:  # states without a centre do not count
+                distance = np.where(np.isfinite(fixed), distance, 0.0)
+            return np.where((distance**2).sum(axis=-1) <= radius**2, 0, 1)
+
+        return in_ball, _IN_AND_OUT
+    classifier = model.classifier
+    assert classifier is not None
+    fixed_values = dict(parameters_of(cube))
+    # one section that meets no condition of a text is between the classes, and no class of its own
+    undecided = [0, *classifier.neutral, *(k for k, word in enumerate(classifier.words) if word == MIXED)]
+
+    def by_motion(section: np.ndarray, values: Mapping[str, float]) -> np.ndarray:
+        one = section.reshape(-1, 1, section.shape[-1])
+        finite = np.isfinite(one).all(axis=(1, 2))
+        codes = np.full(len(one), -1)
+        no_turns = np.zeros((int(finite.sum()), len(model.angles)), np.int64)
+        hz = np.full(int(finite.sum()), values[FREQUENCY_DIM])
+        found = classifier.classify(one[finite], no_turns, hz, {**fixed_values, **values})
+        decided = ~np.isin(found, undecided)
+        codes[finite] = np.where(decided, found, -1)
+        return codes.reshape(section.shape[:-1])
+
+    return by_motion, classifier.words
+
+
+def escapes(run: Run, options: EscapeOptions) -> xr.Dataset:
+    """Compute rates of escape, exit places, last stretches and the fit of Kramers' law.
+
+    Returns
+    -------
+    Dataset
+        Over the parameter points, and over ``set`` (in which cells begin): ``n_cells``, ``n_left``, ``n_to`` (by
+        the set they go to), ``at_risk`` [periods], ``rate``, ``rate_low``, ``rate_high`` [1/s], ``left_share``
+        with its interval, ``constant_p``, ``exit_mean`` and ``exit_std`` of each state; ``path_mean`` and
+        ``path_std`` by section before leaving; over a strength ``barrier`` and so on, see `rates.KramersFit`.
+    """
+    cube, model = run.cube(), run.model
+    dims = point_dims(cube)
+    label, words = labels_of(model, options, cube)
+    shape = tuple(cube.sizes[d] for d in dims)
+    tables = _empty(shape, len(words), options.stretch, model)
+    for cells in cells_at_points(cube):
+        index = tuple(cells.at[d] for d in dims)
+        values = {FREQUENCY_DIM: _frequency(cube, cells), **cells.values}
+        found = find_exits(label(cells.section, values), cells, options.skip, run.spec.integration.n_transient)
+        for k in range(len(words)):
+            _fill(tables, (*index, k), cells, found, k, options, 1.0 / values[FREQUENCY_DIM], model)
+    ds = _dataset(tables, cube, dims, words, options, model)
+    return _with_kramers(ds, dims, options).assign_attrs({**_attrs(cube), "confidence": options.confidence})
+
+
+def _frequency(cube: xr.Dataset, cells: PointCells) -> float:
+    """Return the drive frequency at a point [Hz]."""
+    return cells.values.get(FREQUENCY_DIM, float(cube[FREQUENCY_DIM].values.ravel()[0]))
+
+
+def _attrs(cube: xr.Dataset) -> dict[str, Any]:
+    kept = ("model", "parameters", "noise", "title", "source")
+    return {name: cube.attrs[name] for name in kept if name in cube.attrs}
+
+
+_NUMBERS = ("n_cells", "n_left", "at_risk")
+_REALS = ("rate", "rate_low", "rate_high", "left_share", "left_low", "left_high", "constant_p")
+
+
+def _empty(shape: tuple[int, ...], n_sets: int, stretch: int, model: Model) -> dict[str, np.ndarray]:
+    n = len(model.states)
+    tables: dict[str, np.ndarray] = {name: np.zeros((*shape, n_sets), np.int64) for name in _NUMBERS}
+    tables |= {name: np.full((*shape, n_sets), np.nan) for name in _REALS}
+    tables["interval"] = np.full((*shape, n_sets), np.nan)
+    tables["n_to"] = np.zeros((*shape, n_sets, n_sets), np.int64)
+    tables |= {name: np.full((*shape, n_sets, n), np.nan) for name in ("exit_mean", "exit_std")}
+    tables |= {name: np.full((*shape, n_sets, stretch + 1, n), np.nan) for name in ("path_mean", "path_std")}
+    tables["path_n"] = np.zeros((*shape, n_sets, stretch + 1), np.int64)
+    return tables
+
+
+def _fill(
+    tables: dict[str, np.ndarray],
+    at: tuple[int, ...],
+    cells: PointCells,
+    found: Exits,
+    code: int,
+    options: EscapeOptions,
+    period: float,
+    model: Model,
+) -> None:
+    """Write the numbers of the cells that begin in one set at one parameter point."""
+    own = found.counted & (found.begin == code)
+    left = own & (found.first_out > 0)
+    n, n_left, at_risk = int(own.sum()), int(left.sum()), int(found.at_risk[own].sum())
+    tables["n_cells"][at], tables["n_left"][at], tables["at_risk"][at] = n, n_left, at_risk
+    tables["interval"][at] = period
+    if not n:
+        return
+    ends = np.array(n_left), np.array(at_risk), np.array(period)
+    for name, value in zip(_REALS[:3], rate_interval(*ends, options.confidence), strict=True):
+        tables[name][at] = value
+    low, high = binomial_interval(n_left, n, confidence=options.confidence, method="clopper-pearson")
+    tables["left_share"][at], tables["left_low"][at], tables["left_high"][at] = n_left / n, low, high
+    half = (cells.section.shape[1] - options.skip - 1) // 2
+    early = np.minimum(found.at_risk[own], half)
+    n_early = int((found.first_out[left] <= half).sum())
+    tables["constant_p"][at] = constancy(n_early, n_left - n_early, int(early.sum()), at_risk - int(early.sum()))
+    to, counts = np.unique(found.end[left], return_counts=True)
+    for target, count in zip(to, counts, strict=True):
+        if target >= 0:
+            tables["n_to"][(*at, target)] = count
+    _fill_paths(tables, at, cells.section[left], found.first_out[left] + options.skip, options.stretch, model)
+
+
+def _fill_paths(
+    tables: dict[str, np.ndarray],
+    at: tuple[int, ...],
+    section: np.ndarray,
+    first_out: np.ndarray,
+    stretch: int,
+    model: Model,
+) -> None:
+    """Write mean and spread of the sections before leaving, and of the first one outside."""
+    circle = np.array(model.is_angle)
+    for lag in range(stretch + 1):
+        place = first_out - stretch + lag
+        inside = (place >= 0) & (place < section.shape[1])
+        points = section[inside, place[inside]]
+        points = points[np.isfinite(points).all(axis=1)]
+        tables["path_n"][(*at, lag)] = len(points)
+        if len(points):
+            mean, std = mean_and_spread(points, circle)
+            tables["path_mean"][(*at, lag)], tables["path_std"][(*at, lag)] = mean, std
+    tables["exit_mean"][at] = tables["path_mean"][(*at, stretch)]
+    tables["exit_std"][at] = tables["path_std"][(*at, stretch)]
+
+
+def mean_and_spread(points: np.ndarray, circle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return mean and standard deviation of states, shape (n, state); of angles on the circle."""
+    with np.errstate(invalid="ignore"):
+        turned = np.angle(np.exp(1j * points).mean(axis=0))
+        mean = np.where(circle, turned, points.mean(axis=0))
+        apart = points - mean
+        apart = np.where(circle, (apart + np.pi) % TWO_PI - np.pi, apart)
+    return mean, np.sqrt((apart**2).mean(axis=0))
+
+
+def _dataset(
+    tables: dict[str, np.ndarray],
+    cube: xr.Dataset,
+    dims: list[str],
+    words: tuple[str, ...],
+    options: EscapeOptions,
+    model: Model,
+) -> xr.Dataset:
+    own: dict[str, tuple[str, ...]] = {
+        "n_to": ("to",),
+        "exit_mean": ("state",),
+        "exit_std": ("state",),
+        "path_n": ("lag",),
+    }
+    own |= {"path_mean": ("lag", "state"), "path_std": ("lag", "state")}
+    units = {"rate": "1/s", "rate_low": "1/s", "rate_high": "1/s", "interval": "s"}
+    variables = {
+        name: ((*dims, "set", *own.get(name, ())), value, {"units": units.get(name, "1")})
+        for name, value in tables.items()
+    }
+    coords = coordinates_of(cube, dims)
+    coords |= {"set": np.arange(len(words)), "lag": np.arange(-options.stretch, 1), "state": list(model.state_names)}
+    ds = xr.Dataset(variables, coords=coords)
+    ds["set"].attrs = {"flag_values": list(range(len(words))), "flag_meanings": " ".join(words)}
+    if words == _IN_AND_OUT:  # cells that begin outside are not counted
+        return ds.isel(set=slice(0, 1))
+    begun = ds["n_cells"].sum(dims).values > 0
+    return ds.isel(set=np.flatnonzero(begun))
+
+
+_FIT = ("barrier", "barrier_low", "barrier_high", "log_factor", "n_fitted", "misfit_p")
+
+
+def strength_dim(dims: list[str]) -> str | None:
+    """Return the dim of a strength of the noise, if there is exactly one."""
+    found = [d for d in dims if d.startswith(NOISE_PREFIX)]
+    return found[0] if len(found) == 1 else None
+
+
+def _with_kramers(ds: xr.Dataset, dims: list[str], options: EscapeOptions) -> xr.Dataset:
+    """Add the fit of Kramers' law along the axis of a strength."""
+    along = strength_dim(dims)
+    if along is None:
+        return ds
+    others = [d for d in ds["rate"].dims if d != along]
+    part = {name: ds[name].transpose(*others, along).values for name in ("n_left", "at_risk", "interval")}
+    fits = np.full((len(_FIT), *part["n_left"].shape[:-1]), np.nan)
+    for index in np.ndindex(*fits.shape[1:]):
+        n, m, t = (part[name][index] for name in ("n_left", "at_risk", "interval"))
+        fit: KramersFit = NO_FIT
+        if np.isfinite(t).all():
+            fit = fit_kramers(ds[along].values, n, m, t, options.confidence)
+        fits[(slice(None), *index)] = fit
+    return ds.assign({name: (others, value) for name, value in zip(_FIT, fits, strict=True)})

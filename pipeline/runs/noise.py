@@ -1,0 +1,118 @@
+"""Check the steps of a noisy run: refuse them before it begins if they are too long, and warn at its end."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from magpend_core.models.noisy import NoisyModel
+from pipeline.layout.cells import CellMap, Inputs
+from pipeline.specification.noise import STEPS
+from pipeline.specification.parsing import Spec
+from pipeline.specification.problems import SpecError
+from pipeline.store.files import Files
+from pipeline.store.run import Run
+
+SAMPLE, PERIODS = 32, 4
+"""Cells and periods of the sample that is integrated before a run begins."""
+
+STABLE = 2.5
+"""Largest step times rate of contraction at which the method is stable: 2.51 for its three stages of order 3."""
+
+ORDER, ORDER_OF_OWN = 1.5, 1.0
+"""Strong order of the method, and where a strength depends on its own state: for the step that a message proposes."""
+
+
+def check_steps(spec: Spec) -> None:
+    """Refuse a run with noise whose steps are too long for a layer of its equations or for its tolerance.
+
+    `SAMPLE` cells, evenly spread over the run, are integrated for some periods. The run is refused if the largest
+    of their strong errors is above ``noise.tolerance``, or if a step is longer than the equations can be
+    followed at their fastest contraction (`magpend_core.stiffness`).
+
+    Raises
+    ------
+    SpecError
+        With the step's length, the bound and the number of steps that fits.
+    """
+    if spec.noise is None:
+        return
+    inputs = _sample(spec)
+    steps = spec.noise.steps_at(inputs.frequency_hz[:, 0])
+    lengths = 1.0 / inputs.frequency_hz[:, 0] / steps
+    if problem := _stiff_problem(spec, inputs, lengths):
+        raise SpecError([problem])
+    from pipeline.compute.noise import under_noise
+
+    few = min(PERIODS, spec.integration.n_transient + spec.integration.n_keep)
+    short = replace(spec, integration=spec.integration.model_copy(update={"n_transient": few - 1, "n_keep": 1}))
+    error = under_noise(short, inputs)[1]
+    largest = float(np.nanmax(error)) if np.isfinite(error).any() else 0.0
+    if largest > spec.noise.tolerance:
+        model = spec.model
+        assert isinstance(model, NoisyModel)
+        order = ORDER_OF_OWN if any(model.noise.own) else ORDER
+        factor = (1.2 * largest / spec.noise.tolerance) ** (1.0 / order)
+        raise SpecError(
+            [
+                f"noise.{_step_key(spec)}: halving the steps changes a state within a period by {largest:.2g} of its "
+                f"scale, more than noise.tolerance = {spec.noise.tolerance:g}; set {_remedy(spec, factor)}."
+            ]
+        )
+
+
+def warn_of_steps(spec: Spec, files: Files, echo: Callable[[str], None]) -> None:
+    """Print a warning if cells of a finished run have a strong error above ``noise.tolerance``."""
+    if spec.noise is None:
+        return
+    error = Run.open(files).cube()["strong_error"].values
+    n_above, n = int((error > spec.noise.tolerance).sum()), int(np.isfinite(error).sum())
+    if n_above:
+        echo(
+            f"warning: in {n_above} of {n} cells the last period changes by more than noise.tolerance = "
+            f"{spec.noise.tolerance:g} when its steps are halved (at most {np.nanmax(error):.2g}); take shorter steps."
+        )
+
+
+def _sample(spec: Spec) -> Inputs:
+    """Return the inputs of cells evenly spread over a run."""
+    cells = CellMap(spec)
+    n_cells = int(np.prod(cells.shape))
+    rows = np.unique(np.linspace(0, n_cells - 1, min(SAMPLE, n_cells)).astype(np.int64))
+    found = []
+    for place in np.stack(np.unravel_index(rows, cells.shape), axis=1).tolist():
+        found.append(cells.inputs(tuple(slice(i, i + 1) for i in place)))
+    parts = ("parameters", "frequency_hz", "initial_states")
+    return Inputs(*(np.concatenate([getattr(one, name) for one in found]) for name in parts))
+
+
+def _stiff_problem(spec: Spec, inputs: Inputs, lengths: np.ndarray) -> str | None:
+    from magpend_core.stiffness import fastest_contraction
+
+    given = inputs.parameters[:, 0], inputs.frequency_hz[:, 0], inputs.initial_states
+    rate = fastest_contraction(spec.model.system, *given)
+    longest = float(lengths.max())
+    if not longest * rate > STABLE:
+        return None
+    bound = STABLE / rate
+    return (
+        f"noise.{_step_key(spec)}: a step has {longest:.3g} s, and the equations contract at {rate:.4g} /s in a layer; "
+        f"steps must be shorter than {bound:.3g} s. Set {_remedy(spec, 1.05 * longest / bound)}."
+    )
+
+
+def _step_key(spec: Spec) -> str:
+    assert spec.noise is not None
+    if spec.noise.step is not None:
+        return f"step = {spec.noise.step:g}"
+    return f"steps_per_period = {spec.noise.steps_per_period or STEPS}"
+
+
+def _remedy(spec: Spec, factor: float) -> str:
+    """Return the key and value with steps shorter by a factor."""
+    assert spec.noise is not None
+    if spec.noise.step is not None:
+        return f"step = {spec.noise.step / factor:.2g}"
+    return f"steps_per_period = {int(np.ceil((spec.noise.steps_per_period or STEPS) * factor))}"
