@@ -118,7 +118,20 @@ def check(
 def posterior(
     directory: Annotated[Path, typer.Argument(metavar="DIR", help="Directory of a finished identification.")],
     n: Annotated[int, typer.Option("-n", min=20, max=100_000, help="Number of draws.")] = 200,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the draws.")] = 1,
+    seed: Annotated[int, typer.Option(min=0, max=2**32 - 1, help="Seed of the draws.")] = 1,
+    mcmc: Annotated[
+        bool, typer.Option("--mcmc", help="Sample the posterior density by a chain (emcee) instead of the Gaussian.")
+    ] = False,
+    walkers: Annotated[
+        int,
+        typer.Option(
+            min=0, help="Walkers of the chain; 0 for 32, or four times the number of unknowns if that is more."
+        ),
+    ] = 0,
+    steps: Annotated[int, typer.Option(min=20, help="Most steps of the chain; it ends when it has converged.")] = 2000,
+    spec: Annotated[
+        str | None, typer.Option(help="Specification of the identification; --mcmc needs it if recordings were fitted.")
+    ] = None,
     no_figures: Annotated[bool, typer.Option("--no-figures", help="Draw no figures.")] = False,
     as_json: Json = False,
 ) -> None:
@@ -127,11 +140,18 @@ def posterior(
     The draws are written to DIR/posterior.nc. With measured orbits they are carried through the branches: 95 %
     intervals of folds, doublings and Hopf points, and bands about the branches, in DIR/bands-N.nc and
     DIR/figures/bands-N.png.
+
+    With --mcmc the draws come from a chain, whose convergence figures are printed. DIR keeps the chain: the same
+    command goes on with a stopped one, and with more --steps it gets longer.
     """
     from pipeline.cli import console
+    from pipeline.rig.identify.posterior import Sampling
     from pipeline.rig.identify.posterior_files import write_posterior
 
-    parameters, bifurcations, written = write_posterior(directory, n, seed, figures=not no_figures)
+    sampling = Sampling(walkers, steps, spec) if mcmc else None
+    parameters, bifurcations, written = write_posterior(
+        directory, n, seed, sampling=sampling, figures=not no_figures, echo=console.note
+    )
     if as_json:
         rows = {"parameters": json_rows(parameters), "bifurcations": json_rows(bifurcations)}
         console.result(json.dumps(rows, indent=1))

@@ -15,7 +15,7 @@ from pipeline.layout.identity import canonical, digest_of
 from pipeline.layout.writing import write_atomically
 from pipeline.products.product import Table
 from pipeline.rig.identify.directory import read_result
-from pipeline.rig.identify.posterior import LEVELS, draw_posterior
+from pipeline.rig.identify.posterior import LEVELS, kept_draws
 from pipeline.runs.derive import AnalysedRun
 from pipeline.runs.run import run
 from pipeline.runs.workflows import find_spec, read_given
@@ -74,7 +74,7 @@ def run_posterior(
     parsed, _, default = read_given(path, smoke=smoke)
     names = [name for name in result["names"] if name in result["values"]] + list(result["tied"])
     _refuse_other_model(parsed.model.reference, result, list(parsed.axes), names)
-    drawn = draw_posterior(identification, n, seed)
+    drawn = kept_draws(identification, n, seed)
     tables = read_toml(path)
     if isinstance(tables.get("model"), str) and is_model_file(tables["model"]):
         tables["model"] = str((path.parent / tables["model"]).resolve())
