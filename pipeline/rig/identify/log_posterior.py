@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from magpend_core.models import load_model
 from magpend_core.models.model import Parameters
+from pipeline.analysis.branches.carrying import OrbitData
 from pipeline.rig.identify import directory as store
 from pipeline.rig.identify.bands import stored_tables
 from pipeline.rig.identify.build import build, read_all
@@ -34,7 +35,6 @@ from pipeline.rig.identify.linearise import linearise, loss_scale_of
 from pipeline.rig.identify.local import Fit
 from pipeline.rig.identify.measured_orbits import MeasuredTable, read_orbits
 from pipeline.rig.identify.orbit_rows import orbit_rows
-from pipeline.rig.identify.orbits import OrbitData
 from pipeline.rig.identify.problem import Free, Problem
 from pipeline.rig.identify.specification import load_identification
 from pipeline.rig.identify.statistics import Linearised

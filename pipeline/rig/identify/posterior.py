@@ -12,6 +12,7 @@ import xarray as xr
 
 from magpend_core.models import load_model
 from magpend_core.models.model import Model
+from pipeline.analysis.branches.bands import LEVELS
 from pipeline.products.product import Table
 from pipeline.rig.identify.directory import POSTERIOR, read_info, read_result
 from pipeline.specification.problems import SpecError
@@ -26,9 +27,6 @@ LEAST_WALKERS = 32
 
 LEAST_SHARE = 0.01
 """Least share of the draws that must lie within the bounds."""
-
-LEVELS = (0.025, 0.5, 0.975)
-"""Quantiles that are reported: the median and the ends of the 95 % interval."""
 
 
 def draw_posterior(directory: str | Path, n: int, seed: int = 1) -> xr.Dataset:
@@ -185,9 +183,8 @@ def _all_parameters(result: Mapping[str, Any], names: list[str], drawn: np.ndarr
     values[:, [columns.index(name) for name in names]] = drawn
     for name, (factor, other) in result["tied"].items():
         values[:, columns.index(name)] = factor * values[:, columns.index(other)]
-    return xr.Dataset(
-        {"value": (("draw", "parameter"), values)}, {"parameter": columns}, {"identified": " ".join(names)}
-    )
+    about = {"identified": " ".join(names), "tied": " ".join(result["tied"])}
+    return xr.Dataset({"value": (("draw", "parameter"), values)}, {"parameter": columns}, about)
 
 
 def _refuse_undetermined(names: list[str], matrix: np.ndarray) -> None:

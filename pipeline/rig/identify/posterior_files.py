@@ -7,13 +7,14 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
+from pipeline.analysis.branches.bands import LEVELS
 from pipeline.layout.writing import write_netcdf
 from pipeline.plots.files import save_data, save_figure
 from pipeline.products.product import Table
 from pipeline.rig.identify.bands import bands, bands_table, stored_tables, tubes
 from pipeline.rig.identify.directory import POSTERIOR, read_result
 from pipeline.rig.identify.measured_orbits import MeasuredTable
-from pipeline.rig.identify.posterior import LEVELS, Echo, Sampling, draw_posterior, posterior_table, sample_draws
+from pipeline.rig.identify.posterior import Echo, Sampling, draw_posterior, posterior_table, sample_draws
 from pipeline.rig.measured_branch.figure import Bands, plot_branch
 from pipeline.runs.stopping import stoppable
 from pipeline.store.files import FIGURES, local_path

@@ -10,12 +10,13 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.analysis.branches.bands import LEVELS
 from pipeline.analysis.tabular import words_of
 from pipeline.layout.identity import canonical, digest_of
 from pipeline.layout.writing import write_atomically
 from pipeline.products.product import Table
 from pipeline.rig.identify.directory import read_result
-from pipeline.rig.identify.posterior import LEVELS, kept_draws
+from pipeline.rig.identify.posterior import kept_draws
 from pipeline.runs.derive import AnalysedRun
 from pipeline.runs.run import run
 from pipeline.runs.workflows import find_spec, read_given

@@ -15,7 +15,7 @@ from magpend_core.defaults import RTOL
 from magpend_core.engine.system import System
 from magpend_core.models.model import Model, Parameters
 from magpend_core.sampling import Drive, with_recorded_drive
-from pipeline.rig.identify.orbits import OrbitData, Solution
+from pipeline.analysis.branches.carrying import OrbitData, Solution
 
 ZERO = "zero"
 """Prefix of the names of sensors' zeros: ``zero.CHANNEL`` or ``zero.CHANNEL.RECORDING``."""

@@ -6,6 +6,7 @@ import importlib.util
 import json
 import math
 
+import emcee
 import numpy as np
 import pytest
 import xarray as xr
@@ -15,7 +16,7 @@ from pipeline.rig.identify.identification import identify
 from pipeline.rig.identify.log_posterior import LogPosterior, log_posterior
 from pipeline.rig.identify.posterior import Sampling, kept_draws, posterior_table, sample_draws
 from pipeline.rig.identify.posterior_files import write_posterior
-from pipeline.rig.identify.sampling import judged, sample_posterior, split_rhat
+from pipeline.rig.identify.sampling import _first, judged, sample_posterior, split_rhat
 from pipeline.specification.problems import SpecError
 from pipeline.store.errors import RefusedError
 
@@ -169,6 +170,12 @@ def test_sample_posterior__goes_on_to_the_same_bytes(cycles, closed):
     assert (again.values == first.values).all()
     assert [path.read_bytes() for path in blocks] == content
     assert lines == ["60 steps of the chain were there before"]
+    # one sampling of 200 steps without blocks
+    start = _first(*closed, 32, 4)
+    sampler = emcee.EnsembleSampler(32, 3, closed[0], vectorize=True)
+    random = np.random.RandomState(4).get_state()
+    sampler.run_mcmc(emcee.State(start["values"][0], log_prob=start["log_density"][0], random_state=random), 200)
+    assert (sampler.get_chain()[-len(first.values) :] == first.values).all()
     longer = chain_of(cycles, closed, 4, 240)
     assert len(longer.values) + longer.n_discarded == 240
     other = chain_of(cycles, closed, 5, 40)
