@@ -167,16 +167,19 @@ def spread(
     branches: Annotated[
         bool, typer.Option("--branches", help="Follow the branches of each run, and list their bifurcations.")
     ] = False,
+    attractors: Annotated[
+        bool, typer.Option("--attractors", help="Find the attractors of each run, and match them over the draws.")
+    ] = False,
     as_json: Json = False,
     csv: Csv = None,
 ) -> None:
-    """List how fractions of cells and bifurcations are distributed over the runs of a posterior."""
+    """List how fractions of cells, attractors and bifurcations are distributed over the runs of a posterior."""
     from pipeline.cli import console
     from pipeline.cli.common import check_csv, tell
     from pipeline.rig.identify.posterior_runs import spread as spreading
 
     check_csv(csv)
-    tell(spreading(folder, branches=branches, echo=console.note), csv, as_json)
+    tell(spreading(folder, branches=branches, attractors=attractors, echo=console.note), csv, as_json)
 
 
 def _check_orbits(directory: Path, table: Path, as_json: bool) -> None:

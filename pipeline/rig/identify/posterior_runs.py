@@ -15,6 +15,7 @@ from pipeline.analysis.tabular import words_of
 from pipeline.layout.identity import canonical, digest_of
 from pipeline.layout.writing import write_atomically
 from pipeline.products.product import Table
+from pipeline.rig.identify.attractor_spread import attractor_rows
 from pipeline.rig.identify.directory import read_result
 from pipeline.rig.identify.posterior import kept_draws
 from pipeline.runs.derive import AnalysedRun
@@ -133,8 +134,8 @@ def _establish(folder: Path, tables: Mapping[str, Any], values: np.ndarray, name
 # ---- distributions -----------------------------------------------------------------------------
 
 
-def spread(folder: str | Path, *, branches: bool = False, echo: Echo = print) -> Table:
-    """Collect the distribution of fractions of cells, and of bifurcations, over the runs of `run_posterior`.
+def spread(folder: str | Path, *, branches: bool = False, attractors: bool = False, echo: Echo = print) -> Table:
+    """Collect the distribution of fractions of cells, attractors and bifurcations over the runs of `run_posterior`.
 
     Parameters
     ----------
@@ -142,14 +143,17 @@ def spread(folder: str | Path, *, branches: bool = False, echo: Echo = print) ->
         Folder of the runs.
     branches
         Whether to follow the branches of each run, and to collect their bifurcations. Results are kept in the runs.
+    attractors
+        Whether to find the attractors of each run, and to match them over the draws.
     echo
         Function that prints a line.
 
     Returns
     -------
     Table
-        A row for each status and orbit period with the ``fraction`` of cells, and for each bifurcation of the best run
-        with its ``value``: ``best``, ``median``, ``low`` and ``high`` (95 %), and ``n_draws`` that have it.
+        A row for each status and orbit period with the ``fraction`` of cells, for each attractor with its ``share`` of
+        cells and its ``section`` values (see `attractor_rows`), and for each bifurcation of the best run with its
+        ``value``: ``best``, ``median``, ``low`` and ``high`` (95 %), and ``n_draws`` that have it.
 
     Raises
     ------
@@ -162,13 +166,22 @@ def spread(folder: str | Path, *, branches: bool = False, echo: Echo = print) ->
     n = len(json.loads((folder / STUDY).read_text("utf-8"))["draws"])
     runs = [AnalysedRun.of(folder / place) for place in (BEST, *(f"draw-{k:04d}" for k in range(n)))]
     rows = _fraction_rows([_fractions(one) for one in runs])
+    shown = list(rows)
+    if attractors:
+        sets = []
+        for k, one in enumerate(runs):
+            echo(f"attractors {k + 1} of {len(runs)}")
+            sets.append(one.derive("attractors"))
+        found_rows, printed = attractor_rows(sets, _row)
+        rows, shown = rows + found_rows, shown + printed
     if branches:
         found = []
         for k, one in enumerate(runs):
             echo(f"branches {k + 1} of {len(runs)}")
             found.append(_bifurcations(one))
-        rows += _bifurcation_rows(found)
-    return Table(rows, [_line(row) for row in rows])
+        bifurcations = _bifurcation_rows(found)
+        rows, shown = rows + bifurcations, shown + bifurcations
+    return Table(rows, [_line(row) for row in shown])
 
 
 def _fractions(one: AnalysedRun) -> dict[str, float]:

@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from pipeline.analysis.branches.bands import GRID, LEVELS, stretches
+from pipeline.analysis.branches.bands import GRID, LEVELS, orbit_data, place_variables, stretches
 from pipeline.analysis.branches.bands_product import bands_table
+from pipeline.analysis.branches.carrying import Along
 from pipeline.runs.derive import derive, stored
 from pipeline.runs.drawing import figure
 from pipeline.runs.run import run
@@ -87,6 +88,28 @@ def test_bands__quantiles_of_orbits_are_those_of_the_closed_form(bench):
     # left of the fold of half of the draws there is no band
     for _, _, chosen in stretches(found):
         assert found["parameter_value"].values[chosen].min() > np.median(h - 1 / (4 * g)) - 0.5 / (GRID - 1)
+
+
+def test_orbit_data__a_branch_that_turns_back_is_cut_there():
+    """A branch over [0, 1] and back, stable all the way: two stretches, not one that mixes both."""
+    x = np.concatenate([np.linspace(-0.01, 1.0, 50), np.linspace(0.99, -0.01, 50)])
+    branches = xr.Dataset(
+        {
+            "n_points": ("branch", [100]),
+            "orbit_period": ("branch", [1]),
+            "parameter": (("branch", "point"), x[None]),
+            "n_unstable": (("branch", "point"), np.zeros((1, 100), int)),
+            "section": (("branch", "point", "phase", "state"), np.linspace(0.0, 1.0, 100)[None, :, None, None]),
+        }
+    )
+    data, guesses, places = orbit_data(Along(None, "m", 0.0, 0.9), branches)
+    assert len(data) == 2 * GRID
+    np.testing.assert_allclose([g[-1] for g in guesses], [d.value for d in data])
+    found = [chosen for _, _, chosen in stretches(xr.Dataset(place_variables(data, places, np.ones(len(data)))))]
+    assert [len(chosen) for chosen in found] == [GRID, GRID]
+    sizes = np.array([g[0] for g in guesses])
+    assert (np.diff(sizes[found[0]]) > 0.0).all()
+    assert (np.diff(sizes[found[1]]) < 0.0).all()
 
 
 def test_bands__are_kept_and_depend_on_the_draws(bench, tmp_path):
