@@ -40,7 +40,7 @@ def draw_bands(ax: Axes, bands: xr.Dataset, measure: Measure, max_period: int | 
     list
         Handles for the legend.
     """
-    drawn = False
+    edges: list[float] = []
     levels = bands["section_level"].sel(state=measure.name).values
     low, high = levels[0], levels[-1]
     for _, _, chosen in stretches(bands):
@@ -49,14 +49,23 @@ def draw_bands(ax: Axes, bands: xr.Dataset, measure: Measure, max_period: int | 
             continue
         x = bands["parameter_value"].values[chosen]
         for phase in range(period):
-            pair = (measure.shown(edge[chosen, phase]) for edge in (low, high))
-            ax.fill_between(x, *pair, **SHADE, gid="band")
-            drawn = True
+            below, above = (measure.shown(edge[chosen, phase]) for edge in (low, high))
+            ax.fill_between(x, below, above, **SHADE, gid="band")
+            edges += [np.nanmin(low[chosen, phase]), np.nanmax(high[chosen, phase])]
+    if edges and style.figure_of(ax).frame.ylim is None and not measure.on_circle:
+        _make_room(ax, measure.shown(np.array(edges)))
     bars = _draw_bars(ax, bands, measure, max_period)
-    handles: list[Any] = [Patch(label="95 % of the orbits", **{**SHADE, "zorder": None})] if drawn else []
+    handles: list[Any] = [Patch(label="95 % of the orbits", **{**SHADE, "zorder": None})] if edges else []
     if bars:
         handles.append(Line2D([], [], label="95 % of bifurcations", color=BAR["color"], linewidth=BAR["linewidth"]))
     return handles
+
+
+def _make_room(ax: Axes, heights: np.ndarray) -> None:
+    """Widen the vertical axis so that it shows all heights."""
+    bottom, top = ax.get_ylim()
+    room = 0.03 * (top - bottom)
+    ax.set_ylim(min(bottom, float(heights.min()) - room), max(top, float(heights.max()) + room))
 
 
 def _draw_bars(ax: Axes, bands: xr.Dataset, measure: Measure, max_period: int | None) -> int:

@@ -98,7 +98,7 @@ def _mean_section(one: xr.Dataset, is_angle: np.ndarray) -> np.ndarray:
     points = one["attractor_points"].transpose("point", "state").values
     points = points[np.isfinite(points).all(axis=1)]
     turned = np.angle(np.exp(1j * np.where(is_angle, points, 0.0)).mean(axis=0))
-    return np.where(is_angle, turned, points.mean(axis=0))
+    return np.asarray(np.where(is_angle, turned, points.mean(axis=0)))
 
 
 def _about(angles: np.ndarray) -> np.ndarray:

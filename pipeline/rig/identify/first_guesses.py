@@ -83,9 +83,10 @@ def fit_many_starts(problem: Problem, thetas: Array, starts: Array) -> ManyStart
     for _ in range(MAX_ITERATIONS):
         steps = np.zeros_like(found)
         for i, k in np.argwhere(moving):
-            steps[i, k], gain = _step(*blocks[i][k], damping[i, k])
+            block = blocks[i][k]
+            steps[i, k], gain = _step(block.jacobian, block.rows, damping[i, k])
             # below this gain, rounding decides and no step improves the start
-            moving[i, k] = gain > SETTLED * _cost(blocks[i][k]) and damping[i, k] < MOST_DAMPING
+            moving[i, k] = gain > SETTLED * _cost(block) and damping[i, k] < MOST_DAMPING
         members, pieces = np.flatnonzero(moving.any(axis=1)), np.flatnonzero(moving.any(axis=0))
         if not len(members):
             break

@@ -34,6 +34,7 @@ from pipeline.rig.identify.identification import unpack_fit
 from pipeline.rig.identify.linearise import linearise, loss_scale_of
 from pipeline.rig.identify.local import Fit
 from pipeline.rig.identify.measured_orbits import MeasuredTable, read_orbits
+from pipeline.rig.identify.objective import LOST
 from pipeline.rig.identify.orbit_rows import orbit_rows
 from pipeline.rig.identify.problem import Free, Problem
 from pipeline.rig.identify.specification import load_identification
@@ -107,8 +108,8 @@ class LogPosterior:
         """Return half the chi^2 of the pieces with their initial states fitted, and where a trajectory diverged."""
         guesses = self.best.starts + np.einsum("psf,mf->mps", self.moves, thetas - self.best.theta)
         fitted = fit_many_starts(self.problem, thetas, guesses)
-        # a trajectory that diverges has residuals of `objective.LOST`
-        return fitted.costs.sum(axis=1), (fitted.costs > 1e9).any(axis=1)
+        # a trajectory that diverges has residuals of `LOST`
+        return fitted.costs.sum(axis=1), np.asarray((fitted.costs > 0.1 * LOST**2).any(axis=1))
 
 
 def log_posterior(directory: str | Path, spec: str | Path | None, result: Mapping[str, Any]) -> LogPosterior:

@@ -206,9 +206,7 @@ def _within_bounds(
     mean = np.array([e["value"] for e in estimates])
     low = np.array([-np.inf if e["bounds"][0] is None else e["bounds"][0] for e in estimates])
     high = np.array([np.inf if e["bounds"][1] is None else e["bounds"][1] for e in estimates])
-    scale = np.sqrt(np.diag(matrix))
-    values, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))
-    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    root = root_of(matrix)
     random, kept, tried = np.random.default_rng(seed), np.zeros((0, len(names))), 0
     while len(kept) < n:
         if tried and len(kept) < LEAST_SHARE * tried:
@@ -218,10 +216,21 @@ def _within_bounds(
                     "the bounds allow; widen the bounds, give priors, or identify fewer parameters."
                 ]
             )
-        batch = mean + random.standard_normal((max(4 * n, 1000), len(names))) @ root.T * scale
+        batch = mean + random.standard_normal((max(4 * n, 1000), len(names))) @ root
         tried += len(batch)
         kept = np.vstack([kept, batch[((batch >= low) & (batch <= high)).all(axis=1)]])
     return kept[:n], 1.0 - len(kept) / tried
+
+
+def root_of(matrix: np.ndarray) -> np.ndarray:
+    """Return a factor that turns rows of white noise into rows with a covariance, ``noise @ root``.
+
+    It is the symmetric root of the correlations, times the standard deviations: the same on all processors, whatever
+    signs LAPACK gives the eigenvectors.
+    """
+    scale = np.sqrt(np.diag(matrix))
+    values, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))
+    return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T * scale)
 
 
 def posterior_table(drawn: xr.Dataset) -> Table:

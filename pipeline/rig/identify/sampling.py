@@ -24,6 +24,7 @@ from pipeline.layout.identity import digest_of
 from pipeline.products.reporting import report
 from pipeline.rig.identify.directory import OUTCOMES, Outcomes, read_info
 from pipeline.rig.identify.log_posterior import LogPosterior
+from pipeline.rig.identify.posterior import root_of
 from pipeline.specification.problems import SpecError
 
 Array = NDArray[np.float64]
@@ -191,12 +192,10 @@ def _first(density: LogPosterior, covariance: Array, n_walkers: int, seed: int) 
     The Gaussian shrinks while fewer than a quarter of its draws have one.
     """
     best, random = density.best.theta, np.random.default_rng(seed)
-    scale = np.sqrt(np.diag(covariance))
-    values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
-    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    root = root_of(covariance)
     factor = 1.0
     for _ in range(12):
-        drawn = best + factor * (random.standard_normal((4 * n_walkers, len(best))) @ root.T) * scale
+        drawn = best + factor * (random.standard_normal((4 * n_walkers, len(best))) @ root)
         inside = ((drawn >= density.problem.lower) & (drawn <= density.problem.upper)).all(axis=1)
         if inside.sum() >= n_walkers:
             own = drawn[inside]
