@@ -15,6 +15,7 @@ from magpend_core.models.model import Model
 from pipeline.analysis.branches.bands import LEVELS
 from pipeline.products.product import Table
 from pipeline.rig.identify.directory import POSTERIOR, read_info, read_result
+from pipeline.rig.identify.statistics import root_of
 from pipeline.specification.problems import SpecError
 from pipeline.store.files import local_path
 
@@ -220,17 +221,6 @@ def _within_bounds(
         tried += len(batch)
         kept = np.vstack([kept, batch[((batch >= low) & (batch <= high)).all(axis=1)]])
     return kept[:n], 1.0 - len(kept) / tried
-
-
-def root_of(matrix: np.ndarray) -> np.ndarray:
-    """Return a factor that turns rows of white noise into rows with a covariance, ``noise @ root``.
-
-    It is the symmetric root of the correlations, times the standard deviations: the same on all processors, whatever
-    signs LAPACK gives the eigenvectors.
-    """
-    scale = np.sqrt(np.diag(matrix))
-    values, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))
-    return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T * scale)
 
 
 def posterior_table(drawn: xr.Dataset) -> Table:

@@ -24,7 +24,7 @@ from pipeline.layout.identity import digest_of
 from pipeline.products.reporting import report
 from pipeline.rig.identify.directory import OUTCOMES, Outcomes, read_info
 from pipeline.rig.identify.log_posterior import LogPosterior
-from pipeline.rig.identify.posterior import root_of
+from pipeline.rig.identify.statistics import root_of
 from pipeline.specification.problems import SpecError
 
 Array = NDArray[np.float64]
