@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from pipeline.analysis.branches.bands import LEAST_SHARE, interval_of, stretches
+from pipeline.analysis.draws import LEAST_SHARE, interval_of, stretches
 from pipeline.plots import style
 from pipeline.plots.labels import Measure
 

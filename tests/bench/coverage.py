@@ -19,9 +19,10 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.analysis.branches.bands import LEVELS, bifurcation_data
+from pipeline.analysis.branches.bands import bifurcation_data
 from pipeline.analysis.branches.bifurcations import DOUBLING, FOLD, HOPF
 from pipeline.analysis.branches.carrying import OrbitData, Solution, settled, solve
+from pipeline.analysis.draws import LEVELS
 from pipeline.rig.identify.build import build
 from pipeline.rig.identify.linearise import linearise
 from pipeline.rig.identify.local import fit_local

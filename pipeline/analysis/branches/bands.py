@@ -34,12 +34,6 @@ GRID = 41
 DRAWS = 16
 """Draws that are carried in one call of the engine."""
 
-LEAST_SHARE = 0.5
-"""Least share of the draws that have an orbit, for a band at that value of the parameter."""
-
-LEVELS = (0.025, 0.5, 0.975)
-"""Quantiles that are reported: the median and the ends of the 95 % interval."""
-
 FOLLOWED = (FOLD, DOUBLING, TORUS, HOPF)
 """Kinds of bifurcations that get an interval."""
 
@@ -141,30 +135,6 @@ def carried(table: OrbitData, packed: Array) -> Iterator[tuple[Array, list[list[
         yield own, solve(table, own)
 
 
-def stretches(places: xr.Dataset) -> Iterator[tuple[int, bool, np.ndarray]]:
-    """Yield the stretches of branches over which a band is drawn: branch, stability, and the indices of the orbits by
-    rising parameter.
-
-    Parameters
-    ----------
-    places
-        ``branch``, ``run``, ``step``, ``is_stable`` and ``share`` (of the draws that have it) over ``orbit``.
-
-    Notes
-    -----
-    A stretch is cut where the branch turns back, where its stability changes, and where fewer than `LEAST_SHARE` of
-    the draws have the orbit.
-    """
-    branch, run, step = (places[name].values for name in ("branch", "run", "step"))
-    stable, there = places["is_stable"].values, places["share"].values >= LEAST_SHARE
-    for key in sorted({(int(b), int(r), bool(s)) for b, r, s in zip(branch, run, stable, strict=True)}):
-        chosen = np.flatnonzero((branch == key[0]) & (run == key[1]) & (stable == key[2]) & there)
-        chosen = chosen[np.argsort(step[chosen], kind="stable")]
-        for part in np.split(chosen, np.flatnonzero(np.diff(step[chosen]) > 1) + 1):
-            if len(part) > 1:
-                yield key[0], key[2], part
-
-
 def place_variables(data: list[Datum], places: list[Place], share: np.ndarray) -> dict[str, tuple[str, np.ndarray]]:
     """Return the variables over ``orbit`` that `stretches` reads, and the value of the parameter."""
     return {
@@ -175,10 +145,3 @@ def place_variables(data: list[Datum], places: list[Place], share: np.ndarray) -
         "is_stable": ("orbit", np.array([d.stability == 1 for d in data], bool)),
         "share": ("orbit", share),
     }
-
-
-def interval_of(values: np.ndarray) -> tuple[float, float, float, int]:
-    """Return low end, median and high end of the central 95 % of the known values, and their number."""
-    known = values[np.isfinite(values)]
-    low, middle, high = np.quantile(known, LEVELS) if len(known) else (np.nan, np.nan, np.nan)
-    return float(low), float(middle), float(high), len(known)

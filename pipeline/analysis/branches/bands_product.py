@@ -10,18 +10,11 @@ import numpy as np
 import xarray as xr
 
 from magpend_core.models.model import Parameters
-from pipeline.analysis.branches.bands import (
-    LEVELS,
-    bifurcation_data,
-    carried,
-    interval_of,
-    orbit_data,
-    place_variables,
-    solvable,
-)
+from pipeline.analysis.branches.bands import bifurcation_data, carried, orbit_data, place_variables, solvable
 from pipeline.analysis.branches.carrying import ORBIT, Along, OrbitData, Solution, raw_of
 from pipeline.analysis.branches.problems import FREQUENCY
 from pipeline.analysis.branches.product import settle_branches
+from pipeline.analysis.draws import LEVELS, interval_of
 from pipeline.analysis.run import Run
 from pipeline.analysis.tabular import aligned, words_of
 from pipeline.layout.vocabulary import axis_name, parameter_name, parameters_of

@@ -9,17 +9,9 @@ import numpy as np
 import xarray as xr
 
 from magpend_core.models import load_model
-from pipeline.analysis.branches.bands import (
-    LEVELS,
-    bifurcation_data,
-    carried,
-    interval_of,
-    orbit_data,
-    place_variables,
-    solvable,
-    stretches,
-)
+from pipeline.analysis.branches.bands import bifurcation_data, carried, orbit_data, place_variables, solvable
 from pipeline.analysis.branches.carrying import ORBIT, OrbitData, Solution, solve
+from pipeline.analysis.draws import LEVELS, interval_of, stretches
 from pipeline.products.product import Table
 from pipeline.rig.identify.directory import ORBITS, read_info, read_result
 from pipeline.rig.identify.measured_orbits import MeasuredTable, stored_table

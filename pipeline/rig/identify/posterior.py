@@ -12,7 +12,7 @@ import xarray as xr
 
 from magpend_core.models import load_model
 from magpend_core.models.model import Model
-from pipeline.analysis.branches.bands import LEVELS
+from pipeline.analysis.draws import LEVELS
 from pipeline.products.product import Table
 from pipeline.rig.identify.directory import POSTERIOR, read_info, read_result
 from pipeline.rig.identify.statistics import root_of

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
-from pipeline.analysis.branches.bands import LEVELS
+from pipeline.analysis.draws import LEVELS
 from pipeline.layout.writing import write_netcdf
 from pipeline.plots.files import save_data, save_figure
 from pipeline.products.product import Table

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.analysis.branches.bands import LEVELS
+from pipeline.analysis.draws import LEVELS
 from pipeline.analysis.tabular import words_of
 from pipeline.layout.identity import canonical, digest_of
 from pipeline.layout.writing import write_atomically
