@@ -106,7 +106,20 @@ def check(
 def posterior(
     directory: Annotated[Path, typer.Argument(metavar="DIR", help="Directory of a finished identification.")],
     n: Annotated[int, typer.Option("-n", min=20, max=100_000, help="Number of draws.")] = 200,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the draws.")] = 1,
+    seed: Annotated[int, typer.Option(min=0, max=2**32 - 1, help="Seed of the draws.")] = 1,
+    mcmc: Annotated[
+        bool, typer.Option("--mcmc", help="Sample the posterior density by a chain (emcee) instead of the Gaussian.")
+    ] = False,
+    walkers: Annotated[
+        int,
+        typer.Option(
+            min=0, help="Walkers of the chain; 0 for 32, or four times the number of unknowns if that is more."
+        ),
+    ] = 0,
+    steps: Annotated[int, typer.Option(min=20, help="Most steps of the chain; it ends when it has converged.")] = 2000,
+    spec: Annotated[
+        str | None, typer.Option(help="Specification of the identification; --mcmc needs it if recordings were fitted.")
+    ] = None,
     no_figures: Annotated[bool, typer.Option("--no-figures", help="Draw no figures.")] = False,
     as_json: Json = False,
 ) -> None:
@@ -115,10 +128,17 @@ def posterior(
     The draws are written to DIR/posterior.nc. With measured orbits they are carried through the branches: 95 %
     intervals of folds, doublings and Hopf points, and bands about the branches, in DIR/bands-N.nc and
     DIR/figures/bands-N.png.
+
+    With --mcmc the draws come from a chain, whose convergence figures are printed. DIR keeps the chain: the same
+    command goes on with a stopped one, and with more --steps it gets longer.
     """
+    from pipeline.rig.identify.posterior import Sampling
     from pipeline.rig.identify.posterior_files import write_posterior
 
-    parameters, bifurcations, written = write_posterior(directory, n, seed, figures=not no_figures)
+    sampling = Sampling(walkers, steps, spec) if mcmc else None
+    parameters, bifurcations, written = write_posterior(
+        directory, n, seed, sampling=sampling, figures=not no_figures, echo=console.note
+    )
     rows = {"parameters": json_rows(parameters), "bifurcations": json_rows(bifurcations)}
     tell_data(rows, [*parameters.lines, *bifurcations.lines], as_json)
     console.note(*(f"written: {path}" for path in written))
@@ -129,14 +149,17 @@ def spread(
     branches: Annotated[
         bool, typer.Option("--branches", help="Follow the branches of each run, and list their bifurcations.")
     ] = False,
+    attractors: Annotated[
+        bool, typer.Option("--attractors", help="Find the attractors of each run, and match them over the draws.")
+    ] = False,
     as_json: Json = False,
     csv: Csv = None,
 ) -> None:
-    """List how fractions of cells and bifurcations are distributed over the runs of a posterior."""
+    """List how fractions of cells, attractors and bifurcations are distributed over the runs of a posterior."""
     from pipeline.rig.identify.posterior_runs import spread as spreading
 
     check_csv(csv)
-    tell(spreading(folder, branches=branches, echo=console.note), csv, as_json)
+    tell(spreading(folder, branches=branches, attractors=attractors, echo=console.note), csv, as_json)
 
 
 def _check_orbits(directory: Path, table: Path, as_json: bool) -> None:

@@ -16,6 +16,7 @@ from matplotlib.axes import Axes
 
 from pipeline.layout.vocabulary import split_dims
 from pipeline.plots import labels, pixels, style
+from pipeline.plots.bands import draw_bands, with_bands
 from pipeline.plots.figure import Run, frame_of, noted, values_of
 from pipeline.plots.labels import Measure
 from pipeline.plots.missing_cells import absent_handles, draw_absent, say_empty
@@ -35,6 +36,7 @@ def plot_bifurcation(
     degrees: bool = False,
     layout: str = "overlay",
     at: Mapping[str, float] | None = None,
+    bands: xr.Dataset | None = None,
     frame: style.Frame = style.WIDE,
 ) -> style.DataFigure:
     """Draw the bifurcation diagram of a run: its section points over the swept parameter, coloured by class of motion.
@@ -60,6 +62,8 @@ def plot_bifurcation(
         panel. ``side``: a panel each.
     at
         Values of all swept parameters but one.
+    bands
+        From the analysis ``bands``: 95 % bands of the orbits and intervals of the bifurcations, drawn below the points.
     frame
         Width of the figure and ranges of its axes.
 
@@ -79,8 +83,17 @@ def plot_bifurcation(
     diagram = Diagram.of(ds, state=state, quantity=quantity, degrees=degrees, at=at, frame=frame)
     fig = style.new_figure(4.3, xr.Dataset(), frame)
     panels = _panels(fig, diagram, _layers(diagram.view.layers, layout))
-    style.complete(fig, panels[0].ax, diagram.caption, diagram.handles(layers=layout == "overlay"))
+    handles = diagram.handles(layers=layout == "overlay")
+    if bands is not None:
+        if quantity:
+            raise ValueError(f"bands are of states at the section; drop the quantity {quantity!r}, or the posterior")
+        for panel in panels:
+            entries = draw_bands(panel.ax, bands, diagram.measure)
+        handles += entries
+    style.complete(fig, panels[0].ax, diagram.caption, handles)
     fig.data = diagram.draw(panels)
+    if bands is not None:
+        fig.data = with_bands(fig.data, bands)
     return fig
 
 
@@ -307,6 +320,7 @@ def draw(run: Run, options: BifurcationOptions) -> style.DataFigure:
         degrees=options.degrees,
         layout=options.layout,
         at=at,
+        bands=run.derive("bands", posterior=options.posterior) if options.posterior else None,
         frame=frame_of(options),
     )
     return noted(figure, notes)

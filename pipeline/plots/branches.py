@@ -14,6 +14,7 @@ from matplotlib.patheffects import withStroke
 
 from pipeline.layout.vocabulary import axis_name
 from pipeline.plots import labels, pixels, style
+from pipeline.plots.bands import draw_bands, with_bands
 from pipeline.plots.bifurcation import Diagram, with_diagram
 from pipeline.plots.figure import Run, frame_of, noted, values_of
 from pipeline.plots.labels import Measure
@@ -42,6 +43,7 @@ def plot_branches(
     ds: xr.Dataset,
     cube: xr.Dataset | None = None,
     *,
+    bands: xr.Dataset | None = None,
     state: str = "",
     max_period: int | None = None,
     degrees: bool = False,
@@ -59,6 +61,8 @@ def plot_branches(
         From `pipeline.analysis.branches`.
     cube
         Sweep or continuation over the same parameter, drawn below.
+    bands
+        From the analysis ``bands``: 95 % bands of the orbits and intervals of the bifurcations.
     state, degrees, at
         As for `plot_bifurcation`.
     max_period
@@ -69,7 +73,8 @@ def plot_branches(
     Returns
     -------
     DataFigure
-        Its `data` are the branches; names with the suffix ``_diagram`` are the data of the diagram below.
+        Its `data` are the branches; names with the suffix ``_diagram`` are the data of the diagram below, those with
+        ``_bands`` the data of the bands.
 
     Raises
     ------
@@ -88,6 +93,9 @@ def plot_branches(
         _dress(ax, frame, measure)
     style.label_axes(ax, labels.swept_label(ds.attrs["parameter"], ds.attrs["parameter_units"]), measure.label)
     handles = [*(below.handles() if below is not None else []), *_handles(ds, chosen)]
+    if bands is not None:
+        handles += draw_bands(ax, bands, measure, max_period)
+        fig.data = with_bands(fig.data, bands)
     style.complete(fig, ax, below.caption if below is not None else labels.caption(ds), handles)
     if below is not None:
         fig.data = with_diagram(fig.data, below.draw([pixels.Panel(ax, below.layers)]))
@@ -304,9 +312,13 @@ def draw(run: Run, options: BranchFigureOptions) -> style.DataFigure:
     found = run.derive("branches", **options.part(BranchOptions))
     cube = other.cube()
     below = cube if axis_name(options.parameter) in cube.dims else None
+    bands = None
+    if options.posterior:
+        bands = run.derive("bands", posterior=options.posterior, **options.part(BranchOptions))
     figure = plot_branches(
         found,
         below,
+        bands=bands,
         state=options.state,
         max_period=options.shown,
         degrees=options.degrees,

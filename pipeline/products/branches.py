@@ -38,6 +38,14 @@ class CurveOptions(BranchOptions):
     )
 
 
+class BandOptions(BranchOptions):
+    """Options for carrying draws of the parameters through branches."""
+
+    posterior: str = option(..., "Directory of magpend identify posterior, or a file of its draws.")
+    draws: int = option(0, "Number of draws that are carried; 0 takes all.", ge=0)
+    digest: str = option("", "Digest of the file of draws; found by itself.")
+
+
 class OrbitOptions(Options):
     """Options for searching all periodic orbits at a parameter point."""
 
@@ -73,6 +81,22 @@ CURVES = Analysis(
     settle=f"{_ROOM}:settle_curves",
     builds_on=("branches",),
     figure="curves",
+)
+
+BANDS = Analysis(
+    "bands",
+    """Carry draws of identified parameters through the branches: 95 % intervals of bifurcations, bands about orbits.
+
+    Newton's method carries each orbit and each bifurcation from the run's parameters to those of a draw. The columns
+    median, low and high are those of the draws that have the bifurcation.""",
+    BandOptions,
+    compute="pipeline.analysis.branches.bands_product:bands",
+    table="pipeline.analysis.branches.bands_product:bands_table",
+    settle="pipeline.analysis.branches.bands_product:settle_bands",
+    builds_on=("branches",),
+    figure="branches",
+    # the digest says which draws
+    ignores=("posterior",),
 )
 
 ORBITS = Analysis(

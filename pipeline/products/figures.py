@@ -15,6 +15,8 @@ from pipeline.products.tongues import TongueOptions
 
 Per = Literal["s", "period"]
 
+_POSTERIOR = "Directory of magpend identify posterior whose 95 % bands are drawn."
+
 
 def _without(options: FigureOptions, name: str) -> str:
     return FigureOptions.label(options.model_copy(update={name: ""}))
@@ -29,6 +31,7 @@ class BifurcationOptions(StateOptions):
         "the product extremes.",
     )
     layout: Literal["overlay", "side"] = option("overlay", "Both directions in one panel, or one panel each.")
+    posterior: str = option("", _POSTERIOR)
 
     def label(self) -> str:
         """Return the part of the figure's file name that lists the options. It omits the state if a quantity is
@@ -106,6 +109,7 @@ class BranchFigureOptions(_AlongOptions, StateOptions):
     """Options of a figure of branches of periodic orbits over a bifurcation diagram."""
 
     over: str = option("", "Run whose diagram is drawn below; it must sweep the same parameter. By default DIR.")
+    posterior: str = option("", _POSTERIOR)
     shown: int | None = option(None, "Longest orbit period that is drawn.", unit="drive periods or returns", ge=1)
 
 

@@ -56,6 +56,7 @@ ANALYSES: Registry[Analysis] = Registry(
         "chaos": "pipeline.products.chaos:CHAOS",
         "dimension": "pipeline.products.chaos:DIMENSION",
         "branches": "pipeline.products.branches:BRANCHES",
+        "bands": "pipeline.products.branches:BANDS",
         "curves": "pipeline.products.branches:CURVES",
         "orbits": "pipeline.products.branches:ORBITS",
         "tongues": "pipeline.products.tongues:TONGUES",

@@ -19,14 +19,15 @@ from pathlib import Path
 
 import numpy as np
 
+from pipeline.analysis.branches.bands import bifurcation_data
 from pipeline.analysis.branches.bifurcations import DOUBLING, FOLD, HOPF
-from pipeline.rig.identify.bands import _bifurcations
+from pipeline.analysis.branches.carrying import OrbitData, Solution, settled, solve
+from pipeline.analysis.draws import LEVELS
 from pipeline.rig.identify.build import build
 from pipeline.rig.identify.linearise import linearise
 from pipeline.rig.identify.local import fit_local
 from pipeline.rig.identify.measured_orbits import read_orbits
-from pipeline.rig.identify.orbits import OrbitData, Solution, quantities_of, settled, solve
-from pipeline.rig.identify.posterior import LEVELS
+from pipeline.rig.identify.orbits import quantities_of
 from pipeline.rig.identify.specification import parse_identification
 from pipeline.rig.identify.statistics import covariance_of
 
@@ -84,7 +85,7 @@ def built(case: str, folder: Path, sd: float):
     exact = quantities_of(orbits, packed, solve(orbits, packed))[0]
     data = tuple(replace(d, measured=v) for d, v in zip(orbits.data, exact, strict=True))
     branches, _ = read[0].branches(problem.values(problem.start))
-    points, states = _bifurcations(branches)
+    points, states, _ = bifurcation_data(branches)
     chosen = [i for i, point in enumerate(points) if point.kind in kinds]
     firsts = {points[i].kind: i for i in reversed(chosen)}
     own = [firsts[kind] for kind in kinds]

@@ -54,8 +54,9 @@ POSTERIOR = "posterior.nc"
 
 _ROOM = Path(__file__).parent
 _NOT_NUMBERS = (
-    "bands.py", "check.py", "check_orbits.py", "comparison.py", "directory.py", "figures.py", "orbit_reports.py",
-    "posterior.py", "posterior_files.py", "posterior_runs.py", "reports.py", "residuals.py",
+    "attractor_spread.py", "bands.py", "check.py", "check_orbits.py", "comparison.py", "directory.py", "figures.py",
+    "log_posterior.py", "orbit_reports.py", "posterior.py", "posterior_files.py", "posterior_runs.py", "reports.py",
+    "residuals.py", "sampling.py",
 )  # fmt: skip
 """Modules that do not affect the numbers."""
 

@@ -27,6 +27,14 @@ class Starts(NamedTuple):
     settled: NDArray[np.bool_]  # (n_piece,)
 
 
+class ManyStarts(NamedTuple):
+    """Fitted initial states of the pieces for many sets of unknowns, whether each has converged, and the costs."""
+
+    starts: Array  # (member, piece, n_states)
+    settled: NDArray[np.bool_]  # (member, piece)
+    costs: Array  # (member, piece)
+
+
 def fit_starts(problem: Problem, theta: Array, starts: Array) -> Starts:
     """Fit the initial state of each piece by least squares (Levenberg-Marquardt), with the unknown parameters fixed.
 
@@ -46,28 +54,53 @@ def fit_starts(problem: Problem, theta: Array, starts: Array) -> Starts:
     Starts
         No start is worse than its guess.
     """
-    held = replace(problem.without(dict(zip(problem.names, theta, strict=True))), continuity=None, orbits=())
+    found = fit_many_starts(problem, theta[None], starts[None])
+    return Starts(found.starts[0], found.settled[0])
+
+
+def fit_many_starts(problem: Problem, thetas: Array, starts: Array) -> ManyStarts:
+    """Fit the initial state of each piece, as `fit_starts`, for each row of unknowns in common calls of the engine.
+
+    Parameters
+    ----------
+    problem
+    thetas
+        Unknowns, (member, n_free).
+    starts
+        First guesses, (member, piece, n_states).
+
+    Returns
+    -------
+    ManyStarts
+        No start is worse than its guess. Each member depends on its own unknowns and guesses alone.
+    """
+    held = replace(problem, continuity=None, orbits=(), held=True)
     found = np.array(starts)
-    damping = np.full(len(found), FIRST_DAMPING)
-    blocks = _blocks(held, found)
-    moving = np.ones(len(found), bool)
+    damping = np.full(found.shape[:2], FIRST_DAMPING)
+    blocks = _blocks(held, thetas, found)
+    moving = np.ones(found.shape[:2], bool)
     for _ in range(MAX_ITERATIONS):
         steps = np.zeros_like(found)
-        for k in np.flatnonzero(moving):
-            steps[k], gain = _step(*blocks[k], damping[k])
+        for i, k in np.argwhere(moving):
+            block = blocks[i][k]
+            steps[i, k], gain = _step(block.jacobian, block.rows, damping[i, k])
             # below this gain, rounding decides and no step improves the start
-            moving[k] = gain > SETTLED * _cost(blocks[k]) and damping[k] < MOST_DAMPING
-        still = np.flatnonzero(moving)
-        if not len(still):
+            moving[i, k] = gain > SETTLED * _cost(block) and damping[i, k] < MOST_DAMPING
+        members, pieces = np.flatnonzero(moving.any(axis=1)), np.flatnonzero(moving.any(axis=0))
+        if not len(members):
             break
-        part = replace(held, pieces=tuple(held.pieces[k] for k in still))
-        trial = found[still] + steps[still]
-        for k, start, block in zip(still, trial, _blocks(part, trial), strict=True):
-            better = _cost(block) < _cost(blocks[k])
-            damping[k] *= LESS if better else MORE
-            if better:
-                found[k], blocks[k] = start, block
-    return Starts(found, ~moving)
+        part = replace(held, pieces=tuple(held.pieces[k] for k in pieces))
+        trial = found[np.ix_(members, pieces)] + steps[np.ix_(members, pieces)]
+        for i, own, fitted in zip(members, trial, _blocks(part, thetas[members], trial), strict=True):
+            for k, start, block in zip(pieces, own, fitted, strict=True):
+                if not moving[i, k]:
+                    continue
+                better = _cost(block) < _cost(blocks[i][k])
+                damping[i, k] *= LESS if better else MORE
+                if better:
+                    found[i, k], blocks[i][k] = start, block
+    costs = np.array([[_cost(block) for block in row] for row in blocks]).reshape(moving.shape)
+    return ManyStarts(found, ~moving, costs)
 
 
 def block_rows(problem: Problem) -> list[slice]:
@@ -87,12 +120,15 @@ class _Block(NamedTuple):
     rows: Array
 
 
-def _blocks(problem: Problem, starts: Array) -> list[_Block]:
-    n = len(problem.model.states)
-    whole = evaluate(problem, np.zeros((1, 0)), starts[None], slopes=True)[0]
+def _blocks(problem: Problem, thetas: Array, starts: Array) -> list[list[_Block]]:
+    """Return the block of each piece for each row of unknowns."""
+    n, n_free = len(problem.model.states), len(problem.free)
     return [
-        _Block(whole.jacobian[here, k * n : (k + 1) * n], whole.rows[here])
-        for k, here in enumerate(block_rows(problem))
+        [
+            _Block(whole.jacobian[here, n_free + k * n : n_free + (k + 1) * n], whole.rows[here])
+            for k, here in enumerate(block_rows(problem))
+        ]
+        for whole in evaluate(problem, thetas, starts, slopes=True)
     ]
 
 

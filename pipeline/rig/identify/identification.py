@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from magpend_core.sampling import Drive
+from pipeline.analysis.branches.carrying import Solution
 from pipeline.layout.writing import write_netcdf
 from pipeline.products.reporting import report, track
 from pipeline.rig.identify import directory as store
@@ -23,7 +24,6 @@ from pipeline.rig.identify.linearise import linearise, loss_scale_of
 from pipeline.rig.identify.local import Fit, fit_local
 from pipeline.rig.identify.measured_orbits import judge_orbits, read_orbits
 from pipeline.rig.identify.objective import evaluate
-from pipeline.rig.identify.orbits import Solution
 from pipeline.rig.identify.problem import ZERO, Problem
 from pipeline.rig.identify.profiles import Curvature, Profile, following, profile
 from pipeline.rig.identify.search import search

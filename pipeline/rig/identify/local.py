@@ -9,9 +9,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.analysis.branches.carrying import Solution
 from pipeline.rig.identify.first_guesses import carry_starts, fit_starts, project_starts_out
 from pipeline.rig.identify.objective import Evaluation, evaluate
-from pipeline.rig.identify.orbits import Solution
 from pipeline.rig.identify.problem import Problem
 
 Array = NDArray[np.float64]

@@ -16,13 +16,13 @@ from magpend_core.crossing import Crossing
 from magpend_core.models.model import Model, Parameters
 from magpend_core.models.sectioned import sectioned
 from pipeline.analysis.branches.bifurcations import DOUBLING, FOLD, HOPF, KINDS, TORUS
+from pipeline.analysis.branches.carrying import ORBIT, PARAMETER, Along, Array, Datum, OrbitData, Solution, settled
 from pipeline.analysis.tabular import words_of
 from pipeline.layout.vocabulary import FREQUENCY_DIM, axis_name
 from pipeline.rig.identify.orbit_tables import OrbitsTable
-from pipeline.rig.identify.orbits import ORBIT, PARAMETER, Array, Datum, OrbitData, Solution, settled
 from pipeline.rig.identify.settings import setting_problems
 from pipeline.rig.measured_branch.comparison import amplitudes, compare, nearest_orbit
-from pipeline.rig.measured_branch.computing import Along, branches_along
+from pipeline.rig.measured_branch.computing import branches_along
 from pipeline.rig.measured_branch.reading import STABILITIES, read_branch
 from pipeline.specification.files import read_toml
 from pipeline.specification.problems import SpecError, problems_of

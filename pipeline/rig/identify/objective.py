@@ -12,8 +12,8 @@ from magpend_core.engine.system import System
 from magpend_core.engine.variational import MINUS, PLUS, with_parameter_tangent
 from magpend_core.sampling import Drive, sample
 from magpend_core.status import Status
+from pipeline.analysis.branches.carrying import OrbitData
 from pipeline.rig.identify.orbit_rows import OrbitRows, orbit_rows
-from pipeline.rig.identify.orbits import OrbitData
 from pipeline.rig.identify.problem import Problem
 
 Array = NDArray[np.float64]
@@ -130,8 +130,8 @@ def _steps(problem: Problem, thetas: Array) -> Array:
     """Return the finite-difference steps for each set of unknowns, for the unknowns on which the trajectories depend.
     The steps stay within the bounds.
     """
-    found = np.zeros((len(thetas), len(problem.moving)))
-    for j, i in enumerate(problem.moving):
+    found = np.zeros((len(thetas), len(problem.sloped)))
+    for j, i in enumerate(problem.sloped):
         f, values = problem.free[i], thetas[:, i]
         h = STEP * np.maximum(np.abs(values), f.size)
         h = np.where(values + h > f.upper, -h, h)
@@ -144,7 +144,7 @@ def _changed(problem: Problem, thetas: Array, steps: Array) -> Array:
     members = []
     for theta, own in zip(thetas, steps, strict=True):
         rows = np.tile(theta, (len(own), 1))
-        rows[np.arange(len(own)), list(problem.moving)] += own
+        rows[np.arange(len(own)), list(problem.sloped)] += own
         members.append(problem.pack(rows))
     return np.stack(members)
 
@@ -156,7 +156,7 @@ def _by_differences(problem: Problem, thetas: Array, starts: Array) -> _Motions:
     steps, n = _steps(problem, thetas), len(problem.model.states)
     moves = STEP * np.diag(problem.model.scales)
     packed = problem.pack(thetas)[:, None]
-    n_moving = len(problem.moving)
+    n_moving = len(problem.sloped)
     parameters = np.concatenate([packed, _changed(problem, thetas, steps), np.repeat(packed, n, axis=1)], axis=1)
     start = np.repeat(starts[:, None], 1 + n_moving + n, axis=1)
     start[:, 1 + n_moving :] += moves[:, None, :]
@@ -172,7 +172,7 @@ def _by_tangents(problem: Problem, thetas: Array, starts: Array) -> _Motions:
     component of the initial state.
     """
     system, steps = with_parameter_tangent(problem.system), _steps(problem, thetas)
-    n, n_moving = len(problem.model.states), len(problem.moving)
+    n, n_moving = len(problem.model.states), len(problem.sloped)
     same = np.repeat(problem.pack(thetas)[:, None], n_moving + n, axis=1)
     plus, minus = same.copy(), same.copy()
     plus[:, :n_moving] = _changed(problem, thetas, steps)
@@ -261,7 +261,7 @@ def _block(problem: Problem, k: int, theta: Array, member: _Motions, slopes: boo
     zero = -problem.zeros[piece.recording] / problem.noise[:, None]
     jacobian[:, :n_free] = np.broadcast_to(zero, (*given.shape, n_free))[given]
     moved = -_read(problem, k, member.slopes[:, k]) / problem.noise
-    jacobian[:, [*problem.moving, *range(n_free, n_own)]] += moved[:, given].T
+    jacobian[:, [*problem.sloped, *range(n_free, n_own)]] += moved[:, given].T
     # an orthogonal transformation changes neither the cost nor the normal equations
     whole = np.column_stack([jacobian * factor[:, None], rows])
     triangle: Array = np.linalg.qr(whole, mode="r")  # type: ignore[assignment]
@@ -306,7 +306,7 @@ def _gaps(problem: Problem, starts: Array, member: _Motions, slopes: bool) -> li
         rows = np.full(n_states, LOST) if lost else (member.states[j, at] - starts[k]) * weight
         jacobian = np.zeros((n_states, n_free + 2 * n_states))
         if slopes and not lost:
-            columns = [*problem.moving, *range(n_free, n_free + n_states)]
+            columns = [*problem.sloped, *range(n_free, n_free + n_states)]
             jacobian[:, columns] = (member.slopes[:, j, at] * weight).T
             jacobian[:, n_free + n_states :] = -np.diag(weight)
         found.append((-1 - k, rows, jacobian))

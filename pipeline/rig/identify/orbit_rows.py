@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.analysis.branches.arclength import Point
-from pipeline.rig.identify.orbits import Array, OrbitData, nearest, quantities_of, slopes_along, solution_of, solve
+from pipeline.analysis.branches.carrying import Array, OrbitData, solution_of, solve
+from pipeline.rig.identify.orbits import nearest, quantities_of, slopes_along
 from pipeline.rig.identify.problem import Problem
 
 LOST = 1e6

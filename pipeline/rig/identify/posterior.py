@@ -1,7 +1,9 @@
-"""Draw parameter sets from the Gaussian posterior of an identification."""
+"""Draw parameter sets from the posterior of an identification: a Gaussian, or the chain of an ensemble of walkers."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -10,15 +12,22 @@ import xarray as xr
 
 from magpend_core.models import load_model
 from magpend_core.models.model import Model
+from pipeline.analysis.draws import LEVELS
 from pipeline.products.product import Table
-from pipeline.rig.identify.directory import read_info, read_result
+from pipeline.rig.identify.directory import POSTERIOR, read_info, read_result
+from pipeline.rig.identify.statistics import root_of
 from pipeline.specification.problems import SpecError
+from pipeline.store.files import local_path
+
+Echo = Callable[[str], None]
+
+GAUSS, MCMC = "gauss", "mcmc"
+"""Values of the attribute ``method`` of draws."""
+
+LEAST_WALKERS = 32
 
 LEAST_SHARE = 0.01
 """Least share of the draws that must lie within the bounds."""
-
-LEVELS = (0.025, 0.5, 0.975)
-"""Quantiles that are reported: the median and the ends of the 95 % interval."""
 
 
 def draw_posterior(directory: str | Path, n: int, seed: int = 1) -> xr.Dataset:
@@ -46,19 +55,136 @@ def draw_posterior(directory: str | Path, n: int, seed: int = 1) -> xr.Dataset:
     RefusedError
         If the identification is not finished.
     """
-    info, result = read_info(directory), read_result(directory)
-    names = [name for name in result["names"] if name in result["values"]]
+    result = read_result(directory)
+    names = _identified(result)
     rows = [result["names"].index(name) for name in names]
     matrix = np.array(result["covariance"]["matrix"], dtype=float)[np.ix_(rows, rows)]
     _refuse_undetermined(names, matrix)
     drawn, outside = _within_bounds(result, names, matrix, n, seed)
+    about = {"method": GAUSS, "digest": read_info(directory).digest, "seed": seed, "outside": outside}
+    return _all_parameters(result, names, drawn).assign_attrs(about)
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """Options of the sampling by an ensemble of walkers.
+
+    Attributes
+    ----------
+    n_walkers : int
+        Number of walkers; 0 for the larger of 32 and four times the number of unknowns.
+    most_steps : int
+        Number of steps after which the chain ends, converged or not.
+    spec : str or Path, optional
+        Specification of the identification; needed if recordings were fitted.
+    """
+
+    n_walkers: int = 0
+    most_steps: int = 2000
+    spec: str | Path | None = None
+
+
+def sample_draws(
+    directory: str | Path, n: int, seed: int = 1, sampling: Sampling | None = None, *, echo: Echo = print
+) -> xr.Dataset:
+    """Draw parameter sets from the chain of an ensemble of walkers in the posterior density (affine-invariant MCMC).
+
+    Parameters
+    ----------
+    directory
+        Directory of a finished identification. It keeps the chain; a stopped sampling goes on to the same bytes.
+    n
+        Number of draws, taken at random from the chain.
+    seed
+        Seed of the chain.
+    sampling
+        Walkers and steps.
+    echo
+        Function that prints a line.
+
+    Returns
+    -------
+    Dataset
+        As of `draw_posterior`, with convergence figures of each unknown: ``autocorrelation_time``, ``n_effective`` and
+        ``split_rhat``; attributes ``converged``, ``not_converged_because``, ``accepted`` and others.
+
+    Raises
+    ------
+    SpecError
+        As `draw_posterior`, if emcee is missing, or if a specification is needed.
+    RefusedError
+        If the identification is not finished, or the specification is that of another one.
+    """
+    from pipeline.rig.identify.log_posterior import log_posterior
+    from pipeline.rig.identify.sampling import figures_of, require_emcee, sample_posterior
+
+    asked = sampling or Sampling()
+    require_emcee()
+    result = read_result(directory)
+    matrix = np.array(result["covariance"]["matrix"], dtype=float)
+    _refuse_undetermined(result["names"], matrix)
+    density = log_posterior(directory, asked.spec, result)
+    n_free = len(result["names"])
+    chain = sample_posterior(
+        directory,
+        density,
+        matrix,
+        n_walkers=asked.n_walkers or max(LEAST_WALKERS, 4 * n_free),
+        most_steps=asked.most_steps,
+        seed=seed,
+        echo=echo,
+    )
+    flat = chain.values.reshape(-1, n_free)
+    names = _identified(result)
+    columns = [result["names"].index(name) for name in names]
+    # at random: at even distances the same walkers would return in step with the moves
+    chosen = np.random.default_rng(seed).choice(len(flat), n, replace=n > len(flat))
+    drawn = flat[chosen][:, columns]
+    found = _all_parameters(result, names, drawn).merge(
+        figures_of(chain, result["names"]), combine_attrs="no_conflicts"
+    )
+    return found.assign_attrs(digest=read_info(directory).digest, seed=seed)
+
+
+def kept_draws(directory: str | Path, n: int, seed: int = 1) -> xr.Dataset:
+    """Return draws of the chain that `sample_draws` has stored in the directory, or else draws of the Gaussian.
+
+    Raises
+    ------
+    SpecError
+        If there are fewer draws of the chain than asked for; see also `draw_posterior`.
+    """
+    path = local_path(directory) / POSTERIOR
+    if path.is_file():
+        with xr.open_dataset(path, engine="scipy") as ds:
+            kept = ds.load()
+        if kept.attrs.get("method") == MCMC and kept.attrs.get("digest") == read_info(directory).digest:
+            there = kept.sizes["draw"]
+            if n > there:
+                raise SpecError(
+                    [
+                        f"-n = {n}: {path} has {there} draws of the chain; make more: magpend identify posterior "
+                        f"{directory} --mcmc -n {n}."
+                    ]
+                )
+            return kept.isel(draw=slice(n))
+    return draw_posterior(directory, n, seed)
+
+
+def _identified(result: Mapping[str, Any]) -> list[str]:
+    """Return the names of the identified parameters, without the zero offsets of sensors."""
+    return [name for name in result["names"] if name in result["values"]]
+
+
+def _all_parameters(result: Mapping[str, Any], names: list[str], drawn: np.ndarray) -> xr.Dataset:
+    """Return the values of all parameters of the model for draws of the identified ones."""
     model: Model = load_model(result["model"])
-    values = np.tile([result["values"][name] for name in model.parameter_names], (n, 1))
+    values = np.tile([result["values"][name] for name in model.parameter_names], (len(drawn), 1))
     columns = list(model.parameter_names)
     values[:, [columns.index(name) for name in names]] = drawn
     for name, (factor, other) in result["tied"].items():
         values[:, columns.index(name)] = factor * values[:, columns.index(other)]
-    about = {"identified": " ".join(names), "digest": info.digest, "seed": seed, "outside": outside}
+    about = {"identified": " ".join(names), "tied": " ".join(result["tied"])}
     return xr.Dataset({"value": (("draw", "parameter"), values)}, {"parameter": columns}, about)
 
 
@@ -74,16 +200,14 @@ def _refuse_undetermined(names: list[str], matrix: np.ndarray) -> None:
 
 
 def _within_bounds(
-    result: dict[str, Any], names: list[str], matrix: np.ndarray, n: int, seed: int
+    result: Mapping[str, Any], names: list[str], matrix: np.ndarray, n: int, seed: int
 ) -> tuple[np.ndarray, float]:
     """Draw from the Gaussian until `n` draws lie within the bounds; return them and the fraction that was rejected."""
     estimates = [result["estimates"][name] for name in names]
     mean = np.array([e["value"] for e in estimates])
     low = np.array([-np.inf if e["bounds"][0] is None else e["bounds"][0] for e in estimates])
     high = np.array([np.inf if e["bounds"][1] is None else e["bounds"][1] for e in estimates])
-    scale = np.sqrt(np.diag(matrix))
-    values, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))
-    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    root = root_of(matrix)
     random, kept, tried = np.random.default_rng(seed), np.zeros((0, len(names))), 0
     while len(kept) < n:
         if tried and len(kept) < LEAST_SHARE * tried:
@@ -93,7 +217,7 @@ def _within_bounds(
                     "the bounds allow; widen the bounds, give priors, or identify fewer parameters."
                 ]
             )
-        batch = mean + random.standard_normal((max(4 * n, 1000), len(names))) @ root.T * scale
+        batch = mean + random.standard_normal((max(4 * n, 1000), len(names))) @ root
         tried += len(batch)
         kept = np.vstack([kept, batch[((batch >= low) & (batch <= high)).all(axis=1)]])
     return kept[:n], 1.0 - len(kept) / tried
@@ -111,6 +235,46 @@ def posterior_table(drawn: xr.Dataset) -> Table:
             {"name": name, "mean": values.mean(), "sd": values.std(ddof=1), "median": middle, "low": low, "high": high}
         )
         lines.append(f"{name:{width}} = {middle:.6g}   95 %: {low:.6g} to {high:.6g}")
+    if drawn.attrs["method"] == MCMC:
+        return Table(_with_figures(rows, drawn), [*lines, *_chain_lines(drawn)])
     outside = 100.0 * float(drawn.attrs["outside"])
     lines.append(f"{drawn.sizes['draw']} draws of a Gaussian; {outside:.2g} % lay outside the bounds and were left out")
     return Table(rows, lines)
+
+
+FIGURES = ("autocorrelation_time", "n_effective", "split_rhat")
+"""Convergence figures of each unknown."""
+
+
+def _with_figures(rows: list[dict[str, Any]], drawn: xr.Dataset) -> list[dict[str, Any]]:
+    return [
+        {
+            **row,
+            **{key: float(drawn[key].sel(unknown=row["name"])) for key in FIGURES},
+            "converged": _has_converged(drawn),
+        }
+        for row in rows
+    ]
+
+
+def _has_converged(drawn: xr.Dataset) -> bool:
+    return bool(drawn.attrs["converged"])
+
+
+def _chain_lines(drawn: xr.Dataset) -> list[str]:
+    """Return lines about a chain: its length, its convergence figures, and whether it has converged."""
+    about, time = drawn.attrs, drawn["autocorrelation_time"].values
+    slowest = str(drawn["unknown"].values[int(np.argmax(time))])
+    lines = [
+        f"{drawn.sizes['draw']} draws of a chain: {about['n_walkers']} walkers, {about['n_kept']} steps after "
+        f"{about['n_discarded']} that were left out, {100.0 * float(about['accepted']):.0f} % of the moves accepted",
+        f"autocorrelation time up to {time.max():.3g} steps ({slowest}), at least "
+        f"{drawn['n_effective'].values.min():.0f} independent draws, split R-hat up to "
+        f"{drawn['split_rhat'].values.max():.3f}",
+    ]
+    if float(about["lost"]):
+        share = 100.0 * float(about["lost"])
+        lines.append(f"{share:.2g} % of the proposed parameters have no density: a measured orbit is lost there")
+    if not _has_converged(drawn):
+        lines.append(f"NOT CONVERGED: {about['not_converged_because']}; give more --steps: the chain goes on")
+    return lines

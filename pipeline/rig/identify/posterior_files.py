@@ -7,14 +7,16 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
+from pipeline.analysis.draws import LEVELS
 from pipeline.layout.writing import write_netcdf
 from pipeline.plots.files import save_data, save_figure
 from pipeline.products.product import Table
 from pipeline.rig.identify.bands import bands, bands_table, stored_tables, tubes
 from pipeline.rig.identify.directory import POSTERIOR, read_result
 from pipeline.rig.identify.measured_orbits import MeasuredTable
-from pipeline.rig.identify.posterior import LEVELS, draw_posterior, posterior_table
+from pipeline.rig.identify.posterior import Echo, Sampling, draw_posterior, posterior_table, sample_draws
 from pipeline.rig.measured_branch.figure import Bands, plot_branch
+from pipeline.runs.stopping import stoppable
 from pipeline.store.files import FIGURES, local_path
 from pipeline.store.local import make_folder, refuse_links, writer_lock
 
@@ -23,10 +25,29 @@ SHORT = {"period_doubling": "doubling", "neimark_sacker": "torus", "hopf": "Hopf
 
 
 def write_posterior(
-    directory: str | Path, n: int, seed: int = 1, *, figures: bool = True
+    directory: str | Path,
+    n: int,
+    seed: int = 1,
+    *,
+    sampling: Sampling | None = None,
+    figures: bool = True,
+    echo: Echo = print,
 ) -> tuple[Table, Table, list[Path]]:
     """Draw the posterior, compute the 95 % bands of branches and bifurcations, and write both to the identification's
     directory.
+
+    Parameters
+    ----------
+    directory
+        Directory of a finished identification.
+    n, seed
+        Number of draws, and their seed.
+    sampling
+        Options of the chain that gives the draws; None for draws of the Gaussian.
+    figures
+        Whether to draw.
+    echo
+        Function that prints a line.
 
     Returns
     -------
@@ -36,12 +57,17 @@ def write_posterior(
     Raises
     ------
     SpecError, RefusedError
-        See `draw_posterior`.
+        See `draw_posterior` and `sample_draws`.
+    InterruptedRunError
+        After Ctrl-C or SIGTERM. The chain stays.
     """
     folder = local_path(directory)
-    drawn, result = draw_posterior(folder, n, seed), read_result(folder)
-    found, written = [], [folder / POSTERIOR]
-    with writer_lock(folder):
+    result, found, written = read_result(folder), [], [folder / POSTERIOR]
+    with writer_lock(folder), stoppable(folder):
+        if sampling is None:
+            drawn = draw_posterior(folder, n, seed)
+        else:
+            drawn = sample_draws(folder, n, seed, sampling, echo=echo)
         write_netcdf(written[0], drawn)
         for i, table in enumerate(stored_tables(folder)):
             one = bands(table, result["values"], drawn)

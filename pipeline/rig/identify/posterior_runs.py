@@ -10,12 +10,14 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.analysis.draws import LEVELS
 from pipeline.analysis.tabular import words_of
 from pipeline.layout.identity import canonical, digest_of
 from pipeline.layout.writing import write_atomically
 from pipeline.products.product import Table
+from pipeline.rig.identify.attractor_spread import attractor_rows
 from pipeline.rig.identify.directory import read_result
-from pipeline.rig.identify.posterior import LEVELS, draw_posterior
+from pipeline.rig.identify.posterior import kept_draws
 from pipeline.runs.derive import AnalysedRun
 from pipeline.runs.run import run
 from pipeline.runs.workflows import find_spec, read_given
@@ -74,7 +76,7 @@ def run_posterior(
     parsed, _, default = read_given(path, smoke=smoke)
     names = [name for name in result["names"] if name in result["values"]] + list(result["tied"])
     _refuse_other_model(parsed.model.reference, result, list(parsed.axes), names)
-    drawn = draw_posterior(identification, n, seed)
+    drawn = kept_draws(identification, n, seed)
     tables = read_toml(path)
     if isinstance(tables.get("model"), str) and is_model_file(tables["model"]):
         tables["model"] = str((path.parent / tables["model"]).resolve())
@@ -131,7 +133,7 @@ def _establish(folder: Path, tables: Mapping[str, Any], values: np.ndarray, name
 # ---- distributions -----------------------------------------------------------------------------
 
 
-def spread(folder: str | Path, *, branches: bool = False, echo: Echo = print) -> Table:
+def spread(folder: str | Path, *, branches: bool = False, attractors: bool = False, echo: Echo = print) -> Table:
     """Return median and 95 % interval of cell fractions and bifurcation values over the runs of `run_posterior`.
 
     Parameters
@@ -160,13 +162,22 @@ def spread(folder: str | Path, *, branches: bool = False, echo: Echo = print) ->
     n = len(json.loads((folder / STUDY).read_text("utf-8"))["draws"])
     runs = [AnalysedRun.of(folder / place) for place in (BEST, *(f"draw-{k:04d}" for k in range(n)))]
     rows = _fraction_rows([_fractions(one) for one in runs])
+    shown = list(rows)
+    if attractors:
+        sets = []
+        for k, one in enumerate(runs):
+            echo(f"attractors {k + 1} of {len(runs)}")
+            sets.append(one.derive("attractors"))
+        found_rows, printed = attractor_rows(sets, _row)
+        rows, shown = rows + found_rows, shown + printed
     if branches:
         found = []
         for k, one in enumerate(runs):
             echo(f"branches {k + 1} of {len(runs)}")
             found.append(_bifurcations(one))
-        rows += _bifurcation_rows(found)
-    return Table(rows, [_line(row) for row in rows])
+        bifurcations = _bifurcation_rows(found)
+        rows, shown = rows + bifurcations, shown + bifurcations
+    return Table(rows, [_line(row) for row in shown])
 
 
 def _fractions(one: AnalysedRun) -> dict[str, float]:

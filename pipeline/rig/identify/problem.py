@@ -15,7 +15,7 @@ from magpend_core.defaults import RTOL
 from magpend_core.engine.system import System
 from magpend_core.models.model import Model, Parameters
 from magpend_core.sampling import Drive, with_recorded_drive
-from pipeline.rig.identify.orbits import OrbitData, Solution
+from pipeline.analysis.branches.carrying import OrbitData, Solution
 
 ZERO = "zero"
 """Prefix of the names of sensors' zeros: ``zero.CHANNEL`` or ``zero.CHANNEL.RECORDING``."""
@@ -123,6 +123,8 @@ class Problem:
         Whether the pieces' drives are measured torques instead of the model's own drive.
     orbits : tuple of OrbitData
         Measured orbits and bifurcations that are fitted.
+    held : bool
+        Whether slopes are computed by the starts alone, as the unknowns are held.
     """
 
     model: Model
@@ -139,6 +141,7 @@ class Problem:
     slopes: str = "differences"
     recorded: bool = False
     orbits: tuple[OrbitData, ...] = ()
+    held: bool = False
 
     @cached_property
     def system(self) -> System:
@@ -181,6 +184,11 @@ class Problem:
     def moving(self) -> tuple[int, ...]:
         """Indices of the unknowns on which the trajectories depend."""
         return tuple(i for i, f in enumerate(self.free) if not f.name.startswith(f"{ZERO}."))
+
+    @property
+    def sloped(self) -> tuple[int, ...]:
+        """Indices of the unknowns by which the trajectories' slopes are computed: `moving`, or none if `held`."""
+        return () if self.held else self.moving
 
     @cached_property
     def zeros(self) -> np.ndarray:

@@ -376,6 +376,17 @@ def _of_orbits(fit: Linearised, scale: np.ndarray) -> Covariance:
     )
 
 
+def root_of(matrix: np.ndarray) -> np.ndarray:
+    """Return a factor that turns rows of white noise into rows with a covariance, ``noise @ root``.
+
+    It is the symmetric root of the correlations, times the standard deviations: the same on all processors, whatever
+    signs LAPACK gives the eigenvectors.
+    """
+    scale = np.sqrt(np.diag(matrix))
+    values, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))
+    return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T * scale)
+
+
 def _inverse(information: np.ndarray, scale: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the pseudo-inverse of the information matrix, and a mask of the parameters that are not determined."""
     values, vectors = np.linalg.eigh(information * np.outer(scale, scale))

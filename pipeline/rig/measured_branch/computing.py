@@ -3,63 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import xarray as xr
 
-from magpend_core.models.model import Model, Parameters
+from magpend_core.models.model import Parameters
 from magpend_core.sections import run_branches
 from magpend_core.status import Status
 from pipeline.analysis.branches import Scope, Start, dataset_of, explore
-from pipeline.analysis.branches.problems import Family
-from pipeline.layout.vocabulary import FREQUENCY_DIM
+from pipeline.analysis.branches.carrying import Along
 
 SETTLING = 2000
 """Most drive periods or returns for which a trajectory settles."""
 
 TOLERANCE = 1e-8
 """Tolerance of the integration while trajectories settle; continuation then finds the orbits exactly."""
-
-
-@dataclass(frozen=True)
-class Along:
-    """Model, parameter and parameter interval of the branches to compute.
-
-    Attributes
-    ----------
-    model : Model
-        Forced model, or a flow with its Poincare section.
-    parameter : str
-        Parameter that changes, ``frequency`` for the drive frequency.
-    low, high : float
-        Interval [SI].
-    frequency_hz : float
-        Drive frequency [Hz], unless it is the parameter; of a flow one over the longest time between crossings.
-    max_period : int
-        Longest period of the orbits [drive periods or returns].
-    """
-
-    model: Model
-    parameter: str
-    low: float
-    high: float
-    frequency_hz: float = float("nan")
-    max_period: int = 2
-
-    def family(self, period: int, packed: np.ndarray) -> Family:
-        """Return the continuation problem of orbits with a given period along the parameter (period 0: equilibria)."""
-        scale = self.high - self.low
-        return Family(self.model.system, period, self.frequency_hz, packed, (self.parameter,), (scale,))
-
-    def rows(self, packed: np.ndarray, values: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
-        """Return packed parameters (n, n_parameters) and drive frequencies (n,) for n values of the parameter."""
-        rows, frequency = np.tile(packed, (len(values), 1)), np.full(len(values), self.frequency_hz)
-        if self.parameter == FREQUENCY_DIM:
-            frequency = np.array(values, float)
-        else:
-            rows[:, self.model.parameter_names.index(self.parameter)] = values
-        return rows, frequency
 
 
 def branches_along(along: Along, parameters: Parameters, values: Sequence[float], states: np.ndarray) -> xr.Dataset:

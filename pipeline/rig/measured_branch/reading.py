@@ -26,9 +26,13 @@ from pipeline.specification.tables import Table
 
 STABILITIES = ("unknown", "stable", "unstable")
 
-_YES = {"yes": "stable", "no": "unstable", "unknown": "unknown", "true": "stable", "false": "unstable"}
+_YES = {
+    "yes": "stable", "no": "unstable", "unknown": "unknown", "true": "stable", "false": "unstable",
+    "stable": "stable", "unstable": "unstable",
+}  # fmt: skip
 _NUMBERS = ("amplitude", "amplitude_sd", "mean", "mean_sd", "frequency", "frequency_sd")
-_KNOWN = ("name", "stable", "n_cycles", *_NUMBERS)
+_HARMONICS = tuple(f"harmonic_{k + 1}" for k in range(N_HARMONICS))
+_KNOWN = ("name", "stable", "stability", "n_cycles", *_NUMBERS, *_HARMONICS)
 
 
 class RecordedOrbit(Table):
@@ -66,7 +70,7 @@ def read_branch(path: str | Path, model: Model | None = None, state: str = "") -
     path
         A CSV file, or a TOML file with the table ``[measured.branch]``. The first column of a CSV file is the
         parameter; others are ``amplitude``, ``amplitude_sd``, ``mean``, ``frequency`` (with ``_sd``), ``stable``
-        (yes, no, unknown) and ``name``.
+        (yes, no, unknown) and ``name``. The tables that ``magpend measured branch --csv`` writes can be read as well.
     model
         Model of a CSV file; its parameter and state are looked up there.
     state
@@ -154,6 +158,9 @@ def _from_csv(path: Path, model: Model | None, state: str) -> xr.Dataset:
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise SpecError(f"{path}: cannot be read as a CSV table ({error}).") from None
     lines = [line for line in lines if any(field.strip() for field in line)]
+    if len(header) > 1 and header[0].strip() == "name":
+        # as magpend writes it: the name, then the parameter
+        header, *lines = ([*line[1:2], *line[:1], *line[2:]] for line in (header, *lines))
     if not header or not lines:
         raise SpecError(f"{path}: has no rows; give a header and a row for each orbit.")
     # by position, since the parameter may have the name of another column
@@ -169,7 +176,8 @@ def _from_csv(path: Path, model: Model | None, state: str) -> xr.Dataset:
     for i, (first, *rest) in enumerate(lines, 2):
         line = dict(zip(others, rest, strict=False))
         found = {name: _number(line.get(name), f"row {i}, {name}", problems) for name in _NUMBERS}
-        word = (line.get("stable") or "unknown").strip().lower()
+        found |= {name: _number(line.get(name), f"row {i}, {name}", problems) for name in ("n_cycles", *_HARMONICS)}
+        word = (line.get("stable") or line.get("stability") or "unknown").strip().lower()
         if word not in _YES:
             problems.append(f"row {i}, stable = {word!r}: must be yes, no or unknown.")
         value = _number(first, f"row {i}, {parameter}", problems)
@@ -178,10 +186,11 @@ def _from_csv(path: Path, model: Model | None, state: str) -> xr.Dataset:
         if not math.isfinite(found["amplitude"]):
             problems.append(f"row {i}, amplitude: missing; each orbit needs one.")
         rows.append({"name": line.get("name") or f"orbit {i - 1}", "value": value, "stable": word})
-        columns.append(found | {"n_cycles": 0})
+        columns.append(found | {"n_cycles": int(np.nan_to_num(found["n_cycles"]))})
     if problems:
         raise SpecError([f"{path}: {p}" for p in problems])
-    return _dataset(model, parameter, chosen, rows, columns, None)
+    harmonics = [np.array([c[name] for name in _HARMONICS]) for c in columns] if set(_HARMONICS) & set(others) else None
+    return _dataset(model, parameter, chosen, rows, columns, harmonics)
 
 
 def _number(text: str | None, where: str, problems: list[str]) -> float:

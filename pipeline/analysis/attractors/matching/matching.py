@@ -43,8 +43,8 @@ _, _FIRST, _BRANCH, _DOUBLING, _DISTANCE = range(len(BASES))
 
 
 @dataclass(frozen=True, eq=False)
-class _Seen:
-    """An attractor at one parameter point, with the features by which it is matched."""
+class Seen:
+    """Attractor at one parameter point, from one row of the stored features."""
 
     number: int
     kind: int
@@ -55,32 +55,34 @@ class _Seen:
 
     @property
     def family(self) -> int:
-        """Odd part of the orbit period. All orbits of one period-doubling cascade share it; it is 0 for bounded
-        sets.
-        """
+        """Odd part of the period, equal for all orbits of one doubling cascade; 0 for bounded sets."""
         return self.period // (self.period & -self.period) if self.period else 0
 
 
 @dataclass(frozen=True, eq=False)
-class _Rule:
-    """Rule that decides by distance whether attractors at different parameter points are the same."""
+class Rule:
+    """Rule for matching attractors by distance: which of them may match, and up to which distance."""
 
     threshold: float
     geometry: Geometry
     neutral: frozenset[int]
     known: Connections
 
-    def distance(self, axis: int, before: _Seen, here: _Seen) -> float:
-        """Return the distance between attractors at two parameter points along an axis; infinite if they must not be
-        matched.
-        """
+    def distance(self, axis: int, before: Seen, here: Seen) -> float:
+        """Return the distance of an attractor from an earlier one along an axis; infinite if they may not match."""
         ends = (before.number, before.period), (here.number, here.period)
-        if not self._alike(before, here) or not self.known.may_be_one(axis, *ends):
+        return self.alike(before, here) if self.known.may_be_one(axis, *ends) else np.inf
+
+    def alike(self, before: Seen, here: Seen) -> float:
+        """Return the distance of two attractors at one parameter point; infinite if their kinds, periods or sides
+        exclude that they are one.
+        """
+        if not self._alike(before, here):
             return np.inf
         turned = float(np.nan_to_num(np.abs(before.rotation - here.rotation)).max(initial=0.0))
         return mean_distance(before.points, here.points, self.geometry) + turned
 
-    def _alike(self, a: _Seen, b: _Seen) -> bool:
+    def _alike(self, a: Seen, b: Seen) -> bool:
         sides = {a.side, b.side} - self.neutral
         return a.kind == b.kind and a.family == b.family and len(sides) <= 1
 
@@ -142,14 +144,14 @@ def match(
     links = Connections.none(len(places))
     if connect:
         links = _connections(attractors, places, dims, parameters, system)
-    rule = _Rule(threshold, _geometry(attractors, system), _neutral(attractors), links)
+    rule = Rule(threshold, geometry_of(attractors, system), neutral_sides(attractors), links)
     ids = _Ids(shape, attractors.sizes[_PER_ATTRACTOR], places, rule)
-    seen: dict[tuple[int, ...], dict[int, _Seen]] = {}
+    seen: dict[tuple[int, ...], dict[int, Seen]] = {}
     numbers: dict[tuple[int, ...], list[int]] = {}
     for n, (index, _) in enumerate(places):
         numbers.setdefault(index, []).append(n)
     for index in np.ndindex(*shape):
-        here = [_seen(attractors, n, places[n]) for n in numbers.get(index, [])]
+        here = [seen_at(attractors, n, places[n]) for n in numbers.get(index, [])]
         seen[index] = ids.at(here, _known(seen, index, look_back))
     attrs = {
         **attractors.attrs,
@@ -184,13 +186,14 @@ def _connections(
     return connections(attractors, places, dims, packed, fixed, system)
 
 
-def _geometry(attractors: xr.Dataset, system: System | None) -> Geometry:
+def geometry_of(attractors: xr.Dataset, system: System | None = None) -> Geometry:
+    """Return the geometry of the states, from the given system or else from the model."""
     told: Any = system or model_of(attractors)
     return Geometry(told.is_angle, told.scales)
 
 
-def _neutral(attractors: xr.Dataset) -> frozenset[int]:
-    """Return the codes of the classes of motion that may be matched with any other class."""
+def neutral_sides(attractors: xr.Dataset) -> frozenset[int]:
+    """Return the classifier codes that are compatible with every other code."""
     classifier = model_of(attractors).classifier
     return frozenset(classifier.neutral if classifier else ())
 
@@ -202,7 +205,7 @@ class _Ids:
     there is none. `taken` has the parameter points at which each id is, or will be, used.
     """
 
-    def __init__(self, shape: tuple[int, ...], n_rows: int, places: Sequence[Place], rule: _Rule) -> None:
+    def __init__(self, shape: tuple[int, ...], n_rows: int, places: Sequence[Place], rule: Rule) -> None:
         self.ids = np.full((*shape, n_rows), -1, np.int64)
         self.basis = np.zeros(self.ids.shape, np.int8)
         self.taken: list[set[tuple[int, ...]]] = []
@@ -215,7 +218,7 @@ class _Ids:
         self._by_group: dict[int, int] = {}
         self._met: set[int] = set()
 
-    def at(self, here: Sequence[_Seen], known: Mapping[int, list[tuple[int, _Seen]]]) -> dict[int, _Seen]:
+    def at(self, here: Sequence[Seen], known: Mapping[int, list[tuple[int, Seen]]]) -> dict[int, Seen]:
         """Give ids to the attractors of the next parameter point. Return the attractors by id."""
         free = [one for one in here if self._group[one.number] not in self._by_group]
         for one in here:
@@ -233,22 +236,23 @@ class _Ids:
         self._met |= {self._branch[one.number] for one in here}
         return {self._by_group[self._group[one.number]]: one for one in here}
 
-    def _has_room(self, one: _Seen, identity: int) -> bool:
+    def _has_room(self, one: Seen, identity: int) -> bool:
         """Return whether an id is still free at all parameter points at which an attractor's branch occurs."""
         return not self._where[self._group[one.number]] & self.taken[identity]
 
-    def _give(self, one: _Seen, identity: int) -> None:
+    def _give(self, one: Seen, identity: int) -> None:
         group = self._group[one.number]
         self._by_group[group] = identity
         self.taken[identity] |= self._where[group]
 
-    def _settle(self, one: _Seen, basis: int) -> None:
+    def _settle(self, one: Seen, basis: int) -> None:
         index, row = self._places[one.number]
         self.ids[(*index, row)] = self._by_group[self._group[one.number]]
         self.basis[(*index, row)] = basis
 
 
-def _seen(attractors: xr.Dataset, number: int, place: Place) -> _Seen:
+def seen_at(attractors: xr.Dataset, number: int, place: Place) -> Seen:
+    """Return the attractor of one row at one parameter point."""
     index, row = place
     at = (*index, row)
     points = attractors["attractor_points"].values[at]
@@ -256,16 +260,16 @@ def _seen(attractors: xr.Dataset, number: int, place: Place) -> _Seen:
     side = int(attractors["side"].values[at]) if "side" in attractors else 0
     rotation = attractors["rotation"].values[at] if "rotation" in attractors else np.zeros(0)
     kind, period = (int(attractors[name].values[at]) for name in ("kind", "orbit_period"))
-    return _Seen(number, kind, period, side, points, rotation)
+    return Seen(number, kind, period, side, points, rotation)
 
 
 def _known(
-    seen: dict[tuple[int, ...], dict[int, _Seen]], index: tuple[int, ...], look_back: int
-) -> dict[int, list[tuple[int, _Seen]]]:
+    seen: dict[tuple[int, ...], dict[int, Seen]], index: tuple[int, ...], look_back: int
+) -> dict[int, list[tuple[int, Seen]]]:
     """Return for each id its nearest earlier attractor along each parameter axis, as pairs (axis, attractor)."""
-    known: dict[int, list[tuple[int, _Seen]]] = {}
+    known: dict[int, list[tuple[int, Seen]]] = {}
     for axis in range(len(index)):
-        along: dict[int, _Seen] = {}
+        along: dict[int, Seen] = {}
         for step in range(1, min(look_back, index[axis]) + 1):
             back = (*index[:axis], index[axis] - step, *index[axis + 1 :])
             for identity, appearance in seen[back].items():
@@ -276,10 +280,7 @@ def _known(
 
 
 def _assign(
-    here: Sequence[_Seen],
-    known: Mapping[int, list[tuple[int, _Seen]]],
-    rule: _Rule,
-    is_free: Callable[[_Seen, int], bool],
+    here: Sequence[Seen], known: Mapping[int, list[tuple[int, Seen]]], rule: Rule, is_free: Callable[[Seen, int], bool]
 ) -> list[int | None]:
     """Choose for each attractor the existing id of the nearest earlier attractor; None for a new attractor."""
     given: list[int | None] = [None] * len(here)
@@ -287,7 +288,7 @@ def _assign(
         return given
     identities = sorted(known)
 
-    def cost_of(a: _Seen, identity: int) -> float:
+    def cost_of(a: Seen, identity: int) -> float:
         if not is_free(a, identity):
             return np.inf
         return min(rule.distance(axis, b, a) for axis, b in known[identity])

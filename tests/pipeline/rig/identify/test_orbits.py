@@ -295,7 +295,8 @@ def test_run_posterior__each_draw_is_a_run_and_its_bifurcations_are_those_of_the
     assert (folder / "draw-0001/run.json").stat().st_mtime_ns == before
     with pytest.raises(RefusedError, match="different: draws"):
         run_posterior(path, directory, 2, tmp_path / "study", workers=0)
-    rows = {(row["what"], row["name"]): row for row in spread(folder, branches=True, echo=lambda line: None).rows}
+    table = spread(folder, branches=True, attractors=True, echo=lambda line: None)
+    rows = {(row["what"], row["name"]): row for row in table.rows}
     values = drawn["value"].values[:, names.index("h")]
     fold, g = rows["value", "fold 1"], drawn["value"].values[:, names.index("g")]
     assert fold["median"] == pytest.approx(np.median(values - 1 / (4 * g)), abs=1e-6)
@@ -304,6 +305,15 @@ def test_run_posterior__each_draw_is_a_run_and_its_bifurcations_are_those_of_the
     assert hopf["median"] == pytest.approx(np.median(values), abs=1e-6)
     assert hopf["n_draws"] == 3
     assert sum(row["best"] for row in rows.values() if row["what"] == "fraction") == pytest.approx(1.0)
+    # at m = 0 half of the cells end on the stable cycle, half at rest
+    cycle = next(name for _, name in rows if name.startswith("attractor") and "period 1)" in name).split(" (")[0]
+    section = rows["section x", f"{cycle} at m = 0"]
+    sizes = [radius(0.0, 1, *v) for v in zip(g, values, strict=True)]
+    assert section["median"] == pytest.approx(np.median(sizes), abs=1e-6)
+    assert section["best"] == pytest.approx(radius(0.0, 1, result["values"]["g"], result["values"]["h"]), abs=1e-6)
+    assert rows["share", f"{cycle} at m = 0"]["low"] == 0.5
+    shares = [row["best"] for (what, name), row in rows.items() if what == "share" and "(" in name]
+    assert sum(shares) == pytest.approx(1.0)
 
     path.write_text(
         "\n".join(

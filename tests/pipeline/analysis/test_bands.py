@@ -1,0 +1,150 @@
+"""Draws of the parameters carried through the branches of a run, on an oscillator with closed forms.
+
+    r' = (m - h) r + r^3 - g r^5,  angle' = w
+
+On the section y = 0 its cycles have x = r, with g r^4 - r^2 - (m - h) = 0. The fold of cycles lies at m = h - 1/(4 g),
+the Hopf point at m = h.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from pipeline.analysis.branches.bands import GRID, orbit_data, place_variables
+from pipeline.analysis.branches.bands_product import bands_table
+from pipeline.analysis.branches.carrying import Along
+from pipeline.analysis.draws import LEVELS, stretches
+from pipeline.runs.derive import derive, stored
+from pipeline.runs.drawing import figure
+from pipeline.runs.run import run
+from pipeline.specification.problems import SpecError
+
+TRUTH = {"g": 1.2, "h": 0.05, "w": 6.0}
+MODEL = {
+    "name": "bautin-cycle",
+    "states": {"x": {"scale": 1.0}, "y": {"scale": 1.0}},
+    "parameters": {name: {"value": value} for name, value in {"m": 0.0, **TRUTH}.items()},
+    "define": {"r2": "x**2 + y**2", "growth": "m - h + r2 - g*r2**2"},
+    "equations": {"x": "growth*x - w*y", "y": "growth*y + w*x"},
+}
+SPEC = {
+    "kind": "sweep",
+    "model": MODEL,
+    "section": {"of": "y", "value": 0.0, "direction": "up", "longest": 20.0},
+    "axes": {"m": {"start": -0.3, "stop": 0.2, "num": 6}},
+    "initial_conditions": {"kind": "list", "points": [[1.0, 0.0], [0.01, 0.0]]},
+    "integration": {"n_transient": 200, "n_keep": 2, "stop_when_closed": True},
+}
+
+
+def silent(line):
+    pass
+
+
+def write_draws(path, g, h):
+    """Draws of g and h; m and w are those of the identification, which a run may change."""
+    names = ["m", "g", "h", "w"]
+    values = np.column_stack([np.full(len(g), 7.0), g, h, np.full(len(g), 60.0)])
+    about = {"identified": "g h", "tied": ""}
+    xr.Dataset({"value": (("draw", "parameter"), values)}, {"parameter": names}, about).to_netcdf(path, engine="scipy")
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("bands")
+    run(SPEC, folder / "run", workers=0, echo=silent)
+    random = np.random.default_rng(3)
+    g, h = 1.2 + 0.1 * random.standard_normal(60), 0.05 + 0.01 * random.standard_normal(60)
+    (folder / "fit").mkdir()
+    write_draws(folder / "fit" / "posterior.nc", g, h)
+    return folder, g, h, derive(folder / "run", "bands", {"posterior": str(folder / "fit")})
+
+
+def test_bands__bifurcations_are_those_of_the_closed_form(bench):
+    _, g, h, found = bench
+    words = str(found["kind"].attrs["flag_meanings"]).split()
+    by_kind = {words[int(c)]: found["bifurcation_value"].values[:, k] for k, c in enumerate(found["kind"].values)}
+    fold = h - 1 / (4 * g)
+    np.testing.assert_allclose(by_kind["fold"], fold, atol=1e-6)
+    np.testing.assert_allclose(by_kind["hopf"], h, atol=1e-6)
+    row = next(row for row in bands_table(found).rows if row["type"] == "fold")
+    np.testing.assert_allclose([row["low"], row["median"], row["high"]], np.quantile(fold, LEVELS), atol=1e-6)
+    assert (row["n_draws"], row["share"]) == (60, 1.0)
+    assert row["value"] == pytest.approx(0.05 - 1 / 4.8, abs=1e-7)
+
+
+def test_bands__quantiles_of_orbits_are_those_of_the_closed_form(bench):
+    _, g, h, found = bench
+    assert found.sizes["orbit"] > GRID
+    is_stable = found["is_stable"].values
+    everywhere = np.flatnonzero(found["share"].values == 1.0)
+    for k in everywhere:
+        m = float(found["parameter_value"][k])
+        root = np.sqrt(1 + 4 * g * (m - h)) * (1 if is_stable[k] else -1)
+        expected = np.quantile(np.sqrt((1 + root) / (2 * g)), LEVELS)
+        np.testing.assert_allclose(found["section_level"].sel(state="x").values[:, k, 0], expected, atol=1e-6)
+    assert {bool(s) for s in is_stable[everywhere]} == {True, False}
+    # left of the fold of half of the draws there is no band
+    for _, _, chosen in stretches(found):
+        assert found["parameter_value"].values[chosen].min() > np.median(h - 1 / (4 * g)) - 0.5 / (GRID - 1)
+
+
+def test_orbit_data__a_branch_that_turns_back_is_cut_there():
+    """A branch over [0, 1] and back, stable all the way: two stretches, not one that mixes both."""
+    x = np.concatenate([np.linspace(-0.01, 1.0, 50), np.linspace(0.99, -0.01, 50)])
+    branches = xr.Dataset(
+        {
+            "n_points": ("branch", [100]),
+            "orbit_period": ("branch", [1]),
+            "parameter": (("branch", "point"), x[None]),
+            "n_unstable": (("branch", "point"), np.zeros((1, 100), int)),
+            "section": (("branch", "point", "phase", "state"), np.linspace(0.0, 1.0, 100)[None, :, None, None]),
+        }
+    )
+    data, guesses, places = orbit_data(Along(None, "m", 0.0, 0.9), branches)
+    assert len(data) == 2 * GRID
+    np.testing.assert_allclose([g[-1] for g in guesses], [d.value for d in data])
+    found = [chosen for _, _, chosen in stretches(xr.Dataset(place_variables(data, places, np.ones(len(data)))))]
+    assert [len(chosen) for chosen in found] == [GRID, GRID]
+    sizes = np.array([g[0] for g in guesses])
+    assert (np.diff(sizes[found[0]]) > 0.0).all()
+    assert (np.diff(sizes[found[1]]) < 0.0).all()
+
+
+def test_bands__are_kept_and_depend_on_the_draws(bench, tmp_path):
+    folder, g, h, found = bench
+    xr.testing.assert_equal(stored(folder / "run", "bands"), found)
+    write_draws(tmp_path / "posterior.nc", g[:10], h[:10])
+    other = derive(folder / "run", "bands", {"posterior": str(tmp_path)})
+    np.testing.assert_array_equal(other["bifurcation_value"], found["bifurcation_value"][:10])
+    some = derive(folder / "run", "bands", {"posterior": str(folder / "fit"), "draws": 10})
+    np.testing.assert_array_equal(other["bifurcation_value"], some["bifurcation_value"])
+
+
+@pytest.mark.parametrize("name", ["branches", "bifurcation"])
+def test_figure__shades_the_bands_and_draws_the_intervals(bench, name):
+    folder, g, h, found = bench
+    drawn = figure(folder / "run", name, posterior=str(folder / "fit"))
+    ax = drawn.axes[0]
+    shades = [c for c in ax.collections if c.get_gid() == "band"]
+    assert len(shades) == len(list(stretches(found))) > 1
+    bars = [line.get_xdata() for line in ax.lines if line.get_gid() == "interval"]
+    assert any(np.allclose(bar, np.quantile(h - 1 / (4 * g), [0.025, 0.975]), atol=1e-6) for bar in bars)
+    assert "section_level_bands" in drawn.data
+    assert "95 % of the orbits" in [t.get_text() for legend in drawn.legends for t in legend.get_texts()]
+
+
+def test_bands__names_the_problem(bench, tmp_path):
+    folder = bench[0]
+    with pytest.raises(SpecError, match=r"has no posterior.nc"):
+        derive(folder / "run", "bands", {"posterior": str(tmp_path)})
+    along = {"parameter": "g", "low": 1.0, "high": 1.4}
+    with pytest.raises(SpecError, match=r"g was identified, and the branches run along it"):
+        derive(folder / "run", "bands", {"posterior": str(folder / "fit"), **along})
+    with xr.open_dataset(folder / "fit" / "posterior.nc", engine="scipy") as ds:
+        draws = ds.load()
+    draws.assign_coords(parameter=["a", "b", "c", "d"]).to_netcdf(tmp_path / "other.nc", engine="scipy")
+    with pytest.raises(SpecError, match=r"has the parameters a, b, c, d: another model's"):
+        derive(folder / "run", "bands", {"posterior": str(tmp_path / "other.nc")})
