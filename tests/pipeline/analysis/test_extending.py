@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 
 from magpend_core.status import Status
+from pipeline.analysis.attractors.describing.labelling import _preserves_volume
 from pipeline.analysis.attractors.extension.extending import Outcome, extend
 from pipeline.analysis.attractors.extension.growth import growth_of, on_closed_curves
 from pipeline.analysis.attractors.finding.cell_blocks import Block
 from pipeline.analysis.attractors.finding.closed_orbits import Orbit
 from pipeline.analysis.attractors.finding.requests import LEG, Extended, Leg, Polish, Settings, Slopes
 from pipeline.analysis.sets import Geometry
+from pipeline.analysis.tolerances import ROUGH_SLOPE_RTOL, SLOPE_RTOL
 from pipeline.layout.vocabulary import ATTRACTS, BOUNDED_SET, CHAOTIC_SET, NEUTRAL, NOT_SETTLED, TORUS, TRANSIENT
 
 N_KEEP = 20
@@ -30,7 +32,8 @@ class MapPoint:
         for i in range(N_KEEP):
             state = step(state)
             self.section[:, i] = state
-        self.n_cells, self.n_periods = len(starts), seen * len(starts)
+        self.n_cells, self.n_periods, self.n_states = len(starts), seen * len(starts), starts.shape[1]
+        self.rtols = []
 
     def blocks(self):
         n = self.n_cells
@@ -63,6 +66,7 @@ def settle(point, orbits=(), *, budget=1e6, seen=N_KEEP, scale=1.0) -> Outcome:
                 section, status, np.zeros(n, int), np.zeros((n, 0), int), state, np.zeros(n), np.ones((n, LEG))
             )
         elif isinstance(asked, Slopes):
+            point.rtols.append(asked.rtol)
             answer = point.step(asked.point), point.slope(asked.point)
         else:
             assert isinstance(asked, Polish)
@@ -191,6 +195,46 @@ def test_extend__without_a_budget_nothing_is_said():
     found = settle(MapPoint(*tent(1.9), starts), budget=0.0)
     assert found.spent == 0
     assert {(one.kind, one.stability) for one in found.sets} == {(BOUNDED_SET, NOT_SETTLED)}
+
+
+def test_extend__slopes_are_refined_unless_chaos_is_plain():
+    """The baker's map stretches by 2 and shrinks by 3; a rotation does neither."""
+
+    def baker(z):
+        right = z[:, 0] >= 0.5
+        # bits that rounding takes from the left come back
+        x = (2.0 * z[:, 0] + 1e-13 * z[:, 1]) % 1.0
+        return np.stack([x, z[:, 1] / 3.0 + 0.6 * right], axis=1)
+
+    starts = np.random.default_rng(4).uniform(0.1, 0.8, (50, 2))
+    chaos = MapPoint(baker, lambda z: np.broadcast_to(np.diag([2.0, 1.0 / 3.0]), (len(z), 2, 2)), starts)
+    (one,) = settle(chaos).sets
+    assert (one.kind, one.stability) == (CHAOTIC_SET, ATTRACTS)
+    assert one.growth.rate == pytest.approx(np.log(2.0))
+    assert set(chaos.rtols) == {ROUGH_SLOPE_RTOL}
+    turn = np.array([[np.cos(GOLDEN), -np.sin(GOLDEN)], [np.sin(GOLDEN), np.cos(GOLDEN)]])
+    still = MapPoint(lambda z: z @ turn.T, lambda z: np.broadcast_to(turn, (len(z), 2, 2)), starts)
+    assert {found.stability for found in settle(still).sets} == {NEUTRAL}
+    assert still.rtols[:2] == [ROUGH_SLOPE_RTOL, SLOPE_RTOL]
+
+
+@pytest.mark.parametrize(("factor", "n_asked"), [(1.0, [1, 15]), (0.999, [1])])
+@pytest.mark.parametrize("lossy", [0, 1])
+def test_preserves_volume__asks_few_points_first(factor, n_asked, lossy):
+    """A map that preserves areas on all points, on all but a few, or on none."""
+    point = MapPoint(lambda z: z, None, np.random.default_rng(5).uniform(0.0, 1.0, (16, 2)))
+    work, asked, answer = _preserves_volume(point, None), [], None
+    try:
+        while True:
+            before = work.send(answer).point
+            slopes = np.tile(factor * np.eye(2), (len(before), 1, 1))
+            if lossy and len(before) > 1:
+                slopes[-1] *= 0.99
+            asked.append(len(before))
+            answer = before, slopes
+    except StopIteration as stop:
+        assert stop.value == (factor == 1.0 and not lossy)
+    assert asked == n_asked
 
 
 def test_growth__exponents_of_the_henon_map():
