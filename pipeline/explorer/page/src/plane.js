@@ -6,6 +6,7 @@ import { Frame } from "./frame.js";
 import { number } from "./facts.js";
 import { axisOf, indicesOf } from "./orbit.js";
 import { idAt, imageOf, mapOf } from "./plane-map.js";
+import { Push } from "./push.js";
 import { brokenLines } from "./wrapping.js";
 
 const MOST_KEPT = 12;
@@ -58,10 +59,12 @@ export class Plane {
     this.frame = new Frame(body, { label: "", ratio: 0.8 });
     this.frame.paintBack = (ctx, frame, colours) => this.paint(ctx, frame, colours);
     this.frame.paintFront = (ctx, frame, colours) => this.paintCross(ctx, frame, colours);
+    this.push = new Push(this);
     body.append(this.readout, this.legend, this.told);
     this.listen();
     if (this.live) this.buildLive(body);
     else body.append(el("p", { class: "note", text: NO_LIVE }));
+    body.append(this.push.element);
     this.dress();
   }
 
@@ -104,7 +107,9 @@ export class Plane {
     const asked = ++this.asked;
     [this.orbit, this.isFollowed] = [orbit, isFollowed];
     const place = JSON.stringify([orbit.attrs.parameters, orbit.attrs.frequency, this.pair]);
-    if (place === this.place) return;
+    const isSame = place === this.place;
+    this.push.show(orbit, isFollowed);
+    if (isSame) return;
     this.place = place;
     this.job?.cancel();
     this.cross = null;
@@ -212,6 +217,7 @@ export class Plane {
       ctx.stroke();
     }
     ctx.globalAlpha = 1;
+    this.push.paint(ctx, frame, colours);
     ctx.strokeStyle = colours.card;
     ctx.lineWidth = 1;
     for (const [x, y] of this.dots) {
@@ -278,9 +284,10 @@ export class Plane {
     front.tabIndex = 0;
     front.setAttribute("role", "application");
     front.addEventListener("click", (event) => {
-      const place = this.frame.at(event);
+      const place = this.push.isOn ? null : this.frame.at(event);
       if (place) this.begin(place);
     });
+    this.push.listen(front);
     front.addEventListener("keydown", (event) => this.key(event));
     front.addEventListener("focus", () => this.moveCross(0, 0));
   }
@@ -330,14 +337,18 @@ export class Plane {
   async begin(place) {
     if (!place || !this.orbit) return;
     this.putCross(place);
+    await this.integrate({ ...this.fixed, [this.pair[0]]: place[0], [this.pair[1]]: place[1] }, endSentence);
+  }
+
+  /** Integrate a state; `sentence` says of its end what is told. */
+  async integrate(state, sentence) {
     this.forgetStart();
-    const start = { ...this.fixed, [this.pair[0]]: place[0], [this.pair[1]]: place[1] };
     this.told.textContent = "Integrating this start ...";
     const begun = (this.begun = {});
     try {
-      const end = await this.starter.start({ ...this.point, state: start }, (kind, piece) => begun === this.begun && this.add(kind, piece));
+      const end = await this.starter.start({ ...this.point, state }, (kind, piece) => begun === this.begun && this.add(kind, piece));
       if (begun !== this.begun || end.cancelled) return;
-      this.told.textContent = endSentence(end);
+      this.told.textContent = sentence(end);
       this.end = end.colour;
       this.frame.repaint();
     } catch (error) {
