@@ -20,7 +20,7 @@ MOST_RESOLUTION, LEAST_RESOLUTION = 512, 16
 MOST_PERIODS = 20_000
 """Longest start [drive periods or returns]."""
 
-MOST_NOISE = 100.0
+MOST_NOISE = 10.0
 """Strongest noise on a start [scales over the square root of a second]."""
 
 Name = Annotated[str, Field(min_length=1, max_length=200)]

@@ -4,6 +4,7 @@
 import { el, labelledSelect, numberField, shortened, show } from "./dom.js";
 import { Frame } from "./frame.js";
 import { number } from "./facts.js";
+import { Noise } from "./noise.js";
 import { axisOf, indicesOf } from "./orbit.js";
 import { idAt, imageOf, mapOf } from "./plane-map.js";
 import { Push } from "./push.js";
@@ -76,7 +77,8 @@ export class Plane {
     this.bounds = el("div", { class: "bounds" });
     this.startFields = el("span", { class: "starts" });
     const begin = el("button", { type: "button", text: "Integrate this start", on: { click: () => this.begin(this.cross ?? this.middle) } });
-    body.append(el("div", { class: "controls" }, this.startFields, begin));
+    this.noise = new Noise(this.view, (name) => this.named(name));
+    body.append(el("div", { class: "controls" }, this.startFields, begin), this.noise.element);
     const more = el("details", {}, el("summary", { text: "Bounds, and the other states" }), this.bounds);
     body.append(el("div", { class: "controls" }, this.compute, this.resolution.element, this.stop), this.progress, more);
   }
@@ -247,7 +249,7 @@ export class Plane {
   }
 
   paintCross(ctx, frame, colours) {
-    if (!this.cross) return;
+    if (!this.cross || this.push.isOn) return;
     const [px, py] = [frame.x(this.cross[0]), frame.y(this.cross[1])];
     for (const [width, colour] of [[4, colours.card], [2, colours.ink]]) {
       ctx.lineWidth = width;
@@ -296,8 +298,9 @@ export class Plane {
     const steps = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
     if (event.key in steps) {
       const [dx, dy] = steps[event.key].map((step) => step * (event.shiftKey ? 10 : 1));
-      this.moveCross(dx, dy);
-    } else if (event.key === "Enter" || event.key === " ") this.begin(this.cross);
+      if (this.push.isOn) this.push.nudge(dx, dy);
+      else this.moveCross(dx, dy);
+    } else if (event.key === "Enter" || event.key === " ") this.push.isOn ? this.push.go() : this.begin(this.cross);
     else return;
     event.preventDefault();
   }
@@ -343,12 +346,14 @@ export class Plane {
   /** Integrate a state; `sentence` says of its end what is told. */
   async integrate(state, sentence) {
     this.forgetStart();
-    this.told.textContent = "Integrating this start ...";
+    const { request } = this.noise;
+    this.told.classList.toggle("lost", Boolean(request.noise));
+    this.told.textContent = request.noise ? "Integrating with noise: the first time, code is compiled for some seconds ..." : "Integrating this start ...";
     const begun = (this.begun = {});
     try {
-      const end = await this.starter.start({ ...this.point, state }, (kind, piece) => begun === this.begun && this.add(kind, piece));
+      const end = await this.starter.start({ ...this.point, ...request, state }, (kind, piece) => begun === this.begun && this.add(kind, piece));
       if (begun !== this.begun || end.cancelled) return;
-      this.told.textContent = sentence(end);
+      this.told.textContent = end.noise ? this.noise.sentence(end) : sentence(end);
       this.end = end.colour;
       this.frame.repaint();
     } catch (error) {
@@ -358,6 +363,7 @@ export class Plane {
 
   forgetStart() {
     this.begun = null;
+    this.told.classList.remove("lost");
     [this.paths, this.dots, this.end] = [[], [], null];
     this.frame.repaint();
   }

@@ -57,7 +57,7 @@ export class Push {
     if (!this.plane.live) return;
     this.fill();
     const many = this.orbit.section(this.names[0]).length > 1 ? " Of an orbit with several section points, it is the one that is selected in the diagram." : "";
-    this.hint.textContent = `Drag in the plane from the orbit's section point (ring), or enter the impulse.${many}`;
+    this.hint.textContent = `Drag in the plane, where the ring is the orbit's section point; or use the arrow keys and Enter there, or enter the impulse.${many}`;
   }
 
   fill() {
@@ -107,6 +107,13 @@ export class Push {
     if (!place) return;
     const from = this.drawn(this.base);
     this.plane.pair.forEach((name, k) => (this.jump[this.names.indexOf(name)] = place[k] - from[k]));
+    this.told();
+  }
+
+  /** Change the jump by hundredths of what the plane shows. */
+  nudge(dx, dy) {
+    const [x0, x1, y0, y1] = this.plane.limits, steps = [(dx * (x1 - x0)) / 100, (dy * (y1 - y0)) / 100];
+    this.plane.pair.forEach((name, k) => (this.jump[this.names.indexOf(name)] += steps[k]));
     this.told();
   }
 
