@@ -249,6 +249,7 @@ export class Plane {
   }
 
   paintCross(ctx, frame, colours) {
+    this.push.paintFront(ctx, frame, colours);
     if (!this.cross || this.push.isOn) return;
     const [px, py] = [frame.x(this.cross[0]), frame.y(this.cross[1])];
     for (const [width, colour] of [[4, colours.card], [2, colours.ink]]) {

@@ -6,6 +6,7 @@ import { number } from "./facts.js";
 
 const TURN = 2 * Math.PI;
 const HEAD = 9; // length of an arrow's head [px]
+const FEW = 2; // edge states that are listed at once
 const SHOCKS = [["smallest", []], ["shortest", [6, 4]]];
 
 export class Push {
@@ -70,7 +71,7 @@ export class Push {
   /** Show the jump in the fields, without making them anew. */
   told() {
     this.fields.querySelectorAll("input").forEach((input, i) => (input.value = shortened(this.jump[i])));
-    this.plane.frame.repaint();
+    this.plane.frame.refresh();
   }
 
   /** Where a state is drawn in the plane: angles within half a turn of its middle. */
@@ -149,7 +150,7 @@ export class Push {
     this.shocks = own === null ? null : known?.shocks.find((one) => one.attractor === own) ?? null;
     const lines = [];
     if (this.shocks) for (const [which] of SHOCKS) lines.push(this.shockLine(which));
-    for (const edge of known?.edges ?? []) lines.push(el("li", { text: edgeSentence(edge, this.view) }));
+    if (known?.edges.length) lines.push(this.edgeLines(known.edges));
     for (const note of notes ?? []) lines.push(el("li", { class: "muted", text: `${note[0].toUpperCase()}${note.slice(1)}` }));
     this.list.replaceChildren(...lines);
     show(this.list, lines.length > 0);
@@ -169,10 +170,23 @@ export class Push {
     return line;
   }
 
+  /** The edge states; of more than a few one sees the number first. */
+  edgeLines(edges) {
+    const listed = el("ul", {}, ...edges.map((edge) => el("li", { text: edgeSentence(edge) })));
+    const flat = this.names.length > 2 ? ", drawn without their other states" : "";
+    const summary = el("summary", { text: `${edges.length === 1 ? "1 edge state" : `${edges.length} edge states`} (diamonds${flat})` });
+    return el("li", {}, el("details", { open: edges.length <= FEW }, summary, listed));
+  }
+
   // ---- painting ----------------------------------------------------------------------------
 
+  /** Paint the edge states, below the path of a start. */
   paint(ctx, frame, colours) {
     for (const edge of this.known?.edges ?? []) for (const point of edge.section) diamond(ctx, frame, this.drawn(point), edge.multipliers ? 5 : 3, colours);
+  }
+
+  /** Paint the arrows over all else. */
+  paintFront(ctx, frame, colours) {
     for (const [which, dash] of SHOCKS) {
       const shock = this.shocks?.[which];
       if (shock?.startable) arrow(ctx, frame, this.drawn(shock.from), this.across(shock.jump), dash, colours.ink, colours.card);
@@ -245,9 +259,8 @@ function endOf({ label, motion, status, periods, period, attractor }, own) {
   return period ? `is led to ${what}${after}` : `ends on no attractor of the run: ${what}${after}`;
 }
 
-function edgeSentence({ between, kind, period, section, multipliers, eigenvalues }, view) {
+function edgeSentence({ between, kind, period, section, multipliers, eigenvalues }) {
   const values = (multipliers ?? eigenvalues ?? []).map(([re, im]) => (Math.abs(im) < 1e-12 ? number(re) : `${number(re)} ${im < 0 ? "−" : "+"} ${number(Math.abs(im))}i`));
   const what = multipliers ? `, period ${period}, multipliers ${values.join(", ")}` : eigenvalues ? `, eigenvalues ${values.join(", ")} 1/s` : `, ${section.length} section points`;
-  const flat = view.model.states.length > 2 ? " Its points are drawn without their other states." : "";
-  return `Edge state between ${between.join(" and ")} (diamonds): ${kind}${what}.${flat}`;
+  return `Between ${between.join(" and ")}: ${kind}${what}.`;
 }
