@@ -13,16 +13,12 @@ from pipeline.analysis.resilience.table import end_of
 from pipeline.explorer.data.clicked_orbit import finite
 from pipeline.explorer.data.explored import ExploredRun
 from pipeline.explorer.data.overlays import MOST_SECTION, SAME_VALUE
+from pipeline.explorer.data.view import can_have
 from pipeline.layout.attractor_letters import letter
 from pipeline.layout.vocabulary import ATTRACTS, KINDS
 from pipeline.products.attractors import AttractorOptions
 from pipeline.runs.derive import options_of
 from pipeline.store.run import Run
-
-NOT_COMPUTED = {
-    "resilience": "critical shocks are not computed: magpend analyse resilience DIR",
-    "edge": "edge states are not computed: magpend analyse edge DIR --between A B",
-}
 
 
 def disturbances(run: Run, at: Mapping[str, int]) -> dict[str, Any]:
@@ -51,12 +47,19 @@ def disturbances(run: Run, at: Mapping[str, int]) -> dict[str, Any]:
     place = explored.place(at)
     shocks = next((list(_shocks(explored, one)) for one in _here(explored, "resilience", place)), None)
     edges = [edge for one in _here(explored, "edge", place) for edge in _edges(one)]
-    missing = {"resilience": shocks is None, "edge": not edges}
-    return {
-        "shocks": shocks or [],
-        "edges": edges,
-        "notes": [sentence for name, sentence in NOT_COMPUTED.items() if missing[name]],
-    }
+    notes = []
+    if run_has_basins(explored):
+        if shocks is None:
+            notes.append("critical shocks are not computed here: magpend analyse resilience DIR")
+        if not edges:
+            point = "".join(f" --at {name}=VALUE" for name in place)
+            notes.append(f"edge states are not computed here: magpend analyse edge DIR --between A B{point}")
+    return {"shocks": shocks or [], "edges": edges, "notes": notes}
+
+
+def run_has_basins(run: ExploredRun) -> bool:
+    """Return whether shocks of a run's attractors and edge states can be computed; they need independent starts."""
+    return run.remembered("has basins", lambda: can_have(run, "resilience"))
 
 
 def _here(run: ExploredRun, name: str, place: Mapping[str, int]) -> Iterator[xr.Dataset]:
