@@ -180,3 +180,15 @@ def test_noisy_start__is_refused_in_a_sentence(watcher, monkeypatch):
     assert "seed" in noisy(watcher, noise=0.1, seed=-1)[0]["error"]
     monkeypatch.setattr(noisy_starting, "TOLERANCE", 1e-12)
     assert "too few for this motion" in noisy(watcher, noise=0.1)[0]["error"]
+
+
+def test_noisy_start__takes_shorter_steps_where_it_must(watcher, monkeypatch):
+    plain = noisy(watcher, noise=0.05, periods=1)[0]
+    monkeypatch.setattr(noisy_starting, "TOLERANCE", plain["step_error"] / 1.5)
+    finer = noisy(watcher, noise=0.05, periods=1)[0]
+    assert plain["steps_per_period"] == noisy_starting.STEPS
+    assert finer["steps_per_period"] > noisy_starting.STEPS
+    assert finer["step_error"] <= noisy_starting.TOLERANCE
+    # also later on the way
+    monkeypatch.setattr(noisy_starting._NoisyPath, "choose_steps", lambda path, job: None)
+    assert "256 steps in a period are too few" in noisy(watcher, noise=0.05, periods=40)[0]["error"]
