@@ -190,5 +190,6 @@ def test_noisy_start__takes_shorter_steps_where_it_must(watcher, monkeypatch):
     assert finer["steps_per_period"] > noisy_starting.STEPS
     assert finer["step_error"] <= noisy_starting.TOLERANCE
     # also later on the way
+    monkeypatch.setattr(noisy_starting, "TOLERANCE", plain["step_error"] / 100.0)
     monkeypatch.setattr(noisy_starting._NoisyPath, "choose_steps", lambda path, job: None)
     assert "256 steps in a period are too few" in noisy(watcher, noise=0.05, periods=40)[0]["error"]
