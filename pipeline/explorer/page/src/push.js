@@ -128,7 +128,8 @@ export class Push {
   go() {
     const state = Object.fromEntries(this.names.map((name, i) => [name, this.base[i] + this.jump[i]]));
     const told = jumpOf(this.jump, this.names, this.plane) || "nothing";
-    return this.plane.integrate(state, (end) => `Pushed by ${told}, this orbit ${endOf(end, this.orbit.attrs.attractor)}`);
+    const own = this.orbit.attrs.attractor ?? null; // another orbit may be shown at the end
+    return this.plane.integrate(state, (end) => `Pushed by ${told}, this orbit ${endOf(end, own)}`);
   }
 
   /** Push by a stored shock, from the state where it was found. */
