@@ -155,11 +155,25 @@ def stored(source: Source, name: str) -> xr.Dataset | None:
         Result in memory; None if there is none. Among several sound results of these cells and this version
         of the code it is the one with the fewest options other than the defaults, then the first by name.
     """
+    return next(stored_each(source, name), None)
+
+
+def stored_each(source: Source, name: str) -> Iterator[xr.Dataset]:
+    """Yield all stored results of an analysis for the present cells of a run, in the order in which `stored` prefers
+    them.
+
+    Parameters
+    ----------
+    source
+        Run directory, or an opened run.
+    name
+        One of `pipeline.products.registry.ANALYSES`.
+    """
     run = Run.open(source)
     folder = run.info.files.below(DERIVED)
     places = [p for p in products_in(folder) if p.name.rpartition("/")[2].startswith(f"{name}-")]
     if not places:  # saves the time to compute the code's version
-        return None
+        return
     current = {"cube_digest": run.digest, "analysis_version": code_version(name), "derived_product": name}
     found = []
     for place in places:
@@ -168,9 +182,11 @@ def stored(source: Source, name: str) -> xr.Dataset | None:
             if all(attrs.get(key) == value for key, value in current.items()) and not is_outdone(run, attrs):
                 found.append((_changed_options(run, name, attrs), place.name, place))
     for _, _, place in sorted(found, key=lambda entry: entry[:2]):
-        with contextlib.suppress(DamagedError, FileNotFoundError):
-            return _placed(open_product(place), place)
-    return None
+        try:
+            result = _placed(open_product(place), place)
+        except (DamagedError, FileNotFoundError):
+            continue
+        yield result
 
 
 def _changed_options(run: Run, name: str, attrs: Mapping[str, Any]) -> int:
@@ -178,10 +194,10 @@ def _changed_options(run: Run, name: str, attrs: Mapping[str, Any]) -> int:
         options = prepared(AnalysedRun.of(run), ANALYSES[name], validated(ANALYSES[name].options, {})).plain()
     except SpecError:  # the run does not suit the defaults
         options = {}
-    return sum(options.get(key) != value for key, value in _options_of(attrs).items())
+    return sum(options.get(key) != value for key, value in options_of(attrs).items())
 
 
-def _options_of(attrs: Mapping[str, Any]) -> dict[str, Any]:
+def options_of(attrs: Mapping[str, Any]) -> dict[str, Any]:
     """Return the options with which a stored result was computed; raise DamagedError if they cannot be read."""
     try:
         given = json.loads(str(attrs.get("derived_options", "{}")))
@@ -273,7 +289,7 @@ def _kept_efforts(run: Run) -> list[tuple[dict[str, Any], tuple[float, int]]]:
         with contextlib.suppress(DamagedError, FileNotFoundError, ValueError):
             attrs = read_product_attrs(place)
             if all(attrs.get(key) == value for key, value in current.items()):
-                kept = IdentifyOptions.model_validate(_options_of(attrs))
+                kept = IdentifyOptions.model_validate(options_of(attrs))
                 found.append((_aside(kept), kept.effort))
     return found
 
@@ -286,7 +302,7 @@ def _aside(options: IdentifyOptions) -> dict[str, Any]:
 
 def is_outdone(run: Run, attrs: Mapping[str, Any]) -> bool:
     """Return whether a stored search for attractors has integrated further than the search behind a given result."""
-    name, given = str(attrs.get("derived_product")), _options_of(attrs)
+    name, given = str(attrs.get("derived_product")), options_of(attrs)
     if name not in ANALYSES or not issubclass(ANALYSES[name].options, IdentifyOptions):
         return False
     own = IdentifyOptions.model_validate({k: given[k] for k in IdentifyOptions.model_fields if k in given})

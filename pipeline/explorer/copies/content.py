@@ -17,6 +17,7 @@ from magpend_core.status import Status
 from pipeline.explorer.copies.packing import packed, packed_json
 from pipeline.explorer.data.arrays import unpack_arrays
 from pipeline.explorer.data.diagram import points
+from pipeline.explorer.data.disturbances import disturbances
 from pipeline.explorer.data.explored import ExploredRun
 from pipeline.explorer.data.overlays import attractors, branches, curves
 from pipeline.explorer.data.planes import plane
@@ -117,6 +118,9 @@ def gather(run: ExploredRun, quantities: Sequence[str] = ()) -> Copied:
     )
     everywhere = ((place_key(run, at), partial(attractors, run, at)) for at in places(run))
     _answers(copied, "attractors", everywhere, alike=not known["attractors"])
+    disturbed = bool(run.kept_each("resilience") or run.kept_each("edge"))
+    everywhere = ((place_key(run, at), partial(disturbances, run, at)) for at in places(run))
+    _answers(copied, "disturbances", everywhere, alike=not disturbed)
     return copied
 
 

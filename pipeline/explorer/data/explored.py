@@ -11,7 +11,7 @@ import numpy as np
 
 from pipeline.layout.cells import CellMap, Inputs, parameter_axes
 from pipeline.layout.vocabulary import FREQUENCY_DIM, is_start_dim
-from pipeline.runs.derive import stored
+from pipeline.runs.derive import stored, stored_each
 from pipeline.specification.problems import unknown_name
 from pipeline.store.files import DERIVED
 from pipeline.store.products import products_in
@@ -101,6 +101,10 @@ class ExploredRun(Run):
                 self._opened[key] = None if self.spec.unsteady else stored(self, name)
             found: xr.Dataset | None = self._opened[key]
             return found
+
+    def kept_each(self, name: str) -> list[xr.Dataset]:
+        """Return all stored results of an analysis, such as one for each pair of attractors; see `stored_each`."""
+        return self.remembered(f"each {name}", lambda: [] if self.spec.unsteady else list(stored_each(self, name)))
 
     def bifurcation_curves(self) -> xr.Dataset | None:
         """Return the stored bifurcation curves of this run, or of the other run named for them; None if there are

@@ -242,10 +242,11 @@ def _has(run: ExploredRun) -> dict[str, bool]:
 def commands(run: ExploredRun, directory: str) -> dict[str, str]:
     """Return the command for each analysis that is not yet stored and that the run allows."""
     wanted = [name for name in ("attractors", "branches", "basins") if run.kept(name) is None]
-    return {name: f"magpend analyse {name} {shlex.quote(directory)}" for name in wanted if _can_have(run, name)}
+    return {name: f"magpend analyse {name} {shlex.quote(directory)}" for name in wanted if can_have(run, name)}
 
 
-def _can_have(run: ExploredRun, name: str) -> bool:
+def can_have(run: ExploredRun, name: str) -> bool:
+    """Return whether an analysis suits a run, with its default options."""
     if run.spec.unsteady:
         return False
     analysis = ANALYSES[name]

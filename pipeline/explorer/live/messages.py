@@ -20,6 +20,9 @@ MOST_RESOLUTION, LEAST_RESOLUTION = 512, 16
 MOST_PERIODS = 20_000
 """Longest start [drive periods or returns]."""
 
+MOST_NOISE = 10.0
+"""Strongest noise on a start [scales over the square root of a second]."""
+
 Name = Annotated[str, Field(min_length=1, max_length=200)]
 Values = Annotated[dict[Name, float], Field(max_length=200)]
 Pair = tuple[float, float]
@@ -52,13 +55,24 @@ class Job(Message):
 
 
 class StartRequest(Job):
-    """Message that requests to integrate one initial state and to name the attractor that it reaches."""
+    """Message that requests to integrate one initial state and to name the attractor that it reaches.
+
+    Attributes
+    ----------
+    noise
+        Strength of white noise on the rates, in units of their scales over the square root of a second. With
+        noise no attractor is named.
+    seed
+        Seed of the noise.
+    """
 
     do: Literal["start"]
     parameters: Values = {}
     frequency: float | None = Field(None, gt=0)
     state: Values = {}
     periods: int | None = Field(None, ge=1, le=MOST_PERIODS)
+    noise: float = Field(0.0, ge=0, le=MOST_NOISE)
+    seed: int = Field(0, ge=0, le=2**53)
 
 
 class SliceRequest(Job):

@@ -13,6 +13,7 @@ from pipeline.analysis.attractors.finding.cell_blocks import Block
 from pipeline.explorer.data.series import SAMPLES, fixed_points, series
 from pipeline.explorer.live.jobs import Job
 from pipeline.explorer.live.messages import StartRequest
+from pipeline.explorer.live.noisy_starting import noisy_start
 from pipeline.explorer.live.settling import Flight, Place, conclude, run_start, system_at
 from pipeline.layout.vocabulary import ABSENT
 
@@ -32,6 +33,9 @@ def start(live: LiveRun, job: Job) -> None:
     assert isinstance(request, StartRequest)
     place = live.place(request.parameters, request.frequency)
     state = live.state(request.state, place)
+    if request.noise:
+        noisy_start(live, job, place, state)
+        return
     path = _Path(live, job, place, state)
     path.show(FIRST_PERIODS)
     sections = _Sections(job)

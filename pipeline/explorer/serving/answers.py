@@ -12,6 +12,7 @@ from pydantic import ValidationError
 
 from pipeline.explorer.data.clicked_orbit import orbit
 from pipeline.explorer.data.diagram import diagram
+from pipeline.explorer.data.disturbances import disturbances
 from pipeline.explorer.data.explored import ExploredRun, ExplorerError
 from pipeline.explorer.data.overlays import attractors, branches, curves
 from pipeline.explorer.data.parameter_plane import curve_orbit, parameter_plane
@@ -129,6 +130,10 @@ def _attractors(run: ExploredRun, query: Query, live: LiveRun | None) -> Reply:
     return json_reply(attractors(run, query.at))
 
 
+def _disturbances(run: ExploredRun, query: Query, live: LiveRun | None) -> Reply:
+    return json_reply(disturbances(run, query.at))
+
+
 def _orbit(run: ExploredRun, query: Query, live: LiveRun | None) -> Reply:
     # compiling the code for multipliers would delay the orbit too long
     linearised = live is None or live.is_warm("maps")
@@ -173,6 +178,7 @@ ANSWERS: dict[str, Answer] = {
         Answer("curves", _curves),
         Answer("branches", _branches),
         Answer("attractors", _attractors),
+        Answer("disturbances", _disturbances),
         Answer("orbit", _orbit, integrates=True),
         Answer("plane", _plane),
         Answer("parameter-plane", _parameter_plane),

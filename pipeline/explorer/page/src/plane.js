@@ -4,8 +4,10 @@
 import { el, labelledSelect, numberField, shortened, show } from "./dom.js";
 import { Frame } from "./frame.js";
 import { number } from "./facts.js";
+import { Noise } from "./noise.js";
 import { axisOf, indicesOf } from "./orbit.js";
 import { idAt, imageOf, mapOf } from "./plane-map.js";
+import { Push } from "./push.js";
 import { brokenLines } from "./wrapping.js";
 
 const MOST_KEPT = 12;
@@ -58,10 +60,12 @@ export class Plane {
     this.frame = new Frame(body, { label: "", ratio: 0.8 });
     this.frame.paintBack = (ctx, frame, colours) => this.paint(ctx, frame, colours);
     this.frame.paintFront = (ctx, frame, colours) => this.paintCross(ctx, frame, colours);
+    this.push = new Push(this);
     body.append(this.readout, this.legend, this.told);
     this.listen();
     if (this.live) this.buildLive(body);
     else body.append(el("p", { class: "note", text: NO_LIVE }));
+    body.append(this.push.element);
     this.dress();
   }
 
@@ -73,7 +77,8 @@ export class Plane {
     this.bounds = el("div", { class: "bounds" });
     this.startFields = el("span", { class: "starts" });
     const begin = el("button", { type: "button", text: "Integrate this start", on: { click: () => this.begin(this.cross ?? this.middle) } });
-    body.append(el("div", { class: "controls" }, this.startFields, begin));
+    this.noise = new Noise(this.view, (name) => this.named(name));
+    body.append(el("div", { class: "controls" }, this.startFields, begin), this.noise.element);
     const more = el("details", {}, el("summary", { text: "Bounds, and the other states" }), this.bounds);
     body.append(el("div", { class: "controls" }, this.compute, this.resolution.element, this.stop), this.progress, more);
   }
@@ -104,7 +109,9 @@ export class Plane {
     const asked = ++this.asked;
     [this.orbit, this.isFollowed] = [orbit, isFollowed];
     const place = JSON.stringify([orbit.attrs.parameters, orbit.attrs.frequency, this.pair]);
-    if (place === this.place) return;
+    const isSame = place === this.place;
+    this.push.show(orbit, isFollowed);
+    if (isSame) return;
     this.place = place;
     this.job?.cancel();
     this.cross = null;
@@ -212,6 +219,7 @@ export class Plane {
       ctx.stroke();
     }
     ctx.globalAlpha = 1;
+    this.push.paint(ctx, frame, colours);
     ctx.strokeStyle = colours.card;
     ctx.lineWidth = 1;
     for (const [x, y] of this.dots) {
@@ -241,7 +249,8 @@ export class Plane {
   }
 
   paintCross(ctx, frame, colours) {
-    if (!this.cross) return;
+    this.push.paintFront(ctx, frame, colours);
+    if (!this.cross || this.push.isOn) return;
     const [px, py] = [frame.x(this.cross[0]), frame.y(this.cross[1])];
     for (const [width, colour] of [[4, colours.card], [2, colours.ink]]) {
       ctx.lineWidth = width;
@@ -278,9 +287,10 @@ export class Plane {
     front.tabIndex = 0;
     front.setAttribute("role", "application");
     front.addEventListener("click", (event) => {
-      const place = this.frame.at(event);
+      const place = this.push.isOn ? null : this.frame.at(event);
       if (place) this.begin(place);
     });
+    this.push.listen(front);
     front.addEventListener("keydown", (event) => this.key(event));
     front.addEventListener("focus", () => this.moveCross(0, 0));
   }
@@ -289,8 +299,9 @@ export class Plane {
     const steps = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
     if (event.key in steps) {
       const [dx, dy] = steps[event.key].map((step) => step * (event.shiftKey ? 10 : 1));
-      this.moveCross(dx, dy);
-    } else if (event.key === "Enter" || event.key === " ") this.begin(this.cross);
+      if (this.push.isOn) this.push.nudge(dx, dy);
+      else this.moveCross(dx, dy);
+    } else if (event.key === "Enter" || event.key === " ") this.push.isOn ? this.push.go() : this.begin(this.cross);
     else return;
     event.preventDefault();
   }
@@ -330,14 +341,20 @@ export class Plane {
   async begin(place) {
     if (!place || !this.orbit) return;
     this.putCross(place);
+    await this.integrate({ ...this.fixed, [this.pair[0]]: place[0], [this.pair[1]]: place[1] }, endSentence);
+  }
+
+  /** Integrate a state; `sentence` says of its end what is told. */
+  async integrate(state, sentence) {
     this.forgetStart();
-    const start = { ...this.fixed, [this.pair[0]]: place[0], [this.pair[1]]: place[1] };
-    this.told.textContent = "Integrating this start ...";
+    const { request } = this.noise;
+    this.told.classList.toggle("lost", Boolean(request.noise));
+    this.told.textContent = request.noise ? "Integrating with noise: the first time, code is compiled for some seconds ..." : "Integrating this start ...";
     const begun = (this.begun = {});
     try {
-      const end = await this.starter.start({ ...this.point, state: start }, (kind, piece) => begun === this.begun && this.add(kind, piece));
+      const end = await this.starter.start({ ...this.point, ...request, state }, (kind, piece) => begun === this.begun && this.add(kind, piece));
       if (begun !== this.begun || end.cancelled) return;
-      this.told.textContent = endSentence(end);
+      this.told.textContent = end.noise ? this.noise.sentence(end) : sentence(end);
       this.end = end.colour;
       this.frame.repaint();
     } catch (error) {
@@ -347,6 +364,7 @@ export class Plane {
 
   forgetStart() {
     this.begun = null;
+    this.told.classList.remove("lost");
     [this.paths, this.dots, this.end] = [[], [], null];
     this.frame.repaint();
   }

@@ -117,6 +117,10 @@ export class ExportSource {
     return this.answer("attractors", placeKey(this.described.axes, at));
   }
 
+  disturbances({ at }) {
+    return this.answer("disturbances", placeKey(this.described.axes, at));
+  }
+
   async plane({ at }) {
     const { objects, missing, none } = this.about.planes;
     const name = objects[placeKey(this.described.axes, at)];

@@ -102,6 +102,11 @@ export class ServerSource {
     return this.json(`attractors${queryOf({ at })}`);
   }
 
+  /** Critical shocks and edge states at a place of the axes. */
+  disturbances({ at }) {
+    return this.json(`disturbances${queryOf({ at })}`);
+  }
+
   /** Data of a view to keep: a Blob of CSV or NetCDF. */
   async table(kind, query, format) {
     return (await this.ask(`table${queryOf({ view: kind, format, ...query })}`)).blob();

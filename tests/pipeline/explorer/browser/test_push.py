@@ -1,0 +1,95 @@
+"""Pushes, stored shocks and noisy starts in a real browser."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipeline.explorer.data.disturbances import disturbances
+from pipeline.runs.derive import stored
+from pipeline.store.run import Run
+from tests.pipeline.explorer.browser.conftest import served
+from tests.pipeline.explorer.browser.test_diagram import drawn
+from tests.pipeline.explorer.browser.test_panels import QUIET, choose, note_of
+from tests.pipeline.explorer.shocked_wells import SMOOTH, shocked_wells
+
+RATE = "x\u0307"
+"""The velocity as the page writes it."""
+
+
+@pytest.fixture(scope="module")
+def wells(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return shocked_wells(tmp_path_factory.mktemp("pushed"))
+
+
+@pytest.fixture(scope="module")
+def address(wells: Path) -> Iterator[str]:
+    with served(wells) as found:
+        yield found
+
+
+def pressed(page: Any, name: str) -> None:
+    page.get_by_role("button", name=name).click()
+
+
+def test_push__is_dragged_and_tried_and_shaken(visit: Callable[..., Any], address: str, wells: Path) -> None:
+    found = stored(Run.open(wells), "attractors")
+    assert found is not None
+    ids = found["attractor_id"].transpose("amplitude", "x_0", "v_0").values.ravel()
+    opened = drawn(visit(address, **QUIET))
+    page = opened.page
+    choose(opened, int(np.flatnonzero(ids == 0)[0]))
+    shocks, edges = (disturbances(wells, {"amplitude": SMOOTH})[key] for key in ("shocks", "edges"))
+    (shock,) = (s["shortest"] for s in shocks if s["attractor"] == 0)
+
+    # what is stored is listed
+    listed = page.locator(".disturbances > li")
+    listed.nth(2).wait_for()
+    texts = listed.all_text_contents()
+    assert f"{shock['high']:.4g} of the scales" in texts[1]
+    assert f"leads to {shock['leads_to']}" in texts[1]
+    for value, _ in edges[0]["multipliers"]:
+        assert f"{value:.4g}" in texts[2]
+    assert "Between A and B: periodic orbit, period 1" in texts[2]
+
+    # the stored shock leads away
+    page.get_by_role("button", name=re.compile("Shortest way out .*: try it")).click()
+    assert f"is led to {shock['leads_to']}:" in note_of(opened, "plane", "Pushed by .* after")
+
+    # a shorter one, in numbers, does not
+    for label, value in zip(("Impulse x", f"Impulse {RATE}"), shock["jump"], strict=True):
+        page.get_by_label(label, exact=True).fill(repr(0.9 * value))
+        page.get_by_label(label, exact=True).press("Tab")
+    pressed(page, "Integrate after the push")
+    assert "comes back to A:" in note_of(opened, "plane", "comes back")
+
+    # dragged, the impulse ends under the pointer
+    frame = page.locator(".panel-plane .frame")
+    frame.scroll_into_view_if_needed()
+    box = frame.bounding_box()
+    page.mouse.move(box["x"] + 300, box["y"] + 90)
+    page.mouse.down()
+    page.mouse.move(box["x"] + 200, box["y"] + 120, steps=3)
+    under = page.locator(".panel-plane .readout").text_content()
+    page.mouse.up()
+    told = note_of(opened, "plane", "Pushed by .* after")
+    place = [float(v.replace("−", "-")) for v in re.findall(r"= (−?[\d.]+)", under)]
+    impulse = [float(page.get_by_label(label, exact=True).input_value()) for label in ("Impulse x", f"Impulse {RATE}")]
+    np.testing.assert_allclose(np.array(shock["from"]) + impulse, place, atol=2e-4)
+    assert told.startswith(f"Pushed by x {'+' if impulse[0] > 0 else '−'}{abs(impulse[0]):.4g}"[:16])
+
+    # with noise no attractor is named
+    page.get_by_label(f"Noise on {RATE}").fill("0.05")
+    pressed(page, "Integrate after the push")
+    told = note_of(opened, "plane", "no attractor is named")
+    assert told.startswith("Noisy: strength 0.05")
+    assert "seed 0" in told
+    page.get_by_label(f"Noise on {RATE}").fill("0")
+    pressed(page, "Integrate this start")
+    assert "ends on" in note_of(opened, "plane", "This start ends on")
+    assert opened.complaints == []
