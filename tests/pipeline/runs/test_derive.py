@@ -149,7 +149,7 @@ def test_code_version__follows_what_an_analysis_imports(monkeypatch):
     versions.code_version.cache_clear()
     after = {name: versions.code_version(name) for name in ANALYSES}
     versions.code_version.cache_clear()
-    assert [name for name in ANALYSES if before[name] != after[name]] == ["basins", "overlaps"]
+    assert [name for name in ANALYSES if before[name] != after[name]] == ["basins", "overlaps", "resilience", "edge"]
 
 
 def test_builds_on__is_what_the_code_derives():
@@ -268,7 +268,7 @@ def test_attractors__a_default_given_is_no_other_option(whole):
     two = derive(
         whole.info.directory,
         "attractors",
-        {"threshold": 0.3, "look_back": 3, "n_sample": 32, "n_points": 64.0, **QUICK},
+        {"threshold": 0.3, "look_back": 3, "n_sample": 24, "n_points": 64.0, **QUICK},
     )
     assert one.encoding["source"] == two.encoding["source"]
 
