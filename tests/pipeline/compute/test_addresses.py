@@ -136,17 +136,16 @@ def test_ask__plain_where_tls_is_spoken(tmp_path, monkeypatch):
         scheduler_kwargs={"dashboard": False, "dashboard_address": "127.0.0.1:0"},
         silence_logs=60,
     ) as cluster:
+        settings = {}
         for name, key in (("CA_FILE", "ca_file"), ("CLIENT__CERT", "cert"), ("CLIENT__KEY", "key")):
             file = tmp_path / key
             file.write_text(security.get_tls_config_for_role("client")[key])
             variable = f"DASK_DISTRIBUTED__COMM__TLS__{name}"
-            dask.config.set({f"distributed.comm.tls.{name.lower().replace('__', '.')}": str(file)})
+            settings[f"distributed.comm.tls.{name.lower().replace('__', '.')}"] = str(file)
             monkeypatch.setenv(variable, str(file))
-        try:
+        with dask.config.set(settings):
             ask(read_address(cluster.scheduler_address, "--scheduler"))
             assert "for tls://" in refusal(cluster.scheduler_address.replace("tls", "tcp"))
-        finally:
-            dask.config.refresh()
 
 
 @pytest.mark.parametrize(

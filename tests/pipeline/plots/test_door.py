@@ -91,6 +91,7 @@ def other_value(model, name):
         "low": 2.0,
         "high": 2.5,
         "shown": 2,
+        "between": ("A", "C"),
         "radius": 0.5,
     }
     if name in special:
@@ -103,7 +104,11 @@ def other_value(model, name):
 @pytest.mark.parametrize("name", list(FIGURES))
 def test_label__every_option_that_changes_the_picture_changes_the_name(name):
     model = FIGURES[name].options
-    required = {key: {"second": "q"}.get(key, 1.0) for key, field in model.model_fields.items() if field.is_required()}
+    required = {
+        key: {"second": "q", "between": ("A", "B")}.get(key, 1.0)
+        for key, field in model.model_fields.items()
+        if field.is_required()
+    }
     base = model.model_construct(**required)
     seen = {base.label(): "nothing"}
     for key in model.model_fields:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import json
 import subprocess
+import tempfile
 import time
 from pathlib import Path
 
@@ -67,11 +68,10 @@ pytestmark = [pytest.mark.skipif(bool(slurm.why_not()), reason=slurm.why_not() o
 
 
 @pytest.fixture
-def shell(tmp_path, environment, monkeypatch):
+def shell(environment, monkeypatch):
     """A SLURM that runs, and commands of a shell in which it can be used."""
-    folder = tmp_path / "slurm"
-    folder.mkdir()
-    with slurm.running(folder) as variables:
+    # the name of munge's socket has at most 108 letters, which pytest's own folder can use up
+    with tempfile.TemporaryDirectory(prefix="slurm-") as folder, slurm.running(Path(folder)) as variables:
         for name, value in {**environment, **variables}.items():
             monkeypatch.setenv(name, value)
         monkeypatch.delenv("MAGPEND_CLUSTER", raising=False)
