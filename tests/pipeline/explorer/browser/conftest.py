@@ -51,6 +51,7 @@ n_keep = 20
 CANDIDATES = ("/usr/bin/chromium", "chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 
 WAIT_MS = 60_000  # a machine that is busy with other tests
+ENDING_S = 60.0  # what a server may take to end after SIGTERM
 
 
 def chromium() -> str | None:
@@ -122,6 +123,11 @@ def served(directory: Path, *words: str) -> Iterator[str]:
             yield address
         finally:
             process.terminate()
+            try:
+                process.wait(ENDING_S)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                raise
 
 
 @pytest.fixture(scope="session")
