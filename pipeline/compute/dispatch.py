@@ -142,21 +142,17 @@ class Window:
         futures = self._client.map(self._task, tickets, indices, pure=False)
         for ticket, index, future in zip(tickets, indices, futures, strict=True):
             self._flights[ticket] = _Flight(index, future)
-            future.add_done_callback(partial(self._on_end, ticket))
+            # Not by the future's own callbacks: all clients of this process share one thread for these, and a
+            # callback that waits for a client that is closed meanwhile would hold up every later run.
+            ended = asyncio.run_coroutine_threadsafe(_outcome(self._client, future), self._client.loop.asyncio_loop)
+            ended.add_done_callback(partial(self._on_end, ticket))
 
     def _on_start(self, event: tuple[float, dict[str, Any]]) -> None:
         self._news.put(("start", event[1]["ticket"], event[1]["worker"]))
 
-    def _on_end(self, ticket: int, future: Any) -> None:
-        """Start to fetch the result of a finished task. This runs in a thread of the dask client."""
-        if ticket not in self._flights:
-            return
-        if future.status in ("error", "cancelled"):
-            error = future.exception() if future.status == "error" else asyncio.CancelledError()
-            self._news.put(("end", ticket, (None, error)))
-        else:  # finished; if its worker has died since, the fetch makes dask compute the task again
-            fetch = asyncio.run_coroutine_threadsafe(_fetched(self._client, future), self._client.loop.asyncio_loop)
-            fetch.add_done_callback(lambda fetched: self._news.put(("end", ticket, fetched.result())))
+    def _on_end(self, ticket: int, ended: Any) -> None:
+        if not ended.cancelled():  # as it is when the client closes
+            self._news.put(("end", ticket, ended.result()))
 
     def _wait(self) -> Iterator[tuple[str, int, Any]]:
         """Wait for tasks to start or end, at most `TICK_S`, and yield these events."""
@@ -298,11 +294,12 @@ class Watch:
         self._heard.pop(address, None)
 
 
-async def _fetched(client: Any, future: Any) -> tuple[Any, BaseException | None]:
+async def _outcome(client: Any, future: Any) -> tuple[Any, BaseException | None]:
+    """Wait for a task; return its result or its error. If its worker died after the end, dask computes it again."""
     try:
         return await client.gather(future, asynchronous=True), None
     except (Exception, asyncio.CancelledError) as error:
-        return None, error
+        return None, asyncio.CancelledError() if future.status == "cancelled" else error
 
 
 def _restarted(client: Any, address: str) -> None:

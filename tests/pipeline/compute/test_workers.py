@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from functools import partial
 from pathlib import Path
 
 import pytest
+from distributed import Client
 
 from pipeline.compute import clients, dispatch, limits, local
 from pipeline.compute.addresses import SchedulerError
@@ -70,19 +73,24 @@ def test_workers__poison_kills_them_and_the_others_finish(faulty, tmp_path, monk
 
 def test_workers__one_that_dies_with_a_result_that_was_not_fetched_yet(faulty, tmp_path, monkeypatch):
     """The task is computed again: nobody takes the scheduler for gone."""
-    on_end, states = Window._on_end, []
+    outcome, states = dispatch._outcome, []
 
-    def late(self, ticket, future):
+    async def late(client, future):
         if not states:
-            (holder,) = self._client.who_has([future])[future.key]
-            os.kill(self._client.run(os.getpid)[holder], signal.SIGKILL)
-            until = time.monotonic() + 120
-            while future.status == "finished" and time.monotonic() < until:
-                time.sleep(0.01)
-            states.append(future.status)
-        on_end(self, ticket, future)
+            states.append("finished")
+            await wait_until(lambda: future.status == "finished")
+            (holder,) = (await client.scheduler.who_has(keys=[future.key]))[future.key]
+            os.kill((await client._run(os.getpid))[holder], signal.SIGKILL)
+            await wait_until(lambda: future.status != "finished")
+            states[0] = future.status
+        return await outcome(client, future)
 
-    monkeypatch.setattr(Window, "_on_end", late)
+    async def wait_until(true):
+        until = time.monotonic() + 120
+        while not true() and time.monotonic() < until:
+            await asyncio.sleep(0.01)
+
+    monkeypatch.setattr(dispatch, "_outcome", late)
     task = partial(faulty.raising, str(tmp_path))
     found = [result["task"] for result in run_tasks(task, range(6), seconds=one_second, workers=2)]
     assert sorted(found) == list(range(6))
@@ -125,6 +133,17 @@ def test_workers__tasks_that_hang(faulty, tmp_path, monkeypatch):
     assert sorted(found) == [0, 1, 2, 3, 5]
     assert [line.split(":")[0] for line in lines if "far more" in line].count("task 4") == 3
     assert tries(tmp_path)[2] == 2
+
+
+def test_workers__a_blocked_callback_of_another_client_holds_up_nobody(faulty, tmp_path):
+    task = partial(faulty.raising, str(tmp_path))
+    free = threading.Event()
+    with local_cluster(1) as cluster, Client(cluster) as client:
+        client.submit(abs, -1).add_done_callback(lambda future: free.wait())
+        try:
+            assert len(list(run_tasks(task, range(3), seconds=one_second, workers=1))) == 3
+        finally:
+            free.set()
 
 
 @contextlib.contextmanager
