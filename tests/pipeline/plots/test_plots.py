@@ -326,18 +326,6 @@ def test_plot_bifurcation__fuller_pixels_are_darker(monkeypatch):
     assert_ink(single, style.VERMILLION)
 
 
-def test_plots__integrate_nothing_and_import_no_kernel(monkeypatch):
-    import magpend_core
-
-    def refuse(*args, **options):
-        raise AssertionError("the kernel was called")
-
-    for name in ("run_branches", "sections", "trajectory"):
-        if hasattr(magpend_core, name):
-            monkeypatch.setattr(magpend_core, name, refuse)
-    plot_bifurcation(make_cube())
-
-
 def test_plots__import_neither_kernels_nor_executor():
     import subprocess
 
