@@ -365,3 +365,30 @@ def test_agents__commands_do_what_they_say(tmp_path, monkeypatch):
     spec.loader.exec_module(tutorials)
     monkeypatch.chdir(tmp_path)
     tutorials.follow(ROOT / "AGENTS.md", tmp_path)
+
+
+# the article
+
+
+def test_paper__cites_what_its_bibliography_has():
+    text = (ROOT / "paper" / "paper.md").read_text("utf-8")
+    listed = (ROOT / "paper" / "paper.bib").read_text("utf-8")
+    entries = dict(re.findall(r"^@\w+\{(\w+),\n(.*?)^\}", listed, re.MULTILINE | re.DOTALL))
+    cited = set(re.findall(r"@([a-z]+\d{4})\b", text))
+    assert cited == set(entries)
+    for name, entry in entries.items():
+        assert re.search(r"^  (doi|url|isbn) +=", entry, re.MULTILINE), name
+        assert re.search(rf"year += \{{{name[-4:]}\}}", entry), name
+    body = text.partition("\n---\n")[2].partition("# References")[0]
+    assert 750 < len(body.split()) < 1750  # what the journal asks for
+
+
+def test_paper__figures_are_made_by_the_commands_of_its_script():
+    text = (ROOT / "paper" / "paper.md").read_text("utf-8")
+    spec = importlib.util.spec_from_file_location("figures", ROOT / "paper" / "figures.py")
+    figures = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(figures)
+    assert set(re.findall(r"\]\((\w+\.png)\)", text.replace("\n", " "))) == set(figures.FIGURES)
+    assert all((ROOT / "paper" / name).is_file() for name in figures.FIGURES)
+    for commands, _ in figures.FIGURES.values():
+        assert commands[0].split()[1] in shipped_workflows()
