@@ -288,10 +288,17 @@ def executable(path, text):
     path.chmod(0o755)
 
 
+def too_old(path):
+    """Make a Python that says it is of the version before the oldest that is supported."""
+    before = (3, int(OLDEST.partition(".")[2]) - 1, 9)
+    code = f"import sys; sys.version_info = {before}; exec(sys.argv.pop(1))"
+    executable(path, f'exec {shlex.quote(sys.executable)} -c "{code}" "$2" "$3"')
+
+
 def test_ci__takes_a_newer_python_where_python3_is_too_old(tmp_path):
     (path := tmp_path / "path").mkdir()
     (folder := tmp_path / "scratch").mkdir()
-    executable(path / "python3", "exit 0")  # what one that is too old says
+    too_old(path / "python3")
     executable(path / "python3.99", f'exec {shlex.quote(sys.executable)} "$@"')
     done = chosen_python(path, folder)
     assert done.returncode == 0, done.stderr
@@ -315,7 +322,7 @@ def test_ci__asks_pyenv_for_its_versions(tmp_path):
 
 def test_ci__says_that_no_python_is_new_enough(tmp_path):
     (path := tmp_path / "path").mkdir()
-    executable(path / "python3", "exit 0")
+    too_old(path / "python3")
     done = chosen_python(path, tmp_path)
     assert done.returncode == 1
     assert done.stderr == f"no Python {OLDEST} or later on PATH or in pyenv; install one\n"
