@@ -38,7 +38,7 @@ html_favicon = "site/favicon.svg"
 html_theme_options = {"navigation_with_keys": True}
 html_permalinks_icon = "#"
 
-TOP = {"changelog": "CHANGELOG.md", "contributing": "CONTRIBUTING.md"}
+TOP = {"changelog": "CHANGELOG.md", "contributing": "CONTRIBUTING.md", "programs": "AGENTS.md"}
 """Pages whose text is a file at the top of the repository."""
 
 GROUPS = {
@@ -147,6 +147,8 @@ def _read(app: Any, page: str, source: list[str]) -> None:
     if page in TOP:
         # their links are seen from the top of the repository
         text = (HERE.parent / TOP[page]).read_text("utf-8").replace("](docs/", "](")
+        for target, name in TOP.items():
+            text = text.replace(f"]({name})", f"]({target}.md)")
     up = "../" * page.count("/")
     for target, name in (*TOP.items(), ("index", "README.md")):
         text = text.replace(f"]({up}../{name})", f"]({up}{target}.md)")

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from pkgutil import resolve_name
-from typing import Generic, TypeVar
 
 from pipeline.products.product import Analysis, CellProduct, Figure
 
-P = TypeVar("P", CellProduct, Analysis, Figure)
 
-
-class Registry(Mapping[str, P], Generic[P]):
+class Registry[P: (CellProduct, Analysis, Figure)](Mapping[str, P]):
     """Mapping from names to products; each product is imported when it is first used.
 
     Parameters

@@ -14,11 +14,9 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator, Sequence
 from contextvars import ContextVar
-from typing import Protocol, TypeVar
+from typing import Protocol
 
 from magpend_core.compilation import heard_by
-
-T = TypeVar("T")
 
 
 class Listener(Protocol):
@@ -56,7 +54,7 @@ def is_heard() -> bool:
     return _listener.get() is not None
 
 
-def track(items: Sequence[T], what: str) -> Iterator[T]:
+def track[T](items: Sequence[T], what: str) -> Iterator[T]:
     """Yield items, and report the number of finished items as progress.
 
     Parameters

@@ -51,7 +51,7 @@ def _within(ds: xr.Dataset, axis: str, options: Options) -> xr.Dataset:
     if "at" in options:
         at = _index(ds, axis, float(options["at"]))
         return ds.isel({axis: [] if at is None else [at]})
-    slack = 1e-9 * max(abs(values).max(), 1.0)
+    slack = 1e-9 * max(float(np.abs(values).max()), 1.0)
     low, high = float(options.get("low", -math.inf)), float(options.get("high", math.inf))
     return ds.isel({axis: (values >= low - slack) & (values <= high + slack)})
 

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, TypeVar
+from typing import Any
 
 from pydantic import BaseModel, ValidationError
-
-M = TypeVar("M", bound=BaseModel)
 
 _TAG = "("
 """First character of the union tags in pydantic's locations, which do not belong to the key path."""
@@ -64,7 +62,7 @@ def unknown_name(what: str, name: str, known: Iterable[str]) -> str:
     return f"unknown {what} {name!r}; {hint}"
 
 
-def validated(model: type[M], values: Mapping[str, Any], prefix: str = "") -> M:
+def validated[M: BaseModel](model: type[M], values: Mapping[str, Any], prefix: str = "") -> M:
     """Validate a table of options and return it.
 
     Parameters

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Generator, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
 
 import numpy as np
 
@@ -18,8 +17,6 @@ from magpend_core.orbits import section_map
 from pipeline.analysis.branches.problems import Ends, Problem, Rows, Value
 from pipeline.analysis.tolerances import BRANCH_RTOL
 from pipeline.products.reporting import report
-
-T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -30,11 +27,11 @@ class Query:
     u: np.ndarray
 
 
-Steps = Generator[Query, Value, T]
+type Steps[T] = Generator[Query, Value, T]
 """A computation that returns a `T`."""
 
 
-def run_together(computations: Sequence[Steps[T]], what: str = "", rtol: float = BRANCH_RTOL) -> list[T]:
+def run_together[T](computations: Sequence[Steps[T]], what: str = "", rtol: float = BRANCH_RTOL) -> list[T]:
     """Run computations side by side to their ends, and return their results in the given order.
 
     If the work has a name, progress is reported. The length of a trace is unknown before its end, so it
@@ -74,7 +71,7 @@ def _report(
     report(what, round(n - len(going) + sum(going), 1), n)
 
 
-def run_alone(computation: Steps[T]) -> T:
+def run_alone[T](computation: Steps[T]) -> T:
     """Run one computation and return its result."""
     return run_together([computation])[0]
 

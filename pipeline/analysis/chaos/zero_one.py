@@ -173,7 +173,8 @@ def _growth(phi: Floats, c: Floats) -> Floats:
     """Compute the correlation K_c of the 0-1 test for each observable and each test frequency c, shape (cell, c)."""
     n = phi.shape[1]
     n_cut = n // 10
-    walk = np.cumsum(phi[:, None, :] * np.exp(1j * c[:, None] * np.arange(1, n + 1)), axis=-1)
+    turns: npt.NDArray[np.complex128] = np.exp(1j * c[:, None] * np.arange(1, n + 1))
+    walk = np.cumsum(phi[:, None, :] * turns, axis=-1)
     moved = _displacement(walk, n_cut)
     moved -= moved.mean(axis=-1, keepdims=True)
     lags = np.arange(n_cut) - 0.5 * (n_cut - 1)

@@ -1,0 +1,401 @@
+"""Packages as they are built and installed, their metadata, and the files that describe the project to others."""
+
+from __future__ import annotations
+
+import fnmatch
+import importlib.util
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import tarfile
+import tomllib
+import zipfile
+from email.parser import Parser
+from pathlib import Path
+
+import pytest
+import yaml
+
+from magpend_core.models import model_names
+from pipeline.cli.exits import Exit
+from pipeline.runs.workflows import shipped_workflows
+
+ROOT = Path(__file__).parents[1]
+PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
+PROJECT = PYPROJECT["project"]
+OLDEST = PROJECT["requires-python"].removeprefix(">=")
+README = (ROOT / "README.md").read_text("utf-8")
+PACKAGES = ("magpend_core/", "pipeline/", "workflows/")
+PAGE = "pipeline/explorer/page/"
+"""Sources of the explorer's page; the wheel has what is built from them."""
+
+
+def tracked():
+    """Files of the repository by name, those that are new and not ignored included."""
+    if shutil.which("git") is None or not (ROOT / ".git").exists():
+        pytest.skip("needs a git checkout")
+    words = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
+    listed = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    return {name for name in listed.split("\0") if name and (ROOT / name).is_file()}
+
+
+def copy_files(names, folder):
+    for name in names:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(ROOT / name, folder / name)
+    return folder
+
+
+def build(source, out, *kinds):
+    words = [sys.executable, "-m", "build", "--no-isolation", *kinds, "--outdir", str(out), str(source)]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory):
+    """The wheel and the sdist of the tracked files; the wheel is built from the sdist, as for a release."""
+    folder = tmp_path_factory.mktemp("packages")
+    # a file that is not tracked lies in a package, as after a build of the page
+    copy_files(tracked(), folder / "source")
+    junk = folder / "source" / PAGE / "node_modules" / "left.js"
+    junk.parent.mkdir()
+    junk.write_text("")
+    build(folder / "source", folder / "dist")
+    (wheel,), (sdist,) = folder.glob("dist/*.whl"), folder.glob("dist/*.tar.gz")
+    return wheel, sdist
+
+
+def names_in(wheel):
+    with zipfile.ZipFile(wheel) as archive:
+        return {name for name in archive.namelist() if ".dist-info/" not in name}
+
+
+def installed_names():
+    """Tracked files of the packages, by their places in an installation."""
+    inside = {name for name in tracked() if name.startswith(PACKAGES) and not name.startswith(PAGE)}
+    return {name.removeprefix("pipeline/face/") for name in inside}
+
+
+def test_wheel__has_the_tracked_files_of_the_packages_and_no_others(built):
+    assert names_in(built[0]) == installed_names()
+
+
+def test_sdist__has_what_wheels_are_built_from(built):
+    with tarfile.open(built[1]) as archive:
+        names = {name.partition("/")[2] for name in (m.name for m in archive.getmembers() if m.isfile())}
+    made = {name for name in names if name.startswith("magpend.egg-info/")} | {"PKG-INFO", "setup.cfg"}
+    top = {"CHANGELOG.md", "CITATION.cff", "LICENSE", "MANIFEST.in", "README.md", "pyproject.toml"}
+    assert names - made == {name for name in tracked() if name.startswith(PACKAGES)} | top
+
+
+def test_wheel__metadata_pass_the_check_of_an_index(built):
+    from twine.commands.check import check
+
+    assert not check([str(path) for path in built], strict=True)
+    with zipfile.ZipFile(built[0]) as archive:
+        (name,) = (n for n in archive.namelist() if n.endswith(".dist-info/METADATA"))
+        said = Parser().parsestr(archive.read(name).decode())
+    assert said["Requires-Python"] == PROJECT["requires-python"]
+    assert set(said.get_all("Provides-Extra")) == set(PROJECT["optional-dependencies"])
+    assert said.get_all("License-File") == PROJECT["license-files"]
+
+
+def test_wheel__is_installed_without_a_network_and_runs(built, tmp_path):
+    words = [sys.executable, "-m", "pip", "install", "--quiet", "--no-index", "--no-deps", "--no-compile"]
+    subprocess.run([*words, "--target", str(tmp_path / "site"), str(built[0])], check=True, capture_output=True)
+    code = (
+        "import magpend, magpend_core, pipeline, workflows, sys\n"
+        "print(*(m.__path__[0] for m in (magpend, magpend_core, pipeline, workflows)), sep='\\n')\n"
+        "from pipeline.runs.workflows import shipped_workflows; print(len(shipped_workflows()))\n"
+        "import pipeline.cli.main, pipeline.report, pipeline.explorer\n"
+        "from magpend_core.models import model_names; print(len(model_names()))\n"
+    )
+    around = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path / "site"), os.environ.get("PYTHONPATH", "")])}
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, env=around, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    *places, n_workflows, n_models = done.stdout.splitlines()
+    assert all(place.startswith(str(tmp_path / "site")) for place in places)
+    assert (int(n_workflows), int(n_models)) == (len(shipped_workflows()), len(model_names()))
+
+
+def test_versions__are_the_same_everywhere():
+    """Of magpend in all its descriptions, and of the oldest Python that it runs on."""
+    recipe = yaml.safe_load((ROOT / "recipe" / "recipe.yaml").read_text("utf-8"))
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text("utf-8"))
+    assert recipe["context"]["version"] == citation["version"] == PROJECT["version"]
+    assert recipe["context"]["python_min"] == PYPROJECT["tool"]["mypy"]["python_version"] == OLDEST
+    assert f"on Python {OLDEST} or later" in README
+    assert set(re.findall(r"^FROM python:([\d.]+)-slim", (ROOT / "Dockerfile").read_text(), re.M)) == {OLDEST}
+    tested = yaml.safe_load((ROOT / ".github/workflows/ci.yml").read_text())["jobs"]["versions"]["strategy"]["matrix"]
+    said = [c.rpartition(" ")[2] for c in PROJECT["classifiers"] if re.search(r":: 3\.\d+$", c)]
+    assert min(said, key=lambda v: int(v[2:])) == OLDEST
+    assert set(said) <= set(tested["python"])
+    assert {"python": OLDEST, "resolution": "lowest-direct"} in tested["include"]
+
+
+def test_citation__names_the_same_things():
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text("utf-8"))
+    assert citation["license"] == PROJECT["license"]
+    assert [a["name"] for a in citation["authors"]] == [a["name"] for a in PROJECT["authors"]]
+    (article,) = citation["references"]
+    assert f"https://doi.org/{article['doi']}" in README
+
+
+def test_dependencies__have_lower_bounds_alone():
+    extras, groups = PROJECT["optional-dependencies"], PYPROJECT["dependency-groups"]
+    every = [*PROJECT["dependencies"], *(d for listed in (*extras.values(), *groups.values()) for d in listed)]
+    for text in every:
+        if isinstance(text, str) and not text.startswith("magpend["):
+            assert re.fullmatch(r"[A-Za-z][\w.-]*(\[[\w,]+\])?>=\d[\d.]*", text), text
+
+
+def test_extras__are_for_users_and_named_where_they_are_needed():
+    texts = [
+        p.read_text("utf-8") for top in ("pipeline", "docs") for s in ("py", "md") for p in (ROOT / top).rglob(f"*.{s}")
+    ]
+    for name in PROJECT["optional-dependencies"]:
+        assert any(f"magpend[{name}]" in text for text in texts), name
+    assert not set(PROJECT["optional-dependencies"]) & set(PYPROJECT["dependency-groups"])
+
+
+def test_groups__tests_install_all_extras_and_developers_everything_but_bench():
+    groups = PYPROJECT["dependency-groups"]
+    (own,) = (text for text in groups["test"] if text.startswith("magpend["))
+    assert set(own[len("magpend[") : -1].split(",")) == set(PROJECT["optional-dependencies"])
+    assert {entry["include-group"] for entry in groups["dev"]} == set(groups) - {"dev", "bench"}
+    (command,) = re.findall(r"<!-- run: tests -->\n```sh\n(.*?)\n```", README, re.DOTALL)
+    assert "--group dev " in command
+
+
+CONDA = {"dask[array]": "dask-core", "matplotlib": "matplotlib-base", "npTDMS": "nptdms"}
+"""Packages that have another name in conda-forge."""
+
+
+def in_conda(text):
+    name, version = text.split(">=")
+    return f"{CONDA.get(name, name)} >={version}"
+
+
+def test_recipe__requires_what_the_package_requires():
+    recipe = yaml.safe_load((ROOT / "recipe" / "recipe.yaml").read_text("utf-8"))
+    needs = recipe["requirements"]
+    python, *others = needs["run"]
+    assert python == "python >=${{ python_min }}"
+    assert others == [in_conda(text) for text in PROJECT["dependencies"]]
+    extras = PROJECT["optional-dependencies"].values()
+    assert needs["run_constraints"] == [in_conda(text) for listed in extras for text in listed]
+    (entry,) = recipe["build"]["python"]["entry_points"]
+    assert entry == "magpend = " + PROJECT["scripts"]["magpend"]
+    assert recipe["about"]["license"] == PROJECT["license"]
+    assert recipe["about"]["license_file"] == PROJECT["license-files"]
+
+
+def instructions():
+    text = re.sub(r"\\\n", " ", (ROOT / "Dockerfile").read_text("utf-8"))
+    return [tuple(line.split(maxsplit=1)) for line in text.splitlines() if line and not line.startswith("#")]
+
+
+def into_image(names):
+    """Files that `COPY . .` takes: later lines of .dockerignore win, and `!` takes back."""
+    rules = [r for r in (ROOT / ".dockerignore").read_text("utf-8").splitlines() if r and not r.startswith("#")]
+
+    def is_left_out(name):
+        out = False
+        for rule in rules:
+            pattern = rule.removeprefix("!").removeprefix("**/")
+            parts = [name, *(str(parent) for parent in Path(name).parents)]
+            places = [p for part in parts for p in ((part, Path(part).name) if "**/" in rule else (part,))]
+            if any(fnmatch.fnmatchcase(place, pattern) and (pattern != "*" or "/" not in place) for place in places):
+                out = not rule.startswith("!")
+        return out
+
+    return {name for name in names if not is_left_out(name)}
+
+
+def test_dockerfile__is_the_main_job_for_a_user_without_rights():
+    (main,) = re.findall(r"<!-- run: main job -->\n```sh\n(.*?)\n```", README, re.DOTALL)
+    said = dict(instructions())  # the last of each kind
+    words = yaml.safe_load(said["ENTRYPOINT"]) + yaml.safe_load(said["CMD"])
+    assert main.endswith("bin/" + shlex.join(words))
+    kinds = [kind for kind, _ in instructions()]
+    assert kinds[-4:] == ["WORKDIR", "ENV", "ENTRYPOINT", "CMD"]
+    assert kinds[-5] == "USER"
+    assert said["USER"] != "root"
+
+
+def test_dockerfile__copies_what_the_package_is_built_from_and_nothing_else(built, tmp_path):
+    assert ("COPY", ". .") in instructions()
+    files = into_image(tracked() | {"runs/quickstart/run.json", ".venv/pyvenv.cfg", "pipeline/__pycache__/x.pyc"})
+    assert not [name for name in files if name.startswith((PAGE, "runs/", ".", "tests/", "docs/")) or "pyc" in name]
+    build(copy_files(files, tmp_path / "source"), tmp_path / "dist", "--wheel")
+    (wheel,) = (tmp_path / "dist").glob("*.whl")
+    assert names_in(wheel) == names_in(built[0])
+
+
+def test_workflows__ask_for_no_rights_and_use_no_code_of_others():
+    for path in (ROOT / ".github" / "workflows").glob("*.yml"):
+        flow = yaml.safe_load(path.read_text("utf-8"))
+        assert flow["permissions"] == {}
+        for job in flow["jobs"].values():
+            for step in job["steps"]:
+                assert step.get("uses", "actions/").startswith("actions/")
+                # text of an event never becomes a part of a command
+                assert "${{" not in step.get("run", "")
+    steps = yaml.safe_load((ROOT / ".github/workflows/ci.yml").read_text())["jobs"]["readme"]["steps"]
+    assert steps[-1]["run"] == "bash .ci/run"
+
+
+def test_repository__passes_the_review_of_scientific_python():
+    from repo_review.processor import process
+
+    results = process(ROOT).results
+    assert len(results) > 40
+    failed = {one.name: one.err_msg for one in results if one.result is False}
+    # an ignored check is one that fails, with its reason beside it
+    ignored = {
+        one.name for one in results if one.skip_reason and one.name in PYPROJECT["tool"]["repo-review"]["ignore"]
+    }
+    assert not failed
+    assert ignored == set(PYPROJECT["tool"]["repo-review"]["ignore"])
+
+
+# the Python that README's commands get in CI
+
+
+def chosen_python(path, folder):
+    """Run the part of .ci/run that looks for a Python, with nothing else on PATH; returns its output."""
+    text = (ROOT / ".ci" / "run").read_text("utf-8")
+    (part,) = re.findall(r"^# README's commands call python3.*?^printf 'Python [^\n]*\n", text, re.DOTALL | re.M)
+    for tool in ("sed", "grep", "sort", "awk", "env", "mkdir", "chmod", "paste"):
+        (path / tool).symlink_to(shutil.which(tool))
+    script = (
+        f"set -euo pipefail; cd {shlex.quote(str(ROOT))}; scratch={folder}\n{part}\n"
+        f"type -P python3\npython3 -m venv {folder}/venv"
+    )
+    words = [shutil.which("bash"), "-c", script]
+    return subprocess.run(words, env={"PATH": str(path)}, capture_output=True, text=True, check=False)
+
+
+def executable(path, text):
+    path.write_text(f"#!/bin/sh\n{text}\n")
+    path.chmod(0o755)
+
+
+def too_old(path):
+    """Make a Python that says it is of the version before the oldest that is supported."""
+    before = (3, int(OLDEST.partition(".")[2]) - 1, 9)
+    code = f"import sys; sys.version_info = {before}; exec(sys.argv.pop(1))"
+    executable(path, f'exec {shlex.quote(sys.executable)} -c "{code}" "$2" "$3"')
+
+
+def test_ci__takes_a_newer_python_where_python3_is_too_old(tmp_path):
+    (path := tmp_path / "path").mkdir()
+    (folder := tmp_path / "scratch").mkdir()
+    too_old(path / "python3")
+    executable(path / "python3.99", f'exec {shlex.quote(sys.executable)} "$@"')
+    done = chosen_python(path, folder)
+    assert done.returncode == 0, done.stderr
+    version = ".".join(map(str, sys.version_info[:2]))
+    assert done.stdout.splitlines()[0].startswith(f"Python {version} {sys.executable} ")
+    assert done.stdout.splitlines()[1] == f"{folder}/bin/python3"
+    # the environment still works when the scratch folder's script is gone
+    shutil.rmtree(folder / "bin")
+    subprocess.run([folder / "venv" / "bin" / "python", "-c", "import ssl"], check=True)
+
+
+def test_ci__asks_pyenv_for_its_versions(tmp_path):
+    (path := tmp_path / "path").mkdir()
+    (folder := tmp_path / "scratch").mkdir()
+    run = f'if [ "$PYENV_VERSION" = 3.12.99 ]; then shift 2; exec {shlex.quote(sys.executable)} "$@"; fi'
+    executable(path / "pyenv", f"case $1 in versions) echo 2.7.18; echo 3.9.1; echo 3.12.99;; exec) {run};; esac")
+    done = chosen_python(path, folder)
+    assert done.returncode == 0, done.stderr
+    assert sys.executable in done.stdout.splitlines()[0]
+
+
+def test_ci__says_that_no_python_is_new_enough(tmp_path):
+    (path := tmp_path / "path").mkdir()
+    too_old(path / "python3")
+    done = chosen_python(path, tmp_path)
+    assert done.returncode == 1
+    assert done.stderr == f"no Python {OLDEST} or later on PATH or in pyenv; install one\n"
+
+
+# the page for programs
+
+AGENTS = (ROOT / "AGENTS.md").read_text("utf-8")
+
+
+def test_agents__lists_all_exit_codes():
+    rows = re.findall(r"^\| ([\d, ]+) \| ([^|]+) \|", AGENTS, re.M)
+    said = {int(code): meaning for codes, meaning in rows for code in codes.split(",")}
+    assert set(said) == {int(code) for code in Exit}
+    for code in Exit:
+        if code < Exit.HUNG_UP:
+            assert said[code] == code.sentence
+        else:
+            assert code.sentence.endswith(said[code].partition("; ")[2])
+
+
+def test_agents__shows_the_error_that_comes(tmp_path, monkeypatch, capsys):
+    from pipeline.cli.main import main
+
+    ((edit, shown),) = re.findall(r"<!-- error: sed '([^']+)' -->\n```text\n(.*?)```", AGENTS, re.DOTALL)
+    (text,) = re.findall(r"<!-- file: sweep.toml -->\n```toml\n(.*?)```", AGENTS, re.DOTALL)
+    for old, new in re.findall(r"s/([^/]+)/([^/]+)/", edit):
+        assert old in text
+        text = text.replace(old, new)
+    (tmp_path / "sweep.toml").write_text(text)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["magpend", "run", "sweep.toml"])
+    with pytest.raises(SystemExit) as end:
+        main()
+    said = capsys.readouterr()
+    assert end.value.code == Exit.REFUSED
+    assert said.err.endswith(shown)
+    assert said.out == ""
+    assert not (tmp_path / "runs").exists()
+
+
+@pytest.mark.slow
+def test_agents__commands_do_what_they_say(tmp_path, monkeypatch):
+    spec = importlib.util.spec_from_file_location("run_tutorials", ROOT / "docs" / "run_tutorials.py")
+    tutorials = importlib.util.module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, "run_tutorials", tutorials)
+    spec.loader.exec_module(tutorials)
+    monkeypatch.chdir(tmp_path)
+    tutorials.follow(ROOT / "AGENTS.md", tmp_path)
+
+
+# the article
+
+
+def test_paper__cites_what_its_bibliography_has():
+    text = (ROOT / "paper" / "paper.md").read_text("utf-8")
+    listed = (ROOT / "paper" / "paper.bib").read_text("utf-8")
+    entries = dict(re.findall(r"^@\w+\{(\w+),\n(.*?)^\}", listed, re.MULTILINE | re.DOTALL))
+    cited = set(re.findall(r"@([a-z]+\d{4})\b", text))
+    assert cited == set(entries)
+    for name, entry in entries.items():
+        assert re.search(r"^  (doi|url|isbn) +=", entry, re.MULTILINE), name
+        assert re.search(rf"year += \{{{name[-4:]}\}}", entry), name
+    body = text.partition("\n---\n")[2].partition("# References")[0]
+    assert 750 < len(body.split()) < 1750  # what the journal asks for
+
+
+def test_paper__figures_are_made_by_the_commands_of_its_script():
+    text = (ROOT / "paper" / "paper.md").read_text("utf-8")
+    spec = importlib.util.spec_from_file_location("figures", ROOT / "paper" / "figures.py")
+    figures = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(figures)
+    assert set(re.findall(r"\]\((\w+\.png)\)", text.replace("\n", " "))) == set(figures.FIGURES)
+    assert all((ROOT / "paper" / name).is_file() for name in figures.FIGURES)
+    for commands, _ in figures.FIGURES.values():
+        assert commands[0].split()[1] in shipped_workflows()
