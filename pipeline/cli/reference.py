@@ -1,4 +1,5 @@
-"""Write the tables of README and docs from the code: ``python -m pipeline.cli.reference``.
+"""Write the tables of README and docs, and the typed methods of the Python package, from the code:
+``python -m pipeline.cli.reference``.
 
 A table stands between the marks ``<!-- reference: NAME -->`` and ``<!-- /reference -->``. The text between
 the marks is replaced. With ``--check`` nothing is written, and the exit code is 1 if a page is out of date.
@@ -405,14 +406,22 @@ TABLES: dict[str, Callable[[], str]] = {
 }
 
 
+def texts() -> dict[Path, str]:
+    """Return the texts of all pages and modules that are generated, by path."""
+    from pipeline.cli.signatures import generated
+
+    made = {page: rendered(page.read_text("utf-8")) for page in pages()}
+    return made | {path: text() for path, text in generated().items()}
+
+
 def main() -> None:
-    """Rewrite the documentation pages whose tables are out of date or, with ``--check``, list them."""
+    """Rewrite the pages and modules that are out of date or, with ``--check``, list them."""
     check = "--check" in sys.argv[1:]
-    stale = [page for page in pages() if rendered(page.read_text("utf-8")) != page.read_text("utf-8")]
-    for page in stale:
-        print(f"{'out of date' if check else 'written'}: {page.relative_to(ROOT)}")
+    stale = {p: text for p, text in texts().items() if not p.exists() or p.read_text("utf-8") != text}
+    for path, text in stale.items():
+        print(f"{'out of date' if check else 'written'}: {path.relative_to(ROOT)}")
         if not check:
-            page.write_text(rendered(page.read_text("utf-8")), "utf-8")
+            path.write_text(text, "utf-8")
     if check and stale:
         sys.exit(1)
 

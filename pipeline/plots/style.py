@@ -315,7 +315,7 @@ def _legend(figure: DataFigure, handles: Sequence[Any], place: Any, size: float,
 def legend_inside(ax: Axes, handles: Sequence[Any]) -> None:
     """Place a legend inside axes, in another corner than a legend that is there already."""
     first = ax.get_legend()
-    place = "upper right" if first is None else "lower right"
+    place: Any = "upper right" if first is None else "lower right"
     ax.legend(handles=list(handles), loc=place, framealpha=0.9, fontsize=look_of(ax).tick)
     if first is not None:
         ax.add_artist(first)  # axes have one legend of their own

@@ -102,7 +102,7 @@ class GuestFigure(DataFigure):
         if isinstance(host, Figure) and host.get_layout_engine() is None:
             host.set_layout_engine("constrained")  # legends outside of the axes need it
 
-    @property
+    @property  # type: ignore[misc]
     def axes(self) -> list[Axes]:  # type: ignore[override]
         """Axes of the panels."""
         return self._guests

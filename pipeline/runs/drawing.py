@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.products.product import FigureOptions
 from pipeline.products.registry import FIGURES
+from pipeline.runs.cube_run import ready_cube
 from pipeline.runs.derive import AnalysedRun, Echo, Source, prepared, refused
 from pipeline.specification.problems import SpecError, unknown_name, validated
+from pipeline.store.run import Run
 
 if TYPE_CHECKING:
+    import xarray as xr
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure, SubFigure
 
@@ -59,7 +63,7 @@ def figure(
 
 
 def draw_panels(
-    source: Source,
+    source: Source | xr.Dataset,
     name: str,
     options: Mapping[str, Any],
     *,
@@ -71,7 +75,9 @@ def draw_panels(
 
     Parameters
     ----------
-    source, name, options, echo
+    source
+        Run directory, opened run, or a cube for figures that use nothing but cells.
+    name, options, echo
         See `figure`. With `ax` or a figure, the option ``width`` follows from it.
     ax
         Axes for a figure of one panel.
@@ -104,7 +110,11 @@ def draw_panels(
         from matplotlib import pyplot
 
         make = pyplot.figure
-    run, wanted = ready(source, name, wanted, echo)
+    run: Any
+    if isinstance(source, str | Path | Run):
+        run, wanted = ready(source, name, wanted, echo)
+    else:
+        run, wanted = ready_cube(source, name, wanted, echo)
     with refused(f"{run.name}: {name}"), drawing_into(host, make):
         return drawn(run, name, wanted).panels
 
