@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 _DERIVED = "/derived/"
 
 
-@xr.register_dataset_accessor("magpend")
+@xr.register_dataset_accessor("magpend")  # type: ignore[no-untyped-call]
 class DatasetAccessor:
     """What magpend knows of a Dataset: its model, its run, its table, its figures.
 

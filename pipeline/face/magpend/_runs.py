@@ -268,8 +268,9 @@ class Run(Analyses):
             return {parameter_name(name): value for name, value in (given or {}).items()}
 
         spec, notes = zoom(self.spec, Changes(keyed(ranges), keyed(at), num, keyed(nums), samples))
-        for note in notes if echo is not None else ():
-            echo(note)
+        if echo is not None:
+            for note in notes:
+                echo(note)
         return spec.as_dict()
 
 
