@@ -89,13 +89,13 @@ def _with_source(method: Callable[..., Any]) -> Any:
     return own.replace(parameters=[source, *options])
 
 
-def _analyses() -> tuple[str, ...]:
+def _analysis_names() -> tuple[str, ...]:
     from pipeline.products.registry import COMMANDS
 
     return COMMANDS
 
 
-def _plots() -> list[str]:
+def _plot_names() -> list[str]:
     import pipeline.plots
 
     return pipeline.plots.__all__
@@ -108,9 +108,9 @@ def __getattr__(name: str) -> Any:
         return metadata.version("magpend")
     if name in _HOME_OF:
         value = getattr(import_module(_HOME_OF[name]), name)
-    elif not name.startswith("_") and name in _analyses():
+    elif not name.startswith("_") and name in _analysis_names():
         value = _analysis(name)
-    elif not name.startswith("_") and name in _plots():
+    elif not name.startswith("_") and name in _plot_names():
         value = getattr(import_module("pipeline.plots"), name)
     else:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
@@ -119,7 +119,7 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted({*_HOME_OF, *_analyses(), *_plots(), "__version__", "__doc__"})
+    return sorted({*_HOME_OF, *_analysis_names(), *_plot_names(), "__version__", "__doc__"})
 
 
 class _AccessorRegistration:
