@@ -51,7 +51,7 @@ class Run(Analyses):
     --------
     >>> run = Run.open("runs/quickstart")                                # doctest: +SKIP
     >>> run.attractors().magpend.table()                                 # doctest: +SKIP
-    >>> ax = run.plot.bifurcation(state="psi2")                          # doctest: +SKIP
+    >>> ax = run.plot.bifurcation(degrees=True)                         # doctest: +SKIP
     """
 
     _next = _NEXT
