@@ -406,23 +406,24 @@ TABLES: dict[str, Callable[[], str]] = {
 }
 
 
-def texts() -> dict[Path, str]:
-    """Return the texts of all pages and modules that are generated, by path."""
-    from pipeline.cli.signatures import generated
+def stale() -> dict[Path, str]:
+    """Return the new texts of the pages and modules that are out of date, by path."""
+    from pipeline.cli import signatures
 
-    made = {page: rendered(page.read_text("utf-8")) for page in pages()}
-    return made | {path: text() for path, text in generated().items()}
+    texts = {page: rendered(page.read_text("utf-8")) for page in pages()}
+    texts |= {path: text() for path, text in signatures.generated().items()}
+    return {path: text for path, text in texts.items() if not path.exists() or path.read_text("utf-8") != text}
 
 
 def main() -> None:
     """Rewrite the pages and modules that are out of date or, with ``--check``, list them."""
     check = "--check" in sys.argv[1:]
-    stale = {p: text for p, text in texts().items() if not p.exists() or p.read_text("utf-8") != text}
-    for path, text in stale.items():
+    found = stale()
+    for path, text in found.items():
         print(f"{'out of date' if check else 'written'}: {path.relative_to(ROOT)}")
         if not check:
             path.write_text(text, "utf-8")
-    if check and stale:
+    if check and found:
         sys.exit(1)
 
 
