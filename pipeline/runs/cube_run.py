@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -57,7 +56,7 @@ class CubeRun:
 
     def of(self, source: str) -> AnalysedRun:
         """Open another run by its directory."""
-        return AnalysedRun.of(Path(source))
+        return AnalysedRun.of(source)
 
     def cube(self, chunks: Any = None) -> xr.Dataset:
         """Return the cube."""
