@@ -158,10 +158,12 @@ def test_status_and_verify__are_those_of_the_directory(run):
 
 
 def test_extend__opens_the_wider_run(run, tmp_path):
-    longer = run.extend(out=tmp_path / "more", keep=16, workers=0, echo=lambda _: None)
-    assert type(longer) is magpend.Run
-    assert longer.cube().sizes["period_index"] == 16
-    assert run.cube().sizes["period_index"] == 12
+    more = run.extend(out=tmp_path / "more", starts=3, workers=0, echo=lambda _: None)
+    assert type(more) is magpend.Run
+    assert more.complete
+    assert more.directory == tmp_path / "more"
+    assert (more.cube().sizes["branch"], run.cube().sizes["branch"]) == (6, 4)
+    assert set(run.cube()["section"].values.ravel()) < set(more.cube()["section"].values.ravel())
 
 
 def test_zoom__is_a_specification_that_run_takes(run):
