@@ -27,6 +27,7 @@ from pipeline.store.errors import IncompleteError
 from pipeline.store.files import Files
 from pipeline.store.packing import Packer
 from pipeline.store.places import open_files
+from pipeline.store.record_copy import remove_copy, write_copy
 from pipeline.store.records import Records
 from pipeline.store.runfile import RunInfo
 from pipeline.store.setup import check, establish
@@ -177,8 +178,10 @@ def _complete(
     packer = Packer(info, plan, commits)
     missing = [i for i in range(plan.n_tasks) if i not in commits]
     if not missing:
+        write_copy(info, plan, commits)
         echo(f"{info.name} is complete; nothing to do.")
         return
+    remove_copy(info)
     before = plan.n_cells - sum(plan.cells_in(i) for i in missing)
     check_space(plan, info.files.local, plan.n_cells - before)
     echo(f"{plan.n_cells} cells in {plan.n_tasks} tasks" + (f", {before} cells done before" if before else ""))
@@ -222,3 +225,4 @@ def _require_all(info: RunInfo, plan: Plan, echo: Echo) -> None:
             "and have space to write. Then give the same command again; it computes only these tasks."
         )
     sweep(info, plan, commits, echo)
+    write_copy(info, plan, commits)

@@ -53,14 +53,24 @@ class Declared:
         """Check the size, shape and codecs that a file declares against the plan; return the problem, or None."""
         name, _, rest = key.partition("/")
         if not rest:
-            return None
+            return self._group_problem(bytes(content)) if name == METADATA else None
         if rest == METADATA:
-            return self._metadata_problem(name, bytes(content))
+            return self._metadata_problem(name, _parsed(content))
         declared, most = declared_bytes(content), self._most(name)
         exact = name in self._variables
         if not (declared == most or (0 <= declared < most and not exact)):
             return f"declares {declared} bytes, and {'has' if exact else 'may have'} {most}"
         return self._text_problem(bytes(content)) if name in self._texts else None
+
+    def _group_problem(self, content: bytes) -> str | None:
+        """Check the metadata of arrays that the group's file repeats; return the first problem, or None."""
+        data = _parsed(content)
+        copies = (data.get("consolidated_metadata") or {}) if isinstance(data, dict) else {}
+        arrays = copies.get("metadata") if isinstance(copies, dict) else None
+        for name, metadata in arrays.items() if isinstance(arrays, dict) else ():
+            if problem := self._metadata_problem(name, metadata):
+                return f"its metadata of {name}: {problem}"
+        return None
 
     def _text_problem(self, content: bytes) -> str | None:
         """Check the number of texts that a chunk declares, since decoding allocates memory for it; return a problem or
@@ -80,14 +90,13 @@ class Declared:
         # a coordinate lies along one dim of the cube
         return max(MOST_TEXT, 8 * max(self._sizes.values(), default=1))
 
-    def _metadata_problem(self, name: str, content: bytes) -> str | None:
+    def _metadata_problem(self, name: str, data: Any) -> str | None:
         try:
-            data: dict[str, Any] = json.loads(content)
             shape, dims = tuple(data["shape"]), tuple(data.get("dimension_names") or ())
             chunk = tuple(data["chunk_grid"]["configuration"]["chunk_shape"])
             codecs = tuple(codec["name"] for codec in data["codecs"])
             dtype = data["data_type"]
-        except (ValueError, KeyError, TypeError, RecursionError):
+        except (ValueError, KeyError, TypeError):
             return "is no metadata of an array"
         if codecs not in CODECS:
             return _codecs_problem(codecs)
@@ -97,6 +106,14 @@ class Declared:
             return None if (shape, chunk, dtype) == self._variables[name] else "has another shape than the plan"
         if shape != tuple(self._sizes.get(dim) for dim in dims) or chunk != tuple(max(n, 1) for n in shape):
             return "has another shape than its dims"
+        return None
+
+
+def _parsed(content: Any) -> Any:
+    """Return the data in a text of JSON; None for a text that is none."""
+    try:
+        return json.loads(bytes(content))
+    except (ValueError, RecursionError):
         return None
 
 

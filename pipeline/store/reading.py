@@ -16,6 +16,7 @@ from pipeline.specification.parsing import Spec
 from pipeline.store.parallel_reads import quick_reading
 from pipeline.store.records import Commit
 from pipeline.store.runfile import RunInfo
+from pipeline.store.skeleton import GROUP_KEY, consolidated_metadata
 from pipeline.store.view import committed_view
 
 if TYPE_CHECKING:
@@ -35,15 +36,19 @@ class OpenedRun(Protocol):
     def spec(self) -> Spec: ...  # noqa: D102
     @property
     def model(self) -> Model: ...  # noqa: D102
+    @property
+    def known(self) -> Mapping[str, bytes]: ...  # noqa: D102
 
 
 def cube_of(run: OpenedRun, *, chunks: Any = None, check: bool | None = None) -> xr.Dataset:
     """Return the result cube of an opened run as a dataset; cells without a commit record read as pending."""
     import xarray as xr
 
-    view: Any = committed_view(run.info, run.plan, run.commits, check=check)
+    view: Any = committed_view(run.info, run.plan, run.commits, check=check, known=run.known)
+    copies = consolidated_metadata(run.known.get(GROUP_KEY, b""))
+    whole = all(name in copies for name in view.arrays())
     with quick_reading():
-        ds = xr.open_dataset(view, engine="zarr", chunks=chunks, consolidated=False, mask_and_scale=False)
+        ds = xr.open_dataset(view, engine="zarr", chunks=chunks, consolidated=whole, mask_and_scale=False)
     ds = ds[[v.name for v in run.plan.variables]]
     words = {str(name): _texts(ds[name]) for name in ds.coords if ds[name].dtype.kind not in "biuf"}
     ds = ds.assign_coords(words)

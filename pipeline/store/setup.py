@@ -12,7 +12,7 @@ from pipeline.layout.plan import Plan
 from pipeline.specification.parsing import Spec
 from pipeline.store.checking import ODD, odd_keys, verify
 from pipeline.store.errors import DamagedError, RefusedError
-from pipeline.store.files import COMMITS, CUBE, HOLDER, OWN_NAMES, RUN_FILE, TIMINGS, Files, is_temporary
+from pipeline.store.files import COMMITS, CUBE, HOLDER, OWN_NAMES, RECORD_COPY, RUN_FILE, TIMINGS, Files, is_temporary
 from pipeline.store.lease import is_note
 from pipeline.store.local import run_around
 from pipeline.store.packing import withdraw
@@ -119,7 +119,8 @@ def _is_timings(content: bytes) -> bool:
 
 
 def _is_own(name: str) -> bool:
-    return name in OWN_NAMES or (name.startswith((f".{RUN_FILE}", f".{HOLDER}")) and is_temporary(name))
+    written = tuple(f".{name}." for name in (RUN_FILE, HOLDER, RECORD_COPY))
+    return name in OWN_NAMES or (name.startswith(written) and is_temporary(name))
 
 
 def _names(files: Files) -> list[str]:
@@ -202,7 +203,7 @@ def establish(
     info = check(files, identity)
     names = _names(files)
     if alone:  # else another process may be writing these files now
-        left = (f".{RUN_FILE}.", f".{HOLDER}.")
+        left = (f".{RUN_FILE}.", f".{HOLDER}.", f".{RECORD_COPY}.")
         files.remove([name for name in names if name.startswith(left)])
     if COMMITS not in names:
         files.prepare(COMMITS)

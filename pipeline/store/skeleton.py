@@ -6,6 +6,7 @@ can be rebuilt.
 
 from __future__ import annotations
 
+import json
 import warnings
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -23,10 +24,13 @@ from pipeline.products.registry import CELL_PRODUCTS
 from pipeline.specification.parsing import Spec
 from pipeline.store.arrays import create_array, write_whole
 from pipeline.store.errors import DamagedError
-from pipeline.store.files import CUBE, Files, entry_of, problems_of
+from pipeline.store.files import CUBE, Files, compared, entry_of
 from pipeline.store.runfile import RunInfo
 
 GROUP_KEY = "zarr.json"
+
+MOST_KEPT = 1_000_000
+"""Largest size in bytes of a file of the set-up whose content an opened run keeps, so that it is read once."""
 
 
 def skeleton_files(spec: Spec, plan: Plan, identity: Mapping[str, Any], spec_text: str, title: str) -> dict[str, bytes]:
@@ -108,25 +112,85 @@ def write_skeleton(files: Files, contents: Mapping[str, bytes], keys: Iterable[s
 
 
 def skeleton_problems(info: RunInfo) -> list[str]:
-    """Return a line for each metadata or coordinate file of the result cube that is missing or has changed."""
-    folders = {key.partition("/")[0] for key in info.skeleton if "/" in key}
+    """Return a line for each metadata or coordinate file of the result cube that is missing or has changed.
+
+    If none has, return a line for each array whose metadata differ from their copy in the group's file.
+    """
+    return _compare(info, info.skeleton)[1]
+
+
+def _compare(info: RunInfo, keys: Iterable[str]) -> tuple[dict[str, bytes], list[str]]:
+    """Compare files of the set-up with their digests; return the contents of small ones, and the problems of all."""
+    chosen = {key: info.skeleton[key] for key in keys}
+    folders = {key.partition("/")[0] for key in chosen if "/" in key}
     info.files.refuse_links(CUBE, *(f"{CUBE}/{folder}" for folder in folders))
-    return problems_of(info.files.below(CUBE), info.skeleton)
+    contents, problems = {}, []
+    for key, content, problem in compared(info.files.below(CUBE), chosen):
+        if problem:
+            problems.append(problem)
+        elif len(content) <= MOST_KEPT:
+            contents[key] = content
+    return contents, problems or disagreements(contents)
 
 
-def check_skeleton(info: RunInfo) -> None:
-    """Compare the result cube's metadata and coordinates with their digests in ``run.json``; raise `DamagedError` if
-    one differs.
+def consolidated_metadata(group: bytes) -> dict[str, Any]:
+    """Return the metadata of all arrays, by name, that a group's ``zarr.json`` repeats; empty if it repeats none."""
+    try:
+        found = json.loads(group)["consolidated_metadata"]["metadata"]
+    except (ValueError, KeyError, TypeError, RecursionError):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def disagreements(contents: Mapping[str, bytes]) -> list[str]:
+    """Return a line for each array whose metadata differ from their copy in the group's ``zarr.json``.
+
+    A group without copies has no problem: earlier versions of magpend have made such groups.
+
+    Parameters
+    ----------
+    contents
+        Contents of files by key. Arrays without a ``zarr.json`` among them are not compared.
+    """
+    copies = consolidated_metadata(contents.get(GROUP_KEY, b""))
+    own = {key.rpartition("/")[0]: content for key, content in contents.items() if key.endswith(f"/{GROUP_KEY}")}
+    found = []
+    for name, content in own.items() if copies else ():
+        try:
+            same = json.loads(content) == copies.get(name)
+        except (ValueError, RecursionError):
+            same = False
+        if not same:
+            found.append(f"{GROUP_KEY}: its metadata of {name} are not those of {name}/{GROUP_KEY}")
+    return found
+
+
+def check_skeleton(info: RunInfo) -> dict[str, bytes]:
+    """Compare the result cube's metadata and coordinates with their digests in ``run.json``; return the contents of the
+    small files.
+
+    In an object store, where each file is a request, the arrays' own metadata are not read if the group's file
+    repeats them all: readers then use that file, whose digest is compared, and no other.
 
     Raises
     ------
     DamagedError
         If a file is missing or has changed; the message names the files and the remedy.
     """
-    problems = skeleton_problems(info)
+    keys = list(info.skeleton)
+    first = [key for key in keys if key == GROUP_KEY or not key.endswith(GROUP_KEY)]
+    rest = [key for key in keys if key not in first]
+    if info.files.local is not None:
+        first, rest = keys, []
+    contents, problems = _compare(info, first)
+    copies = consolidated_metadata(contents.get(GROUP_KEY, b""))
+    if any(key.rpartition("/")[0] not in copies for key in rest):
+        own, others = _compare(info, rest)
+        contents, problems = {**contents, **own}, problems + others
     if problems:
         more = f" (and {len(problems) - 3} more)" if len(problems) > 3 else ""
         raise DamagedError(
             f"{info.files.below(CUBE).name}: {'; '.join(problems[:3])}{more}. These files follow from the "
             f"specification: rebuild them with: magpend verify --repair {info.name}"
         )
+    return contents
