@@ -27,6 +27,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pipeline.layout.conventions import conventional
 from pipeline.products.attractors import IdentifyOptions
 from pipeline.products.product import Analysis, Options, function_of
 from pipeline.products.registry import ANALYSES
@@ -349,11 +350,12 @@ def _kept(run: AnalysedRun, place: Files, result: xr.Dataset) -> xr.Dataset:
     except OSError as error:
         kept = place.name.rpartition("/")[2]
         run.echo(f"{kept}: not kept ({error}); the result is shown all the same")
-        return result
+        return conventional(result)
     return _placed(open_product(place), place)
 
 
-def _placed(ds: xr.Dataset, place: Files) -> xr.Dataset:
+def _placed(stored: xr.Dataset, place: Files) -> xr.Dataset:
+    ds = conventional(stored)
     ds.encoding["source"] = place.name
     return ds
 

@@ -14,6 +14,7 @@ from pipeline.layout.domains import check_starts
 from pipeline.layout.identity import identity_of
 from pipeline.layout.limits import check_plan, check_space
 from pipeline.layout.plan import Plan, make_plan
+from pipeline.layout.units import unit_remarks
 from pipeline.runs.mending import sound_commits
 from pipeline.runs.noise import check_steps, warn_of_steps
 from pipeline.runs.progress import Progress, duration
@@ -103,7 +104,7 @@ def run(
     where.resolved()
     check_starts(parsed)
     check_steps(parsed)
-    for remark in parsed.model.flow.remarks:
+    for remark in (*parsed.model.flow.remarks, *unit_remarks(parsed.model)):
         echo(f"warning: {remark}")
     carry_out(parsed, text, files, workers=workers, where=where, echo=echo)
     warn_of_steps(parsed, files, echo)

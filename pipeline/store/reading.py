@@ -10,6 +10,7 @@ import numpy as np
 from magpend_core.models.model import Model
 from pipeline.layout.attributes import netcdf_safe
 from pipeline.layout.cells import DIRECTION_CODES
+from pipeline.layout.conventions import conventional
 from pipeline.layout.plan import Plan
 from pipeline.layout.vocabulary import drift_attributes, model_attribute, noise_attributes, section_attributes
 from pipeline.specification.parsing import Spec
@@ -54,7 +55,7 @@ def cube_of(run: OpenedRun, *, chunks: Any = None, check: bool | None = None) ->
     ds = ds.assign_coords(words)
     if "direction" in ds.coords:
         ds = ds.assign_coords(direction=_directions(ds.coords["direction"]))
-    return netcdf_safe(ds.assign_attrs(_attributes(run)))
+    return conventional(netcdf_safe(ds.assign_attrs(_attributes(run))))
 
 
 def _attributes(run: OpenedRun) -> dict[str, Any]:

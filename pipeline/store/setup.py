@@ -240,8 +240,9 @@ def rebuild_skeleton(info: RunInfo, spec: Spec, plan: Plan) -> list[str]:
     if not problems:
         return []
     damaged = [key for key in info.skeleton if any(p.startswith(f"{key}: ") for p in problems)]
-    contents = skeleton_files(spec, plan, info.identity, info.spec_text, info.title)
-    entries = entries_of(contents)
-    same = [key for key in damaged if entries.get(key) == info.skeleton[key]]
-    write_skeleton(info.files, contents, same)
+    for described in (True, False):  # cubes of earlier versions have fewer attributes
+        contents = skeleton_files(spec, plan, info.identity, info.spec_text, info.title, described=described)
+        entries = entries_of(contents)
+        same = [key for key in damaged if entries.get(key) == info.skeleton[key]]
+        write_skeleton(info.files, contents, same)
     return skeleton_problems(info)

@@ -16,6 +16,7 @@ import zarr
 from zarr.storage import MemoryStore
 
 from pipeline.layout.cells import Coordinate, coordinates
+from pipeline.layout.conventions import CONVENTIONS, Described, conventional_attributes
 from pipeline.layout.identity import digest_of
 from pipeline.layout.moving import moving_coordinates
 from pipeline.layout.plan import Plan
@@ -33,14 +34,24 @@ MOST_KEPT = 1_000_000
 """Largest size in bytes of a file of the set-up whose content an opened run keeps, so that it is read once."""
 
 
-def skeleton_files(spec: Spec, plan: Plan, identity: Mapping[str, Any], spec_text: str, title: str) -> dict[str, bytes]:
+def skeleton_files(
+    spec: Spec, plan: Plan, identity: Mapping[str, Any], spec_text: str, title: str, *, described: bool = True
+) -> dict[str, bytes]:
     """Return the contents of all files of an empty result cube (metadata and coordinates) by key; those of the group
     come first.
+
+    Parameters
+    ----------
+    spec, plan, identity, spec_text, title
+        The run.
+    described
+        Whether variables have the attributes of `pipeline.layout.conventions`. Cubes of earlier versions have none
+        of them.
     """
     attrs = {
         "kind": plan.kind,
         "model": model_attribute(spec.model),
-        "Conventions": "CF-1.11",
+        "Conventions": CONVENTIONS,
         "title": title,
         "spec": spec_text,
         "digest": digest_of(identity),
@@ -50,6 +61,7 @@ def skeleton_files(spec: Spec, plan: Plan, identity: Mapping[str, Any], spec_tex
     store = MemoryStore(data)
     names = " ".join(sorted(c.name for c in found if c.dims != (c.name,)))
     group = zarr.create_group(store, zarr_format=3, attributes={**attrs, "coordinates": names})
+    texts = _attributes(plan, found, described)
     for variable in plan.variables:
         create_array(
             group,
@@ -59,16 +71,24 @@ def skeleton_files(spec: Spec, plan: Plan, identity: Mapping[str, Any], spec_tex
             plan.chunks(variable),
             variable.dtype,
             variable.fill,
-            variable.attributes(),
+            texts[variable.name],
         )
     for coordinate in found:
-        write_whole(group, coordinate.name, coordinate.dims, np.asarray(coordinate.values), coordinate.attrs)
+        write_whole(group, coordinate.name, coordinate.dims, np.asarray(coordinate.values), texts[coordinate.name])
     with warnings.catch_warnings():
         # readers without this key ignore it; with it xarray opens the cube without a warning
         warnings.filterwarnings("ignore", message="Consolidated metadata")
         zarr.consolidate_metadata(store)
     keys = sorted(data, key=lambda key: (key != GROUP_KEY, key))
     return {key: data[key].to_bytes() for key in keys}
+
+
+def _attributes(plan: Plan, found: Iterable[Coordinate], described: bool) -> dict[str, dict[str, Any]]:
+    """Return the attributes of all variables and coordinates of the result cube, by name."""
+    entries = {
+        v.name: Described((*plan.dims, *v.own_dims), np.dtype(v.dtype), v.attributes()) for v in plan.variables
+    } | {c.name: Described(c.dims, np.asarray(c.values).dtype, c.attrs) for c in found}
+    return conventional_attributes(entries) if described else {n: dict(entry.attrs) for n, entry in entries.items()}
 
 
 def skeleton_keys(spec: Spec, plan: Plan) -> list[str]:
