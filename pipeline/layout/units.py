@@ -35,7 +35,7 @@ _PREFIXED = (
     "Wb",
     "T",
 )
-_MORE = ("H", "bar", "L", "l", "eV")
+_MORE = ("T", "H", "bar", "L", "l", "eV")
 _ALONE = ("radian", "radians", "sr", "degree", "degrees", "degC", "min", "h", "hour", "d", "day", "lm", "lx", "%")
 _WORDS = ("meter", "metre", "second", "seconds", "kilogram", "newton", "hertz", "volt", "ampere", "kelvin", "percent")
 _KNOWN = frozenset({*_ALONE, *_WORDS, *(prefix + unit for prefix in _PREFIXES for unit in (*_PREFIXED, *_MORE))})

@@ -86,6 +86,7 @@ def write_spec(tmp_path):
 def _bytes_of(directory: Path) -> dict[str, bytes]:
     folders = [directory / "cube.zarr", directory / "commits"]
     files = [f for folder in folders for f in folder.rglob("*") if f.is_file()]
+    files += directory.glob("records.jsonl")
     return {f.relative_to(directory).as_posix(): f.read_bytes() for f in files}
 
 
