@@ -5,10 +5,10 @@ name, its options, and the version of its code (`code_version`). `derive` return
 key, or computes it. A damaged or incomplete result is computed again. A result of an earlier cube or an
 earlier version of the code is never read; it stays until `prune` is called.
 
-Each result is a zarr group such as ``derived/attractors-1a2b3c4d.zarr``. ``xarray.open_zarr(path,
-consolidated=False)`` reads it. The attribute ``derived_options`` holds the options as JSON. Labels
-(``state``, ``direction``) are codes with the attribute ``words``. If two processes derive the same result at
-once, both compute it, and one of the equal results stays.
+Each result is a zarr group such as ``derived/attractors-1a2b3c4d.zarr``. ``xarray.open_zarr(path)`` reads it.
+The attribute ``derived_options`` holds the options as JSON. Labels (``state``, ``direction``) are codes with
+the attribute ``words``. If two processes derive the same result at once, both compute it, and one of the equal
+results stays.
 
 A longer extension of cells counts for every later analysis: options that ask for less are raised to the
 largest budget of the kept attractors (`most_evidence`). Two results therefore never contradict each other.

@@ -64,10 +64,7 @@ class Declared:
 
     def _group_problem(self, content: bytes) -> str | None:
         """Check the metadata of arrays that the group's file repeats; return the first problem, or None."""
-        data = _parsed(content)
-        copies = (data.get("consolidated_metadata") or {}) if isinstance(data, dict) else {}
-        arrays = copies.get("metadata") if isinstance(copies, dict) else None
-        for name, metadata in arrays.items() if isinstance(arrays, dict) else ():
+        for name, metadata in consolidated_metadata(content).items():
             if problem := self._metadata_problem(name, metadata):
                 return f"its metadata of {name}: {problem}"
         return None
@@ -115,6 +112,34 @@ def _parsed(content: Any) -> Any:
         return json.loads(bytes(content))
     except (ValueError, RecursionError):
         return None
+
+
+def consolidated_metadata(group: bytes) -> dict[str, Any]:
+    """Return the metadata of all arrays, by name, that a group's ``zarr.json`` repeats; empty if it repeats none."""
+    try:
+        found = _parsed(group)["consolidated_metadata"]["metadata"]
+    except (KeyError, TypeError):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def disagreements(contents: Mapping[str, bytes]) -> list[str]:
+    """Return a line for each array whose metadata differ from their copy in the group's ``zarr.json``.
+
+    A group without copies has no problem: earlier versions of magpend have made such groups.
+
+    Parameters
+    ----------
+    contents
+        Contents of files by key. Arrays without a ``zarr.json`` among them are not compared.
+    """
+    copies = consolidated_metadata(contents.get(METADATA, b""))
+    own = {key.rpartition("/")[0]: content for key, content in contents.items() if key.endswith(f"/{METADATA}")}
+    found = []
+    for name, content in own.items() if copies else ():
+        if name not in copies or _parsed(content) != copies[name]:
+            found.append(f"{METADATA}: its metadata of {name} are not those of {name}/{METADATA}")
+    return found
 
 
 def _codecs_problem(codecs: tuple[Any, ...]) -> str:

@@ -14,10 +14,10 @@ from pipeline.layout.conventions import conventional
 from pipeline.layout.plan import Plan
 from pipeline.layout.vocabulary import drift_attributes, model_attribute, noise_attributes, section_attributes
 from pipeline.specification.parsing import Spec
+from pipeline.store.declared import METADATA, consolidated_metadata
 from pipeline.store.parallel_reads import quick_reading
 from pipeline.store.records import Commit
 from pipeline.store.runfile import RunInfo
-from pipeline.store.skeleton import GROUP_KEY, consolidated_metadata
 from pipeline.store.view import committed_view
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ def cube_of(run: OpenedRun, *, chunks: Any = None, check: bool | None = None) ->
     import xarray as xr
 
     view: Any = committed_view(run.info, run.plan, run.commits, check=check, known=run.known)
-    copies = consolidated_metadata(run.known.get(GROUP_KEY, b""))
+    copies = consolidated_metadata(run.known.get(METADATA, b""))
     whole = all(name in copies for name in view.arrays())
     with quick_reading():
         ds = xr.open_dataset(view, engine="zarr", chunks=chunks, consolidated=whole, mask_and_scale=False)

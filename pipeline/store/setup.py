@@ -11,6 +11,7 @@ from pipeline.layout.identity import differences, digest_of
 from pipeline.layout.plan import Plan
 from pipeline.specification.parsing import Spec
 from pipeline.store.checking import ODD, odd_keys, verify
+from pipeline.store.declared import METADATA
 from pipeline.store.errors import DamagedError, RefusedError
 from pipeline.store.files import COMMITS, CUBE, HOLDER, OWN_NAMES, RECORD_COPY, RUN_FILE, TIMINGS, Files, is_temporary
 from pipeline.store.lease import is_note
@@ -18,14 +19,7 @@ from pipeline.store.local import run_around
 from pipeline.store.packing import withdraw
 from pipeline.store.places import open_files
 from pipeline.store.runfile import RunInfo, is_run, read_run, write_run
-from pipeline.store.skeleton import (
-    GROUP_KEY,
-    entries_of,
-    skeleton_files,
-    skeleton_keys,
-    skeleton_problems,
-    write_skeleton,
-)
+from pipeline.store.skeleton import entries_of, skeleton_files, skeleton_keys, skeleton_problems, write_skeleton
 
 Echo = Callable[[str], None]
 
@@ -146,7 +140,7 @@ def _digests(files: Files) -> set[str]:
     records = [f"{COMMITS}/{key}" for key in files.below(COMMITS).everything() if key.endswith((".json", ".jsonl"))]
     # a pack names the digest in its first record
     found = {_text_in(content, "digest") for _, content in files.read_each(records)}
-    for _, content in files.read_each([f"{CUBE}/{GROUP_KEY}"]):
+    for _, content in files.read_each([f"{CUBE}/{METADATA}"]):
         found.add(_text_in(content, "attributes", "digest"))
     return {digest for digest in found if digest}
 

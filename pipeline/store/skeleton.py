@@ -6,7 +6,6 @@ can be rebuilt.
 
 from __future__ import annotations
 
-import json
 import warnings
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -24,11 +23,10 @@ from pipeline.layout.vocabulary import model_attribute
 from pipeline.products.registry import CELL_PRODUCTS
 from pipeline.specification.parsing import Spec
 from pipeline.store.arrays import create_array, write_whole
+from pipeline.store.declared import METADATA, consolidated_metadata, disagreements
 from pipeline.store.errors import DamagedError
 from pipeline.store.files import CUBE, Files, compared, entry_of
 from pipeline.store.runfile import RunInfo
-
-GROUP_KEY = "zarr.json"
 
 MOST_KEPT = 1_000_000
 """Largest size in bytes of a file of the set-up whose content an opened run keeps, so that it is read once."""
@@ -79,7 +77,7 @@ def skeleton_files(
         # readers without this key ignore it; with it xarray opens the cube without a warning
         warnings.filterwarnings("ignore", message="Consolidated metadata")
         zarr.consolidate_metadata(store)
-    keys = sorted(data, key=lambda key: (key != GROUP_KEY, key))
+    keys = sorted(data, key=lambda key: (key != METADATA, key))
     return {key: data[key].to_bytes() for key in keys}
 
 
@@ -94,7 +92,7 @@ def _attributes(plan: Plan, found: Iterable[Coordinate], described: bool) -> dic
 def skeleton_keys(spec: Spec, plan: Plan) -> list[str]:
     """Return the keys of the metadata files of all variables and coordinates of the result cube."""
     names = [v.name for v in plan.variables] + [c.name for c in (*coordinates(spec), *_labels(spec))]
-    return [f"{name}/{GROUP_KEY}" for name in names]
+    return [f"{name}/{METADATA}" for name in names]
 
 
 def _labels(spec: Spec) -> list[Coordinate]:
@@ -153,38 +151,6 @@ def _compare(info: RunInfo, keys: Iterable[str]) -> tuple[dict[str, bytes], list
     return contents, problems or disagreements(contents)
 
 
-def consolidated_metadata(group: bytes) -> dict[str, Any]:
-    """Return the metadata of all arrays, by name, that a group's ``zarr.json`` repeats; empty if it repeats none."""
-    try:
-        found = json.loads(group)["consolidated_metadata"]["metadata"]
-    except (ValueError, KeyError, TypeError, RecursionError):
-        return {}
-    return found if isinstance(found, dict) else {}
-
-
-def disagreements(contents: Mapping[str, bytes]) -> list[str]:
-    """Return a line for each array whose metadata differ from their copy in the group's ``zarr.json``.
-
-    A group without copies has no problem: earlier versions of magpend have made such groups.
-
-    Parameters
-    ----------
-    contents
-        Contents of files by key. Arrays without a ``zarr.json`` among them are not compared.
-    """
-    copies = consolidated_metadata(contents.get(GROUP_KEY, b""))
-    own = {key.rpartition("/")[0]: content for key, content in contents.items() if key.endswith(f"/{GROUP_KEY}")}
-    found = []
-    for name, content in own.items() if copies else ():
-        try:
-            same = json.loads(content) == copies.get(name)
-        except (ValueError, RecursionError):
-            same = False
-        if not same:
-            found.append(f"{GROUP_KEY}: its metadata of {name} are not those of {name}/{GROUP_KEY}")
-    return found
-
-
 def check_skeleton(info: RunInfo) -> dict[str, bytes]:
     """Compare the result cube's metadata and coordinates with their digests in ``run.json``; return the contents of the
     small files.
@@ -198,12 +164,12 @@ def check_skeleton(info: RunInfo) -> dict[str, bytes]:
         If a file is missing or has changed; the message names the files and the remedy.
     """
     keys = list(info.skeleton)
-    first = [key for key in keys if key == GROUP_KEY or not key.endswith(GROUP_KEY)]
+    first = [key for key in keys if key == METADATA or not key.endswith(METADATA)]
     rest = [key for key in keys if key not in first]
     if info.files.local is not None:
         first, rest = keys, []
     contents, problems = _compare(info, first)
-    copies = consolidated_metadata(contents.get(GROUP_KEY, b""))
+    copies = consolidated_metadata(contents.get(METADATA, b""))
     if any(key.rpartition("/")[0] not in copies for key in rest):
         own, others = _compare(info, rest)
         contents, problems = {**contents, **own}, problems + others

@@ -10,6 +10,7 @@ from pipeline import open_run
 from pipeline.runs.mending import sound_commits
 from pipeline.runs.verify import describe, verify_run
 from pipeline.store.commits import read_commits, scan
+from pipeline.store.declared import METADATA
 from pipeline.store.errors import DamagedError
 from pipeline.store.files import RECORD_COPY
 from pipeline.store.packing import withdraw
@@ -17,7 +18,7 @@ from pipeline.store.places import open_files
 from pipeline.store.record_copy import copied_records, copy_text, write_copy
 from pipeline.store.run import Run
 from pipeline.store.runfile import write_run
-from pipeline.store.skeleton import GROUP_KEY, entries_of, skeleton_files, write_skeleton
+from pipeline.store.skeleton import entries_of, skeleton_files, write_skeleton
 from tests.pipeline.store.s3 import BUCKET, KEY_ID, SECRET, Server
 
 PLACE = f"s3://{BUCKET}/runs/copy"
@@ -114,9 +115,9 @@ def test_copy__is_not_read_where_each_file_is_at_hand(whole):
 def remade(made, change, **options):
     """The run with other files of the set-up, and a run.json whose digests fit them."""
     contents = skeleton_files(made.spec, made.plan, made.info.identity, made.info.spec_text, made.info.title, **options)
-    group = json.loads(contents[GROUP_KEY])
+    group = json.loads(contents[METADATA])
     change(group)
-    contents = {**contents, GROUP_KEY: json.dumps(group).encode()}
+    contents = {**contents, METADATA: json.dumps(group).encode()}
     write_skeleton(made.info.files, contents, contents)
     return write_run(made.info.files, made.spec, made.info.identity, made.info.spec_text, entries_of(contents))
 
@@ -231,4 +232,3 @@ def test_open_zarr__asks_for_the_group_and_the_indexes(remote, server, whole):
     indexes = [f"cube.zarr/{name}/c.0" for name in indexed.xindexes]
     xr.open_zarr(store, consolidated=True, zarr_format=3)
     assert sorted(keys_asked(server)) == sorted(["cube.zarr/zarr.json", *indexes])
-
