@@ -22,6 +22,19 @@ CONVENTIONS = "CF-1.11"
 AXES = ("X", "Y", "Z")
 """Values of the attribute ``axis`` for the first dims with values on a continuous scale."""
 
+ADDED = {
+    "units": "of numbers, in a form that UDUNITS and pint read, such as `m/s^2`",
+    GIVEN: "instead of `units`: a unit of the model's text that they do not know, such as `widgets`",
+    "long_name": "the meaning in words",
+    "standard_name": "`status_flag` for the status of cells, `quality_flag` for flags of trust, `time`, `realization`",
+    "axis": "`X`, `Y`, `Z` for the first dims with a coordinate of floats with a unit; `T` for time",
+    "cf_role": "`trajectory_id` for the branches of a continuation",
+    "flag_values": "codes, in the type of the variable",
+    "flag_meanings": "their words",
+    "ancillary_variables": "the status of the cells, and errors and flags of the variable",
+}
+"""Attributes of variables, with their contents. A cell is computed at its coordinates, so these have no ``bounds``."""
+
 _STANDARD_NAMES = {"status": "status_flag", "time": "time", "realization": "realization"}
 _FLAG = "_flag"
 _ANCILLARY = ("_stderr", "_error", "_low", "_high", _FLAG)
@@ -43,8 +56,7 @@ class Described(NamedTuple):
 def conventional(ds: xr.Dataset) -> xr.Dataset:
     """Return a dataset with the attributes of the CF conventions; values and existing texts stay.
 
-    Units that pint or UDUNITS cannot read move to the attribute ``units_as_given``. `conventional_attributes`
-    lists what is added.
+    `ADDED` lists the attributes.
     """
     entries = {
         str(name): Described(tuple(map(str, v.dims)), v.dtype, {str(k): a for k, a in v.attrs.items()})
@@ -60,19 +72,7 @@ def conventional(ds: xr.Dataset) -> xr.Dataset:
 
 
 def conventional_attributes(entries: Mapping[str, Described]) -> dict[str, dict[str, Any]]:
-    """Return the attributes of all variables of a dataset, by name, with those of the CF conventions.
-
-    ========================  =========================================================================
-    ``units``                 for numbers, in a form that UDUNITS and pint read
-    ``long_name``             the name in words, unless there is one
-    ``standard_name``         for the status of cells, flags of trust, time, and realizations of noise
-    ``axis``                  X, Y, Z for the first dims with coordinates of floats with units; T for time
-    ``cf_role``               ``trajectory_id`` for the branches of a continuation
-    ``ancillary_variables``   the status of the cells, and errors and flags of the variable
-    ========================  =========================================================================
-
-    There are no ``bounds``: a cell is computed at its coordinates, and stands for no interval.
-    """
+    """Return the attributes of all variables of a dataset, by name, with those of the CF conventions; see `ADDED`."""
     axes = dict(zip(_continuous(entries), AXES, strict=False))
     found = {}
     for name, entry in entries.items():

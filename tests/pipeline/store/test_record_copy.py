@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+from pathlib import Path
 
 import pytest
 
@@ -215,6 +217,16 @@ def test_open_run__group_that_was_changed_is_refused(remote):
     remote.write("cube.zarr/zarr.json", content)
     with pytest.raises(DamagedError, match=r"zarr\.json: its content has changed"):
         open_run(PLACE)
+
+
+def test_docs__example_of_the_object_store(remote, server, monkeypatch):
+    text = (Path(__file__).parents[3] / "docs/object-stores.md").read_text("utf-8")
+    (block,) = re.findall(r"<!-- tested -->\n```python\n(.*?)```", text, re.DOTALL)
+    monkeypatch.setenv("AWS_ALLOW_HTTP", "true")
+    names = {}
+    exec(block.replace("runs/sweep", "runs/copy"), names)
+    assert names["ds"].sizes == names["plain"].sizes == names["lazy"].sizes
+    assert names["plain"].section.load().equals(names["ds"].section.load())
 
 
 def test_open_zarr__asks_for_the_group_and_the_indexes(remote, server, whole):
