@@ -11,6 +11,7 @@ from pipeline.layout.identity import differences, digest_of
 from pipeline.layout.plan import Plan
 from pipeline.specification.parsing import Spec
 from pipeline.store.checking import ODD, odd_keys, verify
+from pipeline.store.checksums import fits
 from pipeline.store.declared import METADATA
 from pipeline.store.errors import DamagedError, RefusedError
 from pipeline.store.files import COMMITS, CUBE, HOLDER, OWN_NAMES, RECORD_COPY, RUN_FILE, TIMINGS, Files, is_temporary
@@ -98,7 +99,7 @@ def _refuse_foreign(files: Files, names: list[str], digest: str) -> None:
 
 
 def _refuse_notes(files: Files) -> None:
-    for name, is_own in ((HOLDER, is_note), (TIMINGS, _is_timings)):
+    for name, is_own in ((HOLDER, is_note), (TIMINGS, _is_timings), (RECORD_COPY, fits)):
         for _, content in files.read_each([name]):
             if isinstance(content, bytes) and not is_own(content):
                 raise RefusedError(f"{files.name}: has a {name} that no run has left; give another --out.")
@@ -239,4 +240,7 @@ def rebuild_skeleton(info: RunInfo, spec: Spec, plan: Plan) -> list[str]:
         entries = entries_of(contents)
         same = [key for key in damaged if entries.get(key) == info.skeleton[key]]
         write_skeleton(info.files, contents, same)
+        damaged = [key for key in damaged if key not in same]
+        if not damaged:
+            break
     return skeleton_problems(info)

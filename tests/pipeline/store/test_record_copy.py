@@ -13,13 +13,14 @@ from pipeline.runs.mending import sound_commits
 from pipeline.runs.verify import describe, verify_run
 from pipeline.store.commits import read_commits, scan
 from pipeline.store.declared import METADATA
-from pipeline.store.errors import DamagedError
+from pipeline.store.errors import DamagedError, RefusedError
 from pipeline.store.files import RECORD_COPY
 from pipeline.store.packing import withdraw
 from pipeline.store.places import open_files
 from pipeline.store.record_copy import copied_records, copy_text, write_copy
 from pipeline.store.run import Run
 from pipeline.store.runfile import write_run
+from pipeline.store.setup import check
 from pipeline.store.skeleton import entries_of, skeleton_files, write_skeleton
 from tests.pipeline.store.s3 import BUCKET, KEY_ID, SECRET, Server
 
@@ -109,6 +110,13 @@ def test_copy__is_not_read_where_each_file_is_at_hand(whole):
     assert set(read_commits(whole.info, whole.plan)) == {0, 2, 3, 4}
     assert set(scan(whole.info, whole.plan)[0]) == {0, 2, 3, 4}
     assert set(sound_commits(whole.info, whole.plan, silent)) == {0, 2, 3, 4}
+
+
+def test_check__file_of_that_name_by_somebody_else_stays(made, tmp_path):
+    (tmp_path / "data").mkdir()
+    (tmp_path / "data" / RECORD_COPY).write_text('{"mine": 1}\n')
+    with pytest.raises(RefusedError, match=r"has a records\.jsonl that no run has left"):
+        check(tmp_path / "data", made.identity)
 
 
 # ---- metadata of the group ---------------------------------------------------------------------
