@@ -108,7 +108,7 @@ def test_open_run__branches_are_trajectories(walk, tmp_path):
     readable(ds, tmp_path / "cube.nc")
 
 
-@pytest.mark.parametrize("name", ["attractors", "basins", "hysteresis", "settling"])
+@pytest.mark.parametrize("name", ["attractors", "hysteresis", "settling"])
 def test_derive__results_are_described(walk, name):
     ds = derive(walk, name)
     quantities = ds.pint.quantify()
@@ -130,9 +130,9 @@ def test_run__names_units_that_nobody_reads_once(write_spec, tmp_path):
     assert ds.l.attrs["units_as_given"] == "widgets"
     assert ds.pint.quantify().l.pint.units is None
     readable(ds, tmp_path / "cube.nc")
-    magpend.figure(tmp_path / "run", "bifurcation", out=tmp_path / "figure")
-    with xr.open_dataset(tmp_path / "figure.nc") as drawn:
-        assert drawn.x.attrs["units"] == "widgets"
+    drawn = magpend.figure(tmp_path / "run", "bifurcation")
+    assert drawn.data.x.attrs["units"] == "widgets"
+    assert drawn.axes[0].get_xlabel() == "l [widgets]"
 
 
 def test_docs__example_of_the_cube(walk, monkeypatch):
