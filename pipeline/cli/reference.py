@@ -341,6 +341,13 @@ def variables() -> str:
     return table(("variable", "own dims", "type", "unit", "meaning", "product"), rows)
 
 
+def conventions() -> str:
+    """Return the Markdown table of the attributes that describe the variables of an opened cube or result."""
+    from pipeline.layout.conventions import ADDED
+
+    return table(("attribute", "contents"), ((f"`{name}`", contents) for name, contents in ADDED.items()))
+
+
 def statuses() -> str:
     """Return the Markdown table of the status codes of a trajectory."""
     from magpend_core.status import Status
@@ -400,6 +407,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "study": study,
     "measures": measures,
     "variables": variables,
+    "conventions": conventions,
     "statuses": statuses,
     "models": models,
     "public": public,

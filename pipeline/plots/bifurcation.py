@@ -14,6 +14,7 @@ import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 
+from pipeline.layout.units import shown_unit
 from pipeline.layout.vocabulary import split_dims
 from pipeline.plots import labels, pixels, style
 from pipeline.plots.bands import draw_bands, with_bands
@@ -202,7 +203,7 @@ class Diagram:
         shown = int(np.count_nonzero((self.x >= min(left, right)) & (self.x <= max(left, right))))
         drawn = pixels.draw_points(panels, self.view, min(1.7, max(0.75, 0.8 * width / max(shown, 1))))
         axis = self.view.ds[self.parameter]
-        drawn["x"].attrs = {"units": str(axis.attrs.get("units", "1")), "long_name": self.parameter}
+        drawn["x"].attrs = {"units": shown_unit(axis.attrs), "long_name": self.parameter}
         drawn["y"].attrs = {"units": self.measure.unit, "long_name": self.measure.name}
         counts = {
             "cells": self.survey.cells,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import xarray as xr
 from matplotlib.lines import Line2D
 
+from pipeline.layout.units import shown_unit
 from pipeline.plots import labels, style
 from pipeline.plots.branches import KINDS, NAMES
 from pipeline.plots.curve_lines import DASHES, mark_points
@@ -51,8 +52,8 @@ def plot_curves(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.Dat
         seen.setdefault((period, kind), line)
     style.label_axes(
         ax,
-        labels.swept_label(str(ds.attrs["first_parameter"]), str(ds["first"].attrs["units"])),
-        labels.swept_label(str(ds.attrs["second_parameter"]), str(ds["second"].attrs["units"])),
+        labels.swept_label(str(ds.attrs["first_parameter"]), shown_unit(ds["first"].attrs)),
+        labels.swept_label(str(ds.attrs["second_parameter"]), shown_unit(ds["second"].attrs)),
     )
     style.limits(ax, frame)
     mark_points(ax, ds, "first", "second", fig.look.tick)

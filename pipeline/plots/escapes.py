@@ -12,6 +12,7 @@ from matplotlib.ticker import MaxNLocator
 from pipeline.analysis.noise.escapes import strength_dim
 from pipeline.analysis.selection import place
 from pipeline.analysis.tabular import words_of
+from pipeline.layout.units import shown_unit
 from pipeline.plots import labels, style
 from pipeline.plots.figure import Run, frame_of, noted, values_of
 from pipeline.products.figures import EscapeFigureOptions
@@ -71,7 +72,7 @@ def plot_rates(
             name += f": exp(\N{MINUS SIGN}{b:.3g}/σ²), {low:.3g} to {high:.3g}"
         handles.append(style.dot(name, colour, marker=MARKERS[k % len(MARKERS)]))
     ax.set_yscale("log")
-    unit = str(axis.attrs.get("units", "1"))
+    unit = shown_unit(axis.attrs)
     below = f"1/σ², σ = {along}" + ("" if unit == "1" else f" [{unit}]")
     style.label_axes(ax, below if kramers else labels.parameter_label(axis), "rate of escape [1/s]")
     style.limits(ax, frame)

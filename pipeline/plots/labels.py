@@ -16,6 +16,7 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.ticker import Formatter, FuncFormatter, MultipleLocator
 
+from pipeline.layout.units import shown_unit
 from pipeline.layout.vocabulary import model_of
 from pipeline.plots.style import check_choice, join
 
@@ -70,8 +71,8 @@ def with_unit(name: str, unit: str) -> str:
 
 
 def raised(unit: str) -> str:
-    """Write the powers of a unit as superscripts: m/s2 as m/s²."""
-    return re.sub(r"(?<=[A-Za-z])[23]", lambda power: {"2": "²", "3": "³"}[power[0]], unit)
+    """Write the powers of a unit as superscripts: m/s2 or m/s^2 as m/s²."""
+    return re.sub(r"(?<=[A-Za-z])\^?([23])(?!\d)", lambda power: {"2": "²", "3": "³"}[power[1]], unit)
 
 
 def state_measure(ds: xr.Dataset, state: str = "", degrees: bool = False) -> Measure:
@@ -190,7 +191,7 @@ def parameter_label(coordinate: xr.DataArray) -> str:
     name = str(coordinate.attrs.get("long_name", coordinate.name))
     if coordinate.name == "frequency":
         name = "drive frequency"
-    return with_unit(name, str(coordinate.attrs.get("units", "Hz" if coordinate.name == "frequency" else "")))
+    return with_unit(name, shown_unit(coordinate.attrs, "Hz" if coordinate.name == "frequency" else ""))
 
 
 def swept_label(name: str, units: str) -> str:
@@ -225,7 +226,7 @@ def caption(ds: xr.Dataset, *, drop: Iterable[str] = (), with_start: bool = True
 
 
 def _value(ds: xr.Dataset, coordinate: xr.DataArray, is_start: bool) -> str:
-    name, unit = str(coordinate.name), str(coordinate.attrs.get("units", "1"))
+    name, unit = str(coordinate.name), shown_unit(coordinate.attrs)
     value = float(coordinate.values.ravel()[0])
     if is_start:
         measure = start_measure(ds, name)

@@ -7,6 +7,7 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.patheffects import withStroke
 
+from pipeline.layout.units import shown_unit
 from pipeline.plots import labels, style
 from pipeline.plots.bifurcation import swept_parameters
 from pipeline.plots.curve_lines import take_room
@@ -55,8 +56,8 @@ def plot_tongues(
         ax.set_ylim(high)
     style.label_axes(
         ax,
-        labels.swept_label(first, str(ds["first"].attrs["units"])),
-        labels.swept_label(second, str(ds["second"].attrs["units"])),
+        labels.swept_label(first, shown_unit(ds["first"].attrs)),
+        labels.swept_label(second, shown_unit(ds["second"].attrs)),
     )
     if data is None:
         _explain(fig, ds)

@@ -13,6 +13,7 @@ from matplotlib.gridspec import GridSpec, SubplotSpec
 from matplotlib.lines import Line2D
 
 from magpend_core.models.model import Drawing, Model
+from pipeline.layout.units import shown_unit
 from pipeline.layout.vocabulary import model_of, parameters_of
 from pipeline.plots import labels, style
 from pipeline.plots.portrait import Motion, draw_path, draw_portrait, equalise, fixed_handles
@@ -169,7 +170,7 @@ def _others(ds: xr.Dataset, model: Model) -> list[tuple[str, ...]]:
     found: dict[str, tuple[str, ...]] = {}
     for name, values in ds.data_vars.items():
         if values.dims == ("time",) and str(name) not in (*model.state_names, "section_times"):
-            unit = str(values.attrs.get("units", ""))
+            unit = shown_unit(values.attrs, "")
             found[unit] = (*found.get(unit, ()), str(name))[:MOST_LINES]
     return list(found.values())[:MOST_PANELS]
 
@@ -223,7 +224,7 @@ def _draw_others(ax: Axes, ds: xr.Dataset, time: np.ndarray, names: Sequence[str
     for name, symbol, look in zip(names, symbols, ("0.15", style.ORANGE), strict=False):
         values = np.asarray(ds[name].values, dtype=np.float64)
         ax.plot(time, values, color=look, linewidth=0.8, gid=f"series:{name}", label=symbol)
-    unit = str(ds[names[0]].attrs.get("units", ""))
+    unit = shown_unit(ds[names[0]].attrs, "")
     style.label_axes(ax, y=labels.with_unit(", ".join(symbols), unit))
     if len(names) > 1:
         low, high = ax.get_ylim()

@@ -5,10 +5,10 @@ name, its options, and the version of its code (`code_version`). `derive` return
 key, or computes it. A damaged or incomplete result is computed again. A result of an earlier cube or an
 earlier version of the code is never read; it stays until `prune` is called.
 
-Each result is a zarr group such as ``derived/attractors-1a2b3c4d.zarr``. ``xarray.open_zarr(path,
-consolidated=False)`` reads it. The attribute ``derived_options`` holds the options as JSON. Labels
-(``state``, ``direction``) are codes with the attribute ``words``. If two processes derive the same result at
-once, both compute it, and one of the equal results stays.
+Each result is a zarr group such as ``derived/attractors-1a2b3c4d.zarr``. ``xarray.open_zarr(path)`` reads it.
+The attribute ``derived_options`` holds the options as JSON. Labels (``state``, ``direction``) are codes with
+the attribute ``words``. If two processes derive the same result at once, both compute it, and one of the equal
+results stays.
 
 A longer extension of cells counts for every later analysis: options that ask for less are raised to the
 largest budget of the kept attractors (`most_evidence`). Two results therefore never contradict each other.
@@ -27,6 +27,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pipeline.layout.conventions import conventional
 from pipeline.products.attractors import IdentifyOptions
 from pipeline.products.product import Analysis, Options, function_of
 from pipeline.products.registry import ANALYSES
@@ -351,11 +352,12 @@ def _kept(run: AnalysedRun, place: Files, result: xr.Dataset) -> xr.Dataset:
     except OSError as error:
         kept = place.name.rpartition("/")[2]
         run.echo(f"{kept}: not kept ({error}); the result is shown all the same")
-        return result
+        return conventional(result)
     return _placed(open_product(place), place)
 
 
-def _placed(ds: xr.Dataset, place: Files) -> xr.Dataset:
+def _placed(stored: xr.Dataset, place: Files) -> xr.Dataset:
+    ds = conventional(stored)
     ds.encoding["source"] = place.name
     return ds
 

@@ -9,6 +9,7 @@ from typing import Any
 from pipeline.layout.domains import check_starts
 from pipeline.layout.limits import check_space
 from pipeline.layout.plan import Plan, make_plan
+from pipeline.layout.units import unit_remarks
 from pipeline.layout.vocabulary import is_grid_dim, is_start_dim
 from pipeline.runs.estimate import estimate, wall_seconds, writing_seconds
 from pipeline.runs.noise import check_steps
@@ -113,7 +114,7 @@ def describe_plan(
     check_space(plan, files.local, plan.n_cells - sum(plan.cells_in(i) for i in done))
     if parsed.title:
         yield parsed.title
-    yield from (f"warning: {remark}" for remark in parsed.model.flow.remarks)
+    yield from (f"warning: {remark}" for remark in (*parsed.model.flow.remarks, *unit_remarks(parsed.model)))
     dims = ", ".join(f"{d} {n}" for d, n in zip(plan.dims, plan.shape, strict=True))
     yield f"{parsed.kind}: {plan.n_cells} cells ({dims or 'one cell'})"
     yield f"tasks: {plan.n_tasks} of {' x '.join(map(str, plan.block)) or '1'} cells, {len(done)} done"

@@ -14,6 +14,7 @@ from pipeline.layout.domains import check_starts
 from pipeline.layout.identity import identity_of
 from pipeline.layout.limits import check_plan, check_space
 from pipeline.layout.plan import Plan, make_plan
+from pipeline.layout.units import unit_remarks
 from pipeline.runs.mending import sound_commits
 from pipeline.runs.noise import check_steps, warn_of_steps
 from pipeline.runs.progress import Progress, duration
@@ -27,6 +28,7 @@ from pipeline.store.errors import IncompleteError
 from pipeline.store.files import Files
 from pipeline.store.packing import Packer
 from pipeline.store.places import open_files
+from pipeline.store.record_copy import remove_copy, write_copy
 from pipeline.store.records import Records
 from pipeline.store.runfile import RunInfo
 from pipeline.store.setup import check, establish
@@ -102,7 +104,7 @@ def run(
     where.resolved()
     check_starts(parsed)
     check_steps(parsed)
-    for remark in parsed.model.flow.remarks:
+    for remark in (*parsed.model.flow.remarks, *unit_remarks(parsed.model)):
         echo(f"warning: {remark}")
     carry_out(parsed, text, files, workers=workers, where=where, echo=echo)
     warn_of_steps(parsed, files, echo)
@@ -177,8 +179,10 @@ def _complete(
     packer = Packer(info, plan, commits)
     missing = [i for i in range(plan.n_tasks) if i not in commits]
     if not missing:
+        write_copy(info, plan, commits)
         echo(f"{info.name} is complete; nothing to do.")
         return
+    remove_copy(info)
     before = plan.n_cells - sum(plan.cells_in(i) for i in missing)
     check_space(plan, info.files.local, plan.n_cells - before)
     echo(f"{plan.n_cells} cells in {plan.n_tasks} tasks" + (f", {before} cells done before" if before else ""))
@@ -222,3 +226,4 @@ def _require_all(info: RunInfo, plan: Plan, echo: Echo) -> None:
             "and have space to write. Then give the same command again; it computes only these tasks."
         )
     sweep(info, plan, commits, echo)
+    write_copy(info, plan, commits)

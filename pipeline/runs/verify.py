@@ -11,6 +11,7 @@ from pipeline.store.checking import ODD, Verification, verify
 from pipeline.store.files import ASIDE, DERIVED
 from pipeline.store.packing import withdraw
 from pipeline.store.products import remove_product
+from pipeline.store.record_copy import remove_copy
 from pipeline.store.runfile import read_run
 from pipeline.store.setup import rebuild_skeleton
 
@@ -48,6 +49,8 @@ def verify_run(directory: str | Path, *, repair: bool = False) -> Verification:
             info.files.move_aside(key)
         rest = rebuild_skeleton(info, spec, plan)
         withdraw(info, found.damaged)
+        if found.copies:
+            remove_copy(info)
         for name in found.derived:
             remove_product(info.files.below(DERIVED).below(name))
     rebuilt = [problem for problem in found.skeleton if problem not in rest]
@@ -59,7 +62,8 @@ def describe(found: Verification, directory: str | Path, *, repaired: bool) -> l
     lines = [f"{directory}: {found.n_committed} of {found.n_tasks} tasks committed and intact"]
     odd = [f"{key}: {ODD}" for key in found.odd]
     lines += [
-        f"  damaged: {text}" for text in (*odd, *found.damaged.values(), *found.skeleton, *found.derived.values())
+        f"  damaged: {text}"
+        for text in (*odd, *found.damaged.values(), *found.skeleton, *found.derived.values(), *found.copies)
     ]
     lines += [f"  rebuilt: {text}" for text in found.rebuilt]
     if found.leftovers:
@@ -80,6 +84,10 @@ def describe(found: Verification, directory: str | Path, *, repaired: bool) -> l
         lines.append(f"{len(found.derived)} products removed: they are computed again on demand.")
     elif found.derived:
         lines.append("Damaged products are computed again on demand; --repair removes them.")
+    if found.copies:
+        lines.append(
+            "The copy of commit records is removed." if repaired else "--repair removes the copy of commit records."
+        )
     if found.damaged and not repaired:
         lines.append("Withdraw them with --repair, then run the specification again to compute these tasks.")
     return lines

@@ -11,8 +11,10 @@ from pipeline.store.commits import absent_objects, leftover_keys, scan
 from pipeline.store.errors import DamagedError
 from pipeline.store.files import COMMITS, CUBE, DERIVED, Files, problems_of
 from pipeline.store.products import products_in, read_product_attrs
+from pipeline.store.record_copy import copy_problem
 from pipeline.store.records import Records, marker_key
 from pipeline.store.runfile import RunInfo
+from pipeline.store.skeleton import skeleton_problems
 
 ODD = "is a folder where a file should be, or a file where a folder should be"
 
@@ -39,6 +41,8 @@ class Verification:
         Problems of the skeleton that have been repaired.
     odd : list of str
         Folders at the places of files, and files at the places of folders.
+    copies : list of str
+        Problem of the copy of commit records, if it differs from them.
     """
 
     n_tasks: int
@@ -49,11 +53,12 @@ class Verification:
     derived: dict[str, str] = field(default_factory=dict)
     rebuilt: list[str] = field(default_factory=list)
     odd: list[str] = field(default_factory=list)
+    copies: list[str] = field(default_factory=list)
 
     @property
     def sound(self) -> bool:
         """Whether nothing is damaged: neither committed tasks nor metadata, coordinates and stored analysis results."""
-        return not (self.damaged or self.skeleton or self.derived or self.odd)
+        return not (self.damaged or self.skeleton or self.derived or self.odd or self.copies)
 
 
 def verify(info: RunInfo, plan: Plan) -> Verification:
@@ -74,10 +79,11 @@ def verify(info: RunInfo, plan: Plan) -> Verification:
         n_tasks=plan.n_tasks,
         n_committed=n_whole,
         damaged=dict(sorted(damaged.items())),
-        skeleton=problems_of(info.files.below(CUBE), info.skeleton),
+        skeleton=skeleton_problems(info),
         leftovers=sorted(key for key in leftovers if key not in named),
         derived=damaged_products(info),
         odd=odd_keys(info.files, info.skeleton),
+        copies=[problem] if (problem := copy_problem(info, records)) else [],
     )
 
 

@@ -26,6 +26,7 @@ from pipeline.layout.writing import NoFileError, writing
 from pipeline.store.errors import DamagedError, RefusedError, UnreadableError
 from pipeline.store.files import COMMITS, CUBE, RUN_FILE, TIMINGS, Files, entries_of, problems_of
 from pipeline.store.keys import Owners, chunk_keys
+from pipeline.store.record_copy import copied_records
 from pipeline.store.records import (
     BLOCK,
     Commit,
@@ -160,7 +161,7 @@ def read_commits(info: RunInfo, plan: Plan, echo: Echo | None = None) -> Records
     RefusedError
         If a folder is a link.
     """
-    records, rejected = scan(info, plan)
+    records, rejected = scan(info, plan, copies=info.files.local is None)
     problems = [f"{COMMITS}/{name}: {problem}; it does not count" for name, problem in rejected.items()]
     if not records.packs:  # a small run: listing its files takes little time
         absent = absent_objects(info, records)
@@ -196,7 +197,9 @@ def read_commit(info: RunInfo, plan: Plan, index: int) -> Commit | None:
     return scan(info, plan, (index // BLOCK,))[0].get(index)
 
 
-def scan(info: RunInfo, plan: Plan, blocks: Container[int] | None = None) -> tuple[Records, dict[str, str]]:
+def scan(
+    info: RunInfo, plan: Plan, blocks: Container[int] | None = None, *, copies: bool = False
+) -> tuple[Records, dict[str, str]]:
     """Read the folder ``commits``; return the valid commit records, and the problems of the others by file name.
 
     Parameters
@@ -205,6 +208,8 @@ def scan(info: RunInfo, plan: Plan, blocks: Container[int] | None = None) -> tup
         The run and its plan.
     blocks
         Blocks of tasks to read; by default all.
+    copies
+        Whether the copy of a record (`pipeline.store.record_copy`) may be read in the place of its file.
 
     Raises
     ------
@@ -215,14 +220,20 @@ def scan(info: RunInfo, plan: Plan, blocks: Container[int] | None = None) -> tup
     """
     info.files.refuse_links(COMMITS)
     folder = info.files.below(COMMITS)
-    names = _names(folder)
+    sizes = folder.sizes() if copies else {}
+    names = sorted(sizes) if copies else _names(folder)
     for _ in range(_MOST_SCANS):
         found = _Scan(info, plan, blocks)
+        found.singles |= copied_records(info, sizes) if sizes else {}
         vanished = found.read(folder, names)
+        records = Records(info.files, info.digest, found.singles, found.packs)
+        if not vanished and len(records) == plan.n_tasks:  # nothing can be missing
+            return records, found.rejected
+        sizes = {}  # what changes meanwhile is read itself
         before, names = names, _names(folder)
         # another process may have packed a block meanwhile: its records vanish, its pack appears; read again
         if not vanished and _packs(before) == _packs(names):
-            return Records(info.files, info.digest, found.singles, found.packs), found.rejected
+            return records, found.rejected
     raise UnreadableError(
         f"{folder.name}: changes while it is read, {_MOST_SCANS} times in a row; look who writes there, then "
         "give the same command again."
@@ -272,6 +283,8 @@ class _Scan:
         stem = name.removesuffix(".json")
         if not stem.isdecimal():
             return self._blocks is None  # not the name of a record: read it in a full scan, to report it
+        if int(stem) in self.singles:  # its copy was read
+            return False
         pack = self.packs.get(int(stem) // BLOCK)
         return self._asked(int(stem) // BLOCK) and (pack is None or int(stem) in pack.without)
 

@@ -53,14 +53,21 @@ class Declared:
         """Check the size, shape and codecs that a file declares against the plan; return the problem, or None."""
         name, _, rest = key.partition("/")
         if not rest:
-            return None
+            return self._group_problem(bytes(content)) if name == METADATA else None
         if rest == METADATA:
-            return self._metadata_problem(name, bytes(content))
+            return self._metadata_problem(name, _parsed(content))
         declared, most = declared_bytes(content), self._most(name)
         exact = name in self._variables
         if not (declared == most or (0 <= declared < most and not exact)):
             return f"declares {declared} bytes, and {'has' if exact else 'may have'} {most}"
         return self._text_problem(bytes(content)) if name in self._texts else None
+
+    def _group_problem(self, content: bytes) -> str | None:
+        """Check the metadata of arrays that the group's file repeats; return the first problem, or None."""
+        for name, metadata in consolidated_metadata(content).items():
+            if problem := self._metadata_problem(name, metadata):
+                return f"its metadata of {name}: {problem}"
+        return None
 
     def _text_problem(self, content: bytes) -> str | None:
         """Check the number of texts that a chunk declares, since decoding allocates memory for it; return a problem or
@@ -80,14 +87,13 @@ class Declared:
         # a coordinate lies along one dim of the cube
         return max(MOST_TEXT, 8 * max(self._sizes.values(), default=1))
 
-    def _metadata_problem(self, name: str, content: bytes) -> str | None:
+    def _metadata_problem(self, name: str, data: Any) -> str | None:
         try:
-            data: dict[str, Any] = json.loads(content)
             shape, dims = tuple(data["shape"]), tuple(data.get("dimension_names") or ())
             chunk = tuple(data["chunk_grid"]["configuration"]["chunk_shape"])
             codecs = tuple(codec["name"] for codec in data["codecs"])
             dtype = data["data_type"]
-        except (ValueError, KeyError, TypeError, RecursionError):
+        except (ValueError, KeyError, TypeError):
             return "is no metadata of an array"
         if codecs not in CODECS:
             return _codecs_problem(codecs)
@@ -98,6 +104,42 @@ class Declared:
         if shape != tuple(self._sizes.get(dim) for dim in dims) or chunk != tuple(max(n, 1) for n in shape):
             return "has another shape than its dims"
         return None
+
+
+def _parsed(content: Any) -> Any:
+    """Return the data in a text of JSON; None for a text that is none."""
+    try:
+        return json.loads(bytes(content))
+    except (ValueError, RecursionError):
+        return None
+
+
+def consolidated_metadata(group: bytes) -> dict[str, Any]:
+    """Return the metadata of all arrays, by name, that a group's ``zarr.json`` repeats; empty if it repeats none."""
+    try:
+        found = _parsed(group)["consolidated_metadata"]["metadata"]
+    except (KeyError, TypeError):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def disagreements(contents: Mapping[str, bytes]) -> list[str]:
+    """Return a line for each array whose metadata differ from their copy in the group's ``zarr.json``.
+
+    A group without copies has no problem: earlier versions of magpend have made such groups.
+
+    Parameters
+    ----------
+    contents
+        Contents of files by key. Arrays without a ``zarr.json`` among them are not compared.
+    """
+    copies = consolidated_metadata(contents.get(METADATA, b""))
+    own = {key.rpartition("/")[0]: content for key, content in contents.items() if key.endswith(f"/{METADATA}")}
+    found = []
+    for name, content in own.items() if copies else ():
+        if name not in copies or _parsed(content) != copies[name]:
+            found.append(f"{METADATA}: its metadata of {name} are not those of {name}/{METADATA}")
+    return found
 
 
 def _codecs_problem(codecs: tuple[Any, ...]) -> str:

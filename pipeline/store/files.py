@@ -18,8 +18,9 @@ if TYPE_CHECKING:
 RUN_FILE, CUBE, COMMITS, LOCK, TIMINGS = "run.json", "cube.zarr", "commits", "lock", "timings.jsonl"
 HOLDER = "lock.json"
 DERIVED, FIGURES, EXTENDED, ASIDE = "derived", "figures", "extended.json", "aside"
-OWN_FILES = (RUN_FILE, HOLDER, TIMINGS, EXTENDED)
-OWN_NAMES = frozenset({RUN_FILE, CUBE, COMMITS, LOCK, HOLDER, TIMINGS, DERIVED, FIGURES, EXTENDED, ASIDE})
+RECORD_COPY = "records.jsonl"
+OWN_FILES = (RUN_FILE, HOLDER, TIMINGS, EXTENDED, RECORD_COPY)
+OWN_NAMES = frozenset({*OWN_FILES, CUBE, COMMITS, LOCK, DERIVED, FIGURES, ASIDE})
 
 # one letter before the colon is a Windows drive; pathlib turns two slashes into one
 _URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/")
@@ -218,12 +219,32 @@ def problems_of(files: Files, objects: Mapping[str, Mapping[str, Any]]) -> list[
     objects
         Size and sha256 by key, as of `entry_of`.
     """
-    problems = []
+    return [problem for _, _, problem in compared(files, objects) if problem]
+
+
+def compared(files: Files, objects: Mapping[str, Mapping[str, Any]]) -> Iterator[tuple[str, bytes, str]]:
+    """Read files and compare them with their recorded sizes and sha256 digests.
+
+    Parameters
+    ----------
+    files
+        Where the keys of `objects` lie.
+    objects
+        Size and sha256 by key, as of `entry_of`.
+
+    Yields
+    ------
+    key : str
+        Key of the file.
+    content : bytes
+        Its content; empty for a file that is missing.
+    problem : str
+        Line of text; empty if the file is as recorded.
+    """
     for key, content in files.read_each(objects):
         if isinstance(content, NoFileError):
-            problems.append(f"{key}: {content}")
+            yield key, b"", f"{key}: {content}"
         elif isinstance(content, FileNotFoundError):
-            problems.append(f"{key}: missing")
-        elif entry_of(content) != dict(objects[key]):
-            problems.append(f"{key}: its content has changed")
-    return problems
+            yield key, b"", f"{key}: missing"
+        else:
+            yield key, content, "" if entry_of(content) == dict(objects[key]) else f"{key}: its content has changed"

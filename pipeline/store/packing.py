@@ -12,6 +12,7 @@ from collections.abc import Iterable, Mapping
 from pipeline.layout.plan import Plan
 from pipeline.store.commits import scan
 from pipeline.store.files import COMMITS
+from pipeline.store.record_copy import remove_copy
 from pipeline.store.records import BLOCK, Commit, Records, block_of_pack, marker_key, pack_key, pack_text, salvage
 from pipeline.store.runfile import RunInfo
 
@@ -74,6 +75,7 @@ def withdraw(info: RunInfo, names: Iterable[str]) -> None:
         whole records stay.
     """
     info.files.refuse_links(COMMITS)
+    remove_copy(info)
     folder = info.files.below(COMMITS)
     blocks: dict[int, set[int]] = {}
     for name in names:

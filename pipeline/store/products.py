@@ -11,7 +11,8 @@ import errno
 import hashlib
 import json
 import time
-from collections.abc import Callable, Iterable, Mapping
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,7 +25,7 @@ from zarr.storage import LocalStore, MemoryStore
 from pipeline.layout.attributes import netcdf_safe
 from pipeline.layout.writing import TEMPORARY, sync_folder, temporary_beside, writing
 from pipeline.store.arrays import create_array
-from pipeline.store.declared import product_problem
+from pipeline.store.declared import disagreements, product_problem
 from pipeline.store.errors import DamagedError, UnreadableError
 from pipeline.store.files import Files
 from pipeline.store.local import files_below, refuse_links, remove_tree, sync
@@ -166,7 +167,16 @@ def read_product_attrs(place: Place) -> dict[str, Any]:
 
 
 def _refuse_declared(files: Files, contents: Iterable[tuple[str, bytes | FileNotFoundError]]) -> None:
-    if problem := product_problem((key, value) for key, value in contents if isinstance(value, bytes)):
+    metadata: dict[str, bytes] = {}
+
+    def whole() -> Iterator[tuple[str, bytes]]:
+        for key, value in contents:
+            if isinstance(value, bytes):
+                metadata.update({key: value} if key.endswith(_GROUP) else {})
+                yield key, value
+
+    problem = product_problem(whole()) or next(iter(disagreements(metadata)), None)
+    if problem:
         raise DamagedError(f"{files.name}: {problem}")
 
 
@@ -270,6 +280,10 @@ def _write_group(store: Store, ds: xr.Dataset, digests: Callable[[], Digests]) -
     others = sorted(str(name) for name in ds.coords if name not in ds.dims)
     stored = {**attrs, "coordinates": " ".join(others)} if others else attrs
     group.update_attributes({**stored, SEAL: _seal(stored, digests())})
+    with warnings.catch_warnings():
+        # readers over a network then ask once for the metadata of all arrays; see `pipeline.store.skeleton`
+        warnings.filterwarnings("ignore", message="Consolidated metadata")
+        zarr.consolidate_metadata(store)
     return stored
 
 

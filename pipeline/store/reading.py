@@ -10,9 +10,11 @@ import numpy as np
 from magpend_core.models.model import Model
 from pipeline.layout.attributes import netcdf_safe
 from pipeline.layout.cells import DIRECTION_CODES
+from pipeline.layout.conventions import conventional
 from pipeline.layout.plan import Plan
 from pipeline.layout.vocabulary import drift_attributes, model_attribute, noise_attributes, section_attributes
 from pipeline.specification.parsing import Spec
+from pipeline.store.declared import METADATA, consolidated_metadata
 from pipeline.store.parallel_reads import quick_reading
 from pipeline.store.records import Commit
 from pipeline.store.runfile import RunInfo
@@ -35,21 +37,25 @@ class OpenedRun(Protocol):
     def spec(self) -> Spec: ...  # noqa: D102
     @property
     def model(self) -> Model: ...  # noqa: D102
+    @property
+    def known(self) -> Mapping[str, bytes]: ...  # noqa: D102
 
 
 def cube_of(run: OpenedRun, *, chunks: Any = None, check: bool | None = None) -> xr.Dataset:
     """Return the result cube of an opened run as a dataset; cells without a commit record read as pending."""
     import xarray as xr
 
-    view: Any = committed_view(run.info, run.plan, run.commits, check=check)
+    view: Any = committed_view(run.info, run.plan, run.commits, check=check, known=run.known)
+    copies = consolidated_metadata(run.known.get(METADATA, b""))
+    whole = all(name in copies for name in view.arrays())
     with quick_reading():
-        ds = xr.open_dataset(view, engine="zarr", chunks=chunks, consolidated=False, mask_and_scale=False)
+        ds = xr.open_dataset(view, engine="zarr", chunks=chunks, consolidated=whole, mask_and_scale=False)
     ds = ds[[v.name for v in run.plan.variables]]
     words = {str(name): _texts(ds[name]) for name in ds.coords if ds[name].dtype.kind not in "biuf"}
     ds = ds.assign_coords(words)
     if "direction" in ds.coords:
         ds = ds.assign_coords(direction=_directions(ds.coords["direction"]))
-    return netcdf_safe(ds.assign_attrs(_attributes(run)))
+    return conventional(netcdf_safe(ds.assign_attrs(_attributes(run))))
 
 
 def _attributes(run: OpenedRun) -> dict[str, Any]:

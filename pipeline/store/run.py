@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
 from html import escape
 from pathlib import Path
@@ -53,12 +54,15 @@ class Run:
         Plan that follows from `spec`.
     commits : Records
         Valid commit records by task.
+    known : dict
+        Contents of small files of the set-up by key, which were compared with their digests in ``run.json``.
     """
 
     info: RunInfo
     spec: Spec
     plan: Plan
     commits: Records
+    known: Mapping[str, bytes] = field(default_factory=dict, repr=False, compare=False)
 
     _next: ClassVar[tuple[str, ...]] = _NEXT
 
@@ -85,11 +89,11 @@ class Run:
         if isinstance(source, Run):
             return source
         info = read_run(source)
-        check_skeleton(info)
+        known = check_skeleton(info)
         spec = kept_spec(info.spec)
         plan = make_plan(spec)
         check_plan(plan)
-        return cls(info, spec, plan, read_commits(info, plan))
+        return cls(info, spec, plan, read_commits(info, plan), known)
 
     def __repr__(self) -> str:
         facts = (f"  {name:9s} {text}" for name, text in self._facts.items())

@@ -87,9 +87,10 @@ def read_run(place: str | Path | Files) -> RunInfo:
     """
     files = open_files(place)
     directory, path = files.name, files.below(RUN_FILE).name
-    if not is_run(files):
-        raise RefusedError(f"{directory}: no run directory (it has no {RUN_FILE}).")
-    content = files.read(RUN_FILE)
+    try:
+        content = files.read(RUN_FILE)
+    except FileNotFoundError:
+        raise RefusedError(f"{directory}: no run directory (it has no {RUN_FILE}).") from None
     try:
         data = json.loads(content)
         _refuse_format(path, data, content)

@@ -11,21 +11,16 @@ from pipeline.layout.identity import differences, digest_of
 from pipeline.layout.plan import Plan
 from pipeline.specification.parsing import Spec
 from pipeline.store.checking import ODD, odd_keys, verify
+from pipeline.store.checksums import fits
+from pipeline.store.declared import METADATA
 from pipeline.store.errors import DamagedError, RefusedError
-from pipeline.store.files import COMMITS, CUBE, HOLDER, OWN_NAMES, RUN_FILE, TIMINGS, Files, is_temporary
+from pipeline.store.files import COMMITS, CUBE, HOLDER, OWN_NAMES, RECORD_COPY, RUN_FILE, TIMINGS, Files, is_temporary
 from pipeline.store.lease import is_note
 from pipeline.store.local import run_around
 from pipeline.store.packing import withdraw
 from pipeline.store.places import open_files
 from pipeline.store.runfile import RunInfo, is_run, read_run, write_run
-from pipeline.store.skeleton import (
-    GROUP_KEY,
-    entries_of,
-    skeleton_files,
-    skeleton_keys,
-    skeleton_problems,
-    write_skeleton,
-)
+from pipeline.store.skeleton import entries_of, skeleton_files, skeleton_keys, skeleton_problems, write_skeleton
 
 Echo = Callable[[str], None]
 
@@ -104,7 +99,7 @@ def _refuse_foreign(files: Files, names: list[str], digest: str) -> None:
 
 
 def _refuse_notes(files: Files) -> None:
-    for name, is_own in ((HOLDER, is_note), (TIMINGS, _is_timings)):
+    for name, is_own in ((HOLDER, is_note), (TIMINGS, _is_timings), (RECORD_COPY, fits)):
         for _, content in files.read_each([name]):
             if isinstance(content, bytes) and not is_own(content):
                 raise RefusedError(f"{files.name}: has a {name} that no run has left; give another --out.")
@@ -119,7 +114,8 @@ def _is_timings(content: bytes) -> bool:
 
 
 def _is_own(name: str) -> bool:
-    return name in OWN_NAMES or (name.startswith((f".{RUN_FILE}", f".{HOLDER}")) and is_temporary(name))
+    written = tuple(f".{name}." for name in (RUN_FILE, HOLDER, RECORD_COPY))
+    return name in OWN_NAMES or (name.startswith(written) and is_temporary(name))
 
 
 def _names(files: Files) -> list[str]:
@@ -145,7 +141,7 @@ def _digests(files: Files) -> set[str]:
     records = [f"{COMMITS}/{key}" for key in files.below(COMMITS).everything() if key.endswith((".json", ".jsonl"))]
     # a pack names the digest in its first record
     found = {_text_in(content, "digest") for _, content in files.read_each(records)}
-    for _, content in files.read_each([f"{CUBE}/{GROUP_KEY}"]):
+    for _, content in files.read_each([f"{CUBE}/{METADATA}"]):
         found.add(_text_in(content, "attributes", "digest"))
     return {digest for digest in found if digest}
 
@@ -202,7 +198,7 @@ def establish(
     info = check(files, identity)
     names = _names(files)
     if alone:  # else another process may be writing these files now
-        left = (f".{RUN_FILE}.", f".{HOLDER}.")
+        left = (f".{RUN_FILE}.", f".{HOLDER}.", f".{RECORD_COPY}.")
         files.remove([name for name in names if name.startswith(left)])
     if COMMITS not in names:
         files.prepare(COMMITS)
@@ -239,8 +235,12 @@ def rebuild_skeleton(info: RunInfo, spec: Spec, plan: Plan) -> list[str]:
     if not problems:
         return []
     damaged = [key for key in info.skeleton if any(p.startswith(f"{key}: ") for p in problems)]
-    contents = skeleton_files(spec, plan, info.identity, info.spec_text, info.title)
-    entries = entries_of(contents)
-    same = [key for key in damaged if entries.get(key) == info.skeleton[key]]
-    write_skeleton(info.files, contents, same)
+    for described in (True, False):  # cubes of earlier versions have fewer attributes
+        contents = skeleton_files(spec, plan, info.identity, info.spec_text, info.title, described=described)
+        entries = entries_of(contents)
+        same = [key for key in damaged if entries.get(key) == info.skeleton[key]]
+        write_skeleton(info.files, contents, same)
+        damaged = [key for key in damaged if key not in same]
+        if not damaged:
+            break
     return skeleton_problems(info)

@@ -15,6 +15,7 @@ import zarr
 from zarr.storage import MemoryStore
 
 from pipeline.layout.cells import Coordinate, coordinates
+from pipeline.layout.conventions import CONVENTIONS, Described, conventional_attributes
 from pipeline.layout.identity import digest_of
 from pipeline.layout.moving import moving_coordinates
 from pipeline.layout.plan import Plan
@@ -22,21 +23,33 @@ from pipeline.layout.vocabulary import model_attribute
 from pipeline.products.registry import CELL_PRODUCTS
 from pipeline.specification.parsing import Spec
 from pipeline.store.arrays import create_array, write_whole
+from pipeline.store.declared import METADATA, consolidated_metadata, disagreements
 from pipeline.store.errors import DamagedError
-from pipeline.store.files import CUBE, Files, entry_of, problems_of
+from pipeline.store.files import CUBE, Files, compared, entry_of
 from pipeline.store.runfile import RunInfo
 
-GROUP_KEY = "zarr.json"
+MOST_KEPT = 1_000_000
+"""Largest size in bytes of a file of the set-up whose content an opened run keeps, so that it is read once."""
 
 
-def skeleton_files(spec: Spec, plan: Plan, identity: Mapping[str, Any], spec_text: str, title: str) -> dict[str, bytes]:
+def skeleton_files(
+    spec: Spec, plan: Plan, identity: Mapping[str, Any], spec_text: str, title: str, *, described: bool = True
+) -> dict[str, bytes]:
     """Return the contents of all files of an empty result cube (metadata and coordinates) by key; those of the group
     come first.
+
+    Parameters
+    ----------
+    spec, plan, identity, spec_text, title
+        The run.
+    described
+        Whether variables have the attributes of `pipeline.layout.conventions`. Cubes of earlier versions have none
+        of them.
     """
     attrs = {
         "kind": plan.kind,
         "model": model_attribute(spec.model),
-        "Conventions": "CF-1.11",
+        "Conventions": CONVENTIONS,
         "title": title,
         "spec": spec_text,
         "digest": digest_of(identity),
@@ -46,6 +59,7 @@ def skeleton_files(spec: Spec, plan: Plan, identity: Mapping[str, Any], spec_tex
     store = MemoryStore(data)
     names = " ".join(sorted(c.name for c in found if c.dims != (c.name,)))
     group = zarr.create_group(store, zarr_format=3, attributes={**attrs, "coordinates": names})
+    texts = _attributes(plan, found, described)
     for variable in plan.variables:
         create_array(
             group,
@@ -55,22 +69,30 @@ def skeleton_files(spec: Spec, plan: Plan, identity: Mapping[str, Any], spec_tex
             plan.chunks(variable),
             variable.dtype,
             variable.fill,
-            variable.attributes(),
+            texts[variable.name],
         )
     for coordinate in found:
-        write_whole(group, coordinate.name, coordinate.dims, np.asarray(coordinate.values), coordinate.attrs)
+        write_whole(group, coordinate.name, coordinate.dims, np.asarray(coordinate.values), texts[coordinate.name])
     with warnings.catch_warnings():
         # readers without this key ignore it; with it xarray opens the cube without a warning
         warnings.filterwarnings("ignore", message="Consolidated metadata")
         zarr.consolidate_metadata(store)
-    keys = sorted(data, key=lambda key: (key != GROUP_KEY, key))
+    keys = sorted(data, key=lambda key: (key != METADATA, key))
     return {key: data[key].to_bytes() for key in keys}
+
+
+def _attributes(plan: Plan, found: Iterable[Coordinate], described: bool) -> dict[str, dict[str, Any]]:
+    """Return the attributes of all variables and coordinates of the result cube, by name."""
+    entries = {
+        v.name: Described((*plan.dims, *v.own_dims), np.dtype(v.dtype), v.attributes()) for v in plan.variables
+    } | {c.name: Described(c.dims, np.asarray(c.values).dtype, c.attrs) for c in found}
+    return conventional_attributes(entries) if described else {n: dict(entry.attrs) for n, entry in entries.items()}
 
 
 def skeleton_keys(spec: Spec, plan: Plan) -> list[str]:
     """Return the keys of the metadata files of all variables and coordinates of the result cube."""
     names = [v.name for v in plan.variables] + [c.name for c in (*coordinates(spec), *_labels(spec))]
-    return [f"{name}/{GROUP_KEY}" for name in names]
+    return [f"{name}/{METADATA}" for name in names]
 
 
 def _labels(spec: Spec) -> list[Coordinate]:
@@ -108,25 +130,53 @@ def write_skeleton(files: Files, contents: Mapping[str, bytes], keys: Iterable[s
 
 
 def skeleton_problems(info: RunInfo) -> list[str]:
-    """Return a line for each metadata or coordinate file of the result cube that is missing or has changed."""
-    folders = {key.partition("/")[0] for key in info.skeleton if "/" in key}
+    """Return a line for each metadata or coordinate file of the result cube that is missing or has changed.
+
+    If none has, return a line for each array whose metadata differ from their copy in the group's file.
+    """
+    return _compare(info, info.skeleton)[1]
+
+
+def _compare(info: RunInfo, keys: Iterable[str]) -> tuple[dict[str, bytes], list[str]]:
+    """Compare files of the set-up with their digests; return the contents of small ones, and the problems of all."""
+    chosen = {key: info.skeleton[key] for key in keys}
+    folders = {key.partition("/")[0] for key in chosen if "/" in key}
     info.files.refuse_links(CUBE, *(f"{CUBE}/{folder}" for folder in folders))
-    return problems_of(info.files.below(CUBE), info.skeleton)
+    contents, problems = {}, []
+    for key, content, problem in compared(info.files.below(CUBE), chosen):
+        if problem:
+            problems.append(problem)
+        elif len(content) <= MOST_KEPT:
+            contents[key] = content
+    return contents, problems or disagreements(contents)
 
 
-def check_skeleton(info: RunInfo) -> None:
-    """Compare the result cube's metadata and coordinates with their digests in ``run.json``; raise `DamagedError` if
-    one differs.
+def check_skeleton(info: RunInfo) -> dict[str, bytes]:
+    """Compare the result cube's metadata and coordinates with their digests in ``run.json``; return the contents of the
+    small files.
+
+    In an object store, where each file is a request, the arrays' own metadata are not read if the group's file
+    repeats them all: readers then use that file, whose digest is compared, and no other.
 
     Raises
     ------
     DamagedError
         If a file is missing or has changed; the message names the files and the remedy.
     """
-    problems = skeleton_problems(info)
+    keys = list(info.skeleton)
+    first = [key for key in keys if key == METADATA or not key.endswith(METADATA)]
+    rest = [key for key in keys if key not in first]
+    if info.files.local is not None:
+        first, rest = keys, []
+    contents, problems = _compare(info, first)
+    copies = consolidated_metadata(contents.get(METADATA, b""))
+    if any(key.rpartition("/")[0] not in copies for key in rest):
+        own, others = _compare(info, rest)
+        contents, problems = {**contents, **own}, problems + others
     if problems:
         more = f" (and {len(problems) - 3} more)" if len(problems) > 3 else ""
         raise DamagedError(
             f"{info.files.below(CUBE).name}: {'; '.join(problems[:3])}{more}. These files follow from the "
             f"specification: rebuild them with: magpend verify --repair {info.name}"
         )
+    return contents

@@ -52,7 +52,7 @@ class Shown:
 
     def arrays(self) -> list[str]:
         """Return the names of the arrays in the result cube."""
-        return sorted({key.partition("/")[0] for key in self._skeleton})
+        return sorted({key.partition("/")[0] for key in self._skeleton if "/" in key})
 
     def entry(self, key: str) -> Mapping[str, Any] | None:
         """Return the recorded size and sha256 of a file; None if readers do not see the file."""
@@ -80,16 +80,21 @@ class CommittedStore(WrapperStore[Store]):
         Files that readers see.
     checks
         Whether contents are compared with their records.
+    known
+        Contents of files by key that were compared already.
     """
 
-    def __init__(self, store: Store, files: Files, shown: Shown, checks: bool = True) -> None:
+    def __init__(
+        self, store: Store, files: Files, shown: Shown, checks: bool = True, known: Mapping[str, bytes] | None = None
+    ) -> None:
         super().__init__(store)
         self._files = files
         self._shown = shown
         self._checks = checks
+        self._known = known or {}
 
     def _with_store(self, store: Store) -> CommittedStore:
-        return type(self)(store, self._files, self._shown, self._checks)
+        return type(self)(store, self._files, self._shown, self._checks, self._known)
 
     async def get(self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None) -> Buffer | None:
         """Return the content of a file of the result cube for zarr; None if readers must not see the file.
@@ -102,9 +107,11 @@ class CommittedStore(WrapperStore[Store]):
         entry = self._shown.entry(key)
         if entry is None:
             return None
-        if self._files.local is not None:
+        if key in self._known:
+            content: Any = self._compare(key, entry, self._known[key])
+        elif self._files.local is not None:
             # a thread reads and compares, while the event loop asks for other chunks
-            content: Any = await asyncio.to_thread(self._read, key, entry)
+            content = await asyncio.to_thread(self._read, key, entry)
         else:
             found = await self._store.get(key, prototype)
             content = None if found is None else found.to_bytes()
@@ -156,6 +163,10 @@ class CommittedStore(WrapperStore[Store]):
             f"what is damaged; or look at all of it with: magpend verify {name}"
         )
 
+    def arrays(self) -> list[str]:
+        """Return the names of the arrays in the result cube."""
+        return self._shown.arrays()
+
     async def exists(self, key: str) -> bool:
         """Return whether a key belongs to the metadata, the coordinates or a committed chunk of the result cube."""
         return self._shown.entry(key) is not None
@@ -195,7 +206,12 @@ def _slice(byte_range: ByteRequest, size: int) -> slice:
 
 
 def committed_view(
-    info: RunInfo, plan: Plan, commits: Mapping[int, Commit], *, check: bool | None = None
+    info: RunInfo,
+    plan: Plan,
+    commits: Mapping[int, Commit],
+    *,
+    check: bool | None = None,
+    known: Mapping[str, bytes] | None = None,
 ) -> CommittedStore:
     """Return a read-only zarr store that shows the metadata, the coordinates and the committed chunks of a run's result
     cube.
@@ -206,7 +222,9 @@ def committed_view(
         The run, its plan and its valid records.
     check
         Whether to compare chunks with their records. The default follows `checks_chunks`.
+    known
+        Contents of files of the set-up by key that were compared with their digests already.
     """
     store = info.files.below(CUBE).zarr(read_only=True)
     shown = Shown(info, plan, commits)
-    return CommittedStore(store, info.files, shown, checks_chunks() if check is None else check)
+    return CommittedStore(store, info.files, shown, checks_chunks() if check is None else check, known)

@@ -54,7 +54,8 @@ def measure(place: str, text: str, n_requests: Callable[[], int]) -> list[tuple[
     from pipeline.runs.status import state
     from pipeline.runs.verify import verify_run
     from pipeline.specification.parsing import parse_spec
-    from pipeline.store.commits import write_task
+    from pipeline.store.commits import read_commits, write_task
+    from pipeline.store.record_copy import write_copy
     from pipeline.store.setup import create
 
     spec = parse_spec(tomllib.loads(text))
@@ -81,6 +82,7 @@ def measure(place: str, text: str, n_requests: Callable[[], int]) -> list[tuple[
             write_task(info, plan, index, values, {"bounded": plan.cells_in(index)})
 
     timed(f"commit a task of {sum(v.nbytes for v in values.values()) / 1e3:.0f} kB", commit, plan.n_tasks)
+    timed("copy the records", lambda: write_copy(info, plan, read_commits(info, plan)))
     timed(f"status of {plan.n_tasks} tasks", lambda: state(place))
     ds = timed("open", lambda: open_run(place))
     timed("load a variable", ds["section"].load)

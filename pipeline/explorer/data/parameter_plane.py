@@ -16,6 +16,7 @@ from pipeline.explorer.data.arrays import pack_arrays
 from pipeline.explorer.data.clicked_orbit import TOLERANCE, finite
 from pipeline.explorer.data.explored import ExploredRun, ExplorerError
 from pipeline.explorer.data.series import fixed_points, orbit_series
+from pipeline.layout.units import shown_unit
 from pipeline.layout.vocabulary import ATTRACTS, FREQUENCY_DIM, frequency_of, split_dims
 from pipeline.plots.branches import NAMES
 from pipeline.plots.curve_lines import POINT_NAMES
@@ -48,7 +49,7 @@ def parameter_plane(run: Run) -> dict[str, Any]:
     names = [str(found.attrs[f"{role}_parameter"]) for role in ("first", "second")]
     return {
         "axes": [
-            {"name": name, "label": swept_label(name, str(found[role].attrs["units"]))}
+            {"name": name, "label": swept_label(name, shown_unit(found[role].attrs))}
             for name, role in zip(names, ("first", "second"), strict=True)
         ],
         "curves": [_curve(found, i) for i in range(found.sizes["curve"])],

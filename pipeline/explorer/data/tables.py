@@ -18,6 +18,7 @@ from pipeline.explorer.data.explored import ExploredRun, ExplorerError
 from pipeline.explorer.data.overlays import attractors, branches, curves
 from pipeline.explorer.data.planes import plane_of
 from pipeline.explorer.data.verticals import vertical
+from pipeline.layout.units import shown_unit
 from pipeline.layout.vocabulary import told_by
 from pipeline.layout.writing import netcdf_bytes
 from pipeline.plots.files import with_provenance
@@ -195,7 +196,7 @@ def _needed(asked: Asked, name: str) -> Any:
 
 def _unit(run: ExploredRun, axis: str) -> str:
     coordinate = run.cube().coords.get(axis)
-    return "1" if coordinate is None else str(coordinate.attrs.get("units", "1"))
+    return "1" if coordinate is None else shown_unit(coordinate.attrs)
 
 
 def _place(run: ExploredRun, x: str, at: Mapping[str, int]) -> dict[str, float]:
@@ -230,7 +231,7 @@ def _csv(ds: xr.Dataset) -> bytes:
 
 
 def _heading(ds: xr.Dataset, name: str) -> str:
-    unit = ds[name].attrs.get("units", "1")
+    unit = shown_unit(ds[name].attrs)
     return name if unit in ("", "1") else f"{name} [{unit}]"
 
 

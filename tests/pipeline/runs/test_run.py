@@ -36,6 +36,53 @@ n_transient = 100
 n_keep = 4
 """
 EIGHT = "[execution]\ntrajectories_per_task = 8"
+DRIFT = """
+kind = "sweep"
+[model]
+name = "moving-fold"
+states = { x = { escape = 1e6 } }
+parameters = { l = 0.0 }
+equations = { x = "(x + l)**2 - 1" }
+[parameters]
+frequency_hz = 1.0
+[drift.l]
+to = 20.0
+[axes]
+l_rate_per_s = { values = [0.9, 1.0, 1.1, 1.3] }
+[initial_conditions]
+kind = "list"
+points = [[-1.0], [0.25]]
+[integration]
+n_transient = 0
+n_keep = 8
+[execution]
+trajectories_per_task = 2
+"""
+NOISE = """
+kind = "sweep"
+[model]
+name = "well"
+states = { x = { meaning = "position" } }
+parameters = { a = 1.0 }
+equations = { x = "a*x - x**3" }
+[noise]
+strengths = { x = 0.5 }
+seed = 1
+steps_per_period = 8
+[parameters]
+frequency_hz = 5.0
+[axes]
+noise_x = { values = [0.45, 0.7] }
+realization = { start = 0, stop = 7, step = 1 }
+[initial_conditions]
+kind = "list"
+points = [[-1.0]]
+[integration]
+n_transient = 2
+n_keep = 8
+[execution]
+trajectories_per_task = 4
+"""
 MANY_SWEEP = f'kind = "sweep"\n{MANY}\n{EIGHT}'
 HALF = MANY.replace("n = 64", "n = 32")  # both ways, as many cells as the sweep
 MANY_WALK = f'kind = "continuation"\n{HALF}\n[continuation]\ndirection = "both"\n{EIGHT}\npoints_per_task = 1'
@@ -78,15 +125,17 @@ def test_run__sweep_is_what_the_kernel_says(write_spec, sweep_text, tmp_path):
 
 def test_run__same_bytes_with_workers(write_spec, sweep_text, walk_text, tmp_path, bytes_of, monkeypatch):
     with local_cluster(2) as cluster:
-        # one for both runs: workers take seconds to start
+        # one for all runs: workers take seconds to start
         monkeypatch.setattr(clients, "local_cluster", lambda *n, **more: contextlib.nullcontext(cluster))
-        for kind, text in (("sweep", sweep_text), ("walk", walk_text)):
+        texts = {"sweep": sweep_text, "walk": walk_text, "drift": DRIFT, "noise": NOISE}
+        for kind, text in texts.items():
             path, found = write_spec(text, f"{kind}.toml"), []
             for workers in (0, 2):
                 directory = tmp_path / f"{kind}{workers}"
                 assert run(path, directory, workers=workers, echo=silent).complete
                 found.append(bytes_of(directory))
             assert found[0] == found[1], kind
+            assert sum(key.startswith("commits/") for key in found[0]) > 2, kind
 
 
 def test_run__numbers_do_not_depend_on_the_tasks(write_spec, sweep_text, tmp_path):

@@ -107,10 +107,10 @@ def whole(remote):
 
 
 def stored(place=PLACE):
-    """Cube and commits of a run, as bytes."""
+    """Cube and commits of a run, and the copy of the commits, as bytes."""
     files = open_files(place)
     contents = dict(files.read_each(files.everything()))
-    return {k: v for k, v in contents.items() if k.startswith(("cube.zarr/", "commits/"))}
+    return {k: v for k, v in contents.items() if k.startswith(("cube.zarr/", "commits/", "records.jsonl"))}
 
 
 # ---- the same bytes ----------------------------------------------------------------------------

@@ -1,0 +1,145 @@
+"""Opened cubes and results are read by cf-xarray and pint-xarray, and exported as NetCDF."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+
+import magpend
+from pipeline.layout.conventions import CONVENTIONS, conventional
+from pipeline.runs.derive import derive
+from pipeline.runs.run import run
+
+cf_xarray = pytest.importorskip("cf_xarray")
+pytest.importorskip("pint_xarray")
+ROOT = Path(__file__).parents[3]
+
+WALK = """
+kind = "continuation"
+model = "duffing"
+[axes]
+frequency_hz = { start = 0.15, stop = 0.25, num = 6 }
+[initial_conditions]
+kind = "list"
+points = [[-1.0, 0.0], [1.0, 0.5]]
+[continuation]
+path = "frequency_hz"
+direction = "both"
+[integration]
+n_transient = 40
+n_keep = 8
+"""
+ODD = """
+kind = "sweep"
+[model]
+name = "odd"
+states = { x = { unit = "widgets", escape = 1e6 } }
+parameters = { l = { value = 0.0, unit = "widgets" }, k = { value = 1.0, unit = "widgets/s2" } }
+equations = { x = "l - k*x" }
+[parameters]
+frequency_hz = 1.0
+[axes]
+l = { values = [0.5, 1.0] }
+[initial_conditions]
+kind = "list"
+points = [[0.5]]
+[integration]
+n_transient = 1
+n_keep = 2
+"""
+
+
+@pytest.fixture(scope="module")
+def walk(tmp_path_factory):
+    """A finished continuation."""
+    folder = tmp_path_factory.mktemp("conventions")
+    (folder / "walk.toml").write_text(WALK)
+    run(folder / "walk.toml", folder / "run", workers=0, echo=lambda line: None)
+    return folder / "run"
+
+
+def readable(ds, path):
+    """A dataset that both packages read without errors, and that is the same after it was a NetCDF file."""
+    quantities = ds.pint.quantify()
+    for name, variable in ds.variables.items():
+        unit = quantities[name].pint.units
+        assert (unit is None) == ("units" not in variable.attrs), name
+        assert variable.attrs["long_name"], name
+        if "flag_values" in variable.attrs:
+            codes = variable.attrs["flag_values"]
+            assert len(codes) == len(variable.attrs["flag_meanings"].split()), name
+            assert codes.dtype == variable.dtype, name
+        for other in variable.attrs.get("ancillary_variables", "").split():
+            assert set(ds[other].dims) <= {*variable.dims}, name
+    assert quantities.pint.dequantify().sizes == ds.sizes
+    assert ds.attrs["Conventions"] == CONVENTIONS
+    ds.to_netcdf(path)
+    with xr.open_dataset(path) as again:
+        assert again.cf.axes == ds.cf.axes
+        assert np.array_equal(again.status, ds.status)
+    return quantities
+
+
+def test_open_run__sweep_is_described(made, tmp_path):
+    for index in range(made.plan.n_tasks):
+        made.commit(index)
+    ds = magpend.open_run(made.info.directory)
+    assert ds.cf.axes == {"X": ["frequency"], "Y": ["q"], "Z": ["psi1_0"]}
+    assert ds.cf.standard_names == {"status_flag": ["status"]}
+    assert (ds.status.cf == "bounded").all()
+    assert "status" in ds.cf["section"].coords  # an ancillary variable
+    quantities = readable(ds.load(), tmp_path / "cube.nc")
+    assert str(quantities.frequency.pint.to("1/min").pint.units) == "1 / minute"
+    assert np.allclose(quantities.psi1_0.pint.to("degree").pint.magnitude, np.degrees(ds.psi1_0))
+    # plainly opened, the file has the same
+    plain = xr.open_zarr(made.info.directory / "cube.zarr")
+    assert plain.cf.axes == ds.cf.axes
+    plain.pint.quantify()
+
+
+def test_open_run__branches_are_trajectories(walk, tmp_path):
+    ds = magpend.open_run(walk).load()
+    assert ds.cf.cf_roles == {"trajectory_id": ["branch"]}
+    assert ds.cf.axes == {"X": ["frequency"]}
+    readable(ds, tmp_path / "cube.nc")
+
+
+@pytest.mark.parametrize("name", ["attractors", "hysteresis", "settling"])
+def test_derive__results_are_described(walk, name):
+    ds = derive(walk, name)
+    quantities = ds.pint.quantify()
+    assert str(quantities.frequency.pint.units) == "hertz"
+    assert ds.cf.axes["X"] == ["frequency"]
+    again = derive(walk, name)
+    assert again.identical(ds)
+    assert conventional(ds).identical(ds)
+    (stored,) = [path for path in (walk / "derived").glob(f"{name}-*.zarr")]
+    assert set(xr.open_zarr(stored, consolidated=True).variables) == set(ds.variables)
+
+
+def test_run__names_units_that_nobody_reads_once(write_spec, tmp_path):
+    lines = []
+    run(write_spec(ODD), tmp_path / "run", workers=0, echo=lines.append)
+    (line,) = [line for line in lines if "widgets" in line]
+    assert line.startswith("warning: units that other programs cannot read: 'widgets' of x, l; 'widgets/s2' of k. ")
+    ds = magpend.open_run(tmp_path / "run").load()
+    assert ds.l.attrs["units_as_given"] == "widgets"
+    assert ds.pint.quantify().l.pint.units is None
+    readable(ds, tmp_path / "cube.nc")
+    drawn = magpend.figure(tmp_path / "run", "bifurcation")
+    assert drawn.data.x.attrs["units"] == "widgets"
+    assert drawn.axes[0].get_xlabel() == "l [widgets]"
+
+
+def test_docs__example_of_the_cube(walk, monkeypatch):
+    text = (ROOT / "docs/reference/cube.md").read_text("utf-8")
+    (block,) = re.findall(r"<!-- tested -->\n```python\n(.*?)```", text, re.DOTALL)
+    assert "runs/quickstart" in block
+    names = {}
+    exec(block.replace("runs/quickstart", str(walk)), names)
+    assert names["period"].pint.magnitude[0] == pytest.approx(1e3 / 0.15)
+    assert int(names["periodic"].notnull().any(["period_index", "state"]).sum()) == int((names["ds"].status == 1).sum())
