@@ -17,17 +17,19 @@ _ACCOUNT = "account", "set the account that pays: --job account=NAME; {accounts}
 _QUEUE = "queue", "set the queue or partition: --job queue=NAME; {queues} lists them"
 _TIME = "walltime", "ask for a time that the queue allows: --job walltime=HH:MM:SS; {queues} lists the limits"
 _SIZE = "cores", "ask for what one node has: --job cores=N --job memory='N GB'; {queues} lists the queues"
+_LESS = "walltime", "ask for less: --job walltime=HH:MM:SS, --job cores=N or --job memory='N GB'; {queues} lists limits"
 
 _REMEDIES = [
     (r"invalid account|account/partition combination|unknown account|account .*(not|in)valid|must specify.*account"
      r"|no account|unknown project|project .*does not exist|-A .*required|invalid project", *_ACCOUNT),
     (r"invalid qos|qos .*not", "directives", "name a quality of service of yours: --job 'directives=[\"--qos=NAME\"]'; "
      "{accounts} lists them"),
-    (r"invalid partition|no partition specified|unknown queue|queue .*(not|no such)|no such queue|route_destinations"
-     r"|queue is not enabled", *_QUEUE),
     (r"time limit is invalid|requested time limit|max walltime|walltime.*(limit|exceed)|RUNLIMIT|h_rt", *_TIME),
+    (r"invalid partition|no partition specified|unknown queue|\bqueue\b.*\b(not|no such)\b|no such queue"
+     r"|queue is not enabled", *_QUEUE),
     (r"node configuration is not available|cpu count per node|memory specification|more processors requested"
-     r"|queue resource limits|cannot satisfy|too many (cpus|processors)|MEMLIMIT|cannot run in.*resources", *_SIZE),
+     r"|too many (cpus|processors)|MEMLIMIT|cannot run in.*resources", *_SIZE),
+    (r"resource limits|cannot satisfy", *_LESS),
     (r"invalid feature|invalid constraint|invalid generic resource|unknown resource|invalid -l|parallel environment",
      "directives", "correct the extra lines for the batch system: directives in the file of --cluster, or "
      "--job 'directives=[\"...\"]'"),

@@ -139,13 +139,15 @@ def slurm_seconds(text: str) -> int | None:
 
 def pbs_site(kind: str, server: str, queues: str, nodes: str) -> Site:
     """Read the output of ``qstat -B -f``, ``qstat -Q -f`` and ``pbsnodes -a`` of OpenPBS or Torque."""
-    default = next((values["default_queue"] for _, values in _blocks(server) if "default_queue" in values), None)
-    kinds = Counter(filter(None, (_node(values) for _, values in _blocks(nodes))))
+    default = next(
+        (values["default_queue"] for _, values in _blocks(server, "Server") if "default_queue" in values), None
+    )
+    kinds = Counter(filter(None, (_node(values) for _, values in _blocks(nodes, ""))))
     (cores, memory), n_nodes = (
         max(kinds.items(), key=lambda item: (item[1], item[0])) if kinds else ((None, None), None)
     )
     found = []
-    for name, values in _blocks(queues):
+    for name, values in _blocks(queues, "Queue"):
         if "False" in (values.get("enabled"), values.get("started")):
             continue
         limit = values.get("resources_max.walltime")
@@ -153,15 +155,24 @@ def pbs_site(kind: str, server: str, queues: str, nodes: str) -> Site:
     return Site(kind, tuple(found), default)
 
 
-def _blocks(text: str) -> Iterator[tuple[str, dict[str, str]]]:
-    """Yield names and values of the objects that PBS prints: a line with a name, and indented lines ``key = value``."""
+def _blocks(text: str, what: str) -> Iterator[tuple[str, dict[str, str]]]:
+    """Yield names and values of the objects that PBS prints: a line with a name, and indented lines ``key = value``.
+
+    Parameters
+    ----------
+    text
+        The output of a command.
+    what
+        Word before the name, such as ``Queue``; empty for nodes. Other objects are left out.
+    """
     name, key = "", ""
     values: dict[str, str] = {}
     for line in text.splitlines():
         if line[:1].strip():
             if name:
                 yield name, values
-            name, values, key = line.partition(":")[2].strip() or line.strip(), {}, ""
+            word, _, rest = line.partition(":") if what else ("", "", line)
+            name, values, key = rest.strip() if word == what else "", {}, ""
         elif line.startswith("\t") and key and " = " not in line:  # the rest of a long value
             values[key] += line.strip()
         elif " = " in line:
