@@ -143,9 +143,7 @@ def pbs_site(kind: str, server: str, queues: str, nodes: str) -> Site:
         (values["default_queue"] for _, values in _blocks(server, "Server") if "default_queue" in values), None
     )
     kinds = Counter(filter(None, (_node(values) for _, values in _blocks(nodes, ""))))
-    (cores, memory), n_nodes = (
-        max(kinds.items(), key=lambda item: (item[1], item[0])) if kinds else ((None, None), None)
-    )
+    n_nodes, (cores, memory) = max((n, node) for node, n in kinds.items()) if kinds else (None, (None, None))
     found = []
     for name, values in _blocks(queues, "Queue"):
         if "False" in (values.get("enabled"), values.get("started")):

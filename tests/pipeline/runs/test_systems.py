@@ -171,7 +171,7 @@ node1
      power_state = Running
      np = 16
      ntype = cluster
-     status = opsys=linux,uname=Linux node1 4.18,nsessions=0,availmem=65000000kb,physmem=65789012kb,ncpus=16,loadave=0.00
+     status = opsys=linux,uname=Linux node1,availmem=65000000kb,physmem=65789012kb,ncpus=16,loadave=0.00
      mom_service_port = 15002
 """
 
