@@ -38,12 +38,8 @@ def explain(submission: Submission) -> list[str]:
         "change: --job KEY=VALUE, such as --job walltime=02:00:00 --job account=NAME; or a file with [cluster], given "
         "with --cluster FILE",
     ]
-    sent = " ".join(WORDS[cluster.kind].send) + (" <" if cluster.kind == "lsf" else "")
-    lines += [
-        "",
-        f"---- {submission.folder / SCRIPT}, to be sent with: {sent} {SCRIPT}",
-        *submission.script.splitlines(),
-    ]
+    file = submission.folder / SCRIPT
+    lines += ["", f"---- {file}, sent with: {_send(submission, SCRIPT)}", *submission.script.splitlines()]
     if submission.worker is not None:
         title = "a job of workers, which the coordinator sends, up to"
         lines += ["", f"---- {title} {cluster.max_jobs} at a time", *submission.worker.splitlines()]
