@@ -160,6 +160,16 @@ n003
      resources_available.mem = 527685384kb
      resources_available.ncpus = 128
 
+n005
+     state = offline
+     resources_available.mem = 527685384kb
+     resources_available.ncpus = 128
+
+n006
+     state = state-unknown,down
+     resources_available.mem = 527685384kb
+     resources_available.ncpus = 128
+
 n004
      state = free
      resources_available.mem = 64gb
