@@ -12,6 +12,9 @@ comments, which no reader sees, stand before blocks:
     <!-- background -->       each line is a program that runs until the page ends
     <!-- printed -->          each line is among what the blocks before printed, numbers to a thousandth
     <!-- picture: FILE -->    the picture in the next line is this file
+    <!-- run: slurm -->       as `run`, and with other commands of a shell; left out where there is no SLURM
+    <!-- printed: slurm -->   as `printed`, after such blocks
+    <!-- until: slurm; COMMAND; TEXT -->   a command of magpend is repeated until it prints the text
 
 With ``--pictures`` all pictures are made again in the docs. With ``--check`` those that differ from these are
 named, and the exit code is 1 if there are any. `NOT_MADE` lists those that no command makes. Runs compute in
@@ -30,7 +33,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -49,7 +52,11 @@ NOT_MADE = {
 
 PATIENCE_S = 60.0
 
-_BLOCK = re.compile(r"<!-- (file|run|background|printed)(?:: ([^>]*?))? -->\n```(\w*)\n(.*?)```", re.DOTALL)
+_BLOCK = re.compile(
+    r"<!-- (file|run|background|printed)(?:: ([^>]*?))? -->\n```(\w*)\n(.*?)```"
+    r"|<!-- (until): (\w+); ([^;>]+); ([^>]+?) -->",
+    re.DOTALL,
+)
 _BEFORE = re.compile(r"<!-- before: ([^>]+?) -->")
 _PICTURE = re.compile(r"<!-- picture: (\S+) -->\n!\[[^\]]*\]\(([^)]+)\)")
 _NUMBER = re.compile(r"[-+]?\d+\.?\d*(?:[eE][-+]?\d+)?")
@@ -83,12 +90,15 @@ class Session:
         Of the Python blocks.
     started : list
         Programs in the background.
+    others : bool
+        Whether commands other than magpend's are executed.
     """
 
     folder: Path
     printed: str = ""
     names: dict[str, Any] = field(default_factory=dict)
     started: list[Any] = field(default_factory=list)
+    others: bool = False
 
     def do(self, kind: str, about: str, language: str, text: str) -> None:
         """Do what a block says."""
@@ -106,7 +116,9 @@ class Session:
         else:
             for line in re.sub(r"\\\n\s*", " ", text).splitlines():
                 words = shlex.split(line, comments=True)
-                if words:
+                if words and words[0] != "magpend" and self.others:
+                    self.shell(line)
+                elif words:
                     self.command(words)
 
     def command(self, words: list[str]) -> None:
@@ -128,6 +140,26 @@ class Session:
             sys.argv = before
         if code:
             raise TutorialError(f"{shlex.join(words)}: exit code {code}\n{self.printed[-2000:]}")
+
+    def shell(self, line: str) -> None:
+        """Execute another command, which must succeed."""
+        done = subprocess.run(["bash", "-c", line], cwd=self.folder, capture_output=True, text=True, check=False)
+        self.printed += done.stdout + done.stderr
+        if done.returncode:
+            raise TutorialError(f"{line}: exit code {done.returncode}\n{self.printed[-2000:]}")
+
+    def until(self, command: str, text: str) -> None:
+        """Repeat a command of magpend until it prints a text."""
+        until = time.monotonic() + PATIENCE_S
+        while True:
+            before = len(self.printed)
+            with contextlib.suppress(TutorialError):  # there is no run directory yet, say
+                self.command(shlex.split(command))
+            if text in self.printed[before:]:
+                return
+            if time.monotonic() > until:
+                raise TutorialError(f"{command}: did not print {text!r}\n{self.printed[-2000:]}")
+            time.sleep(0.1)
 
     @contextlib.contextmanager
     def listening(self) -> Iterator[None]:
@@ -197,8 +229,14 @@ def _same(wanted: str, found: str) -> bool:
     return all(math.isclose(a, b, rel_tol=1e-3, abs_tol=1e-9) for a, b in pairs)
 
 
-def follow(page: Path, folder: Path) -> dict[str, Path]:
+def follow(page: Path, folder: Path, others: Collection[str] = ()) -> dict[str, Path]:
     """Do what a page says in a folder.
+
+    Parameters
+    ----------
+    page, folder
+    others
+        Names of what there is for blocks that need it, such as ``slurm``; other named blocks are left out.
 
     Returns
     -------
@@ -210,14 +248,16 @@ def follow(page: Path, folder: Path) -> dict[str, Path]:
     TutorialError
         If a command fails, prints something else, or a picture does not come.
     """
-    text, session = page.read_text("utf-8"), Session(folder)
+    text, session = page.read_text("utf-8"), Session(folder, others=bool(others))
     try:
         for command in _BEFORE.findall(text):
             session.do("run", "", "sh", command)
-        for kind, about, language, block in _BLOCK.findall(text):
-            if kind == "run" and about:  # a block for others, such as an installation
-                continue
-            session.do(kind, about, language, block)
+        for kind, about, language, block, until, where, command, printed in _BLOCK.findall(text):
+            if until:
+                if where in others:
+                    session.until(command, printed)
+            elif kind not in ("run", "printed") or not about or about in others:
+                session.do(kind, about, language, block)
     finally:
         session.end()
     pictures = {shown: folder / made for made, shown in _PICTURE.findall(text)}

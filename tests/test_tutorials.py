@@ -3,26 +3,52 @@
 from __future__ import annotations
 
 import importlib.util
+import os
 import re
 import sys
+import tempfile
 from pathlib import Path
 
 import pytest
 from PIL import Image
 
 ROOT = Path(__file__).parents[1]
-_SPEC = importlib.util.spec_from_file_location("run_tutorials", ROOT / "docs" / "run_tutorials.py")
-tutorials = importlib.util.module_from_spec(_SPEC)
-sys.modules[_SPEC.name] = tutorials
-_SPEC.loader.exec_module(tutorials)
+
+
+def load(name, path):
+    """A module that is in no package."""
+    spec = importlib.util.spec_from_file_location(name, path)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+tutorials = load("run_tutorials", ROOT / "docs" / "run_tutorials.py")
+slurm = load("slurm_of_a_test", ROOT / "tests" / "pipeline" / "runs" / "slurm.py")
+
+
+@pytest.fixture
+def others(name, monkeypatch):
+    """Start a SLURM for a page with blocks that need one, if there can be one here."""
+    if "<!-- run: slurm -->" not in tutorials.PAGES[name].read_text("utf-8") or slurm.why_not():
+        yield ()
+        return
+    monkeypatch.delenv("MAGPEND_CLUSTER", raising=False)
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep))
+    # a socket's name has at most 108 letters, which pytest's own folder can use up
+    with tempfile.TemporaryDirectory(prefix="slurm-") as folder, slurm.running(Path(folder)) as variables:
+        for variable, value in variables.items():
+            monkeypatch.setenv(variable, value)
+        yield ("slurm",)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", tutorials.PAGES)
-def test_tutorial__does_what_it_says(name, tmp_path, monkeypatch):
+def test_tutorial__does_what_it_says(name, others, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     page = tutorials.PAGES[name]
-    for shown, made in tutorials.follow(page, tmp_path).items():
+    for shown, made in tutorials.follow(page, tmp_path, others).items():
         kept = page.parent / shown
         assert kept.is_file(), f"make it with: python docs/run_tutorials.py --pictures {name}"
         with Image.open(kept) as one, Image.open(made) as other:

@@ -43,7 +43,7 @@ Scheduler = Annotated[
     typer.Option(
         metavar="WHERE",
         help="local; none (this process); a dask scheduler's tcp:// or tls:// address or FILE.json; or jobs "
-        "of slurm, pbs, sge, lsf. Default: $DASK_SCHEDULER_ADDRESS, or local.",
+        "of slurm, pbs, torque, sge, lsf. Default: $DASK_SCHEDULER_ADDRESS, or local.",
     ),
 ]
 ClusterFile = Annotated[

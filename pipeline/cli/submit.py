@@ -7,32 +7,61 @@ from typing import Annotated
 
 import typer
 
-from pipeline.cli import console
-from pipeline.cli.running import ClusterFile, Spec
+from pipeline.cli.common import tell_data
+from pipeline.cli.outputs import check_file
+from pipeline.cli.running import Spec
 
 
 def submit(
     spec: Spec,
-    out: Annotated[Path | None, typer.Option(help="Run directory; by default runs/NAME.")] = None,
-    cluster: ClusterFile = None,
+    out: Annotated[str | None, typer.Option(help="Run directory, or s3://BUCKET/PREFIX; by default runs/NAME.")] = None,
+    cluster: Annotated[
+        str | None,
+        typer.Option(
+            metavar="WHICH",
+            help="slurm, pbs, torque, sge or lsf, or a TOML file whose table [cluster] describes a job. Default: "
+            "$MAGPEND_CLUSTER, or the batch system whose commands are here.",
+        ),
+    ] = None,
+    job: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--job", metavar="KEY=VALUE", help="Change a key of [cluster], such as walltime=02:00:00; several times."
+        ),
+    ] = None,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Print the batch script; create and send nothing.")
+        bool, typer.Option("--dry-run", help="Explain the jobs and print their files; create and send nothing.")
     ] = False,
+    write: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write the job file to FILE, and send nothing.")
+    ] = None,
     smoke: Annotated[
         bool, typer.Option("--smoke", help="Run the specification's small size, which takes seconds.")
     ] = False,
+    json: Annotated[bool, typer.Option("--json", help="Write the explanation as JSON to the standard output.")] = False,
 ) -> None:
-    """Submit a specification as a job of SLURM, PBS, Grid Engine or LSF, and print commands to watch and cancel the
-    job.
+    """Submit a specification as a job of SLURM, PBS, Torque, Grid Engine or LSF, and print commands to watch and cancel
+    the job.
 
-    The job continues where an earlier one was stopped.
+    What is not given is chosen: the batch system whose commands are here, its default queue, and cores, memory
+    and time by the measured work. The job continues where an earlier one was stopped.
     """
-    from pipeline.runs.submit import prepare, send
+    from pipeline.runs import explaining
+    from pipeline.runs import submit as sending
+    from pipeline.specification.problems import SpecError
 
-    prepared = prepare(spec, out, cluster, smoke=smoke)
+    if dry_run and write is not None:
+        raise SpecError("--dry-run and --write FILE: give one of them; --dry-run creates nothing.")
+    if write is not None:
+        check_file(write, "--write")
+    prepared = sending.prepare(spec, out, cluster, job or [], smoke=smoke)
     if dry_run:
-        console.result(prepared.script.rstrip("\n"))
+        tell_data(explaining.as_data(prepared), explaining.explain(prepared), json)
     elif prepared.complete:
-        console.result(f"{prepared.name} is complete; nothing to send.")
+        tell_data(explaining.as_data(prepared), [f"{prepared.name} is complete; nothing to send."], json)
+    elif write is not None:
+        sending.write(prepared, write)
+        tell_data(explaining.as_data(prepared), explaining.written(prepared, str(write)), json)
     else:
-        console.result(*send(prepared).lines())
+        sent = sending.send(prepared)
+        tell_data(explaining.as_data(sent), explaining.brief(sent), json)

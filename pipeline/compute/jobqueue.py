@@ -16,11 +16,18 @@ from pipeline.specification.clusters import Cluster, hours_and_minutes
 from pipeline.specification.problems import SpecError
 
 JOB_NAME = "magpend-worker"
-_CLASSES = {"slurm": "SLURMCluster", "pbs": "PBSCluster", "sge": "SGECluster", "lsf": "LSFCluster"}
-COMMANDS = {"slurm": "sbatch", "pbs": "qsub", "sge": "qsub", "lsf": "bsub"}
+_CLASSES = {
+    "slurm": "SLURMCluster",
+    "pbs": "PBSCluster",
+    "torque": "PBSCluster",
+    "sge": "SGECluster",
+    "lsf": "LSFCluster",
+}
+COMMANDS = {"slurm": "sbatch", "pbs": "qsub", "torque": "qsub", "sge": "qsub", "lsf": "bsub"}
 """Commands that submit a batch script."""
 
 _THREADS = ("export NUMBA_NUM_THREADS=1", "export OMP_NUM_THREADS=1")
+_NO_JOBQUEUE = "{kind}: needs dask-jobqueue, which is not installed: pip install 'magpend[cluster]'."
 _MEANWHILE_S = 60
 _TARGET = "0.1 s"
 """Target duration of the tasks in flight: short, since only few tasks per worker are in flight."""
@@ -36,7 +43,7 @@ def check_means(cluster: Cluster) -> None:
     """
     problems = []
     if not find_spec("dask_jobqueue"):
-        problems.append(f"{cluster.kind}: needs dask-jobqueue, which is not installed: pip install 'magpend[cluster]'.")
+        problems.append(_NO_JOBQUEUE.format(kind=cluster.kind))
     if not shutil.which(COMMANDS[cluster.kind]):
         problems.append(
             f"{cluster.kind}: there is no command {COMMANDS[cluster.kind]!r} here; use a machine that "
@@ -65,7 +72,7 @@ def settings(cluster: Cluster, folder: Path) -> dict[str, Any]:
     folder
         Folder for the job logs.
     """
-    account = "account" if cluster.kind in ("slurm", "pbs") else "project"
+    account = "project" if cluster.kind in ("sge", "lsf") else "account"
     time = cluster.walltime if cluster.kind != "lsf" else hours_and_minutes(cluster.walltime_s)
     found: dict[str, Any] = {
         "queue": cluster.queue,
@@ -86,7 +93,56 @@ def settings(cluster: Cluster, folder: Path) -> dict[str, Any]:
     }
     if cluster.kind == "lsf":
         found["lsf_units"] = "mb"
+    if cluster.kind == "torque":  # `select` is PBS Professional's; Torque has nodes and ppn
+        found["resource_spec"] = torque_resources(cluster.cores, cluster.memory_bytes)
     return {name: value for name, value in found.items() if value is not None}
+
+
+def torque_resources(cores: int, memory_bytes: int) -> str:
+    """Return the resources of a job on one node as Torque's ``qsub -l`` takes them."""
+    return f"nodes=1:ppn={cores},mem={-(-memory_bytes // 2**20)}mb"
+
+
+def worker_script(cluster: Cluster, folder: Path) -> str:
+    """Return the batch script of a job of workers, as the coordinator will send it; create nothing.
+
+    The scheduler's address and the folder of its keys are known only when the coordinator runs; words in capital
+    letters stand for them.
+
+    Parameters
+    ----------
+    cluster
+        Description of a job.
+    folder
+        Folder for the job logs.
+
+    Raises
+    ------
+    SpecError
+        If dask-jobqueue is not installed.
+    """
+    if not find_spec("dask_jobqueue"):
+        raise SpecError(_NO_JOBQUEUE.format(kind=cluster.kind))
+    import dask_jobqueue
+    from distributed import Security
+
+    kind = getattr(dask_jobqueue, _CLASSES[cluster.kind]).job_cls
+    keys = f"{folder}/.keys-OF-THIS-RUN"
+    # dask-jobqueue creates the folder of the logs when it writes a script
+    with tempfile.TemporaryDirectory(prefix="magpend-script-") as logs:
+        job = kind(
+            scheduler="tls://COORDINATOR:PORT",
+            name=f"{JOB_NAME}-NUMBER",
+            protocol="tls://",
+            security=Security(  # type: ignore[no-untyped-call]
+                require_encryption=True,
+                tls_ca_file=f"{keys}/ca_file",
+                tls_worker_cert=f"{keys}/cert",
+                tls_worker_key=f"{keys}/key",
+            ),
+            **settings(cluster, Path(logs)),
+        )
+        return str(job.job_script()).replace(logs, str(folder))
 
 
 def _keys(folder: Path) -> Any:

@@ -7,6 +7,7 @@ import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from pipeline.compute.jobqueue import torque_resources
 from pipeline.specification.clusters import Cluster, bytes_of, clock, hours_and_minutes, seconds_of
 
 
@@ -44,6 +45,10 @@ class Words:
 WORDS = {
     "slurm": Words(("sbatch", "--parsable"), ("squeue", "-h", "-o", "%T", "-j"), "squeue -j", "scancel"),
     "pbs": Words(("qsub",), ("qstat",), "qstat", "qdel", number=r"(?P<job>\d+[\w.\[\]-]*)"),
+    # Torque lists a job for some time after its end, with the state C
+    "torque": Words(
+        ("qsub",), ("qstat", "-f"), "qstat", "qdel", r"(?s).*job_state = C\b.*", r"(?P<job>\d+[\w.\[\]-]*)"
+    ),
     "sge": Words(("qsub", "-terse"), ("qstat", "-j"), "qstat -j", "qdel"),
     "lsf": Words(("bsub",), ("bjobs", "-noheader", "-o", "stat"), "bjobs", "bkill", r"DONE|EXIT", r"<(?P<job>\d+)>"),
 }
@@ -52,6 +57,29 @@ WORDS = {
 def is_whole(cluster: Cluster) -> bool:
     """Return whether a single batch job both coordinates the run and does its work."""
     return cluster.max_jobs == 1
+
+
+def resources(cluster: Cluster) -> tuple[int, int, int]:
+    """Return the cores, the memory [bytes] and the wall time [s] of the job that coordinates a run."""
+    if is_whole(cluster):
+        return cluster.cores, cluster.memory_bytes, cluster.walltime_s
+    time = cluster.coordinator_walltime
+    return 1, bytes_of(cluster.coordinator_memory), cluster.walltime_s if time is None else seconds_of(time)
+
+
+def log_name(kind: str, log: str, job: str) -> str:
+    """Return the path of a job's output.
+
+    Parameters
+    ----------
+    kind
+        The batch system.
+    log
+        Path without suffix, as for `coordinator_script`.
+    job
+        The job's number, or a word for it.
+    """
+    return f"{log}-{job}.out" if kind in ("slurm", "lsf") else f"{log}.out"
 
 
 def coordinator_script(cluster: Cluster, name: str, log: str, folder: str, command: Sequence[str]) -> str:
@@ -70,12 +98,7 @@ def coordinator_script(cluster: Cluster, name: str, log: str, folder: str, comma
     command
         Words of the command.
     """
-    whole = is_whole(cluster)
-    cores = cluster.cores if whole else 1
-    memory = cluster.memory_bytes if whole else bytes_of(cluster.coordinator_memory)
-    time_s = cluster.walltime_s
-    if not whole and cluster.coordinator_walltime is not None:
-        time_s = seconds_of(cluster.coordinator_walltime)
+    cores, memory, time_s = resources(cluster)
     lines = [
         "#!/usr/bin/env bash",
         *_HEADS[cluster.kind](cluster, name, log, cores, memory, time_s),
@@ -94,6 +117,8 @@ def _slurm(cluster: Cluster, name: str, log: str, cores: int, memory: int, time_
     return [
         f"#SBATCH --job-name={name}",
         f"#SBATCH --output={log}-%j.out",
+        "#SBATCH --open-mode=append",
+        "#SBATCH --requeue",
         *_given("#SBATCH --partition={}", cluster.queue),
         *_given("#SBATCH --account={}", cluster.account),
         "#SBATCH --nodes=1",
@@ -105,14 +130,18 @@ def _slurm(cluster: Cluster, name: str, log: str, cores: int, memory: int, time_
 
 
 def _pbs(cluster: Cluster, name: str, log: str, cores: int, memory: int, time_s: int) -> list[str]:
+    resources = f"select=1:ncpus={cores}:mem={_upwards(memory, 2**20)}mb"
+    if cluster.kind == "torque":
+        resources = torque_resources(cores, memory)
     return [
         f"#PBS -N {name[:15]}",
         f"#PBS -o {log}.out",
         "#PBS -j oe",
+        "#PBS -r y",
         "#PBS -V",
         *_given("#PBS -q {}", cluster.queue),
         *_given("#PBS -A {}", cluster.account),
-        f"#PBS -l select=1:ncpus={cores}:mem={_upwards(memory, 2**20)}mb",
+        f"#PBS -l {resources}",
         f"#PBS -l walltime={clock(time_s)}",
     ]
 
@@ -123,6 +152,7 @@ def _sge(cluster: Cluster, name: str, log: str, cores: int, memory: int, time_s:
         f"#$ -N {name}",
         f"#$ -o {log}.out",
         "#$ -j y",
+        "#$ -r y",
         "#$ -V",
         "#$ -S /bin/bash",
         *_given("#$ -q {}", cluster.queue),
@@ -135,6 +165,7 @@ def _lsf(cluster: Cluster, name: str, log: str, cores: int, memory: int, time_s:
     return [
         f"#BSUB -J {name}",
         f"#BSUB -o {log}-%J.out",
+        "#BSUB -r",
         *_given("#BSUB -q {}", cluster.queue),
         *_given('#BSUB -P "{}"', cluster.account),
         f"#BSUB -n {cores}",
@@ -144,8 +175,8 @@ def _lsf(cluster: Cluster, name: str, log: str, cores: int, memory: int, time_s:
     ]
 
 
-_HEADS = {"slurm": _slurm, "pbs": _pbs, "sge": _sge, "lsf": _lsf}
-_MARKS = {"slurm": "#SBATCH", "pbs": "#PBS", "sge": "#$", "lsf": "#BSUB"}
+_HEADS = {"slurm": _slurm, "pbs": _pbs, "torque": _pbs, "sge": _sge, "lsf": _lsf}
+_MARKS = {"slurm": "#SBATCH", "pbs": "#PBS", "torque": "#PBS", "sge": "#$", "lsf": "#BSUB"}
 
 
 def _directives(cluster: Cluster) -> list[str]:

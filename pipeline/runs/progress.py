@@ -24,6 +24,11 @@ def duration(seconds: float) -> str:
     return f"{hours} h {minutes} min"
 
 
+def whole(seconds: float) -> str:
+    """Format a time without a second part that is zero, such as ``30 min``."""
+    return duration(seconds).removesuffix(" 0 s").removesuffix(" 0 min")
+
+
 def size(n_bytes: float) -> str:
     """Format a number of bytes, such as ``6.3 MB``."""
     for unit in ("bytes", "kB", "MB", "GB"):

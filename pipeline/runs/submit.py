@@ -3,24 +3,29 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import shlex
 import shutil
 import subprocess
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from pipeline.compute.jobqueue import jobs_folder
+from pipeline.compute.jobqueue import jobs_folder, worker_script
 from pipeline.layout.domains import check_starts
 from pipeline.layout.plan import make_plan
 from pipeline.layout.writing import write_atomically
 from pipeline.runs.batch import WORDS, coordinator_script, is_whole
+from pipeline.runs.choosing import Choice, choose, no_command
+from pipeline.runs.noise import check_steps
+from pipeline.runs.refusals import remedy
 from pipeline.runs.run import identity_here
+from pipeline.runs.sites import Site, ask_site, no_default
+from pipeline.runs.sizing import Work, complete, measure
 from pipeline.runs.workflows import default_directory, find_spec
-from pipeline.specification.clusters import Cluster, load_cluster
+from pipeline.specification.clusters import Cluster, cluster_of
+from pipeline.specification.inputs import toml_of
 from pipeline.specification.parsing import load_spec
 from pipeline.specification.problems import SpecError
 from pipeline.store.commits import read_commits
@@ -28,8 +33,7 @@ from pipeline.store.errors import LockedError
 from pipeline.store.places import open_files
 from pipeline.store.setup import check
 
-CLUSTER_FILE = "MAGPEND_CLUSTER"
-SCRIPT, SENT = "job.sh", "job.json"
+SCRIPT, SENT, TABLE = "job.sh", "job.json", "cluster.toml"
 _ANSWER_S = 60.0
 _AWKWARD = re.compile(r"[^\w./+,:=@-]")
 """Characters that batch systems refuse or misread in the path of a log."""
@@ -47,12 +51,26 @@ class Submission:
     ----------
     name : str
         The run directory, as it was given.
+    title : str
+        Title of the specification.
+    retry : str
+        Words after ``magpend submit`` that give the same run again.
     folder : Path
         Folder of its jobs: script, job number, and logs.
+    choice : Choice
+        Batch system, and the given values.
     cluster : Cluster
         Description of a job.
+    reasons : dict of str
+        Reason for each value of the job that was not given, by key.
+    site : Site
+        Queues of the batch system.
+    work : Work
+        Work that the run still has to do.
     script : str
         The batch script.
+    worker : str, optional
+        Batch script of the jobs of workers, if the run has such jobs.
     complete : bool
         Whether there is nothing left to compute.
     job : str, optional
@@ -60,52 +78,66 @@ class Submission:
     """
 
     name: str
+    title: str
+    retry: str
     folder: Path
+    choice: Choice
     cluster: Cluster
+    reasons: dict[str, str]
+    site: Site
+    work: Work
     script: str
+    worker: str | None
     complete: bool
     job: str | None = None
 
-    def lines(self) -> list[str]:
-        """Return text lines with the commands that watch, cancel and continue the job."""
-        words = WORDS[self.cluster.kind]
-        return [
-            f"sent: job {self.job}",
-            f"follow: magpend status {shlex.quote(self.name)}; {words.follow} {self.job}; "
-            f"tail -F {self.folder}/coordinator*",
-            f"cancel: {words.cancel} {self.job}",
-            "after a cancel, or if time ran out: give this command again to continue",
-        ]
+    @property
+    def log(self) -> str:
+        """Path of the job's output, without the suffix that the batch system adds."""
+        return f"{self.folder}/coordinator"
+
+    @property
+    def has_table(self) -> bool:
+        """Whether the job reads its ``[cluster]`` table from a file that is written when it is sent."""
+        return not is_whole(self.cluster) and self.choice.file is None
+
+    def table(self) -> str:
+        """Return the complete ``[cluster]`` table as TOML text."""
+        values = self.cluster.model_dump(exclude_defaults=True)
+        return f"[cluster]\n{toml_of({'kind': self.cluster.kind, **values})}"
 
 
 def prepare(
-    spec: str | Path, out: str | Path | None, cluster_file: str | Path | None, *, smoke: bool = False
+    spec: str | Path,
+    out: str | Path | None,
+    cluster: str | Path | None,
+    changes: Sequence[str] = (),
+    *,
+    smoke: bool = False,
 ) -> Submission:
     """Make the batch script for a run, without creating files or sending anything.
+
+    The time of the run is measured on this machine, for a second or two.
 
     Parameters
     ----------
     spec, out, smoke
         See `run.run`.
-    cluster_file
-        File with the ``[cluster]`` table; by default ``MAGPEND_CLUSTER`` in the environment.
+    cluster, changes
+        See `choosing.choose`.
 
     Raises
     ------
     SpecError
-        If one of the files is not valid, or a batch system would not accept a path.
+        If a file or a value is not valid, if there is not exactly one batch system to choose, or if a batch system
+        would not accept a path.
     RefusedError, DamagedError, UnreadableError
         If the run cannot be done in the directory.
     """
     path = find_spec(spec)
     parsed = load_spec(path, smoke=smoke)
-    file = cluster_file or os.environ.get(CLUSTER_FILE)
-    if not file:
-        raise SpecError(
-            f"a job is not described; write a file with a [cluster] table and give --cluster FILE, or set "
-            f"{CLUSTER_FILE}; docs/clusters.md has an example."
-        )
-    cluster = load_cluster(file)
+    retry = shlex.join([str(spec), *(["--out", str(out)] if out else []), *(["--smoke"] if smoke else [])])
+    choice = choose(cluster, changes, retry)
     files = open_files(out if out is not None else default_directory(path, smoke))
     folder = jobs_folder(files.place)
     if _AWKWARD.search(str(folder)):
@@ -114,13 +146,33 @@ def prepare(
             "digits, and . _ - + , : = @."
         )
     check_starts(parsed)
+    check_steps(parsed)
     plan = make_plan(parsed)
     info = check(files, identity_here(parsed, plan))
-    complete = info is not None and len(read_commits(info, plan)) == plan.n_tasks
-    command = _command(cluster, Path(file), path, files.place, smoke)
+    done = read_commits(info, plan) if info is not None else {}
+    site = ask_site(choice.kind)
+    if site.queues and site.default is None and "queue" not in choice.table:
+        raise SpecError(no_default(site))
+    work = measure(parsed, plan, done)
+    table, reasons = complete(choice.table, work, site)
+    described = cluster_of(table)
+    file = choice.file or folder / TABLE
     name = f"magpend-{re.sub(r'[^A-Za-z0-9_.-]', '-', folder.stem)}"
-    script = coordinator_script(cluster, name, f"{folder}/coordinator", str(Path.cwd()), command)
-    return Submission(files.name, folder, cluster, script, complete)
+    command = _command(described, file, path, files.place, smoke)
+    return Submission(
+        name=files.name,
+        title=parsed.title,
+        retry=retry,
+        folder=folder,
+        choice=choice,
+        cluster=described,
+        reasons=reasons,
+        site=site,
+        work=work,
+        script=coordinator_script(described, name, f"{folder}/coordinator", str(Path.cwd()), command),
+        worker=None if is_whole(described) else worker_script(described, folder),
+        complete=info is not None and len(done) == plan.n_tasks,
+    )
 
 
 def _command(cluster: Cluster, file: Path, spec: Path, place: str, smoke: bool) -> list[str]:
@@ -141,6 +193,12 @@ def _command(cluster: Cluster, file: Path, spec: Path, place: str, smoke: bool) 
     ]
 
 
+def write(submission: Submission, file: Path) -> None:
+    """Write the job file of a submission to a file, and create the folder of its logs; send nothing."""
+    _make_folder(submission)
+    write_atomically(file, submission.script)
+
+
 def send(submission: Submission) -> Submission:
     """Send a job to the batch system, and keep its script and its number beside the run directory.
 
@@ -156,12 +214,9 @@ def send(submission: Submission) -> Submission:
     kind = submission.cluster.kind
     words = WORDS[kind]
     if not shutil.which(words.send[0]):
-        raise SpecError(
-            f"{kind}: there is no command {words.send[0]!r} here; use a machine that sends "
-            "jobs, such as the login node, or use --dry-run to see the script."
-        )
+        raise SpecError(no_command(kind, words.send[0], f"{submission.retry} --cluster {kind}"))
     _refuse_second(submission)
-    submission.folder.mkdir(parents=True, exist_ok=True)
+    _make_folder(submission)
     script = submission.folder / SCRIPT
     write_atomically(script, submission.script)
     by_name, as_input = ([], submission.script) if kind == "lsf" else ([str(script)], None)
@@ -169,11 +224,20 @@ def send(submission: Submission) -> Submission:
     job = words.job(done.stdout) if done.returncode == 0 else None
     if job is None:
         said = " ".join((done.stderr or done.stdout).split()) or f"exit code {done.returncode}"
-        raise SubmitError(f"{words.send[0]} did not take the job: {said}. The script is {script}.")
+        advice = remedy(kind, said)
+        raise SubmitError(
+            f"{words.send[0]} did not take the job: {said.rstrip('.')}.\n"
+            + (f"{advice}\n" if advice else "")
+            + f"The script is {script}."
+        )
     write_atomically(submission.folder / SENT, json.dumps({"kind": kind, "job": job}) + "\n")
-    return Submission(
-        submission.name, submission.folder, submission.cluster, submission.script, submission.complete, job
-    )
+    return replace(submission, job=job)
+
+
+def _make_folder(submission: Submission) -> None:
+    submission.folder.mkdir(parents=True, exist_ok=True)
+    if submission.has_table:
+        write_atomically(submission.folder / TABLE, submission.table())
 
 
 def _refuse_second(submission: Submission) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -12,8 +13,10 @@ from pipeline.specification.files import read_toml
 from pipeline.specification.problems import SpecError, problems_of, unknown_key
 from pipeline.specification.tables import Table
 
-QUEUES = ("slurm", "pbs", "sge", "lsf")
-"""Batch systems that can start workers."""
+TITLES = {"slurm": "SLURM", "pbs": "PBS", "torque": "Torque", "sge": "Grid Engine", "lsf": "LSF"}
+"""Names of the batch systems that can start workers, for messages."""
+
+QUEUES = tuple(TITLES)
 
 _TIME = re.compile(r"(\d{1,4}):([0-5]\d):([0-5]\d)")
 _MEMORY = re.compile(r"(\d+(?:\.\d+)?) ?([kMGT]i?)B")
@@ -54,7 +57,7 @@ def hours_and_minutes(seconds: int) -> str:
 class Cluster(Table):
     """The ``[cluster]`` table: resources of a batch job that runs worker processes, and the number of such jobs."""
 
-    kind: Literal["slurm", "pbs", "sge", "lsf"] = Field(description="Batch system.")
+    kind: Literal["slurm", "pbs", "torque", "sge", "lsf"] = Field(description="Batch system.")
     queue: str | None = Field(None, description="Queue or partition.")
     account: str | None = Field(None, description="Account or project that is charged.")
     cores: int = Field(ge=1, le=4096, description="Cores of a job; each runs one worker process.")
@@ -172,15 +175,54 @@ def load_cluster(path: str | Path) -> Cluster:
     SpecError
         If the file is not valid; the message lists all problems.
     """
+    table, problems = read_table(path)
+    return cluster_of(table, f"{path}: ", problems)
+
+
+def read_table(path: str | Path) -> tuple[dict[str, Any], list[str]]:
+    """Read the ``[cluster]`` table of a TOML file without validating its values, and list what else is in the file.
+
+    Returns
+    -------
+    table : dict
+        The table.
+    problems : list of str
+        A sentence for each other table, which is an error.
+
+    Raises
+    ------
+    SpecError
+        If the file cannot be read, or has no such table.
+    """
     tables = read_toml(path)
     if not isinstance(tables.get("cluster"), dict):
         raise SpecError(f"{path}: has no table [cluster]; docs/clusters.md has an example.")
     problems = [f"{path}: {unknown_key(name, name, ['cluster'])}" for name in tables if name != "cluster"]
+    return tables["cluster"], problems
+
+
+def cluster_of(table: Mapping[str, Any], source: str = "", problems: Sequence[str] = ()) -> Cluster:
+    """Validate a ``[cluster]`` table.
+
+    Parameters
+    ----------
+    table
+        Values by key.
+    source
+        Beginning of each message, such as the file's name.
+    problems
+        Problems that were found before; they are raised together with those of the table.
+
+    Raises
+    ------
+    SpecError
+        If the table is not valid; the message lists all problems.
+    """
     try:
-        found = Cluster.model_validate(tables["cluster"])
+        found = Cluster.model_validate(table)
     except ValidationError as error:
         lines = "\n".join(problems_of(error, Cluster, "cluster")).splitlines()
-        problems += [f"{path}: {line.removeprefix('cluster: ')}" for line in lines]
+        raise SpecError([*problems, *(f"{source}{line.removeprefix('cluster: ')}" for line in lines)]) from None
     if problems:
         raise SpecError(problems)
     return found

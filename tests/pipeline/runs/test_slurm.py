@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import re
 import subprocess
 import tempfile
 import time
@@ -32,6 +33,20 @@ n_keep = 4
 [execution]
 trajectories_per_task = 64
 """
+HOURS = """
+kind = "sweep"
+title = "Basins over the frequency"
+model = "duffing"
+[axes]
+frequency_hz = { start = 0.15, stop = 0.25, num = 121 }
+[initial_conditions]
+kind = "grid"
+x = { start = -1, stop = 1, num = 32 }
+v = { start = -1, stop = 1, num = 32 }
+[integration]
+n_transient = 100000
+n_keep = 16
+"""
 ONE_JOB = """
 [cluster]
 kind = "slurm"
@@ -53,6 +68,7 @@ prologue = ["export PROLOGUE=read"]
 directives = ["--nice=1"]
 """
 PATIENCE_S = 100.0
+DOCS = Path(__file__).parents[3] / "docs"
 
 
 def load(name):
@@ -104,6 +120,59 @@ def wait(for_what, logs):
         time.sleep(0.1)
 
 
+def masked(line):
+    """A line without its numbers and times, which differ from machine to machine, and without its folders."""
+    line = re.sub(r"/\S*/(?=[\w.*-]+)", "", re.sub(r"^cd .*", "cd", line))
+    return re.sub(r"\d[\d.]*(e\+\d+)?( (bytes|[kMGT]B|s|min|h)\b)?( \d+ (s|min)\b)?", "#", line)
+
+
+def test_submit__explains_and_is_refused_by_a_real_slurm(tmp_path, shell, magpend):
+    """Without a file: what SLURM says is chosen, the page shows what is printed, and refusals name the key."""
+    (tmp_path / "mine.toml").write_text(HOURS)
+    printed = magpend("submit", "mine.toml", "--dry-run").splitlines()
+    page = (DOCS / "clusters.md").read_text("utf-8")
+    shown = re.search(r"\$ magpend submit mine.toml --dry-run\n(.*?)```", page, re.DOTALL)[1].splitlines()
+    printed = [masked(line) for line in printed if "so far" not in line]
+    assert [masked(line) for line in shown] == printed
+    assert "partition: short (no time limit, 1 node of 4 cores, 8.4 GB), the default of SLURM" in shown
+    assert not (tmp_path / "runs").exists()
+    for change, words in (
+        ("queue=nix", "Invalid partition name specified.\nSet the queue or partition: --job queue=NAME; sinfo -s"),
+        ("directives=--constraint=nix", "Invalid feature specification.\nCorrect the extra lines"),
+        ("directives=--gres=nix:1", "Invalid generic resource (gres) specification.\nCorrect the extra lines"),
+    ):
+        assert words in magpend("submit", "mine.toml", "--job", change, code=4)
+
+    # SLURM keeps a job that no node can take; the command says so
+    said = magpend("submit", "mine.toml", "--job", "cores=5")
+    assert "warning: cores is 5, above the cores of most nodes of partition short, 4" in said
+    assert "PENDING" in shell("squeue", "-h", "-o", "%T")
+
+
+@pytest.mark.parametrize(
+    ("kind", "cores"), [("torque", "NumCPUs=2 NumTasks=2"), ("pbs", "MinCPUsNode=2 MinMemoryNode=1908M")]
+)
+def test_pbs__slurm_reads_the_job_file(tmp_path, shell, magpend, kind, cores):
+    """SLURM understands lines of PBS, too: it is another reader of what is written for PBS and Torque."""
+    (tmp_path / "mine.toml").write_text(SPEC)
+    values = [word for change in ("cores=2", "account=p-1", "queue=short") for word in ("--job", change)]
+    magpend("submit", "mine.toml", "--cluster", kind, *values, "--write", "job.sh")
+    job = shell("sbatch", "--parsable", "--hold", "job.sh").strip()
+    told = " ".join(shell("scontrol", "show", "job", job).split())
+    for words in (
+        "JobName=magpend-mine ",
+        "Account=p-1 ",
+        "Requeue=1 ",
+        "TimeLimit=00:15:00 ",
+        "Partition=short ",
+        "MinMemoryNode=1908M ",
+        f"StdOut={tmp_path}/runs/mine.jobs/coordinator.out ",
+        f"StdErr={tmp_path}/runs/mine.jobs/coordinator.out ",
+        cores,
+    ):
+        assert words in told
+
+
 def test_submit__follow_cancel_and_go_on(tmp_path, shell, magpend, bytes_of):
     for name, text in (("spec", SPEC), ("one", ONE_JOB), ("several", SEVERAL_JOBS)):
         (tmp_path / f"{name}.toml").write_text(text)
@@ -126,9 +195,17 @@ def test_submit__follow_cancel_and_go_on(tmp_path, shell, magpend, bytes_of):
     assert 2 <= len(state(out).done) < 12
 
     # gone on with by a coordinator in a job, with workers in jobs of their own
+    explained = magpend("submit", "spec.toml", "--cluster", "several.toml", "--out", "out", "--dry-run")
     said = magpend("submit", "spec.toml", "--cluster", "several.toml", "--out", "out")
     job = json.loads((logs / "job.json").read_text())["job"]
+    wait(lambda: "magpend-worker" in shell("squeue", "-h", "-o", "%j"), logs)
+    worker = shell("squeue", "-h", "-n", "magpend-worker", "-o", "%i").split()[0]
+    sent = shell("scontrol", "write", "batch_script", worker, "-")
     wait(lambda: not shell("squeue", "-h", "-j", job), logs)
+    # the dry run has printed the workers' job but for address, number and folder of keys
+    foreseen = explained.partition("a job of workers")[2].partition("\n")[2].strip().splitlines()
+    pattern = "\n".join(map(re.escape, foreseen)).replace("COORDINATOR:PORT", r"\S+").replace("NUMBER", r"\d+")
+    assert re.fullmatch(pattern.replace("OF\\-THIS\\-RUN", r"\w+"), sent.strip()), (pattern, sent)
     told = (logs / f"coordinator-{job}.out").read_text()
     assert "Traceback" not in told
     assert "cells done before" in told

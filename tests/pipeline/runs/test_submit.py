@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import getopt
 import json
+import re
 import shlex
+import shutil
 import subprocess
 import sys
 
@@ -11,10 +14,8 @@ import pytest
 
 from pipeline.runs.batch import WORDS, coordinator_script
 from pipeline.runs.run import run
-from pipeline.runs.submit import prepare
 from pipeline.runs.workflows import find_spec
 from pipeline.specification.clusters import load_cluster
-from pipeline.specification.problems import SpecError
 
 CLUSTER = """
 [cluster]
@@ -44,6 +45,8 @@ WHOLE = {
     "slurm": """
 #SBATCH --job-name=magpend-out
 #SBATCH --output=/logs/coordinator-%j.out
+#SBATCH --open-mode=append
+#SBATCH --requeue
 #SBATCH --partition=short
 #SBATCH --account=p-42
 #SBATCH --nodes=1
@@ -58,6 +61,7 @@ WHOLE = {
 #PBS -N magpend-out
 #PBS -o /logs/coordinator.out
 #PBS -j oe
+#PBS -r y
 #PBS -V
 #PBS -q short
 #PBS -A p-42
@@ -66,10 +70,24 @@ WHOLE = {
 #PBS -pe smp 4
 #PBS --exclusive
 """,
+    "torque": """
+#PBS -N magpend-out
+#PBS -o /logs/coordinator.out
+#PBS -j oe
+#PBS -r y
+#PBS -V
+#PBS -q short
+#PBS -A p-42
+#PBS -l nodes=1:ppn=4,mem=7630mb
+#PBS -l walltime=04:00:00
+#PBS -pe smp 4
+#PBS --exclusive
+""",
     "sge": """
 #$ -N magpend-out
 #$ -o /logs/coordinator.out
 #$ -j y
+#$ -r y
 #$ -V
 #$ -S /bin/bash
 #$ -q short
@@ -81,6 +99,7 @@ WHOLE = {
     "lsf": """
 #BSUB -J magpend-out
 #BSUB -o /logs/coordinator-%J.out
+#BSUB -r
 #BSUB -q short
 #BSUB -P "p-42"
 #BSUB -n 4
@@ -124,6 +143,7 @@ def test_script__one_job_holds_all(cluster, kind):
     [
         ("slurm", ("#SBATCH --cpus-per-task=1", "#SBATCH --mem=3815M", "#SBATCH --time=48:00:00")),
         ("pbs", ("#PBS -l select=1:ncpus=1:mem=3815mb", "#PBS -l walltime=48:00:00")),
+        ("torque", ("#PBS -l nodes=1:ppn=1,mem=3815mb", "#PBS -l walltime=48:00:00")),
         ("sge", ("#$ -l h_rt=48:00:00",)),
         ("lsf", ("#BSUB -n 1", "#BSUB -M 4000", "#BSUB -W 48:00")),
     ],
@@ -148,6 +168,7 @@ def test_script__is_bash(cluster, kind):
         ("slurm", "17\n", "17"),
         ("slurm", "17;north\n", "17"),
         ("pbs", "1234.pbs-server\n", "1234.pbs-server"),
+        ("torque", "1234.head.site\n", "1234.head.site"),
         ("sge", "99\n", "99"),
         ("lsf", "Job <506> is submitted to queue <short>.\n", "506"),
         ("lsf", "Request aborted by esub.\n", None),
@@ -157,16 +178,72 @@ def test_words__number_of_a_job(kind, said, job):
     assert WORDS[kind].job(said) == job
 
 
+OPTIONS = {
+    "pbs": "a:A:c:C:e:fhIj:J:k:l:m:M:N:o:p:P:q:r:R:S:u:v:VW:Xz",
+    "torque": "a:A:b:c:C:d:D:e:fhIj:k:l:m:M:N:o:p:P:q:r:S:t:T:u:v:Vw:W:xXz",
+}
+"""Options of qsub that the manual pages of OpenPBS and of Torque list, in getopt's form."""
+
+
+@pytest.mark.parametrize("kind", OPTIONS)
+def test_script__has_documented_options_of_qsub(cluster, kind):
+    """Each line is read by getopt with the options of the manual page, and values have the documented form."""
+    path = cluster(kind)
+    path.write_text(
+        path.read_text().replace('directives = ["-pe smp 4", "--exclusive"]', 'directives = ["-W umask=022"]')
+    )
+    lines = [line for line in script(path).splitlines() if line.startswith("#PBS ")]
+    found = []
+    for line in lines:
+        options, rest = getopt.getopt(shlex.split(line.removeprefix("#PBS ")), OPTIONS[kind])
+        assert not rest
+        found += options
+    values = dict(found)
+    assert values["-j"] in ("oe", "eo", "n")
+    assert values["-r"] in ("y", "n")
+    assert re.fullmatch(r"[A-Za-z][\w.-]{0,14}", values["-N"])
+    assert re.fullmatch(r"/\S+", values["-o"])
+    resources = [value for option, value in found if option == "-l"]
+    size, time = r"\d+(b|kb|mb|gb|tb)", r"walltime=\d+:\d\d:\d\d"
+    job = {"pbs": rf"select=\d+(:ncpus=\d+)(:mem={size})", "torque": rf"nodes=\d+(:ppn=\d+),mem={size}"}[kind]
+    assert len(resources) == 2
+    assert re.fullmatch(job, resources[0])
+    assert re.fullmatch(time, resources[1])
+
+
 # ---- the command ---------------------------------------------------------------------------------------
 
 
-def test_submit__dry_run(main, tmp_path, write_spec, sweep_text, cluster):
-    path = write_spec(sweep_text)
+@pytest.fixture
+def command_of(tmp_path, monkeypatch):
+    """Put commands on the PATH, which has no others of a batch system."""
+    folder = tmp_path / "bin"
+    folder.mkdir()
+    for name in ("sh", "cat", "bash"):
+        (folder / name).symlink_to(shutil.which(name))
+    monkeypatch.setenv("PATH", str(folder))
+    monkeypatch.delenv("SGE_ROOT", raising=False)
+    monkeypatch.delenv("MAGPEND_CLUSTER", raising=False)
+
+    def write(name, text):
+        (folder / name).write_text(f"#!/bin/sh\n{text}\n")
+        (folder / name).chmod(0o755)
+
+    return write
+
+
+def job_file(out):
+    """The first job file of a dry run."""
+    return out.split("\n---- ")[1].partition("\n")[2].rstrip("\n")
+
+
+def test_submit__dry_run(main, tmp_path, write_spec, cluster):
+    path = write_spec(SMALL)
     code, out, _ = main("submit", path, "--cluster", cluster("slurm"), "--out", "out", "--smoke", "--dry-run")
     assert code == 2  # it has no [smoke]
     code, out, _ = main("submit", path, "--cluster", cluster("slurm"), "--out", "out", "--dry-run")
     assert code == 0
-    words = shlex.split(out.splitlines()[-1])
+    words = shlex.split(job_file(out).splitlines()[-1])
     assert words == [
         "exec",
         sys.executable,
@@ -181,63 +258,195 @@ def test_submit__dry_run(main, tmp_path, write_spec, sweep_text, cluster):
         "--workers",
         "4",
     ]
-    several = cluster("pbs", "max_jobs = 3\n")
-    code, out, _ = main("submit", path, "--cluster", several, "--out", "out", "--dry-run")
-    assert shlex.split(out.splitlines()[-1])[-4:] == ["--scheduler", "pbs", "--cluster", str(several)]
+    for line in (
+        "work: 1 cells in 1 tasks; at most 2 periods; cube ",
+        f"batch system: SLURM (given by {cluster('slurm')})",
+        "jobs: 1 job of 4 cores, 8.0 GB, at most 4 h",
+        "cores = 4: from",
+        "results: out",
+        f"log: {tmp_path / 'out.jobs'}/coordinator-JOB.out",
+        "follow: magpend status out; squeue -j JOB; tail -F",
+        "cancel: scancel JOB",
+        "continue: after a cancel",
+    ):
+        assert line in out
     assert not (tmp_path / "out").exists()
     assert not (tmp_path / "out.jobs").exists()
 
 
-def test_submit__refusals(main, tmp_path, write_spec, sweep_text, cluster, monkeypatch):
-    path = write_spec(sweep_text)
-    monkeypatch.delenv("MAGPEND_CLUSTER", raising=False)
-    assert main("submit", path)[0] == 2
+def test_submit__dry_run_with_workers(main, tmp_path, write_spec, cluster):
+    """Job files of coordinator and workers are printed; with changes, also the table that the coordinator reads."""
+    path, several = write_spec(SMALL), cluster("pbs", "max_jobs = 3\n")
+    words = ("submit", path, "--cluster", several, "--out", "out", "--dry-run")
+    code, out, _ = main(*words)
+    assert code == 0
+    assert shlex.split(job_file(out).splitlines()[-1])[-4:] == ["--scheduler", "pbs", "--cluster", str(several)]
+    assert "it sends 1 to 3 jobs of workers, each of 4 cores, 8.0 GB, at most 4 h" in out
+    assert "#PBS -l select=1:ncpus=4:mem=7630MB" in out
+    assert "dask_worker tls://COORDINATOR:PORT" in out
+    assert "cluster.toml" not in out
+    code, out, _ = main(*words, "--job", "walltime=02:00:00", "--job", "max_jobs=2", "--json")
+    found = json.loads(out)
+    table = tmp_path / "out.jobs" / "cluster.toml"
+    assert shlex.split(found["jobs"][0]["script"].splitlines()[-1])[-1] == str(table)
+    assert [job["role"] for job in found["jobs"]] == ["coordinator", "workers"]
+    assert found["jobs"][0]["walltime_s"] == 48 * 3600
+    assert found["jobs"][1]["walltime_s"] == 2 * 3600
+    assert found["reasons"]["walltime"] == "from --job"
+    assert found["cells"] == found["cells_left"] == 1
+    assert found["sent"] is None
+    assert sorted(path.name for path in tmp_path.iterdir() if path.suffix != ".toml") == []
+
+
+def test_submit__needs_no_file(main, tmp_path, write_spec, command_of):
+    """What a batch system and the measured work say is enough; a key can be changed."""
+    path = write_spec(SMALL)
+    command_of("sbatch", "echo 7")
+    command_of("sinfo", "echo 'short*|up|1:00:00|3|8|16000'; echo 'long|up|infinite|1|64|512000'")
+    code, out, _ = main("submit", path, "--out", "out", "--dry-run")
+    assert code == 0
+    assert f"batch system: SLURM ({tmp_path}/bin/sbatch is here; looked for sbatch (SLURM), bsub (LSF), qsub" in out
+    assert "partition: short (at most 60 min, 3 nodes of 8 cores, 16.8 GB), the default of SLURM" in out
+    assert "jobs: 1 job of 1 core, 1.5 GB, at most 15 min" in out
+    assert "--partition" not in job_file(out)
+    code, out, _ = main(
+        "submit", path, "--out", "out", "--job", "queue=long", "--job", "cores=99", "--job", "account=p-1"
+    )
+    assert code == 0
+    assert "sent: job 7 to SLURM; 1 job of 99 cores" in out
+    assert "warning: cores is 99, above the cores of most nodes of partition long, 64: SLURM may refuse the job" in out
+    lines = (tmp_path / "out.jobs" / "job.sh").read_text().splitlines()
+    assert {"#SBATCH --partition=long", "#SBATCH --account=p-1", "#SBATCH --cpus-per-task=99"} <= set(lines)
+    command_of("sinfo", "echo 'a|up|1:00:00|3|8|16000'; echo 'b|up|infinite|1|64|512000'")
+    code, _, errors = main("submit", path, "--out", "other", "--dry-run")
+    assert code == 2
+    assert "SLURM has no default partition; choose one and give --job queue=NAME" in errors
+    assert "a (at most 60 min, 3 nodes of 8 cores, 16.8 GB); b (no time limit" in errors
+
+
+def test_submit__a_file_may_leave_sizes_out(main, tmp_path, write_spec, command_of):
+    (tmp_path / "mine.toml").write_text('[cluster]\naccount = "p-9"\n')
+    command_of("sbatch", "echo 8")
+    code, out, errors = main("submit", write_spec(SMALL), "--cluster", "mine.toml", "--out", "out", "--dry-run")
+    assert code == 0, errors
+    assert '  account = "p-9": from mine.toml' in out
+    assert "#SBATCH --account=p-9" in job_file(out)
+    assert "its nodes and limits are not known ('sinfo' gave no answer)" in out
+
+
+def test_submit__writes_a_job_file(main, tmp_path, write_spec, command_of):
+    """Also for a system that is not here; an own file is replaced, another is not."""
+    words = ("submit", write_spec(SMALL), "--out", "out", "--cluster", "pbs", "--write")
+    code, out, errors = main(*words, "job.sh")
+    assert code == 0, errors
+    assert "written: job.sh, for PBS: 1 job of 1 core" in out
+    assert "send it: qsub job.sh" in out
+    text = (tmp_path / "job.sh").read_text()
+    assert "#PBS -l select=1:ncpus=1:mem=1431mb" in text
+    assert (tmp_path / "out.jobs").is_dir()  # PBS puts no log into a folder that is not there
+    assert main(*words, "job.sh")[0] == 0
+    (tmp_path / "notes.txt").write_text("mine")
+    assert main(*words, "notes.txt")[0] == 2
+    assert main(*words, "job.sh", "--dry-run")[0] == 2
+
+
+def test_submit__no_batch_system(main, tmp_path, write_spec, command_of):
+    path = write_spec(SMALL)
+    code, _, errors = main("submit", path, "--out", "o", "--dry-run")
+    assert code == 2
+    for words in (
+        "there is no batch system here: none of the commands sbatch (SLURM), bsub (LSF), qsub (PBS, Torque, Grid",
+        f"compute on this machine, now: magpend run {path} --out o\n",
+        f"magpend submit {path} --out o --cluster slurm --write job.sh",
+        f"magpend run {path} --out o --scheduler tcp://HOST:8786",
+    ):
+        assert words in errors
+    code, _, errors = main("submit", path, "--out", "o", "--cluster", "slurm")
+    assert code == 2
+    assert "SLURM: there is no command 'sbatch' here" in errors
+    assert not (tmp_path / "o.jobs").exists()
+
+
+def test_submit__several_batch_systems(main, write_spec, command_of):
+    path = write_spec(SMALL)
+    command_of("sbatch", "echo 1")
+    command_of("qsub", "echo 2.head")
+    command_of("qstat", 'case "$*" in *--version) echo "pbs_version = 20.0.1";; *) exit 1;; esac')
+    code, _, errors = main("submit", path)
+    assert code == 2
+    assert "which batch system? There are SLURM (" in errors
+    assert f"magpend submit {path} --cluster slurm, or magpend submit {path} --cluster pbs." in errors
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--cluster", "slurmm"], "slurmm: is neither a file with a [cluster] table nor a batch system"),
+        (["--cluster", "slurm", "--job", "partition=x"], "--job partition=x: unknown key"),
+        (["--cluster", "slurm", "--job", "cores"], "--job cores: must be KEY=VALUE"),
+        (["--cluster", "slurm", "--job", "cores=0"], "cluster.cores = 0: must be at least 1"),
+        (["--cluster", "slurm", "--job", "cores=many"], "cluster.cores = 'many': must be a whole number"),
+        (["--cluster", "slurm", "--job", "walltime=4h"], "cluster.walltime: '4h': must be hours"),
+        (["--cluster", "sge", "--job", "cores=4"], "Grid Engine wants a parallel environment"),
+    ],
+)
+def test_submit__wrong_words(main, write_spec, words, said):
+    code, _, errors = main("submit", write_spec(SMALL), *words)
+    assert code == 2
+    assert said in errors
+
+
+def test_submit__refusals(main, tmp_path, write_spec, cluster, command_of, monkeypatch):
+    path = write_spec(SMALL)
     monkeypatch.setenv("MAGPEND_CLUSTER", str(cluster("slurm")))
     code, _, errors = main("submit", path, "--out", tmp_path / "my run")
     assert code == 2
     assert "batch systems do not accept this path" in errors
-    monkeypatch.setenv("PATH", str(tmp_path))
     code, _, errors = main("submit", path, "--out", "out")
     assert code == 2
-    assert "slurm: there is no command 'sbatch' here" in errors
+    assert "SLURM: there is no command 'sbatch' here" in errors
     assert not (tmp_path / "out.jobs").exists()
 
 
-def test_submit__what_the_batch_system_says(main, tmp_path, write_spec, sweep_text, cluster, monkeypatch):
+def test_submit__what_the_batch_system_says(main, tmp_path, write_spec, cluster, command_of):
     """A command that refuses, one that says nothing, and a job that is there already."""
-    path, commands = write_spec(sweep_text), tmp_path / "bin"
-    commands.mkdir()
-    monkeypatch.setenv("PATH", f"{commands}:/usr/bin:/bin")
-
-    def command(name, text):
-        (commands / name).write_text(f"#!/bin/sh\n{text}\n")
-        (commands / name).chmod(0o755)
-
-    words = ("submit", path, "--cluster", cluster("slurm"), "--out", "out")
-    command("sbatch", "echo 'error: invalid account' >&2; exit 1")
+    words = ("submit", write_spec(SMALL), "--cluster", cluster("slurm"), "--out", "out")
+    command_of("sbatch", "echo 'error: invalid account' >&2; exit 1")
     code, _, errors = main(*words)
     assert code == 4
-    assert "sbatch did not take the job: error: invalid account. The script is" in errors
-    command("sbatch", "true")
+    assert "sbatch did not take the job: error: invalid account.\nSet the account that pays: --job account=" in errors
+    assert f"The script is {tmp_path / 'out.jobs' / 'job.sh'}." in errors
+    command_of("sbatch", "true")
     assert "sbatch did not take the job: exit code 0" in main(*words)[2]
-    command("sbatch", "echo 7")
-    command("squeue", "echo PENDING")
+    command_of("sbatch", "echo 7")
+    command_of("squeue", "echo PENDING")
     assert main(*words)[0] == 0
     assert json.loads((tmp_path / "out.jobs" / "job.json").read_text()) == {"kind": "slurm", "job": "7"}
     code, _, errors = main(*words)
     assert code == 3
     assert "job 7 of this run exists already (PENDING)" in errors
-    command("squeue", "exit 1")
+    command_of("squeue", "exit 1")
     assert main(*words)[0] == 0
     (tmp_path / "out.jobs" / "job.json").write_text('{"kind": "slurm", "job": "--help; rm"}')
+    assert main(*words)[0] == 0
+
+
+def test_submit__torque_lists_a_job_that_has_ended(main, tmp_path, write_spec, command_of):
+    words = ("submit", write_spec(SMALL), "--cluster", "torque", "--out", "out")
+    command_of("qsub", "echo 12.head")
+    assert main(*words)[0] == 0
+    command_of("qstat", "echo 'Job Id: 12.head'; echo '    job_state = R'")
+    assert main(*words)[0] == 3
+    command_of("qstat", "echo 'Job Id: 12.head'; echo '    job_state = C'; echo '    exit_status = 0'")
     assert main(*words)[0] == 0
 
 
 def test_submit__nothing_to_send(main, tmp_path, write_spec, cluster):
     path = write_spec(SMALL)
     run(path, tmp_path / "out", workers=0, echo=lambda line: None)
-    code, out, _ = main("submit", path, "--cluster", cluster("slurm"), "--out", "out")
-    assert (code, out) == (0, "out is complete; nothing to send.\n")
+    words = ("submit", path, "--cluster", cluster("slurm"), "--out", "out")
+    assert main(*words)[:2] == (0, "out is complete; nothing to send.\n")
+    assert "out is complete; nothing would be sent." in main(*words, "--dry-run")[1]
 
 
 def test_templates__are_in_order():
@@ -246,9 +455,3 @@ def test_templates__are_in_order():
     files = sorted(folder.glob("*.toml"))
     assert [load_cluster(file).kind for file in files] == [file.stem for file in files]
     assert {file.stem for file in files} == set(WORDS)
-
-
-def test_prepare__no_cluster_file(write_spec, sweep_text, monkeypatch):
-    monkeypatch.delenv("MAGPEND_CLUSTER", raising=False)
-    with pytest.raises(SpecError, match="a job is not described"):
-        prepare(write_spec(sweep_text), None, None)
