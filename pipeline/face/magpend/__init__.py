@@ -39,7 +39,7 @@ _HOMES = {
     "pipeline.store.run": ("Run", "open_run"),
     "pipeline.compute.simulate": ("simulate",),
     "pipeline.runs.python": ("run", "table"),
-    "pipeline.specification.inputs": ("load_model",),
+    "pipeline.specification.inputs": ("load_model", "model"),
     "pipeline.runs.status": ("state",),
     "pipeline.runs.verify": ("verify_run",),
     "pipeline.runs.extend": ("extend",),
