@@ -16,9 +16,9 @@ from magpend_core.models.imported import KEY
 from magpend_core.models.model import Model
 from magpend_core.models.text.lines import is_equations, read_lines
 from pipeline.specification.files import read_toml, toml_tables
-from pipeline.specification.models import find_model, is_model_file
+from pipeline.specification.models import find_model, is_model_file, kept_reference
 from pipeline.specification.problems import SpecError, shown
-from pipeline.specification.toml import toml_key, toml_value
+from pipeline.specification.writing import specification_toml
 
 
 def model(
@@ -166,9 +166,24 @@ def is_toml_text(given: Any) -> bool:
     return isinstance(given, str) and ("\n" in given or "=" in given)
 
 
-def toml_of(table: Mapping[str, Any]) -> str:
-    """Return a table as TOML text, one line per key."""
-    return "".join(f"{toml_key(key)} = {toml_value(value)}\n" for key, value in _plain(table).items())
+def plain_tables(given: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the tables of a specification as plain data: no numpy numbers or paths, and models as `kept_reference`.
+
+    Under ``model`` equations are read as `model` reads them.
+    """
+    tables = {str(key): _plain(value) for key, value in given.items() if value is not None and key != "model"}
+    reference = given.get("model")
+    if reference is None:
+        return tables
+    if isinstance(reference, str) and is_equations(reference):
+        reference = model(reference)
+    kept = kept_reference(reference) if isinstance(reference, Model) else _plain(reference)
+    return {**tables, "model": kept}
+
+
+def toml_of(tables: Mapping[str, Any]) -> str:
+    """Return the tables of a specification, given in Python, as TOML text."""
+    return specification_toml(plain_tables(tables))
 
 
 def _plain(given: Any) -> Any:
