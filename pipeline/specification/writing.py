@@ -36,10 +36,11 @@ def specification_toml(tables: Mapping[str, Any]) -> str:
     """
     model = tables.get("model")
     text = model_toml(model) if isinstance(model, str | Mapping) else None
-    lines = [f"{toml_key(k)} = {toml_value(v)}" for k, v in tables.items() if not isinstance(v, Mapping) and k != "model"]
+    plain = {key: value for key, value in tables.items() if key != "model" and not isinstance(value, Mapping)}
+    lines = [f"{toml_key(key)} = {toml_value(value)}" for key, value in plain.items()]
     if model is not None and (text is None or not text.startswith("[")):
         lines.append(text.rstrip("\n") if text is not None else f"model = {toml_value(model)}")
-    names = [k for k, v in tables.items() if isinstance(v, Mapping) and k != "model"]
+    names = [key for key in tables if key not in plain and key != "model"]
     for name in sorted(names, key=lambda n: ORDER.index(n) if n in ORDER else len(ORDER)):
         entries = [f"{toml_key(k)} = {toml_value(v)}" for k, v in tables[name].items()]
         lines += ["", f"[{toml_key(name)}]", *entries] if entries else []

@@ -38,6 +38,7 @@ _HOMES = {
     "pipeline.specification.problems": ("SpecError",),
     "pipeline.store.run": ("Run", "open_run"),
     "pipeline.compute.simulate": ("simulate",),
+    "pipeline.runs.building": ("Spec",),
     "pipeline.runs.python": ("run", "table"),
     "pipeline.specification.inputs": ("load_model", "model"),
     "pipeline.runs.status": ("state",),
