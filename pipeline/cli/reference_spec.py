@@ -108,8 +108,8 @@ METHODS = (
         fixed=("kind", "grid"),
         states=(
             "float | tuple[float, float, int] | Numbers | Mapping[str, Any]",
-            f"{_DEGREES}Each is a number, ``(start, stop, num)``, a list of values, or a table with the keys of `axis`. "
-            "States not given are 0.",
+            f"{_DEGREES}Each is a number, ``(start, stop, num)``, a list of values, or a table with the keys of `axis`."
+            " States not given are 0.",
         ),
     ),
     Method(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self
@@ -130,11 +131,11 @@ class Spec(SpecTables, Mapping[str, Any]):
         """
         check_starts(read_given(self, smoke=smoke)[0])
 
-    def preview(
-        self, out: str | Path | None = None, *, workers: int | None = None, smoke: bool = False
-    ) -> Preview:
-        """Describe the run: cells, bytes, time. The time is measured on some of the run's own cells, which takes
-        seconds; nothing is created.
+    def preview(self, out: str | Path | None = None, *, workers: int | None = None, smoke: bool = False) -> Preview:
+        """Describe the run: cells, bytes, time.
+
+        Nothing is created. The time is measured on some of the run's own cells when the description is shown,
+        or when its `times` are first read, which takes seconds.
 
         Parameters
         ----------
@@ -229,5 +230,4 @@ def _with_file(table: Any, name_of: Callable[[str], str]) -> Any:
 
 
 def _seen_from(name: str, folder: Path) -> str:
-    path = Path(name).resolve()
-    return str(path.relative_to(folder.resolve(), walk_up=True)) if not Path(name).is_absolute() else name
+    return name if Path(name).is_absolute() else os.path.relpath(name, folder)

@@ -214,11 +214,7 @@ def preview(
 
 
 def describe_plan(
-    spec: str | Path | Mapping[str, Any],
-    out: str | Path | None,
-    *,
-    workers: int | None = None,
-    smoke: bool = False,
+    spec: str | Path | Mapping[str, Any], out: str | Path | None, *, workers: int | None = None, smoke: bool = False
 ) -> Iterator[str]:
     """Yield the text lines that a dry run prints, the measured time last. See `preview`."""
     yield from preview(spec, out, workers=workers, smoke=smoke).lines

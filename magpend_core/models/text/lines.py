@@ -3,6 +3,8 @@
     x'' = -d*x' + x - x**3 + drive      a rate; the states are x and x_dot
     drive = A*cos(2*pi*f*t)             a part with a name
     d = 0.2                             a parameter and its value
+
+A comment begins with #. A line with an open bracket goes on in the next one.
 """
 
 from __future__ import annotations
@@ -211,7 +213,7 @@ def _orders(entries: list[Entry], found: Lines) -> dict[str, int]:
 
 
 def _unprimed(entry: Entry, names: Mapping[str, list[str]], found: Lines) -> str:
-    """Return the right side of a line with ``x'`` replaced by the name of the state; report primes that are no state."""
+    """Return the right side of a line with ``x'`` replaced by the state's name; report primes that are no state."""
 
     def state(match: re.Match[str]) -> str:
         name, order = match[1], len(match[2])
@@ -229,9 +231,7 @@ def _unprimed(entry: Entry, names: Mapping[str, list[str]], found: Lines) -> str
     return _PRIMED.sub(state, entry.right)
 
 
-def _states(
-    given: Any, names: Mapping[str, list[str]], rates: Mapping[str, Any], found: Lines
-) -> dict[str, Any] | Any:
+def _states(given: Any, names: Mapping[str, list[str]], rates: Mapping[str, Any], found: Lines) -> dict[str, Any] | Any:
     """Return the states in the order of their equations, with units; a derivative's unit follows from its state's."""
     if not isinstance(given, Mapping):
         return given  # the reader of the table reports it
