@@ -48,14 +48,7 @@ def test_read_lines__of_a_dict():
 
 def test_read_lines__puts_positions_before_their_rates():
     table = read_lines("a'' = -a + b\nb' = -b\nc''' = -c''", {"states": {"c": "rad"}}).table
-    assert table["states"] == {
-        "a": "1",
-        "b": "1",
-        "c": "rad",
-        "a_dot": "1",
-        "c_dot": "rad/s",
-        "c_ddot": "rad/s2",
-    }
+    assert table["states"] == {"a": "1", "b": "1", "c": "rad", "a_dot": "1", "c_dot": "rad/s", "c_ddot": "rad/s2"}
     assert table["equations"]["c_ddot"] == "-c_ddot"
 
 
