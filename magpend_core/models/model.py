@@ -207,6 +207,12 @@ class Model:
     autonomous: bool = False
     text: Mapping[str, Any] | None = None
 
+    def __repr__(self) -> str:
+        states = ", ".join(f"{s.name} [{s.unit}]" for s in self.states)
+        values = ", ".join(f"{name} = {value:g}" for name, value in self.presets[0].values.items())
+        about = "" if self.title == self.name else f": {self.title}"
+        return f"model {self.name}{about}\n  states {states}\n  parameters {values or 'none'}"
+
     @property
     def reference(self) -> str | Mapping[str, Any]:
         """Return the reference that a run stores and `load_model` reads: the model's name, or its text as a table."""

@@ -12,12 +12,11 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.cli.outputs import check_log
 from pipeline.products.reporting import reporting
-from pipeline.runs.progress import duration
+from pipeline.runs.progress import Work
 
 LOG = logging.getLogger("magpend")
 
@@ -174,51 +173,6 @@ class Display:
         """Stop redrawing the progress, and remove the progress bar."""
         self._over.set()
         self.clear()
-
-
-@dataclass
-class Work:
-    """A named piece of work, with the amounts done and in total.
-
-    Attributes
-    ----------
-    what : str
-        Name of the work.
-    started : float
-        Time of its first report [s].
-    begun : float
-        Amount that was done at its first report.
-    done, total : float
-        Amounts of the last report; a total of 0 is unknown.
-    heard : float
-        Time of the last report [s].
-    expected_s : float
-        Expected time of the whole work [s]; 0 if unknown.
-    """
-
-    what: str
-    started: float
-    begun: float = 0.0
-    done: float = 0.0
-    total: float = 0.0
-    heard: float = 0.0
-    expected_s: float = 0.0
-
-    def line(self, now: float) -> str:
-        """Return a line of text with the progress and the remaining time."""
-        elapsed = max(now - self.started, 0.0)
-        if not self.total:
-            return f"{self.what}: {duration(elapsed)} so far"
-        share = min(self.done / self.total, 1.0)
-        text = f"{self.what}: {self.done:g} of {self.total:g} ({100 * share:.0f} %)"
-        if share == 1:
-            return text
-        took, more = self.heard - self.started, self.done - self.begun
-        if more > 0:
-            left, about = took * (self.total - self.done) / more - (now - self.heard), ""
-        else:
-            left, about = self.expected_s - elapsed, "about "
-        return f"{text}, {about}{duration(left)} left" if left > 0 else f"{text}, {duration(elapsed)} so far"
 
 
 def at_rest() -> None:

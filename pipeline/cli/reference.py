@@ -1,5 +1,6 @@
-"""Write the tables of README and docs, and the typed methods of the Python package, from the code:
-``python -m pipeline.cli.reference``.
+"""Write the tables of README and docs, and typed methods of the Python package, from the code.
+
+The command is ``python -m pipeline.cli.reference``.
 
 A table stands between the marks ``<!-- reference: NAME -->`` and ``<!-- /reference -->``. The text between
 the marks is replaced. With ``--check`` nothing is written, and the exit code is 1 if a page is out of date.
@@ -288,14 +289,14 @@ def _keys(head: str, model: Any, more: str, left_out: Sequence[str] = ("kind",))
             continue
         extra: Any = info.json_schema_extra or {}
         unit = f" [{extra['unit']}]" if extra.get("unit") else ""
-        rows.append(
-            (f"`{info.alias or name}`", _default(info), _bounds(info), f"{(info.description or '').rstrip('.')}{unit}")
-        )
+        meaning = f"{(info.description or '').rstrip('.')}{unit}"
+        rows.append((f"`{info.alias or name}`", default_in_words(info), bounds_in_words(info), meaning))
     text = f"{more}\n\n" if more else ""
     return f"### `{head}`\n\n{text}{table(('key', 'default', 'bounds', 'meaning'), rows)}"
 
 
-def _default(info: Any) -> str:
+def default_in_words(info: Any) -> str:
+    """Return the default of a key as Markdown; empty if it says nothing."""
     if info.is_required():
         return "required"
     default = info.get_default(call_default_factory=True)
@@ -304,7 +305,8 @@ def _default(info: Any) -> str:
     return f"`{str(default).lower() if isinstance(default, bool) else repr(default)}`"
 
 
-def _bounds(info: Any) -> str:
+def bounds_in_words(info: Any) -> str:
+    """Return the bounds or the choices of a key as Markdown."""
     from pipeline.cli.options import bounds_of
 
     if get_origin(info.annotation) is Literal:
@@ -416,10 +418,11 @@ TABLES: dict[str, Callable[[], str]] = {
 
 def stale() -> dict[Path, str]:
     """Return the new texts of the pages and modules that are out of date, by path."""
-    from pipeline.cli import signatures
+    from pipeline.cli import reference_spec, signatures
 
     texts = {page: rendered(page.read_text("utf-8")) for page in pages()}
     texts |= {path: text() for path, text in signatures.generated().items()}
+    texts[reference_spec.MODULE] = reference_spec.module()
     return {path: text for path, text in texts.items() if not path.exists() or path.read_text("utf-8") != text}
 
 

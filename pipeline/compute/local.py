@@ -18,13 +18,15 @@ import tempfile
 import threading
 import time
 from collections.abc import Iterator
-from multiprocessing import resource_tracker
+from multiprocessing import resource_tracker, spawn
 from pathlib import Path
 from typing import Any
 
 from pipeline.compute.addresses import SchedulerError
 
 PREFIX = "magpend-workers-"
+WORKER = "Dask Worker process"
+"""Beginning of the names that dask gives to worker processes."""
 
 START_S = 180.0
 """Longest wait for the first worker [s]."""
@@ -83,6 +85,7 @@ def local_cluster(n_workers: int, *, dashboard: bool = False) -> Iterator[Any]:
         # postpone signals: a cluster that is partly started cannot be closed properly
         with _signals_put_off():
             stack.enter_context(_hushed())
+            stack.enter_context(_script_left_alone())
             scratch = stack.enter_context(_scratch())
             settings = {**SETTINGS, **pages, "temporary-directory": str(scratch)}
             stack.enter_context(dask.config.set(settings))
@@ -214,6 +217,29 @@ def _start_tracker() -> None:
 
 
 @contextlib.contextmanager
+def _script_left_alone() -> Iterator[None]:
+    """Start worker processes inside this context without the main module of this process.
+
+    A new process imports it under another name. A script without ``if __name__ == "__main__"`` would begin its
+    run again in each worker. Tasks are functions of modules that workers import, and need nothing of a script.
+    """
+    original = spawn.get_preparation_data
+
+    def prepared(name: str) -> dict[str, Any]:
+        data: dict[str, Any] = original(name)
+        if name.startswith(WORKER):
+            data.pop("init_main_from_path", None)
+            data.pop("init_main_from_name", None)
+        return data
+
+    spawn.get_preparation_data = prepared
+    try:
+        yield
+    finally:
+        spawn.get_preparation_data = original
+
+
+@contextlib.contextmanager
 def _signals_put_off() -> Iterator[None]:
     """Delay SIGINT, SIGTERM and SIGHUP until the end of the context."""
     if threading.current_thread() is not threading.main_thread():
@@ -261,7 +287,7 @@ def _hushed() -> Iterator[None]:
 def kill_workers() -> None:
     """Kill the worker processes at once, without waiting for their tasks."""
     for process in multiprocessing.active_children():
-        if process.name.startswith("Dask Worker process"):
+        if process.name.startswith(WORKER):
             with contextlib.suppress(ValueError):  # closed meanwhile
                 process.kill()
 

@@ -31,6 +31,7 @@ from pipeline.layout.conventions import conventional
 from pipeline.products.attractors import IdentifyOptions
 from pipeline.products.product import Analysis, Options, function_of
 from pipeline.products.registry import ANALYSES
+from pipeline.runs import notebook
 from pipeline.runs.naming import named
 from pipeline.runs.versions import code_version
 from pipeline.specification.problems import SpecError, unknown_name, validated
@@ -137,7 +138,8 @@ def derive(
         run.echo(f"{name}: damaged ({error}); computing it again")
     if place.local is not None and (problem := unwritable(place.local.parent)):
         run.echo(f"{problem}: the result of {name} is shown but not kept")
-    return _kept(run, place, _compute(run, analysis, wanted).assign_attrs(key))
+    with notebook.progress():
+        return _kept(run, place, _compute(run, analysis, wanted).assign_attrs(key))
 
 
 def stored(source: Source, name: str) -> xr.Dataset | None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +17,8 @@ from pipeline.runs.estimate import estimate, wall_seconds, writing_seconds
 from pipeline.runs.noise import check_steps
 from pipeline.runs.progress import duration, size
 from pipeline.runs.run import identity_here
-from pipeline.runs.workflows import default_directory, find_spec
-from pipeline.specification.parsing import Spec, load_spec
+from pipeline.runs.workflows import read_given
+from pipeline.specification.parsing import Spec
 from pipeline.store.commits import read_commits
 from pipeline.store.places import open_files
 from pipeline.store.run import Run
@@ -91,46 +93,145 @@ def shown(run: Run) -> tuple[str, dict[str, Any], str]:
     return name, options, f"left out: {'; '.join(left)}. See: {more}" if left else ""
 
 
-def describe_plan(
-    spec: str | Path, out: str | Path | None, *, workers: int | None = None, smoke: bool = False
-) -> Iterator[str]:
-    """Yield the text lines that a dry run prints; nothing but the compile cache is written.
+@dataclass(frozen=True)
+class Times:
+    """Estimated time of the missing cells of a run.
 
-    The time is measured on some of the run's own cells, after the lines that cost nothing.
+    Attributes
+    ----------
+    core_seconds : float
+        Time on one core [s].
+    wall_seconds : float
+        Time on the chosen number of workers [s].
+    line : str
+        Text line with both, and what they rest on.
+    """
+
+    core_seconds: float
+    wall_seconds: float
+    line: str
+
+
+@dataclass(frozen=True, repr=False)
+class Preview:
+    """Description of a run before it starts; its text is what ``magpend run --dry-run`` prints.
+
+    Attributes
+    ----------
+    spec : Spec
+        The specification, checked.
+    plan : Plan
+        Tasks and arrays that follow from it.
+    directory : str
+        Place of the run.
+    exists : bool
+        Whether the run has been created.
+    done : frozenset of int
+        Committed tasks.
+    workers : int or None
+        Number of workers that the time is for; None for the cores of this machine.
+    """
+
+    spec: Spec
+    plan: Plan
+    directory: str
+    exists: bool
+    done: frozenset[int]
+    workers: int | None = None
+
+    @property
+    def dims(self) -> dict[str, int]:
+        """Number of values along each axis of the run."""
+        return dict(zip(self.plan.dims, self.plan.shape, strict=True))
+
+    @property
+    def n_cells(self) -> int:
+        """Number of cells of the run."""
+        return self.plan.n_cells
+
+    @property
+    def n_tasks(self) -> int:
+        """Number of tasks of the run."""
+        return self.plan.n_tasks
+
+    @property
+    def n_bytes(self) -> int:
+        """Size of the result cube before compression [bytes]."""
+        return self.plan.n_bytes
+
+    @cached_property
+    def times(self) -> Times:
+        """Time of the missing cells, measured on some of them at the first use."""
+        missing = set(range(self.n_tasks)) - self.done
+        share = sum(self.plan.cells_in(i) for i in missing) / self.n_cells
+        return times(self.spec, self.plan, share, len(missing), self.workers)
+
+    @property
+    def lines(self) -> Iterator[str]:
+        """Text lines of a dry run; the last one has the time."""
+        if self.spec.title:
+            yield self.spec.title
+        yield from (f"warning: {remark}" for remark in (*self.spec.model.flow.remarks, *unit_remarks(self.spec.model)))
+        dims = ", ".join(f"{d} {n}" for d, n in self.dims.items())
+        yield f"{self.spec.kind}: {self.n_cells} cells ({dims or 'one cell'})"
+        block = " x ".join(map(str, self.plan.block)) or "1"
+        yield f"tasks: {self.n_tasks} of {block} cells, {len(self.done)} done"
+        yield f"cube: {size(self.n_bytes)} before compression"
+        yield f"directory: {self.directory}" + ("" if self.exists else " (not created)")
+        yield self.times.line
+
+    def __repr__(self) -> str:
+        return "\n".join(self.lines)
+
+
+def preview(
+    spec: str | Path | Mapping[str, Any],
+    out: str | Path | None = None,
+    *,
+    workers: int | None = None,
+    smoke: bool = False,
+) -> Preview:
+    """Describe a run before it starts; nothing but the compile cache is written.
+
+    Parameters
+    ----------
+    spec, out, workers, smoke
+        See `pipeline.runs.run.run`.
 
     Raises
     ------
     SpecError, RefusedError
         See `pipeline.runs.run.run`.
     """
-    path = find_spec(spec)
-    parsed = load_spec(path, smoke=smoke)
+    parsed, _, default = read_given(spec, smoke=smoke)
     check_starts(parsed)
     check_steps(parsed)
-    files = open_files(out if out is not None else default_directory(path, smoke))
+    files = open_files(out if out is not None else default)
     plan = make_plan(parsed)
     info = check(files, identity_here(parsed, plan))
     done = read_commits(info, plan) if info else {}
     check_space(plan, files.local, plan.n_cells - sum(plan.cells_in(i) for i in done))
-    if parsed.title:
-        yield parsed.title
-    yield from (f"warning: {remark}" for remark in (*parsed.model.flow.remarks, *unit_remarks(parsed.model)))
-    dims = ", ".join(f"{d} {n}" for d, n in zip(plan.dims, plan.shape, strict=True))
-    yield f"{parsed.kind}: {plan.n_cells} cells ({dims or 'one cell'})"
-    yield f"tasks: {plan.n_tasks} of {' x '.join(map(str, plan.block)) or '1'} cells, {len(done)} done"
-    yield f"cube: {size(plan.n_bytes)} before compression"
-    yield f"directory: {files.name}" + ("" if info else " (not created)")
-    missing = set(range(plan.n_tasks)) - set(done)
-    share = sum(plan.cells_in(i) for i in missing) / plan.n_cells
-    yield time_line(parsed, plan, share, len(missing), workers)
+    return Preview(parsed, plan, files.name, info is not None, frozenset(done), workers)
+
+
+def describe_plan(
+    spec: str | Path | Mapping[str, Any], out: str | Path | None, *, workers: int | None = None, smoke: bool = False
+) -> Iterator[str]:
+    """Yield the text lines that a dry run prints, the measured time last. See `preview`."""
+    yield from preview(spec, out, workers=workers, smoke=smoke).lines
 
 
 def time_line(spec: Spec, plan: Plan, share: float, n_tasks: int, workers: int | None) -> str:
     """Return a text line with the estimated time for a fraction `share` of a run's cells."""
+    return times(spec, plan, share, n_tasks, workers).line
+
+
+def times(spec: Spec, plan: Plan, share: float, n_tasks: int, workers: int | None) -> Times:
+    """Estimate the time for a fraction `share` of a run's cells, in `n_tasks` tasks."""
     from pipeline.compute.execute import default_workers
 
     if not share:
-        return "time: nothing is left to compute"
+        return Times(0.0, 0.0, "time: nothing is left to compute")
     found = estimate(spec, plan)
     writing_s = writing_seconds(spec, plan)
     seconds = share * found.core_seconds + n_tasks * writing_s
@@ -143,4 +244,5 @@ def time_line(spec: Spec, plan: Plan, share: float, n_tasks: int, workers: int |
     more = (
         f"; after it, analyse attractors may extend cells for up to {whole} of one core" if spec.noise is None else ""
     )
-    return f"time: {bound} {duration(seconds)} of one core, {duration(by_clock)} on {cores} ({rests}){more}"
+    line = f"time: {bound} {duration(seconds)} of one core, {duration(by_clock)} on {cores} ({rests}){more}"
+    return Times(seconds, by_clock, line)

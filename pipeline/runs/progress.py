@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from types import TracebackType
 from typing import Any, Self
 
@@ -36,6 +37,54 @@ def size(n_bytes: float) -> str:
             return f"{n_bytes:.0f} {unit}" if unit == "bytes" else f"{n_bytes:.1f} {unit}"
         n_bytes /= 1000
     return f"{n_bytes:.1f} TB"
+
+
+@dataclass
+class Work:
+    """A named piece of work, with the amounts done and in total.
+
+    Attributes
+    ----------
+    what : str
+        Name of the work.
+    started : float
+        Time of its first report [s].
+    begun : float
+        Amount that was done at its first report.
+    done, total : float
+        Amounts of the last report; a total of 0 is unknown.
+    heard : float
+        Time of the last report [s].
+    expected_s : float
+        Expected time of the whole work [s]; 0 if unknown.
+    """
+
+    what: str
+    started: float
+    begun: float = 0.0
+    done: float = 0.0
+    total: float = 0.0
+    heard: float = 0.0
+    expected_s: float = 0.0
+
+    def counted(self) -> str:
+        """Return the name of the work with the amounts done and in total."""
+        return f"{self.what}: {self.done:g} of {self.total:g} ({100 * min(self.done / self.total, 1.0):.0f} %)"
+
+    def line(self, now: float) -> str:
+        """Return a line of text with the progress and the remaining time."""
+        elapsed = max(now - self.started, 0.0)
+        if not self.total:
+            return f"{self.what}: {duration(elapsed)} so far"
+        text = self.counted()
+        if self.done >= self.total:
+            return text
+        took, more = self.heard - self.started, self.done - self.begun
+        if more > 0:
+            left, about = took * (self.total - self.done) / more - (now - self.heard), ""
+        else:
+            left, about = self.expected_s - elapsed, "about "
+        return f"{text}, {about}{duration(left)} left" if left > 0 else f"{text}, {duration(elapsed)} so far"
 
 
 class Progress:

@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.products.product import function_of
 from pipeline.products.registry import ANALYSES
+from pipeline.runs import notebook
 from pipeline.runs.run import run as complete
+from pipeline.runs.stopping import Interrupted, InterruptedRunError
 from pipeline.runs.workflows import read_given
 from pipeline.store.run import Run
 
@@ -30,14 +32,14 @@ def run(
     Parameters
     ----------
     spec
-        Path of a TOML file, the name of a shipped workflow, TOML text, or a table (a dict).
+        A `Spec`, the path of a TOML file, the name of a shipped workflow, TOML text, or a table (a dict).
     out
         Run directory; by default ``runs/<name>``. For a text or a table the name is its model's with a
         digest, so that the same specification continues its run.
     smoke
         Whether to apply the specification's ``[smoke]`` table.
     echo
-        Function that prints a line.
+        Function that prints a line. In a notebook a bar shows the progress instead of lines.
     options
         ``workers``, ``scheduler``, ``cluster`` and ``dashboard``, see `pipeline.runs.run.run`.
 
@@ -50,6 +52,9 @@ def run(
     ------
     SpecError
         If the specification is wrong; before anything is computed, with all problems.
+    KeyboardInterrupt
+        After Ctrl-C, or an interrupt of the notebook's kernel, when all workers have stopped. The finished cells
+        stay; the same call goes on from there.
     Exception
         See `pipeline.runs.run.run`.
 
@@ -59,7 +64,11 @@ def run(
     """
     if out is None:
         _, _, out = read_given(spec, smoke=smoke)
-    complete(spec, out, smoke=smoke, echo=echo, **options)
+    try:
+        with notebook.progress():
+            complete(spec, out, smoke=smoke, echo=echo, **options)
+    except InterruptedRunError:
+        raise Interrupted(f"Stopped. The finished cells stay in {out}; the same call goes on from there.") from None
     return Run.open(out)
 
 

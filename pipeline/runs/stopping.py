@@ -44,6 +44,13 @@ class InterruptedRunError(Exception):
         super().__init__(message)
 
 
+class Interrupted(KeyboardInterrupt):
+    """Raised in Python code by Ctrl-C during a run; in a notebook it is shown as one line."""
+
+    def _render_traceback_(self) -> list[str]:
+        return [str(self)]
+
+
 class _Listener:
     """Signal handler of the command line: it raises `Stopped` at a first signal, or ends the process."""
 

@@ -11,16 +11,14 @@ from typing import Any
 
 from magpend_core.models.imported import KEY
 from pipeline.specification.files import check_new_file, write_new
-from pipeline.specification.models import model_toml
 from pipeline.specification.parsing import Spec, kept_spec, load_spec
 from pipeline.specification.problems import SpecError, unknown_name
 from pipeline.specification.starts import GridStarts, RandomStarts, degrees_key, state_keys, state_of_key
 from pipeline.specification.tables import FREQUENCY, Range
-from pipeline.specification.toml import toml_key, toml_value
+from pipeline.specification.writing import specification_toml
 from pipeline.store.local import refuse_place
 
 MARK = "(zoom)"
-_ORDER = ("parameters", "axes", "initial_conditions", "continuation", "integration", "products", "execution")
 _ROUNDING = 1e-9
 """Relative amount by which a range may exceed the old one without a note, for conversion of degrees."""
 
@@ -248,19 +246,15 @@ def to_toml(spec: Spec) -> str:
 
     A model as text comes last, with its own tables. A Python object is written as its import path.
     """
-    data = spec.as_dict()
-    model = model_toml(data.pop("model"))
-    is_line = not model.startswith("[")
-    lines = [f"{key} = {toml_value(data[key])}" for key in ("kind", "title") if data[key]]
-    lines += [model.rstrip("\n")] if is_line else []
-    names = [name for name in data if isinstance(data[name], dict)]
-    for name in sorted(names, key=lambda n: _ORDER.index(n) if n in _ORDER else len(_ORDER)):
-        # an empty table is left out
-        table = {key: value for key, value in data[name].items() if value != {}}
-        if table:
-            lines += ["", f"[{name}]", *(f"{toml_key(k)} = {toml_value(v)}" for k, v in table.items())]
-    text = "\n".join(lines) + "\n" + ("" if is_line else f"\n{model}")
+    data = {key: value for key, value in spec.as_dict().items() if value != ""}
+    tables = {name: _filled(table) if name != "model" else table for name, table in data.items()}
+    text = specification_toml(tables)
     read = tomllib.loads(text)
-    assert is_line or read["model"] == spec.reference
+    assert not isinstance(read["model"], dict) or read["model"] == spec.reference
     assert kept_spec({**read, "model": spec.reference}) == spec
     return text
+
+
+def _filled(table: Any) -> Any:
+    """Return a table without its empty tables; any other value unchanged."""
+    return {key: value for key, value in table.items() if value != {}} if isinstance(table, dict) else table

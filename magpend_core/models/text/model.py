@@ -38,7 +38,7 @@ SOURCES = tuple(
 """What decides, with the text, what is integrated."""
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class TextModel(Model):
     """A model given as text; its system for the engine is derived when it is first needed.
 
@@ -50,6 +50,11 @@ class TextModel(Model):
 
     definition: Definition
     shipped: bool = False
+
+    def __repr__(self) -> str:
+        parts = [f"  {name} = {right}" for name, right in self.definition.table.get("define", {}).items()]
+        rates = [f"  {name}' = {right}" for name, right in self.definition.table["equations"].items()]
+        return "\n".join([super().__repr__(), *rates, *parts])
 
     @property
     def reference(self) -> str | Mapping[str, Any]:

@@ -71,6 +71,7 @@ from pipeline.rig.recordings import (
     write_recording as write_recording,
 )
 from pipeline.rig.recordings.figure import plot_recording as plot_recording
+from pipeline.runs.building import Spec as Spec
 from pipeline.runs.derive import derive as derive, prune as prune
 from pipeline.runs.drawing import figure as figure
 from pipeline.runs.extend import extend as extend
@@ -80,7 +81,7 @@ from pipeline.runs.status import state as state
 from pipeline.runs.verify import verify_run as verify_run
 from pipeline.runs.zoom import zoom as zoom
 from pipeline.specification.drive_files import load_drive as load_drive
-from pipeline.specification.inputs import load_model as load_model
+from pipeline.specification.inputs import load_model as load_model, model as model
 from pipeline.specification.problems import SpecError as SpecError
 
 __version__: str

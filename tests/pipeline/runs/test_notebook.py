@@ -1,0 +1,186 @@
+"""Runs from a notebook's kernel and from a script: interrupted, and continued to the same bytes."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import queue
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import psutil
+import pytest
+
+from pipeline.runs import notebook
+from pipeline.runs.run import run
+
+ROOT = Path(__file__).parents[3]
+PATIENCE_S = 240.0
+# the equations of tests/pipeline/runs/test_python.py, which are compiled already
+CELL = """
+import magpend
+model = magpend.model(
+    "x' = v\\nv' = -k*x - 0.2*v + A*cos(2*pi*f*t)", name="oscillator", states={"x": "m", "v": "m/s"}, k=1.0, A=0.5
+)
+spec = (
+    magpend.Spec("sweep", model)
+    .parameters(frequency_hz=0.2)
+    .axis("A", 0.1, 0.4, 16)
+    .start_grid(x=(-1, 1, 16))
+    .integration(n_transient=3000, n_keep=4)
+    .execution(trajectories_per_task=16)
+)
+"""
+COMPUTE = 'run = magpend.run(spec, "run", workers=2)\n'
+
+
+@pytest.fixture
+def whole(tmp_path, bytes_of):
+    """Bytes of the run that was never interrupted."""
+    names: dict = {}
+    exec(CELL, names)
+    run(names["spec"], tmp_path / "whole", workers=0, echo=lambda _: None)
+    return bytes_of(tmp_path / "whole")
+
+
+@pytest.fixture
+def around(tmp_path):
+    path = os.pathsep.join([str(ROOT), str(ROOT / "pipeline" / "face"), os.environ.get("PYTHONPATH", "")])
+    (tmp_path / "temporary").mkdir()
+    return {**os.environ, "PYTHONPATH": path.rstrip(os.pathsep), "TMPDIR": str(tmp_path / "temporary")}
+
+
+def n_committed(folder):
+    return len(list((folder / "run" / "commits").glob("*.json")))
+
+
+def workers_of(process):
+    """Worker processes that a process has started; the tracker of semaphores ends with it."""
+    found = psutil.Process(process).children(recursive=True)
+    words = []
+    for child in found:
+        with contextlib.suppress(psutil.NoSuchProcess):
+            words.append(" ".join(child.cmdline()))
+    return [line for line in words if "resource_tracker" not in line]
+
+
+@pytest.fixture
+def kernel(tmp_path, around):
+    """Run the code of a cell in a kernel; interrupt it when `when` is true. Returns the messages of its outputs."""
+    from jupyter_client.manager import KernelManager
+
+    manager = KernelManager(kernel_name="python3")
+    manager.start_kernel(env=around, cwd=str(tmp_path), stderr=subprocess.DEVNULL)
+    client = manager.client()
+    client.start_channels()
+
+    def cell(code, when=lambda: False):
+        message, outputs, interrupted = client.execute(code), [], False
+        end = time.monotonic() + PATIENCE_S
+        while time.monotonic() < end:
+            if not interrupted and when():
+                interrupted = True
+                manager.interrupt_kernel()
+            with contextlib.suppress(queue.Empty):
+                got = client.get_iopub_msg(timeout=0.02)
+                if got["parent_header"].get("msg_id") != message:
+                    continue
+                if got["content"].get("execution_state") == "idle":
+                    return outputs
+                outputs.append((got["msg_type"], got["content"]))
+        raise AssertionError(outputs)
+
+    try:
+        client.wait_for_ready(timeout=PATIENCE_S)
+        cell.process = manager.provisioner.pid
+        yield cell
+    finally:
+        client.stop_channels()
+        manager.shutdown_kernel(now=True)
+        manager.cleanup_resources()
+
+
+@pytest.mark.slow
+def test_run__interrupted_in_a_cell_goes_on_with_the_same_cell(kernel, whole, tmp_path, bytes_of):
+    stopped = kernel(CELL + COMPUTE + "print('not reached')\n", lambda: n_committed(tmp_path) >= 2)
+    kind, content = stopped[-1]
+    assert (kind, content["ename"]) == ("error", "Interrupted")
+    assert content["traceback"] == ["Stopped. The finished cells stay in run; the same call goes on from there."]
+    assert not any("not reached" in str(content) for _, content in stopped)
+    assert workers_of(kernel.process) == []
+    assert list((tmp_path / "temporary").glob("magpend-workers-*")) == []
+    before = n_committed(tmp_path)
+    assert 2 <= before < 16
+    again = kernel(CELL + COMPUTE + "print('complete:', run.complete)\n")
+    assert [content["text"] for kind, content in again if kind == "stream"][-1].endswith("complete: True\n")
+    assert bytes_of(tmp_path / "run") == whole
+    # one bar, whose last state has all cells, and few lines
+    bars = [content["transient"]["display_id"] for kind, content in again if "display" in kind]
+    assert len(set(bars)) == 1
+    last = [content["data"] for kind, content in again if "display" in kind][-1]
+    assert last["text/plain"].startswith("computing cells: 256 of 256 (100 %), done after")
+    assert "<progress max='256' value='256'" in last["text/html"]
+    assert sum(content["text"].count("\n") for kind, content in again if kind == "stream") <= 4
+
+
+@pytest.mark.slow
+def test_run__interrupted_in_a_script_goes_on_with_the_same_script(around, whole, tmp_path, bytes_of):
+    """The script has no ``if __name__ == "__main__"``: workers do not run it."""
+    script = tmp_path / "script.py"
+    script.write_text(f"print('begun', flush=True)\n{CELL}{COMPUTE}print('complete:', run.complete)\n", "utf-8")
+
+    def begin():
+        return subprocess.Popen(
+            [sys.executable, str(script)],
+            cwd=tmp_path,
+            env=around,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+        )
+
+    process = begin()
+    try:
+        end = time.monotonic() + PATIENCE_S
+        while n_committed(tmp_path) < 2 and process.poll() is None and time.monotonic() < end:
+            time.sleep(0.02)
+        os.killpg(process.pid, signal.SIGINT)
+        out, err = process.communicate(timeout=PATIENCE_S)
+    finally:
+        process.kill()
+    assert process.returncode == -signal.SIGINT, err
+    assert err.splitlines()[-1].endswith("Stopped. The finished cells stay in run; the same call goes on from there.")
+    assert out.count("begun") == 1
+    assert "complete" not in out
+    assert list((tmp_path / "temporary").glob("magpend-workers-*")) == []
+    assert 2 <= n_committed(tmp_path) < 16
+    process = begin()
+    out, err = process.communicate(timeout=PATIENCE_S)
+    assert (process.returncode, out.count("begun"), "complete: True" in out) == (0, 1, True), err
+    assert bytes_of(tmp_path / "run") == whole
+
+
+def test_progress__outside_a_notebook_does_nothing(capsys):
+    from pipeline.products.reporting import is_heard
+
+    assert not notebook.is_notebook()
+    with notebook.progress():
+        assert not is_heard()
+    assert capsys.readouterr() == ("", "")
+
+
+def test_bar__shows_counts_then_how_it_ended():
+    bar = notebook.Bar()
+    bar._show = lambda: None
+    assert repr(bar) == ""
+    bar("compiling", 0, 0)
+    assert "<progress  style" in bar._repr_html_()
+    bar("computing cells", 10, 40)
+    assert repr(bar).startswith("computing cells: 10 of 40 (25 %)")
+    bar.end("stopped")
+    assert repr(bar).startswith("computing cells: 10 of 40 (25 %), stopped after")
