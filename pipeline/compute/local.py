@@ -31,6 +31,9 @@ WORKER = "Dask Worker process"
 START_S = 180.0
 """Longest wait for the first worker [s]."""
 
+CLOSE_S = 60.0
+"""Longest wait for the scheduler to close in order [s]."""
+
 LOGGERS = [
     "tornado",
     "distributed",
@@ -105,10 +108,9 @@ def local_cluster(n_workers: int, *, dashboard: bool = False) -> Iterator[Any]:
                 silence_logs=50,
                 loop=loop,
             )
-            stack.enter_context(cluster)
+            stack.callback(_close, cluster)
         try:
-            cluster.scale(n_workers)  # type: ignore[no-untyped-call]
-            _await_one(cluster)
+            _start_workers(cluster, n_workers)
             yield cluster
         except BaseException:
             for nanny in cluster.workers.values():
@@ -117,12 +119,27 @@ def local_cluster(n_workers: int, *, dashboard: bool = False) -> Iterator[Any]:
             raise
 
 
-def _await_one(cluster: Any) -> None:
+def _start_workers(cluster: Any, n_workers: int) -> None:
+    """Start workers and wait for the first one. If all have failed to start, which dask does not tell, try again."""
     end = time.monotonic() + START_S
+    cluster.scale(n_workers)
     while not cluster.scheduler.workers:
         if time.monotonic() > end:
             raise SchedulerError(f"no worker process has started within {START_S:.0f} s.")
+        nannies = list(cluster.workers.values())
+        if nannies and all(nanny.status.name in ("closed", "failed") for nanny in nannies):
+            cluster.scale(0)
+            cluster.scale(n_workers)
+            time.sleep(1.0)
         time.sleep(0.02)
+
+
+def _close(cluster: Any) -> None:
+    """Close a cluster; kill its workers if it does not end in time, so that nobody waits for ever."""
+    try:
+        cluster.close(timeout=CLOSE_S)
+    except TimeoutError:
+        kill_workers()
 
 
 @contextlib.contextmanager

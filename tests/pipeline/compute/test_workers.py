@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -14,7 +15,7 @@ from functools import partial
 from pathlib import Path
 
 import pytest
-from distributed import Client
+from distributed import Client, Nanny
 
 from pipeline.compute import clients, dispatch, limits, local
 from pipeline.compute.addresses import SchedulerError
@@ -144,6 +145,33 @@ def test_workers__a_blocked_callback_of_another_client_holds_up_nobody(faulty, t
             assert len(list(run_tasks(task, range(3), seconds=one_second, workers=1))) == 3
         finally:
             free.set()
+
+
+def test_local_cluster__whose_workers_all_fail_to_start_tries_again(monkeypatch):
+    instantiate, failed = Nanny.instantiate, []
+
+    async def failing_once(self):
+        if len(failed) < 2:
+            failed.append(self)
+            raise OSError("no process")
+        return await instantiate(self)
+
+    monkeypatch.setattr(Nanny, "instantiate", failing_once)
+    with local_cluster(2) as cluster:
+        assert len(failed) == 2
+        assert cluster.scheduler.workers
+
+
+def test_local_cluster__that_does_not_close_holds_up_nobody(monkeypatch):
+    async def never(self):
+        await asyncio.Event().wait()
+
+    monkeypatch.setattr(local, "CLOSE_S", 0.5)
+    with local_cluster(1) as cluster:
+        (worker,) = (p for p in multiprocessing.active_children() if p.name.startswith("Dask Worker"))
+        monkeypatch.setattr(type(cluster), "_close", never)
+    worker.join(30)
+    assert not worker.is_alive()
 
 
 @contextlib.contextmanager
