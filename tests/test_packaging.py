@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import fnmatch
 import importlib.util
 import os
@@ -154,6 +155,22 @@ def test_dependencies__have_lower_bounds_alone():
     for text in every:
         if isinstance(text, str) and not text.startswith("magpend["):
             assert re.fullmatch(r"[A-Za-z][\w.-]*(\[[\w,]+\])?>=\d[\d.]*", text), text
+
+
+def test_dependencies__are_all_packages_that_are_imported():
+    """One that comes with another package today may not come tomorrow."""
+    extras = [text for listed in PROJECT["optional-dependencies"].values() for text in listed]
+    named = {re.split(r"[\[>]", text)[0].lower().replace("-", "_") for text in (*PROJECT["dependencies"], *extras)}
+    named |= {"pil", "pydantic_core", *(name.strip("/") for name in PACKAGES), "magpend"}  # pillow, a part of pydantic
+    for name in installed_names():
+        if not name.endswith(".py") or name == "workflows/magnet/make_discs.py":  # a script for developers
+            continue
+        path = ROOT / ("pipeline/face/" + name if name.startswith("magpend/") else name)
+        for node in ast.walk(ast.parse(path.read_bytes())):
+            absolute = isinstance(node, ast.ImportFrom) and node.level == 0
+            whole = [a.name for a in node.names] if isinstance(node, ast.Import) else [node.module] if absolute else []
+            for package in {module.partition(".")[0] for module in whole} - sys.stdlib_module_names:
+                assert package.lower() in named, f"{name} imports {package}"
 
 
 def test_extras__are_for_users_and_named_where_they_are_needed():
