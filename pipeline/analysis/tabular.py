@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from pipeline.layout.units import shown_unit
 from pipeline.products.product import padded
 
 FEW_POINTS = 6
@@ -78,7 +79,7 @@ def at_point(ds: xr.Dataset, row: Row, dims: Sequence[str]) -> Words:
 
 def unit_of(ds: xr.Dataset, dim: str) -> str:
     """Return the unit of an axis with a leading space; an empty text for a dimensionless axis."""
-    unit = ds[dim].attrs.get("units", "1")
+    unit = shown_unit(ds[dim].attrs)
     return "" if unit == "1" else f" {unit}"
 
 

@@ -111,7 +111,7 @@ def _with_units(entry: Described) -> dict[str, Any]:
     del attrs["units"]
     if entry.dtype.kind not in "biuf":
         return attrs
-    if str(given).startswith("see "):
+    if str(given).startswith("see ") or "," in str(given):
         return {"comment": f"units of the components: {given}", **attrs}
     units = readable_unit(str(given))
     return {GIVEN: str(given), **attrs} if units is None else {"units": units, **attrs}

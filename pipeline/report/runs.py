@@ -16,6 +16,7 @@ import numpy as np
 from pipeline.analysis.outcomes import sentence
 from pipeline.analysis.tabular import axis_ranges, counted, distinct, number
 from pipeline.layout.attractor_letters import letter
+from pipeline.layout.units import shown_unit
 from pipeline.layout.vocabulary import is_grid_dim, parameter_name, split_dims
 from pipeline.products.product import function_of
 from pipeline.products.registry import ANALYSES, FIGURES
@@ -162,7 +163,7 @@ def _state(shown: Shown) -> Iterator[Block]:
 
 
 def _span(cube: xr.Dataset, name: str) -> str:
-    values, unit = cube[name].values, str(cube[name].attrs.get("units", "1"))
+    values, unit = cube[name].values, shown_unit(cube[name].attrs)
     if values.size == 1:
         return f"{values[0]:g}{'' if unit == '1' else ' ' + unit}"
     return f"{values[0]:g} to {values[-1]:g}{'' if unit == '1' else ' ' + unit} ({values.size} values)"
@@ -320,7 +321,7 @@ def _analysis(shown: Shown, name: str, options: Mapping[str, Any]) -> Iterator[B
         yield Note(str(error))
         return
     path = str(found.attrs.get("path", ""))
-    unit = str(found[path].attrs.get("units", "1")) if path in found.coords else "1"
+    unit = shown_unit(found[path].attrs) if path in found.coords else "1"
     axis = f"{path} [{unit}]" if unit != "1" else path
     rows = [_with_letters(row, axis) for row in function_of(ANALYSES[name].table)(found).rows]
     # the settled options, so that a page made from the stored result is the same
