@@ -14,7 +14,7 @@ comments, which no reader sees, stand before blocks:
     <!-- picture: FILE -->    the picture in the next line is this file
     <!-- run: slurm -->       as `run`, and with other commands of a shell; left out where there is no SLURM
     <!-- printed: slurm -->   as `printed`, after such blocks
-    <!-- until: slurm; COMMAND; TEXT -->   a command of magpend is repeated until it prints the text
+    <!-- until: slurm; COMMAND; TEXT -->   the command is repeated until it prints the text
 
 With ``--pictures`` all pictures are made again in the docs. With ``--check`` those that differ from these are
 named, and the exit code is 1 if there are any. `NOT_MADE` lists those that no command makes. Runs compute in
@@ -50,7 +50,7 @@ NOT_MADE = {
 }
 """Pictures in the docs that this program does not make, with what they show."""
 
-PATIENCE_S = 60.0
+PATIENCE_S = 120.0
 
 _BLOCK = re.compile(
     r"<!-- (file|run|background|printed)(?:: ([^>]*?))? -->\n```(\w*)\n(.*?)```"
@@ -149,12 +149,12 @@ class Session:
             raise TutorialError(f"{line}: exit code {done.returncode}\n{self.printed[-2000:]}")
 
     def until(self, command: str, text: str) -> None:
-        """Repeat a command of magpend until it prints a text."""
+        """Repeat a command until it prints a text."""
         until = time.monotonic() + PATIENCE_S
         while True:
             before = len(self.printed)
             with contextlib.suppress(TutorialError):  # there is no run directory yet, say
-                self.command(shlex.split(command))
+                self.do("run", "", "sh", command)
             if text in self.printed[before:]:
                 return
             if time.monotonic() > until:

@@ -132,7 +132,7 @@ def worker_script(cluster: Cluster, folder: Path) -> str:
     with tempfile.TemporaryDirectory(prefix="magpend-script-") as logs:
         job = kind(
             scheduler="tls://COORDINATOR:PORT",
-            name=f"{JOB_NAME}-NUMBER",
+            name=f"{_CLASSES[cluster.kind]}-NUMBER",
             protocol="tls://",
             security=Security(  # type: ignore[no-untyped-call]
                 require_encryption=True,

@@ -195,7 +195,7 @@ def test_submit__follow_cancel_and_go_on(tmp_path, shell, magpend, bytes_of):
     assert 2 <= len(state(out).done) < 12
 
     # gone on with by a coordinator in a job, with workers in jobs of their own
-    explained = magpend("submit", "spec.toml", "--cluster", "several.toml", "--out", "out", "--dry-run")
+    explained = magpend("submit", "spec.toml", "--cluster", "several.toml", "--out", "out", "--dry-run", "--quiet")
     said = magpend("submit", "spec.toml", "--cluster", "several.toml", "--out", "out")
     job = json.loads((logs / "job.json").read_text())["job"]
     wait(lambda: "magpend-worker" in shell("squeue", "-h", "-o", "%j"), logs)
@@ -205,7 +205,8 @@ def test_submit__follow_cancel_and_go_on(tmp_path, shell, magpend, bytes_of):
     # the dry run has printed the workers' job but for address, number and folder of keys
     foreseen = explained.partition("a job of workers")[2].partition("\n")[2].strip().splitlines()
     pattern = "\n".join(map(re.escape, foreseen)).replace("COORDINATOR:PORT", r"\S+").replace("NUMBER", r"\d+")
-    assert re.fullmatch(pattern.replace("OF\\-THIS\\-RUN", r"\w+"), sent.strip()), (pattern, sent)
+    pattern = pattern.replace(r"OF\-THIS\-RUN", r"\w+")
+    assert re.fullmatch(pattern, sent.strip()), (pattern, sent)
     told = (logs / f"coordinator-{job}.out").read_text()
     assert "Traceback" not in told
     assert "cells done before" in told
