@@ -122,7 +122,7 @@ def load_model(reference: str | Path | Mapping[str, Any] | Model = "pendulum") -
 
 
 def _warned(found: Model, given: Any) -> Model:
-    """Return a model after a warning for each part of its text that nothing uses, in the name of the caller's caller."""
+    """Return a model after a warning for each part of its text that nothing uses."""
     if found is not given:
         for remark in found.remarks:
             warnings.warn(remark, stacklevel=3)
