@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from typer.main import get_command
 
-from pipeline.cli import reference
+from pipeline.cli import reference, reference_spec
 from pipeline.cli.main import app
 from pipeline.layout.vocabulary import FREQUENCY_DIM
 from pipeline.runs.workflows import shipped_workflows
@@ -44,6 +44,11 @@ def test_readme__fits_two_screens():
 def test_docs__tables_are_those_of_the_code(page):
     """Mended by: python -m pipeline.cli.reference."""
     assert reference.rendered(PAGES[page]) == PAGES[page]
+
+
+def test_reference__writes_the_methods_of_spec():
+    """Mended by: python -m pipeline.cli.reference."""
+    assert reference_spec.MODULE not in reference.stale()
 
 
 @pytest.mark.parametrize("page", PAGES)

@@ -97,6 +97,13 @@ def test_pictures__example_is_what_its_page_draws(tmp_path, monkeypatch):
         assert not tutorials.is_stale(page.parent / shown, made)
 
 
+def test_python_start__does_and_draws_what_it_says(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    page = tutorials.pages()["python-start"]
+    for shown, made in tutorials.follow(page, tmp_path).items():
+        assert not tutorials.is_stale(page.parent / shown, made)
+
+
 def test_follow__commands_before_come_first_and_blocks_for_others_are_left(tmp_path):
     page = tmp_path / "page.md"
     text = "<!-- run: tests -->\n```sh\npip install .\n```\n\n<!-- before: magpend models -->\n"

@@ -14,7 +14,9 @@ import sys
 import tomllib
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any, Literal, get_args, get_origin
+from typing import Any
+
+from pipeline.cli.reference_words import bounds_in_words, default_in_words
 
 ROOT = Path(__file__).parents[2]
 _BLOCK = re.compile(r"(<!-- reference: ([\w ]+) -->\n).*?(<!-- /reference -->)", re.DOTALL)
@@ -293,27 +295,6 @@ def _keys(head: str, model: Any, more: str, left_out: Sequence[str] = ("kind",))
         rows.append((f"`{info.alias or name}`", default_in_words(info), bounds_in_words(info), meaning))
     text = f"{more}\n\n" if more else ""
     return f"### `{head}`\n\n{text}{table(('key', 'default', 'bounds', 'meaning'), rows)}"
-
-
-def default_in_words(info: Any) -> str:
-    """Return the default of a key as Markdown; empty if it says nothing."""
-    if info.is_required():
-        return "required"
-    default = info.get_default(call_default_factory=True)
-    if default is None or default in ("", {}):
-        return ""
-    return f"`{str(default).lower() if isinstance(default, bool) else repr(default)}`"
-
-
-def bounds_in_words(info: Any) -> str:
-    """Return the bounds or the choices of a key as Markdown."""
-    from pipeline.cli.options import bounds_of
-
-    if get_origin(info.annotation) is Literal:
-        return ", ".join(f"`{choice}`" for choice in get_args(info.annotation))
-    inner = [part for kind in get_args(info.annotation) for part in getattr(kind, "__metadata__", ())]
-    words = [bounds_of(info)] + [bounds_of(part) for part in inner if hasattr(part, "metadata")]
-    return ", ".join(word for word in words if word)
 
 
 # ---- cube --------------------------------------------------------------------------------------

@@ -14,6 +14,7 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from pydantic import BaseModel
 
+from pipeline.cli.reference_words import bounds_in_words, default_in_words
 from pipeline.products.registry import CELL_PRODUCTS
 from pipeline.specification import drift, noise, recorded_drive, section, starts, tables
 
@@ -205,8 +206,6 @@ def _docstring(summary: str, notes: Sequence[tuple[str, str]]) -> str:
 
 
 def _note(info: Any, required: bool) -> str:
-    from pipeline.cli.reference import bounds_in_words, default_in_words
-
     extra: Any = info.json_schema_extra or {}
     unit = f" [{extra['unit']}]" if extra.get("unit") else ""
     words = [(info.description or "").rstrip(".") + unit, "" if "`" in bounds_in_words(info) else bounds_in_words(info)]

@@ -113,15 +113,20 @@ def model(
         )
     else:
         found = _found(equations)
-    if found is not equations:
-        for remark in found.remarks:
-            warnings.warn(remark, stacklevel=2)
-    return found
+    return _warned(found, equations)
 
 
 def load_model(reference: str | Path | Mapping[str, Any] | Model = "pendulum") -> Model:
     """Return a model by name, path, TOML text, table or equations: `model` without keywords, under its older name."""
-    return model(reference)
+    return _warned(_found(reference), reference) if not _is_equations(reference) else model(reference)
+
+
+def _warned(found: Model, given: Any) -> Model:
+    """Return a model after a warning for each part of its text that nothing uses."""
+    if found is not given:
+        for remark in found.remarks:
+            warnings.warn(remark, stacklevel=3)
+    return found
 
 
 def _is_equations(given: Any) -> bool:

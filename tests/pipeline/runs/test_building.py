@@ -1,0 +1,196 @@
+"""Specifications built in Python: the same runs as their TOML texts, and all problems at once."""
+
+from __future__ import annotations
+
+import inspect
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import magpend
+from pipeline.layout.identity import identity_of
+from pipeline.layout.plan import make_plan
+from pipeline.products.registry import CELL_PRODUCTS
+from pipeline.runs.workflows import read_given, shipped_workflows
+from pipeline.specification.parsing import _KEYS, load_spec, parse_spec
+from pipeline.specification.problems import SpecError
+
+EQUATIONS = "x' = v\nv' = -k*x - 0.2*v + A*cos(2*pi*f*t)"
+TEXT = """
+kind = "sweep"
+title = "forces"
+[parameters]
+frequency_hz = 0.2
+[axes]
+A = { start = 0.1, stop = 0.3, num = 3 }
+k = { values = [1.0, 1.5] }
+[initial_conditions]
+kind = "grid"
+x = { start = -1.0, stop = 1.0, num = 4 }
+v = 0.5
+[integration]
+n_transient = 20
+n_keep = 4
+[products]
+extremes = { quantities = ["x"] }
+[smoke]
+"integration.n_keep" = 2
+[model]
+name = "oscillator"
+states = { x = "m", v = "m/s" }
+parameters = { k = 1.0, A = 0.5 }
+equations = { x = "v", v = "-k*x - 0.2*v + A*cos(2*pi*f*t)" }
+"""
+
+
+def oscillator():
+    return magpend.model(EQUATIONS, name="oscillator", states={"x": "m", "v": "m/s"}, k=1.0, A=0.5)
+
+
+def built():
+    return (
+        magpend.Spec("sweep", oscillator(), "forces")
+        .parameters(frequency_hz=0.2)
+        .axis("A", 0.1, 0.3, 3)
+        .axis("k", values=np.array([1.0, 1.5]))
+        .start_grid(x=(-1, 1, 4), v=0.5)
+        .integration(n_transient=20)
+        .integration(n_keep=np.int64(4))
+        .extremes(quantities=["x"])
+        .smoke({"integration.n_keep": 2})
+    )
+
+
+def identity(spec):
+    return identity_of(spec, make_plan(spec), "kernel")
+
+
+def same_run(spec, text):
+    return identity(read_given(spec)[0]) == identity(read_given(text)[0])
+
+
+def test_model__is_that_of_the_toml_text():
+    of_text = magpend.load_model(TEXT)
+    assert oscillator() is of_text
+    assert oscillator().digest == of_text.digest
+    assert magpend.model("duffing") is magpend.load_model("duffing")
+    assert magpend.model({"x": "v", "v": "-x"}) is magpend.model("x' = v\nv' = -x")
+
+
+def test_model__refuses_keywords_for_a_model_that_is_given(tmp_path):
+    with pytest.raises(SpecError, match=r"amplitude=\.\.\..*keywords belong to equations.*\.load\(NAME=VALUE\)"):
+        magpend.model("duffing", amplitude=0.3)
+    (tmp_path / "m.toml").write_text(TEXT, "utf-8")
+    assert magpend.model(tmp_path / "m.toml") is oscillator()
+    with pytest.warns(UserWarning, match="c: nothing uses it"):
+        magpend.model("x' = -x", c=1.0)
+
+
+def test_model__shows_its_equations():
+    lines = repr(oscillator()).splitlines()
+    assert lines[0] == "model oscillator"
+    assert lines[-2:] == ["  x' = v", "  v' = -k*x - 0.2*v + A*cos(2*pi*f*t)"]
+
+
+def test_spec__is_the_run_of_its_toml_text(tmp_path):
+    spec = built()
+    assert same_run(spec, TEXT)
+    assert same_run(spec.toml(), TEXT)
+    assert identity(load_spec(spec.save(tmp_path / "spec.toml"))) == identity(read_given(spec)[0])
+    assert identity(read_given(spec, smoke=True)[0]) == identity(read_given(TEXT, smoke=True)[0])
+    assert magpend.Spec.read(spec.toml()) == spec
+    assert magpend.Spec.read(TEXT)["axes"] == tomllib.loads(TEXT)["axes"]
+    assert read_given(spec)[2] == read_given(spec.toml())[2] == read_given(dict(spec))[2]
+    assert not same_run(spec.axis("A", 0.1, 0.4, 3), TEXT)
+
+
+def test_spec__takes_tables_as_keywords():
+    tables = {key: value for key, value in built().items() if key != "model"}
+    assert magpend.Spec(**tables, model=oscillator()) == built()
+
+
+def test_spec__is_not_changed_by_its_methods():
+    spec = built()
+    before = spec.toml()
+    spec.integration(n_keep=1).axis("A", 0, 1, 2).start_list([[0.0, 0.0]]).lyapunov(n_exponents=1)
+    assert spec.toml() == before
+    assert spec.start_list([[0.0, 0.0]])["initial_conditions"] == {"kind": "list", "points": [[0.0, 0.0]]}
+    assert spec.lyapunov()["products"] == {"extremes": {"quantities": ["x"]}, "lyapunov": {}}
+
+
+def test_spec__reports_all_problems_at_once():
+    wrong = built().integration(n_keep=0).axis("B", 1, 2, 3).start_grid(y=3)
+    with pytest.raises(SpecError) as caught:
+        wrong.check()
+    assert len(caught.value.problems) == 3
+    for key in ("integration.n_keep = 0", "axes.B", "initial_conditions.y"):
+        assert key in str(caught.value)
+    with pytest.raises(SpecError, match=r"axes = 3: must be a table"):
+        magpend.Spec("sweep", axes=3, initial_conditions={"kind": "list", "points": [[0, 0, 0, 0]]}).check()
+
+
+def test_spec__has_a_method_for_every_table_and_its_keys():
+    """Signatures are explicit, and complete."""
+    named = {"axes": "axis", "initial_conditions": "start_grid"}
+    for key in (*_KEYS, *CELL_PRODUCTS):
+        if key not in ("kind", "title", "model", "products", "measured"):
+            assert callable(getattr(magpend.Spec, named.get(key, key))), key
+    assert "stop_when_closed" in inspect.signature(magpend.Spec.integration).parameters
+    assert "from_" in inspect.signature(magpend.Spec.drift).parameters
+    assert magpend.Spec("sweep").drift("A", from_=0.0, to=1.0)["drift"] == {"A": {"from": 0.0, "to": 1.0}}
+    assert "Relative tolerance of a step" in magpend.Spec.integration.__doc__
+
+
+@pytest.mark.parametrize("name", shipped_workflows())
+def test_spec__reads_and_writes_what_ships(name, tmp_path):
+    path = shipped_workflows()[name]
+    spec = magpend.Spec.read(name)
+    assert parse_spec({k: v for k, v in spec.items() if k != "smoke"}) == load_spec(path)
+    kept = {k: v for k, v in tomllib.loads(spec.toml()).items() if k != "smoke"}
+    assert parse_spec(kept) == load_spec(path)
+
+
+def test_spec__names_files_from_where_it_is(tmp_path, monkeypatch):
+    folder, other = tmp_path / "specs", tmp_path / "other"
+    folder.mkdir(), other.mkdir()
+    (folder / "model.toml").write_text(TEXT.partition("[model]")[2], "utf-8")
+    text = TEXT.partition("[model]")[0].replace('title = "forces"', 'title = "forces"\nmodel = "model.toml"')
+    (folder / "spec.toml").write_text(text, "utf-8")
+    monkeypatch.chdir(tmp_path)
+    spec = magpend.Spec.read(Path("specs") / "spec.toml")
+    assert same_run(spec, TEXT)
+    saved = spec.save(other / "spec.toml")
+    assert 'model = "../specs/model.toml"' in saved.read_text("utf-8")
+    assert load_spec(saved).model is oscillator()
+    assert spec.save(saved) == saved
+    with pytest.raises(SpecError, match="exists already and is not overwritten"):
+        spec.parameters(frequency_hz=0.3).save(saved)
+
+
+def test_preview__is_the_dry_run(tmp_path):
+    found = built().preview(tmp_path / "run", workers=2)
+    assert (found.n_cells, found.dims) == (24, {"A": 3, "k": 2, "x_0": 4})
+    assert found.n_bytes == make_plan(read_given(TEXT)[0]).n_bytes
+    assert found.times.core_seconds > 0
+    assert repr(found).splitlines() == list(found.lines)
+    assert "24 cells" in repr(found)
+    assert not (tmp_path / "run").exists()
+
+
+def test_run__of_a_spec_of_a_dict_and_of_equations(tmp_path, bytes_of):
+    spec, quiet = built(), {"workers": 0, "echo": lambda _: None}
+    whole = magpend.run(spec, tmp_path / "spec", **quiet)
+    assert whole.complete
+    magpend.run({**spec, "model": oscillator()}, tmp_path / "dict", **quiet)
+    (tmp_path / "spec.toml").write_text(TEXT, "utf-8")
+    magpend.run(tmp_path / "spec.toml", tmp_path / "text", **quiet)
+    arrays = {
+        name: {k: v for k, v in bytes_of(tmp_path / name).items() if not k.endswith("cube.zarr/zarr.json")}
+        for name in ("spec", "dict", "text")
+    }
+    assert arrays["spec"] == arrays["dict"] == arrays["text"]
+    of_lines = magpend.run({**spec, "model": f"{EQUATIONS}\nk = 1.0\nA = 0.5"}, tmp_path / "lines", **quiet)
+    section = whole.cube().section
+    assert np.array_equal(of_lines.cube().section.values, section.values)
