@@ -51,21 +51,26 @@ class Connection:
         self._answering, self._deliver = answering, send
         self._sessions: OrderedDict[str, LiveSession] = OrderedDict()
         self._lock, self._sending = threading.Lock(), threading.Lock()
-        self._closed = False
+        self._begun = self._closed = False
 
     def receive(self, message: Any) -> None:
         """Handle a message of a page, and return at once; what is no message of a page is ignored."""
         page = message.get("page") if isinstance(message, Mapping) else None
-        if not isinstance(page, str):
+        if not isinstance(page, str) or self._closed:
             return
+        if not self._begun:  # a widget that nobody looks at computes nothing
+            self._begun = True
+            self._answering.warm()
         if "ask" in message:
             self._ask(page, message)
         elif message.get("open"):
             self._open(page)
         elif message.get("close"):
             self.leave(page)
-        elif isinstance(message.get("live"), str) and (session := self._sessions.get(page)) is not None:
-            session.receive(message["live"])
+        elif isinstance(message.get("live"), str):
+            session = self._sessions.get(page) or self._open(page)
+            if session is not None:
+                session.receive(message["live"])
 
     # ---- data --------------------------------------------------------------------------------
 
@@ -90,10 +95,11 @@ class Connection:
 
     # ---- live computation --------------------------------------------------------------------
 
-    def _open(self, page: str) -> None:
+    def _open(self, page: str) -> LiveSession | None:
+        """Begin a session for a page, which may have had one before."""
         live = self._answering.live
-        if live is None or self._closed:
-            return
+        if live is None:
+            return None
 
         def emit(answer: Answer) -> None:
             if isinstance(answer, bytes):
@@ -108,6 +114,7 @@ class Connection:
             left = [self._sessions.popitem(last=False)[1] for _ in range(len(self._sessions) - MOST_PAGES)]
         for one in left:
             one.close()
+        return session
 
     def leave(self, page: str) -> None:
         """Cancel all jobs of a page that is gone."""

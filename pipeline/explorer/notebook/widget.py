@@ -58,7 +58,6 @@ class Explorer(anywidget.AnyWidget):
         self._connection = Connection(self._answering, self.send)
         super().__init__(height=height)
         self.on_msg(lambda widget, content, buffers: self._connection.receive(content))
-        self._answering.warm()
         _OPEN.add(self)
 
     # ---- what is selected --------------------------------------------------------------------
