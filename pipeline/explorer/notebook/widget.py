@@ -49,7 +49,7 @@ class Explorer(anywidget.AnyWidget):
 
     _esm = (resources.files("pipeline.explorer") / "static" / "explorer-widget.js").read_text("utf-8")
 
-    selected = traitlets.Dict(None, allow_none=True).tag(sync=True)
+    selected = traitlets.Dict(default_value=None, allow_none=True).tag(sync=True)
     view = traitlets.Unicode("").tag(sync=True)
     height = traitlets.Int(720, min=LEAST_HEIGHT).tag(sync=True)
 
