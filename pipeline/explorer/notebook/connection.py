@@ -36,6 +36,10 @@ MOST_PAGES = 8
 Send = Callable[[dict[str, Any], list[bytes]], None]
 
 
+class GoneError(Exception):
+    """Raised by a function that sends, if no page can take messages any more."""
+
+
 class Connection:
     """Messages between the pages of a widget and the run that answers them.
 
@@ -45,6 +49,7 @@ class Connection:
         Run that answers.
     send
         ``send(content, buffers)`` sends a message to all pages; called from several threads, one call at a time.
+        If it raises GoneError, all jobs are cancelled.
     """
 
     def __init__(self, answering: Answering, send: Send) -> None:
@@ -128,7 +133,6 @@ class Connection:
         self._closed = True
         for page in list(self._sessions):
             self.leave(page)
-        self._answering.close()
 
     # ---- sending -----------------------------------------------------------------------------
 
@@ -138,5 +142,7 @@ class Connection:
         try:
             with self._sending:
                 self._deliver(content, buffers)
-        except Exception as error:  # the notebook is gone, or its connection: nobody is left to be told
+        except GoneError:
+            self.close()
+        except Exception as error:  # such as a connection that was just lost: nobody is left to be told
             LOG.info("a page of a notebook takes nothing: %s", error)

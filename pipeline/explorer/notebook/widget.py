@@ -18,7 +18,7 @@ from pipeline.explorer.data.clicked_orbit import facts
 from pipeline.explorer.data.explored import ExplorerError
 from pipeline.explorer.data.tables import orbit_dataset
 from pipeline.explorer.notebook import LEAST_HEIGHT
-from pipeline.explorer.notebook.connection import Connection
+from pipeline.explorer.notebook.connection import Connection, GoneError
 from pipeline.explorer.serving.answering import Answering
 from pipeline.store.run import Run
 
@@ -55,10 +55,16 @@ class Explorer(anywidget.AnyWidget):
 
     def __init__(self, run: Run, *, height: int = 720) -> None:
         self._answering = Answering(run)
-        self._connection = Connection(self._answering, self.send)
+        self._connection = Connection(self._answering, self._deliver)
         super().__init__(height=height)
         self.on_msg(lambda widget, content, buffers: self._connection.receive(content))
         _OPEN.add(self)
+
+    def _deliver(self, content: dict[str, Any], buffers: list[bytes]) -> None:
+        """Send a message to the pages; marimo closes the comm of a cell that runs again, and tells nobody."""
+        if getattr(self.comm, "_closed", False):
+            raise GoneError
+        self.send(content, buffers)
 
     # ---- what is selected --------------------------------------------------------------------
 
@@ -94,9 +100,9 @@ class Explorer(anywidget.AnyWidget):
         if found == (chosen and (chosen["cell"], chosen["point"])):
             return
         try:
-            self.selected = None if found is None else {"cell": found[0], "point": found[1]}
+            self.set_trait("selected", None if found is None else {"cell": found[0], "point": found[1]})
         except traitlets.TraitError:  # an address can name what the run does not have
-            self.selected = None
+            self.set_trait("selected", None)
 
     def orbit(self) -> xr.Dataset | None:
         """Integrate the selected orbit again; return its states and quantities over time.
@@ -115,6 +121,7 @@ class Explorer(anywidget.AnyWidget):
     def end(self) -> None:
         """End all computations of the widget; its page shows what it has, and answers no more."""
         self._connection.close()
+        self._answering.close()
 
     def close(self) -> None:
         """End all computations and remove the widget from the notebook."""

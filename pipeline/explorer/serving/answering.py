@@ -58,8 +58,8 @@ class Answering:
         first = self.pool.submit(first_answers, self.run, self.live)
         if self.live is None:
             return
-        live = self.live
-        self.compiled = compiled = Future()
+        live, compiled = self.live, Future[None]()
+        self.compiled = compiled
 
         def tell(done: int, total: int) -> None:
             if live.is_warm("series") and not compiled.done():

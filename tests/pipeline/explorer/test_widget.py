@@ -89,6 +89,7 @@ def pages(directory):
     found = Pages(directory)
     yield found
     found.connection.close()
+    found.answering.close()
 
 
 @pytest.fixture(scope="module")
@@ -174,6 +175,18 @@ def test_connection__a_page_that_leaves_cancels_its_jobs(directory):
     n_sent = pages.sent.qsize()
     pages.tell("one", id=1, ask="view", words={})
     assert pages.sent.qsize() == n_sent
+    pages.answering.close()
+
+
+def test_widget__a_closed_comm_cancels_its_jobs(widget):
+    """Marimo closes the comm of a cell that runs again before the page can say that it leaves."""
+    plane = {"plane": ["x", "v"], "ranges": [[-1, 1], [-1, 1]], "resolution": 512}
+    widget._connection.receive({"page": "one", "open": True})
+    session = widget._connection._sessions["one"]
+    widget.comm.close()
+    widget._connection.receive({"page": "one", "live": json.dumps({"id": 1, "do": "slice", **plane})})
+    session.join(PATIENCE_S)
+    assert session.is_over
 
 
 # ---- what is selected

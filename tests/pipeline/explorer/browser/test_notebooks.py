@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import json
-import os
 import re
 import socket
-import subprocess
-import sys
 import time
 import tomllib
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +15,8 @@ import numpy as np
 import pytest
 
 from pipeline.store.run import open_run
-from tests.pipeline.explorer.browser.conftest import ROOT, WAIT_MS
+from tests.pipeline.explorer.browser.conftest import WAIT_MS
+from tests.pipeline.explorer.browser.notebooks import Lab, jupyterlab, started
 
 WAIT_S = WAIT_MS / 1000.0
 
@@ -65,106 +61,13 @@ if __name__ == "__main__":
 """
 
 
-# ---- programs that show notebooks
-
-
-@contextmanager
-def started(words: list[str], folder: Path, pattern: str, **environment: str) -> Iterator[str]:
-    """Start a program that serves notebooks, in a home of its own; gives the address that it prints."""
-    homes = {name: str(folder / name.lower()) for name in ("HOME", "XDG_CONFIG_HOME", "IPYTHONDIR")}
-    # what is compiled stays in the cache of all tests
-    paths = os.pathsep.join([str(ROOT), str(ROOT / "pipeline" / "face"), os.environ.get("PYTHONPATH", "")])
-    said = folder / "said.txt"
-    with (
-        said.open("w") as file,
-        subprocess.Popen(
-            [sys.executable, "-m", *words],
-            cwd=folder,
-            env={**os.environ, **homes, "PYTHONPATH": paths.rstrip(os.pathsep), "NO_COLOR": "1", **environment},
-            stdout=file,
-            stderr=subprocess.STDOUT,
-            stdin=subprocess.DEVNULL,
-        ) as process,
-    ):
-        try:
-            end = time.monotonic() + WAIT_S
-            while (found := re.search(pattern, said.read_text("utf-8"))) is None:
-                assert process.poll() is None, said.read_text("utf-8")
-                assert time.monotonic() < end, said.read_text("utf-8")
-                time.sleep(0.1)
-            yield found[0]
-        finally:
-            process.terminate()
-
-
-def jupyter_notebook(path: Path, run: Path) -> None:
-    cells = [
-        {"cell_type": "code", "id": name, "execution_count": None, "metadata": {}, "outputs": [], "source": text}
-        for name, text in ((name, text.format(run=str(run))) for name, text in JUPYTER.items())
-    ]
-    kernel = {"name": "python3", "display_name": "Python 3", "language": "python"}
-    content = {"cells": cells, "metadata": {"kernelspec": kernel}, "nbformat": 4, "nbformat_minor": 5}
-    path.write_text(json.dumps(content), "utf-8")
-
-
-def lab_directory() -> Path:
-    """Where JupyterLab's own page is installed."""
-    distribution = importlib.metadata.distribution("jupyterlab")
-    index = next(f for f in distribution.files or () if str(f).endswith("share/jupyter/lab/static/index.html"))
-    return Path(str(distribution.locate_file(index))).resolve().parents[1]
-
-
-class Lab:
-    """A notebook in JupyterLab: runs cells by name, and reads what they print."""
-
-    def __init__(self, opened: Any) -> None:
-        self.page, self.opened = opened.page, opened
-        self.page.wait_for_selector(".jp-Notebook .jp-Cell")
-        self.page.evaluate(
-            """async () => {
-              const panel = jupyterapp.shell.currentWidget;
-              await panel.context.ready;
-              await panel.sessionContext.ready;
-              await panel.sessionContext.session.kernel.info;
-            }"""
-        )
-
-    def run(self, name: str) -> Any:
-        """Run a cell; give what it prints as JSON, if it prints."""
-        outputs = self.page.evaluate(
-            """async number => {
-              const notebook = jupyterapp.shell.currentWidget.content;
-              notebook.activeCellIndex = number;
-              await jupyterapp.commands.execute("notebook:run-cell");
-              return notebook.widgets[number].model.outputs.toJSON();
-            }""",
-            list(JUPYTER).index(name),
-        )
-        errors = [output for output in outputs if output["output_type"] == "error"]
-        assert errors == []
-        texts = ["".join(output["text"]) for output in outputs if output["output_type"] == "stream"]
-        return json.loads("".join(texts)) if texts else None
-
-    def command(self, name: str, **arguments: Any) -> None:
-        self.page.evaluate("([name, given]) => jupyterapp.commands.execute(name, given)", [name, arguments])
-
-
 @pytest.fixture(scope="module")
 def lab(lasting: Callable[..., Any], looked_at: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
     pytest.importorskip("jupyterlab", reason="JupyterLab is not installed")
-    folder = tmp_path_factory.mktemp("lab")
-    jupyter_notebook(folder / "explorer.ipynb", looked_at)
-    installed = lab_directory()
-    names = ("JUPYTER_CONFIG_DIR", "JUPYTER_DATA_DIR", "JUPYTER_RUNTIME_DIR")
-    places = {name: str(folder / name.lower()) for name in names}
-    places |= {"JUPYTERLAB_DIR": str(installed), "JUPYTER_PATH": str(installed.parent)}
-    words = [
-        "jupyterlab", "--no-browser", "--allow-root", "--ServerApp.ip=127.0.0.1", "--ServerApp.port=0",
-        "--IdentityProvider.token=secret", "--LabApp.expose_app_in_browser=True", "--LabApp.news_url=None",
-        "--LabApp.check_for_updates_class=jupyterlab.NeverCheckForUpdate", "--LabApp.extension_manager=readonly",
-    ]  # fmt: skip
-    with started(words, folder, r"http://127\.0\.0\.1:\d+/lab", **places) as address:
-        yield Lab(lasting(f"{address}/tree/explorer.ipynb?token=secret", 1440, 1300))
+    cells = {name: text.format(run=str(looked_at)) for name, text in JUPYTER.items()}
+    with jupyterlab(tmp_path_factory.mktemp("lab"), cells) as address:
+        opened = lasting(address, 1440, 1300)
+        yield Lab(opened.page, list(cells), opened.complaints)
 
 
 # ---- what is looked at
@@ -251,7 +154,7 @@ def test_jupyter__jobs_end_with_the_output(lab: Lab, looked_at: Path) -> None:
     lab.page.evaluate("() => { jupyterapp.shell.currentWidget.content.activeCellIndex = 0; }")
     lab.command("notebook:clear-cell-output")
     assert lab.run("jobs") == [0, 0]
-    assert [text for text in lab.opened.complaints if "magpend" in text or "script" in text] == []
+    assert [text for text in lab.complaints if "magpend" in text or "script" in text] == []
 
 
 # ---- marimo
