@@ -112,6 +112,10 @@ def grouped() -> dict[str, list[str]]:
     return found
 
 
+_MEMBERS = {"Run": "   :members:\n"}
+"""Options of classes whose methods are shown; those of analyses are shown as functions."""
+
+
 def _docstrings() -> str:
     """Directives that show the docstrings, as MyST takes them."""
     import magpend
@@ -123,7 +127,9 @@ def _docstrings() -> str:
             thing = getattr(magpend, name)
             kind = "exception" if isinstance(thing, type) and issubclass(thing, BaseException) else "class"
             kind = kind if isinstance(thing, type) else "function"
-            parts.append(f"```{{eval-rst}}\n.. auto{kind}:: magpend.{name}\n```\n")
+            parts.append(f"```{{eval-rst}}\n.. auto{kind}:: magpend.{name}\n{_MEMBERS.get(name, '')}```\n")
+    parts.append("## Figures of a run\n\n```{eval-rst}\n.. autoclass:: magpend._figures.Plots\n   :members:\n```\n")
+    parts.append("## Datasets\n\n```{eval-rst}\n.. autoclass:: magpend._accessor.DatasetAccessor\n   :members:\n```\n")
     return "\n".join(parts)
 
 

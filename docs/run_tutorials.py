@@ -1,6 +1,6 @@
 """Do what pages say: ``python docs/run_tutorials.py [--pictures | --check] [PAGE...]``.
 
-Pages are the tutorials and all others with a mark of a picture; without a name all are followed.
+Pages are the tutorials, the page on Python and all others with a mark of a picture; without a name all are followed.
 
 Each page is executed in a folder of its own, in this process but for what runs in the background. Marks in
 comments, which no reader sees, stand before blocks:
@@ -36,7 +36,7 @@ from pathlib import Path
 from typing import Any
 
 DOCS = Path(__file__).resolve().parent
-PAGES = {path.stem: path for path in (*sorted((DOCS / "tutorials").glob("*.md")), DOCS / "rig.md")}
+PAGES = {p.stem: p for p in (*sorted((DOCS / "tutorials").glob("*.md")), DOCS / "rig.md", DOCS / "python.md")}
 NOT_MADE = {
     "branches-map.png": "curves over a map of two parameters, a quarter of an hour",
     "examples/flutter-bands.png": "bands of the flutter rig's fit with priors, which no specification that ships has",

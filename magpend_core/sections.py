@@ -7,6 +7,7 @@ from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from magpend_core.crossing import Crossing
 from magpend_core.defaults import ATOL, CLOSURE, LONGEST_PERIOD, MOST_STEPS, RTOL
@@ -197,8 +198,8 @@ def run_branches(
 
 def sections(
     parameters: Parameters | Sequence[Parameters],
-    frequency_hz: np.ndarray | float | None,
-    initial_states: np.ndarray,
+    frequency_hz: ArrayLike | None,
+    initial_states: ArrayLike,
     *,
     n_transient: int,
     n_keep: int,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from magpend_core.defaults import ATOL, MOST_STEPS, RTOL
 from magpend_core.models.model import Parameters
@@ -19,8 +20,8 @@ MOST_PERIODS = 1e7
 def trajectory(
     parameters: Parameters,
     frequency_hz: float,
-    initial_state: np.ndarray,
-    times: np.ndarray,
+    initial_state: ArrayLike,
+    times: ArrayLike,
     *,
     rtol: float = RTOL,
     atol: float = ATOL,

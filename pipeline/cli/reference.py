@@ -1,4 +1,5 @@
-"""Write the tables of README and docs from the code: ``python -m pipeline.cli.reference``.
+"""Write the tables of README and docs, and the typed methods of the Python package, from the code:
+``python -m pipeline.cli.reference``.
 
 A table stands between the marks ``<!-- reference: NAME -->`` and ``<!-- /reference -->``. The text between
 the marks is replaced. With ``--check`` nothing is written, and the exit code is 1 if a page is out of date.
@@ -405,15 +406,24 @@ TABLES: dict[str, Callable[[], str]] = {
 }
 
 
+def stale() -> dict[Path, str]:
+    """Return the new texts of the pages and modules that are out of date, by path."""
+    from pipeline.cli import signatures
+
+    texts = {page: rendered(page.read_text("utf-8")) for page in pages()}
+    texts |= {path: text() for path, text in signatures.generated().items()}
+    return {path: text for path, text in texts.items() if not path.exists() or path.read_text("utf-8") != text}
+
+
 def main() -> None:
-    """Rewrite the documentation pages whose tables are out of date or, with ``--check``, list them."""
+    """Rewrite the pages and modules that are out of date or, with ``--check``, list them."""
     check = "--check" in sys.argv[1:]
-    stale = [page for page in pages() if rendered(page.read_text("utf-8")) != page.read_text("utf-8")]
-    for page in stale:
-        print(f"{'out of date' if check else 'written'}: {page.relative_to(ROOT)}")
+    found = stale()
+    for path, text in found.items():
+        print(f"{'out of date' if check else 'written'}: {path.relative_to(ROOT)}")
         if not check:
-            page.write_text(rendered(page.read_text("utf-8")), "utf-8")
-    if check and stale:
+            path.write_text(text, "utf-8")
+    if check and found:
         sys.exit(1)
 
 

@@ -292,7 +292,7 @@ def _panels(fig: style.DataFigure, diagram: Diagram, layers: Sequence[tuple[int,
         diagram.dress(ax)
         lowest = ax
         if strip:
-            lowest = fig.add_subplot(grid[1, column], sharex=ax)
+            lowest = fig.add_strip(ax, grid[1, column])
             style.style_axes(lowest, minor=False)
             draw_absent(ax, lowest, diagram.x, diagram.survey, shown)
             ax.tick_params(labelbottom=False)

@@ -66,7 +66,7 @@ def plot_edge(
     style.limits(ax, frame)
     handles = [ax.plot([], [], linestyle="none", label=name, **_MARKS[name])[0] for name in _MARKS if name in shown]
     if handles:
-        ax.legend(handles=handles, loc="upper right", framealpha=0.9, fontsize=fig.look.tick)
+        style.legend_inside(ax, handles)
     style.finish(fig)
     return fig
 

@@ -87,7 +87,7 @@ def plot_lyapunov(
     if frame.ylim:
         bottom.set_ylim(*style.check_range("ylim", frame.ylim))
     if with_strip:
-        lowest = fig.add_subplot(grid[2], sharex=top)
+        lowest = fig.add_strip(top, grid[2])
         _draw_lost(top, bottom, lowest, diagram, lost)
     style.label_axes(lowest, x=labels.parameter_label(part[diagram.parameter]))
     fig.align_ylabels([top, bottom])

@@ -54,7 +54,7 @@ def plot_manifolds(
         ax.set_ylim(limits[1])
     style.limits(ax, frame)
     handles = [Line2D([], [], color=_shade(colours[k]), label=_NAMES[k], linewidth=1.2) for k in _NAMES]
-    ax.legend(handles=handles, loc="upper right", framealpha=0.9, fontsize=fig.look.tick)
+    style.legend_inside(ax, handles)
     style.finish(fig)
     return fig
 

@@ -154,9 +154,10 @@ Counts = Mapping[tuple[int, int], np.ndarray]
 
 
 def _pixels(ax: Axes) -> tuple[int, int]:
-    """Return the height and the width of the image that fills the axes [pixels]; it is finer than the figure."""
-    box = ax.get_window_extent()
-    return max(1, round(box.height * SUPERSAMPLING)), max(1, round(box.width * SUPERSAMPLING))
+    """Return the height and the width of the image that fills the axes [pixels]; it is finer than a saved figure."""
+    box, figure = ax.get_window_extent(), ax.figure
+    fine = SUPERSAMPLING * style.DPI / figure.dpi
+    return max(1, round(box.height * fine)), max(1, round(box.width * fine))
 
 
 def _count(view: View, x: Range, y: Range, shape: tuple[int, int]) -> dict[tuple[int, int], np.ndarray]:

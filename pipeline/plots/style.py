@@ -8,7 +8,8 @@ from __future__ import annotations
 import difflib
 import math
 import threading
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -104,6 +105,48 @@ class DataFigure(Figure):
     look: Look
     notes: list[str]
 
+    @property
+    def panels(self) -> list[Axes]:
+        """Axes of the panels: all visible axes except colour bars and strips."""
+        aside = (STRIP, "<colorbar>")  # the second is matplotlib's own label
+        return [ax for ax in self.axes if ax.get_visible() and ax.get_label() not in aside]
+
+    def add_strip(self, ax: Axes, place: Any) -> Axes:
+        """Add a strip below a panel, at a place of a grid, with the horizontal axis of the panel."""
+        return self.add_subplot(place, sharex=ax, label=STRIP)
+
+    def arrange(self) -> None:
+        """Compute the layout, and fix it."""
+        engine = self.get_layout_engine()
+        if engine is not None:
+            with TEXT_LOCK:
+                engine.execute(self)
+            self.set_layout_engine("none")
+
+
+STRIP = "<strip>"
+"""Label of the axes of a strip, which is no panel of its own."""
+
+
+@dataclass
+class Target:
+    """Target of the next figure: a function that makes it, instead of a figure of its own.
+
+    Attributes
+    ----------
+    make : callable
+        ``make(figsize=..., layout=...)`` returns the empty figure.
+    made : DataFigure, optional
+        The figure, once it is made.
+    """
+
+    make: Callable[..., DataFigure]
+    made: DataFigure | None = None
+
+
+TARGET: ContextVar[Target | None] = ContextVar("TARGET", default=None)
+"""Target of the figures that this thread makes; see `pipeline.plots.targets`."""
+
 
 def new_figure(
     height: float, data: xr.Dataset, frame: Frame = WIDE, *, arranged: bool = True, exact: bool = False
@@ -124,15 +167,16 @@ def new_figure(
         Whether the height holds whatever the width.
     """
     share = 1.0 if exact else min(frame.width / WIDE_MM, 1.0)
-    figure = DataFigure(
-        figsize=(frame.width_in, height * (share + 0.3 * (1.0 - share))),
-        dpi=DPI,
-        facecolor="white",
-        layout="constrained" if arranged else None,
-    )
+    size = (frame.width_in, height * (share + 0.3 * (1.0 - share)))
+    layout: Any = "constrained" if arranged else None
+    target = TARGET.get()
+    if target is None:
+        figure = DataFigure(figsize=size, dpi=DPI, facecolor="white", layout=layout)
+    else:
+        figure = target.made = target.make(figsize=size, layout=layout)
     figure.data, figure.frame, figure.look, figure.notes = data, frame, _LOOKS[frame.compact], []
     engine: Any = figure.get_layout_engine()
-    if arranged:
+    if engine is not None:
         engine.set(w_pad=0.04, h_pad=0.04, hspace=0.02, wspace=0.02)
     return figure
 
@@ -144,7 +188,8 @@ def look_at(frame: Frame) -> Look:
 
 def figure_of(ax: Axes) -> DataFigure:
     """Return the figure that contains the axes."""
-    figure = ax.figure
+    target = TARGET.get()
+    figure = ax.figure if target is None or target.made is None else target.made
     assert isinstance(figure, DataFigure)
     return figure
 
@@ -160,11 +205,7 @@ def finish(figure: DataFigure) -> None:
         assert isinstance(text, Text)
         text.set_fontfamily(FONT)
         text.set_math_fontfamily(MATH_FONT)
-    engine = figure.get_layout_engine()
-    if engine is not None:
-        with TEXT_LOCK:
-            engine.execute(figure)
-        figure.set_layout_engine("none")
+    figure.arrange()
 
 
 def style_axes(ax: Axes, *, inside: bool = True, minor: bool = True) -> None:
@@ -269,6 +310,15 @@ def _legend(figure: DataFigure, handles: Sequence[Any], place: Any, size: float,
             borderaxespad=0.1,
             **spaces,
         )
+
+
+def legend_inside(ax: Axes, handles: Sequence[Any]) -> None:
+    """Place a legend inside axes, in another corner than a legend that is there already."""
+    first = ax.get_legend()
+    place: Any = "upper right" if first is None else "lower right"
+    ax.legend(handles=list(handles), loc=place, framealpha=0.9, fontsize=look_of(ax).tick)
+    if first is not None:
+        ax.add_artist(first)  # axes have one legend of their own
 
 
 def complete(figure: DataFigure, ax: Axes, text: str, handles: Sequence[Any] = ()) -> None:

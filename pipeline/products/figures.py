@@ -180,6 +180,7 @@ BIFURCATION = Figure(
     "Draw a bifurcation diagram: section points over the swept parameter, coloured by class of motion.",
     BifurcationOptions,
     "pipeline.plots.bifurcation:draw",
+    unless=("layout", "side"),
 )
 
 SECTION = Figure(
@@ -205,6 +206,7 @@ GALLERY = Figure(
     One period of each attractor is integrated for the portraits.""",
     AttractorFigureOptions,
     "pipeline.plots.gallery:draw",
+    panels="several",
 )
 
 BASINS = Figure(
@@ -226,6 +228,7 @@ REGIMES = Figure(
     "Draw a map of two swept parameters: coexisting periods or attractors, or their number.",
     RegimeOptions,
     "pipeline.plots.regimes:draw",
+    panels="either",
 )
 
 LYAPUNOV = Figure(
@@ -233,6 +236,8 @@ LYAPUNOV = Figure(
     "Draw Lyapunov exponents, under the bifurcation diagram or as a map over two parameters.",
     LyapunovFigureOptions,
     "pipeline.plots.lyapunov:draw",
+    panels="several",
+    unless=("as_map", True),
 )
 
 CONVERGENCE = Figure(
@@ -240,6 +245,7 @@ CONVERGENCE = Figure(
     "Draw the convergence of the Lyapunov exponents of the cells at one parameter point.",
     ConvergenceOptions,
     "pipeline.plots.convergence:draw",
+    panels="several",
 )
 
 DIMENSION = Figure(
@@ -247,6 +253,7 @@ DIMENSION = Figure(
     "Draw the correlation sum of the chaotic sections of one parameter point, with fit and local slope.",
     DimensionFigureOptions,
     "pipeline.plots.dimension:draw",
+    panels="several",
 )
 
 BRANCHES = Figure(
@@ -307,6 +314,7 @@ RESILIENCE = Figure(
     ResilienceFigureOptions,
     "pipeline.plots.resilience:draw",
     needs="pipeline.analysis.resilience.product:needs_sweep",
+    panels="several",
 )
 
 EDGE = Figure(
@@ -325,6 +333,7 @@ ESCAPES = Figure(
     EscapeFigureOptions,
     "pipeline.plots.escapes:draw",
     needs="pipeline.analysis.noise.escapes:needs_set",
+    unless=("show", "paths"),
 )
 
 DENSITY = Figure(
@@ -332,4 +341,5 @@ DENSITY = Figure(
     "Draw the density of noisy section points, over an axis with its peaks: a stochastic bifurcation diagram.",
     DensityFigureOptions,
     "pipeline.plots.density:draw",
+    panels="either",
 )

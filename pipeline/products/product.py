@@ -264,6 +264,10 @@ class Figure:
         nothing itself.
     needs : str
         See `Analysis`.
+    panels : str
+        Number of panels: ``one``, ``several``, or ``either``, which depends on the run.
+    unless : tuple, optional
+        Option and value that turn one panel into several, or several into one.
     """
 
     name: str
@@ -271,6 +275,14 @@ class Figure:
     options: type[FigureOptions]
     draw: str
     needs: str = ""
+    panels: Literal["one", "several", "either"] = "one"
+    unless: tuple[str, Any] | None = None
+
+    def panels_with(self, options: FigureOptions) -> Literal["one", "several", "either"]:
+        """Return the number of panels that the figure has with some options."""
+        if self.unless is None or getattr(options, self.unless[0]) != self.unless[1]:
+            return self.panels
+        return "several" if self.panels == "one" else "one"
 
 
 def function_of(name: str) -> Callable[..., Any]:

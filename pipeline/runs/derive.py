@@ -158,7 +158,7 @@ def stored(source: Source, name: str) -> xr.Dataset | None:
     return next(stored_each(source, name), None)
 
 
-def stored_each(source: Source, name: str) -> Iterator[xr.Dataset]:
+def stored_each(source: Source, name: str, *, lazy: bool = False) -> Iterator[xr.Dataset]:
     """Yield all stored results of an analysis for the present cells of a run, in the order in which `stored` prefers
     them.
 
@@ -168,6 +168,8 @@ def stored_each(source: Source, name: str) -> Iterator[xr.Dataset]:
         Run directory, or an opened run.
     name
         One of `pipeline.products.registry.ANALYSES`.
+    lazy
+        Whether numbers are read when they are used.
     """
     run = Run.open(source)
     folder = run.info.files.below(DERIVED)
@@ -183,7 +185,7 @@ def stored_each(source: Source, name: str) -> Iterator[xr.Dataset]:
                 found.append((_changed_options(run, name, attrs), place.name, place))
     for _, _, place in sorted(found, key=lambda entry: entry[:2]):
         try:
-            result = _placed(open_product(place), place)
+            result = _placed(open_product(place, lazy=lazy), place)
         except (DamagedError, FileNotFoundError):
             continue
         yield result

@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.products.product import FigureOptions
 from pipeline.products.registry import FIGURES
+from pipeline.runs.cube_run import ready_cube
 from pipeline.runs.derive import AnalysedRun, Echo, Source, prepared, refused
 from pipeline.specification.problems import SpecError, unknown_name, validated
+from pipeline.store.run import Run
 
 if TYPE_CHECKING:
+    import xarray as xr
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure, SubFigure
+
     from pipeline.plots.style import DataFigure
 
 
@@ -53,6 +60,63 @@ def figure(
         wanted = validated(FIGURES[name].options, {**(options or {}), **more})
     run, wanted = ready(source, name, wanted, echo)
     return drawn(run, name, wanted)
+
+
+def draw_panels(
+    source: Source | xr.Dataset,
+    name: str,
+    options: Mapping[str, Any],
+    *,
+    ax: Axes | None = None,
+    figure: Figure | SubFigure | None = None,
+    echo: Echo | None = None,
+) -> list[Axes]:
+    """Draw a figure of a run into axes or a figure of the caller, or into a new figure of pyplot.
+
+    Parameters
+    ----------
+    source
+        Run directory, opened run, or a cube for figures that use nothing but cells.
+    name, options, echo
+        See `figure`. With `ax` or a figure, the option ``width`` follows from it.
+    ax
+        Axes for a figure of one panel.
+    figure
+        Empty figure or subfigure.
+
+    Returns
+    -------
+    list of Axes
+        The panels, without colour bars.
+
+    Raises
+    ------
+    SpecError
+        See `figure`; also if both `ax` and `figure` are given, if `ax` is given for a figure of several
+        panels, or if the given figure has axes already.
+    """
+    from pipeline.plots.targets import PanelsError, drawing_into, width_of
+
+    wanted: Any = validated(FIGURES[name].options, options)
+    host = ax if ax is not None else figure
+    if ax is not None and figure is not None:
+        raise SpecError("ax= and figure= are both given; drop one.")
+    if ax is not None and FIGURES[name].panels_with(wanted) == "several":
+        raise SpecError(f"{name}: {PanelsError()}")
+    make = None
+    if host is not None:
+        wanted = wanted.model_copy(update={"width": width_of(host)})
+    else:
+        from matplotlib import pyplot
+
+        make = pyplot.figure
+    run: Any
+    if isinstance(source, str | Path | Run):
+        run, wanted = ready(source, name, wanted, echo)
+    else:
+        run, wanted = ready_cube(source, name, wanted, echo)
+    with refused(f"{run.name}: {name}"), drawing_into(host, make):
+        return drawn(run, name, wanted).panels
 
 
 def ready(source: Source, name: str, options: FigureOptions, echo: Echo | None) -> tuple[AnalysedRun, FigureOptions]:

@@ -50,6 +50,9 @@ class State:
         """Whether every task of the run is committed."""
         return len(self.done) == self.plan.n_tasks
 
+    def __str__(self) -> str:
+        return "\n".join(describe_state(self))
+
 
 def state(source: str | Path | Files | Run) -> State:
     """Read the state of a run: its committed tasks, and the number of cells by status.

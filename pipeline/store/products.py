@@ -97,8 +97,15 @@ def _put_product(files: Files, ds: xr.Dataset) -> None:
         files.write(key, data[key].to_bytes())
 
 
-def open_product(place: Place) -> xr.Dataset:
+def open_product(place: Place, *, lazy: bool = False) -> xr.Dataset:
     """Read a product (the stored result of an analysis) into memory.
+
+    Parameters
+    ----------
+    place
+        Its folder.
+    lazy
+        Whether numbers are read when they are used. The content is compared with its digest now.
 
     Raises
     ------
@@ -122,8 +129,9 @@ def open_product(place: Place) -> xr.Dataset:
         read_product_attrs(files)
         store = files.zarr(read_only=True)
     try:
-        with xr.open_zarr(store, consolidated=False, chunks=None) as ds:
-            loaded = ds.load().assign(_with_words(ds))
+        ds = xr.open_zarr(store, consolidated=False, chunks=None)
+        with contextlib.nullcontext() if lazy else contextlib.closing(ds):
+            loaded = (ds if lazy else ds.load()).assign(_with_words(ds))
     except (ValueError, KeyError, OSError) as error:
         raise DamagedError(f"{files.name}: {error}") from None
     variables = {name: loaded.variables[name] for name in sorted(map(str, loaded.data_vars))}

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from pipeline.layout.limits import check_plan
 from pipeline.layout.plan import Plan, make_plan
@@ -60,6 +60,8 @@ class Run:
     plan: Plan
     commits: Records
 
+    _next: ClassVar[tuple[str, ...]] = _NEXT
+
     @classmethod
     def open(cls, source: str | Path | Files | Run) -> Run:
         """Open a run directory with its present commit records; return an opened run unchanged.
@@ -91,7 +93,7 @@ class Run:
 
     def __repr__(self) -> str:
         facts = (f"  {name:9s} {text}" for name, text in self._facts.items())
-        return "\n".join([self._title, *facts, *_NEXT])
+        return "\n".join([self._title, *facts, *self._next])
 
     def _repr_html_(self) -> str:
         left = "style='text-align:left'"
@@ -99,7 +101,7 @@ class Run:
             f"<tr><th {left}>{escape(name)}</th><td {left}>{escape(text)}</td></tr>"
             for name, text in self._facts.items()
         )
-        return f"<b>{escape(self._title)}</b><table>{rows}</table><pre>{escape(chr(10).join(_NEXT))}</pre>"
+        return f"<b>{escape(self._title)}</b><table>{rows}</table><pre>{escape(chr(10).join(self._next))}</pre>"
 
     @property
     def _title(self) -> str:

@@ -4,19 +4,21 @@
 
     run = magpend.run("quickstart")              # a name, a path, TOML text or a dict; shows what to do next
     ds = run.cube()                              # an xarray.Dataset
-    found = magpend.attractors(run)              # an analysis, kept in the run directory
-    magpend.table(found)                         # a row per attractor and parameter point, as pandas
-    magpend.figure(run, "bifurcation")           # what the command line draws
-    magpend.explorer(run)                        # the interactive page, in a notebook
+    found = run.attractors()                     # an analysis, kept in the run directory
+    found.magpend.table()                        # a row per attractor and parameter point, as pandas
+    ax = run.plot.bifurcation()                  # matplotlib axes, to go on with
+    run.explore()                                # the interactive page, in a notebook
     duffing = magpend.load_model("duffing").load(amplitude=0.4)
     magpend.sections(duffing, 0.2, [[0.1, 0.0]], n_transient=300, n_keep=50)
 
-Every name is imported when it is first used; ``dir(magpend)`` lists them. Analyses take a run directory, or
-an opened `Run`, and the options of ``magpend analyse``; ``plot_`` functions take datasets.
+Every name is imported when it is first used; ``dir(magpend)`` lists them. Analyses are methods of a `Run`, and
+functions that take a run directory; both have the options of ``magpend analyse``. ``plot_`` functions take datasets.
+Datasets have the accessor ``ds.magpend``.
 """
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from importlib import import_module
 from typing import Any
@@ -37,9 +39,9 @@ _HOMES = {
     "magpend_core.pointwise": ("evaluate", "jacobian", "rates"),
     "magpend_core.status": ("Status",),
     "pipeline.specification.problems": ("SpecError",),
-    "pipeline.store.run": ("Run", "open_run"),
+    "magpend._runs": ("Run", "open_run", "run"),
     "pipeline.compute.simulate": ("simulate",),
-    "pipeline.runs.python": ("run", "table"),
+    "pipeline.runs.python": ("table",),
     "pipeline.specification.inputs": ("load_model",),
     "pipeline.runs.status": ("state",),
     "pipeline.runs.verify": ("verify_run",),
@@ -62,6 +64,7 @@ _HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
 
 def _analysis(name: str) -> Callable[..., Any]:
     """Make the public function for an analysis, with a docstring that lists its options."""
+    from magpend._analyses import Analyses
     from pipeline.products.product import default_of
     from pipeline.products.registry import ANALYSES
     from pipeline.runs.derive import derive
@@ -73,17 +76,28 @@ def _analysis(name: str) -> Callable[..., Any]:
     model = analysis.options
     lines = [f"    {k} = {default_of(model, k)!r}: {info.description}" for k, info in model.model_fields.items()]
     found.__name__ = found.__qualname__ = name
+    found.__signature__ = _with_source(getattr(Analyses, name))  # type: ignore[attr-defined]
     found.__doc__ = "\n".join([analysis.help, "", "Options:", *lines])
     return found
 
 
-def _analyses() -> tuple[str, ...]:
+def _with_source(method: Callable[..., Any]) -> Any:
+    """Return the signature of a method with ``source`` in the place of ``self``."""
+    import inspect
+
+    own = inspect.signature(method)
+    _, *options = own.parameters.values()
+    source = inspect.Parameter("source", inspect.Parameter.POSITIONAL_OR_KEYWORD, annotation="str | Path | Run")
+    return own.replace(parameters=[source, *options])
+
+
+def _analysis_names() -> tuple[str, ...]:
     from pipeline.products.registry import COMMANDS
 
     return COMMANDS
 
 
-def _plots() -> list[str]:
+def _plot_names() -> list[str]:
     import pipeline.plots
 
     return pipeline.plots.__all__
@@ -96,9 +110,9 @@ def __getattr__(name: str) -> Any:
         return metadata.version("magpend")
     if name in _HOME_OF:
         value = getattr(import_module(_HOME_OF[name]), name)
-    elif not name.startswith("_") and name in _analyses():
+    elif not name.startswith("_") and name in _analysis_names():
         value = _analysis(name)
-    elif not name.startswith("_") and name in _plots():
+    elif not name.startswith("_") and name in _plot_names():
         value = getattr(import_module("pipeline.plots"), name)
     else:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
@@ -107,4 +121,33 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted({*_HOME_OF, *_analyses(), *_plots(), "__version__", "__doc__"})
+    return sorted({*_HOME_OF, *_analysis_names(), *_plot_names(), "__version__", "__doc__"})
+
+
+class _AccessorRegistration:
+    """An import hook that registers ``ds.magpend`` once xarray is imported; importing xarray here would be slow."""
+
+    def find_spec(self, name: str, path: Any = None, target: Any = None) -> Any:
+        """Return the spec of xarray, such that its module registers the accessor at its end; None for others."""
+        if name != "xarray":
+            return None
+        from importlib.util import find_spec
+
+        sys.meta_path.remove(self)
+        spec = find_spec(name)
+        loader: Any = spec.loader if spec is not None else None
+        if loader is not None:
+            execute = loader.exec_module
+
+            def execute_and_register(module: Any) -> None:
+                execute(module)
+                import_module("magpend._accessor")
+
+            loader.exec_module = execute_and_register
+        return spec
+
+
+if "xarray" in sys.modules:
+    import_module("magpend._accessor")
+else:
+    sys.meta_path.insert(0, _AccessorRegistration())

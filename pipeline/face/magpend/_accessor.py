@@ -1,0 +1,168 @@
+"""Register the accessor ``ds.magpend`` of xarray Datasets: cubes of runs, and results of analyses."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import xarray as xr
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from magpend._figures import Plots
+    from magpend._runs import Run
+    from magpend_core.models.model import Model, Parameters
+
+_DERIVED = "/derived/"
+
+
+@xr.register_dataset_accessor("magpend")  # type: ignore[no-untyped-call]
+class DatasetAccessor:
+    """What magpend knows of a Dataset: its model, its run, its table, its figures.
+
+    Parameters
+    ----------
+    ds
+        A cube of `magpend.open_run` or a part of it, or the result of an analysis.
+    """
+
+    def __init__(self, ds: xr.Dataset) -> None:
+        self._ds = ds
+
+    @property
+    def model(self) -> Model:
+        """Model that was integrated.
+
+        Raises
+        ------
+        ValueError
+            If the Dataset is none of magpend's.
+        """
+        from pipeline.layout.vocabulary import model_of
+
+        return model_of(self._known())
+
+    @property
+    def parameters(self) -> Parameters:
+        """Values of the model parameters that are not swept.
+
+        Raises
+        ------
+        ValueError
+            If the Dataset is none of magpend's.
+        """
+        from pipeline.layout.vocabulary import parameters_of
+
+        return parameters_of(self._known())
+
+    @property
+    def plot(self) -> Plots:
+        """Figures that need nothing but this cube, or the part of it that was selected.
+
+        ``ds.magpend.plot.bifurcation()``, ``section``, ``lyapunov``, ``convergence`` and ``rotation`` draw cells.
+        The other figures need analyses of the whole run: use ``run.plot``.
+
+        Raises
+        ------
+        ValueError
+            If the Dataset is no cube.
+        """
+        from magpend._figures import Plots
+
+        return Plots(self._cube("plot"))
+
+    def table(self) -> pd.DataFrame:
+        """Return the result of an analysis as a pandas table; see `magpend.table`.
+
+        Raises
+        ------
+        ValueError
+            If the Dataset is not the result of an analysis with a table.
+        """
+        from pipeline.runs.python import table
+
+        return table(self._ds)
+
+    def run(self) -> Run:
+        """Open the run from whose directory the Dataset was read.
+
+        Raises
+        ------
+        ValueError
+            If the Dataset was not read from a run directory, or was computed from one that was.
+        """
+        from magpend._runs import Run
+
+        source = str(self._known().encoding.get("source", ""))
+        place = source.partition(_DERIVED)[0]
+        if not place or ("derived_product" in self._ds.attrs) != (_DERIVED in source):
+            raise ValueError(
+                "ds.magpend.run: the Dataset was not read from a run directory, or was computed from one that was; "
+                "open the run with magpend.Run.open(DIR)."
+            )
+        return Run.open(place)
+
+    def counts(self) -> dict[str, int]:
+        """Return the number of cells by status, such as ``periodic``, ``diverged`` or ``pending``.
+
+        Raises
+        ------
+        ValueError
+            If the Dataset is no cube.
+        """
+        from magpend_core.status import Status
+
+        codes = self._cube("counts")["status"].values
+        numbers = {status.name.lower(): int(np.count_nonzero(codes == status)) for status in Status}
+        return {name: number for name, number in numbers.items() if number}
+
+    def sel_cell(self, *, nearest: bool = False, **values: float) -> xr.Dataset:
+        """Select cells by values on their axes, with the spellings that commands accept.
+
+        Parameters
+        ----------
+        nearest
+            Whether to take the nearest value of an axis. Otherwise a value must be on its axis, except for rounding.
+        values
+            Value by axis: ``frequency`` or ``frequency_hz``, a parameter, ``branch``, or for a grid of initial states
+            the state, with ``_deg`` in degrees.
+
+        Returns
+        -------
+        Dataset
+            The cells, without the axes named.
+
+        Raises
+        ------
+        ValueError
+            If there is no such axis, or if a value is not on its axis; the message names the nearest ones.
+
+        Examples
+        --------
+        >>> ds.magpend.sel_cell(frequency_hz=2.2, x_deg=20)                  # doctest: +SKIP
+        """
+        from pipeline.analysis.selection import place
+        from pipeline.runs.naming import place as axis_of
+
+        cube = self._cube("sel_cell")
+        chosen: dict[str, int] = {}
+        for name, given in values.items():
+            axis, value = axis_of(cube, name, given)
+            along = cube[axis]
+            chosen[axis] = int(np.abs(along.values - value).argmin()) if nearest else place(along, value)
+        return cube.isel(chosen)
+
+    def _known(self) -> xr.Dataset:
+        if "model" not in self._ds.attrs:
+            raise ValueError(
+                "ds.magpend: the Dataset has no attribute 'model', so it is no cube of magpend.open_run and no result "
+                "of an analysis. Arithmetic drops attributes unless xarray.set_options(keep_attrs=True)."
+            )
+        return self._ds
+
+    def _cube(self, name: str) -> xr.Dataset:
+        if "status" not in self._known() or "derived_product" in self._ds.attrs:
+            what = self._ds.attrs.get("derived_product", "another Dataset")
+            raise ValueError(f"ds.magpend.{name}: needs a cube of magpend.open_run, and this is {what}.")
+        return self._ds

@@ -1,0 +1,375 @@
+"""Define `Run`, the opened run of ``import magpend``, and the functions that return one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import wraps
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, ParamSpec, Self, overload
+
+from magpend._analyses import Analyses, AnalysisName
+from magpend._figures import Plots
+from pipeline.runs import python
+from pipeline.store.run import Run as StoredRun
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import xarray as xr
+
+    from pipeline.explorer.notebook.widget import Explorer
+    from pipeline.runs.status import State
+    from pipeline.store.checking import Verification
+    from pipeline.store.files import Files
+
+P = ParamSpec("P")
+
+_NEXT = (
+    "next",
+    "  run.cube()                           the cube, an xarray.Dataset",
+    "  run.plot.bifurcation()               a figure; also basins, section, attractors, ...",
+    '  run.table("attractors")              what attracts, and what has been shown of it',
+)
+
+
+class Run(Analyses):
+    """An opened run directory with its analyses as methods and its figures under `plot`.
+
+    A run holds the commit records found when it was opened, so that all its results use the same cells. Open it
+    again to see cells that were computed later.
+
+    Attributes
+    ----------
+    info : RunInfo
+        Content of ``run.json``.
+    spec : Spec
+        Specification of the run.
+    plan : Plan
+        Plan that follows from `spec`.
+    commits : Records
+        Valid commit records by task.
+
+    Examples
+    --------
+    >>> run = Run.open("runs/quickstart")                                # doctest: +SKIP
+    >>> run.attractors().magpend.table()                                 # doctest: +SKIP
+    >>> ax = run.plot.bifurcation(degrees=True)                         # doctest: +SKIP
+    """
+
+    _next = _NEXT
+
+    @classmethod
+    def open(cls, source: str | Path | Files | StoredRun) -> Self:
+        """Open a run directory with its present commit records; return an opened run unchanged.
+
+        Raises
+        ------
+        RefusedError
+            If there is no run in `source`.
+        DamagedError
+            If ``run.json``, metadata or coordinates have changed since they were written.
+        UnreadableError
+            If a file exists and cannot be read.
+        """
+        if isinstance(source, cls):
+            return source
+        run = StoredRun.open(source)
+        return cls(run.info, run.spec, run.plan, run.commits)
+
+    def cube(self, chunks: Any = None, *, check: bool | None = None) -> xr.Dataset:
+        """Open the run's result cube as an xarray dataset; see `magpend.open_run`."""
+        import magpend._accessor  # noqa: F401 -- registers ds.magpend
+
+        ds = super().cube(chunks, check=check)
+        ds.encoding["source"] = self.name
+        return ds
+
+    def tree(self, chunks: Any = None, *, check: bool | None = None) -> xr.DataTree:
+        """Open the cube and all kept results of analyses as one tree; see `magpend.open_run`."""
+        from magpend._trees import tree_of
+
+        return tree_of(self, chunks, check)
+
+    @property
+    def plot(self) -> Plots:
+        """The figures of the run: ``run.plot.bifurcation()`` draws one and returns its axes."""
+        return Plots(self)
+
+    def table(self, name: AnalysisName, *, echo: Callable[[str], None] | None = None, **options: Any) -> pd.DataFrame:
+        """Return an analysis of the run as a pandas table, as ``magpend analyse NAME --csv`` writes it.
+
+        Parameters
+        ----------
+        name
+            Name of the analysis, such as ``attractors``.
+        echo
+            Function that prints a line about each computation.
+        options
+            Options of the analysis, as of the method of its name.
+
+        Returns
+        -------
+        DataFrame
+            For `attractors`, a row for each attractor at each parameter point. Numbers are in SI units, unrounded.
+
+        Raises
+        ------
+        SpecError
+            If the analysis or an option is unknown or out of bounds, or if the run does not suit.
+        """
+        return python.table(self._analysed(name, {**options, "echo": echo}))
+
+    def explore(self, *, curves: str | Path | StoredRun | None = None, height: int = 720) -> Explorer:
+        """Show the run on the explorer's interactive page, in a cell of Jupyter, VS Code or marimo.
+
+        Parameters
+        ----------
+        curves, height
+            See `magpend.explorer`.
+
+        Returns
+        -------
+        Explorer
+            Widget; as the last value of a cell it is shown. Its ``selected`` is the selected point.
+
+        Raises
+        ------
+        SpecError
+            If anywidget is not installed, or the height is too small.
+
+        Examples
+        --------
+        >>> widget = run.explore()                                           # doctest: +SKIP
+        >>> widget.selected["state"]                                         # doctest: +SKIP
+        """
+        from pipeline.explorer.notebook import explorer
+
+        return explorer(self, curves=curves, height=height)
+
+    def lyapunov(self) -> xr.Dataset:
+        """Return the Lyapunov exponents of the cells, which the run has computed.
+
+        `chaos` tells regular from chaotic attractors with them, and has exponents of orbits for every run.
+
+        Returns
+        -------
+        Dataset
+            The variables of the cube that the product ``lyapunov`` makes, with their standard errors and flags.
+
+        Raises
+        ------
+        SpecError
+            If the run has none.
+        """
+        from pipeline.products.registry import CELL_PRODUCTS
+        from pipeline.specification.problems import SpecError
+
+        if "lyapunov" not in self.spec.products:
+            raise SpecError(
+                f"{self.name}: the run has no Lyapunov exponents. Add them with "
+                'run.extend(products={"lyapunov": {}}), or [products] lyapunov = {} in its specification; '
+                "run.chaos() has the exponents of periodic orbits."
+            )
+        variables = CELL_PRODUCTS["lyapunov"].variables(self.spec.products["lyapunov"], self.model)
+        return self.cube()[["status", *(variable.name for variable in variables)]]
+
+    def status(self) -> State:
+        """Read how much of the run is computed now; printing the result shows the numbers of cells by status."""
+        from pipeline.runs.status import state
+
+        return state(self.info.files)
+
+    def verify(self, *, repair: bool = False) -> Verification:
+        """Compare every stored file with its checksum, and name what is damaged.
+
+        Parameters
+        ----------
+        repair
+            Whether to rebuild or discard damaged files. Open the run again afterwards.
+
+        Returns
+        -------
+        Verification
+            Its attribute ``sound`` says whether nothing is damaged.
+
+        Raises
+        ------
+        LockedError
+            With `repair`, if a run is writing to the directory.
+        """
+        from pipeline.runs.verify import verify_run
+
+        return verify_run(self.name, repair=repair)
+
+    def extend(
+        self,
+        spec: str | Path | None = None,
+        out: str | Path | None = None,
+        *,
+        also: Sequence[str | Path] = (),
+        axes: Mapping[str, Mapping[str, Any]] | None = None,
+        starts: int | None = None,
+        keep: int | None = None,
+        products: Mapping[str, Mapping[str, Any]] | None = None,
+        workers: int | None = None,
+        scheduler: str | None = None,
+        cluster: str | Path | None = None,
+        dashboard: bool = False,
+        echo: Callable[[str], None] = print,
+    ) -> Self:
+        """Compute a wider run, in a new directory or in place of this one, and open it; computed cells are copied.
+
+        Parameters
+        ----------
+        spec, also, starts, keep, workers, scheduler, cluster, dashboard, echo
+            See `magpend.extend`.
+        out
+            Directory of the wider run. By default it replaces this run, which is renamed to ``DIR.before``.
+        axes
+            New ranges by ``frequency_hz``, parameter, or state of a grid:
+            ``{"frequency_hz": {"start": 2.0, "stop": 3.0, "num": 201}}``.
+        products
+            Additional products, with their options: ``{"lyapunov": {}}``.
+
+        Returns
+        -------
+        Run
+            The wider run.
+
+        Raises
+        ------
+        SpecError, RefusedError
+            If no cell can be reused, or if cells would be lost; before anything is created.
+        """
+        from pipeline.runs.extend import extend
+
+        extend(
+            self.name, spec, out, also=also, axes=axes, starts=starts, keep=keep, products=products, workers=workers,
+            scheduler=scheduler, cluster=cluster, dashboard=dashboard, echo=echo,
+        )  # fmt: skip
+        return self.open(self.name if out is None else out)
+
+    def zoom(
+        self,
+        ranges: Mapping[str, tuple[float, float]] | None = None,
+        *,
+        at: Mapping[str, float] | None = None,
+        num: int | None = None,
+        nums: Mapping[str, int] | None = None,
+        samples: int | None = None,
+        echo: Callable[[str], None] | None = None,
+    ) -> dict[str, Any]:
+        """Return this run's specification with narrower ranges, for `magpend.run`.
+
+        Parameters
+        ----------
+        ranges
+            Lowest and highest value by ``frequency_hz``, parameter or state (with ``_deg`` in degrees).
+        at
+            One value by key, as in `ranges`.
+        num
+            Number of points of every new range; by default as before.
+        nums
+            Number of points by key; takes precedence over `num`.
+        samples
+            Number of random initial states.
+        echo
+            Function that prints a note on each range that exceeds the old one.
+
+        Returns
+        -------
+        dict
+            Tables of the specification, as `magpend.run` takes them.
+
+        Raises
+        ------
+        SpecError
+            If nothing changes, a change does not fit, or the result is not a valid specification.
+
+        Examples
+        --------
+        >>> magpend.run(run.zoom({"frequency_hz": (2.1, 2.2)}))              # doctest: +SKIP
+        """
+        from pipeline.layout.vocabulary import parameter_name
+        from pipeline.runs.zoom import Changes, zoom
+
+        def keyed(given: Mapping[str, Any] | None) -> dict[str, Any]:
+            return {parameter_name(name): value for name, value in (given or {}).items()}
+
+        spec, notes = zoom(self.spec, Changes(keyed(ranges), keyed(at), num, keyed(nums), samples))
+        if echo is not None:
+            for note in notes:
+                echo(note)
+        return spec.as_dict()
+
+
+def _opening(function: Callable[P, StoredRun]) -> Callable[P, Run]:
+    """Wrap a function so that the run that it returns has methods for analyses and figures."""
+
+    @wraps(function)
+    def opening(*args: P.args, **kwargs: P.kwargs) -> Run:
+        return Run.open(function(*args, **kwargs))
+
+    return opening
+
+
+run = _opening(python.run)
+
+
+@overload
+def open_run(
+    path: str | Path | StoredRun, *, tree: Literal[False] = False, chunks: Any = None, check: bool | None = None
+) -> xr.Dataset: ...
+
+
+@overload
+def open_run(
+    path: str | Path | StoredRun, *, tree: Literal[True], chunks: Any = None, check: bool | None = None
+) -> xr.DataTree: ...
+
+
+def open_run(
+    path: str | Path | StoredRun, *, tree: bool = False, chunks: Any = None, check: bool | None = None
+) -> xr.Dataset | xr.DataTree:
+    """Open the result cube of a run directory, alone or in a tree with the kept results of all analyses.
+
+    Only coordinates are read until variables are used. Cells that are not committed read as pending: ``status`` 0,
+    ``section`` NaN. Open the run again to see cells that were committed later.
+
+    Parameters
+    ----------
+    path
+        Run directory, or an opened run.
+    tree
+        Whether to return a tree: the cube as ``cube``, and each kept result of an analysis under the name of the
+        analysis. Further results with other options have the key of their folder in the name, such as
+        ``attractors-1a2b3c4d``. Stale results (of an earlier cube or an earlier version of the code) are left
+        out, and damaged ones as well; the root's attribute ``left_out`` names them.
+    chunks
+        As in `xarray.open_zarr`: None indexes lazily and loads what is selected; ``{}`` makes dask arrays in the
+        chunks of the store, for cubes larger than the memory.
+    check
+        Whether every chunk of the cube is compared with the sha256 in its commit record when it is read. The
+        default is True, unless the environment has ``MAGPEND_VERIFY=0``.
+
+    Returns
+    -------
+    Dataset or DataTree
+        The attributes of the cube hold the model's name, the specification's TOML text, the settings of the
+        integration and the provenance. The root of a tree has the run's ``title``, its ``cells``, the number of
+        cells ``computed``, those ``pending``, and ``left_out``. A result has its options in ``derived_options``.
+
+    Raises
+    ------
+    RefusedError
+        If there is no run in `path`.
+    DamagedError
+        If ``run.json``, metadata or coordinates have changed since they were written. When a cell is used later:
+        if its chunk is missing or has changed.
+
+    Examples
+    --------
+    >>> ds = open_run("runs/quickstart")                                    # doctest: +SKIP
+    >>> open_run("runs/quickstart", tree=True)["attractors"].n_cells        # doctest: +SKIP
+    """
+    opened = Run.open(path)
+    return opened.tree(chunks, check=check) if tree else opened.cube(chunks, check=check)

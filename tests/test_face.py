@@ -1,0 +1,358 @@
+"""Runs as objects: methods for analyses and figures, the accessor of Datasets, trees."""
+
+from __future__ import annotations
+
+import inspect
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import xarray as xr
+from matplotlib import pyplot as plt
+
+import magpend
+from magpend._figures import Plots
+from pipeline.cli import reference
+from pipeline.plots.style import TARGET, Target
+from pipeline.plots.targets import GuestFigure
+from pipeline.products.product import Options
+from pipeline.products.registry import ANALYSES, COMMANDS, FIGURES
+from pipeline.runs import python
+from pipeline.runs.workflows import read_given
+from pipeline.specification.problems import SpecError
+
+ROOT = Path(__file__).parents[1]
+
+RESONANCE = {
+    "kind": "continuation",
+    "title": "Duffing, its bent resonance",
+    "model": "duffing",
+    "parameters": {"preset": "hardening"},
+    "axes": {"frequency_hz": {"start": 0.18, "stop": 0.26, "num": 5}},
+    "continuation": {"direction": "both"},
+    "initial_conditions": {"kind": "random", "n": 2, "seed": 1, "x": [-1.0, 1.0], "v": [-1.0, 1.0]},
+    "integration": {"rtol": 1e-8, "atol": 1e-8, "n_transient": 60, "n_keep": 12},
+    "products": {"lyapunov": {"n_transient": 40, "n_periods": 64, "n_blocks": 4}},
+}
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    return magpend.run(RESONANCE, tmp_path_factory.mktemp("face") / "resonance", workers=0, echo=lambda _: None)
+
+
+@pytest.fixture(autouse=True)
+def _close_figures():
+    yield
+    plt.close("all")
+
+
+# ---- signatures ---------------------------------------------------------------------------------
+
+
+def declared(model: type[Options], left_out: tuple[str, ...] = ()) -> dict[str, object]:
+    """Defaults of an options model; the mark of a required parameter where there is none."""
+    return {
+        name: inspect.Parameter.empty if info.is_required() else info.get_default(call_default_factory=True)
+        for name, info in model.model_fields.items()
+        if name not in left_out
+    }
+
+
+def defaults_of(method, aside: set[str]) -> dict[str, object]:
+    parameters = list(inspect.signature(method).parameters.values())[1:]
+    assert {p.kind for p in parameters} == {inspect.Parameter.KEYWORD_ONLY}
+    assert {p.default for p in parameters if p.name in aside} == {None}
+    return {p.name: p.default for p in parameters if p.name not in aside}
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_run__has_each_analysis_with_the_defaults_of_its_options(name):
+    method = getattr(magpend.Run, name)
+    assert defaults_of(method, {"echo"}) == declared(ANALYSES[name].options)
+    for option in ANALYSES[name].options.model_fields:
+        assert f"\n    {option}\n" in f"\n{inspect.getdoc(method)}".replace(f"\n{option}\n", f"\n    {option}\n")
+    assert (
+        list(inspect.signature(getattr(magpend, name)).parameters)[1:] == list(inspect.signature(method).parameters)[1:]
+    )
+
+
+@pytest.mark.parametrize("name", FIGURES)
+def test_plots__have_each_figure_with_the_defaults_of_its_options(name):
+    found = defaults_of(getattr(Plots, name), {"ax", "figure", "echo"})
+    assert found == declared(FIGURES[name].options, ("out", "format"))
+
+
+def test_generated__is_up_to_date():
+    """Mended by: python -m pipeline.cli.reference."""
+    assert list(reference.stale()) == []
+
+
+def test_reference__check_fails_for_stale_methods(monkeypatch, capsys):
+    """A default that has changed in the options makes the methods stale."""
+    monkeypatch.setattr(sys, "argv", ["reference", "--check"])
+    monkeypatch.setattr(reference, "pages", lambda: [])
+    monkeypatch.setattr(ANALYSES["basins"].options.model_fields["box"], "default", 6)
+    with pytest.raises(SystemExit, match="1"):
+        reference.main()
+    printed = capsys.readouterr().out
+    assert "out of date: pipeline/face/magpend/_analyses.py" in printed
+    assert "out of date: pipeline/face/magpend/__init__.pyi" in printed
+
+
+def test_run__function_returns_the_run_with_methods(run):
+    assert type(run) is magpend.Run
+    assert magpend.Run.open(run) is run
+    assert type(magpend.Run.open(str(run.directory))) is magpend.Run
+    assert inspect.signature(magpend.run) == inspect.signature(python.run)
+    assert "run.plot.bifurcation()" in repr(run)
+
+
+# ---- analyses and tables ------------------------------------------------------------------------
+
+
+def test_attractors__options_reach_the_command_and_the_method_alike(run, command, tmp_path):
+    command(tmp_path, "analyse", "attractors", str(run.directory), "--threshold", "0.01", "--csv", "found.csv")
+    from_command = pd.read_csv(tmp_path / "found.csv")
+    table = run.table("attractors", threshold=0.01)
+    pd.testing.assert_frame_equal(table.replace("", np.nan), from_command, check_dtype=False, rtol=0.0, atol=0.0)
+    found = run.attractors(threshold=0.01)
+    assert found.identical(magpend.attractors(run, threshold=0.01))
+    pd.testing.assert_frame_equal(found.magpend.table(), table)
+    # such a threshold tears the branches apart, so that it makes a difference
+    assert found.sizes["attractor"] > run.attractors().sizes["attractor"]
+
+
+def test_attractors__refuses_before_computing(run):
+    with pytest.raises(SpecError, match="threshold = -1"):
+        run.attractors(threshold=-1.0)
+    with pytest.raises(SpecError, match="unknown analysis 'atractors'"):
+        run.table("atractors")
+
+
+def test_lyapunov__sum_is_the_divergence(run):
+    """The exponents of the Duffing oscillator add up to -damping, whatever the orbit."""
+    found = run.lyapunov()
+    damping = run.parameters.as_dict()["damping"]
+    np.testing.assert_allclose(found["lyapunov"].sum("exponent"), -damping, rtol=1e-6)
+
+
+def test_status_and_verify__are_those_of_the_directory(run):
+    assert run.status().complete
+    assert "20 of 20 cells" in str(run.status())
+    assert run.verify().sound
+
+
+def test_extend__opens_the_wider_run(run, tmp_path):
+    axes = {"frequency_hz": {"start": 0.18, "stop": 0.26, "num": 5}}
+    with pytest.raises(SpecError):  # nothing wider
+        run.extend(out=tmp_path / "same", axes=axes, workers=0, echo=lambda _: None)
+    longer = run.extend(out=tmp_path / "more", keep=16, workers=0, echo=lambda _: None)
+    assert type(longer) is magpend.Run
+    assert longer.cube().sizes["period_index"] == 16
+    assert run.cube().sizes["period_index"] == 12
+
+
+def test_zoom__is_a_specification_that_run_takes(run):
+    notes = []
+    table = run.zoom({"frequency": (0.2, 0.28)}, num=3, echo=notes.append)
+    spec, _, _ = read_given(table)
+    np.testing.assert_allclose(spec.axes["frequency_hz"].numbers, [0.2, 0.24, 0.28])
+    assert "reaches beyond the old 0.18 to 0.26" in notes[0]
+
+
+# ---- figures ------------------------------------------------------------------------------------
+
+
+def points_of(ax):
+    """Positions of the markers and of the polygons in axes."""
+    lines = [line.get_xydata() for line in ax.get_lines() if len(line.get_xydata())]
+    filled = [path.vertices for area in ax.collections for path in area.get_paths()]
+    return np.sort(np.concatenate([*lines, *filled]).round(12), axis=0)
+
+
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("bifurcation", {"state": "v"}),
+        ("attractors", {}),
+        ("section", {"at": {"frequency_hz": 0.2}}),
+        ("fractions", {}),
+    ],
+)
+def test_plot__draws_into_the_given_axes_alone(run, name, options):
+    figure, (left, right) = plt.subplots(1, 2, layout="constrained")
+    right.plot([0, 1], [2, 3])
+    before, children = plt.get_fignums(), len(right.get_children())
+    assert getattr(run.plot, name)(ax=left, **options) is left
+    assert plt.get_fignums() == before
+    assert figure.axes == [left, right]
+    assert len(right.get_children()) == children
+    assert len(right.get_lines()) == 1
+    assert not figure.legends
+    own = magpend.figure(run, name, options)
+    np.testing.assert_array_equal(points_of(left), points_of(own.axes[0]))
+    assert left.get_xlabel() == own.axes[0].get_xlabel()
+    assert left.get_xlim() == own.axes[0].get_xlim()
+    assert plt.get_fignums() == before  # `magpend.figure` is its holder's alone
+    figure.canvas.draw()
+
+
+def test_plot__makes_a_figure_of_pyplot_that_holds_its_data(run):
+    ax = run.plot.bifurcation()
+    assert plt.gcf() is ax.figure
+    assert ax.figure.data["x"].size == 5 * 4 * 12
+    panels = run.plot.lyapunov(spectrum=True)
+    assert panels.shape == (2,)
+    assert panels[1].get_ylabel().startswith("Lyapunov")
+    ax.set_title("mine")
+    ax.figure.canvas.draw()
+
+
+def test_plot__draws_several_panels_into_a_subfigure(run):
+    figure = plt.figure(figsize=(9, 4), layout="constrained")
+    left, right = figure.subfigures(1, 2)
+    sides = run.plot.bifurcation(layout="side", figure=left)
+    assert [ax.figure for ax in sides] == [left, left]
+    assert left.axes == list(sides)
+    assert right.axes == []
+    gallery = run.plot.gallery(at={"frequency_hz": 0.2}, figure=right)
+    assert {ax.figure for ax in gallery} == {right}
+    figure.canvas.draw()
+    assert plt.get_fignums() == [figure.number]
+
+
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("gallery", {"at": {"frequency_hz": 0.2}}),
+        ("bifurcation", {"layout": "side"}),
+        ("lyapunov", {}),
+        ("convergence", {}),
+    ],
+)
+def test_plot__refuses_one_pair_of_axes_for_several_panels(run, name, options):
+    _, ax = plt.subplots()
+    children = len(ax.get_children())
+    with pytest.raises(SpecError, match=r"several panels, and ax= holds one; give figure= instead"):
+        getattr(run.plot, name)(ax=ax, **options)
+    assert len(ax.get_children()) == children
+
+
+def test_plot__refuses_a_place_that_is_taken_or_given_twice(run):
+    figure, ax = plt.subplots()
+    with pytest.raises(SpecError, match="has axes already"):
+        run.plot.bifurcation(figure=figure)
+    with pytest.raises(SpecError, match="drop one"):
+        run.plot.bifurcation(figure=figure, ax=ax)
+    with pytest.raises(SpecError, match=r"unknown state 'w'"):
+        run.plot.bifurcation(state="w", ax=ax)
+    assert not ax.get_lines()
+    assert TARGET.get() is None
+
+
+@pytest.mark.parametrize("name", ["bifurcation", "lyapunov", "convergence", "gallery", "attractors"])
+def test_guest_figure__keeps_nothing_for_itself(run, name, monkeypatch):
+    """What is not passed on to the caller's figure would not be seen."""
+    made = []
+    monkeypatch.setattr(
+        Target, "__setattr__", lambda self, key, value: (object.__setattr__(self, key, value), made.append(value))
+    )
+    figure = plt.figure()
+    options = {"at": {"frequency_hz": 0.2}} if name in ("convergence", "gallery") else {}
+    getattr(run.plot, name)(figure=figure, **options)
+    (guest,) = [value for value in made if isinstance(value, GuestFigure)]
+    assert [type(artist).__name__ for artist in guest.get_children()] == ["Rectangle"]
+    assert figure.axes
+
+
+def test_plot__shows_absent_cells_below_the_given_axes(run):
+    cube = run.cube().load()
+    cube["status"][0] = 0
+    _, ax = plt.subplots()
+    assert cube.magpend.plot.bifurcation(ax=ax) is ax
+    (strip,) = ax.child_axes
+    assert strip.get_xlim() == ax.get_xlim()
+    assert cube.magpend.counts()["pending"] == 4
+    whole = cube.magpend.plot.bifurcation()  # a strip is no panel
+    assert len(whole.figure.axes) == 2
+
+
+# ---- Datasets -----------------------------------------------------------------------------------
+
+
+def test_accessor__knows_model_run_and_cells(run):
+    ds = run.cube()
+    assert ds.magpend.model.name == "duffing"
+    assert ds.magpend.parameters.as_dict() == run.parameters.as_dict()
+    assert ds.sel(frequency=0.2).magpend.run().directory == run.directory
+    assert sum(ds.magpend.counts().values()) == 20
+    one = ds.magpend.sel_cell(frequency_hz=0.22, branch=1)
+    assert one.identical(ds.isel(frequency=2, branch=1))
+    assert ds.magpend.sel_cell(frequency=0.225, nearest=True).frequency == pytest.approx(0.22)
+    with pytest.raises(ValueError, match=r"nearest values are 0\.22 and 0\.24"):
+        ds.magpend.sel_cell(frequency=0.225)
+    with pytest.raises(ValueError, match="unknown axis 'q'"):
+        ds.magpend.sel_cell(q=1.0)
+
+
+def test_accessor__refuses_wrong_datasets_in_a_sentence(run):
+    with pytest.raises(ValueError, match=r"no cube of magpend\.open_run and no result"):
+        xr.Dataset().magpend.model  # noqa: B018
+    with pytest.raises(ValueError, match="not the result of an analysis"):
+        run.cube().magpend.table()
+    with pytest.raises(ValueError, match=r"needs a cube of magpend\.open_run, and this is attractors"):
+        run.attractors().magpend.plot  # noqa: B018
+    with pytest.raises(SpecError, match=r"needs the analysis attractors.*use run\.plot"):
+        run.cube().magpend.plot.fractions()
+    with pytest.raises(SpecError, match=r"branches needs an analysis.*use run\.plot"):
+        run.cube().magpend.plot.branches()
+    with pytest.raises(ValueError, match=r"open the run with magpend\.Run\.open"):
+        xr.Dataset(attrs=run.cube().attrs).magpend.run()
+
+
+def test_accessor__is_there_once_both_are_imported():
+    code = (
+        "import sys, magpend\nassert 'xarray' not in sys.modules\nimport xarray as xr\n"
+        "assert not any(type(f).__name__ == '_AccessorRegistration' for f in sys.meta_path)\n"
+        "print(xr.Dataset().magpend)"
+    )
+    path = os.pathsep.join([str(ROOT), str(ROOT / "pipeline" / "face"), os.environ.get("PYTHONPATH", "")])
+    found = subprocess.run(
+        [sys.executable, "-c", code], env={**os.environ, "PYTHONPATH": path}, capture_output=True, text=True, check=True
+    )
+    assert "DatasetAccessor" in found.stdout
+
+
+def test_open_run__tree_has_what_is_kept_and_names_what_is_stale(run, tmp_path):
+    import shutil
+
+    shutil.copytree(run.directory, tmp_path / "copy")
+    shutil.rmtree(tmp_path / "copy" / "derived", ignore_errors=True)
+    copy = magpend.Run.open(tmp_path / "copy")
+    first, second = copy.attractors(), copy.attractors(threshold=0.01)
+    copy.hysteresis()
+    tree = magpend.open_run(copy, tree=True)
+    other = Path(second.encoding["source"]).stem
+    assert set(tree.children) == {"cube", "attractors", other, "hysteresis"}
+    for name, wanted in (("cube", copy.cube()), ("attractors", first), (other, second)):
+        node = tree[name].to_dataset()
+        assert not any(v._in_memory for k, v in node.variables.items() if k in ("section", "n_cells"))
+        assert node.identical(wanted)
+    assert '"threshold": 0.3' in tree["attractors"].attrs["derived_options"]
+    assert {key: tree.attrs[key] for key in ("cells", "computed", "pending")} == {
+        "cells": 20,
+        "computed": 20,
+        "pending": 0,
+    }
+    assert tree.attrs["left_out"] == []
+    # results of an earlier cube: one record is withdrawn
+    next((tmp_path / "copy" / "commits").iterdir()).unlink()
+    late = magpend.open_run(tmp_path / "copy", tree=True)
+    assert set(late.children) == {"cube"}
+    assert late.attrs["pending"] > 0
+    assert f"{other}.zarr" in late.attrs["left_out"]
