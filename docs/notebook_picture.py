@@ -26,7 +26,7 @@ def picture(run: Path, file: Path) -> None:
     cells = {
         "widget": f'import magpend\n\nwidget = magpend.explorer("{run.name}")\nwidget',
         "selected": 'widget.selected = {"cell": 2944}\n'
-        '{name: widget.selected[name] for name in ("frequency", "period", "state", "start")}',
+        '{name: widget.selected[name] for name in ("frequency", "period", "state")}',
     }
     with tempfile.TemporaryDirectory() as folder, sync_playwright() as playwright:
         (Path(folder) / run.name).symlink_to(run.resolve())
@@ -40,7 +40,8 @@ def picture(run: Path, file: Path) -> None:
             page.locator(".magpend-explorer .diagram[data-drawn]").wait_for(timeout=120_000)
             lab.run("selected")
             page.locator(".magpend-explorer .panels[data-shown]").wait_for(timeout=120_000)
-            page.locator(".magpend-explorer .side-column .hint:visible").wait_for(state="detached", timeout=120_000)
+            # multipliers come once their code is compiled
+            page.locator(".magpend-explorer .panel-facts .note").wait_for(state="detached", timeout=120_000)
             page.wait_for_timeout(1000)  # the machine moves
             page.screenshot(path=file)
         browser.close()
