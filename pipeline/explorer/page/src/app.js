@@ -32,7 +32,9 @@ const ROOMS = [["medium", 960], ["slim", 760], ["small", 600]];
  * @returns {Promise<{end: function(): void}>} ends the page, with all that it asked for
  */
 export async function start(source, host) {
-  const { root } = host, messages = new Messages(), page = { ends: [], end: () => page.ends.splice(0).forEach((end) => end()) };
+  const { root } = host, messages = new Messages(), page = { ends: [] };
+  // what was begun last ends first
+  page.end = () => page.ends.splice(0).reverse().forEach((end) => end());
   root.classList.add("explorer");
   page.ends.push(dress(host), measureRoom(root), () => source.live?.close());
   if (host.watch) page.ends.push(host.watch(applyTheme));

@@ -87,7 +87,7 @@ export class Toolbar {
     const commands = Object.values(this.view.commands ?? {});
     if (!commands.length) return [];
     const lines = commands.map((command) => el("li", {}, el("code", { text: command })));
-    const menu = this.menu("More", [], "Not computed yet; run these, then reload this page:");
+    const menu = this.menu("More", [], "Not computed yet; run these, then open the run again:");
     menu.querySelector(".menu-list").append(el("ul", { class: "commands" }, ...lines));
     return [menu];
   }

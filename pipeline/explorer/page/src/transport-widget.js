@@ -35,7 +35,11 @@ export class WidgetTransport {
 
   /** As `ServerTransport.connect`. */
   connect({ opened, taken, closed }) {
-    const channel = { isOpen: !this.isGone, taken, closed, send: (text) => this.send({ live: text }), close: () => this.send({ close: true }) };
+    const channel = { isOpen: !this.isGone, taken, closed, send: (text) => this.send({ live: text }) };
+    channel.close = () => {
+      if (channel.isOpen) this.send({ close: true });
+      channel.isOpen = false;
+    };
     if (this.isGone) return channel;
     this.channel = channel;
     this.send({ open: true });
@@ -79,7 +83,7 @@ export class WidgetTransport {
 
   /** Say that the page has gone, and hear nothing more. */
   end() {
-    if (!this.isGone) this.send({ close: true });
+    this.channel?.close();
     this.model.off("msg:custom", this.take);
     for (const event of ENDS) this.model.off(event, this.lose);
     this.waiting.clear();
