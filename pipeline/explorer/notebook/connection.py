@@ -55,6 +55,7 @@ class Connection:
     def __init__(self, answering: Answering, send: Send) -> None:
         self._answering, self._deliver = answering, send
         self._sessions: OrderedDict[str, LiveSession] = OrderedDict()
+        self._pages: set[str] = set()
         self._lock, self._sending = threading.Lock(), threading.Lock()
         self._begun = self._closed = False
 
@@ -63,6 +64,7 @@ class Connection:
         page = message.get("page") if isinstance(message, Mapping) else None
         if not isinstance(page, str) or self._closed:
             return
+        self._pages.add(page)
         if not self._begun:  # a widget that nobody looks at computes nothing
             self._begun = True
             self._answering.warm()
@@ -112,7 +114,7 @@ class Connection:
             else:
                 self._send({"page": page, "live": json.dumps(answer, allow_nan=False)}, [])
 
-        self.leave(page)
+        self._end_session(page)
         session = LiveSession(live, emit)
         with self._lock:
             self._sessions[page] = session
@@ -123,6 +125,12 @@ class Connection:
 
     def leave(self, page: str) -> None:
         """Cancel all jobs of a page that is gone."""
+        self._end_session(page)
+        self._pages.discard(page)
+        if not self._pages:  # notebooks keep the widget of a cell that runs again
+            self._answering.run.drop_large()
+
+    def _end_session(self, page: str) -> None:
         with self._lock:
             session = self._sessions.pop(page, None)
         if session is not None:
@@ -132,7 +140,7 @@ class Connection:
         """Cancel all jobs of all pages, and send nothing more."""
         self._closed = True
         for page in list(self._sessions):
-            self.leave(page)
+            self._end_session(page)
 
     # ---- sending -----------------------------------------------------------------------------
 

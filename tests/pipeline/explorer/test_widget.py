@@ -163,9 +163,15 @@ def test_connection__a_page_that_leaves_cancels_its_jobs(directory):
     pages.tell("one", live=json.dumps({"id": 1, "do": "slice", **plane}))
     pages.answer("one", lambda content: content.get("live") is True)
     session = pages.connection._sessions["one"]
+    pages.ask("diagram", {"x": "frequency", "y": "x"})
+    kept = pages.answering.run._opened
+    assert kept["large"]
     pages.tell("one", close=True)
     session.join(10.0)
     assert session.is_over
+    # nobody looks any more, and the notebook keeps the widget: the diagram's points are dropped
+    assert "large" not in kept
+    assert not [key for key in kept if "diagram" in key and not key.startswith("lock")]
     # pages that the notebook forgot do not fill the memory
     for number in range(MOST_PAGES + 2):
         pages.tell(f"page {number}", open=True)

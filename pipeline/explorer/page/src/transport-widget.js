@@ -83,7 +83,7 @@ export class WidgetTransport {
 
   /** Say that the page has gone, and hear nothing more. */
   end() {
-    this.channel?.close();
+    if (!this.isGone) this.send({ close: true });
     this.model.off("msg:custom", this.take);
     for (const event of ENDS) this.model.off(event, this.lose);
     this.waiting.clear();
