@@ -51,7 +51,7 @@ _HOMES = {
     "pipeline.runs.drawing": ("figure",),
     "pipeline.runs.filming": ("animation",),
     "pipeline.plots.films": ("save_animation",),
-    "pipeline.explorer.notebook": ("explorer",),
+    "pipeline.explorer.notebook.showing": ("explorer",),
     "pipeline.rig.identify.identification": ("identify",),
     "pipeline.rig.recordings": ("findings_of", "load_mapping", "read_recording", "smooth", "window", "write_recording"),
     "pipeline.rig.recordings.figure": ("plot_recording",),

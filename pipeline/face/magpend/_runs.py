@@ -141,7 +141,7 @@ class Run(Analyses):
         >>> widget = run.explore()                                           # doctest: +SKIP
         >>> widget.selected["state"]                                         # doctest: +SKIP
         """
-        from pipeline.explorer.notebook import explorer
+        from pipeline.explorer.notebook.showing import explorer
 
         return explorer(self, curves=curves, height=height)
 

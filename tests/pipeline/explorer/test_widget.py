@@ -13,8 +13,8 @@ import pytest
 from tornado.websocket import websocket_connect
 
 from pipeline.explorer.data.arrays import unpack_arrays
-from pipeline.explorer.notebook import explorer
 from pipeline.explorer.notebook.connection import MOST_PAGES, Connection
+from pipeline.explorer.notebook.showing import explorer
 from pipeline.explorer.serving.answering import Answering
 from pipeline.explorer.serving.answers import ANSWERS
 from pipeline.runs.derive import derive
@@ -270,8 +270,6 @@ def test_explorer__says_what_is_missing(directory, monkeypatch):
 
 def test_explorer__a_script_that_shows_nothing_starts_nothing(directory):
     """The widget of a script without a page ends with it, and says nothing."""
-    code = (
-        f"from pipeline.explorer.notebook import explorer; w = explorer({str(directory)!r}); w.selected = {{'cell': 1}}"
-    )
+    code = f"from pipeline.explorer.notebook.showing import explorer; w = explorer({str(directory)!r}); w.selected = {{'cell': 1}}"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=PATIENCE_S, check=True)
     assert (done.stdout, done.stderr) == ("", "")
