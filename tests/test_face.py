@@ -13,10 +13,12 @@ import pandas as pd
 import pytest
 import xarray as xr
 from matplotlib import pyplot as plt
+from matplotlib.legend import Legend
 
 import magpend
 from magpend._figures import Plots
 from pipeline.cli import reference
+from pipeline.plots import pixels, style
 from pipeline.plots.style import TARGET, Target
 from pipeline.plots.targets import GuestFigure
 from pipeline.products.product import Options
@@ -116,12 +118,22 @@ def test_run__function_returns_the_run_with_methods(run):
 
 
 def test_attractors__options_reach_the_command_and_the_method_alike(run, command, tmp_path):
-    command(tmp_path, "analyse", "attractors", str(run.directory), "--threshold", "0.01", "--csv", "found.csv")
+    command(
+        tmp_path,
+        "analyse",
+        "attractors",
+        str(run.directory),
+        "--no-connect",
+        "--threshold",
+        "0.01",
+        "--csv",
+        "found.csv",
+    )
     from_command = pd.read_csv(tmp_path / "found.csv")
-    table = run.table("attractors", threshold=0.01)
+    table = run.table("attractors", connect=False, threshold=0.01)
     pd.testing.assert_frame_equal(table.replace("", np.nan), from_command, check_dtype=False, rtol=0.0, atol=0.0)
-    found = run.attractors(threshold=0.01)
-    assert found.identical(magpend.attractors(run, threshold=0.01))
+    found = run.attractors(connect=False, threshold=0.01)
+    assert found.identical(magpend.attractors(run, connect=False, threshold=0.01))
     pd.testing.assert_frame_equal(found.magpend.table(), table)
     # such a threshold tears the branches apart, so that it makes a difference
     assert found.sizes["attractor"] > run.attractors().sizes["attractor"]
@@ -148,20 +160,19 @@ def test_status_and_verify__are_those_of_the_directory(run):
 
 
 def test_extend__opens_the_wider_run(run, tmp_path):
-    axes = {"frequency_hz": {"start": 0.18, "stop": 0.26, "num": 5}}
-    with pytest.raises(SpecError):  # nothing wider
-        run.extend(out=tmp_path / "same", axes=axes, workers=0, echo=lambda _: None)
-    longer = run.extend(out=tmp_path / "more", keep=16, workers=0, echo=lambda _: None)
-    assert type(longer) is magpend.Run
-    assert longer.cube().sizes["period_index"] == 16
-    assert run.cube().sizes["period_index"] == 12
+    more = run.extend(out=tmp_path / "more", starts=3, workers=0, echo=lambda _: None)
+    assert type(more) is magpend.Run
+    assert more.complete
+    assert more.directory == tmp_path / "more"
+    assert (more.cube().sizes["branch"], run.cube().sizes["branch"]) == (6, 4)
+    assert set(run.cube()["section"].values.ravel()) < set(more.cube()["section"].values.ravel())
 
 
 def test_zoom__is_a_specification_that_run_takes(run):
     notes = []
     table = run.zoom({"frequency": (0.2, 0.28)}, num=3, echo=notes.append)
     spec, _, _ = read_given(table)
-    np.testing.assert_allclose(spec.axes["frequency_hz"].numbers, [0.2, 0.24, 0.28])
+    np.testing.assert_allclose(spec.axes["frequency_hz"].array(), [0.2, 0.24, 0.28])
     assert "reaches beyond the old 0.18 to 0.26" in notes[0]
 
 
@@ -208,7 +219,7 @@ def test_plot__makes_a_figure_of_pyplot_that_holds_its_data(run):
     assert ax.figure.data["x"].size == 5 * 4 * 12
     panels = run.plot.lyapunov(spectrum=True)
     assert panels.shape == (2,)
-    assert panels[1].get_ylabel().startswith("Lyapunov")
+    assert panels[1].get_ylabel().startswith("exponents")
     ax.set_title("mine")
     ax.figure.canvas.draw()
 
@@ -280,6 +291,23 @@ def test_plot__shows_absent_cells_below_the_given_axes(run):
     assert cube.magpend.counts()["pending"] == 4
     whole = cube.magpend.plot.bifurcation()  # a strip is no panel
     assert len(whole.figure.axes) == 2
+
+
+def test_plot__counts_points_on_pixels_as_fine_as_in_files(run, monkeypatch):
+    """The image of many points does not depend on the resolution of the screen."""
+    monkeypatch.setattr(pixels, "MARKER_LIMIT", 0)
+    monkeypatch.setitem(plt.rcParams, "figure.dpi", 72.0)
+    (shown,), (kept,) = run.plot.bifurcation().images, magpend.figure(run, "bifurcation").axes[0].images
+    np.testing.assert_allclose(shown.get_array().shape, kept.get_array().shape, rtol=0.02)  # texts differ by pixels
+
+
+def test_legend_inside__keeps_the_first():
+    ax = style.new_figure(3.0, xr.Dataset()).add_subplot()
+    line = ax.plot([0, 1], [0, 1], label="a")
+    style.legend_inside(ax, [*line, *ax.plot([1], [1], label="b")])
+    style.legend_inside(ax, line)
+    legends = [artist for artist in ax.get_children() if isinstance(artist, Legend)]
+    assert sorted(len(legend.get_texts()) for legend in legends) == [1, 2]
 
 
 # ---- Datasets -----------------------------------------------------------------------------------

@@ -58,7 +58,7 @@ def drawing_into(host: Host | None, make: Callable[..., Any] | None = None) -> I
 
     def guest(**about: Any) -> DataFigure:
         assert host is not None
-        return GuestFigure(host, about["figsize"])
+        return GuestFigure(host, about["figsize"], arranged=about["layout"] is not None)
 
     def own(**about: Any) -> DataFigure:
         assert make is not None
@@ -89,9 +89,11 @@ class GuestFigure(DataFigure):
         The caller's axes, figure or subfigure.
     figsize
         Width and height [in] of a figure of its own; places in a figure count in these units.
+    arranged
+        Whether the layout of the caller's figure finds the places of panels and legends.
     """
 
-    def __init__(self, host: Host, figsize: tuple[float, float]) -> None:
+    def __init__(self, host: Host, figsize: tuple[float, float], *, arranged: bool = True) -> None:
         self._guests: list[Axes] = []
         self._others: list[Artist] = []
         super().__init__(figsize=figsize)
@@ -99,7 +101,10 @@ class GuestFigure(DataFigure):
         self._place: Any = host.figure if isinstance(host, Axes) else host
         root = self._place.get_figure(root=True) if isinstance(self._place, SubFigure) else self._place
         self._root: Figure = root
-        if isinstance(host, Figure) and host.get_layout_engine() is None:
+        self._arranged = arranged
+        if isinstance(host, Figure) and not arranged:
+            host.set_layout_engine("none")  # it would find nothing to arrange, and warn of that
+        elif isinstance(host, Figure) and host.get_layout_engine() is None:
             host.set_layout_engine("constrained")  # legends outside of the axes need it
 
     @property  # type: ignore[misc]
@@ -185,7 +190,7 @@ class GuestFigure(DataFigure):
     def arrange(self) -> None:
         """Compute the layout of the caller's figure, which stays free to change."""
         engine = self._root.get_layout_engine()
-        if engine is not None:
+        if engine is not None and self._arranged:
             with TEXT_LOCK:
                 engine.execute(self._root)
 
