@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import queue
 import subprocess
 import sys
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 from tornado.websocket import websocket_connect
 
+import magpend
 from pipeline.explorer.data.arrays import unpack_arrays
 from pipeline.explorer.notebook.connection import MOST_PAGES, Connection
 from pipeline.explorer.notebook.showing import explorer
@@ -21,6 +23,7 @@ from pipeline.runs.derive import derive
 from pipeline.runs.run import run
 from pipeline.specification.problems import SpecError
 from pipeline.store.run import Run
+from tests.pipeline.explorer.browser.notebooks import ROOT
 from tests.pipeline.explorer.test_server import Client
 from tests.pipeline.explorer.test_socket import SPEC
 
@@ -259,6 +262,13 @@ def test_orbit__closes_and_begins_at_the_selected_point(widget):
     np.testing.assert_allclose(orbit["time"].values[-1], seconds, rtol=1e-12)
 
 
+def test_explore__is_a_method_of_a_run(directory):
+    found = magpend.Run.open(directory).explore(height=400)
+    found.selected = {"cell": 1}
+    assert (found.height, found.selected["cell"]) == (400, 1)
+    found.close()
+
+
 def test_explorer__says_what_is_missing(directory, monkeypatch):
     monkeypatch.setitem(sys.modules, "anywidget", None)
     monkeypatch.delitem(sys.modules, "pipeline.explorer.notebook.widget", raising=False)
@@ -270,6 +280,14 @@ def test_explorer__says_what_is_missing(directory, monkeypatch):
 
 def test_explorer__a_script_that_shows_nothing_starts_nothing(directory):
     """The widget of a script without a page ends with it, and says nothing."""
-    code = f"from pipeline.explorer.notebook.showing import explorer; w = explorer({str(directory)!r}); w.selected = {{'cell': 1}}"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=PATIENCE_S, check=True)
+    code = f"from magpend import explorer; w = explorer({str(directory)!r}); w.selected = {{'cell': 1}}"
+    paths = os.pathsep.join([str(ROOT), str(ROOT / "pipeline" / "face"), os.environ.get("PYTHONPATH", "")])
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        check=True,
+        env={**os.environ, "PYTHONPATH": paths.rstrip(os.pathsep)},
+    )
     assert (done.stdout, done.stderr) == ("", "")
