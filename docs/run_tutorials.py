@@ -43,6 +43,7 @@ PAGES = {p.stem: p for p in (*sorted((DOCS / "tutorials").glob("*.md")), DOCS / 
 NOT_MADE = {
     "branches-map.png": "curves over a map of two parameters, a quarter of an hour",
     "examples/flutter-bands.png": "bands of the flutter rig's fit with priors, which no specification that ships has",
+    "explorer-notebook.png": "JupyterLab with the explorer, by docs/notebook_picture.py RUN FILE",
     "identification-residuals.png": "residuals of the identification that ships, which takes an hour",
     "measured.png": "a sweep of 101 frequencies on the virtual rig, beside a run of as many",
     "report.png": "a browser's picture of a part of a report",

@@ -13,6 +13,7 @@ from magpend_core.models.model import Parameters
 from magpend_core.status import Status
 from pipeline.analysis.outcomes import share_interval
 from pipeline.explorer.data.arrays import pack_arrays
+from pipeline.explorer.data.colours import schemes
 from pipeline.explorer.data.explored import ExploredRun, ExplorerError
 from pipeline.explorer.data.series import fixed_points, orbit_series
 from pipeline.layout.vocabulary import ATTRACTS, BRANCH, EVIDENCE, KINDS, PENDING, STABILITIES, UNSTABLE, grid_dim
@@ -131,6 +132,43 @@ def orbit(run: Run, cell: int, point: int, *, linearised: bool = True) -> bytes:
     said = _attrs(explored, found, attractor, linearised)
     attrs = {**said, "period": period or None, "point": point, "n_periods": n_periods}
     return pack_arrays(arrays, attrs)
+
+
+def facts(run: ExploredRun, cell: int, point: int | None = None) -> dict[str, Any]:
+    """Return what is known of a section point without integrating: its cell, state and parameters, and its attractor.
+
+    Parameters
+    ----------
+    cell
+        Flat number of a cell of the cube.
+    point
+        Number of one of its kept sections; by default the last.
+
+    Returns
+    -------
+    dict
+        What JSON can say. ``state`` has the section point and ``start`` the initial state, by the names of the
+        states; ``attractor`` and what follows from it is None where no analysis has it.
+
+    Raises
+    ------
+    ExplorerError
+        If there is no such section.
+    """
+    found = cell_of(run, cell)
+    kept = np.flatnonzero(np.isfinite(found.section).all(axis=1))
+    chosen = point if point is not None else int(kept[-1]) if len(kept) else 0
+    if chosen not in kept:
+        raise ExplorerError(_no_point(found, chosen, len(kept)))
+    attractor = _attractor(run, found)
+    said = _attrs(run, found, attractor, False)
+    for name in ("fixed", "quantities", "seeds", "note"):  # for drawings of the orbit
+        del said[name]
+    names = next((s.categories for s in schemes(run) if s.name == "attractor"), ())
+    label = next((c.label for c in names if c.number == said["attractor"]), None)
+    state = {s.name: float(v) for s, v in zip(run.model.states, found.section[chosen], strict=True)}
+    period = found.period or attractor["period"] or None
+    return {"cell": cell, "point": chosen, "state": state, "period": period, **said, "label": label}
 
 
 def _no_point(cell: Cell, point: int, n_points: int) -> str:

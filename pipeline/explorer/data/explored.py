@@ -150,6 +150,12 @@ class ExploredRun(Run):
         with alone:
             return self.remembered(key, make)
 
+    def drop_large(self) -> None:
+        """Forget the large values, which are computed again when they are needed."""
+        with self._lock:
+            for key in self._opened.pop("large", []):
+                self._opened.pop(key, None)
+
     @property
     def path(self) -> str | None:
         """Name of the axis along which the continuation runs; None if the run is a sweep."""

@@ -129,7 +129,12 @@ _SHOWN = ("kind", "stability", "evidence")
 
 
 def _orbit(run: ExploredRun, asked: Asked) -> xr.Dataset:
-    arrays, attrs = unpack_arrays(orbit(run, _needed(asked, "cell"), _needed(asked, "point")))
+    return orbit_dataset(run, _needed(asked, "cell"), _needed(asked, "point"))
+
+
+def orbit_dataset(run: ExploredRun, cell: int, point: int) -> xr.Dataset:
+    """Integrate the orbit through a section point; return its states and quantities over time, a row per instant."""
+    arrays, attrs = unpack_arrays(orbit(run, cell, point))
     ds = xr.Dataset({"time": ("row", arrays["time"], {"units": "s"})})
     for k, state in enumerate(run.model.states):
         ds[state.name] = ("row", arrays["states"][:, k], {"units": state.unit})

@@ -9,8 +9,10 @@ import { fileURLToPath } from "node:url";
 const here = dirname(fileURLToPath(import.meta.url));
 const STATIC = join(here, "..", "static");
 
-/** What each script of the page begins with. */
-const ENTRIES = { explorer: "src/main.js", "explorer-folder": "src/main-folder.js" };
+/** What each script of the page begins with, and its format: a notebook imports a module. */
+const ENTRIES = {
+  explorer: ["src/main.js", "iife"], "explorer-folder": ["src/main-folder.js", "iife"], "explorer-widget": ["src/main-widget.js", "esm"],
+};
 
 /** Style sheets in the order in which they apply. */
 const STYLES = ["explorer.css", "panels.css"];
@@ -19,7 +21,7 @@ const STYLES = ["explorer.css", "panels.css"];
 const VENDORED = ["zarrita", "@zarrita/storage", "numcodecs", "reference-spec-reader", "unzipit", "fflate"];
 
 const OPTIONS = {
-  bundle: true, format: "iife", minify: true, target: ["es2022"], charset: "utf8", legalComments: "none",
+  bundle: true, minify: true, target: ["es2022"], charset: "utf8", legalComments: "none",
   write: false, absWorkingDir: here, logLevel: "warning", metafile: true,
   // WebAssembly of codecs that exported cubes do not use
   alias: Object.fromEntries(["blosc", "lz4", "zstd"].map((codec) => [`numcodecs/${codec}`, "./src/other-codecs.js"])),
@@ -33,16 +35,25 @@ const workers = {
       path: join(resolveDir, path.slice("worker:".length)), namespace: "worker",
     }));
     builder.onLoad({ filter: /./, namespace: "worker" }, async ({ path }) => {
-      const { outputFiles } = await build({ ...OPTIONS, entryPoints: [path] });
+      const { outputFiles } = await build({ ...OPTIONS, format: "iife", entryPoints: [path] });
       return { contents: outputFiles[0].text, loader: "text" };
     });
   },
 };
 
+/** `import text from "styles:"` gives the style sheet, for a shadow root. */
+const sheet = {
+  name: "styles",
+  setup(builder) {
+    builder.onResolve({ filter: /^styles:$/ }, () => ({ path: "styles", namespace: "styles" }));
+    builder.onLoad({ filter: /./, namespace: "styles" }, async () => ({ contents: await styles(), loader: "text" }));
+  },
+};
+
 async function scripts() {
   const made = {}, used = new Set();
-  for (const [name, entry] of Object.entries(ENTRIES)) {
-    const { outputFiles, metafile } = await build({ ...OPTIONS, entryPoints: [entry], plugins: [workers] });
+  for (const [name, [entry, format]] of Object.entries(ENTRIES)) {
+    const { outputFiles, metafile } = await build({ ...OPTIONS, format, entryPoints: [entry], plugins: [workers, sheet] });
     made[`${name}.js`] = outputFiles[0].text;
     for (const path of Object.keys(metafile.inputs)) {
       const package_ = path.match(/node_modules\/((?:@[^/]+\/)?[^/]+)\//)?.[1];

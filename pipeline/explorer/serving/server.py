@@ -2,8 +2,7 @@
 
 What takes long to import is imported once the address is known, while a browser starts.
 
-Reading goes on in a few threads, so that the page stays at hand; what waits is bounded. `security` says who
-is answered.
+`answering` reads in a few threads, so that the page stays at hand. `security` says who is answered.
 """
 
 from __future__ import annotations
@@ -12,10 +11,8 @@ import asyncio
 import contextlib
 import errno
 import json
-import logging
 import socket
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from importlib import resources
 from pathlib import Path
@@ -26,10 +23,7 @@ from tornado import httpserver, web
 from pipeline.explorer.serving import page_html
 from pipeline.explorer.serving.security import Guard, Rate, headers_of, new_token
 from pipeline.specification.problems import SpecError
-from pipeline.store.errors import StoreError
 from pipeline.store.run import Run
-
-LOG = logging.getLogger(__name__)
 
 if TYPE_CHECKING:
     from pipeline.explorer.serving.answers import Answer
@@ -51,9 +45,6 @@ LIMITS: dict[str, Any] = {
 MOST_ADDRESS = 4096
 """Characters of an address: more is none that the page makes."""
 
-THREADS, MOST_WAITING = 3, 12
-"""Requests that are worked on at once, and those that may wait besides."""
-
 PER_SECOND, BURST = 40.0, 120
 STRANGERS_PER_SECOND, STRANGERS_BURST = 4.0, 20
 """Requests without the token, which are all refused."""
@@ -74,7 +65,7 @@ def static_files() -> dict[str, tuple[bytes, str]]:
 
 
 class Service:
-    """State that all request handlers share: the run, its live computation, worker threads and rate limits.
+    """State that all request handlers share: the run that answers, the check of requests, and rate limits.
 
     Parameters
     ----------
@@ -85,69 +76,13 @@ class Service:
     """
 
     def __init__(self, run: Run, guard: Guard) -> None:
-        from pipeline.explorer.data.explored import ExploredRun
-        from pipeline.explorer.live.live import LiveRun, live_problem
+        from pipeline.explorer.serving.answering import Answering
 
-        self.run = ExploredRun.of(run)
+        self.answering = Answering(run)
         self.guard, self.rate = guard, Rate(PER_SECOND, BURST)
         self.strangers = Rate(STRANGERS_PER_SECOND, STRANGERS_BURST)
         self.files = Rate(PER_SECOND, BURST)
         self.static = static_files()
-        self.live_problem = live_problem(self.run)
-        self.live = None if self.live_problem else LiveRun(self.run)
-        self.pool = ThreadPoolExecutor(THREADS, "explorer")
-        self.waiting = 0
-        self.compiled: asyncio.Event | None = None
-
-    def refresh(self) -> None:
-        """Read the run again, for cells and analyses that were added."""
-        self.run = self.run.refreshed()
-
-    def warm(self) -> None:
-        """Compute what the page requests first while the browser starts; then compile the code for live computation.
-
-        Called in the loop that answers: those who wait for something to be compiled wait there.
-        """
-        from pipeline.explorer.serving.answers import first_answers
-
-        first = self.pool.submit(first_answers, self.run, self.live)
-        if self.live is None:
-            return
-        live, loop = self.live, asyncio.get_running_loop()
-        self.compiled = waiting = asyncio.Event()
-
-        def tell(done: int, total: int) -> None:
-            if live.is_warm("series"):
-                with contextlib.suppress(RuntimeError):  # the loop has ended
-                    loop.call_soon_threadsafe(waiting.set)
-
-        # what is compiled would hold up the first picture
-        first.add_done_callback(lambda done: None if done.cancelled() else live.warm(tell))
-
-    async def work(self, function: Callable[[], Any], *, integrates: bool = False) -> Any:
-        """Call a function in a worker thread and return its result; raise TooManyError if too many requests wait.
-
-        One that integrates waits until what it needs is compiled, once, and not in these threads.
-        """
-        if self.waiting >= THREADS + MOST_WAITING:
-            raise TooManyError("the server has more to do than it may; try again in a moment")
-        self.waiting += 1
-        try:
-            if integrates and self.compiled is not None:
-                await self.compiled.wait()
-            return await asyncio.get_running_loop().run_in_executor(self.pool, function)
-        finally:
-            self.waiting -= 1
-
-    def close(self) -> None:
-        """Cancel the requests that wait, and end live computation."""
-        self.pool.shutdown(wait=False, cancel_futures=True)
-        if self.live is not None:
-            self.live.close()
-
-
-class TooManyError(ValueError):
-    """Raised if more requests wait than the server accepts."""
 
 
 class Handler(web.RequestHandler):
@@ -215,7 +150,7 @@ class PageHandler(Handler):
             self.refuse(500, "the page's script is not installed: install magpend again")
             return
         self.set_header("Content-Type", "text/html; charset=utf-8")
-        self.finish(page_html.page(self.service.run.info.title, self.service.guard.token))
+        self.finish(page_html.page(self.service.answering.run.info.title, self.service.guard.token))
 
 
 class StaticHandler(Handler):
@@ -257,30 +192,14 @@ class ApiHandler(Handler):
         await self._reply(self.request.body)
 
     async def _reply(self, body: bytes) -> None:
+        from pipeline.explorer.serving.answering import RefusedRequestError
         from pipeline.explorer.serving.answers import Query
 
         query = Query({k: v[-1].decode("utf-8", "replace") for k, v in self.request.query_arguments.items()}, body)
-        service, answer = self.service, self.answer
-
-        def work() -> Any:
-            if answer.fresh:
-                service.refresh()
-            service.run.check_axes(query.at)
-            return answer.give(service.run, query, service.live)
-
         try:
-            reply = await service.work(work, integrates=answer.integrates)
-        except TooManyError as error:
-            self.refuse(429, str(error))
-        except (StoreError, OSError) as error:
-            self.refuse(500, str(error))
-        except SpecError as error:
-            self.refuse(400, " ".join(error.problems))
-        except (ValueError, ArithmeticError) as error:
-            self.refuse(400, str(error))
-        except Exception:
-            LOG.exception("api/%s", answer.name)
-            self.refuse(500, "something went wrong that magpend did not expect; its terminal says what")
+            reply = await asyncio.wrap_future(self.service.answering.ask(self.answer.name, query))
+        except RefusedRequestError as error:
+            self.refuse(error.status, str(error))
         else:
             self.set_header("Content-Type", reply.kind)
             if reply.filename:
@@ -321,7 +240,8 @@ def application(service: Service) -> web.Application:
 
 
 def _live_routes(service: Service) -> list[Any]:
-    if service.live is None:
+    live = service.answering.live
+    if live is None:
         return []
 
     from pipeline.explorer.serving.socket import socket_routes
@@ -331,7 +251,7 @@ def _live_routes(service: Service) -> list[Any]:
         token = handler.get_query_argument("token", "")
         return guard.foreign(headers) is None and guard.authorised(headers, token)
 
-    return socket_routes(service.live, authorised)
+    return socket_routes(live, authorised)
 
 
 def listening(port: int) -> socket.socket:
@@ -404,7 +324,7 @@ def serve(
         try:
             asyncio.run(_answer(service, taken))
         finally:
-            service.close()
+            service.answering.close()
     finally:
         taken.close()
 
@@ -412,5 +332,5 @@ def serve(
 async def _answer(service: Service, taken: socket.socket) -> None:
     server = httpserver.HTTPServer(application(service), **LIMITS)
     server.add_socket(taken)
-    service.warm()
+    service.answering.warm()
     await asyncio.Event().wait()

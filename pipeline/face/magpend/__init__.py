@@ -7,6 +7,7 @@
     found = run.attractors()                     # an analysis, kept in the run directory
     found.magpend.table()                        # a row per attractor and parameter point, as pandas
     ax = run.plot.bifurcation()                  # matplotlib axes, to go on with
+    run.explore()                                # the interactive page, in a notebook
     duffing = magpend.load_model("duffing").load(amplitude=0.4)
     magpend.sections(duffing, 0.2, [[0.1, 0.0]], n_transient=300, n_keep=50)
 
@@ -51,6 +52,7 @@ _HOMES = {
     "pipeline.runs.drawing": ("figure",),
     "pipeline.runs.filming": ("animation",),
     "pipeline.plots.films": ("save_animation",),
+    "pipeline.explorer.notebook.showing": ("explorer",),
     "pipeline.rig.identify.identification": ("identify",),
     "pipeline.rig.recordings": ("findings_of", "load_mapping", "read_recording", "smooth", "window", "write_recording"),
     "pipeline.rig.recordings.figure": ("plot_recording",),

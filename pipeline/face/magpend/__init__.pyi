@@ -37,6 +37,7 @@ from pipeline.analysis.chaos.dimensions import (
 from pipeline.analysis.chaos.lyapunov import spectrum_of_jacobians as spectrum_of_jacobians
 from pipeline.analysis.chaos.zero_one import zero_one_test as zero_one_test
 from pipeline.compute.simulate import simulate as simulate
+from pipeline.explorer.notebook.showing import explorer as explorer
 from pipeline.plots import (
     DataFigure as DataFigure,
     Frame as Frame,

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     import pandas as pd
     import xarray as xr
 
+    from pipeline.explorer.notebook.widget import Explorer
     from pipeline.runs.status import State
     from pipeline.store.checking import Verification
     from pipeline.store.files import Files
@@ -116,6 +117,33 @@ class Run(Analyses):
             If the analysis or an option is unknown or out of bounds, or if the run does not suit.
         """
         return python.table(self._analysed(name, {**options, "echo": echo}))
+
+    def explore(self, *, curves: str | Path | StoredRun | None = None, height: int = 720) -> Explorer:
+        """Show the run on the explorer's interactive page, in a cell of Jupyter, VS Code or marimo.
+
+        Parameters
+        ----------
+        curves, height
+            See `magpend.explorer`.
+
+        Returns
+        -------
+        Explorer
+            Widget; as the last value of a cell it is shown. Its ``selected`` is the selected point.
+
+        Raises
+        ------
+        SpecError
+            If anywidget is not installed, or the height is too small.
+
+        Examples
+        --------
+        >>> widget = run.explore()                                           # doctest: +SKIP
+        >>> widget.selected["state"]                                         # doctest: +SKIP
+        """
+        from pipeline.explorer.notebook.showing import explorer
+
+        return explorer(self, curves=curves, height=height)
 
     def lyapunov(self) -> xr.Dataset:
         """Return the Lyapunov exponents of the cells, which the run has computed.

@@ -10,6 +10,7 @@ import signal
 import socket
 import threading
 import time
+from concurrent.futures import Future
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -22,7 +23,7 @@ from tornado.simple_httpclient import SimpleAsyncHTTPClient
 from tornado.websocket import websocket_connect
 
 from pipeline.explorer.data.arrays import unpack_arrays
-from pipeline.explorer.serving import browser, page_html, server
+from pipeline.explorer.serving import answering, browser, page_html, server
 from pipeline.explorer.serving.answers import ANSWERS
 from pipeline.explorer.serving.security import Guard, Rate, content_policy, new_token
 from pipeline.explorer.serving.server import Service, application, listening
@@ -108,8 +109,8 @@ class Client:
         asyncio.run_coroutine_threadsafe(end(), self.loop)
         self._thread.join(30)
         self.loop.close()
-        self.service.close()
-        self.service.pool.shutdown(wait=True)
+        self.service.answering.close()
+        self.service.answering.pool.shutdown(wait=True)
 
 
 SWEEP = """
@@ -377,7 +378,7 @@ def test_first_answers__what_fails_is_logged(client, monkeypatch, caplog):
         raise ValueError("no picture today")
 
     monkeypatch.setattr(answers, "_diagram", fail)
-    answers.first_answers(client.service.run, None)
+    answers.first_answers(client.service.answering.run, None)
     assert "no picture today" in caplog.text
 
 
@@ -389,7 +390,7 @@ def test_api__is_bounded_in_rate_and_in_length(client, monkeypatch):
     answer = client.ask(f"/api/view?x={'a' * server.MOST_ADDRESS}")
     assert answer.code == 414
     with monkeypatch.context() as patched:
-        patched.setattr(client.service, "waiting", server.THREADS + server.MOST_WAITING)
+        patched.setattr(client.service.answering, "waiting", answering.THREADS + answering.MOST_WAITING)
         assert client.ask("/api/view").code == 429
     assert client.ask("/api/view").code == 200
 
@@ -397,29 +398,21 @@ def test_api__is_bounded_in_rate_and_in_length(client, monkeypatch):
 def test_api__what_integrates_waits_for_what_it_needs(client, monkeypatch):
     """Others are answered meanwhile: they do not wait in the threads that read."""
 
-    async def hold():
-        monkeypatch.setattr(client.service, "compiled", asyncio.Event())
-
-    async def release():
-        client.service.compiled.set()
-
-    async def asked():
-        return client.service.waiting
-
-    client.wait(hold())
+    compiled = Future()
+    monkeypatch.setattr(client.service.answering, "compiled", compiled)
     found = []
     orbits = [
         threading.Thread(target=lambda: found.append(client.ask("/api/orbit?cell=99999&point=0").code))
-        for _ in range(server.THREADS + 1)
+        for _ in range(answering.THREADS + 1)
     ]
     for one in orbits:
         one.start()
     until = time.monotonic() + 120
-    while client.wait(asked()) < len(orbits) and time.monotonic() < until:
+    while client.service.answering.waiting < len(orbits) and time.monotonic() < until:
         time.sleep(0.01)
     assert client.ask("/api/view").code == 200
     assert found == []
-    client.wait(release())
+    compiled.set_result(None)
     for one in orbits:
         one.join(30)
     assert found == [400] * len(orbits)

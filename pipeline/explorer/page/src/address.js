@@ -20,7 +20,7 @@ export function defaults(view) {
   return {
     x: path?.name ?? null, y: view.verticals[0].name, at: atFor(view, path?.name, {}), colour: firstColour(view),
     window: null, selected: null, curvePoint: null, plane: null, panel: null, hidden: {},
-    overlays: { branches: view.has.branches, exponents: view.has.lyapunov, fractions: view.has.attractors }, dark: null,
+    overlays: { branches: view.has.branches, exponents: view.has.lyapunov, fractions: view.has.attractors },
   };
 }
 
@@ -58,12 +58,11 @@ export function toAddress(state, view) {
  * Read what stands behind #; what the run does not have is left as it begins.
  * @param {string} text without #
  * @param {Object} view
- * @returns {Object} a whole state but for `dark`
+ * @returns {Object} a whole state
  */
 export function fromAddress(text, view) {
   const query = new URLSearchParams(text.replaceAll("+", "%2B"));
   const state = defaults(view);
-  delete state.dark;
   const among = (key, names) => (names.includes(query.get(key)) ? query.get(key) : state[key]);
   state.x = among("x", view.axes.map((axis) => axis.name));
   state.y = among("y", view.verticals.map((vertical) => vertical.name));
@@ -95,32 +94,34 @@ function readWindow(text) {
 }
 
 /**
- * Keep the address and a state alike, both ways: every change that settles is an entry of the history, so
- * that the back button undoes it.
+ * Keep an address and a state alike, both ways: every change that settles is written, so that where the place
+ * has a history the back button undoes it.
  * @param {Object} state from `createState`
  * @param {Object} view
+ * @param {{read: function(): string, write: function(string, boolean): void, on: function(function): function}} place
+ *   of the address; `write` is told whether it is a new entry
  * @param {number} [settle] ms without a change of the window after which it counts
+ * @returns {function(): void} ends it
  */
-export function keepAddress(state, view, settle = 500) {
+export function keepAddress(state, view, place, settle = 500) {
   let timer = null, reading = false;
   const write = () => {
     const wanted = toAddress(state.get(), view);
-    if (wanted === location.hash.slice(1)) return;
-    const address = `${location.pathname}${location.search}#${wanted}`;
-    if (reading) history.replaceState(null, "", address);
-    else history.pushState(null, "", address);
+    if (wanted !== place.read()) place.write(wanted, !reading);
   };
-  state.on(KEPT, (_, changed) => {
+  const ends = [state.on(KEPT, (_, changed) => {
     clearTimeout(timer);
     if (!reading && changed.every((key) => key === "window")) timer = setTimeout(write, settle);
     else write();
-  });
-  const read = () => {
+  })];
+  ends.push(place.on(() => {
     clearTimeout(timer);
     reading = true;
-    state.set(fromAddress(location.hash.slice(1), view));
+    state.set(fromAddress(place.read(), view));
     reading = false;
+  }));
+  return () => {
+    clearTimeout(timer);
+    for (const end of ends) end();
   };
-  addEventListener("popstate", read);
-  addEventListener("hashchange", read);
 }

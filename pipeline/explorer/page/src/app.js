@@ -13,36 +13,69 @@ import { ParameterPlane } from "./parameter-plane.js";
 import { download } from "./picture.js";
 import { pictureOfView } from "./view-picture.js";
 import { createState } from "./state.js";
-import { onDark, themeSwitch } from "./switch.js";
+import { SourceError } from "./source-error.js";
+import { beginDark, themeSwitch } from "./switch.js";
 import { tabs } from "./tabs.js";
+import { applyTheme, dress } from "./theme.js";
 import { Toolbar } from "./toolbar.js";
 
 /** Format of the answers that this page understands; see pipeline/explorer/data/view.py. */
 const FORMAT = 1;
 
+/** Widths of the page [px] below which it is medium, slim and small; the style sheets name them. */
+const ROOMS = [["medium", 960], ["slim", 760], ["small", 600]];
+
 /**
  * Show a run.
  * @param {Object} source
- * @param {HTMLElement} root
+ * @param {Object} host what the page stands in, see host.js
+ * @returns {Promise<{end: function(): void}>} ends the page, with all that it asked for
  */
-export async function start(source, root) {
-  const messages = new Messages();
-  root.replaceChildren(messages.banner, el("p", { class: "loading", role: "status", text: "Reading the run …" }));
-  try {
-    const view = await source.view();
-    if (view.format !== FORMAT) throw new Error(`The run is described in format ${view.format}, and this page knows ${FORMAT}: reload it.`);
-    build(source, root, view, messages);
-  } catch (error) {
-    root.querySelector(".loading")?.remove();
-    messages.problem(error, () => start(source, root));
-    throw error;
-  }
+export async function start(source, host) {
+  const { root } = host, messages = new Messages(), page = { ends: [] };
+  // what was begun last ends first
+  page.end = () => page.ends.splice(0).reverse().forEach((end) => end());
+  root.classList.add("explorer");
+  page.ends.push(dress(host), measureRoom(root), () => source.live?.close());
+  if (host.watch) page.ends.push(host.watch(applyTheme));
+  beginDark();
+  const show = async () => {
+    root.replaceChildren(messages.banner, el("p", { class: "loading", role: "status", text: "Reading the run …" }));
+    try {
+      const view = await source.view();
+      if (view.format !== FORMAT) throw new Error(`The run is described in format ${view.format}, and this page knows ${FORMAT}: reload it.`);
+      build(source, host, view, messages, page);
+    } catch (error) {
+      root.querySelector(".loading")?.remove();
+      messages.problem(error, () => show());
+      if (!(error instanceof SourceError)) throw error;
+    }
+  };
+  await show();
+  return page;
 }
 
-function build(source, root, view, messages) {
-  const state = createState({ ...defaults(view), ...fromAddress(location.hash.slice(1), view) });
-  onDark(state);
-  document.title = `${view.title || view.name} – magpend`;
+/** Say by an attribute how much room there is; returns what ends that. */
+function measureRoom(root) {
+  let isFirst = true;
+  const measure = () => {
+    const width = root.clientWidth;
+    if (!width) return;
+    root.dataset.room = ROOMS.filter(([, most]) => width <= most).map(([name]) => name).join(" ");
+    // an output of a notebook has colours once it stands in the window
+    if (isFirst) applyTheme();
+    isFirst = false;
+  };
+  const observer = new ResizeObserver(measure);
+  observer.observe(root);
+  measure();
+  return () => observer.disconnect();
+}
+
+function build(source, host, view, messages, page) {
+  const { root } = host;
+  const state = createState({ ...defaults(view), ...fromAddress(host.place.read(), view) });
+  host.title(`${view.title || view.name} – magpend`);
   const legend = new Legend(state, view);
   const reader = {
     say: (text) => messages.say(text),
@@ -54,32 +87,32 @@ function build(source, root, view, messages) {
       messages.say(messages.facts.textContent);
     },
   };
-  const diagram = new Diagram(state, source, view, reader);
+  const diagram = new Diagram(state, source, view, reader, host.wheelAlways);
   const curves = new Curves(state, source, view, diagram, reader);
   const doing = doings({ state, source, view, diagram, curves, messages });
   const toolbar = new Toolbar(state, view, source.formats ?? ["csv"], doing);
   toolbar.curves = curves;
   curves.onLoaded = () => toolbar.showToggles();
   if (source.notice) messages.note(source.notice);
-  else if (view.cells.pending) messages.note(pendingOf(view), () => location.reload());
-  const left = el("div", { class: "main-column" }, toolbar.element, legend.element, diagram.element, curves.element,
-    new ParameterPlane(state, source, view).element, messages.facts);
+  else if (view.cells.pending) messages.note(pendingOf(view), () => host.reload());
+  const plane = new ParameterPlane(state, source, view), dark = themeSwitch();
+  const left = el("div", { class: "main-column" }, toolbar.element, legend.element, diagram.element, curves.element, plane.element, messages.facts);
   const right = el("div", { class: "side-column" });
   const layout = el("div", { class: "layout" }, left, right);
   root.replaceChildren(
-    header(view, state, toolbar.helpButton), messages.banner, messages.notes, messages.progress, tabs(state, root, left, right), layout, messages.line,
+    header(view, toolbar.helpButton, dark.element), messages.banner, messages.notes, messages.progress, tabs(state, root, left, right), layout, messages.line,
   );
-  mountPanels(state, source, right).catch((error) => messages.problem(error));
-  keepAddress(state, view);
+  const panels = mountPanels(state, source, right, view);
+  page.ends.push(keepAddress(state, view, host.place), dark.forget, ...[diagram, curves, toolbar, legend, plane, panels].map((part) => () => part.destroy()));
+  host.shown(Object.assign(page, { state, source, diagram }));
   diagram.load();
-  window.magpend = { state, source, diagram };
 }
 
-function header(view, state, help) {
+function header(view, help, dark) {
   const name = view.title && view.title !== view.name ? el("span", { class: "run-name", text: view.name }) : null;
   return el("header", { class: "page-header" },
     el("div", { class: "titles" }, el("h1", { text: view.title || view.name }), name, el("span", { class: "run-name", text: view.model.title })),
-    el("div", { class: "page-buttons" }, help, themeSwitch(state)));
+    el("div", { class: "page-buttons" }, help, dark));
 }
 
 /** One line on what is shown. */

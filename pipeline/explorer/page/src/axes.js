@@ -117,7 +117,7 @@ function trimmed(text) {
 
 /** Where a picture's axes are: the room around them is the same in all pictures above each other. */
 export function boxOf(width, height, { foot = 44, top = 12 } = {}) {
-  const left = width < 560 ? 52 : 68, right = width < 560 ? 10 : 16;
+  const left = width < 560 ? 60 : 68, right = width < 560 ? 10 : 16;
   return { left, top, width: Math.max(20, width - left - right), height: Math.max(20, height - top - foot) };
 }
 

@@ -17,8 +17,12 @@ export class Curves {
     state.on(["x", "at"], () => this.load());
     state.on(["overlays"], () => this.show());
     state.on(["window", "selected"], () => this.repaint());
-    onTheme(() => this.repaint());
+    this.forget = onTheme(() => this.repaint());
     this.load();
+  }
+
+  destroy() {
+    this.forget();
   }
 
   async load() {
@@ -63,6 +67,7 @@ class Strip {
     this.plot = el("div", { class: "strip-plot" }, this.canvas);
     this.element = el("section", { class: "strip", "aria-label": GROUPS[group], hidden: true }, this.names, this.plot);
     this.gestures = new Gestures(this.plot, {
+      takesWheel: () => curves.diagram.takesWheel,
       box: () => this.box, level: true, window: () => curves.diagram.window,
       set: (bounds) => curves.diagram.moveTo(bounds), reset: () => curves.diagram.reset(),
     });

@@ -3,7 +3,7 @@
 
 import { FONT, boxOf, paintAxes, paintFrame, placeX, placeY, told } from "./axes.js";
 import { bifurcationAt, paintBifurcations, paintBranches } from "./branches.js";
-import { el } from "./dom.js";
+import { el, focusedIn } from "./dom.js";
 import { Gestures, bounded } from "./gestures.js";
 import { onKey } from "./keyboard.js";
 import { bytesOf } from "./palette.js";
@@ -22,9 +22,10 @@ export class Diagram {
    * @param {Object} source
    * @param {Object} view
    * @param {{say: function(string): void, problem: function(Error|null): void, told: function(Object): void}} reader
+   * @param {boolean} wheelAlways whether the wheel zooms also while the diagram has no focus
    */
-  constructor(state, source, view, reader) {
-    Object.assign(this, { state, source, view, reader });
+  constructor(state, source, view, reader, wheelAlways) {
+    Object.assign(this, { state, source, view, reader, wheelAlways });
     this.points = new Points();
     this.lower = el("canvas", { "aria-hidden": "true" });
     this.upper = el("canvas", { "aria-hidden": "true" });
@@ -43,17 +44,30 @@ export class Diagram {
   listen() {
     const { state, element } = this;
     this.gestures = new Gestures(element, {
+      takesWheel: () => this.takesWheel,
       box: () => this.box, window: () => this.window, set: (bounds) => this.moveTo(bounds), reset: () => this.reset(),
       tap: (x, y) => this.select(x, y), hover: (x, y) => this.hover(x, y), marked: (box) => this.setBox(box),
     });
     element.addEventListener("keydown", (event) => onKey(event, this));
     new ResizeObserver(() => this.measure()).observe(element);
-    onTheme(() => this.recolour());
+    this.forget = onTheme(() => this.recolour());
     state.on(["x", "y", "at"], (_, changed) => this.load(changed));
     state.on(["colour", "hidden"], () => this.recolour());
     state.on(["window"], () => this.moved());
     state.on(["selected"], () => this.findSelection());
     state.on(["overlays"], () => this.loadBranches());
+  }
+
+  get takesWheel() {
+    return this.wheelAlways || focusedIn(this.element.parentNode) !== null;
+  }
+
+  destroy() {
+    this.forget();
+    clearTimeout(this.resting);
+    this.asked += 1; // what is still read is for nobody
+    this.data = null;
+    this.points.end();
   }
 
   /** What is shown of the plane. */

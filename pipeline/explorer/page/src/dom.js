@@ -32,6 +32,12 @@ export function show(element, visible) {
   element.hidden = !visible;
 }
 
+/** The element inside of another one that has the focus, or null; also in a shadow root. */
+export function focusedIn(element) {
+  const found = element.getRootNode().activeElement ?? null;
+  return found && element.contains(found) ? found : null;
+}
+
 let serial = 0;
 
 /** An id that no other element of the page has, for labels. */

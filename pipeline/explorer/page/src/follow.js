@@ -1,6 +1,6 @@
 // An orbit that is dragged along a parameter: it follows by continuation, or is lost.
 
-import { el, freshId, labelledSelect } from "./dom.js";
+import { el, focusedIn, freshId, labelledSelect } from "./dom.js";
 import { number } from "./facts.js";
 import { Orbit, withUnit } from "./orbit.js";
 
@@ -130,7 +130,7 @@ export class Follow {
     if (attrs.lost) this.tell(`Lost: ${attrs.sentence ?? `there is no orbit beyond ${place}`}`, true);
     else if (attrs.sentence) this.tell(attrs.sentence);
     else this.tell(`Followed to ${this.parameter.text} = ${place}: ${stability}.`);
-    if (this.wanted === null && document.activeElement !== this.slider) this.mark(this.valueOf(orbit));
+    if (this.wanted === null && !focusedIn(this.slider)) this.mark(this.valueOf(orbit));
     this.panels.show(orbit);
   }
 

@@ -25,7 +25,7 @@ export class Gestures {
    * @param {HTMLElement} element
    * @param {{box: function(): Object, window: function(): number[], set: function(number[]): void,
    *   tap?: function(number, number): void, hover?: function(number|null, number|null): void, reset: function(): void,
-   *   marked?: function(number[]|null): void, level?: boolean}} picture places are in CSS pixels of the element;
+   *   marked?: function(number[]|null): void, level?: boolean, takesWheel?: function(): boolean}} picture places are in CSS pixels of the element;
    *   `level` keeps the vertical axis as it is
    */
   constructor(element, picture) {
@@ -53,6 +53,7 @@ export class Gestures {
   }
 
   wheel(event) {
+    if (!event.ctrlKey && !(this.picture.takesWheel?.() ?? true)) return;
     event.preventDefault();
     const lines = event.deltaMode === 1 ? 16 : event.deltaMode === 2 ? 400 : 1;
     const factor = Math.exp(Math.max(-1, Math.min(1, event.deltaY * lines * (event.ctrlKey ? 0.01 : 0.0016))));

@@ -1,6 +1,6 @@
 // What the colours of the diagram mean; each entry switches its points off and on.
 
-import { el } from "./dom.js";
+import { el, focusedIn } from "./dom.js";
 import { onTheme, theme } from "./theme.js";
 import { visible } from "./palette.js";
 
@@ -12,8 +12,12 @@ export class Legend {
     this.element = el("div", { class: "legend-row", role: "group", "aria-label": "Colours" });
     this.present = null;
     state.on(["colour", "hidden"], () => this.show());
-    onTheme(() => this.show());
+    this.forget = onTheme(() => this.show());
     this.show();
+  }
+
+  destroy() {
+    this.forget();
   }
 
   /** Say which categories the diagram has; others are not listed. */
@@ -35,7 +39,7 @@ export class Legend {
     const known = new Set(colouring.categories.map(({ id }) => id));
     const entries = colouring.categories.filter(({ id }) => !found || found.has(id));
     if (found && [...found].some((id) => !known.has(id))) entries.push(NONE);
-    const off = hidden[colour] ?? [], focused = this.element.contains(document.activeElement) ? document.activeElement.dataset.id : null;
+    const off = hidden[colour] ?? [], focused = focusedIn(this.element)?.dataset.id ?? null;
     this.element.replaceChildren(...entries.map((entry) => this.button(entry, off.includes(entry.id))));
     if (focused) this.element.querySelector(`[data-id="${Number(focused)}"]`)?.focus();
   }

@@ -1,4 +1,4 @@
-// What the server computes while one watches: one connection, jobs by number, pieces as they come.
+// What magpend computes while one watches: one connection, jobs by number, pieces as they come.
 
 import { unpackArrays } from "./arrays.js";
 
@@ -9,10 +9,10 @@ export class LiveError extends Error {}
 
 export class LiveClient {
   /**
-   * @param {string} address of the websocket, with its token
+   * @param {function(Object): Object} open opens a channel, as `connect` of a transport
    */
-  constructor(address) {
-    this.address = address;
+  constructor(open) {
+    this.open = open;
     this.jobs = new Map();
     this.listeners = new Set();
     this.serial = 0;
@@ -37,15 +37,15 @@ export class LiveClient {
 
   connect() {
     if (this.closed) return;
-    this.socket = new WebSocket(this.address);
-    this.socket.binaryType = "arraybuffer";
-    this.socket.onopen = () => {
-      this.wait = FIRST_WAIT_MS;
-      this.tell({ connected: true });
-      for (const text of this.waiting.splice(0)) this.socket.send(text);
-    };
-    this.socket.onmessage = ({ data }) => this.take(data);
-    this.socket.onclose = () => this.lose();
+    this.channel = this.open({
+      opened: () => {
+        this.wait = FIRST_WAIT_MS;
+        this.tell({ connected: true });
+        for (const text of this.waiting.splice(0)) this.channel.send(text);
+      },
+      taken: (data) => this.take(data),
+      closed: () => this.lose(),
+    });
   }
 
   lose() {
@@ -62,7 +62,7 @@ export class LiveClient {
   close() {
     this.closed = true;
     clearTimeout(this.timer);
-    this.socket.close();
+    this.channel.close();
   }
 
   take(data) {
@@ -108,16 +108,7 @@ export class LiveClient {
 
   send(message) {
     const text = JSON.stringify(message);
-    if (this.socket.readyState === WebSocket.OPEN) this.socket.send(text);
+    if (this.channel.isOpen) this.channel.send(text);
     else this.waiting.push(text);
   }
-}
-
-/** Address of the connection beside a page, with the page's token. */
-export function liveAddress(token, page = location) {
-  const address = new URL("ws", page.href);
-  address.protocol = page.protocol === "https:" ? "wss:" : "ws:";
-  address.hash = "";
-  address.search = `?token=${encodeURIComponent(token)}`;
-  return address.href;
 }

@@ -11,7 +11,6 @@ import { Portraits } from "./portrait.js";
 import { saveMenu } from "./save.js";
 import { Series } from "./series.js";
 import { showFacts } from "./facts.js";
-import { themeChanged } from "./theme.js";
 
 /** How long a connection may be away before that is said [ms]. */
 const PATIENCE_MS = 2000;
@@ -29,7 +28,7 @@ class Panels {
     this.liveNote = el("p", { class: "hint", role: "status", hidden: true });
     element.replaceChildren(this.hint, this.liveNote, this.grid);
     this.build();
-    this.forget = [state.on(["selected"], () => this.select()), state.on(["curvePoint"], () => this.selectOnCurve()), state.on(["dark"], themeChanged)];
+    this.forget = [state.on(["selected"], () => this.select()), state.on(["curvePoint"], () => this.selectOnCurve())];
     if (this.live) this.forget.push(this.live.on((status) => this.showLive(status)));
     this.select();
   }
@@ -214,8 +213,9 @@ class Panels {
  * @param {Object} state of `createState`
  * @param {Object} source
  * @param {Element} element
- * @returns {Promise<Panels>} `destroy()` takes them away
+ * @param {Object} view
+ * @returns {Panels} `destroy()` takes them away
  */
-export async function mountPanels(state, source, element) {
-  return new Panels(state, source, element, await source.view());
+export function mountPanels(state, source, element, view) {
+  return new Panels(state, source, element, view);
 }

@@ -33,6 +33,10 @@ export class ParameterPlane {
     if (known) this.load();
   }
 
+  destroy() {
+    this.frame.destroy();
+  }
+
   async load() {
     try {
       this.take(await this.source.parameterPlane());

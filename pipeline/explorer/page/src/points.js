@@ -26,6 +26,12 @@ export class Points {
     this.waiting.clear();
   }
 
+  /** Stop the worker; what was asked is not answered. */
+  end() {
+    this.worker?.terminate();
+    this.waiting.clear();
+  }
+
   take({ id, result, error }) {
     const { resolve, reject } = this.waiting.get(id) ?? {};
     this.waiting.delete(id);

@@ -3,7 +3,7 @@
 import { Cells } from "./cells.js";
 import { parseData, placeKey, unpackData } from "./export-data.js";
 import { tableOf } from "./formats.js";
-import { SourceError } from "./source.js";
+import { SourceError } from "./source-error.js";
 
 const NONE = 0xffffffff;
 /** What an orbit is to a cell, as pipeline/explorer/copies/orbits.py says it. */

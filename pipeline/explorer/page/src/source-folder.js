@@ -4,7 +4,7 @@
 import { get, open, root, slice, withConsolidatedMetadata } from "zarrita";
 import { gunzip } from "./export-data.js";
 import { ExportSource } from "./source-export.js";
-import { SourceError } from "./source.js";
+import { SourceError } from "./source-error.js";
 
 const CUBE = "cube.zarr/";
 const LIST = "objects.json";

@@ -2,7 +2,7 @@
 
 import { gunzip } from "./export-data.js";
 import { ExportSource } from "./source-export.js";
-import { SourceError } from "./source.js";
+import { SourceError } from "./source-error.js";
 
 function decoded(text) {
   if (Uint8Array.fromBase64) return Uint8Array.fromBase64(text);

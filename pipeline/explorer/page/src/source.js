@@ -1,62 +1,42 @@
-// Where the page's numbers come from: a server on this machine.
+// Where the page's numbers come from: a run that is open in magpend, which a transport asks.
 
 import { unpackArrays } from "./arrays.js";
+import { LiveClient } from "./live.js";
 
-/** What went wrong, as one sentence for a reader; `lost` if no server answered. */
-export class SourceError extends Error {
-  constructor(message, lost = false) {
-    super(message);
-    this.lost = lost;
-  }
-}
-
-/** Query of an address: `at` and `x` by their names, nothing that is null. */
-function queryOf(values) {
-  const query = new URLSearchParams();
+/** Arguments of a request: `at` and what else there is by their names, nothing that is null. */
+function wordsOf(values) {
+  const words = {};
   for (const [key, value] of Object.entries(values)) {
     if (value === null || value === undefined) continue;
-    if (key === "at") for (const [axis, index] of Object.entries(value)) query.set(`at.${axis}`, index);
-    else query.set(key, value);
+    if (key === "at") for (const [axis, index] of Object.entries(value)) words[`at.${axis}`] = String(index);
+    else words[key] = String(value);
   }
-  const text = query.toString();
-  return text ? `?${text}` : "";
+  return words;
 }
 
-export class ServerSource {
-  /**
-   * @param {string} token what lets this page in
-   * @param {Object|null} live what computes while one watches
-   */
-  constructor(token, live = null) {
-    this.token = token;
-    this.live = live;
+export class RunSource {
+  /** @param {{ask: function, connect: function}} transport see transport.js */
+  constructor(transport) {
+    this.transport = transport;
+    this.live = null;
     this.notice = null;
     this.formats = ["csv", "nc"];
     this.described = null;
   }
 
-  async ask(path, options = {}) {
-    let answer;
-    try {
-      answer = await fetch(`api/${path}`, {
-        cache: "no-store", credentials: "same-origin", redirect: "error", ...options,
-        headers: { Authorization: `token ${this.token}`, ...options.headers },
-      });
-    } catch (cause) {
-      if (cause.name === "AbortError") throw cause;
-      throw new SourceError("The server does not answer. Was magpend explore stopped? Start it again, then press Try again.", true);
-    }
-    if (answer.ok) return answer;
-    const told = await answer.json().then((body) => body.error, () => null);
-    throw new SourceError(told ?? `The server answered with an error (${answer.status}).`);
+  /** Connect to what computes while one watches, if the run has it. */
+  async begin() {
+    const view = await this.view().catch(() => null);
+    if (view?.live) this.live = new LiveClient((hears) => this.transport.connect(hears));
+    return this;
   }
 
-  async packed(path) {
-    return unpackArrays(await (await this.ask(path)).arrayBuffer());
+  async packed(name, values) {
+    return unpackArrays((await this.transport.ask(name, wordsOf(values))).content);
   }
 
-  async json(path) {
-    return (await this.ask(path)).json();
+  async json(name, values = {}) {
+    return JSON.parse(textOf(await this.transport.ask(name, wordsOf(values))));
   }
 
   /** What the run is; asked once. */
@@ -69,23 +49,23 @@ export class ServerSource {
   }
 
   diagram({ x, y, at }) {
-    return this.packed(`diagram${queryOf({ x, y, at })}`);
+    return this.packed("diagram", { x, y, at });
   }
 
   curves({ x, at }) {
-    return this.json(`curves${queryOf({ x, at })}`);
+    return this.json("curves", { x, at });
   }
 
   branches({ x, y, at }) {
-    return this.json(`branches${queryOf({ x, y, at })}`);
+    return this.json("branches", { x, y, at });
   }
 
   orbit({ cell, point }) {
-    return this.packed(`orbit${queryOf({ cell, point })}`);
+    return this.packed("orbit", { cell, point });
   }
 
   plane({ at }) {
-    return this.packed(`plane${queryOf({ at })}`);
+    return this.packed("plane", { at });
   }
 
   /** Bifurcation curves in the plane of two parameters, over the run's map if it has one. */
@@ -95,28 +75,30 @@ export class ServerSource {
 
   /** The orbit at a point of a bifurcation curve. */
   curveOrbit({ curve, point }) {
-    return this.packed(`curve-orbit${queryOf({ curve, point })}`);
+    return this.packed("curve-orbit", { curve, point });
   }
 
   attractors({ at }) {
-    return this.json(`attractors${queryOf({ at })}`);
+    return this.json("attractors", { at });
   }
 
   /** Critical shocks and edge states at a place of the axes. */
   disturbances({ at }) {
-    return this.json(`disturbances${queryOf({ at })}`);
+    return this.json("disturbances", { at });
   }
 
   /** Data of a view to keep: a Blob of CSV or NetCDF. */
   async table(kind, query, format) {
-    return (await this.ask(`table${queryOf({ view: kind, format, ...query })}`)).blob();
+    const { content, kind: type } = await this.transport.ask("table", wordsOf({ view: kind, format, ...query }));
+    return new Blob([content], { type });
   }
 
   /** Specification of a run of a region: TOML. */
   async zoom(region) {
-    const answer = await this.ask("zoom", {
-      method: "POST", body: JSON.stringify(region), headers: { "Content-Type": "application/json" },
-    });
-    return answer.text();
+    return textOf(await this.transport.ask("zoom", {}, JSON.stringify(region)));
   }
+}
+
+function textOf({ content }) {
+  return new TextDecoder().decode(content);
 }

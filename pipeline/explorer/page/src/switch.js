@@ -2,6 +2,7 @@
 // no part of the address: a link shows a colleague the same view in the colleague's own colours.
 
 import { el } from "./dom.js";
+import { chooseDark, chosenDark, onTheme } from "./theme.js";
 
 const KEY = "magpend-dark";
 const NEXT = new Map([[null, true], [true, false], [false, null]]);
@@ -24,32 +25,22 @@ function remember(dark) {
   }
 }
 
-function apply(dark) {
-  if (dark === null) delete document.documentElement.dataset.theme;
-  else document.documentElement.dataset.theme = dark ? "dark" : "light";
-}
-
 /** Begin with what was chosen last. */
-export function onDark(state) {
-  const dark = remembered();
-  apply(dark);
-  state.set({ dark });
+export function beginDark() {
+  chooseDark(remembered());
 }
 
 /** The button that goes from automatic to dark to light. */
-export function themeSwitch(state) {
-  const button = el("button", { type: "button", class: "theme-switch", on: { click: () => {
-    const dark = NEXT.get(state.get().dark);
+export function themeSwitch() {
+  const button = el("button", { type: "button", class: "theme-switch", title: "Light, dark, or as the surroundings are", on: { click: () => {
+    const dark = NEXT.get(chosenDark());
     remember(dark);
-    apply(dark);
-    state.set({ dark });
-    show();
+    chooseDark(dark);
   } } });
   const show = () => {
-    button.textContent = NAMES.get(state.get().dark);
+    button.textContent = NAMES.get(chosenDark());
     button.setAttribute("aria-label", `Colours: ${button.textContent}`);
-    button.title = "Light, dark, or as the system says";
   };
   show();
-  return button;
+  return { element: button, forget: onTheme(show) };
 }

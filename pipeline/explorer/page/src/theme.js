@@ -5,19 +5,46 @@ const FALLBACK = {
   accent: "#0072B2", warn: "#D55E00", good: "#009E73",
 };
 
-const listeners = new Set();
-let cached = null;
+const listeners = new Set(), hosts = new Set();
+let cached = null, chosen = null;
 
-/** Colours by name: ink, muted, line, grid, paper, card, accent, warn, good. */
+/** Colours by name: ink, muted, line, grid, paper, card, accent, warn, good. All pages of a window have the same. */
 export function theme() {
-  if (!cached) {
-    const style = getComputedStyle(document.documentElement);
-    cached = {};
-    for (const [name, value] of Object.entries(FALLBACK)) {
-      cached[name] = style.getPropertyValue(`--${name}`).trim() || value;
-    }
+  if (cached) return cached;
+  const element = [...hosts].map(({ themed }) => themed).find((one) => one.isConnected) ?? document.documentElement;
+  const style = getComputedStyle(element), found = {};
+  for (const [name, value] of Object.entries(FALLBACK)) found[name] = style.getPropertyValue(`--${name}`).trim() || value;
+  // what does not stand in the window yet has no style
+  if (element.isConnected && hosts.size) cached = found;
+  return found;
+}
+
+/** Dress a host in the colours; returns what ends that. */
+export function dress(host) {
+  hosts.add(host);
+  applyTheme();
+  return () => hosts.delete(host);
+}
+
+/** What the reader chose: true for dark, false for light, null for what the surroundings have. */
+export function chosenDark() {
+  return chosen;
+}
+
+export function chooseDark(dark) {
+  chosen = dark;
+  applyTheme();
+}
+
+/** Make all hosts dark or light: as the reader chose, else as their surroundings are. */
+export function applyTheme() {
+  for (const host of hosts) {
+    const dark = chosen ?? host.dark(), wanted = dark === null ? undefined : dark ? "dark" : "light";
+    if (host.themed.dataset.theme === wanted) continue;
+    if (wanted) host.themed.dataset.theme = wanted;
+    else delete host.themed.dataset.theme;
   }
-  return cached;
+  themeChanged();
 }
 
 /** Call `listener` whenever the colours change; returns what ends that. */
@@ -37,7 +64,4 @@ export function wantsLessMotion() {
   return matchMedia("(prefers-reduced-motion: reduce)").matches;
 }
 
-if (typeof matchMedia === "function") {
-  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", themeChanged);
-  new MutationObserver(themeChanged).observe(document.documentElement, { attributes: true, attributeFilter: ["data-theme"] });
-}
+if (typeof matchMedia === "function") matchMedia("(prefers-color-scheme: dark)").addEventListener("change", applyTheme);

@@ -2,7 +2,7 @@
 
 import { ONE, atFor } from "./address.js";
 import { told } from "./axes.js";
-import { el, freshId } from "./dom.js";
+import { el, focusedIn, freshId } from "./dom.js";
 import { KEYS } from "./keyboard.js";
 
 function withUnit({ label, unit }) {
@@ -12,7 +12,7 @@ function withUnit({ label, unit }) {
 export class Toolbar {
   /** @param {Object} doing what buttons do: zoom(factor), reset(), save(kind, format), region(what) */
   constructor(state, view, formats, doing) {
-    Object.assign(this, { state, view, doing });
+    Object.assign(this, { state, view, doing, ends: [] });
     this.element = el("div", { class: "toolbar", role: "toolbar", "aria-label": "What the diagram shows" });
     this.help = this.dialog();
     this.fields = el("div", { class: "fields" });
@@ -20,6 +20,10 @@ export class Toolbar {
     this.element.append(this.fields, this.toggles, this.buttons(formats));
     state.on(["x", "y", "at", "colour", "overlays"], () => this.show());
     this.show();
+  }
+
+  destroy() {
+    for (const end of this.ends) end();
   }
 
   show() {
@@ -36,7 +40,7 @@ export class Toolbar {
         state.set({ at: { ...state.get().at, [axis.name]: Number(index) } }));
     }
     select("colour", "Colours", [...view.colours.map((c) => [c.name, c.title]), [ONE, "one colour"]], colour, (name) => state.set({ colour: name }));
-    const focused = this.fields.contains(document.activeElement) ? document.activeElement.name : null;
+    const focused = focusedIn(this.fields)?.name;
     this.fields.replaceChildren(...fields);
     if (focused) this.fields.querySelector(`select[name="${CSS.escape(focused)}"]`)?.focus();
     this.showToggles();
@@ -58,7 +62,7 @@ export class Toolbar {
       box.checked = Boolean(overlays[key]);
       return el("span", { class: "toggle" }, box, el("label", { for: id, text }));
     });
-    const focused = this.toggles.contains(document.activeElement) ? document.activeElement.name : null;
+    const focused = focusedIn(this.toggles)?.name;
     this.toggles.replaceChildren(...entries);
     if (focused) this.toggles.querySelector(`input[name="${focused}"]`)?.focus();
   }
@@ -83,7 +87,7 @@ export class Toolbar {
     const commands = Object.values(this.view.commands ?? {});
     if (!commands.length) return [];
     const lines = commands.map((command) => el("li", {}, el("code", { text: command })));
-    const menu = this.menu("More", [], "Not computed yet; run these, then reload this page:");
+    const menu = this.menu("More", [], "Not computed yet; run these, then open the run again:");
     menu.querySelector(".menu-list").append(el("ul", { class: "commands" }, ...lines));
     return [menu];
   }
@@ -100,7 +104,9 @@ export class Toolbar {
       keydown: (event) => { if (event.key === "Escape") { menu.open = false; menu.querySelector("summary").focus(); } },
       focusout: (event) => { if (event.relatedTarget && !menu.contains(event.relatedTarget)) menu.open = false; },
     } }, el("summary", { text: title }), list);
-    document.addEventListener("pointerdown", (event) => { if (!menu.contains(event.target)) menu.open = false; });
+    const leave = (event) => { if (!event.composedPath().includes(menu)) menu.open = false; };
+    document.addEventListener("pointerdown", leave);
+    this.ends.push(() => document.removeEventListener("pointerdown", leave));
     return menu;
   }
 
