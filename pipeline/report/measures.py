@@ -20,6 +20,7 @@ from pipeline.analysis.selection import place
 from pipeline.analysis.sides import classify
 from pipeline.layout.vocabulary import parameter_name, split_dims
 from pipeline.report.estimates import Estimate, Results, absent
+from pipeline.report.result_measures import derived_number, ratio_of_intervals, tabulated
 from pipeline.specification.problems import SpecError
 
 if TYPE_CHECKING:
@@ -362,6 +363,9 @@ MEASURES: dict[str, Measure] = {
     "rarest_motion": rarest_motion,
     "largest_exponent": largest_exponent,
     "agreement": agreement,
+    "tabulated": tabulated,
+    "derived_number": derived_number,
+    "ratio_of_intervals": ratio_of_intervals,
     "share_above": share_above,
     "recorded_duty_cycle": recorded_duty_cycle,
     "curves_described": _of_torques("curves_described"),
