@@ -20,7 +20,7 @@ from pipeline.analysis.selection import place
 from pipeline.analysis.sides import classify
 from pipeline.layout.vocabulary import parameter_name, split_dims
 from pipeline.report.estimates import Estimate, Results, absent
-from pipeline.report.result_measures import derived_number, ratio_of_intervals, tabulated
+from pipeline.report.result_measures import counted_rows, derived_number, ratio_of_intervals, tabulated
 from pipeline.specification.problems import SpecError
 
 if TYPE_CHECKING:
@@ -364,6 +364,7 @@ MEASURES: dict[str, Measure] = {
     "largest_exponent": largest_exponent,
     "agreement": agreement,
     "tabulated": tabulated,
+    "counted_rows": counted_rows,
     "derived_number": derived_number,
     "ratio_of_intervals": ratio_of_intervals,
     "share_above": share_above,

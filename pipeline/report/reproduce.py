@@ -236,7 +236,7 @@ def _digits(width: float) -> str:
 
 def _range(claim: ClaimTable) -> str:
     if claim.expected is not None:
-        return f"{claim.expected:.10g} ± {claim.tolerance:g}"
+        return f"{claim.expected:.10g}" + (f" ± {claim.tolerance:g}" if claim.tolerance else "")
     low, high = math.isfinite(claim.least), math.isfinite(claim.most)
     if low and high:
         return f"{claim.least:g}" if claim.least == claim.most else f"{claim.least:g} to {claim.most:g}"

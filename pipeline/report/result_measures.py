@@ -98,6 +98,16 @@ def _about(row: Row, options: Options) -> str:
     return f"analyse {options['analysis']}: {options['column']}" + (f" ({words})" if words else "")
 
 
+def counted_rows(results: Results, of: Sequence[str], options: Options) -> Estimate:
+    """Return the number of rows in the table of an analysis, such as the number of attractors.
+
+    Options: ``analysis`` and ``with``, its options; ``where``, the values of columns that choose rows. The
+    interval has no width.
+    """
+    n = len(rows_of(results, of[0], options))
+    return Estimate(n, n, n, _about({}, {**options, "column": "rows"}))
+
+
 def derived_number(results: Results, of: Sequence[str], options: Options) -> Estimate:
     """Return a number that an analysis finds once per parameter point, such as the basin entropy.
 

@@ -61,7 +61,7 @@ class ClaimTable(Table):
     least: float = Field(-math.inf, allow_inf_nan=True, description="Least value that meets the claim.")
     most: float = Field(math.inf, allow_inf_nan=True, description="Largest value that meets the claim.")
     expected: float | None = Field(None, description="Published value, instead of least and most.")
-    tolerance: Annotated[float, Field(gt=0)] | None = Field(
+    tolerance: Annotated[float, Field(ge=0)] | None = Field(
         None, description="Largest distance from the expected value that meets the claim."
     )
     unit: str = Field("", description="Unit of these values.")
