@@ -1,4 +1,7 @@
-"""Build the site: ``python docs/build.py [FOLDER]``, by default into ``build/site``.
+"""Build the site: ``python docs/build.py [--copies] [FOLDER]``, by default into ``build/site``.
+
+With ``--copies`` each page of the gallery gets a copy of the explorer with the page's run, in one file. The runs are
+computed in ``build/gallery``, which takes some minutes; complete ones are used again.
 
 Warnings are errors, broken links within the docs among them. Then the built pages are read: nothing in them
 may be loaded from elsewhere.
@@ -6,9 +9,12 @@ may be loaded from elsewhere.
 
 from __future__ import annotations
 
+import os
 import re
+import shutil
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 DOCS = Path(__file__).resolve().parent
@@ -29,6 +35,21 @@ def build(folder: Path) -> int:
     return main([*words, str(DOCS), str(folder)])
 
 
+def copies(runs: Path, figures: Sequence[str] = (), *, smoke: bool = False) -> Path:
+    """Compute the runs of the gallery, and export each as a copy of the explorer; returns the copies' folder."""
+    from pipeline.explorer.copies.export import export_page
+    from pipeline.report.reproduce import reproduce
+    from pipeline.report.study import load_study
+    from pipeline.store.run import Run
+
+    done = reproduce(load_study("gallery"), runs, figures=figures, smoke=smoke, workers=0)
+    folder = done.folder / "copies"
+    folder.mkdir(exist_ok=True)
+    for place in sorted((done.folder / "runs").iterdir()):
+        export_page(Run.open(place), folder / f"{place.name}.html", force=True)
+    return folder
+
+
 def loaded_from_elsewhere(folder: Path) -> list[str]:
     """Return what pages and styles load from other hosts, each with its file."""
     found = []
@@ -41,10 +62,16 @@ def loaded_from_elsewhere(folder: Path) -> list[str]:
 
 def main() -> None:
     """Build, look, and say what was built."""
-    folder = Path(sys.argv[1] if len(sys.argv) > 1 else DOCS.parent / "build" / "site").resolve()
-    begun = time.perf_counter()
+    words = [word for word in sys.argv[1:] if word != "--copies"]
+    folder = Path(words[0] if words else DOCS.parent / "build" / "site").resolve()
+    begun, made = time.perf_counter(), None
+    if "--copies" in sys.argv:
+        made = copies(folder.parent / "gallery")
+        os.environ["MAGPEND_DOCS_COPIES"] = str(made)
     if code := build(folder):
         sys.exit(code)
+    for page in sorted(made.iterdir()) if made else ():
+        shutil.copyfile(page, folder / "gallery" / f"{page.stem}-explorer.html")
     if foreign := loaded_from_elsewhere(folder):
         sys.exit("loaded from elsewhere:\n  " + "\n  ".join(foreign))
     pages = sum(1 for _ in folder.rglob("*.html"))
@@ -52,4 +79,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    sys.path.insert(0, str(DOCS.parent))
     main()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import sys
 from importlib import metadata
@@ -37,6 +38,9 @@ html_css_files = ["magpend.css"]
 html_favicon = "site/favicon.svg"
 html_theme_options = {"navigation_with_keys": True}
 html_permalinks_icon = "#"
+
+COPIES = os.environ.get("MAGPEND_DOCS_COPIES", "")
+"""Folder of the explorer's copies that `docs/build.py --copies` makes: NAME.html for each page of the gallery."""
 
 TOP = {"changelog": "CHANGELOG.md", "contributing": "CONTRIBUTING.md", "programs": "AGENTS.md"}
 """Pages whose text is a file at the top of the repository."""
@@ -150,6 +154,9 @@ def _read(app: Any, page: str, source: list[str]) -> None:
         text += "\n" + _navigation(text)
     if page == "reference/api":
         text = text.replace("<!-- docstrings -->", _docstrings())
+    folder, _, name = page.partition("/")
+    if folder == "gallery" and COPIES and (Path(COPIES) / f"{name}.html").is_file():
+        text += f'\n<p><a href="{name}-explorer.html">Explore this run</a>: a copy of the explorer, one file.</p>\n'
     if page in TOP:
         # their links are seen from the top of the repository
         text = (HERE.parent / TOP[page]).read_text("utf-8").replace("](docs/", "](")

@@ -40,6 +40,9 @@ from typing import Any
 
 DOCS = Path(__file__).resolve().parent
 PAGES = {p.stem: p for p in (*sorted((DOCS / "tutorials").glob("*.md")), DOCS / "rig.md", DOCS / "python.md")}
+GALLERY = DOCS / "gallery"
+COLOURS = 128
+"""Colours in a picture of the gallery."""
 NOT_MADE = {
     "branches-map.png": "curves over a map of two parameters, a quarter of an hour",
     "examples/flutter-bands.png": "bands of the flutter rig's fit with priors, which no specification that ships has",
@@ -128,7 +131,7 @@ class Session:
 
         if words[0] != "magpend":
             raise TutorialError(f"{words[0]}: only commands of magpend are run")
-        if words[1] == "run" and not {"--scheduler", "--dry-run"} & set(words):
+        if words[1] in ("run", "reproduce") and not {"--scheduler", "--dry-run"} & set(words):
             words = [*words, "--workers", "0"]
         before, sys.argv = sys.argv, words
         code: Any = 0
@@ -267,6 +270,17 @@ def follow(page: Path, folder: Path, others: Collection[str] = ()) -> dict[str, 
     return pictures
 
 
+def keep(made: Path, kept: Path) -> None:
+    """Copy a picture into the docs. Those of the gallery are shown together, and get a palette to be small."""
+    from PIL import Image
+
+    if kept.parent != GALLERY:
+        kept.write_bytes(made.read_bytes())
+        return
+    with Image.open(made) as image:
+        image.convert("RGB").quantize(COLOURS).save(kept, optimize=True)
+
+
 def is_stale(kept: Path, made: Path) -> bool:
     """Whether a picture in the docs differs from one just made, in the first frame of films.
 
@@ -293,8 +307,8 @@ def main() -> None:
             pictures = follow(known[name], Path(folder))
             print(f"{name}: {time.process_time() - begun:.1f} s of this process")
             for shown, made in pictures.items() if "--pictures" in words else ():
-                (known[name].parent / shown).write_bytes(made.read_bytes())
-                print(f"  {shown}: {made.stat().st_size / 1000:.0f} kB")
+                keep(made, known[name].parent / shown)
+                print(f"  {shown}: {(known[name].parent / shown).stat().st_size / 1000:.0f} kB")
             for shown, made in pictures.items() if "--check" in words else ():
                 if is_stale(known[name].parent / shown, made):
                     n_stale += 1

@@ -153,7 +153,9 @@ def test_plot__without_kernel(directory, tmp_path, command, monkeypatch):
     assert plotted.read_bytes() == (directory / "figures" / "bifurcation_psi1.png").read_bytes()
 
 
-@pytest.mark.parametrize("name", shipped_workflows())
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.long] if "/" in name else []) for name in shipped_workflows()]
+)
 def test_workflow__smoke(name, tmp_path, command):
     command(tmp_path, "run", name, "--smoke", "--out", name, "--workers", "0")
     with pipeline.open_run(tmp_path / name) as opened:

@@ -20,6 +20,7 @@ from pipeline.analysis.selection import place
 from pipeline.analysis.sides import classify
 from pipeline.layout.vocabulary import parameter_name, split_dims
 from pipeline.report.estimates import Estimate, Results, absent
+from pipeline.report.result_measures import counted_rows, derived_number, ratio_of_intervals, tabulated
 from pipeline.specification.problems import SpecError
 
 if TYPE_CHECKING:
@@ -222,13 +223,13 @@ def located_bifurcation(results: Results, of: Sequence[str], options: Options) -
     orbits on which the run's cells end.
 
     Options: ``type``, as `magpend analyse branches` names it; ``low`` and ``high``; ``max_period``, the
-    longest period of continued orbits. The interval spans all bifurcations found. Each is located exactly,
-    independent of the step of the run's axis.
+    longest period of continued orbits; ``generations`` of branches that spring from bifurcations, by default 1.
+    The interval spans all bifurcations found. Each is located exactly, independent of the step of the run's axis.
     """
     from pipeline.analysis.branches.table import table_of
 
     given = {name: options[name] for name in ("low", "high", "max_period")}
-    found = results.run(of[0]).derive("branches", **given, generations=1)
+    found = results.run(of[0]).derive("branches", **given, generations=int(options.get("generations", 1)))
     rows = [row for row in table_of(found) if row["type"] == options["type"]]
     if not rows:
         return absent(f"no {options['type'].replace('_', ' ')} was found {_asked(options)}")
@@ -362,6 +363,10 @@ MEASURES: dict[str, Measure] = {
     "rarest_motion": rarest_motion,
     "largest_exponent": largest_exponent,
     "agreement": agreement,
+    "tabulated": tabulated,
+    "counted_rows": counted_rows,
+    "derived_number": derived_number,
+    "ratio_of_intervals": ratio_of_intervals,
     "share_above": share_above,
     "recorded_duty_cycle": recorded_duty_cycle,
     "curves_described": _of_torques("curves_described"),

@@ -153,7 +153,7 @@ def judge(results: Results, figure: str, claim: ClaimTable) -> Judgement:
         found = MEASURES[claim.measure](results, claim.of, claim.options)
     except KeyError as error:
         raise SpecError(f"figure {figure}: {claim.measure} lacks the option {error}.") from None
-    plain, reason = judged(found.low, found.high, claim.least, claim.most), ""
+    plain, reason = judged(found.low, found.high, *claim.range), ""
     if found.missing:
         plain, reason = Verdict.UNDECIDED, f"Not measured: {found.missing}.{_decides(claim)}"
     elif claim.step and found.step and found.step > claim.step * (1 + 1e-6):
@@ -177,8 +177,9 @@ def _decides(claim: ClaimTable) -> str:
 
 
 def _part(results: Results, figure: FigureTable, judgements: Sequence[Judgement]) -> Part:
-    many = len(figure.numbers) > 1
     blocks: list[Block] = []
+    if figure.source:
+        blocks.append(Note(figure.source))
     if figure.says:
         blocks.append(Text(f"The paper's text: {figure.says}"))
     if figure.note:
@@ -186,7 +187,13 @@ def _part(results: Results, figure: FigureTable, judgements: Sequence[Judgement]
     blocks += [picture(results, table) for table in figure.pictures]
     blocks += [_outcome(judgement) for judgement in judgements]
     blocks.append(Note("This section alone:", _command(results, figure)))
-    return Part(f"{'Figures' if many else 'Figure'} {figure.number}: {figure.title}", blocks)
+    return Part(f"{_named(figure)}: {figure.title}", blocks)
+
+
+def _named(figure: FigureTable) -> str:
+    if not figure.number[:1].isdigit():
+        return figure.number
+    return f"{'Figures' if len(figure.numbers) > 1 else 'Figure'} {figure.number}"
 
 
 def _command(results: Results, figure: FigureTable) -> str:
@@ -228,6 +235,8 @@ def _digits(width: float) -> str:
 
 
 def _range(claim: ClaimTable) -> str:
+    if claim.expected is not None:
+        return f"{claim.expected:.10g}" + (f" ± {claim.tolerance:g}" if claim.tolerance else "")
     low, high = math.isfinite(claim.least), math.isfinite(claim.most)
     if low and high:
         return f"{claim.least:g}" if claim.least == claim.most else f"{claim.least:g} to {claim.most:g}"
@@ -318,8 +327,9 @@ def _rows(judgements: Sequence[Judgement]) -> str:
             "source": j.claim.source,
             "measure": j.claim.measure,
             "of": list(j.claim.of),
-            "least": json_value(j.claim.least),
-            "most": json_value(j.claim.most),
+            "least": json_value(j.claim.range[0]),
+            "most": json_value(j.claim.range[1]),
+            "expected": json_value(j.claim.expected),
             "unit": j.claim.unit,
             "value": json_value(j.estimate.value),
             "low": json_value(j.estimate.low),

@@ -6,15 +6,12 @@ import math
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, ValidationError
+from pydantic import Field, ValidationError, model_validator
 
 from pipeline.products.registry import FIGURES
-from pipeline.specification.files import read_toml, shipped_files
+from pipeline.specification.files import STUDY, read_toml, shipped_files
 from pipeline.specification.problems import SpecError, problems_of, unknown_name, validated
 from pipeline.specification.tables import Table
-
-STUDY = "study.toml"
-"""File name of a study that ships; its folder has the study's name."""
 
 
 class RunTable(Table):
@@ -63,7 +60,11 @@ class ClaimTable(Table):
     options: dict[str, Any] = Field({}, description="Options of the measure.")
     least: float = Field(-math.inf, allow_inf_nan=True, description="Least value that meets the claim.")
     most: float = Field(math.inf, allow_inf_nan=True, description="Largest value that meets the claim.")
-    unit: str = Field("", description="Unit of least and most.")
+    expected: float | None = Field(None, description="Published value, instead of least and most.")
+    tolerance: Annotated[float, Field(ge=0)] | None = Field(
+        None, description="Largest distance from the expected value that meets the claim."
+    )
+    unit: str = Field("", description="Unit of these values.")
     step: Annotated[float, Field(gt=0)] | None = Field(
         None, description="Coarsest step of the axis that can decide the claim."
     )
@@ -75,14 +76,31 @@ class ClaimTable(Table):
     )
     required: bool = Field(False, description="Whether the command fails if the claim is contradicted.")
 
+    @model_validator(mode="after")
+    def _one_form(self) -> ClaimTable:
+        bounded = self.model_fields_set & {"least", "most"}
+        if (self.expected is None) != (self.tolerance is None):
+            raise ValueError("expected and tolerance belong together; give both, or least and most.")
+        if self.expected is not None and bounded:
+            raise ValueError(f"expected excludes {' and '.join(sorted(bounded))}; give one form.")
+        return self
+
+    @property
+    def range(self) -> tuple[float, float]:
+        """Least and largest value that meet the claim."""
+        if self.expected is None or self.tolerance is None:
+            return self.least, self.most
+        return self.expected - self.tolerance, self.expected + self.tolerance
+
 
 class FigureTable(Table):
     """Table ``[[figures]]`` of a study's file: figures of the paper, with the pictures and claims that reproduce
     them.
     """
 
-    number: str = Field(description="Number of the figure, or several numbers.")
+    number: str = Field(description="Number of the figure, or several numbers; a name without spaces may replace it.")
     title: str = Field(description="Title of the figure.")
+    source: str = Field("", description="Citation of the figure's own paper, if it is not the study's.")
     says: str = Field("", description="Statement of the paper's text, paraphrased, with its place.")
     note: str = Field("", description="Difference from the paper.")
     pictures: Annotated[tuple[PictureTable, ...], Field(strict=False)] = Field(

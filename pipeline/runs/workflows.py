@@ -8,9 +8,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from pipeline.specification.files import find_file, shipped_files, toml_tables
+from pipeline.specification.files import STUDY, find_file, shipped_files, toml_tables
 from pipeline.specification.inputs import is_toml_text, toml_of
 from pipeline.specification.parsing import IDENTIFICATION, Spec, load_spec, spec_of_tables
+
+GALLERY = "gallery"
+"""Folder of the shipped specifications that are named with their folder, ``gallery/NAME``: one per published figure."""
 
 
 def find_spec(name: str | Path) -> Path:
@@ -72,7 +75,8 @@ def _identifies(path: Path) -> bool:
 
 
 def _shipped() -> dict[str, Path]:
-    return {path.stem: path for path in shipped_files("*.toml")}
+    figures = {f"{GALLERY}/{path.stem}": path for path in shipped_files(f"{GALLERY}/*.toml") if path.name != STUDY}
+    return {path.stem: path for path in shipped_files("*.toml")} | figures
 
 
 def default_directory(spec_path: Path, smoke: bool) -> Path:

@@ -16,6 +16,8 @@ MOST_ELEMENTS = 100_000
 MOST_DEPTH = 32
 MOST_KEY = 200
 """Most characters of a key."""
+STUDY = "study.toml"
+"""File name of a study that ships; its folder has the study's name."""
 WHOLE_NUMBERS = range(-(2**63), 2**63)
 
 
@@ -61,10 +63,13 @@ def find_file(what: str, name: str | Path, shipped: Mapping[str, Path]) -> Path:
         If neither a file nor a shipped one has the name.
     """
     path = Path(name)
-    if path.exists() or path.suffix or len(path.parts) > 1:
+    if path.exists() or path.suffix:
         return path
     if str(name) in shipped:
         return shipped[str(name)]
+    folders = {known.partition("/")[0] for known in shipped if "/" in known}
+    if len(path.parts) > 1 and path.parts[0] not in folders:
+        return path
     raise SpecError(f"{name}: no such file; {unknown_name(what, str(name), shipped)}")
 
 

@@ -232,7 +232,7 @@ def test_reproduce__what_is_refused(study, main, tmp_path):
 
 def test_shipped_study__has_every_numerical_figure():
     table = load_study("wojna2018").table
-    assert set(shipped_studies()) == {"wojna2018"}
+    assert set(shipped_studies()) == {"gallery", "wojna2018"}
     numbers = [n for figure in table.figures for n in figure.numbers]
     assert numbers == ["3", "4", "6", "7", "8", "9", "11", "12", "13", "14", "15", "16", "17"]
     for figure in table.figures:
