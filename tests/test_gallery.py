@@ -1,0 +1,101 @@
+"""The gallery of published figures: each entry is complete, and some are computed and judged as their pages say.
+
+All are computed with MAGPEND_LONG=1.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+import re
+import sys
+from pathlib import Path
+
+import pytest
+
+from pipeline.products.registry import ANALYSES, FIGURES
+from pipeline.report.runs import command_of
+from pipeline.report.study import load_study
+from pipeline.runs.workflows import find_spec, shipped_workflows
+from pipeline.specification.parsing import load_spec
+from pipeline.specification.problems import validated
+
+ROOT = Path(__file__).parents[1]
+PAGES = ROOT / "docs" / "gallery"
+_SPEC = importlib.util.spec_from_file_location("run_tutorials_of_gallery", ROOT / "docs" / "run_tutorials.py")
+tutorials = importlib.util.module_from_spec(_SPEC)
+sys.modules[_SPEC.name] = tutorials
+_SPEC.loader.exec_module(tutorials)
+
+STUDY = load_study("gallery")
+FIGURE = {figure.number: figure for figure in STUDY.table.figures}
+QUICK = ("magnetic-pendulum", "ueda-attractor")
+"""Figures that every test run computes; each takes some ten seconds."""
+LARGEST_PICTURE = 60_000
+A_PAGE = 100
+"""Most lines of a specification."""
+
+
+def test_gallery__each_figure_has_a_specification_a_page_and_a_run():
+    specs = {name.partition("/")[2] for name in shipped_workflows() if "/" in name}
+    assert specs == set(FIGURE) == set(STUDY.table.runs) == {page.stem for page in PAGES.glob("*.md")}
+
+
+@pytest.mark.parametrize("name", FIGURE)
+def test_gallery__specification_names_paper_figure_and_number(name):
+    path = find_spec(f"gallery/{name}")
+    text = path.read_text("utf-8")
+    head = text.partition("kind =")[0]
+    assert len(text.splitlines()) <= A_PAGE
+    assert all(line.startswith("#") for line in head.splitlines())
+    for word in ("Paper:", "Figure:", "Number:"):
+        assert word in head, word
+    load_spec(path, smoke=True)
+    assert STUDY.table.runs[name].spec == path.name
+
+
+@pytest.mark.parametrize("name", FIGURE)
+def test_gallery__claims_are_bounded_and_their_options_exist(name):
+    figure = FIGURE[name]
+    assert figure.source
+    assert figure.pictures
+    assert figure.claims
+    for claim in figure.claims:
+        assert claim.source
+        assert any(map(math.isfinite, claim.range)), claim.statement
+        assert not claim.calibrated, claim.statement
+        if "analysis" in claim.options:
+            validated(ANALYSES[claim.options["analysis"]].options, claim.options.get("with", {}))
+
+
+@pytest.mark.parametrize("name", FIGURE)
+def test_gallery__page_draws_the_study_s_figure(name):
+    text = (PAGES / f"{name}.md").read_text("utf-8")
+    picture = FIGURE[name].pictures[0]
+    commands = [line.split("  #")[0].strip() for line in text.replace("\\\n", " ").splitlines()]
+    commands = [" ".join(line.split()) for line in commands]
+    drawn = command_of(f"plot {picture.figure}", picture.options, f"reproduce/gallery/runs/{name}")
+    assert f"magpend reproduce gallery --figure {name}" in commands
+    assert f"{drawn} --width 85 --out {name}.png" in commands
+    assert (PAGES / f"{name}.png").stat().st_size < LARGEST_PICTURE
+    assert f"gallery/{name}.toml" in text
+    assert picture.figure in FIGURES
+
+
+@pytest.mark.parametrize("name", FIGURE)
+def test_gallery__first_page_shows_it(name):
+    index = (ROOT / "docs" / "index.md").read_text("utf-8")
+    assert re.search(rf"\[!\[[^\]]+\]\(gallery/{name}\.png\)\]\(gallery/{name}\.md\)", index)
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[] if name in QUICK else [pytest.mark.long]) for name in FIGURE]
+)
+def test_gallery__page_prints_the_verdicts(name, tmp_path, monkeypatch):
+    """Computes the figure; its page has each claim with its number and verdict, and the picture."""
+    monkeypatch.chdir(tmp_path)
+    page = PAGES / f"{name}.md"
+    for shown, made in tutorials.follow(page, tmp_path).items():
+        assert not tutorials.is_stale(page.parent / shown, made)
+    printed = re.search(r"<!-- printed -->\n```text\n(.*?)```", page.read_text("utf-8"), re.DOTALL).group(1)
+    assert sum(line.startswith(f"{name} ") for line in printed.splitlines()) == len(FIGURE[name].claims)
