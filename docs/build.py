@@ -14,6 +14,7 @@ import re
 import shutil
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 DOCS = Path(__file__).resolve().parent
@@ -34,14 +35,14 @@ def build(folder: Path) -> int:
     return main([*words, str(DOCS), str(folder)])
 
 
-def copies(runs: Path) -> Path:
+def copies(runs: Path, figures: Sequence[str] = (), *, smoke: bool = False) -> Path:
     """Compute the runs of the gallery, and export each as a copy of the explorer; returns the copies' folder."""
     from pipeline.explorer.copies.export import export_page
     from pipeline.report.reproduce import reproduce
     from pipeline.report.study import load_study
     from pipeline.store.run import Run
 
-    done = reproduce(load_study("gallery"), runs, workers=0)
+    done = reproduce(load_study("gallery"), runs, figures=figures, smoke=smoke, workers=0)
     folder = done.folder / "copies"
     folder.mkdir(exist_ok=True)
     for place in sorted((done.folder / "runs").iterdir()):

@@ -22,11 +22,18 @@ from pipeline.specification.problems import validated
 
 ROOT = Path(__file__).parents[1]
 PAGES = ROOT / "docs" / "gallery"
-_SPEC = importlib.util.spec_from_file_location("run_tutorials_of_gallery", ROOT / "docs" / "run_tutorials.py")
-tutorials = importlib.util.module_from_spec(_SPEC)
-sys.modules[_SPEC.name] = tutorials
-_SPEC.loader.exec_module(tutorials)
 
+
+def program(name):
+    """Return a program of the docs as a module."""
+    spec = importlib.util.spec_from_file_location(f"{name}_of_gallery", ROOT / "docs" / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+tutorials = program("run_tutorials")
 STUDY = load_study("gallery")
 FIGURE = {figure.number: figure for figure in STUDY.table.figures}
 QUICK = ("magnetic-pendulum", "ueda-attractor")
@@ -102,3 +109,16 @@ def test_gallery__page_prints_the_verdicts(name, tmp_path, monkeypatch):
         assert not tutorials.is_stale(page.parent / shown, made)
     printed = re.search(r"<!-- printed -->\n```text\n(.*?)```", page.read_text("utf-8"), re.DOTALL).group(1)
     assert sum(line.startswith(f"{name} ") for line in printed.splitlines()) == len(FIGURE[name].claims)
+
+
+def test_copies__a_page_links_to_its_copy_of_the_explorer(tmp_path, monkeypatch):
+    folder = program("build").copies(tmp_path / "gallery", ["ueda-attractor"], smoke=True)
+    (copy,) = folder.iterdir()
+    assert copy.name == "ueda-attractor.html"
+    assert not program("build").loaded_from_elsewhere(folder)
+    monkeypatch.setenv("MAGPEND_DOCS_COPIES", str(folder))
+    conf = program("conf")
+    for page, there in (("gallery/ueda-attractor", True), ("gallery/belt-friction", False), ("index", False)):
+        source = ["text"]
+        conf._read(None, page, source)
+        assert ('href="ueda-attractor-explorer.html"' in source[0]) == there
