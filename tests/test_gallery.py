@@ -36,8 +36,8 @@ def program(name):
 tutorials = program("run_tutorials")
 STUDY = load_study("gallery")
 FIGURE = {figure.number: figure for figure in STUDY.table.figures}
-QUICK = ("magnetic-pendulum", "ueda-attractor")
-"""Figures that every test run computes; each takes some ten seconds."""
+QUICK = ("josephson-steps", "ueda-coexisting")
+"""Figures that every test run computes. Each takes some seconds, and other tests compile their systems."""
 LARGEST_PICTURE = 60_000
 A_PAGE = 100
 """Most lines of a specification."""
@@ -112,13 +112,13 @@ def test_gallery__page_prints_the_verdicts(name, tmp_path, monkeypatch):
 
 
 def test_copies__a_page_links_to_its_copy_of_the_explorer(tmp_path, monkeypatch):
-    folder = program("build").copies(tmp_path / "gallery", ["ueda-attractor"], smoke=True)
+    folder = program("build").copies(tmp_path / "gallery", ["ueda-coexisting"], smoke=True)
     (copy,) = folder.iterdir()
-    assert copy.name == "ueda-attractor.html"
+    assert copy.name == "ueda-coexisting.html"
     assert not program("build").loaded_from_elsewhere(folder)
     monkeypatch.setenv("MAGPEND_DOCS_COPIES", str(folder))
     conf = program("conf")
-    for page, there in (("gallery/ueda-attractor", True), ("gallery/belt-friction", False), ("index", False)):
+    for page, there in (("gallery/ueda-coexisting", True), ("gallery/belt-friction", False), ("index", False)):
         source = ["text"]
         conf._read(None, page, source)
-        assert ('href="ueda-attractor-explorer.html"' in source[0]) == there
+        assert ('href="ueda-coexisting-explorer.html"' in source[0]) == there

@@ -244,13 +244,13 @@ def located_bifurcation(results: Results, of: Sequence[str], options: Options) -
     orbits on which the run's cells end.
 
     Options: ``type``, as `magpend analyse branches` names it; ``low`` and ``high``; ``max_period``, the
-    longest period of continued orbits. The interval spans all bifurcations found. Each is located exactly,
-    independent of the step of the run's axis.
+    longest period of continued orbits; ``generations`` of branches that spring from bifurcations, by default 1.
+    The interval spans all bifurcations found. Each is located exactly, independent of the step of the run's axis.
     """
     from pipeline.analysis.branches.table import table_of
 
     given = {name: options[name] for name in ("low", "high", "max_period")}
-    found = results.run(of[0]).derive("branches", **given, generations=1)
+    found = results.run(of[0]).derive("branches", **given, generations=int(options.get("generations", 1)))
     rows = [row for row in table_of(found) if row["type"] == options["type"]]
     if not rows:
         return absent(f"no {options['type'].replace('_', ' ')} was found {_asked(options)}")

@@ -67,7 +67,8 @@ def find_file(what: str, name: str | Path, shipped: Mapping[str, Path]) -> Path:
         return path
     if str(name) in shipped:
         return shipped[str(name)]
-    if len(path.parts) > 1:
+    folders = {known.partition("/")[0] for known in shipped if "/" in known}
+    if len(path.parts) > 1 and path.parts[0] not in folders:
         return path
     raise SpecError(f"{name}: no such file; {unknown_name(what, str(name), shipped)}")
 

@@ -17,6 +17,7 @@ from pipeline.layout.plan import make_plan
 from pipeline.runs import preview, workflows
 from pipeline.runs.preview import figure_command, first_figure
 from pipeline.specification.parsing import parse_spec
+from pipeline.specification.problems import SpecError
 
 BAD = 'kind = "sweep"\n[axes]\nq = { start = 1, stop = 2, nun = 3 }\n[integration]\nrtol = -1'
 
@@ -271,6 +272,19 @@ def test_find_spec__shipped_workflows():
             # the lines before that of the time, which is measured
             lines = islice(preview.describe_plan(path, os.devnull + "-absent", smoke=smoke), 3)
             assert any("cells (" in line for line in lines)
+
+
+def test_find_spec__of_the_gallery_by_its_folder_and_name(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    name = "gallery/ueda-attractor"
+    assert workflows.find_spec(name) == workflows.shipped_workflows()[name]
+    assert workflows.default_directory(workflows.find_spec(name), smoke=False) == Path("runs/ueda-attractor")
+    with pytest.raises(SpecError, match="did you mean gallery/ueda-attractor"):
+        workflows.find_spec("gallery/ueda-atractor")
+    assert workflows.find_spec("mine/ueda-attractor") == Path("mine/ueda-attractor")
+    (tmp_path / "gallery").mkdir()
+    (tmp_path / name).write_text("", "utf-8")  # a file of one's own comes first
+    assert workflows.find_spec(name) == Path(name)
 
 
 def test_modules__each_library_has_one_room():
