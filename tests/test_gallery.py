@@ -45,7 +45,10 @@ A_PAGE = 100
 
 def test_gallery__each_figure_has_a_specification_a_page_and_a_run():
     specs = {name.partition("/")[2] for name in shipped_workflows() if "/" in name}
-    assert specs == set(FIGURE) == set(STUDY.table.runs) == {page.stem for page in PAGES.glob("*.md")}
+    assert set(FIGURE) == {page.stem for page in PAGES.glob("*.md")}
+    assert set(FIGURE) <= specs == set(STUDY.table.runs)
+    # a figure may need a second run, which begins with its name
+    assert all(any(name.startswith(figure) for figure in FIGURE) for name in specs)
 
 
 @pytest.mark.parametrize("name", FIGURE)

@@ -127,6 +127,27 @@ def largest_share(results: Results, of: Sequence[str], options: Options) -> Esti
     return Estimate(counts[k] / n, low, high, text, _step(ds[axis].values), n)
 
 
+def last_value_with(results: Results, of: Sequence[str], options: Options) -> Estimate:
+    """Return the largest axis value at which any cell has a given orbit period or class of motion.
+
+    Options: ``low`` and ``high``; ``period``, ``motion``. The interval reaches to the next value of the axis, at
+    which no cell has it. More starts can only raise the value: a rare motion may have been missed beyond it.
+    """
+    ds, axis = _cells(results, of[0])
+    here = _within(ds, axis, options)
+    values, n = here[axis].values, here.sizes["cell"]
+    step = _step(ds[axis].values)
+    found = np.flatnonzero(_matches(here, options).any(1))
+    if not found.size:
+        return absent(f"none of {n} cells has it {_asked(options)}", step)
+    last = int(found[-1])
+    if last == values.size - 1:
+        return absent(f"cells have it up to the last value, {values[last]:g}", step)
+    low, high = float(values[last]), float(values[last + 1])
+    text = f"some of {n} cells up to {low:g}, none from {high:g}"
+    return Estimate(0.5 * (low + high), low, high, text, step, n)
+
+
 def _asked(options: Options) -> str:
     if "at" in options:
         return f"{options['at']:g}"
@@ -356,6 +377,7 @@ def _of_torques(name: str) -> Measure:
 MEASURES: dict[str, Measure] = {
     "least_share": least_share,
     "largest_share": largest_share,
+    "last_value_with": last_value_with,
     "window_width": window_width,
     "beside_window": beside_window,
     "change_of_period": change_of_period,

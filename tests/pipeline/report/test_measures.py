@@ -89,6 +89,18 @@ def test_change_of_period__between_neighbouring_values(known):
     assert MEASURES["change_of_period"](known, ["run"], options | {"high": 2.3}).missing
 
 
+def test_last_value_with__one_cell_is_enough(known):
+    found = MEASURES["last_value_with"](known, ["run"], {"period": 2})
+    assert (found.low, found.high) == (pytest.approx(2.49), pytest.approx(2.5))
+    assert found.value == pytest.approx(2.495)
+    known.cubes["run"]["orbit_period"][60, 3] = 2
+    found = MEASURES["last_value_with"](known, ["run"], {"period": 2})
+    assert (found.low, found.high, found.n) == (pytest.approx(2.6), pytest.approx(2.61), N)
+    assert MEASURES["last_value_with"](known, ["run"], {"period": 2, "high": 2.55}).high == pytest.approx(2.5)
+    assert "none of 20 cells" in MEASURES["last_value_with"](known, ["run"], {"period": 5}).missing
+    assert "up to the last value, 3" in MEASURES["last_value_with"](known, ["run"], {"period": 1}).missing
+
+
 def test_beside_window__counts_both_sides(known):
     options = {"period": 1, "contains": 2.8, "other": [2, 4], "within": 0.02}
     found = MEASURES["beside_window"](known, ["run"], options)
