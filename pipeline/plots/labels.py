@@ -27,6 +27,9 @@ _DEGREE_STEPS = (0.1, 0.2, 0.5, 1, 2, 5, 10, 15, 30, 45, 90, 180, 360)
 _PI_STEPS = tuple(0.125 * 2**k for k in range(24))
 
 
+MATH_SPACE = r"\ "
+
+
 @dataclass(frozen=True)
 class Measure:
     """Presentation of a state or quantity on an axis: its symbol, its unit, and the factor to this unit.
@@ -125,7 +128,7 @@ def start_measure(ds: xr.Dataset, dim: str, degrees: bool = False) -> Measure:
     one = model.state(dim.removesuffix("_0"))
     return _measure(
         dim,
-        f"{one.symbol}(0)" if one.symbol else f"{one.name}(0)",
+        f"{one.symbol or one.name.replace('_', MATH_SPACE)}(0)",
         one.unit,
         degrees and one.unit.startswith("rad"),
         one.on_circle,

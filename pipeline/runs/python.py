@@ -10,7 +10,7 @@ from pipeline.products.product import function_of
 from pipeline.products.registry import ANALYSES
 from pipeline.runs import notebook
 from pipeline.runs.run import run as complete
-from pipeline.runs.stopping import Interrupted, InterruptedRunError
+from pipeline.runs.stopping import InterruptedRunError, interrupt
 from pipeline.runs.workflows import read_given
 from pipeline.store.run import Run
 
@@ -68,7 +68,7 @@ def run(
         with notebook.progress():
             complete(spec, out, smoke=smoke, echo=echo, **options)
     except InterruptedRunError:
-        raise Interrupted(f"Stopped. The finished cells stay in {out}; the same call goes on from there.") from None
+        raise interrupt(f"Stopped. The finished cells stay in {out}; the same call goes on from there.") from None
     return Run.open(out)
 
 

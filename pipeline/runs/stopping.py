@@ -44,13 +44,6 @@ class InterruptedRunError(Exception):
         super().__init__(message)
 
 
-class Interrupted(KeyboardInterrupt):
-    """Raised in Python code by Ctrl-C during a run; in a notebook it is shown as one line."""
-
-    def _render_traceback_(self) -> list[str]:
-        return [str(self)]
-
-
 class _Listener:
     """Signal handler of the command line: it raises `Stopped` at a first signal, or ends the process."""
 
@@ -114,6 +107,16 @@ def leave(number: int) -> NoReturn:
     with contextlib.suppress(OSError):
         os.write(2, f"{shown}\nmagpend: {how}.\n".encode())
     os._exit(128 + number)
+
+
+def interrupt(message: str) -> KeyboardInterrupt:
+    """Return the exception for Ctrl-C in Python code; a notebook shows it as one line, its message.
+
+    It is no subclass: a script that ends by a plain `KeyboardInterrupt` ends by the signal, as shells expect.
+    """
+    error = KeyboardInterrupt(message)
+    vars(error)["_render_traceback_"] = lambda: [message]  # IPython looks for it
+    return error
 
 
 @contextlib.contextmanager

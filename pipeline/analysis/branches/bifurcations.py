@@ -186,7 +186,7 @@ def locate(problem: OneParameter, a: Point, b: Point, kind: str, settings: Setti
 
     def tested(point: Point) -> Steps[float]:
         return test(point)
-        yield  # a computation that asks for nothing
+        yield  # type: ignore[unreachable]  # a computation that asks for nothing
 
     found = yield from find_root(problem, (a, test(a)), (b, test(b)), tested, settings)
     if found is None:

@@ -107,7 +107,7 @@ def kernel(tmp_path, around):
 def test_run__interrupted_in_a_cell_goes_on_with_the_same_cell(kernel, whole, tmp_path, bytes_of):
     stopped = kernel(CELL + COMPUTE + "print('not reached')\n", lambda: n_committed(tmp_path) >= 2)
     kind, content = stopped[-1]
-    assert (kind, content["ename"]) == ("error", "Interrupted")
+    assert (kind, content["ename"]) == ("error", "KeyboardInterrupt")
     assert content["traceback"] == ["Stopped. The finished cells stay in run; the same call goes on from there."]
     assert not any("not reached" in content["text"] for kind, content in stopped if kind == "stream")
     assert workers_of(kernel.process) == []
