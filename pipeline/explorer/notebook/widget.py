@@ -113,7 +113,7 @@ class Explorer(anywidget.AnyWidget):
             A row per instant, over the orbit's period or some periods of a motion that does not close; None if
             nothing is selected.
         """
-        chosen = self.selected
+        chosen: Any = self.selected
         return None if chosen is None else orbit_dataset(self._answering.run, chosen["cell"], chosen["point"])
 
     # ---- its end -----------------------------------------------------------------------------
