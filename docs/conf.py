@@ -116,7 +116,7 @@ def grouped() -> dict[str, list[str]]:
     return found
 
 
-_MEMBERS = {"Run": "   :members:\n"}
+_MEMBERS = dict.fromkeys(("Run", "Spec"), "   :members:\n")
 """Options of classes whose methods are shown; those of analyses are shown as functions."""
 
 

@@ -65,7 +65,7 @@ def checked(path: Path) -> list[str]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("page", ["docs/python.md", "README.md"])
+@pytest.mark.parametrize("page", ["docs/python.md", "docs/python-start.md", "README.md"])
 def test_examples__have_types(page, tmp_path):
     module = tmp_path / "example.py"
     blocks = _PYTHON.findall((ROOT / page).read_text("utf-8"))

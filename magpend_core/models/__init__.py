@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
+from weakref import WeakValueDictionary
 
 from magpend_core.crossing import Crossing
 from magpend_core.disturbance import Disturbance
@@ -97,11 +98,17 @@ def _of_table(table: Mapping[str, Any]) -> Model:
         text = json.dumps(table)
         if imported.KEY in table:
             return imported.known_model(table) or _described(text)
-        return _read(json.dumps(_read(text).reference))
+        model = _read(json.dumps(_read(text).reference))
+        assert isinstance(model.reference, Mapping)
+        return _by_meaning.setdefault(json.dumps(sorted(model.reference.items())), model)
     except ParameterError as error:
         raise ModelError(error.problems) from None
     except (TypeError, ValueError, RecursionError) as error:
         raise ModelError([f"the text of a model is no plain data ({error})."]) from None
+
+
+_by_meaning: WeakValueDictionary[str, Model] = WeakValueDictionary()
+"""Models of texts by their tables, in whatever order the tables stand."""
 
 
 @lru_cache(maxsize=64)

