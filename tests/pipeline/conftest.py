@@ -62,7 +62,7 @@ points_per_task = 4
 """
 
 
-@pytest.fixture(scope="session", autouse=True)
+@pytest.fixture(scope="module", autouse=True)  # of a whole session, it would reach tests beside this folder
 def _results_are_read_by_others():
     """Let cf-xarray and pint-xarray read every result of an analysis that any test derives."""
     if any(find_spec(name) is None for name in ("cf_xarray", "pint_xarray")):
