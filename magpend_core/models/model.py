@@ -260,7 +260,7 @@ class Model:
 
     @property
     def angles(self) -> tuple[str, ...]:
-        """Return the names of those states that are angles."""
+        """Return the names of the states that are angles."""
         return tuple(s.name for s in self.states if s.on_circle)
 
     @property

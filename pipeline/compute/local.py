@@ -34,6 +34,9 @@ START_S = 180.0
 CLOSE_S = 60.0
 """Longest wait for the scheduler to close in order [s]."""
 
+MOST_STARTS = 3
+"""Number of times that workers are started if none of them stays."""
+
 LOGGERS = [
     "tornado",
     "distributed",
@@ -69,7 +72,7 @@ def memory_per_worker(n_workers: int) -> float:
 
 @contextlib.contextmanager
 def local_cluster(n_workers: int, *, dashboard: bool = False) -> Iterator[Any]:
-    """Start a dask cluster of processes on this machine, protected by TLS keys of its own, and yield it.
+    """Yield a dask cluster of processes on this machine, whose connections need TLS keys made for it.
 
     The first worker has started; others may still be starting. The dashboard shows the computation to
     everyone on this machine.
@@ -120,17 +123,24 @@ def local_cluster(n_workers: int, *, dashboard: bool = False) -> Iterator[Any]:
 
 
 def _start_workers(cluster: Any, n_workers: int) -> None:
-    """Start workers and wait for the first one. If all have failed to start, which dask does not tell, try again."""
-    end = time.monotonic() + START_S
+    """Start workers and wait for the first one. If all of them failed to start, try again: dask does not."""
+    end, starts = time.monotonic() + START_S, 1
+    given_up: list[Any] = []
     cluster.scale(n_workers)
     while not cluster.scheduler.workers:
         if time.monotonic() > end:
             raise SchedulerError(f"no worker process has started within {START_S:.0f} s.")
-        nannies = list(cluster.workers.values())
+        nannies = [nanny for nanny in cluster.workers.values() if nanny not in given_up]
         if nannies and all(nanny.status.name in ("closed", "failed") for nanny in nannies):
+            if starts == MOST_STARTS:
+                raise SchedulerError(
+                    f"worker processes ended as soon as they started, {starts} times; what they printed says why. "
+                    "--workers 0 computes without them."
+                )
+            starts += 1
+            given_up += nannies
             cluster.scale(0)
             cluster.scale(n_workers)
-            time.sleep(1.0)
         time.sleep(0.02)
 
 
@@ -144,7 +154,7 @@ def _close(cluster: Any) -> None:
 
 @contextlib.contextmanager
 def _loop() -> Iterator[Any]:
-    """Run an event loop in a thread of its own, and yield it.
+    """Yield an event loop that runs in a separate thread.
 
     Ctrl-C goes to every process of the terminal, but only the coordinator should handle it. Workers inherit
     the blocked signals from this thread.

@@ -13,32 +13,11 @@ GIVEN = "units_as_given"
 """Attribute of a variable with a unit that UDUNITS and pint do not both know; it then has no ``units``."""
 
 _PREFIXES = ("", "n", "u", "m", "c", "d", "k", "M", "G")
-_PREFIXED = (
-    "m",
-    "g",
-    "s",
-    "A",
-    "K",
-    "mol",
-    "cd",
-    "rad",
-    "Hz",
-    "N",
-    "Pa",
-    "J",
-    "W",
-    "C",
-    "V",
-    "F",
-    "ohm",
-    "S",
-    "Wb",
-    "T",
-)
-_MORE = ("T", "H", "bar", "L", "l", "eV")
+_BASE = ("m", "g", "s", "A", "K", "mol", "cd", "rad")
+_DERIVED = ("Hz", "N", "Pa", "J", "W", "C", "V", "F", "ohm", "S", "Wb", "T", "H", "bar", "L", "l", "eV")
 _ALONE = ("radian", "radians", "sr", "degree", "degrees", "degC", "min", "h", "hour", "d", "day", "lm", "lx", "%")
 _WORDS = ("meter", "metre", "second", "seconds", "kilogram", "newton", "hertz", "volt", "ampere", "kelvin", "percent")
-_KNOWN = frozenset({*_ALONE, *_WORDS, *(prefix + unit for prefix in _PREFIXES for unit in (*_PREFIXED, *_MORE))})
+_KNOWN = frozenset({*_ALONE, *_WORDS, *(prefix + unit for prefix in _PREFIXES for unit in (*_BASE, *_DERIVED))})
 _SAME = {"deg": "degree", "°": "degree", "Ω": "ohm", "Ohm": "ohm", "µm": "um", "μm": "um", "sec": "s", "1": "1"}
 """Symbols that one of the two lacks or reads otherwise, and what both read."""
 _COUNTS = ("", "-", "cells", "nat", "none", "dimensionless", "count", "counts")

@@ -130,7 +130,7 @@ STRIP = "<strip>"
 
 @dataclass
 class Target:
-    """Target of the next figure: a function that makes it, instead of a figure of its own.
+    """Function that makes the next figure, and the figure that it has made.
 
     Attributes
     ----------

@@ -60,7 +60,7 @@ class Options(BaseModel):
         }
 
     def part(self, model: type[Options]) -> dict[str, Any]:
-        """Return the values of those options that another `Options` model declares."""
+        """Return the values of the options that this model shares with another `Options` model."""
         return {name: getattr(self, name) for name in model.model_fields}
 
 

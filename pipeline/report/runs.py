@@ -206,7 +206,7 @@ def _first_of_others(shown: Shown) -> dict[str, float]:
 
 
 def _attractors(shown: Shown) -> Iterator[Block]:
-    """Make the table of a run's attractors and the figures of these."""
+    """Make the table of a run's attractors, and figures of them."""
     if shown.run.spec.noise is not None:
         return
     known = shown.options_of("attractors")

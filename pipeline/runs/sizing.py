@@ -200,7 +200,7 @@ def remarks(cluster: Cluster, work: Work, site: Site) -> list[str]:
 
 
 def _too_much(cluster: Cluster, queue: Queue, site: Site) -> list[str]:
-    """Return warnings about values above those of a queue; some sites hold such a job for ever."""
+    """Return a warning for each value above the limit of the queue. Some sites never start such a job."""
     asked = [
         ("walltime", cluster.walltime_s, queue.limit_s, whole),
         ("cores", cluster.cores, queue.cores, "{:.0f}".format),

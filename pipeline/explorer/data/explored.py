@@ -138,7 +138,7 @@ class ExploredRun(Run):
             return found
 
     def large(self, key: str, make: Callable[[], T]) -> T:
-        """Return the cached value of a key, or compute it. Only the last few of these large values stay in memory."""
+        """Return the cached value of a key; compute it if it is not cached. The last few values stay in memory."""
         with self._lock:
             last: list[str] = self._opened.setdefault("large", [])
             if key in last:

@@ -70,7 +70,7 @@ class Explorer(anywidget.AnyWidget):
 
     @traitlets.validate("selected")
     def _complete(self, proposal: Mapping[str, Any]) -> dict[str, Any] | None:
-        """Return all that is known of a point of which the cell, and perhaps its section, are given."""
+        """Complete a selection: a cell, or a cell and a section point, becomes all that is known of it."""
         given = proposal["value"]
         if given is None:
             return None

@@ -46,9 +46,10 @@ MOST_ADDRESS = 4096
 """Characters of an address: more is none that the page makes."""
 
 PER_SECOND, BURST = 40.0, 120
+"""Requests that are answered."""
+
 STRANGERS_PER_SECOND, STRANGERS_BURST = 4.0, 20
 """Requests without the token, which are all refused."""
-"""Requests that are answered."""
 
 STATIC = {
     "explorer.js": "text/javascript; charset=utf-8",

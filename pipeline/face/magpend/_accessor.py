@@ -19,7 +19,7 @@ _DERIVED = "/derived/"
 
 @xr.register_dataset_accessor("magpend")  # type: ignore[no-untyped-call]
 class DatasetAccessor:
-    """What magpend knows of a Dataset: its model, its run, its table, its figures.
+    """Model, run, table and figures of a Dataset that magpend has made.
 
     Parameters
     ----------

@@ -162,6 +162,15 @@ def test_local_cluster__whose_workers_all_fail_to_start_tries_again(monkeypatch)
         assert cluster.scheduler.workers
 
 
+def test_local_cluster__whose_workers_never_start_says_so(monkeypatch):
+    async def failing(self):
+        raise OSError("no process")
+
+    monkeypatch.setattr(Nanny, "instantiate", failing)
+    with pytest.raises(SchedulerError, match="ended as soon as they started, 3 times"), local_cluster(2):
+        pass
+
+
 def test_local_cluster__that_does_not_close_holds_up_nobody(monkeypatch):
     async def never(self):
         await asyncio.Event().wait()
