@@ -143,3 +143,11 @@ def test_docs__example_of_the_cube(walk, monkeypatch):
     exec(block.replace("runs/quickstart", str(walk)), names)
     assert names["period"].pint.magnitude[0] == pytest.approx(1e3 / 0.15)
     assert int(names["periodic"].notnull().any(["period_index", "state"]).sum()) == int((names["ds"].status == 1).sum())
+
+
+def test_conventional__axes_are_continuous():
+    """A number of something, such as a period, is no axis, even with a unit."""
+    counts, places = ("n", [1, 2], {"units": "1"}), ("force", [0.1, 0.2], {"units": "N"})
+    ds = conventional(xr.Dataset({"a": (("n", "force"), np.zeros((2, 2)))}, {"n": counts, "force": places}))
+    assert ds["force"].attrs["axis"] == "X"
+    assert "axis" not in ds["n"].attrs
