@@ -116,6 +116,8 @@ def test_connection__answers_as_the_server_byte_for_byte(pages, client, name, wo
     if by_server.code == 200:
         assert buffers == [by_server.body]
         assert content["kind"] == by_server.headers["Content-Type"]
+        disposition = by_server.headers.get("Content-Disposition")
+        assert disposition == (f'attachment; filename="{content["filename"]}"' if content["filename"] else None)
     else:
         assert (content["error"], buffers) == (json.loads(by_server.body)["error"], [])
 
