@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from pkgutil import resolve_name
+from typing import TypeVar
 
 from pipeline.products.product import Analysis, CellProduct, Figure
 
+P = TypeVar("P", CellProduct, Analysis, Figure)
 
-class Registry[P: (CellProduct, Analysis, Figure)](Mapping[str, P]):
+
+class Registry(Mapping[str, P]):
     """Mapping from names to products; each product is imported when it is first used.
 
     Parameters

@@ -14,7 +14,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator, Sequence
 from contextvars import ContextVar
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 from magpend_core.compilation import heard_by
 
@@ -54,7 +54,10 @@ def is_heard() -> bool:
     return _listener.get() is not None
 
 
-def track[T](items: Sequence[T], what: str) -> Iterator[T]:
+T = TypeVar("T")
+
+
+def track(items: Sequence[T], what: str) -> Iterator[T]:
     """Yield items, and report the number of finished items as progress.
 
     Parameters

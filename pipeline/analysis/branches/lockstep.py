@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Generator, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
@@ -27,11 +28,12 @@ class Query:
     u: np.ndarray
 
 
-type Steps[T] = Generator[Query, Value, T]
+T = TypeVar("T")
+Steps = Generator[Query, Value, T]
 """A computation that returns a `T`."""
 
 
-def run_together[T](computations: Sequence[Steps[T]], what: str = "", rtol: float = BRANCH_RTOL) -> list[T]:
+def run_together(computations: Sequence[Steps[T]], what: str = "", rtol: float = BRANCH_RTOL) -> list[T]:
     """Run computations side by side to their ends, and return their results in the given order.
 
     If the work has a name, progress is reported. The length of a trace is unknown before its end, so it
@@ -71,7 +73,7 @@ def _report(
     report(what, round(n - len(going) + sum(going), 1), n)
 
 
-def run_alone[T](computation: Steps[T]) -> T:
+def run_alone(computation: Steps[T]) -> T:
     """Run one computation and return its result."""
     return run_together([computation])[0]
 

@@ -302,7 +302,7 @@ class Run(Analyses):
         return spec.as_dict()
 
 
-def _opening[**P](function: Callable[P, StoredRun]) -> Callable[P, Run]:
+def _opening(function: Callable[P, StoredRun]) -> Callable[P, Run]:
     """Wrap a function so that the run that it returns has methods for analyses and figures."""
 
     @wraps(function)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import xarray as xr
@@ -85,7 +85,8 @@ class Slopes:
 
 
 Request = Leg | Polish | Slopes
-type Work[T] = Generator[Request, Any, T]
+T = TypeVar("T")
+Work = Generator[Request, Any, T]
 """The analysis of a point: a generator that yields requests, receives answers and returns its result."""
 
 
@@ -147,7 +148,7 @@ class Settings:
         )
 
 
-def answer_all[T](
+def answer_all(
     works: Mapping[tuple[int, ...], Work[T]], points: Mapping[tuple[int, ...], Point], settings: Settings, what: str
 ) -> dict[tuple[int, ...], T]:
     """Run the analyses of all parameter points side by side, and answer their requests together. Return the result of
