@@ -1,7 +1,8 @@
 """What all tests share: one compile cache, temporary files in memory, a command called in this process, examples drawn.
 
 ``HYPOTHESIS_PROFILE=fresh`` draws new examples in every run, more of them, and remembers what failed;
-otherwise they are the same ones in every run. ``MAGPEND_LONG=1`` runs what is marked ``long``, too.
+otherwise they are the same ones in every run. Without ``--all`` or ``-m`` the tests marked ``slow`` are left out;
+``MAGPEND_LONG=1`` runs what is marked ``long``, too.
 """
 
 from __future__ import annotations
@@ -72,7 +73,15 @@ def pytest_unconfigure() -> None:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--all", action="store_true", help="run the whole suite, with the tests that are marked slow")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    if not config.getoption("--all") and not config.getoption("-m"):
+        slow = [item for item in items if item.get_closest_marker("slow") or item.get_closest_marker("long")]
+        config.hook.pytest_deselected(items=slow)
+        items[:] = [item for item in items if item not in set(slow)]
     if os.environ.get("MAGPEND_LONG", "0") == "1":
         return
     for item in items:

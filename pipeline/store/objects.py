@@ -21,6 +21,7 @@ from zarr.abc.store import ByteRequest, Store
 from zarr.core.buffer import Buffer, BufferPrototype
 from zarr.storage import ObjectStore
 
+from pipeline.specification.extras import INSTALL
 from pipeline.store.errors import DamagedError, RefusedError, UnreadableError
 
 T = TypeVar("T")
@@ -64,9 +65,7 @@ def parse_url(text: str) -> ObjectFiles:
     try:
         import obstore  # noqa: F401
     except ImportError:
-        raise RefusedError(
-            f"{text}: object stores need the package obstore; install it with: pip install 'magpend[s3]'"
-        ) from None
+        raise RefusedError(f"{text}: object stores need the package obstore; {INSTALL.format('s3')}") from None
     if not any(os.environ.get(name) for name in CREDENTIALS):
         raise RefusedError(f"{text}: there are no credentials; {_CREDENTIALS_HELP}")
     return ObjectFiles(match[1], match[2].strip("/"))

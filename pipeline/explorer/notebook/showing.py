@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from pipeline.explorer.data.explored import ExploredRun
 from pipeline.explorer.notebook import LEAST_HEIGHT
+from pipeline.specification.extras import import_extra
 from pipeline.specification.problems import SpecError
 from pipeline.store.run import Run
 
@@ -43,12 +44,8 @@ def explorer(run: str | Path | Run, *, curves: str | Path | Run | None = None, h
     """
     if height < LEAST_HEIGHT:
         raise SpecError(f"height = {height}: must be {LEAST_HEIGHT} pixels or more.")
-    try:
-        from pipeline.explorer.notebook.widget import Explorer
-    except ModuleNotFoundError as error:
-        if error.name != "anywidget":
-            raise
-        sentence = "explorer: needs anywidget, which is not installed: pip install 'magpend[notebook]'."
-        raise SpecError(sentence) from None
+    import_extra("anywidget", "notebook", "explorer")
+    from pipeline.explorer.notebook.widget import Explorer
+
     found = ExploredRun.of(run)
     return Explorer(found if curves is None else replace(found, curves=Run.open(curves)), height=height)

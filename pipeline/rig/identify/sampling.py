@@ -8,7 +8,6 @@ stopped goes on to the same numbers, and a finished one can be made longer.
 
 from __future__ import annotations
 
-import importlib.util
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -25,6 +24,7 @@ from pipeline.products.reporting import report
 from pipeline.rig.identify.directory import OUTCOMES, Outcomes, read_info
 from pipeline.rig.identify.log_posterior import LogPosterior
 from pipeline.rig.identify.statistics import root_of
+from pipeline.specification.extras import import_extra
 from pipeline.specification.problems import SpecError
 
 Array = NDArray[np.float64]
@@ -88,8 +88,7 @@ class Chain:
 
 def require_emcee() -> None:
     """Raise `SpecError` if the library emcee is missing."""
-    if importlib.util.find_spec("emcee") is None:
-        raise SpecError(["--mcmc: needs emcee, which is not installed: pip install 'magpend[mcmc]'."])
+    import_extra("emcee", "mcmc", "--mcmc")
 
 
 def sample_posterior(

@@ -21,6 +21,7 @@ from pipeline.rig.identify.first_guesses import fit_starts
 from pipeline.rig.identify.local import Echo, Fit, fit_local
 from pipeline.rig.identify.objective import evaluate
 from pipeline.rig.identify.problem import Piece, Problem
+from pipeline.specification.extras import import_extra
 
 Array = NDArray[np.float64]
 
@@ -83,7 +84,13 @@ def search(
     -------
     list of Fit
         Best first; those that converged before those that did not.
+
+    Raises
+    ------
+    SpecError
+        If the package cma is not installed.
     """
+    import_extra("cma", "rig", "identify")  # now, and not when the first starts have failed
     stages = _stages(problem)
     guesses = guess(problem, n_starts, seed, spread, method, n_samples, stages[0])
     fits = [_kept(problem, stages, k, theta, len(guesses), keep, tell) for k, theta in enumerate(guesses)]

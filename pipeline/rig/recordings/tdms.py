@@ -13,6 +13,7 @@ import numpy as np
 
 from pipeline.rig.recordings.findings import Finding
 from pipeline.rig.recordings.raw import Channel, Raw, digest
+from pipeline.specification.extras import import_extra
 from pipeline.specification.problems import SpecError
 
 SIMULATED = "simulated"
@@ -39,8 +40,7 @@ def read_tdms(path: Path) -> Raw:
     SpecError
         If it is not a TDMS file.
     """
-    from nptdms import TdmsFile
-
+    TdmsFile = import_extra("nptdms", "rig", str(path)).TdmsFile
     with _listening() as warnings:
         try:
             file = TdmsFile.read(str(path), raw_timestamps=True)

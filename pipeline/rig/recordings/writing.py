@@ -17,6 +17,7 @@ from pipeline.rig.recordings.delimited import SIMULATED as SIMULATED_LINE
 from pipeline.rig.recordings.mapping import DRIVE, ChannelMap, DriveMap, Mapping, PieceMap, TimeMap
 from pipeline.rig.recordings.raw import Channel, Raw
 from pipeline.rig.recordings.tdms import SIMULATED
+from pipeline.specification.extras import import_extra
 from pipeline.specification.files import check_new_file
 from pipeline.specification.models import kept_reference
 
@@ -104,8 +105,7 @@ def write_raw(raw: Raw, path: str | Path) -> Path:
 
 
 def _write_tdms(channels: Sequence[Channel], path: Path, is_simulated: bool) -> None:
-    from nptdms import ChannelObject, RootObject, TdmsWriter
-
+    nptdms = import_extra("nptdms", "rig", str(path))
     objects = []
     for channel in channels:
         group, _, name = channel.name.rpartition("/")
@@ -116,10 +116,10 @@ def _write_tdms(channels: Sequence[Channel], path: Path, is_simulated: bool) -> 
                 "wf_start_offset": channel.start_s if math.isfinite(channel.start_s) else 0.0,
                 "wf_samples": len(channel),
             }
-        objects.append(ChannelObject(group or GROUP, name, channel.values, properties))
+        objects.append(nptdms.ChannelObject(group or GROUP, name, channel.values, properties))
     content = io.BytesIO()
-    with TdmsWriter(content) as writer:
-        writer.write_segment([RootObject({SIMULATED: 1} if is_simulated else {}), *objects])
+    with nptdms.TdmsWriter(content) as writer:
+        writer.write_segment([nptdms.RootObject({SIMULATED: 1} if is_simulated else {}), *objects])
     write_atomically(path, content.getvalue())
 
 
