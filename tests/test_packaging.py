@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 import fnmatch
-import importlib.util
 import os
 import re
 import shlex
@@ -21,10 +20,10 @@ import pytest
 import yaml
 
 from magpend_core.models import model_names
-from pipeline.cli.exits import Exit
 from pipeline.runs.workflows import shipped_workflows
+from tests.programs import ROOT
 
-ROOT = Path(__file__).parents[1]
+pytestmark = pytest.mark.slow
 PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
 PROJECT = PYPROJECT["project"]
 OLDEST = PROJECT["requires-python"].removeprefix(">=")
@@ -117,10 +116,8 @@ def test_wheel__is_installed_without_a_network_and_runs(built, tmp_path):
         "from magpend_core.models import model_names; print(len(model_names()))\n"
     )
     around = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path / "site"), os.environ.get("PYTHONPATH", "")])}
-    done = subprocess.run(
-        [sys.executable, "-c", code], cwd=tmp_path, env=around, capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done.stderr
+    words = [sys.executable, "-c", code]
+    done = subprocess.run(words, cwd=tmp_path, env=around, capture_output=True, text=True, check=True)
     *places, n_workflows, n_models = done.stdout.splitlines()
     assert all(place.startswith(str(tmp_path / "site")) for place in places)
     assert (int(n_workflows), int(n_models)) == (len(shipped_workflows()), len(model_names()))
@@ -313,12 +310,22 @@ def too_old(path):
     executable(path, f'exec {shlex.quote(sys.executable)} -c "{code}" "$2" "$3"')
 
 
-def test_ci__takes_a_newer_python_where_python3_is_too_old(tmp_path):
+@pytest.mark.parametrize("found_by", ["path", "pyenv", None])
+def test_ci__takes_a_newer_python_where_python3_is_too_old(tmp_path, found_by):
     (path := tmp_path / "path").mkdir()
     (folder := tmp_path / "scratch").mkdir()
     too_old(path / "python3")
-    executable(path / "python3.99", f'exec {shlex.quote(sys.executable)} "$@"')
+    own = f'exec {shlex.quote(sys.executable)} "$@"'
+    if found_by == "path":
+        executable(path / "python3.99", own)
+    elif found_by == "pyenv":
+        run = f'if [ "$PYENV_VERSION" = 3.12.99 ]; then shift 2; {own}; fi'
+        executable(path / "pyenv", f"case $1 in versions) echo 2.7.18; echo 3.9.1; echo 3.12.99;; exec) {run};; esac")
     done = chosen_python(path, folder)
+    if found_by is None:
+        assert done.returncode == 1
+        assert done.stderr == f"no Python {OLDEST} or later on PATH or in pyenv; install one\n"
+        return
     assert done.returncode == 0, done.stderr
     version = ".".join(map(str, sys.version_info[:2]))
     assert done.stdout.splitlines()[0].startswith(f"Python {version} {sys.executable} ")
@@ -326,94 +333,3 @@ def test_ci__takes_a_newer_python_where_python3_is_too_old(tmp_path):
     # the environment still works when the scratch folder's script is gone
     shutil.rmtree(folder / "bin")
     subprocess.run([folder / "venv" / "bin" / "python", "-c", "import ssl"], check=True)
-
-
-def test_ci__asks_pyenv_for_its_versions(tmp_path):
-    (path := tmp_path / "path").mkdir()
-    (folder := tmp_path / "scratch").mkdir()
-    run = f'if [ "$PYENV_VERSION" = 3.12.99 ]; then shift 2; exec {shlex.quote(sys.executable)} "$@"; fi'
-    executable(path / "pyenv", f"case $1 in versions) echo 2.7.18; echo 3.9.1; echo 3.12.99;; exec) {run};; esac")
-    done = chosen_python(path, folder)
-    assert done.returncode == 0, done.stderr
-    assert sys.executable in done.stdout.splitlines()[0]
-
-
-def test_ci__says_that_no_python_is_new_enough(tmp_path):
-    (path := tmp_path / "path").mkdir()
-    too_old(path / "python3")
-    done = chosen_python(path, tmp_path)
-    assert done.returncode == 1
-    assert done.stderr == f"no Python {OLDEST} or later on PATH or in pyenv; install one\n"
-
-
-# the page for programs
-
-AGENTS = (ROOT / "AGENTS.md").read_text("utf-8")
-
-
-def test_agents__lists_all_exit_codes():
-    rows = re.findall(r"^\| ([\d, ]+) \| ([^|]+) \|", AGENTS, re.M)
-    said = {int(code): meaning for codes, meaning in rows for code in codes.split(",")}
-    assert set(said) == {int(code) for code in Exit}
-    for code in Exit:
-        if code < Exit.HUNG_UP:
-            assert said[code] == code.sentence
-        else:
-            assert code.sentence.endswith(said[code].partition("; ")[2])
-
-
-def test_agents__shows_the_error_that_comes(tmp_path, monkeypatch, capsys):
-    from pipeline.cli.main import main
-
-    ((edit, shown),) = re.findall(r"<!-- error: sed '([^']+)' -->\n```text\n(.*?)```", AGENTS, re.DOTALL)
-    (text,) = re.findall(r"<!-- file: sweep.toml -->\n```toml\n(.*?)```", AGENTS, re.DOTALL)
-    for old, new in re.findall(r"s/([^/]+)/([^/]+)/", edit):
-        assert old in text
-        text = text.replace(old, new)
-    (tmp_path / "sweep.toml").write_text(text)
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["magpend", "run", "sweep.toml"])
-    with pytest.raises(SystemExit) as end:
-        main()
-    said = capsys.readouterr()
-    assert end.value.code == Exit.REFUSED
-    assert said.err.endswith(shown)
-    assert said.out == ""
-    assert not (tmp_path / "runs").exists()
-
-
-@pytest.mark.slow
-def test_agents__commands_do_what_they_say(tmp_path, monkeypatch):
-    spec = importlib.util.spec_from_file_location("run_tutorials", ROOT / "docs" / "run_tutorials.py")
-    tutorials = importlib.util.module_from_spec(spec)
-    monkeypatch.setitem(sys.modules, "run_tutorials", tutorials)
-    spec.loader.exec_module(tutorials)
-    monkeypatch.chdir(tmp_path)
-    tutorials.follow(ROOT / "AGENTS.md", tmp_path)
-
-
-# the article
-
-
-def test_paper__cites_what_its_bibliography_has():
-    text = (ROOT / "paper" / "paper.md").read_text("utf-8")
-    listed = (ROOT / "paper" / "paper.bib").read_text("utf-8")
-    entries = dict(re.findall(r"^@\w+\{(\w+),\n(.*?)^\}", listed, re.MULTILINE | re.DOTALL))
-    cited = set(re.findall(r"@([a-z]+\d{4})\b", text))
-    assert cited == set(entries)
-    for name, entry in entries.items():
-        assert re.search(r"^  (doi|url|isbn) +=", entry, re.MULTILINE), name
-        assert re.search(rf"year += \{{{name[-4:]}\}}", entry), name
-    body = text.partition("\n---\n")[2].partition("# References")[0]
-    assert 750 < len(body.split()) < 1750  # what the journal asks for
-
-
-def test_paper__figures_are_made_by_the_commands_of_its_script():
-    text = (ROOT / "paper" / "paper.md").read_text("utf-8")
-    spec = importlib.util.spec_from_file_location("figures", ROOT / "paper" / "figures.py")
-    figures = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(figures)
-    assert set(re.findall(r"\]\((\w+\.png)\)", text.replace("\n", " "))) == set(figures.FIGURES)
-    assert all((ROOT / "paper" / name).is_file() for name in figures.FIGURES)
-    for commands, _ in figures.FIGURES.values():
-        assert commands[0].split()[1] in shipped_workflows()

@@ -8,9 +8,10 @@ from pathlib import Path
 
 import pytest
 
-api = pytest.importorskip("mypy.api")
+from tests.programs import ROOT
 
-ROOT = Path(__file__).parents[1]
+pytestmark = pytest.mark.slow
+
 _PYTHON = re.compile(r"^```python\n(.*?)^```", re.DOTALL | re.MULTILINE)
 
 MISTAKES = """\
@@ -51,6 +52,7 @@ SAID = """\
 
 def checked(path: Path) -> list[str]:
     """Lines of mypy on a file, with the package's own settings."""
+    api = pytest.importorskip("mypy.api")
     cache = Path(os.environ["MAGPEND_CACHE_DIR"]) / "mypy"
     config = ["--config-file", str(ROOT / "pyproject.toml"), "--follow-imports", "silent", "--cache-dir", str(cache)]
     before = Path.cwd()
@@ -64,7 +66,6 @@ def checked(path: Path) -> list[str]:
     return [re.sub(r"^\S+\.py:", "", line) for line in out.splitlines()]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("page", ["docs/python.md", "docs/python-start.md", "README.md"])
 def test_examples__have_types(page, tmp_path):
     module = tmp_path / "example.py"
@@ -74,7 +75,6 @@ def test_examples__have_types(page, tmp_path):
     assert checked(module) == ["Success: no issues found in 1 source file"]
 
 
-@pytest.mark.slow
 def test_mistakes__are_seen(tmp_path):
     module = tmp_path / "mistakes.py"
     module.write_text(MISTAKES, "utf-8")

@@ -13,6 +13,7 @@ from magpend_core.models.parameters import ParameterError
 from pipeline.plots import plot_branches, plot_curves, plot_multipliers
 from pipeline.runs.derive import derive
 from pipeline.specification.problems import SpecError
+from tests.pipeline.plots.made_up import STATES
 
 
 @pytest.fixture
@@ -48,7 +49,7 @@ def made_up():
             "bifurcation_section": (("bifurcation", "phase", "state"), np.zeros((1, 1, 4))),
             **{name: ("bifurcation", [value]) for name, value in event.items()},
         },
-        coords={"state": ["psi1", "psi2", "psi1_dot", "psi2_dot"]},
+        coords={"state": STATES},
         attrs={"parameter": "frequency_hz", "parameter_units": "Hz"},
     )
 
@@ -68,6 +69,9 @@ def test_plot_branches__solid_and_dashed(made_up):
     # both go up to the fold itself
     assert np.max(solid.get_xdata()) == np.max(dashed.get_xdata()) == 3.0
     assert [text.get_text() for text in figure.axes[0].texts] == ["F1"]
+    assert not branch_lines(plot_branches(made_up, max_period=0))
+    with pytest.raises(ValueError, match="unknown state"):
+        plot_branches(made_up, state="psi3")
 
 
 def test_plot_branches__cut_where_an_angle_wraps(made_up):
@@ -75,15 +79,6 @@ def test_plot_branches__cut_where_an_angle_wraps(made_up):
     lines = branch_lines(plot_branches(made_up))
     steps = np.concatenate([np.abs(np.diff(np.asarray(line.get_ydata(), float))) for line in lines])
     assert np.nanmax(steps) < np.pi
-
-
-def test_plot_branches__longest_period(made_up):
-    assert not branch_lines(plot_branches(made_up, max_period=0))
-
-
-def test_plot_branches__unknown_state(made_up):
-    with pytest.raises(ValueError, match="unknown state"):
-        plot_branches(made_up, state="psi3")
 
 
 def test_plot_multipliers__all_points(made_up):

@@ -9,6 +9,8 @@ import pytest
 from pipeline.report.page import Outcome, Page, Part, Text, grid_of, picture_of, write
 from pipeline.report.verdicts import Verdict
 
+pytestmark = pytest.mark.slow
+
 HOSTILE = "<img src=x onerror=\"document.title='run by a title'\"> a title of some length, without a break"
 COMMAND = "magpend plot bifurcation " + "a-directory-with-a-long-name/" * 6
 
