@@ -21,94 +21,49 @@ SWEEP = """
 kind = "sweep"
 title = "Duffing, a plane of two parameters"
 model = "duffing"
-[parameters]
-preset = "twin-well"
-[axes]
-frequency_hz = { values = [0.155, 0.159154943] }
-amplitude = { values = [0.15, 0.3] }
-[initial_conditions]
-kind = "grid"
-x = { start = -1.5, stop = 1.5, num = 5 }
-v = { start = -1.0, stop = 1.0, num = 5 }
-[integration]
-rtol = 1e-7
-atol = 1e-7
-n_transient = 60
-n_keep = 220
-[products]
-lyapunov = { n_transient = 40, n_periods = 64, n_blocks = 4 }
-extremes = { quantities = ["energy", "v"] }
-rotation = { n_periods = 40 }
-[smoke]
-axes.frequency_hz.values = [0.155]
+parameters = { preset = "twin-well" }
+axes = { frequency_hz = { values = [0.155, 0.159154943] }, amplitude = { values = [0.15, 0.3] } }
+initial_conditions.kind = "grid"
+initial_conditions.x = { start = -1.5, stop = 1.5, num = 5 }
+initial_conditions.v = { start = -1.0, stop = 1.0, num = 5 }
+integration = { rtol = 1e-7, atol = 1e-7, n_transient = 60, n_keep = 220 }
+products.lyapunov = { n_transient = 40, n_periods = 64, n_blocks = 4 }
+products.extremes = { quantities = ["energy", "v"] }
+products.rotation = { n_periods = 40 }
+smoke = { axes.frequency_hz.values = [0.155] }
 """
 
 WALK = """
 kind = "continuation"
 title = "Duffing, its bent resonance"
 model = "duffing"
-[parameters]
-preset = "hardening"
-[axes]
-frequency_hz = { start = 0.16, stop = 0.30, num = 15 }
-[continuation]
-direction = "both"
-[initial_conditions]
-kind = "random"
-n = 2
-seed = 1
-x = [-1.0, 1.0]
-v = [-1.0, 1.0]
-[integration]
-rtol = 1e-8
-atol = 1e-8
-n_transient = 60
-n_keep = 12
+parameters = { preset = "hardening" }
+axes = { frequency_hz = { start = 0.16, stop = 0.30, num = 15 } }
+continuation = { direction = "both" }
+initial_conditions = { kind = "random", n = 2, seed = 1, x = [-1.0, 1.0], v = [-1.0, 1.0] }
+integration = { rtol = 1e-8, atol = 1e-8, n_transient = 60, n_keep = 12 }
 """
 
 RAMP = """
 kind = "sweep"
 title = "Duffing, its drive grows while it moves"
 model = "duffing"
-[parameters]
-preset = "twin-well"
-frequency_hz = 0.159154943
-[drift.amplitude]
-from = 0.15
-to = 0.25
-start_periods = 4
-[axes]
-amplitude_rate_per_period = { values = [0.005, 0.02] }
-[initial_conditions]
-kind = "list"
-points = [[-0.8, 0.0], [1.2, 0.0]]
-[integration]
-rtol = 1e-7
-atol = 1e-7
-n_transient = 0
-n_keep = 40
+parameters = { preset = "twin-well", frequency_hz = 0.159154943 }
+drift.amplitude = { from = 0.15, to = 0.25, start_periods = 4 }
+axes = { amplitude_rate_per_period = { values = [0.005, 0.02] } }
+initial_conditions = { kind = "list", points = [[-0.8, 0.0], [1.2, 0.0]] }
+integration = { rtol = 1e-7, atol = 1e-7, n_transient = 0, n_keep = 40 }
 """
 
 NOISY = """
 kind = "sweep"
 title = "Duffing, driven by noise as well"
 model = "duffing"
-[parameters]
-preset = "twin-well"
-frequency_hz = 0.159154943
-[noise]
-strengths = { v = 0.1 }
-seed = 1
-steps_per_period = 128
-[axes]
-noise_v = { values = [0.1, 0.15, 0.2] }
-realization = { start = 0, stop = 19, step = 1 }
-[initial_conditions]
-kind = "list"
-points = [[-0.8, 0.0]]
-[integration]
-n_transient = 0
-n_keep = 100
+parameters = { preset = "twin-well", frequency_hz = 0.159154943 }
+noise = { strengths = { v = 0.1 }, seed = 1, steps_per_period = 128 }
+axes = { noise_v = { values = [0.1, 0.15, 0.2] }, realization = { start = 0, stop = 19, step = 1 } }
+initial_conditions = { kind = "list", points = [[-0.8, 0.0]] }
+integration = { n_transient = 0, n_keep = 100 }
 """
 
 SPECS = {"sweep": SWEEP, "walk": WALK, "ramp": RAMP, "noisy": NOISY}
@@ -192,14 +147,6 @@ def runs(call, day):
         return call(*words)
 
     return after
-
-
-def test_run__dry_run_smoke_and_again(call, day):
-    out, _ = call("run", "sweep.toml", "--dry-run")
-    assert "100 cells" in out
-    call("run", "sweep.toml", "--smoke", "--workers", "0", "--out", "small")
-    _, err = call("run", "sweep.toml", "--smoke", "--workers", "0", "--out", "small")
-    assert "nothing to do" in err
 
 
 def test_cube__has_the_models_own_names(runs, day):
@@ -286,7 +233,3 @@ def test_figures__have_names_of_their_own(drawn):
     """No two commands above write one file, whichever of them have been run before."""
     figures = [drawn(words)[0] for words in PICTURES]
     assert len(set(figures)) >= len(PICTURES) - 1
-
-
-def test_prune__removes_nothing_of_now(runs):
-    assert runs("analyse", "prune", "sweep")[0] == "nothing to remove\n"

@@ -50,10 +50,7 @@ def test_gallery__specification_names_paper_figure_and_number(name):
         assert word in head, word
     load_spec(path, smoke=True)
     assert STUDY.table.runs[name].spec == path.name
-
-
-@pytest.mark.parametrize("name", FIGURE)
-def test_gallery__claims_are_bounded_and_their_options_exist(name):
+    # claims are bounded, and their options exist
     figure = FIGURE[name]
     assert figure.source
     assert figure.pictures

@@ -28,6 +28,10 @@ PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
 PROJECT = PYPROJECT["project"]
 OLDEST = PROJECT["requires-python"].removeprefix(">=")
 README = (ROOT / "README.md").read_text("utf-8")
+RECIPE, CITATION, CI = (
+    yaml.safe_load((ROOT / name).read_text("utf-8"))
+    for name in ("recipe/recipe.yaml", "CITATION.cff", ".github/workflows/ci.yml")
+)
 PACKAGES = ("magpend_core/", "pipeline/", "workflows/")
 PAGE = "pipeline/explorer/page/"
 """Sources of the explorer's page; the wheel has what is built from them."""
@@ -125,25 +129,18 @@ def test_wheel__is_installed_without_a_network_and_runs(built, tmp_path):
 
 def test_versions__are_the_same_everywhere():
     """Of magpend in all its descriptions, and of the oldest Python that it runs on."""
-    recipe = yaml.safe_load((ROOT / "recipe" / "recipe.yaml").read_text("utf-8"))
-    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text("utf-8"))
-    assert recipe["context"]["version"] == citation["version"] == PROJECT["version"]
-    assert recipe["context"]["python_min"] == PYPROJECT["tool"]["mypy"]["python_version"] == OLDEST
+    assert RECIPE["context"]["version"] == CITATION["version"] == PROJECT["version"]
+    assert RECIPE["context"]["python_min"] == PYPROJECT["tool"]["mypy"]["python_version"] == OLDEST
     assert f"on Python {OLDEST} or later" in README
     assert set(re.findall(r"^FROM python:([\d.]+)-slim", (ROOT / "Dockerfile").read_text(), re.M)) == {OLDEST}
-    tested = yaml.safe_load((ROOT / ".github/workflows/ci.yml").read_text())["jobs"]["versions"]["strategy"]["matrix"]
+    tested = CI["jobs"]["versions"]["strategy"]["matrix"]
     said = [c.rpartition(" ")[2] for c in PROJECT["classifiers"] if re.search(r":: 3\.\d+$", c)]
     assert min(said, key=lambda v: int(v[2:])) == OLDEST
     assert set(said) <= set(tested["python"])
     assert {"python": OLDEST, "resolution": "lowest-direct"} in tested["include"]
-
-
-def test_citation__names_the_same_things():
-    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text("utf-8"))
-    assert citation["license"] == PROJECT["license"]
-    assert [a["name"] for a in citation["authors"]] == [a["name"] for a in PROJECT["authors"]]
-    (article,) = citation["references"]
-    assert f"https://doi.org/{article['doi']}" in README
+    assert CITATION["license"] == PROJECT["license"]
+    assert [a["name"] for a in CITATION["authors"]] == [a["name"] for a in PROJECT["authors"]]
+    assert f"https://doi.org/{CITATION['references'][0]['doi']}" in README
 
 
 def test_dependencies__have_lower_bounds_alone():
@@ -171,19 +168,15 @@ def test_dependencies__are_all_packages_that_are_imported():
                 assert package.lower() in named, f"{name} imports {package}"
 
 
-def test_extras__are_for_users_and_named_where_they_are_needed():
-    texts = [
-        p.read_text("utf-8") for top in ("pipeline", "docs") for s in ("py", "md") for p in (ROOT / top).rglob(f"*.{s}")
-    ]
-    for name in PROJECT["optional-dependencies"]:
-        assert any(f"magpend[{name}]" in text for text in texts), name
-    assert not set(PROJECT["optional-dependencies"]) & set(PYPROJECT["dependency-groups"])
-
-
-def test_groups__tests_install_all_extras_and_developers_everything_but_bench():
-    groups = PYPROJECT["dependency-groups"]
+def test_extras_and_groups__are_named_and_installed():
+    """Users are told of each extra; tests install all extras, and developers everything but bench."""
+    extras, groups = set(PROJECT["optional-dependencies"]), PYPROJECT["dependency-groups"]
+    pages = (p for top in ("pipeline", "docs") for s in ("py", "md") for p in (ROOT / top).rglob(f"*.{s}"))
+    text = "".join(page.read_text("utf-8") for page in pages)
+    assert [name for name in extras if f"magpend[{name}]" not in text] == []
+    assert not extras & set(groups)
     (own,) = (text for text in groups["test"] if text.startswith("magpend["))
-    assert set(own[len("magpend[") : -1].split(",")) == set(PROJECT["optional-dependencies"])
+    assert set(own[len("magpend[") : -1].split(",")) == extras
     assert {entry["include-group"] for entry in groups["dev"]} == set(groups) - {"dev", "bench"}
     (command,) = re.findall(r"<!-- run: tests -->\n```sh\n(.*?)\n```", README, re.DOTALL)
     assert "--group dev " in command
@@ -199,17 +192,16 @@ def in_conda(text):
 
 
 def test_recipe__requires_what_the_package_requires():
-    recipe = yaml.safe_load((ROOT / "recipe" / "recipe.yaml").read_text("utf-8"))
-    needs = recipe["requirements"]
+    needs = RECIPE["requirements"]
     python, *others = needs["run"]
     assert python == "python >=${{ python_min }}"
     assert others == [in_conda(text) for text in PROJECT["dependencies"]]
     extras = PROJECT["optional-dependencies"].values()
     assert needs["run_constraints"] == [in_conda(text) for listed in extras for text in listed]
-    (entry,) = recipe["build"]["python"]["entry_points"]
+    (entry,) = RECIPE["build"]["python"]["entry_points"]
     assert entry == "magpend = " + PROJECT["scripts"]["magpend"]
-    assert recipe["about"]["license"] == PROJECT["license"]
-    assert recipe["about"]["license_file"] == PROJECT["license-files"]
+    assert RECIPE["about"]["license"] == PROJECT["license"]
+    assert RECIPE["about"]["license_file"] == PROJECT["license-files"]
 
 
 def instructions():
@@ -263,8 +255,7 @@ def test_workflows__ask_for_no_rights_and_use_no_code_of_others():
                 assert step.get("uses", "actions/").startswith("actions/")
                 # text of an event never becomes a part of a command
                 assert "${{" not in step.get("run", "")
-    steps = yaml.safe_load((ROOT / ".github/workflows/ci.yml").read_text())["jobs"]["readme"]["steps"]
-    assert steps[-1]["run"] == "bash .ci/run"
+    assert CI["jobs"]["readme"]["steps"][-1]["run"] == "bash .ci/run"
 
 
 def test_repository__passes_the_review_of_scientific_python():

@@ -2,34 +2,28 @@
 
 from __future__ import annotations
 
-import pytest
 import xarray as xr
 
 from pipeline.cli.exits import Exit
 
 SWEEP = """
 kind = "sweep"
-[axes]
-frequency_hz = { values = [2.6, 2.8] }
-q = { values = [1.5, 1.6] }
-[initial_conditions]
-kind = "grid"
-psi1_deg = { start = -10, stop = 10, num = 3 }
-psi2_deg = { start = -10, stop = 10, num = 2 }
-[integration]
-rtol = 1e-6
-atol = 1e-6
-n_transient = 200
-n_keep = 16
-stop_when_closed = true
-closure_tolerance = 1e-2
+axes = { frequency_hz = { values = [2.6, 2.8] }, q = { values = [1.5, 1.6] } }
+initial_conditions.kind = "grid"
+initial_conditions.psi1_deg = { start = -10, stop = 10, num = 3 }
+initial_conditions.psi2_deg = { start = -10, stop = 10, num = 2 }
+integration.rtol = 1e-6
+integration.atol = 1e-6
+integration.n_transient = 200
+integration.n_keep = 16
+integration.stop_when_closed = true
+integration.closure_tolerance = 1e-2
 """
 
 
-def test_plot__every_figure_of_a_sweep(main, write_spec, tmp_path):
+def test_plot__every_figure_of_a_sweep(main, copied, tmp_path):
     """One analysis serves them all, and each puts its data beside it."""
-    write_spec(SWEEP)
-    assert main("run", "spec.toml", "--out", "run", "--workers", "0")[0] == 0
+    copied(SWEEP)
     one, both = ["--at", "q=1.5"], ["--at", "q=1.5", "--at", "frequency=2.6"]
     figures = {
         "basins": [*both, "--degrees", "--shade"],
@@ -74,23 +68,3 @@ def test_plot__every_figure_of_a_sweep(main, write_spec, tmp_path):
         assert message in err, err
         assert "Traceback" not in err
         assert sorted(tmp_path.rglob("*")) == before
-
-
-@pytest.mark.parametrize("verb", ["basins", "fractions", "gallery", "attractors", "regimes"])
-def test_plot__no_run(main, tmp_path, verb):
-    code, _, err = main("plot", verb, ".")
-    assert code == Exit.REFUSED
-    assert "Traceback" not in err
-    assert not list(tmp_path.iterdir())
-
-
-def test_plot__continuation_with_loops(main, write_spec, walk_text, tmp_path):
-    write_spec(walk_text)
-    assert main("run", "spec.toml", "--out", "run", "--workers", "0")[0] == 0
-    code, _, err = main("plot", "attractors", "run", "--degrees", "--format", "svg")
-    assert code == 0, err
-    assert "hysteresis: computed" in err
-    path = tmp_path / "run" / "figures" / "attractors_psi1_degrees.nc"
-    with xr.open_dataset(path, engine="scipy") as stored:
-        assert {"value", "share", "present"} <= set(stored.data_vars)
-        assert stored["value"].attrs["units"] == "deg"

@@ -2,25 +2,15 @@
 
 from __future__ import annotations
 
-import shutil
-
 import pytest
-
-from pipeline.runs.run import run
 
 SPEC = """
 kind = "sweep"
 model = "duffing"
-[parameters]
-frequency_hz = 0.2
-[axes]
-amplitude = { start = 0.2, stop = 0.3, num = 3 }
-[initial_conditions]
-kind = "list"
-points = [[0.1, 0.0], [1.0, 0.2]]
-[integration]
-n_transient = 30
-n_keep = 8
+parameters = { frequency_hz = 0.2 }
+axes = { amplitude = { start = 0.2, stop = 0.3, num = 3 } }
+initial_conditions = { kind = "list", points = [[0.1, 0.0], [1.0, 0.2]] }
+integration = { n_transient = 30, n_keep = 8 }
 """
 
 ANALYSE = ("analyse", "attractors", "run", "--no-polish", "--no-extend", "--csv")
@@ -45,18 +35,9 @@ COMMANDS = {
 }
 
 
-@pytest.fixture(scope="module")
-def finished(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("outputs")
-    (folder / "spec.toml").write_text(SPEC)
-    run(folder / "spec.toml", folder / "run", workers=0, echo=lambda line: None)
-    return folder
-
-
 @pytest.fixture
-def whole(finished, tmp_path):
-    shutil.copytree(finished, tmp_path, dirs_exist_ok=True)
-    return tmp_path / "run"
+def whole(copied):
+    return copied(SPEC)
 
 
 def everything(folder):

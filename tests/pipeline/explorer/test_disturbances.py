@@ -16,7 +16,7 @@ from pipeline.explorer.live import noisy_starting
 from pipeline.explorer.serving.answers import ANSWERS, Query
 from pipeline.runs.derive import options_of
 from pipeline.store.run import Run
-from tests.pipeline.explorer.small_runs import FRACTAL, HZ, SMOOTH, WELLS, finished
+from tests.pipeline.explorer.small_runs import FRACTAL, HZ, SMOOTH, finished
 
 DAMPING, AMPLITUDES = 0.15, (0.1, 0.2)
 
@@ -134,14 +134,21 @@ def noisy(watcher, **words):
     return end, watcher.sections(number)
 
 
-NOISY = WELLS.replace("stop_when_closed = true\nclosure_tolerance = 1e-6", "").replace("num = 15", "num = 2")
-NOISY = NOISY.replace("n_transient = 200", "n_transient = 0").replace("n_keep = 8", "n_keep = 40")
-NOISY = NOISY.replace("start = -2.0, stop = 2.0, num = 2 }\nv", "start = -0.5, stop = 0.5, num = 2 }\nv")
-NOISY = NOISY.replace("start = -2.0, stop = 2.0, num = 2", "start = 0.25, stop = 0.75, num = 2")
+NOISY = f"""
+kind = "sweep"
+model = "duffing"
+parameters = {{ preset = "twin-well-periodic", frequency_hz = {HZ} }}
+axes.amplitude = {{ values = [0.1, 0.2] }}
+initial_conditions.kind = "grid"
+initial_conditions.x = {{ start = -0.5, stop = 0.5, num = 2 }}
+initial_conditions.v = {{ start = 0.25, stop = 0.75, num = 2 }}
+integration = {{ rtol = 1e-9, atol = 1e-9, n_transient = 0, n_keep = 40 }}
+noise = {{ seed = 7, strengths = {{ v = 0.05 }} }}
+"""
 
 
 def test_noisy_start__has_the_bits_of_a_noisy_run(watcher, tmp_path):
-    directory = finished(tmp_path, NOISY + "[noise]\nseed = 7\nstrengths = { v = 0.05 }\n")
+    directory = finished(tmp_path, NOISY)
     cell = Run.open(directory).cube().sel(amplitude=0.2, x_0=-0.5, v_0=0.25)
     end, section = noisy(watcher, noise=0.05, seed=7, periods=40)
     np.testing.assert_array_equal(section, cell["section"].transpose("period_index", "state").values)

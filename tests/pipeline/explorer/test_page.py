@@ -7,6 +7,7 @@ import shutil
 import subprocess
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import pipeline.explorer
@@ -49,3 +50,22 @@ def test_colour_of__a_set_that_does_not_attract_has_none():
     given = f"{json.dumps(view)}, {json.dumps(colours)}"
     found = evaluated("orbit.js", f"{json.dumps(orbits)}.map((o) => m.colourOf(o, {given}))")
     assert found == ["#ff0000", "#101010", "#101010"]
+
+
+def test_broken_lines__draw_nothing_across_the_circle():
+    lines = evaluated(
+        "wrapping.js",
+        """(() => {
+            const angle = Float64Array.from({ length: 200 }, (_, i) => 0.1 * i), rate = angle.map(Math.cos);
+            const swing = angle.map((a) => 7 + Math.sin(a));
+            const drawn = (x) => m.brokenLines(x, rate, m.wrappingOf(x, true), { shift: 0, cut: false });
+            return [drawn(angle), drawn(swing)].map((lines) => lines.map((line) => Array.from(line)));
+        })()""",
+    )
+    for line in lines[0]:
+        x = np.array(line[::2])
+        assert np.abs(x).max() <= np.pi + 1e-12
+        assert np.abs(np.diff(x)).max() <= 0.1 + 1e-12
+    assert len(lines[0]) == 4  # 19.9 rad go through half a turn three times
+    assert len(lines[1]) == 1
+    assert max(map(abs, lines[1][0][::2])) < np.pi  # brought next to 0 by a full turn

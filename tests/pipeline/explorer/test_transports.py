@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import queue
+import threading
 from urllib.parse import urlencode
 
 import pytest
@@ -255,6 +256,7 @@ def test_socket__a_page_that_leaves_cancels_its_jobs(client):
         await until(lambda: not client.pages)
         await asyncio.to_thread(handler._session.join, 10.0)
         assert all(desk._thread is None for desk in handler._session._desks.values())
+        assert not any(t.name.startswith("magpend-desk") and t.is_alive() for t in threading.enumerate())
 
     client.wait(conversation())
 

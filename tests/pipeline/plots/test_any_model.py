@@ -31,7 +31,7 @@ def test_attractor_figures__without_angles_and_classifier():
 
 @pytest.mark.parametrize("n", [1, 2])
 def test_plot_gallery__portraits_that_the_model_names_and_no_path(n):
-    found = make_attractors([list(range(n))], CELLS, {"frequency": [0.2]}, attrs=DUFFING)
+    found = make_attractors([list(range(n))], CELLS, {"frequency": [2.2]}, attrs=DUFFING)
     portraits = make_portraits(n, ("x", "v"))
     figure = plot_gallery(found, portraits, frame=Frame(178.0))
     assert [ax.get_xlabel() for ax in figure.axes] == ["$x$ [m]"] * n

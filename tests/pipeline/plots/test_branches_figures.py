@@ -10,7 +10,7 @@ import xarray as xr
 from matplotlib.lines import Line2D
 
 from magpend_core.models.parameters import ParameterError
-from pipeline.plots import plot_branches, plot_curves, plot_multipliers
+from pipeline.plots import plot_branches, plot_multipliers
 from pipeline.runs.derive import derive
 from pipeline.specification.problems import SpecError
 from tests.pipeline.plots.made_up import STATES
@@ -87,24 +87,6 @@ def test_plot_multipliers__all_points(made_up):
     assert len(points.get_offsets()) == 84
     with pytest.raises(ValueError, match="branches 0 to 0"):
         plot_multipliers(made_up, 1)
-
-
-def test_plot_curves__lines():
-    x = np.array([[2.0, 2.5, 3.0], [2.1, 2.2, np.nan]])
-    ds = xr.Dataset(
-        {
-            "first": (("curve", "point"), x, {"units": "Hz"}),
-            "second": (("curve", "point"), x / 2, {"units": "N m"}),
-            "kind": ("curve", [0, 1]),
-            "orbit_period": ("curve", [1, 2]),
-            "n_points": ("curve", [3, 2]),
-            "special_kind": ("special", [], {"flag_meanings": "cusp"}),
-        },
-        attrs={"first_parameter": "frequency_hz", "second_parameter": "q"},
-    )
-    ax = plot_curves(ds).axes[0]
-    assert [len(line.get_xdata()) for line in ax.lines] == [3, 2]
-    assert ax.get_ylabel() == "q [N m]"
 
 
 FREQUENCY = {"parameter": "frequency_hz"}

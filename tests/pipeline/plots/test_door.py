@@ -14,6 +14,8 @@ from magpend_core.models import load_model
 from pipeline.analysis.selection import place
 from pipeline.plots import Frame, draw_figure, save_data, save_figure
 from pipeline.plots.bifurcation import plot_bifurcation
+from pipeline.plots.motions import motions_of
+from pipeline.plots.style import BLUE, GREY
 from pipeline.products.product import Options, default_of
 from pipeline.products.registry import FIGURES
 from tests.pipeline.plots.made_up import PENDULUM
@@ -101,6 +103,8 @@ def other_value(model, name):
 @pytest.mark.parametrize("name", list(FIGURES))
 def test_label__every_option_that_changes_the_picture_changes_the_name(name):
     model = FIGURES[name].options
+    assert issubclass(model, Options)
+    assert {"at", "nearest", "degrees", "width", "xlim", "ylim"} <= set(model.model_fields)
     required = {
         key: {"second": "q", "between": ("A", "B")}.get(key, 1.0)
         for key, field in model.model_fields.items()
@@ -165,30 +169,23 @@ def test_draw_figure__provenance_beside_and_inside(tmp_path):
     assert (attrs["host"], attrs["git_commit"]) == ("node7", "f" * 40)
     assert attrs["created"].startswith("2026-01-02")
     assert attrs["model"] == "pendulum"
-    for suffix in (".png", ".svg", ".pdf"):
+    for suffix in (".png", ".svg"):
         written = save_figure(figure, tmp_path / f"a{suffix}").read_bytes()
-        if suffix != ".pdf":
-            assert b"node7" in written
-            assert b"d" * 64 in written
-        assert b"bifurcation diagram" in written or suffix == ".pdf"
+        assert all(text in written for text in (b"node7", b"d" * 64, b"bifurcation diagram"))
 
 
-def test_save_data__what_is_empty_does_not_spoil_the_file(tmp_path):
+def test_files__without_what_is_empty_and_with_fonts_as_outlines(tmp_path):
     """A dim of length 0 is NetCDF's for one that may grow; scipy does not read it back."""
     figure = plot_bifurcation(make_cube())
+    # type 42 embeds TrueType outlines; type 3 would be drawings without a name that journals take
+    written = save_figure(figure, tmp_path / "a.pdf").read_bytes()
+    assert b"/Type3" not in written
+    assert b"/FontFile2" in written
+    assert b"drive frequency [Hz]</text>" in save_figure(figure, tmp_path / "a.svg").read_bytes()
     figure.data = xr.Dataset({"none": (("empty", "x"), np.zeros((0, 2))), "some": ("x", [1.0, 2.0])})
     with xr.open_dataset(save_data(figure, tmp_path / "a.png"), engine="scipy") as stored:
         assert stored["some"].values.tolist() == [1.0, 2.0]
         assert set(stored.variables) == {"some"}
-
-
-def test_save_figure__fonts_are_outlines_and_texts_stay_texts(tmp_path):
-    figure = plot_bifurcation(make_cube())
-    written = save_figure(figure, tmp_path / "a.pdf").read_bytes()
-    # type 42 embeds TrueType outlines; type 3 would be drawings without a name that journals take
-    assert b"/Type3" not in written
-    assert b"/FontFile2" in written
-    assert b"drive frequency [Hz]</text>" in save_figure(figure, tmp_path / "a.svg").read_bytes()
 
 
 def test_frame__limits_show_and_keep_a_part():
@@ -199,25 +196,14 @@ def test_frame__limits_show_and_keep_a_part():
     assert sorted(set(np.round(figure.data["x"].values, 6))) == [2.05, 2.1]
     with pytest.raises(ValueError, match=r"xlim = 2, 2: must be two different"):
         plot_bifurcation(make_cube(), frame=Frame(xlim=(2.0, 2.0)))
-
-
-def test_bifurcation__fixed_values_are_shown():
+    # fixed values are shown
     cube = xr.concat([make_cube(), make_cube()], xr.DataArray([1.0, 1.5], dims="q", name="q"))
     cube["q"].attrs = {"units": "N m"}
     figure = plot_bifurcation(cube.transpose("frequency", "q", "initial_condition", ...), at={"q": 1.5})
     assert figure.axes[0].get_title(loc="left") == "q = 1.5\N{NO-BREAK SPACE}N m"
 
 
-def test_options__every_figure_has_the_common_ones():
-    for figure in FIGURES.values():
-        assert issubclass(figure.options, Options)
-        assert {"at", "nearest", "degrees", "width", "xlim", "ylim"} <= set(figure.options.model_fields)
-
-
 def test_motions__words_have_colours_and_neutral_ones_are_grey():
-    from pipeline.plots.motions import motions_of
-    from pipeline.plots.style import BLUE, GREY
-
     found = motions_of(make_cube())
     assert found.words == load_model("pendulum").classifier.words
     assert found.colours[found.words.index("left")] == BLUE

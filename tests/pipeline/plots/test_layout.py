@@ -38,7 +38,7 @@ def texts_of(fig):
         found += [*ax.texts, ax.xaxis.label, ax.yaxis.label]
         for axis in (ax.xaxis, ax.yaxis):
             low, high = sorted(axis.get_view_interval())
-            ticks = zip(axis.get_ticklocs(), axis.get_ticklabels(), strict=True)
+            ticks = zip(axis.get_ticklocs(), axis.get_ticklabels(), strict=False)  # shared axes have no labels
             found += [label for place, label in ticks if low <= place <= high]
     return [(t, t.get_window_extent(canvas.get_renderer())) for t in found if t.get_text()]
 

@@ -145,21 +145,15 @@ def test_plot_bifurcation__blank_where_no_cell_is_left():
     ds = make_cube()
     for branch in range(4):
         ds = set_status(ds, branch, 4, PENDING)
-    fig = plot_bifurcation(ds)
-    blank = by_gid(fig)["blank"]
-    xs = np.concatenate([path.vertices[:, 0] for path in blank.get_paths()])
+    xs = np.concatenate([path.vertices[:, 0] for path in by_gid(plot_bifurcation(ds))["blank"].get_paths()])
     assert (xs.min(), xs.max()) == pytest.approx((2.35, 2.45))
-
-
-def test_plot_bifurcation__empty_cube_says_so():
-    ds = make_cube()
     ds["status"][:] = PENDING
     ds["section"][:] = np.nan
-    fig = plot_bifurcation(ds)
-    assert [t.get_text() for t in fig.axes[0].texts] == ["nothing to draw yet: all 20 cells are pending"]
+    texts = plot_bifurcation(ds).axes[0].texts
+    assert [t.get_text() for t in texts] == ["nothing to draw yet: all 20 cells are pending"]
     ds["status"][0] = DIVERGED
-    fig = plot_bifurcation(ds, layout="side")
-    assert fig.axes[0].texts[0].get_text() == "nothing to draw: of 20 cells, 15 pending, 5 diverged"
+    (text, *_) = plot_bifurcation(ds, layout="side").axes[0].texts
+    assert text.get_text() == "nothing to draw: of 20 cells, 15 pending, 5 diverged"
 
 
 def test_plot_bifurcation__sweep_pools_initial_conditions():
@@ -181,13 +175,6 @@ def test_plot_bifurcation__other_and_falling_parameter():
     np.testing.assert_allclose(drawn(fig)["up:left"], expected(ds.rename(q="frequency"), 0))
 
 
-def test_plot_bifurcation__two_parameters_are_refused():
-    ds = xr.concat([make_cube(), make_cube()], xr.DataArray([1.0, 1.5], dims="q", name="q"))
-    with pytest.raises(ValueError, match=r"frequency.*such as --at q=1"):
-        plot_bifurcation(ds.transpose("branch", "frequency", "q", ...))
-    plot_bifurcation(ds.sel(q=1.5))
-
-
 def test_plot_bifurcation__refusals():
     for options, message in (
         ({"state": "psi"}, r"unknown state 'psi'\. Did you mean 'psi2'\? Allowed: psi1, psi2, psi1_dot"),
@@ -197,6 +184,10 @@ def test_plot_bifurcation__refusals():
             plot_bifurcation(make_cube(), **options)
     with pytest.raises(ValueError, match="this cube has up only; use layout 'overlay'"):
         plot_bifurcation(make_cube().isel(branch=[0, 1]), layout="side")
+    ds = xr.concat([make_cube(), make_cube()], xr.DataArray([1.0, 1.5], dims="q", name="q"))
+    with pytest.raises(ValueError, match=r"frequency.*such as --at q=1"):
+        plot_bifurcation(ds.transpose("branch", "frequency", "q", ...))
+    plot_bifurcation(ds.sel(q=1.5))
 
 
 @pytest.mark.parametrize(("chunks", "block_values"), [({"branch": 1}, 50), ({"branch": 3, "frequency": 2}, 1)])
@@ -208,15 +199,10 @@ def test_plot_bifurcation__blocks_do_not_matter(chunks, block_values, monkeypatc
     assert sorted(found) == sorted(want)
     for kind in want:
         np.testing.assert_array_equal(found[kind], want[kind])
-
-
-def test_plot_bifurcation__blocks_are_bounded_and_tile_the_cube(monkeypatch):
-    monkeypatch.setattr(points, "BLOCK_VALUES", 60)
-    section = make_cube(7).chunk(branch=2)["section"]
-    seen = np.zeros((4, 7), int)
+    # blocks are bounded, and tile the cube
+    section, seen = make_cube(7).chunk(chunks)["section"], np.zeros((4, 7), int)
     for selection in points.selections(section):
-        part = section.isel(selection)
-        assert part.size <= 60
+        assert section.isel(selection).size <= max(block_values, 12)
         seen[selection["branch"], selection["frequency"]] += 1
     assert (seen == 1).all()
 

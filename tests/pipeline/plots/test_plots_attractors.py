@@ -42,16 +42,12 @@ PENDING, PERIODIC, BOUNDED, DIVERGED = Status.PENDING, Status.PERIODIC, Status.B
 STEP_LIMIT, INFERRED = Status.STEP_LIMIT, Status.INFERRED
 
 
-def grid_coords(n1, n2):
-    """Cell centres between -1 and 1."""
-
-    def axis(name, n):
-        return (name, -1.0 + (np.arange(n) + 0.5) * 2.0 / n, {"units": "rad"})
-
-    return {"psi1_0": axis("psi1_0", n1), "psi2_0": axis("psi2_0", n2)}
-
-
 GRID = ("psi1_0", "psi2_0")
+
+
+def grid_coords(n):
+    """Cell centres between -1 and 1."""
+    return {name: (name, -1.0 + (np.arange(n) + 0.5) * 2.0 / n, {"units": "rad"}) for name in GRID}
 
 
 @pytest.fixture
@@ -62,7 +58,7 @@ def grid():
     ids[3, 0], ids[3, 1], ids[2, 0], ids[2, 1] = -1, -1, -1, -1
     status = np.where(ids >= 0, PERIODIC, BOUNDED).astype(np.int8)
     status[3, 0], status[3, 1], status[2, 0] = DIVERGED, PENDING, STEP_LIMIT
-    return make_attractors(ids, GRID, grid_coords(4, 4), status=status)
+    return make_attractors(ids, GRID, grid_coords(4), status=status)
 
 
 def colours_of(fig):
@@ -120,16 +116,19 @@ def test_plot_basins__pixels_of_the_file_lie_where_the_axes_say(grid, tmp_path):
 
 
 def test_plot_basins__shading_by_time(grid):
-    """Slower is darker, in the same hue; cells without a closed orbit are not shaded."""
+    """Slower is darker, in the same hue; cells that took no time or did not close are not shaded."""
+    grid["status"][1, :2] = grid["status"][2, 1] = INFERRED  # as the others: no basin of their own
     periods = xr.full_like(grid["attractor_id"], 100)
-    periods[1, :] = 1000
-    plain, shaded = colours_of(plot_basins(grid)), colours_of(plot_basins(grid, n_periods=periods))
-    assert np.allclose(shaded[0], plain[0], atol=0.003)
-    ratio = shaded[1] / plain[1]
-    assert (ratio[plain[1] > 0.1] < 0.5).all()
-    assert np.ptp(ratio[plain[1] > 0.2]) < 0.03
-    assert np.allclose(shaded[2:, :2], plain[2:, :2])
+    periods[1, :] = [0, 0, 1000, 1000]
     fig = plot_basins(grid, n_periods=periods)
+    plain, shaded = colours_of(plot_basins(grid)), colours_of(fig)
+    assert np.allclose(shaded[0], plain[0], atol=0.003)
+    assert (shaded[1, :2] == plain[1, :2]).all()
+    ratio = shaded[1, 2:] / plain[1, 2:]
+    assert (ratio[plain[1, 2:] > 0.1] < 0.5).all()
+    assert np.ptp(ratio[plain[1, 2:] > 0.2]) < 0.03
+    assert np.allclose(shaded[2:, :2], plain[2:, :2])
+    assert "not settled, 6.2 %" in legend_texts(fig)
     assert [ax.get_xlabel() for ax in fig.axes if ax.get_gid() == "time"] == ["drive periods to converge"]
     assert fig.data["n_periods"].transpose(*GRID).values.tolist() == periods.values.tolist()
 
@@ -145,24 +144,6 @@ def test_plot_basins__cells_on_what_does_not_attract_are_grey(grid):
     assert np.abs(picture[2:, 2:] - to_rgb(palette.GREYS["on a transient set"])).max() < 0.003
     assert np.allclose(picture[:2], plain[:2])
     assert fig.data["outcome"].transpose(*GRID).values[2:, 2:].tolist() == [[-1, -1], [-1, -1]]
-    assert not [text for text in fig.axes[0].texts if text.get_text() == "B"]
-
-
-def test_plot_basins__inferred_cells(grid):
-    """They have their basin's colour, took no time, and are not settled if they belong to nothing."""
-    inferred = grid.copy(deep=True)
-    inferred["status"][1, :2] = INFERRED
-    inferred["status"][2, 1] = INFERRED
-    assert legend_texts(plot_basins(inferred)) == legend_texts(plot_basins(grid))
-    plain = colours_of(plot_basins(inferred))
-    assert (plain == colours_of(plot_basins(grid))).all()
-    periods = xr.full_like(grid["attractor_id"], 100)
-    periods[1, 2:] = 1000
-    periods[1, :2] = 0
-    shaded = colours_of(plot_basins(inferred, n_periods=periods))
-    assert (shaded[1, :2] == plain[1, :2]).all()
-    # not the zeros set the bright end of the scale
-    assert np.allclose(shaded[0], plain[0], atol=0.003)
 
 
 def test_plot_basins__selection_and_refusals(grid):
@@ -192,7 +173,7 @@ def test_plot_basins__four_million_cells(tmp_path):
     n = 2000
     x = np.arange(n)
     ids = (x[:, None] ** 2 // n + x[None, :] * 3) % 20
-    ds = make_attractors(ids, GRID, grid_coords(n, n))
+    ds = make_attractors(ids, GRID, grid_coords(n))
     tracemalloc.start()
     started = time.process_time()
     save_figure(plot_basins(ds), tmp_path / "a.png")
@@ -298,24 +279,14 @@ def test_plot_fractions__bands_are_stacked_and_what_is_not_decided_is_on_top(swe
     assert band(fig, "not settled") == [[2.15, 2.25, 0.8, 1.0]]
     assert band(fig, "diverged") == [[2.05, 2.15, 0.8, 0.9]]
     assert band(fig, "pending") == [[2.05, 2.15, 0.9, 1.0]]
-    assert legend_texts(fig) == [
-        "pending",
-        "diverged",
-        "not settled",
-        "A: period 1, left",
-        "B: period 1, left",
-        "95 % interval of an edge",
-    ]
-    (area,) = [a for a in fig.axes[0].collections if a.get_gid() == "band:A"]
-    assert to_rgb(area.get_facecolor()[0]) == legend_patches(fig)["A: period 1, left"]
+    names = ["pending", "diverged", "not settled", "A: period 1, left", "B: period 1, left", "95 % interval of an edge"]
+    assert legend_texts(fig) == names
+    assert to_rgb(by_gid(fig)["band:A"].get_facecolor()[0]) == legend_patches(fig)["A: period 1, left"]
     assert fig.axes[0].get_xlabel() == "drive frequency [Hz]"
     assert fig.data["fraction"].sel(outcome="A").values.tolist() == [0.5, 0.4, 0.0]
     assert fig.data["fraction"].sum("outcome").values == pytest.approx(1.0)
-
-
-def test_plot_fractions__more_attractors_than_colours():
-    ids = np.tile(np.arange(15), (2, 1))
-    fig = plot_fractions(make_attractors(ids, ("q", "initial_condition"), {"q": [1.0, 1.1]}))
+    # more attractors than colours
+    fig = plot_fractions(make_attractors([range(15)] * 2, ("q", "initial_condition"), {"q": [1.0, 1.1]}))
     assert len(legend_patches(fig)) == 13
     assert legend_texts(fig)[0] == "3 others"
     assert band(fig, "3 others") == [[0.95, 1.15, 0.8, 1.0]]
@@ -346,12 +317,11 @@ def test_plot_coexisting__points_and_weights(sweep):
     np.testing.assert_allclose(halves**2, [least + growth * 0.25, least + growth * 0.25, least + growth * 0.4])
 
 
-def test_plot_coexisting__angles_on_the_circle_and_unknown_state(sweep):
+def test_plot_coexisting__angles_on_the_circle(sweep):
     sweep["attractor_points"][:] = sweep["attractor_points"] + 2 * np.pi
-    where, _ = offsets(plot_coexisting(sweep), "points:B")
-    np.testing.assert_allclose(where[:, 1], 0.2)
-    where, _ = offsets(plot_coexisting(sweep, state="psi1_dot"), "points:B")
-    np.testing.assert_allclose(where[:, 1], 0.2 + 2 * np.pi)
+    np.testing.assert_allclose(offsets(plot_coexisting(sweep), "points:B")[0][:, 1], 0.2)
+    rates = offsets(plot_coexisting(sweep, state="psi1_dot"), "points:B")[0][:, 1]
+    np.testing.assert_allclose(rates, 0.2 + 2 * np.pi)
     with pytest.raises(ValueError, match="unknown state 'psi3'"):
         plot_coexisting(sweep, state="psi3")
 
@@ -363,17 +333,11 @@ def test_plot_coexisting__sets_that_do_not_attract_are_small_and_grey(sweep):
     fig = plot_coexisting(sweep)
     np.testing.assert_allclose(offsets(fig, "points:B")[0], [[2.0, 0.2]])
     lines = {line.get_gid(): line for line in fig.axes[0].get_lines()}
-    assert {gid: line.get_xdata().tolist() for gid, line in lines.items()} == {
-        "points:not settled": [2.1],
-        "points:unstable": [2.2],
-    }
+    found = {gid: line.get_xdata().tolist() for gid, line in lines.items()}
+    assert found == {"points:not settled": [2.1], "points:unstable": [2.2]}
     assert lines["points:unstable"].get_color() == palette.GREY_OF[vocabulary.UNSTABLE]
-    assert legend_texts(fig)[:4] == [
-        "A: period 1, left",
-        "B: period 1, left, unstable or not settled in parts",
-        "not settled",
-        "unstable",
-    ]
+    told = ["A: period 1, left", "B: period 1, left, unstable or not settled in parts", "not settled", "unstable"]
+    assert legend_texts(fig)[:4] == told
 
 
 @pytest.fixture
@@ -450,18 +414,18 @@ def test_plot_regimes__each_point_has_its_regime(map_of_two):
 
 
 def test_attractor_figures__say_how_many_cells_are_left_out_and_why(map_of_two, sweep):
-    """Which cells a map of regimes does not count, and a diagram does not show, stood nowhere."""
+    """Which cells a map of regimes does not count, and a diagram or a gallery does not show, stood nowhere."""
     map_of_two["status"][0, 2, 0] = Status.DIVERGED
     map_of_two["attractor_id"][0, 2, 0] = -1
-    total = map_of_two["attractor_id"].size
-    others = palette.other_cells(map_of_two)
-    n = total - sum(int(which.sum()) for which in others.values())
-    told = caption_of(plot_regimes(map_of_two))
-    assert f"{n} of {total} cells end on attractors; 1 diverged" in told
+    n = 24 - sum(int(which.sum()) for which in palette.other_cells(map_of_two).values())
+    assert f"{n} of 24 cells end on attractors; 1 diverged" in caption_of(plot_regimes(map_of_two))
     told = caption_of(plot_coexisting(sweep))
     assert "26 of 30 cells end on attractors; 1 diverged, 2 not settled, 1 pending" in told
-    settled = sweep.isel(frequency=[0])
-    assert "cells end on attractors" not in caption_of(plot_coexisting(settled))
+    assert "cells end on attractors" not in caption_of(plot_coexisting(sweep.isel(frequency=[0])))
+    attractors = make_attractors([0, 1, -1, -1, -1, -1], ("initial_condition",))
+    attractors["status"][2:] = [vocabulary.DIVERGED] * 3 + [vocabulary.UNREACHED]
+    head = " ".join(plot_gallery(attractors, make_portraits(2)).texts[0].get_text().split())
+    assert head.endswith("2 of 6 cells end on attractors; 3 diverged, 1 unreached")
 
 
 @pytest.fixture
@@ -488,17 +452,13 @@ def test_plot_regimes__curves_over_the_map(map_of_two, curves_of_two):
 
 
 def test_plot_curves__names_points_of_codimension_two(curves_of_two):
-    fig = plot_curves(curves_of_two)
-    assert [text.get_text() for text in fig.axes[0].texts if text.get_text()] == ["CP"]
+    ax = plot_curves(curves_of_two).axes[0]
+    assert [text.get_text() for text in ax.texts if text.get_text()] == ["CP"]
+    assert [line.get_xdata().tolist() for line in ax.lines if len(line.get_xdata()) > 1] == [[1.0, 1.5, 2.0]]
+    assert ax.get_xlabel().endswith("[N m]")
     table = curves_table(curves_of_two)
-    assert table.rows[0] == {
-        "type": "cusp",
-        "q": 1.5,
-        "frequency_hz": 2.15,
-        "period": 1,
-        "error": pytest.approx(1e-8),
-        "curve": 0,
-    }
+    row = {"type": "cusp", "q": 1.5, "frequency_hz": 2.15, "period": 1, "error": pytest.approx(1e-8), "curve": 0}
+    assert table.rows[0] == row
     assert table.lines[1].endswith("; ends: stuck")
 
 
@@ -514,14 +474,12 @@ def test_plot_regimes__not_periodic_and_one_parameter(map_of_two, sweep):
     map_of_two["orbit_period"][0, 1, 1] = 0
     map_of_two["kind"][0, 1, 1] = vocabulary.CHAOTIC_SET
     assert regime_names(plot_regimes(map_of_two))[0][1] == "1 + not periodic"
-    with pytest.raises(ValueError, match="two swept parameters, and 1 are left of frequency"):
-        plot_regimes(sweep)
     with pytest.raises(ValueError, match="Did you mean 'periods'"):
         plot_regimes(map_of_two, show="period")
 
 
 def test_plot_gallery__orbits_sections_and_paths():
-    attractors = make_attractors(np.arange(3), ("initial_condition",))
+    attractors = make_attractors(range(3), ("initial_condition",))
     drawn = make_portraits(3, turning=(2,))
     fig = plot_gallery(attractors, drawn)
     lines = by_gid(fig)
@@ -545,20 +503,18 @@ def test_plot_gallery__orbits_sections_and_paths():
 
 
 def test_plot_gallery__scale_of_the_path_is_equal_and_holds_it():
-    fig = plot_gallery(make_attractors(np.arange(2), ("initial_condition",)), make_portraits(2))
+    fig = plot_gallery(make_attractors(range(2), ("initial_condition",)), make_portraits(2))
     for ax in fig.axes:
-        path = [line for line in ax.get_lines() if str(line.get_gid()).startswith("path")]
-        if path:
-            box = ax.get_window_extent()
-            (left, right), (bottom, top) = ax.get_xlim(), ax.get_ylim()
+        for path in (line for line in ax.get_lines() if str(line.get_gid()).startswith("path")):
+            box, (left, right), (bottom, top) = ax.get_window_extent(), ax.get_xlim(), ax.get_ylim()
             assert (right - left) / box.width == pytest.approx((top - bottom) / box.height)
-            x, y = path[0].get_xydata().T
+            x, y = path.get_xydata().T
             assert left < x.min() < x.max() < right
             assert bottom < min(y.min(), -VALUES["h"]) < y.max() < top
 
 
 def test_plot_gallery__largest_shares_are_drawn():
-    attractors = make_attractors(np.arange(11), ("initial_condition",))
+    attractors = make_attractors(range(11), ("initial_condition",))
     portraits = make_portraits(11)
     portraits["share"][0] = 0.0
     fig = plot_gallery(attractors, portraits)
@@ -568,17 +524,8 @@ def test_plot_gallery__largest_shares_are_drawn():
         plot_gallery(attractors, portraits.isel(attractor=[]))
 
 
-def test_plot_gallery__says_what_it_leaves_out():
-    """Of six cells two end on the attractors, three diverged and one was not reached."""
-    attractors = make_attractors(np.array([0, 1, -1, -1, -1, -1]), ("initial_condition",))
-    attractors["status"][2:] = [vocabulary.DIVERGED] * 3 + [vocabulary.UNREACHED]
-    fig = plot_gallery(attractors, make_portraits(2))
-    head = " ".join(fig.texts[0].get_text().split())
-    assert head.endswith("2 of 6 cells end on attractors; 3 diverged, 1 unreached")
-
-
 def test_plot_gallery__sets_that_do_not_attract_are_grey_and_have_no_share():
-    attractors, portraits = make_attractors(np.arange(2), ("initial_condition",)), make_portraits(2)
+    attractors, portraits = make_attractors(range(2), ("initial_condition",)), make_portraits(2)
     for ds in (attractors, portraits):
         ds["stability"][1] = vocabulary.UNSTABLE
     fig = plot_gallery(attractors, portraits)
@@ -611,12 +558,6 @@ def test_greys__every_cell_without_an_attractor_has_one():
     assert [bool(found[name][len(Status) + k]) for k, name in enumerate(on_sets)] == [True] * 4
 
 
-def bars(fig, name):
-    """Position, low and high of the bars at the upper edge of a band."""
-    found = [a for a in fig.axes[0].collections if a.get_gid() == f"interval:{name}"]
-    return [[round(float(v), 9) for v in (s[0][0], s[0][1], s[1][1])] for s in found[-1].get_segments()]
-
-
 def test_plot_fractions__intervals(sweep):
     fig = plot_fractions(sweep)
     # Wilson's score interval, by its own equation: |p - k/n| = z sqrt(p (1 - p) / n) at both ends
@@ -626,20 +567,17 @@ def test_plot_fractions__intervals(sweep):
             p, share = one[end].values, np.array(k) / 10
             inner = (p > 0) & (p < 1)
             assert np.abs(p - share)[inner] == pytest.approx(1.959964 * np.sqrt(p * (1 - p) / 10)[inner])
-        assert (one["low"] <= one["fraction"]).all()
-        assert (one["fraction"] <= one["high"]).all()
-    b = fig.data.sel(outcome="B")
+        assert ((one["low"] <= one["fraction"]) & (one["fraction"] <= one["high"])).all()
     # five bands: the bars of the lowest stand at a fifth of the columns, which are 0.1 Hz wide
-    expected = np.column_stack([[1.97, 2.07, 2.17], b["low"], b["high"]])
-    assert bars(fig, "B") == pytest.approx(expected)
+    b = fig.data.sel(outcome="B")
+    bars = np.array([segment[:, 1] for segment in by_gid(fig)["interval:B"].get_segments()])
+    assert bars == pytest.approx(np.column_stack([b["low"], b["high"]]))
     # the edge above A is none at the first frequency, where A reaches the top, nor at the last
-    assert [x for x, *_ in bars(fig, "A")] == [2.09]
-    caption = caption_of(fig)
-    assert "states" in caption
+    assert [round(float(s[0, 0]), 9) for s in by_gid(fig)["interval:A"].get_segments()] == [2.09]
     # five of ten cells have the widest interval
-    assert caption.endswith(f"±{float(0.5 - b['low'][0]):.2g}")
+    assert caption_of(fig).endswith(f"±{float(0.5 - b['low'][0]):.2g}")
     many = sweep.isel(frequency=np.tile(np.arange(3), 7)).assign_coords(frequency=2.0 + 0.1 * np.arange(21))
-    assert not [a for a in plot_fractions(many).axes[0].collections if "interval" in a.get_gid()]
+    assert not [gid for gid in by_gid(plot_fractions(many)) if "interval" in gid]
 
 
 def test_plot_fractions__branches_are_no_sample(walk):

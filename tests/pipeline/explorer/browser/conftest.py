@@ -35,17 +35,11 @@ HOSTILE = "small <img src=x onerror=\"document.title='run by a title'\"> run"
 SMALL = f"""
 kind = "sweep"
 title = {json.dumps(HOSTILE)}
-[axes]
-frequency_hz = {{ start = 2.2, stop = 2.3, num = 5 }}
-[initial_conditions]
-kind = "grid"
-psi1_deg = {{ start = -20, stop = 20, num = 3 }}
-psi2_deg = {{ start = -20, stop = 20, num = 3 }}
-[integration]
-rtol = 1e-7
-atol = 1e-7
-n_transient = 300
-n_keep = 20
+axes = {{ frequency_hz = {{ start = 2.2, stop = 2.3, num = 5 }} }}
+initial_conditions.kind = "grid"
+initial_conditions.psi1_deg = {{ start = -20, stop = 20, num = 3 }}
+initial_conditions.psi2_deg = {{ start = -20, stop = 20, num = 3 }}
+integration = {{ rtol = 1e-7, atol = 1e-7, n_transient = 300, n_keep = 20 }}
 """
 
 CANDIDATES = ("/usr/bin/chromium", "chromium", "chromium-browser", "google-chrome", "google-chrome-stable")

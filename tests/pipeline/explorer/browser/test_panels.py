@@ -18,8 +18,6 @@ from pipeline.store.run import Run, open_run
 from tests.pipeline.explorer.browser.conftest import WAIT_MS, drawn, reused, served
 from tests.pipeline.explorer.browser.test_diagram import click_on, places_of
 
-SOURCES = Path(__file__).parents[4] / "pipeline" / "explorer" / "page" / "src"
-
 pytestmark = pytest.mark.slow
 
 QUIET = {"reduced_motion": "reduce"}  # no drawing moves unasked, so that time stands at the section
@@ -123,32 +121,15 @@ def test_click__shows_the_orbit_of_the_cube(shown, cube, owners, section):
     # four significant digits, at the section's own instant; the angles of the cube are within half a turn
     assert told[0] == 0.0
     assert told[1:] == pytest.approx(point.tolist(), rel=1e-3)
+    shown.page.locator(".panel-facts summary", has_text="Starts that lead here").click()
+    first = numbers(shown.page.locator(".panel-facts details li").first.text_content())
+    leads = [i for i in np.flatnonzero(owners == owners[cell]) if cells_of(cube)[i]["frequency"] == own["frequency"]]
+    starts = [[cells_of(cube)[i]["psi1_0"], cells_of(cube)[i]["psi2_0"]] for i in leads]
+    assert any(first[:2] == pytest.approx(start, abs=1e-3) for start in starts)
     # compiled for, if nobody has looked yet
     shown.page.locator(".panel-multipliers .value").nth(3).wait_for()
     assert shown.complaints == []
     assert shown.outside == []
-
-
-def test_click__on_a_point_that_comes_once_shows_that_very_point(shown, cube, section):
-    frequency = np.array([cell["frequency"] for cell in cells_of(cube)])
-    lonely, most = (0, 0), 0.0
-    for i in np.flatnonzero(cube["orbit_period"].values.ravel() != 1):
-        here = np.sort(section[frequency == frequency[i], :, 0].ravel())
-        for k, value in enumerate(section[i, :, 0]):
-            gap = np.partition(np.abs(here - value), 1)[1]
-            if gap > most:
-                lonely, most = (int(i), k), gap
-    cell, point = lonely
-    x, y = frequency[[cell]], section[cell, [point], 0]
-    shown.page.evaluate("magpend.state.set({ y: 'psi1' })")
-    click_on(shown.page, places_of(shown.page, x, y)[0])
-    shown.page.locator(f".panels[data-shown='{cell}-{point}']").wait_for()
-    told = numbers(shown.page.locator(".panel-series output").text_content())
-    assert told[1:] == pytest.approx(section[cell, point].tolist(), rel=1e-3)
-    shown.page.locator(".panel-facts summary", has_text="Starts that lead here").click()
-    own = cells_of(cube)[cell]
-    first = numbers(shown.page.locator(".panel-facts details li").first.text_content())
-    assert first[:2] == pytest.approx([own["psi1_0"], own["psi2_0"]], abs=1e-3)
 
 
 def test_live_start__ends_on_the_label_of_the_cube(page, cube, owners):
@@ -242,28 +223,3 @@ def test_connection__that_is_lost_is_said_and_sought(visit, looked_at):
     opened.page.get_by_text("Not connected to magpend").wait_for()
     opened.page.get_by_role("button", name="Integrate this start").click()
     note_of(opened, "plane", "connection to magpend was lost")
-
-
-def test_broken_lines__draw_nothing_across_the_circle(browser):
-    source = (SOURCES / "wrapping.js").read_text("utf-8")
-    context = browser.new_context()
-    lines = context.new_page().evaluate(
-        """async (source) => {
-            const blob = new Blob([source], { type: 'text/javascript' });
-            const { brokenLines, wrappingOf } = await import(URL.createObjectURL(blob));
-            const angle = Float64Array.from({ length: 200 }, (_, i) => 0.1 * i), rate = angle.map(Math.cos);
-            const plain = { shift: 0, cut: false };
-            const turning = brokenLines(angle, rate, wrappingOf(angle, true), plain);
-            const swing = angle.map((a) => 7 + Math.sin(a));
-            return { turning, swinging: brokenLines(swing, rate, wrappingOf(swing, true), plain) };
-        }""",
-        source,
-    )
-    context.close()
-    for line in lines["turning"]:
-        x = np.array(line[::2])
-        assert np.abs(x).max() <= np.pi + 1e-12
-        assert np.abs(np.diff(x)).max() <= 0.1 + 1e-12
-    assert len(lines["turning"]) == 4  # 19.9 rad go through half a turn three times
-    assert len(lines["swinging"]) == 1
-    assert max(map(abs, lines["swinging"][0][::2])) < np.pi  # brought next to 0 by a full turn
