@@ -160,15 +160,6 @@ def test_cube__has_the_models_own_names(runs, day):
     assert magpend.Run.open(day / "sweep").model.name == "duffing"
 
 
-def test_zoom__and_run_it(runs, day):
-    words = "--x 0 1 --num-x 3 --at frequency=0.155 --axis v=0:1 --at amplitude=0.15 --out closer.toml"
-    runs("zoom", "sweep", *words.split())
-    text = (day / "closer.toml").read_text()
-    assert "x = { start = 0.0, stop = 1.0, num = 3 }" in text
-    assert 'model = "duffing"' in text
-    runs("run", "closer.toml", "--dry-run")
-
-
 def test_simulate(call, day):
     words = "--x 0.5 --v 0.1 --frequency 0.16 --set amplitude=0.25 --periods 3 --samples 20 --out one.csv --no-figure"
     call("simulate", "--model", "duffing", *words.split())

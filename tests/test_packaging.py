@@ -85,11 +85,9 @@ def installed_names():
     return {name.removeprefix("pipeline/face/") for name in inside}
 
 
-def test_wheel__has_the_tracked_files_of_the_packages_and_no_others(built):
+def test_packages__have_the_tracked_files_and_no_others(built):
+    """In the wheel those of the packages, in the sdist what wheels are built from."""
     assert names_in(built[0]) == installed_names()
-
-
-def test_sdist__has_what_wheels_are_built_from(built):
     with tarfile.open(built[1]) as archive:
         names = {name.partition("/")[2] for name in (m.name for m in archive.getmembers() if m.isfile())}
     made = {name for name in names if name.startswith("magpend.egg-info/")} | {"PKG-INFO", "setup.cfg"}

@@ -127,13 +127,6 @@ def test_quickstart__chaos_period_2_and_period_1(ds):
     assert ((window == 1).mean("branch") > most).all()
 
 
-def test_quickstart__run_again_does_nothing(directory, command):
-    before = {p: p.stat().st_mtime_ns for p in (directory / "cube.zarr").rglob("*") if p.is_file()}
-    _, notes = command(directory.parent, "run", "quickstart", "--out", directory)
-    assert "nothing to do" in notes
-    assert before == {p: p.stat().st_mtime_ns for p in (directory / "cube.zarr").rglob("*") if p.is_file()}
-
-
 def test_plot__without_kernel(directory, tmp_path, command, monkeypatch):
     """The figure comes from the cube alone: with a kernel that raises, it is the other process's file."""
 

@@ -12,6 +12,8 @@ import pytest
 
 import pipeline.explorer
 
+pytestmark = pytest.mark.slow  # needs node
+
 SOURCES = Path(pipeline.explorer.__file__).parent / "page" / "src"
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import time
-
 import numpy as np
 import pytest
 import xarray as xr
@@ -60,15 +58,6 @@ def test_plot_section__zoom_of_many_points_counts_them_anew():
     assert zoom.axes[0].get_xlim() == (0.5, 0.7)
     # the layers of the attractor lie apart in the zoom: its pixels are finer than those of the whole
     assert np.diff(np.unique(zoom.data["x"])).min() < 0.2 * np.diff(np.unique(whole.data["x"])).min()
-
-
-def test_plot_section__ten_million_points_within_seconds():
-    ds = make_sections(20, 1000)
-    ds = ds.isel(initial_condition=np.tile(np.arange(20), 500))
-    started = time.process_time()
-    figure = plot_section(ds)
-    assert time.process_time() - started < 120.0  # about 3 s; a loop over points in Python takes far longer
-    assert int(figure.data["count"].sum()) == 10_000_000
 
 
 def test_plot_section__one_parameter_point():
