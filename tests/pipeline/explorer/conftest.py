@@ -57,7 +57,7 @@ class Client:
         self.port = self.socket.getsockname()[1]
         self.guard = Guard(new_token(), self.port)
         self.service = Service(run, self.guard)
-        self.loop = asyncio.new_event_loop()
+        self.loop, self._opened = asyncio.new_event_loop(), []
         self._ready = threading.Event()
         self._thread = threading.Thread(target=self._serve)
         self._thread.start()
@@ -68,8 +68,8 @@ class Client:
 
         async def begin():
             served = application(self.service)
-            routes = served.wildcard_router.rules
-            self.pages = next(rule.kwargs["others"] for rule in routes if rule.regex.pattern.startswith("/ws"))
+            routes = (rule.target_kwargs for rule in served.wildcard_router.rules)
+            self.pages = next((given["others"] for given in routes if "others" in given), set())
             self.server = HTTPServer(served, **server.LIMITS)
             self.server.add_socket(self.socket)
             self._ready.set()
@@ -103,11 +103,30 @@ class Client:
         answer = self.wait(fetch())
         return SimpleNamespace(code=answer.code, headers=answer.headers, body=answer.body or b"")
 
-    def page(self):
+    async def page(self):
         """Open the websocket as this server's own page does."""
         headers = {"Origin": f"http://127.0.0.1:{self.port}"}
         address = f"ws://127.0.0.1:{self.port}/ws?token={self.guard.token}"
-        return websocket_connect(HTTPRequest(address, headers=headers))
+        page = await websocket_connect(HTTPRequest(address, headers=headers))
+        self._opened.append((page, page.protocol.stream))
+        return page
+
+    def talk(self, conversation):
+        """Wait for a conversation by websockets, and close what it has opened."""
+
+        async def leave():
+            for page, stream in self._opened:
+                page.close()
+                stream.close()
+            self._opened.clear()
+            while self.pages:  # the server notices that the pages have gone
+                await asyncio.sleep(0.01)
+            await asyncio.sleep(0.05)  # the last callbacks close what is left
+
+        try:
+            return self.wait(conversation)
+        finally:
+            self.wait(leave())
 
     def raw(self, text):
         """What comes back to bytes that no client would send."""
