@@ -5,11 +5,8 @@ All are computed with MAGPEND_LONG=1.
 
 from __future__ import annotations
 
-import importlib.util
 import math
 import re
-import sys
-from pathlib import Path
 
 import pytest
 
@@ -19,21 +16,12 @@ from pipeline.report.study import load_study
 from pipeline.runs.workflows import find_spec, shipped_workflows
 from pipeline.specification.parsing import load_spec
 from pipeline.specification.problems import validated
+from tests.programs import ROOT, program
 
-ROOT = Path(__file__).parents[1]
 PAGES = ROOT / "docs" / "gallery"
 
 
-def program(name):
-    """Return a program of the docs as a module."""
-    spec = importlib.util.spec_from_file_location(f"{name}_of_gallery", ROOT / "docs" / f"{name}.py")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
-
-
-tutorials = program("run_tutorials")
+tutorials = program("docs/run_tutorials.py")
 STUDY = load_study("gallery")
 FIGURE = {figure.number: figure for figure in STUDY.table.figures}
 QUICK = ("josephson-steps", "ueda-coexisting")
@@ -62,10 +50,7 @@ def test_gallery__specification_names_paper_figure_and_number(name):
         assert word in head, word
     load_spec(path, smoke=True)
     assert STUDY.table.runs[name].spec == path.name
-
-
-@pytest.mark.parametrize("name", FIGURE)
-def test_gallery__claims_are_bounded_and_their_options_exist(name):
+    # claims are bounded, and their options exist
     figure = FIGURE[name]
     assert figure.source
     assert figure.pictures
@@ -89,13 +74,9 @@ def test_gallery__page_draws_the_study_s_figure(name):
     assert f"{drawn} --width 85 --out {name}.png" in commands
     assert (PAGES / f"{name}.png").stat().st_size < LARGEST_PICTURE
     assert f"gallery/{name}.toml" in text
-    assert picture.figure in FIGURES
-
-
-@pytest.mark.parametrize("name", FIGURE)
-def test_gallery__first_page_shows_it(name):
     index = (ROOT / "docs" / "index.md").read_text("utf-8")
     assert re.search(rf"\[!\[[^\]]+\]\(gallery/{name}\.png\)\]\(gallery/{name}\.md\)", index)
+    assert picture.figure in FIGURES
 
 
 @pytest.mark.parametrize(
@@ -112,12 +93,13 @@ def test_gallery__page_prints_the_verdicts(name, tmp_path, monkeypatch):
 
 
 def test_copies__a_page_links_to_its_copy_of_the_explorer(tmp_path, monkeypatch):
-    folder = program("build").copies(tmp_path / "gallery", ["ueda-coexisting"], smoke=True)
+    build = program("docs/build.py")
+    folder = build.copies(tmp_path / "gallery", ["ueda-coexisting"], smoke=True)
     (copy,) = folder.iterdir()
     assert copy.name == "ueda-coexisting.html"
-    assert not program("build").loaded_from_elsewhere(folder)
+    assert not build.loaded_from_elsewhere(folder)
     monkeypatch.setenv("MAGPEND_DOCS_COPIES", str(folder))
-    conf = program("conf")
+    conf = program("docs/conf.py")
     for page, there in (("gallery/ueda-coexisting", True), ("gallery/belt-friction", False), ("index", False)):
         source = ["text"]
         conf._read(None, page, source)

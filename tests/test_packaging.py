@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 import fnmatch
-import importlib.util
 import os
 import re
 import shlex
@@ -21,14 +20,18 @@ import pytest
 import yaml
 
 from magpend_core.models import model_names
-from pipeline.cli.exits import Exit
 from pipeline.runs.workflows import shipped_workflows
+from tests.programs import ROOT
 
-ROOT = Path(__file__).parents[1]
+pytestmark = pytest.mark.slow
 PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
 PROJECT = PYPROJECT["project"]
 OLDEST = PROJECT["requires-python"].removeprefix(">=")
 README = (ROOT / "README.md").read_text("utf-8")
+RECIPE, CITATION, CI = (
+    yaml.safe_load((ROOT / name).read_text("utf-8"))
+    for name in ("recipe/recipe.yaml", "CITATION.cff", ".github/workflows/ci.yml")
+)
 PACKAGES = ("magpend_core/", "pipeline/", "workflows/")
 PAGE = "pipeline/explorer/page/"
 """Sources of the explorer's page; the wheel has what is built from them."""
@@ -82,11 +85,9 @@ def installed_names():
     return {name.removeprefix("pipeline/face/") for name in inside}
 
 
-def test_wheel__has_the_tracked_files_of_the_packages_and_no_others(built):
+def test_packages__have_the_tracked_files_and_no_others(built):
+    """In the wheel those of the packages, in the sdist what wheels are built from."""
     assert names_in(built[0]) == installed_names()
-
-
-def test_sdist__has_what_wheels_are_built_from(built):
     with tarfile.open(built[1]) as archive:
         names = {name.partition("/")[2] for name in (m.name for m in archive.getmembers() if m.isfile())}
     made = {name for name in names if name.startswith("magpend.egg-info/")} | {"PKG-INFO", "setup.cfg"}
@@ -117,10 +118,8 @@ def test_wheel__is_installed_without_a_network_and_runs(built, tmp_path):
         "from magpend_core.models import model_names; print(len(model_names()))\n"
     )
     around = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path / "site"), os.environ.get("PYTHONPATH", "")])}
-    done = subprocess.run(
-        [sys.executable, "-c", code], cwd=tmp_path, env=around, capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done.stderr
+    words = [sys.executable, "-c", code]
+    done = subprocess.run(words, cwd=tmp_path, env=around, capture_output=True, text=True, check=True)
     *places, n_workflows, n_models = done.stdout.splitlines()
     assert all(place.startswith(str(tmp_path / "site")) for place in places)
     assert (int(n_workflows), int(n_models)) == (len(shipped_workflows()), len(model_names()))
@@ -128,25 +127,18 @@ def test_wheel__is_installed_without_a_network_and_runs(built, tmp_path):
 
 def test_versions__are_the_same_everywhere():
     """Of magpend in all its descriptions, and of the oldest Python that it runs on."""
-    recipe = yaml.safe_load((ROOT / "recipe" / "recipe.yaml").read_text("utf-8"))
-    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text("utf-8"))
-    assert recipe["context"]["version"] == citation["version"] == PROJECT["version"]
-    assert recipe["context"]["python_min"] == PYPROJECT["tool"]["mypy"]["python_version"] == OLDEST
+    assert RECIPE["context"]["version"] == CITATION["version"] == PROJECT["version"]
+    assert RECIPE["context"]["python_min"] == PYPROJECT["tool"]["mypy"]["python_version"] == OLDEST
     assert f"on Python {OLDEST} or later" in README
     assert set(re.findall(r"^FROM python:([\d.]+)-slim", (ROOT / "Dockerfile").read_text(), re.M)) == {OLDEST}
-    tested = yaml.safe_load((ROOT / ".github/workflows/ci.yml").read_text())["jobs"]["versions"]["strategy"]["matrix"]
+    tested = CI["jobs"]["versions"]["strategy"]["matrix"]
     said = [c.rpartition(" ")[2] for c in PROJECT["classifiers"] if re.search(r":: 3\.\d+$", c)]
     assert min(said, key=lambda v: int(v[2:])) == OLDEST
     assert set(said) <= set(tested["python"])
     assert {"python": OLDEST, "resolution": "lowest-direct"} in tested["include"]
-
-
-def test_citation__names_the_same_things():
-    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text("utf-8"))
-    assert citation["license"] == PROJECT["license"]
-    assert [a["name"] for a in citation["authors"]] == [a["name"] for a in PROJECT["authors"]]
-    (article,) = citation["references"]
-    assert f"https://doi.org/{article['doi']}" in README
+    assert CITATION["license"] == PROJECT["license"]
+    assert [a["name"] for a in CITATION["authors"]] == [a["name"] for a in PROJECT["authors"]]
+    assert f"https://doi.org/{CITATION['references'][0]['doi']}" in README
 
 
 def test_dependencies__have_lower_bounds_alone():
@@ -174,19 +166,15 @@ def test_dependencies__are_all_packages_that_are_imported():
                 assert package.lower() in named, f"{name} imports {package}"
 
 
-def test_extras__are_for_users_and_named_where_they_are_needed():
-    texts = [
-        p.read_text("utf-8") for top in ("pipeline", "docs") for s in ("py", "md") for p in (ROOT / top).rglob(f"*.{s}")
-    ]
-    for name in PROJECT["optional-dependencies"]:
-        assert any(f"magpend[{name}]" in text for text in texts), name
-    assert not set(PROJECT["optional-dependencies"]) & set(PYPROJECT["dependency-groups"])
-
-
-def test_groups__tests_install_all_extras_and_developers_everything_but_bench():
-    groups = PYPROJECT["dependency-groups"]
+def test_extras_and_groups__are_named_and_installed():
+    """Users are told of each extra; tests install all extras, and developers everything but bench."""
+    extras, groups = set(PROJECT["optional-dependencies"]), PYPROJECT["dependency-groups"]
+    pages = (p for top in ("pipeline", "docs") for s in ("py", "md") for p in (ROOT / top).rglob(f"*.{s}"))
+    text = "".join(page.read_text("utf-8") for page in pages)
+    assert [name for name in extras if f"magpend[{name}]" not in text] == []
+    assert not extras & set(groups)
     (own,) = (text for text in groups["test"] if text.startswith("magpend["))
-    assert set(own[len("magpend[") : -1].split(",")) == set(PROJECT["optional-dependencies"])
+    assert set(own[len("magpend[") : -1].split(",")) == extras
     assert {entry["include-group"] for entry in groups["dev"]} == set(groups) - {"dev", "bench"}
     (command,) = re.findall(r"<!-- run: tests -->\n```sh\n(.*?)\n```", README, re.DOTALL)
     assert "--group dev " in command
@@ -202,17 +190,16 @@ def in_conda(text):
 
 
 def test_recipe__requires_what_the_package_requires():
-    recipe = yaml.safe_load((ROOT / "recipe" / "recipe.yaml").read_text("utf-8"))
-    needs = recipe["requirements"]
+    needs = RECIPE["requirements"]
     python, *others = needs["run"]
     assert python == "python >=${{ python_min }}"
     assert others == [in_conda(text) for text in PROJECT["dependencies"]]
     extras = PROJECT["optional-dependencies"].values()
     assert needs["run_constraints"] == [in_conda(text) for listed in extras for text in listed]
-    (entry,) = recipe["build"]["python"]["entry_points"]
+    (entry,) = RECIPE["build"]["python"]["entry_points"]
     assert entry == "magpend = " + PROJECT["scripts"]["magpend"]
-    assert recipe["about"]["license"] == PROJECT["license"]
-    assert recipe["about"]["license_file"] == PROJECT["license-files"]
+    assert RECIPE["about"]["license"] == PROJECT["license"]
+    assert RECIPE["about"]["license_file"] == PROJECT["license-files"]
 
 
 def instructions():
@@ -266,8 +253,7 @@ def test_workflows__ask_for_no_rights_and_use_no_code_of_others():
                 assert step.get("uses", "actions/").startswith("actions/")
                 # text of an event never becomes a part of a command
                 assert "${{" not in step.get("run", "")
-    steps = yaml.safe_load((ROOT / ".github/workflows/ci.yml").read_text())["jobs"]["readme"]["steps"]
-    assert steps[-1]["run"] == "bash .ci/run"
+    assert CI["jobs"]["readme"]["steps"][-1]["run"] == "bash .ci/run"
 
 
 def test_repository__passes_the_review_of_scientific_python():
@@ -313,12 +299,22 @@ def too_old(path):
     executable(path, f'exec {shlex.quote(sys.executable)} -c "{code}" "$2" "$3"')
 
 
-def test_ci__takes_a_newer_python_where_python3_is_too_old(tmp_path):
+@pytest.mark.parametrize("found_by", ["path", "pyenv", None])
+def test_ci__takes_a_newer_python_where_python3_is_too_old(tmp_path, found_by):
     (path := tmp_path / "path").mkdir()
     (folder := tmp_path / "scratch").mkdir()
     too_old(path / "python3")
-    executable(path / "python3.99", f'exec {shlex.quote(sys.executable)} "$@"')
+    own = f'exec {shlex.quote(sys.executable)} "$@"'
+    if found_by == "path":
+        executable(path / "python3.99", own)
+    elif found_by == "pyenv":
+        run = f'if [ "$PYENV_VERSION" = 3.12.99 ]; then shift 2; {own}; fi'
+        executable(path / "pyenv", f"case $1 in versions) echo 2.7.18; echo 3.9.1; echo 3.12.99;; exec) {run};; esac")
     done = chosen_python(path, folder)
+    if found_by is None:
+        assert done.returncode == 1
+        assert done.stderr == f"no Python {OLDEST} or later on PATH or in pyenv; install one\n"
+        return
     assert done.returncode == 0, done.stderr
     version = ".".join(map(str, sys.version_info[:2]))
     assert done.stdout.splitlines()[0].startswith(f"Python {version} {sys.executable} ")
@@ -326,94 +322,3 @@ def test_ci__takes_a_newer_python_where_python3_is_too_old(tmp_path):
     # the environment still works when the scratch folder's script is gone
     shutil.rmtree(folder / "bin")
     subprocess.run([folder / "venv" / "bin" / "python", "-c", "import ssl"], check=True)
-
-
-def test_ci__asks_pyenv_for_its_versions(tmp_path):
-    (path := tmp_path / "path").mkdir()
-    (folder := tmp_path / "scratch").mkdir()
-    run = f'if [ "$PYENV_VERSION" = 3.12.99 ]; then shift 2; exec {shlex.quote(sys.executable)} "$@"; fi'
-    executable(path / "pyenv", f"case $1 in versions) echo 2.7.18; echo 3.9.1; echo 3.12.99;; exec) {run};; esac")
-    done = chosen_python(path, folder)
-    assert done.returncode == 0, done.stderr
-    assert sys.executable in done.stdout.splitlines()[0]
-
-
-def test_ci__says_that_no_python_is_new_enough(tmp_path):
-    (path := tmp_path / "path").mkdir()
-    too_old(path / "python3")
-    done = chosen_python(path, tmp_path)
-    assert done.returncode == 1
-    assert done.stderr == f"no Python {OLDEST} or later on PATH or in pyenv; install one\n"
-
-
-# the page for programs
-
-AGENTS = (ROOT / "AGENTS.md").read_text("utf-8")
-
-
-def test_agents__lists_all_exit_codes():
-    rows = re.findall(r"^\| ([\d, ]+) \| ([^|]+) \|", AGENTS, re.M)
-    said = {int(code): meaning for codes, meaning in rows for code in codes.split(",")}
-    assert set(said) == {int(code) for code in Exit}
-    for code in Exit:
-        if code < Exit.HUNG_UP:
-            assert said[code] == code.sentence
-        else:
-            assert code.sentence.endswith(said[code].partition("; ")[2])
-
-
-def test_agents__shows_the_error_that_comes(tmp_path, monkeypatch, capsys):
-    from pipeline.cli.main import main
-
-    ((edit, shown),) = re.findall(r"<!-- error: sed '([^']+)' -->\n```text\n(.*?)```", AGENTS, re.DOTALL)
-    (text,) = re.findall(r"<!-- file: sweep.toml -->\n```toml\n(.*?)```", AGENTS, re.DOTALL)
-    for old, new in re.findall(r"s/([^/]+)/([^/]+)/", edit):
-        assert old in text
-        text = text.replace(old, new)
-    (tmp_path / "sweep.toml").write_text(text)
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["magpend", "run", "sweep.toml"])
-    with pytest.raises(SystemExit) as end:
-        main()
-    said = capsys.readouterr()
-    assert end.value.code == Exit.REFUSED
-    assert said.err.endswith(shown)
-    assert said.out == ""
-    assert not (tmp_path / "runs").exists()
-
-
-@pytest.mark.slow
-def test_agents__commands_do_what_they_say(tmp_path, monkeypatch):
-    spec = importlib.util.spec_from_file_location("run_tutorials", ROOT / "docs" / "run_tutorials.py")
-    tutorials = importlib.util.module_from_spec(spec)
-    monkeypatch.setitem(sys.modules, "run_tutorials", tutorials)
-    spec.loader.exec_module(tutorials)
-    monkeypatch.chdir(tmp_path)
-    tutorials.follow(ROOT / "AGENTS.md", tmp_path)
-
-
-# the article
-
-
-def test_paper__cites_what_its_bibliography_has():
-    text = (ROOT / "paper" / "paper.md").read_text("utf-8")
-    listed = (ROOT / "paper" / "paper.bib").read_text("utf-8")
-    entries = dict(re.findall(r"^@\w+\{(\w+),\n(.*?)^\}", listed, re.MULTILINE | re.DOTALL))
-    cited = set(re.findall(r"@([a-z]+\d{4})\b", text))
-    assert cited == set(entries)
-    for name, entry in entries.items():
-        assert re.search(r"^  (doi|url|isbn) +=", entry, re.MULTILINE), name
-        assert re.search(rf"year += \{{{name[-4:]}\}}", entry), name
-    body = text.partition("\n---\n")[2].partition("# References")[0]
-    assert 750 < len(body.split()) < 1750  # what the journal asks for
-
-
-def test_paper__figures_are_made_by_the_commands_of_its_script():
-    text = (ROOT / "paper" / "paper.md").read_text("utf-8")
-    spec = importlib.util.spec_from_file_location("figures", ROOT / "paper" / "figures.py")
-    figures = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(figures)
-    assert set(re.findall(r"\]\((\w+\.png)\)", text.replace("\n", " "))) == set(figures.FIGURES)
-    assert all((ROOT / "paper" / name).is_file() for name in figures.FIGURES)
-    for commands, _ in figures.FIGURES.values():
-        assert commands[0].split()[1] in shipped_workflows()

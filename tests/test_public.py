@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 import tomllib
-from pathlib import Path
 
 import pytest
 
 import magpend
 from pipeline.products.registry import ANALYSES, COMMANDS
-
-ROOT = Path(__file__).parents[1]
+from tests.programs import ROOT, fresh_python
 
 
 @pytest.mark.parametrize("name", dir(magpend))
@@ -32,17 +27,37 @@ def test_magpend__completes_and_refuses_as_modules_do():
     assert ANALYSES["basins"].help in magpend.basins.__doc__
 
 
-def test_magpend__imports_nothing_heavy():
-    code = (
-        "import sys, magpend\n"
-        "dir(magpend), magpend.load_model('duffing').state_names\n"
-        "print([m for m in ('numba', 'zarr', 'dask') if m in sys.modules])\n"
-    )
-    path = os.pathsep.join([str(ROOT), str(ROOT / "pipeline" / "face"), os.environ.get("PYTHONPATH", "")])
-    found = subprocess.run(
-        [sys.executable, "-c", code], env={**os.environ, "PYTHONPATH": path}, capture_output=True, text=True, check=True
-    )
-    assert found.stdout.strip() == "[]"
+ACCESSOR = """\
+import magpend
+assert "xarray" not in sys.modules
+import xarray as xr
+assert not any(type(f).__name__ == "_AccessorRegistration" for f in sys.meta_path)
+assert "DatasetAccessor" in str(xr.Dataset().magpend)"""
+HELP = """\
+from pipeline.cli.main import app
+try:
+    app(["--help"])
+except SystemExit:
+    pass"""
+
+
+@pytest.mark.parametrize(
+    ("code", "heavy"),
+    [
+        ("import magpend; dir(magpend), magpend.load_model('duffing').state_names", "numba zarr dask"),
+        (HELP, "numba numpy dask zarr xarray matplotlib pydantic scipy"),
+        (
+            "import pipeline.plots",
+            "numba zarr dask distributed matplotlib.pyplot pipeline.compute.execute pipeline.store.run",
+        ),
+        # the accessor is there once both are imported
+        (ACCESSOR, ""),
+    ],
+    ids=["magpend", "help", "plots", "accessor"],
+)
+def test_imports__are_light(code, heavy):
+    said = fresh_python(f"import sys\n{code}\nprint([m for m in {heavy.split()!r} if m in sys.modules])").stdout
+    assert said.splitlines()[-1] == "[]"
 
 
 def test_load_model__warns_of_what_nothing_uses():

@@ -5,19 +5,20 @@ from __future__ import annotations
 import pkgutil
 import re
 import shlex
+import sys
 import tomllib
-from pathlib import Path
 
 import pytest
 from typer.main import get_command
 
-from pipeline.cli import reference, reference_spec
+from pipeline.cli import main, reference
+from pipeline.cli.exits import Exit
 from pipeline.cli.main import app
 from pipeline.layout.vocabulary import FREQUENCY_DIM
 from pipeline.runs.workflows import shipped_workflows
 from pipeline.specification.parsing import parse_spec
+from tests.programs import ROOT, program
 
-ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text("utf-8")
 PAGES = {page.relative_to(ROOT).as_posix(): page.read_text("utf-8") for page in reference.pages()}
 PAGES["CONTRIBUTING.md"] = (ROOT / "CONTRIBUTING.md").read_text("utf-8")
@@ -38,17 +39,6 @@ def test_readme__specification_is_valid():
 def test_readme__fits_two_screens():
     assert len(README.splitlines()) <= 130
     assert "](docs/quickstart.png)" in README
-
-
-@pytest.mark.parametrize("page", PAGES)
-def test_docs__tables_are_those_of_the_code(page):
-    """Mended by: python -m pipeline.cli.reference."""
-    assert reference.rendered(PAGES[page]) == PAGES[page]
-
-
-def test_reference__writes_the_methods_of_spec():
-    """Mended by: python -m pipeline.cli.reference."""
-    assert reference_spec.MODULE not in reference.stale()
 
 
 @pytest.mark.parametrize("page", PAGES)
@@ -118,3 +108,60 @@ def test_reference__names_everything():
 def test_readme__commands_for_ci_are_one_line(name):
     (command,) = re.findall(rf"<!-- run: {name} -->\n```sh\n(.*?)\n```", README, re.DOTALL)
     assert "\n" not in command
+
+
+# the page for programs
+
+AGENTS = (ROOT / "AGENTS.md").read_text("utf-8")
+
+
+def test_agents__lists_all_exit_codes():
+    rows = re.findall(r"^\| ([\d, ]+) \| ([^|]+) \|", AGENTS, re.M)
+    said = {int(code): meaning for codes, meaning in rows for code in codes.split(",")}
+    assert set(said) == {int(code) for code in Exit}
+    for code in Exit:
+        if code < Exit.HUNG_UP:
+            assert said[code] == code.sentence
+        else:
+            assert code.sentence.endswith(said[code].partition("; ")[2])
+
+
+def test_agents__shows_the_error_that_comes(tmp_path, monkeypatch, capsys):
+    ((edit, shown),) = re.findall(r"<!-- error: sed '([^']+)' -->\n```text\n(.*?)```", AGENTS, re.DOTALL)
+    (text,) = re.findall(r"<!-- file: sweep.toml -->\n```toml\n(.*?)```", AGENTS, re.DOTALL)
+    for old, new in re.findall(r"s/([^/]+)/([^/]+)/", edit):
+        assert old in text
+        text = text.replace(old, new)
+    (tmp_path / "sweep.toml").write_text(text)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["magpend", "run", "sweep.toml"])
+    with pytest.raises(SystemExit) as end:
+        main.main()
+    said = capsys.readouterr()
+    assert end.value.code == Exit.REFUSED
+    assert said.err.endswith(shown)
+    assert said.out == ""
+    assert not (tmp_path / "runs").exists()
+
+
+# the article
+
+
+def test_paper__cites_what_its_bibliography_has():
+    text = (ROOT / "paper" / "paper.md").read_text("utf-8")
+    listed = (ROOT / "paper" / "paper.bib").read_text("utf-8")
+    entries = dict(re.findall(r"^@\w+\{(\w+),\n(.*?)^\}", listed, re.MULTILINE | re.DOTALL))
+    cited = set(re.findall(r"@([a-z]+\d{4})\b", text))
+    assert cited == set(entries)
+    for name, entry in entries.items():
+        assert re.search(r"^  (doi|url|isbn) +=", entry, re.MULTILINE), name
+        assert re.search(rf"year += \{{{name[-4:]}\}}", entry), name
+    body = text.partition("\n---\n")[2].partition("# References")[0]
+    assert 750 < len(body.split()) < 1750  # what the journal asks for
+
+
+def test_paper__figures_are_made_by_the_commands_of_its_script():
+    text, figures = (ROOT / "paper" / "paper.md").read_text("utf-8"), program("paper/figures.py").FIGURES
+    assert set(re.findall(r"\]\((\w+\.png)\)", text.replace("\n", " "))) == set(figures)
+    assert all((ROOT / "paper" / name).is_file() for name in figures)
+    assert {commands[0].split()[1] for commands, _ in figures.values()} <= set(shipped_workflows())

@@ -2,36 +2,25 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import re
-import sys
 import tempfile
 from pathlib import Path
 
 import pytest
 from PIL import Image
 
-ROOT = Path(__file__).parents[1]
+from tests.programs import ROOT, program
 
-
-def load(name, path):
-    """A module that is in no package."""
-    spec = importlib.util.spec_from_file_location(name, path)
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module
-    spec.loader.exec_module(module)
-    return module
-
-
-tutorials = load("run_tutorials", ROOT / "docs" / "run_tutorials.py")
-slurm = load("slurm_of_a_test", ROOT / "tests" / "pipeline" / "runs" / "slurm.py")
+tutorials = program("docs/run_tutorials.py")
+slurm = program("tests/pipeline/runs/slurm.py")
+PAGES = {**tutorials.PAGES, "AGENTS": ROOT / "AGENTS.md"}
 
 
 @pytest.fixture
 def others(name, monkeypatch):
     """Start a SLURM for a page with blocks that need one, if there can be one here."""
-    if "<!-- run: slurm -->" not in tutorials.PAGES[name].read_text("utf-8") or slurm.why_not():
+    if "<!-- run: slurm -->" not in PAGES[name].read_text("utf-8") or slurm.why_not():
         yield ()
         return
     monkeypatch.delenv("MAGPEND_CLUSTER", raising=False)
@@ -44,10 +33,10 @@ def others(name, monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", tutorials.PAGES)
+@pytest.mark.parametrize("name", PAGES)
 def test_tutorial__does_what_it_says(name, others, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    page = tutorials.PAGES[name]
+    page = PAGES[name]
     for shown, made in tutorials.follow(page, tmp_path, others).items():
         kept = page.parent / shown
         assert kept.is_file(), f"make it with: python docs/run_tutorials.py --pictures {name}"
@@ -90,16 +79,10 @@ def test_pictures__each_is_made_by_one_page_or_listed():
     assert not set(made) & listed
 
 
-def test_pictures__example_is_what_its_page_draws(tmp_path, monkeypatch):
+@pytest.mark.parametrize("name", ["van-der-pol", "python-start"])
+def test_pictures__are_what_their_page_draws(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    page = tutorials.pages()["van-der-pol"]
-    for shown, made in tutorials.follow(page, tmp_path).items():
-        assert not tutorials.is_stale(page.parent / shown, made)
-
-
-def test_python_start__does_and_draws_what_it_says(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    page = tutorials.pages()["python-start"]
+    page = tutorials.pages()[name]
     for shown, made in tutorials.follow(page, tmp_path).items():
         assert not tutorials.is_stale(page.parent / shown, made)
 
@@ -112,12 +95,6 @@ def test_follow__commands_before_come_first_and_blocks_for_others_are_left(tmp_p
     page.write_text(text.replace("magpend models", "pip list"), "utf-8")
     with pytest.raises(tutorials.TutorialError, match="only commands of magpend"):
         tutorials.follow(page, tmp_path)
-
-
-@pytest.mark.parametrize("page", sorted((ROOT / "docs").rglob("*.md")), ids=lambda path: path.stem)
-def test_pictures__are_there(page):
-    for target in re.findall(r"!\[[^\]]*\]\(([^)]+)\)", page.read_text("utf-8")):
-        assert (page.parent / target).is_file(), target
 
 
 PAGE = """
@@ -182,18 +159,12 @@ def test_navigation__every_page_is_in_it():
 def test_api__has_every_public_name():
     import magpend
 
-    spec = importlib.util.spec_from_file_location("docs_conf", ROOT / "docs" / "conf.py")
-    conf = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(conf)
-    found = [name for names in conf.grouped().values() for name in names]
+    found = [name for names in program("docs/conf.py").grouped().values() for name in names]
     assert len(found) == len(set(found))
     assert set(found) == {name for name in dir(magpend) if not name.startswith("_")}
 
 
 def test_build__finds_what_is_loaded_from_elsewhere(tmp_path):
-    spec = importlib.util.spec_from_file_location("docs_build", ROOT / "docs" / "build.py")
-    build = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(build)
     (tmp_path / "a.html").write_text(
         '<a href="https://a.example">fine</a><script src="https://b.example/x.js"></script>'
         '<link rel="stylesheet" href="//c.example/y.css"><link rel="canonical" href="https://d.example">'
@@ -201,7 +172,7 @@ def test_build__finds_what_is_loaded_from_elsewhere(tmp_path):
         "utf-8",
     )
     (tmp_path / "b.css").write_text("@font-face { src: url('https://e.example/f.woff2') }", "utf-8")
-    assert build.loaded_from_elsewhere(tmp_path) == [
+    assert program("docs/build.py").loaded_from_elsewhere(tmp_path) == [
         "a.html: https://b.example/x.js",
         "a.html: //c.example/y.css",
         "b.css: https://e.example/f.woff2",

@@ -8,9 +8,10 @@ from pathlib import Path
 
 import pytest
 
-api = pytest.importorskip("mypy.api")
+from tests.programs import ROOT
 
-ROOT = Path(__file__).parents[1]
+pytestmark = pytest.mark.slow
+
 _PYTHON = re.compile(r"^```python\n(.*?)^```", re.DOTALL | re.MULTILINE)
 
 MISTAKES = """\
@@ -49,35 +50,33 @@ SAID = """\
 """
 
 
-def checked(path: Path) -> list[str]:
-    """Lines of mypy on a file, with the package's own settings."""
+PAGES = {"python": "docs/python.md", "start": "docs/python-start.md", "readme": "README.md"}
+
+
+@pytest.fixture(scope="module")
+def said(tmp_path_factory):
+    """Lines of mypy, with the package's own settings, on the examples of each page and on the mistakes; one run."""
+    api = pytest.importorskip("mypy.api")
+    folder = tmp_path_factory.mktemp("types")
+    texts = {name: "\n".join(_PYTHON.findall((ROOT / page).read_text("utf-8"))) for name, page in PAGES.items()}
+    for name, text in {**texts, "mistakes": MISTAKES}.items():
+        assert text
+        (folder / f"{name}.py").write_text(text, "utf-8")
     cache = Path(os.environ["MAGPEND_CACHE_DIR"]) / "mypy"
     config = ["--config-file", str(ROOT / "pyproject.toml"), "--follow-imports", "silent", "--cache-dir", str(cache)]
-    before = Path.cwd()
-    os.chdir(ROOT)
-    try:
-        out, errors, _ = api.run([*config, str(path)])
-    finally:
-        os.chdir(before)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(ROOT)
+        out, errors, _ = api.run([*config, *map(str, folder.glob("*.py"))])
     assert not errors
-    # a result from the cache has the path of an earlier test
-    return [re.sub(r"^\S+\.py:", "", line) for line in out.splitlines()]
+    found = re.findall(r"^(?:.*/)?(\w+)\.py:(\d+: .*)$", out, re.MULTILINE)
+    return {name: [line for file, line in found if file == name] for name in (*PAGES, "mistakes")}
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("page", ["docs/python.md", "docs/python-start.md", "README.md"])
-def test_examples__have_types(page, tmp_path):
-    module = tmp_path / "example.py"
-    blocks = _PYTHON.findall((ROOT / page).read_text("utf-8"))
-    module.write_text("\n".join(blocks), "utf-8")
-    assert len(blocks) >= 1
-    assert checked(module) == ["Success: no issues found in 1 source file"]
+@pytest.mark.parametrize("page", PAGES)
+def test_examples__have_types(said, page):
+    assert said[page] == []
 
 
-@pytest.mark.slow
-def test_mistakes__are_seen(tmp_path):
-    module = tmp_path / "mistakes.py"
-    module.write_text(MISTAKES, "utf-8")
-    said = checked(module)
+def test_mistakes__are_seen(said):
     for line in SAID.splitlines():
-        assert any(one.startswith(line) for one in said), "\n".join(said)
+        assert any(one.startswith(line) for one in said["mistakes"]), "\n".join(said["mistakes"])

@@ -14,8 +14,9 @@ from pipeline.analysis.basins.basins import basins as basins_of
 from pipeline.analysis.basins.table import basins_table
 from pipeline.analysis.tabular import FEW_POINTS
 from pipeline.cli.exits import Exit
-from pipeline.layout.vocabulary import APERIODIC, ATTRACTS, EVIDENCE, KINDS, NOT_SETTLED, PERIODIC_ORBIT, STABILITIES
+from pipeline.layout.vocabulary import APERIODIC, EVIDENCE, KINDS, NOT_SETTLED, STABILITIES
 from pipeline.runs.derive import derive
+from tests.pipeline.plots.made_up import make_attractors
 
 NUMBERS = (
     "multiplier_error",
@@ -30,31 +31,19 @@ COUNTS = ("n_sampled", "n_left", "closes_above")
 
 SPIRALS = """
 kind = "sweep"
-[axes]
-frequency_hz = { values = [2.2, 2.25] }
-[initial_conditions]
-kind = "grid"
-psi1_deg = { start = -20, stop = 20, num = 4 }
-psi2_deg = { start = -20, stop = 20, num = 4 }
-[integration]
-rtol = 1e-7
-atol = 1e-7
-n_transient = 300
-n_keep = 32
-[execution]
-trajectories_per_task = 16
+axes = { frequency_hz = { values = [2.2, 2.25] } }
+initial_conditions.kind = "grid"
+initial_conditions.psi1_deg = { start = -20, stop = 20, num = 4 }
+initial_conditions.psi2_deg = { start = -20, stop = 20, num = 4 }
+integration = { rtol = 1e-7, atol = 1e-7, n_transient = 300, n_keep = 32 }
+execution = { trajectories_per_task = 16 }
 """
 
 
 @pytest.fixture(scope="module")
-def spirals(tmp_path_factory):
+def spirals(computed):
     """A run at 2.2 and 2.25 Hz that finds the left and the right orbit."""
-    from pipeline.runs import run as runs
-
-    folder = tmp_path_factory.mktemp("spirals")
-    (folder / "spirals.toml").write_text(SPIRALS)
-    runs.run(folder / "spirals.toml", folder / "run", workers=0, echo=lambda _: None)
-    return folder / "run"
+    return computed(SPIRALS)
 
 
 def test_attractors__table_per_point(main, spirals, tmp_path):
@@ -113,31 +102,17 @@ def test_basins__fractions_and_boundaries(main, spirals, tmp_path):
 CHAOTIC = """
 kind = "sweep"
 model = "duffing"
-[parameters]
-preset = "twin-well"
-frequency_hz = 0.15915494309189535
-[axes]
-amplitude = { values = [0.25, 0.3] }
-[initial_conditions]
-kind = "random"
-n = 8
-seed = 1
-x = [-1.0, 1.0]
-v = [-1.0, 1.0]
-[integration]
-rtol = 1e-7
-atol = 1e-7
-n_transient = 100
-n_keep = 64
+parameters = { preset = "twin-well", frequency_hz = 0.15915494309189535 }
+axes = { amplitude = { values = [0.25, 0.3] } }
+initial_conditions = { kind = "random", n = 8, seed = 1, x = [-1.0, 1.0], v = [-1.0, 1.0] }
+integration = { rtol = 1e-7, atol = 1e-7, n_transient = 100, n_keep = 64 }
 """
 
 
 @pytest.fixture
-def chaotic(main, write_spec, tmp_path):
+def chaotic(copied):
     """Two orbits of period 1 at the first amplitude, a chaotic attractor at the second."""
-    write_spec(CHAOTIC)
-    assert main("run", "spec.toml", "--out", "run", "--workers", "0")[0] == 0
-    return tmp_path / "run"
+    return copied(CHAOTIC)
 
 
 def test_settling__says_what_stays(main, chaotic, tmp_path):
@@ -181,12 +156,10 @@ def test_settling__without_extending_nothing_is_shown(main, chaotic):
     assert re.search(r"chaotic set +attracts ", out)
 
 
-def test_hysteresis__loops_and_jumps(main, write_spec, walk_text, tmp_path):
-    write_spec(walk_text)
-    assert main("run", "spec.toml", "--out", "run", "--workers", "0")[0] == 0
+def test_hysteresis__loops_and_jumps(main, walk, tmp_path):
     code, out, err = main("analyse", "hysteresis", "run", "--no-polish", "--csv", "h.csv")
     assert code == 0, err
-    ds = derive(tmp_path / "run", "hysteresis", {"polish": False})
+    ds = derive(walk, "hysteresis", {"polish": False})
     assert f"jumps of the branches: {int(ds['jump_count'].sum()) or 'none'}" in out
     assert re.search(rf"^{ds.sizes['loop'] or 'no'} loop", out, re.MULTILINE)
     with (tmp_path / "h.csv").open() as file:
@@ -198,6 +171,13 @@ def test_hysteresis__loops_and_jumps(main, write_spec, walk_text, tmp_path):
     code, _, err = main("analyse", "basins", "run")
     assert code == Exit.REFUSED
     assert "independent initial conditions" in err
+    # the figure of attractors shows the loops
+    code, _, err = main("plot", "attractors", "run", "--degrees", "--format", "svg")
+    assert code == 0, err
+    assert "hysteresis: computed" in err
+    with xr.open_dataset(walk / "figures" / "attractors_psi1_degrees.nc", engine="scipy") as stored:
+        assert {"value", "share", "present"} <= set(stored.data_vars)
+        assert stored["value"].attrs["units"] == "deg"
 
 
 def test_analyse__incomplete_run_and_prune(main, made):
@@ -246,38 +226,32 @@ def test_analyse__refused_before_computing(main, made, arguments, message):
 
 def test_report__a_line_per_attractor_if_there_are_many_points():
     n = FEW_POINTS + 1
-    frequency = 2.0 + 0.5 * np.arange(n)
-    kind = np.ones((n, 2), np.int8)
-    kind[:4, 1] = 0
     cells = np.zeros((n, 10), np.int32)
     cells[4:, :3] = 1
     cells[5, :8] = 1
-    nan = np.full((n, 2), np.nan)
+    frequency, per = 2.0 + 0.5 * np.arange(n), ("frequency", "attractor")
     cells_of = ("frequency", "initial_condition")
+    ds = make_attractors(cells, cells_of, {"frequency": ("frequency", frequency, {"units": "Hz"})})
     flags = {"flag_values": [0, 1, 2], "flag_meanings": "pending periodic bounded"}
-    ds = xr.Dataset(
-        {
-            "attractor_id": (cells_of, cells),
-            "decision": (cells_of, np.ones_like(cells, np.int8), {"flag_meanings": "undecided closed extended"}),
-            "status": (cells_of, np.ones_like(cells, np.int8), flags),
-            "ran_out": ("frequency", np.zeros(n, np.int8)),
-            "kind": (("frequency", "attractor"), PERIODIC_ORBIT * kind, {"flag_meanings": " ".join(KINDS)}),
-            "stability": (("frequency", "attractor"), ATTRACTS * kind, {"flag_meanings": " ".join(STABILITIES)}),
-            "evidence": (("frequency", "attractor"), 0 * kind, {"flag_meanings": " ".join(EVIDENCE)}),
-            "orbit_period": (("frequency", "attractor"), kind * np.array([1, 2])),
-            "period_s": (("frequency", "attractor"), kind * np.array([1, 2]) / frequency[:, None]),
-            "side": (("frequency", "attractor"), 0 * kind, {"flag_meanings": "unknown left right"}),
-            "rotation": (("frequency", "attractor", "link"), np.zeros((n, 2, 2))),
-            "multiplier_real": (("frequency", "attractor", "multiplier"), nan[..., None]),
-            "multiplier_imag": (("frequency", "attractor", "multiplier"), nan[..., None]),
-            "n_cells": (("frequency", "attractor"), np.stack([(cells == i).sum(1) for i in (0, 1)], 1)),
-            **{name: (("frequency", "attractor"), nan) for name in NUMBERS},
-            **{name: (("frequency", "attractor"), 0 * kind) for name in COUNTS},
-            "mirror_partner": (("frequency", "attractor"), -kind),
-            "mirror_distance": (("frequency", "attractor"), nan),
-        },
-        coords={"frequency": ("frequency", frequency, {"units": "Hz"}), "attractor": [0, 1]},
+    meanings = {"decision": "undecided closed extended", "side": "unknown left right", "kind": " ".join(KINDS)}
+    for name, text in {**meanings, "stability": " ".join(STABILITIES)}.items():
+        ds[name].attrs["flag_meanings"] = text
+    ds["status"].attrs, kind = flags, (ds["kind"] > 0).values
+    nan = np.full((n, 2), np.nan)
+    ds = ds.assign(
+        ran_out=("frequency", np.zeros(n, np.int8)),
+        evidence=(per, np.zeros((n, 2), np.int8), {"flag_meanings": " ".join(EVIDENCE)}),
+        orbit_period=(per, kind * np.array([1, 2])),
+        period_s=(per, kind * np.array([1, 2]) / frequency[:, None]),
+        side=ds["side"] * 0,
+        multiplier_real=((*per, "multiplier"), nan[..., None]),
+        multiplier_imag=((*per, "multiplier"), nan[..., None]),
+        mirror_partner=(per, -kind.astype(int)),
+        mirror_distance=(per, nan),
+        **{name: (per, nan) for name in NUMBERS},
+        **{name: (per, np.zeros((n, 2), int)) for name in COUNTS},
     )
+    ds["side"].attrs["flag_meanings"] = meanings["side"]
     lines = attractors_table(ds).lines
     assert lines[0] == f"2 attractors at {n} parameter points"
     assert lines[1].split()[:4] == ["id", "kind", "stability", "periods"]

@@ -2,60 +2,33 @@
 
 from __future__ import annotations
 
-import pytest
-import xarray as xr
-
 from pipeline.cli.exits import Exit
 
 SWEEP = """
 kind = "sweep"
-[axes]
-frequency_hz = { values = [2.6, 2.8] }
-q = { values = [1.5, 1.6] }
-[initial_conditions]
-kind = "grid"
-psi1_deg = { start = -10, stop = 10, num = 3 }
-psi2_deg = { start = -10, stop = 10, num = 2 }
-[integration]
-rtol = 1e-6
-atol = 1e-6
-n_transient = 200
-n_keep = 16
-stop_when_closed = true
-closure_tolerance = 1e-2
+axes = { frequency_hz = { values = [2.6, 2.8] }, q = { values = [1.5, 1.6] } }
+initial_conditions.kind = "grid"
+initial_conditions.psi1_deg = { start = -10, stop = 10, num = 3 }
+initial_conditions.psi2_deg = { start = -10, stop = 10, num = 2 }
+integration.rtol = 1e-6
+integration.atol = 1e-6
+integration.n_transient = 200
+integration.n_keep = 16
+integration.stop_when_closed = true
+integration.closure_tolerance = 1e-2
 """
 
 
-def test_plot__every_figure_of_a_sweep(main, write_spec, tmp_path):
-    """One analysis serves them all, and each puts its data beside it."""
-    write_spec(SWEEP)
-    assert main("run", "spec.toml", "--out", "run", "--workers", "0")[0] == 0
-    one, both = ["--at", "q=1.5"], ["--at", "q=1.5", "--at", "frequency=2.6"]
-    figures = {
-        "basins": [*both, "--degrees", "--shade"],
-        "fractions": one,
-        "gallery": both,
-        "attractors": [*one, "--state", "psi2"],
-        "regimes": ["--show", "number"],
-    }
-    names = {
-        "basins": "basins_q_1.5_frequency_2.6_degrees_shade",
-        "fractions": "fractions_q_1.5",
-        "gallery": "gallery_q_1.5_frequency_2.6",
-        "attractors": "attractors_psi2_q_1.5",
-        "regimes": "regimes_number",
-    }
-    for verb, options in figures.items():
-        code, out, err = main("plot", verb, "run", *options)
-        assert code == 0, err
-        assert ("attractors: computed" in err) == (verb == "basins")
-        name = names[verb]
-        assert out.splitlines()[-2:] == [f"figure: run/figures/{name}.png", f"data: run/figures/{name}.nc"]
-        assert (tmp_path / "run" / "figures" / f"{name}.png").stat().st_size > 5000
-        with xr.open_dataset(tmp_path / "run" / "figures" / f"{name}.nc", engine="scipy") as stored:
-            assert stored.data_vars
-    code, out, _ = main("plot", "regimes", "run", "--out", "map.pdf")
+def test_plot__names_of_files_and_refusals(main, copied, tmp_path):
+    """What each figure shows, and its data: see tests/test_duffing_day.py."""
+    copied(SWEEP)
+    code, out, err = main("plot", "basins", "run", "--at", "q=1.5", "--at", "frequency=2.6", "--degrees", "--shade")
+    assert code == 0, err
+    name = "run/figures/basins_q_1.5_frequency_2.6_degrees_shade"
+    assert out.splitlines()[-2:] == [f"figure: {name}.png", f"data: {name}.nc"]
+    code, out, err = main("plot", "regimes", "run", "--out", "map.pdf")
     assert (code, out.splitlines()[-2:]) == (0, ["figure: map.pdf", "data: map.nc"])
+    assert "attractors: computed" not in err
 
     for arguments, message in (
         (["basins"], "frequency (2 values), q (2 values): choose a value of each, such as frequency=2.8"),
@@ -74,23 +47,3 @@ def test_plot__every_figure_of_a_sweep(main, write_spec, tmp_path):
         assert message in err, err
         assert "Traceback" not in err
         assert sorted(tmp_path.rglob("*")) == before
-
-
-@pytest.mark.parametrize("verb", ["basins", "fractions", "gallery", "attractors", "regimes"])
-def test_plot__no_run(main, tmp_path, verb):
-    code, _, err = main("plot", verb, ".")
-    assert code == Exit.REFUSED
-    assert "Traceback" not in err
-    assert not list(tmp_path.iterdir())
-
-
-def test_plot__continuation_with_loops(main, write_spec, walk_text, tmp_path):
-    write_spec(walk_text)
-    assert main("run", "spec.toml", "--out", "run", "--workers", "0")[0] == 0
-    code, _, err = main("plot", "attractors", "run", "--degrees", "--format", "svg")
-    assert code == 0, err
-    assert "hysteresis: computed" in err
-    path = tmp_path / "run" / "figures" / "attractors_psi1_degrees.nc"
-    with xr.open_dataset(path, engine="scipy") as stored:
-        assert {"value", "share", "present"} <= set(stored.data_vars)
-        assert stored["value"].attrs["units"] == "deg"

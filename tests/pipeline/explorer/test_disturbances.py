@@ -13,30 +13,17 @@ from pipeline.explorer.data.disturbances import disturbances
 from pipeline.explorer.data.explored import ExploredRun, ExplorerError
 from pipeline.explorer.data.overlays import attractors
 from pipeline.explorer.live import noisy_starting
-from pipeline.explorer.live.live import LiveRun
 from pipeline.explorer.serving.answers import ANSWERS, Query
 from pipeline.runs.derive import options_of
-from pipeline.runs.run import run
 from pipeline.store.run import Run
-from tests.pipeline.explorer.shocked_wells import FRACTAL, HZ, SMOOTH, WELLS, shocked_wells
-from tests.pipeline.explorer.test_live import Watcher
+from tests.pipeline.explorer.small_runs import FRACTAL, HZ, SMOOTH, finished
 
 DAMPING, AMPLITUDES = 0.15, (0.1, 0.2)
 
 
-@pytest.fixture(scope="module")
-def wells(tmp_path_factory):
-    return shocked_wells(tmp_path_factory.mktemp("wells"))
-
-
 @pytest.fixture
-def watcher(wells):
-    live = LiveRun(Run.open(wells))
-    found = Watcher(live)
-    yield found
-    found.session.close()
-    found.session.join()
-    live.close()
+def watcher(watch, wells):
+    return watch(wells)
 
 
 def sections(state, amplitude, n):
@@ -144,20 +131,25 @@ def noisy(watcher, **words):
     start = {"parameters": {"amplitude": 0.2}, "frequency": HZ, "state": {"x": -0.5, "v": 0.25}}
     number = watcher.send(do="start", **start, **words)
     end = watcher.wait(number)
-    pieces = [a["arrays"]["section"] for a in watcher.of(number) if a["kind"] == "sections"]
-    return end, np.concatenate(pieces) if pieces else None
+    return end, watcher.sections(number)
 
 
-NOISY = WELLS.replace("stop_when_closed = true\nclosure_tolerance = 1e-6", "").replace("num = 15", "num = 2")
-NOISY = NOISY.replace("n_transient = 200", "n_transient = 0").replace("n_keep = 8", "n_keep = 40")
-NOISY = NOISY.replace("start = -2.0, stop = 2.0, num = 2 }\nv", "start = -0.5, stop = 0.5, num = 2 }\nv")
-NOISY = NOISY.replace("start = -2.0, stop = 2.0, num = 2", "start = 0.25, stop = 0.75, num = 2")
+NOISY = f"""
+kind = "sweep"
+model = "duffing"
+parameters = {{ preset = "twin-well-periodic", frequency_hz = {HZ} }}
+axes.amplitude = {{ values = [0.1, 0.2] }}
+initial_conditions.kind = "grid"
+initial_conditions.x = {{ start = -0.5, stop = 0.5, num = 2 }}
+initial_conditions.v = {{ start = 0.25, stop = 0.75, num = 2 }}
+integration = {{ rtol = 1e-9, atol = 1e-9, n_transient = 0, n_keep = 40 }}
+noise = {{ seed = 7, strengths = {{ v = 0.05 }} }}
+"""
 
 
 def test_noisy_start__has_the_bits_of_a_noisy_run(watcher, tmp_path):
-    (tmp_path / "noisy.toml").write_text(NOISY + "[noise]\nseed = 7\nstrengths = { v = 0.05 }\n", "utf-8")
-    run(tmp_path / "noisy.toml", tmp_path / "noisy", workers=0, echo=lambda line: None)
-    cell = Run.open(tmp_path / "noisy").cube().sel(amplitude=0.2, x_0=-0.5, v_0=0.25)
+    directory = finished(tmp_path, NOISY)
+    cell = Run.open(directory).cube().sel(amplitude=0.2, x_0=-0.5, v_0=0.25)
     end, section = noisy(watcher, noise=0.05, seed=7, periods=40)
     np.testing.assert_array_equal(section, cell["section"].transpose("period_index", "state").values)
     assert (end["kind"], end["noise"], end["seed"], end["noisy_states"]) == ("done", 0.05, 7, ["v"])

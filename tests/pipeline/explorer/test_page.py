@@ -7,9 +7,12 @@ import shutil
 import subprocess
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import pipeline.explorer
+
+pytestmark = pytest.mark.slow  # needs node
 
 SOURCES = Path(pipeline.explorer.__file__).parent / "page" / "src"
 
@@ -26,9 +29,8 @@ def evaluated(module, expression):
     return json.loads(done.stdout)
 
 
-@pytest.mark.parametrize(
-    ("attrs", "stable", "said"),
-    [
+def test_stability_of__what_was_shown_and_by_what():
+    cases = [
         ({"stability": "attracts", "evidence": "multipliers"}, True, "attracts, shown by its multipliers"),
         ({"stability": "attracts", "evidence": "stayed"}, True, "attracts, all extended cells stayed"),
         ({"stability": "transient", "evidence": "left"}, None, "transient, extended cells left it"),
@@ -37,17 +39,35 @@ def evaluated(module, expression):
         ({}, False, "unstable"),
         ({"stability": None}, True, "stable"),
         ({}, None, None),
-    ],
-)
-def test_stability_of__what_was_shown_and_by_what(attrs, stable, said):
-    orbit = json.dumps({"attrs": attrs, "stable": stable})
-    assert evaluated("facts.js", f"m.stabilityOf({orbit})") == said
+    ]
+    orbits = json.dumps([{"attrs": attrs, "stable": stable} for attrs, stable, _ in cases])
+    assert evaluated("facts.js", f"{orbits}.map((o) => m.stabilityOf(o))") == [said for *_, said in cases]
 
 
 def test_colour_of__a_set_that_does_not_attract_has_none():
     view = {"colours": [{"name": "attractor", "categories": [{"id": 3, "colour": "#ff0000"}]}]}
     colours = {"card": "#ffffff", "ink": "#101010", "accent": "#0000ff"}
-    for stability, found in (("attracts", "#ff0000"), ("transient", "#101010"), ("not settled", "#101010")):
-        orbit = {"attrs": {"attractor": 3, "stability": stability}, "stable": None}
-        given = ", ".join(map(json.dumps, (orbit, view, colours)))
-        assert evaluated("orbit.js", f"m.colourOf({given})") == found
+    stabilities = ("attracts", "transient", "not settled")
+    orbits = [{"attrs": {"attractor": 3, "stability": stability}, "stable": None} for stability in stabilities]
+    given = f"{json.dumps(view)}, {json.dumps(colours)}"
+    found = evaluated("orbit.js", f"{json.dumps(orbits)}.map((o) => m.colourOf(o, {given}))")
+    assert found == ["#ff0000", "#101010", "#101010"]
+
+
+def test_broken_lines__draw_nothing_across_the_circle():
+    lines = evaluated(
+        "wrapping.js",
+        """(() => {
+            const angle = Float64Array.from({ length: 200 }, (_, i) => 0.1 * i), rate = angle.map(Math.cos);
+            const swing = angle.map((a) => 7 + Math.sin(a));
+            const drawn = (x) => m.brokenLines(x, rate, m.wrappingOf(x, true), { shift: 0, cut: false });
+            return [drawn(angle), drawn(swing)].map((lines) => lines.map((line) => Array.from(line)));
+        })()""",
+    )
+    for line in lines[0]:
+        x = np.array(line[::2])
+        assert np.abs(x).max() <= np.pi + 1e-12
+        assert np.abs(np.diff(x)).max() <= 0.1 + 1e-12
+    assert len(lines[0]) == 4  # 19.9 rad go through half a turn three times
+    assert len(lines[1]) == 1
+    assert max(map(abs, lines[1][0][::2])) < np.pi  # brought next to 0 by a full turn

@@ -14,18 +14,12 @@ from pipeline.explorer.data.parameter_plane import curve_orbit, parameter_plane
 from pipeline.explorer.data.view import describe_view
 from pipeline.runs.derive import derive
 from pipeline.store.run import Run
-from tests.pipeline.explorer.bent_resonance import CURVES, made_line, made_plane
+from tests.pipeline.explorer.small_runs import CURVES
 
 
-@pytest.fixture(scope="module")
-def runs(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("plane")
-    return made_line(folder), made_plane(folder)
-
-
-def test_line__its_own_curves(runs):
+def test_line__its_own_curves(bent):
     """Of the run that was followed: its curves, and no map."""
-    line, _ = runs
+    line, _ = bent
     found, curves = parameter_plane(Run.open(line)), derive(line, "curves", CURVES)
     assert [axis["name"] for axis in found["axes"]] == ["frequency", "amplitude"]
     assert found["map"] is None
@@ -37,9 +31,9 @@ def test_line__its_own_curves(runs):
     assert {point["label"] for point in found["points"]} <= {"CP", "R1", "GPD"}
 
 
-def test_plane__curves_of_another_run(runs):
+def test_plane__curves_of_another_run(bent):
     """Over the number of attractors, which two folds bound."""
-    line, plane = runs
+    line, plane = bent
     explored = replace(ExploredRun.of(plane), curves=Run.open(line))
     found, attractors = parameter_plane(explored), derive(plane, "attractors")
     assert len(found["curves"]) >= 1
@@ -51,18 +45,18 @@ def test_plane__curves_of_another_run(runs):
     assert explored.refreshed().curves is explored.curves
 
 
-def test_no_curves(runs):
+def test_no_curves(bent):
     """A run without curves says how to get them."""
-    _, plane = runs
+    _, plane = bent
     found = parameter_plane(Run.open(plane))
     assert found["curves"] == []
     assert "magpend analyse curves" in found["note"]
     assert not describe_view(ExploredRun.of(plane), False)["has"]["curves"]
 
 
-def test_curve_orbit__by_another_integrator(runs):
+def test_curve_orbit__by_another_integrator(bent):
     """The orbit closes at the values of its point, with a multiplier 1 on a fold."""
-    line, _ = runs
+    line, _ = bent
     curves = derive(line, "curves", CURVES)
     i = int(np.flatnonzero(curves["kind"].values == 0)[0])
     point = int(curves["n_points"][i]) // 4  # not where the curve begins, at the run's own values
@@ -82,8 +76,8 @@ def test_curve_orbit__by_another_integrator(runs):
     assert end == pytest.approx(states[0], abs=1e-6)
 
 
-def test_curve_orbit__what_is_not_there(runs):
-    line, plane = runs
+def test_curve_orbit__what_is_not_there(bent):
+    line, plane = bent
     with pytest.raises(ExplorerError, match="curve = 99"):
         curve_orbit(Run.open(line), 99, 0)
     with pytest.raises(ExplorerError, match="point = 99999"):

@@ -26,86 +26,47 @@ from pipeline.explorer.data.planes import plane
 from pipeline.explorer.data.series import SAMPLES
 from pipeline.explorer.data.tables import table
 from pipeline.explorer.data.view import describe_view
-from pipeline.explorer.serving.answers import ANSWERS, Query
 from pipeline.layout.identity import identity_of
 from pipeline.layout.plan import make_plan
 from pipeline.layout.vocabulary import ATTRACTS, DIVERGED, EVIDENCE, PERIODIC, TRANSIENT
 from pipeline.plots import palette
 from pipeline.runs.derive import derive
-from pipeline.runs.run import run
 from pipeline.specification.parsing import load_spec
-from pipeline.store.errors import DamagedError
 from pipeline.store.run import Run
 from pipeline.store.setup import create
+from tests.pipeline.explorer.small_runs import FLOW, finished
 
 # the same model, and the same is watched, as in tests/test_duffing_day.py: nothing more is compiled
-SWEEP = """
+TIGHT = "integration = { rtol = 1e-9, atol = 1e-9, n_transient = 150, n_keep = 12 }"
+
+SWEEP = f"""
+{TIGHT}
 kind = "sweep"
 title = "<script>alert(1)</script>"
 model = "duffing"
-[parameters]
-preset = "twin-well-periodic"
-[axes]
-frequency_hz = { values = [0.15, 0.15915494309189535] }
-amplitude = { values = [0.2, 0.25, 0.3] }
-[initial_conditions]
-kind = "grid"
-x = { start = -0.9375, stop = 0.9375, num = 6 }
-v = { start = -0.5, stop = 1.0, num = 4 }
-[integration]
-rtol = 1e-9
-atol = 1e-9
-n_transient = 150
-n_keep = 12
-[products]
-extremes = { quantities = ["energy", "v"] }
+parameters = {{ preset = "twin-well-periodic" }}
+axes = {{ frequency_hz = {{ values = [0.15, 0.15915494309189535] }}, amplitude = {{ values = [0.2, 0.25, 0.3] }} }}
+initial_conditions.kind = "grid"
+initial_conditions.x = {{ start = -0.9375, stop = 0.9375, num = 6 }}
+initial_conditions.v = {{ start = -0.5, stop = 1.0, num = 4 }}
+products = {{ extremes = {{ quantities = ["energy", "v"] }} }}
 """
 
-WALK = """
+WALK = f"""
+{TIGHT}
 kind = "continuation"
 model = "duffing"
-[parameters]
-preset = "twin-well-periodic"
-frequency_hz = 0.15915494309189535
-[axes]
-amplitude = { start = 0.15, stop = 0.3, num = 4 }
-[continuation]
-path = "amplitude"
-direction = "both"
-[initial_conditions]
-kind = "random"
-n = 3
-seed = 2
-x = [-1.0, 1.0]
-v = [-1.0, 1.0]
-[integration]
-rtol = 1e-9
-atol = 1e-9
-n_transient = 150
-n_keep = 12
+parameters = {{ preset = "twin-well-periodic", frequency_hz = 0.15915494309189535 }}
+axes = {{ amplitude = {{ start = 0.15, stop = 0.3, num = 4 }} }}
+continuation = {{ path = "amplitude", direction = "both" }}
+initial_conditions = {{ kind = "random", n = 3, seed = 2, x = [-1.0, 1.0], v = [-1.0, 1.0] }}
 """
 
-FLOW = """
-kind = "sweep"
-[model]
-name = "normal_form"
-states = { x = {}, y = {} }
-parameters = { mu = -0.1, omega = 2.0, cubic = 1.0, quintic = -1.0 }
-define = { s = "x**2 + y**2", g = "mu + cubic*s + quintic*s**2" }
-equations = { x = "g*x - omega*y", y = "omega*x + g*y" }
-[section]
-of = "y"
-value = 0.3
-longest = 20.0
-[initial_conditions]
-kind = "grid"
-x = { start = 0.6, stop = 0.9, num = 2 }
-y = { start = 0.3, stop = 0.35, num = 2 }
-[integration]
-rtol = 1e-9
-atol = 1e-9
-n_transient = 100
-n_keep = 12
+FLOW_STARTS = f"""
+{TIGHT}
+initial_conditions.kind = "grid"
+initial_conditions.x = {{ start = 0.6, stop = 0.9, num = 2 }}
+initial_conditions.y = {{ start = 0.3, stop = 0.35, num = 2 }}
 """
 
 SAME = 1e-6
@@ -113,35 +74,23 @@ SAME = 1e-6
 integrated to 1e-9, and a period of these systems multiplies errors by some tens at most."""
 
 
-def made(folder, text):
-    folder.mkdir()
-    spec = folder / "spec.toml"
-    spec.write_text(text, "utf-8")
-    run(spec, folder / "run", workers=0, echo=lambda line: None)
-    return folder / "run"
-
-
 @pytest.fixture(scope="module")
 def sweep(tmp_path_factory):
-    directory = made(tmp_path_factory.mktemp("view") / "sweep", SWEEP)
+    directory = finished(tmp_path_factory.mktemp("view-sweep"), SWEEP)
     derive(directory, "basins")
     return directory
 
 
 @pytest.fixture(scope="module")
 def walk(tmp_path_factory):
-    directory = made(tmp_path_factory.mktemp("view") / "walk", WALK)
+    directory = finished(tmp_path_factory.mktemp("view-walk"), WALK)
     derive(directory, "branches", {"parameter": "amplitude"})
     return directory
 
 
 @pytest.fixture(scope="module")
 def flow(tmp_path_factory):
-    return made(tmp_path_factory.mktemp("view") / "flow", FLOW)
-
-
-def wrapped(angle):
-    return angle - 2.0 * np.pi * np.round(angle / (2.0 * np.pi))
+    return finished(tmp_path_factory.mktemp("view-flow"), FLOW.partition("axes")[0] + FLOW_STARTS)
 
 
 # ---- the view
@@ -163,11 +112,8 @@ def test_describe_view__says_what_stands_in_a_run(sweep):
     assert found["starts"] == {"dims": ["x_0", "v_0"], "count": 24}
     names = [v["name"] for v in found["verticals"]]
     assert names[:2] == list(explored.model.state_names)
-    quantities = [q.name for q in explored.model.quantities]
-    assert names[2:] == [
-        *quantities,
-        *(f"{watched}.{extreme}" for watched in ("energy", "v") for extreme in ("min", "max", "mean")),
-    ]
+    extremes = [f"{watched}.{extreme}" for watched in ("energy", "v") for extreme in ("min", "max", "mean")]
+    assert names[2:] == [*(q.name for q in explored.model.quantities), *extremes]
     assert found["planes"][0] == ["x", "v"]
     assert found["has"]["attractors"]
     assert found["has"]["basins"]
@@ -184,23 +130,24 @@ def test_describe_view__names_commands_that_the_run_can_have(sweep, walk, made_r
 
 def test_describe_view__reads_what_is_computed_later(walk):
     explored = ExploredRun.of(walk)
-    assert not describe_view(explored, False)["has"]["basins"]
-    assert describe_view(explored, False)["axes"][0]["path"]
+    view = describe_view(explored, False)
+    assert not view["has"]["basins"]
+    assert view["axes"][0]["path"]
     assert explored.refreshed() is explored
     derive(walk, "settling")
     assert explored.refreshed() is not explored
+    # whoever holds an opened run may hand it over; an explored one is taken as it is
+    opened = Run.open(walk)
+    assert ExploredRun.of(ExploredRun.of(opened)).digest == opened.digest
+    assert ExploredRun.of(explored) is explored
 
 
-@pytest.mark.parametrize("name", model_names())
-def test_describe_view__labels_have_no_latex(name):
-    model = load_model(name)
-    for one in (*model.states, *model.quantities, *model.parameters):
-        label = plain(one.symbol, one.name)
-        assert label.strip()
-        assert not set(label) & set("\\{}$^")
-
-
-def test_plain__writes_greek_accents_and_subscripts():
+def test_plain__labels_have_no_latex():
+    for model in map(load_model, model_names()):
+        for one in (*model.states, *model.quantities, *model.parameters):
+            label = plain(one.symbol, one.name)
+            assert label.strip()
+            assert not set(label) & set("\\{}$^"), (model.name, label)
     assert plain(r"\dot{\theta}_1", "rate") == "θ\u0307₁"
     assert plain(r"P_\mathrm{in}", "p") == "Pᵢₙ"
     assert plain(r"\lambda", "l") == "λ"
@@ -285,18 +232,16 @@ def test_diagram__shows_the_last_sections_where_there_are_too_many(sweep, monkey
 
 
 @pytest.mark.parametrize(
-    ("x", "y", "at", "sentence"),
+    ("x", "at", "sentence"),
     [
-        ("q", "x", {}, "unknown axis 'q'"),
-        ("amplitude", "w", {"frequency": 0}, "unknown vertical axis 'w'"),
-        ("amplitude", "x", {}, "at.frequency is missing"),
-        ("amplitude", "x", {"frequency": 2}, "must be 0 to 1"),
-        ("amplitude", "x", {"frequency": 0, "g": 1}, "unknown axis 'g'"),
+        ("q", {}, "unknown axis 'q'"),
+        ("amplitude", {}, "at.frequency is missing"),
+        ("amplitude", {"frequency": 2}, "must be 0 to 1"),
     ],
 )
-def test_diagram__refuses_in_a_sentence(sweep, x, y, at, sentence):
+def test_diagram__refuses_in_a_sentence(sweep, x, at, sentence):
     with pytest.raises(ExplorerError, match=sentence):
-        diagram(ExploredRun.of(sweep), x, y, at)
+        diagram(ExploredRun.of(sweep), x, "x", at)
 
 
 def test_diagram__of_a_run_in_progress_has_what_is_committed(made_run):
@@ -318,24 +263,6 @@ def test_diagram__of_a_run_in_progress_has_what_is_committed(made_run):
         np.testing.assert_array_equal(counts > 0, arrays["status"] != 0)
         total += int((counts > 0).sum())
     assert total == committed == int((cube.status != 0).sum())
-
-
-def test_diagram__stops_at_a_damaged_chunk(made_run):
-    for task in range(made_run.plan.n_tasks):
-        made_run.commit(task)
-    section = made_run.directory / "cube.zarr" / "section"
-    chunk = next(f for f in sorted(section.rglob("*")) if f.is_file() and f.name != "zarr.json")
-    content = bytearray(chunk.read_bytes())
-    content[len(content) // 2] ^= 1
-    chunk.write_bytes(bytes(content))
-    explored = ExploredRun.of(made_run.directory)
-
-    def read():
-        for q in range(2):
-            diagram(explored, "frequency", "psi1", {"q": q})
-
-    with pytest.raises(DamagedError, match="not what was written"):
-        read()
 
 
 @pytest.fixture
@@ -363,8 +290,7 @@ def test_orbit__ends_where_the_cube_goes_on(which, request):
         cell = cell_of(explored, number)
         for point in (0, 5):
             arrays, attrs = unpack_arrays(orbit(explored, number, point))
-            step = SAMPLES
-            ends = arrays["states"][::step]
+            ends = arrays["states"][::SAMPLES]
             assert len(ends) == attrs["n_periods"] + 1
             np.testing.assert_array_equal(ends[0], cell.section[point])
             n = min(len(ends), len(cell.section) - point)
@@ -449,9 +375,8 @@ def test_view__what_does_not_attract_is_no_attractor(sweep):
     assert {told[number][key] for key in ("stability", "evidence")} == {"transient", "left"}
     assert told[number]["name"].endswith(", transient")
     assert told[number]["low"] is None
-    assert number not in {
-        c["attractor"] for c in curves(explored, "amplitude", {"frequency": 1})["curves"] if c["group"] == "fractions"
-    }
+    listed = curves(explored, "amplitude", {"frequency": 1})["curves"]
+    assert number not in {c["attractor"] for c in listed if c["group"] == "fractions"}
     _, attrs = unpack_arrays(orbit(explored, int(cell_on(explored, known, at, number)), 0))
     assert (attrs["attractor"], attrs["stability"], attrs["stable"]) == (number, "transient", None)
 
@@ -464,26 +389,21 @@ def cell_on(explored, found, at, number):
 
 
 def test_orbit__has_multipliers_without_an_analysis(sweep, walk):
-    """Polishing the cell's own section gives those that the analysis of attractors gives."""
+    """Polishing the cell's own section gives those that the analysis of attractors gives; first it says they come."""
     explored = ExploredRun.of(sweep)
     found = derive(sweep, "attractors")
     compared = 0
     for number in some_cells(explored, 6):
-        cell = cell_of(explored, number)
+        cell, index = cell_of(explored, number), explored.cell(number)
         multipliers, seconds = linearise(cell)
-        index = explored.cell(number)
         one = int(found["attractor_id"].isel(index))
         here = found.isel(frequency=index["frequency"], amplitude=index["amplitude"], attractor=one)
         if int(here["orbit_period"]) == cell.period:
             expected = here["multiplier_real"].values + 1j * here["multiplier_imag"].values
             np.testing.assert_allclose(np.sort_complex(multipliers), np.sort_complex(expected), atol=1e-6)
             assert seconds == pytest.approx(cell.period / cell.clock_hz)
-            # they multiply to what the divergence makes of a volume in the time of the period
             compared += 1
     assert compared
-
-
-def test_orbit__without_multipliers_says_that_they_come(walk):
     explored = ExploredRun.of(walk)
     assert explored.kept("attractors") is not None  # what branches rest on
     number = some_cells(explored)[0]
@@ -502,14 +422,6 @@ def test_orbit__exponents_of_a_flow_have_the_one_along_it(flow):
     assert attrs["frequency"] is None
     assert attrs["exponents"][0] == pytest.approx(0.0, abs=1e-9)
     assert attrs["exponents"][1] < 0.0
-
-
-@pytest.mark.parametrize(
-    ("cell", "point", "sentence"), [(10_000, 0, "cells 0 to"), (0, 12, "sections 0 to 11|has no section")]
-)
-def test_orbit__refuses_in_a_sentence(sweep, cell, point, sentence):
-    with pytest.raises(ExplorerError, match=sentence):
-        orbit(ExploredRun.of(sweep), cell, point)
 
 
 def test_orbit__of_a_pending_cell_is_refused(made_run):
@@ -599,9 +511,8 @@ def test_attractors__are_those_of_the_point(sweep):
     json.dumps(found, allow_nan=False)
     assert {a["id"] for a in found} == set(np.flatnonzero(here["kind"].values > 0).tolist())
     assert [a["share"] for a in found] == sorted((a["share"] for a in found), reverse=True)
-    assert {(a["kind"], a["stability"], a["evidence"]) for a in found} == {
-        ("periodic orbit", "attracts", "multipliers")
-    }
+    told = {(a["kind"], a["stability"], a["evidence"]) for a in found}
+    assert told == {("periodic orbit", "attracts", "multipliers")}
     for one in found:
         points = here["attractor_points"].isel(attractor=one["id"]).transpose("point", "state").values
         np.testing.assert_array_equal(one["section"], points[np.isfinite(points).all(axis=1)])
@@ -657,57 +568,11 @@ def test_table__has_the_same_rows_in_both_formats(sweep, kind, tmp_path):
 def test_table__a_word_is_no_formula(monkeypatch):
     """Names come from models and titles; a spreadsheet would run one that begins like a formula."""
     monkeypatch.setattr(tables, "_ROWS_AT_ONCE", 2)
-    ds = xr.Dataset(
-        {
-            "name": ("row", np.array(["=1+1", "+x", "@y", "B: left", ""])),
-            "value": ("row", np.array([-1.0, np.nan, 0.1, 2.0, 1e-300])),
-        }
-    )
-    assert tables._csv(ds).decode().splitlines() == [
-        "name,value",
-        "'=1+1,-1.0",
-        "'+x,",
-        "'@y,0.1",
-        "B: left,2.0",
-        ",1e-300",
-    ]
+    names, values = ["=1+1", "+x", "@y", "B: left", ""], [-1.0, np.nan, 0.1, 2.0, 1e-300]
+    ds = xr.Dataset({"name": ("row", np.array(names)), "value": ("row", np.array(values))})
+    written = ["name,value", "'=1+1,-1.0", "'+x,", "'@y,0.1", "B: left,2.0", ",1e-300"]
+    assert tables._csv(ds).decode().splitlines() == written
 
 
-def test_table__of_branches_and_its_refusals(walk):
-    explored = ExploredRun.of(walk)
-    asked = {"x": "amplitude", "y": "x", "at": {}}
-    assert table(explored, "branches", asked).startswith(b"# title")
-    with pytest.raises(ExplorerError, match="unknown view"):
-        table(explored, "planet", asked)
-    with pytest.raises(ExplorerError, match="unknown format"):
-        table(explored, "curves", asked, "xlsx")
-    with pytest.raises(ExplorerError, match="cell is missing"):
-        table(explored, "orbit", asked)
-
-
-# ---- answers
-
-
-@pytest.mark.parametrize("text", ["-1", "1.0", "", "٣", "1" * 20, "0x1"])
-def test_query__takes_whole_numbers_alone(text):
-    with pytest.raises(ExplorerError, match="whole number"):
-        Query({"cell": text}).count("cell")
-
-
-def test_zoom__is_a_specification_of_the_region(sweep, tmp_path):
-    body = json.dumps({"x": [0.21, 0.24], "axes": ["amplitude", "x"], "y": [0, 1], "at": {"frequency": 0}}).encode()
-    reply = ANSWERS["zoom"].give(ExploredRun.of(sweep), Query({}, body), None)
-    path = tmp_path / "zoom.toml"
-    path.write_bytes(reply.content)
-    spec = load_spec(path)
-    assert spec.axes["amplitude"].array()[[0, -1]].tolist() == [0.21, 0.24]
-    with pytest.raises(ExplorerError, match="x"):
-        ANSWERS["zoom"].give(ExploredRun.of(sweep), Query({}, b'{"x": 3}'), None)
-
-
-def test_explored_run__is_the_run(sweep):
-    """Whoever holds an opened run may hand it over; an explored one is taken as it is."""
-    opened = Run.open(sweep)
-    explored = ExploredRun.of(opened)
-    assert ExploredRun.of(explored) is explored
-    assert explored.digest == opened.digest
+def test_table__of_branches(walk):
+    assert table(ExploredRun.of(walk), "branches", {"x": "amplitude", "y": "x", "at": {}}).startswith(b"# title")

@@ -10,9 +10,10 @@ import xarray as xr
 from matplotlib.lines import Line2D
 
 from magpend_core.models.parameters import ParameterError
-from pipeline.plots import plot_branches, plot_curves, plot_multipliers
+from pipeline.plots import plot_branches, plot_multipliers
 from pipeline.runs.derive import derive
 from pipeline.specification.problems import SpecError
+from tests.pipeline.plots.made_up import STATES
 
 
 @pytest.fixture
@@ -48,7 +49,7 @@ def made_up():
             "bifurcation_section": (("bifurcation", "phase", "state"), np.zeros((1, 1, 4))),
             **{name: ("bifurcation", [value]) for name, value in event.items()},
         },
-        coords={"state": ["psi1", "psi2", "psi1_dot", "psi2_dot"]},
+        coords={"state": STATES},
         attrs={"parameter": "frequency_hz", "parameter_units": "Hz"},
     )
 
@@ -68,6 +69,9 @@ def test_plot_branches__solid_and_dashed(made_up):
     # both go up to the fold itself
     assert np.max(solid.get_xdata()) == np.max(dashed.get_xdata()) == 3.0
     assert [text.get_text() for text in figure.axes[0].texts] == ["F1"]
+    assert not branch_lines(plot_branches(made_up, max_period=0))
+    with pytest.raises(ValueError, match="unknown state"):
+        plot_branches(made_up, state="psi3")
 
 
 def test_plot_branches__cut_where_an_angle_wraps(made_up):
@@ -77,39 +81,12 @@ def test_plot_branches__cut_where_an_angle_wraps(made_up):
     assert np.nanmax(steps) < np.pi
 
 
-def test_plot_branches__longest_period(made_up):
-    assert not branch_lines(plot_branches(made_up, max_period=0))
-
-
-def test_plot_branches__unknown_state(made_up):
-    with pytest.raises(ValueError, match="unknown state"):
-        plot_branches(made_up, state="psi3")
-
-
 def test_plot_multipliers__all_points(made_up):
     figure = plot_multipliers(made_up)
     (points,) = figure.axes[0].collections
     assert len(points.get_offsets()) == 84
     with pytest.raises(ValueError, match="branches 0 to 0"):
         plot_multipliers(made_up, 1)
-
-
-def test_plot_curves__lines():
-    x = np.array([[2.0, 2.5, 3.0], [2.1, 2.2, np.nan]])
-    ds = xr.Dataset(
-        {
-            "first": (("curve", "point"), x, {"units": "Hz"}),
-            "second": (("curve", "point"), x / 2, {"units": "N m"}),
-            "kind": ("curve", [0, 1]),
-            "orbit_period": ("curve", [1, 2]),
-            "n_points": ("curve", [3, 2]),
-            "special_kind": ("special", [], {"flag_meanings": "cusp"}),
-        },
-        attrs={"first_parameter": "frequency_hz", "second_parameter": "q"},
-    )
-    ax = plot_curves(ds).axes[0]
-    assert [len(line.get_xdata()) for line in ax.lines] == [3, 2]
-    assert ax.get_ylabel() == "q [N m]"
 
 
 FREQUENCY = {"parameter": "frequency_hz"}

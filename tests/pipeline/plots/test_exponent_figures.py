@@ -10,6 +10,7 @@ from magpend_core.status import Status
 from pipeline.plots import Frame, plot_convergence, plot_lyapunov, plot_lyapunov_map
 from pipeline.plots.convergence import MOST_LINES
 from pipeline.plots.exponent_map import _scale
+from tests.pipeline.plots.made_up import DUFFING, legend_texts
 
 FREQUENCY = 0.25
 
@@ -37,7 +38,7 @@ def make_cube(n_cells=3, dims=(), sizes=(), exponents=(0.3, -0.4)):
             "frequency": ((), FREQUENCY, {"units": "Hz"}),
             **{d: (d, np.arange(n, dtype=float), {"units": "1"}) for d, n in zip(dims, sizes, strict=True)},
         },
-        attrs={"model": "duffing", "parameters": "", "lyapunov_n_periods": 64},
+        attrs={**DUFFING, "lyapunov_n_periods": 64},
     )
 
 
@@ -109,9 +110,8 @@ def lose(ds, index, status):
 
 def boxes(axes, gid):
     """Range of x of what has an identifier."""
-    found = [c for c in axes.collections if c.get_gid() == gid]
-    xs = np.concatenate([path.vertices[:, 0] for c in found for path in c.get_paths()] or [np.empty(0)])
-    return (xs.min(), xs.max()) if xs.size else None
+    xs = [path.vertices[:, 0] for c in axes.collections if c.get_gid() == gid for path in c.get_paths()]
+    return (min(map(np.min, xs)), max(map(np.max, xs))) if xs else None
 
 
 def test_plot_lyapunov__shows_where_cells_were_lost_and_why():
@@ -123,7 +123,7 @@ def test_plot_lyapunov__shows_where_cells_were_lost_and_why():
     ds["status"][0, 0] = Status.INFERRED  # has a section, and no exponent
     ds["lyapunov"][0, 0] = np.nan
     figure = plot_lyapunov(ds)
-    labels = [text.get_text() for legend in figure.legends for text in legend.get_texts()]
+    labels = legend_texts(figure)
     assert labels[-3:] == ["diverged: 2 of 12 cells", "failed: 1 of 12 cells", "without exponent: 1 of 12 cells"]
     top, bottom, strip = figure.axes
     assert boxes(strip, "absent:diverged") == (3.5, 4.5)

@@ -58,19 +58,16 @@ def test_window_width__between_neighbouring_values(known):
     assert (found.n, found.step) == (N, pytest.approx(0.01))
 
 
-def test_window_width__one_cell_ends_it(known):
+def test_window_width__one_cell_ends_it_and_so_does_the_axis(known):
+    found = MEASURES["window_width"](known, ["run"], {"period": 1, "contains": 2.8})
+    assert (found.low, found.high) == (pytest.approx(0.5), math.inf)
+    assert "end of the axis" in found.text
+    assert MEASURES["window_width"](known, ["run"], {"period": 1, "contains": 3.5}).missing
     known.cubes["run"]["orbit_period"][25, 3] = 0
     found = MEASURES["window_width"](known, ["run"], {"period": 1, "contains": 2.2})
     assert (found.low, found.high) == (pytest.approx(0.14), pytest.approx(0.16))
     known.cubes["run"]["orbit_period"][20, 3] = 0
     assert MEASURES["window_width"](known, ["run"], {"period": 1, "contains": 2.2}).high == 0.0
-
-
-def test_window_width__beyond_the_axis(known):
-    found = MEASURES["window_width"](known, ["run"], {"period": 1, "contains": 2.8})
-    assert (found.low, found.high) == (pytest.approx(0.5), math.inf)
-    assert "end of the axis" in found.text
-    assert MEASURES["window_width"](known, ["run"], {"period": 1, "contains": 3.5}).missing
 
 
 def test_change_of_period__between_neighbouring_values(known):
@@ -119,6 +116,8 @@ def test_least_share__interval_of_the_least_of_many(known):
     assert "2.7" in found.text
     one = MEASURES["least_share"](known, ["run"], {"at": 2.48, "period": 2})
     assert (one.value, one.step) == (1.0, None)
+    with pytest.raises(SpecError, match="no labels for motions"):
+        MEASURES["least_share"](known, ["run"], {"at": 2.2, "motion": "left"})
 
 
 @pytest.mark.parametrize("at", [2.203, 2.2])
@@ -149,24 +148,17 @@ def test_largest_exponent__mean_over_cells_that_are_not_closed(known):
     assert MEASURES["largest_exponent"](known, ["run"], {"at": 2.2}).missing
 
 
-def test_matches__words_of_the_model(known):
-    with pytest.raises(SpecError, match="no labels for motions"):
-        MEASURES["least_share"](known, ["run"], {"at": 2.2, "motion": "left"})
-
-
 def claim(**given):
     table = {
         "statement": "band",
         "source": "here",
         "measure": "window_width",
         "of": ["run"],
-        "options": {"period": 1, "contains": 2.2},
-        "least": 0.2,
-        "most": 0.3,
         "unit": "Hz",
         "step": 0.02,
     }
-    return ClaimTable.model_validate({**table, **given})
+    options = {"period": 1, "contains": 2.2}
+    return ClaimTable.model_validate({**table, "options": options, "least": 0.2, "most": 0.3, **given})
 
 
 @pytest.mark.parametrize(
@@ -196,8 +188,9 @@ def test_judge__never_met_by_a_coarse_grid():
     """Three values of which two have period 1 about 2.2 Hz would give a width within the claim."""
     coarse = np.array([1.95, 2.1, 2.2, 2.3, 2.45])
     known = Known(run=cube_of([0, 1, 1, 1, 0], coarse))
-    assert judge(known, "1", claim(step=0.02)).verdict is Verdict.UNDECIDED
-    assert "steps of at most 0.02" in judge(known, "1", claim(step=0.02)).reason
+    found = judge(known, "1", claim())
+    assert found.verdict is Verdict.UNDECIDED
+    assert "steps of at most 0.02" in found.reason
 
 
 def test_spelled__digits_follow_the_interval(known):

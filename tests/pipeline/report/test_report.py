@@ -18,28 +18,24 @@ from pipeline.runs.derive import derive
 from pipeline.runs.run import run as run_spec
 from pipeline.specification.problems import SpecError
 from pipeline.store.run import Run
+from tests.pipeline.cli.test_cli_analyse import CHAOTIC
 
 HOSTILE = "<script>alert(1)</script> & friends"
 SWEEP = f"""
 kind = "sweep"
 title = "{HOSTILE}"
 model = "duffing"
-[parameters]
-preset = "twin-well"
-frequency_hz = 0.15915494309189535
-[axes]
-amplitude = {{ values = [0.1, 0.15] }}
-[initial_conditions]
-kind = "grid"
-x = {{ start = -1.0, stop = 1.0, num = 3 }}
-v = {{ start = -0.2, stop = 0.2, num = 2 }}
-[integration]
-rtol = 1e-7
-atol = 1e-7
-n_transient = 200
-n_keep = 16
-stop_when_closed = true
-closure_tolerance = 1e-2
+parameters = {{ preset = "twin-well", frequency_hz = 0.15915494309189535 }}
+axes = {{ amplitude = {{ values = [0.1, 0.15] }} }}
+initial_conditions.kind = "grid"
+initial_conditions.x = {{ start = -1.0, stop = 1.0, num = 3 }}
+initial_conditions.v = {{ start = -0.2, stop = 0.2, num = 2 }}
+integration.rtol = 1e-7
+integration.atol = 1e-7
+integration.n_transient = 200
+integration.n_keep = 16
+integration.stop_when_closed = true
+integration.closure_tolerance = 1e-2
 """
 
 
@@ -93,28 +89,6 @@ def test_report__of_a_sweep(folder, command):
     assert html == written(command, folder, "run")
 
 
-CHAOTIC = """
-kind = "sweep"
-model = "duffing"
-[parameters]
-preset = "twin-well"
-frequency_hz = 0.15915494309189535
-[axes]
-amplitude = { values = [0.25, 0.3] }
-[initial_conditions]
-kind = "random"
-n = 8
-seed = 1
-x = [-1.0, 1.0]
-v = [-1.0, 1.0]
-[integration]
-rtol = 1e-7
-atol = 1e-7
-n_transient = 100
-n_keep = 64
-"""
-
-
 def test_report__sets_that_do_not_attract_have_no_share(command, tmp_path):
     """Without extension it is not shown that the chaotic set of the larger amplitude attracts."""
     (tmp_path / "spec.toml").write_text(CHAOTIC)
@@ -145,21 +119,10 @@ def test_report__its_commands_work(folder, command):
 
 WALKS = """
 kind = "continuation"
-[axes]
-frequency_hz = { start = 2.05, stop = 2.11, num = 5 }
-[continuation]
-path = "frequency_hz"
-direction = "both"
-[initial_conditions]
-kind = "random"
-n = 4
-seed = 7
-psi1_deg = [-20.0, 20.0]
-[integration]
-rtol = 1e-6
-atol = 1e-6
-n_transient = 200
-n_keep = 16
+axes = { frequency_hz = { start = 2.05, stop = 2.11, num = 5 } }
+continuation = { path = "frequency_hz", direction = "both" }
+initial_conditions = { kind = "random", n = 4, seed = 7, psi1_deg = [-20.0, 20.0] }
+integration = { rtol = 1e-6, atol = 1e-6, n_transient = 200, n_keep = 16 }
 """
 
 
@@ -170,13 +133,8 @@ def test_report__jumps_of_walks_have_their_place(folder, command):
     found = derive(folder / "walks", "hysteresis")
     assert found.sizes["jump"]
     head = re.search(r"<tr><th scope=\"col\">direction</th>(.*?)</tr>", html)[1]
-    assert re.findall(r"<th scope=\"col\">(.*?)</th>", head) == [
-        "from frequency [Hz]",
-        "to frequency [Hz]",
-        "from attractor",
-        "to attractor",
-        "count",
-    ]
+    heads = ["from frequency [Hz]", "to frequency [Hz]", "from attractor", "to attractor", "count"]
+    assert re.findall(r"<th scope=\"col\">(.*?)</th>", head) == heads
     rows = re.findall(r"<tr><td>(up|down)</td><td>(.*?)</td><td>(.*?)</td><td>([A-Z])</td>", html)
     names = [("up" if d > 0 else "down") for d in found["jump_direction"].values]
     ends = ([f"{v:.6g}" for v in found[f"jump_{end}"].values] for end in ("from", "to"))

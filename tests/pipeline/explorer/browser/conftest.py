@@ -25,7 +25,7 @@ from typing import Any
 import pytest
 
 from pipeline.runs.derive import derive
-from pipeline.runs.run import run
+from tests.pipeline.explorer.small_runs import finished
 
 ROOT = Path(__file__).parents[4]
 
@@ -35,17 +35,11 @@ HOSTILE = "small <img src=x onerror=\"document.title='run by a title'\"> run"
 SMALL = f"""
 kind = "sweep"
 title = {json.dumps(HOSTILE)}
-[axes]
-frequency_hz = {{ start = 2.2, stop = 2.3, num = 5 }}
-[initial_conditions]
-kind = "grid"
-psi1_deg = {{ start = -20, stop = 20, num = 3 }}
-psi2_deg = {{ start = -20, stop = 20, num = 3 }}
-[integration]
-rtol = 1e-7
-atol = 1e-7
-n_transient = 300
-n_keep = 20
+axes = {{ frequency_hz = {{ start = 2.2, stop = 2.3, num = 5 }} }}
+initial_conditions.kind = "grid"
+initial_conditions.psi1_deg = {{ start = -20, stop = 20, num = 3 }}
+initial_conditions.psi2_deg = {{ start = -20, stop = 20, num = 3 }}
+integration = {{ rtol = 1e-7, atol = 1e-7, n_transient = 300, n_keep = 20 }}
 """
 
 CANDIDATES = ("/usr/bin/chromium", "chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
@@ -61,17 +55,7 @@ def chromium() -> str | None:
 
 @dataclass
 class Opened:
-    """A page and what it complained of.
-
-    Attributes
-    ----------
-    page
-        Playwright's page.
-    complaints
-        Errors of the console, of scripts and of requests.
-    outside
-        Requests to other hosts.
-    """
+    """A page, its errors of the console, of scripts and of requests, and its requests to other hosts."""
 
     page: Any
     complaints: list[str] = field(default_factory=list)
@@ -97,15 +81,9 @@ class Opened:
 @pytest.fixture(scope="session")
 def looked_at(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Directory of a small run of the pendulum whose attractors have been analysed."""
-    folder = tmp_path_factory.mktemp("looked-at")
-    (folder / "small.toml").write_text(SMALL, "utf-8")
-    run(folder / "small.toml", folder / "small", workers=0, echo=_silent)
-    derive(folder / "small", "attractors", {})
-    return folder / "small"
-
-
-def _silent(text: str) -> None:
-    """Print nothing."""
+    directory = finished(tmp_path_factory.mktemp("looked-at"), SMALL)
+    derive(directory, "attractors", {})
+    return directory
 
 
 @contextmanager
@@ -168,6 +146,21 @@ def visiting(browser: Any) -> Iterator[Callable[..., Opened]]:
         context.close()
 
 
+def drawn(opened: Opened) -> Opened:
+    """Wait until the diagram of a page is there."""
+    opened.page.wait_for_selector(".diagram[data-drawn]")
+    until(opened.page, "window.magpend && !document.querySelector('.diagram[aria-busy]')")
+    return opened
+
+
+def until(page: Any, expression: str) -> None:
+    """Wait until an expression is true in the page, whose policy stops playwright's own waiting."""
+    end = time.monotonic() + WAIT_MS / 1000.0
+    while not page.evaluate(expression):
+        assert time.monotonic() < end, f"still not so: {expression}"
+        page.wait_for_timeout(20)
+
+
 @pytest.fixture
 def visit(browser: Any) -> Iterator[Callable[..., Opened]]:
     """See `visiting`; what is opened ends with the test."""
@@ -187,9 +180,6 @@ def reused(opened: Opened) -> Iterator[Opened]:
     yield opened
     opened.page.mouse.move(5, 5)
     opened.page.evaluate("begun => { document.activeElement?.blur(); magpend.state.set(begun); }", begun)
-    end = time.monotonic() + WAIT_MS / 1000.0
-    while opened.page.evaluate("!!document.querySelector('.diagram[aria-busy]')"):
-        assert time.monotonic() < end, "what was shown does not come back"
-        opened.page.wait_for_timeout(20)
+    until(opened.page, "!document.querySelector('.diagram[aria-busy]')")
     assert opened.page.evaluate("magpend.state.get()") == begun
     assert opened.complaints == []

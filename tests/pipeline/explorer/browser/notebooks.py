@@ -91,17 +91,7 @@ def jupyterlab(folder: Path, cells: Mapping[str, str]) -> Iterator[str]:
 
 
 class Lab:
-    """A notebook in JupyterLab: runs cells by name, and reads what they print.
-
-    Parameters
-    ----------
-    page
-        Playwright's page.
-    names
-        Of the cells, in their order.
-    complaints
-        What the page complains of.
-    """
+    """A notebook in JupyterLab, a page of playwright: runs cells by name, and reads what they print."""
 
     def __init__(self, page: Any, names: Sequence[str], complaints: Sequence[str] = ()) -> None:
         self.page, self.names, self.complaints = page, names, complaints

@@ -18,6 +18,8 @@ from pipeline.store.run import open_run
 from tests.pipeline.explorer.browser.conftest import WAIT_MS
 from tests.pipeline.explorer.browser.notebooks import Lab, jupyterlab, started
 
+pytestmark = pytest.mark.slow
+
 WAIT_S = WAIT_MS / 1000.0
 
 JUPYTER = {

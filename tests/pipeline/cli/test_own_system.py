@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import shlex
-import sys
 import tomllib
 from pathlib import Path
 
@@ -14,31 +13,13 @@ from magpend_core.models.text.grammar import FUNCTIONS
 from magpend_core.models.text.reading import KEYS
 from pipeline.specification.parsing import parse_spec
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[3]
 PAGE = (ROOT / "docs" / "own-system.md").read_text("utf-8")
 
 
 def block(mark: str, language: str) -> str:
     (text,) = re.findall(rf"<!-- {mark} -->\n```{language}\n(.*?)```", PAGE, re.DOTALL)
     return text
-
-
-@pytest.fixture
-def main(monkeypatch, tmp_path, capsys):
-    from pipeline.cli.main import main as entry
-
-    def call(*arguments):
-        monkeypatch.chdir(tmp_path)
-        monkeypatch.setattr(sys, "argv", ["magpend", *arguments])
-        code = 0
-        try:
-            entry()
-        except SystemExit as end:
-            code = int(end.code or 0)
-        captured = capsys.readouterr()
-        return code, captured.out, captured.err
-
-    return call
 
 
 @pytest.mark.slow

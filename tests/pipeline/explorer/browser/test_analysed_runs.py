@@ -1,4 +1,4 @@
-"""Pushes, stored shocks and noisy starts in a real browser."""
+"""Pushes, stored shocks, noisy starts and bifurcation curves in a real browser."""
 
 from __future__ import annotations
 
@@ -11,20 +11,17 @@ import numpy as np
 import pytest
 
 from pipeline.explorer.data.disturbances import disturbances
+from pipeline.explorer.data.parameter_plane import parameter_plane
 from pipeline.runs.derive import stored
 from pipeline.store.run import Run
-from tests.pipeline.explorer.browser.conftest import served
-from tests.pipeline.explorer.browser.test_diagram import drawn
+from tests.pipeline.explorer.browser.conftest import drawn, served
 from tests.pipeline.explorer.browser.test_panels import QUIET, choose, note_of
-from tests.pipeline.explorer.shocked_wells import SMOOTH, shocked_wells
+from tests.pipeline.explorer.small_runs import SMOOTH
+
+pytestmark = pytest.mark.slow
 
 RATE = "x\u0307"
 """The velocity as the page writes it."""
-
-
-@pytest.fixture(scope="module")
-def wells(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return shocked_wells(tmp_path_factory.mktemp("pushed"))
 
 
 @pytest.fixture(scope="module")
@@ -93,3 +90,43 @@ def test_push__is_dragged_and_tried_and_shaken(visit: Callable[..., Any], addres
     pressed(page, "Integrate this start")
     assert "ends on" in note_of(opened, "plane", "This start ends on")
     assert opened.complaints == []
+
+
+PANEL = ".panel-parameter-plane"
+
+
+def test_click_on_a_curve(bent: tuple[Path, Path], visit: Callable[..., Any]) -> None:
+    """Over the map of another run; the pointer tells the curve, the click shows the orbit at that point."""
+    line, plane = bent
+    found = parameter_plane(Run.open(line))
+    with served(plane, "--curves", str(line)) as address:
+        opened = drawn(visit(address))
+        page = opened.page
+        front = page.locator(f"{PANEL} .frame canvas").nth(1)
+        page.locator(f"{PANEL} .legend li", has_text="fold").wait_for()
+        assert page.locator(f"{PANEL} .legend li", has_text="attractor").count() >= 1
+        front.scroll_into_view_if_needed()
+        front.focus()
+        page.keyboard.press("ArrowRight")
+        page.locator(".panels[data-shown='curve-0-0']").wait_for()
+        told = page.locator(f"{PANEL} .readout").text_content()
+        assert told.startswith("fold, period 1: frequency = ")
+        curve = found["curves"][0]
+        values = [float(v) for v in re.findall(r"= ([\d.]+)", told)]
+        assert values == pytest.approx([curve["x"][0], curve["y"][0]], rel=1e-6)
+        shown = page.locator(".panel-facts dt", has_text="Kind").locator("xpath=following-sibling::dd[1]")
+        assert shown.text_content() == "fold, period 1"
+        # and by a click, where the pointer is told that it is on a curve
+        box = front.bounding_box()
+        hits = []
+        for k in range(2, 39):
+            page.mouse.move(box["x"] + box["width"] * k / 40, box["y"] + box["height"] * 0.5)
+            page.wait_for_timeout(20)
+            text = page.locator(f"{PANEL} .readout").text_content()
+            if text != told and not hits:
+                hits.append(k)
+                page.mouse.click(box["x"] + box["width"] * k / 40, box["y"] + box["height"] * 0.5)
+        assert hits
+        page.wait_for_function("!/curve-0-0$/.test(document.querySelector('.panels').dataset.shown)")
+        assert page.locator(".panels").get_attribute("data-shown").startswith("curve-")
+        assert opened.complaints == []
