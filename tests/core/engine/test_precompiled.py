@@ -56,12 +56,12 @@ def folder(tmp_path_factory):
 @pytest.fixture(scope="module")
 def cold(folder):
     """Rows of a process that begins with an empty cache."""
-    return integrated(folder, "pendulum", "duffing", "three-magnets")
+    return integrated(folder, "driven-pendulum", "duffing", "three-magnets")
 
 
 def test_parts__a_second_system_compiles_its_equations_alone(cold):
     """Other states, other constants, angles or none: what knows no equations is had from the first one."""
-    assert len(cold["pendulum"][2].split(",")) > 30
+    assert len(cold["driven-pendulum"][2].split(",")) > 30
     # besides the equations: the entry, which Python calls, and the stages, in which the equations are
     mine = ("_rhs", "_forcing", "_constants", "_no_edges", "advance_duffing", "run_stages")
     others = [name for name in cold["duffing"][2].split(",") if not name.startswith(mine)]
@@ -77,7 +77,7 @@ def test_parts__bits_depend_on_the_system_alone(cold, folder):
     bits = {name: row[:2] for name, row in cold.items()}
     alone = integrated(folder, "three-magnets", "duffing", MAGPEND_CACHE="0")
     assert {name: row[:2] for name, row in alone.items()} == {name: bits[name] for name in alone}
-    read = integrated(folder, "duffing", "pendulum")
+    read = integrated(folder, "duffing", "driven-pendulum")
     assert {name: row[:2] for name, row in read.items()} == {name: bits[name] for name in read}
     damage(folder / "cache")
     assert integrated(folder, "duffing")["duffing"][:2] == bits["duffing"]
