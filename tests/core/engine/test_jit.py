@@ -61,13 +61,6 @@ def test_kernel__sees_an_edit_of_a_callee_in_a_folder_named_by_the_digest(run_py
     assert float.fromhex(edited[1]) == pytest.approx(float.fromhex(first[1]), rel=0.1)
 
 
-def test_kernel__writes_nothing_when_switched_off(run_python, copied, tmp_path):
-    before = run_python(SCRIPT, package=copied, MAGPEND_CACHE="0").split()
-    assert not (tmp_path / "cache").exists()
-    assert not [p for p in tmp_path.rglob("*") if p.suffix in (".nbi", ".nbc")]
-    assert before[2] == "0"
-
-
 def test_source_digest__changes_with_any_source(copied, monkeypatch):
     versions = {source_digest()}
     monkeypatch.setattr(jit, "_PACKAGE", copied / "magpend_core")

@@ -68,14 +68,16 @@ def test_parts__a_second_system_compiles_its_equations_alone(cold):
     assert not others
 
 
-def test_parts__bits_depend_on_the_system_alone(cold, folder):
+def test_parts__bits_depend_on_the_system_alone(cold, folder, tmp_path):
     """From nothing after others or alone, without a cache, from the cache, and from one that is damaged.
 
     A process that compiles runs its callees as they were compiled alone, one that reads the cache those that were
     optimised once more as parts of the whole.
     """
     bits = {name: row[:2] for name, row in cold.items()}
-    alone = integrated(folder, "three-magnets", "duffing", MAGPEND_CACHE="0")
+    alone = integrated(tmp_path, "three-magnets", "duffing", MAGPEND_CACHE="0")
+    assert not list(tmp_path.iterdir())  # nor anything beside the sources
+    assert not [p for p in Path(jit.__file__).parents[1].rglob("*") if p.suffix in (".nbi", ".nbc")]
     assert {name: row[:2] for name, row in alone.items()} == {name: bits[name] for name in alone}
     read = integrated(folder, "duffing", "driven-pendulum")
     assert {name: row[:2] for name, row in read.items()} == {name: bits[name] for name in read}
