@@ -35,10 +35,10 @@ def kaplan_yorke(spectrum):
 RUBBED = {
     "name": "rubbed",
     "states": {"x": "1", "v": "1"},
-    "equations": {"x": "v", "v": "cos(2*pi*f*t) - x - 0.2*v - 0.5*sign(v - 0.3) - 0.2*tanh(20*v)"},
-    "impacts": [{"of": "x - 0.4", "direction": "up", "set": {"v": "-0.7*v"}}],
+    "equations": {"x": "v", "v": "cos(2*pi*f*t) - x - 0.2*v - 0.4*sign(v + 0.3) - 0.2*tanh(20*v)"},
+    "impacts": [{"of": "x - 0.5", "direction": "up", "set": {"v": "-0.7*v"}}],
 }
-"""A layer, a switch on which the motion slides, and impacts."""
+"""A layer, a switch on which the motion slides for a quarter of the time, and an impact in each period."""
 
 
 @pytest.mark.slow
@@ -47,7 +47,7 @@ def test_with_tangents__loops_give_the_bits_of_written_out_products(table, monke
     model = flow(table)
     system, n = model.system, len(model.states)
     states = np.random.default_rng(3).uniform(-0.3, 0.3, (3, n))
-    cells = np.tile(model.load().pack(), (3, 1)), np.full(3, 0.1), states
+    cells = np.tile(model.load().pack(), (3, 1)), np.full(3, 0.15), states
     options = {"n_transient": 3, "n_periods": 8, "n_blocks": 2, "system": system}
     found = []
     for written_out in (True, False):
