@@ -58,7 +58,7 @@ def model(kind: str) -> NoisyModel:
         "name": "oscillator",
         "states": {"x": {}, "v": {}},
         "parameters": {"d": 0.2, "k": 2.0},
-        "equations": {"x": "v", "v": "cos(t) - d*v - k*x"},
+        "equations": {"x": "v", "v": "cos(2*pi*f*t) - d*v - k*x"},
     }
     return noisy(load_model(table), Disturbance((("v", 0.1),)))
 
