@@ -30,7 +30,6 @@ TINY = {
     "coverage": ["--rigs", "1", "--draws", "10"],
     "curves": ["--points", "2", "--rounds", "1"],
     "identification": ["--rounds", "1", "--pieces", "1"],
-    "intervals": ["1"],
     "kernel": [*SMALL, "--tolerances", "1e-4", "--part", "here"],
     "many_tasks": ["100"],
     "multistable_pendulum": ["--starts", "200", "--rounds", "1"],
