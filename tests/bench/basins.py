@@ -12,7 +12,7 @@ both show a bounded set. The target is a third of the integration, with the same
 the cells. At 200 x 200 this takes some ten minutes.
 
 The last lines say what the fixed way would take with scipy's ``solve_ivp`` (RK45, the same tolerances,
-the compiled scalar model as its right-hand side), extrapolated from a few trajectories.
+the compiled text as its right-hand side), extrapolated from a few trajectories.
 """
 
 from __future__ import annotations
@@ -24,8 +24,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import solvers
 import xarray as xr
-from scalar_peers import scipy_runner
+from peers import text_of
 
 from magpend_core import load_preset, sections
 from magpend_core.models.model import Parameters
@@ -110,13 +111,14 @@ def _labels(found: xr.Dataset) -> tuple[np.ndarray, ...]:
     return kind, found["orbit_period"].values[rows], found["attractor_points"].values[rows, 0]
 
 
-def scipy_seconds(parameters: Parameters, starts: np.ndarray, n_periods: int) -> float:
+def scipy_seconds(starts: np.ndarray, n_periods: int) -> float:
     """Seconds per drive period and trajectory of `solve_ivp` on a few of the starts."""
-    runner = scipy_runner(parameters, "RK45")(TOLERANCE)
-    frequency = np.full(len(starts), FREQUENCY_HZ)
-    runner(frequency[:1], starts[:1], 1)  # compile
+    text = text_of("pendulum")
+    rhs = solvers.scalar_rhs(text, text.load().as_dict(), FREQUENCY_HZ)
+    runner = solvers.scipy_runner(rhs, 1.0 / FREQUENCY_HZ, TOLERANCE, "RK45")
+    runner(starts[:1], 1)  # compile
     started = time.perf_counter()
-    runner(frequency, starts, n_periods)
+    runner(starts, n_periods)
     return (time.perf_counter() - started) / (n_periods * len(starts))
 
 
@@ -153,7 +155,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         found[way.name] = way.identify(parameters, cube)
     _report(fixed, early, found, periods, options.size**2)
     pick = np.random.default_rng(1).choice(options.size**2, min(options.scipy_trajectories, options.size**2))
-    each = scipy_seconds(parameters, starts.reshape(-1, 4)[np.sort(pick)], options.scipy_periods)
+    each = scipy_seconds(starts.reshape(-1, 4)[np.sort(pick)], options.scipy_periods)
     work = options.size**2 * periods[fixed.name]
     print(f"scipy solve_ivp RK45: {1e6 * each:.0f} us per period and trajectory")
     print(f"the fixed way with it: {each * work / 3600:.1f} h, {each * work / fixed.wall_s:.0f} times as long")

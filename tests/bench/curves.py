@@ -13,9 +13,10 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
+from racing import least
 from scipy.integrate import solve_ivp
 from scipy.optimize import fsolve
 
@@ -65,13 +66,6 @@ def scalar(curve: Curve, places: Sequence[int]) -> np.ndarray:
     return np.array(found)
 
 
-def cpu_seconds(function: Callable[[], object]) -> float:
-    """CPU time of one call [s]."""
-    started = time.process_time()
-    function()
-    return time.process_time() - started
-
-
 def main(arguments: Sequence[str] | None = None) -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -85,10 +79,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     places = list(range(cusp + 20, min(cusp + 20 + options.points, len(curve.points) - 1)))
     amplitudes = scalar(curve, places)
     print(f"largest difference of the amplitudes: {np.abs(amplitudes - curve.values[places, 1]).max():.1e}")
-    ours, theirs = np.inf, np.inf
-    for _ in range(options.rounds):
-        ours = min(ours, cpu_seconds(lambda: continue_curves([(0, family, "fold", start)], BOUNDS)))
-        theirs = min(theirs, cpu_seconds(lambda: scalar(curve, places)))
+    runs = {
+        "ours": lambda: continue_curves([(0, family, "fold", start)], BOUNDS),
+        "theirs": lambda: scalar(curve, places),
+    }
+    ours, theirs = (seconds for seconds, _ in least(runs, options.rounds, time.process_time).values())
     ours, theirs = ours / len(curve.points), theirs / len(places)
     print(f"magpend  {1e3 * ours:8.2f} ms per point, points of codimension two located ({len(curve.points)} points)")
     print(f"scalar   {1e3 * theirs:8.2f} ms per point ({len(places)} points)")

@@ -21,6 +21,7 @@ from pathlib import Path
 
 import numpy as np
 from numba import njit
+from racing import least
 from scipy.integrate import solve_ivp
 
 from pipeline.rig.identify.build import build, read_all
@@ -98,19 +99,6 @@ def with_slopes(problem: Problem) -> np.ndarray:
     return (jacobian.T @ jacobian) / np.outer(size, size)
 
 
-def least_time(rounds: int, *functions: Callable[[], object]) -> list[float]:
-    """CPU time [s] of each, the least of some rounds, in turn; compiled before."""
-    times = [np.inf] * len(functions)
-    for function in functions:
-        function()
-    for _ in range(rounds):
-        for k, function in enumerate(functions):
-            started = time.process_time()
-            function()
-            times[k] = min(times[k], time.process_time() - started)
-    return times
-
-
 def shipped_problem(n_pieces: int) -> Problem:
     """The shipped identification at its start, with the first pieces."""
     spec = load_identification(SPEC)
@@ -124,14 +112,20 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--pieces", type=int, default=26)
     options = parser.parse_args(arguments)
+
+    def times(*functions: Callable[[], object]) -> list[float]:
+        found = least(dict(enumerate(functions)), options.rounds, time.process_time)
+        return [seconds for seconds, _ in found.values()]
+
     problem = shipped_problem(options.pieces)
     variational = replace(problem, slopes="variational")
     same = np.abs(by_scipy(problem) - by_lanes(problem)).max() * problem.noise.max()
-    lanes, scipy = least_time(options.rounds, lambda: by_lanes(problem), lambda: by_scipy(problem))
+    assert same < 1e-4, "the two integrate something else"
+    lanes, scipy = times(lambda: by_lanes(problem), lambda: by_scipy(problem))
     print(f"residuals of {len(problem.pieces)} pieces, largest difference {same:.1e} rad")
     print(f"  lanes      {1e3 * lanes:9.2f} ms")
     print(f"  solve_ivp  {1e3 * scipy:9.2f} ms   {scipy / lanes:.0f} times (target {TARGET:.0f})")
-    differences, tangents = least_time(options.rounds, lambda: with_slopes(problem), lambda: with_slopes(variational))
+    differences, tangents = times(lambda: with_slopes(problem), lambda: with_slopes(variational))
     apart = np.abs(with_slopes(problem) - with_slopes(variational)).max()
     print(f"residuals with slopes by {len(problem.free)} unknowns and the starts")
     print(f"  differences between lanes  {1e3 * differences:9.2f} ms")

@@ -1,346 +1,298 @@
-"""magpend's kernel beside other integrators, at equal achieved error.
+"""magpend beside other solvers, at equal achieved error.
 
-Run from the repository's root::
+Run from the repository's root, on a machine that does nothing else::
 
-    python tests/bench/peers.py                      # both drives, every peer that is installed
-    python tests/bench/peers.py --eps-drive 1000 --error-period 10 --points
+    python tests/bench/peers.py                                # all models: some ten minutes
+    python tests/bench/peers.py --models belt pendulum --peers scalar heyoka --points
+    python tests/bench/peers.py --figure work_precision.png    # error against time, too
 
-The same trajectories, from seeded initial states, are integrated by
+Every shipped text, and the paper's pendulum with its magnets and with steep edges of the drive, beside
 
-* ``magpend``: `magpend_core.sections`;
-* ``heyoka``: Taylor series in batches, compiled once per tolerance (`heyoka_model`);
-* ``numbalsoda``: LSODA and DOP853 in C++ on a compiled right-hand side;
-* ``scipy``: `solve_ivp` with DOP853 and RK45 on the same right-hand side.
+* a scalar numba loop: Dormand-Prince 5(4), textbook control;
+* numbalsoda: LSODA and DOP853 in C++;
+* heyoka: Taylor series in batches of 8, each order;
+* scipy: `solve_ivp` with DOP853 and RK45 on the compiled right-hand side.
 
-Every solver is swept over its tolerance (rtol = atol). Its error is the median over the trajectories
-of the scaled error at the section after ``--error-period`` periods, against a reference solution;
-its cost is CPU time of one thread per period and trajectory, warm, the least of ``--rounds`` rounds.
-A round runs all solvers in turn, so that a busy machine slows all alike. The table is read off each
-solver's front of best points, by log-log interpolation at the errors 1e-4, 1e-6 and 1e-8.
+Each solver is swept over its tolerance, magpend by both of its methods. Its error is the median over 16
+trajectories of the scaled error after a few periods, against scipy's DOP853 at 1e-13; its cost is CPU time of one
+thread per trajectory and period over many more periods, the least of the rounds, in which all take turns. Where there
+is no drive a period is a while. Where all settings of a solver are better than an error, the cheapest counts. The
+equations of the peers are made from a text's expressions with parameters as numbers (`solvers`); magpend's parameters
+are read per lane. The pendulum with magnets is functions by hand in magpend, and compared with its text first.
 
-The motion is not chaotic at the default 2.8 Hz, where it settles on period 1, but transients may
-multiply errors: keep ``--error-period`` small. The slow peers are timed on fewer trajectories, and
-scipy's errors are medians over these few.
-
-All of it takes about three minutes of CPU time, most of them heyoka's and magpend's eight rounds.
-
-heyoka and numbalsoda are the optional extra ``bench``; a missing one is reported and left out.
+Models whose motion sticks or jumps (belt-stick, impact) have no peer: none of them says what comes after. heyoka and
+numbalsoda are the dependency group ``bench``; a missing one is reported and left out.
 """
 
 from __future__ import annotations
 
 import argparse
-import itertools
+import dataclasses
 import math
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
 
 import numpy as np
-import scalar_model
-from problem import Curve, Problem, Runner, cpu_time, draw_states, median_error, scaled_error
-from scalar_peers import numbalsoda_runner, scipy_runner, split_solution
+import solvers
+from racing import HEAD, Contestant, Curve, Runner, decades, points, race, ratios, scaled_error
 
-import magpend_core
+from magpend_core import load_model, pointwise, run_branches
+from magpend_core.engine.system import System
+from magpend_core.engine.tableau import METHODS
+from magpend_core.models.text import read_model
 
-ERRORS = (1e-4, 1e-6, 1e-8)
-"""Median errors at which the solvers are compared."""
-
-CHECKED = 4  # trajectories on which the reference is compared with a second solver
+N_ERROR = 16
+PEERS = ("scalar", "numbalsoda", "heyoka", "scipy")
+TURN = 2.0 * math.pi
 
 
 @dataclass(frozen=True)
-class Contestant:
-    """A solver and how much of it a run can afford.
+class Case:
+    """What is integrated of a model.
 
     Attributes
     ----------
-    name : str
-    settings : dict of str to Runner
-        Runner of each point of the sweep.
-    n : int
-        Trajectories that are timed.
-    n_periods : int
-        Periods that are timed.
-    rounds : int
-    n_error : int
-        Trajectories of which the median error is taken.
+    period : float
+        Of the drive [s], or a while.
+    low, high : tuple of float
+        Corners of the box of initial states.
+    horizon : int
+        Periods after which errors are taken; few where motion is chaotic.
+    model : str
+        Name of magpend's model where it is not that of the case.
+    changes : dict
+        Parameters.
     """
 
-    name: str
-    settings: dict[str, Runner]
-    n: int
-    n_periods: int
-    rounds: int
-    n_error: int
+    period: float
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+    horizon: int
+    model: str = ""
+    changes: Mapping[str, float] = field(default_factory=dict)
+
+    def starts(self, n: int) -> np.ndarray:
+        """Return seeded initial states (n, n_states)."""
+        return np.random.default_rng(1).uniform(self.low, self.high, (n, len(self.low)))
 
 
-def decades(first: float, last: float, per_decade: int = 1) -> list[float]:
-    """Powers of ten from ``10**-first`` down to ``10**-last``."""
-    n = round((last - first) * per_decade)
-    return [10.0 ** -(first + i / per_decade) for i in range(n + 1)]
+HANGING = (1.0 / 2.8, (-0.3, -0.3, -1.0, -1.0), (0.3, 0.3, 1.0, 1.0), 5)
+CASES = {
+    "duffing5": Case(TURN, (-1.0, -0.5), (1.0, 1.0), 4),
+    "driven-pendulum": Case(TURN, (-3.0, -2.0), (3.0, 2.0), 2),
+    "three-magnets": Case(5.0, (-1.5, -1.5, 0.0, 0.0), (1.5, 1.5, 0.0, 0.0), 2),
+    "belt": Case(TURN, (-2.0, -2.0), (2.0, 2.0), 3),
+    "van-der-pol": Case(TURN, (-2.0, -2.0), (2.0, 2.0), 3),
+    "rossler": Case(18.0, (-5.0, -5.0, 0.0), (5.0, 5.0, 1.0), 1),
+    "lorenz": Case(4.0, (-10.0, -10.0, 15.0), (10.0, 10.0, 35.0), 1),
+    "pendulum-text": Case(*HANGING),
+    "pendulum": Case(*HANGING),
+    "pendulum, steep drive": Case(*HANGING, "pendulum", {"eps_drive": 1000.0}),
+}
 
 
-def magpend_lanes(parameters: magpend_core.Parameters, tolerance: float) -> Runner:
-    """Runner of our kernel."""
+def text_of(name: str) -> Any:
+    """Return a model as text; for the paper's pendulum that of the library with its magnets added (Eq. 18-20).
 
-    def runner(frequency_hz: np.ndarray, initial_states: np.ndarray, n_periods: int) -> np.ndarray:
-        options = {"n_transient": 0, "n_keep": n_periods, "rtol": tolerance, "atol": tolerance}
-        return magpend_core.sections(parameters, frequency_hz, initial_states, **options).section
+    Angles are not brought back to one turn there: the trajectories of the benchmark do not rotate.
+    """
+    model = load_model(name)
+    if name != "pendulum":
+        return model
+    table = load_model("pendulum-text").definition.table
+    moment = {
+        f"f{i}": f"alpha{i}/2*exp(-((rel + beta{i})/gamma{i})**2 - ((psi1 + p{i}*rel + r{i})/c{i}_mag)**2)"
+        for i in (1, 2)
+    }
+    define = {
+        "rel": "psi2 - psi1",
+        **moment,
+        "side": "2/pi*atan(eps_mag*(psi1 + (p1 + p2)/2*rel + (r1 + r2)/2))",
+        "fx": "((f1 - f2)*side + f1 + f2)/h",
+        "dx": "l1*s1 + l2*s2",
+        "fy": "fx*(h - l1*c1 - l2*c2)*dx/(dx**2 + delta**2)",
+        **table["define"],
+        "b1": table["define"]["b1"] + " + l1*(fx*c1 + fy*s1)",
+        "b2": table["define"]["b2"] + " + l2*(fx*c2 + fy*s2)",
+    }
+    values = model.load().as_dict()
+    own = {f"{k}_mag" if k in ("c1", "c2") else k: v for k, v in values.items()}
+    return read_model(
+        {
+            "name": "pendulum-magnets",
+            "states": table["states"],
+            "parameters": own,
+            "define": define,
+            "equations": table["equations"],
+        }
+    )
+
+
+def lanes(system: System, packed: np.ndarray, frequency: float, tolerance: float, on_steps: Any = None) -> Runner:
+    """Runner of the engine."""
+
+    def runner(initial: np.ndarray, n_periods: int) -> np.ndarray:
+        n = len(initial)
+        found = run_branches(
+            np.tile(packed, (n, 1, 1)),
+            np.full((n, 1), frequency),
+            initial,
+            n_transient=n_periods - 1,
+            n_keep=1,
+            rtol=tolerance,
+            atol=tolerance,
+            system=system,
+            max_steps_per_period=1_000_000,
+        )
+        if on_steps is not None:
+            on_steps(found)
+        return found.section[:, 0, 0]
 
     return runner
 
 
-def reference_solution(
-    parameters: magpend_core.Parameters, frequency_hz: np.ndarray, initial_states: np.ndarray, n_periods: int
-) -> tuple[np.ndarray, float]:
-    """Sections to be taken as true, and their largest difference from a second solver's.
-
-    DOP853 of numbalsoda at a tolerance of 1e-13, compared on a few trajectories with DOP853 of scipy
-    that starts anew at each switch of the drive. Without numbalsoda scipy alone serves, on 16
-    trajectories, compared with itself at 1e-12. Both use `scalar_model`, which shares no code with
-    the kernel.
-    """
-
-    def split(n: int, tolerance: float) -> np.ndarray:
-        rows = zip(frequency_hz[:n].tolist(), initial_states[:n], strict=True)
-        return np.array([split_solution(parameters, f, state, n_periods, tolerance) for f, state in rows])
-
-    try:
-        runner = numbalsoda_runner(parameters, "dop853")(1e-13)
-        section, second = runner(frequency_hz, initial_states, n_periods), split(CHECKED, 1e-13)
-    except ImportError:
-        section, second = split(16, 1e-13), split(CHECKED, 1e-12)
-    return section, float(np.max(scaled_error(section[:CHECKED], second)))
+def engine_entry(
+    name: str, system: System, packed: np.ndarray, case: Case, size: tuple[int, int], methods: Sequence[str]
+) -> Contestant:
+    """Enter the engine, swept over rtol = atol = 1e-3 ... 1e-11 by each method."""
+    sweep = {
+        f"{method} {t:.0e}": lanes(dataclasses.replace(system, method=method), packed, 1.0 / case.period, t)
+        for method in methods
+        for t in decades(3, 11, 2)
+    }
+    return Contestant(name, sweep, *size)
 
 
-def build_problem(options: argparse.Namespace, eps_drive: float | None) -> Problem:
-    """Draw the trajectories for one drive and solve them for reference."""
-    overrides = {} if eps_drive is None else {"eps_drive": eps_drive}
-    parameters = magpend_core.load_preset(**overrides)
-    frequency_hz = np.full(options.trajectories, options.frequency)
-    initial_states = draw_states(options.trajectories, options.seed)
-    solution = reference_solution(parameters, frequency_hz, initial_states, options.error_period)
-    return Problem(parameters, frequency_hz, initial_states, *solution)
+def rhs_of(text: Any, case: Case) -> Any:
+    """Compile the scalar right-hand side of a text."""
+    return solvers.scalar_rhs(text, text.load(**case.changes).as_dict(), 1.0 / case.period)
 
 
-def enter_magpend(problem: Problem, options: argparse.Namespace) -> Iterator[Contestant]:
-    """Enter our kernel, swept over rtol = 1e-3 ... 1e-11."""
-    settings = {f"{tol:.1e}": magpend_lanes(problem.parameters, tol) for tol in decades(3, 11, 2)}
-    n = options.trajectories
-    yield Contestant("magpend", settings, n, options.periods, options.rounds, n)
+def peer_entries(text: Any, case: Case, peers: Sequence[str], n_most: int, periods: int) -> Iterator[Contestant]:
+    """Enter the peers that were asked for."""
+    n, rhs = len(case.low), rhs_of(text, case)
+    few = max(8, n_most // 8)
+    if "scalar" in peers:
+        loop = solvers.scalar_loop(rhs, n, case.period)
+        yield Contestant("scalar numba", {f"{t:.0e}": loop(t) for t in decades(3, 11, 1)}, few, periods)
+    if "numbalsoda" in peers:
+        for method in ("lsoda", "dop853"):
+            solver = solvers.numbalsoda_loop(rhs, n, case.period, method)
+            settings = {f"{t:.0e}": solver(t) for t in decades(4, 11, 1)}
+            yield Contestant(f"numbalsoda {method.upper()}", settings, 8, max(1, periods // 4))
+    if "heyoka" in peers:
+        values = text.load(**case.changes).as_dict()
+        settings = {
+            f"order {order}": solvers.heyoka_batch(text, values, 1.0 / case.period, tolerance, 8)
+            for order, tolerance in solvers.orders(2, 14)
+        }
+        yield Contestant("heyoka", settings, few, periods)
+    if "scipy" in peers:
+        for method, last in (("DOP853", 10), ("RK45", 9)):
+            settings = {f"{t:.0e}": solvers.scipy_runner(rhs, case.period, t, method) for t in decades(4, last, 1)}
+            yield Contestant(f"scipy {method}", settings, 4, case.horizon)
 
 
-def enter_heyoka(problem: Problem, options: argparse.Namespace) -> Iterator[Contestant]:
-    """Enter heyoka with each order and batch width; its front is the best of them.
-
-    heyoka's tolerance sets the order, ``ceil(1 - log(tol)/2)``, and the step follows from the order
-    alone: one tolerance per order is a full sweep.
-    """
-    from heyoka_model import HeyokaSections, HeyokaSettings
-
-    settings = {}
-    for batch, order in itertools.product(options.heyoka_batches, range(4, 13)):
-        tol = 1.0001 * math.exp(-2.0 * (order - 1))
-        setting = HeyokaSettings(
-            batch=batch, fast_math=not options.heyoka_strict_math, load_sweeps=options.heyoka_sweeps
-        )
-        settings[f"{tol:.1e} batch {batch}"] = HeyokaSections(problem.parameters.as_dict(), tol, setting)
-    n = min(options.trajectories, 64)
-    yield Contestant("heyoka", settings, n, options.periods, options.rounds, options.trajectories)
-
-
-def enter_numbalsoda(problem: Problem, options: argparse.Namespace) -> Iterator[Contestant]:
-    """Enter LSODA and DOP853 in C++."""
-    for method in ("lsoda", "dop853"):
-        solver = numbalsoda_runner(problem.parameters, method)
-        settings = {f"{tol:.1e}": solver(tol) for tol in decades(3, 12)}
-        n = min(options.trajectories, 32)
-        name = f"numbalsoda {method.upper()}"
-        yield Contestant(name, settings, n, options.periods, min(options.rounds, 2), options.trajectories)
-
-
-def enter_scipy(problem: Problem, options: argparse.Namespace) -> Iterator[Contestant]:
-    """Enter scipy's `solve_ivp`, one trajectory after the other."""
-    for method, last in (("DOP853", 10), ("RK45", 9)):
-        solver = scipy_runner(problem.parameters, method)
-        settings = {f"{tol:.1e}": solver(tol) for tol in decades(4, last)}
-        n = min(options.trajectories, options.scipy_trajectories)
-        yield Contestant(f"scipy {method}", settings, n, options.error_period, 1, n)
-
-
-ENTRIES: dict[str, Callable[[Problem, argparse.Namespace], Iterator[Contestant]]] = {
-    "magpend": enter_magpend,
-    "heyoka": enter_heyoka,
-    "numbalsoda": enter_numbalsoda,
-    "scipy": enter_scipy,
-}
-
-
-def enter_all(problem: Problem, options: argparse.Namespace) -> list[Contestant]:
-    """All solvers that were asked for and are installed."""
-    contestants: list[Contestant] = []
-    for name in options.peers:
+def installed(peers: Sequence[str]) -> list[str]:
+    """Return those of the peers that can be imported; the others are reported."""
+    found = []
+    for name in peers:
         try:
-            contestants += ENTRIES[name](problem, options)
+            if name != "scalar":
+                __import__(name)
+            found.append(name)
         except ImportError as error:
-            print(f"{name} is left out: {error} (it comes with the extra `bench`)")
-    return contestants
+            print(f"{name} is left out: {error} (it comes with the group `bench`)")
+    return found
 
 
-def deeper(function: Callable[[], None], depth: int) -> None:
-    """Call a function from `depth` more frames down the C stack."""
-    if depth == 0:
-        function()
-    else:
-        next(map(lambda _: deeper(function, depth - 1), (0,)))
+def error_by(rhs: Any, case: Case, system: System) -> Callable[[Runner], float]:
+    """Return a function from a runner to its median error at the horizon, against scipy's DOP853."""
+    initial = case.starts(N_ERROR)
+    reference = solvers.scipy_runner(rhs, case.period, 1e-13, "DOP853")(initial, case.horizon)
+
+    def error_of(runner: Runner) -> float:
+        found = runner(initial, case.horizon)
+        return float(np.median(scaled_error(found, reference, system.is_angle, system.scales)))
+
+    return error_of
 
 
-def race(contestants: list[Contestant], problem: Problem) -> list[Curve]:
-    """Errors of all points, which also warms everything up, then their costs, round by round.
-
-    Each round starts from another depth of the stack. Compiled code spills vectors of 512 bits
-    there, and where these straddle cache lines heyoka runs a quarter slower, magpend up to a tenth.
-    The place is random for each process; the least cost over the rounds is that of a good place.
-    """
-    curves = []
-    for c in contestants:
-        errors = [median_error(runner, problem, c.n_error) for runner in c.settings.values()]
-        curves.append(Curve(c.name, list(c.settings), errors, [math.inf] * len(errors)))
-    for i_round in range(max(c.rounds for c in contestants)):
-        deeper(lambda: time_all(contestants, curves, problem, i_round), i_round)  # noqa: B023
-    return curves
-
-
-def time_all(contestants: list[Contestant], curves: list[Curve], problem: Problem, i_round: int) -> None:
-    """One round: lower the costs in `curves` where this round's are less."""
-    for c, curve in zip(contestants, curves, strict=True):
-        if i_round < c.rounds:
-            costs = [cpu_time(runner, problem, c.n, c.n_periods) for runner in c.settings.values()]
-            curve.cost = [min(pair) for pair in zip(curve.cost, costs, strict=True)]
-
-
-def model_differences(parameters: magpend_core.Parameters, seed: int) -> dict[str, float]:
-    """Largest relative difference of the accelerations of each peer's model from the kernel's."""
-    rng = np.random.default_rng(seed)
-    states = rng.uniform(-1.0, 1.0, (64, 4)) * (1.5, 1.5, 10.0, 10.0)
-    t, frequency_hz = rng.uniform(0.0, 2.0, 64), rng.uniform(0.1, 3.0, 64)
-    rows = zip(t, states, frequency_hz, strict=True)
-    ours = np.array([magpend_core.accelerations(time, y, parameters, f) for time, y, f in rows])
-    arguments = (parameters.as_dict(), t, states, frequency_hz)
-    theirs = {"scalar model": scalar_model.evaluate_accelerations(*arguments)}
-    try:
-        from heyoka_model import HeyokaSettings, evaluate_accelerations
-
-        for n in (3, 4):
-            setting = HeyokaSettings(load_sweeps=n)
-            theirs[f"heyoka's with {n} sweeps"] = evaluate_accelerations(*arguments, setting)
-    except ImportError:
-        pass
-    scale = np.abs(ours).max(axis=1, keepdims=True)
-    return {name: float(np.max(np.abs(a - ours) / scale)) for name, a in theirs.items()}
-
-
-def check_models(parameters: magpend_core.Parameters, seed: int) -> str:
-    """Say by how much the peers' models differ from the kernel's.
+def check_equations(parameters: Any, rhs: Any, case: Case) -> float:
+    """Return the largest relative difference of the peers' rates from magpend's.
 
     Raises
     ------
     AssertionError
-        If one differs by more than 1e-10: its timings would be of something else.
+        If it is above 1e-10: the timings would be of something else.
     """
-    differences = model_differences(parameters, seed)
-    for name, difference in differences.items():
-        if not difference < 1e-10:
-            raise AssertionError(f"{name} differs from the kernel by {difference:.1e}, more than 1e-10")
-    parts = ", ".join(f"{name} {difference:.1e}" for name, difference in differences.items())
-    return f"largest relative difference of accelerations from magpend's: {parts}"
+    states = case.starts(64)
+    ours = pointwise.rates(0.1, states, parameters, 1.0 / case.period)
+    theirs = np.array([rhs(0.1, *y) for y in states.tolist()])
+    largest = float(np.max(np.abs(theirs - ours) / np.abs(ours).max(axis=1, keepdims=True)))
+    if not largest < 1e-10:
+        raise AssertionError(f"the equations of the peers differ from magpend's by {largest:.1e}, more than 1e-10")
+    return largest
 
 
-def table(curves: list[Curve]) -> str:
-    """Costs at the compared errors, with ratios to the first curve's."""
-    head = "".join(f"{f'at {error:.0e}':>20}" for error in ERRORS)
-    lines = [f"{'us per period':<20}{head}", f"{'':<20}" + f"{'(ratio)':>20}" * len(ERRORS)]
-    for curve in curves:
-        cells = []
-        for error in ERRORS:
-            cost, ours = curve.cost_at(error), curves[0].cost_at(error)
-            ratio = f"({cost / ours:.2f})" if math.isfinite(ours) else "(-)"
-            cells.append(f"{f'{cost:.3g}  {ratio}' if math.isfinite(cost) else '-':>20}")
-        lines.append(f"{curve.name:<20}" + "".join(cells))
-    return "\n".join(lines)
+def compare(name: str, peers: Sequence[str], size: tuple[int, int], rounds: int) -> list[Curve]:
+    """Race on a case, and print its table."""
+    case = CASES[name]
+    parameters, text = load_model(case.model or name).load(**case.changes), text_of(case.model or name)
+    system, rhs = parameters.model.system, rhs_of(text, case)
+    same = check_equations(parameters, rhs, case)
+    error_of = error_by(rhs, case, system)
+    engine = engine_entry("magpend", system, parameters.pack(), case, size, tuple(METHODS))
+    agreed = error_of(engine.settings["dopri5 1e-11"])
+    entries = [engine, *peer_entries(text, case, peers, *size)]
+    curves = race(entries, case.starts(size[0]), error_of, rounds)
+    print(f"\n{name}: {case.horizon} periods of {case.period:.3g} s; reference and magpend at 1e-11 differ by")
+    print(f"  {agreed:.0e}, rates by {same:.0e}\n{HEAD}")
+    print("\n".join(ratios(curves)), flush=True)
+    return curves
 
 
-def points(curves: list[Curve]) -> str:
-    """Every measured point."""
-    lines = [f"{'solver':<20}{'setting':<18}{'median error':>14}{'us per period':>15}"]
-    for curve in curves:
-        for setting, error, cost in zip(curve.setting, curve.error, curve.cost, strict=True):
-            lines.append(f"{curve.name:<20}{setting:<18}{error:>14.2e}{cost:>15.2f}")
-    return "\n".join(lines)
+def draw(results: Mapping[str, list[Curve]], path: Path) -> None:
+    """Draw error against time, a panel for each case: lines along fronts, other settings as faint markers."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    n = len(results)
+    figure, row = plt.subplots(1, n, figsize=(3.6 * n + 0.2, 3.9), sharey=True, squeeze=False, layout="constrained")
+    for axes, (name, curves) in zip(row[0], results.items(), strict=True):
+        for curve, marker in zip(curves, "osD^vxP+", strict=False):
+            (line,) = axes.plot(*curve.front(), marker=marker, label=curve.name)
+            axes.plot(curve.error, curve.cost, marker, color=line.get_color(), alpha=0.25, zorder=1)
+        axes.set(xscale="log", yscale="log", xlim=(3e-3, 1.3e-11), title=name, xlabel="median scaled error")
+        axes.grid(color="0.9", linewidth=0.6)
+    row[0][0].set_ylabel("CPU time per period and trajectory [\N{MICRO SIGN}s]")
+    figure.legend(*row[0][0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
+    figure.savefig(path, dpi=300)
+    print(path)
 
 
-def drive_steepness(text: str) -> float | None:
-    """Value of ``--eps-drive``: a number, or None for the preset's."""
-    return None if text == "preset" else float(text)
-
-
-def parser() -> argparse.ArgumentParser:
-    """Command line of the benchmark; the work-precision figure shares it."""
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Measure and print."""
     p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    p.add_argument("--trajectories", type=int, default=256, help="a multiple of 8 (256)")
-    p.add_argument("--periods", type=int, default=40, help="drive periods that are timed (40)")
-    p.add_argument("--error-period", type=int, default=5, help="section at which errors are taken (5)")
-    p.add_argument("--frequency", type=float, default=2.8, help="of the drive [Hz] (2.8)")
-    p.add_argument(
-        "--eps-drive",
-        type=drive_steepness,
-        nargs="+",
-        default=[None, 1000.0],
-        metavar="EPS",
-        help="steepness of the drive's edges, or `preset` (both: preset 1000)",
-    )
-    p.add_argument("--seed", type=int, default=1, help="of the initial states (1)")
-    p.add_argument("--rounds", type=int, default=8, help="timed rounds, of which the best counts (8)")
-    p.add_argument("--peers", nargs="+", choices=list(ENTRIES), default=list(ENTRIES))
-    p.add_argument("--heyoka-batches", type=int, nargs="+", default=[8, 4], help="batch widths (8 4)")
-    p.add_argument("--heyoka-sweeps", type=int, default=3, help="sweeps for the bearing loads (3)")
-    p.add_argument("--heyoka-strict-math", action="store_true", help="without fast_math")
-    p.add_argument("--scipy-trajectories", type=int, default=8, help="trajectories for scipy (8)")
+    p.add_argument("--models", nargs="+", choices=list(CASES), default=list(CASES))
+    p.add_argument("--peers", nargs="*", choices=PEERS, default=list(PEERS))
+    p.add_argument("--trajectories", type=int, default=128, help="a multiple of 8 (128)")
+    p.add_argument("--periods", type=int, default=100, help="periods that are timed (100)")
+    p.add_argument("--rounds", type=int, default=3)
     p.add_argument("--points", action="store_true", help="print every measured point")
-    return p
-
-
-def checked_options(arguments: list[str] | None, p: argparse.ArgumentParser) -> argparse.Namespace:
-    """Parse the command line and refuse what no solver could run."""
+    p.add_argument("--figure", type=Path, help="PNG, PDF or SVG of error against time")
     options = p.parse_args(arguments)
-    if options.trajectories < 8 or options.trajectories % 8:
-        p.error(f"--trajectories {options.trajectories} must be a positive multiple of 8")
-    if options.peers[0] != "magpend":
-        options.peers = ["magpend", *(name for name in options.peers if name != "magpend")]
-    return options
-
-
-def describe(problem: Problem) -> str:
-    """Heading of one drive's results."""
-    m, n_periods = problem.reference.shape[:2]
-    return (
-        f"eps_drive = {problem.parameters['eps_drive']:g}, {problem.frequency_hz[0]:g} Hz, "
-        f"{len(problem.frequency_hz)} trajectories, median error of {m} at section {n_periods} "
-        f"(reference good to {problem.uncertainty:.0e})"
-    )
-
-
-def main(arguments: list[str] | None = None) -> None:
-    """Run the benchmark and print its tables."""
-    options = checked_options(arguments, parser())
-    print(check_models(magpend_core.load_preset(), options.seed))
-    for eps_drive in options.eps_drive:
-        problem = build_problem(options, eps_drive)
-        print(f"\n{describe(problem)}", flush=True)
-        curves = race(enter_all(problem, options), problem)
-        print(table(curves))
-        if options.points:
-            print(points(curves))
+    peers, size = installed(options.peers), (options.trajectories, options.periods)
+    results = {name: compare(name, peers, size, options.rounds) for name in options.models}
+    if options.points:
+        for name, curves in results.items():
+            print(f"\n{name}", *points(curves), sep="\n")
+    if options.figure:
+        draw(results, options.figure)
 
 
 if __name__ == "__main__":

@@ -6,6 +6,7 @@ import os
 import shutil
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -150,22 +151,19 @@ def run_python(tmp_path):
     says otherwise.
     """
 
-    def run(script, *, package=Path(magpend_core.__file__).parent.parent, **env):
-        keep = {k: v for k, v in os.environ.items() if not k.startswith(("NUMBA_", "MAGPEND_", "COV"))}
-        settings = {"MAGPEND_CACHE_DIR": str(tmp_path / "cache"), **env, "PYTHONPATH": str(package)}
-        done = subprocess.run(
-            [sys.executable, "-W", "error", "-c", script],
-            env=keep | settings,
-            cwd=tmp_path,
-            capture_output=True,
-            text=True,
-            timeout=300,
-            check=False,
-        )
-        assert done.returncode == 0, done.stderr
-        return done.stdout
+    return partial(run_script, tmp_path)
 
-    return run
+
+def run_script(folder, script, *, package=Path(magpend_core.__file__).parent.parent, **env):
+    """Run a script in a fresh interpreter in a folder, which also holds its compile cache; return what it prints."""
+    keep = {k: v for k, v in os.environ.items() if not k.startswith(("NUMBA_", "MAGPEND_", "COV"))}
+    settings = {"MAGPEND_CACHE_DIR": str(folder / "cache"), **env, "PYTHONPATH": str(package)}
+    words = [sys.executable, "-W", "error", "-c", script]
+    done = subprocess.run(
+        words, env=keep | settings, cwd=folder, capture_output=True, text=True, timeout=300, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
 
 
 def _pendulum_rhs(p, torque):

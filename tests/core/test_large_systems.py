@@ -32,14 +32,22 @@ def kaplan_yorke(spectrum):
     return k + 1 + sums[k] / abs(spectrum[k + 1])
 
 
+RUBBED = {
+    "name": "rubbed",
+    "states": {"x": "1", "v": "1"},
+    "equations": {"x": "v", "v": "cos(2*pi*f*t) - x - 0.2*v - 0.4*sign(v + 0.3) - 0.2*tanh(20*v)"},
+    "impacts": [{"of": "x - 0.5", "direction": "up", "set": {"v": "-0.7*v"}}],
+}
+"""A layer, a switch on which the motion slides for a quarter of the time, and an impact in each period."""
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["seven", "belt", "belt-stick", "impact"])
-def test_with_tangents__loops_give_the_bits_of_written_out_products(name, monkeypatch):
-    # a ring of seven with a sparse Jacobian; a layer; a switch on which the motion slides; impacts
-    model = flow(lorenz96(7)) if name == "seven" else load_model(name)
+@pytest.mark.parametrize("table", [lorenz96(7), RUBBED], ids=["sparse", "rubbed"])
+def test_with_tangents__loops_give_the_bits_of_written_out_products(table, monkeypatch):
+    model = flow(table)
     system, n = model.system, len(model.states)
     states = np.random.default_rng(3).uniform(-0.3, 0.3, (3, n))
-    cells = np.tile(model.load().pack(), (3, 1)), np.full(3, 1.3), states
+    cells = np.tile(model.load().pack(), (3, 1)), np.full(3, 0.15), states
     options = {"n_transient": 3, "n_periods": 8, "n_blocks": 2, "system": system}
     found = []
     for written_out in (True, False):

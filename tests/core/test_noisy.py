@@ -4,14 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import math
-import os
 import pickle
-import platform
-import subprocess
-import sys
 from collections.abc import Callable
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -63,7 +58,7 @@ def model(kind: str) -> NoisyModel:
         "name": "oscillator",
         "states": {"x": {}, "v": {}},
         "parameters": {"d": 0.2, "k": 2.0},
-        "equations": {"x": "v", "v": "cos(t) - d*v - k*x"},
+        "equations": {"x": "v", "v": "cos(2*pi*f*t) - d*v - k*x"},
     }
     return noisy(load_model(table), Disturbance((("v", 0.1),)))
 
@@ -281,41 +276,7 @@ def test_with_strengths__refuses_impacts() -> None:
         with_strengths(bouncing.system, model("oscillator").noise)
 
 
-BUILDS = {
-    "avx2": {"NUMBA_CPU_NAME": "haswell", "NUMBA_CPU_FEATURES": "+avx,+avx2,+fma,+bmi,+bmi2,+f16c,+lzcnt,+popcnt"},
-    # the C library computes what this CPU has no operation for
-    "without-fused-operation": {"NUMBA_CPU_NAME": "x86-64", "NUMBA_CPU_FEATURES": ""},
-}
-DIGEST = """
-import test_noisy
-print(test_noisy.digest())
-"""
-
-
 def digest() -> str:
-    """Of some sections with multiplicative noise, which use every function of a step."""
+    """Of some sections with multiplicative noise, which use every function of a step (see test_same_bits, test_jit)."""
     found = run("ito", 20, 16, 1.0, n_keep=3)
     return hashlib.sha256(found.section.tobytes() + found.strong_error.tobytes()).hexdigest()
-
-
-@pytest.mark.parametrize("build", BUILDS)
-@pytest.mark.slow
-def test_noisy_sections__same_bits_on_any_cpu(build: str) -> None:
-    if platform.machine() != "x86_64":
-        pytest.skip("the other builds are of x86")
-    here = Path(__file__).parent
-    environment = {**os.environ, **BUILDS[build], "PYTHONPATH": os.pathsep.join([str(here), str(here.parents[1])])}
-    made = subprocess.run([sys.executable, "-c", DIGEST], env=environment, capture_output=True, text=True, check=True)
-    assert made.stdout.strip() == digest()
-
-
-def test_noisy_sections__plain_python_agrees() -> None:
-    """Without the compiler, sums of products are rounded twice: the numbers agree to rounding."""
-    here = Path(__file__).parent
-    script = "import test_noisy; print(*test_noisy.run('ito', 3, 4, 1.0).section.ravel().tolist())"
-    paths = os.pathsep.join([str(here), str(here.parents[1])])
-    environment = {**os.environ, "NUMBA_DISABLE_JIT": "1", "PYTHONPATH": paths}
-    made = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=True)
-    np.testing.assert_allclose(
-        [float(x) for x in made.stdout.split()], run("ito", 3, 4, 1.0).section.ravel(), rtol=1e-13
-    )

@@ -130,14 +130,6 @@ def test_sections__one_frequency_serves_all(preset):
     assert (one.section[:, -1] == one.final_state).all()
 
 
-def test_sections__takes_dipoles(dipoles, preset):
-    start = [[0.2, 0.2, 0.0, 0.0]]
-    a = sections(dipoles, 2.2, start, n_transient=0, n_keep=1).section
-    b = sections(preset, 2.2, start, n_transient=0, n_keep=1).section
-    assert np.isfinite(a).all()
-    assert np.max(abs(a - b)) > 1e-3
-
-
 GOOD = {"frequency_hz": [2.2], "initial_states": [[0.1, 0.1, 0.0, 0.0]], "n_transient": 0, "n_keep": 1}
 
 

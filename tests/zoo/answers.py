@@ -1,6 +1,6 @@
 """Known answers of the zoo: one file NAME.answer.toml beside each specification NAME.toml.
 
-Keys of a file: `source` (where the answer comes from), `quick` (whether the short test has the system), sets
+Keys of a file: `source` (where the answer comes from), `quick` (whether the suite has the system), sets
 as tables ``[[set]]``, `also` (stabilities besides those of the sets that rows may have), `share_error`, and
 `sample` (arguments of `independent.shares`).
 

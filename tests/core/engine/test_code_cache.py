@@ -193,18 +193,14 @@ def test_keep__a_full_disk_costs_the_entry_alone(cache, caplog, monkeypatch):
     assert "No space left on device" in record.message
 
 
-FOLDER = "from magpend_core.engine.jit import CACHE_FOLDER; print(CACHE_FOLDER)"
-
-
-def test_cache_folder__empty_is_as_unset(run_python, tmp_path):
-    found = run_python(FOLDER, MAGPEND_CACHE_DIR="", XDG_CACHE_HOME=str(tmp_path / "xdg")).strip()
-    assert Path(found).parent == tmp_path / "xdg" / "magpend"
-    assert not list(tmp_path.glob("*numba*"))
-
-
-def test_cache_folder__stays_when_the_process_goes_elsewhere(run_python, tmp_path):
-    found = run_python(FOLDER, MAGPEND_CACHE_DIR="mine").strip()
-    assert Path(found).parent == tmp_path / "mine"
+def test_cache_folder__empty_is_as_unset_and_it_stays_when_the_process_goes_elsewhere(monkeypatch, tmp_path):
+    monkeypatch.setenv("MAGPEND_CACHE", "1")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
+    monkeypatch.setenv("MAGPEND_CACHE_DIR", "")
+    assert jit._cache_folder().parent == tmp_path / "xdg" / "magpend"
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MAGPEND_CACHE_DIR", "mine")
+    assert jit._cache_folder().parent == tmp_path / "mine"
 
 
 SCRIPT = """

@@ -1,7 +1,7 @@
 """Products are fused by a rule of our own: bits against an interpreter that knows nothing of compilers.
 
 The interpreter runs the same Python with numbers that remember the product they come from, and with the C
-library's fused operation.
+library's fused operation. Elementary functions are compared with it in test_vecmath.
 """
 
 import ctypes
@@ -15,32 +15,7 @@ from numba.np.unsafe.ndarray import to_fixed_tuple
 from magpend_core import load_model
 from magpend_core.engine import simd
 from magpend_core.engine.jit import OPTIONS, inline
-from magpend_core.engine.simd import WIDTH, absolute, load_rows, maximum, multiply_add, store_rows, where_less
-from magpend_core.engine.vecmath import (
-    acos,
-    asin,
-    atan,
-    atan2,
-    cos,
-    cosh,
-    exp,
-    exp2_falling,
-    exp2_rough,
-    expm1,
-    hypot_rough,
-    inverse_sqrt,
-    log,
-    log2_rough,
-    power,
-    sign,
-    sin,
-    sincos,
-    sinh,
-    square_wave,
-    tan,
-    tanh,
-    wrapped,
-)
+from magpend_core.engine.simd import WIDTH, load_rows, maximum, multiply_add, store_rows, where_less
 
 C_FMA = ctypes.CDLL(None).fma
 C_FMA.restype, C_FMA.argtypes = ctypes.c_double, [ctypes.c_double] * 3
@@ -219,40 +194,6 @@ def _sums(v):
     )
 
 
-@inline
-def _elementary(v):
-    (x,) = v
-    sine, cosine = sincos(x)
-    return (
-        exp(x),
-        sine,
-        cosine,
-        sin(x),
-        cos(x),
-        atan(x),
-        log2_rough(absolute(x)),
-        exp2_rough(x),
-        wrapped(x),
-        log(x),
-        exp2_falling(x),
-        hypot_rough(x, 1.5),
-        tan(x),
-        tanh(x),
-        sinh(x),
-        cosh(x),
-        asin(x),
-        acos(x),
-        expm1(x),
-        sign(x),
-        square_wave(x, 0.3),
-        power(x, 1.7),
-        power(x, -17.3),
-        atan2(0.7, x),
-        atan2(x, -0.4),
-        inverse_sqrt(x),
-    )
-
-
 def test_rule__sums_and_differences():
     rng = np.random.default_rng(5)
     assert_follows_the_rule(_sums, rng.normal(size=(400, 4)))
@@ -285,12 +226,6 @@ def test_rule__ends_at_branches_and_loops():
     # the square is 1 + 2**-29 + 2**-60, of which a float64 drops the last
     a, c = 1.0 + 2.0**-30, -1.0 - 2.0**-29
     assert of(a, a, c, 1) == (2.0**-60, 0.0, 0.0)
-
-
-def test_rule__elementary_functions():
-    rng = np.random.default_rng(6)
-    x = np.concatenate([rng.uniform(-1.0, 1.0, 300), rng.normal(0.0, 30.0, 300), 10.0 ** rng.uniform(-300, 2, 100)])
-    assert_follows_the_rule(_elementary, x[:, None])
 
 
 MODELS = ["pendulum", "pendulum-dipole-sine", "double-pendulum", "duffing", "pendulum-text", "impact"]

@@ -2,7 +2,9 @@
 
 import dataclasses
 import gc
+import os
 import re
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +19,7 @@ from magpend_core.engine.lanes import engine_bindings
 from magpend_core.engine.observers import RECORD
 from magpend_core.engine.variational import with_tangents
 from magpend_core.models.pendulum.systems import PENDULUM_FITTED
+from tests.core import test_noisy
 
 SCRIPT = """
 import numba
@@ -56,13 +59,6 @@ def test_kernel__sees_an_edit_of_a_callee_in_a_folder_named_by_the_digest(run_py
     assert edited[1] != first[1]
     assert edited[2:] == ["0", "1"]
     assert float.fromhex(edited[1]) == pytest.approx(float.fromhex(first[1]), rel=0.1)
-
-
-def test_kernel__writes_nothing_when_switched_off(run_python, copied, tmp_path):
-    before = run_python(SCRIPT, package=copied, MAGPEND_CACHE="0").split()
-    assert not (tmp_path / "cache").exists()
-    assert not [p for p in tmp_path.rglob("*") if p.suffix in (".nbi", ".nbc")]
-    assert before[2] == "0"
 
 
 def test_source_digest__changes_with_any_source(copied, monkeypatch):
@@ -105,8 +101,11 @@ def test_plain_python__gives_the_same_numbers(run_python, preset):
         "print(*accelerations(0.1, y, p, 2.2), *jacobian(0.1, y, p, 2.2).ravel())\n"
         "r = sections(p, 2.9, [y], n_transient=0, n_keep=1, rtol=1e-6, atol=1e-6)\n"
         "print(*r.section.ravel(), *r.n_steps)\n"
+        "import test_noisy\n"
+        "print(*test_noisy.run('ito', 3, 4, 1.0).section.ravel())\n"
     )
-    lines = run_python(script, NUMBA_DISABLE_JIT="1").splitlines()
+    path = os.pathsep.join(str(Path(module.__file__).parents[n]) for module, n in ((magpend_core, 1), (test_noisy, 0)))
+    lines = run_python(script, package=path, NUMBA_DISABLE_JIT="1").splitlines()
     y = [0.05, 0.1, 1.0, -2.0]
     compiled = sections(preset, 2.9, [y], n_transient=0, n_keep=1, rtol=1e-6, atol=1e-6)
     values = np.array(lines[0].split(), dtype=float)
@@ -116,6 +115,8 @@ def test_plain_python__gives_the_same_numbers(run_python, preset):
     section = np.array(lines[1].split(), dtype=float)
     assert section[:4] == pytest.approx(compiled.section.ravel(), abs=1e-9)
     assert section[4] == compiled.n_steps[0]
+    noisy = test_noisy.run("ito", 3, 4, 1.0).section.ravel()
+    assert np.array(lines[2].split(), dtype=float) == pytest.approx(noisy, rel=1e-13)
 
 
 @pytest.mark.parametrize("changes", [{"escape": (1.0, 1.0, 1.0, 1.0)}, {"scales": (1.0, 1.0, 5.0, 5.0)}])

@@ -12,6 +12,7 @@ from numba import njit
 from magpend_core.engine import jit, linking
 from magpend_core.engine.jit import PARTS, bound_part, entry, inline
 from magpend_core.engine.simd import WIDTH, load, load_rows, store
+from tests.core.conftest import run_script
 
 pytestmark = pytest.mark.skipif(os.environ.get("NUMBA_DISABLE_JIT") == "1", reason="nothing is compiled")
 
@@ -41,35 +42,64 @@ for name in sys.argv[1:]:
 """
 
 
-@pytest.fixture
-def integrated(run_python, tmp_path):
-    """Integrates models one after the other in a fresh process; returns a row of words for each."""
-
-    def run(*models, **variables):
-        code = RUN.replace("sys.argv[1:]", repr(list(models)))
-        folder = {"MAGPEND_CACHE_DIR": str(tmp_path / "cache"), **variables}
-        return [line.split() for line in run_python(code, **folder).splitlines()]
-
-    return run
+def integrated(folder, *models, **variables):
+    """Integrate models one after the other in a fresh process; return a row of words for each."""
+    out = run_script(folder, RUN.replace("sys.argv[1:]", repr(list(models))), **variables)
+    return {line.split()[0]: line.split()[1:] for line in out.splitlines()}
 
 
-def test_parts__a_second_system_compiles_its_equations_alone(integrated):
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("parts")
+
+
+@pytest.fixture(scope="module")
+def cold(folder):
+    """Rows of a process that begins with an empty cache."""
+    return integrated(folder, "driven-pendulum", "duffing", "three-magnets")
+
+
+def test_parts__a_second_system_compiles_its_equations_alone(cold):
     """Other states, other constants, angles or none: what knows no equations is had from the first one."""
-    first, second = integrated("driven-pendulum"), integrated("duffing")
-    assert len(first[0][3].split(",")) > 30
+    assert len(cold["driven-pendulum"][2].split(",")) > 30
     # besides the equations: the entry, which Python calls, and the stages, in which the equations are
     mine = ("_rhs", "_forcing", "_constants", "_no_edges", "advance_duffing", "run_stages")
-    others = [name for name in second[0][3].split(",") if not name.startswith(mine)]
+    others = [name for name in cold["duffing"][2].split(",") if not name.startswith(mine)]
     assert not others
 
 
-def test_parts__bits_depend_on_the_system_alone(integrated):
-    """From the cache, after another system with other sizes, or compiled from nothing."""
-    mixed = {row[0]: row[1:3] for row in integrated("duffing", "three-magnets")}
-    again = {row[0]: row[1:3] for row in integrated("three-magnets", "duffing", MAGPEND_CACHE="0")}
-    alone = {"three-magnets": integrated("three-magnets", MAGPEND_CACHE="0")[0][1:3]}
-    assert mixed == again
-    assert mixed["three-magnets"] == alone["three-magnets"]
+def test_parts__bits_depend_on_the_system_alone(cold, folder, tmp_path):
+    """From nothing after others or alone, without a cache, from the cache, and from one that is damaged.
+
+    A process that compiles runs its callees as they were compiled alone, one that reads the cache those that were
+    optimised once more as parts of the whole.
+    """
+    bits = {name: row[:2] for name, row in cold.items()}
+    alone = integrated(tmp_path, "three-magnets", "duffing", MAGPEND_CACHE="0")
+    assert not list(tmp_path.iterdir())  # nor anything beside the sources
+    assert not [p for p in Path(jit.__file__).parents[1].rglob("*") if p.suffix in (".nbi", ".nbc")]
+    assert {name: row[:2] for name, row in alone.items()} == {name: bits[name] for name in alone}
+    read = integrated(folder, "duffing", "driven-pendulum")
+    assert {name: row[:2] for name, row in read.items()} == {name: bits[name] for name in read}
+    damage(folder / "cache")
+    assert integrated(folder, "duffing")["duffing"][:2] == bits["duffing"]
+
+
+def damage(cache):
+    """Take away the engines, and damage some of their parts each in its own way."""
+    records = sorted(cache.rglob("*.part"))
+    assert len(records) > 30
+    for engine in cache.rglob("*.nbc"):
+        engine.unlink()
+    content = [record.read_bytes() for record in records]
+    half = len(content[0]) // 2
+    records[0].write_bytes(content[0][:half] + bytes([content[0][half] ^ 4]) + content[0][half + 1 :])
+    records[1].write_bytes(content[1][:100])
+    records[2].write_bytes(b"")
+    records[3].unlink()
+    records[3].mkdir()
+    records[4].write_bytes(content[5])
+    records[5].write_bytes(content[4])
 
 
 def _sum_of_states(w, out):
@@ -156,24 +186,6 @@ def test_load_rows__of_so_many_rows_is_compiled_for_each_number():
         w, out = np.arange(5.0 * WIDTH), np.zeros(WIDTH)
         njit(lambda w, out, part=part: part(w, out))(w, out)
         np.testing.assert_array_equal(out, w[:WIDTH] + w[(n - 1) * WIDTH : n * WIDTH])
-
-
-def test_damaged_records__are_compiled_again(integrated, tmp_path):
-    whole = integrated("duffing")[0]
-    records = sorted((tmp_path / "cache").rglob("*.part"))
-    assert len(records) > 30
-    for engine in (tmp_path / "cache").rglob("*.nbc"):
-        engine.unlink()
-    content = [record.read_bytes() for record in records]
-    half = len(content[0]) // 2
-    records[0].write_bytes(content[0][:half] + bytes([content[0][half] ^ 4]) + content[0][half + 1 :])
-    records[1].write_bytes(content[1][:100])
-    records[2].write_bytes(b"")
-    records[3].unlink()
-    records[3].mkdir()
-    records[4].write_bytes(content[5])
-    records[5].write_bytes(content[4])
-    assert integrated("duffing")[0][1:3] == whole[1:3]
 
 
 def test_parts__are_kept_beside_the_engines():

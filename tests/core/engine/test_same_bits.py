@@ -1,6 +1,7 @@
 """Bits depend on the trajectory alone: not on lanes, neighbours, order, CPU, compiler or restarts."""
 
 import hashlib
+import os
 import platform
 import shutil
 from pathlib import Path
@@ -11,6 +12,7 @@ import pytest
 
 import magpend_core
 from magpend_core import Status, load_model, load_preset, run_branches
+from tests.core import test_noisy
 
 
 def many(n=96):
@@ -98,6 +100,7 @@ INSTRUCTIONS = {"avx2": "ymm fma", "avx512": "zmm ymm fma", "scalar-without-fuse
 SCRIPT = """
 import hashlib
 import numpy as np
+import test_noisy
 from magpend_core import load_model, run_branches
 from magpend_core.engine.lanes import engine_of
 from magpend_core.engine.observers import RECORD
@@ -111,6 +114,7 @@ print(digest(run_branches(packed, frequency, starts, n_transient=7, n_keep=3, rt
 packed, frequency, starts = (inputs["struck_" + k] for k in ("packed", "frequency", "starts"))
 settings = {"n_transient": 0, "n_keep": 9, "rtol": 1e-7, "atol": 1e-7, "system": load_model("impact").system}
 print(digest(run_branches(packed, frequency, starts, **settings)))
+print(test_noisy.digest())
 code = "".join(engine_of(PENDULUM_FITTED, RECORD, ()).__wrapped__.inspect_asm().values())
 print(WIDTH)
 print(*[word for word in ("zmm", "ymm") if word in code], *["fma"] * ("vfmadd" in code))
@@ -158,28 +162,11 @@ def test_engine__same_bits_however_it_is_built(straight, straight_struck, run_py
         f"struck_{name}": x for name, x in zip(names, struck(), strict=True)
     }
     np.savez(tmp_path / "inputs.npz", **inputs)
-    out = run_python(SCRIPT, package=package, MAGPEND_CACHE="0", **settings).splitlines()
-    assert out[:2] == [digest(straight), digest(straight_struck)]
-    assert out[2] == ("1" if build.startswith("scalar") else "16")
-    assert out[3] == INSTRUCTIONS[build]
-
-
-CACHED = """
-import hashlib
-import numpy as np
-from magpend_core import run_branches
-packed, frequency, starts = (np.load("many.npz")[k] for k in ("packed", "frequency", "starts"))
-found = run_branches(packed, frequency, starts, n_transient=7, n_keep=3, rtol=1e-7, atol=1e-7)
-print(hashlib.sha256(found.section.tobytes() + found.n_steps.tobytes()).hexdigest())
-"""
-
-
-def test_engine__same_bits_when_read_from_the_compile_cache(straight, run_python, tmp_path):
-    # a process that compiles runs its callees as they were compiled alone, one that reads the cache
-    # those that were optimised once more as parts of the whole
-    packed, frequency, starts = many()
-    np.savez(tmp_path / "many.npz", packed=packed, frequency=frequency, starts=starts)
-    assert [run_python(CACHED).strip() for _ in range(2)] == [digest(straight)] * 2
+    path = f"{package}{os.pathsep}{Path(test_noisy.__file__).parent}"
+    out = run_python(SCRIPT, package=path, MAGPEND_CACHE="0", **settings).splitlines()
+    assert out[:3] == [digest(straight), digest(straight_struck), test_noisy.digest()]
+    assert out[3] == ("1" if build.startswith("scalar") else "16")
+    assert out[4] == INSTRUCTIONS[build]
 
 
 def test_run_branches__continues_bit_for_bit():

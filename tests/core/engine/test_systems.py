@@ -81,16 +81,6 @@ def test_duffing__determinant_of_the_map_is_that_of_the_damping(oscillator, damp
         assert determinant == pytest.approx(np.exp(-damping * n * PERIOD), rel=1e-8)
 
 
-def test_duffing__derivative_agrees_with_differences_of_sections(oscillator):
-    duffing, start, h = [0.15, -1.0, 1.0, 0.2], np.array([0.3, 0.2]), 1e-4
-    shifts = np.array([[h, 0.0], [-h, 0.0], [0.0, h], [0.0, -h]])
-    ends = run(oscillator, duffing, start + shifts, n_transient=0, n_keep=1)[:, 0, :2]
-    differences = np.stack([ends[0] - ends[1], ends[2] - ends[3]], axis=1) / (2.0 * h)
-    derivative = run(oscillator, duffing, [start], n_transient=0, n_keep=1)[0, 0, 2:].reshape(2, 2)
-    # differences of second order, and 1e-11 of error over 2e-4
-    assert np.max(abs(derivative - differences)) < 1e-6
-
-
 def test_engine_of__keeps_systems_from_outside_apart(oscillator):
     assert is_covered(*PENDULUM_FITTED.functions)
     assert is_covered(*PENDULUM_DIPOLE.functions)

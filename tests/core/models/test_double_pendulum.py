@@ -9,7 +9,7 @@ from scipy.integrate import quad, solve_ivp
 
 from magpend_core import evaluate
 from magpend_core.models import load_model
-from magpend_core.pointwise import jacobian, rates
+from magpend_core.pointwise import rates
 from magpend_core.sampling import sample
 
 MODEL = load_model("double-pendulum")
@@ -74,15 +74,6 @@ def test_rates__are_those_of_lagrange_with_drag_by_quadrature():
     for state, rate in zip(states, found, strict=True):
         q1, q2 = torques(p, state, p["q"] * np.sin(2 * np.pi * f * t))
         np.testing.assert_allclose(rate[2:], solve(*state, q1, q2), rtol=1e-10)
-
-
-def test_jacobian__is_that_of_differences():
-    states, h = some_states(), 1e-6
-    found = jacobian(0.1, states, VALUES, 1.0)
-    for j in range(4):
-        step = h * np.eye(4)[j]
-        difference = (rates(0.1, states + step, VALUES, 1.0) - rates(0.1, states - step, VALUES, 1.0)) / (2 * h)
-        np.testing.assert_allclose(found[..., j], difference, rtol=1e-6, atol=1e-5)
 
 
 def test_energy__is_lost_as_the_quantities_say():

@@ -15,7 +15,7 @@ from magpend_core.crossing import Crossing
 from magpend_core.models import LIBRARY, load_model
 from magpend_core.models.sectioned import sectioned
 from magpend_core.orbits import polish_orbits, scaled_distance
-from magpend_core.pointwise import evaluate, jacobian, rates
+from magpend_core.pointwise import evaluate, rates
 from magpend_core.sections import run_branches
 
 HZ = 1.0 / (2.0 * math.pi)
@@ -152,19 +152,6 @@ def test_library__rates_are_those_of_the_literature(name):
     expected = [right_hand_side(t, y, published) for t, y in zip(times, states, strict=True)]
     # a few roundings of numbers of size 10
     assert rates(times, states, parameters, HZ) == pytest.approx(np.array(expected), rel=1e-13, abs=1e-13)
-
-
-@pytest.mark.parametrize("name", [n for n in EQUATIONS if n != "belt-stick"])
-def test_library__jacobian_is_the_slope_of_the_rates(name):
-    parameters = load_model(name).load()
-    states = np.random.default_rng(6).uniform(-1.2, 1.2, (12, len(parameters.model.states)))
-    step = 1e-6
-    slopes = [
-        (rates(0.3, states + step * unit, parameters, HZ) - rates(0.3, states - step * unit, parameters, HZ))
-        / (2.0 * step)
-        for unit in np.eye(states.shape[1])
-    ]
-    assert jacobian(0.3, states, parameters, HZ) == pytest.approx(np.stack(slopes, -1), rel=1e-6, abs=1e-7)
 
 
 def _polished(name, orbits, frequency_hz=HZ, off=1e-3, **values):

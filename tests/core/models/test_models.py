@@ -4,7 +4,6 @@ import math
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 from magpend_core import ParameterError, energy, evaluate, jacobian, load_model, model_names, rates, sections, torques
@@ -48,12 +47,13 @@ def test_jacobian__is_the_derivative_of_the_rates(name, preset):
     parameters = load_model(name).load(preset)
     model = parameters.model
     y, h = states_of(model), 1e-6
+    close = 2e-4 if name.startswith("pendulum") else 1e-5  # layers of a width of 1e-3
     found = jacobian(0.21, y, parameters, FREQUENCY)
     for j in range(len(model.states)):
         step = np.eye(len(model.states))[j] * h * model.scales[j]
         ahead, behind = (rates(0.21, y + s, parameters, FREQUENCY) for s in (step, -step))
         by_differences = (ahead - behind) / (2.0 * step[j])
-        np.testing.assert_allclose(found[..., j], by_differences, rtol=2e-4, atol=2e-4)
+        np.testing.assert_allclose(found[..., j], by_differences, rtol=close, atol=close)
 
 
 @pytest.mark.parametrize("name", [n for n in model_names() if load_model(n).mirror])
@@ -66,20 +66,6 @@ def test_mirror__maps_rates_on_rates(name):
     here = rates(0.1 / FREQUENCY, y, parameters, FREQUENCY)
     there = rates(0.6 / FREQUENCY, signs * y, parameters, FREQUENCY)
     np.testing.assert_allclose(there, signs * here, rtol=1e-9, atol=1e-9)
-
-
-def test_duffing__section_agrees_with_another_integrator():
-    parameters = load_model("duffing").load("hardening", damping=0.17, linear=-0.3, cubic=0.8)
-    p, y0 = parameters.as_dict(), [0.4, -0.2]
-
-    def rhs(t, y):
-        force = p["amplitude"] * math.cos(2 * math.pi * FREQUENCY * t)
-        return [y[1], force - p["damping"] * y[1] - p["linear"] * y[0] - p["cubic"] * y[0] ** 3]
-
-    end = solve_ivp(rhs, (0.0, 3 / FREQUENCY), y0, method="DOP853", rtol=1e-12, atol=1e-12).y[:, -1]
-    found = sections(parameters, FREQUENCY, [y0], n_transient=2, n_keep=1, rtol=1e-11, atol=1e-11)
-    np.testing.assert_allclose(found.section[0, 0], end, rtol=0, atol=2e-10)
-    assert found.turns.shape == (1, 0)
 
 
 def test_duffing__two_wells_have_the_published_orbits():

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from magpend_core import load_model
 from magpend_core.models.text import read_model
 from magpend_core.pointwise import rates
 
@@ -46,17 +45,3 @@ def test_source__quotients_by_roots_have_no_divisions():
 def test_source__root_that_is_zero_shows():
     model = oscillator("-x/sqrt(x**2)")
     assert not np.isfinite(rates(0.0, [[0.0, 1.0]], model.load(), 1.0)[0, 1])
-
-
-def test_three_magnets__forces_are_those_of_numpy():
-    model = load_model("three-magnets")
-    p = model.load()
-    states = np.random.default_rng(1).uniform(-1.5, 1.5, (30, 4))
-    x, y, vx, vy = states.T
-    ax, ay = -(p["w0"] ** 2) * x - p["d"] * vx, -(p["w0"] ** 2) * y - p["d"] * vy
-    for angle in (0.0, 2.0 * np.pi / 3.0, -2.0 * np.pi / 3.0):
-        dx, dy = x - np.cos(angle), y - np.sin(angle)
-        pull = p["strength"] / (dx * dx + dy * dy + p["h"] ** 2) ** 1.5
-        ax, ay = ax - dx * pull, ay - dy * pull
-    # forces of up to 100 that cancel
-    assert np.allclose(rates(0.0, states, p, 1.0)[:, 2:].T, [ax, ay], rtol=1e-12, atol=1e-12)

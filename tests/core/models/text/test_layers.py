@@ -129,29 +129,6 @@ def test_layers__that_move_with_time_carry_tangents(shaken):
         np.testing.assert_allclose(carried[2 * k : 2 * k + 2], slope, atol=1e-5)
 
 
-DRIVEN_FRICTION = {
-    "name": "driven-friction",
-    "states": {"x": {"unit": "1"}, "v": {"unit": "1/s"}},
-    "parameters": {"zeta": 0.02, "mu": 0.3, "amplitude": 1.0, "eps": 1e3},
-    "equations": {"x": "v", "v": "amplitude*cos(2*pi*f*t) - 2*zeta*v - x - mu*tanh(eps*v)"},
-}
-"""To the letter that of tests/bench/text_models.py, so that its engines serve here, too."""
-
-
-def test_layers__make_a_steep_friction_cheaper():
-    """The same system with and without its layer: the limit saves most of the attempts that are rejected."""
-    model = read_model(DRIVEN_FRICTION)
-    system = model.system
-    y0 = np.random.default_rng(2).normal(size=(8, 2))
-    packed = np.tile(model.load(zeta=0.0, amplitude=0.5, eps=3e3).pack(), (8, 1, 1))
-    found = [
-        run_branches(packed, np.full((8, 1), 0.2), y0, n_transient=6, n_keep=1, rtol=1e-7, atol=1e-7, system=s)
-        for s in (system, dataclasses.replace(system, name=f"{system.name}_without", has_layers=False))
-    ]
-    with_layer, without = (int(f.n_rejected.sum()) for f in found)
-    assert with_layer < 0.2 * without
-
-
 def test_edges__of_a_smooth_wave_are_its_zeros():
     model = model_of({"x": "a*tanh(40*(cos(2*pi*f*t) - 0.3)) - x"}, {"a": 2.0})
     edges, _ = declared(model, [0.1], frequency=0.5)

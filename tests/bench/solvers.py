@@ -14,13 +14,11 @@ from typing import Any
 
 import numpy as np
 from numba import njit
+from racing import Runner
 
 from magpend_core.models.text.grammar import Tree
 from magpend_core.models.text.model import TextModel
 from magpend_core.models.text.numeric import CALLS
-
-Runner = Callable[[np.ndarray, int], np.ndarray]
-"""From initial states (n, n_states) and a number of periods to the states after them."""
 
 _OPTIONS = {"error_model": "numpy", "fastmath": True, "nogil": True}
 _NAMES = {"abs": "abs", "min": "min", "max": "max", "sign": "_sign", "square": "_square"}
@@ -119,12 +117,14 @@ def _step_source(n: int) -> Iterator[str]:
 def scalar_loop(rhs: Any, n: int, period: float) -> Callable[[float], Runner]:
     """Dormand-Prince 5(4) in a loop over trajectories, as one writes it in numba.
 
-    Step control is the textbook's: Hairer, Norsett and Wanner, Solving ODEs I, II.4.
+    Step control is the textbook's: Hairer, Norsett and Wanner, Solving ODEs I, II.4. The attribute `attempts` of a
+    runner counts the steps of its last run.
     """
     ys, zs = (", ".join(f"{letter}{i}" for i in range(n)) for letter in "yz")
     body = "\n                ".join(_step_source(n))
     source = f"""
 def loop(initial, n_periods, tolerance, out):
+    attempts = 0
     for j in range(len(initial)):
         {ys}, = {", ".join(f"initial[j, {i}]" for i in range(n))},
         t, wish, rejected = 0.0, {1e-3 * period!r}, False
@@ -135,6 +135,7 @@ def loop(initial, n_periods, tolerance, out):
                 last = wish >= end - t
                 h = end - t if last else wish
                 {body}
+                attempts += 1
                 grow = 0.9 * max(error, 1e-10) ** -0.2
                 factor = min(5.0, max(0.2, grow))
                 if error > 1.0:
@@ -146,6 +147,7 @@ def loop(initial, n_periods, tolerance, out):
                 t = end if last else t + h
                 {ys}, {_slopes(0, n)}, = {zs}, {_slopes(6, n)},
         {", ".join(f"out[j, {i}]" for i in range(n))}, = {ys},
+    return attempts
 """
     scope: dict[str, Any] = {"rhs": rhs, "math": math}
     exec(source, scope)
@@ -154,7 +156,7 @@ def loop(initial, n_periods, tolerance, out):
     def with_tolerance(tolerance: float) -> Runner:
         def runner(initial: np.ndarray, n_periods: int) -> np.ndarray:
             out = np.empty_like(initial)
-            loop(initial, n_periods, tolerance, out)
+            runner.attempts = loop(initial, n_periods, tolerance, out)
             return out
 
         return runner
@@ -162,19 +164,31 @@ def loop(initial, n_periods, tolerance, out):
     return with_tolerance
 
 
-def scipy_states(rhs: Any, initial: np.ndarray, end: float, tolerance: float) -> np.ndarray:
-    """States at `end` by scipy's DOP853, which shares nothing with the engine."""
+def scipy_runner(rhs: Any, period: float, tolerance: float, method: str) -> Runner:
+    """Runner with scipy's `solve_ivp`, which shares nothing with the engine."""
     from scipy.integrate import solve_ivp
 
-    n = initial.shape[1]
+    function = _array_function(rhs)
+
+    def runner(initial: np.ndarray, n_periods: int) -> np.ndarray:
+        options = {"method": method, "rtol": tolerance, "atol": tolerance}
+        rows = [solve_ivp(function, (0.0, n_periods * period), y, **options).y[:, -1] for y in initial]
+        return np.array(rows)
+
+    return runner
+
+
+@cache
+def _array_function(rhs: Any) -> Any:
+    """Compile ``function(t, y)`` -> array, once for all tolerances."""
+    n = rhs.py_func.__code__.co_argcount - 1
+    fixed = _tuple_of(n)
 
     @njit(error_model="numpy")
     def function(t: float, y: np.ndarray) -> np.ndarray:
-        return np.array(rhs(t, *_fixed(y, n)))
+        return np.array(rhs(t, *fixed(y, n)))
 
-    _fixed = _tuple_of(n)
-    rows = [solve_ivp(function, (0.0, end), y, "DOP853", rtol=tolerance, atol=tolerance).y[:, -1] for y in initial]
-    return np.array(rows)
+    return function
 
 
 @cache
