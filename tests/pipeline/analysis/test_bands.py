@@ -1,10 +1,4 @@
-"""Draws of the parameters carried through the branches of a run, on an oscillator with closed forms.
-
-    r' = (m - h) r + r^3 - g r^5,  angle' = w
-
-On the section y = 0 its cycles have x = r, with g r^4 - r^2 - (m - h) = 0. The fold of cycles lies at m = h - 1/(4 g),
-the Hopf point at m = h.
-"""
+"""Draws of the parameters carried through the branches of a run, on an oscillator with closed forms."""
 
 from __future__ import annotations
 
@@ -20,23 +14,7 @@ from pipeline.runs.derive import derive, stored
 from pipeline.runs.drawing import figure
 from pipeline.runs.run import run
 from pipeline.specification.problems import SpecError
-
-TRUTH = {"g": 1.2, "h": 0.05, "w": 6.0}
-MODEL = {
-    "name": "bautin-cycle",
-    "states": {"x": {"scale": 1.0}, "y": {"scale": 1.0}},
-    "parameters": {name: {"value": value} for name, value in {"m": 0.0, **TRUTH}.items()},
-    "define": {"r2": "x**2 + y**2", "growth": "m - h + r2 - g*r2**2"},
-    "equations": {"x": "growth*x - w*y", "y": "growth*y + w*x"},
-}
-SPEC = {
-    "kind": "sweep",
-    "model": MODEL,
-    "section": {"of": "y", "value": 0.0, "direction": "up", "longest": 20.0},
-    "axes": {"m": {"start": -0.3, "stop": 0.2, "num": 6}},
-    "initial_conditions": {"kind": "list", "points": [[1.0, 0.0], [0.01, 0.0]]},
-    "integration": {"n_transient": 200, "n_keep": 2, "stop_when_closed": True},
-}
+from tests.pipeline.bautin import SWEEP
 
 
 def silent(line):
@@ -54,7 +32,7 @@ def write_draws(path, g, h):
 @pytest.fixture(scope="module")
 def bench(tmp_path_factory):
     folder = tmp_path_factory.mktemp("bands")
-    run(SPEC, folder / "run", workers=0, echo=silent)
+    run(SWEEP, folder / "run", workers=0, echo=silent)
     random = np.random.default_rng(3)
     g, h = 1.2 + 0.1 * random.standard_normal(60), 0.05 + 0.01 * random.standard_normal(60)
     (folder / "fit").mkdir()
