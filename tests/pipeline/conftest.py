@@ -232,6 +232,23 @@ def main(monkeypatch, tmp_path, capsys):
     return call
 
 
+@pytest.fixture(scope="session")
+def computed(tmp_path_factory):
+    """Compute a specification, each one once, and return its run directory, which nobody may change."""
+    from pipeline.runs.run import run
+
+    directories: dict[str, Path] = {}
+
+    def call(spec) -> Path:
+        key = str(spec)
+        if key not in directories:
+            directories[key] = tmp_path_factory.mktemp("computed") / "run"
+            run(spec, directories[key], workers=0, echo=lambda line: None)
+        return directories[key]
+
+    return call
+
+
 # ---- a second system ---------------------------------------------------------------------------
 
 

@@ -173,14 +173,6 @@ def test_identify__parameters_from_the_run_and_its_axes(cube, found):
         identify(cube.drop_vars("orbit_period"))
 
 
-def test_identify__attributes(found):
-    for name, variable in found.data_vars.items():
-        assert variable.attrs["long_name"], name
-    assert found["kind"].attrs["flag_meanings"].split()[PERIODIC_ORBIT] == "periodic_orbit"
-    assert found["energy_min"].attrs["units"] == "J"
-    assert found["attractor_id"].dtype == np.int32
-
-
 def test_match__one_point(found):
     named = match(found)
     assert same(found, named)

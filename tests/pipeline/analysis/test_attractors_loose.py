@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -17,6 +19,7 @@ from pipeline.layout.vocabulary import ATTRACTS, CLOSED, EXTENDED, PERIODIC_ORBI
 STATES = ["psi1", "psi2", "psi1_dot", "psi2_dot"]
 
 
+@cache
 def run(frequency, closure_tolerance, n=8, n_transient=3000):
     """Cube of n x n starts at rest within 1 rad, each stopped once it has closed."""
     line = np.linspace(-0.95, 1.0, n)

@@ -116,12 +116,3 @@ def test_portraits__of_a_model_without_a_drawing(strange):
     found = portraits(strange, n_periods=2, n_samples=16)
     assert found["orbit"].shape == (1, 33, 2)
     assert "points" not in found
-
-
-def test_datasets__are_fit_for_netcdf(chaotic, strange, tmp_path):
-    for name, ds in (("found", strange), ("ids", match(strange)), ("chaos", chaos(chaotic, strange))):
-        ds.to_netcdf(tmp_path / f"{name}.nc", engine="scipy")
-        with xr.open_dataset(tmp_path / f"{name}.nc", engine="scipy") as stored:
-            assert set(stored.data_vars) == set(ds.data_vars)
-            if "state" in ds.coords:
-                assert stored["state"].values.tolist() == ["x", "v"]

