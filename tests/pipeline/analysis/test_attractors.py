@@ -149,17 +149,6 @@ def test_identify__order_and_blocks_of_cells_do_not_matter(cube, found):
     assert np.array_equal(blocks["attractor_id"].values, found["attractor_id"].values)
 
 
-def test_identify__grid_of_starts(cube, found):
-    grid = cube.drop_vars("state").rename(initial_condition="cell").assign_coords(state=STATES)
-    shape = {"psi1_0": 8, "psi2_0": 8}
-    data = {n: ((*shape, *v.dims[1:]), v.values.reshape(8, 8, *v.shape[1:])) for n, v in grid.data_vars.items()}
-    grid = xr.Dataset(data, coords={"state": STATES, "frequency": FREQUENCY})
-    result = identify(grid, parameters=load_preset(), block_bytes=40_000)
-    assert result["attractor_id"].dims == ("psi1_0", "psi2_0")
-    assert np.array_equal(result["attractor_id"].values.ravel(), found["attractor_id"].values)
-    assert same(found, result)
-
-
 def test_identify__parameters_from_the_run_and_its_axes(cube, found):
     """An axis replaces the attribute of the same name."""
     lines = "\n".join(f"{k} = {v!r}" for k, v in load_preset(q=1.0).as_dict().items())

@@ -325,29 +325,6 @@ def test_hysteresis__loop_and_jumps():
     assert not hysteresis(ds, ids)["differs"].any()
 
 
-def test_identify__largest_exponent_of_bounded_sets_is_that_of_their_good_cells():
-    # two clouds far apart; a flagged cell and the cells of the other cloud do not count
-    rng = np.random.default_rng(3)
-    section = 0.05 * rng.normal(size=(6, 40, 4))
-    section[3:] += 1.0
-    ds = xr.Dataset(
-        {
-            "section": (("initial_condition", "period_index", "state"), section),
-            "turns": (("initial_condition", "link"), np.zeros((6, 2), np.int32)),
-            "status": ("initial_condition", np.full(6, 2, np.int8)),
-            "orbit_period": ("initial_condition", np.zeros(6, np.int16)),
-            "lyapunov": (("initial_condition", "exponent"), np.array([[0.1], [0.3], [9.0], [0.5], [0.6], [0.7]])),
-            "lyapunov_stderr": (("initial_condition", "exponent"), np.full((6, 1), 0.01)),
-            "lyapunov_flag": ("initial_condition", np.array([1, 1, 2, 1, 1, 1], np.int8)),
-        },
-        coords={"state": ["psi1", "psi2", "psi1_dot", "psi2_dot"], "frequency": 2.0},
-    )
-    found = identify(ds, polish=False)
-    assert found["attractor_id"].values.tolist() == [0, 0, 0, 1, 1, 1]
-    assert found["lyapunov_max"].values == pytest.approx([0.2, 0.6])
-    assert np.isnan(identify(ds.drop_vars("lyapunov"), polish=False)["lyapunov_max"]).all()
-
-
 @pytest.mark.parametrize(
     ("periods", "width", "same"),
     [

@@ -182,17 +182,6 @@ def test_plot_lyapunov__points_are_the_largest_exponents_with_their_errors(cube)
     assert bottom.get_ylabel() == "largest exponent [1/s]"
 
 
-def test_plot_lyapunov__spectrum_per_period(cube):
-    fig = plot_lyapunov(cube, spectrum=True, per="period")
-    for k in range(4):
-        (line,) = artists(fig, f"exponent:{k + 1}")
-        assert sorted(line.get_ydata()) == pytest.approx(
-            sorted((cube.lyapunov.values[..., k] / FREQUENCY[:, None]).ravel())
-        )
-    assert fig.axes[1].get_ylabel() == "exponents [1/period]"
-    assert fig.data["exponent_value"].attrs["per"] == "drive period"
-
-
 def test_plot_lyapunov__mistakes(cube):
     with pytest.raises(ValueError, match="unknown unit"):
         plot_lyapunov(cube, per="second")

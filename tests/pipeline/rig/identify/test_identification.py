@@ -262,14 +262,6 @@ def test_identify__bad_input_is_refused_before_anything(bench, tmp_path, old, ne
     assert not (tmp_path / "out").exists()
 
 
-def test_identify__a_mapping_to_a_channel_that_is_not_there(bench, tmp_path):
-    folder, _, _ = bench
-    (folder / "wrong.toml").write_text(MAPPING.replace('channel = "x"', 'channel = "y"'))
-    (folder / "bad.toml").write_text(SPEC.replace("ringdown.toml", "wrong.toml"))
-    with pytest.raises(SpecError, match=r"recordings\[0\].*'y'"):
-        identification.identify(folder / "bad.toml", tmp_path / "out", echo=lambda _: None)
-
-
 def test_identify__no_convergence_is_no_result(bench, tmp_path, monkeypatch, main):
     from dataclasses import replace
 

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
+from copy import deepcopy
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -33,10 +36,10 @@ START = {"g": {"start": 1.15, "bounds": [0.5, 3.0]}, "h": {"start": 0.04, "bound
 STABLE, UNSTABLE = (-0.1, -0.05, 0.1), (-0.1, -0.02)
 
 
-@pytest.fixture
-def data(tmp_path):
-    write_orbits(tmp_path / "stable.csv", STABLE, 1)
-    write_orbits(tmp_path / "unstable.csv", UNSTABLE, -1)
+def data_in(folder, sd=0.002):
+    """Specification of a fit to stable and unstable cycles, whose tables are written."""
+    write_orbits(folder / "stable.csv", STABLE, 1, sd=sd)
+    write_orbits(folder / "unstable.csv", UNSTABLE, -1, sd=sd)
     common = {"section": SECTION, "range": [-0.3, 0.3]}
     return {
         "kind": "identification",
@@ -44,6 +47,11 @@ def data(tmp_path):
         "identify": {name: dict(one) for name, one in START.items()},
         "orbits": [{"file": "stable.csv", **common}, {"file": "unstable.csv", **common}],
     }
+
+
+@pytest.fixture
+def data(tmp_path):
+    return data_in(tmp_path)
 
 
 def built(data, folder):
@@ -173,14 +181,19 @@ def test_identify__judges_orbits_that_were_held_out(data, tmp_path):
     assert table.rows[0]["orbits_held_out"] < 1e-4
 
 
-@pytest.fixture
-def fitted(data, tmp_path):
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
     """An identification with errors of some per cent."""
-    for name, values, sign in (("stable", STABLE, 1), ("unstable", UNSTABLE, -1)):
-        write_orbits(tmp_path / f"{name}.csv", values, sign, sd=0.02)
-    data["search"] = {"n_starts": 1, "profiles": False}
-    result = identify(write_toml(tmp_path / "fit.toml", data), tmp_path / "out", figures=False, echo=lambda line: None)
-    return tmp_path / "out", result
+    folder = tmp_path_factory.mktemp("finished")
+    path = write_toml(folder / "fit.toml", {**data_in(folder, 0.02), "search": {"n_starts": 1, "profiles": False}})
+    return folder / "out", identify(path, folder / "out", figures=False, echo=lambda line: None)
+
+
+@pytest.fixture
+def fitted(finished, tmp_path):
+    """A copy of it."""
+    directory, result = finished
+    return Path(shutil.copytree(directory, tmp_path / "fitted")), deepcopy(result)
 
 
 def test_posterior__draws_are_those_of_the_covariance(fitted):
@@ -197,9 +210,9 @@ def test_posterior__draws_are_those_of_the_covariance(fitted):
 
 def test_posterior__bifurcations_and_branches_of_each_draw_are_those_of_the_closed_form(fitted):
     directory, result = fitted
-    _, bifurcations, written = write_posterior(directory, 40, seed=2)
+    _, bifurcations, written = write_posterior(directory, 16, seed=2)
     assert all(path.is_file() for path in written)
-    drawn = draw_posterior(directory, 40, seed=2)
+    drawn = draw_posterior(directory, 16, seed=2)
     g, h = (drawn["value"].sel(parameter=name).values for name in "gh")
     found = bands(stored_tables(directory)[0], result["values"], drawn)
     by_kind = {str(kind): found["bifurcation_value"].values[:, b] for b, kind in enumerate(found["kind"].values)}
@@ -208,7 +221,7 @@ def test_posterior__bifurcations_and_branches_of_each_draw_are_those_of_the_clos
     low, high = np.quantile(h - 1 / (4 * g), [0.025, 0.975])
     fold = next(row for row in bifurcations.rows if row["kind"] == "fold")
     assert (fold["low"], fold["high"]) == (pytest.approx(low, abs=1e-6), pytest.approx(high, abs=1e-6))
-    assert fold["n_draws"] == 40
+    assert fold["n_draws"] == 16
     for k in range(found.sizes["orbit"]):
         m, is_stable = float(found["parameter_value"][k]), bool(found["is_stable"][k])
         inside = 1 + 4 * g * (m - h)

@@ -12,6 +12,7 @@ from pipeline.rig.recordings.formats import read_raw
 from pipeline.rig.recordings.mapping import CsvMap
 from pipeline.specification.problems import SpecError
 
+from .lvm_files import lvm_segment, written_lvm
 from .test_broken_files import check_damaged_files
 
 pytestmark = pytest.mark.slow  # needs nptdms
@@ -187,58 +188,6 @@ def test_read_matlab__cells_that_differ_in_number_are_refused(tmp_path):
 
 
 # ---- LVM -----------------------------------------------------------------------------------------
-
-LVM_HEAD = """LabVIEW Measurement\t
-Writer_Version\t2
-Reader_Version\t2
-Separator\tTab
-Decimal_Separator\t{decimal}
-Multi_Headings\t{multi}
-X_Columns\t{columns}
-Time_Pref\tAbsolute
-Operator\trig
-Date\t2026/03/01
-Time\t12:00:00{decimal}5
-***End_of_Header***\t
-\t
-"""
-
-
-def lvm_segment(a, b, *, columns, time, x0=0.0, step=0.002, samples=None, comment=""):
-    """A segment of two channels as LabVIEW writes it, with points."""
-    n = len(a) if samples is None else samples
-    gap = "\t\t" if columns == "Multi" else "\t"
-    lines = [
-        "Channels\t2\t",
-        f"Samples\t{n}{gap}{n}\t",
-        f"Date\t2026/03/01{gap}2026/03/01\t",
-        f"Time\t{time}{gap}{time}\t",
-        f"Y_Unit_Label\tVolts{gap}Volts\t",
-        f"X_Dimension\tTime{gap}Time\t",
-        f"X0\t{x0:.16E}{gap}{x0:.16E}\t",
-        f"Delta_X\t{step:.6f}{gap}{step:.6f}\t",
-        "***End_of_Header***\t\t\t",
-    ]
-    x = [f"{x0 + step * i:.6f}" for i in range(len(a))]
-    head = (
-        "X_Value\tVoltage_0\tX_Value\tVoltage_1\tComment"
-        if columns == "Multi"
-        else "X_Value\tVoltage_0\tVoltage_1\tComment"
-    )
-    lines.append(head)
-    for i, (p, q) in enumerate(zip(a, b, strict=True)):
-        middle = f"\t{x[i]}\t" if columns == "Multi" else "\t"
-        first = "" if columns == "No" else x[i]
-        lines.append(f"{first}\t{p:.12f}{middle}{q:.12f}" + (f"\t{comment}" if comment and i == 0 else ""))
-    return "\n".join(lines) + "\n\n"
-
-
-def written_lvm(path, segments, *, decimal=".", columns="One", multi="Yes"):
-    body = "".join(segments)
-    text = LVM_HEAD.format(decimal=decimal, columns=columns, multi=multi)
-    path.write_bytes((text + (body.replace(".", ",") if decimal == "," else body)).encode("cp1252"))
-    return path
-
 
 LVM_MAPPING = {
     "model": "pendulum",
