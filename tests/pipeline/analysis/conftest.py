@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from magpend_core.models import load_model
-from magpend_core.sections import run_branches
 from pipeline.analysis.branches import Scope, Start, explore
 from pipeline.analysis.branches.problems import Family
+
+from .cubes import integrated
 
 
 @pytest.fixture(scope="session")
@@ -16,17 +17,7 @@ def settled():
     """Section point of a Duffing oscillator after some periods."""
 
     def call(parameters, frequency, state, n=300):
-        found = run_branches(
-            parameters.pack()[None, None],
-            np.array([[frequency]]),
-            np.array([state]),
-            n_transient=n,
-            n_keep=1,
-            rtol=1e-9,
-            atol=1e-9,
-            system=parameters.model.system,
-        )
-        return found.section[0, 0, -1]
+        return integrated(parameters, frequency, [state], n_transient=n, n_keep=1).section[0, 0, -1]
 
     return call
 

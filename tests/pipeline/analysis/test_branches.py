@@ -469,10 +469,7 @@ def test_explore__brute_force_agrees(right_family):
         np.tile(parameters.pack(), (n, 1, 1)),
         np.array([[branches[i].values[j]] for i, j in chosen]),
         np.array([orbit[0] for orbit in orbits]) + [1e-3, -1e-3, 1e-2, 1e-2],
-        n_transient=1500,
-        n_keep=4,
-        rtol=1e-9,
-        atol=1e-9,
+        **{"n_transient": 1500, "n_keep": 4, "rtol": 1e-9, "atol": 1e-9},
         stop_when_closed=True,
         closure_tolerance=1e-7,
     )

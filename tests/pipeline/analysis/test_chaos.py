@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from magpend_core import Status
 from pipeline import open_run
 from pipeline.analysis.attractors.attractors import identify
 from pipeline.analysis.chaos.chaos import chaos, chaotic_cells
@@ -32,33 +31,19 @@ from pipeline.layout.vocabulary import (
 from pipeline.plots import plot_convergence, plot_dimension
 from pipeline.runs.derive import derive
 
-STATES = ["psi1", "psi2", "psi1_dot", "psi2_dot"]
+from .cubes import exponents_cube
+
 SPREAD = np.array([0.0, -0.4, -0.9, -1.5])
 
 
-def made_up(first, frequency=(2.0,), *, stderr=0.02, n_blocks=16, n_keep=5):
+def made_up(first, frequency=(2.0,), n_keep=5):
     """Cube with exponents; `first` are the largest, shape (frequency, cell)."""
     first = np.atleast_2d(np.asarray(first, float))
-    spectrum = first[..., None] + SPREAD
-    wave = 0.05 * np.resize([1.0, -1.0], n_blocks)
-    cells = ("frequency", "initial_condition")
-    rng = np.random.default_rng(0)
-    return xr.Dataset(
-        {
-            "section": ((*cells, "period_index", "state"), rng.uniform(-1, 1, (*first.shape, n_keep, 4))),
-            "status": (cells, np.full(first.shape, Status.BOUNDED, np.int8)),
-            "orbit_period": (cells, np.zeros(first.shape, np.int16)),
-            "lyapunov": ((*cells, "exponent"), spectrum, {"units": "1/s"}),
-            "lyapunov_stderr": ((*cells, "exponent"), np.full(spectrum.shape, stderr)),
-            "lyapunov_blocks": ((*cells, "block", "exponent"), spectrum[..., None, :] + wave[:, None]),
-            "divergence": (cells, spectrum.sum(-1)),
-            "lyapunov_flag": (cells, np.ones(first.shape, np.int8)),
-        },
-        coords={
-            "frequency": ("frequency", list(frequency), {"units": "Hz"}),
-            "state": STATES,
-            "exponent": np.arange(1, 5),
-        },
+    cells = np.arange(first.shape[1])
+    cube = exponents_cube(first, n_blocks=16, frequency=list(frequency), initial_condition=cells)
+    section = np.random.default_rng(0).uniform(-1, 1, (*first.shape, n_keep, 4))
+    return cube.drop_dims("period_index").assign(
+        section=(("frequency", "initial_condition", "period_index", "state"), section)
     )
 
 

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import xarray as xr
 from matplotlib.collections import PolyCollection
 
 from magpend_core import Status, load_preset, lyapunov_exponents
@@ -10,43 +9,15 @@ from magpend_core.orbits import stroboscopic_map
 from pipeline.analysis.chaos.lyapunov import Motion, spectrum_of_jacobians, summarise
 from pipeline.plots import plot_lyapunov, plot_lyapunov_map
 
+from .cubes import exponents_cube
 from .maps import henon, slopes_of
 
-STATES = ["psi1", "psi2", "psi1_dot", "psi2_dot"]
-
-
-def make_cube(rates, *, stderr=0.02, n_exponents=4, blocks=8, **dims):
-    """Cube of made-up exponents; `rates` are the largest, with the given dims."""
-    names, shape = list(dims), tuple(len(v) for v in dims.values())
-    rates = np.asarray(rates, float).reshape(shape)
-    spectrum = rates[..., None] + np.array([0.0, -0.4, -0.9, -1.5])[:n_exponents]
-    wave = 0.05 * np.array([1, -1] * (blocks // 2))
-    series = spectrum[..., None, :] + wave[:, None]
-    section = np.full((*shape, 5, 4), 0.3)
-    return xr.Dataset(
-        {
-            "section": ((*names, "period_index", "state"), section),
-            "status": (names, np.full(shape, Status.BOUNDED, np.int8)),
-            "orbit_period": (names, np.zeros(shape, np.int16)),
-            "turns": ((*names, "link"), np.zeros((*shape, 2), np.int32)),
-            "lyapunov": ((*names, "exponent"), spectrum, {"units": "1/s"}),
-            "lyapunov_stderr": ((*names, "exponent"), np.full(spectrum.shape, stderr)),
-            "lyapunov_blocks": ((*names, "block", "exponent"), series),
-            "divergence": (names, spectrum.sum(-1) + 0.001),
-            "lyapunov_flag": (names, np.ones(shape, np.int8)),
-        },
-        coords={**dims, "state": STATES, "exponent": np.arange(1, n_exponents + 1), "frequency": dims["frequency"]},
-        attrs={"model": "pendulum", "parameters": PARAMETERS},
-    )
-
-
-PARAMETERS = "\n".join(f"{k} = {v!r}" for k, v in load_preset().items())
 FREQUENCY = np.array([1.0, 2.0, 4.0])
 
 
 @pytest.fixture
 def cube():
-    return make_cube([[1.0, 0.2], [0.01, -0.3], [0.9, 0.8]], frequency=FREQUENCY, initial_condition=[0, 1])
+    return exponents_cube([[1.0, 0.2], [0.01, -0.3], [0.9, 0.8]], frequency=FREQUENCY, initial_condition=[0, 1])
 
 
 def test_summarise__per_period_is_per_time_over_frequency(cube):
@@ -187,7 +158,7 @@ def test_plot_lyapunov__mistakes(cube):
         plot_lyapunov(cube, per="second")
     with pytest.raises(ValueError, match=r"two swept parameters, and 1 are left \(frequency\)"):
         plot_lyapunov_map(cube)
-    two = make_cube(np.zeros((2, 2)), frequency=[1.0, 2.0], q=[1.0, 1.5])
+    two = exponents_cube(np.zeros((2, 2)), frequency=[1.0, 2.0], q=[1.0, 1.5])
     with pytest.raises(ValueError, match="choose a value first"):
         plot_lyapunov(two)
     assert plot_lyapunov(two, at={"q": 1.5}).data["exponent_value"].sizes == {"frequency": 2, "exponent": 1}
@@ -195,7 +166,7 @@ def test_plot_lyapunov__mistakes(cube):
 
 def test_plot_lyapunov_map__the_largest_over_the_cells():
     rates = np.array([[[0.5, -0.1], [-0.2, -0.3]], [[0.1, 0.7], [np.nan, np.nan]]])
-    cube = make_cube(rates, frequency=[1.0, 2.0], q=[1.0, 1.5], initial_condition=[0, 1])
+    cube = exponents_cube(rates, frequency=[1.0, 2.0], q=[1.0, 1.5], initial_condition=[0, 1])
     fig = plot_lyapunov_map(cube)
     (mesh,) = artists(fig, "map")
     expected = np.array([[0.5, 0.7], [-0.2, np.nan]])  # rows q, columns frequency

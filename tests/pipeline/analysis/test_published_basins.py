@@ -1,12 +1,10 @@
 """Published basins, through the engine's and the analyses' public functions: Duffing, a pendulum."""
 
 import importlib
-import math
 from pathlib import Path
 
 import numpy as np
 import pytest
-import xarray as xr
 from scipy.integrate import solve_ivp
 
 from magpend_core import load_model, run_branches
@@ -15,34 +13,16 @@ from pipeline.analysis.attractors.attractors import identify
 from pipeline.analysis.basins.numbers import basin_fractions
 from pipeline.layout.vocabulary import ABSENT, PERIODIC_ORBIT
 
+from .cubes import cube_of, integrated
+
 UNIT_FREQUENCY = 1.0 / TWO_PI  # forcing cos t
 
 
 DUFFING = load_model("duffing").system
-TWO_WELLS = load_model("duffing").load("twin-well-periodic").pack()  # x'' = .2 cos t + x - x^3 - .15 x'
+TWO_WELLS = load_model("duffing").load("twin-well-periodic")  # x'' = .2 cos t + x - x^3 - .15 x'
 
 # recomputed independently, also in issue 139 of DynamicalSystemsBase.jl
 POINTS = np.array([[-0.7790549287, 0.0274168155], [1.2100908241, 0.0552949542]])
-
-
-def cube_of(result, system, frequency, **axis):
-    """Sections of run_branches as a cube over starts and, before them, an axis if one is given."""
-    lengths = [len(values) for values in axis.values()]
-    shape = (*lengths, len(result.status) // math.prod(lengths))
-
-    def variable(name, *own):
-        values = getattr(result, name)[:, 0]
-        return (*axis, "initial_condition", *own), values.reshape(*shape, *values.shape[1:])
-
-    return xr.Dataset(
-        {
-            "section": variable("section", "period_index", "state"),
-            "status": variable("status"),
-            "orbit_period": variable("orbit_period"),
-            "turns": variable("turns", "angle"),
-        },
-        coords={**axis, "state": list(system.state_names), "frequency": frequency},
-    )
 
 
 def grid(n, x, y):
@@ -60,25 +40,14 @@ STARTS = grid(40, (-2.2, 2.2), (-2.2, 2.2))
 @pytest.fixture(scope="module")
 def two_wells():
     """The starts integrated until their orbits close, as a cube."""
-    n = len(STARTS)
-    result = run_branches(
-        np.broadcast_to(TWO_WELLS, (n, 1, 4)),
-        np.full((n, 1), UNIT_FREQUENCY),
-        STARTS,
-        system=DUFFING,
-        n_transient=400,
-        n_keep=16,
-        rtol=1e-8,
-        atol=1e-8,
-        stop_when_closed=True,
-        max_orbit_period=4,
-    )
-    return cube_of(result, DUFFING, UNIT_FREQUENCY)
+    options = {"n_transient": 400, "n_keep": 16, "stop_when_closed": True, "max_orbit_period": 4}
+    result = integrated(TWO_WELLS, UNIT_FREQUENCY, STARTS, rtol=1e-8, atol=1e-8, **options)
+    return cube_of(result, DUFFING.state_names, frequency=UNIT_FREQUENCY)
 
 
 @pytest.fixture(scope="module")
 def found_wells(two_wells):
-    return identify(two_wells, system=DUFFING, parameters=TWO_WELLS)
+    return identify(two_wells, system=DUFFING, parameters=TWO_WELLS.pack())
 
 
 def test_basin_fractions__duffing_as_published(found_wells):
@@ -156,11 +125,12 @@ def rest_fraction(bench, torques, n):
         closure_tolerance=1e-4,
         max_orbit_period=1,
     )
-    ds = cube_of(result, bench.PENDULUM, 0.1, torque=torques)
+    dims, shape = ("torque", "initial_condition"), (len(torques), len(starts))
+    ds = cube_of(result, bench.PENDULUM.state_names, dims, shape, frequency=0.1, torque=torques)
     # not polished: at rest, steps that the trajectory alone controls grow too long for its tangents
     found = identify(ds, system=bench.PENDULUM, parameters=np.array([0.1, 0.0]), polish=False, tolerance=1e-3)
-    turning = np.abs(found["rotation"].isel(angle=0)) > 0.1
-    at_rest = (found["kind"] == PERIODIC_ORBIT) & (np.abs(found["rotation"].isel(angle=0)) < 1e-3)
+    turning = np.abs(found["rotation"].isel(link=0)) > 0.1
+    at_rest = (found["kind"] == PERIODIC_ORBIT) & (np.abs(found["rotation"].isel(link=0)) < 1e-3)
     assert ((found["kind"] == ABSENT) | turning | at_rest).all()
     ids = found["attractor_id"]
     assert (ids >= 0).all()
@@ -172,7 +142,7 @@ def test_basin_fractions__rest_against_torque_as_published(bench):
     fractions, found = rest_fraction(bench, TORQUES, 40)
     assert fractions["fraction"].sel(label=0).values == pytest.approx(REST_FRACTIONS, abs=0.02)
     # below 4 damping/pi (to first order) no rotation lasts; above, there is rest and rotation
-    turns = (np.abs(found["rotation"].isel(angle=0)) > 0.1).any("attractor")
+    turns = (np.abs(found["rotation"].isel(link=0)) > 0.1).any("attractor")
     assert turns.values.tolist() == [False, True, True, True, True, True, True]
 
 

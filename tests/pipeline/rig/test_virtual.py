@@ -27,15 +27,13 @@ def ideal(*names):
     return {name: Sensor() for name in names}
 
 
+def recorded(parameters, sensors, start=START, times=TIMES):
+    """Recording of fourteen periods at 2.2 Hz."""
+    return record(parameters, [Step(2.2, 14)], start, times, sensors=sensors, seed=0)
+
+
 def test_record__ideal_sensors_see_the_engines_states(parameters):
-    ds = record(
-        parameters,
-        [Step(2.2, 14)],
-        START,
-        TIMES,
-        sensors={**ideal("psi1", "psi2", "psi1_dot"), "drive": DriveSensor("torque")},
-        seed=0,
-    )
+    ds = recorded(parameters, {**ideal("psi1", "psi2", "psi1_dot"), "drive": DriveSensor("torque")})
     states = trajectory(parameters, 2.2, np.array(START), TIMES, rtol=TOLERANCE, atol=TOLERANCE)
     for i, name in ((0, "psi1"), (1, "psi2"), (2, "psi1_dot")):
         # both walk the drive's periods with the same steps; what differs is rounding, which chaos lets grow
@@ -91,23 +89,15 @@ def test_record__drive_signal_follows_the_steps(parameters):
 
 
 def test_record__noise_and_quantisation_are_those_of_the_sensor(parameters):
-    ideal_ds = record(parameters, [Step(2.2, 14)], START, TIMES, sensors=ideal("psi1", "psi2"), seed=0)
-    ds = record(
-        parameters,
-        [Step(2.2, 14)],
-        START,
-        TIMES,
-        sensors={"psi1": Sensor("encoder", 2e-3), "psi2": Sensor("encoder", 0.0, 12)},
-        seed=0,
-    )
+    ideal_ds = recorded(parameters, ideal("psi1", "psi2"))
+    ds = recorded(parameters, {"psi1": Sensor("encoder", 2e-3), "psi2": Sensor("encoder", 0.0, 12)})
     error = ds - ideal_ds
     assert float(error["psi1"].std()) == pytest.approx(2e-3, rel=0.05)
     grain = 2.0 * math.pi / 2**12
     assert float(np.abs(error["psi2"]).max()) == pytest.approx(grain / 2, rel=0.02)
     assert float(error["psi2"].std()) == pytest.approx(grain / 12**0.5, rel=0.05)
     for kind in ("encoder", "potentiometer"):  # an offset is what the mapping does not know
-        sensors = {"psi1": Sensor(kind, offset=0.02)}
-        ds = record(parameters, [Step(2.2, 14)], START, TIMES, sensors=sensors, seed=0)
+        ds = recorded(parameters, {"psi1": Sensor(kind, offset=0.02)})
         np.testing.assert_allclose(ds["psi1"] - ideal_ds["psi1"], 0.02, atol=1e-12)
 
 
@@ -116,8 +106,8 @@ def test_record__potentiometer_over_the_top(parameters):
     sensors = {"psi1": Sensor("potentiometer", 1e-3, 12, 0.3), "psi2": Sensor("potentiometer", 1e-3, 12, 0.3)}
     start = (0.0, 0.0, 0.0, 25.0)
     times = np.arange(1000) / 500.0
-    true = record(parameters, [Step(2.2, 14)], start, times, sensors=ideal("psi2"), seed=0)["psi2"].values
-    ds = record(parameters, [Step(2.2, 14)], start, times, sensors=sensors, seed=0)
+    true = recorded(parameters, ideal("psi2"), start, times)["psi2"].values
+    ds = recorded(parameters, sensors, start, times)
     assert np.ptp(true) > 2.0 * math.pi
     assert {f.kind for f in findings_of(ds)} == {"dead-band", "wrap"}
     measured = ds["psi2"].values

@@ -39,15 +39,8 @@ def problem_of(parameters, channels, pieces, *, recorded=False) -> Problem:
 def forced():
     """An oscillator under a sine that was measured."""
     parameters = load_model("duffing").load("hardening", amplitude=0.4)
-    ds = record(
-        parameters,
-        [Step(0.2, 6)],
-        [0.5, 0.0],
-        0.02 * np.arange(1400),
-        sensors={"x": Sensor(noise=NOISE), "drive": DriveSensor("torque", 1e-3)},
-        seed=3,
-    )
-    return parameters, ds
+    sensors = {"x": Sensor(noise=NOISE), "drive": DriveSensor("torque", 1e-3)}
+    return parameters, record(parameters, [Step(0.2, 6)], [0.5, 0.0], 0.02 * np.arange(1400), sensors=sensors, seed=3)
 
 
 CHANNELS = ("psi1", "psi2")

@@ -11,7 +11,8 @@ import pytest
 from pipeline.rig.recordings import write_raw
 from pipeline.rig.virtual import DriveSensor, Sensor, Step, readings
 
-RIGHT = [0.05208, 0.13572, -3.01085, 3.20903]
+from .conftest import RIGHT
+
 FREQUENCIES = (2.46, 2.48, 2.54, 2.56)
 FEW = ("--transient", 50)
 

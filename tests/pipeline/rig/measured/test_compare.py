@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from magpend_core.sections import run_branches
 from pipeline.products.measured import SweepOptions
 from pipeline.rig.measured.compare import compare, compare_with
 from pipeline.rig.measured.computed import Computed
@@ -16,7 +15,7 @@ from pipeline.rig.measured.tables import edges_table, steps_table, summary_lines
 from pipeline.runs.derive import AnalysedRun
 from pipeline.specification.problems import SpecError
 
-from .conftest import RUN
+from .conftest import RUN, walked
 
 SWEPT = np.array([2.46, 2.48, 2.5, 2.52, 2.54])
 LEFT, RIGHT = 1, 2
@@ -36,19 +35,8 @@ def compared(measured, run_directory):
 
 def truth(pendulum, start, frequencies):
     """Periods along a sweep without noise, from other code: the engine's closure test on stepped walks."""
-    packed = np.broadcast_to(pendulum.pack(), (1, len(frequencies), len(pendulum.names)))
-    found = run_branches(
-        packed,
-        np.array(frequencies)[None],
-        np.array([start]),
-        n_transient=600,
-        n_keep=16,
-        rtol=1e-8,
-        atol=1e-8,
-        stop_when_closed=True,
-        closure_tolerance=1e-5,
-        system=pendulum.model.system,
-    )
+    options = {"n_transient": 600, "n_keep": 16, "stop_when_closed": True, "closure_tolerance": 1e-5}
+    found = walked(pendulum, frequencies, start, rtol=1e-8, atol=1e-8, **options)
     return found.orbit_period[0]
 
 
@@ -152,18 +140,7 @@ def test_candidates__orbits_are_interpolated_between_frequencies(run_directory, 
     """Halfway between two frequencies of the run: against the orbit that the engine settles on there."""
     computed = Computed.of(AnalysedRun.of(run_directory), "pendulum")
     right = next(c for c in computed.candidates(2.545, pendulum.model.state_names) if c.side == RIGHT)
-    start = np.array([right.points[0]])
-    packed = np.broadcast_to(pendulum.pack(), (1, 1, len(pendulum.names)))
-    exact = run_branches(
-        packed,
-        np.array([[2.545]]),
-        start,
-        n_transient=2000,
-        n_keep=1,
-        rtol=1e-9,
-        atol=1e-9,
-        system=pendulum.model.system,
-    ).section[0, 0]
+    exact = walked(pendulum, [2.545], right.points[0], n_transient=2000, n_keep=1).section[0, 0]
     nearest = computed.candidates(2.54, pendulum.model.state_names)
     off = np.abs(right.points - exact).max()
     assert off < 2e-4

@@ -42,14 +42,15 @@ def swing(main, tmp_path):
 def test_recordings_show__lists_the_channels_of_a_file(main, swing):
     code, out, _ = main("recordings", "show", swing.name)
     assert code == 0
-    assert "3 channels, simulated" in out
+    assert "4 channels, simulated" in out
     assert [line.split()[:3] for line in out.splitlines()[2:]] == [
-        ["rig/psi1", "1000", "500"],
-        ["rig/psi2", "1000", "500"],
-        ["rig/drive", "1000", "500"],
+        ["time", "1000", "-"],
+        ["rig/psi1", "1000", "-"],
+        ["rig/psi2", "1000", "-"],
+        ["rig/drive", "1000", "-"],
     ]
     code, out, _ = main("recordings", "show", swing.name, "--json")
-    assert [row["channel"] for row in json.loads(out)] == ["rig/psi1", "rig/psi2", "rig/drive"]
+    assert [row["channel"] for row in json.loads(out)] == ["time", "rig/psi1", "rig/psi2", "rig/drive"]
 
 
 def test_recordings_show__with_a_mapping_says_what_was_found(main, swing, tmp_path):
