@@ -166,12 +166,12 @@ def test_sample_draws__not_converged_is_an_answer(cycles):
 
 def test_write_posterior__keeps_the_draws_for_runs(cycles):
     sampling = Sampling(most_steps=20)
-    _, bifurcations, _ = write_posterior(cycles, 30, seed=5, sampling=sampling, figures=False, echo=quiet)
-    kept = kept_draws(cycles, 30)
-    xr.testing.assert_equal(kept["value"], sample_draws(cycles, 30, 5, sampling, echo=quiet)["value"])
+    _, bifurcations, _ = write_posterior(cycles, 12, seed=5, sampling=sampling, figures=False, echo=quiet)
+    kept = kept_draws(cycles, 12)
+    xr.testing.assert_equal(kept["value"], sample_draws(cycles, 12, 5, sampling, echo=quiet)["value"])
     assert kept_draws(cycles, 10).sizes["draw"] == 10
-    with pytest.raises(SpecError, match=r"-n = 31: .* has 30 draws"):
-        kept_draws(cycles, 31)
+    with pytest.raises(SpecError, match=r"-n = 13: .* has 12 draws"):
+        kept_draws(cycles, 13)
     hopf = next(row for row in bifurcations.rows if row["kind"] == "hopf")
     h = kept["value"].sel(parameter="h").values
     assert (hopf["low"], hopf["high"]) == pytest.approx(tuple(np.quantile(h, [0.025, 0.975])), abs=1e-6)
