@@ -8,13 +8,16 @@ import pytest
 from pipeline.analysis.attractors.extension.clouds import OTHER, SAME, Cloud, group, is_stationary, members, mixing
 from pipeline.analysis.sets import Geometry
 
-from . import maps
-
 PLANE = Geometry((False, False), (1.0, 1.0))
 
 
 def henon(n, seed, shift=0.0):
-    return maps.henon(1, n, seed, 100)[0] + shift
+    x = np.random.default_rng(seed).uniform(-0.1, 0.1, 2)
+    path = []
+    for _ in range(100 + n):
+        x = np.array([1.0 - 1.4 * x[0] ** 2 + x[1], 0.3 * x[0]])
+        path.append(x + shift)
+    return np.array(path[100:])
 
 
 GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)

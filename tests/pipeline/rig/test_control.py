@@ -43,6 +43,8 @@ frequency_hz = 0.22
 start = 0.3
 stop = 2.1
 num = 7
+settle = 8
+measure = 4
 """
 
 
