@@ -23,13 +23,13 @@ def integrated(parameters, frequency_hz, states, **options):
     return run_branches(packed, np.full((n, 1), frequency_hz), states, system=parameters.model.system, **options)
 
 
-def cube_of(found, states, cells=("initial_condition",), shape=(-1,), **coords):
+def cube_of(found, states, cells=("initial_condition",), shape=None, **coords):
     """Cube of a result of `sections`, or of `run_branches` with one point per branch."""
     data = {}
     for name, dims in OWN.items():
         values = np.asarray(getattr(found, name))
         values = values[:, 0] if np.ndim(found.status) == 2 else values
-        data[name] = ((*cells, *dims), values.reshape(*shape, *values.shape[1:]))
+        data[name] = ((*cells, *dims), values.reshape(*(shape or values.shape[:1]), *values.shape[1:]))
     return xr.Dataset(data, coords={"state": list(states), **coords})
 
 

@@ -129,8 +129,8 @@ def rest_fraction(bench, torques, n):
     ds = cube_of(result, bench.PENDULUM.state_names, dims, shape, frequency=0.1, torque=torques)
     # not polished: at rest, steps that the trajectory alone controls grow too long for its tangents
     found = identify(ds, system=bench.PENDULUM, parameters=np.array([0.1, 0.0]), polish=False, tolerance=1e-3)
-    turning = np.abs(found["rotation"].isel(link=0)) > 0.1
-    at_rest = (found["kind"] == PERIODIC_ORBIT) & (np.abs(found["rotation"].isel(link=0)) < 1e-3)
+    turning = np.abs(found["rotation"].isel(angle=0)) > 0.1
+    at_rest = (found["kind"] == PERIODIC_ORBIT) & (np.abs(found["rotation"].isel(angle=0)) < 1e-3)
     assert ((found["kind"] == ABSENT) | turning | at_rest).all()
     ids = found["attractor_id"]
     assert (ids >= 0).all()
@@ -142,7 +142,7 @@ def test_basin_fractions__rest_against_torque_as_published(bench):
     fractions, found = rest_fraction(bench, TORQUES, 40)
     assert fractions["fraction"].sel(label=0).values == pytest.approx(REST_FRACTIONS, abs=0.02)
     # below 4 damping/pi (to first order) no rotation lasts; above, there is rest and rotation
-    turns = (np.abs(found["rotation"].isel(link=0)) > 0.1).any("attractor")
+    turns = (np.abs(found["rotation"].isel(angle=0)) > 0.1).any("attractor")
     assert turns.values.tolist() == [False, True, True, True, True, True, True]
 
 

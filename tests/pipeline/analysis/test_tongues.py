@@ -138,7 +138,7 @@ def test_tongues__edges_by_another_integrator(van_der_pol):
         "tongues",
         parameter="frequency_hz",
         second="A",
-        second_low=0.7,
+        second_low=0.9,
         second_high=1.1,
         max_denominator=3,
         at={"A": 1.0},

@@ -239,17 +239,17 @@ def test_posterior__bifurcations_and_branches_of_each_draw_are_those_of_the_clos
 def test_run_posterior__each_draw_is_a_run_and_its_bifurcations_are_those_of_the_closed_form(fitted, tmp_path):
     directory, result = fitted
     path = write_toml(tmp_path / "sweep.toml", SWEEP)
-    folder = run_posterior(path, directory, 3, tmp_path / "study", workers=0, echo=lambda line: None)
-    drawn = draw_posterior(directory, 3)
+    folder = run_posterior(path, directory, 2, tmp_path / "study", workers=0, echo=lambda line: None)
+    drawn = draw_posterior(directory, 2)
     names = [str(name) for name in drawn["parameter"].values]
-    for k in range(3):
+    for k in range(2):
         parameters = parameters_of(AnalysedRun.of(folder / f"draw-{k:04d}").cube())
         assert parameters["g"] == drawn["value"].values[k, names.index("g")]
     before = (folder / "draw-0001/run.json").stat().st_mtime_ns
-    run_posterior(path, directory, 3, tmp_path / "study", workers=0, echo=lambda line: None)
+    run_posterior(path, directory, 2, tmp_path / "study", workers=0, echo=lambda line: None)
     assert (folder / "draw-0001/run.json").stat().st_mtime_ns == before
     with pytest.raises(RefusedError, match="different: draws"):
-        run_posterior(path, directory, 2, tmp_path / "study", workers=0)
+        run_posterior(path, directory, 3, tmp_path / "study", workers=0)
     table = spread(folder, branches=True, attractors=True, echo=lambda line: None)
     rows = {(row["what"], row["name"]): row for row in table.rows}
     values = drawn["value"].values[:, names.index("h")]
@@ -258,7 +258,7 @@ def test_run_posterior__each_draw_is_a_run_and_its_bifurcations_are_those_of_the
     hopf = rows["value", "hopf 0"]
     assert hopf["best"] == pytest.approx(result["values"]["h"], abs=1e-6)
     assert hopf["median"] == pytest.approx(np.median(values), abs=1e-6)
-    assert hopf["n_draws"] == 3
+    assert hopf["n_draws"] == 2
     assert sum(row["best"] for row in rows.values() if row["what"] == "fraction") == pytest.approx(1.0)
     # at m = 0 half of the cells end on the stable cycle, half at rest
     cycle = next(name for _, name in rows if name.startswith("attractor") and "period 1)" in name).split(" (")[0]
