@@ -8,6 +8,7 @@ import pytest
 from pipeline.analysis.attractors.finding.assigning import decide
 from pipeline.analysis.attractors.finding.cell_blocks import Block
 from pipeline.analysis.attractors.finding.closed_orbits import Orbit, raw_orbit
+from pipeline.analysis.attractors.finding.spirals import near_closed
 from pipeline.analysis.sets import Geometry, groups, hashes, mean_distance, nearest_distances
 from pipeline.layout.vocabulary import APPROACHING, CERTAIN, CLOSED, UNDECIDED
 
@@ -125,3 +126,13 @@ def test_decide__never_on_an_unstable_orbit():
     orbit = stable_orbit()
     unstable = Orbit(orbit.points, orbit.multipliers / SHRINK * 1.01, 1e-12, orbit.derivative)
     assert decision_of(spiral(0.2), orbit=unstable) == [UNDECIDED]
+
+
+def test_near_closed__finds_the_period_of_a_spiral():
+    sections = np.stack([spiral(0.05), spiral(0.01), np.random.default_rng(0).normal(size=(32, 2))])
+    found = near_closed(sections, 4, PLANE)
+    assert set(found.period) == {1}
+    assert len(found.key) >= 1
+    alternating = sections[:1].copy()
+    alternating[:, ::2, 0] += 0.5
+    assert near_closed(alternating, 4, PLANE).period.tolist() == [2]
