@@ -12,10 +12,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from magpend_core.engine.jit import inline
-from magpend_core.engine.system import System
-from magpend_core.engine.vecmath import TWO_PI, sincos
-
 ROOT = Path(__file__).parents[2]
 
 SWEEP = """
@@ -232,62 +228,21 @@ def main(monkeypatch, tmp_path, capsys):
     return call
 
 
-# ---- a second system ---------------------------------------------------------------------------
-
-
-@inline
-def _constants(frequency, p, out):
-    out[0] = p[0]
-    out[1] = p[1]
-    out[2] = TWO_PI * frequency
-
-
-@inline
-def _forcing(t, c):
-    return c[1] * sincos(c[2] * t)[1]
-
-
-@inline
-def _rhs(y, u, c):
-    return y[1], u - c[0] * y[1] + y[0] - y[0] * y[0] * y[0]
-
-
-@inline
-def _no_edges(frequency, p, times, half_widths, jumps):
-    return
-
-
-@inline
-def _no_layers(y, dy, c):
-    return ()
-
-
-@inline
-def _jacobian(y, u, c):
-    zero = 0.0 * y[0]
-    return zero, zero + 1.0, 1.0 - 3.0 * y[0] * y[0], zero - c[0]
-
-
 @pytest.fixture(scope="session")
-def duffing():
-    """x'' = x - x^3 - damping x' + amplitude cos(2 pi f t), one system for all tests: it compiles once."""
-    return System(
-        name="duffing",
-        state_names=("x", "v"),
-        is_angle=(False, False),
-        scales=(1.0, 1.0),
-        parameter_names=("damping", "amplitude"),
-        n_constants=3,
-        constants=_constants,
-        forcing=_forcing,
-        rhs=_rhs,
-        n_edges=0,
-        edges=_no_edges,
-        layers=_no_layers,
-        jacobian=_jacobian,
-        escape=(1e3, 1e3),
-        has_layers=False,
-    )
+def computed(tmp_path_factory):
+    """Compute a specification, each one once, and return its run directory, which nobody may change."""
+    from pipeline.runs.run import run
+
+    directories: dict[str, Path] = {}
+
+    def call(spec) -> Path:
+        key = str(spec)
+        if key not in directories:
+            directories[key] = tmp_path_factory.mktemp("computed") / "run"
+            run(spec, directories[key], workers=0, echo=lambda line: None)
+        return directories[key]
+
+    return call
 
 
 # ---- systems of one's own ----------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""Compute basin fractions and tipping probabilities, with their errors.
+"""Compute basin fractions with their errors.
 
 Basin entropy and uncertainty exponent are in `boundaries`, and the Wada test is in `wada`; all can also be
 imported from here. They take labels: an integer per cell that names its outcome (see `labels`).
@@ -18,14 +18,7 @@ from pipeline.analysis.basins.labels import UNFINISHED, LabelGrid, read_labels
 from pipeline.analysis.basins.wada import wada_merge_test
 from pipeline.analysis.intervals import REFERENCES, Interval, binomial_interval
 
-__all__ = [
-    "basin_entropy",
-    "basin_fractions",
-    "binomial_interval",
-    "tipping_probabilities",
-    "uncertainty_exponent",
-    "wada_merge_test",
-]
+__all__ = ["basin_entropy", "basin_fractions", "binomial_interval", "uncertainty_exponent", "wada_merge_test"]
 
 
 def basin_fractions(
@@ -115,77 +108,6 @@ def basin_fractions(
         ds["n_inferred"] = ((*kept, "label"), _count_inferred(grid, np.asarray(inferred), shape))
     ds["fraction"].attrs = {"long_name": "basin fraction among the finished cells", "units": "1"}
     return ds.assign_attrs(_provenance(unfinished, confidence, method))
-
-
-def tipping_probabilities(
-    labels_before: npt.ArrayLike | xr.DataArray,
-    labels_after: npt.ArrayLike | xr.DataArray,
-    *,
-    unfinished: Collection[int] = UNFINISHED,
-    confidence: float = 0.95,
-    method: Interval = "wilson",
-) -> xr.Dataset:
-    """Compute the probability that a state in basin i lies in basin j after a parameter change.
-
-    It is the fraction of each basin's cells before the change that belongs to each basin after it:
-    ``P(i -> j) = |B_i(before) and B_j(after)| / |B_i(before)|`` (Kaszás, Feudel and Tél, Sci. Rep. 9,
-    8654, 2019).
-
-    Parameters
-    ----------
-    labels_before, labels_after
-        Outcome per cell, integers, the same cells in both. Ids should be matched between the two for
-        the diagonal to mean "stays"; that is not validated.
-    unfinished
-        Codes of cells whose outcome is not known; ``()`` if every code, such as that of divergence, is
-        an outcome.
-    confidence, method
-        See `binomial_interval`; the notes of `basin_fractions` on independent cells apply.
-
-    Returns
-    -------
-    Dataset
-        On `before` and `after`: `count`; `probability`, among the cells finished both times, with
-        `low` and `high`; `probability_if_none`, `probability_if_all`, `low_if_none`, `high_if_all`: the
-        same if none or all of the cells unfinished after the change went to j. On `before`: `n_cells`,
-        `n_unfinished` after the change, `fraction_unfinished`. Scalar: `fraction_unfinished_before`,
-        the part of the cells that belongs to no row.
-
-    Raises
-    ------
-    TypeError
-        If the labels are not integers.
-    ValueError
-        If the two are not of one shape, or of other dims or coordinates.
-    """
-    if isinstance(labels_before, xr.DataArray) and isinstance(labels_after, xr.DataArray):
-        labels_after = _same_cells(labels_before, labels_after)
-    before, after = read_labels(labels_before, unfinished), read_labels(labels_after, unfinished)
-    if before.codes.shape != after.codes.shape:
-        raise ValueError(
-            f"labels before are of shape {before.codes.shape}, after of {after.codes.shape}: label the same "
-            "cells at both parameters"
-        )
-    n_rows, n_columns = before.ids.size, after.ids.size + 1
-    row, column = before.codes.ravel(), after.codes.ravel() + 1  # column 0: unfinished after
-    known = row >= 0
-    pairs = row[known].astype(np.int64) * n_columns + column[known]
-    table = np.bincount(pairs, minlength=n_rows * n_columns).reshape(n_rows, n_columns)
-    n_cells, n_unfinished = table.sum(axis=1), table[:, 0]
-    ds = xr.Dataset(coords={"before": before.ids, "after": after.ids})
-    ds = ds.assign(
-        _with_intervals(table[:, 1:], n_cells, n_unfinished, ("before", "after"), confidence, method, "probability")
-    )
-    ds = ds.assign(
-        n_cells=("before", n_cells),
-        n_unfinished=("before", n_unfinished),
-        fraction_unfinished=("before", n_unfinished / n_cells),
-        fraction_unfinished_before=((), before.fraction_unfinished),
-    )
-    ds["probability"].attrs = {"long_name": "tipping probability", "units": "1"}
-    attrs = _provenance(unfinished, confidence, method)
-    attrs["references"] = f"Kaszás, Feudel and Tél, Sci. Rep. 9, 8654 (2019); {attrs['references']}"
-    return ds.assign_attrs(attrs)
 
 
 def _kept_dims(

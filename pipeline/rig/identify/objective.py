@@ -264,7 +264,7 @@ def _block(problem: Problem, k: int, theta: Array, member: _Motions, slopes: boo
     jacobian[:, [*problem.sloped, *range(n_free, n_own)]] += moved[:, given].T
     # an orthogonal transformation changes neither the cost nor the normal equations
     whole = np.column_stack([jacobian * factor[:, None], rows])
-    triangle: Array = np.linalg.qr(whole, mode="r")
+    triangle: Array = np.asarray(np.linalg.qr(whole, mode="r"))
     return k, triangle[:, -1], triangle[:, :-1]
 
 

@@ -7,25 +7,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import xarray as xr
 
 from magpend_core import load_preset, sections
 from magpend_core.models import load_model
 from magpend_core.models.pendulum.sides import Side
-from magpend_core.sections import run_branches
 from pipeline.analysis.attractors.attractors import identify, match
 from pipeline.layout.vocabulary import ATTRACTS, EXTENDED, PERIODIC_ORBIT
 
+from .cubes import STATES, attributes_of, cube_of, integrated
+
 ORBITS = json.loads((Path(__file__).parents[2] / "core" / "data" / "orbits.json").read_text("utf-8"))
-STATES = ["psi1", "psi2", "psi1_dot", "psi2_dot"]
 FREQUENCY = 2.2
-
-
-def dataset(result, cell_dims=("initial_condition",), **coords):
-    """Cube of the engine's result."""
-    own = {"section": ("period_index", "state"), "turns": ("link",), "status": (), "orbit_period": ()}
-    data = {name: ((*cell_dims, *dims), getattr(result, name)) for name, dims in own.items()}
-    return xr.Dataset(data, coords={"state": STATES, "link": STATES[:2], **coords})
 
 
 @pytest.fixture(scope="session")
@@ -39,7 +31,7 @@ def starts():
 @pytest.fixture(scope="session")
 def cube(starts):
     result = sections(load_preset(), FREQUENCY, starts, n_transient=400, n_keep=32, rtol=1e-8)
-    return dataset(result, frequency=FREQUENCY)
+    return cube_of(result, STATES, frequency=FREQUENCY)
 
 
 @pytest.fixture(scope="session")
@@ -111,11 +103,10 @@ def test_identify__every_cell_where_it_belongs(cube, found):
     assert found["share"].values == pytest.approx(np.bincount(ids) / 64)
 
 
-@pytest.mark.parametrize("n_transient", [250, 180])
-def test_identify__slow_spirals_stay_whole(starts, found, n_transient):
+def test_identify__slow_spirals_stay_whole(starts, found):
     """Cells stopped at 1e-2 to 1e-5 from their orbits: the same two orbits, and no others beside them."""
-    result = sections(load_preset(), FREQUENCY, starts, n_transient=n_transient, n_keep=32, rtol=1e-8)
-    early = identify(dataset(result, frequency=FREQUENCY), parameters=load_preset())
+    result = sections(load_preset(), FREQUENCY, starts, n_transient=180, n_keep=32, rtol=1e-8)
+    early = identify(cube_of(result, STATES, frequency=FREQUENCY), parameters=load_preset())
     here = [row_of(early, o["section"]) for o in ORBITS[:2]]
     there = [row_of(found, o["section"]) for o in ORBITS[:2]]
     for a, b, orbit in zip(here, there, ORBITS, strict=False):
@@ -140,30 +131,15 @@ def same(a, b):
 
 def test_identify__order_and_blocks_of_cells_do_not_matter(cube, found):
     order = np.random.default_rng(5).permutation(64)
-    shuffled = identify(cube.isel(initial_condition=order), parameters=load_preset())
+    shuffled = identify(cube.isel(initial_condition=order), parameters=load_preset(), block_bytes=40_000)
     assert same(found, shuffled)
     assert np.array_equal(shuffled["attractor_id"].values, found["attractor_id"].values[order])
     assert np.array_equal(shuffled["decision"].values, found["decision"].values[order])
-    blocks = identify(cube, parameters=load_preset(), block_bytes=40_000)
-    assert same(found, blocks)
-    assert np.array_equal(blocks["attractor_id"].values, found["attractor_id"].values)
-
-
-def test_identify__grid_of_starts(cube, found):
-    grid = cube.drop_vars("state").rename(initial_condition="cell").assign_coords(state=STATES)
-    shape = {"psi1_0": 8, "psi2_0": 8}
-    data = {n: ((*shape, *v.dims[1:]), v.values.reshape(8, 8, *v.shape[1:])) for n, v in grid.data_vars.items()}
-    grid = xr.Dataset(data, coords={"state": STATES, "frequency": FREQUENCY})
-    result = identify(grid, parameters=load_preset(), block_bytes=40_000)
-    assert result["attractor_id"].dims == ("psi1_0", "psi2_0")
-    assert np.array_equal(result["attractor_id"].values.ravel(), found["attractor_id"].values)
-    assert same(found, result)
 
 
 def test_identify__parameters_from_the_run_and_its_axes(cube, found):
     """An axis replaces the attribute of the same name."""
-    lines = "\n".join(f"{k} = {v!r}" for k, v in load_preset(q=1.0).as_dict().items())
-    ds = cube.expand_dims(q=[load_preset()["q"]]).assign_attrs(parameters=lines)
+    ds = cube.expand_dims(q=[load_preset()["q"]]).assign_attrs(attributes_of(load_preset(q=1.0)))
     result = identify(ds)
     assert same(found, result.isel(q=0))
     assert result["attractor_id"].dims == ("q", "initial_condition")
@@ -171,14 +147,6 @@ def test_identify__parameters_from_the_run_and_its_axes(cube, found):
         identify(cube)
     with pytest.raises(ValueError, match="orbit_period"):
         identify(cube.drop_vars("orbit_period"))
-
-
-def test_identify__attributes(found):
-    for name, variable in found.data_vars.items():
-        assert variable.attrs["long_name"], name
-    assert found["kind"].attrs["flag_meanings"].split()[PERIODIC_ORBIT] == "periodic_orbit"
-    assert found["energy_min"].attrs["units"] == "J"
-    assert found["attractor_id"].dtype == np.int32
 
 
 def test_match__one_point(found):
@@ -199,25 +167,8 @@ def test_identify__rotating_orbits_close():
     model, n, frequency = load_model("driven-pendulum"), 24, 2.0 / 3.0 / (2.0 * np.pi)
     parameters = model.load(d=0.5, A=1.4)
     starts = np.random.default_rng(1).uniform(-2, 2, (n, 2))
-    result = run_branches(
-        np.tile(parameters.pack(), (n, 1, 1)),
-        np.full((n, 1), frequency),
-        starts,
-        n_transient=100,
-        n_keep=24,
-        rtol=1e-9,
-        atol=1e-9,
-        system=model.system,
-    )
-    ds = xr.Dataset(
-        {
-            "section": (("initial_condition", "period_index", "state"), result.section[:, 0]),
-            "turns": (("initial_condition", "link"), result.turns[:, 0]),
-            "status": ("initial_condition", result.status[:, 0]),
-            "orbit_period": ("initial_condition", result.orbit_period[:, 0]),
-        },
-        coords={"state": list(model.state_names), "frequency": frequency},
-    )
+    result = integrated(parameters, frequency, starts, n_transient=100, n_keep=24)
+    ds = cube_of(result, model.state_names, frequency=frequency)
     found = identify(ds, parameters=parameters.pack(), system=model.system)
     assert found["kind"].values.tolist() == [PERIODIC_ORBIT] * 2
     assert found["n_cells"].values.sum() == n

@@ -6,15 +6,15 @@ import json
 
 import numpy as np
 import pytest
-import xarray as xr
 
-from magpend_core import run_branches
 from magpend_core.crossing import Crossing
 from magpend_core.models.sectioned import sectioned
 from pipeline.analysis.attractors.attractors import identify
 from pipeline.compute.integrate import rest_states
 from pipeline.layout.vocabulary import ATTRACTS, BOUNDED_SET, EQUILIBRIUM, PERIODIC_ORBIT, section_attributes
 from tests.core.flows import BAUTIN, HOPF, flow
+
+from .cubes import attributes_of, cube_of, integrated
 
 GRID = [[x, y] for x in np.linspace(-1.2, 1.2, 7) for y in np.linspace(-1.1, 1.1, 7)]
 
@@ -23,36 +23,21 @@ def cube(table, states, *, crossing=None, frequency_hz=1.0, n_transient=200, n_k
     """Cells of one parameter point, as a run stores them."""
     model = flow(table)
     model = model if crossing is None else sectioned(model, crossing)
-    parameters, n = model.load(**values), len(states)
+    parameters = model.load(**values)
     rate = frequency_hz if crossing is None else crossing.frequency_hz
-    found = run_branches(
-        np.tile(parameters.pack(), (n, 1, 1)),
-        np.full((n, 1), rate),
-        np.array(states),
-        n_transient=n_transient,
-        n_keep=n_keep,
-        rtol=1e-9,
-        atol=1e-9,
-        system=model.system,
-    )
-    cells = "initial_condition"
-    variables = {
-        "section": ((cells, "period_index", "state"), found.section[:, 0]),
-        "status": (cells, found.status[:, 0], {"flag_values": [], "flag_meanings": ""}),
-        "orbit_period": (cells, found.orbit_period[:, 0]),
-    }
-    coords = {"state": list(model.state_names)}
+    found = integrated(parameters, rate, states, n_transient=n_transient, n_keep=n_keep)
+    ds = cube_of(found, model.state_names)
     if crossing is None:
-        coords["frequency"] = float(frequency_hz)
+        ds = ds.assign_coords(frequency=float(frequency_hz))
     else:
-        variables["rest_state"] = ((cells, "state"), rest_states(found)[:, 0])
+        ds["rest_state"] = (("initial_condition", "state"), rest_states(found)[:, 0])
     attrs = {
+        **attributes_of(parameters),
         "model": json.dumps(model.reference),
         "closure_tolerance": 1e-6,
         **section_attributes(model.crossing),
-        "parameters": "\n".join(f"{k} = {v!r}" for k, v in parameters.as_dict().items()),
     }
-    return xr.Dataset(variables, coords=coords, attrs=attrs)
+    return ds.assign_attrs(attrs)
 
 
 def kinds(found):
@@ -98,10 +83,9 @@ def test_identify__strobed_cycle_is_one(frequency_hz):
 
 
 def test_identify__order_of_cells():
-    """Neither at crossings nor at even times does it matter which cell comes first."""
-    for options in ({"crossing": Crossing("y", 0.0, longest=20.0), "mu": -0.1}, {"mu": -0.1}):
-        ds = cube(BAUTIN, GRID, **options)
-        order = np.random.default_rng(1).permutation(len(GRID))
-        one, other = identify(ds), identify(ds.isel(initial_condition=order))
-        np.testing.assert_array_equal(one["attractor_id"].values[order], other["attractor_id"].values)
-        np.testing.assert_allclose(one["period_s"], other["period_s"], rtol=1e-9)
+    """It does not matter which cell comes first."""
+    ds = cube(BAUTIN, GRID, crossing=Crossing("y", 0.0, longest=20.0), mu=-0.1)
+    order = np.random.default_rng(1).permutation(len(GRID))
+    one, other = identify(ds), identify(ds.isel(initial_condition=order))
+    np.testing.assert_array_equal(one["attractor_id"].values[order], other["attractor_id"].values)
+    np.testing.assert_allclose(one["period_s"], other["period_s"], rtol=1e-9)

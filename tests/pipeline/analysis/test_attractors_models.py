@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import xarray as xr
 
 from magpend_core import load_model, sections
 from pipeline.analysis.attractors.attractors import identify, match
@@ -14,6 +13,8 @@ from pipeline.analysis.attractors.table import attractors_table
 from pipeline.analysis.basins.basins import basins
 from pipeline.analysis.chaos.chaos import chaos
 from pipeline.layout.vocabulary import ATTRACTS, CHAOTIC_SET
+
+from .cubes import attributes_of, cube_of
 
 DUFFING = load_model("duffing")
 FREQUENCY = 1.0 / (2.0 * np.pi)
@@ -25,29 +26,11 @@ def cube(preset, n, n_transient, n_keep, **overrides):
     axis = np.linspace(-2.0, 2.0, n)
     starts = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)
     found = sections(parameters, FREQUENCY, starts, n_transient=n_transient, n_keep=n_keep, rtol=1e-9, atol=1e-9)
-    dims = ("x_0", "v_0")
+    coords = {"x_0": axis, "v_0": axis, "frequency": FREQUENCY, "state_units": ("state", ["m", "m/s"])}
+    ds = cube_of(found, ["x", "v"], ("x_0", "v_0"), (n, n), **coords).drop_vars("turns")
     flags = {"flag_values": np.arange(3, dtype=np.int8), "flag_meanings": "pending periodic bounded"}
-    return xr.Dataset(
-        {
-            "section": ((*dims, "period_index", "state"), found.section.reshape(n, n, n_keep, 2)),
-            "status": (dims, found.status.reshape(n, n), flags),
-            "orbit_period": (dims, found.orbit_period.reshape(n, n)),
-            "n_periods": (dims, found.n_periods.reshape(n, n)),
-        },
-        coords={
-            "x_0": axis,
-            "v_0": axis,
-            "frequency": FREQUENCY,
-            "state": ["x", "v"],
-            "state_units": ("state", ["m", "m/s"]),
-        },
-        attrs={
-            "model": "duffing",
-            "rtol": 1e-9,
-            "atol": 1e-9,
-            "parameters": "\n".join(f"{k} = {v!r}" for k, v in parameters.items()),
-        },
-    )
+    ds["status"].attrs = flags
+    return ds.assign_attrs(attributes_of(parameters), rtol=1e-9, atol=1e-9)
 
 
 @pytest.fixture(scope="module")
@@ -116,12 +99,3 @@ def test_portraits__of_a_model_without_a_drawing(strange):
     found = portraits(strange, n_periods=2, n_samples=16)
     assert found["orbit"].shape == (1, 33, 2)
     assert "points" not in found
-
-
-def test_datasets__are_fit_for_netcdf(chaotic, strange, tmp_path):
-    for name, ds in (("found", strange), ("ids", match(strange)), ("chaos", chaos(chaotic, strange))):
-        ds.to_netcdf(tmp_path / f"{name}.nc", engine="scipy")
-        with xr.open_dataset(tmp_path / f"{name}.nc", engine="scipy") as stored:
-            assert set(stored.data_vars) == set(ds.data_vars)
-            if "state" in ds.coords:
-                assert stored["state"].values.tolist() == ["x", "v"]

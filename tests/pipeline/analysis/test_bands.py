@@ -1,10 +1,4 @@
-"""Draws of the parameters carried through the branches of a run, on an oscillator with closed forms.
-
-    r' = (m - h) r + r^3 - g r^5,  angle' = w
-
-On the section y = 0 its cycles have x = r, with g r^4 - r^2 - (m - h) = 0. The fold of cycles lies at m = h - 1/(4 g),
-the Hopf point at m = h.
-"""
+"""Draws of the parameters carried through the branches of a run, on an oscillator with closed forms."""
 
 from __future__ import annotations
 
@@ -18,29 +12,8 @@ from pipeline.analysis.branches.carrying import Along
 from pipeline.analysis.draws import LEVELS, stretches
 from pipeline.runs.derive import derive, stored
 from pipeline.runs.drawing import figure
-from pipeline.runs.run import run
 from pipeline.specification.problems import SpecError
-
-TRUTH = {"g": 1.2, "h": 0.05, "w": 6.0}
-MODEL = {
-    "name": "bautin-cycle",
-    "states": {"x": {"scale": 1.0}, "y": {"scale": 1.0}},
-    "parameters": {name: {"value": value} for name, value in {"m": 0.0, **TRUTH}.items()},
-    "define": {"r2": "x**2 + y**2", "growth": "m - h + r2 - g*r2**2"},
-    "equations": {"x": "growth*x - w*y", "y": "growth*y + w*x"},
-}
-SPEC = {
-    "kind": "sweep",
-    "model": MODEL,
-    "section": {"of": "y", "value": 0.0, "direction": "up", "longest": 20.0},
-    "axes": {"m": {"start": -0.3, "stop": 0.2, "num": 6}},
-    "initial_conditions": {"kind": "list", "points": [[1.0, 0.0], [0.01, 0.0]]},
-    "integration": {"n_transient": 200, "n_keep": 2, "stop_when_closed": True},
-}
-
-
-def silent(line):
-    pass
+from tests.pipeline.bautin import SWEEP
 
 
 def write_draws(path, g, h):
@@ -52,18 +25,18 @@ def write_draws(path, g, h):
 
 
 @pytest.fixture(scope="module")
-def bench(tmp_path_factory):
+def bench(tmp_path_factory, computed):
     folder = tmp_path_factory.mktemp("bands")
-    run(SPEC, folder / "run", workers=0, echo=silent)
+    directory = computed(SWEEP)
     random = np.random.default_rng(3)
     g, h = 1.2 + 0.1 * random.standard_normal(60), 0.05 + 0.01 * random.standard_normal(60)
     (folder / "fit").mkdir()
     write_draws(folder / "fit" / "posterior.nc", g, h)
-    return folder, g, h, derive(folder / "run", "bands", {"posterior": str(folder / "fit")})
+    return folder, directory, g, h, derive(directory, "bands", {"posterior": str(folder / "fit")})
 
 
 def test_bands__bifurcations_are_those_of_the_closed_form(bench):
-    _, g, h, found = bench
+    _, _, g, h, found = bench
     words = str(found["kind"].attrs["flag_meanings"]).split()
     by_kind = {words[int(c)]: found["bifurcation_value"].values[:, k] for k, c in enumerate(found["kind"].values)}
     fold = h - 1 / (4 * g)
@@ -76,7 +49,7 @@ def test_bands__bifurcations_are_those_of_the_closed_form(bench):
 
 
 def test_bands__quantiles_of_orbits_are_those_of_the_closed_form(bench):
-    _, g, h, found = bench
+    _, _, g, h, found = bench
     assert found.sizes["orbit"] > GRID
     is_stable = found["is_stable"].values
     everywhere = np.flatnonzero(found["share"].values == 1.0)
@@ -114,19 +87,19 @@ def test_orbit_data__a_branch_that_turns_back_is_cut_there():
 
 
 def test_bands__are_kept_and_depend_on_the_draws(bench, tmp_path):
-    folder, g, h, found = bench
-    xr.testing.assert_equal(stored(folder / "run", "bands"), found)
+    folder, directory, g, h, found = bench
+    xr.testing.assert_equal(stored(directory, "bands"), found)
     write_draws(tmp_path / "posterior.nc", g[:10], h[:10])
-    other = derive(folder / "run", "bands", {"posterior": str(tmp_path)})
+    other = derive(directory, "bands", {"posterior": str(tmp_path)})
     np.testing.assert_array_equal(other["bifurcation_value"], found["bifurcation_value"][:10])
-    some = derive(folder / "run", "bands", {"posterior": str(folder / "fit"), "draws": 10})
+    some = derive(directory, "bands", {"posterior": str(folder / "fit"), "draws": 10})
     np.testing.assert_array_equal(other["bifurcation_value"], some["bifurcation_value"])
 
 
 @pytest.mark.parametrize("name", ["branches", "bifurcation"])
 def test_figure__shades_the_bands_and_draws_the_intervals(bench, name):
-    folder, g, h, found = bench
-    drawn = figure(folder / "run", name, posterior=str(folder / "fit"))
+    folder, directory, g, h, found = bench
+    drawn = figure(directory, name, posterior=str(folder / "fit"))
     ax = drawn.axes[0]
     shades = [c for c in ax.collections if c.get_gid() == "band"]
     assert len(shades) == len(list(stretches(found))) > 1
@@ -137,14 +110,14 @@ def test_figure__shades_the_bands_and_draws_the_intervals(bench, name):
 
 
 def test_bands__names_the_problem(bench, tmp_path):
-    folder = bench[0]
+    folder, directory, *_ = bench
     with pytest.raises(SpecError, match=r"has no posterior.nc"):
-        derive(folder / "run", "bands", {"posterior": str(tmp_path)})
+        derive(directory, "bands", {"posterior": str(tmp_path)})
     along = {"parameter": "g", "low": 1.0, "high": 1.4}
     with pytest.raises(SpecError, match=r"g was identified, and the branches run along it"):
-        derive(folder / "run", "bands", {"posterior": str(folder / "fit"), **along})
+        derive(directory, "bands", {"posterior": str(folder / "fit"), **along})
     with xr.open_dataset(folder / "fit" / "posterior.nc", engine="scipy") as ds:
         draws = ds.load()
     draws.assign_coords(parameter=["a", "b", "c", "d"]).to_netcdf(tmp_path / "other.nc", engine="scipy")
     with pytest.raises(SpecError, match=r"has the parameters a, b, c, d: another model's"):
-        derive(folder / "run", "bands", {"posterior": str(tmp_path / "other.nc")})
+        derive(directory, "bands", {"posterior": str(tmp_path / "other.nc")})

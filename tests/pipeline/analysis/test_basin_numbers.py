@@ -12,7 +12,6 @@ from pipeline.analysis.basins.numbers import (
     basin_entropy,
     basin_fractions,
     binomial_interval,
-    tipping_probabilities,
     uncertainty_exponent,
     wada_merge_test,
 )
@@ -183,71 +182,6 @@ def test_basin_fractions__inferred_cells_count_and_are_told():
             basin_fractions([0, 1, 1], inferred=wrong)
 
 
-def test_basin_fractions__refuses():
-    with pytest.raises(TypeError, match=r"float64.*integer code"):
-        basin_fractions([0.0, 1.0])
-    for nothing in (np.zeros((0, 3), dtype=int), 4):
-        with pytest.raises(ValueError, match="no cells"):
-            basin_fractions(nothing)
-    with pytest.raises(ValueError, match="confidence is 95"):
-        basin_fractions([0, 1], confidence=95)
-    with pytest.raises(ValueError, match="'wald'"):
-        basin_fractions([0, 1], method="wald")
-    with pytest.raises(ValueError, match="also in unfinished"):
-        basin_fractions([0, 1], ids=[-1])
-    with pytest.raises(ValueError, match=r"'y'.*not dims"):
-        basin_fractions(xr.DataArray([0, 1], dims="x"), dims=["y"])
-    with pytest.raises(ValueError, match="not within 0 and n"):
-        binomial_interval(5, 4)
-
-
-# --- tipping ---------------------------------------------------------------------------------------------
-
-
-def test_tipping_probabilities__published_toy_case():
-    # JuliaDynamics/Attractors.jl, test/basins/tipping_points_tests.jl
-    before, after = np.ones((20, 20), dtype=int), np.ones((20, 20), dtype=int)
-    before[:10, :10] = -1
-    after[:, 10:] = 2
-    ds = tipping_probabilities(before, after, unfinished=())
-    p = ds["probability"].sel(before=[1, -1], after=[1, 2]).values
-    np.testing.assert_allclose(p, [[1 / 3, 2 / 3], [1, 0]])
-    assert np.all((ds["low"] <= ds["probability"]) & (ds["probability"] <= ds["high"]))
-    assert 0 < ds["high"].sel(before=-1, after=2).item() < 0.05
-
-
-def test_tipping_probabilities__map_known_on_paper():
-    x = np.random.default_rng(2).uniform(-2, 2, 40_000)
-    ds = tipping_probabilities(cubic_map(x), cubic_map(x, threshold=1.5))
-    expected = [[1, 0, 0], [0.5, 0.5, 0], [0.5, 0, 0.5]]
-    np.testing.assert_allclose(ds["probability"], expected, atol=0.02)
-    covered = ((ds["low"] <= expected) & (expected <= ds["high"])).values
-    assert covered.all()
-
-
-def test_tipping_probabilities__unfinished():
-    ds = tipping_probabilities([0, 0, 0, 0, 1, 1, -1, -1], [0, 0, 1, -1, 1, -1, 0, 1])
-    np.testing.assert_allclose(ds["probability"], [[2 / 3, 1 / 3], [0, 1]])
-    np.testing.assert_allclose(ds["probability_if_none"], [[0.5, 0.25], [0, 0.5]])
-    np.testing.assert_allclose(ds["probability_if_all"], [[0.75, 0.5], [0.5, 1]])
-    np.testing.assert_allclose(ds["fraction_unfinished"], [0.25, 0.5])
-    assert ds["fraction_unfinished_before"].item() == 0.25
-
-
-def test_tipping_probabilities__cells_must_be_the_same():
-    a = xr.DataArray([[0, 1, 1], [0, 0, 0]], dims=("y", "x"), coords={"x": [0.0, 1.0, 2.0], "frequency": 2.0})
-    b = (1 - a).assign_coords(frequency=2.1)
-    straight = tipping_probabilities(a, b)
-    np.testing.assert_array_equal(straight["probability"], [[0, 1], [1, 0]])
-    xr.testing.assert_identical(tipping_probabilities(a, b.T), straight)
-    with pytest.raises(ValueError, match="'x' differs"):
-        tipping_probabilities(a, b.assign_coords(x=[0.0, 1.0, 3.0]))
-    with pytest.raises(ValueError, match="dims"):
-        tipping_probabilities(a, b.rename(y="z"))
-    with pytest.raises(ValueError, match="shape"):
-        tipping_probabilities([0, 1], [0, 1, 1])
-
-
 # --- entropy ---------------------------------------------------------------------------------------------
 
 
@@ -304,13 +238,6 @@ def test_basin_entropy__unfinished():
     assert basin_entropy(labels, 2, unfinished=())["n_labels"].item() == 3
 
 
-def test_basin_entropy__no_boundary():
-    ds = basin_entropy(np.full((20, 20), 4))
-    assert ds["entropy"].item() == 0.0
-    assert np.isnan(ds["boundary_entropy"].item())
-    assert not ds["above_ln2"].item()
-
-
 @pytest.mark.parametrize(("patch", "block", "low", "high"), [(1, 1, 0.8, 1.25), (4, 4, 0.8, 1.25), (4, 1, 0.1, 0.45)])
 def test_basin_entropy__bootstrap_tells_the_scatter(patch, block, low, high):
     # patches of boxes are mixed or not by a coin: the scatter over many such grids is the true error
@@ -333,20 +260,6 @@ def test_boundaries__names_of_labels_do_not_matter():
         for name in ("entropy", "entropy_stderr", "exponent", "exponent_stderr", "hausdorff_distance", "beyond_stderr"):
             if name in one:
                 np.testing.assert_allclose(one[name], other[name], rtol=1e-12)
-
-
-def test_basin_entropy__refuses():
-    labels = np.zeros((10, 10), dtype=int)
-    with pytest.raises(ValueError, match="2 cells"):
-        basin_entropy(labels, 1)
-    with pytest.raises(ValueError, match=r"larger than the grid \(10, 10\)"):
-        basin_entropy(labels, 11)
-    with pytest.raises(ValueError, match="3 sides, the grid 2"):
-        basin_entropy(labels, (2, 2, 2))
-    with pytest.raises(ValueError, match="block is 0"):
-        basin_entropy(labels, block=0)
-    with pytest.raises(ValueError, match="resamples is 1"):
-        basin_entropy(labels, resamples=1)
 
 
 # --- uncertainty exponent --------------------------------------------------------------------------------
@@ -440,23 +353,16 @@ def test_uncertainty_exponent__unfinished_cells_are_no_boundary():
     assert uncertainty_exponent(spoilt, unfinished=())["exponent"].item() < 0.7
 
 
-@pytest.mark.parametrize("method", ["perturbation", "boxes", "entropy"])
-def test_uncertainty_exponent__no_boundary(method):
-    ds = uncertainty_exponent(np.zeros((50, 50), dtype=int), method=method)
-    assert np.isnan(ds["exponent"].item())
-    assert not ds["used"].any()
-
-
-def test_uncertainty_exponent__refuses():
-    labels = np.zeros((50, 50), dtype=int)
-    with pytest.raises(ValueError, match="fewer than 3"):
-        uncertainty_exponent(labels, epsilons=[1, 2, 2])
-    with pytest.raises(ValueError, match="not within 1 and 24"):
-        uncertainty_exponent(labels, epsilons=[1, 2, 25])
-    with pytest.raises(ValueError, match="not within 2 and 50"):
-        uncertainty_exponent(labels, epsilons=[1, 2, 3], method="boxes")
-    with pytest.raises(ValueError, match="'balls'"):
-        uncertainty_exponent(labels, method="balls")
+def test_boundaries__of_one_basin():
+    labels = np.full((50, 50), 4)
+    for method in ("perturbation", "boxes", "entropy"):
+        ds = uncertainty_exponent(labels, method=method)
+        assert np.isnan(ds["exponent"].item())
+        assert not ds["used"].any()
+    ds = basin_entropy(labels)
+    assert ds["entropy"].item() == 0.0
+    assert np.isnan(ds["boundary_entropy"].item())
+    assert not ds["above_ln2"].item()
 
 
 # --- Wada ------------------------------------------------------------------------------------------------
@@ -525,15 +431,6 @@ def test_wada_merge_test__hidden_boundary():
     assert ds["fraction_unfinished"].item() == 0.25
 
 
-def test_wada_merge_test__refuses():
-    with pytest.raises(ValueError, match=r"2 labels \[0, 1\].*3 or more"):
-        wada_merge_test([[0, 1], [-1, 0]])
-    with pytest.raises(ValueError, match="radius 0"):
-        wada_merge_test([[0, 1], [2, 0]], [0, 3])
-    with pytest.raises(ValueError, match="'euclidean'"):
-        wada_merge_test([[0, 1], [2, 0]], metric="euclidean")
-
-
 def test_basin_entropy__few_boxes_have_no_error():
     """Three labels in one box exceed ln 2, and one box proves nothing."""
     one = np.arange(25).reshape(5, 5) % 3
@@ -550,3 +447,37 @@ def test_basin_entropy__few_boxes_have_no_error():
     assert not found["above_ln2_surely"]
     many = basin_entropy(np.tile(one, (8, 1)), 5)
     assert many["above_ln2_surely"]
+
+
+ONE, THREE = np.zeros((50, 50), int), [[0, 1], [2, 0]]
+
+
+@pytest.mark.parametrize(
+    ("function", "arguments", "message"),
+    [
+        (basin_fractions, ([0.0, 1.0],), r"float64.*integer code"),
+        (basin_fractions, (np.zeros((0, 3), int),), "no cells"),
+        (basin_fractions, (4,), "no cells"),
+        (basin_fractions, ([0, 1], {"confidence": 95}), "confidence is 95"),
+        (basin_fractions, ([0, 1], {"method": "wald"}), "'wald'"),
+        (basin_fractions, ([0, 1], {"ids": [-1]}), "also in unfinished"),
+        (basin_fractions, (xr.DataArray([0, 1], dims="x"), {"dims": ["y"]}), r"'y'.*not dims"),
+        (binomial_interval, (5, 4), "not within 0 and n"),
+        (basin_entropy, (ONE, 1), "2 cells"),
+        (basin_entropy, (ONE, 51), r"larger than the grid \(50, 50\)"),
+        (basin_entropy, (ONE, (2, 2, 2)), "3 sides, the grid 2"),
+        (basin_entropy, (ONE, {"block": 0}), "block is 0"),
+        (basin_entropy, (ONE, {"resamples": 1}), "resamples is 1"),
+        (uncertainty_exponent, (ONE, {"epsilons": [1, 2, 2]}), "fewer than 3"),
+        (uncertainty_exponent, (ONE, {"epsilons": [1, 2, 25]}), "not within 1 and 24"),
+        (uncertainty_exponent, (ONE, {"epsilons": [1, 2, 3], "method": "boxes"}), "not within 2 and 50"),
+        (uncertainty_exponent, (ONE, {"method": "balls"}), "'balls'"),
+        (wada_merge_test, ([[0, 1], [-1, 0]],), r"2 labels \[0, 1\].*3 or more"),
+        (wada_merge_test, (THREE, [0, 3]), "radius 0"),
+        (wada_merge_test, (THREE, {"metric": "euclidean"}), "'euclidean'"),
+    ],
+)
+def test_numbers__refuse(function, arguments, message):
+    options = arguments[-1] if isinstance(arguments[-1], dict) else {}
+    with pytest.raises((TypeError, ValueError), match=message):
+        function(*arguments[: len(arguments) - bool(options)], **options)

@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from magpend_core import trajectory
 from magpend_core.models import load_model
 from pipeline.analysis.branches import Scope, Start, curves_dataset, curves_from, dataset_of, explore
 from pipeline.analysis.branches.arclength import Settings
 from pipeline.analysis.branches.problems import Family
-from pipeline.analysis.branches.table import branches_table, curves_table, windows_of
+from pipeline.analysis.branches.table import curves_table
 
 DUFFING = load_model("duffing")
 TWO_PI = 2.0 * np.pi
@@ -64,21 +63,6 @@ def test_explore__folds_by_harmonic_balance():
     assert (errors[0] / errors[1] > 8.0).all()
 
 
-def test_dataset_of__model_without_angles():
-    """States, units and dims are the model's; there are no sides, and no angle turns."""
-    parameters = weakly_nonlinear(0.1)
-    branch, found, _ = folds_of(parameters)
-    ds = dataset_of([branch], "frequency", parameters)
-    assert ds["state"].values.tolist() == ["x", "v"]
-    assert ds["section"].attrs["units"] == "m, m/s"
-    assert ds.sizes["angle"] == 0
-    assert "side" not in ds
-    table = branches_table(ds)
-    assert [row["frequency_hz"] for row in table.rows] == pytest.approx(found / TWO_PI)
-    assert any("stable segments" in line for line in table.lines)
-    assert {w["begins"] for w in windows_of(ds)} == {"bound", "fold"}
-
-
 def test_curves_from__folds_meet_in_a_cusp():
     """With less drive the two folds come together; the curve is one, through the cusp."""
     parameters = weakly_nonlinear(0.025)
@@ -96,22 +80,3 @@ def test_curves_from__folds_meet_in_a_cusp():
     (row,) = curves_table(told).rows
     assert (row["type"], row["period"]) == ("cusp", 1)
     assert row["amplitude"] == pytest.approx(least, rel=1e-3)
-
-
-def test_explore__twin_wells_are_mirror_images():
-    """Both wells' cascades have their doublings at the same amplitudes, half a period apart."""
-    frequency = 1.2 / TWO_PI
-    parameters = DUFFING.load("twin-well", damping=0.3, amplitude=0.2)
-    family = Family(DUFFING.system, 1, frequency, parameters.pack(), ("amplitude",), (0.1,))
-    times = np.array([400.0, 400.5]) / frequency
-    right, half = trajectory(parameters, frequency, np.array([1.2, 0.0]), times)
-    scope = Scope(0.2, 0.29, max_period=2, settings=Settings(longest_step=0.05))
-    branches = explore([Start(family, right, 0.2), Start(family, -half, 0.2)], scope)
-    assert sorted(b.family.period for b in branches) == [1, 1, 2, 2]
-    for period in (1, 2):
-        one, other = (b for b in branches if b.family.period == period)
-        at = [[b.family.values(x.point.u)[0] for x in b.bifurcations] for b in (one, other)]
-        assert at[0] == pytest.approx(at[1], abs=1e-8)
-    rows = branches_table(dataset_of(branches, "amplitude", parameters)).rows
-    assert {row["type"] for row in rows} == {"period_doubling"}
-    assert {row["frequency_hz"] for row in rows} == {frequency}

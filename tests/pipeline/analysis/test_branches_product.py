@@ -15,7 +15,6 @@ from pipeline.products.branches import BranchOptions
 from pipeline.products.registry import ANALYSES, FIGURES
 from pipeline.products.reporting import reporting
 from pipeline.runs.derive import AnalysedRun, derive, prepared
-from pipeline.runs.run import run
 from pipeline.specification.problems import SpecError
 
 SPEC = """
@@ -44,12 +43,9 @@ SHORT = {**ALONG, "max_period": 2}
 
 
 @pytest.fixture(scope="module")
-def directory(tmp_path_factory):
+def directory(computed):
     """A run over the cascade of a twin-well oscillator: periods 1, 2, 4 and chaos."""
-    folder = tmp_path_factory.mktemp("branches")
-    (folder / "spec.toml").write_text(SPEC)
-    run(folder / "spec.toml", folder / "run", workers=0, echo=lambda line: None)
-    return folder / "run"
+    return computed(SPEC)
 
 
 def test_attractors__ids_through_the_cascade(directory):

@@ -14,7 +14,6 @@ from pipeline.analysis.attractors.matching.matching import BASES, match
 from pipeline.analysis.branches import connecting, lockstep
 from pipeline.analysis.branches.arclength import Settings
 from pipeline.analysis.branches.connecting import Found, Link, connect, grouped
-from pipeline.analysis.branches.exploring import Scope, Start, explore
 from pipeline.analysis.branches.problems import Family
 from pipeline.layout.vocabulary import PERIODIC_ORBIT
 
@@ -23,20 +22,6 @@ FREQUENCY = 1.2 / (2.0 * np.pi)
 # the orbit in one well doubles its period at 0.2656 and again at 0.2867
 TWIN_WELL = DUFFING.load("twin-well", damping=0.3)
 HARDENING = DUFFING.load("hardening")
-
-
-def settled(parameters, frequency, state, n=300):
-    result = run_branches(
-        parameters.pack()[None, None],
-        np.array([[frequency]]),
-        np.array([state]),
-        n_transient=n,
-        n_keep=1,
-        rtol=1e-9,
-        atol=1e-9,
-        system=DUFFING.system,
-    )
-    return result.section[0, 0, -1]
 
 
 def closed(parameters, frequency, state, period):
@@ -53,12 +38,9 @@ def closed(parameters, frequency, state, period):
 
 
 @pytest.fixture(scope="module")
-def wells():
+def wells(cascade):
     """Orbits of one well by period and amplitude, taken from its branches."""
-    start = settled(TWIN_WELL.replace(amplitude=0.2), FREQUENCY, [1.2, 0.0])
-    family = Family(DUFFING.system, 1, FREQUENCY, TWIN_WELL.pack(), ("amplitude",), (0.1,))
-    scope = Scope(0.15, 0.3, max_period=4, settings=Settings(longest_step=0.05))
-    branches = explore([Start(family, start, 0.2)], scope)
+    _, branches = cascade
 
     def orbit(period, amplitude):
         branch = next(b for b in branches if b.family.period == period)
@@ -103,17 +85,16 @@ def test_connect__doublings(wells):
     assert found.down == {1: "linked", 2: "linked"}
 
 
-def resonance(*frequencies):
+@pytest.fixture(scope="module")
+def resonance(settled):
     """Orbits of a hardening spring, on the upper branch below the fold and on the lower one above."""
-    found, state = [], [0.3, 0.0]
-    for frequency in frequencies:
-        state = settled(HARDENING, frequency, state)
-        found.append(closed(HARDENING, frequency, state, 1))
-    return found
+    low = settled(HARDENING, 0.15, [0.3, 0.0])
+    high = settled(HARDENING, 0.3, low)
+    return closed(HARDENING, 0.15, low, 1), closed(HARDENING, 0.3, high, 1)
 
 
-def test_connect__beyond_a_fold_is_another_branch():
-    low, high = resonance(0.15, 0.3)
+def test_connect__beyond_a_fold_is_another_branch(resonance):
+    low, high = resonance
     orbits = line((0, 0.15, low), (1, 0.3, high), scale=0.15, free="frequency", parameters=HARDENING)
     (found,) = connect([orbits])
     assert not found.links
@@ -206,8 +187,8 @@ def test_match__coexisting_attractors_have_different_ids(wells):
     assert named["orbit_period"].values.tolist() == [[1, 0], [1, 2]]
 
 
-def test_match__distance_does_not_overrule_a_fold():
-    ds = appearances("frequency", [0.15, 0.3], *([x] for x in resonance(0.15, 0.3)), parameters=HARDENING)
+def test_match__distance_does_not_overrule_a_fold(resonance):
+    ds = appearances("frequency", [0.15, 0.3], *([x] for x in resonance), parameters=HARDENING)
     assert told(match(ds, threshold=10.0)) == [[(0, "first_appearance")], [(1, "first_appearance")]]
     assert told(match(ds, threshold=10.0, connect=False)) == [[(0, "first_appearance")], [(0, "distance")]]
 

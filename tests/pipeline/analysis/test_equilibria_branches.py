@@ -194,27 +194,9 @@ def flutter_matrices():
     return np.linalg.inv(mass), damping, stiffness
 
 
-def flutter():
-    """The flutter rig as text: heave, pitch, lag and their rates."""
-    p = type("P", (), FLUTTER | RIG)
-    inverse, damping, stiffness = flutter_matrices()
-    terms = [("", 1.0), ("*U", 1.0), ("*U^2", 1.0), ("*U^3", 1.0)]
-    equations = {"h": "vh", "al": "va", "w": "vw"}
-    for i, name in enumerate(("vh", "va", "vw")):
-        parts = [f"({float(-inverse[i, 1] * p.k2)!r})*al^2", f"({float(-inverse[i, 1] * p.k3)!r})*al^3"]
-        for power, (factor, _) in enumerate(terms):
-            for matrix, states in ((damping, ("vh", "va", "vw")), (stiffness, ("h", "al", "w"))):
-                row = -(inverse @ matrix[power])[i]
-                parts += [f"({float(c)!r}){factor}*{state}" for c, state in zip(row, states, strict=True) if c != 0.0]
-        equations[name] = " + ".join(parts)
-    scales = {"h": 0.05, "al": 0.3, "w": 0.3, "vh": 1.0, "va": 5.0, "vw": 5.0}
-    states = {name: {"unit": "1", "scale": scale} for name, scale in scales.items()}
-    return load_model({"name": "flutter", "states": states, "parameters": {"U": 16.0}, "equations": equations})
-
-
 def test_equilibria__flutter_rig():
     """Hopf point and fold of the cycles as own shooting with DOP853 found them (Lee, Barton and Renson's model)."""
-    found, _ = branches_of(flutter(), "U", (14.0, 20.0), [0.0] * 6, 19.0, Crossing("h", 0.0, "up", 5.0))
+    found, _ = branches_of(load_model("flutter"), "U", (14.0, 20.0), [0.0] * 6, 19.0, Crossing("h", 0.0, "up", 5.0))
     hopf, speed = only(found[0], "hopf")
     assert speed == pytest.approx(17.957265, abs=1e-6)
     assert hopf.criticality == "subcritical"

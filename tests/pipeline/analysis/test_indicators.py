@@ -10,6 +10,8 @@ from pipeline.analysis.chaos.zero_one import _displacement, zero_one_test
 from pipeline.analysis.sets import Geometry
 from pipeline.products.lyapunov import LyapunovFlag
 
+from .maps import henon
+
 LINE, PLANE = Geometry((False,), (1.0,)), Geometry((False, False), (1.0, 1.0))
 CIRCLE, TORUS = Geometry((True,), (1.0,)), Geometry((True, True), (1.0, 1.0))
 GOLDEN = 2.0 * np.pi * 0.5 * (np.sqrt(5.0) - 1.0)
@@ -22,17 +24,6 @@ def cube(section, status=None):
     if status is not None:
         ds["status"] = ("initial_condition", np.array(status, np.int8))
     return ds.assign_coords(state=[f"x{i}" for i in range(section.shape[-1])])
-
-
-def henon(n_cells, n, seed=0):
-    """x' = 1 - 1.4 x^2 + y, y' = 0.3 x, after a transient."""
-    x, y = np.random.default_rng(seed).uniform(-0.1, 0.1, (2, n_cells))
-    section = np.empty((n_cells, n, 2))
-    for i in range(-200, n):
-        x, y = 1.0 - 1.4 * x * x + y, 0.3 * x
-        if i >= 0:
-            section[:, i] = np.stack([x, y], axis=-1)
-    return section
 
 
 def logistic(rates, n):

@@ -2,50 +2,22 @@
 
 import numpy as np
 import pytest
-import xarray as xr
 from matplotlib.collections import PolyCollection
-from matplotlib.legend import Legend
 
 from magpend_core import Status, load_preset, lyapunov_exponents
 from magpend_core.orbits import stroboscopic_map
 from pipeline.analysis.chaos.lyapunov import Motion, spectrum_of_jacobians, summarise
 from pipeline.plots import plot_lyapunov, plot_lyapunov_map
 
-STATES = ["psi1", "psi2", "psi1_dot", "psi2_dot"]
+from .cubes import exponents_cube
+from .maps import henon, slopes_of
 
-
-def make_cube(rates, *, stderr=0.02, n_exponents=4, blocks=8, **dims):
-    """Cube of made-up exponents; `rates` are the largest, with the given dims."""
-    names, shape = list(dims), tuple(len(v) for v in dims.values())
-    rates = np.asarray(rates, float).reshape(shape)
-    spectrum = rates[..., None] + np.array([0.0, -0.4, -0.9, -1.5])[:n_exponents]
-    wave = 0.05 * np.array([1, -1] * (blocks // 2))
-    series = spectrum[..., None, :] + wave[:, None]
-    section = np.full((*shape, 5, 4), 0.3)
-    return xr.Dataset(
-        {
-            "section": ((*names, "period_index", "state"), section),
-            "status": (names, np.full(shape, Status.BOUNDED, np.int8)),
-            "orbit_period": (names, np.zeros(shape, np.int16)),
-            "turns": ((*names, "link"), np.zeros((*shape, 2), np.int32)),
-            "lyapunov": ((*names, "exponent"), spectrum, {"units": "1/s"}),
-            "lyapunov_stderr": ((*names, "exponent"), np.full(spectrum.shape, stderr)),
-            "lyapunov_blocks": ((*names, "block", "exponent"), series),
-            "divergence": (names, spectrum.sum(-1) + 0.001),
-            "lyapunov_flag": (names, np.ones(shape, np.int8)),
-        },
-        coords={**dims, "state": STATES, "exponent": np.arange(1, n_exponents + 1), "frequency": dims["frequency"]},
-        attrs={"model": "pendulum", "parameters": PARAMETERS},
-    )
-
-
-PARAMETERS = "\n".join(f"{k} = {v!r}" for k, v in load_preset().items())
 FREQUENCY = np.array([1.0, 2.0, 4.0])
 
 
 @pytest.fixture
 def cube():
-    return make_cube([[1.0, 0.2], [0.01, -0.3], [0.9, 0.8]], frequency=FREQUENCY, initial_condition=[0, 1])
+    return exponents_cube([[1.0, 0.2], [0.01, -0.3], [0.9, 0.8]], frequency=FREQUENCY, initial_condition=[0, 1])
 
 
 def test_summarise__per_period_is_per_time_over_frequency(cube):
@@ -103,13 +75,8 @@ def test_summarise__a_cube_without_exponents_is_refused(cube):
 
 def test_spectrum_of_jacobians__henon():
     # a = 1.4, b = 0.3: l1 = 0.419 (0.4192), l1 + l2 = ln 0.3
-    n_cells, n_transient, n = 100, 50, 4096
-    x, y = np.random.default_rng(0).uniform(-0.1, 0.1, (2, n_cells))
-    jacobians = np.zeros((n_cells, n_transient + n, 2, 2))
-    jacobians[..., 0, 1], jacobians[..., 1, 0] = 1.0, 0.3
-    for i in range(n_transient + n):
-        jacobians[:, i, 0, 0] = -2.8 * x
-        x, y = 1.0 - 1.4 * x * x + y, 0.3 * x
+    n_transient = 50
+    jacobians = slopes_of(henon(100, n_transient + 4096, n_transient=0))
     found = spectrum_of_jacobians(jacobians, n_transient=n_transient)
     assert found.exponents[:, 0].mean() == pytest.approx(0.419, abs=0.001)
     assert found.exponents.sum(axis=1) == pytest.approx(np.log(0.3), abs=1e-12)
@@ -166,53 +133,32 @@ def artists(fig, gid):
     return [a for a in fig.findobj(lambda a: getattr(a, "get_gid", lambda: None)() == gid)]
 
 
-def test_plot_lyapunov__points_are_the_largest_exponents(cube):
+def test_plot_lyapunov__points_are_the_largest_exponents_with_their_errors(cube):
+    cube["lyapunov"][0, 1, 0] = 0.97
+    cube["lyapunov_flag"][1, 1] = 2
     fig = plot_lyapunov(cube)
-    (line,) = artists(fig, "exponent:2")  # right: psi1 = psi2 = 0.3
-    drawn = sorted(zip(line.get_xdata(), line.get_ydata(), strict=True))
+    (line,), (flagged,) = artists(fig, "exponent:2"), artists(fig, "flagged:exponent:2")  # right: psi1 = psi2 = 0.3
+    drawn = [*zip(line.get_xdata(), line.get_ydata(), strict=True)]
+    assert (flagged.get_xdata().tolist(), flagged.get_ydata().tolist()) == ([2.0], pytest.approx([-0.3]))
     expected = sorted((f, v) for f, row in zip(FREQUENCY, cube.lyapunov.values[..., 0], strict=True) for v in row)
-    assert np.array(drawn) == pytest.approx(np.array(expected))
+    expected.remove((2.0, -0.3))
+    assert np.array(sorted(drawn)) == pytest.approx(np.array(expected))
+    # bands are one error wide; those of 1.0 and 0.97 overlap
+    (band,) = [a for a in artists(fig, "band:exponent:2") if isinstance(a, PolyCollection)]
+    assert (0.95, 1.02) in {
+        (round(p.vertices[:, 1].min(), 9), round(p.vertices[:, 1].max(), 9)) for p in band.get_paths()
+    }
     top, bottom = fig.axes
     assert bottom.get_shared_x_axes().joined(top, bottom)
     assert bottom.get_ylabel() == "largest exponent [1/s]"
-    assert bottom.get_xlabel() == "drive frequency [Hz]"
-
-
-def test_plot_lyapunov__bands_are_one_error_wide_and_joined(cube):
-    cube["lyapunov"][0, 1, 0] = 0.97
-    (band,) = [a for a in artists(plot_lyapunov(cube), "band:exponent:2") if isinstance(a, PolyCollection)]
-    spans = {(round(p.vertices[:, 1].min(), 9), round(p.vertices[:, 1].max(), 9)) for p in band.get_paths()}
-    assert (0.95, 1.02) in spans  # 1.0 and 0.97 overlap
-    assert (-0.32, -0.28) in spans
-    assert len(spans) == 5
-
-
-def test_plot_lyapunov__spectrum_per_period(cube):
-    fig = plot_lyapunov(cube, spectrum=True, per="period")
-    for k in range(4):
-        (line,) = artists(fig, f"exponent:{k + 1}")
-        assert sorted(line.get_ydata()) == pytest.approx(
-            sorted((cube.lyapunov.values[..., k] / FREQUENCY[:, None]).ravel())
-        )
-    assert fig.axes[1].get_ylabel() == "exponents [1/period]"
-    assert fig.data["exponent_value"].attrs["per"] == "drive period"
-
-
-def test_plot_lyapunov__flagged_cells_are_open(cube):
-    cube["lyapunov_flag"][1, 1] = 2
-    fig = plot_lyapunov(cube)
-    (line,) = artists(fig, "flagged:exponent:2")
-    assert (line.get_xdata().tolist(), line.get_ydata().tolist()) == ([2.0], pytest.approx([-0.3]))
-    assert line.get_markerfacecolor() == "none"
-    assert "flagged" in [t.get_text() for legend in fig.findobj(Legend) for t in legend.get_texts()]
 
 
 def test_plot_lyapunov__mistakes(cube):
     with pytest.raises(ValueError, match="unknown unit"):
         plot_lyapunov(cube, per="second")
-    with pytest.raises(ValueError, match="no Lyapunov exponents"):
-        plot_lyapunov(cube.drop_vars("lyapunov"))
-    two = make_cube(np.zeros((2, 2)), frequency=[1.0, 2.0], q=[1.0, 1.5])
+    with pytest.raises(ValueError, match=r"two swept parameters, and 1 are left \(frequency\)"):
+        plot_lyapunov_map(cube)
+    two = exponents_cube(np.zeros((2, 2)), frequency=[1.0, 2.0], q=[1.0, 1.5])
     with pytest.raises(ValueError, match="choose a value first"):
         plot_lyapunov(two)
     assert plot_lyapunov(two, at={"q": 1.5}).data["exponent_value"].sizes == {"frequency": 2, "exponent": 1}
@@ -220,7 +166,7 @@ def test_plot_lyapunov__mistakes(cube):
 
 def test_plot_lyapunov_map__the_largest_over_the_cells():
     rates = np.array([[[0.5, -0.1], [-0.2, -0.3]], [[0.1, 0.7], [np.nan, np.nan]]])
-    cube = make_cube(rates, frequency=[1.0, 2.0], q=[1.0, 1.5], initial_condition=[0, 1])
+    cube = exponents_cube(rates, frequency=[1.0, 2.0], q=[1.0, 1.5], initial_condition=[0, 1])
     fig = plot_lyapunov_map(cube)
     (mesh,) = artists(fig, "map")
     expected = np.array([[0.5, 0.7], [-0.2, np.nan]])  # rows q, columns frequency
@@ -230,8 +176,3 @@ def test_plot_lyapunov_map__the_largest_over_the_cells():
     assert per_period == pytest.approx(expected / np.array([1.0, 2.0]), nan_ok=True)
     # white is zero on both sides of the scale
     assert mesh.norm(0.0) == 0.5
-
-
-def test_plot_lyapunov_map__needs_two_parameters(cube):
-    with pytest.raises(ValueError, match=r"two swept parameters, and 1 are left \(frequency\)"):
-        plot_lyapunov_map(cube)

@@ -20,7 +20,6 @@ from pipeline.plots.edge import plot_edge
 from pipeline.plots.resilience import plot_resilience
 from pipeline.products.attractors import AttractorOptions
 from pipeline.runs.derive import AnalysedRun
-from pipeline.runs.run import run
 from pipeline.specification.problems import SpecError
 
 DUFFING = """
@@ -66,22 +65,10 @@ closure_tolerance = 1e-4
 """
 
 
-def computed(folder, text):
-    """Compute a run."""
-    (folder / "spec.toml").write_text(text)
-    run(folder / "spec.toml", folder / "run", workers=0, echo=lambda line: None)
-    return AnalysedRun.of(folder / "run")
-
-
 @pytest.fixture(scope="module")
-def duffing(tmp_path_factory):
+def duffing(computed):
     """Make a run of the Duffing oscillator with some values of its own."""
-
-    def make(**values):
-        folder = tmp_path_factory.mktemp("duffing")
-        return computed(folder, DUFFING.format(**{**WELLS, **values}))
-
-    return make
+    return lambda **values: AnalysedRun.of(computed(DUFFING.format(**{**WELLS, **values})))
 
 
 @pytest.fixture(scope="module")
@@ -95,8 +82,8 @@ def found(wells):
 
 
 @pytest.fixture(scope="module")
-def magnets(tmp_path_factory):
-    return computed(tmp_path_factory.mktemp("magnets"), MAGNETS)
+def magnets(computed):
+    return AnalysedRun.of(computed(MAGNETS))
 
 
 def at_point(a_run):
@@ -135,16 +122,15 @@ def well_of(states, begin):
 def exhaustive():
     """Smallest shock of v from each orbit at each of eight phases, from all multiples of .004 up to .3 (DOP853)."""
     sizes = np.arange(1, 76) * 0.004
+    shocks = np.outer(np.concatenate([sizes, -sizes]), [0.0, 1.0])
     least = np.full((2, 8), np.inf)
     for k in range(8):
         begin = 2.0 * np.pi * k / 8
-        for well, point in enumerate(WELL_POINTS):
-            base = flow(point[None], 0.0, begin, rtol=1e-12)[0] if k else point
-            for sign in (1.0, -1.0):
-                ends = well_of(base + sizes[:, None] * [0.0, sign], begin)
-                away = np.flatnonzero(ends == 1 - well)
-                if len(away):
-                    least[well, k] = min(least[well, k], sizes[away[0]])
+        base = flow(WELL_POINTS, 0.0, begin, rtol=1e-12) if k else WELL_POINTS
+        ends = well_of((base[:, None] + shocks).reshape(-1, 2), begin).reshape(2, 2, -1)
+        for well in (0, 1):
+            away = (ends[well] == 1 - well).any(axis=0)
+            least[well, k] = sizes[away.argmax()] if away.any() else np.inf
     return least
 
 
@@ -300,10 +286,8 @@ def test_edge__of_a_fractal_boundary(wells):
     lines = edge_table(found).lines
     assert "on a path" in "\n".join(lines)
     figure = plot_edge(found)
-    assert {line.get_gid().partition(":")[0] for line in figure.axes[0].lines if ":" in (line.get_gid() or "")} == {
-        "edge orbit",
-        "edge set",
-    }
+    gids = {line.get_gid().partition(":")[0] for line in figure.axes[0].lines if ":" in (line.get_gid() or "")}
+    assert gids == {"edge orbit", "edge set"}
 
 
 def test_edge__of_a_smooth_boundary(duffing):

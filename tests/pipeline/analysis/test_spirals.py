@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import xarray as xr
 
 from magpend_core import load_preset, sections
 from pipeline.analysis.attractors.attractors import identify
@@ -13,6 +12,8 @@ from pipeline.analysis.attractors.finding.requests import LEG
 from pipeline.analysis.attractors.finding.spirals import Recurrence, leap, near_closed
 from pipeline.analysis.sets import Geometry
 from pipeline.layout.vocabulary import ATTRACTS, BOUNDED_SET, NOT_SETTLED, PERIODIC_ORBIT
+
+from .cubes import STATES, cube_of
 
 LINE, PLANE = Geometry((False,), (1.0,)), Geometry((False, False), (1.0, 1.0))
 
@@ -31,16 +32,7 @@ SLOW = [
 def cell(frequency, state):
     """One cell that did not close, as the quickstart keeps it."""
     found = sections(load_preset(), frequency, np.array([state]), n_transient=0, n_keep=60, rtol=1e-7, atol=1e-7)
-    return xr.Dataset(
-        {
-            "section": (("initial_condition", "period_index", "state"), found.section),
-            "turns": (("initial_condition", "link"), found.turns),
-            "status": ("initial_condition", found.status),
-            "orbit_period": ("initial_condition", found.orbit_period),
-        },
-        coords={"frequency": frequency, "state": ["psi1", "psi2", "psi1_dot", "psi2_dot"]},
-        attrs={"rtol": 1e-7, "atol": 1e-7},
-    )
+    return cube_of(found, STATES, frequency=frequency).assign_attrs(rtol=1e-7, atol=1e-7)
 
 
 @pytest.mark.parametrize(("frequency", "state", "period"), SLOW)

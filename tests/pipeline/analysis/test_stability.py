@@ -11,7 +11,6 @@ from pipeline.analysis.attractors.table import attractors_table
 from pipeline.analysis.outcomes import other_cells, outcomes, sentence
 from pipeline.layout.vocabulary import ATTRACTS, NEUTRAL, UNSTABLE
 from pipeline.runs.derive import derive, stale
-from pipeline.runs.run import run
 
 
 def orbit(multiplier, residual=1e-13):
@@ -45,14 +44,14 @@ kind = "sweep"
 frequency_hz = 1.0
 [model]
 name = "unst"
-states = {{ x = {{}}, y = {{}} }}
-parameters = {{ r = 0.3 }}
-equations = {{ x = "r*x - x**3", y = "-y + cos(2*pi*f*t)" }}
+states = { x = {}, y = {} }
+parameters = { r = 0.3 }
+equations = { x = "r*x - x**3", y = "-y + cos(2*pi*f*t)" }
 [axes]
-r = {{ values = {values} }}
+r = { values = [0.0, 0.001, 3.0] }
 [initial_conditions]
 kind = "grid"
-x = {{ start = -1.0, stop = 1.0, num = 5 }}
+x = { start = -1.0, stop = 1.0, num = 5 }
 y = 0.0
 [integration]
 n_transient = 300
@@ -62,11 +61,8 @@ n_keep = 60
 
 
 @pytest.fixture(scope="module")
-def pitchfork(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("pitchfork")
-    (folder / "spec.toml").write_text(SPEC.format(values=[0.0, 0.001, 3.0]))
-    run(folder / "spec.toml", folder / "run", workers=0)
-    return folder / "run"
+def pitchfork(computed):
+    return computed(SPEC)
 
 
 def test_attractors__a_repeller_on_the_grid_is_none(pitchfork):

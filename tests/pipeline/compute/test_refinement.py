@@ -185,17 +185,17 @@ def test_orbits__cyclic_sets_on_the_circle_with_turns():
 # ---- Duffing oscillator ------------------------------------------------------------------------
 
 
-TOLERANCE = 1e-4
+TOLERANCE, DUFFING = 1e-4, load_model("duffing").system
 
 
-def two_wells(n, system):
+def two_wells(n):
     """Function that integrates cells of an n x n grid of the Duffing oscillator by their flat indices."""
     x = np.linspace(-2.0, 2.0, n)
     starts = np.stack(np.meshgrid(x, x, indexing="ij"), axis=-1).reshape(-1, 2)
 
     def integrate(cells):
         result = run_branches(
-            np.broadcast_to([0.25, 0.08], (len(cells), 1, 2)),
+            np.broadcast_to([0.25, -1.0, 1.0, 0.08], (len(cells), 1, 4)),
             np.full((len(cells), 1), 0.2),
             starts[cells],
             n_transient=200,
@@ -205,24 +205,24 @@ def two_wells(n, system):
             stop_when_closed=True,
             closure_tolerance=TOLERANCE,
             max_orbit_period=4,
-            system=system,
+            system=DUFFING,
         )
         return {v.name: getattr(result, v.name)[:, 0] for v in VARIABLES}
 
     return integrate
 
 
-def test_infer__duffing_against_the_full_grid(duffing):
+def test_infer__duffing_against_the_full_grid():
     n = 96
-    integrate, asked = two_wells(n, duffing), []
+    integrate, asked = two_wells(n), []
 
     def counted(cells):
         asked.extend(cells)
         return integrate(cells)
 
     full = integrate(np.arange(n * n))
-    found = infer((n, n), 8, counted, closure_tolerance=TOLERANCE, system=duffing)
-    orbits = Orbits(SAME * TOLERANCE, duffing)
+    found = infer((n, n), 8, counted, closure_tolerance=TOLERANCE, system=DUFFING)
+    orbits = Orbits(SAME * TOLERANCE, DUFFING)
     labels = orbits.classes(full)
     assert set(np.unique(labels)) == {0, 1}
     inferred = found["status"] == Status.INFERRED
@@ -406,7 +406,7 @@ def test_parse_spec__refine_problems(change, path, remedy):
     assert remedy in problem
 
 
-def test_orbits__model_without_angles_has_no_turns(duffing):
+def test_orbits__model_without_angles_has_no_turns():
     section = np.array([[[0.1, 0.2]], [[0.1, 0.2]], [[0.9, 0.0]]])
     cells = {"section": section, "status": np.full(3, Status.PERIODIC, np.int8), "orbit_period": np.ones(3, np.int16)}
-    assert Orbits(1e-6, duffing).classes(cells).tolist() == [0, 0, 1]
+    assert Orbits(1e-6, DUFFING).classes(cells).tolist() == [0, 0, 1]

@@ -94,16 +94,6 @@ def test_find_edges__a_band_outside_the_levels_is_refused(hysteresis):
         find_edges(time, square(time), hysteresis=hysteresis)
 
 
-def test_frequency__noise_free_edges_give_the_drive_back():
-    time = np.arange(120_000) / 1000
-    timing = find_edges(time, square(time, 2.2)).frequency()
-    assert timing.frequency_hz == pytest.approx(2.2, abs=4 * timing.frequency_error_hz)
-    assert timing.frequency_error_hz < 2e-6
-    assert timing.duty_cycle == pytest.approx(DUTY, abs=4 * timing.duty_cycle_error)
-    # an edge is known to a sample's 1/sqrt(12), and the line through it has that scatter
-    assert timing.jitter_s == pytest.approx(1e-3 / np.sqrt(12), rel=0.1)
-
-
 @pytest.mark.parametrize("jitter", [2e-3, 1e-4, 0.0])
 def test_frequency__errors_hold_over_many_recordings(jitter):
     """Monte Carlo: over recordings with a known jitter, the z scores have spread 1."""
@@ -151,11 +141,8 @@ def test_frequency__a_missing_edge_is_counted():
     assert timing.frequency_hz == pytest.approx(2.5, rel=1e-12)
     assert timing.n_periods == 49
     assert timing.duty_cycle == pytest.approx(0.5, rel=1e-12)
-
-
-def test_frequency__far_from_time_zero_nothing_cancels():
-    rising = 1e6 + np.arange(50) / 2.5
-    assert Edges(rising, rising + 0.2).frequency().frequency_hz == pytest.approx(2.5, rel=1e-9)
+    # far from time zero nothing cancels
+    assert Edges(rising + 1e6, rising + 1e6 + 0.2).frequency().frequency_hz == pytest.approx(2.5, rel=1e-9)
 
 
 def test_frequency__too_few_edges_or_no_period_are_refused():

@@ -12,12 +12,17 @@ from pipeline.rig.measured_branch.cycles import CyclesError, cycles_of
 from pipeline.rig.measured_branch.figure import plot_branch
 from pipeline.rig.measured_branch.reading import read_branch
 from pipeline.runs.derive import AnalysedRun
-from pipeline.runs.run import run
 from pipeline.runs.workflows import shipped_workflows
 from pipeline.specification.problems import SpecError
 
 LINEAR = """
 kind = "sweep"
+model = "duffing"
+[parameters.overrides]
+damping = 0.3
+linear = 1.0
+cubic = 0.0
+amplitude = 0.2
 [axes]
 frequency_hz = { start = 0.1, stop = 0.3, num = 5 }
 [initial_conditions]
@@ -28,11 +33,6 @@ rtol = 1e-10
 atol = 1e-10
 n_transient = 300
 n_keep = 4
-[model]
-name = "linear"
-states = { x = { unit = "m" }, v = { unit = "m/s" } }
-parameters = { d = 0.3, A = 0.2 }
-equations = { x = "v", v = "A*cos(2*pi*f*t) - d*v - x" }
 """
 
 FLUTTER = shipped_workflows()["flutter"]
@@ -91,11 +91,8 @@ def test_read_branch__recordings_of_the_flutter_rig():
 
 
 @pytest.fixture(scope="module")
-def linear(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("linear")
-    (folder / "spec.toml").write_text(LINEAR)
-    run(folder / "spec.toml", folder / "run", workers=0, echo=lambda line: None)
-    return AnalysedRun.of(folder / "run")
+def linear(computed):
+    return AnalysedRun.of(computed(LINEAR))
 
 
 def response(frequency):
@@ -136,9 +133,9 @@ def test_compare__with_a_table(linear, tmp_path):
 
 
 def test_compare__another_parameter(linear, tmp_path):
-    (tmp_path / "orbits.csv").write_text("d,amplitude\n0.3,0.1\n")
+    (tmp_path / "orbits.csv").write_text("damping,amplitude\n0.3,0.1\n")
     branches = linear.derive("branches", parameter="frequency_hz")
-    with pytest.raises(SpecError, match="measured along d"):
+    with pytest.raises(SpecError, match="measured along damping"):
         compare(read_branch(tmp_path / "orbits.csv", linear.model), branches, np.zeros((1, 1)))
 
 

@@ -18,34 +18,31 @@ from pipeline.rig.recordings.reading import recording_of
 from pipeline.rig.simulation import load_rig, simulated
 from pipeline.specification.problems import SpecError
 
+from .identify.test_identification import MAPPING, TRUTH, oscillator, write_ringdowns
+
 MODEL = """
 name = "spring"
 states = { x = "m", v = "m/s" }
-parameters = { damping = 0.1, linear = 1.0, cubic = 0.5 }
+parameters = { damping = 0.15, linear = 1.1, cubic = 0.4 }
 equations = { x = "v", v = "-damping*v - linear*x - cubic*x**3" }
 """
-MAPPING = """
-model = "spring.toml"
-time = { channel = "time" }
-drive = "none"
-[channels.x]
-channel = "x"
-unit = "m"
-"""
-TRUTH = {"damping": 0.15, "linear": 1.1, "cubic": 0.4}
 SPEC = """
 kind = "identification"
 model = "spring.toml"
 [identify.damping]
+start = 0.1
 bounds = [0.0, 1.0]
 [identify.linear]
+start = 1.0
 [identify.cubic]
+start = 0.5
+[sensors]
+zero = ["x"]
 [[recordings]]
 file = "swing.csv"
 mapping = "mapping.toml"
 [search]
-n_starts = 2
-n_samples = 4
+n_starts = 1
 profiles = false
 """
 RIG = """
@@ -59,29 +56,12 @@ noise = 0.002
 """
 
 
-def swing(p, start, t):
-    """The spring's place by DOP853."""
-
-    def rates(_, y):
-        return [y[1], -p["damping"] * y[1] - p["linear"] * y[0] - p["cubic"] * y[0] ** 3]
-
-    return solve_ivp(rates, (0.0, t[-1]), start, "DOP853", t, rtol=1e-10, atol=1e-10).y[0]
-
-
-def silent(line):
-    pass
-
-
 @pytest.fixture
 def bench(tmp_path):
     """A folder with a model, a mapping and a recording by DOP853."""
-    rng, rows = np.random.default_rng(1), []
-    for piece in range(2):
-        t = 0.1 * np.arange(150)
-        x = swing(TRUTH, [1.5 - piece, 0.5], t)
-        rows += [f"{17 * piece + a:.3f},{b + 0.004 * rng.normal():.8f}" for a, b in zip(t, x, strict=True)]
-    (tmp_path / "swing.csv").write_text("\n".join(["time,x", *rows]) + "\n")
-    for name, text in (("spring", MODEL), ("mapping", MAPPING), ("spec", SPEC), ("rig", RIG)):
+    write_ringdowns(tmp_path / "swing.csv", 1, n_pieces=2)
+    mapping = MAPPING.replace('"duffing"', '"spring.toml"')
+    for name, text in (("spring", MODEL), ("mapping", mapping), ("spec", SPEC), ("rig", RIG)):
         (tmp_path / f"{name}.toml").write_text(text)
     return tmp_path
 
@@ -94,7 +74,7 @@ def test_mapping__keeps_the_text_of_its_model(bench):
     with pytest.raises(SpecError, match=r"spring\.toml: cannot be read"):
         load_mapping(bench / "mapping.toml")
     with pytest.raises(SpecError, match="keeps the text"):
-        parse_mapping(MAPPING)
+        parse_mapping(MAPPING.replace('"duffing"', '"spring.toml"'))
 
 
 def test_read_recording__says_its_model_and_writes_it_back(bench):
@@ -112,8 +92,7 @@ def test_load_rig__text_of_a_file(bench):
     assert mapping.system.name == "spring"
     x = recording_of(raw, mapping)["x"].values
     t = np.arange(x.size) / 20.0
-    plain = {"damping": 0.1, "linear": 1.0, "cubic": 0.5}
-    wanted = swing(plain, [1.5, 0.0], t)
+    wanted = solve_ivp(oscillator, (0.0, t[-1]), [1.5, 0.0], "DOP853", t, rtol=1e-10, atol=1e-10).y[0]
     assert np.std(x - wanted) == pytest.approx(0.002, rel=0.15)
 
 

@@ -15,7 +15,6 @@ from pipeline.rig.identify.problem import Problem
 from pipeline.rig.identify.specification import RecordingTable
 from pipeline.rig.recordings import smooth
 from pipeline.rig.virtual import DriveSensor, Sensor, Step, record
-from pipeline.specification.problems import SpecError
 
 NOISE = 1e-3
 
@@ -40,15 +39,8 @@ def problem_of(parameters, channels, pieces, *, recorded=False) -> Problem:
 def forced():
     """An oscillator under a sine that was measured."""
     parameters = load_model("duffing").load("hardening", amplitude=0.4)
-    ds = record(
-        parameters,
-        [Step(0.2, 6)],
-        [0.5, 0.0],
-        0.02 * np.arange(1400),
-        sensors={"x": Sensor(noise=NOISE), "drive": DriveSensor("torque", 1e-3)},
-        seed=3,
-    )
-    return parameters, ds
+    sensors = {"x": Sensor(noise=NOISE), "drive": DriveSensor("torque", 1e-3)}
+    return parameters, record(parameters, [Step(0.2, 6)], [0.5, 0.0], 0.02 * np.arange(1400), sensors=sensors, seed=3)
 
 
 CHANNELS = ("psi1", "psi2")
@@ -131,12 +123,6 @@ def test_pieces_of__starts_where_all_is_measured(forced):
     truth = ds["x"].values[7:40]
     rate = np.polyfit(0.02 * np.arange(33), truth, 3)[-2]
     assert piece.start[1] == pytest.approx(rate, abs=0.05)
-
-
-def test_pieces_of__too_short(forced):
-    parameters, ds = forced
-    with pytest.raises(SpecError, match="a piece needs 12 or more"):
-        b.pieces_of(parameters.model, ("x",), (ds, smooth(ds)), table(piece_s=0.1), 0)
 
 
 def test_noise_of__is_that_of_the_unit(forced):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import tomllib
 
-import numpy as np
 import pytest
 
 from pipeline.rig.identify import directory as d
@@ -82,29 +81,6 @@ def test_read_info__damaged(begun):
     path.write_text(json.dumps(data))
     with pytest.raises(DamagedError, match="digest does not fit"):
         d.read_info(begun.directory)
-
-
-def test_outcomes__come_back_bit_by_bit(tmp_path):
-    outcomes = d.Outcomes(tmp_path)
-    value = {"theta": np.array([0.1, 1 / 3]), "message": np.array("ended")}
-    assert outcomes.recall("start-0", dict) is None
-    outcomes.store("start-0", value)
-    found = outcomes.recall("start-0", dict)
-    assert found is not None
-    np.testing.assert_array_equal(found["theta"], value["theta"])
-    assert str(found["message"]) == "ended"
-    assert outcomes.recalled == 1
-
-
-def test_outcomes__one_that_is_not_whole_is_not_there(tmp_path):
-    outcomes = d.Outcomes(tmp_path)
-    value = {"theta": np.array([0.1, 1 / 3])}
-    outcomes.store("start-0", value)
-    data = (tmp_path / "start-0.npz").read_bytes()
-    (tmp_path / "start-0.npz").write_bytes(data[:-30])
-    assert outcomes.recall("start-0", dict) is None
-    outcomes.store("start-0", value)
-    assert (tmp_path / "start-0.npz").read_bytes() == data
 
 
 def test_is_complete__looks_at_every_file(begun):

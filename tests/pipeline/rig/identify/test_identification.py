@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 import signal
 import time
@@ -18,7 +17,6 @@ from pipeline.rig.identify import check as checking
 from pipeline.rig.identify import directory as d
 from pipeline.rig.identify import identification
 from pipeline.specification.problems import SpecError
-from pipeline.store.errors import RefusedError
 
 TRUTH = {"damping": 0.15, "linear": 1.1, "cubic": 0.4}
 NOISE, ZERO = 0.004, 0.02
@@ -96,7 +94,11 @@ def files_of(folder):
 
 
 def test_identify__truth_is_within_the_intervals(bench):
-    _, result, _ = bench
+    _, result, lines = bench
+    # three gaps: a warning or a note each, nothing that makes the numbers wrong
+    said = result["recordings"][0]["findings"]
+    assert all(line in "\n".join(lines) for line in said)
+    assert not any("error" in line for line in said)
     truth = {**TRUTH, "zero.x": ZERO}
     assert result["names"] == ["damping", "linear", "cubic", "zero.x"]
     for name, value in truth.items():
@@ -165,36 +167,23 @@ def test_identify__goes_on_to_the_same_bytes(bench, tmp_path):
     assert (out / "outcomes" / "start-0000.npz").stat().st_mtime_ns == kept
 
 
-def test_identify__killed_goes_on_to_the_same_bytes(bench, tmp_path, start):
-    """A process killed between two outcomes, and the same command again."""
+def test_identify__stopped_by_a_signal_goes_on_to_the_same_bytes(bench, tmp_path, start):
+    """A process stopped between two outcomes says so, and the same command continues."""
     folder, _, _ = bench
     out = tmp_path / "out"
     process = start("identify", folder / "spec.toml", "--out", out)
     deadline = time.monotonic() + 120
     while not list(out.glob("outcomes/start-*.npz")) and time.monotonic() < deadline:
         time.sleep(0.01)
-    os.killpg(process.pid, signal.SIGKILL)
-    process.wait()
+    process.send_signal(signal.SIGTERM)
+    _, err = process.communicate(timeout=120)
+    assert process.returncode == 143
+    assert "the same command continues from there" in err
     assert not (out / d.RESULT).exists()
     identification.identify(folder / "spec.toml", out, echo=lambda _: None)
     whole, found = files_of(folder / "out"), files_of(out)
     begun = {d.IDENTIFICATION}  # says when and where
     assert {k: v for k, v in found.items() if k not in begun} == {k: v for k, v in whole.items() if k not in begun}
-
-
-def test_identify__another_specification_is_refused(bench):
-    folder, _, _ = bench
-    (folder / "changed.toml").write_text(SPEC.replace("n_starts = 3", "n_starts = 4"))
-    with pytest.raises(RefusedError, match=r"search\.n_starts: 3 in the directory, 4 now"):
-        identification.identify(folder / "changed.toml", folder / "out", echo=lambda _: None)
-
-
-def test_identify__says_what_is_wrong_with_a_recording(bench):
-    """Three gaps: a warning or a note each, nothing that makes the numbers wrong."""
-    _, result, lines = bench
-    said = result["recordings"][0]["findings"]
-    assert all(line in "\n".join(lines) for line in said)
-    assert not any("error" in line for line in said)
 
 
 def test_result__an_error_in_a_recording_is_a_warning_of_the_result():
@@ -271,14 +260,6 @@ def test_identify__bad_input_is_refused_before_anything(bench, tmp_path, old, ne
     with pytest.raises(SpecError, match=words):
         identification.identify(folder / "bad.toml", tmp_path / "out", echo=lambda _: None)
     assert not (tmp_path / "out").exists()
-
-
-def test_identify__a_mapping_to_a_channel_that_is_not_there(bench, tmp_path):
-    folder, _, _ = bench
-    (folder / "wrong.toml").write_text(MAPPING.replace('channel = "x"', 'channel = "y"'))
-    (folder / "bad.toml").write_text(SPEC.replace("ringdown.toml", "wrong.toml"))
-    with pytest.raises(SpecError, match=r"recordings\[0\].*'y'"):
-        identification.identify(folder / "bad.toml", tmp_path / "out", echo=lambda _: None)
 
 
 def test_identify__no_convergence_is_no_result(bench, tmp_path, monkeypatch, main):
@@ -370,36 +351,6 @@ def test_check__long_pieces_of_other_numbers_and_lengths(bench, tmp_path):
     assert len(found["pieces"]) == 3
     for piece in found["pieces"]:
         assert piece["rms"]["x"] == pytest.approx(NOISE, rel=0.25)
-
-
-def test_judge__a_piece_that_went_astray_is_found_alone(bench):
-    """A first guess of a start that is off by much: the others do not suffer."""
-    from dataclasses import replace
-
-    from pipeline.rig.identify.build import build, read_all
-    from pipeline.rig.identify.judging import judge
-    from pipeline.rig.identify.specification import load_identification
-
-    folder, result, _ = bench
-    spec = load_identification(folder / "spec.toml")
-    problem = build(spec, read_all(spec)).problem
-    far = replace(problem.pieces[1], start=np.array([-4.0, 9.0]))
-    pieces = [problem.pieces[0], far, problem.pieces[2]]
-    judged, fit = judge(problem, result["values"], result["zeros"], pieces)
-    assert fit.converged
-    assert judged.rms["x"] == pytest.approx(NOISE, rel=0.15)
-
-
-def test_identify__stopped_by_a_signal_says_so(bench, tmp_path, start):
-    folder, _, _ = bench
-    process = start("identify", folder / "spec.toml", "--out", tmp_path / "out")
-    deadline = time.monotonic() + 120
-    while not list((tmp_path / "out").glob("outcomes/start-*.npz")) and time.monotonic() < deadline:
-        time.sleep(0.01)
-    process.send_signal(signal.SIGTERM)
-    _, err = process.communicate(timeout=120)
-    assert process.returncode == 143
-    assert "the same command continues from there" in err
 
 
 def test_judgement__without_a_spread_has_no_correlation():

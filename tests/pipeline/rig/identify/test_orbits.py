@@ -1,15 +1,12 @@
-"""Measured orbits as data of a fit, on an oscillator with closed forms.
-
-    r' = (m - h) r + r^3 - g r^5,  angle' = w
-
-Its cycles have g r^4 - r^2 - (m - h) = 0 and frequency w/2 pi: the larger r is stable, the smaller one is not. The fold
-of cycles lies at m = h - 1/(4 g), the Hopf point at m = h.
-"""
+"""Measured orbits as data of a fit, on an oscillator with closed forms (`tests/pipeline/bautin.py`)."""
 
 from __future__ import annotations
 
 import json
 import math
+import shutil
+from copy import deepcopy
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -32,42 +29,17 @@ from pipeline.rig.identify.specification import parse_identification
 from pipeline.runs.derive import AnalysedRun
 from pipeline.specification.problems import SpecError
 from pipeline.store.errors import RefusedError
-
-TRUTH = {"g": 1.2, "h": 0.05, "w": 6.0}
-
-MODEL = {
-    "name": "bautin-cycle",
-    "states": {"x": {"scale": 1.0}, "y": {"scale": 1.0}},
-    "parameters": {name: {"value": value} for name, value in {"m": 0.0, **TRUTH}.items()},
-    "define": {"r2": "x**2 + y**2", "growth": "m - h + r2 - g*r2**2"},
-    "equations": {"x": "growth*x - w*y", "y": "growth*y + w*x"},
-}
-
-SECTION = {"of": "y", "value": 0.0, "direction": "up", "longest": 20.0}
+from tests.pipeline.bautin import MODEL, SECTION, SWEEP, TRUTH, radius, write_orbits, write_toml
 
 START = {"g": {"start": 1.15, "bounds": [0.5, 3.0]}, "h": {"start": 0.04, "bounds": [-0.5, 0.5]}, "w": {"start": 6.2}}
 
 STABLE, UNSTABLE = (-0.1, -0.05, 0.1), (-0.1, -0.02)
 
 
-def radius(m, sign, g=TRUTH["g"], h=TRUTH["h"]):
-    return math.sqrt((1.0 + sign * math.sqrt(1.0 + 4.0 * g * (m - h))) / (2.0 * g))
-
-
-def table_of(path, values, sign, sd=0.002, factor=1.0):
-    lines = ["m,name,stable,amplitude,amplitude_sd,frequency,frequency_sd"]
-    for m in values:
-        size = factor * radius(m, sign)
-        word = "yes" if sign > 0 else "no"
-        lines.append(f"{m},{word} {m},{word},{size!r},{sd},{TRUTH['w'] / (2 * math.pi)!r},0.001")
-    path.write_text("\n".join(lines) + "\n")
-    return path
-
-
-@pytest.fixture
-def data(tmp_path):
-    table_of(tmp_path / "stable.csv", STABLE, 1)
-    table_of(tmp_path / "unstable.csv", UNSTABLE, -1)
+def data_in(folder, sd=0.002):
+    """Specification of a fit to stable and unstable cycles, whose tables are written."""
+    write_orbits(folder / "stable.csv", STABLE, 1, sd=sd)
+    write_orbits(folder / "unstable.csv", UNSTABLE, -1, sd=sd)
     common = {"section": SECTION, "range": [-0.3, 0.3]}
     return {
         "kind": "identification",
@@ -75,6 +47,11 @@ def data(tmp_path):
         "identify": {name: dict(one) for name, one in START.items()},
         "orbits": [{"file": "stable.csv", **common}, {"file": "unstable.csv", **common}],
     }
+
+
+@pytest.fixture
+def data(tmp_path):
+    return data_in(tmp_path)
 
 
 def built(data, folder):
@@ -174,26 +151,10 @@ def test_lost__an_orbit_beyond_its_fold_is_counted(data, tmp_path):
     assert found.cost > 1e11
 
 
-def toml(v):
-    if isinstance(v, dict):
-        return "{ " + ", ".join(f"{k} = {toml(x)}" for k, x in v.items()) + " }"
-    return json.dumps(v)
-
-
-def write(folder, data):
-    """Write a specification as TOML."""
-    lines = [f"{k} = {toml(v)}" for k, v in data.items() if k != "orbits"]
-    for table in data["orbits"]:
-        lines += ["[[orbits]]", *(f"{k} = {toml(v)}" for k, v in table.items())]
-    path = folder / "fit.toml"
-    path.write_text("\n".join(lines) + "\n")
-    return path
-
-
 def test_identify__judges_orbits_that_were_held_out(data, tmp_path):
     data["orbits"][1]["hold_out"] = ["no -0.02"]
     data["search"] = {"n_starts": 1, "profiles": False}
-    path = write(tmp_path, data)
+    path = write_toml(tmp_path / "fit.toml", data)
     result = identify(path, tmp_path / "out", figures=True, echo=lambda line: None)
     rows = result["orbits"][1]["orbits"]
     assert [row["held_out"] for row in rows] == [False, True]
@@ -212,7 +173,7 @@ def test_identify__judges_orbits_that_were_held_out(data, tmp_path):
     assert again["estimates"] == json.loads(first)["estimates"]
     assert again["orbits"] == json.loads(first)["orbits"]
 
-    table_of(tmp_path / "more.csv", (0.05, 0.15), 1, factor=1.1)
+    write_orbits(tmp_path / "more.csv", (0.05, 0.15), 1, factor=1.1)
     assert is_table(tmp_path / "more.csv")
     judged = check_orbits(tmp_path / "out", tmp_path / "more.csv")
     assert judged["rms"]["fitted"]["stable"]["amplitude"] == pytest.approx(1 - 1 / 1.1, abs=1e-5)
@@ -220,14 +181,19 @@ def test_identify__judges_orbits_that_were_held_out(data, tmp_path):
     assert table.rows[0]["orbits_held_out"] < 1e-4
 
 
-@pytest.fixture
-def fitted(data, tmp_path):
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
     """An identification with errors of some per cent."""
-    for name, values, sign in (("stable", STABLE, 1), ("unstable", UNSTABLE, -1)):
-        table_of(tmp_path / f"{name}.csv", values, sign, sd=0.02)
-    data["search"] = {"n_starts": 1, "profiles": False}
-    result = identify(write(tmp_path, data), tmp_path / "out", figures=False, echo=lambda line: None)
-    return tmp_path / "out", result
+    folder = tmp_path_factory.mktemp("finished")
+    path = write_toml(folder / "fit.toml", {**data_in(folder, 0.02), "search": {"n_starts": 1, "profiles": False}})
+    return folder / "out", identify(path, folder / "out", figures=False, echo=lambda line: None)
+
+
+@pytest.fixture
+def fitted(finished, tmp_path):
+    """A copy of it."""
+    directory, result = finished
+    return Path(shutil.copytree(directory, tmp_path / "fitted")), deepcopy(result)
 
 
 def test_posterior__draws_are_those_of_the_covariance(fitted):
@@ -244,9 +210,9 @@ def test_posterior__draws_are_those_of_the_covariance(fitted):
 
 def test_posterior__bifurcations_and_branches_of_each_draw_are_those_of_the_closed_form(fitted):
     directory, result = fitted
-    _, bifurcations, written = write_posterior(directory, 40, seed=2)
+    _, bifurcations, written = write_posterior(directory, 16, seed=2)
     assert all(path.is_file() for path in written)
-    drawn = draw_posterior(directory, 40, seed=2)
+    drawn = draw_posterior(directory, 16, seed=2)
     g, h = (drawn["value"].sel(parameter=name).values for name in "gh")
     found = bands(stored_tables(directory)[0], result["values"], drawn)
     by_kind = {str(kind): found["bifurcation_value"].values[:, b] for b, kind in enumerate(found["kind"].values)}
@@ -255,7 +221,7 @@ def test_posterior__bifurcations_and_branches_of_each_draw_are_those_of_the_clos
     low, high = np.quantile(h - 1 / (4 * g), [0.025, 0.975])
     fold = next(row for row in bifurcations.rows if row["kind"] == "fold")
     assert (fold["low"], fold["high"]) == (pytest.approx(low, abs=1e-6), pytest.approx(high, abs=1e-6))
-    assert fold["n_draws"] == 40
+    assert fold["n_draws"] == 16
     for k in range(found.sizes["orbit"]):
         m, is_stable = float(found["parameter_value"][k]), bool(found["is_stable"][k])
         inside = 1 + 4 * g * (m - h)
@@ -270,31 +236,20 @@ def test_posterior__bifurcations_and_branches_of_each_draw_are_those_of_the_clos
         assert (known == there)[clear].all()
 
 
-SWEEP = {
-    "kind": "sweep",
-    "model": MODEL,
-    "section": SECTION,
-    "axes": {"m": {"start": -0.3, "stop": 0.2, "num": 6}},
-    "initial_conditions": {"kind": "list", "points": [[1.0, 0.0], [0.01, 0.0]]},
-    "integration": {"n_transient": 200, "n_keep": 2, "stop_when_closed": True},
-}
-
-
 def test_run_posterior__each_draw_is_a_run_and_its_bifurcations_are_those_of_the_closed_form(fitted, tmp_path):
     directory, result = fitted
-    path = tmp_path / "sweep.toml"
-    path.write_text("\n".join(f"{k} = {toml(v)}" for k, v in SWEEP.items()))
-    folder = run_posterior(path, directory, 3, tmp_path / "study", workers=0, echo=lambda line: None)
-    drawn = draw_posterior(directory, 3)
+    path = write_toml(tmp_path / "sweep.toml", SWEEP)
+    folder = run_posterior(path, directory, 2, tmp_path / "study", workers=0, echo=lambda line: None)
+    drawn = draw_posterior(directory, 2)
     names = [str(name) for name in drawn["parameter"].values]
-    for k in range(3):
+    for k in range(2):
         parameters = parameters_of(AnalysedRun.of(folder / f"draw-{k:04d}").cube())
         assert parameters["g"] == drawn["value"].values[k, names.index("g")]
     before = (folder / "draw-0001/run.json").stat().st_mtime_ns
-    run_posterior(path, directory, 3, tmp_path / "study", workers=0, echo=lambda line: None)
+    run_posterior(path, directory, 2, tmp_path / "study", workers=0, echo=lambda line: None)
     assert (folder / "draw-0001/run.json").stat().st_mtime_ns == before
     with pytest.raises(RefusedError, match="different: draws"):
-        run_posterior(path, directory, 2, tmp_path / "study", workers=0)
+        run_posterior(path, directory, 3, tmp_path / "study", workers=0)
     table = spread(folder, branches=True, attractors=True, echo=lambda line: None)
     rows = {(row["what"], row["name"]): row for row in table.rows}
     values = drawn["value"].values[:, names.index("h")]
@@ -303,7 +258,7 @@ def test_run_posterior__each_draw_is_a_run_and_its_bifurcations_are_those_of_the
     hopf = rows["value", "hopf 0"]
     assert hopf["best"] == pytest.approx(result["values"]["h"], abs=1e-6)
     assert hopf["median"] == pytest.approx(np.median(values), abs=1e-6)
-    assert hopf["n_draws"] == 3
+    assert hopf["n_draws"] == 2
     assert sum(row["best"] for row in rows.values() if row["what"] == "fraction") == pytest.approx(1.0)
     # at m = 0 half of the cells end on the stable cycle, half at rest
     cycle = next(name for _, name in rows if name.startswith("attractor") and "period 1)" in name).split(" (")[0]
@@ -315,11 +270,7 @@ def test_run_posterior__each_draw_is_a_run_and_its_bifurcations_are_those_of_the
     shares = [row["best"] for (what, name), row in rows.items() if what == "share" and "(" in name]
     assert sum(shares) == pytest.approx(1.0)
 
-    path.write_text(
-        "\n".join(
-            f"{k} = {toml(v)}" for k, v in {**SWEEP, "axes": {"g": {"start": 1.0, "stop": 1.1, "num": 2}}}.items()
-        )
-    )
+    write_toml(path, {**SWEEP, "axes": {"g": {"start": 1.0, "stop": 1.1, "num": 2}}})
     with pytest.raises(SpecError, match=r"axes.g: is an identified parameter"):
         run_posterior(path, directory, 3, tmp_path / "other", workers=0)
 

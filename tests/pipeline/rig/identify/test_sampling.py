@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import importlib.util
-import json
 import math
 
-import emcee
 import numpy as np
 import pytest
 import xarray as xr
@@ -19,17 +17,9 @@ from pipeline.rig.identify.posterior_files import write_posterior
 from pipeline.rig.identify.sampling import _first, judged, sample_posterior, split_rhat
 from pipeline.specification.problems import SpecError
 from pipeline.store.errors import RefusedError
+from tests.pipeline.bautin import MODEL, SECTION, TRUTH, radius, write_orbits, write_toml
 
-TRUTH = {"g": 1.2, "h": 0.05, "w": 6.0}
-
-# r' = (m - h) r + r^3 - g r^5, angle' = w, as in test_orbits.py
-MODEL = {
-    "name": "bautin-cycle",
-    "states": {"x": {"scale": 1.0}, "y": {"scale": 1.0}},
-    "parameters": {name: {"value": value} for name, value in {"m": 0.0, **TRUTH}.items()},
-    "define": {"r2": "x**2 + y**2", "growth": "m - h + r2 - g*r2**2"},
-    "equations": {"x": "growth*x - w*y", "y": "growth*y + w*x"},
-}
+pytestmark = pytest.mark.slow  # needs emcee
 
 VALUES, SD, FREQUENCY_SD = (0.05, 0.1, 0.3), 0.1, 0.05
 """Parameter values of three stable cycles, and standard deviations so large that the posterior is far from Gaussian."""
@@ -37,21 +27,10 @@ VALUES, SD, FREQUENCY_SD = (0.05, 0.1, 0.3), 0.1, 0.05
 BOUNDS = {"g": (0.3, 5.0), "h": (-1.0, 0.4), "w": (0.0, 100.0)}
 
 
-def radius(m, g, h):
-    inside = 1.0 + 4.0 * g * (m - h)
-    return np.sqrt((1.0 + np.sqrt(np.where((inside > 0) & (g > 0), inside, np.nan))) / (2.0 * np.abs(g)))
-
-
 def chi2_of(g, h, w):
     """Sum of squared residuals in standard deviations, from the closed form; NaN where a cycle does not exist."""
-    amplitudes = sum(((radius(m, TRUTH["g"], TRUTH["h"]) - radius(m, g, h)) / SD) ** 2 for m in VALUES)
+    amplitudes = sum(((radius(m) - radius(m, 1, g, h)) / SD) ** 2 for m in VALUES)
     return amplitudes + len(VALUES) * ((TRUTH["w"] - w) / (2 * math.pi) / FREQUENCY_SD) ** 2
-
-
-def toml(v):
-    if isinstance(v, dict):
-        return "{ " + ", ".join(f"{k} = {toml(x)}" for k, x in v.items()) + " }"
-    return json.dumps(v)
 
 
 def quiet(line):
@@ -62,23 +41,15 @@ def quiet(line):
 def cycles(tmp_path_factory):
     """An identification from three stable cycles without noise."""
     folder = tmp_path_factory.mktemp("cycles")
-    lines = ["m,stable,amplitude,amplitude_sd,frequency,frequency_sd"]
-    lines += [
-        f"{m},yes,{float(radius(m, TRUTH['g'], TRUTH['h']))!r},{SD},{TRUTH['w'] / (2 * math.pi)!r},{FREQUENCY_SD}"
-        for m in VALUES
-    ]
-    (folder / "cycles.csv").write_text("\n".join(lines) + "\n")
+    write_orbits(folder / "cycles.csv", VALUES, sd=SD, frequency_sd=FREQUENCY_SD)
     data = {
         "kind": "identification",
         "model": MODEL,
         "identify": {name: {"start": TRUTH[name], "bounds": list(BOUNDS[name])} for name in TRUTH},
         "search": {"n_starts": 1, "profiles": False},
+        "orbits": [{"file": "cycles.csv", "section": SECTION, "range": [-0.3, 0.5]}],
     }
-    section = {"of": "y", "value": 0.0, "direction": "up", "longest": 20.0}
-    orbits = {"file": "cycles.csv", "section": section, "range": [-0.3, 0.5]}
-    text = [f"{k} = {toml(v)}" for k, v in data.items()]
-    text += ["[[orbits]]", *(f"{k} = {toml(v)}" for k, v in orbits.items())]
-    (folder / "fit.toml").write_text("\n".join(text) + "\n")
+    write_toml(folder / "fit.toml", data)
     identify(folder / "fit.toml", folder / "out", figures=False, echo=quiet)
     return folder / "out"
 
@@ -156,6 +127,8 @@ def test_sample_posterior__agrees_with_quadrature(cycles, closed):
 
 
 def test_sample_posterior__goes_on_to_the_same_bytes(cycles, closed):
+    import emcee
+
     before = set((cycles / "outcomes").glob("chain-*.npz"))
     first = chain_of(cycles, closed, 4, 200)
     blocks = sorted(set((cycles / "outcomes").glob("chain-*.npz")) - before)
@@ -193,12 +166,12 @@ def test_sample_draws__not_converged_is_an_answer(cycles):
 
 def test_write_posterior__keeps_the_draws_for_runs(cycles):
     sampling = Sampling(most_steps=20)
-    _, bifurcations, _ = write_posterior(cycles, 30, seed=5, sampling=sampling, figures=False, echo=quiet)
-    kept = kept_draws(cycles, 30)
-    xr.testing.assert_equal(kept["value"], sample_draws(cycles, 30, 5, sampling, echo=quiet)["value"])
+    _, bifurcations, _ = write_posterior(cycles, 12, seed=5, sampling=sampling, figures=False, echo=quiet)
+    kept = kept_draws(cycles, 12)
+    xr.testing.assert_equal(kept["value"], sample_draws(cycles, 12, 5, sampling, echo=quiet)["value"])
     assert kept_draws(cycles, 10).sizes["draw"] == 10
-    with pytest.raises(SpecError, match=r"-n = 31: .* has 30 draws"):
-        kept_draws(cycles, 31)
+    with pytest.raises(SpecError, match=r"-n = 13: .* has 12 draws"):
+        kept_draws(cycles, 13)
     hopf = next(row for row in bifurcations.rows if row["kind"] == "hopf")
     h = kept["value"].sel(parameter="h").values
     assert (hopf["low"], hopf["high"]) == pytest.approx(tuple(np.quantile(h, [0.025, 0.975])), abs=1e-6)

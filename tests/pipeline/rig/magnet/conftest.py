@@ -10,6 +10,9 @@ import pytest
 
 from magpend_core import load_model
 from magpend_core.models.pendulum import magnet_torque as laws
+from pipeline.rig.magnet.fitting import fit_measurement
+from pipeline.rig.magnet.measurement import read_measurement
+from pipeline.rig.magnet.results import write_results
 
 HEADER = """
 title = "a known torque"
@@ -85,3 +88,14 @@ def write_rig(folder):
 def rig(tmp_path):
     """A folder with a measurement."""
     return write_rig(tmp_path)
+
+
+@pytest.fixture(scope="session")
+def fitted(tmp_path_factory):
+    """The same, its readings and their fit, and a folder with what is written of it."""
+    folder = tmp_path_factory.mktemp("measurement")
+    rig = write_rig(folder)
+    measured = read_measurement(rig.path)
+    outcome = fit_measurement(measured)
+    write_results(outcome, folder)
+    return SimpleNamespace(rig=rig, measured=measured, outcome=outcome, folder=folder)

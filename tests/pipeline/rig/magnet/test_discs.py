@@ -20,7 +20,7 @@ DISC = HEADER["synthesis"]
 VOLUME = np.pi / 4 * DISC["diameter_m"] ** 2 * DISC["thickness_m"]
 MOMENT = DISC["remanence_T"] / (4e-7 * np.pi) * VOLUME  # A m2
 
-magpylib = pytest.importorskip("magpylib")
+pytestmark = pytest.mark.slow  # needs magpylib
 
 
 @pytest.fixture(scope="module")
@@ -67,6 +67,8 @@ def test_loads__on_one_axis_are_those_of_current_sheets(make_discs, distance):
 
     The azimuthal sheet current M [A/m] in the fixed disc's radial field pulls along the axis.
     """
+    import magpylib
+
     fixed = magpylib.magnet.Cylinder(
         dimension=(DISC["diameter_m"], DISC["thickness_m"]), polarization=(0, 0, DISC["remanence_T"])
     )
@@ -85,6 +87,7 @@ def test_loads__on_one_axis_are_those_of_current_sheets(make_discs, distance):
 
 def test_loads__bent_are_those_of_magpylib(make_discs):
     """The library's own force and torque, by cells of the moving disc's volume."""
+    import magpylib
     from scipy.spatial.transform import Rotation
 
     p, psi1, psi2 = geometry(), np.radians([4.0, -10.0]), np.radians([9.0, 5.0])

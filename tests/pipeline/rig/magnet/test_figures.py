@@ -10,21 +10,22 @@ from magpend_core import load_model
 from magpend_core.models.pendulum import magnet_torque as laws
 from pipeline.plots.style import Frame
 from pipeline.rig.magnet.figures import FIGURES, write_figures
-from pipeline.rig.magnet.fitting import fit_measurement
-from pipeline.rig.magnet.measurement import read_measurement
 
-from .conftest import TRUE, write_rig
+from .conftest import TRUE
+
+
+@pytest.fixture
+def outcome(fitted):
+    return fitted.outcome
 
 
 @pytest.fixture(scope="module")
-def outcome(tmp_path_factory):
-    """One fit for all figures, which change nothing in it."""
-    rig = write_rig(tmp_path_factory.mktemp("measurement"))
-    return fit_measurement(read_measurement(rig.path))
+def figures(fitted):
+    return {name: draw(fitted.outcome, Frame(85.0)) for name, draw in FIGURES.items()}
 
 
-def test_draw_curves__data_are_readings_and_bumps(outcome):
-    data = FIGURES["fig6"](outcome).data
+def test_draw_curves__data_are_readings_and_bumps(outcome, figures):
+    data = figures["fig6"].data
     assert data.sizes == {"reading": 5 * 42, "curve": 10, "fine": 241}
     assert set(np.unique(data["curve_locked"].round(9))) == {-32.0, -16.0, 0.0, 16.0, 32.0}
     fit = next(f for f in outcome.curves if f.curve.locked == 0.0 and f.curve.side == 0)
@@ -33,8 +34,8 @@ def test_draw_curves__data_are_readings_and_bumps(outcome):
     np.testing.assert_allclose(row["bump"], expected, atol=1e-12)
 
 
-def test_draw_numbers__the_joint_law_is_that_of_the_readings(outcome):
-    data = FIGURES["fig7"](outcome).data
+def test_draw_numbers__the_joint_law_is_that_of_the_readings(figures):
+    data = figures["fig7"].data
     locked = np.radians(data["fine_locked"].values)
     expected = TRUE["alpha2"] * np.exp(-(((locked + TRUE["beta2"]) / TRUE["gamma2"]) ** 2))
     np.testing.assert_allclose(data["A_joint"][1], expected, rtol=1e-7)
@@ -42,8 +43,8 @@ def test_draw_numbers__the_joint_law_is_that_of_the_readings(outcome):
     assert data.sizes["curve"] == 18
 
 
-def test_draw_map__is_the_models_torque(outcome):
-    data = FIGURES["fig8"](outcome).data
+def test_draw_map__is_the_models_torque(figures):
+    data = figures["fig8"].data
     p = load_model("pendulum").load(**TRUE)
     angle, locked = np.radians(data["fine_angle"].values), np.radians(data["fine_locked"].values)
     np.testing.assert_allclose(data["torque_map"], laws.magnet_moment(angle, locked[:, None], p), atol=1e-8)
@@ -51,23 +52,18 @@ def test_draw_map__is_the_models_torque(outcome):
     np.testing.assert_allclose(data["transition"], np.degrees(line.slope * locked + line.offset), atol=1e-6)
 
 
-def test_draw_comparison__what_is_left_over_is_readings_less_models(outcome):
-    data = FIGURES["fig9"](outcome).data
+def test_draw_comparison__what_is_left_over_is_readings_less_models(outcome, figures):
+    data = figures["fig9"].data
     assert np.abs(data["left_by_fit"]).max() < 1e-8
     p = {**outcome.measured.parameters, **outcome.dipoles.values}
     computed = laws.dipole_moment(np.radians(data["angle"].values), np.radians(data["locked"].values), p)
     np.testing.assert_allclose(data["torque"] - data["left_by_dipoles"], computed, atol=1e-12)
 
 
-@pytest.mark.parametrize("name", FIGURES)
-def test_figures__fit_a_column_and_say_that_readings_are_synthetic(outcome, name):
-    figure = FIGURES[name](outcome, Frame(85.0))
-    texts = " ".join(t.get_text() for t in figure.findobj(lambda a: hasattr(a, "get_text")))
-    assert "SYNTHETIC" in texts
-    assert figure.data.attrs["synthetic"] == 1
-
-
-def test_write_figures__data_lie_beside_them(outcome, tmp_path):
+def test_figures__say_that_readings_are_synthetic_and_their_data_lie_beside_them(outcome, figures, tmp_path):
+    for figure in figures.values():
+        assert "SYNTHETIC" in " ".join(t.get_text() for t in figure.findobj(lambda a: hasattr(a, "get_text")))
+        assert figure.data.attrs["synthetic"] == 1
     written = write_figures(outcome, tmp_path)
     assert [path.name for path in written[:2]] == ["fig6.png", "fig6.nc"]
     with xr.open_dataset(tmp_path / "fig9.nc", engine="scipy") as ds:

@@ -10,7 +10,7 @@ from scipy.optimize import curve_fit
 
 from magpend_core.models.pendulum import magnet_torque as laws
 from pipeline.rig.magnet.fitting import fit_curve, fit_curves, fit_dipoles, fit_jointly, fit_laws, fit_measurement
-from pipeline.rig.magnet.measurement import Curve, read_measurement
+from pipeline.rig.magnet.measurement import Curve
 from pipeline.rig.magnet.solving import errors_by_cluster, solve
 
 from .conftest import TRUE
@@ -20,8 +20,8 @@ T_95 = 1.96  # 365 degrees of freedom
 
 
 @pytest.fixture
-def measured(rig):
-    return read_measurement(rig.path)
+def measured(fitted):
+    return fitted.measured
 
 
 def with_noise(measured, seed, noise=NOISE):
@@ -49,15 +49,15 @@ def test_fit_curve__recovers_a_bump(side):
 def test_fit_curve__errors_are_what_estimates_scatter_by():
     angle, curve = np.linspace(-0.02, 0.2, 17), Curve(0, 0.1, np.arange(17))
     torque, rng = laws.bump(angle, 1.1, -0.031, 0.052), np.random.default_rng(11)
-    fits = [fit_curve(angle, torque + rng.normal(0.0, NOISE, 17), curve) for _ in range(400)]
+    fits = [fit_curve(angle, torque + rng.normal(0.0, NOISE, 17), curve) for _ in range(200)]
     for name, truth in {"A": 1.1, "b": -0.031, "c": 0.052}.items():
         values = np.array([f.values[name] for f in fits])
         errors = np.array([f.errors[name] for f in fits])
-        # 400 draws tell a standard deviation to 3.5 %
-        assert np.sqrt((errors**2).mean()) == pytest.approx(values.std(), rel=0.12)
+        # 200 draws tell a standard deviation to 5 %
+        assert np.sqrt((errors**2).mean()) == pytest.approx(values.std(), rel=0.16)
         # the quantile of Student's t for 14 degrees of freedom
         covered = np.mean(np.abs(values - truth) < 2.145 * errors)
-        assert 0.92 < covered < 0.98
+        assert 0.9 < covered < 0.99
 
 
 @pytest.mark.parametrize(
@@ -97,17 +97,11 @@ def test_fit_laws__recovers_gaussian_line_and_constant(measured):
     assert min(found.r2.values()) == pytest.approx(1.0, abs=1e-12)
 
 
-def test_fit_jointly__recovers_all_parameters_without_noise(measured):
-    found = fit_jointly(measured, near(TRUE))
-    assert found.values == pytest.approx(TRUE, rel=1e-8)
-    assert found.quality.r2 == pytest.approx(1.0, abs=1e-14)
-    assert found.undetermined == {}
-
-
 def test_fit_jointly__holds_what_is_held(measured):
     held = {"eps_mag": TRUE["eps_mag"], "c2": TRUE["c2"]}
     found = fit_jointly(measured, near(TRUE), held)
     assert found.values == pytest.approx(TRUE, rel=1e-8)
+    assert found.undetermined == {}
     assert set(found.free) == set(TRUE) - set(held)
     assert found.correlation.shape == (11, 11)
     wrong = fit_jointly(measured, near(TRUE), {"eps_mag": 20.0})
@@ -117,22 +111,22 @@ def test_fit_jointly__holds_what_is_held(measured):
 
 def test_fit_jointly__covers_the_truth_and_scatters_as_its_covariance_says(measured):
     start = fit_laws(fit_curves(measured)).values
-    fits = [fit_jointly(with_noise(measured, seed), start) for seed in range(300)]
+    fits = [fit_jointly(with_noise(measured, seed), start) for seed in range(150)]
     names = fits[0].free
     values = np.array([[f.values[n] for n in names] for f in fits])
     errors = np.array([[f.errors[n] for n in names] for f in fits])
     truth = np.array([TRUE[n] for n in names])
-    # 300 draws: 4.1 % of a standard deviation, 1.3 % of a coverage; 13 parameters are looked at
-    np.testing.assert_allclose(np.sqrt((errors**2).mean(axis=0)), values.std(axis=0), rtol=0.16)
+    # 150 draws: 5.8 % of a standard deviation, 1.8 % of a coverage; 13 parameters are looked at
+    np.testing.assert_allclose(np.sqrt((errors**2).mean(axis=0)), values.std(axis=0), rtol=0.2)
     covered = (np.abs(values - truth) < T_95 * errors).mean(axis=0)
-    assert ((covered > 0.91) & (covered < 0.985)).all(), dict(zip(names, covered, strict=True))
-    assert 0.935 < covered.mean() < 0.965
+    assert ((covered > 0.88) & (covered < 0.995)).all(), dict(zip(names, covered, strict=True))
+    assert 0.93 < covered.mean() < 0.97
     # without any likeness within curves, their jackknife says the same; 17 degrees of freedom
     by_curve = np.array([[f.errors_by_curve[n] for n in names] for f in fits])
     assert 0.93 < (np.abs(values - truth) < 2.11 * by_curve).mean() < 0.97
-    # at most 6 % of 1 for each of 78 pairs
+    # at most 8 % of 1 for each of 78 pairs
     expected = np.mean([f.correlation for f in fits], axis=0)
-    np.testing.assert_allclose(np.corrcoef(values, rowvar=False), expected, rtol=0, atol=0.2)
+    np.testing.assert_allclose(np.corrcoef(values, rowvar=False), expected, rtol=0, atol=0.28)
     rms = np.mean([f.quality.rms for f in fits])
     assert rms == pytest.approx(NOISE * np.sqrt((378 - 13) / 378), rel=0.01)
 
@@ -173,7 +167,7 @@ def test_errors_by_cluster__are_the_jackknife_of_a_line():
 def test_fit_jointly__errors_by_curve_hold_where_residuals_of_a_curve_are_alike(measured):
     """With a common shift of every curve those from the residuals' variance are too small."""
     start, fits = fit_laws(fit_curves(measured)).values, []
-    for seed in range(150):
+    for seed in range(80):
         rng = np.random.default_rng(1000 + seed)
         torque = measured.torque + rng.normal(0.0, 0.002, len(measured.torque))
         for curve in measured.curves:
@@ -185,8 +179,8 @@ def test_fit_jointly__errors_by_curve_hold_where_residuals_of_a_curve_are_alike(
         for errors in ([f.errors for f in fits], [f.errors_by_curve for f in fits])
     )
     assert plain < 0.75 * values.std()
-    # 150 draws tell a standard deviation to 6 %, 18 curves that of each draw to 17 %
-    assert by_curve == pytest.approx(values.std(), rel=0.2)
+    # 80 draws tell a standard deviation to 8 %, 18 curves that of each draw to 17 %
+    assert by_curve == pytest.approx(values.std(), rel=0.25)
     assert np.mean([f.neighbours for f in fits]) > 0.5
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -21,10 +22,9 @@ def states(angle, locked):
     return np.stack([angle, angle + locked, 0 * angle, 0 * angle], axis=-1)
 
 
-def test_write_results__the_preset_gives_the_measured_torque_in_the_model(rig, tmp_path):
-    m = read_measurement(rig.path)
-    write_results(fit_measurement(m), tmp_path)
-    p = load_model("pendulum").load(tmp_path / "preset.toml")
+def test_write_results__the_preset_gives_the_measured_torque_in_the_model(fitted):
+    m, rig = fitted.measured, fitted.rig
+    p = load_model("pendulum").load(fitted.folder / "preset.toml")
     at = states(m.angle, m.locked)
     found = evaluate(["magnet_moment"], 0.0, at, p, 2.0)[:, 0]
     # the readings are without noise, and the fit finds their parameters to 1e-8
@@ -36,21 +36,20 @@ def test_write_results__the_preset_gives_the_measured_torque_in_the_model(rig, t
     np.testing.assert_allclose(torques.sum(axis=1), rig.magnets, rtol=0, atol=1e-8)
 
 
-def test_write_results__every_value_has_its_origin(rig, tmp_path):
-    write_results(fit_measurement(read_measurement(rig.path)), tmp_path)
-    found = load_model("pendulum").preset(tmp_path / "preset.toml")
+def test_write_results__every_value_has_its_origin(fitted):
+    found = load_model("pendulum").preset(fitted.folder / "preset.toml")
     assert found.title == "SYNTHETIC: a known torque"
     for name in TRUE:
         assert found.provenance[name].startswith("joint fit of 18 torque curves (SYNTHETIC readings, readings.csv")
     assert found.provenance["h"] == "ruler"
     assert found.provenance["delta"] == "calibrated"
-    dipoles = load_model("pendulum-dipole").preset(tmp_path / "preset-dipoles.toml")
+    dipoles = load_model("pendulum-dipole").preset(fitted.folder / "preset-dipoles.toml")
     assert "R2 = " in dipoles.provenance["pole1"]
     assert dipoles.values["h"] == 0.39
 
 
-def test_write_results__the_preset_may_rest_on_a_preset_from_a_file(rig, tmp_path):
-    write_results(fit_measurement(read_measurement(rig.path)), tmp_path)
+def test_write_results__the_preset_may_rest_on_a_preset_from_a_file(rig, fitted, tmp_path):
+    shutil.copy(fitted.folder / "preset.toml", tmp_path)
     text = rig.path.read_text().replace('"wojna2018"', '"preset.toml"')
     rig.path.write_text(
         text.replace("[parameters]", "[parameters]\ndelta = 0.002").replace(
@@ -82,10 +81,9 @@ def test_write_results__what_is_held_keeps_its_own_origin(rig, tmp_path):
     assert any(line.startswith("joint fit, nothing held") for line in summary_of(outcome))
 
 
-def test_report__holds_curves_joint_fit_and_dipoles(rig, tmp_path):
-    outcome = fit_measurement(read_measurement(rig.path))
-    write_results(outcome, tmp_path)
-    report = json.loads((tmp_path / "fit.json").read_text())
+def test_report__holds_curves_joint_fit_and_dipoles(fitted):
+    outcome = fitted.outcome
+    report = json.loads((fitted.folder / "fit.json").read_text())
     assert report["synthetic"] is True
     assert report["n_readings"] == 378
     assert len(report["curves"]) == 18
@@ -116,15 +114,11 @@ def test_fit_magnet__writes_all_and_says_where(main, rig, tmp_path):
     assert min(imread(out / "fig8.png").shape[:2]) > 300
 
 
-def test_fit_magnet__json_is_the_report(main, rig, tmp_path):
+def test_fit_magnet__json_is_the_report_and_the_preset_drives_a_simulation(main, rig, tmp_path):
     code, result, _ = main("fit-magnet", str(rig.path), "--out", str(tmp_path / "x"), "--json", "--no-figures")
     assert code == 0
     assert json.loads(result)["joint"] == json.loads((tmp_path / "x" / "fit.json").read_text())["joint"]
     assert not list((tmp_path / "x").glob("fig*"))
-
-
-def test_fit_magnet__the_preset_drives_a_simulation(main, rig, tmp_path):
-    assert main("fit-magnet", str(rig.path), "--out", str(tmp_path / "x"), "--no-figures")[0] == 0
     series = tmp_path / "t.csv"
     words = ["--preset", str(tmp_path / "x" / "preset.toml"), "--periods", "2", "--out", str(series)]
     assert main("simulate", *words, "--no-figure")[0] == 0

@@ -7,6 +7,7 @@ import pytest
 import xarray as xr
 
 from magpend_core.models import load_model
+from magpend_core.sections import run_branches
 from magpend_core.trajectory import trajectory
 
 RATE_HZ = 1000.0
@@ -32,6 +33,14 @@ atol = 1e-7
 n_transient = 300
 n_keep = 40
 """
+
+
+def walked(parameters, frequencies, start, **options):
+    """Result of the engine's walk along frequencies."""
+    packed = np.broadcast_to(parameters.pack(), (1, len(frequencies), len(parameters.names)))
+    options = {"rtol": 1e-9, "atol": 1e-9, **options}
+    places = np.array(frequencies)[None], np.array([start])
+    return run_branches(packed, *places, system=parameters.model.system, **options)
 
 
 def stepped(parameters, steps, start, *, noise=1e-3, bits=12, seed=1, drive_noise=0.02, rate_hz=RATE_HZ):
@@ -94,11 +103,6 @@ def swept(pendulum):
 
 
 @pytest.fixture(scope="session")
-def run_directory(tmp_path_factory):
+def run_directory(computed):
     """A run of the rig's model over the swept range."""
-    from pipeline.runs.run import run
-
-    folder = tmp_path_factory.mktemp("measured")
-    (folder / "spec.toml").write_text(RUN, "utf-8")
-    run(folder / "spec.toml", folder / "run", workers=0, echo=str)
-    return folder / "run"
+    return computed(RUN)

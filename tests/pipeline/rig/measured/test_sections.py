@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from pipeline.rig.edges import Edges, edges_of
+from pipeline.rig.edges import Edges
 from pipeline.rig.measured.recorded_sections import find_sections
 from pipeline.specification.problems import SpecError
 
@@ -63,19 +63,6 @@ def test_find_sections__its_noise_is_the_scatter():
     np.testing.assert_allclose(z.mean(axis=0), 0.0, atol=0.15)
     assert '"psi1": 0.00' in found.attrs["noise"]
     assert float(found.attrs["noise"].split(":")[1].rstrip("}")) == pytest.approx(2e-3, rel=0.02)
-
-
-def test_find_sections__a_rig_is_met_within_its_noise(swept):
-    """Against the true sections of a pendulum on its attractor; the bias is that of the polynomials."""
-    (ds, truth), _ = swept
-    found = find_sections(ds, edges_of(ds))
-    true = np.concatenate([t[:-1] for t in truth])
-    # the first rising edge in the recording is that of the second period
-    off = found["section"].values - true[found["number"].values + 1]
-    noise = found["section_noise"].values
-    # instants seen to a sample move the angles by their rates: up to 3 rad/s times 0.3 ms
-    assert np.abs(off[:, :2]).mean() < 1e-3
-    np.testing.assert_allclose((off / noise)[:, 2:].std(axis=0), 1.0, atol=0.15)
 
 
 def test_find_sections__edges_at_gaps_and_ends_are_left_out():

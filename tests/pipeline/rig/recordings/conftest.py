@@ -33,11 +33,10 @@ def raw_of(*stretches, apart=False):
     return Raw(Path("made.tdms"), "tdms", "0" * 64, tuple(stretches), apart=apart)
 
 
-def mapping_of(**more):
-    """A mapping of the channels a and b, with further keys of the first."""
-    return parse_mapping(
-        {"model": "pendulum", "channels": {"psi1": {"channel": "a", **more}, "psi2": {"channel": "b"}}}
-    )
+def mapping_of(*, tables=None, second=None, **first):
+    """A mapping of the channels a and b, with further keys of either, and further tables."""
+    channels = {"psi1": {"channel": "a", **first}, "psi2": {"channel": "b", **(second or {})}}
+    return parse_mapping({"model": "pendulum", "channels": channels, **(tables or {})})
 
 
 def recorded(a=None, b=None, **more):
@@ -46,6 +45,16 @@ def recorded(a=None, b=None, **more):
     a = own_a if a is None else a
     b = own_b[: len(a)] if b is None else b
     return recording_of(raw_of(channels_of({"a": a, "b": b})), mapping_of(**more))
+
+
+def same(found, wanted):
+    assert set(found.data_vars) == set(wanted.data_vars)
+    for name in wanted.data_vars:
+        np.testing.assert_array_equal(found[name], wanted[name])
+        assert found[name].attrs == wanted[name].attrs
+    np.testing.assert_array_equal(found["piece"], wanted["piece"])
+    np.testing.assert_allclose(found["time"], wanted["time"], rtol=0, atol=1e-12)
+    assert found.attrs["sampling_rate_hz"] == wanted.attrs["sampling_rate_hz"]
 
 
 @pytest.fixture(scope="session")
@@ -57,6 +66,7 @@ def make():
         raw=raw_of,
         mapping=mapping_of,
         recorded=recorded,
+        same=same,
         time=np.arange(N) / RATE_HZ,
         rate_hz=RATE_HZ,
         step_s=1.0 / RATE_HZ,

@@ -12,26 +12,7 @@ from pipeline.rig.recordings.formats import read_raw
 from pipeline.rig.recordings.writing import write_raw
 from pipeline.specification.problems import SpecError
 
-LVM = """LabVIEW Measurement\t
-Separator\tTab
-Decimal_Separator\t,
-Multi_Headings\tYes
-X_Columns\tOne
-***End_of_Header***\t
-\t
-Channels\t1\t
-Samples\t4\t
-Date\t2026/03/01\t
-Time\t12:00:00,25\t
-X0\t0,0E+0\t
-Delta_X\t0,01\t
-***End_of_Header***\t
-X_Value\ta\tComment
-0,00\t1,0
-0,01\t1,5
-0,02\t2,0
-0,03\t1,0
-"""
+from .lvm_files import lvm_segment, written_lvm
 
 
 def damaged(data, rng):
@@ -48,11 +29,12 @@ def damaged(data, rng):
     return bytes(broken)
 
 
-@pytest.mark.parametrize("suffix", [".tdms", ".csv", ".lvm"])
-def test_read_raw__damaged_files_are_read_or_refused(tmp_path, make, suffix):
+def check_damaged_files(tmp_path, make, suffix):
+    """Read 300 damaged files, which are read or refused."""
     source, target = tmp_path / f"whole{suffix}", tmp_path / f"x{suffix}"
     if suffix == ".lvm":
-        source.write_text(LVM)
+        segment = lvm_segment([1.0, 1.5, 2.0, 1.0], [0.0] * 4, columns="One", time="12:00:00.25", step=0.01)
+        written_lvm(source, [segment], decimal=",")
     else:
         write_raw(make.raw(make.channels({"a": np.arange(20.0), "b": np.ones(20)})), source)
     rng, outcomes = random.Random(7), []
@@ -67,6 +49,11 @@ def test_read_raw__damaged_files_are_read_or_refused(tmp_path, make, suffix):
         except SpecError:
             outcomes.append("refused")
     assert set(outcomes) == {"read", "refused"}
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".lvm"])
+def test_read_raw__damaged_files_are_read_or_refused(tmp_path, make, suffix):
+    check_damaged_files(tmp_path, make, suffix)
 
 
 @pytest.mark.parametrize("share", [0.02, 0.3, 0.6, 0.9, 0.99])

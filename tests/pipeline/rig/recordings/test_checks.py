@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from pipeline.rig.recordings import findings_of
+from pipeline.rig.recordings import findings_of, recording_of
 from pipeline.rig.recordings.findings import Finding, runs, to_json
 
 
@@ -15,12 +15,9 @@ def kinds(ds):
     return [(f.kind, f.channel) for f in findings_of(ds)]
 
 
-def test_recording_of__clean_recording_has_no_findings(make):
-    assert findings_of(make.recorded()) == []
-
-
-def test_recording_of__clean_noisy_quantised_recording_has_no_findings(make):
+def test_recording_of__clean_recordings_have_no_findings(make):
     """Turning points of a quantised swing hold their reading for a while; that is no cut-off top."""
+    assert findings_of(make.recorded()) == []
     rng = np.random.default_rng(0)
     a, b = make.swing()
     for grain, noise in ((2e-3, 0.0), (2e-3, 1e-3), (0.02, 0.0), (1e-6, 1e-2)):
@@ -114,14 +111,6 @@ def test_wrap__that_nobody_has_stated_is_an_error_and_is_left(make):
     np.testing.assert_array_equal(ds["psi1"], folded)
 
 
-def test_wrap__that_is_stated_is_unwrapped_and_noted(make):
-    angle = -2.5 * make.time
-    folded = np.mod(angle + math.pi, 2.0 * math.pi) - math.pi
-    ds = make.recorded(folded, wraps=True)
-    assert {(f.kind, f.severity) for f in findings_of(ds)} == {("wrap", "note")}
-    np.testing.assert_allclose(ds["psi1"], angle, atol=1e-12)
-
-
 def test_leaps__flank_of_a_wrap_that_was_sampled(make):
     """A filter before the converter makes a ramp of the wrap: parts of a turn, none of which is one."""
     angle = 2.0 * make.time
@@ -148,8 +137,6 @@ def test_leaps__none_in_a_fast_and_coarsely_sampled_turn(make):
 
 def test_unwrapped__begins_anew_in_each_piece(make):
     """How often a sensor turned while nobody looked is not known."""
-    from pipeline.rig.recordings.reading import recording_of
-
     angle = 2.0 * make.time
     folded = np.mod(angle + math.pi, 2.0 * math.pi) - math.pi
     halves = [make.channels({"a": folded[s], "b": folded[s]}) for s in (slice(0, 1000), slice(1000, None))]
@@ -160,16 +147,8 @@ def test_unwrapped__begins_anew_in_each_piece(make):
 
 
 def test_relative_to__is_added(make):
-    from pipeline.rig.recordings.mapping import parse_mapping
-    from pipeline.rig.recordings.reading import recording_of
-
     a, b = make.swing()
-    mapping = parse_mapping(
-        {
-            "model": "pendulum",
-            "channels": {"psi1": {"channel": "a"}, "psi2": {"channel": "b", "relative_to": "psi1", "sign": -1}},
-        }
-    )
+    mapping = make.mapping(second={"relative_to": "psi1", "sign": -1})
     ds = recording_of(make.raw(make.channels({"a": a, "b": b})), mapping)
     np.testing.assert_allclose(ds["psi2"], a - b)
 

@@ -34,22 +34,23 @@ dead_band = 0.2
 def swing(main, tmp_path):
     """Recording of a virtual rig, and its mapping."""
     (tmp_path / "rig.toml").write_text(RIG)
-    code, out, err = main("recordings", "simulate", "rig.toml", "--out", "swing.tdms")
-    assert (code, out) == (0, "recording: swing.tdms\nmapping: swing.toml\n"), err
-    return tmp_path / "swing.tdms"
+    code, out, err = main("recordings", "simulate", "rig.toml", "--out", "swing.csv")
+    assert (code, out) == (0, "recording: swing.csv\nmapping: swing.toml\n"), err
+    return tmp_path / "swing.csv"
 
 
 def test_recordings_show__lists_the_channels_of_a_file(main, swing):
     code, out, _ = main("recordings", "show", swing.name)
     assert code == 0
-    assert "3 channels, simulated" in out
+    assert "4 channels, simulated" in out
     assert [line.split()[:3] for line in out.splitlines()[2:]] == [
-        ["rig/psi1", "1000", "500"],
-        ["rig/psi2", "1000", "500"],
-        ["rig/drive", "1000", "500"],
+        ["time", "1000", "-"],
+        ["rig/psi1", "1000", "-"],
+        ["rig/psi2", "1000", "-"],
+        ["rig/drive", "1000", "-"],
     ]
     code, out, _ = main("recordings", "show", swing.name, "--json")
-    assert [row["channel"] for row in json.loads(out)] == ["rig/psi1", "rig/psi2", "rig/drive"]
+    assert [row["channel"] for row in json.loads(out)] == ["time", "rig/psi1", "rig/psi2", "rig/drive"]
 
 
 def test_recordings_show__with_a_mapping_says_what_was_found(main, swing, tmp_path):
@@ -70,13 +71,12 @@ def test_recordings_show__with_a_mapping_says_what_was_found(main, swing, tmp_pa
 
 
 def test_recordings_convert__is_read_with_its_mapping(main, swing):
-    for name in ("x.csv", "y.tdms"):
-        words = ("--mapping", "swing.toml", "--window", 0.5, 1.5, "--out", name)
-        code, out, err = main("recordings", "convert", swing.name, *words)
-        assert (code, out) == (0, f"recording: {name}\nmapping: {name[0]}.toml\n"), err
-        code, out, _ = main("recordings", "show", name, "--mapping", f"{name[0]}.toml")
-        assert "501 samples at 500 Hz" in out
-        assert "simulated" in out
+    words = ("--mapping", "swing.toml", "--window", 0.5, 1.5, "--out", "x.csv")
+    code, out, err = main("recordings", "convert", swing.name, *words)
+    assert (code, out) == (0, "recording: x.csv\nmapping: x.toml\n"), err
+    code, out, _ = main("recordings", "show", "x.csv", "--mapping", "x.toml")
+    assert "501 samples at 500 Hz" in out
+    assert "simulated" in out
     code, out, _ = main("recordings", "convert", swing.name, "--mapping", "swing.toml", "--out", "x.nc", "--smooth")
     assert out == "recording: x.nc\n"
 
@@ -94,12 +94,12 @@ def test_recordings_show__real_pendulum(main, tmp_path):
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (("none.tdms",), "there is no such file"),
-        (("swing.tdms", "--mapping", "none.toml"), "cannot be read"),
-        (("swing.tdms", "--out", "x.png"), "--mapping: missing"),
-        (("swing.tdms", "--mapping", "swing.toml", "--out", "x.gif"), "suffix"),
-        (("swing.tdms", "--mapping", "swing.toml", "--window", "90", "99"), "holds 0 samples"),
-        (("swing.tdms", "--mapping", "rig.toml"), "channels: missing"),
+        (("none.csv",), "there is no such file"),
+        (("swing.csv", "--mapping", "none.toml"), "cannot be read"),
+        (("swing.csv", "--out", "x.png"), "--mapping: missing"),
+        (("swing.csv", "--mapping", "swing.toml", "--out", "x.gif"), "suffix"),
+        (("swing.csv", "--mapping", "swing.toml", "--window", "90", "99"), "holds 0 samples"),
+        (("swing.csv", "--mapping", "rig.toml"), "channels: missing"),
     ],
 )
 def test_recordings_show__refuses(main, swing, words, sentence):
@@ -113,12 +113,12 @@ def test_recordings__never_replace_what_they_read(main, swing, tmp_path):
     before = {p.name: p.read_bytes() for p in tmp_path.iterdir()}
     for words in (
         ("simulate", "rig.toml", "--out", "rig.csv"),
-        ("convert", "swing.tdms", "--mapping", "swing.toml", "--out", "swing.csv"),
-        ("convert", "swing.tdms", "--mapping", "swing.toml", "--out", "swing.tdms"),
+        ("convert", "swing.csv", "--mapping", "swing.toml", "--out", "swing.csv"),
+        ("convert", "swing.csv", "--mapping", "swing.toml", "--out", "swing.tdms"),
     ):
         code, out, err = main("recordings", *words)
         assert (code, out) == (2, "")
         assert "give another name" in err
     assert {p.name: p.read_bytes() for p in tmp_path.iterdir()} == before
-    assert main("recordings", "simulate", "rig.toml", "--out", "swing.tdms")[0] == 0  # the same again
+    assert main("recordings", "simulate", "rig.toml", "--out", "swing.csv")[0] == 0  # the same again
     assert {p.name: p.read_bytes() for p in tmp_path.iterdir()} == before
