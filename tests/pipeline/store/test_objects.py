@@ -6,8 +6,10 @@ import json
 import os
 import pickle
 import platform
+import re
 import subprocess
 import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -21,42 +23,32 @@ from pipeline.runs.zoom import read_source
 from pipeline.store import lease, objects
 from pipeline.store.commits import read_commits, sweep, write_task
 from pipeline.store.errors import DamagedError, LockedError, RefusedError
+from pipeline.store.files import RECORD_COPY
 from pipeline.store.places import open_files
 from pipeline.store.products import open_product, products_in, remove_product, write_product
+from pipeline.store.record_copy import write_copy
+from pipeline.store.run import Run
 from pipeline.store.setup import check, create, establish
+from tests.pipeline.factories import SQUARE, duffing, quietly, silent
 from tests.pipeline.store.s3 import BUCKET, KEY_ID, SECRET, Server, in_turn, once
 
-pytest.importorskip("moto", reason="needs moto[s3], flask and flask-cors")
-pytest.importorskip("obstore")
+pytestmark = pytest.mark.slow
 
 PLACE = f"s3://{BUCKET}/runs/one"
 
-DUFFING = """
-kind = "sweep"
-title = "small"
-model = "duffing"
-[axes]
-frequency_hz = { start = 0.1, stop = 0.3, num = 6 }
-[initial_conditions]
-kind = "grid"
-x = { start = -1.0, stop = 1.0, num = 2 }
-v = { start = -1.0, stop = 1.0, num = 2 }
-[integration]
-rtol = 1e-6
-atol = 1e-6
-n_transient = 5
-n_keep = 4
-[execution]
-trajectories_per_task = 8
-"""
-
-
-def silent(line):
-    pass
+DUFFING = duffing(
+    "frequency_hz = { start = 0.1, stop = 0.3, num = 6 }",
+    SQUARE,
+    n_transient=5,
+    n_keep=4,
+    execution="trajectories_per_task = 18",
+)
 
 
 @pytest.fixture(scope="module")
 def server():
+    pytest.importorskip("moto", reason="needs moto[s3], flask and flask-cors")
+    pytest.importorskip("obstore")
     found = Server()
     yield found
     found.close()
@@ -118,7 +110,7 @@ def stored(place=PLACE):
 
 def test_run__same_bytes_as_in_a_folder(s3, write_spec, tmp_path, bytes_of):
     spec = write_spec(DUFFING)
-    run(spec, tmp_path / "run", workers=0, echo=silent)
+    quietly(spec, tmp_path / "run")
     said = []
     found = run(spec, PLACE, workers=0, echo=said.append)
     assert found.complete
@@ -164,7 +156,7 @@ def test_read_commits__pending_cells_are_not_data(remote):
 # ---- harm --------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kinds", [("503",), ("500", "503"), ("lost",), (None, "lost", "500")])
+@pytest.mark.parametrize("kinds", [("500", "503"), (None, "lost", "500")])
 def test_run__same_bytes_whatever_the_network_does(made, s3, bytes_of, kinds):
     for index in range(made.plan.n_tasks):
         made.commit(index)
@@ -201,7 +193,7 @@ def test_write_task__an_answer_that_never_comes(remote, s3, part, kind):
 
 def test_run__an_outage_is_one_line_and_the_same_command_goes_on(s3, write_spec, tmp_path, bytes_of):
     spec = write_spec(DUFFING)
-    run(spec, tmp_path / "run", workers=0, echo=silent)
+    quietly(spec, tmp_path / "run")
     marker = f"/{BUCKET}/runs/one/commits/000001.json"
     down = []
 
@@ -212,12 +204,12 @@ def test_run__an_outage_is_one_line_and_the_same_command_goes_on(s3, write_spec,
 
     s3.harm = harm
     with pytest.raises(Exception, match=r"127\.0\.0\.1:\d+ answers 503 Harm; committed results stay") as caught:
-        run(spec, PLACE, workers=0, echo=silent)
+        quietly(spec, PLACE)
     assert KEY_ID not in str(caught.value)
     s3.reset()
     lease.LEASE_S, before = 0.0, lease.LEASE_S  # nobody could take the lock away
     try:
-        assert run(spec, PLACE, workers=0, echo=silent).complete
+        assert quietly(spec, PLACE).complete
     finally:
         lease.LEASE_S = before
     assert stored() == bytes_of(tmp_path / "run")
@@ -462,3 +454,93 @@ def test_explorer__reads_a_run_there_as_in_a_folder(whole, made):
     points = [diagram(run, "frequency", "psi1", {"q": 1}) for run in (there, here)]
     assert points[0] == points[1]
     assert there.refreshed() is there
+
+
+# ---- the copy of the records -------------------------------------------------------------------
+
+
+@pytest.fixture
+def copied(made, s3):
+    """A complete run with the copy of its records, put into the object store file by file; returns its files."""
+    for index in range(made.plan.n_tasks):
+        made.commit(index)
+    write_copy(made.info, made.plan, read_commits(made.info, made.plan))
+    files, here = open_files(PLACE), made.info.files
+    for key in here.everything():
+        if key.rpartition("/")[2] != "lock":
+            files.write(key, here.read(key))
+    s3.reset()
+    return files
+
+
+def keys_asked(s3):
+    """Keys of the objects that were read; empty texts are listings."""
+    found = [path.partition("/runs/one/")[2] for _, path, _ in s3.requests]
+    s3.reset()
+    return found
+
+
+def test_open_run__requests_do_not_grow_with_the_tasks(copied, s3, made):
+    ds = open_run(PLACE)
+    asked = keys_asked(s3)
+    coordinates = [f"cube.zarr/{key}" for key in made.info.skeleton if not key.endswith("zarr.json")]
+    listings = ["", ""]
+    assert sorted(asked) == sorted([*listings, "run.json", "records.jsonl", "cube.zarr/zarr.json", *coordinates])
+    assert ds.load().identical(open_run(made.info.directory).load())
+    s3.reset()
+    # without the copy, a request for each record
+    copied.remove([RECORD_COPY])
+    s3.reset()
+    open_run(PLACE)
+    assert len(keys_asked(s3)) == len(asked) + made.plan.n_tasks
+
+
+def test_open_run__record_that_is_gone_is_pending(copied, made):
+    copied.remove(["commits/000001.json"])
+    run = Run.open(PLACE)
+    assert set(run.commits) == {0, 2}
+    assert (run.cube().status.values[made.plan.task(1)] == 0).all()
+
+
+def test_open_run__record_that_is_damaged_is_found_by_verify(copied):
+    content = bytearray(copied.read("commits/000001.json"))
+    content[50] ^= 1
+    copied.write("commits/000001.json", bytes(content))
+    assert len(Run.open(PLACE).commits) == 3  # the copy has the record as it was written, with its own checksum
+    found = verify_run(PLACE, repair=True)
+    assert list(found.damaged) == ["000001.json"]
+    assert not copied.is_there(RECORD_COPY)
+    assert set(Run.open(PLACE).commits) == {0, 2}
+
+
+def test_open_run__group_that_was_changed_is_refused(copied):
+    content = copied.read("cube.zarr/zarr.json").replace(b'"units": "s"', b'"units": "h"')
+    copied.write("cube.zarr/zarr.json", content)
+    with pytest.raises(DamagedError, match=r"zarr\.json: its content has changed"):
+        open_run(PLACE)
+
+
+def test_docs__example_of_the_object_store(copied, s3, monkeypatch):
+    text = (Path(__file__).parents[3] / "docs/object-stores.md").read_text("utf-8")
+    (block,) = re.findall(r"<!-- tested -->\n```python\n(.*?)```", text, re.DOTALL)
+    monkeypatch.setenv("AWS_ALLOW_HTTP", "true")
+    names = {}
+    exec(block.replace("runs/sweep", "runs/one"), names)
+    assert names["ds"].sizes == names["plain"].sizes == names["lazy"].sizes
+    assert names["plain"].section.load().equals(names["ds"].section.load())
+
+
+def test_open_zarr__asks_for_the_group_and_the_indexes(copied, s3, made):
+    """What xarray does alone: one request for all metadata, and one for each index unless they are left out."""
+    from zarr.storage import ObjectStore
+
+    store = ObjectStore(copied.below("cube.zarr").store, read_only=True)
+    ds = xr.open_zarr(store, consolidated=True, zarr_format=3, create_default_indexes=False)
+    assert keys_asked(s3) == ["cube.zarr/zarr.json"]
+    assert set(ds.variables) == set(open_run(made.info.directory).variables)
+    indexed = xr.open_zarr(store, consolidated=True, zarr_format=3)
+    s3.reset()
+    assert indexed.status.dims == ds.status.dims
+    indexes = [f"cube.zarr/{name}/c.0" for name in indexed.xindexes]
+    xr.open_zarr(store, consolidated=True, zarr_format=3)
+    assert sorted(keys_asked(s3)) == sorted(["cube.zarr/zarr.json", *indexes])
