@@ -16,6 +16,7 @@ from pipeline.products.registry import CELL_PRODUCTS
 from pipeline.runs.workflows import read_given, shipped_workflows
 from pipeline.specification.parsing import _KEYS, load_spec, parse_spec
 from pipeline.specification.problems import SpecError
+from tests.pipeline.factories import silent
 
 EQUATIONS = "x' = v\nv' = -k*x - 0.2*v + A*cos(2*pi*f*t)"
 TEXT = """
@@ -77,6 +78,9 @@ def test_model__is_that_of_the_toml_text():
     assert oscillator().digest == of_text.digest
     assert magpend.model("duffing") is magpend.load_model("duffing")
     assert magpend.model({"x": "v", "v": "-x"}) is magpend.model("x' = v\nv' = -x")
+    lines = repr(oscillator()).splitlines()
+    assert lines[0] == "model oscillator"
+    assert lines[-2:] == ["  x' = v", "  v' = -k*x - 0.2*v + A*cos(2*pi*f*t)"]
 
 
 def test_model__refuses_keywords_for_a_model_that_is_given(tmp_path):
@@ -86,12 +90,6 @@ def test_model__refuses_keywords_for_a_model_that_is_given(tmp_path):
     assert magpend.model(tmp_path / "m.toml") is oscillator()
     with pytest.warns(UserWarning, match="c: nothing uses it"):
         magpend.model("x' = -x", c=1.0)
-
-
-def test_model__shows_its_equations():
-    lines = repr(oscillator()).splitlines()
-    assert lines[0] == "model oscillator"
-    assert lines[-2:] == ["  x' = v", "  v' = -k*x - 0.2*v + A*cos(2*pi*f*t)"]
 
 
 def test_spec__is_the_run_of_its_toml_text(tmp_path):
@@ -104,11 +102,8 @@ def test_spec__is_the_run_of_its_toml_text(tmp_path):
     assert magpend.Spec.read(TEXT)["axes"] == tomllib.loads(TEXT)["axes"]
     assert read_given(spec)[2] == read_given(spec.toml())[2] == read_given(dict(spec))[2]
     assert not same_run(spec.axis("A", 0.1, 0.4, 3), TEXT)
-
-
-def test_spec__takes_tables_as_keywords():
-    tables = {key: value for key, value in built().items() if key != "model"}
-    assert magpend.Spec(**tables, model=oscillator()) == built()
+    tables = {key: value for key, value in spec.items() if key != "model"}
+    assert magpend.Spec(**tables, model=oscillator()) == spec
 
 
 def test_spec__is_not_changed_by_its_methods():
@@ -143,15 +138,13 @@ def test_spec__has_a_method_for_every_table_and_its_keys():
     assert "Relative tolerance of a step" in magpend.Spec.integration.__doc__
 
 
-@pytest.mark.parametrize("name", shipped_workflows())
-def test_spec__reads_and_writes_what_ships(name, tmp_path):
-    path = shipped_workflows()[name]
-    spec = magpend.Spec.read(name)
-    shipped = load_spec(path)
-    for tables in (spec, tomllib.loads(spec.toml())):
-        again = parse_spec({key: value for key, value in tables.items() if key != "smoke"})
-        assert again.as_dict() == shipped.as_dict()
-        assert again.model.reference == shipped.model.reference
+def test_spec__reads_and_writes_what_ships():
+    for name, path in shipped_workflows().items():
+        spec, shipped = magpend.Spec.read(name), load_spec(path)
+        for tables in (spec, tomllib.loads(spec.toml())):
+            again = parse_spec({key: value for key, value in tables.items() if key != "smoke"})
+            assert again.as_dict() == shipped.as_dict(), name
+            assert again.model.reference == shipped.model.reference, name
 
 
 def test_spec__names_files_from_where_it_is(tmp_path, monkeypatch):
@@ -182,17 +175,19 @@ def test_preview__is_the_dry_run(tmp_path):
 
 
 def test_run__of_a_spec_of_a_dict_and_of_equations(tmp_path, bytes_of):
-    spec, quiet = built(), {"workers": 0, "echo": lambda _: None}
-    whole = magpend.run(spec, tmp_path / "spec", **quiet)
-    assert whole.complete
-    magpend.run({**spec, "model": oscillator()}, tmp_path / "dict", **quiet)
+    spec = built()
     (tmp_path / "spec.toml").write_text(TEXT, "utf-8")
-    magpend.run(tmp_path / "spec.toml", tmp_path / "text", **quiet)
-    arrays = {
-        name: {k: v for k, v in bytes_of(tmp_path / name).items() if not k.endswith("cube.zarr/zarr.json")}
-        for name in ("spec", "dict", "text")
+    given = {
+        "spec": spec,
+        "dict": {**spec, "model": oscillator()},
+        "text": tmp_path / "spec.toml",
+        "lines": {**spec, "model": f"{EQUATIONS}\nk = 1.0\nA = 0.5"},
     }
-    assert arrays["spec"] == arrays["dict"] == arrays["text"]
-    of_lines = magpend.run({**spec, "model": f"{EQUATIONS}\nk = 1.0\nA = 0.5"}, tmp_path / "lines", **quiet)
-    section = whole.cube().section
-    assert np.array_equal(of_lines.cube().section.values, section.values)
+    runs = {name: magpend.run(one, tmp_path / name, workers=0, echo=silent) for name, one in given.items()}
+    assert runs["spec"].complete
+    arrays = {
+        name: {k: v for k, v in bytes_of(tmp_path / name).items() if k.startswith("cube.zarr/section/c")}
+        for name in given
+    }
+    assert arrays["spec"] == arrays["dict"] == arrays["text"] == arrays["lines"]
+    assert runs["spec"].digest == runs["dict"].digest == runs["text"].digest
