@@ -41,9 +41,9 @@ ODD = {
     "deep lists": ("kind = " + "[" * DEEP + "]" * DEEP, "nested too deeply"),
     "deep tables": ("kind = " + "{a = " * DEEP + "1" + "}" * DEEP, "nested too deeply"),
     "deep key": ("a." * DEEP + "b = 1", "nested too deeply"),
-    "deep quoted key": (BASE + '"' + "a." * DEEP + 'b" = 1', "unknown key"),
+    "deep quoted key": (BASE + '"' + "a." * DEEP + 'b" = 1', "characters; the limit is 200"),
     "rather deep": ("kind = " + "[" * 60 + "]" * 60, "nested too deeply"),
-    "endless key": ("a" * 100_000 + " = 1", "unknown key"),
+    "endless key": ("a" * 100_000 + " = 1", "characters; the limit is 200"),
     "dates": ("kind = 2020-01-01\ntitle = 12:00:00", "title"),
     "no text": ("kind = \x00", "not valid TOML"),
     "empty": ("", "kind: missing"),
@@ -67,14 +67,14 @@ def refused(main, tmp_path):
     """Give a specification to the command, which must refuse it; returns what it says."""
     spec = tmp_path / "spec.toml"
 
-    def call(text, *options):
+    def call(text, *options, ways=(["--out", "run"], ["--dry-run"])):
         spec.write_bytes(text if isinstance(text, bytes) else text.encode("utf-8", "surrogatepass"))
-        for words in (["--out", "run"], ["--dry-run"]):
+        for words in ways:
             code, _, said = main("run", "spec.toml", *words, *options)
             assert code == 2, said
-            assert said.startswith("magpend: ")
+            assert said.count("magpend: ") == 1
             assert "Traceback" not in said
-            assert 20 < len(said.encode()) <= 2000
+            assert 20 < len(said.encode()) <= 2100
             assert all(c.isprintable() or c == "\n" for c in said)
         assert sorted(p.name for p in tmp_path.iterdir()) == ["spec.toml"]
         return said
@@ -180,7 +180,7 @@ def held(refused, path, content):
     path.write_bytes(content)
     for smoke, options in ((False, ()), (True, ("--smoke",))):
         if not outcome(path, smoke):
-            refused(content, *options)
+            refused(content, *options, ways=[["--dry-run"]])
 
 
 def test_outcome__what_is_mutated_can_be_planned(write_spec):

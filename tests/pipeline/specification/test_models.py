@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
 import sys
 import tomllib
 
 import pytest
 
-from magpend_core.models import import_model, load_model
+from magpend_core.models import import_model, imported, load_model
 from magpend_core.models.imported import DescribedModel, origin
 from magpend_core.models.parameters import ParameterError
 from pipeline.runs.zoom import Changes, Source, write_zoom
@@ -134,8 +132,6 @@ def test_parse_spec__imports_the_object_that_a_person_names(own, tmp_path, modul
 
 
 def test_kept_spec__describes_an_object_without_importing_it(own, tmp_path, module, monkeypatch):
-    from magpend_core.models import imported
-
     (name, trace), (spec, plain) = module, object_spec(own, module, tmp_path)
     trace.unlink()
     sys.modules.pop(name)
@@ -151,25 +147,19 @@ def test_kept_spec__describes_an_object_without_importing_it(own, tmp_path, modu
     assert load_model(model.reference) is model  # so that parameters compare
 
 
-def test_import_model__digest_is_that_of_the_module(own, tmp_path, module):
+def test_import_model__digest_is_that_of_the_module(own, tmp_path, module, monkeypatch):
     """What is commented does not count, what is computed does."""
     name, _ = module
     digests = []
     for i, change in enumerate([("", ""), ("def rhs", "# a remark\ndef rhs"), ("- y[0]", "- 2.0 * y[0]")]):
-        folder = tmp_path / str(i)
-        own.write_module(folder, name)
-        path = folder / f"{name}.py"
+        own.write_module(tmp_path / str(i), name)
+        path = tmp_path / str(i) / f"{name}.py"
         path.write_text(path.read_text().replace(*change) if change[0] else path.read_text())
-        code = f"from magpend_core.models import import_model as i; print(i('{name}:MINE', '.').digest)"
-        found = subprocess.run(
-            [sys.executable, "-c", code],
-            cwd=folder,
-            capture_output=True,
-            text=True,
-            check=True,
-            env={**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)},
-        )
-        digests.append(found.stdout.strip())
+        monkeypatch.setattr(imported, "_imported", {})
+        monkeypatch.setattr(sys, "path", [*sys.path])
+        sys.modules.pop(name, None)
+        digests.append(import_model(f"{name}:MINE", path.parent).digest)
+        assert sys.modules[name].__file__ == str(path)
     assert digests[0] == digests[1] != digests[2]
 
 

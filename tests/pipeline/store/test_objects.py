@@ -143,16 +143,6 @@ def test_write_task__few_requests(made, remote, s3):
     assert s3.requests[-1][:2] == ("PUT", f"/{BUCKET}/runs/one/commits/000001.json")
 
 
-def test_read_commits__pending_cells_are_not_data(remote):
-    remote.commit(1)
-    remote.info.files.below("commits").remove(["000001.json"])
-    assert (open_run(PLACE).status == 0).all()
-    commits = read_commits(remote.info, remote.plan)
-    assert not commits
-    assert sweep(remote.info, remote.plan, commits) > 0
-    assert set(stored()) == {f"cube.zarr/{key}" for key in remote.info.skeleton}
-
-
 # ---- harm --------------------------------------------------------------------------------------
 
 
@@ -340,15 +330,12 @@ def test_lease__names_its_holder_and_ends_with_it(remote):
     assert not files.is_there("lock")
 
 
-def test_lease__of_a_process_that_was_killed_is_free_at_once(remote):
+def test_lease__lapses_when_it_is_not_renewed_and_at_once_when_its_process_was_killed(remote, monkeypatch):
     process = subprocess.Popen([sys.executable, "-c", ""])
     process.wait()
     held_by(remote, pid=process.pid)
     with remote.info.files.lock():
         pass
-
-
-def test_lease__lapses_when_it_is_not_renewed(remote, monkeypatch):
     held_by(remote, host="elsewhere")
     with pytest.raises(LockedError, match=r"on elsewhere since .*lapses 150 s after"), remote.info.files.lock():
         pass
@@ -375,37 +362,36 @@ def test_lease__lost_answers_do_not_lock_oneself_out(remote, s3):
 # ---- what is refused ---------------------------------------------------------------------------
 
 
-def one_line(text):
-    (line,) = text.strip().splitlines()
-    return line
-
-
 def test_main__refusals_are_one_line(s3, made, main, monkeypatch, tmp_path):
-    def errors(*arguments, code=2):
+    def refused(words, *arguments, code=2):
         found, _, text = main(*arguments)
         assert found == code
         assert SECRET not in text
         assert KEY_ID not in text
-        return one_line(text)
+        (line,) = text.strip().splitlines()
+        assert words in line
 
-    assert "runs/none: no run directory" in errors("status", f"s3://{BUCKET}/runs/none")
-    assert "there is no such bucket at 127.0.0.1" in errors("status", "s3://nobucket/run")
-    assert "there is no such bucket at 127.0.0.1" in errors("run", "spec.toml", "--out", "s3://nobucket/run")
-    assert "give a path, or s3://BUCKET/PREFIX" in errors("status", "s3:/measurements/run")
-    assert "give a path, or s3://BUCKET/PREFIX" in errors("status", "gs://measurements/run")
-    assert "must be s3://BUCKET/PREFIX" in errors("status", "s3://")
-    assert "must be s3://BUCKET/PREFIX" in errors("status", f"s3://{BUCKET}/../run")
-    assert "no user, password or query" in errors("status", f"s3://{KEY_ID}:{SECRET}@host/run")
+    for words, place in (
+        ("runs/none: no run directory", f"s3://{BUCKET}/runs/none"),
+        ("there is no such bucket at 127.0.0.1", "s3://nobucket/run"),
+        ("give a path, or s3://BUCKET/PREFIX", "s3:/measurements/run"),
+        ("give a path, or s3://BUCKET/PREFIX", "gs://measurements/run"),
+        ("must be s3://BUCKET/PREFIX", "s3://"),
+        ("must be s3://BUCKET/PREFIX", f"s3://{BUCKET}/../run"),
+        ("no user, password or query", f"s3://{KEY_ID}:{SECRET}@host/run"),
+    ):
+        refused(words, "status", place)
+    refused("there is no such bucket at 127.0.0.1", "run", "spec.toml", "--out", "s3://nobucket/run")
     s3.harm = lambda method, path, n: "403"
-    assert "refuses access (403 Harm); check AWS_ACCESS_KEY_ID" in errors("status", PLACE)
+    refused("refuses access (403 Harm); check AWS_ACCESS_KEY_ID", "status", PLACE)
     with monkeypatch.context() as patch:
         patch.setitem(sys.modules, "obstore", None)
-        assert "pip install 'magpend[s3]'" in errors("status", PLACE)
+        refused("magpend[s3]", "status", PLACE)
     with monkeypatch.context() as patch:
         patch.delenv("AWS_ACCESS_KEY_ID")
-        assert "there are no credentials; set AWS_ACCESS_KEY_ID" in errors("status", PLACE)
+        refused("there are no credentials; set AWS_ACCESS_KEY_ID", "status", PLACE)
     monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://{KEY_ID}:{SECRET}@127.0.0.1:1")
-    assert "127.0.0.1:1 does not answer" in errors("status", PLACE, code=4)
+    refused("127.0.0.1:1 does not answer", "status", PLACE, code=4)
     assert not (tmp_path / "s3:").exists()
 
 
@@ -495,14 +481,7 @@ def test_open_run__requests_do_not_grow_with_the_tasks(copied, s3, made):
     assert len(keys_asked(s3)) == len(asked) + made.plan.n_tasks
 
 
-def test_open_run__record_that_is_gone_is_pending(copied, made):
-    copied.remove(["commits/000001.json"])
-    run = Run.open(PLACE)
-    assert set(run.commits) == {0, 2}
-    assert (run.cube().status.values[made.plan.task(1)] == 0).all()
-
-
-def test_open_run__record_that_is_damaged_is_found_by_verify(copied):
+def test_open_run__record_that_is_damaged_is_found_by_verify(copied, made):
     content = bytearray(copied.read("commits/000001.json"))
     content[50] ^= 1
     copied.write("commits/000001.json", bytes(content))
@@ -510,7 +489,9 @@ def test_open_run__record_that_is_damaged_is_found_by_verify(copied):
     found = verify_run(PLACE, repair=True)
     assert list(found.damaged) == ["000001.json"]
     assert not copied.is_there(RECORD_COPY)
-    assert set(Run.open(PLACE).commits) == {0, 2}
+    run = Run.open(PLACE)
+    assert set(run.commits) == {0, 2}
+    assert (run.cube().status.values[made.plan.task(1)] == 0).all()
 
 
 def test_open_run__group_that_was_changed_is_refused(copied):
@@ -528,19 +509,3 @@ def test_docs__example_of_the_object_store(copied, s3, monkeypatch):
     exec(block.replace("runs/sweep", "runs/one"), names)
     assert names["ds"].sizes == names["plain"].sizes == names["lazy"].sizes
     assert names["plain"].section.load().equals(names["ds"].section.load())
-
-
-def test_open_zarr__asks_for_the_group_and_the_indexes(copied, s3, made):
-    """What xarray does alone: one request for all metadata, and one for each index unless they are left out."""
-    from zarr.storage import ObjectStore
-
-    store = ObjectStore(copied.below("cube.zarr").store, read_only=True)
-    ds = xr.open_zarr(store, consolidated=True, zarr_format=3, create_default_indexes=False)
-    assert keys_asked(s3) == ["cube.zarr/zarr.json"]
-    assert set(ds.variables) == set(open_run(made.info.directory).variables)
-    indexed = xr.open_zarr(store, consolidated=True, zarr_format=3)
-    s3.reset()
-    assert indexed.status.dims == ds.status.dims
-    indexes = [f"cube.zarr/{name}/c.0" for name in indexed.xindexes]
-    xr.open_zarr(store, consolidated=True, zarr_format=3)
-    assert sorted(keys_asked(s3)) == sorted(["cube.zarr/zarr.json", *indexes])
