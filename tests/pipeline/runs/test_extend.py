@@ -278,7 +278,7 @@ def test_extend__refuses_what_would_lose_or_take_nothing(place, write_spec):
         "10 of its cells would be lost": ("start = 0.10, stop = 0.14", "start = 0.12, stop = 0.16"),
         r"integration\.rtol: 1e-06 in the directory, 1e-07 now": ("rtol = 1e-06", "rtol = 1e-07"),
         "no initial state is the same": ("v = 0.1", "v = 0.2"),
-        "judged by the last 64 sections: keep as many": ("n_keep = 4", "n_keep = 40"),
+        "judged by the last 43 sections: keep as many": ("n_keep = 4", "n_keep = 40"),
     }
     for words, change in changes.items():
         assert change[0] in BASE

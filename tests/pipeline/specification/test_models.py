@@ -150,13 +150,13 @@ def test_kept_spec__describes_an_object_without_importing_it(own, tmp_path, modu
 def test_import_model__digest_is_that_of_the_module(own, tmp_path, module, monkeypatch):
     """What is commented does not count, what is computed does."""
     name, _ = module
-    digests = []
+    digests, path_before = [], [*sys.path]
     for i, change in enumerate([("", ""), ("def rhs", "# a remark\ndef rhs"), ("- y[0]", "- 2.0 * y[0]")]):
         own.write_module(tmp_path / str(i), name)
         path = tmp_path / str(i) / f"{name}.py"
         path.write_text(path.read_text().replace(*change) if change[0] else path.read_text())
         monkeypatch.setattr(imported, "_imported", {})
-        monkeypatch.setattr(sys, "path", [*sys.path])
+        monkeypatch.setattr(sys, "path", [*path_before])
         sys.modules.pop(name, None)
         digests.append(import_model(f"{name}:MINE", path.parent).digest)
         assert sys.modules[name].__file__ == str(path)
