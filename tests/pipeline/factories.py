@@ -11,6 +11,58 @@ WELLS = 'kind = "list"\npoints = [[0.1, 0.0], [1.0, 0.2]]'
 SQUARE = 'kind = "grid"\nx = { start = -1.0, stop = 1.0, num = 3 }\nv = { start = -1.0, stop = 1.0, num = 3 }'
 
 
+# a double well with noise
+WELL = """
+kind = "sweep"
+title = "double well with noise"
+
+[model]
+name = "well"
+states = { x = { meaning = "position" } }
+parameters = { a = 1.0 }
+equations = { x = "a*x - x**3" }
+
+[noise]
+strengths = { x = 0.5 }
+seed = 1
+steps_per_period = 8
+
+[parameters]
+frequency_hz = 5.0
+
+[axes]
+noise_x = { values = [0.45, 0.55, 0.7] }
+realization = { start = 0, stop = 199, step = 1 }
+
+[initial_conditions]
+kind = "list"
+points = [[-1.0]]
+
+[integration]
+n_transient = 0
+n_keep = 1000
+"""
+
+# a fold that moves: x + l = -1 is stable, 1 unstable
+FOLD_LENGTH = 20.0
+MODEL = {
+    "name": "moving-fold",
+    "states": {"x": {"escape": 1e6}},
+    "parameters": {"l": 0.0},
+    "equations": {"x": "(x + l)**2 - 1"},
+}
+FOLD = {
+    "kind": "sweep",
+    "title": "a fold that moves",
+    "model": MODEL,
+    "parameters": {"frequency_hz": 1.0},
+    "drift": {"l": {"to": FOLD_LENGTH}},
+    "axes": {"l_rate_per_s": {"values": [0.9, 1.0, 1.1, 1.3]}},
+    "initial_conditions": {"kind": "list", "points": [[-1.0], [0.25]]},
+    "integration": {"rtol": 1e-10, "atol": 1e-10, "n_transient": 0, "n_keep": 40},
+}
+
+
 def silent(line: str) -> None:
     """Echo nothing."""
 

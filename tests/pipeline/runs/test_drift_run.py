@@ -17,25 +17,9 @@ from pipeline.runs.derive import derive
 from pipeline.runs.drawing import figure
 from pipeline.specification.parsing import kept_spec, parse_spec
 from pipeline.specification.problems import SpecError
-from tests.pipeline.factories import quietly
+from tests.pipeline.factories import FOLD, FOLD_LENGTH, quietly
 
-LENGTH = 20.0
-MODEL = {
-    "name": "moving-fold",
-    "states": {"x": {"escape": 1e6}},
-    "parameters": {"l": 0.0},
-    "equations": {"x": "(x + l)**2 - 1"},
-}
-SPEC = {
-    "kind": "sweep",
-    "title": "a fold that moves",
-    "model": MODEL,
-    "parameters": {"frequency_hz": 1.0},
-    "drift": {"l": {"to": LENGTH}},
-    "axes": {"l_rate_per_s": {"values": [0.9, 1.0, 1.1, 1.3]}},
-    "initial_conditions": {"kind": "list", "points": [[-1.0], [0.25]]},
-    "integration": {"rtol": 1e-10, "atol": 1e-10, "n_transient": 0, "n_keep": 40},
-}
+LENGTH, SPEC = FOLD_LENGTH, FOLD
 
 
 def with_changes(**tables):

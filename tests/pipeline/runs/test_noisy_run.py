@@ -23,38 +23,8 @@ from pipeline.runs.run import run
 from pipeline.specification.parsing import parse_spec
 from pipeline.specification.problems import SpecError
 from pipeline.store.places import open_files
-from tests.pipeline.factories import finished, quietly
+from tests.pipeline.factories import WELL, finished, quietly
 
-WELL = """
-kind = "sweep"
-title = "double well with noise"
-
-[model]
-name = "well"
-states = { x = { meaning = "position" } }
-parameters = { a = 1.0 }
-equations = { x = "a*x - x**3" }
-
-[noise]
-strengths = { x = 0.5 }
-seed = 1
-steps_per_period = 8
-
-[parameters]
-frequency_hz = 5.0
-
-[axes]
-noise_x = { values = [0.45, 0.55, 0.7] }
-realization = { start = 0, stop = 199, step = 1 }
-
-[initial_conditions]
-kind = "list"
-points = [[-1.0]]
-
-[integration]
-n_transient = 0
-n_keep = 1000
-"""
 S = (0.45, 0.55, 0.7)
 
 

@@ -5,17 +5,16 @@ from __future__ import annotations
 import json
 import re
 import shutil
-import subprocess
 import sys
 import time
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
 from magpend_core.engine import jit
+from magpend_core.models import imported
 from pipeline import open_run
 from pipeline.layout.identity import digest_of
 from pipeline.layout.vocabulary import model_of
@@ -29,44 +28,6 @@ def text_spec(own, write_spec, tmp_path):
     """A specification whose model is a file beside it."""
     (tmp_path / "shared.toml").write_text(own.text)
     return write_spec(own.spec('model = "shared.toml"'))
-
-
-IN_TURN = """
-import contextlib, io, json, os, sys
-from pipeline.cli.main import main
-found = []
-for folder, *words in json.loads(sys.argv[1]):
-    os.chdir(folder)
-    sys.argv, out, err, code = ["magpend", *words], io.StringIO(), io.StringIO(), 0
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        try:
-            main()
-        except SystemExit as end:
-            code = int(end.code or 0)
-    found.append({"returncode": code, "stdout": out.getvalue(), "stderr": err.getvalue()})
-print(json.dumps(found))
-"""
-
-
-@pytest.fixture
-def in_turn(tmp_path, environment):
-    """Commands, each in its folder, one after another in one new process, which has imported nothing yet."""
-
-    def call(*commands):
-        words = json.dumps([[str(word) for word in command] for command in commands])
-        done = subprocess.run(
-            [sys.executable, "-c", IN_TURN, words],
-            cwd=tmp_path,
-            env=environment,
-            capture_output=True,
-            text=True,
-            timeout=300,
-            check=False,
-        )
-        assert done.returncode == 0, done.stderr
-        return [SimpleNamespace(**one) for one in json.loads(done.stdout)]
-
-    return call
 
 
 def rewritten(directory: Path, change) -> None:
@@ -215,7 +176,7 @@ def test_open_run__stranger_s_object_is_never_imported(own, stored, tmp_path, ma
 
 
 @pytest.mark.slow
-def test_run__object_reaches_workers_and_is_held_to_its_digest(own, tmp_path, magpend, in_turn, main):
+def test_run__object_reaches_workers_and_is_held_to_its_digest(own, tmp_path, magpend, main, monkeypatch):
     """The module lies beside the specification alone; the run is made from elsewhere."""
     project, elsewhere = tmp_path / "project", tmp_path / "elsewhere"
     trace = own.write_module(project, "mine")
@@ -239,19 +200,21 @@ def test_run__object_reaches_workers_and_is_held_to_its_digest(own, tmp_path, ma
     trace.unlink()
     assert main("analyse", "attractors", elsewhere / "run")[0] == 2
     assert not trace.exists()
-    found = magpend("analyse", "attractors", elsewhere / "run", *named, "--json", cwd=project)
-    assert [row["orbit_period"] for row in json.loads(found.stdout)] == [1]
+    monkeypatch.syspath_prepend(project)
+    code, out, err = main("analyse", "attractors", elsewhere / "run", *named, "--json")
+    assert code == 0, err
+    assert [row["orbit_period"] for row in json.loads(out)] == [1]
+    # as another process sees it, in which the object has changed
     module = project / "mine.py"
     module.write_text(module.read_text().replace("- y[0]", "- 1.1 * y[0]"))
-    again, kept, settling, more = in_turn(
-        (elsewhere, "run", project / "spec.toml", "--out", "run"),
-        (project, "analyse", "attractors", elsewhere / "run", *named, "--json"),
-        (project, "analyse", "settling", elsewhere / "run", *named),
-        (project, "analyse", "settling", elsewhere / "run", *named, "--budget", "2"),
-    )
-    assert again.returncode == 2
-    assert "model_digest" in again.stderr
-    assert kept.returncode == 0  # what was kept needs no object
-    assert settling.returncode == 0  # and neither does what follows from it
-    assert more.returncode == 2  # a longer extension integrates
-    assert "restore the code" in more.stderr
+    sys.modules.pop("mine")
+    monkeypatch.setattr(imported, "_imported", {})
+    code, _, said = main("run", project / "spec.toml", "--out", elsewhere / "run")
+    assert code == 2
+    assert "model_digest" in said
+    assert main("analyse", "attractors", elsewhere / "run", *named, "--json")[0] == 0  # what was kept needs no object
+    assert main("analyse", "settling", elsewhere / "run", *named)[0] == 0  # and neither does what follows from it
+    code, _, said = main("analyse", "settling", elsewhere / "run", *named, "--budget", "2")
+    assert code == 2  # a longer extension integrates
+    assert "restore the code" in said
+    sys.modules.pop("mine")
