@@ -19,7 +19,7 @@ from tests.pipeline.factories import quietly
 ROOT = Path(__file__).parents[3]
 PATIENCE_S = 240.0
 pytestmark = pytest.mark.slow
-# the equations of tests/pipeline/runs/test_python.py, which are compiled already
+# the equations of tests/pipeline/runs/test_building.py, which are compiled already
 CELL = """
 import magpend
 model = magpend.model(

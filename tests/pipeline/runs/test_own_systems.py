@@ -40,26 +40,6 @@ def rewritten(directory: Path, change) -> None:
     path.write_text(seal(json.dumps(data)))
 
 
-@pytest.mark.slow
-def test_run__text_from_the_specification_to_the_figure(text_spec, tmp_path, magpend, command):
-    """Elsewhere, in another process, with the shared file gone: the run explains itself."""
-    directory, elsewhere = tmp_path / "run", tmp_path / "elsewhere"
-    elsewhere.mkdir()
-    done = magpend("run", text_spec, "--out", directory, "--workers", 0)
-    assert done.returncode == 0, done.stderr
-    (tmp_path / "shared.toml").unlink()
-    assert "complete" in magpend("status", directory, cwd=elsewhere).stdout
-    assert "intact" in command(elsewhere, "verify", directory)[0]
-    table = json.loads(command(elsewhere, "analyse", "attractors", directory, "--json")[0])
-    assert "periodic_orbit" in {row["kind"] for row in table}
-    command(elsewhere, "analyse", "basins", directory, "--json")
-    command(elsewhere, "plot", "basins", directory)
-    assert (directory / "figures" / "basins.png").is_file()
-    command(elsewhere, "zoom", directory, "--x", "-0.5", "0.5", "--out", "closer.toml")
-    command(elsewhere, "run", "closer.toml", "--workers", 0)
-    assert open_run(elsewhere / "runs" / "closer").x_0.values.max() == 0.5
-
-
 @pytest.fixture(scope="module")
 def finished_text(own, tmp_path_factory):
     """A finished run of a model in a text."""
@@ -72,6 +52,22 @@ def finished_text(own, tmp_path_factory):
 def stored(finished_text, tmp_path):
     """A copy of it."""
     return shutil.copytree(finished_text, tmp_path / "run")
+
+
+@pytest.mark.slow
+def test_run__text_explains_itself_from_status_to_figure(stored, tmp_path, magpend, command):
+    """Elsewhere, in another process, without the shared file."""
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    assert "complete" in magpend("status", stored, cwd=elsewhere).stdout
+    assert "intact" in command(elsewhere, "verify", stored)[0]
+    table = json.loads(command(elsewhere, "analyse", "attractors", stored, "--json")[0])
+    assert "periodic_orbit" in {row["kind"] for row in table}
+    command(elsewhere, "plot", "basins", stored)
+    assert (stored / "figures" / "basins.png").is_file()
+    command(elsewhere, "zoom", stored, "--x", "-0.5", "0.5", "--out", "closer.toml")
+    command(elsewhere, "run", "closer.toml", "--workers", 0)
+    assert open_run(elsewhere / "runs" / "closer").x_0.values.max() == 0.5
 
 
 def test_run__text_is_integrated_as_it_is_written(finished_text):
