@@ -21,25 +21,14 @@ from pipeline.runs.estimate import _points, _sample, estimate, mean_with_tail, w
 from pipeline.runs.preview import describe_plan
 from pipeline.specification.parsing import parse_spec
 from pipeline.store import commits
-from tests.pipeline.factories import quietly
+from tests.pipeline.factories import duffing, quietly
 
-CLOSING = """
-kind = "sweep"
-[axes]
-frequency_hz = { start = 2.0, stop = 3.0, num = 5 }
-[initial_conditions]
-kind = "random"
-n = 64
-psi1_deg = [-40, 40]
-psi2_deg = [-40, 40]
-[integration]
-rtol = 1e-6
-atol = 1e-6
-n_transient = 400
-n_keep = 16
-stop_when_closed = true
-closure_tolerance = 1e-2
-"""
+CLOSING = duffing(
+    "frequency_hz = { start = 0.15, stop = 0.25, num = 5 }",
+    'kind = "random"\nn = 64\nx = [-1, 1]\nv = [-1, 1]',
+    n_transient=400,
+    n_keep=16,
+).replace("n_keep = 16", "n_keep = 16\nstop_when_closed = true\nclosure_tolerance = 1e-2")
 
 
 def read(text):
