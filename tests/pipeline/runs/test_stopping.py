@@ -13,16 +13,22 @@ import psutil
 import pytest
 
 from pipeline.compute import local
-from tests.pipeline.factories import duffing
 
-SPEC = duffing(
-    "frequency_hz = { start = 0.1, stop = 0.3, num = 8 }",
-    'kind = "random"\nn = 64\nx = [-1, 1]',
-    n_transient=300,
-    n_keep=4,
-    tolerance=1e-8,
-    execution="trajectories_per_task = 16",
-)
+SPEC = """
+kind = "sweep"
+model = "duffing"
+[axes]
+frequency_hz = { start = 0.1, stop = 0.3, num = 8 }
+[initial_conditions]
+kind = "random"
+n = 64
+x = [-1, 1]
+[integration]
+n_transient = 300
+n_keep = 4
+[execution]
+trajectories_per_task = 16
+"""
 
 
 def heed_signals():
