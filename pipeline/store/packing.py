@@ -94,8 +94,8 @@ def _rewrite(info: RunInfo, block: int, tasks: set[int]) -> None:
     """Rewrite a pack (a file of many commit records) without the records of some tasks and without damaged ones."""
     try:
         content = info.files.read(pack_key(block))
-    except FileNotFoundError:
-        return
+    except FileNotFoundError:  # none, or a link, which is not read
+        content = b""
     kept: Mapping[int, Commit] = {
         index: commit for index, commit in salvage(content, info.digest, block).items() if index not in tasks
     }

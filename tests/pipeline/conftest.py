@@ -167,7 +167,7 @@ def magpend(tmp_path, environment):
     def call(*arguments, **options):
         return subprocess.run(
             [sys.executable, "-m", "pipeline.cli.main", *map(str, arguments)],
-            cwd=tmp_path,
+            cwd=options.pop("cwd", tmp_path),
             env=environment,
             capture_output=True,
             text=True,
@@ -331,7 +331,7 @@ MINE = Model(
 '''
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def own():
     """A system of one's own, as text and as a Python module that leaves a trace when it is imported."""
 

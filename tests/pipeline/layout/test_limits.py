@@ -4,6 +4,7 @@ import shutil
 import subprocess
 import sys
 import time
+import tomllib
 from collections import namedtuple
 
 import pytest
@@ -12,38 +13,21 @@ from pipeline.layout import limits
 from pipeline.layout.limits import MOST_CHUNK_BYTES, check_plan, check_space, in_words
 from pipeline.layout.plan import MOST_TASKS, make_plan
 from pipeline.runs.preview import describe_plan
-from pipeline.runs.run import run
 from pipeline.specification.parsing import parse_spec
 from pipeline.specification.problems import SpecError
 from pipeline.store.commits import read_commits
 from pipeline.store.runfile import read_run
-
-SPEC = """
-kind = "sweep"
-model = "duffing"
-[parameters]
-frequency_hz = 0.2
-[axes]
-amplitude = {{ start = 0.2, stop = 0.3, num = {points} }}
-[initial_conditions]
-kind = "grid"
-x = {{ start = -1.0, stop = 1.0, num = {starts} }}
-v = {{ start = -1.0, stop = 1.0, num = {starts} }}
-[integration]
-n_transient = 2
-n_keep = {keep}
-[execution]
-{execution}
-"""
+from tests.pipeline.factories import duffing, quietly
 
 
 def text_of(points=3, starts=2, keep=3, execution=""):
-    return SPEC.format(points=points, starts=starts, keep=keep, execution=execution)
+    side = f"{{ start = -1.0, stop = 1.0, num = {starts} }}"
+    axes = f"amplitude = {{ start = 0.2, stop = 0.3, num = {points} }}"
+    fixed = "[parameters]\nfrequency_hz = 0.2"
+    return duffing(axes, f'kind = "grid"\nx = {side}\nv = {side}', n_keep=keep, execution=execution, more=fixed)
 
 
 def plan_of(**sizes):
-    import tomllib
-
     return make_plan(parse_spec(tomllib.loads(text_of(**sizes))))
 
 
@@ -61,7 +45,7 @@ def refuses(write_spec, tmp_path):
         path = write_spec(text_of(**sizes))
         started = time.process_time()
         words = {
-            refused(lambda: run(path, tmp_path / "run", workers=0)),
+            refused(lambda: quietly(path, tmp_path / "run")),
             refused(lambda: list(describe_plan(path, tmp_path / "run"))),
         }
         assert time.process_time() - started < 60
@@ -72,44 +56,45 @@ def refuses(write_spec, tmp_path):
     return call
 
 
-def test_run__more_tasks_than_anyone_can_follow(refuses):
-    said = refuses(points=1_000_000, starts=40, execution="trajectories_per_task = 16")
-    assert "120000000 tasks" in said
-    assert f"the limit is {MOST_TASKS}" in said
-    assert "execution.trajectories_per_task to 38400 or more" in said
+@pytest.mark.parametrize(
+    ("sizes", "words"),
+    [
+        (
+            {"points": 1_000_000, "starts": 40, "execution": "trajectories_per_task = 16"},
+            ("120000000 tasks", f"the limit is {MOST_TASKS}", "execution.trajectories_per_task to 38400 or more"),
+        ),
+        (
+            {"starts": 40, "keep": 1_000_000, "execution": "trajectories_per_task = 1600"},
+            (
+                "section: 1600 cells of a task take 25.6 GB in one piece",
+                "the limit of compression is 2.15 GB",
+                "trajectories_per_task to 134 or less",
+            ),
+        ),
+        (
+            {"points": 100_000, "starts": 100, "keep": 1000},
+            ("needs up to 16 TB (its cells before compression), and there are", "MAGPEND_SPACE=0"),
+        ),
+    ],
+    ids=["tasks", "pieces", "room"],
+)
+def test_run__refuses_what_is_too_large(refuses, sizes, words):
+    said = refuses(**sizes)
+    assert all(word in said for word in words), said
 
 
-def test_make_plan__the_remedy_is_one():
-    check_plan(plan_of(points=1_000_000, starts=40, execution="trajectories_per_task = 38400"))
-
-
-@pytest.mark.parametrize(("points", "starts"), [(1_000_000, 40), (10_000_000, 3), (70, 3000), (2, 10_000)])
-def test_make_plan__many_cells_are_cut_into_as_many_tasks_as_can_be_followed(points, starts):
-    plan = plan_of(points=points, starts=starts, keep=60)
-    assert plan.n_cells == points * starts**2
-    assert plan.n_tasks <= MOST_TASKS
-    check_plan(plan)
-
-
-def test_run__sections_that_cannot_be_compressed_in_one_piece(refuses):
-    said = refuses(starts=40, keep=1_000_000, execution="trajectories_per_task = 1600")
-    assert "section: 1600 cells of a task take 25.6 GB in one piece" in said
-    assert "the limit of compression is 2.15 GB" in said
-    assert "trajectories_per_task to 134 or less" in said
-
-
-def test_make_plan__the_largest_pieces_can_be_written():
-    """The bound is that of the compressor."""
+def test_make_plan__the_remedies_are_some():
+    """The bound of a piece is that of the compressor."""
     from numcodecs import blosc
 
+    check_plan(plan_of(points=1_000_000, starts=40, execution="trajectories_per_task = 38400"))
     check_plan(plan_of(starts=40, keep=1_000_000, execution="trajectories_per_task = 120"))
     assert MOST_CHUNK_BYTES == blosc.MAX_BUFFERSIZE
-
-
-def test_run__no_room(refuses):
-    said = refuses(points=100_000, starts=100, keep=1000)
-    assert "needs up to 16 TB (its cells before compression), and there are" in said
-    assert "MAGPEND_SPACE=0" in said
+    for points, starts in ((1_000_000, 40), (10_000_000, 3), (70, 3000), (2, 10_000)):
+        plan = plan_of(points=points, starts=starts, keep=60)
+        assert plan.n_cells == points * starts**2
+        assert plan.n_tasks <= MOST_TASKS
+        check_plan(plan)
 
 
 def test_parse_spec__cells_that_nobody_can_count():
@@ -155,14 +140,14 @@ def test_check_space__files_count_too(monkeypatch, tmp_path):
 def test_run__goes_on_where_the_rest_fits(monkeypatch, write_spec, tmp_path):
     """A run that is half done asks for the room of the other half alone."""
     path, out = write_spec(text_of(execution="trajectories_per_task = 2")), tmp_path / "run"
-    run(path, out, workers=0, echo=lambda line: None)
+    quietly(path, out)
     info, plan = read_run(out), plan_of(execution="trajectories_per_task = 2")
     assert len(read_commits(info, plan)) == plan.n_tasks > 2
     monkeypatch.setattr(shutil, "disk_usage", lambda place: Usage(0, 0, 10))
-    run(path, out, workers=0, echo=lambda line: None)  # nothing is missing
+    quietly(path, out)  # nothing is missing
     assert any("0.2" in line or "nothing" in line for line in describe_plan(path, out))
     with pytest.raises(SpecError, match="needs up to"):
-        run(path, tmp_path / "another", workers=0, echo=lambda line: None)
+        quietly(path, tmp_path / "another")
     assert not (tmp_path / "another").exists()
 
 

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import numpy as np
 import xarray as xr
 
 from magpend_core import load_model
 from magpend_core.crossing import Crossing
 from magpend_core.models.sectioned import sectioned
+from pipeline.layout.conventions import conventional
 from pipeline.layout.period_names import once, period_of, section_name
+from pipeline.layout.units import readable_unit, shown_unit, unit_remarks
 from pipeline.layout.vocabulary import frequency_of, model_attribute, model_of, section_attributes, told_by
 from pipeline.plots.section import section_pair
+from pipeline.specification.inputs import load_model as load_given
 from tests.core.flows import ROSSLER, VAN_DER_POL, flow
 
 
@@ -44,3 +48,31 @@ def test_section_pair__leaves_the_crossing_state_out():
     # in a plane one state is left: it is drawn over the other
     assert section_pair(sectioned(flow(VAN_DER_POL), Crossing("v"))) == ("x", "v")
     assert section_pair(load_model())[0] == load_model().portraits[0][0]
+
+
+def test_readable_unit__none():
+    """What others read: test_units."""
+    phrases = ["widgets", "drive periods", "length of the pendulum"]
+    for text in [*phrases, "2 m", "m/", "(m", "m)", "m^", "1e-3 m", "$", "s^1.5"]:
+        assert readable_unit(text) is None, text
+
+
+def test_unit_remarks__name_what_nobody_reads():
+    text = 'states = {x = {unit = "widgets"}, y = "1"}\nparameters = {a = {value = 1.0, unit = "widgets/s"}}\n'
+    model = load_given(f'name = "odd"\n{text}equations = {{x = "-a*x", y = "-y"}}')
+    (line,) = unit_remarks(model)
+    assert line.startswith("units that other programs cannot read: 'widgets' of x; 'widgets/s' of a. ")
+
+
+def test_shown_unit__as_the_model_names_it():
+    assert shown_unit({"units_as_given": "widgets"}) == "widgets"
+    assert shown_unit({"units": "m"}) == "m"
+    assert shown_unit({}, "Hz") == "Hz"
+
+
+def test_conventional__axes_are_continuous():
+    """A number of something, such as a period, is no axis, even with a unit."""
+    counts, places = ("n", [1, 2], {"units": "1"}), ("force", [0.1, 0.2], {"units": "N"})
+    ds = conventional(xr.Dataset({"a": (("n", "force"), np.zeros((2, 2)))}, {"n": counts, "force": places}))
+    assert ds["force"].attrs["axis"] == "X"
+    assert "axis" not in ds["n"].attrs

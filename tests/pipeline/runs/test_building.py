@@ -10,12 +10,14 @@ import numpy as np
 import pytest
 
 import magpend
+from magpend_core.models import ModelError
 from pipeline.layout.identity import identity_of
 from pipeline.layout.plan import make_plan
 from pipeline.products.registry import CELL_PRODUCTS
 from pipeline.runs.workflows import read_given, shipped_workflows
 from pipeline.specification.parsing import _KEYS, load_spec, parse_spec
 from pipeline.specification.problems import SpecError
+from tests.pipeline.factories import silent
 
 EQUATIONS = "x' = v\nv' = -k*x - 0.2*v + A*cos(2*pi*f*t)"
 TEXT = """
@@ -77,6 +79,9 @@ def test_model__is_that_of_the_toml_text():
     assert oscillator().digest == of_text.digest
     assert magpend.model("duffing") is magpend.load_model("duffing")
     assert magpend.model({"x": "v", "v": "-x"}) is magpend.model("x' = v\nv' = -x")
+    lines = repr(oscillator()).splitlines()
+    assert lines[0] == "model oscillator"
+    assert lines[-2:] == ["  x' = v", "  v' = -k*x - 0.2*v + A*cos(2*pi*f*t)"]
 
 
 def test_model__refuses_keywords_for_a_model_that_is_given(tmp_path):
@@ -86,12 +91,6 @@ def test_model__refuses_keywords_for_a_model_that_is_given(tmp_path):
     assert magpend.model(tmp_path / "m.toml") is oscillator()
     with pytest.warns(UserWarning, match="c: nothing uses it"):
         magpend.model("x' = -x", c=1.0)
-
-
-def test_model__shows_its_equations():
-    lines = repr(oscillator()).splitlines()
-    assert lines[0] == "model oscillator"
-    assert lines[-2:] == ["  x' = v", "  v' = -k*x - 0.2*v + A*cos(2*pi*f*t)"]
 
 
 def test_spec__is_the_run_of_its_toml_text(tmp_path):
@@ -104,11 +103,8 @@ def test_spec__is_the_run_of_its_toml_text(tmp_path):
     assert magpend.Spec.read(TEXT)["axes"] == tomllib.loads(TEXT)["axes"]
     assert read_given(spec)[2] == read_given(spec.toml())[2] == read_given(dict(spec))[2]
     assert not same_run(spec.axis("A", 0.1, 0.4, 3), TEXT)
-
-
-def test_spec__takes_tables_as_keywords():
-    tables = {key: value for key, value in built().items() if key != "model"}
-    assert magpend.Spec(**tables, model=oscillator()) == built()
+    tables = {key: value for key, value in spec.items() if key != "model"}
+    assert magpend.Spec(**tables, model=oscillator()) == spec
 
 
 def test_spec__is_not_changed_by_its_methods():
@@ -143,15 +139,13 @@ def test_spec__has_a_method_for_every_table_and_its_keys():
     assert "Relative tolerance of a step" in magpend.Spec.integration.__doc__
 
 
-@pytest.mark.parametrize("name", shipped_workflows())
-def test_spec__reads_and_writes_what_ships(name, tmp_path):
-    path = shipped_workflows()[name]
-    spec = magpend.Spec.read(name)
-    shipped = load_spec(path)
-    for tables in (spec, tomllib.loads(spec.toml())):
-        again = parse_spec({key: value for key, value in tables.items() if key != "smoke"})
-        assert again.as_dict() == shipped.as_dict()
-        assert again.model.reference == shipped.model.reference
+def test_spec__reads_and_writes_what_ships():
+    for name, path in shipped_workflows().items():
+        spec, shipped = magpend.Spec.read(name), load_spec(path)
+        for tables in (spec, tomllib.loads(spec.toml())):
+            again = parse_spec({key: value for key, value in tables.items() if key != "smoke"})
+            assert again.as_dict() == shipped.as_dict(), name
+            assert again.model.reference == shipped.model.reference, name
 
 
 def test_spec__names_files_from_where_it_is(tmp_path, monkeypatch):
@@ -182,17 +176,104 @@ def test_preview__is_the_dry_run(tmp_path):
 
 
 def test_run__of_a_spec_of_a_dict_and_of_equations(tmp_path, bytes_of):
-    spec, quiet = built(), {"workers": 0, "echo": lambda _: None}
-    whole = magpend.run(spec, tmp_path / "spec", **quiet)
-    assert whole.complete
-    magpend.run({**spec, "model": oscillator()}, tmp_path / "dict", **quiet)
+    spec = built()
     (tmp_path / "spec.toml").write_text(TEXT, "utf-8")
-    magpend.run(tmp_path / "spec.toml", tmp_path / "text", **quiet)
-    arrays = {
-        name: {k: v for k, v in bytes_of(tmp_path / name).items() if not k.endswith("cube.zarr/zarr.json")}
-        for name in ("spec", "dict", "text")
+    given = {
+        "spec": spec,
+        "dict": {**spec, "model": oscillator()},
+        "text": tmp_path / "spec.toml",
+        "lines": {**spec, "model": f"{EQUATIONS}\nk = 1.0\nA = 0.5"},
     }
-    assert arrays["spec"] == arrays["dict"] == arrays["text"]
-    of_lines = magpend.run({**spec, "model": f"{EQUATIONS}\nk = 1.0\nA = 0.5"}, tmp_path / "lines", **quiet)
-    section = whole.cube().section
-    assert np.array_equal(of_lines.cube().section.values, section.values)
+    runs = {name: magpend.run(one, tmp_path / name, workers=0, echo=silent) for name, one in given.items()}
+    assert runs["spec"].complete
+    same = [bytes_of(tmp_path / name) for name in ("spec", "dict", "text")]
+    for files in same:
+        del files["cube.zarr/zarr.json"]  # it has the text as it was given
+    assert same[0] == same[1] == same[2]
+    assert np.array_equal(runs["lines"].cube().section.values, runs["spec"].cube().section.values)
+
+
+@pytest.fixture(scope="module")
+def driven(tmp_path_factory):
+    """A finished run of a table with numpy's arrays and a model as a table."""
+    table = {
+        "kind": "sweep",
+        "title": "three forces",
+        "model": tomllib.loads(TEXT)["model"],
+        "axes": {"A": {"values": np.array([0.1, 0.2, 0.3])}},
+        "parameters": {"frequency_hz": 0.2},
+        "initial_conditions": {"kind": "list", "points": [[0.0, 0.0], (0.5, np.float64(0.1))]},
+        "integration": {"n_transient": 200, "n_keep": 4},
+    }
+    return magpend.run(table, tmp_path_factory.mktemp("made") / "run", workers=0, echo=silent)
+
+
+def test_run__of_a_table_is_opened_and_exact(driven):
+    assert driven.complete
+    cube = driven.cube()
+    assert cube.sizes["A"] == 3
+    # x = Re(A exp(i w t)/(k - w**2 + .2 i w)) at t = 0
+    w = 2.0 * np.pi * 0.2
+    expected = (np.array([0.1, 0.2, 0.3]) / (1.0 - w * w + 0.2j * w)).real
+    found = cube.section.sel(state="x").isel(period_index=-1, initial_condition=1).values
+    assert found == pytest.approx(expected, abs=1e-6)
+
+
+def test_run__of_a_text_goes_on_where_it_was(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    said = []
+    first = magpend.run(TEXT, workers=0, echo=silent)
+    again = magpend.run(TEXT, workers=0, echo=said.append)
+    assert again.directory == first.directory
+    assert first.directory.name.startswith("oscillator-")
+    assert any("nothing to do" in line for line in said)
+
+
+def test_repr__tells_what_it_is_and_what_to_do_next(driven):
+    text = repr(driven)
+    assert len(text.splitlines()) <= 20
+    for words in ("three forces", "oscillator", "6: A (3) x initial_condition (2)", "6 of 6", "run.cube()"):
+        assert words in text
+    assert repr(magpend.attractors(driven)) != text
+    assert "<table>" in driven._repr_html_()
+    assert "three forces" in driven._repr_html_()
+
+
+def test_table__has_a_row_per_attractor_and_parameter_point(driven):
+    found = magpend.table(magpend.attractors(driven))
+    assert len(found) == 3
+    assert found["A"].tolist() == [0.1, 0.2, 0.3]
+    assert set(found["kind"]) == {"periodic_orbit"}
+    with pytest.raises(ValueError, match="not the result of an analysis"):
+        magpend.table(driven.cube())
+
+
+def test_load_model__from_anywhere(tmp_path):
+    whole, alone, named = tmp_path / "spec.toml", tmp_path / "model.toml", tmp_path / "named.toml"
+    whole.write_text(TEXT)
+    alone.write_text(TEXT.partition("[model]")[2])
+    named.write_text('kind = "sweep"\nmodel = "duffing"\n')
+    models = [
+        magpend.load_model(given)
+        for given in (tomllib.loads(TEXT)["model"], TEXT, whole, str(alone), alone.read_text())
+    ]
+    assert {model.name for model in models} == {"oscillator"}
+    assert magpend.load_model(named) is magpend.load_model("duffing")
+    with pytest.raises(ModelError, match="does not exist"):
+        magpend.load_model("duffin")
+    with pytest.raises(SpecError, match="cannot be read"):
+        magpend.load_model(tmp_path / "none.toml")
+
+
+def test_sections__of_one_set_or_of_many():
+    model = oscillator()
+    sets = [model.load(A=a) for a in (0.1, 0.3)]
+    starts = [[0.0, 0.0], [0.0, 0.0]]
+    both = magpend.sections(sets, 0.2, starts, n_transient=5, n_keep=2)
+    for i, one in enumerate(sets):
+        alone = magpend.sections(one, 0.2, starts[:1], n_transient=5, n_keep=2)
+        assert np.array_equal(both.section[i], alone.section[0])
+    with pytest.raises(ValueError, match="of one model"):
+        magpend.sections([sets[0], magpend.load_model("duffing").load()], 0.2, starts, n_transient=0, n_keep=1)
+    with pytest.raises(ValueError, match="3 sets for 2 cells"):
+        magpend.sections([*sets, sets[0]], 0.2, starts, n_transient=0, n_keep=1)

@@ -12,27 +12,19 @@ import xarray as xr
 import magpend
 from pipeline.layout.conventions import CONVENTIONS, conventional
 from pipeline.runs.derive import derive
-from pipeline.runs.run import run
+from tests.pipeline.factories import duffing, finished, quietly
 
-cf_xarray = pytest.importorskip("cf_xarray")
-pytest.importorskip("pint_xarray")
 ROOT = Path(__file__).parents[3]
+pytestmark = pytest.mark.slow
 
-WALK = """
-kind = "continuation"
-model = "duffing"
-[axes]
-frequency_hz = { start = 0.15, stop = 0.25, num = 6 }
-[initial_conditions]
-kind = "list"
-points = [[-1.0, 0.0], [1.0, 0.5]]
-[continuation]
-path = "frequency_hz"
-direction = "both"
-[integration]
-n_transient = 40
-n_keep = 8
-"""
+WALK = duffing(
+    "frequency_hz = { start = 0.15, stop = 0.25, num = 6 }",
+    'kind = "list"\npoints = [[-1.0, 0.0], [1.0, 0.5]]',
+    kind="continuation",
+    n_transient=40,
+    n_keep=8,
+    more='[continuation]\npath = "frequency_hz"\ndirection = "both"',
+)
 ODD = """
 kind = "sweep"
 [model]
@@ -53,13 +45,16 @@ n_keep = 2
 """
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _readers():
+    pytest.importorskip("cf_xarray")
+    pytest.importorskip("pint_xarray")
+
+
 @pytest.fixture(scope="module")
 def walk(tmp_path_factory):
     """A finished continuation."""
-    folder = tmp_path_factory.mktemp("conventions")
-    (folder / "walk.toml").write_text(WALK)
-    run(folder / "walk.toml", folder / "run", workers=0, echo=lambda line: None)
-    return folder / "run"
+    return finished(tmp_path_factory.mktemp("conventions"), WALK)
 
 
 def readable(ds, path):
@@ -123,7 +118,7 @@ def test_derive__results_are_described(walk, name):
 
 def test_run__names_units_that_nobody_reads_once(write_spec, tmp_path):
     lines = []
-    run(write_spec(ODD), tmp_path / "run", workers=0, echo=lines.append)
+    quietly(write_spec(ODD), tmp_path / "run", echo=lines.append)
     (line,) = [line for line in lines if "widgets" in line]
     assert line.startswith("warning: units that other programs cannot read: 'widgets' of x, l; 'widgets/s2' of k. ")
     ds = magpend.open_run(tmp_path / "run").load()
@@ -143,11 +138,3 @@ def test_docs__example_of_the_cube(walk, monkeypatch):
     exec(block.replace("runs/quickstart", str(walk)), names)
     assert names["period"].pint.magnitude[0] == pytest.approx(1e3 / 0.15)
     assert int(names["periodic"].notnull().any(["period_index", "state"]).sum()) == int((names["ds"].status == 1).sum())
-
-
-def test_conventional__axes_are_continuous():
-    """A number of something, such as a period, is no axis, even with a unit."""
-    counts, places = ("n", [1, 2], {"units": "1"}), ("force", [0.1, 0.2], {"units": "N"})
-    ds = conventional(xr.Dataset({"a": (("n", "force"), np.zeros((2, 2)))}, {"n": counts, "force": places}))
-    assert ds["force"].attrs["axis"] == "X"
-    assert "axis" not in ds["n"].attrs

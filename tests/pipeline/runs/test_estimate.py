@@ -21,24 +21,14 @@ from pipeline.runs.estimate import _points, _sample, estimate, mean_with_tail, w
 from pipeline.runs.preview import describe_plan
 from pipeline.specification.parsing import parse_spec
 from pipeline.store import commits
+from tests.pipeline.factories import duffing, quietly
 
-CLOSING = """
-kind = "sweep"
-[axes]
-frequency_hz = { start = 2.0, stop = 3.0, num = 5 }
-[initial_conditions]
-kind = "random"
-n = 64
-psi1_deg = [-40, 40]
-psi2_deg = [-40, 40]
-[integration]
-rtol = 1e-6
-atol = 1e-6
-n_transient = 400
-n_keep = 16
-stop_when_closed = true
-closure_tolerance = 1e-2
-"""
+CLOSING = duffing(
+    "frequency_hz = { start = 0.15, stop = 0.25, num = 5 }",
+    'kind = "random"\nn = 64\nx = [-1, 1]\nv = [-1, 1]',
+    n_transient=400,
+    n_keep=16,
+).replace("n_keep = 16", "n_keep = 16\nstop_when_closed = true\nclosure_tolerance = 1e-2")
 
 
 def read(text):
@@ -46,19 +36,14 @@ def read(text):
     return spec, make_plan(spec)
 
 
-def test_mean_with_tail__all_ended():
+def test_mean_with_tail():
+    """All have ended; some have, exponentially; none has."""
     assert mean_with_tail(np.array([3.0, 5.0]), 10, 1000) == 4.0
     assert mean_with_tail(np.array([10.0, 10.0]), 10, 10) == 10.0
-
-
-@pytest.mark.parametrize("most", [2_000, 100_000])
-def test_mean_with_tail__exponential(most):
     periods = np.random.default_rng(0).exponential(800, 20_000)
-    seen = mean_with_tail(np.minimum(periods, 1000), 1000, most)
-    assert seen == pytest.approx(np.minimum(periods, most).mean(), rel=0.03)
-
-
-def test_mean_with_tail__nothing_ends():
+    for most in (2_000, 100_000):
+        seen = mean_with_tail(np.minimum(periods, 1000), 1000, most)
+        assert seen == pytest.approx(np.minimum(periods, most).mean(), rel=0.03)
     assert mean_with_tail(np.full(8, 100.0), 100, 5000) == 5000
 
 
@@ -123,13 +108,9 @@ def test_writing_seconds__takes_the_time_of_writing_and_leaves_nothing(sweep_tex
     assert writing_seconds(spec, plan) >= 0.2
     assert len(written) <= 3
     assert list(tmp_path.iterdir()) == []
-
-
-def test_writing_seconds__of_many_cells_is_by_the_rule(sweep_text, monkeypatch):
-    spec, plan = read(sweep_text)
+    # many cells are not tried: by the rule
     monkeypatch.setattr(estimates, "MOST_WRITTEN_CELLS", plan.n_cells - 1)
-    n_files = len(plan.variables) + 1
-    assert writing_seconds(spec, plan) == pytest.approx(n_files * estimates.FILE_S)
+    assert writing_seconds(spec, plan) == pytest.approx((len(plan.variables) + 1) * estimates.FILE_S)
 
 
 def test_time_line__counts_files_and_start_up(sweep_text, monkeypatch):
@@ -144,19 +125,14 @@ def test_time_line__counts_files_and_start_up(sweep_text, monkeypatch):
     assert estimates.wall_seconds(420.0, 20_000, 0) == 420.0
 
 
-def test_describe_plan__says_what_the_time_rests_on(write_spec, sweep_text, tmp_path):
-    lines = describe_plan(write_spec(sweep_text), tmp_path / "run")
-    first = next(lines)
+def test_describe_plan__says_what_the_time_rests_on_and_what_is_left(write_spec, sweep_text, tmp_path):
+    path = write_spec(sweep_text)
+    first, *_, last = describe_plan(path, tmp_path / "run")
     assert first == "small sweep"
-    assert "measured: 24 of its cells" in list(lines)[-1]
+    assert "measured: 24 of its cells" in last
     assert not (tmp_path / "run").exists()
-
-
-def test_describe_plan__complete_run_takes_nothing(write_spec, sweep_text, tmp_path):
-    from pipeline.runs.run import run
-
-    run(write_spec(sweep_text), tmp_path / "run", workers=0, echo=lambda line: None)
-    assert list(describe_plan(tmp_path / "spec.toml", tmp_path / "run"))[-1] == ("time: nothing is left to compute")
+    quietly(path, tmp_path / "run")
+    assert list(describe_plan(path, tmp_path / "run"))[-1] == "time: nothing is left to compute"
 
 
 @pytest.mark.parametrize("stops", [True, False])

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import signal
-import time
 
 import numpy as np
 import pytest
@@ -16,44 +13,22 @@ from pipeline.compute import exponents, extension, integrate, task
 from pipeline.compute.execute import TaskFailedError
 from pipeline.runs import extend as extending
 from pipeline.runs.extend import extend
-from pipeline.runs.run import run
 from pipeline.specification.problems import SpecError
 from pipeline.store.errors import RefusedError
 from pipeline.store.run import Run
+from tests.pipeline.factories import duffing, quietly, silent
 
-BASE = """
-kind = "sweep"
-model = "duffing"
-title = "small"
-[axes]
-frequency_hz = { start = 0.10, stop = 0.14, num = 5 }
-[initial_conditions]
-kind = "grid"
-x = { start = -1.0, stop = 1.0, num = 5 }
-v = 0.1
-[integration]
-rtol = 1e-6
-atol = 1e-6
-n_transient = 3
-n_keep = 4
-[execution]
-trajectories_per_task = 7
-"""
-RANDOM = BASE.replace(
-    """kind = "grid"
-x = { start = -1.0, stop = 1.0, num = 5 }
-v = 0.1
-""",
-    """kind = "random"
-n = 6
-seed = 4
-x = [-1.0, 1.0]
-""",
+BASE = duffing(
+    "frequency_hz = { start = 0.10, stop = 0.14, num = 5 }",
+    'kind = "grid"\nx = { start = -1.0, stop = 1.0, num = 5 }\nv = 0.1',
+    n_transient=3,
+    n_keep=4,
+    execution="trajectories_per_task = 7",
 )
-
-
-def silent(line):
-    pass
+RANDOM = BASE.replace(
+    'kind = "grid"\nx = { start = -1.0, stop = 1.0, num = 5 }\nv = 0.1',
+    'kind = "random"\nn = 6\nseed = 4\nx = [-1.0, 1.0]',
+)
 
 
 class Count:
@@ -93,10 +68,10 @@ def grown(write_spec, tmp_path, bytes_of, count):
     """Run one text, widen it to another, and hold that against a fresh run; returns the cells integrated."""
 
     def grow(old, new, **more):
-        run(write_spec(old, "old.toml"), tmp_path / "old", workers=0, echo=silent)
+        quietly(write_spec(old, "old.toml"), tmp_path / "old")
         before = bytes_of(tmp_path / "old")
         path = write_spec(new, "new.toml")
-        run(path, tmp_path / "fresh", workers=0, echo=silent)
+        quietly(path, tmp_path / "fresh")
         count.cells = count.tangents = count.more = 0
         found = extend(tmp_path / "old", path, tmp_path / "new", workers=0, echo=silent, **more)
         assert found.complete
@@ -108,7 +83,6 @@ def grown(write_spec, tmp_path, bytes_of, count):
 
 
 WIDER = {
-    "a finer axis": (BASE, BASE.replace("num = 5 }\n[init", "num = 9 }\n[init"), 20),
     "a longer axis": (BASE, BASE.replace("stop = 0.14, num = 5", "stop = 0.16, num = 7"), 10),
     "a finer and longer grid": (
         BASE,
@@ -148,11 +122,7 @@ WALK = (
 )
 WALKS = {
     "a longer path": (WALK, WALK.replace("stop = 0.14, num = 5", "stop = 0.16, num = 7"), 10 + 35),
-    "a longer path the other way": (
-        WALK,
-        WALK.replace("start = 0.10, stop = 0.14, num = 5", "start = 0.08, stop = 0.14, num = 7"),
-        10 + 35,
-    ),
+    "a longer path the other way": (WALK, WALK.replace("0.10, stop = 0.14, num = 5", "0.08, stop = 0.14, num = 7"), 45),
     "more seeds": (WALK, WALK.replace("stop = 1.0, num = 5", "stop = 1.5, num = 6"), 10),
     "the other direction": (WALK.replace('"both"', '"down"'), WALK, 25),
     "a further parameter": (
@@ -171,8 +141,7 @@ def test_walk__goes_on_where_it_ended(grown, what):
 
 
 def test_walk__new_products(grown, count):
-    lyapunov = "[products]\nlyapunov = { n_transient = 2, n_periods = 4, n_blocks = 2 }\n[execution]"
-    new = WALK.replace("[execution]", lyapunov).replace("stop = 0.14, num = 5", "stop = 0.15, num = 6")
+    new = WALK.replace("[execution]", LYAPUNOV).replace("stop = 0.14, num = 5", "stop = 0.15, num = 6")
     assert grown(WALK.replace('"both"', '"up"'), new.replace('"both"', '"up"')) == 5
     assert count.tangents == 30
 
@@ -218,67 +187,31 @@ def test_more_sections__go_on_from_the_last(grown, count, tmp_path, what):
     assert count.more > 0
 
 
-def test_more_sections__too_few_to_judge(tmp_path, write_spec):
-    run(write_spec(KEPT), tmp_path / "old", workers=0, echo=silent)
-    with pytest.raises(RefusedError, match="judged by the last 64 sections: keep as many"):
-        extend(tmp_path / "old", keep=40, out=tmp_path / "new", echo=silent)
+LYAPUNOV = "[products]\nlyapunov = { n_transient = 2, n_periods = 4, n_blocks = 2 }\n[execution]"
 
 
-def test_extend__new_products_go_on_from_the_sections(grown, count):
-    lyapunov = "[products]\nlyapunov = { n_transient = 2, n_periods = 4, n_blocks = 2 }\n[execution]"
-    assert grown(BASE, BASE.replace("[execution]", lyapunov)) == 0
-    assert count.tangents == 25
-
-
-def test_extend__same_products_are_taken(grown, count):
-    lyapunov = "[products]\nlyapunov = { n_transient = 2, n_periods = 4, n_blocks = 2 }\n[execution]"
-    old = BASE.replace("[execution]", lyapunov)
-    assert grown(old, old.replace("stop = 0.14, num = 5", "stop = 0.15, num = 6")) == 5
-    assert count.tangents == 5
-
-
-def test_extend__damaged_cells_are_integrated(grown, tmp_path, write_spec, bytes_of, count):
-    path = write_spec(BASE)
-    run(path, tmp_path / "old", workers=0, echo=silent)
-    chunk = next((tmp_path / "old" / "cube.zarr" / "section").glob("c.1.*"))
-    content = bytearray(chunk.read_bytes())
-    content[len(content) // 2] ^= 1
-    chunk.write_bytes(content)
-    count.cells = 0
-    extend(tmp_path / "old", path, tmp_path / "new", workers=0, echo=silent)
-    assert count.cells == 5
-    run(path, tmp_path / "fresh", workers=0, echo=silent)
-    assert bytes_of(tmp_path / "new") == bytes_of(tmp_path / "fresh")
+@pytest.mark.parametrize("had", [False, True])
+def test_extend__products_go_on_from_the_sections_or_are_taken(grown, count, had):
+    new = BASE.replace("[execution]", LYAPUNOV)
+    assert grown(new if had else BASE, new.replace("stop = 0.14, num = 5", "stop = 0.15, num = 6")) == 5
+    assert count.tangents == (5 if had else 30)
 
 
 def test_extend__two_halves(tmp_path, write_spec, bytes_of, count):
     """What merging is for: two halves that were computed apart."""
     low = write_spec(BASE.replace("stop = 0.14, num = 5", "stop = 0.12, num = 3"), "low.toml")
     high = write_spec(BASE.replace("start = 0.10, stop = 0.14, num = 5", "values = [0.12, 0.13, 0.14]"), "high.toml")
-    run(low, tmp_path / "low", workers=0, echo=silent)
-    run(high, tmp_path / "high", workers=0, echo=silent)
+    quietly(low, tmp_path / "low")
+    quietly(high, tmp_path / "high")
     whole = write_spec(BASE, "whole.toml")
     count.cells = 0
     extend(tmp_path / "low", whole, tmp_path / "new", also=[tmp_path / "high"], workers=0, echo=silent)
     assert count.cells == 0
-    run(whole, tmp_path / "fresh", workers=0, echo=silent)
+    quietly(whole, tmp_path / "fresh")
     assert bytes_of(tmp_path / "new") == bytes_of(tmp_path / "fresh")
     record = json.loads((tmp_path / "new" / "extended.json").read_text())
     assert [s["cells"] for s in record["sources"]] == [15, 10]
     assert record["reused"] == 25
-
-
-def test_extend__says_why_nothing_is_taken(tmp_path, write_spec):
-    run(write_spec(BASE), tmp_path / "old", workers=0, echo=silent)
-    other = write_spec(BASE.replace("rtol = 1e-6", "rtol = 1e-7"), "other.toml")
-    with pytest.raises(RefusedError, match=r"integration\.rtol: 1e-06 in the directory, 1e-07 now"):
-        extend(tmp_path / "old", other, tmp_path / "new", echo=silent)
-    off = write_spec(BASE.replace("v = 0.1", "v = 0.2"), "off.toml")
-    with pytest.raises(RefusedError, match="no initial state is the same"):
-        extend(tmp_path / "old", off, tmp_path / "new", echo=silent)
-    with pytest.raises(SpecError, match="nothing to change"):
-        extend(tmp_path / "old", None, tmp_path / "new", echo=silent)
-    assert not (tmp_path / "new").exists()
 
 
 LONGER = BASE.replace("stop = 0.14, num = 5", "stop = 0.16, num = 7")
@@ -287,9 +220,9 @@ LONGER = BASE.replace("stop = 0.14, num = 5", "stop = 0.16, num = 7")
 @pytest.fixture
 def place(tmp_path, write_spec, count):
     """A finished run, a wider specification, and a fresh run of that."""
-    run(write_spec(BASE, "old.toml"), tmp_path / "runs" / "mine", workers=0, echo=silent)
+    quietly(write_spec(BASE, "old.toml"), tmp_path / "runs" / "mine")
     wide = write_spec(LONGER, "new.toml")
-    run(wide, tmp_path / "fresh", workers=0, echo=silent)
+    quietly(wide, tmp_path / "fresh")
     count.cells = 0
     return tmp_path / "runs" / "mine", wide, tmp_path / "fresh"
 
@@ -339,44 +272,36 @@ def test_in_place__the_same_command_goes_on(place, bytes_of, monkeypatch, count,
         assert count.cells == 10
 
 
-def test_in_place__nothing_is_lost(place, write_spec):
+def test_extend__refuses_what_would_lose_or_take_nothing(place, write_spec):
     mine, *_ = place
-    moved = write_spec(BASE.replace("start = 0.10, stop = 0.14", "start = 0.12, stop = 0.16"), "moved.toml")
-    with pytest.raises(RefusedError, match="10 of its cells would be lost"):
-        extend(mine, moved, echo=silent)
+    changes = {
+        "10 of its cells would be lost": ("start = 0.10, stop = 0.14", "start = 0.12, stop = 0.16"),
+        r"integration\.rtol: 1e-06 in the directory, 1e-07 now": ("rtol = 1e-06", "rtol = 1e-07"),
+        "no initial state is the same": ("v = 0.1", "v = 0.2"),
+        "judged by the last 43 sections: keep as many": ("n_keep = 4", "n_keep = 40"),
+    }
+    for words, change in changes.items():
+        assert change[0] in BASE
+        out = None if "lost" in words else mine.with_name("new")
+        with pytest.raises(RefusedError, match=words):
+            extend(mine, write_spec(BASE.replace(*change), "other.toml"), out, echo=silent)
+    with pytest.raises(SpecError, match="nothing to change"):
+        extend(mine, None, mine.with_name("new"), echo=silent)
     assert [p.name for p in mine.parent.iterdir()] == ["mine"]
 
 
-def test_incomplete__what_is_committed_is_taken(place, tmp_path, monkeypatch, bytes_of, count):
+def test_incomplete__what_is_committed_and_sound_is_taken(place, tmp_path, bytes_of, count):
     mine, wide, fresh = place
     for record in sorted((mine / "commits").iterdir())[:2]:
         record.unlink()
+    chunk = next((mine / "cube.zarr" / "section").glob("c.4.*"))
+    content = bytearray(chunk.read_bytes())
+    content[len(content) // 2] ^= 1
+    chunk.write_bytes(content)
     lines = []
     extend(mine, wide, tmp_path / "new", workers=0, echo=lines.append)
     assert f"{mine}: is not complete; only its 15 of 25 committed cells are reused" in lines
-    assert f"15 of 35 cells are reused from {mine}" in lines
-    assert count.cells == 20
-    assert bytes_of(tmp_path / "new") == bytes_of(fresh)
-
-
-def integrated(timings):
-    """Cells of finished tasks that were not taken from the old run."""
-    lines = timings.read_text().splitlines(keepends=True) if timings.exists() else []
-    done = [json.loads(line) for line in lines if line.endswith("\n")]
-    return sum(task["cells"] - task.get("reused", 0) for task in done)
-
-
-def test_kill__extended_run_has_the_same_bytes(place, start, tmp_path, bytes_of):
-    mine, wide, fresh = place
-    process = start("extend", mine, wide, "--out", "new", "--workers", 1)
-    # a task of taken cells alone would say nothing of those that a worker integrates
-    timings = tmp_path / "new" / "timings.jsonl"
-    while process.poll() is None and not integrated(timings):
-        time.sleep(0.002)
-    assert integrated(timings)
-    os.killpg(process.pid, signal.SIGKILL)
-    process.communicate()
-    extend(mine, wide, tmp_path / "new", workers=0, echo=silent)
+    assert count.cells == 25
     assert bytes_of(tmp_path / "new") == bytes_of(fresh)
 
 
@@ -395,45 +320,31 @@ def test_command__says_what_is_taken(place, main, bytes_of, tmp_path):
     # the text that was written is a specification like any other
     text = tmp_path / "again.toml"
     text.write_text(Run.open(mine).info.spec_text)
-    run(text, tmp_path / "again", workers=0, echo=silent)
+    quietly(text, tmp_path / "again")
     assert bytes_of(tmp_path / "again") == bytes_of(mine)
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
+def test_command__refuses(place, main):
+    for words, message in (
         (["--axis", "frequency=1:2"], "must be NAME=LOW:HIGH:NUM"),
         (["--axis", "q=1:2:3"], "unknown axis"),
         (["--product", "lyapunov=3"], "must be NAME or NAME="),
         (["--product", "liapunov"], "did you mean lyapunov"),
         (["--starts", "9"], "not random samples; widen a state's range"),
         ([], "nothing to change"),
-    ],
-)
-def test_command__refuses(place, main, words, message):
-    code, _, err = main("extend", place[0], *words)
-    assert code == 2
-    assert message in err
+    ):
+        code, _, err = main("extend", place[0], *words)
+        assert code == 2
+        assert message in err
 
 
-FULL = """
-kind = "sweep"
-model = "duffing"
-[parameters]
-overrides = { amplitude = 0.02 }
-[axes]
-frequency_hz = { values = [0.2] }
-[initial_conditions]
-kind = "grid"
-x = { start = 0.5, stop = 1.5, num = 9 }
-v = { start = 0.0, stop = 0.5, num = 9 }
-[integration]
-rtol = 1e-6
-atol = 1e-6
-n_transient = 100
-n_keep = 2
-closure_tolerance = 1e-3
-"""
+FULL = duffing(
+    "frequency_hz = { values = [0.2] }",
+    'kind = "grid"\nx = { start = 0.5, stop = 1.5, num = 9 }\nv = { start = 0.0, stop = 0.5, num = 9 }',
+    n_transient=100,
+    n_keep=2,
+    more="[parameters]\noverrides = { amplitude = 0.02 }",
+).replace("n_keep = 2", "n_keep = 2\nclosure_tolerance = 1e-3")
 REFINED = FULL.replace("num = 9 }\n[int", "num = 9 }\nrefine = 4\n[int")
 
 

@@ -20,34 +20,24 @@ from pipeline.runs import instants
 from pipeline.runs.derive import AnalysedRun
 from pipeline.runs.filming import Start, animation
 from pipeline.runs.moving import of_attractors
-from pipeline.specification.problems import SpecError
+from tests.pipeline.factories import duffing, finished
 
 HZ = 0.11
 
-RUN = """
-kind = "sweep"
-model = "duffing"
-title = "two wells"
-[parameters]
-preset = "twin-well-periodic"
-[axes]
-frequency_hz = { values = [0.15915494309189535, 0.16] }
-[initial_conditions]
-kind = "list"
-points = [[1.0, 0.0], [-1.0, 0.0], [0.9, 0.1]]
-[integration]
-n_transient = 200
-n_keep = 8
-"""
+RUN = duffing(
+    "frequency_hz = { values = [0.15915494309189535, 0.16] }",
+    'kind = "list"\npoints = [[1.0, 0.0], [-1.0, 0.0], [0.9, 0.1]]',
+    n_transient=200,
+    n_keep=8,
+    tolerance=1e-8,
+    more='[parameters]\npreset = "twin-well-periodic"',
+)
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     """Two orbits of period 1, one in each well, found from three starts."""
-    folder = tmp_path_factory.mktemp("animations")
-    (folder / "wells.toml").write_text(RUN, "utf-8")
-    magpend.run(folder / "wells.toml", out=folder / "run", workers=0)
-    return folder / "run"
+    return finished(tmp_path_factory.mktemp("animations"), RUN)
 
 
 @pytest.fixture(scope="module")
@@ -75,29 +65,15 @@ def test_animation__frames_are_where_another_integration_says(swinging):
     there = solve_ivp(pendulum, (0.0, at_frames[-1]), [0.4, -0.2], "DOP853", at_frames, rtol=1e-11, atol=1e-11)
     found = data.orbit.isel(motion=0, sample=slice(None, None, data.attrs["substeps"])).values
     np.testing.assert_allclose(found, there.y.T, atol=1e-6)
+    frames = list(swinging.frames())
+    assert len(frames) == swinging.n_frames == 24
+    assert not np.array_equal(frames[3], frames[20])
     machine = swinging.movers[0]
     for k in (0, 7, swinging.n_frames - 1):
         machine.at(k * data.attrs["substeps"])
         bob = np.array([np.sin(there.y[0, k]), -np.cos(there.y[0, k])])
         np.testing.assert_allclose(np.ravel(machine.traced.dot.get_data()), bob, atol=1e-6)
         np.testing.assert_allclose(np.transpose(machine.lines[0].get_data()), [[0.0, 0.0], bob], atol=1e-6)
-
-
-def test_animation__pixels_of_the_bob_are_where_the_data_are(swinging):
-    """The blue disc in the drawing's half of a frame, by the centre of its pixels."""
-    data, axes = swinging.figure.data, swinging.figure.axes[0]
-    frames = list(swinging.frames())
-    assert len(frames) == swinging.n_frames == 24
-    for k in (3, 20):
-        height, width, _ = frames[k].shape
-        rows, columns = np.nonzero((frames[k][:, : int(0.5 * width)] == [0x00, 0x72, 0xB2]).all(axis=-1))
-        place = data.points.isel(motion=0, sample=k * data.attrs["substeps"]).sel(place="bob").values
-        x, y = axes.transData.transform(place)
-        near = np.hypot(columns - x, height - rows - y) < 8.0
-        # the trail has the same colour, fading: most of the full colour is the disc's
-        assert near.sum() > 40
-        assert columns[near].mean() == pytest.approx(x, abs=1.5)
-        assert (height - rows[near]).mean() == pytest.approx(y, abs=1.5)
 
 
 def test_of_attractors__what_does_not_attract_is_shown_when_asked_for(run, monkeypatch):
@@ -149,23 +125,15 @@ def test_animation__attractors_side_by_side_repeat(run):
     assert all(np.abs(starts - point).max(axis=1).min() < 1e-4 for point in kept)
 
 
-@pytest.mark.parametrize("seconds", [1.0, 3.0, 5.1, 8.0])
 @pytest.mark.parametrize(("period", "hz"), [(2.0 / 2.44, 2.44), (6.0, 1.0), (1.0 / 2.6, 2.6), (np.nan, 2.2)])
-def test_schedule__lasts_what_was_asked(seconds, period, hz):
+def test_schedule__lasts_what_was_asked(period, hz):
     """Whole periods are shown by another speed, not by another length."""
-    plan = instants.schedule([one_moving(period, hz)], AnimationOptions(seconds=seconds, fps=16))
-    assert plan.n_frames / 16 == pytest.approx(seconds, abs=1 / 16)
-    assert plan.duration == pytest.approx(plan.speed * plan.n_frames / 16)
-    if plan.repeats:
-        assert plan.duration / period == pytest.approx(round(plan.duration / period))
-
-
-@pytest.mark.parametrize(("period", "repeats"), [(0.95, True), (0.8, False)])
-def test_schedule__a_speed_that_was_given_is_changed_a_little(period, repeats):
-    """By 5 % so that two periods fill two seconds; not by 20 %."""
-    plan = instants.schedule([one_moving(period, 1.0)], AnimationOptions(seconds=2, fps=10, speed=1.0))
-    assert plan.repeats is repeats
-    assert plan.speed == pytest.approx(period if repeats else 1.0)
+    for seconds in (1.0, 3.0, 5.1, 8.0):
+        plan = instants.schedule([one_moving(period, hz)], AnimationOptions(seconds=seconds, fps=16))
+        assert plan.n_frames / 16 == pytest.approx(seconds, abs=1 / 16)
+        assert plan.duration == pytest.approx(plan.speed * plan.n_frames / 16)
+        if plan.repeats:
+            assert plan.duration / period == pytest.approx(round(plan.duration / period))
 
 
 def test_animation__cells_pass_through_their_sections(run):
@@ -217,7 +185,7 @@ def test_animate__files_open_with_their_frames_and_loop(main, run, tmp_path):
         assert code == Exit.REFUSED
 
 
-def test_animate__a_start_without_a_run(main, run, tmp_path):
+def test_animate__a_start_with_and_without_a_run(main, run, tmp_path):
     """States come first, or after the directory: neither is taken for the other."""
     small = ["--seconds", "1", "--fps", "4", "--size", "200"]
     words = ["--th", "0.4", "--w", "-0.2", "--model", "driven-pendulum", "--frequency", str(HZ)]
@@ -230,6 +198,7 @@ def test_animate__a_start_without_a_run(main, run, tmp_path):
     assert main(*words, *small)[0] == 0
     with xr.open_dataset(tmp_path / "film.nc", engine="scipy") as stored:
         assert stored.orbit.values[0, 0].tolist() == [0.3, 0.0]
+        assert stored.drive_frequency.values.tolist() == [0.16]
 
 
 def test_animate__mp4_without_ffmpeg_is_refused(main, tmp_path, monkeypatch):
@@ -240,36 +209,37 @@ def test_animate__mp4_without_ffmpeg_is_refused(main, tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["RUN", "--at", "frequency=0.1595"], "frequency = 0.1595 is not on its axis"),
-        (["RUN"], "frequency (2 values): choose a value of each"),
-        (["RUN", "--at", "frequency=0.16", "--attractor", "Z"], "--attractor Z: does not exist at this point; there"),
-        (["RUN", "--cell", "6"], "--cell 6: the run has the cells 0 to 5, counted through frequency, i"),
-        (["RUN", "--cell", "1", "--attractor", "A"], "--attractor and --cell: a film shows one of these"),
-        (["RUN", "--cell", "1", "--at", "frequency=0.16"], "--at: a cell already has a parameter point"),
-        (["RUN", "--model", "duffing"], "--model: the run sets this"),
-        (["RUN", "--at", "frequency=0.16", "--y", "1"], "unknown state of duffing 'y'"),
-        (["RUN", "--at", "frequency=0.16", "--degrees"], "have no angle"),
-        (["RUN", "--at", "frequency=0.16", "--portrait", "y"], "unknown portrait 'y'; there are portr"),
-        (["--at", "q=1"], "--at: needs a run; give its directory."),
-        (["--out", "film.avi"], "film.avi: the suffix must be one of .gif, .webp, .mp4."),
-        (["--out", "gone/film.gif"], "gone: no such folder; make it first."),
-        (["--fps", "60"], "--fps 60: a GIF has at most 50 frames a second"),
-        (["--seconds", "0"], "seconds = 0.0: must be greater than 0"),
-        (["--seconds", "500", "--fps", "50"], "25000 frames; at most 5000. Lower one of the two."),
-        (["--speed", "1e6", "--model", "duffing"], "periods are too many for a film"),
-        (["--transient", "-1"], "--transient -1: must be at least 0."),
-        (["--size", "10"], "size = 10: must be at least 200"),
-    ],
-)
-def test_animate__refuses_in_one_sentence(main, run, tmp_path, words, said):
+POINT = ["RUN", "--at", "frequency=0.16"]
+REFUSED = [
+    (["RUN", "--at", "frequency=0.1595"], "frequency = 0.1595 is not on its axis"),
+    (["RUN"], "frequency (2 values): choose a value of each"),
+    ([*POINT, "--attractor", "Z"], "--attractor Z: does not exist at this point; there"),
+    (["RUN", "--cell", "6"], "--cell 6: the run has the cells 0 to 5, counted through frequency, i"),
+    (["RUN", "--cell", "1", "--attractor", "A"], "--attractor and --cell: a film shows one of these"),
+    ([*POINT, "--cell", "1"], "--at: a cell already has a parameter point"),
+    (["RUN", "--model", "duffing"], "--model: the run sets this"),
+    ([*POINT, "--y", "1"], "unknown state of duffing 'y'"),
+    ([*POINT, "--degrees"], "have no angle"),
+    ([*POINT, "--portrait", "y"], "unknown portrait 'y'; there are portr"),
+    (["--at", "q=1"], "--at: needs a run; give its directory."),
+    (["--out", "film.avi"], "film.avi: the suffix must be one of .gif, .webp, .mp4."),
+    (["--out", "gone/film.gif"], "gone: no such folder; make it first."),
+    (["--fps", "60"], "--fps 60: a GIF has at most 50 frames a second"),
+    (["--seconds", "0"], "seconds = 0.0: must be greater than 0"),
+    (["--seconds", "500", "--fps", "50"], "25000 frames; at most 5000. Lower one of the two."),
+    (["--speed", "1e6", "--model", "duffing"], "periods are too many for a film"),
+    (["--transient", "-1"], "--transient -1: must be at least 0."),
+    (["--size", "10"], "size = 10: must be at least 200"),
+]
+
+
+def test_animate__refuses_in_one_sentence(main, run, tmp_path):
     before = sorted(run.rglob("*"))
-    code, _, err = main("animate", *[str(run) if word == "RUN" else word for word in words])
-    assert code == Exit.REFUSED
-    assert said in err
-    assert "Traceback" not in err
+    for words, said in REFUSED:
+        code, _, err = main("animate", *[str(run) if word == "RUN" else word for word in words])
+        assert code == Exit.REFUSED, words
+        assert said in err
+        assert "Traceback" not in err
     assert not list(tmp_path.iterdir())
     assert {p for p in sorted(run.rglob("*")) if p not in before} <= set((run / "derived").rglob("*"))
 
@@ -277,6 +247,13 @@ def test_animate__refuses_in_one_sentence(main, run, tmp_path, words, said):
 def one_moving(period, hz=0.5):
     parameters = magpend.load_model("duffing").load()
     return instants.Moving("", "0", parameters, hz, np.zeros(2), np.empty((0, 2)), period)
+
+
+def test_schedule__a_speed_that_was_given_is_changed_a_little():
+    """By 5 % so that two periods fill two seconds; not by 20 %."""
+    for period, repeats in ((0.95, True), (0.8, False)):
+        plan = instants.schedule([one_moving(period, 1.0)], AnimationOptions(seconds=2, fps=10, speed=1.0))
+        assert (plan.repeats, plan.speed) == (repeats, pytest.approx(period if repeats else 1.0))
 
 
 def test_schedule__whole_periods_where_they_fit():
@@ -298,11 +275,3 @@ def test_schedule__whole_periods_where_they_fit():
 def test_durations__add_up():
     assert durations(3, 30.0, 10) == [30, 40, 30]
     assert sum(durations(300, 24.0, 10)) == 12_500
-
-
-def test_animation__a_start_of_a_run_is_at_its_point(run):
-    film = animation(run, at={"frequency": 0.16}, start={"x": 0.3}, seconds=1, fps=4)
-    assert film.figure.data.drive_frequency.values.tolist() == [0.16]
-    assert film.figure.data.orbit.values[0, 0].tolist() == [0.3, 0.0]
-    with pytest.raises(SpecError, match="unknown state"):
-        animation(run, at={"frequency": 0.16}, start={"z": 0.3})

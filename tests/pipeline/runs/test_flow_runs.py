@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
-
 import numpy as np
 import pytest
 
@@ -16,8 +14,7 @@ from pipeline.compute import integrate, task
 from pipeline.layout.vocabulary import model_of, parameters_of
 from pipeline.runs.derive import derive
 from pipeline.runs.extend import extend
-from pipeline.runs.run import run
-from pipeline.specification.parsing import parse_spec
+from tests.pipeline.factories import finished, quietly
 
 SPEC = """
 kind = "sweep"
@@ -56,10 +53,7 @@ lyapunov = { n_transient = 20, n_periods = 64, n_blocks = 4 }
 
 @pytest.fixture(scope="module")
 def directory(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("flow")
-    (folder / "spec.toml").write_text(SPEC)
-    run(folder / "spec.toml", folder / "run", workers=0)
-    return folder / "run"
+    return finished(tmp_path_factory.mktemp("flow"), SPEC)
 
 
 @pytest.mark.slow
@@ -113,17 +107,11 @@ def test_derive__attractors_chaos_and_branches(directory):
     assert any("equilibrium" in line for line in branches.lines)
 
 
-def test_workflows__flows_read():
-    """What a flow's specification says is read back from the plain data of a run."""
-    spec = parse_spec(tomllib.loads(SPEC))
-    assert parse_spec(spec.as_dict()) == spec
-
-
 def test_extend__takes_what_stands_there(directory, tmp_path, bytes_of, monkeypatch):
     text = SPEC.replace("[-0.2, -0.1, 0.1]", "[-0.2, 0.1]").replace("num = 6 }\n\n[int", "num = 7 }\n\n[int")
     text = text.replace("start = -1.05, stop = 0.95, num = 7", "start = -1.05, stop = 1.35, num = 7")
     (tmp_path / "spec.toml").write_text(text)
-    run(tmp_path / "spec.toml", tmp_path / "fresh", workers=0)
+    quietly(tmp_path / "spec.toml", tmp_path / "fresh")
     calls = []
     original = integrate.run_branches
 

@@ -18,9 +18,8 @@ def run(made):
     return Run.open(made.info.directory)
 
 
-@pytest.mark.parametrize(
-    ("name", "value", "degrees", "expected"),
-    [
+def test_place__every_spelling(run):
+    for name, value, degrees, expected in (
         ("frequency", 2.5, False, ("frequency", 2.5)),
         ("frequency_hz", 2.5, True, ("frequency", 2.5)),
         ("q", 1.5, True, ("q", 1.5)),
@@ -28,10 +27,8 @@ def run(made):
         ("psi1", 0.1, False, ("psi1_0", 0.1)),
         ("psi1", 30.0, True, ("psi1_0", math.radians(30.0))),
         ("psi2_deg", 30.0, False, ("psi2_0", math.radians(30.0))),
-    ],
-)
-def test_place__every_spelling(run, name, value, degrees, expected):
-    assert place(run.cube(), name, value, degrees) == expected
+    ):
+        assert place(run.cube(), name, value, degrees) == expected
 
 
 def test_named__axes_parameters_and_states_of_the_run(run):
@@ -42,16 +39,12 @@ def test_named__axes_parameters_and_states_of_the_run(run):
     assert named(run, FigureOptions()) == FigureOptions()
 
 
-@pytest.mark.parametrize(
-    ("options", "sentence"),
-    [
+def test_named__names_the_nearest(run):
+    for options, sentence in (
         (FigureOptions(at={"freqency": 1.0, "qq": 1.0}), r"(?s)'freqency'; did you mean frequency.*'qq'"),
         (FigureOptions(at={"duty_cycle": 0.5}), "unknown axis 'duty_cycle'; known: frequency, q"),
         (StateOptions(state="psi3"), "unknown state 'psi3'; did you mean psi"),
         (BranchOptions(parameter="eps_drve"), "unknown parameter 'eps_drve'; did you mean eps_drive"),
-    ],
-    ids=["axes", "not swept", "state", "parameter"],
-)
-def test_named__names_the_nearest(run, options, sentence):
-    with pytest.raises(SpecError, match=sentence):
-        named(run, options)
+    ):
+        with pytest.raises(SpecError, match=sentence):
+            named(run, options)

@@ -23,37 +23,8 @@ from pipeline.runs.run import run
 from pipeline.specification.parsing import parse_spec
 from pipeline.specification.problems import SpecError
 from pipeline.store.places import open_files
+from tests.pipeline.factories import WELL, finished, quietly
 
-WELL = """
-kind = "sweep"
-title = "double well with noise"
-
-[model]
-name = "well"
-states = { x = { meaning = "position" } }
-parameters = { a = 1.0 }
-equations = { x = "a*x - x**3" }
-
-[noise]
-strengths = { x = 0.5 }
-seed = 1
-steps_per_period = 8
-
-[parameters]
-frequency_hz = 5.0
-
-[axes]
-noise_x = { values = [0.45, 0.55, 0.7] }
-realization = { start = 0, stop = 199, step = 1 }
-
-[initial_conditions]
-kind = "list"
-points = [[-1.0]]
-
-[integration]
-n_transient = 0
-n_keep = 1000
-"""
 S = (0.45, 0.55, 0.7)
 
 
@@ -82,10 +53,7 @@ def passage_time(s: float, end: float, start: float = -1.0) -> float:
 
 @pytest.fixture(scope="module")
 def directory(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("noise")
-    (folder / "spec.toml").write_text(WELL)
-    run(folder / "spec.toml", folder / "run", workers=0, echo=lambda _: None)
-    return folder / "run"
+    return finished(tmp_path_factory.mktemp("noise"), WELL)
 
 
 def test_escapes__mean_first_passage_time_by_quadrature(directory: Path) -> None:
@@ -171,31 +139,25 @@ SMALL: dict[str, Any] = {
 }
 
 
-def test_extend__gives_the_bytes_of_a_longer_run(tmp_path: Path) -> None:
-    quiet = {"workers": 0, "echo": lambda _: None}
+def test_extend__gives_the_bytes_of_a_longer_run(tmp_path: Path, bytes_of: Any) -> None:
     short = WELL.replace("[0.45, 0.55, 0.7]", "[0.2]").replace("stop = 199", "stop = 19")
     short = short.replace("n_transient = 0", "n_transient = 2").replace("n_keep = 1000", "n_keep = 5")
     longer = short.replace("[0.2]", "[0.2, 0.3]").replace("stop = 19", "stop = 24").replace("n_keep = 5", "n_keep = 9")
     for name, text in (("short", short), ("whole", longer)):
         (tmp_path / f"{name}.toml").write_text(text)
-        run(tmp_path / f"{name}.toml", tmp_path / name, **quiet)
+        quietly(tmp_path / f"{name}.toml", tmp_path / name)
     lines: list[str] = []
     extend(tmp_path / "short", tmp_path / "whole.toml", out=tmp_path / "wide", workers=0, echo=lines.append)
     assert any("30 cells are left to integrate" in line for line in lines), lines
-    files = sorted(
-        p.relative_to(tmp_path / "whole") for p in (tmp_path / "whole" / "cube.zarr").rglob("*") if p.is_file()
-    )
-    for name in files:
-        assert (tmp_path / "whole" / name).read_bytes() == (tmp_path / "wide" / name).read_bytes(), name
+    assert bytes_of(tmp_path / "whole") == bytes_of(tmp_path / "wide")
     # the first cells of the short run are kept as they were
     first, whole = (open_run(tmp_path / name)["section"].values for name in ("short", "whole"))
     np.testing.assert_array_equal(first[0], whole[0, :20, :, :5])
 
 
 def test_run__tasks_do_not_change_the_numbers(tmp_path: Path) -> None:
-    quiet = {"workers": 0, "echo": lambda _: None}
     for n in (3, 20):
-        run(spec(**SMALL, execution={"trajectories_per_task": n}), tmp_path / str(n), **quiet)
+        quietly(spec(**SMALL, execution={"trajectories_per_task": n}), tmp_path / str(n))
     few, all_ = (open_run(tmp_path / str(n)) for n in (3, 20))
     np.testing.assert_array_equal(few["section"].values, all_["section"].values)
 
@@ -205,7 +167,7 @@ def test_derive__refuses_analyses_of_the_other_kind(directory: Path, tmp_path: P
         derive(directory, "attractors")
     plain = {k: v for k, v in spec(**SMALL).items() if k != "noise"}
     plain["axes"] = {"a": {"values": [1.0]}}
-    run(plain, tmp_path / "plain", workers=0, echo=lambda _: None)
+    quietly(plain, tmp_path / "plain")
     with pytest.raises(SpecError, match="escapes needs a run with noise"):
         derive(tmp_path / "plain", "escapes", {"high": {"x": 0.8}})
     with pytest.raises(SpecError, match="has no classifier of motions"):
@@ -249,12 +211,12 @@ PROBLEMS = [
 ]
 
 
-@pytest.mark.parametrize(("changes", "problem"), PROBLEMS, ids=[p[1][:40] for p in PROBLEMS])
-def test_parse_spec__noise_problems(changes: dict[str, Any], problem: str) -> None:
-    with pytest.raises(SpecError, match=problem) as caught:
-        parse_spec(spec(**changes))
-    if "noise" in changes:  # what only follows from it is not said
-        assert not any("axes." in p for p in caught.value.problems)
+def test_parse_spec__noise_problems() -> None:
+    for changes, problem in PROBLEMS:
+        with pytest.raises(SpecError, match=problem) as caught:
+            parse_spec(spec(**changes))
+        if "noise" in changes:  # what only follows from it is not said
+            assert not any("axes." in p for p in caught.value.problems)
 
 
 def test_parse_spec__reads_back_what_it_writes() -> None:

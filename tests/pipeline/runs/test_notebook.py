@@ -14,12 +14,12 @@ from pathlib import Path
 import psutil
 import pytest
 
-from pipeline.runs import notebook
-from pipeline.runs.run import run
+from tests.pipeline.factories import quietly
 
 ROOT = Path(__file__).parents[3]
 PATIENCE_S = 240.0
-# the equations of tests/pipeline/runs/test_python.py, which are compiled already
+pytestmark = pytest.mark.slow
+# the equations of tests/pipeline/runs/test_building.py, which are compiled already
 CELL = """
 import magpend
 model = magpend.model(
@@ -42,7 +42,7 @@ def whole(tmp_path, bytes_of):
     """Bytes of the run that was never interrupted."""
     names: dict = {}
     exec(CELL, names)
-    run(names["spec"], tmp_path / "whole", workers=0, echo=lambda _: None)
+    quietly(names["spec"], tmp_path / "whole")
     return bytes_of(tmp_path / "whole")
 
 
@@ -70,9 +70,7 @@ def workers_of(process):
 @pytest.fixture
 def kernel(tmp_path, around):
     """Run the code of a cell in a kernel; interrupt it when `when` is true. Returns the messages of its outputs."""
-    from jupyter_client.manager import KernelManager
-
-    manager = KernelManager(kernel_name="python3")
+    manager = pytest.importorskip("jupyter_client.manager").KernelManager(kernel_name="python3")
     manager.start_kernel(env=around, cwd=str(tmp_path), stderr=subprocess.DEVNULL)
     client = manager.client()
     client.start_channels()
@@ -103,7 +101,6 @@ def kernel(tmp_path, around):
         manager.cleanup_resources()
 
 
-@pytest.mark.slow
 def test_run__interrupted_in_a_cell_goes_on_with_the_same_cell(kernel, whole, tmp_path, bytes_of):
     stopped = kernel(CELL + COMPUTE + "print('not reached')\n", lambda: n_committed(tmp_path) >= 2)
     kind, content = stopped[-1]
@@ -126,7 +123,6 @@ def test_run__interrupted_in_a_cell_goes_on_with_the_same_cell(kernel, whole, tm
     assert sum(content["text"].count("\n") for kind, content in again if kind == "stream") <= 4
 
 
-@pytest.mark.slow
 def test_run__interrupted_in_a_script_goes_on_with_the_same_script(around, whole, tmp_path, bytes_of):
     """The script has no ``if __name__ == "__main__"``: workers do not run it."""
     script = tmp_path / "script.py"
@@ -163,24 +159,3 @@ def test_run__interrupted_in_a_script_goes_on_with_the_same_script(around, whole
     out, err = process.communicate(timeout=PATIENCE_S)
     assert (process.returncode, out.count("begun"), "complete: True" in out) == (0, 1, True), err
     assert bytes_of(tmp_path / "run") == whole
-
-
-def test_progress__outside_a_notebook_does_nothing(capsys):
-    from pipeline.products.reporting import is_heard
-
-    assert not notebook.is_notebook()
-    with notebook.progress():
-        assert not is_heard()
-    assert capsys.readouterr() == ("", "")
-
-
-def test_bar__shows_counts_then_how_it_ended():
-    bar = notebook.Bar()
-    bar._show = lambda: None
-    assert repr(bar) == ""
-    bar("compiling", 0, 0)
-    assert "<progress  style" in bar._repr_html_()
-    bar("computing cells", 10, 40)
-    assert repr(bar).startswith("computing cells: 10 of 40 (25 %)")
-    bar.end("stopped")
-    assert repr(bar).startswith("computing cells: 10 of 40 (25 %), stopped after")

@@ -3,91 +3,31 @@
 from __future__ import annotations
 
 import json
-import os
 import re
-import signal
-import subprocess
+import shutil
 import sys
 import time
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
 from magpend_core.engine import jit
+from magpend_core.models import imported
 from pipeline import open_run
 from pipeline.layout.identity import digest_of
 from pipeline.layout.vocabulary import model_of
-from pipeline.runs.run import run
 from pipeline.store.checksums import seal, unseal
 from pipeline.store.runfile import read_run
-
-MANY = '[smoke]\n"initial_conditions.x.num" = 80\n"integration.n_transient" = 400\n'
+from tests.pipeline.factories import finished, quietly
 
 
 @pytest.fixture
 def text_spec(own, write_spec, tmp_path):
     """A specification whose model is a file beside it."""
     (tmp_path / "shared.toml").write_text(own.text)
-    return write_spec(own.spec('model = "shared.toml"', MANY))
-
-
-@pytest.fixture
-def process(environment):
-    """Run the command line in a folder of one's choice."""
-
-    def call(folder: Path, *arguments):
-        return subprocess.run(
-            [sys.executable, "-m", "pipeline.cli.main", *map(str, arguments)],
-            cwd=folder,
-            env=environment,
-            capture_output=True,
-            text=True,
-            timeout=300,
-            check=False,
-        )
-
-    return call
-
-
-IN_TURN = """
-import contextlib, io, json, os, sys
-from pipeline.cli.main import main
-found = []
-for folder, *words in json.loads(sys.argv[1]):
-    os.chdir(folder)
-    sys.argv, out, err, code = ["magpend", *words], io.StringIO(), io.StringIO(), 0
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        try:
-            main()
-        except SystemExit as end:
-            code = int(end.code or 0)
-    found.append({"returncode": code, "stdout": out.getvalue(), "stderr": err.getvalue()})
-print(json.dumps(found))
-"""
-
-
-@pytest.fixture
-def in_turn(tmp_path, environment):
-    """Commands, each in its folder, one after another in one new process, which has imported nothing yet."""
-
-    def call(*commands):
-        words = json.dumps([[str(word) for word in command] for command in commands])
-        done = subprocess.run(
-            [sys.executable, "-c", IN_TURN, words],
-            cwd=tmp_path,
-            env=environment,
-            capture_output=True,
-            text=True,
-            timeout=300,
-            check=False,
-        )
-        assert done.returncode == 0, done.stderr
-        return [SimpleNamespace(**one) for one in json.loads(done.stdout)]
-
-    return call
+    return write_spec(own.spec('model = "shared.toml"'))
 
 
 def rewritten(directory: Path, change) -> None:
@@ -100,30 +40,39 @@ def rewritten(directory: Path, change) -> None:
     path.write_text(seal(json.dumps(data)))
 
 
+@pytest.fixture(scope="module")
+def finished_text(own, tmp_path_factory):
+    """A finished run of a model in a text."""
+    folder = tmp_path_factory.mktemp("text")
+    (folder / "shared.toml").write_text(own.text)
+    return finished(folder, own.spec('model = "shared.toml"'))
+
+
+@pytest.fixture
+def stored(finished_text, tmp_path):
+    """A copy of it."""
+    return shutil.copytree(finished_text, tmp_path / "run")
+
+
 @pytest.mark.slow
-def test_run__text_from_the_specification_to_the_figure(text_spec, tmp_path, process, command):
-    """Elsewhere, in another process, with the shared file gone: the run explains itself."""
-    directory, elsewhere = tmp_path / "run", tmp_path / "elsewhere"
+def test_run__text_explains_itself_from_status_to_figure(stored, tmp_path, magpend, command):
+    """Elsewhere, in another process, without the shared file."""
+    elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
-    done = process(tmp_path, "run", text_spec, "--out", directory, "--workers", 0)
-    assert done.returncode == 0, done.stderr
-    (tmp_path / "shared.toml").unlink()
-    assert "complete" in process(elsewhere, "status", directory).stdout
-    assert "intact" in command(elsewhere, "verify", directory)[0]
-    table = json.loads(command(elsewhere, "analyse", "attractors", directory, "--json")[0])
+    assert "complete" in magpend("status", stored, cwd=elsewhere).stdout
+    assert "intact" in command(elsewhere, "verify", stored)[0]
+    table = json.loads(command(elsewhere, "analyse", "attractors", stored, "--json")[0])
     assert "periodic_orbit" in {row["kind"] for row in table}
-    command(elsewhere, "analyse", "basins", directory, "--json")
-    command(elsewhere, "plot", "basins", directory)
-    assert (directory / "figures" / "basins.png").is_file()
-    command(elsewhere, "zoom", directory, "--x", "-0.5", "0.5", "--out", "closer.toml")
+    command(elsewhere, "plot", "basins", stored)
+    assert (stored / "figures" / "basins.png").is_file()
+    command(elsewhere, "zoom", stored, "--x", "-0.5", "0.5", "--out", "closer.toml")
     command(elsewhere, "run", "closer.toml", "--workers", 0)
     assert open_run(elsewhere / "runs" / "closer").x_0.values.max() == 0.5
 
 
-def test_run__text_is_integrated_as_it_is_written(text_spec, tmp_path):
+def test_run__text_is_integrated_as_it_is_written(finished_text):
     """Against scipy's DOP853 of the same equations, from another hand."""
-    run(text_spec, tmp_path / "run", workers=0, echo=lambda line: None)
-    ds = open_run(tmp_path / "run")
+    ds = open_run(finished_text)
     f, d, amplitude = float(ds.frequency), 0.08, 0.2
 
     def rhs(t, y):
@@ -136,43 +85,23 @@ def test_run__text_is_integrated_as_it_is_written(text_spec, tmp_path):
     assert cell.section.values == pytest.approx(found, abs=2e-5)
 
 
-def test_run__workers_take_text_from_the_compile_cache(text_spec, tmp_path, bytes_of):
-    run(text_spec, tmp_path / "one", workers=0, echo=lambda line: None)
-    system = model_of(open_run(tmp_path / "one")).system.name
+def test_run__workers_take_text_from_the_compile_cache(finished_text, text_spec, tmp_path, bytes_of):
+    system = model_of(open_run(finished_text)).system.name
     # other tests compile beside this one
     mine = re.compile(rf"lanes\.advance_{system}_[0-9a-f]+_record-.*\.nbc")
     before = {p for p in jit.CACHE_FOLDER.rglob("*") if mine.fullmatch(p.name)}
-    run(text_spec, tmp_path / "two", workers=1, echo=lambda line: None)
+    quietly(text_spec, tmp_path / "two", workers=1)
     assert before
     assert {p for p in jit.CACHE_FOLDER.rglob("*") if mine.fullmatch(p.name)} == before
-    assert bytes_of(tmp_path / "one") == bytes_of(tmp_path / "two")
+    assert bytes_of(finished_text) == bytes_of(tmp_path / "two")
 
 
-@pytest.mark.slow
-def test_run__text_killed_and_resumed(text_spec, tmp_path, start, bytes_of):
-    directory = tmp_path / "run"
-    process = start("run", text_spec, "--smoke", "--out", directory, "--workers", 1)
-    limit = time.monotonic() + 200
-    while not list((directory / "commits").glob("*.json")) if (directory / "commits").is_dir() else True:
-        assert time.monotonic() < limit
-        assert process.poll() is None, process.communicate()
-        time.sleep(0.02)
-    os.killpg(process.pid, signal.SIGKILL)
-    process.wait()
-    left = len(list((directory / "commits").glob("*.json")))
-    assert not run(text_spec, directory, smoke=True, workers=0, echo=lambda line: None).cells.get("pending")
-    run(text_spec, tmp_path / "whole", smoke=True, workers=0, echo=lambda line: None)
-    assert 0 < left < 40
-    assert bytes_of(directory) == bytes_of(tmp_path / "whole")
-
-
-def test_open_run__cube_names_its_model_in_words(text_spec, tmp_path):
-    run(text_spec, tmp_path / "run", workers=0, echo=lambda line: None)
-    ds = open_run(tmp_path / "run")
+def test_open_run__cube_names_its_model_in_words(finished_text, tmp_path):
+    ds = open_run(finished_text)
     assert json.loads(ds.attrs["model"])["equations"]["v"] == "drive - d*v - x**3"
     assert model_of(ds).name == "shared" or model_of(ds).name == "duffing5"
     ds.to_netcdf(tmp_path / "cube.nc", engine="scipy")  # attributes that any format takes
-    assert read_run(tmp_path / "run").spec["model"]["states"] == {"x": {"unit": "m"}, "v": {"unit": "m/s"}}
+    assert read_run(finished_text).spec["model"]["states"] == {"x": {"unit": "m"}, "v": {"unit": "m/s"}}
 
 
 @pytest.mark.parametrize(
@@ -186,13 +115,11 @@ def test_open_run__cube_names_its_model_in_words(text_spec, tmp_path):
         "v; import os",
     ],
 )
-def test_open_run__stranger_s_text_is_one_error(text_spec, tmp_path, main, text):
-    run(text_spec, tmp_path / "run", workers=0, echo=lambda line: None)
-
+def test_open_run__stranger_s_text_is_one_error(stored, tmp_path, main, text):
     def change(spec):
         spec["model"]["equations"]["v"] = text
 
-    rewritten(tmp_path / "run", change)
+    rewritten(stored, change)
     for call in (("status",), ("plot", "basins"), ("analyse", "attractors"), ("verify",)):
         started = time.perf_counter()
         code, _, said = main(*call, tmp_path / "run")
@@ -203,12 +130,11 @@ def test_open_run__stranger_s_text_is_one_error(text_spec, tmp_path, main, text)
     assert not (tmp_path / "pwned").exists()
 
 
-def test_open_run__stranger_s_object_is_never_imported(own, text_spec, tmp_path, main, monkeypatch):
+def test_open_run__stranger_s_object_is_never_imported(own, stored, tmp_path, main, monkeypatch):
     """The module lies in the current folder and on the path; opening and drawing leave it alone."""
     trace = own.write_module(tmp_path, "trap")
     monkeypatch.syspath_prepend(str(tmp_path))
-    run(text_spec, tmp_path / "run", workers=0, echo=lambda line: None)
-    table = read_run(tmp_path / "run").spec["model"]
+    table = read_run(stored).spec["model"]
     described = {
         "python": "trap:MINE",
         "digest": "0123456789abcdef",
@@ -226,33 +152,33 @@ def test_open_run__stranger_s_object_is_never_imported(own, text_spec, tmp_path,
     def change(spec):
         spec["model"] = described
 
-    rewritten(tmp_path / "run", change)
-    assert main("status", tmp_path / "run")[0] == 0
-    assert main("verify", tmp_path / "run")[0] == 5  # the commits are another run's
-    code, out, said = main("plot", "section", tmp_path / "run")
+    rewritten(stored, change)
+    assert main("status", stored)[0] == 0
+    assert main("verify", stored)[0] == 5  # the commits are another run's
+    code, out, said = main("plot", "section", stored)
     assert code == 0, said
     assert "section" in out
-    code, _, said = main("analyse", "attractors", tmp_path / "run")
+    code, _, said = main("analyse", "attractors", stored)
     assert code == 2
     assert "--import-model trap:MINE" in said
     for form in ("trap:MINE", "shared.toml"):  # a name where a run keeps a whole
-        rewritten(tmp_path / "run", lambda spec, form=form: spec.update(model=form))
-        assert main("status", tmp_path / "run")[0] == 2
+        rewritten(stored, lambda spec, form=form: spec.update(model=form))
+        assert main("status", stored)[0] == 2
     assert not trace.exists()
     assert "trap" not in sys.modules
-    code, _, said = main("status", tmp_path / "run", "--import-model", "trap:MINE")
+    code, _, said = main("status", stored, "--import-model", "trap:MINE")
     assert trace.exists()  # a person has named it
     sys.modules.pop("trap", None)
 
 
 @pytest.mark.slow
-def test_run__object_reaches_workers_and_is_held_to_its_digest(own, tmp_path, process, in_turn, main):
+def test_run__object_reaches_workers_and_is_held_to_its_digest(own, tmp_path, magpend, main, monkeypatch):
     """The module lies beside the specification alone; the run is made from elsewhere."""
     project, elsewhere = tmp_path / "project", tmp_path / "elsewhere"
     trace = own.write_module(project, "mine")
     elsewhere.mkdir()
     (project / "spec.toml").write_text(own.spec('model = "mine:MINE"'))
-    done = process(elsewhere, "run", project / "spec.toml", "--out", "run", "--workers", 1)
+    done = magpend("run", project / "spec.toml", "--out", "run", "--workers", 1, cwd=elsewhere)
     assert done.returncode == 0, done.stderr
     ds = open_run(elsewhere / "run")
     cell, f = ds.isel(x_0=1, v_0=2), float(ds.frequency)
@@ -270,19 +196,21 @@ def test_run__object_reaches_workers_and_is_held_to_its_digest(own, tmp_path, pr
     trace.unlink()
     assert main("analyse", "attractors", elsewhere / "run")[0] == 2
     assert not trace.exists()
-    found = process(project, "analyse", "attractors", elsewhere / "run", *named, "--json")
-    assert [row["orbit_period"] for row in json.loads(found.stdout)] == [1]
+    monkeypatch.syspath_prepend(project)
+    code, out, err = main("analyse", "attractors", elsewhere / "run", *named, "--json")
+    assert code == 0, err
+    assert [row["orbit_period"] for row in json.loads(out)] == [1]
+    # as another process sees it, in which the object has changed
     module = project / "mine.py"
     module.write_text(module.read_text().replace("- y[0]", "- 1.1 * y[0]"))
-    again, kept, settling, more = in_turn(
-        (elsewhere, "run", project / "spec.toml", "--out", "run"),
-        (project, "analyse", "attractors", elsewhere / "run", *named, "--json"),
-        (project, "analyse", "settling", elsewhere / "run", *named),
-        (project, "analyse", "settling", elsewhere / "run", *named, "--budget", "2"),
-    )
-    assert again.returncode == 2
-    assert "model_digest" in again.stderr
-    assert kept.returncode == 0  # what was kept needs no object
-    assert settling.returncode == 0  # and neither does what follows from it
-    assert more.returncode == 2  # a longer extension integrates
-    assert "restore the code" in more.stderr
+    sys.modules.pop("mine")
+    monkeypatch.setattr(imported, "_imported", {})
+    code, _, said = main("run", project / "spec.toml", "--out", elsewhere / "run")
+    assert code == 2
+    assert "model_digest" in said
+    assert main("analyse", "attractors", elsewhere / "run", *named, "--json")[0] == 0  # what was kept needs no object
+    assert main("analyse", "settling", elsewhere / "run", *named)[0] == 0  # and neither does what follows from it
+    code, _, said = main("analyse", "settling", elsewhere / "run", *named, "--budget", "2")
+    assert code == 2  # a longer extension integrates
+    assert "restore the code" in said
+    sys.modules.pop("mine")

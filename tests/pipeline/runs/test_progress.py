@@ -1,9 +1,11 @@
-"""Progress in plain lines."""
+"""Progress in plain lines, and as a bar in a notebook."""
 
 from __future__ import annotations
 
 import pytest
 
+from pipeline.products.reporting import is_heard
+from pipeline.runs import notebook
 from pipeline.runs.progress import LINE_EVERY_S, Progress, duration, size
 
 
@@ -37,3 +39,22 @@ def test_duration(seconds, text):
 @pytest.mark.parametrize(("n", "text"), [(12, "12 bytes"), (6.28e6, "6.3 MB"), (2e13, "20.0 TB")])
 def test_size(n, text):
     assert size(n) == text
+
+
+def test_progress__outside_a_notebook_does_nothing(capsys):
+    assert not notebook.is_notebook()
+    with notebook.progress():
+        assert not is_heard()
+    assert capsys.readouterr() == ("", "")
+
+
+def test_bar__shows_counts_then_how_it_ended():
+    bar = notebook.Bar()
+    bar._show = lambda: None
+    assert repr(bar) == ""
+    bar("compiling", 0, 0)
+    assert "<progress  style" in bar._repr_html_()
+    bar("computing cells", 10, 40)
+    assert repr(bar).startswith("computing cells: 10 of 40 (25 %)")
+    bar.end("stopped")
+    assert repr(bar).startswith("computing cells: 10 of 40 (25 %), stopped after")

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import json
-import signal
-import time
+import shutil
 
 import numpy as np
 import pytest
@@ -25,6 +24,7 @@ from pipeline.specification.parsing import parse_spec
 from pipeline.specification.problems import SpecError
 from pipeline.store.errors import DamagedError, RefusedError
 from pipeline.store.runfile import read_run
+from tests.pipeline.factories import finished, quietly, silent
 
 HZ = 2.2
 CELLS = """
@@ -43,10 +43,6 @@ trajectories_per_task = 6
 RECORDED = f'kind = "sweep"\n[drive]\nfile = "drive.csv"\n{CELLS}'
 ORDINARY = f'kind = "sweep"\n[parameters]\nfrequency_hz = {HZ}\n{CELLS}'
 EXTREMES = '[products]\nextremes = { quantities = ["drive_torque"] }\n'
-
-
-def silent(line):
-    pass
 
 
 def edges(n=12, jitter=0.0, start=3.5):
@@ -70,8 +66,8 @@ def recorded(write_spec, tmp_path):
 
 
 def test_run__equal_periods_give_the_numbers_of_the_ordinary_run(recorded, write_spec, tmp_path):
-    run(recorded(RECORDED + EXTREMES, edges()), tmp_path / "recorded", workers=0, echo=silent)
-    run(write_spec(ORDINARY + EXTREMES), tmp_path / "ordinary", workers=0, echo=silent)
+    quietly(recorded(RECORDED + EXTREMES, edges()), tmp_path / "recorded")
+    quietly(write_spec(ORDINARY + EXTREMES), tmp_path / "ordinary")
     one, other = open_run(tmp_path / "recorded").load(), open_run(tmp_path / "ordinary").load()
     assert one.section.dims == other.section.dims
     # 11 periods at rtol 1e-8, of cells that are not yet settled
@@ -95,7 +91,7 @@ def torque(n=1200):
 def test_run__same_bytes_in_other_tasks_and_after_a_failure(recorded, tmp_path, monkeypatch, bytes_of, kind):
     text = RECORDED.replace("n_transient = 7", "n_transient = 5")
     path = recorded(text.replace("q = {", "T1 = {"), torque()) if kind == "torque" else recorded(text)
-    run(path, tmp_path / "whole", workers=0, echo=silent)
+    quietly(path, tmp_path / "whole")
     original, calls = task.compute, []
 
     def failing(*arguments, **options):
@@ -107,32 +103,34 @@ def test_run__same_bytes_in_other_tasks_and_after_a_failure(recorded, tmp_path, 
     with monkeypatch.context() as patch:
         patch.setattr(task, "compute", failing)
         with pytest.raises(TaskFailedError):
-            run(path, tmp_path / "run", workers=0, echo=silent)
+            quietly(path, tmp_path / "run")
     assert state(tmp_path / "run").done == {0, 1}
     # a worker reads the drive from run.json, not from its file
     run(path, tmp_path / "run", workers=1 if kind == "edges" else 0, echo=silent)
     assert bytes_of(tmp_path / "run") == bytes_of(tmp_path / "whole")
     path.write_text(path.read_text("utf-8").replace("per_task = 6", "per_task = 5"), "utf-8")
-    run(path, tmp_path / "other", workers=0, echo=silent)
+    quietly(path, tmp_path / "other")
     one, other = open_run(tmp_path / "whole").load(), open_run(tmp_path / "other").load()
     assert one.drop_attrs(deep=False).identical(other.drop_attrs(deep=False))
 
 
-def test_run__killed_and_resumed_has_the_same_bytes(recorded, tmp_path, start, bytes_of):
-    path = recorded(RECORDED.replace("num = 3", "num = 9").replace("num = 4", "num = 12"))
-    run(path, tmp_path / "whole", workers=0, echo=silent)
-    process = start("run", path, "--out", "run", "--workers", "1")
-    deadline = time.monotonic() + 200
-    while time.monotonic() < deadline and not list((tmp_path / "run" / "commits").glob("**/*.json")):
-        time.sleep(0.05)
-    process.send_signal(signal.SIGKILL)
-    process.wait()
-    assert run(path, tmp_path / "run", workers=0, echo=silent).complete
-    assert bytes_of(tmp_path / "run") == bytes_of(tmp_path / "whole")
+@pytest.fixture(scope="module")
+def once(tmp_path_factory):
+    """A finished run under a recording, beside its files."""
+    folder = tmp_path_factory.mktemp("recorded")
+    (folder / "drive.csv").write_text(edges(jitter=0.01), "utf-8")
+    finished(folder, RECORDED)
+    return folder
 
 
-def test_run__explains_itself_when_the_file_is_gone(recorded, tmp_path):
-    run(recorded(), tmp_path / "run", workers=0, echo=silent)
+@pytest.fixture
+def path(once, tmp_path):
+    """A copy of it: its specification, beside the drive's file and the run."""
+    shutil.copytree(once, tmp_path, dirs_exist_ok=True)
+    return tmp_path / "spec.toml"
+
+
+def test_run__explains_itself_when_the_file_is_gone(path, tmp_path):
     text = (tmp_path / "drive.csv").read_text("utf-8")
     (tmp_path / "drive.csv").unlink()
     spec = parse_spec(read_run(tmp_path / "run").spec)
@@ -142,38 +140,32 @@ def test_run__explains_itself_when_the_file_is_gone(recorded, tmp_path):
     assert figure(tmp_path / "run", "section", {"at": {"q": 1.6}}).axes
 
 
-def test_run__with_another_drive_is_refused(recorded, tmp_path, bytes_of):
-    path = recorded()
-    run(path, tmp_path / "run", workers=0, echo=silent)
+def test_run__with_another_drive_is_refused(path, recorded, tmp_path, bytes_of):
     before = bytes_of(tmp_path / "run")
     recorded(drive=edges(jitter=0.02))
     with pytest.raises(RefusedError, match=r"spec\.drive\.sha256"):
-        run(path, tmp_path / "run", workers=0, echo=silent)
+        quietly(path, tmp_path / "run")
     assert bytes_of(tmp_path / "run") == before
 
 
-def test_run__damaged_drive_is_found_and_rebuilt(recorded, tmp_path, bytes_of):
-    path, directory = recorded(), tmp_path / "run"
-    run(path, directory, workers=0, echo=silent)
+def test_run__damaged_drive_is_found_and_rebuilt(path, tmp_path, bytes_of):
+    directory = tmp_path / "run"
     before, file = bytes_of(directory), directory / "run.json"
     data = json.loads(file.read_text("utf-8"))
     data["spec"]["drive"]["text"] = data["spec"]["drive"]["text"].replace("3.", "4.", 1)
     file.write_text(json.dumps(data), "utf-8")
     with pytest.raises(DamagedError, match=r"run\.json: damaged"):
         open_run(directory)
-    run(path, directory, workers=0, echo=silent)
+    quietly(path, directory)
     assert bytes_of(directory) == before
 
 
-@pytest.mark.parametrize("name", ["attractors", "basins", "chaos", "settling"])
-def test_derive__refuses_what_goes_on_beyond_the_recording(recorded, tmp_path, name):
-    run(recorded(), tmp_path / "run", workers=0, echo=silent)
-    with pytest.raises(
-        SpecError, match=rf"drive is the recording drive\.csv, which ends, but {name} integrates further"
-    ):
-        derive(tmp_path / "run", name)
+def test_derive__refuses_what_goes_on_beyond_the_recording(once):
+    for name in ("attractors", "basins", "chaos", "settling"):
+        with pytest.raises(SpecError, match=rf"recording drive\.csv, which ends, but {name} integrates further"):
+            derive(once / "run", name)
     with pytest.raises(SpecError, match="integrates further"):
-        figure(tmp_path / "run", "gallery", {"at": {"q": 1.6}})
+        figure(once / "run", "gallery", {"at": {"q": 1.6}})
 
 
 def test_describe_plan__measures_a_recorded_drive(recorded, tmp_path):
@@ -198,10 +190,9 @@ def test_cli__says_which_numbers_do_not_fit(recorded, tmp_path, main):
     assert not (tmp_path / "run").exists()
 
 
-def test_extend__cells_under_the_same_recording(recorded, tmp_path, bytes_of, monkeypatch):
-    run(recorded(), tmp_path / "old", workers=0, echo=silent)
+def test_extend__cells_under_the_same_recording(once, recorded, tmp_path, bytes_of, monkeypatch):
     wider = recorded(RECORDED.replace("[0.6, 1.6]", "[0.6, 1.1, 1.6]"))
-    run(wider, tmp_path / "fresh", workers=0, echo=silent)
+    quietly(wider, tmp_path / "fresh")
     calls = []
     original = branches.under_recording
 
@@ -211,11 +202,11 @@ def test_extend__cells_under_the_same_recording(recorded, tmp_path, bytes_of, mo
 
     monkeypatch.setattr(branches, "under_recording", counted)
     monkeypatch.setattr(task, "warm_up", lambda spec: 0.0)
-    extend(tmp_path / "old", wider, tmp_path / "new", workers=0, echo=silent)
+    extend(once / "run", wider, tmp_path / "new", workers=0, echo=silent)
     assert sum(calls) == 12
     assert bytes_of(tmp_path / "new") == bytes_of(tmp_path / "fresh")
     with pytest.raises(RefusedError, match="cells under a recorded drive do not go on"):
-        extend(tmp_path / "old", keep=5, out=tmp_path / "longer", echo=silent)
+        extend(once / "run", keep=5, out=tmp_path / "longer", echo=silent)
     other = recorded(drive=edges(jitter=0.02))
     with pytest.raises(RefusedError, match=r"drive\.sha256"):
-        extend(tmp_path / "old", other, tmp_path / "other", echo=silent)
+        extend(once / "run", other, tmp_path / "other", echo=silent)

@@ -12,6 +12,7 @@ import numpy as np
 import psutil
 import pytest
 
+from magpend import Spec
 from magpend_core import load_preset, run_branches
 from pipeline import open_run
 from pipeline.compute import clients, task
@@ -23,6 +24,7 @@ from pipeline.runs.status import state
 from pipeline.specification.parsing import parse_spec
 from pipeline.store.errors import LockedError, RefusedError
 from pipeline.store.runfile import read_run
+from tests.pipeline.factories import FOLD, WELL, silent
 
 MANY = """
 [axes]
@@ -36,60 +38,13 @@ n_transient = 100
 n_keep = 4
 """
 EIGHT = "[execution]\ntrajectories_per_task = 8"
-DRIFT = """
-kind = "sweep"
-[model]
-name = "moving-fold"
-states = { x = { escape = 1e6 } }
-parameters = { l = 0.0 }
-equations = { x = "(x + l)**2 - 1" }
-[parameters]
-frequency_hz = 1.0
-[drift.l]
-to = 20.0
-[axes]
-l_rate_per_s = { values = [0.9, 1.0, 1.1, 1.3] }
-[initial_conditions]
-kind = "list"
-points = [[-1.0], [0.25]]
-[integration]
-n_transient = 0
-n_keep = 8
-[execution]
-trajectories_per_task = 2
-"""
-NOISE = """
-kind = "sweep"
-[model]
-name = "well"
-states = { x = { meaning = "position" } }
-parameters = { a = 1.0 }
-equations = { x = "a*x - x**3" }
-[noise]
-strengths = { x = 0.5 }
-seed = 1
-steps_per_period = 8
-[parameters]
-frequency_hz = 5.0
-[axes]
-noise_x = { values = [0.45, 0.7] }
-realization = { start = 0, stop = 7, step = 1 }
-[initial_conditions]
-kind = "list"
-points = [[-1.0]]
-[integration]
-n_transient = 2
-n_keep = 8
-[execution]
-trajectories_per_task = 4
-"""
+DRIFT = Spec(**FOLD).integration(n_keep=8).execution(trajectories_per_task=2).toml()
+NOISE = WELL.replace("[0.45, 0.55, 0.7]", "[0.45, 0.7]").replace("stop = 199", "stop = 7")
+NOISE = NOISE.replace("n_transient = 0", "n_transient = 2").replace("n_keep = 1000", "n_keep = 8")
+NOISE = f"{NOISE}\n[execution]\ntrajectories_per_task = 4"
 MANY_SWEEP = f'kind = "sweep"\n{MANY}\n{EIGHT}'
 HALF = MANY.replace("n = 64", "n = 32")  # both ways, as many cells as the sweep
 MANY_WALK = f'kind = "continuation"\n{HALF}\n[continuation]\ndirection = "both"\n{EIGHT}\npoints_per_task = 1'
-
-
-def silent(line):
-    pass
 
 
 def test_run__walk_is_what_the_kernel_says(write_spec, walk_text, tmp_path):

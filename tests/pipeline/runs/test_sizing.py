@@ -81,30 +81,33 @@ def test_complete__nodes_that_are_not_known():
 
 def test_complete__what_is_given_stays():
     found, reasons = sized(cores=2, memory="3 GB", walltime="00:05:00")
-    assert (found.cores, found.memory, found.walltime) == (2, "3 GB", "00:05:00")
-    assert reasons == {}
+    assert (found.cores, found.memory, found.walltime, reasons) == (2, "3 GB", "00:05:00", {})
 
 
-def test_remarks__a_job_that_fits():
-    assert remarks(sized()[0], WORK, SITE) == []
-
-
-def test_remarks__a_job_that_ends_too_early():
-    found, _ = sized(cores=4, walltime="01:00:00")
-    early, several = remarks(found, WORK, SITE)
-    assert "the work takes about 2 h 30 min on 4 cores, and the job ends after 60 min: send it about 3 times" in early
-    assert "--job max_jobs=6" in several
-
-
-def test_remarks__above_the_limits_of_a_queue():
-    found, _ = sized(walltime="02:00:00", cores=40, memory="80 GB")
-    said = remarks(found, WORK, SITE)
-    assert len(said) == 3
-    assert said[0].startswith("walltime is 2 h, above the longest time of partition short, 60 min")
-    assert said[1].startswith("cores is 40, above the cores of most nodes of partition short, 32")
-    assert said[2].startswith("memory is 80.0 GB, above the memory of most nodes of partition short, 64.0 GB")
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({}, []),
+        (
+            {"cores": 4, "walltime": "01:00:00"},
+            ["2 h 30 min on 4 cores, and the job ends after 60 min: send it about 3 times", "--job max_jobs=6"],
+        ),
+        (
+            {"walltime": "02:00:00", "cores": 40, "memory": "80 GB"},
+            [
+                "walltime is 2 h, above the longest time of partition short, 60 min",
+                "cores is 40, above the cores of most nodes of partition short, 32",
+                "memory is 80.0 GB, above the memory of most nodes of partition short, 64.0 GB",
+            ],
+        ),
+    ],
+)
+def test_remarks(given, said):
+    found = remarks(sized(**given)[0], WORK, SITE)
+    assert len(found) == len(said)
+    assert all(words in line for words, line in zip(said, found, strict=True)), found
 
 
 def test_remarks__a_queue_that_is_not_listed():
-    found, _ = sized(queue="shrot")
-    assert "queue 'shrot': SLURM lists no such partition, but short, long" in remarks(found, WORK, SITE)[0]
+    said = remarks(sized(queue="shrot")[0], WORK, SITE)[0]
+    assert "queue 'shrot': SLURM lists no such partition, but short, long" in said

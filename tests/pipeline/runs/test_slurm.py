@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import re
 import subprocess
@@ -12,41 +11,26 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.runs.run import run
 from pipeline.runs.status import state
+from tests.pipeline.factories import duffing, quietly
+from tests.pipeline.runs import slurm
 
-SPEC = """
-kind = "sweep"
-title = "small Duffing sweep"
-model = "duffing"
-[axes]
-frequency_hz = { start = 0.15, stop = 0.25, num = 12 }
-[initial_conditions]
-kind = "grid"
-x = { start = -1, stop = 1, num = 8 }
-v = { start = -1, stop = 1, num = 8 }
-[integration]
-rtol = 1e-9
-atol = 1e-9
-n_transient = 2000
-n_keep = 4
-[execution]
-trajectories_per_task = 64
-"""
-HOURS = """
-kind = "sweep"
-title = "Basins over the frequency"
-model = "duffing"
-[axes]
-frequency_hz = { start = 0.15, stop = 0.25, num = 121 }
-[initial_conditions]
-kind = "grid"
-x = { start = -1, stop = 1, num = 32 }
-v = { start = -1, stop = 1, num = 32 }
-[integration]
-n_transient = 100000
-n_keep = 16
-"""
+SQUARE = "x = {{ start = -1, stop = 1, num = {n} }}\nv = {{ start = -1, stop = 1, num = {n} }}"
+SPEC = duffing(
+    "frequency_hz = { start = 0.15, stop = 0.25, num = 12 }",
+    f'kind = "grid"\n{SQUARE.format(n=8)}',
+    n_transient=2000,
+    n_keep=4,
+    tolerance=1e-9,
+    execution="trajectories_per_task = 64",
+)
+HOURS = duffing(
+    "frequency_hz = { start = 0.15, stop = 0.25, num = 121 }",
+    f'kind = "grid"\n{SQUARE.format(n=32)}',
+    n_transient=100000,
+    n_keep=16,
+    tolerance=1e-8,
+).replace('"small"', '"Basins over the frequency"')
 ONE_JOB = """
 [cluster]
 kind = "slurm"
@@ -71,21 +55,14 @@ PATIENCE_S = 100.0
 DOCS = Path(__file__).parents[3] / "docs"
 
 
-def load(name):
-    """A module of this folder, which is no package."""
-    spec = importlib.util.spec_from_file_location(name, Path(__file__).with_name(f"{name}.py"))
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-slurm = load("slurm")
-pytestmark = [pytest.mark.skipif(bool(slurm.why_not()), reason=slurm.why_not() or "SLURM can be had")]
+pytestmark = pytest.mark.slow
 
 
 @pytest.fixture
 def shell(environment, monkeypatch):
     """A SLURM that runs, and commands of a shell in which it can be used."""
+    if reason := slurm.why_not():
+        pytest.skip(reason)
     # the name of munge's socket has at most 108 letters, which pytest's own folder can use up
     with tempfile.TemporaryDirectory(prefix="slurm-") as folder, slurm.running(Path(folder)) as variables:
         for name, value in {**environment, **variables}.items():
@@ -176,7 +153,7 @@ def test_pbs__slurm_reads_the_job_file(tmp_path, shell, magpend, kind, cores):
 def test_submit__follow_cancel_and_go_on(tmp_path, shell, magpend, bytes_of):
     for name, text in (("spec", SPEC), ("one", ONE_JOB), ("several", SEVERAL_JOBS)):
         (tmp_path / f"{name}.toml").write_text(text)
-    run(tmp_path / "spec.toml", tmp_path / "laptop", workers=0, echo=lambda line: None)
+    quietly(tmp_path / "spec.toml", tmp_path / "laptop")
     out, logs = tmp_path / "out", tmp_path / "out.jobs"
 
     # one job holds all; it is cancelled when some tasks are committed and some are not

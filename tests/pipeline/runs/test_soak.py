@@ -14,29 +14,15 @@ import psutil
 from pipeline.runs import run as runs
 from pipeline.runs.status import state
 from pipeline.runs.verify import verify_run
+from tests.pipeline.factories import duffing
 
 N_TASKS = 10_000 if os.environ.get("MAGPEND_LONG") == "1" else 150
 KILOBYTES_PER_TASK = 10 if N_TASKS > 1000 else 40
 """What a process may grow by; over few tasks, what it takes in once weighs more."""
 HANDLES = 4
 
-SPEC = f"""
-kind = "sweep"
-model = "duffing"
-[axes]
-frequency_hz = {{ start = 0.15, stop = 0.25, num = {N_TASKS} }}
-[initial_conditions]
-kind = "grid"
-x = 0.5
-v = 0.1
-[integration]
-rtol = 1e-6
-atol = 1e-6
-n_transient = 2
-n_keep = 3
-[execution]
-trajectories_per_task = 1
-"""
+AXES = f"frequency_hz = {{ start = 0.15, stop = 0.25, num = {N_TASKS} }}"
+SPEC = duffing(AXES, 'kind = "grid"\nx = 0.5\nv = 0.1', execution="trajectories_per_task = 1")
 
 
 class Watch:

@@ -104,17 +104,10 @@ def test_zoom__beyond_the_old_range_is_noted(sweep):
         _, notes = zoom(sweep, Changes({key: pair}))
         assert len(notes) == noted, (key, pair)
         assert all(note.startswith(f"{key}: ") and "beyond the old" in note for note in notes)
-
-
-def test_zoom__old_range_in_radians_new_in_degrees(sweep):
     radians, _ = zoom(sweep, Changes({"psi1": (-0.5, 0.5)}))
     assert zoom(radians, Changes({"psi1_deg": (-28, 28)}))[1] == []
     assert len(zoom(radians, Changes({"psi1_deg": (-29, 0)}))[1]) == 1
-
-
-def test_zoom__a_fixed_state_becomes_a_range(sweep):
-    with pytest.raises(SpecError, match="psi1_dot: a range has 2 points or more"):
-        zoom(sweep, Changes({"psi1_dot": (0, 1)}))
+    # a state that was fixed becomes a range
     new, notes = zoom(sweep, Changes({"psi1_dot": (0, 1)}, nums={"psi1_dot": 6}))
     assert notes == []
     assert len(new.initial_conditions.psi1_dot.array()) == 6
@@ -144,40 +137,39 @@ def test_zoom__samples(walk):
     assert zoom(walk, Changes({"psi1": (-0.1, 0.1)}))[0].initial_conditions.n == 5
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        (Changes(), "nothing to change"),
-        (Changes({"psi1": (1, 1)}), "psi1 = 1 1: the second number must be greater"),
-        (Changes({"psi1": (float("nan"), 1)}), "must be greater"),
-        (Changes({"psi1": (0, float("inf"))}), "finite"),
-        (Changes({"psi1": (0, 1), "psi1_deg": (0, 1)}), "psi1: is changed twice"),
-        (Changes({"q": (1, 2)}, {"q": 1}), "q: is changed twice"),
-        (Changes({"psi1": (0, 1)}, num=1), "psi1: a range has 2 points or more"),
-        (Changes({"psi1": (0, 1)}, nums={"psi2": 3}), "psi2: no range is given for it"),
-        (Changes({"psi1": (0, 1)}, samples=3), "samples = 3: the initial conditions are not random"),
-        (Changes({}, {"q": 1.5}, num=3), "num = 3: no new range has points"),
-        (Changes({"qq": (0, 1)}, num=3), "did you mean q"),
-        (Changes({"m1": (-2, 1)}, num=3), "axes.m1"),
-        (Changes({}, {"q": float("nan")}), "parameters.overrides"),
-        (Changes({}, {"frequency_hz": -2.0}), "parameters.frequency_hz = -2.0"),
-    ],
-)
-def test_zoom__refused(sweep, changes, message):
-    with pytest.raises(SpecError) as caught:
-        zoom(sweep, changes)
-    assert any(message in p for p in caught.value.problems), caught.value.problems
+REFUSED = [
+    (Changes(), "nothing to change"),
+    (Changes({"psi1": (1, 1)}), "psi1 = 1 1: the second number must be greater"),
+    (Changes({"psi1": (float("nan"), 1)}), "must be greater"),
+    (Changes({"psi1": (0, float("inf"))}), "finite"),
+    (Changes({"psi1": (0, 1), "psi1_deg": (0, 1)}), "psi1: is changed twice"),
+    (Changes({"q": (1, 2)}, {"q": 1}), "q: is changed twice"),
+    (Changes({"psi1": (0, 1)}, num=1), "psi1: a range has 2 points or more"),
+    (Changes({"psi1": (0, 1)}, nums={"psi2": 3}), "psi2: no range is given for it"),
+    (Changes({"psi1": (0, 1)}, samples=3), "samples = 3: the initial conditions are not random"),
+    (Changes({}, {"q": 1.5}, num=3), "num = 3: no new range has points"),
+    (Changes({"qq": (0, 1)}, num=3), "did you mean q"),
+    (Changes({"m1": (-2, 1)}, num=3), "axes.m1"),
+    (Changes({}, {"q": float("nan")}), "parameters.overrides"),
+    (Changes({}, {"frequency_hz": -2.0}), "parameters.frequency_hz = -2.0"),
+    (Changes({"psi1_dot": (0, 1)}), "psi1_dot: a range has 2 points or more"),
+]
 
 
-def test_zoom__refused_for_lists_samples_and_paths(walk):
+def test_zoom__refused(sweep, walk):
+    for changes, message in REFUSED:
+        with pytest.raises(SpecError) as caught:
+            zoom(sweep, changes)
+        assert any(message in p for p in caught.value.problems), caught.value.problems
     with pytest.raises(SpecError, match="a list, which has no ranges"):
         zoom(parse_spec(tomllib.loads(LIST)), Changes({"psi1": (0, 1)}))
-    with pytest.raises(SpecError, match="num = 4: no new range has points"):
-        zoom(walk, Changes({"psi1": (0, 1)}, num=4))
-    with pytest.raises(SpecError, match="random samples have no grid"):
-        zoom(walk, Changes({"psi1": (0, 1)}, nums={"psi1": 4}))
-    with pytest.raises(SpecError, match=r"continuation\.path"):
-        zoom(walk, Changes({}, {"frequency_hz": 2.2}))
+    for changes, message in (
+        (Changes({"psi1": (0, 1)}, num=4), "num = 4: no new range has points"),
+        (Changes({"psi1": (0, 1)}, nums={"psi1": 4}), "random samples have no grid"),
+        (Changes({}, {"frequency_hz": 2.2}), r"continuation\.path"),
+    ):
+        with pytest.raises(SpecError, match=message):
+            zoom(walk, changes)
 
 
 def test_zoom__refinement_must_fit(sweep_text):
@@ -218,15 +210,14 @@ def test_zoom__command(main, write_spec, sweep_text, tmp_path):
     assert (tmp_path / "zoom.toml").read_text().startswith("# Zoom. Derived from specification spec.toml.\n")
     assert len(new.initial_conditions.psi1_deg.array()) == 9
     assert len(new.axes["q"].array()) == 11
-    for arguments, message in [
+    for arguments, message in (
         (["--axis", "q=1.5"], "--axis q=1.5: must be NAME=LOW:HIGH"),
         (["--axis", "q=1:2:3:4"], "must be NAME=LOW:HIGH"),
         (["--at", "q"], "--at q: must be NAME=VALUE"),
         (["--at", "qq=1"], "did you mean q"),
         ([], "nothing to change"),
-    ]:
+    ):
         code, _, said = main("zoom", path, *arguments, "--out", "other.toml")
         assert code == Exit.REFUSED
         assert message in said
-        assert "Traceback" not in said
     assert not (tmp_path / "other.toml").exists()

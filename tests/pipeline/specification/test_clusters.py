@@ -40,21 +40,14 @@ def problems(load, text):
     return refused.value.problems
 
 
-def test_cluster__whole(load):
-    found = load(WHOLE)
-    assert (found.cores, found.memory_bytes, found.max_jobs) == (16, 32 * 10**9, 8)
-    assert found.prologue[0] == "module load python/3.12"
-
-
 @pytest.mark.parametrize("walltime", ["00:00:10", "00:01:00", "00:10:00", "01:00:00", "48:00:00"])
 def test_cluster__workers_leave_before_their_job_ends(load, walltime):
     found = load(WHOLE.replace("04:00:00", walltime))
+    assert (found.cores, found.memory_bytes, found.max_jobs) == (16, 32 * 10**9, 8)
+    assert found.prologue[0] == "module load python/3.12"
     assert found.lifetime_s - found.stagger_s > 0
     margin = found.walltime_s - found.lifetime_s - found.stagger_s
     assert margin == min(max(found.walltime_s // 10, 30), 900, found.walltime_s // 2)
-
-
-def test_cluster__given_lifetime(load):
     found = load(WHOLE + 'lifetime = "03:00:00"\nlifetime_stagger = "00:10:00"\n')
     assert (found.lifetime_s, found.stagger_s) == (10800, 600)
 
@@ -97,22 +90,17 @@ def test_cluster__what_does_not_fit_together(load):
     assert len(found) == 2
     assert "min_jobs = 9: must be at most max_jobs = 8" in found[0]
     assert "must end before walltime = '04:00:00'" in found[1]
-
-
-def test_cluster__grid_engine_wants_a_parallel_environment(load):
     text = WHOLE.replace("slurm", "sge")
     assert "such as '-pe smp 16'" in problems(load, text)[0]
     load(text.replace("--constraint=avx512", "-pe orte 16"))
 
 
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [("", "has no table [cluster]"), ("cluster = 3", "has no table [cluster]"), ("[cluster", "is not valid TOML")],
-)
-def test_cluster__no_table(load, text, words):
-    assert words in problems(load, text)[0]
-
-
-def test_cluster__no_file(tmp_path):
+def test_cluster__no_table(load, tmp_path):
+    for text, words in (
+        ("", "has no table [cluster]"),
+        ("cluster = 3", "has no table [cluster]"),
+        ("[cluster", "is not valid TOML"),
+    ):
+        assert words in problems(load, text)[0]
     with pytest.raises(SpecError, match="cannot be read"):
         load_cluster(tmp_path / "none.toml")

@@ -13,17 +13,17 @@ import urllib.request
 from pathlib import Path
 
 import pytest
-import yaml
 
 from pipeline.runs.workflows import find_spec
 
-ROOT = Path(__file__).parents[3]
-DOCKERFILE = ROOT / "Dockerfile"
+DOCKERFILE = Path(__file__).parents[3] / "Dockerfile"
+pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
 def parts():
     """The objects of the manifest, by kind."""
+    yaml = pytest.importorskip("yaml")
     text = (find_spec("quickstart").parent / "clusters" / "kubernetes.yaml").read_text("utf-8")
     return {part["kind"]: part for part in yaml.safe_load_all(text)}
 
@@ -57,7 +57,6 @@ def test_manifest__parts_fit_each_other(parts, pods):
         assert containers["coordinator"]["args"][-1].startswith(mount["mountPath"] + "/")
 
 
-@pytest.mark.skipif(not DOCKERFILE.is_file(), reason="there is no Dockerfile")
 def test_manifest__fits_the_image(pods):
     """The coordinator's words follow the image's entry point; its user can write to the volume."""
     text = DOCKERFILE.read_text("utf-8")

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
 import sys
 import tomllib
 
 import pytest
 
-from magpend_core.models import import_model, load_model
+from magpend_core.models import import_model, imported, load_model
 from magpend_core.models.imported import DescribedModel, origin
 from magpend_core.models.parameters import ParameterError
 from pipeline.runs.zoom import Changes, Source, write_zoom
@@ -23,6 +21,12 @@ def problems_of(call, *arguments):
     with pytest.raises(SpecError) as caught:
         call(*arguments)
     return caught.value.problems
+
+
+def object_spec(own, module, folder):
+    """A specification whose model is an object of a module beside it, and its plain data as a run keeps them."""
+    spec = parse_spec(tomllib.loads(own.spec(f'model = "{module[0]}:MINE"')), folder)
+    return spec, json.loads(json.dumps(spec.as_dict()))
 
 
 @pytest.fixture
@@ -53,12 +57,13 @@ def test_load_spec__file_of_a_model_takes_the_place_of_its_name(own, tmp_path, w
     assert kept_spec(spec.as_dict()) == spec
 
 
-def test_read_model_file__below_its_head_or_at_the_top(own, tmp_path):
-    (tmp_path / "a.toml").write_text(own.text)
-    (tmp_path / "b.toml").write_text(own.text.replace("[model]", ""))
-    assert read_model_file(tmp_path / "a.toml") == read_model_file(tmp_path / "b.toml")
-    (tmp_path / "c.toml").write_text(own.spec(own.text))  # a whole specification
-    assert read_model_file(tmp_path / "c.toml") == read_model_file(tmp_path / "a.toml")
+def test_read_model_file__below_its_head_at_the_top_or_in_a_specification(own, tmp_path):
+    texts = {"a": own.text, "b": own.text.replace("[model]", ""), "c": own.spec(own.text)}
+    for name, text in texts.items():
+        (tmp_path / f"{name}.toml").write_text(text)
+    assert len({str(read_model_file(tmp_path / f"{name}.toml")) for name in texts}) == 1
+    (found,) = problems_of(load_spec, tmp_path / "b.toml")  # a model is no specification
+    assert "magpend model show" in found
 
 
 def test_parse_spec__errors_of_the_text_come_with_the_others(own):
@@ -86,13 +91,10 @@ def test_load_spec__smoke_replaces_keys_of_a_text_and_of_a_file(own, tmp_path, w
     assert load_spec(path).values["d"] == 0.08
 
 
-@pytest.mark.parametrize("model", [3, ["duffing"], True])
-def test_find_model__says_what_a_model_can_be(model):
-    (found,) = problems_of(find_model, model)
-    assert all(word in found for word in (f"model = {model!r}", "FILE.toml", "package.module:NAME", "table"))
-
-
-def test_find_model__unknown_name():
+def test_find_model__says_what_a_model_can_be():
+    for model in (3, ["duffing"], True):
+        (found,) = problems_of(find_model, model)
+        assert all(word in found for word in (f"model = {model!r}", "FILE.toml", "package.module:NAME", "table"))
     (found,) = problems_of(find_model, "dufing")
     assert found.startswith("model: ")
     assert "did you mean duffing" in found
@@ -120,23 +122,17 @@ def test_kept_spec__reads_no_file_of_a_preset(own, tmp_path, monkeypatch):
 
 
 def test_parse_spec__imports_the_object_that_a_person_names(own, tmp_path, module):
-    name, trace = module
-    spec = parse_spec(tomllib.loads(own.spec(f'model = "{name}:MINE"')), tmp_path)
+    (name, trace), (spec, plain) = module, object_spec(own, module, tmp_path)
     assert trace.read_text() == "x"
     assert spec.model.system.name == "mine"
     assert origin(spec.model) == (f"{name}:MINE", str(tmp_path))
-    plain = json.loads(json.dumps(spec.as_dict()))
     assert plain["model"]["python"] == f"{name}:MINE"
     assert kept_spec(plain) == spec
     assert kept_spec(plain).model is spec.model
 
 
 def test_kept_spec__describes_an_object_without_importing_it(own, tmp_path, module, monkeypatch):
-    from magpend_core.models import imported
-
-    name, trace = module
-    spec = parse_spec(tomllib.loads(own.spec(f'model = "{name}:MINE"')), tmp_path)
-    plain = json.loads(json.dumps(spec.as_dict()))
+    (name, trace), (spec, plain) = module, object_spec(own, module, tmp_path)
     trace.unlink()
     sys.modules.pop(name)
     monkeypatch.setattr(imported, "_imported", {})
@@ -151,44 +147,24 @@ def test_kept_spec__describes_an_object_without_importing_it(own, tmp_path, modu
     assert load_model(model.reference) is model  # so that parameters compare
 
 
-def test_kept_spec__place_of_an_object_is_refused_unread(own, tmp_path, module, monkeypatch):
-    """The module could be imported: it lies on the path."""
-    name, trace = module
-    monkeypatch.syspath_prepend(str(tmp_path))
-    monkeypatch.chdir(tmp_path)
-    (found,) = problems_of(kept_spec, tomllib.loads(own.spec(f'model = "{name}:MINE"')))
-    assert f"--import-model {name}:MINE" in found
-    with pytest.raises(ParameterError):
-        load_model(f"{name}:MINE")
-    assert not trace.exists()
-
-
-def test_import_model__digest_is_that_of_the_module(own, tmp_path, module):
+def test_import_model__digest_is_that_of_the_module(own, tmp_path, module, monkeypatch):
     """What is commented does not count, what is computed does."""
     name, _ = module
-    digests = []
+    digests, path_before = [], [*sys.path]
     for i, change in enumerate([("", ""), ("def rhs", "# a remark\ndef rhs"), ("- y[0]", "- 2.0 * y[0]")]):
-        folder = tmp_path / str(i)
-        own.write_module(folder, name)
-        path = folder / f"{name}.py"
+        own.write_module(tmp_path / str(i), name)
+        path = tmp_path / str(i) / f"{name}.py"
         path.write_text(path.read_text().replace(*change) if change[0] else path.read_text())
-        code = f"from magpend_core.models import import_model as i; print(i('{name}:MINE', '.').digest)"
-        found = subprocess.run(
-            [sys.executable, "-c", code],
-            cwd=folder,
-            capture_output=True,
-            text=True,
-            check=True,
-            env={**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)},
-        )
-        digests.append(found.stdout.strip())
+        monkeypatch.setattr(imported, "_imported", {})
+        monkeypatch.setattr(sys, "path", [*path_before])
+        sys.modules.pop(name, None)
+        digests.append(import_model(f"{name}:MINE", path.parent).digest)
+        assert sys.modules[name].__file__ == str(path)
     assert digests[0] == digests[1] != digests[2]
 
 
 def test_described_model__object_that_was_changed_is_not_the_run_s(own, tmp_path, module):
-    name, _ = module
-    spec = parse_spec(tomllib.loads(own.spec(f'model = "{name}:MINE"')), tmp_path)
-    plain = json.loads(json.dumps(spec.as_dict()))
+    _, plain = object_spec(own, module, tmp_path)
     plain["model"]["digest"] = "0123456789abcdef"
     with pytest.raises(ParameterError, match="restore the code"):
         _ = kept_spec(plain).model.system
@@ -208,27 +184,26 @@ def test_import_model__says_why(path, words):
     assert problems_of(find_model, path)[0].startswith("model: ")
 
 
-@pytest.mark.parametrize(
-    ("change", "place"),
-    [
-        ({"python": "a b"}, "python"),
-        ({"states": {}}, "states"),
-        ({"states": {"x": {"unit": 3, "meaning": "place"}}}, "states.x.unit"),
-        ({"states": {"x; import os": {"unit": "m", "meaning": "place"}}}, "states"),
-        ({"states": {"x": {"unit": "m", "meaning": "place", "scale": "1"}}}, "states.x.scale"),
-        ({"parameters": {"d": {"unit": "m", "meaning": "place", "bound": "any"}}}, "parameters.d.bound"),
-        ({"parameters": {"d": "m"}}, "parameters.d"),
-        ({"presets": {"p": {"values": {"d": "1"}}}}, "presets.p.values"),
-        ({"mirror": {"signs": [1], "half_period": True}}, "mirror"),
-        ({"title": 3}, "title"),
-        ({"sources": ["/etc/passwd"]}, "sources"),
-    ],
-)
-def test_described_model__checks_what_a_stranger_wrote(own, tmp_path, module, change, place):
-    name, _ = module
-    spec = parse_spec(tomllib.loads(own.spec(f'model = "{name}:MINE"')), tmp_path)
-    found = problems_of(find_model, {**spec.as_dict()["model"], **change})
-    assert any(place in p for p in found)
+CHANGED = [
+    ({"python": "a b"}, "python"),
+    ({"states": {}}, "states"),
+    ({"states": {"x": {"unit": 3, "meaning": "place"}}}, "states.x.unit"),
+    ({"states": {"x; import os": {"unit": "m", "meaning": "place"}}}, "states"),
+    ({"states": {"x": {"unit": "m", "meaning": "place", "scale": "1"}}}, "states.x.scale"),
+    ({"parameters": {"d": {"unit": "m", "meaning": "place", "bound": "any"}}}, "parameters.d.bound"),
+    ({"parameters": {"d": "m"}}, "parameters.d"),
+    ({"presets": {"p": {"values": {"d": "1"}}}}, "presets.p.values"),
+    ({"mirror": {"signs": [1], "half_period": True}}, "mirror"),
+    ({"title": 3}, "title"),
+    ({"sources": ["/etc/passwd"]}, "sources"),
+]
+
+
+def test_described_model__checks_what_a_stranger_wrote(own, tmp_path, module):
+    _, plain = object_spec(own, module, tmp_path)
+    for change, place in CHANGED:
+        found = problems_of(find_model, {**plain["model"], **change})
+        assert any(place in p for p in found), change
 
 
 def test_model_toml__reads_back(own):
@@ -250,8 +225,7 @@ def test_find_model__specification_that_names_its_model(own, tmp_path):
 
 
 def test_write_zoom__names_the_object_and_says_that_it_is_imported(own, tmp_path, module):
-    name, _ = module
-    spec = parse_spec(tomllib.loads(own.spec(f'model = "{name}:MINE"')), tmp_path)
+    (name, _), (spec, _) = module, object_spec(own, module, tmp_path)
     notes = write_zoom(Source(spec, "a run"), Changes(ranges={"x": (0.0, 0.5)}), tmp_path / "z.toml")
     assert any(f"imports the Python object {name}:MINE" in note for note in notes)
     assert f'model = "{name}:MINE"' in (tmp_path / "z.toml").read_text()
@@ -264,9 +238,3 @@ def test_write_zoom__text_goes_with_it(own, tmp_path):
     again = load_spec(tmp_path / "z.toml")
     assert again.model is spec.model
     assert again.values["A"] == 0.3
-
-
-def test_load_spec__file_of_a_model_is_no_specification(own, tmp_path):
-    (tmp_path / "shared.toml").write_text(own.text.replace("[model]", ""))
-    (found,) = problems_of(load_spec, tmp_path / "shared.toml")
-    assert "magpend model show" in found

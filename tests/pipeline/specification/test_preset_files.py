@@ -8,11 +8,10 @@ from magpend_core import load_model
 from magpend_core.models.preset_writing import write_preset
 from pipeline.layout.identity import digest_of
 from pipeline.layout.plan import make_plan
-from pipeline.runs.run import identity_here, run
+from pipeline.runs.run import identity_here
 from pipeline.runs.zoom import Changes, to_toml, zoom
 from pipeline.specification.parsing import load_spec, parse_spec
 from pipeline.specification.problems import SpecError
-from pipeline.store.run import Run
 
 FIT, SOURCES = {"c1": 0.068, "alpha1": 1.75}, {"c1": "fit of curve 3", "alpha1": "fit"}
 HEAD = "model = 'pendulum'\nbase = 'wojna2018'"
@@ -50,6 +49,7 @@ def test_load_spec__reads_the_preset_beside_it_and_keeps_it_whole(tmp_path):
     again = parse_spec(spec.as_dict())
     assert again == spec
     assert again.parameters.chosen.provenance["c1"] == "fit of curve 3"
+    assert identity_here(spec, make_plan(spec))["spec"]["parameters"]["preset"]["title"] == "test rig"
 
 
 def test_load_spec__smoke_may_choose_another_preset(tmp_path):
@@ -77,21 +77,11 @@ def test_zoom__carries_the_preset_along(tmp_path):
     assert "fit of curve 3" in to_toml(narrower)
 
 
-def test_run__explains_itself_when_the_file_is_gone(tmp_path):
-    path = write(tmp_path)
-    run(path, tmp_path / "run", workers=0, scheduler="none", echo=lambda line: None)
-    (tmp_path / "rig.toml").unlink()
-    path.unlink()
-    opened = Run.open(tmp_path / "run")
-    assert opened.parameters["alpha1"] == FIT["alpha1"]
-    assert opened.spec.parameters.chosen.provenance["alpha1"] == "fit"
-    assert opened.info.identity["spec"]["parameters"]["preset"]["title"] == "test rig"
-
-
 @pytest.mark.parametrize(
     ("content", "words"),
     [
         (None, "cannot be read"),
+        (3, "must be a text in quotes"),
         ("model = 'duffing'", "is of model 'duffing'"),
         ("model = 'pendulum'\nbase = 'wojna2018'\n[values]\nc1 = 'x'\n[provenance]\nc1 = 'y'", "must be a number"),
         ("model = 'pendulum'\nbase = 'wojna2018'\n[values]\nc1 = -1\n[provenance]\nc1 = 'y'", "greater than 0"),
@@ -101,21 +91,15 @@ def test_load_spec__says_what_is_wrong_with_the_file_beside_all_else(tmp_path, c
     path = write(tmp_path)
     path.write_text(path.read_text().replace("n_keep = 2", "n_keep = 0"))
     rig = tmp_path / "rig.toml"
-    rig.unlink() if content is None else rig.write_text(content)
+    if content == 3:
+        path.write_text(path.read_text().replace('preset = "rig.toml"', "preset = 3"))
+    elif content is None:
+        rig.unlink()
+    else:
+        rig.write_text(content)
     with pytest.raises(SpecError) as caught:
         load_spec(path)
     own = [p for p in caught.value.problems if p.startswith("parameters.preset")]
     assert len(own) == 1
     assert words in own[0]
     assert any(p.startswith("integration.n_keep") for p in caught.value.problems)
-
-
-def test_parse_spec__a_preset_is_a_name_or_a_table():
-    with pytest.raises(SpecError, match=r"parameters.preset = 3: must be a text in quotes"):
-        parse_spec(
-            {
-                "kind": "sweep",
-                "parameters": {"preset": 3, "frequency_hz": 2.0},
-                "initial_conditions": {"kind": "list", "points": [[0.0] * 4]},
-            }
-        )

@@ -40,11 +40,8 @@ def test_parse_spec__section():
     assert again == spec
     assert again.model is spec.model
     assert pickle.loads(pickle.dumps(spec.values)) == spec.values
-
-
-def test_parse_spec__section_default():
-    spec = parse_spec({**SPEC, "section": {"of": "x"}})
-    assert spec.section.model_dump() == {"of": "x", "value": 0.0, "direction": "up", "longest": 100.0}
+    default = parse_spec({**SPEC, "section": {"of": "x"}}).section
+    assert default.model_dump() == {"of": "x", "value": 0.0, "direction": "up", "longest": 100.0}
 
 
 def test_cells__no_frequency():
@@ -61,13 +58,11 @@ def test_cells__no_frequency():
     np.testing.assert_array_equal(inputs.parameters[:, 0], [[0.5, 0.5], [0.5, 0.5], [1.0, 0.5], [1.0, 0.5]])
 
 
-@pytest.mark.parametrize(
-    "change", [{"of": "x"}, {"value": 0.4}, {"direction": "up"}, {"longest": 40.0}], ids=lambda c: next(iter(c))
-)
-def test_identity__every_key_of_the_section(change):
+def test_identity__every_key_of_the_section():
     spec = parse_spec(SPEC)
-    other = parse_spec({**SPEC, "section": {**SPEC["section"], **change}})
-    assert identity_of(spec, make_plan(spec), "0") != identity_of(other, make_plan(other), "0")
+    for change in ({"of": "x"}, {"value": 0.4}, {"direction": "up"}, {"longest": 40.0}):
+        other = parse_spec({**SPEC, "section": {**SPEC["section"], **change}})
+        assert identity_of(spec, make_plan(spec), "0") != identity_of(other, make_plan(other), "0"), change
 
 
 def test_parse_spec__swept_level():
@@ -89,6 +84,9 @@ def test_parse_spec__strobed_flow():
     assert "frequency" in [c.name for c in coordinates(spec)]
 
 
+FREQUENCY = "a section by crossing needs no frequency; drop one of the two."
+
+
 @pytest.mark.parametrize(
     ("changes", "text"),
     [
@@ -97,22 +95,11 @@ def test_parse_spec__strobed_flow():
         ({"section": {"of": "x", "longest": 0.0}}, "section.longest = 0.0: must be greater than 0.0."),
         ({"section": {"value": 0.0}}, "section.of: missing"),
         ({"section": 3}, "section = 3: must be a table; write [section]."),
-        (
-            {"parameters": {"frequency_hz": 1.0}},
-            "parameters.frequency_hz: a section by crossing needs no frequency; drop one of the two.",
-        ),
-        (
-            {"axes": {"frequency_hz": {"values": [1.0]}}},
-            "axes.frequency_hz: a section by crossing needs no frequency; drop one of the two.",
-        ),
+        ({"parameters": {"frequency_hz": 1.0}}, f"parameters.frequency_hz: {FREQUENCY}"),
+        ({"axes": {"frequency_hz": {"values": [1.0]}}}, f"axes.frequency_hz: {FREQUENCY}"),
+        ({"model": "duffing", "axes": {"amplitude": {"values": [0.3]}}}, "section: duffing has a drive"),
     ],
 )
 def test_parse_spec__refused(changes, text):
     found = problems(**changes)
     assert any(p.startswith(text) for p in found), found
-
-
-def test_parse_spec__forced_model():
-    data = {"model": "duffing", "axes": {"amplitude": {"values": [0.3]}}}
-    found = problems(**data)
-    assert any(p.startswith("section: duffing has a drive") for p in found), found

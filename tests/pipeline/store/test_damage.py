@@ -1,448 +1,463 @@
-"""What damage, failing disks, links and foreign files do to a run: nothing is lost without a word."""
+"""A finished run under damage, place by place: what `verify`, a reader, a repair and the same command make of it.
+
+Every case damages copies of one finished run in one way and place. ``MAGPEND_LONG=1`` draws more places of each
+kind, and repairs and mends after every one.
+"""
 
 from __future__ import annotations
 
-import errno
+import contextlib
 import json
 import os
 import shutil
-from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import xarray as xr
-import zarr
 
 from pipeline import open_run
-from pipeline.compute import execute, task
-from pipeline.runs.derive import prune
-from pipeline.runs.preview import describe_plan
+from pipeline.compute import task
 from pipeline.runs.run import run
 from pipeline.runs.status import state
 from pipeline.runs.verify import describe, verify_run
-from pipeline.runs.zoom import read_source
-from pipeline.store import local
+from pipeline.store import commits, packing, records
 from pipeline.store.checksums import seal, unseal
-from pipeline.store.commits import marker_key, read_commits, sweep
-from pipeline.store.errors import DamagedError, IncompleteError, RefusedError, UnreadableError
-from pipeline.store.files import local_path
-from pipeline.store.local import LocalFiles
-from pipeline.store.records import Records
+from pipeline.store.errors import DamagedError, RefusedError, StoreError
+from pipeline.store.products import write_product
 from pipeline.store.run import Run
-from pipeline.store.setup import check, create, establish
-from pipeline.store.skeleton import skeleton_files
+from tests.pipeline.factories import duffing, finished, quietly, silent
+
+LONG = os.environ.get("MAGPEND_LONG") == "1"
+PLACES = 20 if LONG else 4
+GRID = 'kind = "grid"\nx = { start = -1.0, stop = 1.0, num = 5 }\nv = 0.1'
+SPEC = duffing("frequency_hz = { start = 0.15, stop = 0.25, num = 5 }", GRID, execution="trajectories_per_task = 5")
 
 
-def silent(line):
-    pass
+def values_of(directory):
+    """Every variable and coordinate as a reader gets them."""
+    ds = open_run(directory)
+    return {str(name): ds[name].values for name in ds.variables}
 
 
-def everything(directory):
-    """Content of all files below a folder."""
-    return {
-        f.relative_to(directory).as_posix(): f.read_bytes()
-        for f in directory.rglob("*")
-        if f.is_file() and f.name != "lock"
-    }
+@pytest.fixture(scope="module")
+def sound(tmp_path_factory):
+    """A finished run of two packs, a record of its own and the copy of that, with a product beside it."""
+    folder, patch = tmp_path_factory.mktemp("damage"), pytest.MonkeyPatch()
+    for module in (records, commits, packing):
+        patch.setattr(module, "BLOCK", 2)
+    directory = finished(folder, SPEC)
+    names = sorted(f.name for f in (directory / "commits").iterdir())
+    assert names == ["000000-000001.jsonl", "000002-000003.jsonl", "000004.json"]
+    ds = xr.Dataset({"mean": ("place", np.arange(5.0))}, attrs={"derived_product": "mean"})
+    write_product(directory / "derived/mean-12345678.zarr", ds)
+    pending = {v.name: v.fill for v in state(directory).plan.variables}
+    yield SimpleNamespace(spec=folder / "spec.toml", run=directory, values=values_of(directory), pending=pending)
+    patch.undo()
 
 
-def fail_reading(monkeypatch, part, number=errno.EIO):
-    """Let reading of files fail whose path contains `part`."""
-    original = local.open_plain
-
-    def open_plain(path, mode, **options):
-        if part in path.as_posix():
-            raise OSError(number, os.strerror(number), str(path))
-        return original(path, mode, **options)
-
-    monkeypatch.setattr(local, "open_plain", open_plain)
+# ---- places ------------------------------------------------------------------------------------
 
 
-def fail_listing(monkeypatch, name, number=errno.EACCES):
-    """Let listing of a folder fail."""
-    original = os.scandir
+def record_files(directory, suffix):
+    return sorted((directory / "commits").glob(f"*{suffix}"))
 
-    def scandir(path="."):
-        if Path(path).name == name:
-            raise OSError(number, os.strerror(number), str(path))
-        return original(path)
 
-    monkeypatch.setattr(os, "scandir", scandir)
+def sealed_lines(path):
+    """The records of a file, one or a pack, as lines with their checksums."""
+    lines = path.read_bytes().splitlines(keepends=True)
+    return lines[:-1] if path.suffix == ".jsonl" else lines
+
+
+def chunks(directory):
+    """Chunks of cells, which the records vouch for."""
+    lines = [line for path in record_files(directory, "json*") for line in sealed_lines(path)]
+    return [directory / "cube.zarr" / key for line in lines for key in unseal(line)["objects"]]
+
+
+def set_up(directory, *, metadata):
+    """Files of the set-up: metadata, or coordinates' chunks."""
+    cells = set(chunks(directory))
+    files = sorted(f for f in (directory / "cube.zarr").rglob("*") if f.is_file() and f not in cells)
+    return [f for f in files if (f.name == "zarr.json") == metadata]
+
+
+def folders(directory):
+    cube = directory / "cube.zarr"
+    return [cube, directory / "commits", *sorted(f for f in cube.iterdir() if f.is_dir())]
+
+
+# files of a place, the part of verify's result that names their damage, and the most tasks that it can cost
+TABLE = {
+    "chunk": (chunks, "damaged", 1),
+    "record": (lambda d: record_files(d, ".json"), "damaged", 1),
+    "pack": (lambda d: record_files(d, ".jsonl"), "damaged", 2),
+    "copy": (lambda d: [d / "records.jsonl"], "copies", 0),
+    "coordinate": (lambda d: set_up(d, metadata=False), "skeleton", 0),
+    "metadata": (lambda d: set_up(d, metadata=True), "skeleton", 0),
+    "run.json": (lambda d: [d / "run.json"], "refused", 0),
+    "product": (lambda d: sorted(f for f in (d / "derived").rglob("*") if f.is_file()), "derived", 0),
+    "folder": (folders, "odd", 5),
+}
+
+# ---- ways to damage ----------------------------------------------------------------------------
+
+
+def flip(path, rng):
+    data = bytearray(path.read_bytes())
+    place = int(rng.integers(8 * len(data)))
+    data[place // 8] ^= 1 << (place % 8)
+    path.write_bytes(data)
+
+
+def truncate(path, rng):
+    path.write_bytes(path.read_bytes()[: int(rng.integers(path.stat().st_size))])
+
+
+def extend(path, rng):
+    path.write_bytes(path.read_bytes() + rng.bytes(int(rng.integers(1, 40))))
+
+
+def zero(path, rng):
+    """A page of zeros where a file was, as some file systems leave after a power cut."""
+    path.write_bytes(bytes(path.stat().st_size))
+
+
+def garble(path, rng):
+    path.write_bytes(rng.bytes(path.stat().st_size))
+
+
+def delete(path, rng):
+    shutil.rmtree(path) if path.is_dir() else path.unlink()
+
+
+def link(path, rng):
+    """A link to the very content."""
+    elsewhere = next(p for p in path.parents if p.name == "run").with_name("elsewhere")
+    path.rename(elsewhere)
+    path.symlink_to(elsewhere)
+
+
+def misplace(path, rng):
+    """A folder with a file in the place of a file, or a file in that of a folder."""
+    was_folder = path.is_dir()
+    delete(path, rng)
+    if not was_folder:
+        path.mkdir()
+    (path if was_folder else path / "theirs").write_text("somebody's")
+
+
+def swap(paths, rng):
+    """Exchange two files of one size that differ."""
+    same = [(a, b) for i, a in enumerate(paths) for b in paths[:i] if a.stat().st_size == b.stat().st_size]
+    pairs = [(a, b) for a, b in same if a.read_bytes() != b.read_bytes()]
+    a, b = pairs[int(rng.integers(len(pairs)))]
+    first, second = a.read_bytes(), b.read_bytes()
+    a.write_bytes(second)
+    b.write_bytes(first)
+
+
+def edit(path, rng, changes):
+    """Edit JSON in one line of a file as a person would, who leaves the checksum as it was."""
+    lines = path.read_bytes().splitlines(keepends=True) if path.suffix == ".jsonl" else [path.read_bytes()]
+    i = int(rng.integers(max(len(lines) - 1, 1)))
+    data = json.loads(lines[i])
+    changes[int(rng.integers(len(changes)))](data)
+    path.write_bytes(b"".join([*lines[:i], json.dumps(data).encode() + b"\n", *lines[i + 1 :]]))
+
+
+def first_object(data):
+    return data["objects"][min(data["objects"])]
+
+
+RECORD_EDITS = [
+    lambda d: d["objects"].pop(min(d["objects"])),
+    lambda d: d["status"].update(bounded=1),
+    lambda d: d["status"].update(diverged=2),
+    lambda d: first_object(d).update(size=1),
+    lambda d: first_object(d).update(sha256="0" * 64),
+    lambda d: d.update(task=d["task"] + 1),
+    lambda d: d.update(task=99),
+    lambda d: d.update(objects={}),
+    lambda d: d.pop("status"),
+]
+RUN_EDITS = [
+    lambda d: d.update(title="another"),
+    lambda d: d.update(spec_text="kind = 'sweep'"),
+    lambda d: d["versions"].update(magpend="0.0.1"),
+    lambda d: d["provenance"].update(host="elsewhere"),
+    lambda d: d["skeleton"].pop("frequency/c.0"),
+    lambda d: d["skeleton"]["x_0/c.0"].update(sha256="0" * 64),
+    lambda d: d["spec"]["integration"].update(n_keep=4),
+    lambda d: d["identity"]["spec"]["integration"].update(n_keep=4),
+    lambda d: d["identity"].update(format=99),
+    lambda d: d["identity"].pop("format"),
+    lambda d: d.update(digest="0" * 32),
+    lambda d: d.pop("skeleton"),
+    lambda d: d.update(another=1),
+    lambda d: d.update(spec={}),
+]
+METADATA_EDITS = [
+    lambda d: d.update(fill_value=1),
+    lambda d: d["shape"].__setitem__(0, 3),
+    lambda d: d["attributes"].update(units="K"),
+    lambda d: d["codecs"].pop(),
+    lambda d: d.update(dimension_names=None),
+]
+
+
+def one_of(place, way):
+    """A function that damages one of the files of a place."""
+
+    def damage(directory, rng):
+        paths = TABLE[place][0](directory)
+        way(paths[int(rng.integers(len(paths)))], rng)
+
+    return damage
+
+
+def edits(place, changes):
+    return one_of(place, lambda path, rng: edit(path, rng, changes))
+
+
+def foreign_file(directory, rng):
+    """What nobody of this run has written, or what an earlier one has left."""
+    names = ["cube.zarr/status/c.9.9", "cube.zarr/notes.txt", "cube.zarr/more/zarr.json"]
+    names += ["commits/.3.tmp", "commits/000077.json", "commits/notes.txt"]
+    path = directory / names[int(rng.integers(len(names)))]
+    path.parent.mkdir(exist_ok=True)
+    path.write_bytes(rng.bytes(30))
+
+
+def record_of_another_run(directory, rng):
+    (path,) = record_files(directory, ".json")
+    path.write_text(seal(json.dumps({**unseal(path.read_bytes()), "digest": "0" * 32}, sort_keys=True)))
+
+
+def run_file_and_chunk(directory, rng):
+    """What is rebuilt is held against what there is."""
+    (directory / "run.json").unlink()
+    one_of("chunk", flip)(directory, rng)
+
+
+FILE_WAYS = (flip, truncate, extend, zero, garble, delete, link, misplace)
+UNTOUCHED = {("run.json", misplace), ("copy", misplace), ("copy", delete), ("copy", link), ("product", misplace)}
+"""What lies in the place of these is not ours to move; a copy that is gone is no damage."""
+
+CASES = {
+    f"{way.__name__} {place}": (one_of(place, way), place)
+    for place in TABLE
+    for way in ((delete, misplace, link) if place == "folder" else FILE_WAYS)
+    if (place, way) not in UNTOUCHED
+} | {
+    "swap chunks": (lambda d, rng: swap(chunks(d), rng), "chunk"),
+    "swap coordinates": (lambda d, rng: swap(set_up(d, metadata=False), rng), "coordinate"),
+    "swap packs": (lambda d, rng: swap(record_files(d, ".jsonl"), rng), "pack"),
+    "edit record": (edits("record", RECORD_EDITS), "record"),
+    "edit pack": (edits("pack", RECORD_EDITS), "pack"),
+    "edit run.json": (edits("run.json", RUN_EDITS), "run.json"),
+    "edit metadata": (
+        lambda d, rng: edit(d / "cube.zarr" / ["section", "x_0"][rng.integers(2)] / "zarr.json", rng, METADATA_EDITS),
+        "metadata",
+    ),
+    "foreign file": (foreign_file, "leftover"),
+    "record of another run": (record_of_another_run, "record"),
+    "run.json and a chunk": (run_file_and_chunk, "run.json"),
+}
+MOST_COMPUTED = {"swap chunks": 2, "swap packs": 4, "run.json and a chunk": 1, "foreign file": 0}
+
+
+# ---- what must hold ----------------------------------------------------------------------------
+
+
+def verdict(directory):
+    """Parts of verify's result that say something is not as it was written, or that it refuses to look."""
+    try:
+        found = verify_run(directory)
+    except (DamagedError, RefusedError):
+        return {"refused"}
+    parts = {p for p in ("damaged", "copies", "skeleton", "derived", "odd", "leftovers") if getattr(found, p)}
+    assert found.sound == (parts <= {"leftovers"})
+    return parts | ({"missing"} if found.n_committed < found.n_tasks else set())
+
+
+def wrong(directory, sound):
+    """Names of what a reader gets that is neither what was written nor pending."""
+    try:
+        found = values_of(directory)
+    except StoreError:  # one sentence; anything else is a traceback, and fails the test
+        return []
+    names = []
+    for name, written in sound.values.items():
+        pending = np.full_like(written, sound.pending[name]) if name in sound.pending else written
+        same = np.asarray(found[name] == written) | ((found[name] != found[name]) & (written != written))
+        empty = np.asarray(found[name] == pending) | ((found[name] != found[name]) & (pending != pending))
+        # a task is a frequency here: it is there as a whole or not at all
+        rows = range(len(written)) if name in sound.pending else [...]
+        if not all(same[row].all() or empty[row].all() for row in rows):
+            names.append(name)
+    return names
+
+
+def content_of(folder):
+    return {f: f.read_bytes() for f in folder.rglob("*") if f.is_file()} if folder.is_dir() else folder.read_bytes()
 
 
 @pytest.fixture
-def whole(made):
-    """A run directory whose tasks are all committed."""
-    for index in range(made.plan.n_tasks):
-        made.commit(index)
-    return made
+def whole(sound, tmp_path):
+    """Copies to damage, one after the other in one place."""
+
+    def copy():
+        shutil.rmtree(tmp_path / "run", ignore_errors=True)
+        elsewhere = tmp_path / "elsewhere"
+        if elsewhere.exists():
+            delete(elsewhere, None)
+        return shutil.copytree(sound.run, tmp_path / "run")
+
+    return copy
 
 
-def establish_again(made, echo=silent):
-    return establish(made.info.directory, made.spec, made.plan, made.identity, made.info.spec_text, echo)
+@pytest.fixture
+def computed(monkeypatch):
+    """Blocks of the tasks that a run computes."""
+    blocks, original = [], task.compute
+    monkeypatch.setattr(task, "compute", lambda *a: blocks.append(a[-1]) or original(*a))
+    return blocks
 
 
-# ---- failing disks -----------------------------------------------------------------------------
+@pytest.mark.parametrize("case", CASES)
+def test_damage__is_found_never_read_repaired_and_mended(case, whole, sound, bytes_of, computed):
+    damage, place = CASES[case]
+    part = "odd" if case.startswith("misplace") else TABLE[place][1] if place in TABLE else "leftovers"
+    # what is gone is missing, with its metadata if it was a folder; of a linked folder nothing is read
+    expected = {part} | {"damaged": {"missing"}, "odd": {"missing", "skeleton", "refused"}}.get(part, set())
+    for i in range(PLACES):
+        rng = [sum(case.encode()), i]
+        directory = whole()
+        damage(directory, np.random.default_rng(rng))
+        assert verdict(directory) & expected, (i, verdict(directory))
+        assert not wrong(directory, sound), i
+        with contextlib.suppress(StoreError):  # it looks at the records alone
+            assert not state(directory).complete or place != "record", i
+        if i and not LONG:
+            continue
+        repaired(directory, case, place, sound)
+        directory = whole()
+        damage(directory, np.random.default_rng(rng))
+        mended(directory, case, place, sound, bytes_of, computed)
 
 
-@pytest.mark.parametrize("number", [errno.EIO, errno.EACCES, errno.ESTALE])
-def test_read_commits__unreadable_record_stops(whole, monkeypatch, number):
-    fail_reading(monkeypatch, "000001.json", number)
-    with pytest.raises(UnreadableError, match=r"000001\.json: cannot be read .* Nothing was removed"):
-        read_commits(whole.info, whole.plan)
-
-
-@pytest.mark.parametrize("name", ["commits", "cube.zarr", "status"])
-def test_read_commits__unreadable_folder_stops(whole, monkeypatch, name):
-    fail_listing(monkeypatch, name)
-    with pytest.raises(UnreadableError, match=f"{name}: cannot be read"):
-        read_commits(whole.info, whole.plan)
-
-
-def test_run__unreadable_record_removes_nothing(write_spec, sweep_text, tmp_path, monkeypatch):
-    path = write_spec(sweep_text)
-    run(path, tmp_path / "run", workers=0, echo=silent)
-    before = everything(tmp_path / "run")
-    with monkeypatch.context() as patch:
-        fail_reading(patch, "000000.json")
-        with pytest.raises(UnreadableError):
-            run(path, tmp_path / "run", workers=0, echo=silent)
-    assert everything(tmp_path / "run") == before
-
-
-def test_sweep__says_what_it_removes(whole):
-    (whole.info.directory / marker_key(1)).write_text("{")
-    said = []
-    commits = read_commits(whole.info, whole.plan, said.append)
-    assert said == ["commits/000001.json: torn or damaged; it does not count"]
-    n = sweep(whole.info, whole.plan, commits, said.append)
-    assert f"removed {n} files that no commit record vouches for: cube.zarr/" in said[1]
-    assert sweep(whole.info, whole.plan, commits, said.append) == 0
-    assert len(said) == 2
-
-
-def test_read_commits__names_a_missing_chunk(whole):
-    chunk = next(f for f in (whole.info.directory / "cube.zarr/section").iterdir() if f.name != "zarr.json")
-    chunk.unlink()
-    said = []
-    read_commits(whole.info, whole.plan, said.append)
-    assert "is missing or has another size; it is computed again" in said[0]
-
-
-# ---- foreign files and links -------------------------------------------------------------------
-
-
-def test_check__foreign_cube_stays(made, tmp_path):
-    directory = tmp_path / "thesis"
-    zarr.create_group(zarr.storage.LocalStore(directory / "cube.zarr"), attributes={"digest": "of mine"})
-    before = everything(directory)
-    with pytest.raises(RefusedError, match=r"digest of mine.*Give another --out"):
-        check(directory, made.identity)
-    (directory / "cube.zarr/zarr.json").write_text("{}")
-    with pytest.raises(RefusedError, match=r"has cube\.zarr, and nothing in it shows that this run"):
-        check(directory, made.identity)
-    assert set(everything(directory)) == set(before)
-
-
-def test_check__records_of_another_run_stay(whole):
-    (whole.info.directory / "run.json").unlink()
-    other = {**whole.identity, "kernel_version": "newer"}
-    with pytest.raises(RefusedError, match="what another run has left"):
-        check(whole.info.directory, other)
-    assert check(whole.info.directory, whole.identity) is None
-
-
-def move_away(path, tmp_path):
-    """Put a link in the place of something."""
-    target = tmp_path / f"elsewhere-{path.name}"
-    path.rename(target)
-    path.symlink_to(target)
-    return target
-
-
-@pytest.mark.parametrize("name", ["commits", "cube.zarr", "cube.zarr/section"])
-def test_run__links_are_not_followed(whole, tmp_path, name):
-    target = move_away(whole.info.directory / name, tmp_path)
-    before = everything(target)
-    for use in (
-        lambda: read_commits(whole.info, whole.plan),
-        lambda: Run.open(whole.info.directory),
-        lambda: establish_again(whole),
-        lambda: whole.commit(0),
-    ):
-        with pytest.raises(RefusedError, match=f"{name}: is a link"):
-            use()
-    if name != "cube.zarr/section":
-        with pytest.raises(RefusedError, match="is a link"):
-            sweep(whole.info, whole.plan, Records(whole.info.files, whole.info.digest, {}))
-    assert everything(target) == before
-
-
-def test_sweep__removes_a_link_and_not_what_it_leads_to(whole, tmp_path):
-    folder, file = tmp_path / "folder", tmp_path / "file"
-    folder.mkdir()
-    (folder / "kept").write_text("x")
-    file.write_text("x")
-    cube = whole.info.directory / "cube.zarr"
-    (cube / "status/c.link").symlink_to(file)
-    (cube / "status/folder").symlink_to(folder)
-    assert verify_run(whole.info.directory).leftovers == ["status/c.link", "status/folder"]
-    assert sweep(whole.info, whole.plan, read_commits(whole.info, whole.plan)) == 2
-    assert (folder / "kept").read_text() == file.read_text() == "x"
-
-
-def test_verify__a_linked_chunk_is_damaged(whole, tmp_path):
-    chunk = next(f for f in (whole.info.directory / "cube.zarr/section").iterdir() if f.name != "zarr.json")
-    move_away(chunk, tmp_path)
-    (problem,) = verify_run(whole.info.directory).damaged.values()
-    assert problem == f"section/{chunk.name}: is a link"
-
-
-def test_prune__links_are_not_followed(whole, tmp_path):
-    derived, outside = whole.info.directory / "derived", tmp_path / "outside"
-    (outside / "x.zarr").mkdir(parents=True)
-    (outside / "x.zarr/kept").write_text("x")
-    derived.mkdir()
-    (derived / "mean-1.zarr").symlink_to(outside / "x.zarr")
-    prune(whole.info.directory)
-    assert not (derived / "mean-1.zarr").is_symlink()
-    derived.rmdir()
-    derived.symlink_to(outside)
-    with pytest.raises(RefusedError, match="derived: is a link"):
-        prune(whole.info.directory)
-    assert (outside / "x.zarr/kept").read_text() == "x"
-
-
-@pytest.mark.parametrize("path", ["s3:/bucket/run", "https://host/run", "gs://b"])
-def test_local_path__urls_are_refused(path, write_spec, sweep_text, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    spec = write_spec(sweep_text)
-    before = sorted(tmp_path.iterdir())
-    for use in (
-        lambda: run(spec, path, workers=0, echo=silent),
-        lambda: list(describe_plan(spec, path)),
-        lambda: state(path),
-        lambda: open_run(path),
-        lambda: verify_run(path),
-        lambda: read_source(path),
-    ):
-        with pytest.raises(RefusedError, match="no folder and no object store; give a path"):
-            use()
-    assert sorted(tmp_path.iterdir()) == before
-
-
-def test_local_path__folders():
-    for path in ("runs/x", "C:/runs", "/a/b:c/d", "a:b"):
-        assert local_path(path) == Path(path)
-
-
-# ---- what follows from the specification is made again -----------------------------------------
-
-
-def damage_something(directory, what):
-    path = directory / what
-    if what.endswith("c.0"):
-        data = bytearray(path.read_bytes())
-        data[-1] ^= 1
-        path.write_bytes(data)
-    else:
-        path.unlink()
-
-
-SKELETON = ["cube.zarr/frequency/zarr.json", "cube.zarr/zarr.json", "cube.zarr/psi1_0/c.0"]
-
-
-@pytest.mark.parametrize("what", SKELETON)
-def test_open_run__damaged_skeleton_is_named(whole, what):
-    damage_something(whole.info.directory, what)
-    key = what.removeprefix("cube.zarr/")
-    with pytest.raises(DamagedError, match=rf"{key}: .*magpend verify --repair") as caught:
-        open_run(whole.info.directory)
-    assert str(whole.info.directory) in str(caught.value)
-
-
-@pytest.mark.parametrize("what", SKELETON)
-@pytest.mark.parametrize("command", ["verify", "run"])
-def test_rebuild__skeleton_has_the_same_bytes(whole, what, command):
-    directory = whole.info.directory
-    before, said = everything(directory), []
-    damage_something(directory, what)
-    if command == "verify":
+def repaired(directory, case, place, sound):
+    """`verify --repair` leaves what is sound alone, and a directory in which nothing is damaged."""
+    try:
         found = verify_run(directory, repair=True)
-        assert found.sound
-        said = describe(found, directory, repaired=True)
+    except (DamagedError, RefusedError):
+        assert place == "run.json" or case == "link folder"
+        return
+    said = "\n".join(describe(found, directory, repaired=True))
+    assert ("withdrawn" in said) == bool(found.damaged)
+    assert "another version" not in said
+    assert not verdict(directory) - {"missing", "leftovers"}
+    assert verify_run(directory).n_committed >= found.n_tasks - MOST_COMPUTED.get(case, TABLE.get(place, [0] * 3)[2])
+    assert not wrong(directory, sound)
+
+
+def mended(directory, case, place, sound, bytes_of, computed):
+    """The same command gives the very bytes again, and computes no task that was sound."""
+    computed.clear()
+    elsewhere = directory.with_name("elsewhere")
+    linked = content_of(elsewhere) if elsewhere.exists() else None
+    refusal = None
+    try:
+        assert run(sound.spec, directory, workers=0, echo=silent).complete
+    except RefusedError as error:
+        refusal = str(error)
+    assert linked is None or content_of(elsewhere) == linked
+    if refusal is not None:
+        assert case.startswith("link") and "is a link" in refusal, refusal  # noqa: PT018
+        return
+    assert bytes_of(directory) == bytes_of(sound.run)
+    assert len(computed) <= MOST_COMPUTED.get(case, TABLE.get(place, [0] * 3)[2])
+    assert verdict(directory) == ({"derived"} if place == "product" else set())
+    kept = [f.read_text() for f in (directory / "aside").rglob("*") if f.is_file()]
+    assert kept == (["somebody's"] if case.startswith("misplace") else [])
+
+
+@pytest.mark.parametrize("older", [False, True])
+def test_another_format__is_refused_and_left_alone(whole, sound, bytes_of, older):
+    directory = whole()
+    path = directory / "run.json"
+    if older:  # format 2 had no checksum
+        data = json.loads(path.read_text().replace('"format": 3', '"format": 2'))
+        del data["checksum"]
+        path.write_text(json.dumps(data))
     else:
-        establish_again(whole, said.append)
-    assert any(what.removeprefix("cube.zarr/") in line and "rebuilt" in line for line in said)
-    assert everything(directory) == before
+        data = unseal(path.read_bytes())
+        data["identity"]["format"] += 1
+        path.write_text(seal(json.dumps(data)))
+    before = bytes_of(directory), path.read_bytes()
+    for use in (open_run, verify_run, state, lambda d: quietly(sound.spec, d)):
+        with pytest.raises(RefusedError, match="format"):
+            use(directory)
+    assert (bytes_of(directory), path.read_bytes()) == before
 
 
-@pytest.mark.parametrize("change", [lambda p: p.unlink(), lambda p: p.write_text(p.read_text()[:100])])
-def test_rebuild__run_json(whole, change):
-    directory = whole.info.directory
-    before, said = everything(directory), []
-    change(directory / "run.json")
-    (directory / "cube.zarr/q/zarr.json").unlink()
-    info = establish_again(whole, said.append)
-    assert "rebuilt from the specification" in said[0]
-    assert info.skeleton == whole.info.skeleton
-    assert len(read_commits(info, whole.plan)) == whole.plan.n_tasks
-    after = everything(directory)
-    assert {k: v for k, v in after.items() if k != "run.json"} == {k: v for k, v in before.items() if k != "run.json"}
+def test_run__mends_by_sizes_alone_if_asked(whole, sound, computed, monkeypatch):
+    directory, said = whole(), []
+    chunk = next(path for path in chunks(directory) if path.parent.name == "n_steps")
+    zero(chunk, None)
+    monkeypatch.setenv("MAGPEND_VERIFY", "0")
+    assert run(sound.spec, directory, workers=0, echo=said.append).complete
+    assert "nothing to do" in said[-1]
+    monkeypatch.delenv("MAGPEND_VERIFY")
+    assert run(sound.spec, directory, workers=0, echo=said.append).complete
+    assert f"n_steps/{chunk.name}: its content has changed: computed again" in said
+    assert len(computed) == 1
 
 
-def test_rebuild__keeps_only_what_fits_its_record(whole):
-    directory, said = whole.info.directory, []
-    (directory / "run.json").unlink()
-    chunk = next(iter(read_commits(whole.info, whole.plan)[1].objects))
-    path = directory / "cube.zarr" / chunk
-    data = bytearray(path.read_bytes())
-    data[0] ^= 1
-    path.write_bytes(data)
-    info = establish_again(whole, said.append)
-    assert set(read_commits(info, whole.plan)) == set(range(whole.plan.n_tasks)) - {1}
-    assert any(chunk in line and "computed again" in line for line in said)
+@pytest.mark.parametrize("name", ["section", "n_steps"])
+def test_flipped_bit__is_seen_by_readers_that_opened_before_and_by_zarr_alone(whole, name):
+    """The record's digest, and the checksum in the chunk, for readers that know no records."""
+    directory = whole()
+
+    opened = Run.open(directory)
+    chunk = next(path for path in chunks(directory) if path.parent.name == name)
+    content = chunk.read_bytes()
+    for i in range(20):
+        chunk.write_bytes(content)
+        flip(chunk, np.random.default_rng(i))
+        with pytest.raises(DamagedError, match=rf"{name}/{chunk.name}: is not what was written"):
+            opened.cube()[name].load()
+        with pytest.raises(Exception, match=r"(?i)checksum|crc32c|is not what was written"):
+            opened.cube(check=False)[name].load()
+    chunk.unlink()
+    with pytest.raises(DamagedError, match=rf"{name}/{chunk.name}: is missing"):
+        opened.cube()[name].load()
 
 
-def test_rebuild__files_worded_by_another_version(whole):
-    """Where the metadata come out otherwise, repair leaves them; a run writes them and their digests anew."""
-    directory = whole.info.directory
-    data = unseal((directory / "run.json").read_bytes())
-    metadata = directory / "cube.zarr/q/zarr.json"
-    data["skeleton"]["q/zarr.json"] = {"size": 1, "sha256": "0" * 64}
-    (directory / "run.json").write_text(seal(json.dumps(data)))
-    found = verify_run(directory, repair=True)
-    assert found.skeleton == ["q/zarr.json: its content has changed"]
-    assert "another version" in describe(found, directory, repaired=True)[-1]
-    establish_again(whole)
-    assert verify_run(directory).sound
-    assert metadata.is_file()
-    assert len(Run.open(directory).commits) == whole.plan.n_tasks
-
-
-def test_run__rebuilds_and_computes_nothing(write_spec, sweep_text, tmp_path, monkeypatch, bytes_of):
-    path, directory = write_spec(sweep_text), tmp_path / "run"
-    run(path, directory, workers=0, echo=silent)
-    before = bytes_of(directory)
-    (directory / "run.json").write_text("{")
-    shutil.rmtree(directory / "cube.zarr/frequency")
-    monkeypatch.setattr(task, "compute", None)
-    assert run(path, directory, workers=0, echo=silent).complete
-    assert bytes_of(directory) == before
-
-
-def test_skeleton_files__same_bytes_again(made):
-    arguments = (made.spec, made.plan, made.identity, "text", "title")
-    assert skeleton_files(*arguments) == skeleton_files(*arguments)
-    # sizes differ only in the text: nothing of this machine or moment is in it
-    other = skeleton_files(made.spec, made.plan, made.identity, "other", "title")
-    assert {key for key in other if other[key] != skeleton_files(*arguments)[key]} == {"zarr.json"}
-
-
-def test_create__crash_anywhere_starts_again(made, tmp_path, monkeypatch):
-    n_files = len(made.info.skeleton)
-    for n in (0, 1, n_files // 2, n_files - 1):
-        directory, calls = tmp_path / f"again{n}", []
-        original = LocalFiles.write
-
-        def crash(self, key, content, calls=calls, n=n, original=original):
-            if len(calls) == n:
-                raise KeyboardInterrupt
-            calls.append(key)
-            original(self, key, content)
-
-        with monkeypatch.context() as patch:
-            patch.setattr(LocalFiles, "write", crash)
-            with pytest.raises(KeyboardInterrupt):
-                create(directory, made.spec, made.plan, made.identity, "text")
-        (directory / "cube.zarr/.zarr.json.abc.tmp").write_text("{")  # what a power cut leaves
-        (directory / ".run.json.abc.tmp").write_text("{")
-        assert check(directory, made.identity) is None
-        info = establish(directory, made.spec, made.plan, made.identity, "text", silent)
-        sweep(info, made.plan, Records(info.files, info.digest, {}))
-        assert verify_run(directory).sound
-        assert not list(directory.rglob("*.tmp"))
-
-
-def test_read_run__another_format(whole):
-    path = whole.info.directory / "run.json"
-    older = json.loads(path.read_text().replace('"format": 3', '"format": 2'))
-    del older["checksum"]  # format 2 had none
-    path.write_text(json.dumps(older))
-    before = everything(whole.info.directory)
-    for use in (lambda: open_run(whole.info.directory), lambda: check(whole.info.directory, whole.identity)):
-        with pytest.raises(RefusedError, match=r"format 2, and this magpend reads 3"):
-            use()
-    assert everything(whole.info.directory) == before
-
-
-# ---- whether all is there ----------------------------------------------------------------------
-
-
-def test_run__workers_that_wrote_elsewhere(write_spec, sweep_text, tmp_path, monkeypatch):
-    def elsewhere(job, indices, **options):
-        yield from ({"task": i, "cells": 1} for i in indices)
-
-    monkeypatch.setattr(execute, "run_tasks", elsewhere)
-    with pytest.raises(IncompleteError, match=r"5 of 5 tasks were computed but are not committed here"):
-        run(write_spec(sweep_text), tmp_path / "run", workers=0, echo=silent)
-
-
-def test_run__a_record_that_vanished(write_spec, sweep_text, tmp_path, monkeypatch):
-    original = execute.run_tasks
-
-    def losing(job, indices, **options):
-        yield from original(job, indices, **options)
-        (tmp_path / "run" / marker_key(2)).unlink()
-
-    with monkeypatch.context() as patch:
-        patch.setattr(execute, "run_tasks", losing)
-        with pytest.raises(IncompleteError, match=r"1 of 5 .*the first is 2"):
-            run(write_spec(sweep_text), tmp_path / "run", workers=0, echo=silent)
-    assert run(tmp_path / "spec.toml", tmp_path / "run", workers=0, echo=silent).complete
-
-
-def test_main__exit_codes(write_spec, sweep_text, main, monkeypatch):
-    write_spec(sweep_text)
-    with monkeypatch.context() as patch:
-        patch.setattr(execute, "run_tasks", lambda job, indices, **options: iter(()))
-        code, _, errors = main("run", "spec.toml", "--out", "run", "--workers", 0)
-    assert (code, "not committed" in errors) == (4, True)
-    code, _, errors = main("run", "spec.toml", "--out", "gs://bucket/run")
-    assert (code, "no object store" in errors) == (2, True)
-    Path("run/cube.zarr/frequency/zarr.json").unlink()
-    assert main("status", "run")[0] == 5
-    assert main("plot", "bifurcation", "run")[0] == 5
-
-
-# ---- other readers -----------------------------------------------------------------------------
-
-
-@pytest.mark.filterwarnings("error")
-def test_open_zarr__the_cube_explains_itself_to_plain_xarray(whole):
-    with xr.open_zarr(whole.info.directory / "cube.zarr", chunks=None) as ds:
-        assert ds["state"].values.tolist() == ["psi1", "psi2", "psi1_dot", "psi2_dot"]
-        assert ds["state_units"].values.tolist() == ["rad", "rad", "rad/s", "rad/s"]
-        assert ds["link"].values.tolist() == ["psi1", "psi2"]
-        assert set(ds.data_vars) == {v.name for v in whole.plan.variables}
-        assert "units" not in ds["section"].attrs
-        assert {"psi1_dot_0", "psi2_dot_0", "frequency", "q"} <= set(ds.coords)
-
-
-def test_to_netcdf__cube(whole, tmp_path):
-    ds = open_run(whole.info.directory)
-    ds.to_netcdf(tmp_path / "cube.nc", engine="scipy")
-    with xr.open_dataset(tmp_path / "cube.nc", engine="scipy", decode_cf=False) as raw:
-        assert raw.sizes["state"] == 4
-    with xr.open_dataset(tmp_path / "cube.nc", engine="scipy") as found:
-        assert np.array_equal(found["section"], ds["section"])
-        assert found["state"].values.tolist() == ds["state"].values.tolist()
-        assert found.attrs["spec"] == ds.attrs["spec"]
-
-
-def test_open_run__says_what_made_it(whole):
-    ds = open_run(whole.info.directory)
-    for name in ("source", "created", "host"):
-        assert ds.attrs[name]
-    assert ds.attrs["created"] == whole.info.provenance["created"]
-    assert "created" not in (whole.info.directory / "cube.zarr/zarr.json").read_text()
+def test_commands__name_what_is_damaged_and_what_to_do(whole, main):
+    """The words, for one damage of each kind."""
+    directory = whole()
+    key = chunks(directory)[0].relative_to(directory / "cube.zarr").as_posix()
+    flip(directory / "cube.zarr" / key, np.random.default_rng(0))
+    (directory / "cube.zarr/x_0/zarr.json").unlink()
+    (directory / "commits/notes.txt").write_text("mine")
+    flip(directory / "records.jsonl", np.random.default_rng(0))
+    misplace(directory / "commits/000002-000003.jsonl", None)
+    code, said, _ = main("verify", "run")
+    assert code == 5
+    for words in (
+        "run: 2 of 5 tasks committed and intact",
+        "  damaged: commits/000002-000003.jsonl: is a folder where a file should be",
+        f"  damaged: {key}: its content has changed",
+        "  damaged: x_0/zarr.json: missing",
+        "  damaged: records.jsonl: differs from the commit records",
+        "uncommitted files, which nothing reads; the next run removes them",
+        "rebuild them with --repair",
+        "then run the specification again to compute these tasks.",
+    ):
+        assert words in said
+    code, _, said = main("plot", "bifurcation", "run")
+    assert code == 5
+    assert "x_0/zarr.json: " in said
+    assert "magpend verify --repair" in said

@@ -14,7 +14,6 @@ import signal
 import subprocess
 import sys
 import warnings
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -22,48 +21,29 @@ import pytest
 
 from pipeline import open_run
 from pipeline.layout.plan import make_plan
-from pipeline.runs.run import run
 from pipeline.specification.parsing import load_spec
 from pipeline.store import commits, packing, records
 from pipeline.store.checksums import fits, unseal
 from pipeline.store.errors import StoreError
-
-sys.path.insert(0, str(Path(__file__).parent))
-import faults
-from faults import CHANGES, MKDIR, OPEN, READ, RENAME, SYNC, WRITE, Disk, Steps
-
-sys.path.pop(0)
+from tests.pipeline.factories import duffing, quietly
+from tests.pipeline.store import faults
+from tests.pipeline.store.faults import CHANGES, MKDIR, OPEN, READ, RENAME, SYNC, WRITE, Disk, Steps
 
 LONG = os.environ.get("MAGPEND_LONG") == "1"
 KILLS = 16
 
-SPEC = """
-kind = "continuation"
-model = "duffing"
-[axes]
-frequency_hz = { start = 0.15, stop = 0.25, num = 4 }
-[continuation]
-path = "frequency_hz"
-direction = "up"
-[initial_conditions]
-kind = "list"
-points = [[0.1, 0.0], [1.0, 0.2]]
-[integration]
-rtol = 1e-5
-atol = 1e-5
-n_transient = 1
-n_keep = 2
-[execution]
-points_per_task = 2
-"""
-
-
-def silent(line):
-    pass
+SPEC = duffing(
+    kind="continuation",
+    n_transient=1,
+    n_keep=2,
+    tolerance=1e-5,
+    execution="points_per_task = 2",
+    more='[continuation]\npath = "frequency_hz"\ndirection = "up"',
+)
 
 
 def go(folder):
-    return run(folder / "spec.toml", folder / "run", workers=0, echo=silent)
+    return quietly(folder / "spec.toml", folder / "run")
 
 
 @pytest.fixture(scope="module")

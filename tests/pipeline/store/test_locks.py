@@ -12,29 +12,17 @@ import time
 
 import pytest
 
-from pipeline.runs.run import run
 from pipeline.runs.status import state
 from pipeline.runs.verify import verify_run
 from pipeline.store.errors import LockedError
 from pipeline.store.local import writer_lock
+from tests.pipeline.factories import duffing, quietly
 
-SPEC = """
-kind = "sweep"
-model = "duffing"
-[axes]
-frequency_hz = { start = 0.15, stop = 0.25, num = 20 }
-[initial_conditions]
-kind = "grid"
-x = 0.5
-v = 0.1
-[integration]
-rtol = 1e-6
-atol = 1e-6
-n_transient = 2
-n_keep = 3
-[execution]
-trajectories_per_task = 1
-"""
+SPEC = duffing(
+    "frequency_hz = { start = 0.15, stop = 0.25, num = 20 }",
+    'kind = "grid"\nx = 0.5\nv = 0.1',
+    execution="trajectories_per_task = 1",
+)
 
 WITHOUT_LOCKS = """
 import sys, time, warnings
@@ -49,10 +37,6 @@ while time.time() < float(start):
     time.sleep(0.01)
 assert run(spec, out, workers=0, echo=lambda line: None).complete
 """
-
-
-def silent(line):
-    pass
 
 
 def _hold(directory, ready, done):
@@ -95,10 +79,9 @@ def test_writer_lock__holder_unknown(holder, tmp_path):
             pass
 
 
-def test_run__two_without_locks_end_with_the_same_bytes(tmp_path, environment, bytes_of):
-    spec = tmp_path / "spec.toml"
-    spec.write_text(SPEC)
-    run(spec, tmp_path / "alone", workers=0, echo=silent)
+def test_run__two_without_locks_end_with_the_same_bytes(write_spec, tmp_path, environment, bytes_of):
+    spec = write_spec(SPEC)
+    quietly(spec, tmp_path / "alone")
     # once the imports are done, both begin at the same moment
     arguments = [sys.executable, "-c", WITHOUT_LOCKS, str(spec), str(tmp_path / "both"), str(time.time() + 6)]
     both = [subprocess.Popen(arguments, env=environment, stderr=subprocess.PIPE, text=True) for _ in range(2)]

@@ -25,7 +25,6 @@ from pipeline.layout.identity import identity_of
 from pipeline.layout.plan import make_plan
 from pipeline.runs.extend import extend
 from pipeline.runs.mending import sound_commits
-from pipeline.runs.run import run
 from pipeline.runs.status import state
 from pipeline.runs.verify import verify_run
 from pipeline.specification.parsing import load_spec
@@ -35,31 +34,21 @@ from pipeline.store.errors import DamagedError, RefusedError, StoreError
 from pipeline.store.packing import Packer, pack_block
 from pipeline.store.run import Run
 from pipeline.store.setup import create, establish
+from tests.pipeline.factories import duffing, finished, silent
 
 LONG = os.environ.get("MAGPEND_LONG") == "1"
 
 N_TASKS, N_WIDE = 5, 9
-SPEC = """
-kind = "sweep"
-model = "duffing"
-[axes]
-frequency_hz = {{ start = 0.15, stop = 0.25, num = {n} }}
-[initial_conditions]
-kind = "grid"
-x = 0.1
-v = 0.1
-[integration]
-n_transient = 2
-n_keep = 2
-[execution]
-trajectories_per_task = 1
-"""
+ONE = 'kind = "grid"\nx = 0.1\nv = 0.1'
+
+
+def spec_of(n: int) -> str:
+    axes = f"frequency_hz = {{ start = 0.15, stop = 0.25, num = {n} }}"
+    return duffing(axes, ONE, n_keep=2, execution="trajectories_per_task = 1")
+
+
 TASKS = st.integers(0, N_TASKS - 1)
 SEEDS = st.integers(0, 10_000)
-
-
-def silent(line):
-    pass
 
 
 class KilledError(Exception):
@@ -75,9 +64,8 @@ def bytes_of(run: Path) -> dict[str, bytes]:
 def computed(n: int) -> tuple[dict[str, bytes], xr.Dataset]:
     """Bytes and cube of a run that nothing happens to."""
     with tempfile.TemporaryDirectory(prefix="life-") as folder:
-        (Path(folder) / "spec.toml").write_text(SPEC.format(n=n))
-        run(Path(folder) / "spec.toml", Path(folder) / "run", workers=0, echo=silent)
-        return bytes_of(Path(folder) / "run"), Run.open(Path(folder) / "run").cube().load()
+        directory = finished(Path(folder), spec_of(n))
+        return bytes_of(directory), Run.open(directory).cube().load()
 
 
 class Directory:
@@ -85,7 +73,7 @@ class Directory:
 
     def __init__(self, folder: Path) -> None:
         self.path = folder / "run"
-        text = SPEC.format(n=N_TASKS)
+        text = spec_of(N_TASKS)
         (folder / "spec.toml").write_text(text)
         self.spec = load_spec(folder / "spec.toml")
         self.plan = make_plan(self.spec)
@@ -103,7 +91,7 @@ class Directory:
 
     def go_on(self) -> None:
         """What a run does."""
-        self.info = establish(self.path, self.spec, self.plan, self.identity, SPEC.format(n=N_TASKS), silent)
+        self.info = establish(self.path, self.spec, self.plan, self.identity, spec_of(N_TASKS), silent)
         found = sound_commits(self.info, self.plan, silent)
         packer = Packer(self.info, self.plan, found)
         for index in range(N_TASKS):
@@ -229,7 +217,7 @@ class Life(RuleBasedStateMachine):
     def extend(self):
         """Refined, in whatever state: the bytes of a run that was so fine from the beginning."""
         finer, wide = self.folder / "finer.toml", self.folder / "wide"
-        finer.write_text(SPEC.format(n=N_WIDE))
+        finer.write_text(spec_of(N_WIDE))
         try:
             extend(self.run.path, finer, wide, workers=0, echo=silent)
         except StoreError:  # no cell is there to be taken, or run.json or metadata are not what they were

@@ -6,8 +6,10 @@ import json
 import os
 import pickle
 import platform
+import re
 import subprocess
 import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -21,42 +23,32 @@ from pipeline.runs.zoom import read_source
 from pipeline.store import lease, objects
 from pipeline.store.commits import read_commits, sweep, write_task
 from pipeline.store.errors import DamagedError, LockedError, RefusedError
+from pipeline.store.files import RECORD_COPY
 from pipeline.store.places import open_files
 from pipeline.store.products import open_product, products_in, remove_product, write_product
+from pipeline.store.record_copy import write_copy
+from pipeline.store.run import Run
 from pipeline.store.setup import check, create, establish
+from tests.pipeline.factories import SQUARE, duffing, quietly, silent
 from tests.pipeline.store.s3 import BUCKET, KEY_ID, SECRET, Server, in_turn, once
 
-pytest.importorskip("moto", reason="needs moto[s3], flask and flask-cors")
-pytest.importorskip("obstore")
+pytestmark = pytest.mark.slow
 
 PLACE = f"s3://{BUCKET}/runs/one"
 
-DUFFING = """
-kind = "sweep"
-title = "small"
-model = "duffing"
-[axes]
-frequency_hz = { start = 0.1, stop = 0.3, num = 6 }
-[initial_conditions]
-kind = "grid"
-x = { start = -1.0, stop = 1.0, num = 2 }
-v = { start = -1.0, stop = 1.0, num = 2 }
-[integration]
-rtol = 1e-6
-atol = 1e-6
-n_transient = 5
-n_keep = 4
-[execution]
-trajectories_per_task = 8
-"""
-
-
-def silent(line):
-    pass
+DUFFING = duffing(
+    "frequency_hz = { start = 0.1, stop = 0.3, num = 6 }",
+    SQUARE,
+    n_transient=5,
+    n_keep=4,
+    execution="trajectories_per_task = 18",
+)
 
 
 @pytest.fixture(scope="module")
 def server():
+    pytest.importorskip("moto", reason="needs moto[s3], flask and flask-cors")
+    pytest.importorskip("obstore")
     found = Server()
     yield found
     found.close()
@@ -118,7 +110,7 @@ def stored(place=PLACE):
 
 def test_run__same_bytes_as_in_a_folder(s3, write_spec, tmp_path, bytes_of):
     spec = write_spec(DUFFING)
-    run(spec, tmp_path / "run", workers=0, echo=silent)
+    quietly(spec, tmp_path / "run")
     said = []
     found = run(spec, PLACE, workers=0, echo=said.append)
     assert found.complete
@@ -151,20 +143,10 @@ def test_write_task__few_requests(made, remote, s3):
     assert s3.requests[-1][:2] == ("PUT", f"/{BUCKET}/runs/one/commits/000001.json")
 
 
-def test_read_commits__pending_cells_are_not_data(remote):
-    remote.commit(1)
-    remote.info.files.below("commits").remove(["000001.json"])
-    assert (open_run(PLACE).status == 0).all()
-    commits = read_commits(remote.info, remote.plan)
-    assert not commits
-    assert sweep(remote.info, remote.plan, commits) > 0
-    assert set(stored()) == {f"cube.zarr/{key}" for key in remote.info.skeleton}
-
-
 # ---- harm --------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kinds", [("503",), ("500", "503"), ("lost",), (None, "lost", "500")])
+@pytest.mark.parametrize("kinds", [("500", "503"), (None, "lost", "500")])
 def test_run__same_bytes_whatever_the_network_does(made, s3, bytes_of, kinds):
     for index in range(made.plan.n_tasks):
         made.commit(index)
@@ -201,7 +183,7 @@ def test_write_task__an_answer_that_never_comes(remote, s3, part, kind):
 
 def test_run__an_outage_is_one_line_and_the_same_command_goes_on(s3, write_spec, tmp_path, bytes_of):
     spec = write_spec(DUFFING)
-    run(spec, tmp_path / "run", workers=0, echo=silent)
+    quietly(spec, tmp_path / "run")
     marker = f"/{BUCKET}/runs/one/commits/000001.json"
     down = []
 
@@ -212,12 +194,12 @@ def test_run__an_outage_is_one_line_and_the_same_command_goes_on(s3, write_spec,
 
     s3.harm = harm
     with pytest.raises(Exception, match=r"127\.0\.0\.1:\d+ answers 503 Harm; committed results stay") as caught:
-        run(spec, PLACE, workers=0, echo=silent)
+        quietly(spec, PLACE)
     assert KEY_ID not in str(caught.value)
     s3.reset()
     lease.LEASE_S, before = 0.0, lease.LEASE_S  # nobody could take the lock away
     try:
-        assert run(spec, PLACE, workers=0, echo=silent).complete
+        assert quietly(spec, PLACE).complete
     finally:
         lease.LEASE_S = before
     assert stored() == bytes_of(tmp_path / "run")
@@ -348,15 +330,12 @@ def test_lease__names_its_holder_and_ends_with_it(remote):
     assert not files.is_there("lock")
 
 
-def test_lease__of_a_process_that_was_killed_is_free_at_once(remote):
+def test_lease__lapses_when_it_is_not_renewed_and_at_once_when_its_process_was_killed(remote, monkeypatch):
     process = subprocess.Popen([sys.executable, "-c", ""])
     process.wait()
     held_by(remote, pid=process.pid)
     with remote.info.files.lock():
         pass
-
-
-def test_lease__lapses_when_it_is_not_renewed(remote, monkeypatch):
     held_by(remote, host="elsewhere")
     with pytest.raises(LockedError, match=r"on elsewhere since .*lapses 150 s after"), remote.info.files.lock():
         pass
@@ -383,37 +362,36 @@ def test_lease__lost_answers_do_not_lock_oneself_out(remote, s3):
 # ---- what is refused ---------------------------------------------------------------------------
 
 
-def one_line(text):
-    (line,) = text.strip().splitlines()
-    return line
-
-
 def test_main__refusals_are_one_line(s3, made, main, monkeypatch, tmp_path):
-    def errors(*arguments, code=2):
+    def refused(words, *arguments, code=2):
         found, _, text = main(*arguments)
         assert found == code
         assert SECRET not in text
         assert KEY_ID not in text
-        return one_line(text)
+        (line,) = text.strip().splitlines()
+        assert words in line
 
-    assert "runs/none: no run directory" in errors("status", f"s3://{BUCKET}/runs/none")
-    assert "there is no such bucket at 127.0.0.1" in errors("status", "s3://nobucket/run")
-    assert "there is no such bucket at 127.0.0.1" in errors("run", "spec.toml", "--out", "s3://nobucket/run")
-    assert "give a path, or s3://BUCKET/PREFIX" in errors("status", "s3:/measurements/run")
-    assert "give a path, or s3://BUCKET/PREFIX" in errors("status", "gs://measurements/run")
-    assert "must be s3://BUCKET/PREFIX" in errors("status", "s3://")
-    assert "must be s3://BUCKET/PREFIX" in errors("status", f"s3://{BUCKET}/../run")
-    assert "no user, password or query" in errors("status", f"s3://{KEY_ID}:{SECRET}@host/run")
+    for words, place in (
+        ("runs/none: no run directory", f"s3://{BUCKET}/runs/none"),
+        ("there is no such bucket at 127.0.0.1", "s3://nobucket/run"),
+        ("give a path, or s3://BUCKET/PREFIX", "s3:/measurements/run"),
+        ("give a path, or s3://BUCKET/PREFIX", "gs://measurements/run"),
+        ("must be s3://BUCKET/PREFIX", "s3://"),
+        ("must be s3://BUCKET/PREFIX", f"s3://{BUCKET}/../run"),
+        ("no user, password or query", f"s3://{KEY_ID}:{SECRET}@host/run"),
+    ):
+        refused(words, "status", place)
+    refused("there is no such bucket at 127.0.0.1", "run", "spec.toml", "--out", "s3://nobucket/run")
     s3.harm = lambda method, path, n: "403"
-    assert "refuses access (403 Harm); check AWS_ACCESS_KEY_ID" in errors("status", PLACE)
+    refused("refuses access (403 Harm); check AWS_ACCESS_KEY_ID", "status", PLACE)
     with monkeypatch.context() as patch:
         patch.setitem(sys.modules, "obstore", None)
-        assert "pip install 'magpend[s3]'" in errors("status", PLACE)
+        refused("magpend[s3]", "status", PLACE)
     with monkeypatch.context() as patch:
         patch.delenv("AWS_ACCESS_KEY_ID")
-        assert "there are no credentials; set AWS_ACCESS_KEY_ID" in errors("status", PLACE)
+        refused("there are no credentials; set AWS_ACCESS_KEY_ID", "status", PLACE)
     monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://{KEY_ID}:{SECRET}@127.0.0.1:1")
-    assert "127.0.0.1:1 does not answer" in errors("status", PLACE, code=4)
+    refused("127.0.0.1:1 does not answer", "status", PLACE, code=4)
     assert not (tmp_path / "s3:").exists()
 
 
@@ -462,3 +440,72 @@ def test_explorer__reads_a_run_there_as_in_a_folder(whole, made):
     points = [diagram(run, "frequency", "psi1", {"q": 1}) for run in (there, here)]
     assert points[0] == points[1]
     assert there.refreshed() is there
+
+
+# ---- the copy of the records -------------------------------------------------------------------
+
+
+@pytest.fixture
+def copied(made, s3):
+    """A complete run with the copy of its records, put into the object store file by file; returns its files."""
+    for index in range(made.plan.n_tasks):
+        made.commit(index)
+    write_copy(made.info, made.plan, read_commits(made.info, made.plan))
+    files, here = open_files(PLACE), made.info.files
+    for key in here.everything():
+        if key.rpartition("/")[2] != "lock":
+            files.write(key, here.read(key))
+    s3.reset()
+    return files
+
+
+def keys_asked(s3):
+    """Keys of the objects that were read; empty texts are listings."""
+    found = [path.partition("/runs/one/")[2] for _, path, _ in s3.requests]
+    s3.reset()
+    return found
+
+
+def test_open_run__requests_do_not_grow_with_the_tasks(copied, s3, made):
+    ds = open_run(PLACE)
+    asked = keys_asked(s3)
+    coordinates = [f"cube.zarr/{key}" for key in made.info.skeleton if not key.endswith("zarr.json")]
+    listings = ["", ""]
+    assert sorted(asked) == sorted([*listings, "run.json", "records.jsonl", "cube.zarr/zarr.json", *coordinates])
+    assert ds.load().identical(open_run(made.info.directory).load())
+    s3.reset()
+    # without the copy, a request for each record
+    copied.remove([RECORD_COPY])
+    s3.reset()
+    open_run(PLACE)
+    assert len(keys_asked(s3)) == len(asked) + made.plan.n_tasks
+
+
+def test_open_run__record_that_is_damaged_is_found_by_verify(copied, made):
+    content = bytearray(copied.read("commits/000001.json"))
+    content[50] ^= 1
+    copied.write("commits/000001.json", bytes(content))
+    assert len(Run.open(PLACE).commits) == 3  # the copy has the record as it was written, with its own checksum
+    found = verify_run(PLACE, repair=True)
+    assert list(found.damaged) == ["000001.json"]
+    assert not copied.is_there(RECORD_COPY)
+    run = Run.open(PLACE)
+    assert set(run.commits) == {0, 2}
+    assert (run.cube().status.values[made.plan.task(1)] == 0).all()
+
+
+def test_open_run__group_that_was_changed_is_refused(copied):
+    content = copied.read("cube.zarr/zarr.json").replace(b'"units": "s"', b'"units": "h"')
+    copied.write("cube.zarr/zarr.json", content)
+    with pytest.raises(DamagedError, match=r"zarr\.json: its content has changed"):
+        open_run(PLACE)
+
+
+def test_docs__example_of_the_object_store(copied, s3, monkeypatch):
+    text = (Path(__file__).parents[3] / "docs/object-stores.md").read_text("utf-8")
+    (block,) = re.findall(r"<!-- tested -->\n```python\n(.*?)```", text, re.DOTALL)
+    monkeypatch.setenv("AWS_ALLOW_HTTP", "true")
+    names = {}
+    exec(block.replace("runs/sweep", "runs/one"), names)
+    assert names["ds"].sizes == names["plain"].sizes == names["lazy"].sizes
+    assert names["plain"].section.load().equals(names["ds"].section.load())

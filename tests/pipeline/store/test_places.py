@@ -1,4 +1,4 @@
-"""What lies where a run directory has something else, and places that no run may take."""
+"""Places that no run may take, disks that fail, set-ups that stopped: nothing is lost without a word."""
 
 from __future__ import annotations
 
@@ -6,110 +6,184 @@ import errno
 import json
 import os
 import shutil
+from pathlib import Path
 
+import numpy as np
 import pytest
+import xarray as xr
+import zarr
 
-from pipeline.compute import task
-from pipeline.runs.run import run
-from pipeline.runs.verify import verify_run
-from pipeline.store import commits
-from pipeline.store.errors import RefusedError, UnreadableError
+from pipeline import open_run
+from pipeline.compute import execute, task
+from pipeline.runs.preview import describe_plan
+from pipeline.runs.status import state
+from pipeline.runs.verify import describe, verify_run
+from pipeline.runs.zoom import read_source
+from pipeline.store import commits, local
+from pipeline.store.checksums import seal, unseal
+from pipeline.store.commits import marker_key, read_commits, sweep
+from pipeline.store.errors import IncompleteError, RefusedError, UnreadableError
+from pipeline.store.files import RECORD_COPY, local_path
+from pipeline.store.local import LocalFiles
+from pipeline.store.records import Records
+from pipeline.store.run import Run
+from pipeline.store.setup import check, create, establish
+from pipeline.store.skeleton import skeleton_files
+from tests.pipeline.factories import duffing, finished, quietly, silent
 
-SPEC = """
-kind = "sweep"
-model = "duffing"
-[axes]
-frequency_hz = { start = 0.15, stop = 0.25, num = 4 }
-[initial_conditions]
-kind = "list"
-points = [[0.1, 0.0], [1.0, 0.2]]
-[integration]
-rtol = 1e-5
-atol = 1e-5
-n_transient = 1
-n_keep = 2
-[execution]
-trajectories_per_task = 2
-"""
+SPEC = duffing(execution="trajectories_per_task = 2", tolerance=1e-5)
 
 
-def silent(line):
-    pass
+def everything(directory):
+    """Content of all files below a folder."""
+    files = [f for f in directory.rglob("*") if f.is_file() and f.name != "lock"]
+    return {f.relative_to(directory).as_posix(): f.read_bytes() for f in files}
 
 
 @pytest.fixture(scope="module")
-def finished(tmp_path_factory):
+def sound(tmp_path_factory):
     folder = tmp_path_factory.mktemp("places")
-    (folder / "spec.toml").write_text(SPEC)
-    run(folder / "spec.toml", folder / "run", workers=0, echo=silent)
+    finished(folder, SPEC)
     return folder
 
 
 @pytest.fixture
-def whole(finished, tmp_path):
-    shutil.copytree(finished, tmp_path, dirs_exist_ok=True)
+def place(sound, tmp_path):
+    """A copy of a finished run, beside its specification."""
+    shutil.copytree(sound, tmp_path, dirs_exist_ok=True)
     return tmp_path / "run"
 
 
-def files_of(directory):
-    tops = (directory / "cube.zarr", directory / "commits")
-    return {f.relative_to(directory): f.read_bytes() for top in tops for f in top.rglob("*") if f.is_file()}
+@pytest.fixture
+def whole(made):
+    """A run directory whose tasks are all committed."""
+    for index in range(made.plan.n_tasks):
+        made.commit(index)
+    return made
 
 
-# ---- folders for files, and files for folders --------------------------------------------------
-
-ODD = [
-    "commits/000001.json",
-    "cube.zarr/section/c.1.0.0.0",
-    "cube.zarr/zarr.json",
-    "cube.zarr/section/zarr.json",
-    "cube.zarr/frequency/zarr.json",
-    "cube.zarr/section",
-    "cube.zarr",
-    "commits",
-]
+def establish_again(made, echo=silent):
+    return establish(made.info.directory, made.spec, made.plan, made.identity, made.info.spec_text, echo)
 
 
-def misplace(path):
-    """Put a folder with a file in the place of a file, or a file in that of a folder."""
-    was_folder = path.is_dir()
-    shutil.rmtree(path) if was_folder else path.unlink(missing_ok=True)
-    if was_folder:
-        path.write_text("somebody's")
-    else:
-        path.mkdir()
-        (path / "theirs").write_text("somebody's")
+# ---- places that no run may take ---------------------------------------------------------------
 
 
-@pytest.mark.parametrize("place", ODD)
-def test_run__moves_aside_what_is_in_the_way(finished, whole, main, place):
-    misplace(whole / place)
-    assert main("status", "run")[0] in (0, 5)
-    code, said, _ = main("verify", "run")
-    assert code == 5
-    assert f"{place}: is a folder where a file should be" in said
-    code, _, said = main("run", "spec.toml", "--out", "run", "--workers", 0)
-    assert code == 0, said
-    assert f"{place}: is a folder where a file should be" in said
-    assert files_of(whole) == files_of(finished / "run")
-    (kept,) = [f for f in (whole / "aside").rglob("*") if f.is_file()]
-    assert kept.read_text() == "somebody's"
-    assert verify_run(whole).sound
+@pytest.mark.parametrize("below", ["cube.zarr/new", "commits/new", "new", "cube.zarr", "derived/a/b"])
+def test_run__refuses_a_place_inside_of_another_run(place, below):
+    before = everything(place)
+    with pytest.raises(RefusedError, match=r"lies inside of the run directory .*; give another --out"):
+        quietly(place.with_name("spec.toml"), place / below)
+    assert everything(place) == before
 
 
-def test_verify__repair_moves_a_pack_aside(whole):
-    misplace(whole / "commits/000000-000999.jsonl")
-    found = verify_run(whole, repair=True)
-    assert found.odd == ["commits/000000-000999.jsonl"]
-    assert verify_run(whole).sound
+FOREIGN = {
+    "thesis.tex": ("x", "is not empty and no run directory"),
+    "lock.json": ('{"packages": {}}', "has a lock.json that no run has left"),
+    "lock.json of nothing": ("", "has a lock.json that no run has left"),
+    "timings.jsonl": ('{"name": "somebody"}\n', "has a timings.jsonl that no run has left"),
+    "timings.jsonl of numbers": ("1 2 3\n", "has a timings.jsonl that no run has left"),
+    RECORD_COPY: ('{"mine": 1}\n', rf"has a {RECORD_COPY} that no run has left"),
+    "cube.zarr/zarr.json": ('{"attributes": {"digest": "of mine"}}', "digest of mine"),
+    "cube.zarr/zarr.json of nothing": ("{}", "and nothing in it shows that this run"),
+}
 
 
-def test_scan__commits_that_never_stay_the_same_stop(whole, monkeypatch):
+@pytest.mark.parametrize("what", FOREIGN)
+def test_check__a_folder_with_a_file_of_somebody_else_stays(made, tmp_path, what):
+    text, words = FOREIGN[what]
+    path = tmp_path / "theirs" / what.partition(" of ")[0]
+    path.parent.mkdir(parents=True)
+    assert check(tmp_path / "theirs", made.identity) is None
+    path.write_text(text)
+    with pytest.raises(RefusedError, match=f"(?s){words}.*[Gg]ive another --out"):
+        check(tmp_path / "theirs", made.identity)
+    assert [f.read_text() for f in (tmp_path / "theirs").rglob("*") if f.is_file()] == [text]
+    with pytest.raises(RefusedError, match="is a file"):
+        check(path, made.identity)
+    link = tmp_path / "link"
+    link.symlink_to(tmp_path / "nowhere")
+    with pytest.raises(RefusedError, match="is a link that leads nowhere; remove it, or give another --out"):
+        check(link, made.identity)
+
+
+def test_check__another_run_stays_and_the_difference_is_named(whole):
+    directory, other = whole.info.directory, {**whole.identity, "kernel_version": "newer"}
+    assert check(directory, whole.identity) == whole.info
+    with pytest.raises(RefusedError, match="kernel_version: test-kernel in the directory, newer now"):
+        check(directory, other)
+    (directory / "run.json").unlink()
+    with pytest.raises(RefusedError, match="what another run has left"):
+        check(directory, other)
+    assert check(directory, whole.identity) is None
+
+
+def test_run__takes_what_a_killed_one_has_left(tmp_path):
+    """A lock's note, timings and empty folders are left if a run is killed, or removed while it goes on."""
+    (tmp_path / "run/cube.zarr/section").mkdir(parents=True)
+    note = {"host": "here", "pid": 1, "since": "2026-01-01T00:00:00+00:00"}
+    (tmp_path / "run/lock.json").write_text(json.dumps(note))
+    (tmp_path / "run/timings.jsonl").write_text('{"task": 0, "cells": 2}\n')
+    assert state(finished(tmp_path, SPEC)).complete
+
+
+@pytest.mark.parametrize("path", ["s3:/bucket/run", "https://host/run", "gs://b"])
+def test_local_path__urls_are_refused(path, write_spec, tmp_path, monkeypatch, main):
+    monkeypatch.chdir(tmp_path)
+    spec = write_spec(SPEC)
+    uses = (
+        state,
+        open_run,
+        verify_run,
+        read_source,
+        lambda p: quietly(spec, p),
+        lambda p: list(describe_plan(spec, p)),
+    )
+    for use in uses:
+        with pytest.raises(RefusedError, match="no folder and no object store; give a path"):
+            use(path)
+    assert main("run", "spec.toml", "--out", path)[0] == 2
+    assert list(tmp_path.iterdir()) == [spec]
+    for folder in ("runs/x", "C:/runs", "/a/b:c/d", "a:b"):
+        assert local_path(folder) == Path(folder)
+
+
+# ---- disks that fail ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("number", [errno.EIO, errno.EACCES, errno.ESTALE])
+def test_read__an_unreadable_record_stops_and_removes_nothing(place, monkeypatch, number):
+    before, original = everything(place), local.open_plain
+
+    def open_plain(path, mode, **options):
+        if path.name == "000001.json":
+            raise OSError(number, os.strerror(number), str(path))
+        return original(path, mode, **options)
+
+    monkeypatch.setattr(local, "open_plain", open_plain)
+    for use in (Run.open, verify_run, lambda d: quietly(place.with_name("spec.toml"), d)):
+        with pytest.raises(UnreadableError, match=r"000001\.json: cannot be read .* Nothing was removed"):
+            use(place)
+    assert everything(place) == before
+
+
+@pytest.mark.parametrize("name", ["commits", "cube.zarr", "status"])
+def test_read_commits__an_unreadable_folder_stops(whole, monkeypatch, name):
+    original = os.scandir
+
+    def scandir(path="."):
+        if Path(path).name == name:
+            raise OSError(errno.EACCES, os.strerror(errno.EACCES), str(path))
+        return original(path)
+
+    monkeypatch.setattr(os, "scandir", scandir)
+    with pytest.raises(UnreadableError, match=f"{name}: cannot be read"):
+        read_commits(whole.info, whole.plan)
+
+
+def test_scan__commits_that_never_stay_the_same_stop(place, monkeypatch):
     """Somebody packs and unpacks for ever: reading ends all the same."""
-    from pipeline.store.run import Run
-
-    opened = Run.open(whole)
-    calls = []
+    opened, calls = Run.open(place), []
 
     def names(folder):
         calls.append(folder)
@@ -120,111 +194,38 @@ def test_scan__commits_that_never_stay_the_same_stop(whole, monkeypatch):
         commits.scan(opened.info, opened.plan)
 
 
-# ---- places that no run may take ---------------------------------------------------------------
-
-
-@pytest.mark.parametrize("below", ["cube.zarr/new", "commits/new", "new", "cube.zarr", "derived/a/b"])
-def test_run__refuses_a_place_inside_of_another_run(finished, whole, below):
-    before = files_of(whole)
-    with pytest.raises(RefusedError, match=r"lies inside of the run directory .*; give another --out"):
-        run(whole.parent / "spec.toml", whole / below, workers=0, echo=silent)
-    assert files_of(whole) == before
-
-
-def test_run__refuses_a_link_that_leads_nowhere(whole):
-    place = whole.parent / "link"
-    place.symlink_to(whole.parent / "nowhere")
-    with pytest.raises(RefusedError, match="is a link that leads nowhere; remove it, or give another --out"):
-        run(whole.parent / "spec.toml", place, workers=0, echo=silent)
-
-
-@pytest.mark.parametrize(
-    ("name", "text"),
-    [
-        ("lock.json", '{"packages": {}}'),
-        ("lock.json", ""),
-        ("timings.jsonl", '{"name": "somebody"}\n'),
-        ("timings.jsonl", "1 2 3\n"),
-    ],
-)
-def test_run__refuses_a_folder_with_a_file_of_somebody_else(tmp_path, name, text):
-    (tmp_path / "spec.toml").write_text(SPEC)
-    (tmp_path / "run").mkdir()
-    (tmp_path / "run" / name).write_text(text)
-    with pytest.raises(RefusedError, match=f"has a {name} that no run has left; give another --out"):
-        run(tmp_path / "spec.toml", tmp_path / "run", workers=0, echo=silent)
-    assert (tmp_path / "run" / name).read_text() == text
-
-
-def test_run__takes_what_a_killed_one_has_left(tmp_path):
-    """A lock's note, timings and empty folders are left if a run is killed, or removed while it goes on."""
-    (tmp_path / "spec.toml").write_text(SPEC)
-    (tmp_path / "run/cube.zarr/section").mkdir(parents=True)
-    note = {"host": "here", "pid": 1, "since": "2026-01-01T00:00:00+00:00"}
-    (tmp_path / "run/lock.json").write_text(json.dumps(note))
-    (tmp_path / "run/timings.jsonl").write_text('{"task": 0, "cells": 2}\n')
-    assert run(tmp_path / "spec.toml", tmp_path / "run", workers=0, echo=silent).complete
-
-
-@pytest.mark.parametrize("moment", ["before writing", "while writing"])
-def test_run__removed_while_it_goes_on_ends_and_can_be_made_again(finished, tmp_path, monkeypatch, moment):
-    (tmp_path / "spec.toml").write_text(SPEC)
-    original, done = task.write_task, []
-
-    def write_task(info, plan, index, *rest):
-        done.append(index)
-        if len(done) == 2 and moment == "before writing":
-            shutil.rmtree(tmp_path / "run")
-        original(info, plan, index, *rest)
-
-    block = commits.write_block
-
-    def write_block(cube, *rest):
-        if len(done) == 2 and moment == "while writing" and (tmp_path / "run").exists():
-            shutil.rmtree(tmp_path / "run")
-            # as zarr would make it, had it opened the array before
-            (tmp_path / "run/cube.zarr/section").mkdir(parents=True)
-        return block(cube, *rest)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(task, "write_task", write_task)
-        patch.setattr(commits, "write_block", write_block)
-        with pytest.raises(Exception, match=r"removed|gone|missing|damaged|not found|No such|fail"):
-            run(tmp_path / "spec.toml", tmp_path / "run", workers=0, echo=silent)
-    assert run(tmp_path / "spec.toml", tmp_path / "run", workers=0, echo=silent).complete
-    assert files_of(tmp_path / "run") == files_of(finished / "run")
-
-
-# ---- errors of writing -------------------------------------------------------------------------
-
-
 def fail_at(monkeypatch, name, kind):
-    """Let the n-th call of the system fail without a path, as `write` and `fsync` do."""
-    original = getattr(os, kind)
+    """Let calls of the system fail without a path, as `write` and `fsync` do; returns the calls that did."""
+    original, failed = getattr(os, kind), []
 
     def call(first, *arguments, **options):
         target = os.readlink(f"/proc/self/fd/{first}") if isinstance(first, int) else str(first)
         if name in target:
+            failed.append(target)
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         return original(first, *arguments, **options)
 
     monkeypatch.setattr(os, kind, call)
+    return failed
 
 
-@pytest.mark.parametrize("kind", ["fsync", "replace", "mkdir"])
-@pytest.mark.parametrize("name", ["run.json", "cube.zarr", "commits", "section", "000001.json"])
+@pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="needs /proc to name open files")
+@pytest.mark.parametrize(
+    ("kind", "name"),
+    [(k, n) for k in ("fsync", "replace") for n in ("run.json", "section", "000001.json")]
+    + [("fsync", "commits"), ("mkdir", "cube.zarr"), ("mkdir", "commits"), ("mkdir", "section")],
+)
 def test_run__names_what_could_not_be_written(tmp_path, main, monkeypatch, name, kind):
-    if not os.path.isdir("/proc/self/fd"):
-        pytest.skip("needs /proc to name open files")
     (tmp_path / "spec.toml").write_text(SPEC)
-    fail_at(monkeypatch, name, kind)
+    failed = fail_at(monkeypatch, name, kind)
     code, _, said = main("run", "spec.toml", "--out", "run", "--workers", 0)
-    if code:  # else that call is not made there
-        assert code == 4, said
-        assert name in said
-        assert "cannot be written (No space left on device); make room on its disk" in said
+    assert failed
+    assert code == 4, said
+    assert name in said
+    assert "cannot be written (No space left on device); make room on its disk" in said
 
 
+@pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="needs /proc to name open files")
 @pytest.mark.parametrize(
     "command",
     [
@@ -234,11 +235,180 @@ def test_run__names_what_could_not_be_written(tmp_path, main, monkeypatch, name,
         ("report", "run", "--out", "page.html", "--only-stored"),
     ],
 )
-def test_commands__name_what_could_not_be_written(whole, main, monkeypatch, command):
-    if not os.path.isdir("/proc/self/fd"):
-        pytest.skip("needs /proc to name open files")
-    fail_at(monkeypatch, str(whole.parent), "fsync")
+def test_commands__name_what_could_not_be_written(place, main, monkeypatch, command):
+    fail_at(monkeypatch, str(place.parent), "fsync")
     code, _, said = main(*command)
     assert code == 4, said
     assert "cannot be written (No space left on device); make room on its disk" in said
     assert "[Errno" not in said
+
+
+@pytest.mark.parametrize("moment", ["before writing", "while writing"])
+def test_run__removed_while_it_goes_on_ends_and_can_be_made_again(sound, tmp_path, monkeypatch, bytes_of, moment):
+    (tmp_path / "spec.toml").write_text(SPEC)
+    write_task, write_block, done = task.write_task, commits.write_block, []
+
+    def writing_task(info, plan, index, *rest):
+        done.append(index)
+        if len(done) == 2 and moment == "before writing":
+            shutil.rmtree(tmp_path / "run")
+        write_task(info, plan, index, *rest)
+
+    def writing_block(cube, *rest):
+        if len(done) == 2 and moment == "while writing" and (tmp_path / "run").exists():
+            shutil.rmtree(tmp_path / "run")
+            # as zarr would make it, had it opened the array before
+            (tmp_path / "run/cube.zarr/section").mkdir(parents=True)
+        return write_block(cube, *rest)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(task, "write_task", writing_task)
+        patch.setattr(commits, "write_block", writing_block)
+        with pytest.raises(Exception, match=r"removed|gone|missing|damaged|not found|No such|fail"):
+            quietly(tmp_path / "spec.toml", tmp_path / "run")
+    assert quietly(tmp_path / "spec.toml", tmp_path / "run").complete
+    assert bytes_of(tmp_path / "run") == bytes_of(sound / "run")
+
+
+def test_run__ends_only_if_every_task_is_committed_here(place, main, monkeypatch):
+    """Workers that wrote elsewhere, and a record that vanished."""
+    original = execute.run_tasks
+
+    def elsewhere(job, indices, **options):
+        yield from ({"task": i, "cells": 1} for i in indices)
+
+    def losing(job, indices, **options):
+        yield from original(job, indices, **options)
+        (place.with_name("losing") / marker_key(2)).unlink()
+
+    for function, words in (
+        (elsewhere, "4 of 4 tasks were computed but are not committed here"),
+        (losing, "1 of 4 .*the first is 2"),
+    ):
+        with monkeypatch.context() as patch:
+            patch.setattr(execute, "run_tasks", function)
+            with pytest.raises(IncompleteError, match=words):
+                quietly(place.with_name("spec.toml"), place.with_name(function.__name__))
+    with monkeypatch.context() as patch:
+        patch.setattr(execute, "run_tasks", elsewhere)
+        assert main("run", "spec.toml", "--out", "losing", "--workers", 0)[0] == 4
+    assert quietly(place.with_name("spec.toml"), place.with_name("losing")).complete
+
+
+# ---- setting up, sweeping, rebuilding ------------------------------------------------------------
+
+
+def test_sweep__removes_and_names_what_no_record_vouches_for_and_nothing_else(whole, tmp_path):
+    """A chunk without its record, a file of a crash, and links: not what they lead to."""
+    directory, said = whole.info.directory, []
+    outside = tmp_path / "outside"
+    outside.mkdir()
+    (outside / "kept").write_text("x")
+    for name in ("derived/kept.txt", "figures/kept.txt"):
+        (directory / name).parent.mkdir()
+        (directory / name).write_text("x")
+    before = everything(directory)
+    (directory / "cube.zarr/section/c.0.0.abc.partial").write_bytes(b"x")
+    (directory / "cube.zarr/status/c.link").symlink_to(outside / "kept")
+    (directory / "cube.zarr/status/folder").symlink_to(outside)
+    leftovers = ["section/c.0.0.abc.partial", "status/c.link", "status/folder"]
+    assert verify_run(directory).leftovers == leftovers
+    found = read_commits(whole.info, whole.plan)
+    assert sweep(whole.info, whole.plan, found, said.append) == 3
+    assert "removed 3 files that no commit record vouches for: cube.zarr/" in said[0]
+    assert everything(directory) == before
+    assert (outside / "kept").read_text() == "x"
+    (directory / marker_key(1)).write_text("{")
+    chunk = next((directory / "cube.zarr/section").glob("c.0.*"))
+    chunk.unlink()
+    said.clear()
+    commits_left = read_commits(whole.info, whole.plan, said.append)
+    assert set(commits_left) == set(range(whole.plan.n_tasks)) - {0, 1}
+    assert "commits/000001.json: torn or damaged; it does not count" in said
+    assert any("is missing or has another size; it is computed again" in line for line in said)
+    assert sweep(whole.info, whole.plan, commits_left) > 0
+    assert sweep(whole.info, whole.plan, commits_left) == 0
+
+
+def test_create__crash_anywhere_starts_again(made, tmp_path, monkeypatch):
+    n_files, original = len(made.info.skeleton), LocalFiles.write
+    for n in (0, 1, n_files // 2, n_files - 1, n_files):
+        directory, calls = tmp_path / f"again{n}", []
+
+        def crash(self, key, content, calls=calls, n=n):
+            if len(calls) == n:
+                raise KeyboardInterrupt
+            calls.append(key)
+            original(self, key, content)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(LocalFiles, "write", crash)
+            with pytest.raises(KeyboardInterrupt):
+                create(directory, made.spec, made.plan, made.identity, "text")
+        with pytest.raises(RefusedError, match="no run directory"):
+            open_run(directory)
+        (directory / "cube.zarr/.zarr.json.abc.tmp").write_text("{")  # what a power cut leaves
+        (directory / ".run.json.abc.tmp").write_text("{")
+        assert check(directory, made.identity) is None
+        info = establish(directory, made.spec, made.plan, made.identity, "text", silent)
+        sweep(info, made.plan, Records(info.files, info.digest, {}))
+        assert verify_run(directory).sound
+        assert not list(directory.rglob("*.tmp"))
+
+
+def test_rebuild__files_worded_by_another_version(whole):
+    """Where the metadata come out otherwise, repair leaves them; a run writes them and their digests anew."""
+    directory = whole.info.directory
+    data = unseal((directory / "run.json").read_bytes())
+    data["skeleton"]["q/zarr.json"] = {"size": 1, "sha256": "0" * 64}
+    (directory / "run.json").write_text(seal(json.dumps(data)))
+    found = verify_run(directory, repair=True)
+    assert found.skeleton == ["q/zarr.json: its content has changed"]
+    assert "another version" in describe(found, directory, repaired=True)[-1]
+    establish_again(whole)
+    assert verify_run(directory).sound
+    assert len(Run.open(directory).commits) == whole.plan.n_tasks
+
+
+def test_skeleton_files__hold_nothing_of_this_machine_or_moment(made):
+    one, same, other = (
+        skeleton_files(made.spec, made.plan, made.identity, text, "title") for text in ("text", "text", "other")
+    )
+    assert one == same
+    assert {key for key in other if other[key] != one[key]} == {"zarr.json"}
+
+
+# ---- other readers -----------------------------------------------------------------------------
+
+
+@pytest.mark.filterwarnings("error")
+def test_cube__explains_itself_to_plain_xarray_and_as_netcdf(whole, tmp_path):
+    with xr.open_zarr(whole.info.directory / "cube.zarr", chunks=None) as ds:
+        assert ds["state"].values.tolist() == ["psi1", "psi2", "psi1_dot", "psi2_dot"]
+        assert ds["state_units"].values.tolist() == ["rad", "rad", "rad/s", "rad/s"]
+        assert ds["link"].values.tolist() == ["psi1", "psi2"]
+        assert set(ds.data_vars) == {v.name for v in whole.plan.variables}
+        assert "units" not in ds["section"].attrs
+        assert {"psi1_dot_0", "psi2_dot_0", "frequency", "q"} <= set(ds.coords)
+    ds = open_run(whole.info.directory)
+    for name in ("source", "created", "host"):
+        assert ds.attrs[name]
+    assert ds.attrs["created"] == whole.info.provenance["created"]
+    assert "created" not in (whole.info.directory / "cube.zarr/zarr.json").read_text()
+    ds.to_netcdf(tmp_path / "cube.nc", engine="scipy")
+    with xr.open_dataset(tmp_path / "cube.nc", engine="scipy") as found:
+        assert np.array_equal(found["section"], ds["section"])
+        assert found["state"].values.tolist() == ds["state"].values.tolist()
+        assert found.attrs["spec"] == ds.attrs["spec"]
+
+
+def test_cube__schema_versus_store(whole):
+    group = zarr.open_group(whole.info.directory / "cube.zarr", mode="r")
+    for v in whole.plan.variables:
+        array = group[v.name]
+        assert str(array.dtype) == v.dtype
+        assert array.metadata.dimension_names == (*whole.plan.dims, *v.own_dims)
+        assert array.chunks == whole.plan.chunks(v)
+        assert np.array_equal(array.fill_value, v.fill, equal_nan=True)
+        assert array.attrs.get("units", "") == v.units
+        assert array.metadata.to_dict()["codecs"][-1]["name"] == "crc32c"

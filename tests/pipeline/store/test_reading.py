@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import ast
+from pathlib import Path
+
 import numpy as np
-import pytest
 
 from magpend_core import Status
 from magpend_core.models import load_model
 from pipeline import open_run
 from pipeline.layout.schema import base_variables
-from pipeline.store.errors import RefusedError
+from pipeline.store import parallel_reads
 from pipeline.store.view import CommittedStore
 
 VARIABLES = base_variables(load_model())
@@ -37,11 +39,6 @@ def test_open_run__explains_itself(made):
     for name in ds.data_vars:
         assert ("units" in ds[name].attrs) == (name != "section")
         assert ds[name].attrs["long_name"]
-
-
-def test_open_run__selects_by_label(made):
-    made.commit(0)
-    ds = open_run(made.info.directory)
     assert ds.section.sel(frequency=2.26, method="nearest").frequency == 2.25
     assert ds.section.sel(frequency=2.25, q=1.6, state="psi1").dims == ("psi1_0", "psi2_0", "period_index")
 
@@ -70,18 +67,8 @@ def test_open_run__reads_no_chunk_before_it_is_used(made, monkeypatch):
         asked.clear()
 
 
-def test_open_run__no_run_there(tmp_path):
-    with pytest.raises(RefusedError, match="no run directory"):
-        open_run(tmp_path)
-
-
 def test_quick__builds_on_what_zarr_makes_public():
     """No module of `zarr.core`: what is there may change with any version."""
-    import ast
-    from pathlib import Path
-
-    from pipeline.store import parallel_reads
-
     tree = ast.parse(Path(parallel_reads.__file__).read_text("utf-8"))
     modules = {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
     assert not {name for name in modules if name and name.startswith("zarr.core")}
