@@ -22,7 +22,10 @@ from pipeline.analysis.attractors.finding.closed_orbits import Orbit, polish, ru
 from pipeline.analysis.attractors.finding.points import Point
 from pipeline.analysis.sets import Geometry, hashes
 from pipeline.analysis.tolerances import SLOPE_RTOL, STRICT
-from pipeline.products.reporting import report
+from pipeline.products.reporting import UNTOLD, report
+
+FINDING, EXTENDING = "finding attractors", "extending cells"
+"""Names of the work before and after the first leg of an extension."""
 
 LEG = 64
 """Number of drive periods or returns in a leg of an extension."""
@@ -149,15 +152,19 @@ class Settings:
 
 
 def answer_all(
-    works: Mapping[tuple[int, ...], Work[T]], points: Mapping[tuple[int, ...], Point], settings: Settings, what: str
+    works: Mapping[tuple[int, ...], Work[T]], points: Mapping[tuple[int, ...], Point], settings: Settings
 ) -> dict[tuple[int, ...], T]:
     """Run the analyses of all parameter points side by side, and answer their requests together. Return the result of
     each point.
+
+    Progress is the number of points that are decided. A point may take a thousand times longer than another, so this
+    number does not tell the time left.
     """
+    what = FINDING
     answers: dict[tuple[int, ...], Any] = dict.fromkeys(works)
     results: dict[tuple[int, ...], T] = {}
     while answers:
-        report(what, len(results), len(works))
+        report(what, len(results), len(works), UNTOLD)
         asked: dict[tuple[int, ...], Request] = {}
         for index, answer in answers.items():
             try:
@@ -167,10 +174,13 @@ def answer_all(
         legs = {index: request for index, request in asked.items() if isinstance(request, Leg)}
         guesses = {index: request for index, request in asked.items() if isinstance(request, Polish)}
         slopes = {index: request for index, request in asked.items() if isinstance(request, Slopes)}
+        if legs and what != EXTENDING:
+            what = EXTENDING
+            report(what, len(results), len(works), UNTOLD)
         answers = _legs(legs, points, settings) if legs else {}
         answers |= _polished(guesses, points, settings) if guesses else {}
         answers |= _slopes(slopes, points, settings) if slopes else {}
-    report(what, len(results), len(works))
+    report(what, len(results), len(works), UNTOLD)
     return results
 
 
