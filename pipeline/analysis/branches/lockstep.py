@@ -43,7 +43,7 @@ def run_together(computations: Sequence[Steps[T]], what: str = "", rtol: float =
     """
     covered = [0.0] * len(computations)
 
-    def run(numbers: Sequence[int], is_over: Callable[[], bool]) -> list[T | None]:
+    def run(numbers: Sequence[int], is_over: Callable[[], bool]) -> list[T]:
         results: dict[int, T] = {}
         waiting: dict[int, Query] = {}
         seen: dict[int, tuple[float, float]] = {}
@@ -67,9 +67,9 @@ def run_together(computations: Sequence[Steps[T]], what: str = "", rtol: float =
                 covered[i] = min(seen[i][1] - seen[i][0], 0.9)
             if what:
                 report(what, round(sum(covered), 1), len(computations))
-        return [results.get(i) for i in numbers]
+        return [results[i] for i in numbers if i in results]
 
-    return in_halves(run, range(len(computations)))  # type: ignore[return-value]
+    return in_halves(run, range(len(computations)))
 
 
 def run_alone(computation: Steps[T]) -> T:

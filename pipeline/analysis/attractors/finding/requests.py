@@ -164,7 +164,7 @@ def answer_all(
     results: dict[tuple[int, ...], T] = {}
     what = FINDING
 
-    def answer(indices: Sequence[tuple[int, ...]], is_over: Callable[[], bool]) -> list[T | None]:
+    def answer(indices: Sequence[tuple[int, ...]], is_over: Callable[[], bool]) -> list[T]:
         nonlocal what
         answers: dict[tuple[int, ...], Any] = dict.fromkeys(indices)
         while answers and not is_over():
@@ -184,11 +184,11 @@ def answer_all(
             answers = _legs(legs, points, settings) if legs else {}
             answers |= _polished(guesses, points, settings) if guesses else {}
             answers |= _slopes(slopes, points, settings) if slopes else {}
-        return [results.get(index) for index in indices]
+        return [results[index] for index in indices if index in results]
 
-    in_halves(answer, list(works))
+    found = in_halves(answer, list(works))
     report(what, len(results), len(works), UNTOLD)
-    return {index: results[index] for index in works}
+    return dict(zip(works, found, strict=True))
 
 
 def _gathered(
