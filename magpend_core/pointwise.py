@@ -13,10 +13,14 @@ from magpend_core.engine.events import event_bindings
 from magpend_core.engine.jacobians import places_of, whole_jacobian
 from magpend_core.engine.jit import bound_part, entry, keeping
 from magpend_core.engine.modes import mode_bindings
-from magpend_core.engine.simd import WIDTH, load, load_rows, store_rows
+from magpend_core.engine.simd import WIDTH, load, load_rows, store_rows, take
 from magpend_core.engine.system import System
+from magpend_core.engine.threads import share
 from magpend_core.models.model import Parameters
 from magpend_core.validation import check_frequency, check_states, check_times
+
+WORTH = 128
+"""An evaluation is so short beside an integration that fewer rows than a group's lanes times this are not shared."""
 
 
 def _rates(t: Any, y: Any, c: Any) -> Any:
@@ -56,9 +60,10 @@ class _Desk(NamedTuple):
     y: Any  # states
     values: Any  # of the bound function
     edge_table: Any  # (3, n_edges), see `lanes.Work`
+    queue: Any  # int64 (1,), the next group of times: shared by all threads
 
 
-def _desk_for(system: System, n_out: int) -> _Desk:
+def _desk_for(system: System, n_out: int, queue: np.ndarray) -> _Desk:
     n_rows = system.n_constants + system.n_modes
     return _Desk(
         np.empty(system.n_constants),
@@ -67,6 +72,7 @@ def _desk_for(system: System, n_out: int) -> _Desk:
         np.zeros(system.n_states * WIDTH),
         np.zeros(n_out * WIDTH),
         np.zeros((3, max(system.n_edges, 1))),
+        queue,
     )
 
 
@@ -74,14 +80,15 @@ def _evaluate(desk: _Desk, t: Any, states: Any, frequency: float, p: Any, out: A
     """Evaluate the rates, Jacobian or quantities (fixed at compilation) at times (n,) and states (n, N); write them to
     `out`.
     """
-    c, rows, time, y, values, edge_table = desk
+    c, rows, time, y, values, edge_table, queue = desk
     constants(frequency, p, c)
     for i in range(N_OWN):
         for lane in range(WIDTH):
             rows[i * WIDTH + lane] = c[i]
     n = len(t)
     edges(frequency, p, edge_table[0], edge_table[1], edge_table[2])
-    for first in range(0, n, WIDTH):
+    first = take(queue) * WIDTH
+    while first < n:
         for lane in range(WIDTH):
             source = first + lane if first + lane < n else n - 1
             time[lane] = t[source]
@@ -93,6 +100,7 @@ def _evaluate(desk: _Desk, t: Any, states: Any, frequency: float, p: Any, out: A
         for lane in range(WIDTH if n - first > WIDTH else n - first):
             for i in range(out.shape[1]):
                 out[first + lane, i] = values[i * WIDTH + lane]
+        first = take(queue) * WIDTH
 
 
 def _forced(t: Any, y: Any, c: Any) -> Any:
@@ -126,7 +134,10 @@ def _evaluator(system: System, kind: str) -> Any:
 
     @wraps(compiled)
     def evaluator(t: Any, states: Any, frequency: float, p: Any, out: Any) -> None:
-        compiled(_desk_for(system, out.shape[1]), t, states, frequency, p, out)
+        def run(queue: np.ndarray, n_lanes: int) -> None:
+            compiled(_desk_for(system, out.shape[1], queue), t, states, frequency, p, out)
+
+        share(run, len(t) // WORTH, WIDTH)
 
     return evaluator
 

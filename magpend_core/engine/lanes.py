@@ -50,10 +50,12 @@ from magpend_core.engine.simd import (
     multiply_add,
     store,
     store_rows,
+    take,
     where_less,
 )
 from magpend_core.engine.system import System
 from magpend_core.engine.tangents import n_entries, tangent_bindings
+from magpend_core.engine.threads import share
 from magpend_core.engine.vecmath import TWO_PI, exp2_rough, hypot_rough, log2_rough
 from magpend_core.engine.watching import (
     begin_watch,
@@ -557,6 +559,7 @@ class Work(NamedTuple):
     events: Any  # int64 per group: whether one of its lanes has an event
     scratch: Any  # float64, for constants and for states
     section: Any  # float64 (n_states,)
+    queue: Any  # int64 (1,), the next branch: shared by all threads
 
 
 class Cells(NamedTuple):
@@ -736,7 +739,7 @@ def keep_time(w: Any, base: int, lane: int, memory: Any, out: Any) -> None:
         out[n_kept(memory)] = time
 
 
-def work_for(system: System, observer: Observer, cells: Cells, n_lanes: int, settings: Any) -> Work:
+def work_for(system: System, observer: Observer, cells: Cells, n_lanes: int, settings: Any, queue: np.ndarray) -> Work:
     """Allocate the working arrays for `n_lanes` SIMD lanes."""
     n_groups = -(-min(n_lanes, len(cells.frequency)) // WIDTH)
     size = n_groups * WIDTH
@@ -757,23 +760,28 @@ def work_for(system: System, observer: Observer, cells: Cells, n_lanes: int, set
         events=np.zeros(n_groups, np.int64),
         scratch=np.zeros(max(system.n_constants + system.n_modes, system.n_states)),
         section=np.zeros(system.n_states),
+        queue=queue,
     )
 
 
 def advance(
-    cells: Cells, work: Work, active: int, rtol: float, atol: float, max_attempts: float, settings: Any
+    cells: Cells, work: Work, n_lanes: int, rtol: float, atol: float, max_attempts: float, settings: Any
 ) -> None:
-    """Integrate all branches in SIMD lanes, at most `active` branches at the same time, and fill the output arrays of
-    `cells`.
+    """Integrate the branches of the queue in SIMD lanes, at most `n_lanes` branches at the same time, and fill the
+    output arrays of `cells`.
     """
     n_branches = cells.frequency.shape[0]
+    branch, active = ZERO, ZERO
     # local names: numba counts references of a tuple's field atomically at every use, too slow per lane
     rows, events, scratch, section = work.lanes, work.events, work.scratch, work.section
     for lane in range(len(work.branch)):
+        following = take(work.queue) if lane < n_lanes else n_branches
+        if following < n_branches:
+            branch, active = following, lane + 1
+        elif active == 0:
+            return
         # spare lanes of the last group repeat the last branch, so that they hold valid numbers; nothing reads them
-        branch = lane if lane < n_branches else n_branches - 1
         start_branch(cells, work, lane, branch, settings, scratch)
-    next_branch = active
     while active > 0:
         in_use = (active + WIDTH - 1) // WIDTH
         attempt(rows, events, work.n_watching, in_use, cells.slack, rtol, atol, max_attempts)
@@ -786,9 +794,10 @@ def advance(
                 event = rows[group * ROWS.size + ROWS.event + lane % WIDTH]
                 if event == NOTHING or not serve(cells, work, lane, settings, section, scratch):
                     lane += 1
-                elif next_branch < n_branches:
-                    start_branch(cells, work, lane, next_branch, settings, scratch)
-                    next_branch += 1
+                    continue
+                branch = take(work.queue)
+                if branch < n_branches:
+                    start_branch(cells, work, lane, branch, settings, scratch)
                     lane += 1
                 else:
                     # no branch is left for this lane: move the last active lane here and serve it next
@@ -943,7 +952,10 @@ def _engine_of(system: System, observer: Observer, watched: tuple[int, ...]) -> 
 
     @wraps(compiled)
     def engine(cells: Cells, n_lanes: int, rtol: float, atol: float, attempts: float, settings: Any) -> None:
-        work = work_for(system, observer, cells, n_lanes, settings)
-        compiled(cells, work, min(n_lanes, len(cells.frequency)), rtol, atol, attempts, settings)
+        def run(queue: np.ndarray, n_lanes: int) -> None:
+            work = work_for(system, observer, cells, n_lanes, settings, queue)
+            compiled(cells, work, n_lanes, rtol, atol, attempts, settings)
+
+        share(run, len(cells.frequency), n_lanes)
 
     return engine

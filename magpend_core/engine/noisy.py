@@ -34,11 +34,13 @@ import numpy as np
 
 from magpend_core.engine import lanes
 from magpend_core.engine.jit import bound_part, entry, inline, keeping
+from magpend_core.engine.lanes import ZERO
 from magpend_core.engine.noise import ITO, Noise
 from magpend_core.engine.observers import Observer
 from magpend_core.engine.random_numbers import normal_pair, tag_word
-from magpend_core.engine.simd import WIDTH, load, load_rows, store, store_rows
+from magpend_core.engine.simd import WIDTH, load, load_rows, store, store_rows, take
 from magpend_core.engine.system import System
+from magpend_core.engine.threads import share
 from magpend_core.status import Status
 
 PENDING, DIVERGED = int(Status.PENDING), int(Status.DIVERGED)
@@ -110,6 +112,7 @@ class NoisyWork(NamedTuple):
     memory: Any  # float64 (lanes, n_memory), the observer's own
     scratch: Any  # float64, for constants and for states
     section: Any  # float64 (n_states,)
+    queue: Any  # int64 (1,), the next cell: shared by all threads
 
 
 def slope(w: Any, base: int, state: int, time: Any, out: int) -> None:
@@ -315,13 +318,19 @@ def move_cell(work: NoisyWork, source: int, target: int) -> None:
         work.memory[target, i] = work.memory[source, i]
 
 
-def advance(cells: NoisyCells, work: NoisyWork, active: int, keys: Any, settings: Any, halves: bool) -> None:
-    """Integrate all cells, at most `active` at the same time, and fill the output arrays of `cells`."""
-    n_cells, following = len(cells.frequency), active
+def advance(cells: NoisyCells, work: NoisyWork, n_lanes: int, keys: Any, settings: Any, halves: bool) -> None:
+    """Integrate the cells of the queue, at most `n_lanes` at the same time, and fill the output arrays of `cells`."""
+    n_cells = len(cells.frequency)
+    cell, active = ZERO, ZERO
     rows, scratch, section = work.lanes, work.scratch, work.section
     for lane in range(len(work.cell)):
+        following = take(work.queue) if lane < n_lanes else n_cells
+        if following < n_cells:
+            cell, active = following, lane + 1
+        elif active == 0:
+            return
         # lanes beyond the last cell repeat it, so that they hold ordinary numbers; no one looks
-        begin_cell(cells, work, lane, lane if lane < n_cells else n_cells - 1, scratch)
+        begin_cell(cells, work, lane, cell, scratch)
     while active > 0:
         in_use = (active + WIDTH - 1) // WIDTH
         for group in range(in_use):
@@ -337,9 +346,10 @@ def advance(cells: NoisyCells, work: NoisyWork, active: int, keys: Any, settings
             while lane < last:
                 if work.left[lane] > 0 or not end_period(cells, work, lane, settings, section):
                     lane += 1
-                elif following < n_cells:
-                    begin_cell(cells, work, lane, following, scratch)
-                    following += 1
+                    continue
+                cell = take(work.queue)
+                if cell < n_cells:
+                    begin_cell(cells, work, lane, cell, scratch)
                     lane += 1
                 else:
                     # the last lane moves here, at whatever step it is
@@ -423,19 +433,22 @@ def noisy_engine_of(system: System, noise: Noise, observer: Observer) -> Callabl
 
     @wraps(compiled)
     def engine(cells: NoisyCells, n_lanes: int, keys: Any, settings: Any, halves: bool) -> None:
-        active = min(n_lanes, len(cells.frequency))
-        n_groups = -(-active // WIDTH)
-        size = n_groups * WIDTH
-        work = NoisyWork(
-            lanes=np.zeros(n_groups * rows.size),
-            cell=np.zeros(size, np.int64),
-            left=np.zeros(size, np.int64),
-            i_period=np.zeros(size, np.int64),
-            turns=np.zeros((size, system.n_states), np.int64),
-            memory=np.zeros((size, memory_size(settings, system.n_states))),
-            scratch=np.zeros(max(system.n_constants, system.n_states)),
-            section=np.zeros(system.n_states),
-        )
-        compiled(cells, work, active, keys, settings, halves)
+        def run(queue: np.ndarray, n_lanes: int) -> None:
+            n_groups = -(-min(n_lanes, len(cells.frequency)) // WIDTH)
+            size = n_groups * WIDTH
+            work = NoisyWork(
+                lanes=np.zeros(n_groups * rows.size),
+                cell=np.zeros(size, np.int64),
+                left=np.zeros(size, np.int64),
+                i_period=np.zeros(size, np.int64),
+                turns=np.zeros((size, system.n_states), np.int64),
+                memory=np.zeros((size, memory_size(settings, system.n_states))),
+                scratch=np.zeros(max(system.n_constants, system.n_states)),
+                section=np.zeros(system.n_states),
+                queue=queue,
+            )
+            compiled(cells, work, n_lanes, keys, settings, halves)
+
+        share(run, len(cells.frequency), n_lanes)
 
     return engine

@@ -30,14 +30,16 @@ from magpend_core.engine.lanes import (
     STEP_LIMIT,
     STEP_UNDERFLOW,
     TOO_MANY_STEPS,
+    ZERO,
     engine_bindings,
     rows_of,
 )
 from magpend_core.engine.modes import CHATTERED
 from magpend_core.engine.observers import RECORD
-from magpend_core.engine.simd import WIDTH, load, store
+from magpend_core.engine.simd import WIDTH, load, store, take
 from magpend_core.engine.system import System
 from magpend_core.engine.tableau import DENSE, N_STAGES
+from magpend_core.engine.threads import share
 from magpend_core.engine.vecmath import TWO_PI
 from magpend_core.status import Status
 
@@ -85,6 +87,7 @@ class Seats(NamedTuple):
     scratch: Any  # float64, for constants
     events: Any  # int64 per group: whether one of its lanes has an event
     n_watching: Any  # int64 per group: 0
+    queue: Any  # int64 (1,), the next trajectory: shared by all threads
 
 
 def begin_interval(samples: Samples, seats: Seats, lane: int, scratch: Any) -> None:
@@ -244,7 +247,7 @@ def copy_seat(seats: Seats, source: int, target: int) -> None:
         seats.before[b + row] = seats.before[a + row]
 
 
-def seats_for(system: System, samples: Samples, n_lanes: int) -> Seats:
+def seats_for(system: System, samples: Samples, n_lanes: int, queue: np.ndarray) -> Seats:
     """Allocate the arrays of the sampling loop for a number of SIMD lanes."""
     n_groups = -(-min(n_lanes, len(samples.piece)) // WIDTH)
     size, n = n_groups * WIDTH, system.n_states
@@ -263,16 +266,22 @@ def seats_for(system: System, samples: Samples, n_lanes: int) -> Seats:
         scratch=np.zeros(max(system.n_constants + system.n_modes, n)),
         events=np.zeros(n_groups, np.int64),
         n_watching=np.zeros(n_groups, np.int64),
+        queue=queue,
     )
 
 
-def follow_all(samples: Samples, seats: Seats, active: int, rtol: float, atol: float, max_attempts: float) -> None:
-    """Integrate all trajectories, `active` at a time, and fill the output arrays of `samples`."""
+def follow_all(samples: Samples, seats: Seats, n_lanes: int, rtol: float, atol: float, max_attempts: float) -> None:
+    """Integrate the trajectories of the queue, `n_lanes` at a time, and fill the output arrays of `samples`."""
     n, scratch = len(samples.piece), seats.scratch
+    number, active = ZERO, ZERO
     for lane in range(len(seats.trajectory)):
+        following = take(seats.queue) if lane < n_lanes else n
+        if following < n:
+            number, active = following, lane + 1
+        elif active == 0:
+            return
         # spare lanes of the last group repeat the last trajectory, so that they hold valid numbers; nothing reads them
-        begin_trajectory(samples, seats, lane, lane if lane < n else n - 1, scratch)
-    following = active
+        begin_trajectory(samples, seats, lane, number, scratch)
     rows, before, clock = seats.lanes, seats.before, seats.clock
     events, n_watching = seats.events, seats.n_watching
     while active > 0:
@@ -287,9 +296,9 @@ def follow_all(samples: Samples, seats: Seats, active: int, rtol: float, atol: f
                 lane += 1
                 continue
             end_trajectory(samples, seats, lane, status)
-            if following < n:
-                begin_trajectory(samples, seats, lane, following, scratch)
-                following += 1
+            number = take(seats.queue)
+            if number < n:
+                begin_trajectory(samples, seats, lane, number, scratch)
                 lane += 1
             else:
                 # no trajectory is left for this lane: move the last active lane here and process it next
@@ -312,7 +321,9 @@ def sampler_of(system: System) -> Callable[..., None]:
 
     @wraps(compiled)
     def sampler(samples: Samples, n_lanes: int, rtol: float, atol: float, attempts: float) -> None:
-        seats, active = seats_for(system, samples, n_lanes), min(n_lanes, len(samples.piece))
-        compiled(samples, seats, active, rtol, atol, attempts)
+        def run(queue: np.ndarray, n_lanes: int) -> None:
+            compiled(samples, seats_for(system, samples, n_lanes, queue), n_lanes, rtol, atol, attempts)
+
+        share(run, len(samples.piece), n_lanes)
 
     return sampler

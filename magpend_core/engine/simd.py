@@ -429,3 +429,21 @@ def _lower_store_rows(context: Any, builder: Any, sig: Any, values: Any) -> Any:
         vector = _as(builder, builder.extract_value(values[2], i), numba_type, lanes_type)
         builder.store(vector, pointer, align=8)
     return context.get_dummy_value()
+
+
+def take(queue: np.ndarray) -> int:
+    """Return the next number of a queue. Compiled threads that share the queue get different numbers."""
+    number = int(queue[0])
+    queue[0] += 1
+    return number
+
+
+@type_callable(take)
+def _type_take(context: Any) -> Any:
+    return lambda queue: types.int64
+
+
+@lower_builtin(take, types.Array)
+def _lower_take(context: Any, builder: Any, sig: Any, values: Any) -> Any:
+    place = context.make_array(sig.args[0])(context, builder, values[0]).data
+    return builder.atomic_rmw("add", place, ir.Constant(ir.IntType(64), 1), "monotonic")

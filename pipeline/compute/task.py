@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from magpend_core import Status, kernel_version
+from magpend_core.engine.threads import using_threads
 from magpend_core.models import import_model
 from pipeline.compute.continuation import WALKED, going_on
 from pipeline.compute.integrate import Integrate, integrate
@@ -115,7 +116,8 @@ def run_task(
     started = time.perf_counter()
     taken: list[int] = []
     how = _taking(directory, digest, sources, cells, plan.task(index), taken)
-    values = compute(spec, cells, plan.task(index), **_left(info, plan, cells, index), **how)
+    with using_threads(1):  # the tasks keep the cores busy
+        values = compute(spec, cells, plan.task(index), **_left(info, plan, cells, index), **how)
     computed = time.perf_counter()
     codes, numbers = np.unique(values["status"], return_counts=True)
     counts = {Status(int(c)).name.lower(): int(n) for c, n in zip(codes, numbers, strict=True)}

@@ -12,6 +12,7 @@ Without a listener nothing is shown, and reporting takes almost no time. Results
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Iterator, Sequence
 from contextvars import ContextVar
 from typing import Protocol, TypeVar
@@ -28,6 +29,9 @@ class Listener(Protocol):
 
 _listener: ContextVar[Listener | None] = ContextVar("listener", default=None)
 
+UNTOLD = math.inf
+"""Expected time of work whose parts differ so much that their number does not tell the time left."""
+
 COMPILING = "compiling"
 """Name of the work while the compiler runs."""
 
@@ -42,7 +46,7 @@ def report(what: str, done: float, total: float, expected_s: float = 0.0) -> Non
     done, total
         Amounts in any unit; `total` may grow during the work, and is 0 if it is unknown.
     expected_s
-        Expected time of the rest, used until the speed is known [s].
+        Expected time of the rest, used until the speed is known [s]. `UNTOLD`: no time left is shown.
     """
     listener = _listener.get()
     if listener is not None:

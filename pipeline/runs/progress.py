@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import Any, Self
 
-from pipeline.products.reporting import is_heard, report
+from pipeline.products.reporting import UNTOLD, is_heard, report
 
 LINE_EVERY_S = 10.0
 WORK = "computing cells"
@@ -56,7 +56,7 @@ class Work:
     heard : float
         Time of the last report [s].
     expected_s : float
-        Expected time of the whole work [s]; 0 if unknown.
+        Expected time of the whole work [s]; 0 if unknown, `UNTOLD` if no time left is to be shown.
     """
 
     what: str
@@ -80,7 +80,9 @@ class Work:
         if self.done >= self.total:
             return text
         took, more = self.heard - self.started, self.done - self.begun
-        if more > 0:
+        if self.expected_s == UNTOLD:
+            left, about = 0.0, ""
+        elif more > 0:
             left, about = took * (self.total - self.done) / more - (now - self.heard), ""
         else:
             left, about = self.expected_s - elapsed, "about "

@@ -200,7 +200,7 @@ def identify(
         if dynamics.can_rest and not dynamics.is_flow and options.polish:
             tell_cycles(points.values(), tolerance, options.max_orbit_period, options.residual, dynamics.geometry)
         works = {index: analyse(point, search) for index, point in points.items()}
-        found |= answer_all(works, points, settings, "finding attractors")
+        found |= answer_all(works, points, settings)
     return _with_exponents(_dataset(ds, found, search), ds)
 
 

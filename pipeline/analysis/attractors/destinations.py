@@ -255,7 +255,7 @@ class Destinations:
         cells = self._as_point(section, flights)
         loose = np.full(len(rows), UNDECIDED, np.int64)
         work = extend(cells, self.orbits, loose, self.settings, self.options.budget, self.options.n_sample)
-        found = answer_all({(): work}, {(): cells}, self.settings, "extending trajectories")[()]
+        found = answer_all({(): work}, {(): cells}, self.settings)[()]
         ends = {course.key: self._end_of(course, found) for course in found.courses}
         keys = keys_of(section, self.settings.closure, self.geometry)
         flights.label[rows] = [ends.get(key, UNDECIDED) for key in keys.tolist()]

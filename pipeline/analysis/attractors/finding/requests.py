@@ -6,7 +6,7 @@ so that their trajectories fill the engine's lanes together.
 
 from __future__ import annotations
 
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar
 
@@ -15,6 +15,7 @@ import xarray as xr
 
 from magpend_core.defaults import ATOL, MOST_STEPS, RTOL
 from magpend_core.engine.system import System
+from magpend_core.engine.threads import in_halves
 from magpend_core.orbits import section_map
 from magpend_core.sections import run_branches
 from pipeline.analysis.attractors.finding.cell_blocks import Guesses
@@ -22,7 +23,10 @@ from pipeline.analysis.attractors.finding.closed_orbits import Orbit, polish, ru
 from pipeline.analysis.attractors.finding.points import Point
 from pipeline.analysis.sets import Geometry, hashes
 from pipeline.analysis.tolerances import SLOPE_RTOL, STRICT
-from pipeline.products.reporting import report
+from pipeline.products.reporting import UNTOLD, report
+
+FINDING, EXTENDING = "finding attractors", "extending cells"
+"""Names of the work before and after the first leg of an extension."""
 
 LEG = 64
 """Number of drive periods or returns in a leg of an extension."""
@@ -149,29 +153,42 @@ class Settings:
 
 
 def answer_all(
-    works: Mapping[tuple[int, ...], Work[T]], points: Mapping[tuple[int, ...], Point], settings: Settings, what: str
+    works: Mapping[tuple[int, ...], Work[T]], points: Mapping[tuple[int, ...], Point], settings: Settings
 ) -> dict[tuple[int, ...], T]:
     """Run the analyses of all parameter points side by side, and answer their requests together. Return the result of
     each point.
+
+    Progress is the number of points that are decided. A point may take a thousand times longer than another, so this
+    number does not tell the time left.
     """
-    answers: dict[tuple[int, ...], Any] = dict.fromkeys(works)
     results: dict[tuple[int, ...], T] = {}
-    while answers:
-        report(what, len(results), len(works))
-        asked: dict[tuple[int, ...], Request] = {}
-        for index, answer in answers.items():
-            try:
-                asked[index] = works[index].send(answer)
-            except StopIteration as stop:
-                results[index] = stop.value
-        legs = {index: request for index, request in asked.items() if isinstance(request, Leg)}
-        guesses = {index: request for index, request in asked.items() if isinstance(request, Polish)}
-        slopes = {index: request for index, request in asked.items() if isinstance(request, Slopes)}
-        answers = _legs(legs, points, settings) if legs else {}
-        answers |= _polished(guesses, points, settings) if guesses else {}
-        answers |= _slopes(slopes, points, settings) if slopes else {}
-    report(what, len(results), len(works))
-    return results
+    what = FINDING
+
+    def answer(indices: Sequence[tuple[int, ...]], is_over: Callable[[], bool]) -> list[T]:
+        nonlocal what
+        answers: dict[tuple[int, ...], Any] = dict.fromkeys(indices)
+        while answers and not is_over():
+            report(what, len(results), len(works), UNTOLD)
+            asked: dict[tuple[int, ...], Request] = {}
+            for index, value in answers.items():
+                try:
+                    asked[index] = works[index].send(value)
+                except StopIteration as stop:
+                    results[index] = stop.value
+            legs = {index: request for index, request in asked.items() if isinstance(request, Leg)}
+            guesses = {index: request for index, request in asked.items() if isinstance(request, Polish)}
+            slopes = {index: request for index, request in asked.items() if isinstance(request, Slopes)}
+            if legs and what != EXTENDING:
+                what = EXTENDING
+                report(what, len(results), len(works), UNTOLD)
+            answers = _legs(legs, points, settings) if legs else {}
+            answers |= _polished(guesses, points, settings) if guesses else {}
+            answers |= _slopes(slopes, points, settings) if slopes else {}
+        return [results[index] for index in indices if index in results]
+
+    found = in_halves(answer, list(works))
+    report(what, len(results), len(works), UNTOLD)
+    return dict(zip(works, found, strict=True))
 
 
 def _gathered(

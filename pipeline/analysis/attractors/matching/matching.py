@@ -33,6 +33,7 @@ from magpend_core.models.model import Parameters
 from pipeline.analysis.attractors.matching.connections import Connections, Place, connections, followable
 from pipeline.analysis.sets import Geometry, mean_distance, order_by_points
 from pipeline.layout.vocabulary import frequency_of, model_of, parameters_of
+from pipeline.products.reporting import track
 
 _PER_ATTRACTOR = "attractor"
 
@@ -150,7 +151,7 @@ def match(
     numbers: dict[tuple[int, ...], list[int]] = {}
     for n, (index, _) in enumerate(places):
         numbers.setdefault(index, []).append(n)
-    for index in np.ndindex(*shape):
+    for index in track(list(np.ndindex(*shape)), "matching attractors"):
         here = [seen_at(attractors, n, places[n]) for n in numbers.get(index, [])]
         seen[index] = ids.at(here, _known(seen, index, look_back))
     attrs = {

@@ -1,0 +1,46 @@
+"""Progress of the search for attractors: it does not promise an end that is far away."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+
+from magpend_core.engine.threads import using_threads
+from pipeline.analysis.attractors.finding import requests
+from pipeline.analysis.attractors.finding.requests import EXTENDING, Leg, Polish, answer_all
+from pipeline.cli.console import Display
+from pipeline.products.reporting import reporting
+from pipeline.runs.progress import duration
+
+LEG_S = 1.0
+
+
+def point(n_legs):
+    """Work on a parameter point: an orbit is polished, and cells are extended by some legs."""
+    yield Polish(None)
+    for _ in range(n_legs):
+        yield Leg(np.zeros((1, 1)), np.zeros(1))
+    return n_legs
+
+
+def test_answer_all__tells_no_time_left_that_is_wrong(monkeypatch):
+    now, lines = [0.0], []
+    display = Display("analyse", terminal=False, clock=lambda: now[0])
+
+    def legs(asked, points, settings):
+        for _ in range(4):  # the display shows lines between reports, too
+            now[0] += LEG_S / 4
+            lines.append((now[0], display._work.line(now[0])))
+        return dict.fromkeys(asked)
+
+    monkeypatch.setattr(requests, "_legs", legs)
+    monkeypatch.setattr(requests, "_polished", lambda asked, points, settings: dict.fromkeys(asked))
+    with using_threads(1), reporting(display):
+        found = answer_all({(i,): point(100 if i >= 15 else 1) for i in range(20)}, {}, None)
+    assert found == {(i,): 100 if i >= 15 else 1 for i in range(20)}
+    assert any("15 of 20 (75 %)" in line for _, line in lines)
+    for at, line in lines:
+        left = re.search(r"([\d.]+) s left", line)
+        assert left is None or float(left[1]) > 0.5 * (now[0] - at), line
+    assert lines[-1][1] == f"{EXTENDING}: 15 of 20 (75 %), {duration(now[0])} so far"
