@@ -6,6 +6,7 @@ A task is named by the run directory, the run's digest and its index; it reads t
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Mapping
 from dataclasses import replace
@@ -19,6 +20,7 @@ from magpend_core.models import import_model
 from pipeline.compute.continuation import WALKED, going_on
 from pipeline.compute.integrate import Integrate, integrate
 from pipeline.compute.refinement import infer
+from pipeline.compute.threads import writing_results
 from pipeline.layout.cells import CellMap, Inputs
 from pipeline.layout.identity import differences, digest_of, identity_of
 from pipeline.layout.plan import Plan, make_plan
@@ -29,10 +31,13 @@ from pipeline.store.errors import RefusedError
 from pipeline.store.runfile import RunInfo, read_run
 from pipeline.store.task_cells import read_cells
 
+_PREPARING = threading.Lock()
+"""Lock for the reading of a run: the first of its threads reads it for all."""
+
 
 @lru_cache(maxsize=4)
 def _prepare(directory: str, digest: str, origin: tuple[str, str] | None) -> tuple[RunInfo, Spec, Plan, CellMap]:
-    """Read the run that a task belongs to, once per worker; raise RefusedError if this worker would compute other
+    """Read the run that a task belongs to, once per process; raise RefusedError if this worker would compute other
     results.
     """
     if origin is not None:
@@ -111,15 +116,18 @@ def run_task(
         Task, cells, cells by status, and the seconds taken by the kernel and by writing; with `sources` how
         many cells were taken.
     """
-    info, spec, plan, cells = _prepare(directory, digest, origin)
+    with _PREPARING:
+        info, spec, plan, cells = _prepare(directory, digest, origin)
     started = time.perf_counter()
     taken: list[int] = []
     how = _taking(directory, digest, sources, cells, plan.task(index), taken)
+    # ENGINE THREADS: `with using_threads(1):` of magpend_core.engine.threads goes around this call
     values = compute(spec, cells, plan.task(index), **_left(info, plan, cells, index), **how)
     computed = time.perf_counter()
     codes, numbers = np.unique(values["status"], return_counts=True)
     counts = {Status(int(c)).name.lower(): int(n) for c, n in zip(codes, numbers, strict=True)}
-    write_task(info, plan, index, values, counts)
+    with writing_results():
+        write_task(info, plan, index, values, counts)
     return {
         "task": index,
         "cells": plan.cells_in(index),
@@ -163,8 +171,8 @@ def _taking(
 def warm_up(spec: Spec) -> float:
     """Compile the functions that a run needs into the compile cache; return the time that this took [s].
 
-    One process compiles, so that workers find the machine code instead of each making it: what they
-    will do is done here for a single cell over no more than a few periods.
+    It is compiled once, before threads or workers need it: what they will do is done here for a single cell over no
+    more than a few periods.
     """
     started = time.perf_counter()
     short = Inputs(spec.values.pack().reshape(1, 1, -1), np.ones((1, 1)), np.zeros((1, len(spec.model.states))))

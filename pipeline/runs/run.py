@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -207,10 +208,12 @@ def _complete(
             scheduler=where,
             echo=echo,
         )
-        for result in results:
-            log_timing(info, {**result, "at_s": round(time.perf_counter() - started, 4)})
-            packer.add(result["task"])
-            progress.add(result["cells"])
+        # closed at once, also by an error or a signal: only then may others use the directory
+        with contextlib.closing(results):
+            for result in results:
+                log_timing(info, {**result, "at_s": round(time.perf_counter() - started, 4)})
+                packer.add(result["task"])
+                progress.add(result["cells"])
     _require_all(info, plan, echo)
 
 
