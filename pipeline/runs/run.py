@@ -218,7 +218,7 @@ def _complete(
 
 
 def _require_all(info: RunInfo, plan: Plan, echo: Echo) -> None:
-    """Raise IncompleteError unless every task is committed; remove the files that stopped workers left."""
+    """Raise IncompleteError unless every task is committed; remove the files that stopped tasks left."""
     commits, problems = damaged_records(info, plan, contents=False)
     absent = [i for i in range(plan.n_tasks) if i not in commits or name_of(i) in problems]
     if absent:

@@ -179,7 +179,7 @@ def refusal(scheduler_file, n_workers, **where):
 
     with Client(scheduler_file=str(scheduler_file), set_as_default=False) as client:
         client.wait_for_workers(n_workers, timeout=PATIENCE_S)
-    with pytest.raises(SchedulerError) as refused, connected(Where(str(scheduler_file), **where), 1, silent):
+    with pytest.raises(SchedulerError) as refused, connected(Where(str(scheduler_file), **where), silent):
         pass
     text = str(refused.value)
     assert "\n" not in text
@@ -243,21 +243,6 @@ def test_sees(tmp_path, monkeypatch):
     (tmp_path / key).write_text("token")
     assert probe.sees(place, key, "token") == ""
     assert [path.name for path in (tmp_path / "commits").iterdir()] == [".probe.tmp"]
-
-
-# ---- the dashboard -------------------------------------------------------------------------------------
-
-
-def test_dashboard__on_loopback():
-    import urllib.request
-
-    lines = []
-    with connected(Where("local", dashboard=True), 1, lines.append):
-        (line,) = [line for line in lines if line.startswith("dashboard: ")]
-        address = line.removeprefix("dashboard: ")
-        assert address.startswith("http://127.0.0.1:")
-        with urllib.request.urlopen(address, timeout=30) as page:
-            assert "Dask" in page.read().decode()
 
 
 # ---- scripts of worker jobs ----------------------------------------------------------------------------
