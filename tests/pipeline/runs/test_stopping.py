@@ -98,10 +98,12 @@ def test_stopping__while_it_loads(begin, tmp_path):
     assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.parametrize("scheduler", ["threads", "processes"])
-@pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize(
+    ("scheduler", "number"),
+    [("threads", signal.SIGHUP), ("threads", signal.SIGINT), ("threads", signal.SIGTERM), ("processes", signal.SIGINT)],
+)
 def test_stopping__beside_running_kernels(begin, tmp_path, scheduler, number):
-    """The tasks take a minute each, and the command ends in less than two seconds, and frees the directory."""
+    """The tasks take minutes, and the command ends in less than two seconds, and frees the directory."""
     process = begin("long.toml", "--scheduler", scheduler)
     own = psutil.Process(process.pid)
     commits = tmp_path / "run" / "commits"
