@@ -36,8 +36,7 @@ Spec = Annotated[
 
 
 Workers = Annotated[
-    int | None,
-    typer.Option(min=0, help="Threads, or processes; 0: the calling thread alone. Default: all cores."),
+    int | None, typer.Option(min=0, help="Threads, or processes; 0: the calling thread alone. Default: all cores.")
 ]
 Scheduler = Annotated[
     str | None,

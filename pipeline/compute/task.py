@@ -32,7 +32,7 @@ from pipeline.store.runfile import RunInfo, read_run
 from pipeline.store.task_cells import read_cells
 
 _PREPARING = threading.Lock()
-"""Lock for the reading of a run: the first of its threads reads it for all."""
+"""Lock for reading a run and those that it copies from: the first of its threads reads them for all."""
 
 
 @lru_cache(maxsize=4)
@@ -165,7 +165,9 @@ def _taking(
         return {}
     from pipeline.compute.reuse import pool_of
 
-    return {"integrate": pool_of(directory, digest, sources).integrator(cells, block, taken)}
+    with _PREPARING:
+        pool = pool_of(directory, digest, sources)
+    return {"integrate": pool.integrator(cells, block, taken)}
 
 
 def warm_up(spec: Spec) -> float:

@@ -254,7 +254,7 @@ def test_submit__dry_run(main, tmp_path, write_spec, cluster):
         "--out",
         str(tmp_path / "out"),
         "--scheduler",
-        "local",
+        "threads",
         "--workers",
         "4",
     ]
