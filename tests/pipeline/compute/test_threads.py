@@ -19,11 +19,11 @@ from pipeline.compute.processes import Processes
 from pipeline.compute.threads import in_threads, writing_results
 
 
-@pytest.mark.parametrize("place", ["threads", "processes"])
-def test_run_tasks__order_failures_and_a_second_try(faulty, tmp_path, place):
+@pytest.mark.parametrize("place", ["threads", "processes", "dask"])
+def test_run_tasks__order_failures_and_a_second_try(faulty, tmp_path, scheduler, place):
     task = partial(faulty.raising, str(tmp_path), poison=(5,), unlucky=(2,))
-    found = []
-    results = run_tasks(task, range(12), after=lambda i: i - 1 if i % 4 else None, workers=2, scheduler=place)
+    found, where = [], scheduler() if place == "dask" else place
+    results = run_tasks(task, range(12), after=lambda i: i - 1 if i % 4 else None, workers=2, scheduler=where)
     with pytest.raises(TaskFailedError, match=r"^task 5: .*RuntimeError: out of luck; 2 tasks that come after"):
         found.extend(result["task"] for result in results)
     assert sorted(found) == [0, 1, 2, 3, 4, 8, 9, 10, 11]

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import os
 import signal
-import subprocess
 import sys
 import threading
 import time
 from functools import partial
-from pathlib import Path
 
 import pytest
 
@@ -22,46 +19,8 @@ from pipeline.compute.limits import Limits
 from pipeline.compute.order import TaskFailedError
 
 
-@pytest.fixture
-def scheduler(faulty):
-    """Start a dask scheduler with two workers and some settings; returns its address."""
-    import dask
-    from distributed import LocalCluster
-
-    with contextlib.ExitStack() as stack:
-
-        def begin(n_workers=2, **settings):
-            names = {name.replace("_", "-"): value for name, value in settings.items()}
-            stack.enter_context(dask.config.set({f"distributed.scheduler.{n}": v for n, v in names.items()}))
-            cluster = LocalCluster(
-                n_workers=n_workers,
-                threads_per_worker=1,
-                host="127.0.0.1",
-                scheduler_kwargs={"dashboard": False, "dashboard_address": "127.0.0.1:0"},
-                silence_logs=60,
-            )
-            return stack.enter_context(cluster).scheduler_address
-
-        yield begin
-
-
-def in_steps_of(n):
-    return lambda i: i - 1 if i % n else None
-
-
 def one_second(index):
     return 1.0
-
-
-def test_workers__order_failures_and_a_second_try(faulty, scheduler, tmp_path):
-    task = partial(faulty.raising, str(tmp_path), poison=(5,), unlucky=(2,))
-    found = []
-    results = run_tasks(task, range(12), after=in_steps_of(4), seconds=one_second, scheduler=scheduler())
-    with pytest.raises(TaskFailedError, match=r"^task 5: RuntimeError: out of luck; 2 tasks that come after"):
-        found.extend(result["task"] for result in results)
-    assert sorted(found) == [0, 1, 2, 3, 4, 8, 9, 10, 11]
-    assert all(found.index(i) > found.index(i - 1) for i in found if i % 4)
-    assert faulty.tries(tmp_path) == {0: 1, 1: 1, 2: 2, 3: 1, 4: 1, 5: 2, 8: 1, 9: 1, 10: 1, 11: 1}
 
 
 def test_workers__poison_kills_them_and_the_others_finish(faulty, scheduler, tmp_path):
@@ -138,41 +97,15 @@ def test_workers__a_blocked_callback_of_another_client_holds_up_nobody(faulty, s
             free.set()
 
 
-@contextlib.contextmanager
-def dask_command(name, folder, *words):
-    """A program of dask, in a process of its own."""
-    words = ["--host", "127.0.0.1", "--scheduler-file", folder / "scheduler.json", *words]
-    with subprocess.Popen(
-        [sys.executable, "-m", f"distributed.cli.dask_{name}", *words],
-        cwd=folder,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    ) as process:
-        try:
-            yield process
-        finally:
-            process.kill()
-
-
-def test_workers__scheduler_dies(faulty, tmp_path, monkeypatch):
+def test_workers__scheduler_dies(faulty, processes, scheduler_file, worker, tmp_path):
     """A scheduler that is killed: an error in one sentence, soon."""
     (tmp_path / "log").mkdir()
-    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent), prepend=os.pathsep)
-    nothing_shown = ("--no-dashboard", "--dashboard-address", "127.0.0.1:0")
-    with (
-        dask_command("scheduler", tmp_path, "--port", "0", *nothing_shown) as scheduler,
-        dask_command("worker", tmp_path, "--no-nanny", "--nthreads", "1"),
-    ):
-        written = tmp_path / "scheduler.json"
-        # the file is there before it is whole
-        while not (written.exists() and written.read_text("utf-8").rstrip().endswith("}")):
-            time.sleep(0.02)
-        task = partial(faulty.slow, str(tmp_path / "log"))
-        results = run_tasks(task, range(1000), scheduler=str(tmp_path / "scheduler.json"))
-        next(results)
-        scheduler.kill()
-        with pytest.raises(SchedulerError, match=r"is gone\. Committed results stay"):
-            list(results)
+    worker(PYTHONPATH=os.pathsep.join(sys.path))
+    results = run_tasks(partial(faulty.slow, str(tmp_path / "log")), range(1000), scheduler=str(scheduler_file))
+    next(results)
+    processes.started[0].kill()
+    with pytest.raises(SchedulerError, match=r"is gone\. Committed results stay"):
+        list(results)
 
 
 def test_limits__learn_from_what_finished():
