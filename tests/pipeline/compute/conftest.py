@@ -53,13 +53,14 @@ def scheduler(faulty):
 def processes(tmp_path, environment):
     """Starts processes; all are gone at the end."""
     started = []
+    path = os.pathsep.join([str(Path(__file__).parent), environment["PYTHONPATH"]])
 
     def begin(*words, before=(), **variables):
         log = (tmp_path / f"process-{len(started)}.log").open("wb")
         process = subprocess.Popen(
             [*before, sys.executable, "-m", *map(str, words)],
             cwd=tmp_path,
-            env={**environment, **variables},
+            env={**environment, "PYTHONPATH": path, **variables},
             stdout=log,
             stderr=log,
             start_new_session=True,

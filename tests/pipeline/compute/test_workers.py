@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import os
 import signal
-import sys
 import threading
 import time
 from functools import partial
@@ -100,7 +99,7 @@ def test_workers__a_blocked_callback_of_another_client_holds_up_nobody(faulty, s
 def test_workers__scheduler_dies(faulty, processes, scheduler_file, worker, tmp_path):
     """A scheduler that is killed: an error in one sentence, soon."""
     (tmp_path / "log").mkdir()
-    worker(PYTHONPATH=os.pathsep.join(sys.path))
+    worker()
     results = run_tasks(partial(faulty.slow, str(tmp_path / "log")), range(1000), scheduler=str(scheduler_file))
     next(results)
     processes.started[0].kill()
