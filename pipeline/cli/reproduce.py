@@ -39,7 +39,7 @@ def reproduce(
         bool, typer.Option("--smoke", help="Use the small size: it takes minutes and leaves most claims undecided.")
     ] = False,
     workers: Annotated[
-        int | None, typer.Option(help="Worker processes, 0: none. By default one per core; with --smoke none.", min=0)
+        int | None, typer.Option(help="Threads, 0: none. By default one per core; with --smoke none.", min=0)
     ] = None,
 ) -> None:
     """Compute and draw the figures of a study, test its claims, and write one HTML page on them.

@@ -36,14 +36,14 @@ Spec = Annotated[
 
 
 Workers = Annotated[
-    int | None, typer.Option(min=0, help="Worker processes; 0 computes in this process. Default: all cores.")
+    int | None, typer.Option(min=0, help="Threads, or processes; 0: the calling thread alone. Default: all cores.")
 ]
 Scheduler = Annotated[
     str | None,
     typer.Option(
         metavar="WHERE",
-        help="local; none (this process); a dask scheduler's tcp:// or tls:// address or FILE.json; or jobs "
-        "of slurm, pbs, torque, sge, lsf. Default: $DASK_SCHEDULER_ADDRESS, or local.",
+        help="threads; processes; none (the calling thread); a dask scheduler's tcp:// or tls:// address or FILE.json; "
+        "or jobs of slurm, pbs, torque, sge, lsf. Default: $DASK_SCHEDULER_ADDRESS, or threads.",
     ),
 ]
 ClusterFile = Annotated[
@@ -51,7 +51,7 @@ ClusterFile = Annotated[
     typer.Option(metavar="FILE", help="TOML file whose table [cluster] describes a job. Default: $MAGPEND_CLUSTER."),
 ]
 Dashboard = Annotated[
-    bool, typer.Option("--dashboard", help="Serve dask's dashboard on this machine, and print its address.")
+    bool, typer.Option("--dashboard", help="With a dask scheduler: serve its dashboard, and print the address.")
 ]
 DryRun = Annotated[bool, typer.Option("--dry-run", help="Describe the work; create nothing.")]
 

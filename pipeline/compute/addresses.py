@@ -72,7 +72,8 @@ def read_address(text: str, source: str) -> Address:
     if match is None or not 0 < int(match["port"]) < 65536:
         raise SpecError(
             f"{source}: {text!r} is no address of a scheduler; give tcp://HOST:PORT with a port from 1 to "
-            "65535, tls://HOST:PORT, the scheduler's FILE.json, slurm, pbs, torque, sge, lsf, local or none."
+            "65535, tls://HOST:PORT, the scheduler's FILE.json, slurm, pbs, torque, sge, lsf, threads, processes or "
+            "none."
         )
     if scheme not in SCHEMES:
         hint = " A dashboard's address is another than its scheduler's." if scheme.startswith("http") else ""

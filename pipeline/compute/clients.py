@@ -1,4 +1,4 @@
-"""Connect to dask: a local cluster, jobs of a batch system, or an existing scheduler."""
+"""Choose where tasks run, and connect to dask: jobs of a batch system, or an existing scheduler."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from typing import Any
 
 from pipeline.compute.addresses import OPTION, Address, SchedulerError, ask, read_address, security_of
 from pipeline.compute.jobqueue import check_means, job_cluster, jobs_folder
-from pipeline.compute.local import local_cluster
 from pipeline.compute.probe import check_directory, check_versions
 from pipeline.specification.clusters import QUEUES, Cluster, clock, load_cluster, seconds_of
 from pipeline.specification.problems import SpecError
@@ -23,7 +22,9 @@ Echo = Callable[[str], None]
 ALLOWED_FAILURES = 3
 """Worker deaths that dask allows per task: a single one may have another cause than the task."""
 
-LOCAL, IN_PROCESS = "local", "none"
+THREADS, PROCESSES, IN_PROCESS = "threads", "processes", "none"
+"""Places on this machine: threads of this process, processes, and the calling thread."""
+
 ADDRESS, CLUSTER_FILE, WAIT = "DASK_SCHEDULER_ADDRESS", "MAGPEND_CLUSTER", "MAGPEND_WAIT_FOR_WORKERS"
 WAIT_FOR_WORKERS = "00:10:00"
 _SAY_EVERY_S, _CONNECT_S = 30.0, 10.0
@@ -31,17 +32,17 @@ _SAY_EVERY_S, _CONNECT_S = 30.0, 10.0
 
 @dataclass(frozen=True)
 class Where:
-    """Choice of where tasks run: in this process, in local processes, on a dask scheduler or as jobs of a batch system.
+    """Choice of where tasks run: in threads or processes of this machine, on a dask scheduler or as batch jobs.
 
     Attributes
     ----------
     scheduler : str, optional
-        ``local`` for processes of this machine, ``none`` for this process, a scheduler's address or JSON
-        file, or the name of a batch system. By default ``DASK_SCHEDULER_ADDRESS``, else ``local``.
+        ``threads`` or ``processes`` of this machine, ``none`` for the calling thread, a scheduler's address or
+        JSON file, or the name of a batch system. By default ``DASK_SCHEDULER_ADDRESS``, else ``threads``.
     cluster_file : Path, optional
         File with the ``[cluster]`` table of a batch system; by default the value of ``MAGPEND_CLUSTER``.
     dashboard : bool
-        Whether to serve dask's dashboard on loopback, and print its address.
+        Whether to serve dask's dashboard on loopback, and print its address; not for places on this machine.
     place : str, optional
         Place of the run directory, which all workers must see (`open_files`).
     """
@@ -57,8 +58,8 @@ class Where:
         return scheduler if isinstance(scheduler, Where) else cls(scheduler)
 
     def resolved(self) -> Address | Cluster | str:
-        """Decide where tasks run, without starting anything: an address, a batch system's settings, ``local`` or
-        ``none``.
+        """Decide where tasks run, without starting anything: an address, a batch system's settings, or a place on this
+        machine.
 
         Raises
         ------
@@ -66,7 +67,12 @@ class Where:
             If the statement is invalid, or not available here.
         """
         found = self._resolved()
-        if self.dashboard and found != IN_PROCESS and not isinstance(found, Address) and not find_spec("bokeh"):
+        if self.dashboard and isinstance(found, str):
+            raise SpecError(
+                "--dashboard: shows a dask scheduler, and there is none on this machine; leave it out, or give "
+                "--scheduler an address or a batch system."
+            )
+        if self.dashboard and isinstance(found, Cluster) and not find_spec("bokeh"):
             raise SpecError("--dashboard: needs bokeh; install it: pip install 'magpend[dashboard]'.")
         return found
 
@@ -79,12 +85,12 @@ class Where:
                 f"--cluster {self.cluster_file}: says what a job of a batch system is, and --scheduler "
                 f"{wanted} asks for none; leave one of them out, or give --scheduler {' or '.join(QUEUES)}."
             )
-        if wanted.lower() in (LOCAL, IN_PROCESS):
+        if wanted.lower() in (THREADS, PROCESSES, IN_PROCESS):
             return wanted.lower()
         if wanted:
             return read_address(wanted, OPTION)
         inherited = os.environ.get(ADDRESS, "").strip()
-        return read_address(inherited, ADDRESS) if inherited else LOCAL
+        return read_address(inherited, ADDRESS) if inherited else THREADS
 
     def _cluster(self, kind: str) -> Cluster:
         file = self.cluster_file or os.environ.get(CLUSTER_FILE)
@@ -117,15 +123,13 @@ def reach(where: Where) -> None:
 
 
 @contextlib.contextmanager
-def connected(where: Where, n_workers: int, echo: Echo = print) -> Iterator[Any]:
-    """Yield a dask client when its workers have started, have the same software, and see the run directory.
+def connected(where: Where, echo: Echo = print) -> Iterator[Any]:
+    """Yield a dask client when it has workers that have the same software and see the run directory.
 
     Parameters
     ----------
     where
-        Choice of where tasks run; not ``none``.
-    n_workers
-        Number of processes of a local cluster.
+        Choice of where tasks run: a dask scheduler or a batch system.
     echo
         Function that prints a line.
 
@@ -144,18 +148,15 @@ def connected(where: Where, n_workers: int, echo: Echo = print) -> Iterator[Any]
             ask(target)
             client = stack.enter_context(_client(target.url, security_of(target)))
             _wait(client, target.named, _patience(), echo)
-        elif isinstance(target, Cluster):
+        else:
+            assert isinstance(target, Cluster)
             folder = jobs_folder(where.place or "magpend")
             jobs = stack.enter_context(job_cluster(target, folder, dashboard=where.dashboard, echo=echo))
             client = stack.enter_context(_client(jobs, None))
             _wait(client, f"jobs of {target.kind}", target.wait_s, echo)
-        else:
-            cluster = stack.enter_context(local_cluster(n_workers, dashboard=where.dashboard))
-            client = stack.enter_context(_client(cluster, None))
         if where.dashboard:
             echo(f"dashboard: {client.dashboard_link}")
-        if target != LOCAL:
-            _check(client, where.place)
+        _check(client, where.place)
         yield client
 
 

@@ -1,4 +1,5 @@
-"""Run tasks on the workers of a dask scheduler, with few tasks per thread at a time, and restart workers that hang.
+"""Run tasks on the workers of a dask scheduler, with few tasks per thread at a time, and restart workers whose task
+hangs. Workers that fall silent are the scheduler's business (its setting ``worker-ttl``).
 
 All waiting happens in the client's event loop. Results and starts of tasks arrive in one queue, so that a
 stopped worker cannot hold up the others.
@@ -18,23 +19,18 @@ from functools import partial
 from typing import Any
 
 from pipeline.compute.addresses import SchedulerError
-from pipeline.compute.limits import SILENT_S, Limits
+from pipeline.compute.limits import Limits
 from pipeline.compute.order import Order, why
+from pipeline.compute.threads import Task
 
 WINDOW = 3
 """Tasks in flight (submitted, not finished) per worker thread."""
 
 TICK_S = 1.0
-"""Time between two checks of the workers [s]."""
-
-MOST_LOOKED_AT = 100
-"""Workers checked per second; if there are more, each is checked less often."""
+"""Time between two looks at the scheduler [s]."""
 
 ANSWER_S = 30.0
 """Longest wait for an answer of the scheduler [s]; after it the scheduler counts as gone."""
-
-MOST_PATIENCE = 8
-"""Largest factor by which the limit for silent workers grows."""
 
 WAITING_S = 30.0
 """Time without workers after which a line is printed [s]."""
@@ -42,7 +38,6 @@ WAITING_S = 30.0
 MOST_HANGS = 2
 """Number of hangs after which a task is set aside; it is tried again alone, after all others."""
 
-Task = Callable[[int], dict[str, Any]]
 Echo = Callable[[str], None]
 
 
@@ -99,7 +94,9 @@ class Window:
         self._ticket = 0
         self._news: queue.SimpleQueue[tuple[str, int, Any]] = queue.SimpleQueue()
         self._hangs: dict[int, int] = {}
-        self._watch = Watch()
+        self._n_threads = 0
+        self._now = self._looked = 0.0
+        self._clock = time.monotonic()
         self._waiting_since: float | None = None
 
     def results(self) -> Iterator[dict[str, Any]]:
@@ -118,7 +115,8 @@ class Window:
         while self._flights:
             for kind, ticket, value in self._wait():
                 yield from self._take(kind, ticket, value)
-            if self._watch.due():
+            self._tick()
+            if self._now - self._looked >= TICK_S:
                 self._look()
                 self._give_up_late()
             self._fill()
@@ -127,7 +125,7 @@ class Window:
         """Send ready tasks to the workers until enough are in flight. At the end, send failed tasks again, one at a
         time.
         """
-        wanted = WINDOW * max(self._watch.n_threads, 1) - len(self._flights)
+        wanted = WINDOW * max(self._n_threads, 1) - len(self._flights)
         chosen: list[int] = []
         while len(chosen) < wanted and (index := self._order.take()) is not None:
             chosen.append(index)
@@ -135,6 +133,12 @@ class Window:
             chosen.append(index)
         if chosen:
             self._submit(chosen)
+
+    def _tick(self) -> None:
+        """Advance a clock that stops while this process is suspended, so that no task is blamed for that time."""
+        now = time.monotonic()
+        self._now += min(now - self._clock, 5 * TICK_S)
+        self._clock = now
 
     def _submit(self, indices: list[int]) -> None:
         tickets = range(self._ticket, self._ticket + len(indices))
@@ -166,13 +170,13 @@ class Window:
         if flight is None:
             return  # the event belongs to a task that was given up
         if kind == "start":
-            flight.started, flight.worker = self._watch.now, value
+            flight.started, flight.worker = self._now, value
             return
         del self._flights[ticket]
         result, error = value
         if error is None:
             if flight.started is not None:
-                self._limits.finished(flight.index, self._watch.now - flight.started)
+                self._limits.finished(flight.index, self._now - flight.started)
             self._order.done(flight.index)
             yield result
         elif isinstance(error, asyncio.CancelledError):
@@ -187,23 +191,20 @@ class Window:
         )
 
     def _look(self) -> None:
-        """Ask the scheduler which workers have reported, and restart those that are silent for too long."""
+        """Ask the scheduler how many threads its workers have, and say if there are none for long."""
         try:
-            seen = self._client.sync(self._client.scheduler.identity, n_workers=-1, callback_timeout=ANSWER_S)
+            found = self._client.sync(self._client.scheduler.ncores, callback_timeout=ANSWER_S)
         except (OSError, TimeoutError) as error:
             raise SchedulerError(self._lost()) from error
-        limit = self._watch.limit_s
-        for address in self._watch.look(seen["workers"]):
-            self._echo(f"a worker has not answered for {limit:.0f} s: it is restarted, its tasks go elsewhere")
-            self._restart(address)
+        self._looked, self._n_threads = self._now, sum(found.values())
         self._say_if_waiting()
 
     def _say_if_waiting(self) -> None:
-        if self._watch.n_threads:
+        if self._n_threads:
             self._waiting_since = None
         elif self._waiting_since is None:
-            self._waiting_since = self._watch.now
-        elif self._watch.now - self._waiting_since > WAITING_S:
+            self._waiting_since = self._now
+        elif self._now - self._waiting_since > WAITING_S:
             self._waiting_since = float("inf")
             self._echo("the scheduler has no workers; waiting for some")
 
@@ -214,7 +215,7 @@ class Window:
                 continue
             tries = 1 + self._hangs.get(flight.index, 0)
             limit = self._limits.limit_s(flight.index, tries)
-            if self._watch.now - flight.started > limit:
+            if self._now - flight.started > limit:
                 self._give_up(ticket, flight, limit)
 
     def _give_up(self, ticket: int, flight: _Flight, limit: float) -> None:
@@ -230,68 +231,7 @@ class Window:
             self._order.failed(flight.index, text)
 
     def _restart(self, address: str) -> None:
-        self._watch.forget(address)
         threading.Thread(target=_restarted, args=(self._client, address), daemon=True).start()
-
-
-class Watch:
-    """Record of when each dask worker last reported. It shows which workers hang.
-
-    Its clock stops while this process is suspended, by Ctrl-Z or a closed lid: no worker is blamed for that
-    time.
-    """
-
-    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        self._clock = clock
-        self._last = clock()
-        self._looked = float("-inf")
-        self._heard: dict[str, tuple[float, float]] = {}
-        self._patience = 1
-        self.n_threads = 0
-        self._time = 0.0
-
-    @property
-    def limit_s(self) -> float:
-        """Time after which a silent worker is taken to hang [s].
-
-        It doubles with each check that finds silent workers, since all workers of an overloaded machine
-        answer slowly.
-        """
-        least = max(SILENT_S, len(self._heard) / 50)  # dask asks many workers to report less often
-        return least * min(self._patience, MOST_PATIENCE)
-
-    @property
-    def now(self) -> float:
-        """Time on a clock [s] that stops while this process is suspended."""
-        now = self._clock()
-        self._time += min(now - self._last, 5 * TICK_S)
-        self._last = now
-        return self._time
-
-    def due(self) -> bool:
-        """Return whether it is time to check the workers again."""
-        return self.now - self._looked >= max(TICK_S, len(self._heard) / MOST_LOOKED_AT)
-
-    def look(self, workers: dict[str, Any]) -> list[str]:
-        """Update the record from the scheduler's list of workers. Return the addresses of workers that are silent for
-        too long.
-        """
-        now = self._looked = self.now
-        self.n_threads = sum(w["nthreads"] for w in workers.values())
-        heard = {}
-        for address, worker in workers.items():
-            seen = worker["last_seen"]
-            before = self._heard.get(address)
-            heard[address] = before if before is not None and before[0] == seen else (seen, now)
-        self._heard = heard
-        silent = [address for address, (_, since) in heard.items() if now - since > self.limit_s]
-        if silent:
-            self._patience *= 2
-        return silent
-
-    def forget(self, address: str) -> None:
-        """Delete a worker from the record."""
-        self._heard.pop(address, None)
 
 
 async def _outcome(client: Any, future: Any) -> tuple[Any, BaseException | None]:

@@ -1,21 +1,22 @@
-"""Run tasks: in this process, or on the workers of a dask scheduler.
+"""Run tasks: in threads or processes of this machine, or on the workers of a dask scheduler.
 
-Tasks are submitted in a window, so that a scheduler holds only few of them in a long run. Their results are
-small dicts. This module does not depend on what a task computes.
+The results of tasks are small dicts. This module does not depend on what a task computes.
 """
 
 from __future__ import annotations
 
+import contextlib
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from typing import Any
 
-from pipeline.compute.clients import IN_PROCESS, Where, connected
+from pipeline.compute.clients import IN_PROCESS, PROCESSES, THREADS, Where, connected
 from pipeline.compute.order import Order, Predecessor, TaskFailedError, why
+from pipeline.compute.processes import Processes
+from pipeline.compute.threads import Task, in_threads
 
 __all__ = ["TaskFailedError", "default_workers", "run_tasks"]
 
-Task = Callable[[int], dict[str, Any]]
 Echo = Callable[[str], None]
 
 
@@ -33,26 +34,27 @@ def run_tasks(
     workers: int | None = None,
     scheduler: Where | str | None = None,
     echo: Echo = print,
-) -> Iterator[dict[str, Any]]:
+) -> Generator[dict[str, Any], None, None]:
     """Run a task function for every index, and yield the results as they come.
 
-    If a task fails, the others continue; the failed task is tried again alone at the end.
+    If a task fails, the others continue; the failed task is tried again alone at the end. After the generator has
+    been closed, no task of this machine writes anything any more.
 
     Parameters
     ----------
     task
-        Function of an index, importable on the workers, or a partial of one. Running it twice, even at the
-        same time, must do no harm.
+        Function of an index, or a partial of one; for processes and dask workers it must be importable there.
+        Running it twice, even at the same time, must do no harm.
     indices
         Tasks to run, each once.
     after
         Function that returns a task's predecessor or None. A predecessor that is not in `indices` counts as
         done.
     seconds
-        Estimated time of a task on one core [s]. A worker that takes far longer (see
-        `pipeline.compute.limits`) is restarted, and its task runs elsewhere. Not used in this process.
+        Estimated time of a task on one core [s]. A dask worker that takes far longer (see
+        `pipeline.compute.limits`) is restarted, and its task runs elsewhere.
     workers
-        Number of processes of the local cluster; 0 runs in this process.
+        Number of threads or processes of this machine, by default of its cores; 0 runs in the calling thread.
     scheduler
         Place of the computation; a text stands for ``Where(text)``.
     echo
@@ -67,20 +69,25 @@ def run_tasks(
     """
     order = Order(indices, after)
     where = Where.of(scheduler)
-    if where.resolved() == IN_PROCESS or workers == 0:
-        yield from _in_process(task, order)
-        return
-    from pipeline.compute.dispatch import Window
-    from pipeline.compute.probe import Fitting
-
+    place = where.resolved()
     n_workers = min(workers or default_workers(), len(indices))
-    with connected(where, n_workers, echo) as client:
-        task = Fitting(task)
-        yield from Window(client, task, order, seconds=seconds, echo=echo).results()
+    if place == IN_PROCESS or workers == 0:
+        yield from _in_calling_thread(task, order)
+    elif place == THREADS:
+        yield from in_threads(task, order, n_workers)
+    elif place == PROCESSES:
+        with contextlib.closing(Processes(task)) as processes:
+            yield from in_threads(processes, order, n_workers)
+    else:
+        from pipeline.compute.dispatch import Window
+        from pipeline.compute.probe import Fitting
+
+        with connected(where, echo) as client:
+            yield from Window(client, Fitting(task), order, seconds=seconds, echo=echo).results()
     order.close()
 
 
-def _in_process(task: Task, order: Order) -> Iterator[dict[str, Any]]:
+def _in_calling_thread(task: Task, order: Order) -> Generator[dict[str, Any], None, None]:
     while (index := order.take()) is not None or (index := order.take_failed()) is not None:
         try:
             result = task(index)
@@ -89,4 +96,3 @@ def _in_process(task: Task, order: Order) -> Iterator[dict[str, Any]]:
             continue
         order.done(index)
         yield result
-    order.close()

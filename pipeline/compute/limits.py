@@ -16,9 +16,6 @@ SHORT_S = 1.0
 MORE = 2.0
 """Factor of the limit from one try of a task to the next."""
 
-SILENT_S = 20.0
-"""A worker that is silent for this time counts as stopped [s]; workers report every half second."""
-
 
 class Limits:
     """Limits of the run time of tasks, from estimated and measured times.

@@ -6,6 +6,7 @@ A task is named by the run directory, the run's digest and its index; it reads t
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Mapping
 from dataclasses import replace
@@ -20,6 +21,7 @@ from magpend_core.models import import_model
 from pipeline.compute.continuation import WALKED, going_on
 from pipeline.compute.integrate import Integrate, integrate
 from pipeline.compute.refinement import infer
+from pipeline.compute.threads import writing_results
 from pipeline.layout.cells import CellMap, Inputs
 from pipeline.layout.identity import differences, digest_of, identity_of
 from pipeline.layout.plan import Plan, make_plan
@@ -30,10 +32,13 @@ from pipeline.store.errors import RefusedError
 from pipeline.store.runfile import RunInfo, read_run
 from pipeline.store.task_cells import read_cells
 
+_PREPARING = threading.Lock()
+"""Lock for reading a run and those that it copies from: the first of its threads reads them for all."""
+
 
 @lru_cache(maxsize=4)
 def _prepare(directory: str, digest: str, origin: tuple[str, str] | None) -> tuple[RunInfo, Spec, Plan, CellMap]:
-    """Read the run that a task belongs to, once per worker; raise RefusedError if this worker would compute other
+    """Read the run that a task belongs to, once per process; raise RefusedError if this worker would compute other
     results.
     """
     if origin is not None:
@@ -112,7 +117,8 @@ def run_task(
         Task, cells, cells by status, and the seconds taken by the kernel and by writing; with `sources` how
         many cells were taken.
     """
-    info, spec, plan, cells = _prepare(directory, digest, origin)
+    with _PREPARING:
+        info, spec, plan, cells = _prepare(directory, digest, origin)
     started = time.perf_counter()
     taken: list[int] = []
     how = _taking(directory, digest, sources, cells, plan.task(index), taken)
@@ -121,7 +127,8 @@ def run_task(
     computed = time.perf_counter()
     codes, numbers = np.unique(values["status"], return_counts=True)
     counts = {Status(int(c)).name.lower(): int(n) for c, n in zip(codes, numbers, strict=True)}
-    write_task(info, plan, index, values, counts)
+    with writing_results():
+        write_task(info, plan, index, values, counts)
     return {
         "task": index,
         "cells": plan.cells_in(index),
@@ -159,14 +166,16 @@ def _taking(
         return {}
     from pipeline.compute.reuse import pool_of
 
-    return {"integrate": pool_of(directory, digest, sources).integrator(cells, block, taken)}
+    with _PREPARING:
+        pool = pool_of(directory, digest, sources)
+    return {"integrate": pool.integrator(cells, block, taken)}
 
 
 def warm_up(spec: Spec) -> float:
     """Compile the functions that a run needs into the compile cache; return the time that this took [s].
 
-    One process compiles, so that workers find the machine code instead of each making it: what they
-    will do is done here for a single cell over no more than a few periods.
+    It is compiled once, before threads or workers need it: what they will do is done here for a single cell over no
+    more than a few periods.
     """
     started = time.perf_counter()
     short = Inputs(spec.values.pack().reshape(1, 1, -1), np.ones((1, 1)), np.zeros((1, len(spec.model.states))))

@@ -33,13 +33,6 @@ CLOSING_S = 0.8
 LEAST_PERIODS = 8
 NEVER_CLOSES = 1e-300
 
-
-START_S = 4.0
-"""Time until worker processes have started and read their input [s]."""
-
-DISPATCH_S = 0.02
-"""Time to hand out a task and to take its result, in all processes together [s]."""
-
 WRITTEN, WRITING_S = 20, 0.5
 """Number of tasks that are written to time the writing, and the most time for it [s]."""
 
@@ -128,7 +121,7 @@ def writing_seconds(spec: Spec, plan: Plan) -> float:
 
 
 def wall_seconds(core_seconds: float, n_tasks: int, workers: int) -> float:
-    """Convert the time that a run takes on one core to the time with a number of worker processes [s].
+    """Convert the time that a run takes on one core to the time with a number of threads or workers [s].
 
     Parameters
     ----------
@@ -137,11 +130,9 @@ def wall_seconds(core_seconds: float, n_tasks: int, workers: int) -> float:
     n_tasks
         Number of tasks that are left.
     workers
-        Number of processes; 0 stands for this process.
+        Number of threads or workers; 0 stands for the calling thread.
     """
-    if not workers:
-        return core_seconds
-    return START_S + (core_seconds + n_tasks * DISPATCH_S) / min(workers, n_tasks)
+    return core_seconds / max(1, min(workers, n_tasks))
 
 
 def _sample(spec: Spec, plan: Plan, rng: np.random.Generator, n_branches: int, *, pairs: bool) -> Inputs:

@@ -53,8 +53,8 @@ def run(
     SpecError
         If the specification is wrong; before anything is computed, with all problems.
     KeyboardInterrupt
-        After Ctrl-C, or an interrupt of the notebook's kernel, when all workers have stopped. The finished cells
-        stay; the same call goes on from there.
+        After Ctrl-C, or an interrupt of the notebook's kernel. The finished cells stay, unfinished tasks write
+        nothing any more, and the same call goes on from there.
     Exception
         See `pipeline.runs.run.run`.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -207,15 +208,17 @@ def _complete(
             scheduler=where,
             echo=echo,
         )
-        for result in results:
-            log_timing(info, {**result, "at_s": round(time.perf_counter() - started, 4)})
-            packer.add(result["task"])
-            progress.add(result["cells"])
+        # closed at once, also by an error or a signal: only then may others use the directory
+        with contextlib.closing(results):
+            for result in results:
+                log_timing(info, {**result, "at_s": round(time.perf_counter() - started, 4)})
+                packer.add(result["task"])
+                progress.add(result["cells"])
     _require_all(info, plan, echo)
 
 
 def _require_all(info: RunInfo, plan: Plan, echo: Echo) -> None:
-    """Raise IncompleteError unless every task is committed; remove the files that stopped workers left."""
+    """Raise IncompleteError unless every task is committed; remove the files that stopped tasks left."""
     commits, problems = damaged_records(info, plan, contents=False)
     absent = [i for i in range(plan.n_tasks) if i not in commits or name_of(i) in problems]
     if absent:

@@ -1,7 +1,8 @@
 """Handle the signals that end a command: Ctrl-C, SIGTERM, and SIGHUP of a closing terminal.
 
-The first signal ends a command in order: current tasks are given up, workers end, temporary files and folders
-are removed. The second signal ends it at once. Before a command has begun, the first signal ends it at once.
+The first signal ends a command in order: current tasks are given up, the run directory is freed, temporary files are
+removed. A running kernel cannot be interrupted; the process ends without waiting for it. The second signal ends a
+command at once. Before a command has begun, the first signal ends it at once.
 """
 
 from __future__ import annotations
@@ -98,10 +99,7 @@ def end_if_stopped(code: int) -> None:
 
 
 def leave(number: int) -> NoReturn:
-    """End this process and its workers at once."""
-    local: Any = sys.modules.get("pipeline.compute.local")
-    if hasattr(local, "abandon"):  # absent while the module is being imported
-        local.abandon()
+    """End this process at once."""
     shown = "\x1b[?25h" if sys.stderr.isatty() else ""
     how = "stopped" if _listener.first is None else "stopped at once; committed results stay"
     with contextlib.suppress(OSError):

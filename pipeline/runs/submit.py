@@ -176,7 +176,7 @@ def prepare(
 
 
 def _command(cluster: Cluster, file: Path, spec: Path, place: str, smoke: bool) -> list[str]:
-    where = ["--scheduler", "local", "--workers", str(cluster.cores)]
+    where = ["--scheduler", "threads", "--workers", str(cluster.cores)]
     if not is_whole(cluster):
         where = ["--scheduler", cluster.kind, "--cluster", str(file.absolute())]
     python = cluster.python or sys.executable

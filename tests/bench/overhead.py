@@ -1,15 +1,13 @@
-"""What dask and the store cost on top of the kernel.
+"""What the store and the thread of a run cost on top of the kernel.
 
 Run it alone on a machine that does nothing else::
 
     python tests/bench/overhead.py [--seconds 60]
 
-A sweep with the default task size is computed twice in one run: in this process without a store, task
-by task, then through a local cluster of one worker into a run directory. The overhead is what the
-tasks of the cluster took on the wall from the first to the last, the start of the worker left out,
-over the kernel's time in this process. Two runs of the same numbers differ by several per cent on a
-busy machine, so the parts are printed as well: the kernel's time inside the worker, the writing, and
-the rest, which is dask. The target is 5 % of dask's.
+A sweep with the default task size is computed twice in one run: without a store, task by task, then by
+a thread into a run directory. The overhead is what the tasks took on the wall from the first to the last,
+over the kernel's time without the store. Two runs of the same numbers differ by several per cent on a
+busy machine, so the parts are printed as well: the kernel's time inside the run, the writing, and the rest.
 """
 
 from __future__ import annotations
@@ -58,10 +56,10 @@ def measure(seconds: float, folder: Path) -> dict[str, float]:
     inside, writing = (sum(line[key] for line in lines[1:]) for key in ("kernel_s", "write_s"))
     return {
         "tasks": plan.n_tasks,
-        "kernel in this process": kernel,
-        "kernel in the worker": inside + first["kernel_s"],
+        "kernel without a store": kernel,
+        "kernel in the run": inside + first["kernel_s"],
         "per cent, writing": 100 * writing / inside,
-        "per cent, dask": 100 * (whole - inside - writing) / inside,
+        "per cent, the rest": 100 * (whole - inside - writing) / inside,
         "per cent, both, over the kernel here": 100 * (whole / (kernel * (plan.n_tasks - 1) / plan.n_tasks) - 1),
     }
 

@@ -1,11 +1,12 @@
-"""How runs scale with workers, and how many workers one coordinator keeps busy.
+"""How runs scale with threads, and how many dask workers one coordinator keeps busy.
 
 Run it alone on a machine that does nothing else::
 
     python tests/bench/scaling.py [--seconds 30] [--workers 1000] [--task-seconds 20]
 
-*Strong scaling*: the same sweep with one worker and with two, from the first result to the last. *Weak
-scaling*: two workers with twice the cells against one with the cells once.
+*Strong scaling*: the same sweep with one thread and with two, from the first result to the last. *Weak
+scaling*: two threads with twice the cells against one with the cells once. The sweep is computed by two
+processes, too: they share no interpreter, so the ratio says what sharing it costs.
 
 *Ceiling*: a real scheduler, a real client and the window of `magpend run` in this process, and simulated
 workers in another: threads of dask `Worker` objects whose tasks sleep for a known time. All of them share an
@@ -58,14 +59,14 @@ THREADS = 50
 """Simulated workers per `Worker` object."""
 
 
-def wall_s(folder: Path, n: int, per_task: int, workers: int) -> float:
+def wall_s(folder: Path, n: int, per_task: int, workers: int, scheduler: str = "threads") -> float:
     """Seconds from the first result of a run to its last, for all of its tasks but the first ones."""
     path = folder / f"spec-{n}.toml"
     path.write_text(SPEC.format(n=n, per_task=per_task))
-    directory = folder / f"run-{n}-{workers}"
-    runs.run(path, directory, workers=workers, echo=lambda line: None)
+    directory = folder / f"run-{n}-{workers}-{scheduler}"
+    runs.run(path, directory, workers=workers, scheduler=scheduler, echo=lambda line: None)
     at = [json.loads(line)["at_s"] for line in (directory / "timings.jsonl").read_text().splitlines()]
-    # the first result of each worker holds the start of its process
+    # the first result of each process holds its start
     return (at[-1] - at[workers - 1]) * len(at) / (len(at) - workers)
 
 
@@ -75,11 +76,14 @@ def scaling(seconds: float, folder: Path) -> dict[str, float]:
     per_task = max(1, n // 2)
     one, two = (wall_s(folder, n, per_task, workers) for workers in (1, 2))
     twice = wall_s(folder, 2 * n, per_task, 2)
+    processes = wall_s(folder, n, per_task, 2, "processes")
     return {
-        "1 worker [s]": one,
-        "2 workers [s]": two,
+        "1 thread [s]": one,
+        "2 threads [s]": two,
+        "2 processes [s]": processes,
         "strong speed-up": one / two,
-        "2 workers, twice the cells [s]": twice,
+        "time of threads over processes": two / processes,
+        "2 threads, twice the cells [s]": twice,
         "weak speed-up": 2 * one / twice,
     }
 

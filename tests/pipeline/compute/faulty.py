@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import gc
 import os
 import signal
 import time
-import tracemalloc
 from pathlib import Path
 
 
@@ -18,14 +16,15 @@ def log(folder: str, index: int) -> int:
     return path.stat().st_size
 
 
-def fine(folder: str, index: int) -> dict:
-    log(folder, index)
-    return {"task": index}
+def tries(folder: str | Path) -> dict[int, int]:
+    """How often each task began."""
+    return {int(path.name): path.stat().st_size for path in Path(folder).iterdir()}
 
 
 def raising(folder: str, index: int, poison: tuple = (), unlucky: tuple = ()) -> dict:
-    """Some tasks always fail, some the first time."""
+    """Some tasks always fail, some the first time; all print something."""
     tries = log(folder, index)
+    print(index)
     if index in poison or (index in unlucky and tries == 1):
         raise RuntimeError("out of luck")
     return {"task": index}
@@ -49,25 +48,7 @@ def hanging(folder: str, index: int, number: int = 0, unlucky: tuple = (), poiso
     return {"task": index}
 
 
-def greedy(folder: str, index: int, poison: tuple = ()) -> dict:
-    """Some tasks take all memory that there is."""
-    log(folder, index)
-    held = []
-    while index in poison and len(held) < 60:
-        held.append(b"x" * 50_000_000)
-        time.sleep(0.02)
-    return {"task": index}
-
-
 def slow(folder: str, index: int, seconds: float = 0.2) -> dict:
     log(folder, index)
     time.sleep(seconds)
     return {"task": index}
-
-
-def traced() -> int:
-    """Bytes that this process holds, counted from the first call on."""
-    if not tracemalloc.is_tracing():
-        tracemalloc.start()
-    gc.collect()
-    return tracemalloc.get_traced_memory()[0]

@@ -212,11 +212,11 @@ CLUSTER = '[cluster]\nkind = "slurm"\ncores = 2\nmemory = "4 GB"\nwalltime = "01
 
 def test_where__default_and_environment(monkeypatch):
     monkeypatch.delenv("DASK_SCHEDULER_ADDRESS", raising=False)
-    assert Where().resolved() == "local"
+    assert Where().resolved() == "threads"
     monkeypatch.setenv("DASK_SCHEDULER_ADDRESS", "tcp://host:1")
     assert Where().resolved() == Address("tcp", "host", 1, "DASK_SCHEDULER_ADDRESS")
-    assert Where("local").resolved() == "local"
-    assert Where("none").resolved() == "none"
+    for place in ("threads", "processes", "none"):
+        assert Where(place).resolved() == place
     monkeypatch.setenv("DASK_SCHEDULER_ADDRESS", "nonsense")
     with pytest.raises(SpecError, match="DASK_SCHEDULER_ADDRESS: 'nonsense' is no address"):
         Where().resolved()
@@ -230,8 +230,8 @@ def test_where__jobs_need_a_file(tmp_path, monkeypatch):
     path.write_text(CLUSTER)
     with pytest.raises(SpecError, match="describes jobs of slurm"):
         Where("pbs", path).resolved()
-    with pytest.raises(SpecError, match="and --scheduler local asks for none"):
-        Where("local", path).resolved()
+    with pytest.raises(SpecError, match="and --scheduler threads asks for none"):
+        Where("threads", path).resolved()
 
 
 def test_where__no_batch_system_here(tmp_path, monkeypatch):
@@ -245,11 +245,16 @@ def test_where__no_batch_system_here(tmp_path, monkeypatch):
         Where("slurm").resolved()
 
 
-def test_where__dashboard_without_its_package(monkeypatch):
+def test_where__dashboard_without_its_package_or_a_scheduler(tmp_path, monkeypatch):
+    path = tmp_path / "cluster.toml"
+    path.write_text(CLUSTER)
     monkeypatch.setattr(clients, "find_spec", lambda name: None)
+    monkeypatch.setattr(clients, "check_means", lambda cluster: None)
     with pytest.raises(SpecError, match=r"needs bokeh; install it: pip install 'magpend\[dashboard\]'"):
-        Where("local", dashboard=True).resolved()
-    Where("none", dashboard=True).resolved()
+        Where("slurm", path, dashboard=True).resolved()
+    for place in ("threads", "processes", "none"):
+        with pytest.raises(SpecError, match="--dashboard: shows a dask scheduler, and there is none"):
+            Where(place, dashboard=True).resolved()
 
 
 def test_run__wrong_address(main, tmp_path, write_spec, sweep_text):

@@ -121,7 +121,8 @@ def test_time_line__counts_files_and_start_up(sweep_text, monkeypatch):
     line = preview.time_line(spec, plan, 1.0, 20_000, 2)
     assert "about 7.0 min of one core, 6.9 min on 2" in line or "7 min" in line, line
     assert "writing a task takes 20 ms" in line
-    assert estimates.wall_seconds(420.0, 20_000, 2) == estimates.START_S + 410.0
+    assert estimates.wall_seconds(420.0, 20_000, 2) == 210.0
+    assert estimates.wall_seconds(420.0, 1, 2) == 420.0
     assert estimates.wall_seconds(420.0, 20_000, 0) == 420.0
 
 

@@ -11,7 +11,6 @@ import sys
 import time
 from pathlib import Path
 
-import psutil
 import pytest
 
 from tests.pipeline.factories import quietly
@@ -57,16 +56,6 @@ def n_committed(folder):
     return len(list((folder / "run" / "commits").glob("*.json")))
 
 
-def workers_of(process):
-    """Worker processes that a process has started; the tracker of semaphores ends with it."""
-    found = psutil.Process(process).children(recursive=True)
-    words = []
-    for child in found:
-        with contextlib.suppress(psutil.NoSuchProcess):
-            words.append(" ".join(child.cmdline()))
-    return [line for line in words if "resource_tracker" not in line]
-
-
 @pytest.fixture
 def kernel(tmp_path, around):
     """Run the code of a cell in a kernel; interrupt it when `when` is true. Returns the messages of its outputs."""
@@ -93,7 +82,6 @@ def kernel(tmp_path, around):
 
     try:
         client.wait_for_ready(timeout=PATIENCE_S)
-        cell.process = manager.provisioner.pid
         yield cell
     finally:
         client.stop_channels()
@@ -107,8 +95,6 @@ def test_run__interrupted_in_a_cell_goes_on_with_the_same_cell(kernel, whole, tm
     assert (kind, content["ename"]) == ("error", "KeyboardInterrupt")
     assert content["traceback"] == ["Stopped. The finished cells stay in run; the same call goes on from there."]
     assert not any("not reached" in content["text"] for kind, content in stopped if kind == "stream")
-    assert workers_of(kernel.process) == []
-    assert list((tmp_path / "temporary").glob("magpend-workers-*")) == []
     before = n_committed(tmp_path)
     assert 2 <= before < 16
     again = kernel(CELL + COMPUTE + "print('complete:', run.complete)\n")
@@ -123,10 +109,12 @@ def test_run__interrupted_in_a_cell_goes_on_with_the_same_cell(kernel, whole, tm
     assert sum(content["text"].count("\n") for kind, content in again if kind == "stream") <= 4
 
 
-def test_run__interrupted_in_a_script_goes_on_with_the_same_script(around, whole, tmp_path, bytes_of):
-    """The script has no ``if __name__ == "__main__"``: workers do not run it."""
-    script = tmp_path / "script.py"
-    script.write_text(f"print('begun', flush=True)\n{CELL}{COMPUTE}print('complete:', run.complete)\n", "utf-8")
+@pytest.mark.slow
+@pytest.mark.parametrize("scheduler", ["threads", "processes"])
+def test_run__interrupted_in_a_script_goes_on_with_the_same_script(around, whole, tmp_path, bytes_of, scheduler):
+    """The script has no ``if __name__ == "__main__"``: processes do not run it."""
+    script, compute = tmp_path / "script.py", COMPUTE.replace("=2", f"=2, scheduler={scheduler!r}")
+    script.write_text(f"print('begun', flush=True)\n{CELL}{compute}print('complete:', run.complete)\n", "utf-8")
 
     def begin():
         return subprocess.Popen(
@@ -153,7 +141,6 @@ def test_run__interrupted_in_a_script_goes_on_with_the_same_script(around, whole
     assert err.splitlines()[-1].endswith("Stopped. The finished cells stay in run; the same call goes on from there.")
     assert out.count("begun") == 1
     assert "complete" not in out
-    assert list((tmp_path / "temporary").glob("magpend-workers-*")) == []
     assert 2 <= n_committed(tmp_path) < 16
     process = begin()
     out, err = process.communicate(timeout=PATIENCE_S)

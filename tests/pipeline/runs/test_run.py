@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import os
 import signal
+import threading
 import time
 import tomllib
 
@@ -15,10 +17,10 @@ import pytest
 from magpend import Spec
 from magpend_core import load_preset, run_branches
 from pipeline import open_run
-from pipeline.compute import clients, task
+from pipeline.compute import task
 from pipeline.compute.execute import TaskFailedError
-from pipeline.compute.local import local_cluster
 from pipeline.runs.preview import describe_plan
+from pipeline.runs.progress import Progress
 from pipeline.runs.run import InterruptedRunError, run
 from pipeline.runs.status import state
 from pipeline.specification.parsing import parse_spec
@@ -78,19 +80,34 @@ def test_run__sweep_is_what_the_kernel_says(write_spec, sweep_text, tmp_path):
     assert int(cell.n_steps) == expected.n_steps[0, 0]
 
 
-def test_run__same_bytes_with_workers(write_spec, sweep_text, walk_text, tmp_path, bytes_of, monkeypatch):
-    with local_cluster(2) as cluster:
-        # one for all runs: workers take seconds to start
-        monkeypatch.setattr(clients, "local_cluster", lambda *n, **more: contextlib.nullcontext(cluster))
-        texts = {"sweep": sweep_text, "walk": walk_text, "drift": DRIFT, "noise": NOISE}
-        for kind, text in texts.items():
-            path, found = write_spec(text, f"{kind}.toml"), []
-            for workers in (0, 2):
-                directory = tmp_path / f"{kind}{workers}"
-                assert run(path, directory, workers=workers, echo=silent).complete
-                found.append(bytes_of(directory))
-            assert found[0] == found[1], kind
-            assert sum(key.startswith("commits/") for key in found[0]) > 2, kind
+@pytest.mark.parametrize("kind", ["sweep", "walk", "drift", "noise"])
+def test_run__same_bytes_everywhere(write_spec, sweep_text, walk_text, tmp_path, bytes_of, kind):
+    path = write_spec({"sweep": sweep_text, "walk": walk_text, "drift": DRIFT, "noise": NOISE}[kind])
+    places = [(0, None), (1, "threads"), (2, "threads"), (3, "threads")]
+    places += [(2, "processes")] if kind == "walk" else []
+    found = []
+    for workers, scheduler in places:
+        directory = tmp_path / f"{scheduler}{workers}"
+        assert run(path, directory, workers=workers, scheduler=scheduler, echo=silent).complete
+        found.append(bytes_of(directory))
+    assert all(other == found[0] for other in found[1:])
+    assert sum(key.startswith("commits/") for key in found[0]) > 2
+
+
+def test_run__in_another_thread_and_inside_an_event_loop(write_spec, walk_text, tmp_path):
+    path, done = write_spec(walk_text), []
+
+    async def compute():
+        done.append(run(path, tmp_path / "loop", workers=2, echo=silent).complete)
+
+    def loop():
+        asyncio.run(compute())
+        done.append(run(path, tmp_path / "thread", workers=2, echo=silent).complete)
+
+    thread = threading.Thread(target=loop)
+    thread.start()
+    thread.join()
+    assert done == [True, True]
 
 
 def test_run__numbers_do_not_depend_on_the_tasks(write_spec, sweep_text, tmp_path):
@@ -235,28 +252,20 @@ def test_kill__resumed_run_has_the_same_bytes(uninterrupted, start, tmp_path, by
     assert bytes_of(directory) == bytes_of(uninterrupted / kind)
 
 
-def workers_of(process):
-    """Processes that compute for a run: not the one that keeps track of shared resources."""
-    with contextlib.suppress(psutil.Error):
-        children = psutil.Process(process.pid).children(recursive=True)
-        return [child for child in children if any("spawn_main" in word for word in child.cmdline())]
-    return []
-
-
-def test_kill__of_workers_over_and_over_loses_nothing(uninterrupted, start, tmp_path, bytes_of):
-    """A worker dies with every second task that is committed; those that live and new ones do the rest."""
+def test_kill__of_processes_over_and_over_loses_nothing(uninterrupted, start, tmp_path, bytes_of):
+    """A process dies with every third task that is committed; those that live and new ones do the rest."""
     rng = np.random.default_rng(4)
     spec, directory = uninterrupted / "sweep.toml", tmp_path / "run"
-    process = start("run", spec, "--out", directory, "--workers", 2)
+    process = start("run", spec, "--out", directory, "--workers", 2, "--scheduler", "processes")
     killed = 0
-    for count in range(2, 14, 2):
+    for count in range(2, 14, 3):
         wait_for_commits(process, directory, count)
-        if found := workers_of(process):
-            with contextlib.suppress(psutil.NoSuchProcess):
-                found[rng.integers(len(found))].kill()
-                killed += 1
+        with contextlib.suppress(psutil.NoSuchProcess):
+            found = psutil.Process(process.pid).children()
+            found[rng.integers(len(found))].kill()
+            killed += 1
     out, err = process.communicate(timeout=240)
-    assert killed >= 4
+    assert killed >= 3
     assert process.returncode == 0, (out, err)
     assert "Traceback" not in err
     assert state(directory).complete
@@ -300,11 +309,17 @@ def test_scheduler__existing_one(write_spec, sweep_text, tmp_path, bytes_of, mon
         assert bytes_of(tmp_path / name) == bytes_of(tmp_path / "alone")
 
 
-def test_local_cluster__listens_on_loopback_only():
-    with clients.connected(clients.Where("local"), 1) as client:
-        assert len(client.nthreads()) == 1
+@pytest.mark.parametrize("scheduler", ["threads", "processes"])
+def test_run__on_this_machine_listens_nowhere(write_spec, sweep_text, tmp_path, monkeypatch, scheduler):
+    def look(self, cells):
         processes = [psutil.Process(), *psutil.Process().children(recursive=True)]
-        listening = {
-            c.laddr.ip for p in processes for c in p.net_connections(kind="inet") if c.status == psutil.CONN_LISTEN
-        }
-    assert listening == {"127.0.0.1"}
+        listening.update(
+            c.laddr for p in processes for c in p.net_connections(kind="inet") if c.status == psutil.CONN_LISTEN
+        )
+
+    listening = set()
+    look(None, 0)
+    before = set(listening)
+    monkeypatch.setattr(Progress, "add", look)
+    run(write_spec(sweep_text), tmp_path / "run", workers=1, scheduler=scheduler, echo=silent)
+    assert listening == before

@@ -1,4 +1,4 @@
-"""Many small tasks: memory and file handles of coordinator and workers stay where they are.
+"""Many small tasks: memory and file handles stay where they are.
 
 150 tasks as part of the suite; ``MAGPEND_LONG=1`` takes 10,000.
 """
@@ -26,7 +26,7 @@ SPEC = duffing(AXES, 'kind = "grid"\nx = 0.5\nv = 0.1', execution="trajectories_
 
 
 class Watch:
-    """Memory and open files of this process and its workers, every so many tasks."""
+    """Memory and open files of this process and its children, every so many tasks."""
 
     def __init__(self) -> None:
         self.n = 0
@@ -49,13 +49,14 @@ def test_run__many_small_tasks_in_flat_memory(write_spec, tmp_path, monkeypatch)
     watch = Watch()
     original = runs.log_timing
     monkeypatch.setattr(runs, "log_timing", lambda *arguments: watch.look() or original(*arguments))
-    runs.run(write_spec(SPEC), tmp_path / "run", workers=1, echo=lambda line: None)
+    where = {"workers": 1, "scheduler": "processes"}
+    runs.run(write_spec(SPEC), tmp_path / "run", **where, echo=lambda line: None)
     assert state(tmp_path / "run").complete
     found = verify_run(tmp_path / "run")
     assert (found.sound, found.leftovers) == (True, [])
     assert len(list((tmp_path / "run/commits").iterdir())) == N_TASKS // 1000 + N_TASKS % 1000
     long_lived = [samples for samples in watch.seen.values() if len(samples) > 25]
-    assert len(long_lived) >= 2  # the coordinator and its worker at least
+    assert len(long_lived) >= 2  # this process and its child at least
     for samples in long_lived:
         later = samples[len(samples) // 3 :]
         n = later[-1].n - later[0].n

@@ -183,7 +183,7 @@ def test_submit__dry_run(main, tmp_path, write_spec, cluster):
     code, out, _ = main(*words)
     assert code == 0
     program = ["exec", sys.executable, "-m", "pipeline.cli.main"]
-    here = ["run", str(path), "--out", str(tmp_path / "out"), "--scheduler", "local", "--workers", "4"]
+    here = ["run", str(path), "--out", str(tmp_path / "out"), "--scheduler", "threads", "--workers", "4"]
     assert shlex.split(job_file(out).splitlines()[-1]) == program + here
     for line in (
         "work: 1 cells in 1 tasks; at most 2 periods; cube ",

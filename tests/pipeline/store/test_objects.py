@@ -411,10 +411,11 @@ def test_place__never_becomes_a_path(s3, main, write_spec, monkeypatch, tmp_path
 
 
 def test_run__credentials_are_nowhere(s3, write_spec, magpend, environment, tmp_path):
-    """A worker process that opens the store itself; nothing written or said names a key."""
+    """A process that opens the store itself; nothing written or said names a key."""
     write_spec(DUFFING)
     environment.update({name: value for name, value in os.environ.items() if name.startswith("AWS_")})
-    done = magpend("run", "spec.toml", "--out", PLACE, "--workers", 1, "--verbose", "--log", "run.log")
+    words = ("--out", PLACE, "--scheduler", "processes", "--workers", 1)
+    done = magpend("run", "spec.toml", *words, "--verbose", "--log", "run.log")
     assert done.returncode == 0, done.stderr
     assert state(PLACE).complete
     files = open_files(PLACE)

@@ -1,0 +1,118 @@
+"""Run tasks in processes of this machine: a task that crashes, or is killed for its memory, takes nothing else along.
+
+Each thread of `pipeline.compute.threads` starts a process and talks to it through pipes, which nobody else can reach.
+A process reads tasks from its standard input. When that ends, however this process ended, it ends too.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import pickle
+import subprocess
+import sys
+import threading
+from queue import SimpleQueue
+from typing import Any, NoReturn
+
+from pipeline.compute.order import why
+from pipeline.compute.threads import Task
+
+
+class ProcessError(Exception):
+    """Raised if a task failed in its process, or if the process died."""
+
+
+class Processes:
+    """Task that each thread runs in a process of its own, which is replaced if it dies.
+
+    A process does not import the main module, so a script needs no ``if __name__ == "__main__"``.
+    """
+
+    def __init__(self, task: Task) -> None:
+        self._task = pickle.dumps(task)
+        self._own = threading.local()
+        self._started: list[subprocess.Popen[bytes]] = []
+        self._lock = threading.Lock()
+        self._is_closed = False
+
+    def __call__(self, index: int) -> dict[str, Any]:
+        """Run the task in the process of this thread.
+
+        Raises
+        ------
+        ProcessError
+            If it fails there, or the process dies.
+        """
+        process: subprocess.Popen[bytes] = getattr(self._own, "process", None) or self._start()
+        assert process.stdin
+        assert process.stdout
+        try:
+            pickle.dump((self._task, index), process.stdin)
+            process.stdin.flush()
+            result, reason = pickle.load(process.stdout)
+        except (OSError, EOFError, pickle.UnpicklingError):
+            self._own.process = None
+            _end(process)
+            raise ProcessError("its process died (out of memory, or killed)") from None
+        if reason:
+            raise ProcessError(reason)
+        return dict(result)
+
+    def _start(self) -> subprocess.Popen[bytes]:
+        # the same folders, also those that were added since the start of Python
+        code = f"import sys; sys.path[:] = {sys.path!r}; from {__name__} import serve; serve()"
+        with self._lock:
+            if self._is_closed:
+                raise ProcessError("the run has ended")
+            self._own.process = process = subprocess.Popen(
+                [sys.executable, "-c", code],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                start_new_session=True,  # Ctrl-C in the terminal is for this process alone
+            )
+            self._started.append(process)
+        return process
+
+    def close(self) -> None:
+        """Kill all processes, without waiting for their tasks."""
+        with self._lock:
+            self._is_closed = True
+        for process in self._started:
+            _end(process)
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    process.kill()
+    process.wait()
+    for pipe in (process.stdin, process.stdout):
+        with contextlib.suppress(OSError):  # a request may not have left the buffer
+            pipe.close()  # type: ignore[union-attr]
+
+
+def serve() -> NoReturn:
+    """Run tasks in this process until its standard input ends: a pickled task and an index each, answered by the result
+    and the reason of a failure.
+    """
+    answers = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)  # what a task prints must not get among the answers
+    logging.disable()  # the process that sends the tasks says the same
+    requests: SimpleQueue[tuple[bytes, int]] = SimpleQueue()
+    threading.Thread(target=_listen, args=(requests,), daemon=True).start()
+    while True:
+        task, index = requests.get()
+        try:
+            answer = pickle.loads(task)(index), ""
+        except Exception as error:
+            answer = {}, why(error)
+        pickle.dump(answer, answers)
+        answers.flush()
+
+
+def _listen(requests: SimpleQueue[tuple[bytes, int]]) -> None:
+    """Read requests beside the running task, so that the end of the input ends this process at once."""
+    with contextlib.suppress(EOFError):
+        while True:
+            requests.put(pickle.load(sys.stdin.buffer))
+    os._exit(0)
