@@ -74,10 +74,10 @@ def run_tasks(
     if place == IN_PROCESS or workers == 0:
         yield from _in_calling_thread(task, order)
     elif place == THREADS:
-        yield from in_threads(task, order, n_workers)
+        yield from in_threads(task, indices, after, order, n_workers)
     elif place == PROCESSES:
         with contextlib.closing(Processes(task)) as processes:
-            yield from in_threads(processes, order, n_workers)
+            yield from in_threads(processes, indices, after, order, n_workers)
     else:
         from pipeline.compute.dispatch import Window
         from pipeline.compute.probe import Fitting

@@ -1,4 +1,4 @@
-"""Run tasks in threads of this process.
+"""Run tasks in threads of this process, by dask's threaded scheduler.
 
 The compiled kernel releases the GIL, and it takes nearly all of a task's time. So threads compute as fast as processes
 do, with one start of Python, one compilation and one copy of the modules in memory.
@@ -11,12 +11,16 @@ from __future__ import annotations
 
 import contextlib
 import threading
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Collection, Generator, Sequence
 from contextvars import ContextVar
+from functools import partial
+from multiprocessing.pool import ThreadPool
 from queue import SimpleQueue
 from typing import Any
 
-from pipeline.compute.order import Order, why
+from dask.threaded import get
+
+from pipeline.compute.order import Order, Predecessor, why
 
 Task = Callable[[int], dict[str, Any]]
 
@@ -44,6 +48,11 @@ class Gate:
             self._n_inside -= 1
             self._changed.notify_all()
 
+    @property
+    def is_closed(self) -> bool:
+        """Whether the run has ended."""
+        return self._is_closed
+
     def close(self) -> None:
         """Let no task enter any more, and wait for those that are writing."""
         with self._changed:
@@ -59,51 +68,80 @@ def writing_results() -> contextlib.AbstractContextManager[None]:
     return _gate.get() or contextlib.nullcontext()
 
 
-def in_threads(task: Task, order: Order, n_threads: int) -> Generator[dict[str, Any], None, None]:
-    """Run the tasks of an order in threads, and yield the results as they come.
+def in_threads(
+    task: Task, indices: Sequence[int], after: Predecessor | None, order: Order, n_threads: int
+) -> Generator[dict[str, Any], None, None]:
+    """Run tasks on dask's threaded scheduler, and yield the results as they come.
 
     If the generator is closed or raises, no task writes anything after that, see `writing_results`.
+
+    Parameters
+    ----------
+    task
+        Function of an index.
+    indices, after
+        As for `pipeline.compute.execute.run_tasks`.
+    order
+        Books of the same tasks: failed ones are tried again alone, at the end.
+    n_threads
+        Number of threads.
 
     Raises
     ------
     TaskFailedError
         As soon as so many tasks have failed that the cause cannot lie in single tasks.
     """
-    waiting: SimpleQueue[int | None] = SimpleQueue()
-    ended: SimpleQueue[tuple[int, dict[str, Any], str]] = SimpleQueue()
+    ended: SimpleQueue[tuple[int, dict[str, Any], str] | None] = SimpleQueue()
     gate = Gate()
 
-    def work() -> None:
+    def attempt(index: int, *is_done: bool) -> bool:
+        """Run a task whose predecessor is done, and return whether it is done as well."""
+        if gate.is_closed or not all(is_done):
+            return False
         _gate.set(gate)
-        while (index := waiting.get()) is not None:
-            try:
-                result, reason = task(index), ""
-            except BaseException as error:
-                result, reason = {}, why(error)
-            ended.put((index, result, reason))
+        try:
+            result, reason = task(index), ""
+        except BaseException as error:
+            result, reason = {}, why(error)
+        ended.put((index, result, reason))
+        return not reason
 
-    n_running = 0
+    def compute(chosen: Collection[int]) -> None:
+        graph = {}
+        for index in chosen:
+            before = after(index) if after else None
+            graph[f"task {index}"] = (partial(attempt, index), *[f"task {before}"] * (before in chosen))
+        # its threads are daemons: the end of Python does not wait for a kernel
+        with contextlib.closing(ThreadPool(n_threads)) as pool:
+            try:
+                get(graph, list(graph), pool=pool)
+            finally:
+                ended.put(None)
+
+    tried: set[int] = set()
+    chosen: Collection[int] = set(indices)
     try:
-        for _ in range(n_threads):
-            # daemons: the end of Python does not wait for a kernel
-            threading.Thread(target=work, name="magpend task", daemon=True).start()
-        while True:
-            while n_running < n_threads and (index := order.take()) is not None:
-                waiting.put(index)
-                n_running += 1
-            if not n_running:
-                if (index := order.take_failed()) is None:
-                    return
-                waiting.put(index)
-                n_running = 1
-            index, result, reason = ended.get()
-            n_running -= 1
-            if reason:
-                order.failed(index, reason)
-            else:
-                order.done(index)
-                yield result
+        while chosen:
+            threading.Thread(target=compute, args=(chosen,), daemon=True).start()
+            while (end := ended.get()) is not None:
+                index, result, reason = end
+                tried.add(index)
+                if reason:
+                    order.failed(index, reason)
+                else:
+                    order.done(index)
+                    yield result
+            chosen = _rest(order, tried)
     finally:
-        for _ in range(n_threads):
-            waiting.put(None)
         gate.close()
+
+
+def _rest(order: Order, tried: Collection[int]) -> list[int]:
+    """Return the tasks that wait for one that was tried again with success, or the next one to try again."""
+    ready = []
+    while (index := order.take()) is not None:
+        ready.append(index)
+    ready = [index for index in ready if index not in tried]
+    if not ready and (index := order.take_failed()) is not None:
+        ready.append(index)
+    return ready
