@@ -5,7 +5,7 @@
 FROM python:3.12-slim AS build
 WORKDIR /source
 COPY . .
-RUN python -m venv /opt/magpend && /opt/magpend/bin/python -m pip install --quiet --no-cache-dir .
+RUN python -m venv /opt/magpend && /opt/magpend/bin/python -m pip install --quiet --no-cache-dir '.[cluster]'
 
 FROM python:3.12-slim
 COPY --from=build /opt/magpend /opt/magpend

@@ -7,7 +7,6 @@ import os
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +14,7 @@ from pipeline.compute.addresses import OPTION, Address, SchedulerError, ask, rea
 from pipeline.compute.jobqueue import check_means, job_cluster, jobs_folder
 from pipeline.compute.probe import check_directory, check_versions
 from pipeline.specification.clusters import QUEUES, Cluster, clock, load_cluster, seconds_of
+from pipeline.specification.extras import import_extra
 from pipeline.specification.problems import SpecError
 
 Echo = Callable[[str], None]
@@ -72,8 +72,10 @@ class Where:
                 "--dashboard: shows a dask scheduler, and there is none on this machine; leave it out, or give "
                 "--scheduler an address or a batch system."
             )
-        if self.dashboard and isinstance(found, Cluster) and not find_spec("bokeh"):
-            raise SpecError("--dashboard: needs bokeh; install it: pip install 'magpend[dashboard]'.")
+        if isinstance(found, Address):
+            import_extra("distributed", "cluster", OPTION)
+        if self.dashboard and isinstance(found, Cluster):
+            import_extra("bokeh", "dashboard", "--dashboard")
         return found
 
     def _resolved(self) -> Address | Cluster | str:

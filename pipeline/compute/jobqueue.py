@@ -7,12 +7,12 @@ import os
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 from pipeline.compute.addresses import SchedulerError
 from pipeline.specification.clusters import Cluster, hours_and_minutes
+from pipeline.specification.extras import import_extra
 from pipeline.specification.problems import SpecError
 
 JOB_NAME = "magpend-worker"
@@ -27,7 +27,6 @@ COMMANDS = {"slurm": "sbatch", "pbs": "qsub", "torque": "qsub", "sge": "qsub", "
 """Commands that submit a batch script."""
 
 _THREADS = ("export NUMBA_NUM_THREADS=1", "export OMP_NUM_THREADS=1")
-_NO_JOBQUEUE = "{kind}: needs dask-jobqueue, which is not installed: pip install 'magpend[cluster]'."
 _MEANWHILE_S = 60
 _TARGET = "0.1 s"
 """Target duration of the tasks in flight: short, since only few tasks per worker are in flight."""
@@ -41,16 +40,12 @@ def check_means(cluster: Cluster) -> None:
     SpecError
         If an extra is not installed or a command is not found; the message names it.
     """
-    problems = []
-    if not find_spec("dask_jobqueue"):
-        problems.append(_NO_JOBQUEUE.format(kind=cluster.kind))
+    import_extra("dask_jobqueue", "cluster", cluster.kind)
     if not shutil.which(COMMANDS[cluster.kind]):
-        problems.append(
+        raise SpecError(
             f"{cluster.kind}: there is no command {COMMANDS[cluster.kind]!r} here; use a machine that "
             "sends jobs, such as the login node."
         )
-    if problems:
-        raise SpecError(problems)
 
 
 def jobs_folder(place: str) -> Path:
@@ -121,9 +116,7 @@ def worker_script(cluster: Cluster, folder: Path) -> str:
     SpecError
         If dask-jobqueue is not installed.
     """
-    if not find_spec("dask_jobqueue"):
-        raise SpecError(_NO_JOBQUEUE.format(kind=cluster.kind))
-    import dask_jobqueue
+    dask_jobqueue = import_extra("dask_jobqueue", "cluster", cluster.kind)
     from distributed import Security
 
     kind = getattr(dask_jobqueue, _CLASSES[cluster.kind]).job_cls
