@@ -72,11 +72,6 @@ def _three_rates(y, u, c):
 
 
 @inline
-def _one_rate(y, u, c):
-    return (y[1],)
-
-
-@inline
 def _bare_rate(y, u, c):
     return y[1]
 
@@ -95,7 +90,6 @@ def _nowhere_finite(y, u, c):
     ("rhs", "words"),
     [
         (_three_rates, r"rhs returns 3 numbers; .* tuple of 2: .*\(x, v\)"),
-        (_one_rate, "rhs returns 1 numbers; it must return a tuple of 2"),
         (_bare_rate, "rhs returns a ndarray; it must return a tuple of 2"),
         (_beyond_states, "rhs fails: IndexError: tuple index out of range"),
         (_nowhere_finite, "rhs is finite at none of 16 states"),
