@@ -76,15 +76,6 @@ def test_trajectory__meets_the_sections(preset):
         assert np.max(abs(found - kept.section[0])[:, 2:]) < 1e-10
 
 
-def test_trajectory__angles_are_continuous_over_turns(preset):
-    times = np.linspace(0.0, 2.0 / FREQUENCY, 4001)
-    found = trajectory(preset, FREQUENCY, [3.0, -3.0, 60.0, -50.0], times)
-    # steps of the angles are rate times time, nowhere 2 pi
-    expected = 0.5 * (found[1:, 2:] + found[:-1, 2:]) * np.diff(times)[:, None]
-    assert np.max(abs(np.diff(found[:, :2], axis=0) - expected)) < 1e-4
-    assert np.ptp(found[:, 0]) > 4.0 * np.pi
-
-
 def test_trajectory__grid_does_not_change_the_motion(preset):
     fine = np.linspace(0.0, 4.3 / FREQUENCY, 1201)
     whole = trajectory(preset, FREQUENCY, START, fine)

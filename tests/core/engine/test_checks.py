@@ -107,12 +107,6 @@ def _too_few_constants(frequency, p, out):
 
 
 @inline
-def _too_many_constants(frequency, p, out):
-    for i in range(6):
-        out[i] = frequency
-
-
-@inline
 def _beyond_parameters(frequency, p, out):
     for i in range(5):
         out[i] = p[i]
@@ -129,7 +123,6 @@ def _infinite_constant(frequency, p, out):
     ("constants", "words"),
     [
         (_too_few_constants, ("number 4 is nan", "n_constants = 5")),
-        (_too_many_constants, ("constants fails: IndexError", "size 5")),
         (_beyond_parameters, ("constants fails: IndexError", "size 4")),
     ],
 )

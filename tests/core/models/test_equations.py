@@ -128,22 +128,6 @@ def gap(y, parameters):
     return dx, dy
 
 
-def test_magnet_torque__sum_tends_to_the_moment_as_delta_goes_to_0():
-    y = near_magnet(400, 6)
-    dx, _ = gap(y, load_preset())
-    y = y[abs(dx) > 3e-3]
-    errors = []
-    for delta in (1e-3, 5e-4, 1e-9):
-        f = torques(0.0, y, load_preset(delta=delta), 2.0)
-        errors.append(np.abs(f.magnet_torque.sum(axis=1) - f.magnet_moment))
-    assert (errors[2] <= 1e-14).all()
-    # second order in delta
-    large = errors[0] > 1e-8
-    assert large.sum() > 50
-    ratio = errors[0][large] / errors[1][large]
-    assert ((ratio > 3.6) & (ratio < 4.0001)).all()
-
-
 def test_magnet_torque__sum_with_regularisation(preset):
     # Fx h = M_M and Fy = Fx dy dx/(dx^2 + delta^2) give Q1 + Q2 = M_M (1 - dy/h delta^2/(dx^2 + delta^2))
     y = near_magnet(400, 7)
