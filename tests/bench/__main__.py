@@ -13,38 +13,18 @@ from pathlib import Path
 
 FOLDER = Path(__file__).parent
 SMALL = ["--trajectories", "16", "--periods", "2", "--rounds", "1"]
+SCIPY = ["--scipy-trajectories", "1", "--scipy-periods", "1"]
 TINY = {
-    "basins": [
-        "--size",
-        "4",
-        "--bands",
-        "2",
-        "--transient",
-        "300",
-        "--scipy-trajectories",
-        "1",
-        "--scipy-periods",
-        "1",
-    ],
+    "basins": ["--size", "4", "--bands", "2", "--transient", "300", *SCIPY],
     "costs": SMALL,
     "coverage": ["--rigs", "1", "--draws", "10"],
-    "curves": ["--points", "2", "--rounds", "1"],
-    "identification": ["--rounds", "1", "--pieces", "1"],
     "kernel": [*SMALL, "--tolerances", "1e-4", "--part", "here"],
-    "many_tasks": ["100"],
-    "multistable_pendulum": ["--starts", "200", "--rounds", "1"],
-    "object_store": ["--tasks", "2", "--latency-ms", "1"],
-    "overhead": ["--seconds", "2"],
     "peers": [*SMALL, "--models", "lorenz", "pendulum", "--points"],
     "same_set": ["--cells", "6", "--cases", "Ueda"],
     "scaling": ["--seconds", "0", "--workers", "4", "--task-seconds", "0.05", "--rounds", "3"],
-    "text_models": [*SMALL, "--pairs", "duffing", "--oscillators", "belt", "--models", "lorenz"],
     "virtual_rig": ["--seeds", "0"],
 }
 """Options of the smallest size of each benchmark."""
-
-DEFAULTS = {"many_tasks": ["10000"]}
-"""Arguments of those that need some."""
 
 
 def main() -> int:
@@ -56,7 +36,7 @@ def main() -> int:
     failed = []
     for name in options.names or TINY:
         print(f"== {name}", flush=True)
-        words = TINY[name] if options.tiny else DEFAULTS.get(name, [])
+        words = TINY[name] if options.tiny else []
         if subprocess.run([sys.executable, FOLDER / f"{name}.py", *words], check=False).returncode:
             failed.append(name)
     print("failed: " + ", ".join(failed) if failed else "all ran")

@@ -133,13 +133,6 @@ def test_lyapunov__a_cell_depends_on_itself_alone(mixed):
         assert (a[4] == getattr(alone, name)[0]).all(), name
 
 
-def test_lyapunov__blocks_average_to_the_exponents(mixed):
-    found = lyapunov_exponents(*mixed[:3], **mixed[3])
-    assert found.blocks.shape == (18, 4, 4)
-    assert found.blocks.mean(axis=1) == pytest.approx(found.exponents, abs=1e-12)
-    assert found.stderr == pytest.approx(found.blocks.std(axis=1, ddof=1) / 2.0, abs=1e-12)
-
-
 def test_lyapunov__a_trajectory_that_fails_has_no_exponents():
     # negative cubic stiffness: one of the two escapes
     found = lyapunov_exponents(

@@ -48,19 +48,6 @@ def test_polish_orbits__reference(reference, packed, guessed_period):
         assert np.abs(own[:, None] - known[None, :]).min(axis=0).max() < 1e-5
 
 
-def test_polish_orbits__period_2(packed):
-    """At 2.48 Hz the one-sided motions have period 2; a point that settled there is the guess."""
-    settled = run_branches(
-        packed[:1, None], [[2.48]], [[0.05, 0.1, 0.0, 0.0]], n_transient=600, n_keep=2, rtol=1e-9, atol=1e-9
-    )
-    found = polish_orbits(packed[:1], np.array([2.48]), settled.section[0, :, 0], np.array([2]))
-    assert found.converged[0]
-    assert found.orbit_period[0] == 2
-    images, _ = stroboscopic_map(packed[:1], np.array([2.48]), found.section, 2)
-    assert scaled_distance(images[0, 1], found.section[0]) < 1e-10
-    assert scaled_distance(images[0, 0], found.section[0]) > 1e-3
-
-
 def test_polish_orbits__far_from_any(packed):
     found = polish_orbits(packed[:1], np.array([2.03]), [[2.0, -2.0, 15.0, -20.0]], np.array([1]), max_iterations=3)
     assert not found.converged[0]

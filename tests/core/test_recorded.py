@@ -237,15 +237,3 @@ def test_evaluate_recorded__of_a_torque_is_the_torque():
     found = evaluate_recorded(["drive", "power_in"], at, series, LINEAR, drive)
     np.testing.assert_allclose(found[:, 0], np.interp(at, times, torque), atol=1e-9)
     np.testing.assert_allclose(found[:, 1], found[:, 0] * series[:, 1], atol=1e-9)
-
-
-@pytest.mark.parametrize(
-    ("model", "wanted"),
-    [("pendulum", {"duty_cycle", "q", "eps_drive"}), ("duffing", {"amplitude"}), ("double-pendulum", {"q"})],
-)
-def test_drive_parameters__are_those_of_the_forcing(model, wanted):
-    from magpend_core.engine.driven import drive_parameters
-
-    found = load_model(model)
-    values = found.load(q=1.0) if "q" in found.parameter_names else found.load()
-    assert wanted <= set(drive_parameters(found.system, values.pack())) <= {*wanted, "duty_cycle", "eps_drive"}

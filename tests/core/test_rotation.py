@@ -101,13 +101,6 @@ def test_section_points(rate):
     np.testing.assert_allclose(found.rotation, (rate / np.pi) % 1.0, atol=1e-6)
 
 
-def test_finer_samples():
-    """Hundred turns in a drive period are counted by finer samples."""
-    found = rotation(CIRCLE, [[1.5, 0.0]], TurningState((1, 0), (0.0, 1.0)), 0.01, n_periods=8, w=6.4)
-    assert found.rotation[0] == pytest.approx(640.0 / (2.0 * np.pi), abs=1e-6)
-    assert found.widest_turn[0] < 0.75 * np.pi
-
-
 def test_closed_orbit():
     """A closed orbit makes a whole number of turns: three in two periods, to the last digit."""
     turning = TurningState((1, 0), (0.0, 1.0))

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
-from scipy.signal import lsim
 
 from magpend_core.engine.vecmath import TWO_PI
 from magpend_core.models import load_model
@@ -49,41 +47,6 @@ def test_sample__does_not_depend_on_the_neighbours():
     alone = sample(PENDULUM.system, packed[:1], states[5:6], times[1:], drives=drives[1:])
     np.testing.assert_array_equal(alone.states[0], among.states[5, :3])
     assert np.isnan(among.states[5, 3:]).all()
-
-
-def test_sample__follows_measured_edges(pendulum_rhs):
-    """Periods of unequal lengths and duty cycles, a start within the first: against another integrator."""
-    values = PENDULUM.load(mu=0.0, eps=40.0, eps_drive=30.0)
-    p = values.as_dict()
-    rising = np.array([0.0, 0.41, 0.86, 1.25, 1.72])
-    falling = np.array([0.22, 0.62, 1.06, 1.49])
-    late = 0.13
-    drive = Drive.from_edges(rising, falling, start_s=late)
-
-    def torque(t):
-        k = min(int(np.searchsorted(rising, t + late, side="right")) - 1, 3)
-        length = rising[k + 1] - rising[k]
-        d = (falling[k] - rising[k]) / length
-        phase = (np.pi - 2 * np.pi * d) / 2
-        wave = np.sin(2 * np.pi * (t + late - rising[k]) / length + phase) - np.sin(phase)
-        return p["q"] * 2 / np.pi * np.arctan(p["eps_drive"] * wave)
-
-    times, start = np.linspace(0, 1.5, 61), [0.4, -0.3, 1.0, -2.0]
-    found = sample(PENDULUM.system, values.pack()[None], [start], [times], drives=[drive], rtol=1e-11, atol=1e-11)
-    other = solve_ivp(pendulum_rhs(p, torque), (0, 1.5), start, "DOP853", times, rtol=1e-10, atol=1e-10, max_step=2e-3)
-    np.testing.assert_allclose(found.states[0], other.y.T, atol=2e-6)
-
-
-def test_sample__follows_a_measured_torque():
-    """Values joined by lines, of a linear oscillator: against the exact response of scipy."""
-    times = np.linspace(0, 6, 241)
-    torque = np.random.default_rng(2).normal(size=241).cumsum() * 0.1
-    system = with_recorded_drive(DUFFING.system)
-    packed = np.append(LINEAR.pack(), [0.0, 0.0])[None]
-    drive = Drive.from_torque(times, torque)
-    found = sample(system, packed, [[0.1, 0.0]], [times], drives=[drive], rtol=1e-11, atol=1e-11)
-    exact = lsim(([[0, 1], [-4.0, -0.3]], [[0], [1]], np.eye(2), [[0], [0]]), torque, times, [0.1, 0.0])[1]
-    np.testing.assert_allclose(found.states[0], exact, atol=1e-9)
 
 
 def test_drive__window_is_the_same_drive():

@@ -26,12 +26,3 @@ def test_fastest_contraction__finds_a_layer_away_from_the_state() -> None:
     # at v = u the friction's slope is 1000 /s; at the state itself it is nothing
     found = fastest_contraction(model.system, model.load().pack()[None], np.ones(1), np.array([[0.5, -2.0]]))
     assert found == pytest.approx(1000.0, rel=1e-3)
-
-
-def test_fastest_contraction__of_the_pendulum_bounds_the_step_by_milliseconds() -> None:
-    model = load_model()
-    states = np.random.default_rng(1).uniform(-1.0, 1.0, (4, 4)) * [3.0, 3.0, 5.0, 5.0]
-    packed = np.tile(model.load().pack(), (4, 1))
-    found = fastest_contraction(model.system, packed, np.full(4, 2.2), states)
-    # 2/pi eps (T + mu N)/J of the friction's layers: one to some thousands per second
-    assert 500.0 < found < 5000.0

@@ -392,39 +392,6 @@ def shares(
     return nearest, float(np.quantile(distances.min(axis=1), 0.99))
 
 
-def lifetime(
-    field: Field,
-    spec: Mapping[str, Any],
-    sets: list[dict[str, Any]],
-    n: int = 400,
-    n_periods: int = 2000,
-    n_steps: int = 100,
-    near: float = 0.05,
-    after: int = 100,
-) -> tuple[float, float]:
-    """Mean lifetime of the transients before some attractors [periods, or s], and its standard error.
-
-    A trajectory has left when it stays nearer than `near` to a set. Of those that have not after `after`
-    periods the lifetimes are exponential; their mean is the time of all together over the number that left.
-    """
-    from scipy.spatial import cKDTree
-
-    low, high = box(spec, field)
-    starts = np.random.default_rng(54321).uniform(low, high, (n, len(low)))
-    period = field.period if np.isfinite(field.period) else 1.0
-    known = np.concatenate([cloud(field, s, 64) for s in sets])
-    tree = cKDTree(np.where(field.circle, np.mod(known, 2 * np.pi), known))
-    left = np.empty(n)
-    for i, start in enumerate(starts):
-        run = strobed(field.f, start[None], period, n_steps, 0, n_periods)[0]
-        far = tree.query(np.where(field.circle, np.mod(run, 2 * np.pi), run))[0] > near
-        left[i] = np.flatnonzero(far)[-1] + 1 if far.any() else 0
-    alive = left > after
-    gone = alive & (left < n_periods)
-    mean = (left[alive] - after).sum() / gone.sum()
-    return float(mean * period if not np.isfinite(field.period) else mean), float(mean / math.sqrt(gone.sum()))
-
-
 def _line(what: str, said: Any, found: Any, error: float) -> None:
     """Print a number of an answer beside the one found here."""
     worst = max(abs(a - b) for a, b in zip(np.atleast_1d(said), np.atleast_1d(found), strict=False))

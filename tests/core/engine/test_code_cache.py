@@ -89,17 +89,6 @@ def test_keep__damaged_entries_are_compiled_again(cache, caplog, n):
     assert entries(cache) == [path]
 
 
-def test_keep__says_what_is_damaged(cache, caplog):
-    called()
-    (path,) = entries(cache)
-    path.write_bytes(b"")
-    called()
-    (record,) = caplog.records
-    assert str(path) in record.message
-    assert "damaged" in record.message
-    assert "\n" not in record.message
-
-
 def test_keep__an_entry_of_another_function_is_not_taken(cache):
     def squared(x):
         return x * x

@@ -567,13 +567,6 @@ def test_impact__of_a_bouncing_ball_is_the_closed_form():
     assert found.return_time[:, 0, 1:] == pytest.approx(2.0 * speeds[:, :-1] / g, abs=1e-11)
 
 
-def test_impact__without_loss_keeps_the_energy():
-    above = Crossing("x", 0.1, "down")
-    found = returns(TOSS, ball(1.0, 1.0), [[0.5, 0.0], [1.3, 0.4]], above, n_keep=200, rtol=1e-9)
-    energy = found.section[..., 0] + 0.5 * found.section[..., 1] ** 2
-    assert energy == pytest.approx(np.broadcast_to([[[0.5]], [[1.38]]], energy.shape), abs=1e-11)
-
-
 def test_section__of_a_flow_with_switches_or_impacts():
     a, g, height = 0.7, 2.0, 0.9
     relay = [0.0, 1.0, 0.0, -1e3, 1.0, 0.0]
@@ -778,17 +771,6 @@ def test_lyapunov__through_sticking_has_a_largest_exponent():
 def given(system, *values):
     """What doors for parameters of a model ask of them."""
     return SimpleNamespace(model=SimpleNamespace(system=system), pack=lambda: np.array(values, float))
-
-
-def test_trajectory__of_dry_friction_and_impacts_is_the_closed_form():
-    force, mu, frequency = 1.0, 0.3, 0.07
-    times = np.linspace(0.05, 60.0, 240)
-    states = DryFriction(force, mu, frequency).state(0.3, times)
-    found = trajectory(given(STICK, *dry(force, mu)), frequency, [0.3, 0.0], times, rtol=1e-11, atol=1e-11)
-    assert found == pytest.approx(states, abs=1e-8)
-    g, r, times = 9.81, 0.8, np.linspace(0.01, 2.4, 100)
-    found = trajectory(given(TOSS, *ball(g, r)), 0.4, [1.0, 0.0], times)
-    assert found == pytest.approx(np.array([ball_exactly(1.0, g, r, t)[:2] for t in times]), abs=1e-10)
 
 
 def test_rates__take_switches_by_their_signs_and_segments_by_time():

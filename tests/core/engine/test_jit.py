@@ -14,7 +14,7 @@ from numba.core.compiler_lock import global_compiler_lock
 import magpend_core
 from magpend_core import accelerations, sections
 from magpend_core.engine import jit
-from magpend_core.engine.jit import bound_part, is_covered, source_digest, specialise
+from magpend_core.engine.jit import bound_part, source_digest
 from magpend_core.engine.lanes import engine_bindings
 from magpend_core.engine.observers import RECORD
 from magpend_core.engine.variational import with_tangents
@@ -71,24 +71,6 @@ def test_source_digest__changes_with_any_source(copied, monkeypatch):
         versions.add(source_digest())
     assert len(versions) == 3
     assert all(re.fullmatch("[0-9a-f]{16}", version) for version in versions)
-
-
-def test_specialise__binds_names_and_renames():
-    def template(x):
-        return x + OFFSET  # noqa: F821
-
-    bound = specialise(template, "seven", OFFSET=7)
-    assert bound(1) == 8
-    assert bound.__name__ == "template_seven"
-    assert bound.__qualname__.endswith("template_seven")
-    assert bound.__module__ == template.__module__
-    with pytest.raises(NameError):
-        template(1)
-
-
-def test_is_covered__goes_by_the_module():
-    assert is_covered(accelerations, sections)
-    assert not is_covered(accelerations, np.median)
 
 
 def test_plain_python__gives_the_same_numbers(run_python, preset):

@@ -10,7 +10,7 @@ import pytest
 from numba import njit
 
 from magpend_core.engine import jit, linking
-from magpend_core.engine.jit import PARTS, bound_part, entry, inline
+from magpend_core.engine.jit import bound_part, entry, inline
 from magpend_core.engine.simd import WIDTH, load, load_rows, store
 from tests.core.conftest import run_script
 
@@ -186,7 +186,3 @@ def test_load_rows__of_so_many_rows_is_compiled_for_each_number():
         w, out = np.arange(5.0 * WIDTH), np.zeros(WIDTH)
         njit(lambda w, out, part=part: part(w, out))(w, out)
         np.testing.assert_array_equal(out, w[:WIDTH] + w[(n - 1) * WIDTH : n * WIDTH])
-
-
-def test_parts__are_kept_beside_the_engines():
-    assert PARTS is None or Path(PARTS._folder).parent == jit.CACHE_FOLDER

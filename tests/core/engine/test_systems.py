@@ -135,13 +135,6 @@ RELAXATION = System(
 BOUNDED_RELAXATION = dataclasses.replace(RELAXATION, name="bounded_relaxation", escape=(10.0,))
 
 
-def test_system__fills_in_what_is_left_out():
-    assert (RELAXATION.is_angle, RELAXATION.scales, RELAXATION.escape) == ((False,), (1.0,), (np.inf,))
-    assert (RELAXATION.n_edges, RELAXATION.has_layers, RELAXATION.n_states) == (0, False, 1)
-    assert dataclasses.replace(RELAXATION) == RELAXATION
-    assert hash(dataclasses.replace(RELAXATION)) == hash(RELAXATION)
-
-
 def test_system__takes_lists_and_whole_numbers(duffing):
     listed = dataclasses.replace(
         duffing, state_names=["x", "v"], is_angle=[0, np.False_], scales=np.array([1, 1]), escape=[1000, 1000]
@@ -191,21 +184,6 @@ GROWTH = System(
     name="growth", state_names=("x",), parameter_names=(), n_constants=0, constants=_no_constants, rhs=_growth_rhs
 )
 """x' = x (1 - x), the least of all: neither forcing nor parameters"""
-
-
-def test_one_state__that_is_left_unbounded_fails_by_a_status():
-    # x' = cos t + 0.5 x leaves any bound
-    result = run_branches(
-        np.array([[[-0.5]]]),
-        np.array([[UNIT_FREQUENCY]]),
-        np.array([[1.0]]),
-        system=BOUNDED_RELAXATION,
-        n_transient=50,
-        n_keep=1,
-        rtol=1e-6,
-        atol=1e-6,
-    )
-    assert result.status.item() == Status.DIVERGED
 
 
 # ---- an observer of one's own ------------------------------------------------------------------------

@@ -285,16 +285,6 @@ def test_odd_functions__keep_signs_and_zeros():
     assert (right["atan"][-3:] == x[-3:]).all()
 
 
-def test_sines__square_sum_and_quadrants():
-    values = evaluate(points((-50.0, 50.0)))
-    sine, cosine = values["sine of sincos"], values["cosine of sincos"]
-    assert abs(sine**2 + cosine**2 - 1.0).max() < 1e-15
-    at = evaluate(np.arange(-8, 9) * (np.pi / 2))
-    quarter = np.arange(-8, 9) % 4
-    assert np.allclose(at["sine of sincos"], np.array([0.0, 1.0, 0.0, -1.0])[quarter], atol=2e-15)
-    assert np.allclose(at["cosine of sincos"], np.array([1.0, 0.0, -1.0, 0.0])[quarter], atol=2e-15)
-
-
 def test_nan__stays_nan_in_sines_and_atan():
     values = evaluate([np.nan])
     for name in set(NAMES) - {"log2_rough", "exp2_rough", "exp2_falling", "hypot_rough", "square_wave"}:

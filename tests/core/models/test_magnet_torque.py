@@ -57,15 +57,6 @@ def test_dipole_moment__is_that_of_the_model():
     np.testing.assert_allclose(laws.dipole_moment(PSI1, PSI_REL, p), expected, rtol=1e-9, atol=1e-13)
 
 
-def test_weight_torque__is_the_sum_of_weights_times_levers():
-    p = uneven()
-    psi2 = PSI1 + PSI_REL
-    first = p["e1"] * np.sin(PSI1)
-    second = p["l1"] * np.sin(PSI1) + p["e2"] * np.sin(psi2)
-    expected = -p["g"] * (p["m1"] * first + p["m2"] * second)
-    np.testing.assert_allclose(laws.weight_torque(PSI1, PSI_REL, p), expected, rtol=0, atol=1e-14)
-
-
 def test_weight_torque__is_minus_the_slope_of_the_energy():
     p, h = uneven(), 1e-6
     up, down = (evaluate(["energy"], 0.0, STATES + s * np.array([h, h, 0, 0]), p, 2.0)[:, 0] for s in (1, -1))

@@ -1,12 +1,10 @@
 """The models that ship, each against something that shares no code with it."""
 
-import math
-
 import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from magpend_core import ParameterError, energy, evaluate, jacobian, load_model, model_names, rates, sections, torques
+from magpend_core import ParameterError, energy, evaluate, jacobian, load_model, model_names, rates, torques
 from magpend_core.models import LIBRARY
 from magpend_core.models.pendulum.sides import Side, classify, slowest_hz
 
@@ -66,16 +64,6 @@ def test_mirror__maps_rates_on_rates(name):
     here = rates(0.1 / FREQUENCY, y, parameters, FREQUENCY)
     there = rates(0.6 / FREQUENCY, signs * y, parameters, FREQUENCY)
     np.testing.assert_allclose(there, signs * here, rtol=1e-9, atol=1e-9)
-
-
-def test_duffing__two_wells_have_the_published_orbits():
-    # DynamicalSystemsBase.jl, issue 139
-    parameters = load_model("duffing").load("twin-well-periodic")
-    found = sections(parameters, 1 / (2 * math.pi), [[0.2, 0.2], [1.0, 0.0]], n_transient=600, n_keep=1)
-    points = found.section[np.argsort(found.section[:, 0, 0]), 0]
-    left, right = [-0.7790549287, 0.0274168155], [1.2100908241, 0.0552949542]
-    expected = [right] if points[0, 0] > 0 else [left]
-    np.testing.assert_allclose(points[:1], expected, atol=1e-8)
 
 
 @pytest.mark.parametrize("drive", ["", "-sine"])

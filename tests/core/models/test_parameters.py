@@ -4,7 +4,7 @@ import pickle
 import numpy as np
 import pytest
 
-from magpend_core import ParameterError, load_model, load_preset, preset_names, preset_provenance
+from magpend_core import ParameterError, load_preset, preset_names, preset_provenance
 from magpend_core.models.pendulum.systems import PENDULUM_DIPOLE, PENDULUM_FITTED
 
 TABLE_1 = {
@@ -92,15 +92,11 @@ def test_preset_provenance__says_which_values_are_calibrated(preset):
         ("m2", 0.0, ["m2 = 0.0", "greater than 0"]),
         ("T1", -1e-9, ["T1 = -1e-09", "0 or greater"]),
         ("duty_cycle", 0.0, ["duty_cycle = 0.0", "between 0 and 1"]),
-        ("duty_cycle", 1, ["duty_cycle = 1", "between 0 and 1"]),
         ("duty_cycle", 1.2, ["duty_cycle = 1.2", "between 0 and 1"]),
         ("q", math.nan, ["q = nan", "not finite"]),
         ("alpha1", math.inf, ["alpha1 = inf", "not finite"]),
-        ("g", math.nan, ["g = nan", "not finite"]),
         ("q", "1.5", ["q = '1.5'", "not a number"]),
-        ("q", None, ["q = None", "not a number"]),
         ("q", True, ["q = True", "not a number"]),
-        ("delta", 0.0, ["delta = 0.0", "greater than 0"]),
         ("pole1", 1.0, ["'pole1'", "is not a parameter"]),
     ],
 )
@@ -133,12 +129,6 @@ def test_parameters__dipoles_must_not_meet(preset, dipoles, h):
     assert dipoles.replace(h=0.3529)["h"] == 0.3529
     # the fitted torque has no such bound
     assert preset.replace(h=h)["h"] == h
-
-
-def test_dipole_magnet__checks_its_own_values():
-    with pytest.raises(ParameterError) as caught:
-        load_model("pendulum-dipole").load(pole1=math.nan, pole2=1.0, l2=-1.0, h=0.0)
-    assert [p.split(" ")[0] for p in caught.value.problems] == ["pole1", "l2", "h"]
 
 
 def test_pack__has_the_order_of_the_systems(preset, dipoles):

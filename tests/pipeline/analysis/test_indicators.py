@@ -5,8 +5,8 @@ import pytest
 import xarray as xr
 
 from magpend_core.status import Status
-from pipeline.analysis.chaos.dimensions import _Pairs, correlation_dimension, kaplan_yorke_dimension
-from pipeline.analysis.chaos.zero_one import _displacement, zero_one_test
+from pipeline.analysis.chaos.dimensions import correlation_dimension, kaplan_yorke_dimension
+from pipeline.analysis.chaos.zero_one import zero_one_test
 from pipeline.analysis.sets import Geometry
 from pipeline.products.lyapunov import LyapunovFlag
 
@@ -102,15 +102,6 @@ def test_zero_one_test__is_the_published_formula():
     low, high = np.percentile(rates, [25, 75])
     assert found["zero_one_low"].item() == pytest.approx(low, abs=0.03)
     assert found["zero_one_high"].item() == pytest.approx(high, abs=0.03)
-
-
-def test_displacement__is_the_mean_square():
-    rng = np.random.default_rng(2)
-    walk = np.cumsum(rng.normal(size=(2, 3, 211)) + 2j * rng.normal(size=(2, 3, 211)), axis=-1)
-    n_cut = 21
-    moved = [walk[..., lag : 190 + lag] - walk[..., :190] for lag in range(1, n_cut + 1)]
-    expected = np.stack([(abs(m) ** 2).mean(axis=-1) for m in moved], axis=-1)
-    assert _displacement(walk, n_cut) == pytest.approx(expected, rel=1e-9)
 
 
 def test_zero_one_test__error_covers_other_frequencies():
@@ -284,21 +275,6 @@ def test_correlation_dimension__pairs_are_those_of_the_definition():
     for x, y in zip(found["log_radius"].values, found["log_correlation_sum"].values, strict=True):
         share = (distance[apart] <= np.exp(x) * (1 + 1e-12)).mean()
         assert (np.isnan(y) and share == 0.0) or np.exp(y) == pytest.approx(share, rel=1e-12)
-
-
-def test_pairs__without_a_part_are_those_of_the_other_points():
-    section, radii = henon(2, 100), np.array([0.01, 0.1, 1.0, 3.0])
-    pairs = _Pairs.of(section, radii, 3, PLANE)
-    points = section.reshape(-1, 2)
-    cell, time = np.divmod(np.arange(200), 100)
-    distance = abs(points[:, None] - points[None]).max(axis=-1)
-    apart = (cell[:, None] != cell[None]) | (abs(time[:, None] - time[None]) > 3)
-    # ten parts of 20 points
-    for part in range(10):
-        left = np.delete(np.arange(200), np.arange(20 * part, 20 * part + 20))
-        both = apart[np.ix_(left, left)]
-        count = [(both & (distance[np.ix_(left, left)] <= r)).sum() for r in radii]
-        assert pairs.without(part).tolist() == count
 
 
 def test_correlation_dimension__closed_orbits_points_and_failed_cells():

@@ -14,7 +14,7 @@ from pipeline.analysis.attractors.finding.points import BUDGET, Dynamics, slabs
 from pipeline.analysis.resilience.base_states import Asked, Bases, Shocked, answer
 from pipeline.analysis.resilience.edge_table import edge_table
 from pipeline.analysis.resilience.shocks import Settings, ShockSearch
-from pipeline.analysis.resilience.table import resilience_table, size_of
+from pipeline.analysis.resilience.table import resilience_table
 from pipeline.layout.vocabulary import BOUNDED_SET, EQUILIBRIUM, PERIODIC_ORBIT
 from pipeline.plots.edge import plot_edge
 from pipeline.plots.resilience import plot_resilience
@@ -197,12 +197,6 @@ def test_resilience__basin_stability_and_table(found, wells):
     figure = plot_resilience(found, wells.derive("attractors"))
     assert [ax.get_ylabel() for ax in figure.axes] == ["basin stability", "smallest shock", "arrival [drive periods]"]
     assert float(figure.data["shock_high"].isel(attractor=0)) == float(found["shock_high"].isel(attractor=0))
-
-
-def test_size_of():
-    assert size_of(0.2, 0.3) == "0.2 to 0.3"
-    assert size_of(0.23599999, 0.236) == "0.236"
-    assert size_of(2.0, np.inf) == "above 2"
 
 
 # ---- one attractor -----------------------------------------------------------------------------

@@ -8,7 +8,7 @@ import xarray as xr
 
 from magpend_core.models import load_model
 from pipeline.compute.simulate import simulate
-from pipeline.rig.driving import drive_file, thinned
+from pipeline.rig.driving import drive_file
 from pipeline.rig.recordings import read_recording
 from pipeline.specification.drive_files import load_drive, parse_drive
 from pipeline.specification.problems import SpecError
@@ -87,12 +87,6 @@ def test_drive_file__thinned_torque_stays_within_the_tolerance(tolerance):
     assert off == pytest.approx(made.error)
     assert made.error <= tolerance * (1 + 1e-12)
     assert made.n_rows < (2500 if tolerance == 0.02 else 400)
-
-
-def test_thinned__line_is_its_ends():
-    time = np.sort(np.random.default_rng(0).uniform(0, 1, 500))
-    assert thinned(time, 3 * time - 1, 1e-12).tolist() == [0, 499]
-    assert thinned(time[:2], time[:2], 0.0).tolist() == [0, 1]
 
 
 def test_drive_file__refuses():

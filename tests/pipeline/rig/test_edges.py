@@ -166,9 +166,3 @@ def test_edges_of__a_recording_without_a_drive_says_what_to_map():
     ds = xr.Dataset(coords={"time": ("sample", np.arange(3.0))}, attrs={"file": "free.tdms"})
     with pytest.raises(SpecError, match=r"free\.tdms: no drive channel.*\[drive\]"):
         edges_of(ds)
-
-
-def test_between__keeps_the_edges_of_a_window():
-    edges = Edges(np.arange(10.0), np.arange(10.0) + 0.5).between(2.0, 4.0)
-    np.testing.assert_array_equal(edges.rising, [2.0, 3.0])
-    np.testing.assert_array_equal(edges.falling, [2.5, 3.5])

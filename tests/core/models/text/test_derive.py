@@ -12,7 +12,7 @@ import sympy
 from hypothesis import given, reject
 from hypothesis import strategies as st
 
-from magpend_core import evaluate, jacobian, load_model, rates, sections
+from magpend_core import evaluate, sections
 from magpend_core.engine.plain_python import plain
 from magpend_core.models import ModelError
 from magpend_core.models.text import graph, read_model
@@ -206,41 +206,6 @@ def test_jacobian__is_sympys_derivative(text):
         if np.isfinite(b) and b.imag == 0.0 and abs(b) < 1e8 and np.isfinite(a):
             assert a == pytest.approx(b.real, rel=1e-8, abs=1e-7)
     np.testing.assert_allclose(found[1], [v, x])
-
-
-def test_duffing__is_the_hand_written_one():
-    hand = load_model("duffing")
-    text = model_of(
-        {"x": "v", "v": "amplitude*cos(2*pi*f*t) - damping*v - linear*x - cubic*x**3"},
-        dict(hand.load("hardening")),
-        quantities={
-            "energy": "0.5*v**2 + 0.5*linear*x**2 + 0.25*cubic*x**4",
-            "power_in": "amplitude*cos(2*pi*f*t)*v",
-            "power_dissipated": "damping*v**2",
-            "drive": "amplitude*cos(2*pi*phase)",
-        },
-    )
-    y = np.random.default_rng(3).normal(size=(50, 2)) * 3.0
-    t = np.linspace(0.0, 1.0 / FREQUENCY, 50)
-    names = [q.name for q in hand.quantities]
-    for function in (rates, jacobian, lambda *a: evaluate(names, *a)):
-        wanted = function(t, y, hand.load("hardening"), FREQUENCY)
-        found = function(t, y, text.load(), FREQUENCY)
-        np.testing.assert_allclose(found, wanted, rtol=1e-12, atol=1e-12)
-
-
-def test_pendulum__jacobian_is_the_hand_written_one():
-    """Friction that depends on loads that depend on accelerations; its rates are in test_library."""
-    text, hand = load_model("pendulum-text"), load_model("pendulum-free")
-    own = hand.load(**{n: v for n, v in text.load().items() if n in hand.parameter_names})
-    y = np.random.default_rng(4).uniform(-1.0, 1.0, (60, 4)) * [3.0, 3.0, 15.0, 15.0]
-    wanted = jacobian(0.2, y, own, 1.7)
-    scale = np.abs(wanted).max(axis=0)
-    # the hand-written one leaves out what the friction of the loads changes at second order
-    assert (np.abs(jacobian(0.2, y, text.load(), 1.7) - wanted) <= 1e-3 * scale + 1e-9).all()
-
-
-VALUES = {"sin": 0.8, "tan": 0.8, "acos": -0.3, "asin": 0.9, "log": 3.7, "sqrt": 2.0}
 
 
 @pytest.fixture(scope="module")

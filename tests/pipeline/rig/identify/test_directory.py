@@ -68,12 +68,6 @@ def test_check__refuses_a_folder_that_holds_something_else(tmp_path, spec):
         d.check(tmp_path / "run", d.identity_of(spec(), d.sources_of(spec())))
 
 
-def test_read_info__says_that_a_run_is_one(tmp_path):
-    (tmp_path / "run.json").write_text("{}")
-    with pytest.raises(RefusedError, match="It is a run"):
-        d.read_info(tmp_path)
-
-
 def test_read_info__damaged(begun):
     path = begun.directory / d.IDENTIFICATION
     data = json.loads(path.read_text())

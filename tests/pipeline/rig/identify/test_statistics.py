@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -164,10 +162,3 @@ def test_coverage__autocorrelated_noise(ringdown, n_pieces, n):
     assert chosen == {"pieces" if n_pieces > 2 else "newey-west"}
     assert (share >= 0.9).all(), share
     assert (plain < 0.9).any(), plain
-
-
-def test_linearised__counts_what_is_fitted(ringdown, rng):
-    found = ringdown.fit(*ringdown.record(rng, dead_band=True))
-    linear = replace(found.linear, prior=np.array([1.0, 0.0]))
-    assert linear.n_fitted == 1 + 20
-    assert linear.n_samples == sum(int(np.isfinite(r).sum()) for r in found.residuals) < 1200

@@ -17,9 +17,6 @@ from pipeline.rig.magnet.measurement import read_measurement
 ROOM = Path(__file__).parents[4] / "workflows" / "magnet"
 HEADER = tomllib.loads((ROOM / "discs.toml").read_text("utf-8"))
 DISC = HEADER["synthesis"]
-VOLUME = np.pi / 4 * DISC["diameter_m"] ** 2 * DISC["thickness_m"]
-MOMENT = DISC["remanence_T"] / (4e-7 * np.pi) * VOLUME  # A m2
-
 pytestmark = pytest.mark.slow  # needs magpylib
 
 
@@ -51,14 +48,6 @@ def test_discs_csv__is_what_the_script_makes(make_discs):
         assert (float(row[0]), float(row[1]), row[2]) == (pytest.approx(a), pytest.approx(b), side)
         # printed to 1e-4 N m
         assert float(row[3]) == pytest.approx(torque, abs=5.1e-5)
-
-
-def test_loads__are_converged(make_discs):
-    psi1 = np.radians([-30.0, 1.0, 3.3, 6.0, 15.0])
-    psi2 = psi1 + np.radians([35.0, 0.0, 5.0, -10.0, -20.0])
-    coarse = make_discs.loads(psi1, psi2, geometry(), DISC)[1]
-    fine = make_discs.loads(psi1, psi2, geometry(), DISC, rings=20, spokes=72)[1]
-    np.testing.assert_allclose(coarse, fine, rtol=0, atol=2e-7)
 
 
 @pytest.mark.parametrize("distance", [0.020, 0.040, 0.100])
@@ -110,21 +99,6 @@ def test_loads__bent_are_those_of_magpylib(make_discs):
         # 4000 cells: some 0.2 %
         np.testing.assert_allclose(force[i], f[[0, 2]], rtol=5e-3, atol=5e-3)
         assert moment[i] == pytest.approx(-t[1], rel=5e-3)
-
-
-def test_loads__far_apart_are_those_of_dipoles(make_discs):
-    """3 mu_0 m**2/(2 pi z**4), with the next term of the discs' size to its 1/z**2."""
-    for distance, tolerance in ((0.5, 5e-3), (2.0, 3e-4)):
-        force, _ = make_discs.loads(*hanging(), geometry(distance), DISC)
-        assert force[0, 1] == pytest.approx(6e-7 * MOMENT**2 / distance**4, rel=tolerance)
-
-
-def test_loads__mirrored_are_mirrored(make_discs):
-    psi1, psi2 = np.radians([3.0, 10.0]), np.radians([-5.0, 20.0])
-    force, moment = make_discs.loads(psi1, psi2, geometry(), DISC)
-    other, opposite = make_discs.loads(-psi1, -psi2, geometry(), DISC)
-    np.testing.assert_allclose(other, force * [-1, 1], atol=1e-10)
-    np.testing.assert_allclose(opposite, -moment, atol=1e-10)
 
 
 def test_discs__readings_are_corrected_to_the_field_and_noise(make_discs):

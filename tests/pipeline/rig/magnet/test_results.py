@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 
 import numpy as np
 import pytest
@@ -46,24 +45,6 @@ def test_write_results__every_value_has_its_origin(fitted):
     dipoles = load_model("pendulum-dipole").preset(fitted.folder / "preset-dipoles.toml")
     assert "R2 = " in dipoles.provenance["pole1"]
     assert dipoles.values["h"] == 0.39
-
-
-def test_write_results__the_preset_may_rest_on_a_preset_from_a_file(rig, fitted, tmp_path):
-    shutil.copy(fitted.folder / "preset.toml", tmp_path)
-    text = rig.path.read_text().replace('"wojna2018"', '"preset.toml"')
-    rig.path.write_text(
-        text.replace("[parameters]", "[parameters]\ndelta = 0.002").replace(
-            "[provenance]", '[provenance]\ndelta = "guess"'
-        )
-    )
-    second = tmp_path / "second"
-    second.mkdir()
-    write_results(fit_measurement(read_measurement(rig.path)), second)
-    (tmp_path / "preset.toml").unlink()
-    found = load_model("pendulum").preset(second / "preset.toml")
-    assert found.values["delta"] == 0.002
-    assert found.base == "wojna2018"
-    load_model("pendulum-dipole").load(second / "preset-dipoles.toml")
 
 
 def test_write_results__what_is_held_keeps_its_own_origin(rig, tmp_path):

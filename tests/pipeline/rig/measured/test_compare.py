@@ -11,7 +11,6 @@ from pipeline.rig.measured.compare import compare, compare_with
 from pipeline.rig.measured.computed import Computed
 from pipeline.rig.measured.figures import plot_comparison, plot_measured
 from pipeline.rig.measured.measuring import measure
-from pipeline.rig.measured.tables import edges_table, steps_table, summary_lines
 from pipeline.runs.derive import AnalysedRun
 from pipeline.specification.problems import SpecError
 
@@ -172,19 +171,6 @@ def test_measure__recordings_that_do_not_fit_are_refused(swept):
         measure([up.drop_vars("drive")], WAY)
     with pytest.raises(SpecError, match="no edges"):
         measure([up.assign(drive=xr.ones_like(up["drive"]))], WAY)
-
-
-def test_tables__say_what_was_measured_and_compared(measured, compared):
-    plain = steps_table(measured)
-    assert len(plain.rows) == 10
-    assert "winner" not in plain.rows[0]
-    assert plain.rows[0]["side"] == "right"
-    told = steps_table(compared)
-    assert told.rows[0]["computed_side"] == "right"
-    ends = edges_table(compared)
-    assert ends.rows[0]["before"] == "period 2, right"
-    assert ends.rows[0]["after"] == "period 1, right"
-    assert "sides agree at 100 %" in "\n".join(summary_lines(compared))
 
 
 @pytest.mark.parametrize(("layout", "simulated"), [("side", 1), ("over", 0)])

@@ -10,7 +10,6 @@ import pytest
 from magpend_core.models import load_model
 from pipeline.products.measured import SweepOptions
 from pipeline.rig.measured.measuring import measure
-from pipeline.rig.measured.overlays import plot_series
 from pipeline.rig.measured.phase import section_phase
 from pipeline.rig.measured.series import series_of
 from pipeline.rig.virtual import DriveSensor, Sensor, Step, record
@@ -119,13 +118,3 @@ def test_series_of__what_does_not_fit_is_refused(pendulum, swept):
         series_of(recording, pendulum, start_s=1e6)
     with pytest.raises(SpecError, match="periods = 0"):
         series_of(recording, pendulum, n_periods=0)
-
-
-def test_plot_series__a_panel_for_each_state_and_portrait(pendulum, swept):
-    ds = series_of(swept[0][0], pendulum, start_s=30.0, n_periods=3)
-    fig = plot_series(ds, degrees=True)
-    assert len(fig.axes) == 6
-    assert fig.axes[0].get_ylabel().endswith("[deg]")
-    gids = [line.get_gid() for line in fig.axes[0].lines]
-    assert gids == ["series:psi1", "series:psi1_computed"]
-    assert fig.legends[0].get_texts()[0].get_text() == "simulated rig"

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pipeline.rig.recordings import findings_of, recording_of
-from pipeline.rig.recordings.findings import Finding, runs, to_json
+from pipeline.rig.recordings.findings import runs
 
 
 def kinds(ds):
@@ -151,16 +151,6 @@ def test_relative_to__is_added(make):
     mapping = make.mapping(second={"relative_to": "psi1", "sign": -1})
     ds = recording_of(make.raw(make.channels({"a": a, "b": b})), mapping)
     np.testing.assert_allclose(ds["psi2"], a - b)
-
-
-def test_findings__pass_through_json():
-    found = [Finding("gap", "", 1.0, 2.0, text="x"), Finding("unit", "a", severity="note", text="y")]
-    import xarray as xr
-
-    back = findings_of(xr.Dataset(attrs={"findings": to_json(found)}))
-    assert back[0] == found[0]
-    assert math.isnan(back[1].start_s)
-    assert back[1].text == "y"
 
 
 def test_runs__ends_where_a_piece_does():

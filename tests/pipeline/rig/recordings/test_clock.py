@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from pipeline.rig.recordings import findings_of, recording_of, window
-from pipeline.rig.recordings.clock import clock_of
 from pipeline.rig.recordings.formats import read_raw
 from pipeline.rig.recordings.mapping import parse_mapping
 from pipeline.rig.recordings.raw import Channel
@@ -266,15 +265,3 @@ def test_window__keeps_time_and_the_findings_in_it(make):
     assert found.start_s == pytest.approx(stamps[1499])
     with pytest.raises(SpecError, match=r"window_s = \[10, 20\]: holds 0 samples"):
         window(ds, (10.0, 20.0))
-
-
-def test_clock_of__a_million_stamps_take_seconds():
-    """Vectorised: no loop over samples."""
-    import time
-
-    stamps = np.arange(1_000_000) / 1e4
-    channel = Channel("a", np.zeros(len(stamps)), time=stamps)
-    begin = time.process_time()
-    clock = clock_of([{"a": channel}], None, "x")
-    assert time.process_time() - begin < 12.0
-    assert clock.step_s == pytest.approx(1e-4)

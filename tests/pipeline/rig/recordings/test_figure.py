@@ -68,14 +68,6 @@ def test_describe_recording__counts(broken):
     assert "in 2 pieces" in quantities.lines[0]
 
 
-def test_describe_recording__findings_of_one_kind_share_a_line(make):
-    a, _ = make.swing()
-    _, findings = describe_recording(make.recorded(np.clip(a, -0.9, 0.9), range=[-0.9, 0.9]))
-    assert len(findings.rows) > 2
-    (line,) = findings.lines
-    assert line.startswith(f"warning: saturated of psi1 ({len(findings.rows)} times, first at ")
-
-
 def test_describe_file__lists_stretches_and_empty_fields(make):
     a, b = make.swing()
     a[3] = np.nan

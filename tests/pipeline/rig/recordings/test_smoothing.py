@@ -9,7 +9,7 @@ import pytest
 
 from pipeline.rig.recordings import recording_of, smooth
 from pipeline.rig.recordings.mapping import parse_mapping
-from pipeline.rig.recordings.smoothing import _first_samples, _smoothed, _switches
+from pipeline.rig.recordings.smoothing import _smoothed, _switches
 from pipeline.specification.problems import SpecError
 
 
@@ -194,10 +194,3 @@ def test_smoothed__noise_and_score_are_those_of_the_operator(width, order):
         others = own[own != i]
         errors.append(y[i] - np.polyval(np.polyfit(others, y[others], order), i))
     assert found.score == pytest.approx(np.mean(np.square(errors)), rel=1e-9)
-
-
-def test_first_samples__cuts_the_last_stretch():
-    parts = np.array([[0, 10], [20, 50], [60, 90]])
-    assert _first_samples(parts, 25).tolist() == [[0, 10], [20, 35]]
-    assert _first_samples(parts, 1000).tolist() == parts.tolist()
-    assert _first_samples(parts[:0], 5).size == 0
