@@ -18,8 +18,6 @@ from pipeline.runs.preview import figure_command, first_figure
 from pipeline.specification.parsing import parse_spec
 from pipeline.specification.problems import SpecError
 
-BAD = 'kind = "sweep"\n[axes]\nq = { start = 1, stop = 2, nun = 3 }\n[integration]\nrtol = -1'
-
 
 def test_help__exit_codes(main):
     for arguments in (["--help"], ["run", "--help"]):
@@ -28,19 +26,6 @@ def test_help__exit_codes(main):
             assert f"{int(code)} {code.sentence}" in text
     for command in ("run", "status", "verify", "analyse", "plot", "simulate", "models", "presets"):
         assert command in main("--help")[1]
-
-
-def test_run__bad_spec_creates_nothing(main, write_spec, tmp_path):
-    path = write_spec(BAD)
-    before = sorted(tmp_path.rglob("*"))
-    for option in ([], ["--dry-run"]):
-        code, _, said = main("run", path, "--out", "somewhere", *option)
-        assert code == Exit.REFUSED
-        for problem in ("axes.q.nun: unknown key; did you mean num?", "integration.rtol = -1"):
-            assert problem in said
-        assert "initial_conditions: missing" in said
-        assert "Traceback" not in said
-        assert sorted(tmp_path.rglob("*")) == before
 
 
 REFUSED = {
@@ -273,15 +258,3 @@ def test_find_spec__of_the_gallery_by_its_folder_and_name(tmp_path, monkeypatch)
     (tmp_path / "gallery").mkdir()
     (tmp_path / name).write_text("", "utf-8")  # a file of one's own comes first
     assert workflows.find_spec(name) == Path(name)
-
-
-def test_modules__each_library_has_one_room():
-    """Only `store` knows zarr, only `compute` knows dask."""
-    import pipeline
-
-    top = Path(pipeline.__file__).parent
-    for path in top.rglob("*.py"):
-        text, room = path.read_text("utf-8"), path.relative_to(top).parts[0]
-        for library, home in (("zarr", "store"), ("dask", "compute"), ("distributed", "compute")):
-            imports = re.search(rf"^\s*(import|from) {library}\b", text, re.MULTILINE)
-            assert not imports or room == home, (path.name, library)

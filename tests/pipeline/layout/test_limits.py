@@ -1,8 +1,6 @@
 """What is too large is refused at once, in words, before anything is created."""
 
 import shutil
-import subprocess
-import sys
 import time
 import tomllib
 from collections import namedtuple
@@ -10,7 +8,7 @@ from collections import namedtuple
 import pytest
 
 from pipeline.layout import limits
-from pipeline.layout.limits import MOST_CHUNK_BYTES, check_plan, check_space, in_words
+from pipeline.layout.limits import MOST_CHUNK_BYTES, check_plan, check_space
 from pipeline.layout.plan import MOST_TASKS, make_plan
 from pipeline.runs.preview import describe_plan
 from pipeline.specification.parsing import parse_spec
@@ -149,23 +147,3 @@ def test_run__goes_on_where_the_rest_fits(monkeypatch, write_spec, tmp_path):
     with pytest.raises(SpecError, match="needs up to"):
         quietly(path, tmp_path / "another")
     assert not (tmp_path / "another").exists()
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="a small file system is mounted")
-def test_check_space__a_small_disk(tmp_path):
-    """On a real file system of 1 MB."""
-    place = tmp_path / "disk"
-    place.mkdir()
-    words = ["mount", "-t", "tmpfs", "-o", "size=1M,nr_inodes=100", "none", str(place)]
-    mounted = subprocess.run(words, capture_output=True, check=False)
-    if mounted.returncode:
-        pytest.skip("no file system can be mounted here")
-    try:
-        with pytest.raises(SpecError, match=r"up to .*MB .*, and there are 1.05 MB and .* files, and"):
-            check_space(plan_of(points=1000, starts=10), place / "run")
-    finally:
-        subprocess.run(["umount", str(place)], check=True)
-
-
-def test_in_words__sizes():
-    assert [in_words(n) for n in (0, 999, 1.9e12, 5e15)] == ["0 bytes", "999 bytes", "1.9 TB", "5 PB"]

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import subprocess
-import sys
 import tomllib
 from dataclasses import replace
 from pathlib import Path
@@ -107,14 +105,6 @@ def test_task__out_of_range(sweep_text):
     plan = make_plan(parse_spec(tomllib.loads(sweep_text)))
     with pytest.raises(IndexError, match="does not exist"):
         plan.task(plan.n_tasks)
-
-
-def test_import__pure():
-    modules = "pipeline.layout.plan, pipeline.layout.schema, pipeline.specification.parsing, pipeline.layout.identity"
-    heavy = "('dask', 'zarr', 'xarray', 'matplotlib')"
-    code = f"import sys, {modules}; print([m for m in {heavy} if m in sys.modules])"
-    found = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
-    assert found.stdout.strip() == "[]"
 
 
 def test_identity__what_counts(sweep_text):

@@ -84,20 +84,6 @@ def test_tipping__critical_rates_are_those_of_the_closed_form(moving_fold):
     assert any("both ends decided" in line for line in table.lines)
 
 
-def test_tipping__tips_at_rate_1_on_a_long_ramp(tmp_path):
-    """x' = (x + l)^2 - 1 tips at dl/dt = 1 where the ramp is long enough: at 1 + (pi/length)^2."""
-    length = 6000.0
-    spec = with_changes(
-        drift={"l": {"to": length}},
-        axes={"l_rate_per_s": {"values": [0.9, 1.1]}},
-        initial_conditions={"kind": "list", "points": [[-1.0]]},
-        integration={**SPEC["integration"], "n_transient": 6670, "n_keep": 4},
-    )
-    quietly(spec, tmp_path / "long")
-    ds = derive(tmp_path / "long", "tipping", {"settle": 60, "keep": 32, "width": 1e-6})
-    assert float(ds["critical_value"][0]) == pytest.approx(1.0, abs=1e-6)
-
-
 def test_delay__of_a_synthetic_passage():
     """An orbit of period 1 that begins to alternate at section 30, after a start off the orbit."""
     n = np.arange(60)

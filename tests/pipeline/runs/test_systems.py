@@ -2,30 +2,11 @@
 
 from __future__ import annotations
 
-import shutil
-
 import pytest
 
 from pipeline.runs.refusals import remedy
 from pipeline.runs.sites import Queue, Site, ask_site, pbs_site, slurm_seconds, slurm_site
-from pipeline.runs.systems import answer, find_systems
-
-
-@pytest.fixture
-def command(tmp_path, monkeypatch):
-    """Put commands on the PATH, which has no others of a batch system."""
-    folder = tmp_path / "bin"
-    folder.mkdir()
-    (folder / "sh").symlink_to(shutil.which("sh"))
-    monkeypatch.setenv("PATH", str(folder))
-    monkeypatch.delenv("SGE_ROOT", raising=False)
-
-    def write(name, text, shell="#!/bin/sh"):
-        (folder / name).write_text(f"{shell}\n{text}\n")
-        (folder / name).chmod(0o755)
-        return str(folder / name)
-
-    return write
+from pipeline.runs.systems import find_systems
 
 
 def kinds():
@@ -62,14 +43,6 @@ def test_find_systems__several_and_the_qsub_of_slurm_is_none_of_them(command):
     for name in ("bsub", "qsub", "qconf"):
         command(name, "true")
     assert kinds() == ["slurm", "lsf", "sge"]
-
-
-def test_answer__none_of_a_command_that_fails(command):
-    command("good", "echo yes")
-    command("bad", "echo no; exit 3")
-    assert answer(["good"]) == "yes\n"
-    assert answer(["bad"]) is None
-    assert answer(["absent"]) is None
 
 
 # ---- queues and nodes ----------------------------------------------------------------------------------
