@@ -19,7 +19,6 @@ from pipeline.explorer.copies.content import Column
 from pipeline.explorer.copies.export import RESERVE, export_page
 from pipeline.explorer.copies.folder import export_folder
 from pipeline.explorer.copies.orbits import ALIKE, NEAREST, NONE, SAME_ATTRACTOR, choose
-from pipeline.explorer.copies.packing import packed
 from pipeline.explorer.data.arrays import unpack_arrays
 from pipeline.explorer.data.explored import ExploredRun
 from pipeline.store.errors import RefusedError
@@ -56,15 +55,6 @@ def run(made):
     for index in range(made.plan.n_tasks - 1):
         made.commit(index)
     return Run.open(made.info.directory)
-
-
-def test_packed__is_read_back(tmp_path):
-    arrays = {"a": np.arange(6.0).reshape(2, 3) / 7, "b": np.arange(3, dtype=np.uint8), "c": np.empty(0)}
-    back, attrs = _data(packed(arrays, {"k": [1, None]}))
-    assert attrs == {"k": [1, None]}
-    for name, values in arrays.items():
-        np.testing.assert_array_equal(back[name], values)
-        assert back[name].shape == values.shape
 
 
 def test_export_page__has_the_cubes_numbers(run, tmp_path):

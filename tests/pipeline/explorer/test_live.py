@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 from types import SimpleNamespace
 
 import numpy as np
@@ -237,17 +236,6 @@ def test_slice__without_an_analysis_tells_orbits_apart(directories, watch):
     assert all(line["attractor"] is None for line in end["labels"])
     assert len({line["colour"] for line in orbits}) == len(orbits)
     assert len({line["label"] for line in end["labels"]}) == len(end["labels"])
-
-
-def test_slice__ends_when_cancelled(directories, watch):
-    watcher = watch(directories["whole"])
-    number = watcher.send(**slice_of([-1, 1], [-1, 1], 512))
-    watcher.wait(number, "slice")
-    watcher.send(do="cancel", job=number)
-    assert watcher.wait(number)["cancelled"] is True
-    n = len(watcher.of(number))
-    time.sleep(0.2)
-    assert len(watcher.of(number)) == n
 
 
 # ---- orbits that follow --------------------------------------------------------------------------

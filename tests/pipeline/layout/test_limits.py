@@ -7,7 +7,6 @@ from collections import namedtuple
 
 import pytest
 
-from pipeline.layout import limits
 from pipeline.layout.limits import MOST_CHUNK_BYTES, check_plan, check_space
 from pipeline.layout.plan import MOST_TASKS, make_plan
 from pipeline.runs.preview import describe_plan
@@ -123,15 +122,6 @@ def test_check_space__counts_what_is_missing(monkeypatch, tmp_path):
         check_space(plan, tmp_path, plan.n_cells)
     check_space(plan, None)
     monkeypatch.setenv("MAGPEND_SPACE", "0")
-    check_space(plan, tmp_path)
-
-
-def test_check_space__files_count_too(monkeypatch, tmp_path):
-    plan = plan_of(points=1000, execution="trajectories_per_task = 1")
-    monkeypatch.setattr(limits, "_free_files", lambda place: 20_000)
-    with pytest.raises(SpecError, match=r"\d+ files, and there is room for 20000"):
-        check_space(plan, tmp_path)
-    monkeypatch.setattr(limits, "_free_files", lambda place: None)
     check_space(plan, tmp_path)
 
 

@@ -12,13 +12,10 @@ import pytest
 
 from pipeline.analysis.outcomes import sentence
 from pipeline.layout.vocabulary import ATTRACTS
-from pipeline.report.report import report
 from pipeline.report.stored import stored_options
 from pipeline.runs.derive import derive
 from pipeline.runs.run import run as run_spec
-from pipeline.specification.problems import SpecError
 from pipeline.store.run import Run
-from tests.pipeline.cli.test_cli_analyse import CHAOTIC
 
 HOSTILE = "<script>alert(1)</script> & friends"
 SWEEP = f"""
@@ -89,6 +86,16 @@ def test_report__of_a_sweep(folder, command):
     assert html == written(command, folder, "run")
 
 
+CHAOTIC = """
+kind = "sweep"
+model = "duffing"
+parameters = { preset = "twin-well", frequency_hz = 0.15915494309189535 }
+axes = { amplitude = { values = [0.25, 0.3] } }
+initial_conditions = { kind = "random", n = 8, seed = 1, x = [-1.0, 1.0], v = [-1.0, 1.0] }
+integration = { rtol = 1e-7, atol = 1e-7, n_transient = 100, n_keep = 64 }
+"""
+
+
 def test_report__sets_that_do_not_attract_have_no_share(command, tmp_path):
     """Without extension it is not shown that the chaotic set of the larger amplitude attracts."""
     (tmp_path / "spec.toml").write_text(CHAOTIC)
@@ -115,15 +122,6 @@ def test_report__its_commands_work(folder, command):
     for c in mine:
         _, notes = command(folder, *shlex.split(c)[1:])
         assert not re.search(r": computed", notes), c
-
-
-def test_report__what_is_refused(folder, command):
-    with pytest.raises(SpecError, match="unknown analysis 'branch'; did you mean branches"):
-        report([str(folder / "run")], also=["branch"], echo=lambda _: None)
-    with pytest.raises(AssertionError, match=r"suffix must be \.html"):
-        command(folder, "report", "run", "--out", "page.pdf")
-    with pytest.raises(AssertionError, match="no run directory"):
-        command(folder, "report", "nowhere")
 
 
 def test_stored_options__of_these_cells(folder):

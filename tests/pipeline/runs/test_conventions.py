@@ -77,13 +77,6 @@ def test_open_run__sweep_is_described(made, tmp_path):
     plain.pint.quantify()
 
 
-def test_open_run__branches_are_trajectories(walk, tmp_path):
-    ds = magpend.open_run(walk).load()
-    assert ds.cf.cf_roles == {"trajectory_id": ["branch"]}
-    assert ds.cf.axes == {"X": ["frequency"]}
-    readable(ds, tmp_path / "cube.nc")
-
-
 def test_docs__example_of_the_cube(walk, monkeypatch):
     text = (ROOT / "docs/reference/cube.md").read_text("utf-8")
     (block,) = re.findall(r"<!-- tested -->\n```python\n(.*?)```", text, re.DOTALL)

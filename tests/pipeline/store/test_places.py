@@ -8,11 +8,8 @@ import os
 import shutil
 from pathlib import Path
 
-import numpy as np
 import pytest
-import xarray as xr
 
-from pipeline import open_run
 from pipeline.compute import execute, task
 from pipeline.runs.verify import describe, verify_run
 from pipeline.store import commits, local
@@ -287,24 +284,3 @@ def test_skeleton_files__hold_nothing_of_this_machine_or_moment(made):
 
 
 # ---- other readers -----------------------------------------------------------------------------
-
-
-@pytest.mark.filterwarnings("error")
-def test_cube__explains_itself_to_plain_xarray_and_as_netcdf(whole, tmp_path):
-    with xr.open_zarr(whole.info.directory / "cube.zarr", chunks=None) as ds:
-        assert ds["state"].values.tolist() == ["psi1", "psi2", "psi1_dot", "psi2_dot"]
-        assert ds["state_units"].values.tolist() == ["rad", "rad", "rad/s", "rad/s"]
-        assert ds["link"].values.tolist() == ["psi1", "psi2"]
-        assert set(ds.data_vars) == {v.name for v in whole.plan.variables}
-        assert "units" not in ds["section"].attrs
-        assert {"psi1_dot_0", "psi2_dot_0", "frequency", "q"} <= set(ds.coords)
-    ds = open_run(whole.info.directory)
-    for name in ("source", "created", "host"):
-        assert ds.attrs[name]
-    assert ds.attrs["created"] == whole.info.provenance["created"]
-    assert "created" not in (whole.info.directory / "cube.zarr/zarr.json").read_text()
-    ds.to_netcdf(tmp_path / "cube.nc", engine="scipy")
-    with xr.open_dataset(tmp_path / "cube.nc", engine="scipy") as found:
-        assert np.array_equal(found["section"], ds["section"])
-        assert found["state"].values.tolist() == ds["state"].values.tolist()
-        assert found.attrs["spec"] == ds.attrs["spec"]

@@ -13,12 +13,9 @@ import numpy as np
 import pytest
 
 from pipeline.store.run import open_run
-from tests.pipeline.explorer.browser.conftest import WAIT_MS
 from tests.pipeline.explorer.browser.notebooks import Lab, jupyterlab, started
 
 pytestmark = pytest.mark.slow
-
-WAIT_S = WAIT_MS / 1000.0
 
 JUPYTER = {
     "widget": "import json, magpend\nw = magpend.explorer({run!r})\nseen = []\nw.observe(seen.append, 'selected')\nw",
