@@ -133,12 +133,6 @@ def test_attractors__options_reach_the_command_and_the_method_alike(run, command
         run.table("atractors")
 
 
-def test_lyapunov__sum_is_the_divergence(run):
-    """The exponents of the Duffing oscillator add up to -damping, whatever the orbit."""
-    total = run.lyapunov()["lyapunov"].sum("exponent")
-    np.testing.assert_allclose(total, -run.parameters.as_dict()["damping"], rtol=1e-6)
-
-
 def test_extend__opens_the_wider_run(run, tmp_path):
     more = run.extend(out=tmp_path / "more", starts=3, workers=0, echo=lambda _: None)
     assert type(more) is magpend.Run

@@ -91,7 +91,7 @@ def test_packages__have_the_tracked_files_and_no_others(built):
     with tarfile.open(built[1]) as archive:
         names = {name.partition("/")[2] for name in (m.name for m in archive.getmembers() if m.isfile())}
     made = {name for name in names if name.startswith("magpend.egg-info/")} | {"PKG-INFO", "setup.cfg"}
-    top = {"CHANGELOG.md", "CITATION.cff", "LICENSE", "MANIFEST.in", "README.md", "pyproject.toml"}
+    top = {"CHANGELOG.md", "CITATION.cff", "LICENSE", "MANIFEST.in", "README.md", "pyproject.toml", "setup.py"}
     assert names - made == {name for name in tracked() if name.startswith(PACKAGES)} | top
 
 
@@ -130,11 +130,12 @@ def test_versions__are_the_same_everywhere():
     assert RECIPE["context"]["version"] == CITATION["version"] == PROJECT["version"]
     assert RECIPE["context"]["python_min"] == PYPROJECT["tool"]["mypy"]["python_version"] == OLDEST
     assert f"on Python {OLDEST} or later" in README
-    assert set(re.findall(r"^FROM python:([\d.]+)-slim", (ROOT / "Dockerfile").read_text(), re.M)) == {OLDEST}
     tested = CI["jobs"]["versions"]["strategy"]["matrix"]
     said = [c.rpartition(" ")[2] for c in PROJECT["classifiers"] if re.search(r":: 3\.\d+$", c)]
     assert min(said, key=lambda v: int(v[2:])) == OLDEST
     assert set(said) <= set(tested["python"])
+    (image,) = set(re.findall(r"^FROM python:([\d.]+)-slim", (ROOT / "Dockerfile").read_text(), re.M))
+    assert image in said
     assert {"python": OLDEST, "resolution": "lowest-direct"} in tested["include"]
     assert CITATION["license"] == PROJECT["license"]
     assert [a["name"] for a in CITATION["authors"]] == [a["name"] for a in PROJECT["authors"]]
@@ -167,17 +168,18 @@ def test_dependencies__are_all_packages_that_are_imported():
 
 
 def test_extras_and_groups__are_named_and_installed():
-    """Users are told of each extra; tests install all extras, and developers everything but bench."""
+    """Users are told of each extra; the whole suite needs all extras, and developers everything but bench."""
     extras, groups = set(PROJECT["optional-dependencies"]), PYPROJECT["dependency-groups"]
     pages = (p for top in ("pipeline", "docs") for s in ("py", "md") for p in (ROOT / top).rglob(f"*.{s}"))
     text = "".join(page.read_text("utf-8") for page in pages)
-    assert [name for name in extras if f"magpend[{name}]" not in text] == []
+    assert [name for name in extras if not re.search(rf"(magpend|\.)\[{name}\]", text)] == []
     assert not extras & set(groups)
-    (own,) = (text for text in groups["test"] if text.startswith("magpend["))
+    (own,) = (text for text in groups["whole"] if text.startswith("magpend["))
     assert set(own[len("magpend[") : -1].split(",")) == extras
     assert {entry["include-group"] for entry in groups["dev"]} == set(groups) - {"dev", "bench"}
-    (command,) = re.findall(r"<!-- run: tests -->\n```sh\n(.*?)\n```", README, re.DOTALL)
-    assert "--group dev " in command
+    for name, group in (("tests", "test"), ("whole suite", "dev")):
+        (command,) = re.findall(rf"<!-- run: {name} -->\n```sh\n(.*?)\n```", README, re.DOTALL)
+        assert f"--group {group} " in command
 
 
 CONDA = {"dask[array]": "dask-core", "matplotlib": "matplotlib-base", "npTDMS": "nptdms"}
@@ -270,55 +272,22 @@ def test_repository__passes_the_review_of_scientific_python():
     assert ignored == set(PYPROJECT["tool"]["repo-review"]["ignore"])
 
 
-# the Python that README's commands get in CI
+# the Python that README's commands get
 
 
-def chosen_python(path, folder):
-    """Run the part of .ci/run that looks for a Python, with nothing else on PATH; returns its output."""
+def test_setup__says_what_to_do_where_python_is_too_old():
+    before = (3, int(OLDEST.partition(".")[2]) - 1)
+    code = f"import runpy, sys; sys.version_info = {before}; runpy.run_path('setup.py')"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    (line,) = done.stderr.splitlines()
+    assert line.startswith(f"magpend needs Python {OLDEST} or later, and this is {before[0]}.{before[1]}: ")
+    for remedy in ("python3.12 -m venv .venv", "uvx --from . magpend run quickstart --plot"):
+        assert remedy in line
+        assert f"`{remedy}`" in README
+
+
+def test_ci__runs_every_command_of_readme_with_the_python_that_is_there():
     text = (ROOT / ".ci" / "run").read_text("utf-8")
-    (part,) = re.findall(r"^# README's commands call python3.*?^printf 'Python [^\n]*\n", text, re.DOTALL | re.M)
-    for tool in ("sed", "grep", "sort", "awk", "env", "mkdir", "chmod", "paste"):
-        (path / tool).symlink_to(shutil.which(tool))
-    script = (
-        f"set -euo pipefail; cd {shlex.quote(str(ROOT))}; scratch={folder}\n{part}\n"
-        f"type -P python3\npython3 -m venv {folder}/venv"
-    )
-    words = [shutil.which("bash"), "-c", script]
-    return subprocess.run(words, env={"PATH": str(path)}, capture_output=True, text=True, check=False)
-
-
-def executable(path, text):
-    path.write_text(f"#!/bin/sh\n{text}\n")
-    path.chmod(0o755)
-
-
-def too_old(path):
-    """Make a Python that says it is of the version before the oldest that is supported."""
-    before = (3, int(OLDEST.partition(".")[2]) - 1, 9)
-    code = f"import sys; sys.version_info = {before}; exec(sys.argv.pop(1))"
-    executable(path, f'exec {shlex.quote(sys.executable)} -c "{code}" "$2" "$3"')
-
-
-@pytest.mark.parametrize("found_by", ["path", "pyenv", None])
-def test_ci__takes_a_newer_python_where_python3_is_too_old(tmp_path, found_by):
-    (path := tmp_path / "path").mkdir()
-    (folder := tmp_path / "scratch").mkdir()
-    too_old(path / "python3")
-    own = f'exec {shlex.quote(sys.executable)} "$@"'
-    if found_by == "path":
-        executable(path / "python3.99", own)
-    elif found_by == "pyenv":
-        run = f'if [ "$PYENV_VERSION" = 3.12.99 ]; then shift 2; {own}; fi'
-        executable(path / "pyenv", f"case $1 in versions) echo 2.7.18; echo 3.9.1; echo 3.12.99;; exec) {run};; esac")
-    done = chosen_python(path, folder)
-    if found_by is None:
-        assert done.returncode == 1
-        assert done.stderr == f"no Python {OLDEST} or later on PATH or in pyenv; install one\n"
-        return
-    assert done.returncode == 0, done.stderr
-    version = ".".join(map(str, sys.version_info[:2]))
-    assert done.stdout.splitlines()[0].startswith(f"Python {version} {sys.executable} ")
-    assert done.stdout.splitlines()[1] == f"{folder}/bin/python3"
-    # the environment still works when the scratch folder's script is gone
-    shutil.rmtree(folder / "bin")
-    subprocess.run([folder / "venv" / "bin" / "python", "-c", "import ssl"], check=True)
+    assert re.findall(r'^run_command "(.*)"$', text, re.M) == re.findall(r"<!-- run: (.*) -->", README)
+    assert "PATH=" not in text

@@ -60,17 +60,6 @@ def test_imports__are_light(code, heavy):
     assert said.splitlines()[-1] == "[]"
 
 
-def test_load_model__warns_of_what_nothing_uses():
-    table = {
-        "name": "oscillator",
-        "states": {"x": "m", "v": "m/s"},
-        "parameters": {"c": 0.1, "k": 2.0},
-        "equations": {"x": "v", "v": "-x - c*v + cos(2*pi*f*t)"},
-    }
-    with pytest.warns(UserWarning, match=r"model.parameters.k: nothing uses it; use it"):
-        magpend.load_model(table)
-
-
 def test_packages__are_all_shipped():
     """Every folder with modules is in the list of packages, and the face is mapped to its folder."""
     setup = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]

@@ -104,7 +104,7 @@ def test_reference__names_everything():
     assert f"`{FREQUENCY_DIM}`" in PAGES["docs/reference/cube.md"]
 
 
-@pytest.mark.parametrize("name", ["main job", "tests"])
+@pytest.mark.parametrize("name", ["main job", "tests", "whole suite"])
 def test_readme__commands_for_ci_are_one_line(name):
     (command,) = re.findall(rf"<!-- run: {name} -->\n```sh\n(.*?)\n```", README, re.DOTALL)
     assert "\n" not in command

@@ -6,23 +6,7 @@ import shutil
 
 import pytest
 
-from pipeline.runs.run import run
 from tests.pipeline.conftest import WALK
-
-
-@pytest.fixture(scope="session")
-def computed(tmp_path_factory):
-    """Compute a specification once: ``computed(text)`` is its run directory."""
-    kept = {}
-
-    def once(text):
-        if text not in kept:
-            folder = kept[text] = tmp_path_factory.mktemp("computed")
-            (folder / "spec.toml").write_text(text, "utf-8")
-            run(folder / "spec.toml", folder / "run", workers=0, echo=lambda line: None)
-        return kept[text] / "run"
-
-    return once
 
 
 @pytest.fixture

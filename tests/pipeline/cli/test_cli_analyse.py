@@ -7,27 +7,9 @@ import re
 
 import numpy as np
 import pytest
-import xarray as xr
 
-from pipeline.analysis.attractors.table import attractors_table
-from pipeline.analysis.basins.basins import basins as basins_of
-from pipeline.analysis.basins.table import basins_table
-from pipeline.analysis.tabular import FEW_POINTS
 from pipeline.cli.exits import Exit
-from pipeline.layout.vocabulary import APERIODIC, EVIDENCE, KINDS, NOT_SETTLED, STABILITIES
 from pipeline.runs.derive import derive
-from tests.pipeline.plots.made_up import make_attractors
-
-NUMBERS = (
-    "multiplier_error",
-    "lyapunov_max",
-    "lyapunov_low",
-    "lyapunov_high",
-    "mean_lifetime",
-    "lifetime_low",
-    "lifetime_high",
-)
-COUNTS = ("n_sampled", "n_left", "closes_above")
 
 SPIRALS = """
 kind = "sweep"
@@ -80,82 +62,6 @@ def test_attractors__table_per_point(main, spirals, tmp_path):
     assert "attractors: taken from" in err
 
 
-def test_basins__fractions_and_boundaries(main, spirals, tmp_path):
-    arguments = ["analyse", "basins", spirals, "--box", "2", "--interval", "clopper-pearson"]
-    code, out, err = main(*arguments, "--csv", tmp_path / "b.csv")
-    assert code == 0, err
-    assert "clopper-pearson, 95 %" in out
-    # four boxes are too few for an error
-    assert re.search(r"basin entropy: 0\.\d+ \(error not known\)", out)
-    assert "not computed: uncertainty exponent" in out
-    assert "an attractor that no cell shows: at most 0.171 of the region" in out
-    with (tmp_path / "b.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    for frequency in ("2.2", "2.25"):
-        counts = [int(row["n_cells"]) for row in rows if row["frequency"] == frequency]
-        assert sum(counts) == 16
-    code, _, err = main(*arguments, "--box", "3")
-    assert "attractors: taken from" in err
-    assert "basins: computed" in err
-
-
-CHAOTIC = """
-kind = "sweep"
-model = "duffing"
-parameters = { preset = "twin-well", frequency_hz = 0.15915494309189535 }
-axes = { amplitude = { values = [0.25, 0.3] } }
-initial_conditions = { kind = "random", n = 8, seed = 1, x = [-1.0, 1.0], v = [-1.0, 1.0] }
-integration = { rtol = 1e-7, atol = 1e-7, n_transient = 100, n_keep = 64 }
-"""
-
-
-@pytest.fixture
-def chaotic(copied):
-    """Two orbits of period 1 at the first amplitude, a chaotic attractor at the second."""
-    return copied(CHAOTIC)
-
-
-def test_settling__says_what_stays(main, chaotic, tmp_path):
-    """The cells of the chaotic attractor are extended, and none leaves."""
-    code, out, err = main("analyse", "settling", chaotic, "--n-sample", "4", "--csv", tmp_path / "s.csv")
-    assert code == 0, err
-    ds = derive(chaotic, "settling", {"n_sample": 4})
-    (place,) = np.argwhere(np.isin(ds["kind"].values, APERIODIC))
-    one = ds.isel(amplitude=place[0], attractor=place[1])
-    assert out.startswith("sets that do not close: 1; lifetimes are in drive periods\n")
-    with (tmp_path / "s.csv").open() as file:
-        (row,) = csv.DictReader(file)
-    assert (float(row["amplitude"]), int(row["attractor_id"])) == (0.3, place[1])
-    assert (row["kind"], row["stability"]) == ("chaotic_set", "attracts")
-    assert int(row["n_cells"]) == 8
-    assert 4 <= int(row["n_sampled"]) == int(one["n_sampled"])
-    assert int(row["n_left"]) == 0
-    assert float(row["lifetime_low"]) == float(one["lifetime_low"]) > 100
-    names = "id +kind +stability +cells +extended +near an orbit +left later +mean lifetime +to"
-    assert re.search(rf"amplitude m/s2 +{names}\n", out)
-    assert f"above {float(row['lifetime_low']):.0f}" in out
-    # the same is said of it in the table of attractors
-    _, out, _ = main("analyse", "attractors", chaotic, "--n-sample", "4")
-    assert f"{row['n_sampled']} stayed, lifetime above {float(row['lifetime_low']):.0f}" in out
-
-
-def test_settling__without_extending_nothing_is_shown(main, chaotic):
-    """More than that is known once it was asked for, and no analysis contradicts it later."""
-    code, out, err = main("analyse", "attractors", chaotic, "--no-extend")
-    assert code == 0, err
-    assert re.search(r"bounded set +not settled .* - +- +", out)
-    assert "8 of 16 cells end on attractors; 8 not settled" in out
-    assert "2 attractors at 2 parameter points, and 1 other set on which cells end" in out
-    assert "nothing was extended (--no-extend)" in out
-    code, out, err = main("analyse", "attractors", chaotic)
-    assert code == 0, err
-    assert "all 16 cells end on attractors" in out
-    code, out, err = main("analyse", "settling", chaotic, "--no-extend")
-    assert code == 0, err
-    assert "attractors: taken from" in err
-    assert re.search(r"chaotic set +attracts ", out)
-
-
 def test_hysteresis__loops_and_jumps(main, walk, tmp_path):
     code, out, err = main("analyse", "hysteresis", "run", "--no-polish", "--csv", "h.csv")
     assert code == 0, err
@@ -171,13 +77,6 @@ def test_hysteresis__loops_and_jumps(main, walk, tmp_path):
     code, _, err = main("analyse", "basins", "run")
     assert code == Exit.REFUSED
     assert "independent initial conditions" in err
-    # the figure of attractors shows the loops
-    code, _, err = main("plot", "attractors", "run", "--degrees", "--format", "svg")
-    assert code == 0, err
-    assert "hysteresis: computed" in err
-    with xr.open_dataset(walk / "figures" / "attractors_psi1_degrees.nc", engine="scipy") as stored:
-        assert {"value", "share", "present"} <= set(stored.data_vars)
-        assert stored["value"].attrs["units"] == "deg"
 
 
 def test_analyse__incomplete_run_and_prune(main, made):
@@ -200,14 +99,8 @@ def test_analyse__incomplete_run_and_prune(main, made):
     [
         (["attractors", "--tolerance", "-1"], "tolerance = -1.0: must be at least 0."),
         (["attractors", "--threshold", "0"], "threshold = 0.0: must be greater than 0."),
-        (["settling", "--n-sample", "0"], "n_sample = 0: must be at least 1."),
-        (["settling", "--lifetime-confidence", "1"], "lifetime_confidence = 1.0: must be less than 1."),
-        (["attractors", "--look-back", "0"], "look_back = 0: must be at least 1."),
-        (["basins", "--budget", "-1"], "budget = -1.0: must be at least 0."),
         (["basins", "--confidence", "nan"], "confidence = nan: must be a finite number."),
-        (["basins", "--box", "1"], "box = 1: must be at least 2."),
         (["basins", "--interval", "wilsen"], "Did you mean 'wilson'?"),
-        (["attractors", "--treshold", "1"], "did you mean"),
         (["dimension", "--at", "freqency_hz=2.2"], "unknown axis 'freqency_hz'; did you mean frequency?"),
         (["branches", "--parameter", "frequency_h"], "did you mean frequency_hz?"),
         (["hysteresis"], 'hysteresis needs a continuation with direction = "both".'),
@@ -222,60 +115,6 @@ def test_analyse__refused_before_computing(main, made, arguments, message):
     assert message in err
     assert out == ""
     assert not (made.info.directory / "derived").exists()
-
-
-def test_report__a_line_per_attractor_if_there_are_many_points():
-    n = FEW_POINTS + 1
-    cells = np.zeros((n, 10), np.int32)
-    cells[4:, :3] = 1
-    cells[5, :8] = 1
-    frequency, per = 2.0 + 0.5 * np.arange(n), ("frequency", "attractor")
-    cells_of = ("frequency", "initial_condition")
-    ds = make_attractors(cells, cells_of, {"frequency": ("frequency", frequency, {"units": "Hz"})})
-    flags = {"flag_values": [0, 1, 2], "flag_meanings": "pending periodic bounded"}
-    meanings = {"decision": "undecided closed extended", "side": "unknown left right", "kind": " ".join(KINDS)}
-    for name, text in {**meanings, "stability": " ".join(STABILITIES)}.items():
-        ds[name].attrs["flag_meanings"] = text
-    ds["status"].attrs, kind = flags, (ds["kind"] > 0).values
-    nan = np.full((n, 2), np.nan)
-    ds = ds.assign(
-        ran_out=("frequency", np.zeros(n, np.int8)),
-        evidence=(per, np.zeros((n, 2), np.int8), {"flag_meanings": " ".join(EVIDENCE)}),
-        orbit_period=(per, kind * np.array([1, 2])),
-        period_s=(per, kind * np.array([1, 2]) / frequency[:, None]),
-        side=ds["side"] * 0,
-        multiplier_real=((*per, "multiplier"), nan[..., None]),
-        multiplier_imag=((*per, "multiplier"), nan[..., None]),
-        mirror_partner=(per, -kind.astype(int)),
-        mirror_distance=(per, nan),
-        **{name: (per, nan) for name in NUMBERS},
-        **{name: (per, np.zeros((n, 2), int)) for name in COUNTS},
-    )
-    ds["side"].attrs["flag_meanings"] = meanings["side"]
-    lines = attractors_table(ds).lines
-    assert lines[0] == f"2 attractors at {n} parameter points"
-    assert lines[1].split()[:4] == ["id", "kind", "stability", "periods"]
-    assert re.search(r"^  0 +periodic orbit +attracts +1 +unknown +2 to 5 +7 +56 .*1\.0000 at 2 Hz", lines[2])
-    assert re.search(r"^  1 +periodic orbit +attracts +2 +unknown +4 to 5 +3 +14 .*0\.8000 at 4\.5 Hz", lines[3])
-    assert lines[4] == "all 70 cells end on attractors"
-    other = ds.copy(deep=True)
-    other["stability"][5, 1] = NOT_SETTLED
-    lines = attractors_table(other).lines
-    assert re.search(r"^  1 +periodic orbit +attracts, not settled +2 .*0\.3000 at 4 Hz", lines[3])
-    assert lines[4] == "62 of 70 cells end on attractors; 8 not settled"
-    cube = ds[["status"]].assign(n_periods=ds["status"])
-    measured = basins_of(cube, ds)
-    lines = basins_table(measured).lines
-    assert re.search(r"^  1 +4 to 5 +3 +14 .*0\.8000 at 4\.5 Hz", lines[3])
-    assert lines[4] == "not computed: boundaries: the starts are no grid"
-    assert not any("inferred" in line for line in lines)
-    refined = ds["status"].where(cells == 0, 7).astype(np.int8).assign_attrs(flags)
-    measured = basins_of(cube, ds.assign(status=refined))
-    rows = basins_table(measured).rows
-    assert [row["n_inferred"] for row in rows] == [row["n_cells"] * (row["label"] == 1) for row in rows]
-    lines = basins_table(measured).lines
-    assert lines[1].endswith("inferred cells")
-    assert re.search(r"^  1 +4 to 5 +3 +14 +0\.8000 at 4\.5 Hz.* 14$", lines[3])
 
 
 def test_analyse__run_without_attractors(main, write_spec, tmp_path):

@@ -18,7 +18,7 @@ from magpend_core.engine import jit
 from magpend_core.models import DEFAULT
 from pipeline.cli import console, models
 from pipeline.cli.common import tell
-from pipeline.cli.console import Display, Work, progress
+from pipeline.cli.console import Work, progress
 from pipeline.cli.exits import Exit
 from pipeline.products.product import Table
 from pipeline.products.reporting import report, reporting, track
@@ -120,14 +120,6 @@ def test_reporting__says_when_it_compiles():
     assert heard == ["work", "compiling", "work"]
 
 
-def test_display__a_bar_is_taken_away(capsys):
-    display = Display("work", terminal=True)
-    display("work", 1, 4)
-    display.show()
-    display.stop()
-    assert capsys.readouterr().err.endswith("\r\x1b[2K")
-
-
 def test_head__ends_with_0(magpend, made, environment):
     """Whoever reads no further is no error."""
     command = f"{sys.executable} -m pipeline.cli.main status {made.info.directory} | head -c 1"
@@ -195,16 +187,6 @@ def test_models__lists_states_parameters_and_presets(main):
     assert code == Exit.REFUSED
     assert "duffing" in err
     assert "twin-well" in main("presets", "--model", "duffing")[1]
-
-
-@pytest.mark.parametrize("name", ["frequency", "frequency_hz"])
-def test_zoom__both_names_of_the_frequency(main, write_spec, sweep_text, tmp_path, name):
-    write_spec(sweep_text)
-    code, _, err = main("zoom", "spec.toml", f"--{name.replace('_', '-')}", "2.1", "2.2", "--out", "a.toml")
-    assert code == 0, err
-    assert "frequency_hz = { start = 2.1, stop = 2.2" in (tmp_path / "a.toml").read_text()
-    assert main("zoom", "spec.toml", "--at", f"{name}=2.5", "--out", "b.toml")[0] == 0
-    assert "frequency_hz = 2.5" in (tmp_path / "b.toml").read_text()
 
 
 def test_status__for_programs(main, made):

@@ -67,50 +67,6 @@ def test_show__text_of_a_specification(main, tmp_path, own):
     assert r"\frac{\mathrm{d}v}{\mathrm{d}t} &= \mathrm{drive} - d \, v - x^{3}" in out
 
 
-BALL = """
-name = "ball"
-section = "each millisecond"
-[states]
-h = "m"
-v = "m/s"
-[parameters]
-r = 0.8
-mass = 1.0
-[define]
-table = "0.01*sin(2*pi*f*t)"
-speed = "-r*v"
-[equations]
-h = "v"
-v = "-9.81"
-[[impacts]]
-of = "h - table"
-direction = "down"
-set = { v = "speed" }
-"""
-
-
-def test_show__definitions_of_impacts_and_names_without_use(main, tmp_path):
-    (tmp_path / "ball.toml").write_text(BALL)
-    code, out, said = main("model", "show", "ball.toml")
-    assert code == 0, said
-    assert {"  table = 0.01*sin(2*pi*f*t)", "  speed = -r*v"} <= set(out.splitlines())
-    assert "  model.parameters.mass: nothing uses it; use it in an expression" in out
-    found = json.loads(main("model", "show", "ball.toml", "--json")[1])
-    assert found["definitions"].keys() == {"table", "speed"}
-    assert len(found["warnings"]) == 1
-    assert "mathrm{speed} &= " in main("model", "show", "ball.toml", "--latex")[1]
-
-
-def test_run__warns_of_names_without_use(main, tmp_path, own):
-    (tmp_path / "spec.toml").write_text(own.spec(own.text.replace("parameters = {", "parameters = { k = 1.0,")))
-    code, out, said = main("run", "spec.toml", "--dry-run")
-    assert code == 0, said
-    assert "warning: model.parameters.k: nothing uses it; " in out
-    code, _, said = main("run", "spec.toml", "--workers", 0)
-    assert code == 0, said
-    assert "warning: model.parameters.k: nothing uses it; " in said
-
-
 def test_show__file_of_a_model_and_one_that_ships(main, tmp_path, own):
     (tmp_path / "shared.toml").write_text(own.text.replace("[model]", "").replace('name = "duffing5"', ""))
     code, out, _ = main("model", "show", "shared.toml")
@@ -131,19 +87,6 @@ def test_run__start_without_a_value_is_refused_before_anything_is_made(main, tmp
     assert "model.equations.v: log(x + 0.5): logarithm of -0.5 at the start x = -1" in said
     assert not (tmp_path / "runs").exists()
     assert main("run", "spec.toml", "--dry-run")[0] == 2
-
-
-def test_simulate__text_of_a_file(main, tmp_path, own):
-    (tmp_path / "shared.toml").write_text(own.text)
-    words = ("--x", 0.5, "--set", "A=0.3", "--frequency", 0.16, "--periods", 2, "--out", "series.csv", "--no-figure")
-    code, _, said = main("simulate", "--model", "shared.toml", *words)
-    assert code == 0, said
-    head, first = (tmp_path / "series.csv").read_text().splitlines()[:2]
-    assert head == "time_s,x_m,v_m_per_s"
-    assert first.split(",")[1] == "0.5"
-    code, _, said = main("simulate", "--model", "shared.toml", "--y", "0.5", "--no-figure")
-    assert code == 2
-    assert "unknown state of duffing5" in said
 
 
 IMPACT = '\n[[model.impacts]]\nof = "x - d"\ndirection = "up"\nset = { v = "-0.5*v" }\n'

@@ -64,8 +64,9 @@ def test_commands__write_into_no_run_directory_and_follow_no_link(whole, main, t
 @pytest.mark.parametrize("name", [n for n in COMMANDS if n not in ("film.gif", "copy.html", "new.toml")])
 def test_commands__replace_what_is_their_own_alone(whole, main, tmp_path, name):
     path = tmp_path / name
-    # a table of other columns is a stranger's, too
-    for theirs in (b"time,x\n0,1\n", b"a;b\n1;2\n") if name.endswith(".csv") else (b"somebody's data\n",):
+    # a table of other columns is a stranger's, too; a series may have any
+    others = {"table.csv": (b"time,x\n0,1\n", b"a;b\n1;2\n"), "series.csv": (b"a;b\n1;2\n",)}
+    for theirs in others.get(name, (b"somebody's data\n",)):
         path.write_bytes(theirs)
         code, _, said = main(*COMMANDS[name], path)
         assert code == 2, said

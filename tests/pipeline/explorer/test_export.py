@@ -14,16 +14,14 @@ import pytest
 
 from pipeline.explorer.copies import folder as folder_module
 from pipeline.explorer.copies import orbits as copied_orbits
-from pipeline.explorer.copies.columns import fit, levels, thinned
-from pipeline.explorer.copies.content import Column, column
+from pipeline.explorer.copies.columns import fit, levels
+from pipeline.explorer.copies.content import Column
 from pipeline.explorer.copies.export import RESERVE, export_page
 from pipeline.explorer.copies.folder import export_folder
 from pipeline.explorer.copies.orbits import ALIKE, NEAREST, NONE, SAME_ATTRACTOR, choose
-from pipeline.explorer.copies.packing import packed
 from pipeline.explorer.data.arrays import unpack_arrays
 from pipeline.explorer.data.explored import ExploredRun
-from pipeline.specification.problems import SpecError
-from pipeline.store.errors import DamagedError, RefusedError
+from pipeline.store.errors import RefusedError
 from pipeline.store.run import Run
 
 HOSTILE = '</script><script>alert(1)</script><!-- \\" onload=alert(1) &lt;b'
@@ -57,15 +55,6 @@ def run(made):
     for index in range(made.plan.n_tasks - 1):
         made.commit(index)
     return Run.open(made.info.directory)
-
-
-def test_packed__is_read_back(tmp_path):
-    arrays = {"a": np.arange(6.0).reshape(2, 3) / 7, "b": np.arange(3, dtype=np.uint8), "c": np.empty(0)}
-    back, attrs = _data(packed(arrays, {"k": [1, None]}))
-    assert attrs == {"k": [1, None]}
-    for name, values in arrays.items():
-        np.testing.assert_array_equal(back[name], values)
-        assert back[name].shape == values.shape
 
 
 def test_export_page__has_the_cubes_numbers(run, tmp_path):
@@ -113,17 +102,6 @@ def test_export_page__leaves_out_what_does_not_fit_and_says_what(run, tmp_path):
     with pytest.raises(RefusedError, match="--folder OUT"):
         export_page(run, tmp_path / "none.html", most_orbits=0, most_bytes=10_000)
     assert not (tmp_path / "none.html").exists()
-
-
-def test_thinned__keeps_a_period_of_closed_orbits_and_the_last_section_of_all():
-    column = Column(np.array([6, 0, 5, 4], np.uint32), np.arange(15, dtype=float))
-    found = thinned(column, np.array([2, 0, 0, 8]), 3)
-    np.testing.assert_array_equal(found.count, [2, 0, 2, 4])
-    np.testing.assert_array_equal(found.y, [4, 5, 7, 10, 11, 12, 13, 14])
-    assert thinned(column, np.array([2, 0, 0, 8]), 0) is column
-    every = thinned(column, np.zeros(4, int), 100)
-    np.testing.assert_array_equal(every.count, [1, 0, 1, 1])
-    np.testing.assert_array_equal(every.y, [5, 10, 14])
 
 
 def test_fit__gives_numbers_that_are_those_of_what_it_keeps():
@@ -273,30 +251,6 @@ def test_export_folder__that_fails_leaves_what_was_there(run, tmp_path, monkeypa
         export_folder(run, site, most_orbits=0, force=True)
     assert (site / "objects.json").read_bytes() == before
     assert [p.name for p in tmp_path.iterdir() if p.name.startswith(".")] == []
-
-
-def test_export__of_a_damaged_run_is_refused(run, tmp_path):
-    chunk = next((run.directory / "cube.zarr" / "section").glob("c.*"))
-    chunk.write_bytes(chunk.read_bytes()[:-1] + b"\0")
-    for write, name in ((export_page, "copy.html"), (export_folder, "site")):
-        with pytest.raises(DamagedError, match="section"):
-            write(run, tmp_path / name, most_orbits=0)
-        assert not (tmp_path / name).exists()
-
-
-def test_export__a_quantity_on_the_vertical_axis(run, tmp_path):
-    name = run.model.quantities[0].name
-    explored = ExploredRun.of(run)
-    wanted, _ = column(explored, "frequency", name)
-    written = export_page(run, tmp_path / "copy.html", most_orbits=0, quantities=[name])
-    assert any(f"{len(run.model.quantities) - 1} quantities of the model are not" in s for s in written.sentences)
-    objects = _objects(tmp_path / "copy.html")
-    view, about = _about(objects)
-    assert [v["name"] for v in view["verticals"]] == [*run.model.state_names, name]
-    arrays, _ = _data(objects[about["columns"][name]])
-    np.testing.assert_array_equal(arrays["y"], wanted.y)
-    with pytest.raises(SpecError, match="--quantity"):
-        export_page(run, tmp_path / "other.html", most_orbits=0, quantities=["enthusiasm"])
 
 
 def test_export__command(main, run, tmp_path):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 from types import SimpleNamespace
 
 import numpy as np
@@ -15,12 +14,10 @@ from pipeline.explorer.data.colours import rgb
 from pipeline.explorer.live import slices
 from pipeline.explorer.live.catalog import Entry
 from pipeline.explorer.live.legend import Legend
-from pipeline.explorer.live.live import LiveRun, live_problem
-from pipeline.explorer.live.messages import MOST_BYTES, Region, RequestError
+from pipeline.explorer.live.live import LiveRun
+from pipeline.explorer.live.messages import MOST_BYTES, Region
 from pipeline.explorer.live.regions import zoom_toml, zoomed
 from pipeline.explorer.live.settling import settle_cells
-from pipeline.layout.identity import identity_of
-from pipeline.layout.plan import make_plan
 from pipeline.layout.vocabulary import (
     ABSENT,
     ATTRACTS,
@@ -35,9 +32,7 @@ from pipeline.plots import palette
 from pipeline.runs.derive import derive
 from pipeline.runs.status import state
 from pipeline.specification.parsing import load_spec
-from pipeline.specification.problems import SpecError
 from pipeline.store.run import Run
-from pipeline.store.setup import create
 from tests.pipeline.explorer.small_runs import FLOW, finished
 
 HZ = 0.15915494309189535
@@ -243,17 +238,6 @@ def test_slice__without_an_analysis_tells_orbits_apart(directories, watch):
     assert len({line["label"] for line in end["labels"]}) == len(end["labels"])
 
 
-def test_slice__ends_when_cancelled(directories, watch):
-    watcher = watch(directories["whole"])
-    number = watcher.send(**slice_of([-1, 1], [-1, 1], 512))
-    watcher.wait(number, "slice")
-    watcher.send(do="cancel", job=number)
-    assert watcher.wait(number)["cancelled"] is True
-    n = len(watcher.of(number))
-    time.sleep(0.2)
-    assert len(watcher.of(number)) == n
-
-
 # ---- orbits that follow --------------------------------------------------------------------------
 
 
@@ -366,22 +350,6 @@ def test_zoomed__is_the_region_and_reads_back(directories, tmp_path):
     assert spec.initial_conditions == opened.spec.initial_conditions
 
 
-@pytest.mark.parametrize(
-    ("text", "word"),
-    [
-        ('{"x": [1, 0]}', "empty"),
-        ('{"x": [0, 1], "axes": ["q", null]}', "not what the run sweeps"),
-        ('{"x": [-1, 1], "axes": ["x", null], "at": {"A": 9}}', "2 values"),
-        ('{"x": [-1, 1], "axes": ["x", null], "at": {"A": -1}}', "2 values"),
-        ('{"x": [-1.7e308, 1.7e308], "axes": ["A", null]}', "too long"),
-    ],
-)
-def test_zoomed__refuses_with_a_sentence(directories, text, word):
-    region = Region.model_validate_json(text)
-    with pytest.raises((RequestError, SpecError), match=word):
-        zoomed(Run.open(directories["whole"]), region)
-
-
 def test_run__a_region_beside_the_run(directories, watch, monkeypatch):
     watcher = watch(directories["whole"])
     beside = directories["whole"].parent
@@ -458,24 +426,3 @@ def test_receive__answers_what_is_wrong_and_goes_on(directories, watch):
     ):
         assert word in watcher.ask(**wrong)["error"]
     assert watcher.ask(do="start", parameters={"A": 0.2}, state={"x": 0.3})["kind"] == "done"
-
-
-def test_live_problem__of_a_model_that_is_an_object(tmp_path, own, monkeypatch):
-    """Opening a run imports nothing, and so nothing of it can be computed live."""
-    from magpend_core.models import imported
-
-    trace = own.write_module(tmp_path, "live_mine")
-    monkeypatch.syspath_prepend(tmp_path)
-    text = own.spec('model = "live_mine:MINE"')
-    (tmp_path / "spec.toml").write_text(text)
-    spec = load_spec(tmp_path / "spec.toml")
-    plan = make_plan(spec)
-    create(tmp_path / "run", spec, plan, identity_of(spec, plan, "test-kernel"), text)
-    monkeypatch.setattr(imported, "_imported", {})
-    n = len(trace.read_text())
-    said = live_problem(Run.open(tmp_path / "run"))
-    assert said is not None
-    assert "live_mine:MINE" in said
-    with pytest.raises(RequestError):
-        LiveRun(Run.open(tmp_path / "run"))
-    assert len(trace.read_text()) == n

@@ -332,17 +332,3 @@ def test_explore__takes_a_region_that_it_runs_along(made_run, start):
         child.kill()
     assert not alive
     assert gone
-
-
-def test_explore__a_page_that_is_open_sees_new_cells(made):
-    """A run in progress is looked at again whenever the page is loaded."""
-    found = Client(Run.open(made.info.directory))
-    try:
-        assert json.loads(found.ask("/api/view").body)["cells"]["pending"] == made.plan.n_cells
-        made.commit(0)
-        view = json.loads(found.ask("/api/view").body)
-        assert view["cells"]["pending"] == made.plan.n_cells - made.plan.cells_in(0)
-        assert not view["complete"]
-        assert found.ask("/api/diagram?x=frequency&y=psi1&at.q=0").code == 200
-    finally:
-        found.close()

@@ -17,7 +17,7 @@ from pipeline.explorer.data import diagram as diagrams
 from pipeline.explorer.data import tables
 from pipeline.explorer.data.arrays import unpack_arrays
 from pipeline.explorer.data.clicked_orbit import cell_of, linearise, orbit
-from pipeline.explorer.data.colours import NONE, rgb, schemes
+from pipeline.explorer.data.colours import NONE
 from pipeline.explorer.data.diagram import diagram
 from pipeline.explorer.data.explored import ExploredRun, ExplorerError
 from pipeline.explorer.data.overlays import attractors, branches, curves
@@ -28,8 +28,7 @@ from pipeline.explorer.data.tables import table
 from pipeline.explorer.data.view import describe_view
 from pipeline.layout.identity import identity_of
 from pipeline.layout.plan import make_plan
-from pipeline.layout.vocabulary import ATTRACTS, DIVERGED, EVIDENCE, PERIODIC, TRANSIENT
-from pipeline.plots import palette
+from pipeline.layout.vocabulary import ATTRACTS, DIVERGED, PERIODIC
 from pipeline.runs.derive import derive
 from pipeline.specification.parsing import load_spec
 from pipeline.store.run import Run
@@ -183,20 +182,6 @@ def test_diagram__has_every_point_of_the_cube(sweep, x, y):
     assert len(arrays["cell"]) == status.size // cube.sizes[other]
 
 
-def test_diagram__shows_quantities_at_the_sections(sweep):
-    """The energy at the end of a period lies between its extremes over that period, and nowhere else."""
-    explored = ExploredRun.of(sweep)
-    found = [
-        unpack_arrays(diagram(explored, "frequency", y, {"amplitude": 2}))[0]["y"]
-        for y in ("energy", "energy.min", "energy.max")
-    ]
-    energy, low, high = found
-    assert len(energy) == len(low) > 100
-    # extremes are those of the states at the steps' ends, of which the section is one
-    assert np.all((energy >= low - 1e-9) & (energy <= high + 1e-9))
-    assert np.ptp(energy) > 1e-3
-
-
 def test_diagram__colours_are_those_of_the_analyses(sweep):
     explored = ExploredRun.of(sweep)
     arrays, _ = unpack_arrays(diagram(explored, "amplitude", "x", {"frequency": 0}))
@@ -229,19 +214,6 @@ def test_diagram__shows_the_last_sections_where_there_are_too_many(sweep, monkey
     monkeypatch.setattr(diagrams, "MOST_POINTS", 71)
     with pytest.raises(ExplorerError, match="71 cells at most"):
         diagram(explored, "amplitude", "x", {"frequency": 0})
-
-
-@pytest.mark.parametrize(
-    ("x", "at", "sentence"),
-    [
-        ("q", {}, "unknown axis 'q'"),
-        ("amplitude", {}, "at.frequency is missing"),
-        ("amplitude", {"frequency": 2}, "must be 0 to 1"),
-    ],
-)
-def test_diagram__refuses_in_a_sentence(sweep, x, at, sentence):
-    with pytest.raises(ExplorerError, match=sentence):
-        diagram(ExploredRun.of(sweep), x, "x", at)
 
 
 def test_diagram__of_a_run_in_progress_has_what_is_committed(made_run):
@@ -345,47 +317,6 @@ def test_orbit__says_what_the_cube_and_the_analysis_say(sweep):
             assert attrs["stable"]
             assert (attrs["kind"], attrs["stability"]) == ("periodic orbit", "attracts")
             assert attrs["evidence"] == "multipliers"
-
-
-def test_view__what_does_not_attract_is_no_attractor(sweep):
-    """Cells on it are grey by what it is; the page is told so, and that it has no share."""
-    explored = ExploredRun.of(sweep)
-    known = explored.kept("attractors")
-    at = {"frequency": 1, "amplitude": 0}
-    number = int(known["share"].isel(at).values.argmax())
-    changed = known.copy(deep=True)
-    changed["stability"].loc[{"attractor": number}] = TRANSIENT
-    changed["evidence"].loc[{"attractor": number}] = EVIDENCE.index("left")
-    changed["share"].loc[{"attractor": number}] = 0.0
-    explored._opened["derived attractors"] = changed
-
-    (scheme,) = (s for s in schemes(explored) if s.name == "attractor")
-    (grey,) = (c for c in scheme.categories if c.label == "on a transient set")
-    assert grey.colour == rgb(palette.GREYS["on a transient set"])
-    assert next(c for c in scheme.categories if c.number == number).label.endswith(", transient")
-    arrays, _ = unpack_arrays(diagram(explored, "amplitude", "x", {"frequency": 1}))
-    own = known["attractor_id"].transpose(*explored.plan.dims).values.ravel()[arrays["cell"]] == number
-    assert own.any()
-    np.testing.assert_array_equal(arrays["colour_attractor"] == grey.number, own)
-    arrays, attrs = unpack_arrays(plane(explored, at))
-    assert grey.number in arrays["label"]
-    assert grey.number in {c["id"] for c in attrs["labels"]}
-
-    told = {a["id"]: a for a in attractors(explored, at)["attractors"]}
-    assert {told[number][key] for key in ("stability", "evidence")} == {"transient", "left"}
-    assert told[number]["name"].endswith(", transient")
-    assert told[number]["low"] is None
-    listed = curves(explored, "amplitude", {"frequency": 1})["curves"]
-    assert number not in {c["attractor"] for c in listed if c["group"] == "fractions"}
-    _, attrs = unpack_arrays(orbit(explored, int(cell_on(explored, known, at, number)), 0))
-    assert (attrs["attractor"], attrs["stability"], attrs["stable"]) == (number, "transient", None)
-
-
-def cell_on(explored, found, at, number):
-    """Flat number of a cell at a point that is on a set."""
-    index = np.argwhere(found["attractor_id"].isel(at).transpose("x_0", "v_0").values == number)[0]
-    place = {**at, "x_0": int(index[0]), "v_0": int(index[1])}
-    return np.ravel_multi_index([place[d] for d in explored.plan.dims], explored.plan.shape)
 
 
 def test_orbit__has_multipliers_without_an_analysis(sweep, walk):
@@ -496,12 +427,6 @@ def test_branches__lie_on_the_diagram(walk):
                 assert np.abs(np.array(heights) - value).min() < 5e-3
     assert tried
     assert {p["branch"] for p in found["points"]} <= {b["id"] for b in found["branches"]}
-
-
-def test_branches__without_an_analysis_say_how_to_get_them(sweep):
-    found = branches(ExploredRun.of(sweep), "amplitude", "x", {"frequency": 0})
-    assert found["branches"] == []
-    assert "magpend analyse branches" in found["note"]
 
 
 def test_attractors__are_those_of_the_point(sweep):

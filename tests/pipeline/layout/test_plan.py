@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import subprocess
-import sys
 import tomllib
 from dataclasses import replace
 from pathlib import Path
@@ -66,23 +64,6 @@ def test_chunks__tasks_own_whole_chunks(n_points, n_branches, n_keep):
         assert size <= planning.CHUNK_BYTES or chunks[0] == 1
 
 
-def test_make_plan__multiples_of_lanes_and_sizes():
-    text = """
-    kind = "sweep"
-    [axes]
-    frequency_hz = { start = 2.0, stop = 3.0, num = 101 }
-    [initial_conditions]
-    kind = "grid"
-    psi1_deg = { start = -57, stop = 57, num = 400 }
-    psi2_deg = { start = -57, stop = 57, num = 400 }
-    """
-    plan = make_plan(parse_spec(tomllib.loads(text)))
-    assert plan.n_cells == 101 * 400 * 400
-    cells = plan.cells_in(0)
-    assert 1e6 < cells * sum(v.itemsize({"period_index": 60, "state": 4, "link": 2}) for v in VARIABLES) <= 8.1e6
-    assert plan.n_tasks < 20_000
-
-
 @pytest.mark.parametrize("n_seeds", [1, 5, 6, 7, 12])
 @pytest.mark.parametrize("wanted", [1, 2, 4, 5, 8, 24])
 def test_make_plan__no_task_walks_both_ways(walk_text, n_seeds, wanted):
@@ -107,14 +88,6 @@ def test_task__out_of_range(sweep_text):
     plan = make_plan(parse_spec(tomllib.loads(sweep_text)))
     with pytest.raises(IndexError, match="does not exist"):
         plan.task(plan.n_tasks)
-
-
-def test_import__pure():
-    modules = "pipeline.layout.plan, pipeline.layout.schema, pipeline.specification.parsing, pipeline.layout.identity"
-    heavy = "('dask', 'zarr', 'xarray', 'matplotlib')"
-    code = f"import sys, {modules}; print([m for m in {heavy} if m in sys.modules])"
-    found = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
-    assert found.stdout.strip() == "[]"
 
 
 def test_identity__what_counts(sweep_text):

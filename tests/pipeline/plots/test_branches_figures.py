@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 import xarray as xr
 from matplotlib.lines import Line2D
 
-from magpend_core.models.parameters import ParameterError
 from pipeline.plots import plot_branches, plot_multipliers
-from pipeline.runs.derive import derive
-from pipeline.specification.problems import SpecError
 from tests.pipeline.plots.made_up import STATES
 
 
@@ -87,55 +82,3 @@ def test_plot_multipliers__all_points(made_up):
     assert len(points.get_offsets()) == 84
     with pytest.raises(ValueError, match="branches 0 to 0"):
         plot_multipliers(made_up, 1)
-
-
-FREQUENCY = {"parameter": "frequency_hz"}
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"parameter": "ep"}, "did you mean eps"),
-        ({"parameter": "c"}, "--from and --to"),
-        ({**FREQUENCY, "low": 2.5, "high": 2.4}, "is empty"),
-        ({"max_period": -1}, "max_period = -1"),
-        ({**FREQUENCY, "low": -1.0}, "greater than 0"),
-        ({"parameter": "m1", "low": -1.0, "high": 1.0}, "m1 = -1.0 is out of bounds"),
-    ],
-)
-def test_branches__bad_input(made, options, message):
-    with pytest.raises((SpecError, ParameterError), match=message):
-        derive(made.info.directory, "branches", options)
-
-
-def figure_of(done, folder):
-    """File that a command says it wrote."""
-    return folder / next(line for line in done.stdout.splitlines() if line.startswith("figure: "))[8:]
-
-
-@pytest.mark.slow
-def test_branches__command(main, tmp_path):
-    """The shipped workflow's small size, its table, a figure."""
-
-    def magpend(*words):
-        code, out, notes = main(*words)
-        return SimpleNamespace(returncode=code, stdout=out, stderr=notes)
-
-    assert magpend("run", "branches_2_3hz", "--smoke", "--workers", 0, "--out", "run").returncode == 0
-    options = ("--from", 2.45, "--to", 2.7, "--period", 2, "--generations", 1)
-    done = magpend("analyse", "branches", "run", *options, "--csv", "table.csv")
-    assert done.returncode == 0, done.stderr
-    rows = [line.split(",") for line in (tmp_path / "table.csv").read_text().splitlines()]
-    halvings = [row for row in rows if row[2:5] == ["period_doubling", "supercritical", "1"]]
-    assert sorted(round(float(row[0]), 5) for row in halvings) == [2.49861, 2.50566]
-    assert {row[5] for row in halvings} == {"left", "right"}
-    drawn = magpend("plot", "branches", "run", *options)
-    assert drawn.returncode == 0, drawn.stderr
-    assert "taken from" in drawn.stderr
-    assert figure_of(drawn, tmp_path).stat().st_size > 10_000
-    curved = magpend("plot", "curves", "run", *options, "--second", "q", "--second-from", 1.5, "--second-to", 1.6)
-    assert curved.returncode == 0, curved.stderr
-    assert figure_of(curved, tmp_path).stat().st_size > 10_000
-    refused = magpend("plot", "curves", "run", *options, "--second", "q", "--second-from", 2, "--second-to", 1)
-    assert refused.returncode == 2
-    assert "is empty" in refused.stderr

@@ -9,7 +9,6 @@ import xarray as xr
 from magpend_core.status import Status
 from pipeline.plots import Frame, plot_convergence, plot_lyapunov, plot_lyapunov_map
 from pipeline.plots.convergence import MOST_LINES
-from pipeline.plots.exponent_map import _scale
 from tests.pipeline.plots.made_up import DUFFING, legend_texts
 
 FREQUENCY = 0.25
@@ -78,17 +77,6 @@ def test_plot_lyapunov_map__says_that_it_shows_the_maximum_over_cells():
     (mesh,) = [c for c in figure.axes[0].collections if c.get_gid() == "map"]
     assert mesh.norm.vmin == -mesh.norm.vmax
     assert figure.axes[0].get_title(loc="left").startswith("$f$ = 0.25")
-
-
-def test_scale__same_depth_on_both_sides_of_zero():
-    norm, extend = _scale(np.array([[-0.1, 0.2, 0.3, np.nan]]))
-    assert (norm.vmin, norm.vmax, extend) == (-0.3, 0.3, "neither")
-    # one cell far out does not pale all others, and the bar says so
-    grid = np.concatenate([np.linspace(-0.3, 0.3, 200), [-40.0]])
-    norm, extend = _scale(grid)
-    assert norm.vmax < 0.4
-    assert norm.vmin == -norm.vmax
-    assert extend == "both"
 
 
 def test_plot_lyapunov__over_a_parameter_at_a_fixed_frequency():

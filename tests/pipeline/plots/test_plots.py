@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import threading
-
 import numpy as np
 import pytest
 import xarray as xr
@@ -311,18 +309,3 @@ def test_plot_bifurcation__many_points_in_little_memory():
     assert image_of(fig)[0].ndim == 3
     # 64 MB of sections; blocks of 32 MB with their labels, then counts and picture of 13 and 40 MB
     assert peak < 300e6
-
-
-def test_plot_bifurcation__same_in_threads():
-    ds = make_cube()
-    results = [None] * 4
-
-    def work(i):
-        results[i] = drawn(plot_bifurcation(ds))
-
-    threads = [threading.Thread(target=work, args=(i,)) for i in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert [sorted(found) for found in results] == [sorted(KINDS)] * 4

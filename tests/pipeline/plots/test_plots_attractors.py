@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import time
-import tracemalloc
 
 import matplotlib
 import numpy as np
@@ -133,19 +131,6 @@ def test_plot_basins__shading_by_time(grid):
     assert fig.data["n_periods"].transpose(*GRID).values.tolist() == periods.values.tolist()
 
 
-def test_plot_basins__cells_on_what_does_not_attract_are_grey(grid):
-    """They are no basin: B's cells have the name of what B is, and A keeps its colour."""
-    plain = colours_of(plot_basins(grid))
-    grid["stability"][1] = vocabulary.TRANSIENT
-    fig = plot_basins(grid)
-    assert legend_texts(fig)[:2] == ["A: period 1, left, 50.0 %", "not settled, 6.2 %"]
-    assert "on a transient set, 25.0 %" in legend_texts(fig)
-    picture = colours_of(fig)
-    assert np.abs(picture[2:, 2:] - to_rgb(palette.GREYS["on a transient set"])).max() < 0.003
-    assert np.allclose(picture[:2], plain[:2])
-    assert fig.data["outcome"].transpose(*GRID).values[2:, 2:].tolist() == [[-1, -1], [-1, -1]]
-
-
 def test_plot_basins__selection_and_refusals(grid):
     more = xr.concat([grid, grid.assign(attractor_id=1 - grid["attractor_id"].clip(0))], "frequency")
     more = more.assign_coords(frequency=("frequency", [2.2, 2.4], {"units": "Hz"}))
@@ -157,31 +142,6 @@ def test_plot_basins__selection_and_refusals(grid):
     sample = grid.stack(initial_condition=GRID).drop_vars([*GRID, "initial_condition"])
     with pytest.raises(ValueError, match=r'lie along: initial_condition; .* kind = "grid"'):
         plot_basins(sample)
-
-
-def test_plot_basins__third_start_axis_must_be_chosen(grid):
-    more = xr.concat([grid, grid], "psi1_dot_0").assign_coords(psi1_dot_0=[0.0, 1.0])
-    for name in ("kind", "stability", "n_cells", "share", "orbit_period", "side", "rotation"):
-        more[name] = grid[name]
-    with pytest.raises(ValueError, match=r"3 of the initial states are left.*such as psi1_dot_0=0"):
-        plot_basins(more)
-    assert plot_basins(more, at={"psi1_dot_0": 1.0}).axes[0].get_xlabel().startswith(r"$\psi_1")
-    assert plot_basins(more, at={"psi2_0": 0.25}).axes[0].get_ylabel() == r"$\dot{\psi}_1(0)$ [rad/s]"
-
-
-def test_plot_basins__four_million_cells(tmp_path):
-    n = 2000
-    x = np.arange(n)
-    ids = (x[:, None] ** 2 // n + x[None, :] * 3) % 20
-    ds = make_attractors(ids, GRID, grid_coords(n))
-    tracemalloc.start()
-    started = time.process_time()
-    save_figure(plot_basins(ds), tmp_path / "a.png")
-    took = time.process_time() - started
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert took < 120.0  # about 1.5 s; a loop over cells in Python takes far longer
-    assert peak < 6e8
 
 
 def test_cast_of__most_cells_have_own_colours_and_selection_changes_none():
@@ -324,20 +284,6 @@ def test_plot_coexisting__angles_on_the_circle(sweep):
     np.testing.assert_allclose(rates, 0.2 + 2 * np.pi)
     with pytest.raises(ValueError, match="unknown state 'psi3'"):
         plot_coexisting(sweep, state="psi3")
-
-
-def test_plot_coexisting__sets_that_do_not_attract_are_small_and_grey(sweep):
-    """B attracts at the first frequency only; there it has its colour, elsewhere the grey of what it is."""
-    sweep["stability"][1:, 1] = [vocabulary.NOT_SETTLED, vocabulary.UNSTABLE]
-    sweep["share"][1:, 1] = 0.0
-    fig = plot_coexisting(sweep)
-    np.testing.assert_allclose(offsets(fig, "points:B")[0], [[2.0, 0.2]])
-    lines = {line.get_gid(): line for line in fig.axes[0].get_lines()}
-    found = {gid: line.get_xdata().tolist() for gid, line in lines.items()}
-    assert found == {"points:not settled": [2.1], "points:unstable": [2.2]}
-    assert lines["points:unstable"].get_color() == palette.GREY_OF[vocabulary.UNSTABLE]
-    told = ["A: period 1, left", "B: period 1, left, unstable or not settled in parts", "not settled", "unstable"]
-    assert legend_texts(fig)[:4] == told
 
 
 @pytest.fixture
@@ -502,17 +448,6 @@ def test_plot_gallery__orbits_sections_and_paths():
     assert titles[0] == "A: period 1, left, share 10.0 %"
 
 
-def test_plot_gallery__scale_of_the_path_is_equal_and_holds_it():
-    fig = plot_gallery(make_attractors(range(2), ("initial_condition",)), make_portraits(2))
-    for ax in fig.axes:
-        for path in (line for line in ax.get_lines() if str(line.get_gid()).startswith("path")):
-            box, (left, right), (bottom, top) = ax.get_window_extent(), ax.get_xlim(), ax.get_ylim()
-            assert (right - left) / box.width == pytest.approx((top - bottom) / box.height)
-            x, y = path.get_xydata().T
-            assert left < x.min() < x.max() < right
-            assert bottom < min(y.min(), -VALUES["h"]) < y.max() < top
-
-
 def test_plot_gallery__largest_shares_are_drawn():
     attractors = make_attractors(range(11), ("initial_condition",))
     portraits = make_portraits(11)
@@ -522,17 +457,6 @@ def test_plot_gallery__largest_shares_are_drawn():
     assert any("3 more sets" in t.get_text() for t in fig.texts)
     with pytest.raises(ValueError, match="no attractor at this parameter point"):
         plot_gallery(attractors, portraits.isel(attractor=[]))
-
-
-def test_plot_gallery__sets_that_do_not_attract_are_grey_and_have_no_share():
-    attractors, portraits = make_attractors(range(2), ("initial_condition",)), make_portraits(2)
-    for ds in (attractors, portraits):
-        ds["stability"][1] = vocabulary.UNSTABLE
-    fig = plot_gallery(attractors, portraits)
-    titles = [t.get_text().replace("\N{NO-BREAK SPACE}", " ") for ax in fig.axes for t in ax.texts]
-    assert [t for t in titles if t] == ["A: period 1, left, share 10.0 %", "B: period 1, left, unstable"]
-    (line,) = [line for ax in fig.axes for line in ax.get_lines() if line.get_gid() == "orbit:B:psi1"]
-    assert to_rgb(line.get_color()) == to_rgb(palette.GREY_OF[vocabulary.UNSTABLE])
 
 
 def test_greys__every_cell_without_an_attractor_has_one():

@@ -6,7 +6,6 @@ import matplotlib
 import numpy as np
 import pytest
 import xarray as xr
-from matplotlib.figure import Figure
 
 from magpend_core.models import load_model
 from pipeline.plots import Frame, labels, plot_trajectory, save_figure
@@ -60,12 +59,6 @@ def test_plot_trajectory__path_of_the_magnet(width):
     assert (right - left) / box.width == pytest.approx((top - bottom) / box.height)
 
 
-def test_plot_trajectory__given_section_times():
-    ds = make_trajectory().assign_coords(section_times=("section", [0.125, 0.625, 9.0]))
-    np.testing.assert_allclose(lines(plot_trajectory(ds))["section:psi2"], [[0.2, 0.0]] * 2, atol=1e-12)
-    assert "section:psi1" not in lines(plot_trajectory(make_trajectory().drop_attrs()))
-
-
 @pytest.mark.parametrize("wrapped", [False, True])
 def test_plot_trajectory__rotation_is_drawn_on_the_circle(wrapped):
     ds = make_trajectory()
@@ -99,13 +92,6 @@ def test_save_figure__same_bytes_each_time(tmp_path, suffix, start, monkeypatch)
     assert matplotlib.rcParams["svg.hashsalt"] == salt
     assert not [stamp for stamp in (b"CreationDate", b"dc:date") if stamp in first]
     assert suffix != ".png" or int.from_bytes(first[16:20], "big") == 1401  # the width
-
-
-@pytest.mark.parametrize("name", ["a.jpg", "a", "a.png.txt"])
-def test_save_figure__unknown_suffix(tmp_path, name):
-    with pytest.raises(ValueError, match=r"is not one of \.png, \.pdf, \.svg"):
-        save_figure(Figure(), tmp_path / name)
-    assert not list(tmp_path.iterdir())
 
 
 def test_pi_fraction():

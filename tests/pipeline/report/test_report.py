@@ -12,13 +12,10 @@ import pytest
 
 from pipeline.analysis.outcomes import sentence
 from pipeline.layout.vocabulary import ATTRACTS
-from pipeline.report.report import report
 from pipeline.report.stored import stored_options
 from pipeline.runs.derive import derive
 from pipeline.runs.run import run as run_spec
-from pipeline.specification.problems import SpecError
 from pipeline.store.run import Run
-from tests.pipeline.cli.test_cli_analyse import CHAOTIC
 
 HOSTILE = "<script>alert(1)</script> & friends"
 SWEEP = f"""
@@ -89,6 +86,16 @@ def test_report__of_a_sweep(folder, command):
     assert html == written(command, folder, "run")
 
 
+CHAOTIC = """
+kind = "sweep"
+model = "duffing"
+parameters = { preset = "twin-well", frequency_hz = 0.15915494309189535 }
+axes = { amplitude = { values = [0.25, 0.3] } }
+initial_conditions = { kind = "random", n = 8, seed = 1, x = [-1.0, 1.0], v = [-1.0, 1.0] }
+integration = { rtol = 1e-7, atol = 1e-7, n_transient = 100, n_keep = 64 }
+"""
+
+
 def test_report__sets_that_do_not_attract_have_no_share(command, tmp_path):
     """Without extension it is not shown that the chaotic set of the larger amplitude attracts."""
     (tmp_path / "spec.toml").write_text(CHAOTIC)
@@ -115,48 +122,6 @@ def test_report__its_commands_work(folder, command):
     for c in mine:
         _, notes = command(folder, *shlex.split(c)[1:])
         assert not re.search(r": computed", notes), c
-
-
-WALKS = """
-kind = "continuation"
-axes = { frequency_hz = { start = 2.05, stop = 2.11, num = 5 } }
-continuation = { path = "frequency_hz", direction = "both" }
-initial_conditions = { kind = "random", n = 4, seed = 7, psi1_deg = [-20.0, 20.0] }
-integration = { rtol = 1e-6, atol = 1e-6, n_transient = 200, n_keep = 16 }
-"""
-
-
-def test_report__jumps_of_walks_have_their_place(folder, command):
-    (folder / "walks.toml").write_text(WALKS)
-    run_spec(folder / "walks.toml", folder / "walks", workers=0, echo=lambda _: None)
-    html = written(command, folder, "walks")
-    found = derive(folder / "walks", "hysteresis")
-    assert found.sizes["jump"]
-    head = re.search(r"<tr><th scope=\"col\">direction</th>(.*?)</tr>", html)[1]
-    heads = ["from frequency [Hz]", "to frequency [Hz]", "from attractor", "to attractor", "count"]
-    assert re.findall(r"<th scope=\"col\">(.*?)</th>", head) == heads
-    rows = re.findall(r"<tr><td>(up|down)</td><td>(.*?)</td><td>(.*?)</td><td>([A-Z])</td>", html)
-    names = [("up" if d > 0 else "down") for d in found["jump_direction"].values]
-    ends = ([f"{v:.6g}" for v in found[f"jump_{end}"].values] for end in ("from", "to"))
-    letters = [chr(65 + int(i)) for i in found["jump_from_id"].values]
-    assert rows == list(zip(names, *ends, letters, strict=True))
-
-
-def test_report__several_runs(folder, tmp_path):
-    both = [str(bare(folder, tmp_path / name)) for name in ("first", "second")]
-    page = report(both, only_stored=True, echo=lambda _: None)
-    assert page.title == "2 runs"
-    assert [part.title for part in page.parts] == [HOSTILE, HOSTILE]
-    assert len(page.summary[0].rows) == 2
-
-
-def test_report__what_is_refused(folder, command):
-    with pytest.raises(SpecError, match="unknown analysis 'branch'; did you mean branches"):
-        report([str(folder / "run")], also=["branch"], echo=lambda _: None)
-    with pytest.raises(AssertionError, match=r"suffix must be \.html"):
-        command(folder, "report", "run", "--out", "page.pdf")
-    with pytest.raises(AssertionError, match="no run directory"):
-        command(folder, "report", "nowhere")
 
 
 def test_stored_options__of_these_cells(folder):

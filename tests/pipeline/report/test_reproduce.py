@@ -3,20 +3,12 @@
 from __future__ import annotations
 
 import json
-import os
 import re
-import signal
-import subprocess
-import sys
-import time
 
 import pytest
 
 from pipeline.cli.exits import Exit
-from pipeline.report.estimates import Estimate
-from pipeline.report.reproduce import Judgement, calibrated_on, decided_first, headline
-from pipeline.report.study import ClaimTable, load_study, shipped_studies
-from pipeline.report.verdicts import Verdict
+from pipeline.report.study import load_study, shipped_studies
 from pipeline.specification.problems import SpecError
 
 SPEC = """
@@ -128,53 +120,6 @@ def test_reproduce__a_required_claim_is_contradicted(study, main, tmp_path, cali
         assert "not met: Nothing closes" in out
 
 
-@pytest.mark.parametrize("smoke", [False, True])
-def test_headline__decided_claims_come_first_and_calibrated_ones_are_a_paragraph(smoke):
-    judgements = [
-        _judgement("1", "A.", Verdict.UNDECIDED),
-        _judgement("2", "B", Verdict.MET),
-        _judgement("3", "C.", Verdict.CALIBRATED, Verdict.MET),
-        _judgement("4", "D", Verdict.NOT_MET),
-        _judgement("5", "E", Verdict.CALIBRATED, Verdict.UNDECIDED),
-        _judgement("6", "F", Verdict.CALIBRATED, Verdict.MET),
-    ]
-    assert [j.figure for j in decided_first(judgements)] == ["2", "4", "1"]
-    assert calibrated_on(judgements) == (
-        "3 of 6 claims are no test: parameters were calibrated on them. Came out: figure 3: C; figure 6: F. "
-        "Undecided whether they came out: figure 5: E."
-    )
-    assert calibrated_on(judgements[:2]) == ""
-    assert headline(judgements, smoke).startswith("Of 3 claims that are tests, 1 are met, 1 not met, 1 undecided.")
-    assert ("without --smoke" in headline(judgements, smoke)) == smoke
-
-
-def _judgement(figure, statement, verdict, plain=None):
-    claim = ClaimTable(statement=statement, source="us", measure="share_above", of=["sweep"])
-    return Judgement(figure, claim, Estimate(1.0, 1.0, 1.0), verdict, plain or verdict, "")
-
-
-@pytest.mark.slow
-def test_reproduce__goes_on_after_a_kill(study, main, tmp_path):
-    study(STUDY + FALSE.replace("required = true", ""))
-    slow = SPEC.replace("n_transient = 200", "n_transient = 1500").replace("integration.stop_when_closed = true\n", "")
-    (tmp_path / "sweep.toml").write_text(slow + "[execution]\ntrajectories_per_task = 2\n", "utf-8")
-    code = "import sys; from pipeline.cli.main import main; sys.argv[0] = 'magpend'; main()"
-    words = ["reproduce", "mine.toml", "--out", "done", "--workers", "0"]
-    process = subprocess.Popen([sys.executable, "-c", code, *words], cwd=tmp_path, start_new_session=True)
-    commits, end = tmp_path / "done" / "runs" / "sweep" / "commits", time.monotonic() + 120
-    while not list(commits.glob("0*.json")) and time.monotonic() < end and process.poll() is None:
-        time.sleep(0.005)
-    os.killpg(process.pid, signal.SIGKILL)
-    process.wait()
-    assert not (tmp_path / "done" / "report.html").exists()
-    code, _, err = main(*words)
-    assert code == 0, err
-    assert "cells done before" in err
-    killed = (tmp_path / "done" / "claims.json").read_bytes()
-    assert main(*words[:3], "whole", "--workers", "0")[0] == 0
-    assert killed == (tmp_path / "whole" / "claims.json").read_bytes()
-
-
 def test_load_study__all_that_is_wrong(study):
     bad = STUDY.replace('of = ["sweep"]', 'of = ["swept"]').replace("share_above", "share_abov")
     with pytest.raises(SpecError) as caught:
@@ -198,8 +143,6 @@ def test_reproduce__all_is_read_before_anything_is_computed(study, main, tmp_pat
         assert words in err
     code, _, err = main("reproduce", "mine.toml", "--out", "done", "--smoke")
     assert "sweep: smoke: this specification has no [smoke] table" in err
-    study(STUDY.replace('figure = "section"', 'figure = "sections"'))
-    assert "figures[1].pictures[0].figure: unknown figure 'sections'" in main("reproduce", "mine.toml")[2]
     study(STUDY.replace("options = { at", "options = { colour = 3, at"))
     assert "figures[1].pictures[0].options.colour" in main("reproduce", "mine.toml")[2]
     study(STUDY)

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 import magpend
-from magpend_core.models import ModelError
 from pipeline.layout.identity import identity_of
 from pipeline.layout.plan import make_plan
 from pipeline.products.registry import CELL_PRODUCTS
@@ -208,17 +207,6 @@ def driven(tmp_path_factory):
     return magpend.run(table, tmp_path_factory.mktemp("made") / "run", workers=0, echo=silent)
 
 
-def test_run__of_a_table_is_opened_and_exact(driven):
-    assert driven.complete
-    cube = driven.cube()
-    assert cube.sizes["A"] == 3
-    # x = Re(A exp(i w t)/(k - w**2 + .2 i w)) at t = 0
-    w = 2.0 * np.pi * 0.2
-    expected = (np.array([0.1, 0.2, 0.3]) / (1.0 - w * w + 0.2j * w)).real
-    found = cube.section.sel(state="x").isel(period_index=-1, initial_condition=1).values
-    assert found == pytest.approx(expected, abs=1e-6)
-
-
 def test_run__of_a_text_goes_on_where_it_was(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     said = []
@@ -246,23 +234,6 @@ def test_table__has_a_row_per_attractor_and_parameter_point(driven):
     assert set(found["kind"]) == {"periodic_orbit"}
     with pytest.raises(ValueError, match="not the result of an analysis"):
         magpend.table(driven.cube())
-
-
-def test_load_model__from_anywhere(tmp_path):
-    whole, alone, named = tmp_path / "spec.toml", tmp_path / "model.toml", tmp_path / "named.toml"
-    whole.write_text(TEXT)
-    alone.write_text(TEXT.partition("[model]")[2])
-    named.write_text('kind = "sweep"\nmodel = "duffing"\n')
-    models = [
-        magpend.load_model(given)
-        for given in (tomllib.loads(TEXT)["model"], TEXT, whole, str(alone), alone.read_text())
-    ]
-    assert {model.name for model in models} == {"oscillator"}
-    assert magpend.load_model(named) is magpend.load_model("duffing")
-    with pytest.raises(ModelError, match="does not exist"):
-        magpend.load_model("duffin")
-    with pytest.raises(SpecError, match="cannot be read"):
-        magpend.load_model(tmp_path / "none.toml")
 
 
 def test_sections__of_one_set_or_of_many():

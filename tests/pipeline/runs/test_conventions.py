@@ -10,9 +10,8 @@ import pytest
 import xarray as xr
 
 import magpend
-from pipeline.layout.conventions import CONVENTIONS, conventional
-from pipeline.runs.derive import derive
-from tests.pipeline.factories import duffing, finished, quietly
+from pipeline.layout.conventions import CONVENTIONS
+from tests.pipeline.factories import duffing, finished
 
 ROOT = Path(__file__).parents[3]
 pytestmark = pytest.mark.slow
@@ -25,24 +24,6 @@ WALK = duffing(
     n_keep=8,
     more='[continuation]\npath = "frequency_hz"\ndirection = "both"',
 )
-ODD = """
-kind = "sweep"
-[model]
-name = "odd"
-states = { x = { unit = "widgets", escape = 1e6 } }
-parameters = { l = { value = 0.0, unit = "widgets" }, k = { value = 1.0, unit = "widgets/s2" } }
-equations = { x = "l - k*x" }
-[parameters]
-frequency_hz = 1.0
-[axes]
-l = { values = [0.5, 1.0] }
-[initial_conditions]
-kind = "list"
-points = [[0.5]]
-[integration]
-n_transient = 1
-n_keep = 2
-"""
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -94,40 +75,6 @@ def test_open_run__sweep_is_described(made, tmp_path):
     plain = xr.open_zarr(made.info.directory / "cube.zarr")
     assert plain.cf.axes == ds.cf.axes
     plain.pint.quantify()
-
-
-def test_open_run__branches_are_trajectories(walk, tmp_path):
-    ds = magpend.open_run(walk).load()
-    assert ds.cf.cf_roles == {"trajectory_id": ["branch"]}
-    assert ds.cf.axes == {"X": ["frequency"]}
-    readable(ds, tmp_path / "cube.nc")
-
-
-@pytest.mark.parametrize("name", ["attractors", "hysteresis", "settling"])
-def test_derive__results_are_described(walk, name):
-    ds = derive(walk, name)
-    quantities = ds.pint.quantify()
-    assert str(quantities.frequency.pint.units) == "hertz"
-    assert ds.cf.axes["X"] == ["frequency"]
-    again = derive(walk, name)
-    assert again.identical(ds)
-    assert conventional(ds).identical(ds)
-    (stored,) = [path for path in (walk / "derived").glob(f"{name}-*.zarr")]
-    assert set(xr.open_zarr(stored, consolidated=True).variables) == set(ds.variables)
-
-
-def test_run__names_units_that_nobody_reads_once(write_spec, tmp_path):
-    lines = []
-    quietly(write_spec(ODD), tmp_path / "run", echo=lines.append)
-    (line,) = [line for line in lines if "widgets" in line]
-    assert line.startswith("warning: units that other programs cannot read: 'widgets' of x, l; 'widgets/s2' of k. ")
-    ds = magpend.open_run(tmp_path / "run").load()
-    assert ds.l.attrs["units_as_given"] == "widgets"
-    assert ds.pint.quantify().l.pint.units is None
-    readable(ds, tmp_path / "cube.nc")
-    drawn = magpend.figure(tmp_path / "run", "bifurcation")
-    assert drawn.data.x.attrs["units"] == "widgets"
-    assert drawn.axes[0].get_xlabel() == "l [widgets]"
 
 
 def test_docs__example_of_the_cube(walk, monkeypatch):

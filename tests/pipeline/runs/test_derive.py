@@ -16,7 +16,6 @@ from pipeline.products.registry import ANALYSES
 from pipeline.runs import derive as deriving
 from pipeline.runs import versions
 from pipeline.runs.derive import AnalysedRun, derive
-from pipeline.specification.problems import SpecError
 from pipeline.store.errors import DamagedError
 from pipeline.store.packing import withdraw
 from pipeline.store.run import Run
@@ -263,17 +262,3 @@ def test_attractors__what_was_shown_holds_from_then_on(whole):
     assert found.encoding["source"] in (more.encoding["source"], others.encoding["source"])
     assert less.encoding["source"] in deriving.stale(directory)
     assert more.encoding["source"] not in deriving.stale(directory)
-
-
-def test_attractors__pending_cells_stay_pending(made):
-    made.commit(0)
-    found = derive(made.info.directory, "attractors", {**QUICK})
-    pending = found["status"] == 0
-    assert int((~pending).sum()) == made.plan.cells_in(0)
-    assert (found["attractor_id"].where(pending, -1) == -1).all()
-
-
-def test_attractors__unknown_option(whole):
-    with pytest.raises(SpecError, match="did you mean threshold"):
-        derive(whole.info.directory, "attractors", {"treshold": 0.2})
-    assert not products(whole, "*")

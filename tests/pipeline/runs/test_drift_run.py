@@ -84,20 +84,6 @@ def test_tipping__critical_rates_are_those_of_the_closed_form(moving_fold):
     assert any("both ends decided" in line for line in table.lines)
 
 
-def test_tipping__tips_at_rate_1_on_a_long_ramp(tmp_path):
-    """x' = (x + l)^2 - 1 tips at dl/dt = 1 where the ramp is long enough: at 1 + (pi/length)^2."""
-    length = 6000.0
-    spec = with_changes(
-        drift={"l": {"to": length}},
-        axes={"l_rate_per_s": {"values": [0.9, 1.1]}},
-        initial_conditions={"kind": "list", "points": [[-1.0]]},
-        integration={**SPEC["integration"], "n_transient": 6670, "n_keep": 4},
-    )
-    quietly(spec, tmp_path / "long")
-    ds = derive(tmp_path / "long", "tipping", {"settle": 60, "keep": 32, "width": 1e-6})
-    assert float(ds["critical_value"][0]) == pytest.approx(1.0, abs=1e-6)
-
-
 def test_delay__of_a_synthetic_passage():
     """An orbit of period 1 that begins to alternate at section 30, after a start off the orbit."""
     n = np.arange(60)
@@ -143,17 +129,13 @@ def test_spec__comes_back_and_is_the_identity():
 # bounds hold at both ends of a ramp: a mass is above 0; the drive switches at instants that its duty cycle sets
 PENDULUM = {"model": None, "axes": None, "initial_conditions": {"kind": "random", "n": 2}}
 PROBLEMS = [
-    ({"drift": {"q": {"to": 1.0}}}, "drift.q: 'q' is not a parameter"),
     ({"drift": {"frequency_hz": {"to": 1.0, "duration_s": 2.0}}}, "drift.frequency_hz: the drive's frequency"),
     ({"drift": {"l": {}}}, "drift.l: give two of to, a rate"),
-    ({"drift": {"l": {"to": 1.0, "duration_s": 3.0}}}, "drift.l: give two of to"),
     ({"drift": {"l": {"to": -1.0}}}, "drift.l: from 0 to -1 the ramp would take"),
     ({"drift": {"l": {"to": 1.0, "rate_per_period": 1.0}}}, "rate_per_s and rate_per_period are both given"),
     ({"drift": {"l": {"to": 1.0, "rate_per_s": 1.0}}}, "axes.l_rate_per_s: is also drift.l.rate_per_s"),
-    ({"drift": {"l": {"to": 1.0, "speed": 1.0}}}, "drift.l.speed: unknown key"),
     ({"drift": {"l": {"to": 1.0, "start_s": -1.0}}}, "drift.l.start_s = -1.0: must be at least 0"),
     ({"drift": {"l": {"file": "no.csv"}}}, "drift.l.file = 'no.csv': cannot be read"),
-    ({"drift": {"l": 3.0}}, "drift.l = 3.0: must be a table"),
     ({"kind": "continuation", "continuation": {"path": "l_rate_per_s"}}, "drift: a continuation starts"),
     ({"section": {"of": "x"}, "parameters": {}}, "section: parameters move in time"),
     ({"integration": {"stop_when_closed": True}}, "integration.stop_when_closed: an orbit cannot close"),

@@ -16,8 +16,7 @@ from pipeline.compute.task import warm_up
 from pipeline.layout.cells import CellMap
 from pipeline.layout.plan import make_plan, seconds_per_period
 from pipeline.runs import estimate as estimates
-from pipeline.runs import preview
-from pipeline.runs.estimate import _points, _sample, estimate, mean_with_tail, writing_seconds
+from pipeline.runs.estimate import estimate, mean_with_tail, writing_seconds
 from pipeline.runs.preview import describe_plan
 from pipeline.specification.parsing import parse_spec
 from pipeline.store import commits
@@ -45,29 +44,6 @@ def test_mean_with_tail():
         seen = mean_with_tail(np.minimum(periods, 1000), 1000, most)
         assert seen == pytest.approx(np.minimum(periods, most).mean(), rel=0.03)
     assert mean_with_tail(np.full(8, 100.0), 100, 5000) == 5000
-
-
-def test_points__pairs_are_neighbours():
-    for n_points in (1, 2, 3, 9, 200):
-        for seed in range(20):
-            single = _points(n_points, np.random.default_rng(seed), pairs=False)
-            assert (np.diff(single) > 0).all()
-            assert 0 <= single[0] <= single[-1] < n_points
-            pairs = _points(n_points, np.random.default_rng(seed), pairs=True)
-            assert pairs.max() < n_points
-            if n_points > 1:
-                assert (pairs[1::2] - pairs[::2] == 1).all()
-
-
-def test_sample__cells_of_the_run(walk_text, sweep_text):
-    spec, plan = read(walk_text)
-    inputs = _sample(spec, plan, np.random.default_rng(0), 32, pairs=False)
-    assert inputs.initial_states.shape == (5, 4)  # what a task has
-    assert set(inputs.frequency_hz.ravel()) <= set(spec.axes["frequency_hz"].array())
-    spec, plan = read(sweep_text)
-    inputs = _sample(spec, plan, np.random.default_rng(0), 32, pairs=True)
-    assert inputs.frequency_hz.shape == (24, 1)
-    assert len(np.unique(inputs.frequency_hz)) == 5
 
 
 def test_estimate__within_a_factor_of_what_it_takes(monkeypatch):
@@ -111,19 +87,6 @@ def test_writing_seconds__takes_the_time_of_writing_and_leaves_nothing(sweep_tex
     # many cells are not tried: by the rule
     monkeypatch.setattr(estimates, "MOST_WRITTEN_CELLS", plan.n_cells - 1)
     assert writing_seconds(spec, plan) == pytest.approx((len(plan.variables) + 1) * estimates.FILE_S)
-
-
-def test_time_line__counts_files_and_start_up(sweep_text, monkeypatch):
-    """20,000 tasks of one cell take what their files take: 20 ms each, 20 ms to hand out, two at a time."""
-    spec, plan = read(sweep_text)
-    monkeypatch.setattr(preview, "estimate", lambda spec, plan: estimates.Estimate(20.0, "measured", 0.0))
-    monkeypatch.setattr(preview, "writing_seconds", lambda spec, plan: 0.02)
-    line = preview.time_line(spec, plan, 1.0, 20_000, 2)
-    assert "about 7.0 min of one core, 6.9 min on 2" in line or "7 min" in line, line
-    assert "writing a task takes 20 ms" in line
-    assert estimates.wall_seconds(420.0, 20_000, 2) == 210.0
-    assert estimates.wall_seconds(420.0, 1, 2) == 420.0
-    assert estimates.wall_seconds(420.0, 20_000, 0) == 420.0
 
 
 def test_describe_plan__says_what_the_time_rests_on_and_what_is_left(write_spec, sweep_text, tmp_path):

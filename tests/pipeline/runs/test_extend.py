@@ -324,20 +324,6 @@ def test_command__says_what_is_taken(place, main, bytes_of, tmp_path):
     assert bytes_of(tmp_path / "again") == bytes_of(mine)
 
 
-def test_command__refuses(place, main):
-    for words, message in (
-        (["--axis", "frequency=1:2"], "must be NAME=LOW:HIGH:NUM"),
-        (["--axis", "q=1:2:3"], "unknown axis"),
-        (["--product", "lyapunov=3"], "must be NAME or NAME="),
-        (["--product", "liapunov"], "did you mean lyapunov"),
-        (["--starts", "9"], "not random samples; widen a state's range"),
-        ([], "nothing to change"),
-    ):
-        code, _, err = main("extend", place[0], *words)
-        assert code == 2
-        assert message in err
-
-
 FULL = duffing(
     "frequency_hz = { values = [0.2] }",
     'kind = "grid"\nx = { start = 0.5, stop = 1.5, num = 9 }\nv = { start = 0.0, stop = 0.5, num = 9 }',

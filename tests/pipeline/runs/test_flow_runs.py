@@ -10,11 +10,9 @@ from pipeline import open_run
 from pipeline.analysis.attractors.table import attractors_table
 from pipeline.analysis.branches.table import branches_table
 from pipeline.analysis.chaos.table import chaos_table
-from pipeline.compute import integrate, task
 from pipeline.layout.vocabulary import model_of, parameters_of
 from pipeline.runs.derive import derive
-from pipeline.runs.extend import extend
-from tests.pipeline.factories import finished, quietly
+from tests.pipeline.factories import finished
 
 SPEC = """
 kind = "sweep"
@@ -105,22 +103,3 @@ def test_derive__attractors_chaos_and_branches(directory):
     assert [row["mu"] for row in branches.rows] == pytest.approx([-0.25, 0.0], abs=1e-8)
     assert branches.rows[1]["normal_form"] == pytest.approx(1.0, rel=1e-6)
     assert any("equilibrium" in line for line in branches.lines)
-
-
-def test_extend__takes_what_stands_there(directory, tmp_path, bytes_of, monkeypatch):
-    text = SPEC.replace("[-0.2, -0.1, 0.1]", "[-0.2, 0.1]").replace("num = 6 }\n\n[int", "num = 7 }\n\n[int")
-    text = text.replace("start = -1.05, stop = 0.95, num = 7", "start = -1.05, stop = 1.35, num = 7")
-    (tmp_path / "spec.toml").write_text(text)
-    quietly(tmp_path / "spec.toml", tmp_path / "fresh")
-    calls = []
-    original = integrate.run_branches
-
-    def counted(parameters, *words, **options):
-        calls.append(len(parameters))
-        return original(parameters, *words, **options)
-
-    monkeypatch.setattr(integrate, "run_branches", counted)
-    monkeypatch.setattr(task, "warm_up", lambda spec: 0.0)
-    extend(directory, tmp_path / "spec.toml", tmp_path / "new", workers=0)
-    assert sum(calls) == 2 * 6
-    assert bytes_of(tmp_path / "new") == bytes_of(tmp_path / "fresh")

@@ -54,22 +54,6 @@ def stored(finished_text, tmp_path):
     return shutil.copytree(finished_text, tmp_path / "run")
 
 
-@pytest.mark.slow
-def test_run__text_explains_itself_from_status_to_figure(stored, tmp_path, magpend, command):
-    """Elsewhere, in another process, without the shared file."""
-    elsewhere = tmp_path / "elsewhere"
-    elsewhere.mkdir()
-    assert "complete" in magpend("status", stored, cwd=elsewhere).stdout
-    assert "intact" in command(elsewhere, "verify", stored)[0]
-    table = json.loads(command(elsewhere, "analyse", "attractors", stored, "--json")[0])
-    assert "periodic_orbit" in {row["kind"] for row in table}
-    command(elsewhere, "plot", "basins", stored)
-    assert (stored / "figures" / "basins.png").is_file()
-    command(elsewhere, "zoom", stored, "--x", "-0.5", "0.5", "--out", "closer.toml")
-    command(elsewhere, "run", "closer.toml", "--workers", 0)
-    assert open_run(elsewhere / "runs" / "closer").x_0.values.max() == 0.5
-
-
 def test_run__text_is_integrated_as_it_is_written(finished_text):
     """Against scipy's DOP853 of the same equations, from another hand."""
     ds = open_run(finished_text)

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import pytest
-
 from pipeline.products.reporting import is_heard
 from pipeline.runs import notebook
-from pipeline.runs.progress import LINE_EVERY_S, Progress, duration, size
+from pipeline.runs.progress import LINE_EVERY_S, Progress
 
 
 def test_progress__rate_and_time_left_count_this_session_only():
@@ -27,18 +25,6 @@ def test_progress__bar(capsys):
         progress.add(10)
     shown = capsys.readouterr()
     assert "10/10" in shown.out + shown.err
-
-
-@pytest.mark.parametrize(
-    ("seconds", "text"), [(3.21, "3.2 s"), (42.4, "42 s"), (200, "3 min 20 s"), (7260, "2 h 1 min")]
-)
-def test_duration(seconds, text):
-    assert duration(seconds) == text
-
-
-@pytest.mark.parametrize(("n", "text"), [(12, "12 bytes"), (6.28e6, "6.3 MB"), (2e13, "20.0 TB")])
-def test_size(n, text):
-    assert size(n) == text
 
 
 def test_progress__outside_a_notebook_does_nothing(capsys):

@@ -16,10 +16,8 @@ from pipeline.compute.execute import TaskFailedError
 from pipeline.runs.derive import derive
 from pipeline.runs.drawing import figure
 from pipeline.runs.extend import extend
-from pipeline.runs.preview import describe_plan
 from pipeline.runs.run import run
 from pipeline.runs.status import state
-from pipeline.runs.zoom import Changes, read_source, to_toml, zoom
 from pipeline.specification.parsing import parse_spec
 from pipeline.specification.problems import SpecError
 from pipeline.store.errors import DamagedError, RefusedError
@@ -166,28 +164,6 @@ def test_derive__refuses_what_goes_on_beyond_the_recording(once):
             derive(once / "run", name)
     with pytest.raises(SpecError, match="integrates further"):
         figure(once / "run", "gallery", {"at": {"q": 1.6}})
-
-
-def test_describe_plan__measures_a_recorded_drive(recorded, tmp_path):
-    lines = list(describe_plan(recorded(), tmp_path / "run", workers=1))
-    assert any("24 cells" in line for line in lines)
-    assert any("measured" in line for line in lines)
-    assert not (tmp_path / "run").exists()
-
-
-def test_zoom__takes_the_drive_along(recorded, tmp_path):
-    source = read_source(recorded())
-    found, _ = zoom(source.spec, Changes(ranges={"q": (0.6, 1.0)}))
-    assert found.drive == source.spec.drive
-    assert 'sha256 = "' in to_toml(found)
-
-
-def test_cli__says_which_numbers_do_not_fit(recorded, tmp_path, main):
-    path = recorded(RECORDED.replace("n_transient = 7", "n_transient = 9"))
-    code, _, err = main("run", path, "--out", "run")
-    assert code == 2
-    assert "n_transient = 9 and n_keep = 4 are 13 drive periods, and drive.csv has 12" in err
-    assert not (tmp_path / "run").exists()
 
 
 def test_extend__cells_under_the_same_recording(once, recorded, tmp_path, bytes_of, monkeypatch):

@@ -24,13 +24,6 @@ SPEC = duffing(
     tolerance=1e-9,
     execution="trajectories_per_task = 64",
 )
-HOURS = duffing(
-    "frequency_hz = { start = 0.15, stop = 0.25, num = 121 }",
-    f'kind = "grid"\n{SQUARE.format(n=32)}',
-    n_transient=100000,
-    n_keep=16,
-    tolerance=1e-8,
-).replace('"small"', '"Basins over the frequency"')
 ONE_JOB = """
 [cluster]
 kind = "slurm"
@@ -52,7 +45,6 @@ prologue = ["export PROLOGUE=read"]
 directives = ["--nice=1"]
 """
 PATIENCE_S = 100.0
-DOCS = Path(__file__).parents[3] / "docs"
 
 
 pytestmark = pytest.mark.slow
@@ -95,35 +87,6 @@ def wait(for_what, logs):
         said = "\n".join(f"{file}:\n{file.read_text()}" for file in logs.rglob("*.out"))
         assert time.monotonic() < deadline, said
         time.sleep(0.1)
-
-
-def masked(line):
-    """A line without its numbers and times, which differ from machine to machine, and without its folders."""
-    line = re.sub(r"/\S*/(?=[\w.*-]+)", "", re.sub(r"^cd .*", "cd", line))
-    return re.sub(r"\d[\d.]*(e\+\d+)?( (bytes|[kMGT]B|s|min|h)\b)?( \d+ (s|min)\b)?", "#", line)
-
-
-def test_submit__explains_and_is_refused_by_a_real_slurm(tmp_path, shell, magpend):
-    """Without a file: what SLURM says is chosen, the page shows what is printed, and refusals name the key."""
-    (tmp_path / "mine.toml").write_text(HOURS)
-    printed = magpend("submit", "mine.toml", "--dry-run").splitlines()
-    page = (DOCS / "clusters.md").read_text("utf-8")
-    shown = re.search(r"\$ magpend submit mine.toml --dry-run\n(.*?)```", page, re.DOTALL)[1].splitlines()
-    printed = [masked(line) for line in printed if "so far" not in line]
-    assert [masked(line) for line in shown] == printed
-    assert "partition: short (no time limit, 1 node of 4 cores, 8.4 GB), the default of SLURM" in shown
-    assert not (tmp_path / "runs").exists()
-    for change, words in (
-        ("queue=nix", "Invalid partition name specified.\nSet the queue or partition: --job queue=NAME; sinfo -s"),
-        ("directives=--constraint=nix", "Invalid feature specification.\nCorrect the extra lines"),
-        ("directives=--gres=nix:1", "Invalid generic resource (gres) specification.\nCorrect the extra lines"),
-    ):
-        assert words in magpend("submit", "mine.toml", "--job", change, code=4)
-
-    # SLURM keeps a job that no node can take; the command says so
-    said = magpend("submit", "mine.toml", "--job", "cores=5")
-    assert "warning: cores is 5, above the cores of most nodes of partition short, 4" in said
-    assert "PENDING" in shell("squeue", "-h", "-o", "%T")
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shlex
-import shutil
 import subprocess
 import sys
 
@@ -137,10 +136,8 @@ def test_script__coordinator_of_other_jobs(cluster, kind, lines):
 @pytest.mark.parametrize(
     ("kind", "said", "job"),
     [
-        ("slurm", "17\n", "17"),
         ("slurm", "17;north\n", "17"),
         ("pbs", "1234.pbs-server\n", "1234.pbs-server"),
-        ("torque", "1234.head.site\n", "1234.head.site"),
         ("sge", "99\n", "99"),
         ("lsf", "Job <506> is submitted to queue <short>.\n", "506"),
         ("lsf", "Request aborted by esub.\n", None),
@@ -151,24 +148,6 @@ def test_words__number_of_a_job(kind, said, job):
 
 
 # ---- the command ---------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def command_of(tmp_path, monkeypatch):
-    """Put commands on the PATH, which has no others of a batch system."""
-    folder = tmp_path / "bin"
-    folder.mkdir()
-    for name in ("sh", "cat", "bash"):
-        (folder / name).symlink_to(shutil.which(name))
-    monkeypatch.setenv("PATH", str(folder))
-    monkeypatch.delenv("SGE_ROOT", raising=False)
-    monkeypatch.delenv("MAGPEND_CLUSTER", raising=False)
-
-    def write(name, text):
-        (folder / name).write_text(f"#!/bin/sh\n{text}\n")
-        (folder / name).chmod(0o755)
-
-    return write
 
 
 def job_file(out):
@@ -274,34 +253,22 @@ def test_submit__writes_a_job_file(main, tmp_path, write_spec, command_of):
 def test_submit__no_batch_system_or_several(main, tmp_path, write_spec, cluster, command_of, monkeypatch):
     path = write_spec(SMALL)
 
-    def refused(*words, more=()):
+    def refused(*words):
         code, _, errors = main("submit", path, *words)
         assert code == 2
-        assert all(word in errors for word in more), errors
+        return errors
 
-    refused(
-        "--out",
-        "o",
-        "--dry-run",
-        more=(
-            "there is no batch system here: none of the commands sbatch (SLURM), bsub (LSF), qsub (PBS, Torque, Grid",
-            f"compute on this machine, now: magpend run {path} --out o\n",
-            f"magpend submit {path} --out o --cluster slurm --write job.sh",
-            f"magpend run {path} --out o --scheduler tcp://HOST:8786",
-        ),
-    )
-    refused("--out", "o", "--cluster", "slurm", more=["SLURM: there is no command 'sbatch' here"])
-    monkeypatch.setenv("MAGPEND_CLUSTER", str(cluster("slurm")))
-    refused("--out", "o", more=["SLURM: there is no command 'sbatch' here"])
-    refused("--out", tmp_path / "my run", more=["batch systems do not accept this path"])
+    assert f"magpend submit {path} --out o --cluster slurm --write job.sh" in refused("--out", "o", "--dry-run")
+    for words in (("--cluster", "slurm"), ()):
+        assert "SLURM: there is no command 'sbatch' here" in refused("--out", "o", *words)
+        monkeypatch.setenv("MAGPEND_CLUSTER", str(cluster("slurm")))
+    assert "batch systems do not accept this path" in refused("--out", tmp_path / "my run")
     monkeypatch.delenv("MAGPEND_CLUSTER")
     assert not (tmp_path / "o.jobs").exists()
     command_of("sbatch", "echo 1")
     command_of("qsub", "echo 2.head")
     command_of("qstat", 'case "$*" in *--version) echo "pbs_version = 20.0.1";; *) exit 1;; esac')
-    refused(
-        more=["which batch system?", f"magpend submit {path} --cluster slurm, or magpend submit {path} --cluster pbs."]
-    )
+    assert f"magpend submit {path} --cluster slurm, or magpend submit {path} --cluster pbs." in refused()
 
 
 @pytest.mark.parametrize(
@@ -310,9 +277,6 @@ def test_submit__no_batch_system_or_several(main, tmp_path, write_spec, cluster,
         (["--cluster", "slurmm"], "slurmm: is neither a file with a [cluster] table nor a batch system"),
         (["--cluster", "slurm", "--job", "partition=x"], "--job partition=x: unknown key"),
         (["--cluster", "slurm", "--job", "cores"], "--job cores: must be KEY=VALUE"),
-        (["--cluster", "slurm", "--job", "cores=0"], "cluster.cores = 0: must be at least 1"),
-        (["--cluster", "slurm", "--job", "cores=many"], "cluster.cores = 'many': must be a whole number"),
-        (["--cluster", "slurm", "--job", "walltime=4h"], "cluster.walltime: '4h': must be hours"),
         (["--cluster", "sge", "--job", "cores=4"], "Grid Engine wants a parallel environment"),
     ],
 )

@@ -2,30 +2,11 @@
 
 from __future__ import annotations
 
-import shutil
-
 import pytest
 
 from pipeline.runs.refusals import remedy
 from pipeline.runs.sites import Queue, Site, ask_site, pbs_site, slurm_seconds, slurm_site
-from pipeline.runs.systems import answer, find_systems
-
-
-@pytest.fixture
-def command(tmp_path, monkeypatch):
-    """Put commands on the PATH, which has no others of a batch system."""
-    folder = tmp_path / "bin"
-    folder.mkdir()
-    (folder / "sh").symlink_to(shutil.which("sh"))
-    monkeypatch.setenv("PATH", str(folder))
-    monkeypatch.delenv("SGE_ROOT", raising=False)
-
-    def write(name, text, shell="#!/bin/sh"):
-        (folder / name).write_text(f"{shell}\n{text}\n")
-        (folder / name).chmod(0o755)
-        return str(folder / name)
-
-    return write
+from pipeline.runs.systems import find_systems
 
 
 def kinds():
@@ -45,31 +26,23 @@ def kinds():
         ("something else", "pbs"),
     ],
 )
-def test_find_systems__qsub_has_several_makers(command, version, kind):
-    command("qsub", "true")
-    command("qstat", f"echo '{version}' >&2")
+def test_find_systems__qsub_has_several_makers(command_of, version, kind):
+    command_of("qsub", "true")
+    command_of("qstat", f"echo '{version}' >&2")
     assert kinds() == [kind]
 
 
-def test_find_systems__several_and_the_qsub_of_slurm_is_none_of_them(command):
+def test_find_systems__several_and_the_qsub_of_slurm_is_none_of_them(command_of):
     """Debian's slurm-wlm-torque has a qsub in Perl, which calls sbatch; that of Grid Engine has qconf beside it."""
     assert find_systems() == []
-    path = command("sbatch", "true")
-    command("qsub", "# This file is part of Slurm, a resource management program.", "#! /usr/bin/perl -w")
+    path = command_of("sbatch", "true")
+    command_of("qsub", "# This file is part of Slurm, a resource management program.", "#! /usr/bin/perl -w")
     (found,) = find_systems()
     assert (found.kind, found.command, found.named) == ("slurm", path, f"SLURM ({path})")
-    command("qstat", "exit 1")
+    command_of("qstat", "exit 1")
     for name in ("bsub", "qsub", "qconf"):
-        command(name, "true")
+        command_of(name, "true")
     assert kinds() == ["slurm", "lsf", "sge"]
-
-
-def test_answer__none_of_a_command_that_fails(command):
-    command("good", "echo yes")
-    command("bad", "echo no; exit 3")
-    assert answer(["good"]) == "yes\n"
-    assert answer(["bad"]) is None
-    assert answer(["absent"]) is None
 
 
 # ---- queues and nodes ----------------------------------------------------------------------------------
@@ -178,13 +151,13 @@ def test_pbs_site__openpbs_and_torque():
     assert pbs_site("pbs", "", "", "") == Site("pbs")
 
 
-def test_ask_site__asks_the_commands(command):
-    command("sinfo", "echo 'short*|up|1:00:00|1|4|8000'")
+def test_ask_site__asks_the_commands(command_of):
+    command_of("sinfo", "echo 'short*|up|1:00:00|1|4|8000'")
     assert ask_site("slurm").queue(None).cores == 4
-    command("sinfo", "exit 1")
+    command_of("sinfo", "exit 1")
     assert ask_site("slurm").silent == "sinfo"
-    command("qstat", f"case \"$1\" in -B) echo '{SERVER}';; *) echo '{QUEUES}';; esac")
-    command("pbsnodes", f"echo '{NODES}'")
+    command_of("qstat", f"case \"$1\" in -B) echo '{SERVER}';; *) echo '{QUEUES}';; esac")
+    command_of("pbsnodes", f"echo '{NODES}'")
     assert ask_site("pbs") == pbs_site("pbs", SERVER, QUEUES, NODES)
     assert ask_site("lsf") == Site("lsf")
 
@@ -196,32 +169,18 @@ def test_ask_site__asks_the_commands(command):
     ("kind", "said", "words"),
     [
         ("slurm", "Invalid account or account/partition combination specified", "--job account=NAME; sacctmgr show"),
-        ("slurm", "invalid partition specified: nix", "--job queue=NAME; sinfo -s lists them"),
-        ("slurm", "No partition specified or system default partition", "--job queue=NAME"),
         ("slurm", "Requested time limit is invalid (missing or exceeds some limit)", "--job walltime="),
-        ("slurm", "Requested node configuration is not available", "--job cores=N"),
-        ("slurm", "Invalid qos specification", '"--qos=NAME"'),
         ("slurm", "Invalid feature specification", "directives in the file of --cluster"),
         (
             "slurm",
             "Job violates accounting/QOS policy (job submit limit, user's size and/or time limits)",
             "wait until",
         ),
-        ("slurm", "Unable to contact slurm controller (connect failure)", "try again later"),
-        ("pbs", "qsub: Unknown queue", "--job queue=NAME; qstat -Q lists them"),
-        ("pbs", "qsub: Job violates queue and/or server resource limits", "Ask for less: --job walltime="),
-        ("torque", "submit error (Unknown queue MSG=cannot locate queue)", "--job queue=NAME"),
-        ("torque", "Job exceeds queue resource limits MSG=cannot satisfy queue max walltime requirement", "walltime="),
-        ("pbs", "qsub: Bad UID for job execution", "send it as yourself"),
-        (
-            "sge",
-            'Unable to run job: job rejected: the requested parallel environment "smp" does not exist.',
-            "directives",
-        ),
-        ("sge", "Unable to run job: unknown project", "--job account=NAME; qconf -sprjl"),
         ("slurm", "the moon is full", ""),
+        ("pbs", "qsub: Unknown queue", "--job queue=NAME; qstat -Q lists them"),
+        ("torque", "Job exceeds queue resource limits MSG=cannot satisfy queue max walltime requirement", "walltime="),
+        ("sge", "Unable to run job: unknown project", "--job account=NAME; qconf -sprjl"),
         ("lsf", "nix: No such queue. Job not submitted.", "--job queue=NAME; bqueues"),
-        ("lsf", "RUNLIMIT: Cannot exceed queue's hard limit(s). Job not submitted.", "--job walltime="),
     ],
 )
 def test_remedy__names_the_key(kind, said, words):

@@ -10,7 +10,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.cli.exits import Exit
 from pipeline.layout.cells import coordinates
 from pipeline.runs.preview import describe_plan
 from pipeline.runs.run import run
@@ -140,7 +139,6 @@ def test_zoom__samples(walk):
 REFUSED = [
     (Changes(), "nothing to change"),
     (Changes({"psi1": (1, 1)}), "psi1 = 1 1: the second number must be greater"),
-    (Changes({"psi1": (float("nan"), 1)}), "must be greater"),
     (Changes({"psi1": (0, float("inf"))}), "finite"),
     (Changes({"psi1": (0, 1), "psi1_deg": (0, 1)}), "psi1: is changed twice"),
     (Changes({"q": (1, 2)}, {"q": 1}), "q: is changed twice"),
@@ -148,11 +146,7 @@ REFUSED = [
     (Changes({"psi1": (0, 1)}, nums={"psi2": 3}), "psi2: no range is given for it"),
     (Changes({"psi1": (0, 1)}, samples=3), "samples = 3: the initial conditions are not random"),
     (Changes({}, {"q": 1.5}, num=3), "num = 3: no new range has points"),
-    (Changes({"qq": (0, 1)}, num=3), "did you mean q"),
-    (Changes({"m1": (-2, 1)}, num=3), "axes.m1"),
-    (Changes({}, {"q": float("nan")}), "parameters.overrides"),
     (Changes({}, {"frequency_hz": -2.0}), "parameters.frequency_hz = -2.0"),
-    (Changes({"psi1_dot": (0, 1)}), "psi1_dot: a range has 2 points or more"),
 ]
 
 
@@ -210,14 +204,3 @@ def test_zoom__command(main, write_spec, sweep_text, tmp_path):
     assert (tmp_path / "zoom.toml").read_text().startswith("# Zoom. Derived from specification spec.toml.\n")
     assert len(new.initial_conditions.psi1_deg.array()) == 9
     assert len(new.axes["q"].array()) == 11
-    for arguments, message in (
-        (["--axis", "q=1.5"], "--axis q=1.5: must be NAME=LOW:HIGH"),
-        (["--axis", "q=1:2:3:4"], "must be NAME=LOW:HIGH"),
-        (["--at", "q"], "--at q: must be NAME=VALUE"),
-        (["--at", "qq=1"], "did you mean q"),
-        ([], "nothing to change"),
-    ):
-        code, _, said = main("zoom", path, *arguments, "--out", "other.toml")
-        assert code == Exit.REFUSED
-        assert message in said
-    assert not (tmp_path / "other.toml").exists()

@@ -433,31 +433,3 @@ def test_flipped_bit__is_seen_by_readers_that_opened_before_and_by_zarr_alone(wh
     chunk.unlink()
     with pytest.raises(DamagedError, match=rf"{name}/{chunk.name}: is missing"):
         opened.cube()[name].load()
-
-
-def test_commands__name_what_is_damaged_and_what_to_do(whole, main):
-    """The words, for one damage of each kind."""
-    directory = whole()
-    key = chunks(directory)[0].relative_to(directory / "cube.zarr").as_posix()
-    flip(directory / "cube.zarr" / key, np.random.default_rng(0))
-    (directory / "cube.zarr/x_0/zarr.json").unlink()
-    (directory / "commits/notes.txt").write_text("mine")
-    flip(directory / "records.jsonl", np.random.default_rng(0))
-    misplace(directory / "commits/000002-000003.jsonl", None)
-    code, said, _ = main("verify", "run")
-    assert code == 5
-    for words in (
-        "run: 2 of 5 tasks committed and intact",
-        "  damaged: commits/000002-000003.jsonl: is a folder where a file should be",
-        f"  damaged: {key}: its content has changed",
-        "  damaged: x_0/zarr.json: missing",
-        "  damaged: records.jsonl: differs from the commit records",
-        "uncommitted files, which nothing reads; the next run removes them",
-        "rebuild them with --repair",
-        "then run the specification again to compute these tasks.",
-    ):
-        assert words in said
-    code, _, said = main("plot", "bifurcation", "run")
-    assert code == 5
-    assert "x_0/zarr.json: " in said
-    assert "magpend verify --repair" in said

@@ -22,13 +22,13 @@ from pipeline.runs.verify import verify_run
 from pipeline.runs.zoom import read_source
 from pipeline.store import lease, objects
 from pipeline.store.commits import read_commits, sweep, write_task
-from pipeline.store.errors import DamagedError, LockedError, RefusedError
+from pipeline.store.errors import DamagedError, LockedError
 from pipeline.store.files import RECORD_COPY
 from pipeline.store.places import open_files
 from pipeline.store.products import open_product, products_in, remove_product, write_product
 from pipeline.store.record_copy import write_copy
 from pipeline.store.run import Run
-from pipeline.store.setup import check, create, establish
+from pipeline.store.setup import create, establish
 from tests.pipeline.factories import SQUARE, duffing, quietly, silent
 from tests.pipeline.store.s3 import BUCKET, KEY_ID, SECRET, Server, in_turn, once
 
@@ -242,27 +242,6 @@ def test_write_task__killed_between_any_two_puts(made, remote, bytes_of, monkeyp
 # ---- damage ------------------------------------------------------------------------------------
 
 
-def test_verify__finds_damage_and_repair_withdraws_it(whole, made):
-    before = stored()
-    files = whole.info.files
-    key = next(iter(read_commits(whole.info, whole.plan)[1].objects))
-    content = bytearray(files.read(f"cube.zarr/{key}"))
-    content[-9] ^= 1
-    files.write(f"cube.zarr/{key}", bytes(content))
-    files.remove(["cube.zarr/q/zarr.json"])
-    found = verify_run(PLACE)
-    assert not found.sound
-    assert key in str(found.damaged)
-    assert found.skeleton == ["q/zarr.json: missing"]
-    assert verify_run(PLACE, repair=True).rebuilt == found.skeleton
-    commits = read_commits(whole.info, whole.plan)
-    assert 1 not in commits
-    sweep(whole.info, whole.plan, commits)
-    whole.commit(1)
-    assert stored() == before
-    assert verify_run(PLACE).sound
-
-
 def test_write_once__another_content_is_not_replaced(remote):
     files = remote.info.files
     files.write_once("commits/000000.json", b"one")
@@ -270,17 +249,6 @@ def test_write_once__another_content_is_not_replaced(remote):
     with pytest.raises(DamagedError, match=r"000000\.json: is there with another content"):
         files.write_once("commits/000000.json", b"two")
     assert files.read("commits/000000.json") == b"one"
-
-
-def test_check__another_run_or_foreign_objects(whole, s3):
-    with pytest.raises(RefusedError, match="holds another run"):
-        check(PLACE, {**whole.identity, "kernel_version": "newer"})
-    whole.info.files.remove(["run.json"])
-    with pytest.raises(RefusedError, match="what another run has left"):
-        check(PLACE, {**whole.identity, "kernel_version": "newer"})
-    assert check(PLACE, whole.identity) is None
-    with pytest.raises(RefusedError, match=r"is not empty and no run directory \(one\)"):
-        check(f"s3://{BUCKET}/runs", whole.identity)
 
 
 def test_write_product__the_seal_comes_last(remote, s3):
@@ -425,24 +393,6 @@ def test_run__credentials_are_nowhere(s3, write_spec, magpend, environment, tmp_
     assert any(KEY_ID in header for _, _, header in s3.requests)
 
 
-def test_explorer__reads_a_run_there_as_in_a_folder(whole, made):
-    from pipeline.explorer.data.diagram import diagram
-    from pipeline.explorer.data.explored import ExploredRun
-    from pipeline.explorer.data.view import describe_view
-
-    for task in range(made.plan.n_tasks):
-        made.commit(task)
-    there, here = ExploredRun.of(PLACE), ExploredRun.of(made.info.directory)
-    views = [describe_view(run, False) for run in (there, here)]
-    assert views[0]["name"] == PLACE.rpartition("/")[2]
-    assert "one" in views[0]["commands"]["attractors"]
-    named = {"name": "", "commands": {}}
-    assert views[0] | named == views[1] | named
-    points = [diagram(run, "frequency", "psi1", {"q": 1}) for run in (there, here)]
-    assert points[0] == points[1]
-    assert there.refreshed() is there
-
-
 # ---- the copy of the records -------------------------------------------------------------------
 
 
@@ -493,13 +443,6 @@ def test_open_run__record_that_is_damaged_is_found_by_verify(copied, made):
     run = Run.open(PLACE)
     assert set(run.commits) == {0, 2}
     assert (run.cube().status.values[made.plan.task(1)] == 0).all()
-
-
-def test_open_run__group_that_was_changed_is_refused(copied):
-    content = copied.read("cube.zarr/zarr.json").replace(b'"units": "s"', b'"units": "h"')
-    copied.write("cube.zarr/zarr.json", content)
-    with pytest.raises(DamagedError, match=r"zarr\.json: its content has changed"):
-        open_run(PLACE)
 
 
 def test_docs__example_of_the_object_store(copied, s3, monkeypatch):

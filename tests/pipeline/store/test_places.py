@@ -8,26 +8,17 @@ import os
 import shutil
 from pathlib import Path
 
-import numpy as np
 import pytest
-import xarray as xr
-import zarr
 
-from pipeline import open_run
 from pipeline.compute import execute, task
-from pipeline.runs.preview import describe_plan
-from pipeline.runs.status import state
 from pipeline.runs.verify import describe, verify_run
-from pipeline.runs.zoom import read_source
 from pipeline.store import commits, local
 from pipeline.store.checksums import seal, unseal
 from pipeline.store.commits import marker_key, read_commits, sweep
 from pipeline.store.errors import IncompleteError, RefusedError, UnreadableError
-from pipeline.store.files import RECORD_COPY, local_path
-from pipeline.store.local import LocalFiles
-from pipeline.store.records import Records
+from pipeline.store.files import RECORD_COPY
 from pipeline.store.run import Run
-from pipeline.store.setup import check, create, establish
+from pipeline.store.setup import check, establish
 from pipeline.store.skeleton import skeleton_files
 from tests.pipeline.factories import duffing, finished, quietly, silent
 
@@ -118,36 +109,6 @@ def test_check__another_run_stays_and_the_difference_is_named(whole):
     assert check(directory, whole.identity) is None
 
 
-def test_run__takes_what_a_killed_one_has_left(tmp_path):
-    """A lock's note, timings and empty folders are left if a run is killed, or removed while it goes on."""
-    (tmp_path / "run/cube.zarr/section").mkdir(parents=True)
-    note = {"host": "here", "pid": 1, "since": "2026-01-01T00:00:00+00:00"}
-    (tmp_path / "run/lock.json").write_text(json.dumps(note))
-    (tmp_path / "run/timings.jsonl").write_text('{"task": 0, "cells": 2}\n')
-    assert state(finished(tmp_path, SPEC)).complete
-
-
-@pytest.mark.parametrize("path", ["s3:/bucket/run", "https://host/run", "gs://b"])
-def test_local_path__urls_are_refused(path, write_spec, tmp_path, monkeypatch, main):
-    monkeypatch.chdir(tmp_path)
-    spec = write_spec(SPEC)
-    uses = (
-        state,
-        open_run,
-        verify_run,
-        read_source,
-        lambda p: quietly(spec, p),
-        lambda p: list(describe_plan(spec, p)),
-    )
-    for use in uses:
-        with pytest.raises(RefusedError, match="no folder and no object store; give a path"):
-            use(path)
-    assert main("run", "spec.toml", "--out", path)[0] == 2
-    assert list(tmp_path.iterdir()) == [spec]
-    for folder in ("runs/x", "C:/runs", "/a/b:c/d", "a:b"):
-        assert local_path(folder) == Path(folder)
-
-
 # ---- disks that fail ---------------------------------------------------------------------------
 
 
@@ -165,20 +126,6 @@ def test_read__an_unreadable_record_stops_and_removes_nothing(place, monkeypatch
         with pytest.raises(UnreadableError, match=r"000001\.json: cannot be read .* Nothing was removed"):
             use(place)
     assert everything(place) == before
-
-
-@pytest.mark.parametrize("name", ["commits", "cube.zarr", "status"])
-def test_read_commits__an_unreadable_folder_stops(whole, monkeypatch, name):
-    original = os.scandir
-
-    def scandir(path="."):
-        if Path(path).name == name:
-            raise OSError(errno.EACCES, os.strerror(errno.EACCES), str(path))
-        return original(path)
-
-    monkeypatch.setattr(os, "scandir", scandir)
-    with pytest.raises(UnreadableError, match=f"{name}: cannot be read"):
-        read_commits(whole.info, whole.plan)
 
 
 def test_scan__commits_that_never_stay_the_same_stop(place, monkeypatch):
@@ -207,22 +154,6 @@ def fail_at(monkeypatch, name, kind):
 
     monkeypatch.setattr(os, kind, call)
     return failed
-
-
-@pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="needs /proc to name open files")
-@pytest.mark.parametrize(
-    ("kind", "name"),
-    [(k, n) for k in ("fsync", "replace") for n in ("run.json", "section", "000001.json")]
-    + [("fsync", "commits"), ("mkdir", "cube.zarr"), ("mkdir", "commits"), ("mkdir", "section")],
-)
-def test_run__names_what_could_not_be_written(tmp_path, main, monkeypatch, name, kind):
-    (tmp_path / "spec.toml").write_text(SPEC)
-    failed = fail_at(monkeypatch, name, kind)
-    code, _, said = main("run", "spec.toml", "--out", "run", "--workers", 0)
-    assert failed
-    assert code == 4, said
-    assert name in said
-    assert "cannot be written (No space left on device); make room on its disk" in said
 
 
 @pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="needs /proc to name open files")
@@ -330,32 +261,6 @@ def test_sweep__removes_and_names_what_no_record_vouches_for_and_nothing_else(wh
     assert sweep(whole.info, whole.plan, commits_left) == 0
 
 
-def test_create__crash_anywhere_starts_again(made, tmp_path, monkeypatch):
-    n_files, original = len(made.info.skeleton), LocalFiles.write
-    for n in (0, 1, n_files // 2, n_files - 1, n_files):
-        directory, calls = tmp_path / f"again{n}", []
-
-        def crash(self, key, content, calls=calls, n=n):
-            if len(calls) == n:
-                raise KeyboardInterrupt
-            calls.append(key)
-            original(self, key, content)
-
-        with monkeypatch.context() as patch:
-            patch.setattr(LocalFiles, "write", crash)
-            with pytest.raises(KeyboardInterrupt):
-                create(directory, made.spec, made.plan, made.identity, "text")
-        with pytest.raises(RefusedError, match="no run directory"):
-            open_run(directory)
-        (directory / "cube.zarr/.zarr.json.abc.tmp").write_text("{")  # what a power cut leaves
-        (directory / ".run.json.abc.tmp").write_text("{")
-        assert check(directory, made.identity) is None
-        info = establish(directory, made.spec, made.plan, made.identity, "text", silent)
-        sweep(info, made.plan, Records(info.files, info.digest, {}))
-        assert verify_run(directory).sound
-        assert not list(directory.rglob("*.tmp"))
-
-
 def test_rebuild__files_worded_by_another_version(whole):
     """Where the metadata come out otherwise, repair leaves them; a run writes them and their digests anew."""
     directory = whole.info.directory
@@ -379,36 +284,3 @@ def test_skeleton_files__hold_nothing_of_this_machine_or_moment(made):
 
 
 # ---- other readers -----------------------------------------------------------------------------
-
-
-@pytest.mark.filterwarnings("error")
-def test_cube__explains_itself_to_plain_xarray_and_as_netcdf(whole, tmp_path):
-    with xr.open_zarr(whole.info.directory / "cube.zarr", chunks=None) as ds:
-        assert ds["state"].values.tolist() == ["psi1", "psi2", "psi1_dot", "psi2_dot"]
-        assert ds["state_units"].values.tolist() == ["rad", "rad", "rad/s", "rad/s"]
-        assert ds["link"].values.tolist() == ["psi1", "psi2"]
-        assert set(ds.data_vars) == {v.name for v in whole.plan.variables}
-        assert "units" not in ds["section"].attrs
-        assert {"psi1_dot_0", "psi2_dot_0", "frequency", "q"} <= set(ds.coords)
-    ds = open_run(whole.info.directory)
-    for name in ("source", "created", "host"):
-        assert ds.attrs[name]
-    assert ds.attrs["created"] == whole.info.provenance["created"]
-    assert "created" not in (whole.info.directory / "cube.zarr/zarr.json").read_text()
-    ds.to_netcdf(tmp_path / "cube.nc", engine="scipy")
-    with xr.open_dataset(tmp_path / "cube.nc", engine="scipy") as found:
-        assert np.array_equal(found["section"], ds["section"])
-        assert found["state"].values.tolist() == ds["state"].values.tolist()
-        assert found.attrs["spec"] == ds.attrs["spec"]
-
-
-def test_cube__schema_versus_store(whole):
-    group = zarr.open_group(whole.info.directory / "cube.zarr", mode="r")
-    for v in whole.plan.variables:
-        array = group[v.name]
-        assert str(array.dtype) == v.dtype
-        assert array.metadata.dimension_names == (*whole.plan.dims, *v.own_dims)
-        assert array.chunks == whole.plan.chunks(v)
-        assert np.array_equal(array.fill_value, v.fill, equal_nan=True)
-        assert array.attrs.get("units", "") == v.units
-        assert array.metadata.to_dict()["codecs"][-1]["name"] == "crc32c"

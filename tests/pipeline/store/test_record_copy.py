@@ -14,7 +14,7 @@ from pipeline.store.declared import METADATA
 from pipeline.store.errors import DamagedError
 from pipeline.store.files import RECORD_COPY
 from pipeline.store.packing import withdraw
-from pipeline.store.record_copy import copied_records, copy_text, write_copy
+from pipeline.store.record_copy import copied_records, write_copy
 from pipeline.store.runfile import write_run
 from pipeline.store.skeleton import entries_of, skeleton_files, write_skeleton
 from tests.pipeline.factories import silent
@@ -52,15 +52,6 @@ def test_copied_records__count_only_with_the_records_file(whole):
     del sizes["000001.json"]
     sizes["000002.json"] += 1
     assert set(copied_records(whole.info, sizes)) == {0, 3, 4}
-
-
-@pytest.mark.parametrize("way", ["cut", "of another run"])
-def test_copied_records__damaged_copy_has_none(whole, way):
-    """`verify` and a run find it: test_damage."""
-    other = copy_text({0: read_commits(whole.info, whole.plan)[0]}, "0" * 32)
-    whole.path.write_bytes(whole.path.read_bytes()[:-9] if way == "cut" else other)
-    assert not copied_records(whole.info, sizes_in(whole))
-    assert verify_run(whole.info.directory).copies
 
 
 def test_withdraw__removes_the_copy_first(whole, monkeypatch):

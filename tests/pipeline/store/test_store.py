@@ -151,31 +151,6 @@ def test_packs__same_bytes_in_any_order_late_and_twice(packed, bytes_of, order):
     assert bytes_of(packed.info.directory) == packed.before
 
 
-class CrashError(Exception):
-    """Stands for a power cut."""
-
-
-@pytest.mark.parametrize("step", ["write", "remove"])
-def test_pack_block__crash_between_steps(whole, monkeypatch, step):
-    files = type(whole.info.files)
-    original = getattr(files, step)
-
-    def crash(self, first, *rest):
-        if step == "remove":  # some are gone
-            original(self, list(first)[:1])
-        raise CrashError
-
-    with monkeypatch.context() as patch:
-        patch.setattr(files, step, crash)
-        with pytest.raises(CrashError):
-            pack_block(whole.info, whole.plan, 0)
-    assert len(read_commits(whole.info, whole.plan)) == 5
-    assert verify_run(whole.info.directory).n_committed == 5
-    assert go_on(whole) == []
-    assert names_in(whole) == PACKED
-    assert verify_run(whole.info.directory).sound
-
-
 def test_withdraw__leaves_the_others_of_a_pack(packed, bytes_of):
     withdraw(packed.info, ["000001.json"])
     assert names_in(packed) == PACKED

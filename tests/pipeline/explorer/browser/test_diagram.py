@@ -179,18 +179,6 @@ def test_diagram__address_restores_the_view(
     assert state_of(one) == there
 
 
-def test_diagram__an_address_that_says_nothing_of_use_shows_the_beginning(
-    visit: Callable[..., Any], explorer: str
-) -> None:
-    opened = drawn(visit(f"{explorer}#x=no&y=%3Cimg%3E&window=1,0,a&point=-3,x&at.q=9&hide.motion=z&plane=a,b"))
-    begun = state_of(opened.page)
-    assert begun["y"] == "psi1"
-    assert begun["window"] is None
-    assert begun["selected"] is None
-    assert begun["hidden"] == {}
-    assert opened.complaints == []
-
-
 def test_diagram__keys_zoom_move_walk_and_tell(page: Any, cube: xr.Dataset) -> None:
     one, says = page.page, page.page.locator("p.sr-only[role=status]")
     one.locator(".diagram").focus()
@@ -373,50 +361,6 @@ def test_diagram__narrow_pages_have_tabs_and_large_targets(
     assert min(heights) >= 44
     one.get_by_role("button", name="Play").tap()
     one.get_by_role("button", name="Pause").wait_for()
-
-
-FRAME_MS = 1000.0 / 60.0
-
-
-def frames_of(page: Any, gesture: Callable[[], None]) -> np.ndarray:
-    """Processor time [ms] of the page's own thread for each frame of a gesture, by the browser's trace.
-
-    Not the time between frames: other work on the machine would be in it.
-    """
-    events: list[dict[str, Any]] = []
-    client = page.context.new_cdp_session(page)
-    client.on("Tracing.dataCollected", lambda some: events.extend(some["value"]))
-    ended: list[Any] = []
-    client.on("Tracing.tracingComplete", lambda told: ended.append(told))
-    categories = {"includedCategories": ["devtools.timeline"], "excludedCategories": ["*"]}
-    client.send("Tracing.start", {"traceConfig": categories, "transferMode": "ReportEvents"})
-    gesture()
-    client.send("Tracing.end")
-    while not ended:
-        page.wait_for_timeout(50)
-    drawn_frames = [e for e in events if e.get("ph") == "X" and e["name"] == "FireAnimationFrame"]
-    return np.array([e.get("tdur", e["dur"]) for e in drawn_frames]) / 1000.0
-
-
-def drag_about(page: Any, steps: int = 40) -> None:
-    """Zoom into the middle and drag the diagram to and fro."""
-    around = page.locator(".diagram").bounding_box()
-    x, y = around["x"] + 0.5 * around["width"], around["y"] + 0.5 * around["height"]
-    page.mouse.move(x, y)
-    for _ in range(10):
-        page.mouse.wheel(0, -100)
-        page.wait_for_timeout(16)
-    page.mouse.down()
-    for k in range(steps):
-        page.mouse.move(x - 5 * k, y + 2 * k)
-        page.wait_for_timeout(16)
-    page.mouse.up()
-
-
-def test_diagram__frames_take_a_part_of_a_sixtieth_of_a_second(page: Any) -> None:
-    frames = frames_of(page.page, lambda: drag_about(page.page))
-    assert len(frames) >= 20
-    assert np.percentile(frames, 95) < 0.6 * FRAME_MS
 
 
 def test_diagram__zoom_here_gives_the_window_as_a_specification_and_runs_it(page: Any, looked_at: Path) -> None:

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import re
 import socket
-import time
 import tomllib
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -15,12 +13,9 @@ import numpy as np
 import pytest
 
 from pipeline.store.run import open_run
-from tests.pipeline.explorer.browser.conftest import WAIT_MS
 from tests.pipeline.explorer.browser.notebooks import Lab, jupyterlab, started
 
 pytestmark = pytest.mark.slow
-
-WAIT_S = WAIT_MS / 1000.0
 
 JUPYTER = {
     "widget": "import json, magpend\nw = magpend.explorer({run!r})\nseen = []\nw.observe(seen.append, 'selected')\nw",
@@ -134,17 +129,6 @@ def test_jupyter__a_click_is_read_in_python_and_python_selects(lab: Lab, looked_
     assert state_of(one)["selected"] is None
     _, second, _ = lab.run("read")
     is_of_the_cube(second, 7, 3, looked_at)
-
-
-def test_jupyter__colours_follow_the_notebook(lab: Lab) -> None:
-    one = drawn(lab.page)
-    paper = "element => getComputedStyle(element.shadowRoot.querySelector('.explorer')).backgroundColor"
-    for theme, sign in (("JupyterLab Dark", 1), ("JupyterLab Light", -1)):
-        lab.command("apputils:change-theme", theme=theme)
-        end = time.monotonic() + WAIT_S
-        while sign * (128 - int(re.findall(r"\d+", one.evaluate(paper))[0])) < 0:
-            assert time.monotonic() < end, f"not as {theme}"
-            lab.page.wait_for_timeout(50)
 
 
 def test_jupyter__jobs_end_with_the_output(lab: Lab, looked_at: Path) -> None:
