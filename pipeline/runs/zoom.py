@@ -79,7 +79,7 @@ def read_source(path: str | Path) -> Source:
     if is_url(path) or local_path(path).is_dir():
         info = read_run(path)
         name = info.files.local.resolve().name if info.files.local else info.name
-        return Source(kept_spec(info.spec), f"run {name}, digest {info.digest}")
+        return Source(info.parsed_spec(), f"run {name}, digest {info.digest}")
     found = find_spec(path)
     return Source(load_spec(found), f"specification {found.name}")
 

@@ -212,8 +212,13 @@ def absent_objects(info: RunInfo, records: Mapping[int, Commit]) -> dict[int, st
     # a chunk is durable before its record is, so a missing one was lost later
     sizes = info.files.below(CUBE).sizes() if records else {}
     found = {}
-    for index, commit in records.items():
-        keys = (key for key, entry in commit.objects.items() if sizes.get(key) != entry["size"])
+    for index in records:
+        try:
+            objects = records[index].objects
+        except DamagedError as error:  # a line of a pack is no record
+            found[index] = str(error)
+            continue
+        keys = (key for key, entry in objects.items() if sizes.get(key) != entry["size"])
         key = next(keys, None)
         if key is not None:
             found[index] = f"{key} is missing or has another size"

@@ -131,7 +131,8 @@ def open_product(place: Place, *, lazy: bool = False) -> xr.Dataset:
         ds = xr.open_zarr(store, consolidated=False, chunks=None)
         with contextlib.nullcontext() if lazy else contextlib.closing(ds):
             loaded = (ds if lazy else ds.load()).assign(_with_words(ds))
-    except (ValueError, KeyError, OSError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, IndexError, OverflowError, OSError) as error:
+        # of zarr and xarray: metadata from a stranger may have any type
         raise DamagedError(f"{files.name}: {error}") from None
     variables = {name: loaded.variables[name] for name in sorted(map(str, loaded.data_vars))}
     return netcdf_safe(xr.Dataset(variables, loaded.coords, _own(loaded.attrs)))
