@@ -63,7 +63,8 @@ def check_starts(spec: Spec) -> None:
 
 def _check_period(model: TextModel, states: np.ndarray, points: Sequence[Mapping[str, Any]]) -> None:
     """Raise `SpecError` for an equation that does not repeat after a period of the drive."""
-    definition, problems = model.definition, {}
+    definition = model.definition
+    problems: dict[str, str] = {}
     for point in points:
         before, after = (_rates(model, states, point, late) for late in (0.0, 1.0))
         for name in definition.equations:
@@ -81,7 +82,7 @@ def _check_period(model: TextModel, states: np.ndarray, points: Sequence[Mapping
 
 
 def _rates(model: TextModel, states: np.ndarray, point: Mapping[str, Any], late: float) -> dict[str, np.ndarray]:
-    """Return the rates of the states at some instants of the drive's period, or as many periods later as `late` says."""
+    """Return the rates of the states at some instants of the drive's period, `late` periods later."""
     definition, frequency = model.definition, point[FREQUENCY] or 1.0
     rows = np.resize(states, (len(SHARES), states.shape[1])).T
     known: dict[str, Any] = {
