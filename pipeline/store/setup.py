@@ -73,8 +73,8 @@ def _other_version(info: RunInfo) -> str:
     """Explain why a run of another version is not continued, and what keeps its finished cells."""
     made, commit = info.versions.get("magpend", "unknown"), info.provenance.get("git_commit", "")
     return (
-        f"{info.name}: was begun by another version of magpend ({made}{f', commit {commit[:12]}' if commit else ''}), and "
-        "cells of two versions are not mixed in one run. Its finished cells stay, and this version opens, analyses and "
+        f"{info.name}: was begun by another version of magpend ({made}{f', commit {commit[:12]}' if commit else ''}), "
+        "and cells of two versions are not mixed in one run. Its finished cells stay, and this version opens, analyses and "
         f"draws them: magpend status, analyse, plot or report {info.name}. To complete it, give the command again with "
         "that version; or compute all of it with this one: --out ANOTHER_DIR."
     )
