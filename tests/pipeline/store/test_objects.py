@@ -408,7 +408,7 @@ def test_main__refusals_are_one_line(s3, made, main, monkeypatch, tmp_path):
     assert "refuses access (403 Harm); check AWS_ACCESS_KEY_ID" in errors("status", PLACE)
     with monkeypatch.context() as patch:
         patch.setitem(sys.modules, "obstore", None)
-        assert "pip install 'magpend[s3]'" in errors("status", PLACE)
+        assert "pip install '.[s3]'" in errors("status", PLACE)
     with monkeypatch.context() as patch:
         patch.delenv("AWS_ACCESS_KEY_ID")
         assert "there are no credentials; set AWS_ACCESS_KEY_ID" in errors("status", PLACE)
