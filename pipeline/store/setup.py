@@ -57,7 +57,7 @@ def check(place: str | Path | Files, identity: Mapping[str, Any]) -> RunInfo | N
         return None
     lines = differences(info.identity, identity)
     if lines and all(line.startswith(_VERSIONS) for line in lines):
-        raise RefusedError(_other_version(info))
+        raise RefusedError(_other_version(info, lines))
     if lines:
         raise RefusedError(
             f"{files.name}: holds another run. Give another --out, or remove it. Differences:\n  " + "\n  ".join(lines)
@@ -69,14 +69,15 @@ _VERSIONS = ("kernel_version: ", "code.")
 """Keys of an identity that differ where only the version of magpend does."""
 
 
-def _other_version(info: RunInfo) -> str:
+def _other_version(info: RunInfo, lines: list[str]) -> str:
     """Explain why a run of another version is not continued, and what keeps its finished cells."""
-    made, commit = info.versions.get("magpend", "unknown"), info.provenance.get("git_commit", "")
+    commit = info.provenance.get("git_commit", "")
+    made = info.versions.get("magpend", "unknown") + (f", commit {commit[:12]}" if commit else "")
     return (
-        f"{info.name}: was begun by another version of magpend ({made}{f', commit {commit[:12]}' if commit else ''}), "
-        "and cells of two versions are not mixed in one run. Its finished cells stay, and this version opens, analyses and "
-        f"draws them: magpend status, analyse, plot or report {info.name}. To complete it, give the command again with "
-        "that version; or compute all of it with this one: --out ANOTHER_DIR."
+        f"{info.name}: was begun by another version of magpend ({made}), and cells of two versions are not mixed in one "
+        "run. Its finished cells stay, and this version opens, analyses and draws them: magpend status, analyse, plot or "
+        f"report {info.name}. To complete it, give the command again with that version; or compute all of it with this "
+        "one: --out ANOTHER_DIR. Differences:\n  " + "\n  ".join(lines)
     )
 
 
