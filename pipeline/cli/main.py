@@ -100,6 +100,7 @@ app.add_typer(identify_app, name="identify")
 
 def _codes() -> list[tuple[tuple[type[BaseException], ...], Exit]]:
     """Return the exceptions that mean a user's error or a failed run, with the exit code of each."""
+    from magpend_core.engine.checks import SystemCheckError
     from magpend_core.models.parameters import ParameterError
     from pipeline.compute.addresses import SchedulerError
     from pipeline.compute.execute import TaskFailedError
@@ -111,7 +112,7 @@ def _codes() -> list[tuple[tuple[type[BaseException], ...], Exit]]:
         ((LockedError,), Exit.LOCKED),
         ((DamagedError,), Exit.DAMAGED),
         ((IncompleteError, UnreadableError), Exit.FAILED),
-        ((SpecError, ParameterError, StoreError), Exit.REFUSED),
+        ((SpecError, ParameterError, SystemCheckError, StoreError), Exit.REFUSED),
         ((TaskFailedError, SchedulerError, SubmitError, ArithmeticError, OSError), Exit.FAILED),
     ]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Collection
 from pathlib import Path
 
 _LOOKED_AT = 100_000
@@ -42,8 +43,15 @@ def check_place(path: Path, option: str = "--out", within: str = "") -> None:
     refuse_place(path, option, within)
 
 
-def check_file(path: Path, option: str = "--out", within: str = "") -> None:
+def check_file(path: Path, option: str = "--out", within: str = "", digests: Collection[str] = ()) -> None:
     """Raise an error if a file cannot be written, or if it exists and magpend did not write it.
+
+    Parameters
+    ----------
+    path, option, within
+        See `check_place`.
+    digests
+        Digests of the runs that the file is to show, all of which an existing file must name.
 
     Raises
     ------
@@ -53,6 +61,11 @@ def check_file(path: Path, option: str = "--out", within: str = "") -> None:
     check_place(path, option, within)
     if path.is_file() and not _is_own(path):
         _refuse(path, option)
+    if path.is_file() and path.stat().st_size and digests:
+        content = path.read_bytes()
+        # in a PDF, texts with letters beyond ASCII are in UTF-16
+        if not all(d.encode() in content or d.encode("utf-16-be") in content for d in digests):
+            _refuse(path, option, "shows another run")
 
 
 def check_table(path: Path, header: str) -> None:
@@ -87,13 +100,11 @@ def check_log(path: Path) -> None:
             _refuse(path, "--log")
 
 
-def _refuse(path: Path, option: str) -> None:
+def _refuse(path: Path, option: str, why: str = "magpend did not write it") -> None:
     from pipeline.specification.problems import SpecError
 
     if not _forced:
-        raise SpecError(
-            f"{option} {path}: exists, and magpend did not write it; give another name, or --force to replace it."
-        )
+        raise SpecError(f"{option} {path}: exists, and {why}; give another name, or --force to replace it.")
 
 
 def _is_own(path: Path) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -46,11 +47,15 @@ def draw(directory: str, name: str, options: FigureOptions) -> None:
     from pipeline.store.errors import RefusedError
     from pipeline.store.files import FIGURES
     from pipeline.store.local import make_folder, refuse_links, unwritable
+    from pipeline.store.runfile import read_run
 
     if options.out:
-        check_figure_path(_target_of(options), FIGURES)
+        check_figure_path(_target_of(options), FIGURES, [read_run(directory).digest])
     run, wanted = ready(directory, name, options, console.note)
     target = _target_of(wanted) if wanted.out else _in_run(run.info.files, name, wanted)
+    if not wanted.out and run.info.files.local is None:  # runs of other buckets may have the same name
+        for file in (target, target.with_suffix(".nc")):
+            check_file(file, digests=[run.info.digest])
     if not wanted.out:
         refuse_links(target.parent, target, target.with_suffix(".nc"))
     if problem := unwritable(target.parent):
@@ -77,10 +82,10 @@ def _in_run(files: Files, name: str, options: FigureOptions) -> Path:
     return folder / f"{name}{options.label()}.{options.format or 'png'}"
 
 
-def check_figure_path(path: Path, within: str = "") -> None:
+def check_figure_path(path: Path, within: str = "", digests: Collection[str] = ()) -> None:
     """Raise an error if a figure file cannot be written, before anything is computed; see `check_file`."""
     from pipeline.specification.files import check_new_file
 
     check_new_file(path, SUFFIXES)
     for file in (path, path.with_suffix(".nc")):
-        check_file(file, within=within)
+        check_file(file, within=within, digests=digests)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from pathlib import Path
 from typing import Annotated
 
@@ -13,7 +14,9 @@ from pipeline.cli.outputs import check_file
 
 def report(
     directories: Annotated[list[str], typer.Argument(metavar="DIR...", help="Run directories, or s3://BUCKET/PREFIX.")],
-    out: Annotated[Path, typer.Option(metavar="FILE", help="File of the page.")] = Path("report.html"),
+    out: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="File of the page. Default: NAME-report.html, by the first run.")
+    ] = None,
     title: Annotated[str, typer.Option(help="Title of the page; by default that of the run.")] = "",
     also: Annotated[
         list[str] | None,
@@ -33,15 +36,19 @@ def report(
     """
     from pipeline.report.page import write
     from pipeline.report.report import report as make
+    from pipeline.store.runfile import read_run
 
-    check_page(out)
+    infos = [read_run(directory) for directory in directories]
+    if out is None:
+        out = Path(f"{Path(infos[0].name).resolve().name}-report.html")
+    check_page(out, [info.digest for info in infos])
     page = make(directories, title=title, also=also or [], only_stored=only_stored, echo=console.note)
     write(page, out)
     console.result(f"report: {out} ({out.stat().st_size / 1e6:.1f} MB)")
 
 
-def check_page(path: Path) -> None:
-    """Raise an error if the HTML page cannot be written, before anything is computed."""
+def check_page(path: Path, digests: Collection[str] = ()) -> None:
+    """Raise an error if the HTML page cannot be written, before anything is computed; see `check_file`."""
     from pipeline.specification.problems import SpecError
     from pipeline.store.errors import RefusedError
     from pipeline.store.local import unwritable
@@ -50,6 +57,6 @@ def check_page(path: Path) -> None:
         raise SpecError(f"--out {path}: the suffix must be .html.")
     if path.is_dir() or not path.parent.is_dir():
         raise SpecError(f"--out {path}: must be a file in a folder that exists.")
-    check_file(path)
+    check_file(path, digests=digests)
     if problem := unwritable(path.parent):
         raise RefusedError(f"{problem}; give another place for the page: --out FILE.")

@@ -5,13 +5,14 @@ from __future__ import annotations
 import contextlib
 import os
 import shutil
+import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 from pipeline.compute.addresses import SchedulerError
-from pipeline.specification.clusters import Cluster, hours_and_minutes
+from pipeline.specification.clusters import Cluster, hours_and_minutes, refuse_breaks
 from pipeline.specification.extras import import_extra
 from pipeline.specification.problems import SpecError
 
@@ -66,7 +67,13 @@ def settings(cluster: Cluster, folder: Path) -> dict[str, Any]:
         Description of a job.
     folder
         Folder for the job logs.
+
+    Raises
+    ------
+    SpecError
+        If the folder or Python has a line break or another control character in its name.
     """
+    refuse_breaks((str(folder), cluster.python or sys.executable))
     account = "project" if cluster.kind in ("sge", "lsf") else "account"
     time = cluster.walltime if cluster.kind != "lsf" else hours_and_minutes(cluster.walltime_s)
     found: dict[str, Any] = {

@@ -10,6 +10,7 @@ import numpy as np
 
 from magpend_core.models import load_model
 from magpend_core.models.text.model import TextModel
+from magpend_core.models.text.numeric import value_of
 from pipeline.layout.cells import initial_states, parameter_axes
 from pipeline.specification.parsing import Spec
 from pipeline.specification.problems import SpecError
@@ -21,12 +22,20 @@ if TYPE_CHECKING:
 
 MOST_STARTS = 4096
 """Most starts at which the equations are evaluated. Of more starts so many are chosen, evenly spread."""
+SHARES = np.sqrt([2, 3, 5, 7, 11, 13, 17, 19]) % 1.0
+"""Instants in the drive's period at which the equations are compared with themselves one period later: at none of
+them an edge is to be expected.
+"""
+PERIODIC, TWICE = 1e-6, 2
+"""Largest relative difference after a period, and least number of instants with a larger one."""
 MOST_CORNERS = 64
 """Most corners of the box of swept parameters at which the equations are evaluated."""
 
 
 def check_starts(spec: Spec) -> None:
     """Refuse a run of a model written as text if its equations cannot be evaluated at the initial conditions.
+
+    They must also have the drive's period in time, in most of some drawn states at the ends of every axis.
 
     They are evaluated at time 0 at all starts (at most `MOST_STARTS`), at both ends of every axis. If they
     have values at some of the ends, the run is not refused: the status of its cells shows where they have
@@ -46,7 +55,50 @@ def check_starts(spec: Spec) -> None:
     names = [a.parameter for a in axes]
     fixed = {**spec.values, FREQUENCY: spec.frequency_hz}
     points = [{**fixed, **dict(zip(names, corner, strict=True))} for corner in corners]
-    check_states(load_model(spec.reference), states.at(chosen), points)
+    model = load_model(spec.reference)
+    check_states(model, states.at(chosen), points)
+    if isinstance(model, TextModel) and not model.autonomous and spec.drive is None:
+        _check_period(model, states.at(chosen[: len(SHARES)]), points)
+
+
+def _check_period(model: TextModel, states: np.ndarray, points: Sequence[Mapping[str, Any]]) -> None:
+    """Raise `SpecError` for an equation that does not repeat after a period of the drive."""
+    definition = model.definition
+    problems: dict[str, str] = {}
+    for point in points:
+        before, after = (_rates(model, states, point, late) for late in (0.0, 1.0))
+        for name in definition.equations:
+            size = np.abs(before[name]).max()
+            if (np.abs(after[name] - before[name]) > PERIODIC * size).sum() >= TWICE:
+                at = ", ".join(f"{n} = {point[n]:.6g}" for n in (FREQUENCY, *model.parameter_names))
+                problems.setdefault(
+                    name,
+                    f"model.equations.{name} = {definition.table['equations'][name]!r}: does not repeat after a period "
+                    f"of the drive, 1/f, at {at}. Time must enter with this period: write 2*pi*f*t, or phase, and give "
+                    "the drive's rate as frequency_hz.",
+                )
+    if problems:
+        raise SpecError(list(problems.values()))
+
+
+def _rates(model: TextModel, states: np.ndarray, point: Mapping[str, Any], late: float) -> dict[str, np.ndarray]:
+    """Return the rates of the states at some instants of the drive's period, `late` periods later."""
+    definition, frequency = model.definition, point[FREQUENCY] or 1.0
+    rows = np.resize(states, (len(SHARES), states.shape[1])).T
+    known: dict[str, Any] = {
+        "pi": np.pi,
+        **{name: float(point[name]) for name in model.parameter_names},
+        **dict(zip(model.state_names, rows, strict=True)),
+        "f": frequency,
+        "phase": SHARES,
+        "t": (SHARES + late) / frequency,
+    }
+    with np.errstate(all="ignore"):
+        for name in definition.used(definition.equations.values()):
+            if name in definition.define:
+                known[name] = value_of(definition.define[name], known)
+        values = {name: value_of(tree, known) for name, tree in definition.equations.items()}
+    return {name: np.nan_to_num(np.broadcast_to(value, SHARES.shape)) for name, value in values.items()}
 
 
 def check_states(model: Model, states: np.ndarray, points: Sequence[Mapping[str, Any]]) -> None:

@@ -52,9 +52,9 @@ def plot_basins(
     Returns
     -------
     DataFigure
-        Cells that end on no attractor are grey, with the reason. The legend gives each basin's share of the
-        cells drawn. Its `data` hold ``attractor_id``, ``status`` and ``outcome`` of the cells drawn, and
-        ``n_periods`` if drawn.
+        Cells that end on no attractor are grey, with the reason. The legend gives each basin's share of the cells
+        drawn that end on attractors or diverge, as the table of basins does, and the number of the others. Its `data`
+        hold ``attractor_id``, ``status`` and ``outcome`` of the cells drawn, and ``n_periods`` if drawn.
 
     Raises
     ------
@@ -71,7 +71,7 @@ def plot_basins(
         data["n_periods"] = times["attractor_id"].transpose(*reversed(axes))
     cast = palette.cast_of(attractors, part)
     codes, counts = _codes(data, part, axes, cast)
-    fig, ax = palette.new_panel(_stored(data, part, cast), _entries(cast, counts, codes.size), frame, 4.7)
+    fig, ax = palette.new_panel(_stored(data, part, cast), _entries(cast, counts), frame, 4.7)
     scale = _scale(data, part)
     ax.imshow(
         _painted(codes, data, part, cast, scale),
@@ -85,7 +85,9 @@ def plot_basins(
     _dress(ax, attractors, axes, degrees)
     if scale is not None:
         _draw_scale(fig, ax, scale, periods_of(model_of(attractors)))
-    style.complete(fig, ax, labels.caption(part, drop=axes))
+    finished = _finished(counts)
+    about = f"shares of the {finished} of {codes.size} cells that end on attractors or diverge"
+    style.complete(fig, ax, style.join([labels.caption(part, drop=axes), about if finished < codes.size else ""]))
     _write_letters(ax, codes, cast)
     return fig
 
@@ -205,15 +207,29 @@ def _dress(ax: Axes, attractors: xr.Dataset, axes: tuple[str, str], degrees: boo
     labels.angle_ticks(ax, y, "y")
 
 
-def _entries(cast: palette.Cast, counts: Mapping[int, int], total: int) -> list[tuple[str, str]]:
+_DIVERGED = _FIRST_GREY - list(palette.GREYS).index("diverged")
+
+
+def _finished(counts: Mapping[int, int]) -> int:
+    """Return the number of cells with an outcome: they end on attractors or diverge."""
+    return sum(n for code, n in counts.items() if code >= 0 or code in (_OTHERS, _DIVERGED))
+
+
+def _entries(cast: palette.Cast, counts: Mapping[int, int]) -> list[tuple[str, str]]:
+    finished = _finished(counts)
     own = sorted((i for i in counts if i >= 0), key=lambda i: (-counts[i], i))
-    entries = [(f"{cast.names[i]}, {palette.percent(counts[i] / total)}", cast.colours[i]) for i in own]
+    entries = [(f"{cast.names[i]}, {palette.percent(counts[i] / finished)}", cast.colours[i]) for i in own]
     if _OTHERS in counts:
         n = len(cast.names) - len(cast.main)
-        entries.append((f"{n} others, {palette.percent(counts[_OTHERS] / total)}", palette.OTHERS))
+        entries.append((f"{n} others, {palette.percent(counts[_OTHERS] / finished)}", palette.OTHERS))
     for k, name in enumerate(palette.GREYS):
         if (code := _FIRST_GREY - k) in counts:
-            entries.append((f"{name}, {palette.percent(counts[code] / total)}", palette.GREYS[name]))
+            share = (
+                palette.percent(counts[code] / finished)
+                if code == _DIVERGED
+                else f"{counts[code]} cell{'s' * (counts[code] > 1)}"
+            )
+            entries.append((f"{name}, {share}", palette.GREYS[name]))
     return entries
 
 

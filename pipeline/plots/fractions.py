@@ -133,7 +133,7 @@ def _about(data: xr.Dataset) -> str:
         return f"{n} branches each"
     seen = data["fraction"] > 0
     half = float((0.5 * (data["high"] - data["low"])).where(seen).max())
-    return f"{n} initial states each, 95 % intervals within ±{half:.2g}"
+    return f"shares of all {n} initial states, grey ones included, 95 % intervals within ±{half:.2g}"
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from pipeline.compute.jobqueue import torque_resources
-from pipeline.specification.clusters import Cluster, bytes_of, clock, hours_and_minutes, seconds_of
+from pipeline.specification.clusters import Cluster, bytes_of, clock, hours_and_minutes, refuse_breaks, seconds_of
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,13 @@ def coordinator_script(cluster: Cluster, name: str, log: str, folder: str, comma
         Working directory of the command.
     command
         Words of the command.
+
+    Raises
+    ------
+    SpecError
+        If a name or a word has a line break or another control character.
     """
+    refuse_breaks((name, log, folder, *command))
     cores, memory, time_s = resources(cluster)
     lines = [
         "#!/usr/bin/env bash",

@@ -310,7 +310,10 @@ def is_outdone(run: Run, attrs: Mapping[str, Any]) -> bool:
     name, given = str(attrs.get("derived_product")), options_of(attrs)
     if name not in ANALYSES or not issubclass(ANALYSES[name].options, IdentifyOptions):
         return False
-    own = IdentifyOptions.model_validate({k: given[k] for k in IdentifyOptions.model_fields if k in given})
+    try:
+        own = validated(IdentifyOptions, {k: given[k] for k in IdentifyOptions.model_fields if k in given})
+    except SpecError as error:
+        raise DamagedError(f"its options: {error.problems[0]}") from None
     return bool(most_evidence(run, own) != own)
 
 

@@ -142,6 +142,7 @@ def carry_out(
     if check(files, identity) is None:
         check_space(plan, files.local)
         clients.reach(where)  # before anything is created
+        _compile(spec, echo)
     with stoppable(files.name), files.lock() as alone:
         is_alone = alone is not False
         info = establish(files, spec, plan, identity, text, echo, alone=is_alone)
@@ -188,9 +189,7 @@ def _complete(
     check_space(plan, info.files.local, plan.n_cells - before)
     echo(f"{plan.n_cells} cells in {plan.n_tasks} tasks" + (f", {before} cells done before" if before else ""))
     clients.reach(where)
-    seconds = task.warm_up(spec)
-    if seconds > 1:
-        echo(f"kernel compiled in {duration(seconds)}")
+    _compile(spec, echo)
     job = partial(task.run_task, info.files.place, info.digest, origin=origin(spec.model))
     if sources:
         job = partial(job, sources=tuple(sources))
@@ -215,6 +214,15 @@ def _complete(
                 packer.add(result["task"])
                 progress.add(result["cells"])
     _require_all(info, plan, echo)
+
+
+def _compile(spec: Spec, echo: Echo) -> None:
+    """Compile what a run needs, which also checks its model; do nothing for what is compiled already."""
+    from pipeline.compute import task
+
+    seconds = task.warm_up(spec)
+    if seconds > 1:
+        echo(f"kernel compiled in {duration(seconds)}")
 
 
 def _require_all(info: RunInfo, plan: Plan, echo: Echo) -> None:

@@ -6,7 +6,6 @@ from dataclasses import replace
 from pathlib import Path
 
 from pipeline.layout.plan import make_plan
-from pipeline.specification.parsing import kept_spec
 from pipeline.store.checking import ODD, Verification, verify
 from pipeline.store.files import ASIDE, DERIVED
 from pipeline.store.packing import withdraw
@@ -39,7 +38,7 @@ def verify_run(directory: str | Path, *, repair: bool = False) -> Verification:
         With `repair`, if a run is writing to the directory.
     """
     info = read_run(directory)
-    spec = kept_spec(info.spec)
+    spec = info.parsed_spec()
     plan = make_plan(spec)
     if not repair:
         return verify(info, plan)

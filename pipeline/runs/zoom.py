@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from magpend_core.models.imported import KEY
-from pipeline.specification.files import check_new_file, write_new
+from pipeline.specification.files import check_new_file, merged, nested, write_new
 from pipeline.specification.parsing import Spec, kept_spec, load_spec
 from pipeline.specification.problems import SpecError, unknown_name
 from pipeline.specification.starts import GridStarts, RandomStarts, degrees_key, state_keys, state_of_key
@@ -33,10 +33,13 @@ class Source:
         The specification.
     origin : str
         Phrase for the comment at the head of the new file.
+    smoke : dict
+        Its ``[smoke]`` table; empty if it has none.
     """
 
     spec: Spec
     origin: str
+    smoke: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -79,16 +82,25 @@ def read_source(path: str | Path) -> Source:
     if is_url(path) or local_path(path).is_dir():
         info = read_run(path)
         name = info.files.local.resolve().name if info.files.local else info.name
-        return Source(kept_spec(info.spec), f"run {name}, digest {info.digest}")
+        return Source(info.parsed_spec(), f"run {name}, digest {info.digest}", _smoke_in(info.spec_text))
     found = find_spec(path)
-    return Source(load_spec(found), f"specification {found.name}")
+    return Source(load_spec(found), f"specification {found.name}", _smoke_in(found.read_text("utf-8")))
+
+
+def _smoke_in(text: str) -> Mapping[str, Any]:
+    """Return the table ``[smoke]`` of a specification's text; empty for a text without one."""
+    try:
+        table = tomllib.loads(text).get("smoke")
+    except tomllib.TOMLDecodeError:  # of a run that came from a table of Python
+        table = None
+    return table if isinstance(table, dict) else {}
 
 
 def zoom(spec: Spec, changes: Changes) -> tuple[Spec, list[str]]:
     """Change the ranges and values of a specification; return also notes on ranges that exceed the old ones.
 
     A range keeps its number of points. A state or parameter with one value can get a range with a given
-    number of points. New ranges are evenly spaced. A ``[smoke]`` table is not copied.
+    number of points. New ranges are evenly spaced.
 
     Raises
     ------
@@ -126,7 +138,13 @@ def write_zoom(source: Source, changes: Changes, out: Path) -> list[str]:
     check_new_file(out, [".toml"])
     refuse_place(out, "--out")
     spec, notes = zoom(source.spec, changes)
-    text = derived_toml("Zoom", source.origin, spec)
+    smoke = source.smoke
+    try:
+        kept_spec(merged(spec.as_dict(), nested(smoke)))
+    except SpecError:
+        smoke = {}
+        notes = [*notes, "[smoke]: is left out, since it does not fit the new ranges."]
+    text = derived_toml("Zoom", source.origin, spec, smoke)
     if isinstance(spec.reference, Mapping) and (place := spec.reference.get(KEY)):
         notes = [*notes, f"model: running {out} imports the Python object {place}; read its code first."]
     write_new(out, text, "--out")
@@ -235,21 +253,24 @@ def put_value(spec: Spec, data: dict[str, Any], key: str, value: Any) -> None:
 # ---- TOML --------------------------------------------------------------------------------------
 
 
-def derived_toml(how: str, origin: str, spec: Spec) -> str:
-    """Return a derived specification as TOML, below a comment that names its origin."""
+def derived_toml(how: str, origin: str, spec: Spec, smoke: Mapping[str, Any] | None = None) -> str:
+    """Return a derived specification as TOML, below a comment that names its origin; with a ``[smoke]`` table if one is
+    given.
+    """
     printable = "".join(c if c.isprintable() else "?" for c in origin)
-    return f"# {how}. Derived from {printable}.\n{to_toml(spec)}"
+    return f"# {how}. Derived from {printable}.\n{to_toml(spec, smoke)}"
 
 
-def to_toml(spec: Spec) -> str:
+def to_toml(spec: Spec, smoke: Mapping[str, Any] | None = None) -> str:
     """Return a specification as TOML text, from which the same specification is read.
 
     A model as text comes last, with its own tables. A Python object is written as its import path.
     """
     data = {key: value for key, value in spec.as_dict().items() if value != ""}
     tables = {name: _filled(table) if name != "model" else table for name, table in data.items()}
-    text = specification_toml(tables)
+    text = specification_toml({**tables, **({"smoke": smoke} if smoke else {})})
     read = tomllib.loads(text)
+    read.pop("smoke", None)
     assert not isinstance(read["model"], dict) or read["model"] == spec.reference
     assert kept_spec({**read, "model": spec.reference}) == spec
     return text

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -23,6 +23,8 @@ _MEMORY = re.compile(r"(\d+(?:\.\d+)?) ?([kMGT]i?)B")
 _UNITS = {"k": 10**3, "M": 10**6, "G": 10**9, "T": 10**12, "ki": 2**10, "Mi": 2**20, "Gi": 2**30, "Ti": 2**40}
 _LEAST_MARGIN_S, _MOST_MARGIN_S = 30, 900
 
+_CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]")
+
 Lines = Annotated[tuple[str, ...], Field(strict=False)]
 
 
@@ -33,6 +35,13 @@ def seconds_of(time: str) -> int:
         raise ValueError(f"{time!r}: must be hours, minutes and seconds above zero, such as '04:00:00'.")
     hours, minutes, seconds = map(int, match.groups())
     return 3600 * hours + 60 * minutes + seconds
+
+
+def refuse_breaks(texts: Iterable[str]) -> None:
+    """Raise `SpecError` for a text with control characters, which would begin a line of its own in a job file."""
+    for text in texts:
+        if _CONTROL.search(text):
+            raise SpecError(f"{text!r}: has line breaks or control characters, which no job file may have; rename it.")
 
 
 def bytes_of(memory: str) -> int:

@@ -204,8 +204,8 @@ def _with_smoke(data: dict[str, Any], smoke: bool, folder: Path) -> dict[str, An
     plain = {key: value for key, value in data.items() if key != "smoke"}
     if "smoke" not in data:
         if smoke:
-            raise SpecError("smoke: this specification has no [smoke] table; add one or run it in full.")
-        return plain
+            parse_spec(plain, folder)  # its tables have their types from here on
+        return _small(plain) if smoke else plain
     table = data["smoke"]
     if not isinstance(table, dict):
         raise SpecError(f"smoke = {shown(table)}: must be a table of keys to replace.")
@@ -217,6 +217,27 @@ def _with_smoke(data: dict[str, Any], smoke: bool, folder: Path) -> dict[str, An
     except SpecError as error:
         _raise_new(plain, folder, error)
     return small if smoke else plain
+
+
+def _small(data: dict[str, Any]) -> dict[str, Any]:
+    """Return a valid specification with the ends of each axis and range of states, and at most two other starts."""
+    starts = dict(data["initial_conditions"])
+    starts.pop("refine", None)
+    for key, value in starts.items():
+        if isinstance(value, dict):
+            starts[key] = _ends(value)
+        elif key in ("points", "points_deg"):
+            starts[key] = value[:2]
+    if "n" in starts:
+        starts["n"] = min(starts["n"], 2)
+    axes = {name: _ends(axis) for name, axis in data.get("axes", {}).items()}
+    return {**data, "initial_conditions": starts, **({"axes": axes} if axes else {})}
+
+
+def _ends(values: dict[str, Any]) -> dict[str, Any]:
+    if "values" in values:
+        return {"values": [values["values"][0], *values["values"][1:][-1:]]}
+    return {"start": values["start"], "stop": values["stop"], "num": 2}
 
 
 def _raise_new(plain: dict[str, Any], folder: Path, smoke_error: SpecError) -> None:

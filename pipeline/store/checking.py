@@ -131,7 +131,10 @@ def _changed_objects(info: RunInfo, records: Records) -> dict[int, str]:
     for n, index in enumerate(records):
         if n % _TASKS_PER_REPORT == 0:
             report("comparing what is committed with its records", n, len(records))
-        problems = problems_of(cube, records[index].objects)
+        try:
+            problems = problems_of(cube, records[index].objects)
+        except DamagedError as error:  # a line of a pack is no record
+            problems = [str(error)]
         if problems:
             found[index] = "; ".join(problems)
     return found

@@ -20,11 +20,14 @@ from typing import Any
 
 import numpy as np
 import zarr
+from zarr.abc.store import Store
+from zarr.core.buffer import Buffer
+from zarr.storage import WrapperStore
 
 from pipeline.layout.plan import Plan
 from pipeline.layout.writing import NoFileError, writing
 from pipeline.store.errors import DamagedError, RefusedError, UnreadableError
-from pipeline.store.files import COMMITS, CUBE, RUN_FILE, TIMINGS, Files, entries_of, problems_of
+from pipeline.store.files import COMMITS, CUBE, RUN_FILE, TIMINGS, Files, entry_of, problems_of
 from pipeline.store.keys import Owners, chunk_keys
 from pipeline.store.record_copy import copied_records
 from pipeline.store.records import (
@@ -80,10 +83,13 @@ def write_task(
     info.files.refuse_links(CUBE, *(f"{CUBE}/{v.name}" for v in plan.variables), COMMITS)
     cube = info.files.below(CUBE)
     _require_metadata(info, plan)
-    objects = [key for v in plan.variables for key in write_block(cube, plan, index, v.name, values[v.name])]
+    objects: dict[str, dict[str, Any]] = {}
+    for v in plan.variables:
+        objects |= write_block(cube, plan, index, v.name, values[v.name])
     cube.sync(objects)  # the chunks are durable before their record exists
+    _require_written(cube, objects)
     # the record holds no time and no host name: its bytes do not depend on who computes the task
-    record = {"digest": info.digest, "task": index, "status": dict(counts), "objects": entries_of(cube, objects)}
+    record = {"digest": info.digest, "task": index, "status": dict(counts), "objects": objects}
     # check for a removed run, but not in an object store: there a run is no folder, and the check costs a request
     if info.files.local is not None and not info.files.is_there(RUN_FILE):
         cube.remove(objects)
@@ -104,6 +110,30 @@ def _require_metadata(info: RunInfo, plan: Plan) -> None:
         )
 
 
+def _require_written(cube: Files, objects: Mapping[str, Mapping[str, Any]]) -> None:
+    """Raise `DamagedError` if chunks do not read back as the bytes that were handed to the store; remove them."""
+    problems = problems_of(cube, objects)
+    if problems:
+        cube.remove(objects)
+        raise DamagedError(
+            f"{cube.name}/{problems[0]} while it was written: memory, disk or network is at fault. Its task is not "
+            "committed; check them, then give the same command again."
+        )
+
+
+class _Noted(WrapperStore[Store]):
+    """A zarr store that notes the size and sha256 of what it is given to write, by key."""
+
+    def __init__(self, store: Store) -> None:
+        super().__init__(store)
+        self.entries: dict[str, dict[str, Any]] = {}
+
+    async def set(self, key: str, value: Buffer) -> None:
+        """Note the content of a key, then write it."""
+        self.entries[key] = entry_of(value.to_bytes())
+        await super().set(key, value)
+
+
 def is_packed(info: RunInfo, index: int) -> bool:
     """Return whether a task's commit record lies in a pack, a file of many records."""
     block = index // BLOCK
@@ -113,9 +143,13 @@ def is_packed(info: RunInfo, index: int) -> bool:
     return isinstance(pack, Pack) and index not in pack.without
 
 
-def write_block(cube: Files, plan: Plan, index: int, name: str, values: np.ndarray) -> list[str]:
-    """Write the values of one variable for the cells of a task as chunks; return the keys of the chunks."""
-    array = zarr.open_array(cube.zarr(read_only=False), path=name, mode="r+", zarr_format=3)
+def write_block(cube: Files, plan: Plan, index: int, name: str, values: np.ndarray) -> dict[str, dict[str, Any]]:
+    """Write the values of one variable for the cells of a task as chunks; return size and sha256 of each by key.
+
+    These are of the bytes that were handed to the store, so that reading back can reveal bytes changed on the way.
+    """
+    store = _Noted(cube.zarr(read_only=False))
+    array = zarr.open_array(store, path=name, mode="r+", zarr_format=3)
     # without this setting, which zarr does not store, a block of fill values would write no file
     array = array.with_config({"write_empty_chunks": True})
     block = plan.task(index)
@@ -128,7 +162,7 @@ def write_block(cube: Files, plan: Plan, index: int, name: str, values: np.ndarr
     cube.refuse_links(*keys)
     with writing(f"{cube.name}/{name}"):
         array[region] = values
-    return keys
+    return {key: store.entries[key] for key in keys}
 
 
 def log_timing(info: RunInfo, entry: Mapping[str, Any]) -> None:
@@ -178,8 +212,13 @@ def absent_objects(info: RunInfo, records: Mapping[int, Commit]) -> dict[int, st
     # a chunk is durable before its record is, so a missing one was lost later
     sizes = info.files.below(CUBE).sizes() if records else {}
     found = {}
-    for index, commit in records.items():
-        keys = (key for key, entry in commit.objects.items() if sizes.get(key) != entry["size"])
+    for index in records:
+        try:
+            objects = records[index].objects
+        except DamagedError as error:  # a line of a pack is no record
+            found[index] = str(error)
+            continue
+        keys = (key for key, entry in objects.items() if sizes.get(key) != entry["size"])
         key = next(keys, None)
         if key is not None:
             found[index] = f"{key} is missing or has another size"

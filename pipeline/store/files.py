@@ -199,16 +199,6 @@ def entry_of(data: bytes) -> dict[str, Any]:
     return {"size": len(data), "sha256": hashlib.sha256(data).hexdigest()}
 
 
-def entries_of(files: Files, keys: Iterable[str]) -> dict[str, dict[str, Any]]:
-    """Read files that were just written; return their sizes and sha256 by key."""
-    found = {}
-    for key, content in files.read_each(keys):
-        if isinstance(content, FileNotFoundError):
-            raise content
-        found[key] = entry_of(content)
-    return found
-
-
 def problems_of(files: Files, objects: Mapping[str, Mapping[str, Any]]) -> list[str]:
     """Compare files with their recorded sizes and sha256 digests; return a line for each file that differs.
 

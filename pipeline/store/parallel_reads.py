@@ -59,7 +59,7 @@ def _put(item: Any, target: np.ndarray) -> bool:
     content = place.store.small_chunk(place.path)
     if content is None:
         return False
-    # small_chunk has compared the chunk's sha256, or its crc32c
+    # small_chunk has compared the chunk's crc32c
     data = numcodecs.blosc.decompress(content[:-_CHECKSUM_BYTES])
     dtype = spec.dtype.to_native_dtype().newbyteorder("<")
     target[selection] = np.frombuffer(data, dtype).reshape(spec.shape)[chunk_selection]

@@ -12,15 +12,14 @@ import hashlib
 import json
 import time
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import zarr
-from zarr.abc.store import Store
 from zarr.core.buffer import cpu
-from zarr.storage import LocalStore, MemoryStore
+from zarr.storage import MemoryStore
 
 from pipeline.layout.attributes import netcdf_safe
 from pipeline.layout.writing import TEMPORARY, sync_folder, temporary_beside, writing
@@ -72,8 +71,12 @@ def write_product(place: Place, ds: xr.Dataset) -> None:
     try:
         with writing(path):
             path.parent.mkdir(exist_ok=True)
-            attrs = _write_group(LocalStore(temporary), ds, lambda: _digests(open_files(temporary)))
+            data, attrs = _contents(ds)
+            for key, content in data.items():
+                (temporary / key).parent.mkdir(parents=True, exist_ok=True)
+                (temporary / key).write_bytes(content)
             sync(files_below(temporary), temporary)
+            read_product_attrs(temporary)  # the digest is of what was handed over: bytes changed on the way show
             _put_in_place(temporary, path, attrs)
             sync_folder(path.parent)
     finally:
@@ -84,18 +87,13 @@ def _put_product(files: Files, ds: xr.Dataset) -> None:
     """Write a product into an object store; ``zarr.json`` with the digest of the content comes last and makes it
     valid.
     """
-    data: dict[str, Any] = {}
-
-    def digests() -> Digests:
-        return [(key, _sha256(value.to_bytes())) for key, value in data.items() if key != _GROUP]
-
-    attrs = _write_group(MemoryStore(data), ds, digests)
+    data, attrs = _contents(ds)
     with contextlib.suppress(FileNotFoundError, DamagedError):
         if _own(read_product_attrs(files)) == attrs:
             return
     remove_product(files)
     for key in sorted(data, key=lambda key: (key == _GROUP, key)):
-        files.write(key, data[key].to_bytes())
+        files.write(key, data[key])
 
 
 def open_product(place: Place, *, lazy: bool = False) -> xr.Dataset:
@@ -133,7 +131,8 @@ def open_product(place: Place, *, lazy: bool = False) -> xr.Dataset:
         ds = xr.open_zarr(store, consolidated=False, chunks=None)
         with contextlib.nullcontext() if lazy else contextlib.closing(ds):
             loaded = (ds if lazy else ds.load()).assign(_with_words(ds))
-    except (ValueError, KeyError, OSError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, IndexError, OverflowError, OSError) as error:
+        # of zarr and xarray: metadata from a stranger may have any type
         raise DamagedError(f"{files.name}: {error}") from None
     variables = {name: loaded.variables[name] for name in sorted(map(str, loaded.data_vars))}
     return netcdf_safe(xr.Dataset(variables, loaded.coords, _own(loaded.attrs)))
@@ -263,10 +262,12 @@ def _put_in_place(temporary: Path, path: Path, attrs: Mapping[str, Any]) -> None
     temporary.rename(path)
 
 
-def _write_group(store: Store, ds: xr.Dataset, digests: Callable[[], Digests]) -> dict[str, Any]:
-    """Write all variables of a dataset, then its attributes and a digest of the content; return the attributes without
-    the digest.
+def _contents(ds: xr.Dataset) -> tuple[dict[str, bytes], dict[str, Any]]:
+    """Return the files of a product by key, which hold all variables, the attributes and a digest of the content; and
+    the attributes without the digest.
     """
+    data: dict[str, Any] = {}
+    store = MemoryStore(data)
     group = zarr.create_group(store, zarr_format=3)
     for name in sorted(map(str, ds.variables)):
         values, attrs = _coded(name, ds.variables[name])
@@ -279,12 +280,13 @@ def _write_group(store: Store, ds: xr.Dataset, digests: Callable[[], Digests]) -
     attrs = _plain(ds.attrs)
     others = sorted(str(name) for name in ds.coords if name not in ds.dims)
     stored = {**attrs, "coordinates": " ".join(others)} if others else attrs
-    group.update_attributes({**stored, SEAL: _seal(stored, digests())})
+    digests = [(key, _sha256(value.to_bytes())) for key, value in data.items() if key != _GROUP]
+    group.update_attributes({**stored, SEAL: _seal(stored, digests)})
     with warnings.catch_warnings():
         # readers over a network then ask once for the metadata of all arrays; see `pipeline.store.skeleton`
         warnings.filterwarnings("ignore", message="Consolidated metadata")
         zarr.consolidate_metadata(store)
-    return stored
+    return {key: value.to_bytes() for key, value in data.items()}, stored
 
 
 def _seal(attrs: Mapping[str, Any], digests: Digests) -> str:

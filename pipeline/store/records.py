@@ -19,9 +19,10 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from pipeline.store.checksums import fits, seal, unseal
+from pipeline.store.checksums import CHECKSUM, fits, seal, unseal
 from pipeline.store.errors import DamagedError
 from pipeline.store.files import COMMITS, Files
+from pipeline.store.stored_json import StoredCommit, StoredPack, WrongTypeError, parsed
 
 BLOCK = 1000
 """Tasks whose records make a pack; this number is part of the directory's format."""
@@ -81,16 +82,12 @@ def record_text(record: Mapping[str, Any]) -> str:
 def read_record(content: bytes, digest: str) -> Commit | str:
     """Parse a commit record; return it if it is undamaged and of this run, otherwise return the problem as text."""
     try:
-        data = unseal(content)
-        commit = Commit(int(data["task"]), dict(data["status"]), dict(data["objects"]))
-        found = data["digest"]
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        data = parsed(StoredCommit, unseal(content))
+    except WrongTypeError as error:
+        return f"torn or damaged ({error})"
+    except (ValueError, KeyError, TypeError, RecursionError):
         return "torn or damaged"
-    if found != digest:
-        return "of another run"
-    # a key must not lead out of the run directory, which may come from a stranger
-    climbs = any(".." in key.split("/") or key.startswith("/") for key in commit.objects)
-    return "torn or damaged" if climbs else commit
+    return Commit(**data) if data.pop("digest") == digest else "of another run"
 
 
 def line_of(commit: Commit, digest: str) -> bytes:
@@ -148,13 +145,16 @@ def read_pack(content: bytes, digest: str, block: int) -> Pack | str:
         return "torn or damaged"
     try:
         last = json.loads(content[content.rfind(b"\n", 0, -1) + 1 :])
-        pack = Pack(int(last["block"]), dict(last["cells"]), tuple(map(int, last["without"])))
-        found = last["digest"]
-    except (ValueError, KeyError, TypeError):
+        del last[CHECKSUM]
+        last = parsed(StoredPack, last)
+    except WrongTypeError as error:
+        return f"torn or damaged ({error})"
+    except (ValueError, KeyError, TypeError, RecursionError):
         return "torn or damaged"
-    if found != digest:
+    if last["digest"] != digest:
         return "of another run"
-    return pack if pack.block == block else "torn or damaged"
+    pack = Pack(last["block"], last["cells"], tuple(last["without"]))
+    return pack if pack.block == block and len(pack.tasks) == content.count(b"\n") - 1 else "torn or damaged"
 
 
 def salvage(content: bytes, digest: str, block: int) -> dict[int, Commit]:
@@ -219,8 +219,11 @@ class Records(Mapping[int, Commit]):
         lines = self._block(index // BLOCK)
         line = lines[index]
         if isinstance(line, bytes):
-            data = json.loads(line)
-            line = lines[index] = Commit(data["task"], data["status"], data["objects"])
+            found = read_record(line, self._digest)
+            if isinstance(found, str) or found.task != index:
+                key, problem = pack_key(index // BLOCK), found if isinstance(found, str) else "of another task"
+                raise DamagedError(f"{self._files.name}/{key}: its record of task {index} is {problem}.")
+            line = lines[index] = found
         return line
 
     def _block(self, block: int) -> dict[int, bytes | Commit]:

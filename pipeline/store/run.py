@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from pipeline.layout.limits import check_plan
 from pipeline.layout.plan import Plan, make_plan
-from pipeline.specification.parsing import Spec, kept_spec
+from pipeline.specification.parsing import Spec
 from pipeline.store.commits import cube_digest, read_commits
 from pipeline.store.files import Files
 from pipeline.store.records import Records
@@ -90,7 +90,7 @@ class Run:
             return source
         info = read_run(source)
         known = check_skeleton(info)
-        spec = kept_spec(info.spec)
+        spec = info.parsed_spec()
         plan = make_plan(spec)
         check_plan(plan)
         return cls(info, spec, plan, read_commits(info, plan), known)

@@ -12,13 +12,15 @@ from typing import Any
 
 from pipeline.layout.identity import digest_of
 from pipeline.layout.schema import FORMAT
-from pipeline.specification.parsing import Spec
+from pipeline.specification.parsing import Spec, kept_spec
+from pipeline.specification.problems import SpecError, shown
 from pipeline.specification.recorded_drive import is_whole
 from pipeline.store.checksums import CHECKSUM, fits, has_seal, seal
 from pipeline.store.errors import DamagedError, RefusedError
 from pipeline.store.files import RUN_FILE, Files
 from pipeline.store.places import open_files
 from pipeline.store.provenance import provenance, versions
+from pipeline.store.stored_json import StoredRun, parsed
 
 
 @dataclass(frozen=True)
@@ -62,6 +64,17 @@ class RunInfo:
         """Path or URL of the run directory."""
         return self.files.name
 
+    def parsed_spec(self) -> Spec:
+        """Parse the specification; raise `DamagedError` if this version cannot read it."""
+        try:
+            return kept_spec(self.spec)
+        except SpecError as error:
+            made = self.versions.get("magpend", "not named")
+            raise DamagedError(
+                f"{self.files.below(RUN_FILE).name}: its specification cannot be read: {error.problems[0]} It was made "
+                f"by magpend {made}; read it with that version, or run its specification into another directory."
+            ) from None
+
     @property
     def directory(self) -> Path:
         """Path of the run directory; raises `RefusedError` for a run that is not in a folder of this machine."""
@@ -95,7 +108,7 @@ def read_run(place: str | Path | Files) -> RunInfo:
         data = json.loads(content)
         _refuse_format(path, data, content)
         whole = fits(content) and data.pop(CHECKSUM) is not None
-        info = RunInfo(files=files, **data) if whole else None
+        info = RunInfo(files=files, **parsed(StoredRun, data)) if whole else None
         whole = info is not None and digest_of(info.identity) == info.digest and is_whole(info.spec.get("drive"))
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
         raise DamagedError(f"{path}: damaged ({error}); {_remedy(directory)}") from None
@@ -111,7 +124,7 @@ def _refuse_format(path: str, data: Mapping[str, Any], content: bytes) -> None:
     found = data["identity"]["format"]
     if isinstance(found, (int, float)) and found != FORMAT and (fits(content) or not has_seal(content)):
         raise RefusedError(
-            f"{path}: format {found:g}, and this magpend reads {FORMAT}; read it with the version that "
+            f"{path}: format {shown(found)}, and this magpend reads {FORMAT}; read it with the version that "
             f"made it ({data['versions'].get('magpend', 'not named')}), or run its specification "
             "into another directory."
         )

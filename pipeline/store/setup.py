@@ -56,11 +56,29 @@ def check(place: str | Path | Files, identity: Mapping[str, Any]) -> RunInfo | N
         _refuse_foreign(files, names, digest_of(identity))
         return None
     lines = differences(info.identity, identity)
+    if lines and all(line.startswith(_VERSIONS) for line in lines):
+        raise RefusedError(_other_version(info, lines))
     if lines:
         raise RefusedError(
             f"{files.name}: holds another run. Give another --out, or remove it. Differences:\n  " + "\n  ".join(lines)
         )
     return info
+
+
+_VERSIONS = ("kernel_version: ", "code.")
+"""Keys of an identity that differ where only the version of magpend does."""
+
+
+def _other_version(info: RunInfo, lines: list[str]) -> str:
+    """Explain why a run of another version is not continued, and what keeps its finished cells."""
+    commit = info.provenance.get("git_commit", "")
+    made = info.versions.get("magpend", "unknown") + (f", commit {commit[:12]}" if commit else "")
+    return (
+        f"{info.name}: was begun by another version of magpend ({made}), and cells of two versions are not mixed in one "
+        "run. Its finished cells stay, and this version opens, analyses and draws them: magpend status, analyse, plot or "
+        f"report {info.name}. To complete it, give the command again with that version; or compute all of it with this "
+        "one: --out ANOTHER_DIR. Differences:\n  " + "\n  ".join(lines)
+    )
 
 
 def _refuse_place(folder: Path) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -17,6 +17,9 @@ MIXED = 1e-3
 
 GAP_STEPS = 1.5
 """Distance of two time stamps above which there is a gap [sampling intervals]."""
+
+OFTEN = 0.02
+"""Fraction of samples with a gap before them above which the sampling is irregular."""
 
 SHAKY = 0.05
 """Median deviation of time stamps from even steps above which a late stamp may be jitter, not a gap."""
@@ -111,8 +114,45 @@ def clock_of(
     forced[begins] = apart or cut
     if numbers is not None:
         forced |= _changes(numbers, stretches, taken)
-    time, piece, own_step, found = _cut(np.concatenate(stamps) - stamps[0][0], forced, step, stated)
+    time, piece, own_step, found = _cut(np.concatenate(stamps) - stamps[0][0], forced, step, stated, source)
     return Clock(time, piece, own_step, taken, findings + found)
+
+
+def resampled(channel: Channel, rate_hz: float) -> Channel:
+    """Return a channel with time stamps at even steps: linear interpolation between neighbours, NaN in gaps.
+
+    A gap is a step of more than `GAP_STEPS` times the longest of 99 % of the steps, and more than that many steps of
+    the new rate.
+
+    Raises
+    ------
+    SpecError
+        If the time stamps do not increase.
+    """
+    time = channel.time
+    if time is None or len(time) < 2 or not (np.diff(time) > 0.0).all():
+        raise SpecError(f"resample: the time stamps of {channel.name} must be numbers that increase.")
+    even = time[0] + np.arange(math.floor((time[-1] - time[0]) * rate_hz + 1e-9) + 1) / rate_hz
+    values = np.interp(even, time, channel.values)
+    steps = np.diff(time)
+    gap = GAP_STEPS * max(float(np.quantile(steps, 0.99)), 1.0 / rate_hz)
+    before = np.clip(np.searchsorted(time, even, side="right") - 1, 0, len(steps) - 1)
+    inside = (steps[before] > gap) & (even > time[before]) & (even < time[before + 1])
+    values[inside] = np.nan
+    return replace(channel, time=even, values=values)
+
+
+def _refuse_irregular(time: np.ndarray, is_gap: np.ndarray, step: float, source: str) -> None:
+    """Raise `SpecError` if samples were taken at irregular times: every few samples would begin a piece."""
+    steps = np.diff(time)
+    off = np.abs(steps / step - np.round(steps / step))
+    if is_gap.mean() > OFTEN and np.median(off) > SHAKY:
+        low, high = 1e3 * np.quantile(steps, (0.01, 0.99))
+        raise SpecError(
+            f"{source}: samples are taken at irregular times, with steps of {low:.3g} to {high:.3g} ms: no rate fits, "
+            f"and they would fall into {int(is_gap.sum()) + 1} pieces. Add to the mapping: resample = "
+            f"{float(f'{len(steps) / (time[-1] - time[0]):.3g}'):g}, the rate [Hz] to which values are interpolated."
+        )
 
 
 def _changes(
@@ -273,12 +313,14 @@ def _checked_stamps(stamps: list[np.ndarray], step: float, source: str) -> list[
 
 
 def _cut(
-    time: np.ndarray, forced: np.ndarray, step: float, stated: float | None
+    time: np.ndarray, forced: np.ndarray, step: float, stated: float | None, source: str
 ) -> tuple[np.ndarray, np.ndarray, float, list[Finding]]:
     """Divide the samples into pieces at gaps and where `forced` is true, and make the sample times even within each
     piece.
     """
     is_gap = _missing(time, step) > 0
+    if stated is None:
+        _refuse_irregular(time, is_gap, step, source)
     piece = np.cumsum(is_gap | np.concatenate([[False], forced[1:]])).astype(np.int64)
     even, own_step, residual = _even(time, piece, step, stated)
     findings = [
@@ -418,7 +460,7 @@ def _jitter_findings(time: np.ndarray, residual: np.ndarray, step: float) -> lis
             "",
             float(time[far[0, 0]]),
             float(time[far[-1, 1] - 1]),
-            text=f"{text}; even steps are used. If the sampling itself was uneven, resample the file before it is "
-            "read.",
+            text=f"{text}; even steps are used. If the sampling itself was uneven, add resample = "
+            f"{1.0 / step:.4g} to the mapping.",
         )
     ]

@@ -109,6 +109,10 @@ class Mapping(Table):
     sampling_rate_hz: Positive | None = Field(
         default=None, description="Sampling rate, if the file does not state it [Hz]."
     )
+    resample: Positive | None = Field(
+        default=None,
+        description="Rate to which samples with uneven time stamps are interpolated, linearly between neighbours [Hz].",
+    )
     window_s: Pair | None = Field(
         default=None, description="Start and end of the part to read [s since the first sample]."
     )
@@ -197,6 +201,13 @@ def parse_mapping(data: AnyMapping[str, Any] | str, source: str = "", folder: st
         problems.append(f'drive = {drive!r}: must be "none", or a table [drive] with channel and kind.')
     rest = {key: value for key, value in tables.items() if key not in ("model", "channels", "drive")}
     known = _rest(rest, problems)
+    if "resample" in known:
+        problems += [
+            f"channels.{name}.wraps: nothing can be interpolated where a reading jumps back; resample the file before "
+            "it is read."
+            for name, channel in channels.items()
+            if channel.wraps
+        ]
     if model is not None:
         problems += _quantity_problems(model, channels, drive if isinstance(drive, DriveMap) else None)
     if problems:
@@ -224,6 +235,8 @@ def _rest(rest: dict[str, Any], problems: list[str]) -> dict[str, Any]:
             found[key] = tuple(value) if isinstance(value, list) else value
     if found.get("time") is not None and "sampling_rate_hz" in found:
         problems.append("sampling_rate_hz: the time channel gives it; keep time or sampling_rate_hz.")
+    if "resample" in found and found.get("time") is None:
+        problems.append('resample: needs time stamps; add time = { channel = "NAME" }, or drop the key.')
     if found.get("time") is not None and units.factor(found["time"].unit, "s") is None:
         problems.append(f"time.unit = {found['time'].unit!r}: must be one of {', '.join(units.UNITS['s'])}.")
     window = found.get("window_s")

@@ -14,7 +14,7 @@ import xarray as xr
 
 from pipeline.layout.vocabulary import model_attribute
 from pipeline.rig.recordings import checks, formats, units
-from pipeline.rig.recordings.clock import Clock, clock_of
+from pipeline.rig.recordings.clock import Clock, clock_of, resampled
 from pipeline.rig.recordings.findings import Finding, findings_of, to_json
 from pipeline.rig.recordings.mapping import (
     DRIVE,
@@ -231,7 +231,12 @@ def _timed(
         stamps = (units.factor(mapping.time.unit, "s") or 1.0) * axes["time"]
         chosen = {name: replace(c, time=stamps[: len(c)]) for name, c in chosen.items()}
     first = next(iter(chosen.values()))
-    return chosen, axes.get("piece", np.zeros(len(first)))[: len(first)]
+    numbers = axes.get("piece", np.zeros(len(first)))[: len(first)]
+    if mapping.resample is None:
+        return chosen, numbers
+    even = {name: resampled(c, mapping.resample) for name, c in chosen.items()}
+    before = np.searchsorted(np.asarray(first.time), np.asarray(even[first.name].time), side="right") - 1
+    return even, numbers[before]
 
 
 def _joined(stretches: Sequence[AnyMapping[str, Channel]], name: str, clock: Clock) -> np.ndarray:

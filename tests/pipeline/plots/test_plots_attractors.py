@@ -15,12 +15,14 @@ from magpend_core.models.pendulum.sides import Side
 from magpend_core.models.pendulum.systems import PENDULUM_FITTED
 from magpend_core.status import Status
 from pipeline.analysis.attractors.matching.hysteresis import hysteresis
+from pipeline.analysis.basins.numbers import basin_fractions
 from pipeline.analysis.branches.arclength import Point
 from pipeline.analysis.branches.codimension_two import SpecialPoint
 from pipeline.analysis.branches.curves import Curve
 from pipeline.analysis.branches.curves_dataset import curves_dataset
 from pipeline.analysis.branches.problems import Family, Value
 from pipeline.analysis.branches.table import curves_table
+from pipeline.analysis.outcomes import outcomes
 from pipeline.layout import vocabulary
 from pipeline.layout.attractor_letters import letter
 from pipeline.layout.vocabulary import ATTRACTS, PERIODIC_ORBIT
@@ -74,22 +76,33 @@ def test_plot_basins__each_cell_has_the_colour_of_its_legend(grid):
     fig = plot_basins(grid)
     picture, legend = colours_of(fig), legend_colours(fig)
     assert list(legend) == [
-        "A: period 1, left, 50.0 %",
-        "B: period 1, left, 25.0 %",
-        "not settled, 6.2 %",
-        "diverged, 6.2 %",
-        "failed, 6.2 %",
-        "pending, 6.2 %",
+        "A: period 1, left, 61.5 %",
+        "B: period 1, left, 30.8 %",
+        "not settled, 1 cell",
+        "diverged, 7.7 %",
+        "failed, 1 cell",
+        "pending, 1 cell",
     ]
     expected = np.empty((4, 4, 3))
-    expected[:], expected[2:, 2:] = legend["A: period 1, left, 50.0 %"], legend["B: period 1, left, 25.0 %"]
+    expected[:], expected[2:, 2:] = legend["A: period 1, left, 61.5 %"], legend["B: period 1, left, 30.8 %"]
     for cell, name in {(3, 0): "diverged", (3, 1): "pending", (2, 0): "failed", (2, 1): "not settled"}.items():
-        expected[cell] = legend[f"{name}, 6.2 %"]
+        expected[cell] = legend[f"{name}, {'7.7 %' if name == 'diverged' else '1 cell'}"]
     assert np.abs(picture - expected).max() < 0.003
     np.testing.assert_array_equal(fig.data["attractor_id"].transpose(*GRID), grid["attractor_id"])
     np.testing.assert_array_equal(fig.data["status"].transpose(*GRID), grid["status"])
     assert fig.data["share"].values.tolist() == [0.5, 0.25]
     assert fig.data["name"].values.tolist() == ["A: period 1, left", "B: period 1, left"]
+
+
+def test_plot_basins__the_denominator_of_the_table(grid):
+    """Legend and table count the cells that end on attractors or diverge, and the figure says so."""
+    ids = outcomes(grid)
+    table = basin_fractions(ids, dims=[d for d in ids.dims if d in GRID], unfinished=(-1,)).squeeze()
+    fig = plot_basins(grid)
+    for i, name in enumerate("AB"):
+        share = 100 * float(table["fraction"].sel(label=i))
+        assert any(text.startswith(f"{name}: ") and text.endswith(f"{share:.1f} %") for text in legend_texts(fig))
+    assert "shares of the 13 of 16 cells that end on attractors or diverge" in caption_of(fig)
 
 
 def test_plot_basins__pixels_of_the_file_lie_where_the_axes_say(grid, tmp_path):

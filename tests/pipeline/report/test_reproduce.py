@@ -141,8 +141,8 @@ def test_reproduce__all_is_read_before_anything_is_computed(study, main, tmp_pat
     assert code == Exit.REFUSED
     for words in ("other: fig31: no such file", "r: ", "none.toml", "t: disks", "did you mean discs"):
         assert words in err
-    code, _, err = main("reproduce", "mine.toml", "--out", "done", "--smoke")
-    assert "sweep: smoke: this specification has no [smoke] table" in err
+    study(STUDY.replace('figure = "section"', 'figure = "sections"'))
+    assert "figures[1].pictures[0].figure: unknown figure 'sections'" in main("reproduce", "mine.toml")[2]
     study(STUDY.replace("options = { at", "options = { colour = 3, at"))
     assert "figures[1].pictures[0].options.colour" in main("reproduce", "mine.toml")[2]
     study(STUDY)

@@ -354,7 +354,7 @@ def test_main__refusals_are_one_line(s3, made, main, monkeypatch, tmp_path):
     refused("refuses access (403 Harm); check AWS_ACCESS_KEY_ID", "status", PLACE)
     with monkeypatch.context() as patch:
         patch.setitem(sys.modules, "obstore", None)
-        refused("magpend[s3]", "status", PLACE)
+        refused("pip install '.[s3]'", "status", PLACE)
     with monkeypatch.context() as patch:
         patch.delenv("AWS_ACCESS_KEY_ID")
         refused("there are no credentials; set AWS_ACCESS_KEY_ID", "status", PLACE)

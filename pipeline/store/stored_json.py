@@ -1,0 +1,109 @@
+"""Declare the types of stored JSON (``run.json``, commit records, packs), which may come from a stranger."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, TypeVar
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+
+from pipeline.specification.problems import problems_of
+from pipeline.store.declared import METADATA
+
+
+class Stored(BaseModel):
+    """A stored object: its keys are all there, no others are, and each value has its type."""
+
+    model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False, frozen=True)
+
+
+S = TypeVar("S", bound=Stored)
+
+
+def _key(text: str) -> str:
+    parts = text.split("/")
+    if not text.isprintable() or ".." in parts or "" in parts:  # a key must not lead out of the run directory
+        raise ValueError("is not the path of a file in the cube")
+    return text
+
+
+def _group_first(entries: dict[str, Any]) -> dict[str, Any]:
+    if METADATA not in entries:
+        raise ValueError(f"has no {METADATA}")
+    return entries
+
+
+Count = Annotated[int, Field(ge=0, lt=2**63)]
+CellCounts = dict[Annotated[str, Field(pattern="^[a-z_]+$")], Count]
+
+
+class Entry(Stored):
+    """Size and sha256 of a file."""
+
+    size: Count
+    sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
+
+
+Entries = dict[Annotated[str, AfterValidator(_key)], Entry]
+
+
+class StoredCommit(Stored):
+    """A commit record: its run's digest, its task, cells by status, and the task's files by key below the cube."""
+
+    digest: str
+    task: Count
+    status: CellCounts
+    objects: Entries
+
+
+class StoredPack(Stored):
+    """The last line of a pack of commit records."""
+
+    block: Count
+    cells: CellCounts
+    digest: str
+    without: list[Count]
+
+
+class StoredIdentity(Stored):
+    """What decides a run's numbers and layout."""
+
+    refinement: int | None = None
+    format: int | float
+    kernel_version: str
+    code: dict[str, str]
+    spec: dict[str, Any]
+    model_digest: str
+    parameter_values: dict[str, int | float]
+    coordinates: str
+    chunks: dict[str, list[Count]]
+
+
+class StoredRun(Stored):
+    """The content of ``run.json``."""
+
+    digest: str
+    identity: StoredIdentity
+    title: str
+    spec: dict[str, Any]
+    spec_text: str
+    versions: dict[str, str]
+    provenance: dict[str, str]
+    skeleton: Annotated[Entries, AfterValidator(_group_first)]
+
+
+class WrongTypeError(ValueError):
+    """An error for stored JSON of other types; its message names the first key."""
+
+
+def parsed(model: type[S], data: Any) -> dict[str, Any]:
+    """Compare stored JSON with its types; return it as plain data.
+
+    Raises
+    ------
+    WrongTypeError
+        If a key is missing or unknown, or a value has another type.
+    """
+    try:
+        return model.model_validate(data).model_dump(exclude_unset=True)
+    except ValidationError as error:
+        raise WrongTypeError(problems_of(error, model, "")[0]) from None
