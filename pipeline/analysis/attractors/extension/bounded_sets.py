@@ -167,12 +167,11 @@ def _verdict(
 
 def _growth(own: Sequence[Course], point: Point, settings: Settings, most: int) -> Work[Growth | None]:
     """Compute the Lyapunov exponents of the section map along trajectories of a set; None if there are too few section
-    points.
+    points, or if the flow has one state and no direction beside its own.
     """
-    n = min(course.length for course in own)
-    if n < LEG:
+    n, n_states = min(course.length for course in own), settings.geometry.n_states
+    if n < LEG or n_states == point.n_neutral:
         return None
-    n_states = settings.geometry.n_states
     most = min(most, max(256, 20_000_000 // n_states**2))
     n_cells = max(1, min(len(own), most // min(n, most)))
     n = min(n, most // n_cells)

@@ -1,0 +1,149 @@
+"""Conclusions about attractors that must not be drawn: rotation at rest, families that attract, sets of one cell."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from magpend_core import run_branches
+from magpend_core.crossing import Crossing
+from magpend_core.equilibria import find_equilibria
+from magpend_core.models import load_model
+from magpend_core.models.sectioned import sectioned
+from pipeline.analysis.attractors.attractors import identify
+from pipeline.compute.integrate import rest_states
+from pipeline.layout.vocabulary import (
+    ATTRACTS,
+    BOUNDED_SET,
+    EQUILIBRIUM,
+    NOT_SETTLED,
+    PERIODIC_ORBIT,
+    section_attributes,
+)
+
+CIRCLE = {"on_circle": True}
+
+UNIFORM_ANGLE = {
+    "name": "uniform_angle",
+    "states": {"r": {}, "th": CIRCLE},
+    "parameters": {"w": 1.0},
+    "equations": {"r": "r*(1-r**2)", "th": "w"},
+}
+"""Radius and angle: a limit cycle of 2 pi/w with the multiplier exp(-4 pi/w)."""
+
+IDLE_CLOCK = {
+    "name": "idle_clock",
+    "states": {"x": {}, "v": {}, "th": CIRCLE},
+    "parameters": {"w": 1.3, "c": 0.2},
+    "equations": {"x": "v", "v": "-c*v-x", "th": "w"},
+}
+"""A damped oscillator at rest beside a clock: the multipliers exp(-c pi/w) are two."""
+
+ANGLES = ("a", "b", "c")
+KURAMOTO = {
+    "name": "kuramoto",
+    "states": dict.fromkeys(ANGLES, CIRCLE),
+    "parameters": {"wa": 1.0, "wb": 1.1, "wc": 0.9, "k": 1.0},
+    "equations": {x: f"w{x}+k/3*(" + "+".join(f"sin({y}-{x})" for y in ANGLES if y != x) + ")" for x in ANGLES},
+}
+"""Phase oscillators: locked, all turn at the mean of their frequencies."""
+
+QUADRATIC = {"name": "quadratic", "states": {"x": {}}, "parameters": {"e": 0.0}, "equations": {"x": "e + x**2"}}
+"""One state: a half-stable equilibrium at e = 0, and its ghost at e > 0."""
+
+
+def found_of(table, starts, *, crossing=None, frequency_hz=1.0, n_transient=200, n_keep=20, values=(), **options):
+    """Integrate cells of one parameter point, and find their sets."""
+    model = load_model(table)
+    model = model if crossing is None else sectioned(model, crossing)
+    parameters, n = model.load(**dict(values)), len(starts)
+    rate = frequency_hz if crossing is None else crossing.frequency_hz
+    found = run_branches(
+        np.tile(parameters.pack(), (n, 1, 1)),
+        np.full((n, 1), rate),
+        np.array(starts),
+        n_transient=n_transient,
+        n_keep=n_keep,
+        rtol=1e-9,
+        atol=1e-9,
+        system=model.system,
+    )
+    cells = "initial_condition"
+    variables = {
+        "section": ((cells, "period_index", "state"), found.section[:, 0]),
+        "status": (cells, found.status[:, 0], {"flag_values": [], "flag_meanings": ""}),
+        "orbit_period": (cells, found.orbit_period[:, 0]),
+        "turns": ((cells, "angle"), found.turns[:, 0]),
+    }
+    coords = {"state": list(model.state_names)}
+    if crossing is None:
+        coords["frequency"] = float(frequency_hz)
+    else:
+        variables["rest_state"] = ((cells, "state"), rest_states(found)[:, 0])
+    attrs = {
+        "model": json.dumps(model.reference),
+        "closure_tolerance": 1e-6,
+        "n_transient": n_transient,
+        "n_keep": n_keep,
+        **section_attributes(model.crossing),
+        "parameters": "\n".join(f"{k} = {v!r}" for k, v in parameters.as_dict().items()),
+    }
+    return identify(xr.Dataset(variables, coords=coords, attrs=attrs), **options)
+
+
+# ---- turning is not resting --------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("table", "states", "is_rest"),
+    [
+        (UNIFORM_ANGLE, [[1.0, 0.3]], False),
+        (KURAMOTO, [[0.0, 0.1, -0.1]], False),
+        ({**UNIFORM_ANGLE, "equations": {"r": "r*(1-r**2)", "th": "w*(1-r)"}}, [[1.0, 0.3]], True),
+        ({**UNIFORM_ANGLE, "equations": {"r": "-r**3", "th": "-w*sin(th)"}}, [[1e-3, 0.0]], True),
+    ],
+    ids=["clock", "locked", "line of equilibria", "degenerate"],
+)
+def test_find_equilibria__every_rate_vanishes(table, states, is_rest):
+    """The Jacobian of each is singular, so that a short Newton step proves nothing."""
+    parameters = load_model(table).load()
+    found = find_equilibria(parameters.model.system, np.array(states), parameters.pack(), max_iterations=100)
+    assert found.converged.tolist() == [is_rest]
+
+
+@pytest.mark.parametrize("strobed", [False, True])
+@pytest.mark.parametrize(
+    ("table", "starts", "of", "seconds", "multiplier"),
+    [
+        (UNIFORM_ANGLE, [[0.5, 1.0], [1.5, 2.0], [0.2, 0.0]], "th", 2.0 * np.pi, np.exp(-4.0 * np.pi)),
+        (IDLE_CLOCK, [[0.5, 1.0, 0.3], [1.5, -2.0, 1.0]], "th", 2.0 * np.pi / 1.3, np.exp(-0.2 * np.pi / 1.3)),
+        (KURAMOTO, [[0.0, 1.0, 2.0], [3.0, 1.0, 0.5]], "a", 2.0 * np.pi, None),
+    ],
+    ids=["angle", "clock", "locked"],
+)
+def test_identify__a_steady_rotation_is_a_limit_cycle(table, starts, of, seconds, multiplier, strobed):
+    """At crossings and at even times; never at rest."""
+    section = {"frequency_hz": 0.37} if strobed else {"crossing": Crossing(of, 0.0, longest=50.0)}
+    found = found_of(table, starts, **section)
+    assert found["kind"].values.tolist() == [PERIODIC_ORBIT]
+    assert found["stability"].values.tolist() == [ATTRACTS]
+    assert float(found["period_s"][0]) == pytest.approx(seconds, rel=1e-9)
+    own = np.hypot(found["multiplier_real"], found["multiplier_imag"]).values[0]
+    if multiplier is not None:
+        assert own[1 if strobed else 0] == pytest.approx(multiplier, rel=1e-6)
+        assert not strobed or own[0] == 1.0
+
+
+# ---- one state ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("e", [0.0, 1e-9])
+def test_identify__one_state_beside_a_ghost(e):
+    """No direction is left beside the flow's own: nothing is settled, and nothing fails."""
+    found = found_of(QUADRATIC, [[-1.0]], values={"e": e})
+    assert found["kind"].values.tolist() == [BOUNDED_SET]
+    assert found["stability"].values.tolist() == [NOT_SETTLED]
+    assert EQUILIBRIUM not in found["kind"]
