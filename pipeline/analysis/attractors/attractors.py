@@ -65,6 +65,7 @@ variable                 dims                                  dtype, fill  mean
 ``mean_lifetime``,       parameter dims, attractor             float64, NaN lifetime and its interval, or its
 ``lifetime_low``,                                                           lower bound and infinity [drive
 ``lifetime_high``                                                           periods]; see `lifetimes`
+``dimension``            parameter dims, attractor             int8, 0      of a torus; 0 of any other set
 ``closes_above``         parameter dims, attractor             int32, 0     period that cells seem to close
                                                                             with, above the longest looked for
 ======================== ===================================== ============ ==================================
@@ -330,6 +331,7 @@ _TABLE: dict[str, tuple[tuple[str, ...], str, float, str, str]] = {
     "mean_lifetime": ((), "float64", np.nan, "1", "mean lifetime in drive periods"),
     "lifetime_low": ((), "float64", np.nan, "1", "lower end of the interval, drive periods"),
     "lifetime_high": ((), "float64", np.nan, "1", "upper end of the interval, drive periods"),
+    "dimension": ((), "int8", 0, "1", "dimension of a torus, 0 of any other set"),
     "closes_above": ((), "int32", 0, "1", "period of cells that seem to close above the longest looked for"),
 }
 """Own dims, dtype, fill, units and long name of the variables per attractor."""

@@ -108,7 +108,7 @@ def _columns(ds: xr.Dataset, dims: Sequence[str]) -> dict[str, np.ndarray]:
     size = np.hypot(array_of("multiplier_real"), array_of("multiplier_imag"))
     largest = np.where(np.isfinite(size).any(axis=-1), size[..., 0], np.nan)
     found["multiplier_modulus"] = largest.astype(object)
-    add("multiplier_error", *_NUMBERS, "n_sampled", "n_left", "closes_above")
+    add("multiplier_error", *_NUMBERS, "n_sampled", "n_left", "closes_above", "dimension")
     if "eigenvalue_real" in ds:
         found["eigenvalue_real"] = array_of("eigenvalue_real")[..., 0].astype(object)
         found["eigenvalue_imag"] = np.abs(array_of("eigenvalue_imag")[..., 0]).astype(object)
@@ -122,7 +122,10 @@ def _remarks(ds: xr.Dataset, rows: Sequence[Row]) -> list[str]:
     """
     lines = []
     if any(row["evidence"] == "volume" for row in rows):
-        lines.append("the flow preserves volume: a conservative system has no attractors")
+        if any(row["stability"] == STABILITIES[ATTRACTS] for row in rows):
+            lines.append("the flow preserves volume on some sets: none of them attracts")
+        else:
+            lines.append("the flow preserves volume: a conservative system has no attractors")
     above = sorted({row["closes_above"] for row in rows if row["closes_above"]})
     longest = int(ds.attrs.get("identify_max_orbit_period", 0))
     unsettled = [row for row in rows if row["stability"] == "not_settled"]
@@ -155,7 +158,7 @@ def _attractor_words(row: Row, n_points: int) -> Words:
     open_set = row["kind"] in ("torus", "chaotic_set", "bounded_set")
     return {
         "id": str(row["attractor_id"]),
-        "kind": plain(row["kind"]),
+        "kind": _kind(row),
         "stability": plain(row["stability"]),
         "period": str(row["orbit_period"] or "-"),
         "seconds": number(row["period_s"], ".6g") if flow else None,
@@ -172,6 +175,11 @@ def _attractor_words(row: Row, n_points: int) -> Words:
         "decided": ", ".join(decided),
         "shown by": _shown_by(row),
     }
+
+
+def _kind(row: Row) -> str:
+    """Name the kind of a set, a torus with its dimension."""
+    return f"{row['dimension']}-torus" if row["kind"] == "torus" else plain(row["kind"])
 
 
 _SHOWN_BY = {
@@ -206,7 +214,7 @@ def _id_summary(ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str]) -> Wor
     span = f"{min(seconds):.4g} to {max(seconds):.4g}" if seconds else "-"
     return {
         "id": str(first["attractor_id"]),
-        "kind": distinct(plain(r["kind"]) for r in rows),
+        "kind": distinct(_kind(r) for r in rows),
         "stability": distinct(plain(r["stability"]) for r in rows),
         "periods": distinct(r["orbit_period"] for r in rows if r["orbit_period"]) or "-",
         "seconds": span if "eigenvalue_real" in first else None,

@@ -19,8 +19,10 @@ from pipeline.layout.vocabulary import (
     ATTRACTS,
     BOUNDED_SET,
     EQUILIBRIUM,
+    NEUTRAL,
     NOT_SETTLED,
     PERIODIC_ORBIT,
+    TORUS,
     section_attributes,
 )
 
@@ -50,6 +52,48 @@ KURAMOTO = {
     "equations": {x: f"w{x}+k/3*(" + "+".join(f"sin({y}-{x})" for y in ANGLES if y != x) + ")" for x in ANGLES},
 }
 """Phase oscillators: locked, all turn at the mean of their frequencies."""
+
+
+def oscillators(*rates):
+    """Return oscillators without coupling, each with a limit cycle of radius 1: a torus of as many dimensions."""
+    equations = {}
+    for i, w in enumerate(rates):
+        equations |= {
+            f"x{i}": f"x{i}*(1 - x{i}**2 - y{i}**2) - {w}*y{i}",
+            f"y{i}": f"y{i}*(1 - x{i}**2 - y{i}**2) + {w}*x{i}",
+        }
+    return {
+        "name": f"oscillators{len(rates)}",
+        "states": {x: {} for x in equations},
+        "parameters": {"a": 1.0},
+        "equations": equations,
+    }
+
+
+RATES = (1.0, float(np.sqrt(2.0)), float(np.sqrt(5.0) - 1.0))
+
+HELD = {
+    **oscillators(1.0),
+    "name": "held",
+    "states": {"x0": {}, "y0": {}, "s": {}},
+    "equations": {**oscillators(1.0)["equations"], "s": "0*s"},
+}
+"""A parameter written as a state: a limit cycle for each value of it."""
+
+PREY = {
+    "name": "prey",
+    "states": {"x": {}, "y": {}},
+    "parameters": {"a": 1.0},
+    "equations": {"x": "x*(a - y)", "y": "y*(x - a)"},
+}
+"""Lotka and Volterra: closed orbits around a centre, and a volume that is preserved in logarithms only."""
+
+PENDULUM = {
+    "name": "free_pendulum",
+    "states": {"x": CIRCLE, "v": {}},
+    "parameters": {"w": 1.0},
+    "equations": {"x": "v", "v": "-w**2*sin(x)"},
+}
 
 QUADRATIC = {"name": "quadratic", "states": {"x": {}}, "parameters": {"e": 0.0}, "equations": {"x": "e + x**2"}}
 """One state: a half-stable equilibrium at e = 0, and its ghost at e > 0."""
@@ -147,3 +191,51 @@ def test_identify__one_state_beside_a_ghost(e):
     assert found["kind"].values.tolist() == [BOUNDED_SET]
     assert found["stability"].values.tolist() == [NOT_SETTLED]
     assert EQUILIBRIUM not in found["kind"]
+
+
+# ---- a multiplier of 1 is not attraction -------------------------------------------------------
+
+
+@pytest.mark.parametrize("section", [{"frequency_hz": 0.3}, {"crossing": Crossing("x0", 0.0, longest=50.0)}])
+@pytest.mark.parametrize(("rates", "n"), [((1.0, 1.0), 1), ((1.0, 1.0), 4), (RATES, 4)])
+def test_identify__oscillators_without_coupling_are_one_torus(rates, n, section):
+    """Of equal rates each trajectory is closed, and neutral; otherwise it fills the torus. There is one torus."""
+    starts = np.random.default_rng(0).uniform(-1.5, 1.5, (n, 2 * len(rates)))
+    found = found_of(oscillators(*rates), starts, **section)
+    assert found["kind"].values.tolist() == [TORUS]
+    assert found["stability"].values.tolist() == [ATTRACTS]
+    assert found["dimension"].values.tolist() == [len(rates)]
+    assert found["n_cells"].values.tolist() == [n]
+
+
+def test_identify__tori_that_turn_against_each_other_are_two():
+    """The ranges of all states are equal, and so are the exponents: x**2 + y**2 = 1 in both."""
+    own = oscillators(1.0, 1.0)
+    turn = {"z": "z*(1 - z**2)"}
+    equations = {k: v.replace("1.0*", "z*") if k in ("x0", "y0") else v for k, v in own["equations"].items()}
+    table = {**own, "name": "turning", "states": {**own["states"], "z": {}}, "equations": {**equations, **turn}}
+    starts = np.random.default_rng(1).uniform(-1.5, 1.5, (4, 5))
+    starts[:, 4] = [0.4, -0.4, 0.7, -0.7]
+    found = found_of(table, starts, frequency_hz=0.3)
+    assert found["kind"].values.tolist() == [TORUS] * 2
+    assert found["dimension"].values.tolist() == [2] * 2
+    ids = found["attractor_id"].values
+    assert ids[0] == ids[2] != ids[1] == ids[3]
+
+
+@pytest.mark.parametrize("strobed", [False, True])
+@pytest.mark.parametrize(
+    ("table", "of", "level", "starts"),
+    [
+        (HELD, "x0", 0.0, [[0.5, 0.2, 0.1], [1.2, 0.3, -0.8]]),
+        (PREY, "x", 1.0, [[0.4, 0.9], [1.1, 1.7], [0.9, 0.3]]),
+        (PENDULUM, "v", 0.0, [[1.0, 0.0], [2.0, 0.3], [0.0, 2.5]]),
+    ],
+    ids=["parameter as a state", "prey", "pendulum"],
+)
+def test_identify__a_family_of_orbits_does_not_attract(table, of, level, starts, strobed):
+    """No neighbour comes nearer, and neighbours differ in amplitude."""
+    section = {"frequency_hz": 0.37} if strobed else {"crossing": Crossing(of, level, longest=50.0)}
+    found = found_of(table, starts, **section)
+    assert set(found["stability"].values.tolist()) == {NEUTRAL}
+    assert TORUS not in found["kind"]

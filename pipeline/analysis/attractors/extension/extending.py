@@ -24,6 +24,7 @@ from pipeline.analysis.attractors.extension.bounded_sets import BoundedSet, desc
 from pipeline.analysis.attractors.extension.clouds import group, members
 from pipeline.analysis.attractors.extension.courses import AT_REST, DIVERGED, FAILED, Course
 from pipeline.analysis.attractors.extension.lifetimes import lifetime_interval
+from pipeline.analysis.attractors.extension.tori import is_one_torus
 from pipeline.analysis.attractors.finding import stability
 from pipeline.analysis.attractors.finding.assigning import decide
 from pipeline.analysis.attractors.finding.cell_blocks import Block, ClosedCells, Guesses
@@ -353,12 +354,29 @@ class _Extension:
             [course for course, n in zip(going, numbers, strict=True) if n == k] for k in range(int(numbers.max()) + 1)
         ]
         gone = [] if has_stayed else [course for course in self.courses if course.has_left]
-        self.sets, in_doubt, self._told = [], not is_sure, self._lengths()
-        for own, left in self._with_those_left(groups, gone):
-            one = yield from describe(own, left, self.point, self.settings, has_stayed)
-            self.sets.append(one)
-            in_doubt |= one.stability == NOT_SETTLED
-        return in_doubt
+        self._told = self._lengths()
+        parts = self._with_those_left(groups, gone)
+        sets = []
+        for own, left in parts:
+            sets.append((yield from describe(own, left, self.point, self.settings, has_stayed)))
+        self.sets = yield from self._joined(sets, [own for own, _ in parts], has_stayed)
+        return not is_sure or any(one.stability == NOT_SETTLED for one in self.sets)
+
+    def _joined(self, sets: list[BoundedSet], owns: list[list[Course]], has_stayed: bool) -> Work[list[BoundedSet]]:
+        """Join the tori that are one: the points of each trajectory on it may lie on a curve of its own."""
+        k = 0
+        while k < len(sets):
+            for i in range(k):
+                attract = sets[i].stability == sets[k].stability == ATTRACTS
+                alike = sets[i].dimension == sets[k].dimension >= 2
+                if attract and alike and (yield from is_one_torus(owns[i][0], owns[k][0], self.geometry)):
+                    owns[i] += owns.pop(k)
+                    sets.pop(k)
+                    sets[i] = yield from describe(owns[i], [], self.point, self.settings, has_stayed)
+                    break
+            else:
+                k += 1
+        return sets
 
     def _with_those_left(
         self, groups: Sequence[list[Course]], gone: Sequence[Course]
