@@ -55,7 +55,8 @@ variable                 dims                                  dtype, fill  mean
 ``period_s``             parameter dims, attractor             float64, NaN period of a polished orbit [s]
 ``eigenvalue_real``,     parameter dims, attractor, multiplier float64, NaN of an equilibrium [1/s], by
 ``eigenvalue_imag``                                                         falling real part
-``n_sampled``            parameter dims, attractor             int64, 0     its cells that were extended
+``n_sampled``            parameter dims, attractor             int64, 0     its cells that were extended, and
+                                                                            neighbours of them
 ``n_left``               parameter dims, attractor             int64, 0     extended cells that left it
 ``n_leaving``            parameter dims, attractor             int64, 0     extended cells near their end
                                                                             from the start
@@ -323,7 +324,7 @@ _TABLE: dict[str, tuple[tuple[str, ...], str, float, str, str]] = {
     "period_s": ((), "float64", np.nan, "s", "period of a polished orbit"),
     "eigenvalue_real": (("multiplier",), "float64", np.nan, "1/s", "eigenvalues at rest, real part"),
     "eigenvalue_imag": (("multiplier",), "float64", np.nan, "1/s", "eigenvalues at rest, imaginary part"),
-    "n_sampled": ((), "int64", 0, "1", "cells of the set that were extended"),
+    "n_sampled": ((), "int64", 0, "1", "cells of the set, and neighbours, that were extended"),
     "n_left": ((), "int64", 0, "1", "extended cells that left the set"),
     "n_leaving": ((), "int64", 0, "1", "extended cells that were near their end from the start"),
     "n_to": (("destination",), "int64", 0, "1", "extended cells that left, by where they ended"),

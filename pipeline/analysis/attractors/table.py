@@ -109,6 +109,8 @@ def _columns(ds: xr.Dataset, dims: Sequence[str]) -> dict[str, np.ndarray]:
     largest = np.where(np.isfinite(size).any(axis=-1), size[..., 0], np.nan)
     found["multiplier_modulus"] = largest.astype(object)
     add("multiplier_error", *_NUMBERS, "n_sampled", "n_left", "closes_above", "dimension")
+    confidence = float(ds.attrs.get("identify_lifetime_confidence", 0.95))
+    found["lifetime_confidence"] = np.full(largest.shape, confidence, object)
     if "eigenvalue_real" in ds:
         found["eigenvalue_real"] = array_of("eigenvalue_real")[..., 0].astype(object)
         found["eigenvalue_imag"] = np.abs(array_of("eigenvalue_imag")[..., 0]).astype(object)
@@ -194,7 +196,7 @@ _SHOWN_BY = {
 def _shown_by(row: Row) -> str:
     low = number(row["lifetime_low"], ".0f")
     if row["evidence"] == "stayed":
-        return f"{row['n_sampled']} stayed, lifetime above {low}"
+        return f"{row['n_sampled']} stayed, lifetime above {low} ({100.0 * row['lifetime_confidence']:g} %)"
     if row["evidence"] == "left":
         high = number(row["lifetime_high"], ".0f")
         return f"{row['n_left']} of {row['n_sampled']} left, lifetime {low} to {high}"

@@ -13,16 +13,24 @@ from magpend_core.crossing import Crossing
 from magpend_core.equilibria import find_equilibria
 from magpend_core.models import load_model
 from magpend_core.models.sectioned import sectioned
+from magpend_core.status import Status
 from pipeline.analysis.attractors.attractors import identify
+from pipeline.analysis.attractors.extension.extending import extend
+from pipeline.analysis.attractors.finding.cell_blocks import Block
+from pipeline.analysis.attractors.finding.closed_orbits import Orbit
+from pipeline.analysis.attractors.finding.requests import LEG, Extended, Leg, Settings, Slopes
+from pipeline.analysis.sets import Geometry
 from pipeline.compute.integrate import rest_states
 from pipeline.layout.vocabulary import (
     ATTRACTS,
     BOUNDED_SET,
+    CHAOTIC_SET,
     EQUILIBRIUM,
     NEUTRAL,
     NOT_SETTLED,
     PERIODIC_ORBIT,
     TORUS,
+    TRANSIENT,
     section_attributes,
 )
 
@@ -239,3 +247,95 @@ def test_identify__a_family_of_orbits_does_not_attract(table, of, level, starts,
     found = found_of(table, starts, **section)
     assert set(found["stability"].values.tolist()) == {NEUTRAL}
     assert TORUS not in found["kind"]
+
+
+# ---- one cell proves little --------------------------------------------------------------------
+
+
+class LeakyTent:
+    """A tent map in place of a parameter point: of a uniform density a share of 2/slope stays at every step."""
+
+    can_rest, is_flow, n_neutral, n_states, n_cells = False, False, 0, 1, 1
+
+    def __init__(self, slope, start, seen):
+        self.slope, self.n_periods = slope, seen
+        self.section = np.empty((1, 20, 1))
+        state = np.array([[start]])
+        for i in range(20):
+            state = self.section[:, i] = self.step(state)
+
+    def step(self, x):
+        inside = self.slope * np.minimum(x, 1.0 - x)
+        return np.where(x <= 1.0, inside, 2.0 + 0.5 * (x - 2.0))
+
+    def blocks(self):
+        one = np.zeros(1, int)
+        yield Block(slice(0, 1), self.section, np.full(1, Status.BOUNDED), one, np.zeros((1, 0)))
+
+    def volumes(self, derivatives, before, after):
+        return np.log(np.abs(derivatives[:, 0, 0]))
+
+
+def extended(point, budget):
+    """Drive the extension of a map's only cell."""
+    geometry = Geometry((False,), (1.0 / 0.3,))
+    settings = Settings(1e-8, 1e-8, 100, 1e-5, 4, 1e-10, point.n_periods, None, "", geometry)
+    work = extend(point, [FIXED], np.full(1, -1), settings, budget, 24)
+    answer = None
+    while True:
+        try:
+            asked = work.send(answer)
+        except StopIteration as stop:
+            return stop.value
+        if isinstance(asked, Leg):
+            n, state = len(asked.state), asked.state
+            section = np.empty((n, LEG, 1))
+            for i in range(LEG):
+                state = section[:, i] = point.step(state)
+            status = np.full(n, Status.BOUNDED)
+            none = np.zeros(n, int)
+            answer = Extended(section, status, none, np.zeros((n, 0), int), state, np.zeros(n), np.ones((n, LEG)))
+        elif isinstance(asked, Slopes):
+            slopes = np.where(asked.point < 0.5, point.slope, -point.slope)
+            answer = point.step(asked.point), slopes[:, :, None]
+        else:
+            answer = [None] * len(asked.guesses.key)
+
+
+FIXED = Orbit(np.array([[2.0]]), np.array([0.5 + 0j]), 1e-12, np.array([[0.5]]))
+
+
+def long_lived(slope, least):
+    """Return a start whose trajectory stays for `least` steps at least."""
+    for start in np.random.default_rng(0).uniform(0.0, 1.0, 400):
+        point = LeakyTent(slope, start, 20)
+        x = np.array([[start]])
+        for _ in range(least):
+            x = point.step(x)
+        if x[0, 0] <= 1.0:
+            return start
+    raise AssertionError("no start stays")
+
+
+def test_extend__one_long_life_is_no_attraction():
+    """The cell stays for six mean lifetimes of 401, longer than the bound asks; its neighbours do not."""
+    slope = 2.005
+    found = extended(LeakyTent(slope, long_lived(slope, 1600), 100), 1.0)
+    (one,) = [one for one in found.sets if one.n_sampled]
+    assert one.stability == TRANSIENT
+    assert one.n_left >= 4
+
+
+def test_extend__neighbours_of_one_cell_show_that_a_set_attracts():
+    """They stay for ten times the run, each; a tenth of the budget shows too little, more of it more."""
+    least = [0.0, 0.0, 0.0]
+    for i, budget in enumerate((0.1, 1.0, 2.0)):
+        found = extended(LeakyTent(1.9, 0.3, 2000), budget)
+        (one,) = found.sets
+        assert one.kind == CHAOTIC_SET or budget < 1.0
+        assert one.stability == (NOT_SETTLED if budget < 1.0 else ATTRACTS)
+        assert found.ran_out == (budget < 1.0)
+        assert one.cells.tolist() == [0] * one.n_sampled
+        least[i] = one.time_at_risk
+    assert least[1] >= 8 * 10 * 2000
+    assert least[2] >= 2 * least[1]

@@ -219,10 +219,11 @@ def _label_courses(point: Point, found: Outcome, labels: _Labels, groups: np.nda
     """Label cells by the end of a similar cell that was integrated further. Cells are similar if they share a box or a
     group of section points.
     """
-    ends = {course.key: course.end for course in found.courses if not course.goes_on}
-    if not ends:
+    ended = [course for course in found.courses if not course.goes_on and not course.is_neighbour]
+    if not ended:
         return
-    by_group = {int(groups[c.cell]): c.end for c in found.courses if not c.goes_on and groups[c.cell] >= 0}
+    ends = {course.key: course.end for course in ended}
+    by_group = {int(groups[course.cell]): course.end for course in ended if groups[course.cell] >= 0}
     elsewhere = _is_elsewhere(point)
     for block in point.blocks():
         rows = np.flatnonzero((block.is_closed | block.is_bounded) & (labels.label[block.cells] < 0))
