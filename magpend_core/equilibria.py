@@ -15,6 +15,11 @@ TOLERANCE = 1e-10
 TRUST = 0.5
 """Longest Newton step in units of the system's scales."""
 
+RATE_LEFT, RATE_ROUNDING = 1e-8, 1e-14
+"""Largest rate that may be left at an equilibrium, relative to the rate at the guess; and the rounding error of a rate,
+in units of the state's scale and of the Jacobian's norm.
+"""
+
 
 @dataclass(frozen=True, eq=False)
 class Equilibria:
@@ -29,7 +34,7 @@ class Equilibria:
     residual : ndarray, (n,)
         Scaled length of the Newton step from there: the distance from the equilibrium to first order.
     converged : ndarray of bool, (n,)
-        Whether that is within the tolerance.
+        Whether that is within the tolerance, and every rate vanishes: a steady rotation is no equilibrium.
     jacobians : ndarray, (n, n_states, n_states)
         At these states [1/s per unit of the states].
     """
@@ -46,7 +51,9 @@ class Equilibria:
         return np.asarray(self.eigenvalues.real.max(axis=1) < 0.0)
 
 
-def newton_steps(system: System, states: np.ndarray, packed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def newton_steps(
+    system: System, states: np.ndarray, packed: np.ndarray, met: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the Newton step towards an equilibrium, and the Jacobian, at each of several states.
 
     Parameters
@@ -57,19 +64,32 @@ def newton_steps(system: System, states: np.ndarray, packed: np.ndarray) -> tupl
         Finite ones, shape (n, n_states).
     packed
         Parameters, shape (n_parameters,).
+    met
+        Largest rates that were met on the way to each state, of its shape; raised here to the rates of `states`.
 
     Returns
     -------
     steps : ndarray, (n, n_states)
         In the least-squares sense where the Jacobian is singular.
     jacobians : ndarray, (n, n_states, n_states)
+    vanishes : ndarray of bool, (n,)
+        Whether the step removes every rate, to first order. It does not where an angle turns and the equations do not
+        depend on it: the Jacobian is singular there, and a short step proves nothing.
     """
     rates, jacobians = rates_at(system, states, packed), jacobian_at(system, states, packed)
     good = np.isfinite(rates).all(axis=1) & np.isfinite(jacobians).all(axis=(1, 2))
-    steps = np.full(states.shape, np.nan)
-    inverse = np.linalg.pinv(jacobians[good], rcond=1e-14)
+    steps, vanishes = np.full(states.shape, np.nan), np.zeros(len(states), bool)
+    own, scales = jacobians[good], np.asarray(system.scales)
+    inverse = np.linalg.pinv(own, rcond=1e-14)
     steps[good] = -np.einsum("nij,nj->ni", inverse, rates[good])
-    return steps, jacobians
+    left = np.abs(rates[good] + np.einsum("nij,nj->ni", own, steps[good]))
+    if met is None:
+        met = np.zeros(states.shape)
+    met[good] = np.maximum(met[good], np.abs(rates[good]))
+    norms = np.abs(own * scales / scales[:, None]).max(axis=(1, 2), initial=0.0)
+    allowed = np.maximum(RATE_LEFT * met[good], RATE_ROUNDING * norms[:, None] * scales)
+    vanishes[good] = (left <= allowed).all(axis=1)
+    return steps, jacobians, vanishes
 
 
 def find_equilibria(system: System, states: np.ndarray, packed: np.ndarray, *, max_iterations: int = 30) -> Equilibria:
@@ -90,16 +110,19 @@ def find_equilibria(system: System, states: np.ndarray, packed: np.ndarray, *, m
     scales = np.asarray(system.scales)
     residual = np.full(len(found), np.nan)
     jacobians = np.full((len(found), system.n_states, system.n_states), np.nan)
+    met, vanishes = np.zeros(found.shape), np.zeros(len(found), bool)
     rows = np.flatnonzero(np.isfinite(found).all(axis=1))
     for _ in range(max_iterations + 1):
         if not len(rows):
             break
-        steps, jacobians[rows] = newton_steps(system, found[rows], packed)
+        fastest = met[rows]
+        steps, jacobians[rows], vanishes[rows] = newton_steps(system, found[rows], packed, fastest)
+        met[rows] = fastest
         residual[rows] = np.abs(steps / scales).max(axis=1)
         going = residual[rows] > 0.01 * TOLERANCE
         rows, steps, lengths = rows[going], steps[going], residual[rows[going]]
         found[rows] += steps * np.minimum(1.0, TRUST / lengths)[:, None]
-    converged = residual <= TOLERANCE
+    converged = (residual <= TOLERANCE) & vanishes
     eigenvalues = np.full((len(found), system.n_states), np.nan, np.complex128)
     for row in np.flatnonzero(converged):
         values = np.linalg.eigvals(jacobians[row])

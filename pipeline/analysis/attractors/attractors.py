@@ -55,7 +55,8 @@ variable                 dims                                  dtype, fill  mean
 ``period_s``             parameter dims, attractor             float64, NaN period of a polished orbit [s]
 ``eigenvalue_real``,     parameter dims, attractor, multiplier float64, NaN of an equilibrium [1/s], by
 ``eigenvalue_imag``                                                         falling real part
-``n_sampled``            parameter dims, attractor             int64, 0     its cells that were extended
+``n_sampled``            parameter dims, attractor             int64, 0     its cells that were extended, and
+                                                                            neighbours of them
 ``n_left``               parameter dims, attractor             int64, 0     extended cells that left it
 ``n_leaving``            parameter dims, attractor             int64, 0     extended cells near their end
                                                                             from the start
@@ -65,6 +66,7 @@ variable                 dims                                  dtype, fill  mean
 ``mean_lifetime``,       parameter dims, attractor             float64, NaN lifetime and its interval, or its
 ``lifetime_low``,                                                           lower bound and infinity [drive
 ``lifetime_high``                                                           periods]; see `lifetimes`
+``dimension``            parameter dims, attractor             int8, 0      of a torus; 0 of any other set
 ``closes_above``         parameter dims, attractor             int32, 0     period that cells seem to close
                                                                             with, above the longest looked for
 ======================== ===================================== ============ ==================================
@@ -322,7 +324,7 @@ _TABLE: dict[str, tuple[tuple[str, ...], str, float, str, str]] = {
     "period_s": ((), "float64", np.nan, "s", "period of a polished orbit"),
     "eigenvalue_real": (("multiplier",), "float64", np.nan, "1/s", "eigenvalues at rest, real part"),
     "eigenvalue_imag": (("multiplier",), "float64", np.nan, "1/s", "eigenvalues at rest, imaginary part"),
-    "n_sampled": ((), "int64", 0, "1", "cells of the set that were extended"),
+    "n_sampled": ((), "int64", 0, "1", "cells of the set, and neighbours, that were extended"),
     "n_left": ((), "int64", 0, "1", "extended cells that left the set"),
     "n_leaving": ((), "int64", 0, "1", "extended cells that were near their end from the start"),
     "n_to": (("destination",), "int64", 0, "1", "extended cells that left, by where they ended"),
@@ -330,6 +332,7 @@ _TABLE: dict[str, tuple[tuple[str, ...], str, float, str, str]] = {
     "mean_lifetime": ((), "float64", np.nan, "1", "mean lifetime in drive periods"),
     "lifetime_low": ((), "float64", np.nan, "1", "lower end of the interval, drive periods"),
     "lifetime_high": ((), "float64", np.nan, "1", "upper end of the interval, drive periods"),
+    "dimension": ((), "int8", 0, "1", "dimension of a torus, 0 of any other set"),
     "closes_above": ((), "int32", 0, "1", "period of cells that seem to close above the longest looked for"),
 }
 """Own dims, dtype, fill, units and long name of the variables per attractor."""

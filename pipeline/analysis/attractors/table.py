@@ -108,7 +108,9 @@ def _columns(ds: xr.Dataset, dims: Sequence[str]) -> dict[str, np.ndarray]:
     size = np.hypot(array_of("multiplier_real"), array_of("multiplier_imag"))
     largest = np.where(np.isfinite(size).any(axis=-1), size[..., 0], np.nan)
     found["multiplier_modulus"] = largest.astype(object)
-    add("multiplier_error", *_NUMBERS, "n_sampled", "n_left", "closes_above")
+    add("multiplier_error", *_NUMBERS, "n_sampled", "n_left", "closes_above", "dimension")
+    confidence = float(ds.attrs.get("identify_lifetime_confidence", 0.95))
+    found["lifetime_confidence"] = np.full(largest.shape, confidence, object)
     if "eigenvalue_real" in ds:
         found["eigenvalue_real"] = array_of("eigenvalue_real")[..., 0].astype(object)
         found["eigenvalue_imag"] = np.abs(array_of("eigenvalue_imag")[..., 0]).astype(object)
@@ -122,7 +124,10 @@ def _remarks(ds: xr.Dataset, rows: Sequence[Row]) -> list[str]:
     """
     lines = []
     if any(row["evidence"] == "volume" for row in rows):
-        lines.append("the flow preserves volume: a conservative system has no attractors")
+        if any(row["stability"] == STABILITIES[ATTRACTS] for row in rows):
+            lines.append("the flow preserves volume on some sets: none of them attracts")
+        else:
+            lines.append("the flow preserves volume: a conservative system has no attractors")
     above = sorted({row["closes_above"] for row in rows if row["closes_above"]})
     longest = int(ds.attrs.get("identify_max_orbit_period", 0))
     unsettled = [row for row in rows if row["stability"] == "not_settled"]
@@ -155,7 +160,7 @@ def _attractor_words(row: Row, n_points: int) -> Words:
     open_set = row["kind"] in ("torus", "chaotic_set", "bounded_set")
     return {
         "id": str(row["attractor_id"]),
-        "kind": plain(row["kind"]),
+        "kind": _kind(row),
         "stability": plain(row["stability"]),
         "period": str(row["orbit_period"] or "-"),
         "seconds": number(row["period_s"], ".6g") if flow else None,
@@ -174,6 +179,11 @@ def _attractor_words(row: Row, n_points: int) -> Words:
     }
 
 
+def _kind(row: Row) -> str:
+    """Name the kind of a set, a torus with its dimension."""
+    return f"{row['dimension']}-torus" if row["kind"] == "torus" else plain(row["kind"])
+
+
 _SHOWN_BY = {
     "none": "-",
     "eigenvalues": "eigenvalues",
@@ -186,7 +196,7 @@ _SHOWN_BY = {
 def _shown_by(row: Row) -> str:
     low = number(row["lifetime_low"], ".0f")
     if row["evidence"] == "stayed":
-        return f"{row['n_sampled']} stayed, lifetime above {low}"
+        return f"{row['n_sampled']} stayed, lifetime above {low} ({100.0 * row['lifetime_confidence']:g} %)"
     if row["evidence"] == "left":
         high = number(row["lifetime_high"], ".0f")
         return f"{row['n_left']} of {row['n_sampled']} left, lifetime {low} to {high}"
@@ -206,7 +216,7 @@ def _id_summary(ds: xr.Dataset, rows: Sequence[Row], dims: Sequence[str]) -> Wor
     span = f"{min(seconds):.4g} to {max(seconds):.4g}" if seconds else "-"
     return {
         "id": str(first["attractor_id"]),
-        "kind": distinct(plain(r["kind"]) for r in rows),
+        "kind": distinct(_kind(r) for r in rows),
         "stability": distinct(plain(r["stability"]) for r in rows),
         "periods": distinct(r["orbit_period"] for r in rows if r["orbit_period"]) or "-",
         "seconds": span if "eigenvalue_real" in first else None,

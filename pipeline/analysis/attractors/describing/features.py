@@ -146,6 +146,7 @@ class Features:
     lifetime_high: float = np.nan
     n_to: np.ndarray | None = None
     closes_above: int = 0
+    dimension: int = 0
     period_s: float = np.nan
     eigenvalues: np.ndarray | None = None
     image: np.ndarray | None = None

@@ -31,6 +31,7 @@ from pipeline.analysis.tolerances import PRESERVED_VOLUME, VOLUME_RTOL
 from pipeline.layout.vocabulary import (
     APPROACHING,
     AT_REST,
+    ATTRACTS,
     BOUNDED_SET,
     CLOSED,
     DIVERGES,
@@ -98,9 +99,11 @@ def analyse(point: Point, search: Search) -> Work[Found]:
         yield from _probe(point, state, labels, search)
     options = search.options
     budget = options.budget if options.extend and options.polish else 0.0
-    loose = np.where(_is_elsewhere(point), 0, labels.label)
+    in_family = _in_families(point, state.orbits, labels)
+    loose = np.where(_is_elsewhere(point), 0, np.where(in_family, -1, labels.label))
     found = yield from extend(point, state.orbits, loose, search.settings, budget, options.n_sample)
     state.orbits = found.orbits
+    found.sets = _with_families(found.sets, in_family, labels)
     _label_courses(point, found, labels, groups, search)
     raw = _label_raw(point, state, groups, labels, search)
     _label_sets(point, len(state.orbits) + len(raw), found.sets, labels, groups, search)
@@ -191,14 +194,36 @@ def _probe(point: Point, state: State, labels: _Labels, search: Search) -> Work[
         put_at_rest(point, search.tolerance, search.geometry)
 
 
+def _in_families(point: Point, orbits: Sequence[Orbit], labels: _Labels) -> np.ndarray:
+    """Return which cells lie on a neutral orbit of an autonomous flow, around which there may be a torus."""
+    neutral = [i for i, orbit in enumerate(orbits) if orbit.is_polished and orbit.stability == NEUTRAL]
+    return np.isin(labels.label, neutral) & point.can_rest
+
+
+def _with_families(sets: Sequence[BoundedSet], in_family: np.ndarray, labels: _Labels) -> list[BoundedSet]:
+    """Give the cells on neutral orbits to the tori on which these orbits lie; drop all other sets around the orbits."""
+    found = []
+    for one in sets:
+        own = in_family[one.cells]
+        is_torus = one.dimension > 0 and one.stability == ATTRACTS
+        if own.any() and is_torus:
+            cells = np.flatnonzero(np.isin(labels.label, labels.label[one.cells[own]]))
+            one = replace(one, cells=np.union1d(one.cells, cells))
+            labels.put(cells, -1, UNDECIDED)
+        if is_torus or not len(own) or not own.all():
+            found.append(one)
+    return found
+
+
 def _label_courses(point: Point, found: Outcome, labels: _Labels, groups: np.ndarray, search: Search) -> None:
     """Label cells by the end of a similar cell that was integrated further. Cells are similar if they share a box or a
     group of section points.
     """
-    ends = {course.key: course.end for course in found.courses if not course.goes_on}
-    if not ends:
+    ended = [course for course in found.courses if not course.goes_on and not course.is_neighbour]
+    if not ended:
         return
-    by_group = {int(groups[c.cell]): c.end for c in found.courses if not c.goes_on and groups[c.cell] >= 0}
+    ends = {course.key: course.end for course in ended}
+    by_group = {int(groups[course.cell]): course.end for course in ended if groups[course.cell] >= 0}
     elsewhere = _is_elsewhere(point)
     for block in point.blocks():
         rows = np.flatnonzero((block.is_closed | block.is_bounded) & (labels.label[block.cells] < 0))
@@ -369,7 +394,7 @@ def _of_points(cells: Cells, kind: int, period: int, point: Point, search: Searc
 def _of_set(cells: Cells, one: BoundedSet, point: Point, search: Search) -> Features:
     found = _of_points(cells, one.kind, 0, point, search)
     found.stability, found.evidence = one.stability, one.evidence
-    found.closes_above = one.closes_above
+    found.closes_above, found.dimension = one.closes_above, one.dimension
     found.n_sampled, found.n_left, found.n_leaving = one.n_sampled, one.n_left, one.n_leaving
     if one.time_at_risk > 0.0:
         found.time_at_risk = one.time_at_risk

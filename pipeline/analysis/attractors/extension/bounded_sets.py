@@ -10,11 +10,12 @@ import numpy as np
 from pipeline.analysis.attractors.extension.clouds import OTHER, Cloud, is_stationary, mixing, thinned
 from pipeline.analysis.attractors.extension.courses import Course
 from pipeline.analysis.attractors.extension.growth import Growth, growth_of, kind_of
+from pipeline.analysis.attractors.extension.tori import differs_in_phase
 from pipeline.analysis.attractors.finding import stability
 from pipeline.analysis.attractors.finding.points import Point
 from pipeline.analysis.attractors.finding.requests import LEG, Settings, Slopes, Work
 from pipeline.analysis.tolerances import ROUGH_SLOPE_RTOL, SLOPE_RTOL
-from pipeline.layout.vocabulary import ATTRACTS, BOUNDED_SET, NEUTRAL, NOT_SETTLED, TRANSIENT
+from pipeline.layout.vocabulary import ATTRACTS, BOUNDED_SET, NEUTRAL, NOT_SETTLED, TORUS, TRANSIENT
 
 SLOPES = (1024, 4096)
 """Most derivatives of the section map for the exponents of a set: at first, and if the first are too few."""
@@ -47,6 +48,8 @@ class BoundedSet:
         Numbers of cells that left it, by `Course.end`.
     closes_above : int
         Period with which it may close, longer than the search allows; 0 if none is seen.
+    dimension : int
+        Dimension of a torus; 0 of any other set.
     """
 
     cells: np.ndarray
@@ -62,6 +65,7 @@ class BoundedSet:
     time_at_risk: float
     ended: dict[int, int]
     closes_above: int = 0
+    dimension: int = 0
 
     @classmethod
     def neutral(cls) -> BoundedSet:
@@ -100,7 +104,17 @@ def describe(
         kind = kind_of(growth, thinned(pooled, MOST_SHAPED), settings.geometry)
         if kind != BOUNDED_SET or growth.contracts or growth.preserves_volume:
             break
-    verdict, evidence = _verdict(own, left, growth, has_stayed, settings)
+    verdict, evidence = _verdict(left, growth, has_stayed)
+    dimension = _dimension(growth, kind, point)
+    in_phase = None
+    if verdict == ATTRACTS and _is_in_family(pooled, dimension, point, settings):
+        in_phase = yield from differs_in_phase(own[0], point, settings.geometry)
+    if in_phase:
+        kind = TORUS
+    elif in_phase is not None:
+        kind, verdict, evidence = BOUNDED_SET, NEUTRAL, stability.BY_MULTIPLIERS
+    elif verdict == ATTRACTS and not all(is_stationary(x, settings.geometry, settings.closure) for x in paths):
+        verdict, evidence = NOT_SETTLED, stability.BY_NOTHING
     return BoundedSet(
         np.array([c.cell for c in own], np.int64),
         Cloud.of(paths, settings.geometry, settings.closure),
@@ -115,7 +129,25 @@ def describe(
         float(sum(c.length for c in own) + sum(c.periods for c in left)),
         ends_of(left),
         _closes_above(own, growth, settings),
+        dimension if kind == TORUS else 0,
     )
+
+
+def _dimension(growth: Growth | None, kind: int, point: Point) -> int:
+    """Return the number of zero exponents of the flow, the phase of a drive included; 0 if it is not certain."""
+    if growth is not None and growth.n_zero > 0:
+        return growth.n_zero + 1 - point.n_neutral
+    return 2 if kind == TORUS else 0
+
+
+def _is_in_family(points: np.ndarray, dimension: int, point: Point, settings: Settings) -> bool:
+    """Return whether the flow has more zero exponents than one trajectory with these section points fills."""
+    if dimension < 2 or not (dimension > 2 or point.can_rest):
+        return False
+    if dimension > 2 or point.n_neutral:
+        return True
+    # at crossings a torus shows as a curve, and an orbit as a few points
+    return len(np.unique(settings.geometry.boxes(points, 10.0 * settings.closure), axis=0)) <= 2 * settings.longest
 
 
 def left_behind(left: Sequence[Course], settings: Settings) -> BoundedSet:
@@ -151,28 +183,23 @@ def were_on(course: Course, own: Sequence[Course], settings: Settings) -> bool:
     return bool(mixing(course.stayed, points, settings.geometry, settings.closure, OTHER) >= OTHER)
 
 
-def _verdict(
-    own: Sequence[Course], left: Sequence[Course], growth: Growth | None, has_stayed: bool, settings: Settings
-) -> tuple[int, int]:
+def _verdict(left: Sequence[Course], growth: Growth | None, has_stayed: bool) -> tuple[int, int]:
     if growth is not None and growth.preserves_volume:
         return NEUTRAL, stability.BY_VOLUME
     if left:
         return TRANSIENT, stability.BY_LEAVING
     if not has_stayed or growth is None or growth.contracts:
         return NOT_SETTLED, stability.BY_NOTHING
-    if not all(is_stationary(course.stayed, settings.geometry, settings.closure) for course in own):
-        return NOT_SETTLED, stability.BY_NOTHING
     return ATTRACTS, stability.BY_STAYING
 
 
 def _growth(own: Sequence[Course], point: Point, settings: Settings, most: int) -> Work[Growth | None]:
     """Compute the Lyapunov exponents of the section map along trajectories of a set; None if there are too few section
-    points.
+    points, or if the flow has one state and no direction beside its own.
     """
-    n = min(course.length for course in own)
-    if n < LEG:
+    n, n_states = min(course.length for course in own), settings.geometry.n_states
+    if n < LEG or n_states == point.n_neutral:
         return None
-    n_states = settings.geometry.n_states
     most = min(most, max(256, 20_000_000 // n_states**2))
     n_cells = max(1, min(len(own), most // min(n, most)))
     n = min(n, most // n_cells)

@@ -35,6 +35,8 @@ class Course:
         Drive periods or returns from its last kept section until it came near its end.
     is_leaving : bool
         Whether it was near its end from the start.
+    is_neighbour : bool
+        Whether it was drawn beside a cell, and is none itself.
     """
 
     cell: int
@@ -46,6 +48,7 @@ class Course:
     end: int = ON_SET
     periods: float = 0.0
     is_leaving: bool = False
+    is_neighbour: bool = False
 
     @property
     def goes_on(self) -> bool:

@@ -24,6 +24,7 @@ from pipeline.analysis.attractors.extension.bounded_sets import BoundedSet, desc
 from pipeline.analysis.attractors.extension.clouds import group, members
 from pipeline.analysis.attractors.extension.courses import AT_REST, DIVERGED, FAILED, Course
 from pipeline.analysis.attractors.extension.lifetimes import lifetime_interval
+from pipeline.analysis.attractors.extension.tori import is_one_torus
 from pipeline.analysis.attractors.finding import stability
 from pipeline.analysis.attractors.finding.assigning import decide
 from pipeline.analysis.attractors.finding.cell_blocks import Block, ClosedCells, Guesses
@@ -34,10 +35,20 @@ from pipeline.analysis.attractors.finding.requests import LEG, Extended, Leg, Po
 from pipeline.analysis.attractors.finding.spirals import keys_of, leap, near_closed
 from pipeline.analysis.sets import Geometry
 from pipeline.analysis.tolerances import REACH
-from pipeline.layout.vocabulary import ATTRACTS, NEUTRAL, NOT_SETTLED
+from pipeline.layout.vocabulary import ATTRACTS, CHAOTIC_SET, NEUTRAL, NOT_SETTLED
 
 LEAST_BUDGET = 16_384
 """Least budget of a parameter point [periods], however short the run was."""
+
+LEAST_PATHS, MOST_PATHS = 8, 64
+"""Fewest trajectories that must stay on a chaotic set before it is said to attract, for a budget of 1; and the most
+that a larger budget asks for, in proportion.
+
+Beside too few cells neighbours are drawn. A single cell can outlive the bound on a set that most cells leave before.
+"""
+
+ASIDE = 1e-6
+"""Largest scaled distance of a neighbour from its cell: chaos separates them, and they start on the same set."""
 
 LEAST_STAY = 512
 """Least extension of a cell [sections]: enough points to separate two sets, and chaos from a torus."""
@@ -127,7 +138,10 @@ class _Extension:
     def __init__(self, point: Point, orbits: list[Orbit], settings: Settings, budget: float) -> None:
         self.point, self.orbits, self.settings = point, orbits, settings
         self.geometry: Geometry = settings.geometry
-        self.budget = int(max(budget * point.n_periods, LEAST_BUDGET)) if budget > 0.0 else 0
+        self.paths = int(np.clip(LEAST_PATHS * budget, LEAST_PATHS, MOST_PATHS))
+        # whatever the run's length, a budget of 1 suffices for the trajectories of one set
+        needed = min(budget, MOST_PATHS) * LEAST_PATHS * stability.TIMES_LONGEST * settings.seen
+        self.budget = int(max(budget * point.n_periods, LEAST_BUDGET, needed)) if budget > 0.0 else 0
         self.courses: list[Course] = []
         self.sets: list[BoundedSet] = []
         self.spent, self.ran_out = 0, False
@@ -198,16 +212,24 @@ class _Extension:
         """Integrate the sampled trajectories further, until it is decided for each of them whether its set attracts."""
         target = LEAST_STAY
         for _ in range(DOUBLINGS + 1):
-            yield from self._extend(target)
-            if not any(course.goes_on for course in self.courses):
-                self.sets = []
+            in_doubt = yield from self._extend_and_tell(target)
+            if self.has_budget and self._draw_neighbours():
+                in_doubt = yield from self._extend_and_tell(target)
+            if not self.sets:
                 return
-            in_doubt = yield from self._tell_sets()
             if not in_doubt and all(one.stability in (ATTRACTS, NEUTRAL) for one in self.sets):
                 self.ran_out = False  # the budget ended, but it was enough
             if not in_doubt or not self.has_budget:
                 return
             target = 2 * max(c.length for c in self.courses if c.goes_on)
+
+    def _extend_and_tell(self, target: int) -> Work[bool]:
+        """Extend the trajectories and describe the sets on which they stay. Return whether a set is in doubt."""
+        yield from self._extend(target)
+        if any(course.goes_on for course in self.courses):
+            return (yield from self._tell_sets())
+        self.sets = []
+        return False
 
     def conclude(self) -> Work[None]:
         """Describe the sets again if their trajectories were integrated further since the last description."""
@@ -238,6 +260,8 @@ class _Extension:
         if least < target:
             return False
         longest = stability.TIMES_LONGEST * self._longest_transient()
+        if any(course.is_neighbour for course in going):
+            return least >= longest
         at_risk = float(sum(course.length for course in going))
         return least >= longest or lifetime_interval(0, at_risk)[0] >= longest
 
@@ -340,6 +364,25 @@ class _Extension:
             if np.isfinite(state).all():
                 own[i].state, own[i].step = state, 0.0
 
+    def _draw_neighbours(self) -> bool:
+        """Draw neighbours of the cells on each chaotic set with too few cells; return whether any were drawn."""
+        random, scales = np.random.default_rng(0), np.asarray(self.geometry.scales)
+        n_before = len(self.courses)
+        for one in self.sets:
+            if one.kind != CHAOTIC_SET or one.stability != NOT_SETTLED:
+                continue
+            on_set = [course for course in self.courses if course.goes_on and course.cell in one.cells]
+            for i in range(self.paths - len(on_set)):
+                near = on_set[i % len(on_set)]
+                aside = ASIDE * random.uniform(-1.0, 1.0, len(scales)) * scales
+                self.courses.append(Course(near.cell, near.key, near.kept, near.state + aside, is_neighbour=True))
+        return len(self.courses) > n_before
+
+    def _are_enough(self, own: Sequence[Course]) -> bool:
+        """Return whether the trajectories on a chaotic set, neighbours included, are enough to say that it attracts."""
+        stayed = not any(course.is_neighbour for course in own) or self._has_stayed(own, LEAST_STAY)
+        return len(own) >= self.paths and stayed
+
     # ---- sets ----------------------------------------------------------------------------------
 
     def _tell_sets(self) -> Work[bool]:
@@ -347,18 +390,39 @@ class _Extension:
         still uncertain.
         """
         going = [course for course in self.courses if course.goes_on]
-        has_stayed = bool(going[0].legs) and self._has_stayed(going, LEAST_STAY)
+        cells = [course for course in going if not course.is_neighbour]
+        has_stayed = bool(cells) and bool(cells[0].legs) and self._has_stayed(cells, LEAST_STAY)
         numbers, is_sure = group([c.stayed for c in going], self.geometry, self.settings.closure)
         groups = [
             [course for course, n in zip(going, numbers, strict=True) if n == k] for k in range(int(numbers.max()) + 1)
         ]
         gone = [] if has_stayed else [course for course in self.courses if course.has_left]
-        self.sets, in_doubt, self._told = [], not is_sure, self._lengths()
-        for own, left in self._with_those_left(groups, gone):
+        self._told = self._lengths()
+        parts = self._with_those_left(groups, gone)
+        sets = []
+        for own, left in parts:
             one = yield from describe(own, left, self.point, self.settings, has_stayed)
-            self.sets.append(one)
-            in_doubt |= one.stability == NOT_SETTLED
-        return in_doubt
+            if one.kind == CHAOTIC_SET and one.stability == ATTRACTS and not self._are_enough(own):
+                one = replace(one, stability=NOT_SETTLED, evidence=stability.BY_NOTHING)
+            sets.append(one)
+        self.sets = yield from self._joined(sets, [own for own, _ in parts], has_stayed)
+        return not is_sure or any(one.stability == NOT_SETTLED for one in self.sets)
+
+    def _joined(self, sets: list[BoundedSet], owns: list[list[Course]], has_stayed: bool) -> Work[list[BoundedSet]]:
+        """Join the tori that are one: the points of each trajectory on it may lie on a curve of its own."""
+        k = 0
+        while k < len(sets):
+            for i in range(k):
+                attract = sets[i].stability == sets[k].stability == ATTRACTS
+                alike = sets[i].dimension == sets[k].dimension >= 2
+                if attract and alike and (yield from is_one_torus(owns[i][0], owns[k][0], self.geometry)):
+                    owns[i] += owns.pop(k)
+                    sets.pop(k)
+                    sets[i] = yield from describe(owns[i], [], self.point, self.settings, has_stayed)
+                    break
+            else:
+                k += 1
+        return sets
 
     def _with_those_left(
         self, groups: Sequence[list[Course]], gone: Sequence[Course]

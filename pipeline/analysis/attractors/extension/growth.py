@@ -68,6 +68,9 @@ class Growth:
         Mean change of the logarithm of a volume along the flow, and its standard error (`_mean`).
     length : int
         Number of sections of each cell.
+    n_zero : int
+        Number of exponents that are 0 within their interval, those that are 0 by construction included; -1 unless all
+        others are negative beyond doubt.
     """
 
     rate: float
@@ -78,6 +81,7 @@ class Growth:
     volume: float
     volume_error: float
     length: int
+    n_zero: int
 
     @property
     def is_chaotic(self) -> bool:
@@ -147,7 +151,25 @@ def growth_of(derivatives: np.ndarray, n_known: int, volumes: np.ndarray) -> Gro
         volume,
         volume_error,
         n,
+        _n_zero(steps),
     )
+
+
+def _n_zero(steps: np.ndarray) -> int:
+    """Count the exponents that are 0 within their interval, from logarithms of growth (cell, section, state).
+
+    Return -1 if one of the others is not negative beyond doubt.
+    """
+    n, n_zero = steps.shape[1], 0
+    # a shear grows in proportion to time
+    most = 2.0 + np.log(n)
+    for own in np.moveaxis(steps, -1, 0):
+        rate, error = _mean(own)
+        if abs(rate) <= N_SIGMA * error + ZERO and abs(rate) * n <= most:
+            n_zero += 1
+        elif rate + N_SIGMA * error >= 0.0 or rate * n > -GROWN:
+            return -1
+    return n_zero
 
 
 def _mean(values: np.ndarray) -> tuple[float, float]:

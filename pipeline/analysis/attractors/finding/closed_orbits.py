@@ -216,7 +216,7 @@ def _polished(
     order.
     """
     found = polish_orbits(packed, frequency, points, period, tolerance=tolerance, system=system)
-    orbits = [_orbit_of(found, row) if found.converged[row] else None for row in range(len(points))]
+    orbits = [orbit_of(found, row) if found.converged[row] else None for row in range(len(points))]
     least = {row: _rolled(one.points, geometry)[0] for row, one in enumerate(orbits) if one is not None}
     rows = [row for row, point in least.items() if (point != orbits[row].points[0]).any()]  # type: ignore[union-attr]
     if rows:
@@ -225,11 +225,12 @@ def _polished(
             packed[rows], frequency[rows], starts, found.orbit_period[rows], tolerance=tolerance, system=system
         )
         for i, row in enumerate(rows):
-            orbits[row] = _orbit_of(again, i) if again.converged[i] else None
+            orbits[row] = orbit_of(again, i) if again.converged[i] else None
     return orbits
 
 
-def _orbit_of(found: PeriodicOrbits, row: int) -> Orbit:
+def orbit_of(found: PeriodicOrbits, row: int) -> Orbit:
+    """Return a row of orbits that Newton's method found."""
     return Orbit(
         found.points[row, : found.orbit_period[row]],
         found.multipliers[row],

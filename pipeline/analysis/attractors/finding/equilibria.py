@@ -78,9 +78,9 @@ def _waited(point: Point, states: np.ndarray) -> np.ndarray:
     states, system = states.copy(), point.integrates
     far = np.flatnonzero(np.isfinite(states).all(axis=1))
     for _ in range(WAITS):
-        steps, _ = newton_steps(system, states[far], point.packed)
+        steps, _, vanishes = newton_steps(system, states[far], point.packed)
         away = np.abs(steps / np.asarray(system.scales)).max(axis=1, initial=0.0)
-        far = far[~(away <= 0.5 * NEAR_REST)]
+        far = far[~((away <= 0.5 * NEAR_REST) & vanishes)]
         if not len(far):
             break
         result = run_branches(
@@ -103,7 +103,7 @@ def _found(point: Point, states: np.ndarray, reach: np.ndarray, geometry: Geomet
     """Find the equilibria near the cells' last states by Newton's method, in canonical order."""
     if not len(states):
         return []
-    steps, _ = newton_steps(point.integrates, states, point.packed)
+    steps, _, _ = newton_steps(point.integrates, states, point.packed)
     length = np.abs(steps / np.asarray(geometry.scales)).max(axis=1, initial=0.0)
     # a state with a Newton step beyond twice its reach is unlikely to be within reach of an equilibrium
     near = np.flatnonzero(length <= 2.0 * reach)
@@ -214,7 +214,7 @@ def rest_of_orbit(point: Point, state: np.ndarray, geometry: Geometry) -> int | 
     """Return the index of the equilibrium to which a refined orbit has shrunk; None if the orbit has not shrunk to a
     point.
     """
-    steps, _ = newton_steps(point.integrates, state[None], point.packed)
+    steps, _, _ = newton_steps(point.integrates, state[None], point.packed)
     if not np.abs(steps / np.asarray(geometry.scales)).max() <= 10.0 * SAME_EQUILIBRIUM:
         return None
     for one in equilibria_near(point, state[None], geometry):

@@ -17,10 +17,12 @@ from magpend_core.engine.crossing import with_section
 from magpend_core.orbits import polish_orbits
 from magpend_core.pointwise import rates_at
 from magpend_core.sections import run_branches
+from pipeline.analysis.attractors.finding.closed_orbits import orbit_of
 from pipeline.analysis.attractors.finding.known_sets import Cycle
 from pipeline.analysis.attractors.finding.points import Point
 from pipeline.analysis.sets import Geometry, hashes
 from pipeline.analysis.tolerances import CROSSING_RTOL, SAME_RETURN
+from pipeline.layout.vocabulary import ATTRACTS
 
 RETURNS = 32
 """Most crossings of the level per period."""
@@ -66,7 +68,8 @@ class _Crossings:
             return None
         packed, rate = np.append(self._packed, level)[None], np.array([self._rate])
         found = polish_orbits(packed, rate, path[-1:], np.array([near[0] + 1]), tolerance=residual, system=self._system)
-        if not found.converged[0] or not found.is_stable[0]:
+        # one multiplier is 1, along the flow; with a second one the cycle lies in a family, and does not attract
+        if not found.converged[0] or orbit_of(found, 0).stability != ATTRACTS:
             return None
         own = found.multipliers[0][:-1]  # the last one is 0: the direction of the flow
         cycle = Cycle(float(found.seconds[0]), np.append(1.0 + 0.0j, own), float(found.residual[0]))
