@@ -139,7 +139,7 @@ def test_plot_basins__shading_by_time(grid):
     assert (ratio[plain[1, 2:] > 0.1] < 0.5).all()
     assert np.ptp(ratio[plain[1, 2:] > 0.2]) < 0.03
     assert np.allclose(shaded[2:, :2], plain[2:, :2])
-    assert "not settled, 6.2 %" in legend_texts(fig)
+    assert "not settled, 1 cell" in legend_texts(fig)
     assert [ax.get_xlabel() for ax in fig.axes if ax.get_gid() == "time"] == ["drive periods to converge"]
     assert fig.data["n_periods"].transpose(*GRID).values.tolist() == periods.values.tolist()
 
