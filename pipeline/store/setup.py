@@ -76,8 +76,8 @@ def _other_version(info: RunInfo, lines: list[str]) -> str:
     return (
         f"{info.name}: was begun by another version of magpend ({made}), and cells of two versions are not mixed in "
         "one run. Its finished cells stay, and this version opens, analyses and draws them: magpend status, analyse, "
-        f"plot or report {info.name}. To complete it, give the command again with that version; or compute all of it with this "
-        "one: --out ANOTHER_DIR. Differences:\n  " + "\n  ".join(lines)
+        f"plot or report {info.name}. To complete it, give the command again with that version; or compute all of it "
+        "with this one: --out ANOTHER_DIR. Differences:\n  " + "\n  ".join(lines)
     )
 
 
