@@ -100,7 +100,7 @@ def test_explore__is_a_method_of_a_run(little, widget):
 def test_explorer__says_what_is_missing(little, monkeypatch):
     monkeypatch.setitem(sys.modules, "anywidget", None)
     monkeypatch.delitem(sys.modules, "pipeline.explorer.notebook.widget", raising=False)
-    with pytest.raises(SpecError, match=r"pip install 'magpend\[notebook\]'"):
+    with pytest.raises(SpecError, match=r"pip install '\.\[notebook\]'"):
         explorer(little)
     with pytest.raises(SpecError, match="height = 100: must be 320 pixels or more"):
         explorer(little, height=100)

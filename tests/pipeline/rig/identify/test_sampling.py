@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import importlib.util
 import math
+import sys
 
 import numpy as np
 import pytest
@@ -180,8 +180,8 @@ def test_write_posterior__keeps_the_draws_for_runs(cycles):
 def test_sample_draws__names_the_remedy(cycles, monkeypatch):
     with pytest.raises(SpecError, match=r"--walkers = 5: must be even and at least 6"):
         sample_draws(cycles, 20, sampling=Sampling(n_walkers=5), echo=quiet)
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(SpecError, match=r"pip install 'magpend\[mcmc\]'"):
+    monkeypatch.setitem(sys.modules, "emcee", None)
+    with pytest.raises(SpecError, match=r"pip install '\.\[mcmc\]'"):
         sample_draws(cycles, 20, echo=quiet)
 
 
