@@ -33,6 +33,12 @@ from pipeline.layout.vocabulary import (
     TRANSIENT,
     section_attributes,
 )
+from pipeline.products.product import function_of
+from pipeline.products.registry import ANALYSES
+from pipeline.runs.derive import derive
+from pipeline.runs.run import run
+from pipeline.specification.problems import SpecError
+from tests.zoo.variants import write
 
 CIRCLE = {"on_circle": True}
 
@@ -149,6 +155,7 @@ def found_of(table, starts, *, crossing=None, frequency_hz=1.0, n_transient=200,
 # ---- turning is not resting --------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("table", "states", "is_rest"),
     [
@@ -166,6 +173,7 @@ def test_find_equilibria__every_rate_vanishes(table, states, is_rest):
     assert found.converged.tolist() == [is_rest]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("strobed", [False, True])
 @pytest.mark.parametrize(
     ("table", "starts", "of", "seconds", "multiplier"),
@@ -192,6 +200,7 @@ def test_identify__a_steady_rotation_is_a_limit_cycle(table, starts, of, seconds
 # ---- one state ---------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("e", [0.0, 1e-9])
 def test_identify__one_state_beside_a_ghost(e):
     """No direction is left beside the flow's own: nothing is settled, and nothing fails."""
@@ -204,6 +213,7 @@ def test_identify__one_state_beside_a_ghost(e):
 # ---- a multiplier of 1 is not attraction -------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("section", [{"frequency_hz": 0.3}, {"crossing": Crossing("x0", 0.0, longest=50.0)}])
 @pytest.mark.parametrize(("rates", "n"), [((1.0, 1.0), 1), ((1.0, 1.0), 4), (RATES, 4)])
 def test_identify__oscillators_without_coupling_are_one_torus(rates, n, section):
@@ -216,6 +226,7 @@ def test_identify__oscillators_without_coupling_are_one_torus(rates, n, section)
     assert found["n_cells"].values.tolist() == [n]
 
 
+@pytest.mark.slow
 def test_identify__tori_that_turn_against_each_other_are_two():
     """The ranges of all states are equal, and so are the exponents: x**2 + y**2 = 1 in both."""
     own = oscillators(1.0, 1.0)
@@ -231,6 +242,7 @@ def test_identify__tori_that_turn_against_each_other_are_two():
     assert ids[0] == ids[2] != ids[1] == ids[3]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("strobed", [False, True])
 @pytest.mark.parametrize(
     ("table", "of", "level", "starts"),
@@ -326,6 +338,7 @@ def test_extend__one_long_life_is_no_attraction():
     assert one.n_left >= 4
 
 
+@pytest.mark.slow
 def test_extend__neighbours_of_one_cell_show_that_a_set_attracts():
     """They stay for ten times the run, each; a tenth of the budget shows too little, more of it more."""
     least = [0.0, 0.0, 0.0]
@@ -339,3 +352,37 @@ def test_extend__neighbours_of_one_cell_show_that_a_set_attracts():
         least[i] = one.time_at_risk
     assert least[1] >= 8 * 10 * 2000
     assert least[2] >= 2 * least[1]
+
+
+# ---- every analysis ends in a table or in a sentence -------------------------------------------
+
+CORNERS = {
+    "approached for ever": ({"x": {}}, {"x": "-x**2"}, [[1.0]]),
+    "all diverged": ({"x": {"escape": 5.0}}, {"x": "x"}, [[1.0], [0.5]]),
+    "all at rest": ({"x": {}}, {"x": "-x"}, [[0.0], [0.0]]),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CORNERS)
+def test_derive__every_analysis_of_a_corner_case(name, tmp_path):
+    """One state, one cell, no closed cell, all diverged, all at rest."""
+    states, equations, starts = CORNERS[name]
+    spec = {
+        "kind": "sweep",
+        "model": {"name": "corner", "states": states, "parameters": {"a": 1.0}, "equations": equations},
+        "parameters": {"frequency_hz": 1.0},
+        "initial_conditions": {"kind": "list", "points": starts},
+        "integration": {"n_transient": 50, "n_keep": 16},
+    }
+    run(write(spec, tmp_path), tmp_path / "run", workers=0, echo=lambda _: None)
+    shown = []
+    for analysis in ANALYSES:
+        try:
+            found = derive(tmp_path / "run", analysis)
+        except SpecError:  # a sentence: the analysis needs an option, or another kind of run
+            continue
+        if ANALYSES[analysis].table:
+            assert function_of(ANALYSES[analysis].table)(found).lines, analysis
+            shown.append(analysis)
+    assert {"attractors", "basins", "settling", "chaos"} <= set(shown)
