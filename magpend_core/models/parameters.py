@@ -7,7 +7,7 @@ that an override or a sweep axis needs the bare name only.
 from __future__ import annotations
 
 import difflib
-import math
+import sys
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -21,6 +21,7 @@ POSITIVE = "greater than 0"
 NON_NEGATIVE = "0 or greater"
 FRACTION = "between 0 and 1, both excluded"
 FINITE = "a finite number"
+LARGEST = sys.float_info.max
 
 BOUNDS: dict[str, Callable[[float], bool]] = {
     POSITIVE: lambda x: x > 0.0,
@@ -69,7 +70,7 @@ class Parameter:
         wanted = self.bound if self.bound == FINITE else f"a number {self.bound}"
         if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
             return f"{self.name} = {value!r} is not a number; give {wanted}."
-        if not math.isfinite(value):
+        if not abs(value) <= LARGEST:  # NaN, infinities, and whole numbers that no float holds
             return f"{self.name} = {value!r} is not finite; give {wanted}."
         if not BOUNDS[self.bound](float(value)):
             return f"{self.name} = {value!r} is out of bounds: it must be {self.bound}."
