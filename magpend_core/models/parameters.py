@@ -7,6 +7,7 @@ that an override or a sweep axis needs the bare name only.
 from __future__ import annotations
 
 import difflib
+import math
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -70,7 +71,7 @@ class Parameter:
         wanted = self.bound if self.bound == FINITE else f"a number {self.bound}"
         if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
             return f"{self.name} = {value!r} is not a number; give {wanted}."
-        if not abs(value) <= LARGEST:  # NaN, infinities, and whole numbers that no float holds
+        if (isinstance(value, int) and abs(value) > LARGEST) or not math.isfinite(value):
             return f"{self.name} = {value!r} is not finite; give {wanted}."
         if not BOUNDS[self.bound](float(value)):
             return f"{self.name} = {value!r} is out of bounds: it must be {self.bound}."
