@@ -6,12 +6,14 @@ Needs nothing but numpy; takes milliseconds, whatever is given.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from typing import Any
 
 from magpend_core.models.model import Quantity, State
 from magpend_core.models.parameters import FINITE, FRACTION, NON_NEGATIVE, POSITIVE, Parameter, near_names
 from magpend_core.models.text.definition import Definition, Impact
 from magpend_core.models.text.grammar import Tree, names
+from magpend_core.models.text.latex import symbol_of
 from magpend_core.models.text.scene import mirror_problem
 from magpend_core.models.text.tables import shown
 from magpend_core.models.text.views import MAX_OTHERS, MAX_PARAMETERS, ViewsReader
@@ -219,7 +221,7 @@ class _Reading(ViewsReader):
                 continue
             trees[name] = self.expression(table[name], self.at("equations", name), self.known)
         found = {name: tree for name, tree in trees.items() if tree is not None}
-        return tuple(_with_rate(s, found.get(s.name), own) for s in states), found
+        return _with_dots([_with_rate(s, found.get(s.name), own) for s in states]), found
 
     def _quantities(self, given: Any) -> tuple[tuple[Quantity, ...], dict[str, Tree]]:
         described, trees = [], {}
@@ -299,6 +301,17 @@ def _with_rate(state: State, tree: Tree | None, states: Iterable[str]) -> State:
     if tree is None or tree.kind != "name" or str(tree.value) not in states or tree.value == state.name:
         return state
     return State(**{**vars(state), "rate": str(tree.value)})
+
+
+def _with_dots(states: list[State]) -> tuple[State, ...]:
+    """Give each state that is named as the rate of another (x_dot, xdot, dx or v of x) a symbol with a dot."""
+    symbols = {s.name: s.symbol for s in states if s.symbol}
+    for one in states:
+        names = (f"{one.name}_dot", f"{one.name}dot", f"d{one.name}", "v", one.name.replace("_dot", "_ddot"))
+        if one.rate in names and one.rate not in symbols:
+            head, mark, index = symbol_of(one.name, symbols).partition("_")
+            symbols[one.rate] = rf"\dot{{{head}}}{mark}{index}"
+    return tuple(replace(s, symbol=symbols.get(s.name, "")) for s in states)
 
 
 def _plain(value: Any) -> Any:

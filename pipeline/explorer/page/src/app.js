@@ -85,6 +85,8 @@ function build(source, host, view, messages, page) {
       legend.setPresent(data);
       messages.facts.textContent = factsOf(view, count, data, attrs);
       messages.say(messages.facts.textContent);
+      // their horizontal axis is the diagram's, which is known only now
+      curves.repaint();
     },
   };
   const diagram = new Diagram(state, source, view, reader, host.wheelAlways);

@@ -68,7 +68,7 @@ def problems_of(table):
 
 def test_read_model__fills_in_what_a_short_text_leaves_out():
     model = read_model(DUFFING)
-    assert model.states == (State("x", "m", "x", escape=1e9, rate="v"), State("v", "m/s", "v", escape=1e9))
+    assert model.states == (State("x", "m", "x", escape=1e9, rate="v"), State("v", "m/s", "v", r"\dot{x}", escape=1e9))
     assert [(p.name, p.unit, p.meaning) for p in model.parameters] == [("d", "1", "d"), ("A", "N", "amplitude")]
     assert dict(model.load()) == {"d": 0.08, "A": 0.2}
     assert model.preset_names == ("default",)
