@@ -108,7 +108,7 @@ def test_open_run__stranger_s_text_is_one_error(stored, tmp_path, main, text):
         started = time.perf_counter()
         code, _, said = main(*call, tmp_path / "run")
         assert time.perf_counter() - started < 120
-        assert code == 2
+        assert code == 5
         assert "model.equations.v" in said
         assert "Traceback" not in said
     assert not (tmp_path / "pwned").exists()
@@ -147,7 +147,7 @@ def test_open_run__stranger_s_object_is_never_imported(own, stored, tmp_path, ma
     assert "--import-model trap:MINE" in said
     for form in ("trap:MINE", "shared.toml"):  # a name where a run keeps a whole
         rewritten(stored, lambda spec, form=form: spec.update(model=form))
-        assert main("status", stored)[0] == 2
+        assert main("status", stored)[0] == 5
     assert not trace.exists()
     assert "trap" not in sys.modules
     code, _, said = main("status", stored, "--import-model", "trap:MINE")

@@ -90,7 +90,7 @@ def test_complete__what_is_given_stays():
         ({}, []),
         (
             {"cores": 4, "walltime": "01:00:00"},
-            ["2 h 30 min on 4 cores, and the job ends after 60 min: send it about 3 times", "--job max_jobs=6"],
+            ["2 h 30 min on 4 cores, and the job ends after 60 min: send it about 3 times", "--job max_jobs=5"],
         ),
         (
             {"walltime": "02:00:00", "cores": 40, "memory": "80 GB"},

@@ -131,12 +131,10 @@ def test_load_spec__smoke_replaces_leaves(write_spec, sweep_text, form):
     assert (small.integration.n_transient, small.integration.n_keep) == (0, 3)
 
 
-def test_load_spec__bad_or_no_smoke(write_spec, sweep_text):
+def test_load_spec__bad_smoke(write_spec, sweep_text):
     path = write_spec(f"{sweep_text}\n[smoke]\nintegration.n_kep = 0\n")
     with pytest.raises(SpecError, match=r"with \[smoke\]: integration.n_kep.*n_keep"):
         load_spec(path)
-    with pytest.raises(SpecError, match=r"no \[smoke\] table"):
-        load_spec(write_spec(sweep_text), smoke=True)
 
 
 def test_range__values_are_the_decimals_a_person_would_write():
