@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import difflib
 import math
+import reprlib
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -70,11 +71,11 @@ class Parameter:
         """Return an error sentence if a value is not allowed for this parameter, else None."""
         wanted = self.bound if self.bound == FINITE else f"a number {self.bound}"
         if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
-            return f"{self.name} = {value!r} is not a number; give {wanted}."
+            return f"{self.name} = {reprlib.repr(value)} is not a number; give {wanted}."
         if (isinstance(value, int) and abs(value) > LARGEST) or not math.isfinite(value):
-            return f"{self.name} = {value!r} is not finite; give {wanted}."
+            return f"{self.name} = {reprlib.repr(value)} is not finite; give {wanted}."
         if not BOUNDS[self.bound](float(value)):
-            return f"{self.name} = {value!r} is out of bounds: it must be {self.bound}."
+            return f"{self.name} = {reprlib.repr(value)} is out of bounds: it must be {self.bound}."
         return None
 
 

@@ -1,8 +1,5 @@
 """Published basins, through the engine's and the analyses' public functions: Duffing, a pendulum."""
 
-import importlib
-from pathlib import Path
-
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -13,6 +10,7 @@ from pipeline.analysis.attractors.attractors import identify
 from pipeline.analysis.basins.numbers import basin_fractions
 from pipeline.layout.vocabulary import ABSENT, PERIODIC_ORBIT
 
+from . import torque_pendulum as bench
 from .cubes import cube_of, integrated
 
 UNIT_FREQUENCY = 1.0 / TWO_PI  # forcing cos t
@@ -97,15 +95,7 @@ REST_FRACTIONS = [1.0, 0.483, 0.327, 0.238, 0.147, 0.065, 0.007]
 """Of the pendulum with constant torque, recomputed after bSTAB's first case; each +- .02."""
 
 
-@pytest.fixture(scope="module")
-def bench():
-    """The benchmark that defines the pendulum."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(Path(__file__).parents[2] / "bench")
-        return importlib.import_module("multistable_pendulum")
-
-
-def rest_fraction(bench, torques, n):
+def rest_fraction(torques, n):
     """Fractions of rest on n x n starts, and what `identify` found."""
     rest = np.arcsin(0.5)
     starts = grid(n, (rest - np.pi, rest + np.pi), (-10.0, 10.0))
@@ -138,23 +128,23 @@ def rest_fraction(bench, torques, n):
     return basin_fractions(label, dims=("initial_condition",), ids=(0, 1)), found
 
 
-def test_basin_fractions__rest_against_torque_as_published(bench):
-    fractions, found = rest_fraction(bench, TORQUES, 40)
+def test_basin_fractions__rest_against_torque_as_published():
+    fractions, found = rest_fraction(TORQUES, 40)
     assert fractions["fraction"].sel(label=0).values == pytest.approx(REST_FRACTIONS, abs=0.02)
     # below 4 damping/pi (to first order) no rotation lasts; above, there is rest and rotation
     turns = (np.abs(found["rotation"].isel(angle=0)) > 0.1).any("attractor")
     assert turns.values.tolist() == [False, True, True, True, True, True, True]
 
 
-def test_basin_fractions__rest_at_torque_one_half_as_published(bench):
-    fractions, found = rest_fraction(bench, np.array([0.5]), 60)
+def test_basin_fractions__rest_at_torque_one_half_as_published():
+    fractions, found = rest_fraction(np.array([0.5]), 60)
     assert fractions["fraction"].sel(label=0).item() == pytest.approx(0.152, abs=0.008)
     at_rest = found.isel(torque=0, attractor=found["kind"].values[0].argmin())
     assert at_rest["attractor_points"].values[0] == pytest.approx([np.arcsin(0.5), 0.0], abs=1e-5)
 
 
 @pytest.mark.parametrize("torque", [0.2, 0.5])
-def test_regions__rotation_begins_at_the_unstable_manifold(bench, torque):
+def test_regions__rotation_begins_at_the_unstable_manifold(torque):
     """Speed over angle from the saddle on, d(w^2/2)/d(angle) = torque - damping w - sin(angle)."""
     saddle = np.pi - np.arcsin(torque) - TWO_PI
     slope = -0.05 + np.sqrt(0.05**2 + np.sqrt(1.0 - torque**2))  # the saddle's larger eigenvalue
@@ -173,7 +163,7 @@ def test_regions__rotation_begins_at_the_unstable_manifold(bench, torque):
         assert ((label == bench.ROTATION) == (shift > 0.0)).all()
 
 
-def test_regions__certain_states_go_there(bench):
+def test_regions__certain_states_go_there():
     """What the two regions promise, against scipy; and they leave room for the boundary alone."""
     regions = bench.Regions.of(bench.TORQUE)
     starts = bench.draw_starts(300, seed=5)
