@@ -149,6 +149,7 @@ def runs(call, day):
     return after
 
 
+@pytest.mark.slow
 def test_cube__has_the_models_own_names(runs, day):
     assert "complete" in runs("status", "sweep")[0]
     ds = magpend.open_run(day / "sweep")
@@ -169,6 +170,7 @@ def test_simulate(call, day):
     assert "energy_J_per_kg" in rows[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in COMMANDS if name not in ELSEWHERE])
 def test_analyse(runs, name):
     """Prints a table for people, and the same for programs."""
@@ -202,6 +204,7 @@ def drawn(runs, outputs):
     return draw
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("words", PICTURES)
 def test_plot(drawn, day, words):
     """Draws a figure; the data beside it say what it shows and how it is drawn, which gives the same again."""

@@ -85,6 +85,7 @@ def test_plots__have_each_figure_with_the_defaults_of_its_options(name):
     assert found == declared(FIGURES[name].options, ("out", "format"))
 
 
+@pytest.mark.slow
 def test_generated__is_up_to_date():
     """Mended by: python -m pipeline.cli.reference."""
     assert list(reference.stale()) == []
@@ -102,6 +103,7 @@ def test_reference__check_fails_for_stale_methods(monkeypatch, capsys):
     assert "out of date: pipeline/face/magpend/__init__.pyi" in printed
 
 
+@pytest.mark.slow
 def test_run__function_returns_the_run_with_methods(run):
     assert type(run) is magpend.Run
     assert magpend.Run.open(run) is run
@@ -116,6 +118,7 @@ def test_run__function_returns_the_run_with_methods(run):
 # ---- analyses and tables ------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_attractors__options_reach_the_command_and_the_method_alike(run, command, tmp_path):
     words = ("--no-connect", "--threshold", "0.01", "--csv", "found.csv")
     command(tmp_path, "analyse", "attractors", str(run.directory), *words)
@@ -133,6 +136,7 @@ def test_attractors__options_reach_the_command_and_the_method_alike(run, command
         run.table("atractors")
 
 
+@pytest.mark.slow
 def test_extend__opens_the_wider_run(run, tmp_path):
     more = run.extend(out=tmp_path / "more", starts=3, workers=0, echo=lambda _: None)
     assert type(more) is magpend.Run
@@ -163,6 +167,7 @@ def points_of(ax):
 AT = {"at": {"frequency_hz": 0.2}}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "options"), [("bifurcation", {"state": "v"}), ("attractors", {}), ("section", AT), ("fractions", {})]
 )
@@ -184,6 +189,7 @@ def test_plot__draws_into_the_given_axes_alone(run, name, options):
     figure.canvas.draw()
 
 
+@pytest.mark.slow
 def test_plot__makes_a_figure_of_pyplot_that_holds_its_data(run):
     ax = run.plot.bifurcation()
     assert plt.gcf() is ax.figure
@@ -222,6 +228,7 @@ def test_plot__refuses_a_place_that_does_not_fit(run):
     assert TARGET.get() is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["bifurcation", "lyapunov", "convergence", "gallery", "attractors"])
 def test_guest_figure__keeps_nothing_for_itself(run, name, monkeypatch):
     """What is not passed on to the caller's figure would not be seen."""
@@ -237,6 +244,7 @@ def test_guest_figure__keeps_nothing_for_itself(run, name, monkeypatch):
     assert figure.axes
 
 
+@pytest.mark.slow
 def test_plot__shows_absent_cells_below_the_given_axes(run):
     cube = run.cube().load()
     cube["status"][0] = 0
@@ -249,6 +257,7 @@ def test_plot__shows_absent_cells_below_the_given_axes(run):
     assert len(whole.figure.axes) == 2
 
 
+@pytest.mark.slow
 def test_plot__counts_points_on_pixels_as_fine_as_in_files(run, monkeypatch):
     """The image of many points does not depend on the resolution of the screen."""
     monkeypatch.setattr(pixels, "MARKER_LIMIT", 0)
@@ -297,6 +306,7 @@ def test_accessor__refuses_wrong_datasets_in_a_sentence(run):
             wrong()
 
 
+@pytest.mark.slow
 def test_open_run__tree_has_what_is_kept_and_names_what_is_stale(run, tmp_path):
     shutil.copytree(run.directory, tmp_path / "copy", ignore=shutil.ignore_patterns("derived"))
     copy = magpend.Run.open(tmp_path / "copy")

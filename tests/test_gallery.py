@@ -92,6 +92,7 @@ def test_gallery__page_prints_the_verdicts(name, tmp_path, monkeypatch):
     assert sum(line.startswith(f"{name} ") for line in printed.splitlines()) == len(FIGURE[name].claims)
 
 
+@pytest.mark.slow
 def test_copies__a_page_links_to_its_copy_of_the_explorer(tmp_path, monkeypatch):
     build = program("docs/build.py")
     folder = build.copies(tmp_path / "gallery", ["ueda-coexisting"], smoke=True)

@@ -41,6 +41,7 @@ except SystemExit:
     pass"""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("code", "heavy"),
     [

@@ -61,6 +61,7 @@ def ds(directory):
         yield opened.load()
 
 
+@pytest.mark.slow
 def test_quickstart__complete(directory, ds):
     assert (directory / "figures" / "bifurcation_psi1.png").stat().st_size > 20_000
     assert set(np.unique(ds.status)) <= {Status.PERIODIC, Status.BOUNDED}
@@ -77,6 +78,7 @@ def differing(one: Path, other: Path) -> float:
     return float((shades > 32).mean())
 
 
+@pytest.mark.slow
 def test_quickstart__the_docs_show_this_run(directory):
     """The README's picture is what its command draws. An older kernel's differs in 7 % of its pixels."""
     made = directory / "figures" / "bifurcation_psi1.png"
@@ -127,6 +129,7 @@ def test_quickstart__chaos_period_2_and_period_1(ds):
     assert ((window == 1).mean("branch") > most).all()
 
 
+@pytest.mark.slow
 def test_plot__without_kernel(directory, tmp_path, command, monkeypatch):
     """The figure comes from the cube alone: with a kernel that raises, it is the other process's file."""
 

@@ -60,6 +60,7 @@ def commands():
                         yield page, words[1:]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("page", "words"), list(commands()), ids=lambda value: str(value))
 def test_docs__commands_and_options_exist(page, words):
     command = get_command(app)

@@ -58,6 +58,7 @@ def test_is_stale__tells_a_changed_picture(tmp_path):
     assert tutorials.is_stale(tmp_path / "gone.png", kept)
 
 
+@pytest.mark.slow
 def test_first_motion__is_what_its_command_draws(tmp_path, command):
     """The motion has closed, and the tutorial's picture shows it."""
     page = (ROOT / "docs" / "tutorials" / "first-diagram.md").read_text("utf-8")
@@ -79,6 +80,7 @@ def test_pictures__each_is_made_by_one_page_or_listed():
     assert not set(made) & listed
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["van-der-pol", "python-start"])
 def test_pictures__are_what_their_page_draws(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

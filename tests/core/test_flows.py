@@ -65,6 +65,7 @@ def test_polish_orbits__van_der_pol():
     assert found.multipliers[0, 0].imag == 0.0
 
 
+@pytest.mark.slow
 def test_polish_orbits__complex_multipliers():
     parameters = seen(PAIR, "y", mu=-0.1)
     found = polish(parameters, [[1.1, 0.0, 0.05, -0.02]])
@@ -147,6 +148,7 @@ def exponents(parameters, starts, n_periods, tolerance=1e-8):
     )
 
 
+@pytest.mark.slow
 def test_lyapunov_exponents__limit_cycle():
     """Per second, though returns count the periods: 0 along the flow, and the logarithm of the multiplier."""
     parameters = seen(VAN_DER_POL, "v", direction="down")

@@ -163,6 +163,7 @@ def test_lyapunov__standard_case_of_forty_states():
     assert (found.status == Status.BOUNDED).all()
 
 
+@pytest.mark.slow
 def test_jacobian__of_a_large_text_is_whole():
     model = flow(lorenz96(N))
     entries = model.system.jacobian_entries
@@ -226,6 +227,7 @@ def test_check_system__entries_of_the_jacobian(entries, words):
         check_system(system, *cell, jacobian=True)
 
 
+@pytest.mark.slow
 def test_lyapunov__a_system_of_two_states_may_declare_its_entries():
     options = {"n_transient": 1, "n_periods": 8, "n_blocks": 2, "system": CHAIN}
     found = lyapunov_exponents(np.zeros((1, 0)), np.ones(1), np.array([[0.3, 0.2]]), **options)

@@ -54,6 +54,7 @@ def test_linear_oscillator__exponents_are_half_the_damping():
     assert (found.exponents[:, 0] >= found.exponents[:, 1]).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", [0, 1])
 def test_lyapunov__reference_spectra(preset, reference, case):
     expected = reference("lyapunov")[case]
@@ -69,6 +70,7 @@ def test_lyapunov__reference_spectra(preset, reference, case):
     assert (np.abs(found.exponents.mean(axis=0) - expected["lyapunov_per_s"]) < 3.0 * errors).all()
 
 
+@pytest.mark.slow
 def test_lyapunov__on_closed_orbits_the_logarithms_of_the_multipliers(preset, reference):
     orbits = reference("orbits")
     points = np.array([orbit["section"] for orbit in orbits])
@@ -87,6 +89,7 @@ def test_lyapunov__on_closed_orbits_the_logarithms_of_the_multipliers(preset, re
     assert (np.abs(found.exponents - expected) < 4.0 / 400 * frequency[:, None]).all()
 
 
+@pytest.mark.slow
 def test_lyapunov__like_a_qr_of_the_period_maps(preset):
     # the textbook recipe, on Jacobians of the stroboscopic map and numpy's QR
     # few periods: chaos separates the two computations
@@ -113,6 +116,7 @@ def mixed(preset):
     return packed(preset, 18), frequency, states, {"n_transient": 20, "n_periods": 32, "n_blocks": 4}
 
 
+@pytest.mark.slow
 def test_lyapunov__sum_is_the_divergence(mixed):
     found = lyapunov_exponents(*mixed[:3], rtol=1e-10, atol=1e-10, **mixed[3])
     missing = np.abs(found.exponents.sum(axis=1) - found.divergence)
@@ -121,6 +125,7 @@ def test_lyapunov__sum_is_the_divergence(mixed):
     assert found.loss.max() < MOST_LOSS
 
 
+@pytest.mark.slow
 def test_lyapunov__a_cell_depends_on_itself_alone(mixed):
     parameters, frequency, states, options = mixed
     together = lyapunov_exponents(parameters, frequency, states, n_lanes=16, **options)
@@ -168,6 +173,7 @@ def test_lyapunov__rows_that_do_not_agree(preset):
         lyapunov_exponents(packed(preset, 1), np.array([2.2, 2.3]), np.zeros((1, 4)))
 
 
+@pytest.mark.slow
 def test_lyapunov__of_a_stiff_rest(preset):
     # without the drive the pendulum comes to rest, where friction decays at 1800 /s: the steps must not
     # outgrow that, though the trajectory would allow it

@@ -122,6 +122,7 @@ def errors_of(kind: str, reference: Callable[[int, int], np.ndarray], steps: tup
     return strong, weak
 
 
+@pytest.mark.slow
 def test_noisy_sections__additive_noise_has_strong_order_three_halves() -> None:
     strong, weak = errors_of("ou", lambda n, k: ou_reference(n, k, 1.0), (4, 8, 16, 32), 4000)
     assert slope_of(strong) > 1.4
@@ -129,6 +130,7 @@ def test_noisy_sections__additive_noise_has_strong_order_three_halves() -> None:
     assert strong[-1] < 2e-4  # of a standard deviation of .4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["ito", "stratonovich"])
 def test_noisy_sections__multiplicative_noise_has_strong_order_one(kind: str) -> None:
     strong, weak = errors_of(kind, lambda n, k: gbm_reference(kind, n, k, 1.0), (16, 32, 64, 128), 4000)
@@ -151,6 +153,7 @@ def test_noisy_sections__order_holds_for_a_nonlinear_equation() -> None:
     assert slope_of(errors) > 1.4
 
 
+@pytest.mark.slow
 def test_noisy_sections__strength_of_a_state_without_noise() -> None:
     # dv = (-x - d v) dt + s x dW, dx = v dt: Ito and Stratonovich agree, and the order is that of additive noise
     errors = [float(np.median(run("shaken", 2000, k, [1.0, 0.0]).strong_error)) for k in (4, 8, 16, 32)]
@@ -170,6 +173,7 @@ def test_parameters__with_noise_can_be_pickled() -> None:
     assert pickle.loads(pickle.dumps(parameters)) == parameters
 
 
+@pytest.mark.slow
 def test_noisy_sections__oscillator_has_the_closed_covariance() -> None:
     # x'' + .2 x' + 2 x = cos t + .1 xi: Lyapunov's equation gives var x = .01/(2 .2 2), var v = .01/(2 .2), cov 0
     found = run("oscillator", 20_000, 64, [0.96, 0.19], hz=1 / (2 * math.pi), n_transient=12, checks_step=False)

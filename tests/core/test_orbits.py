@@ -93,6 +93,7 @@ def test_section_map__a_number_of_periods_for_each_row(packed, reference):
         assert (found.derivatives[row] == alone.derivatives[0]).all()
 
 
+@pytest.mark.slow
 def test_polish_orbits__points_and_derivative(packed, reference):
     """Orbits of several periods in one call, one of them from a multiple of its period."""
     points, frequency, _ = reference
@@ -110,6 +111,7 @@ def test_polish_orbits__points_and_derivative(packed, reference):
         assert np.abs(found.derivative[row] - derivatives[0]).max() < 1e-6
 
 
+@pytest.mark.slow
 def test_with_tangents__trajectory_unchanged():
     """Tangents stay out of the error control: same steps, same states."""
     arguments = {"n_transient": 0, "n_keep": 5, "rtol": 1e-8, "atol": 1e-8}

@@ -6,6 +6,7 @@ import magpend_core
 from magpend_core.source_digests import kernel_version, meaning_digest
 
 
+@pytest.mark.slow
 def test_import__leaves_the_compiler_out(run_python):
     script = (
         "import sys, magpend_core\n"
@@ -28,6 +29,7 @@ def test_package__has_all_its_names_and_no_other():
         _ = magpend_core.section
 
 
+@pytest.mark.slow
 def test_package__functions_are_not_hidden_by_modules_of_their_name(run_python):
     script = (
         "import magpend_core.sections, magpend_core.trajectory\n"
@@ -113,6 +115,7 @@ def version_after(run_python, copied, name, old, new):
     return run_python("from magpend_core import kernel_version; print(kernel_version())", package=copied).strip()
 
 
+@pytest.mark.slow
 def test_kernel_version__follows_the_engines_meaning(run_python, copied):
     edited = version_after(run_python, copied, "engine/lanes.py", "# accepted in this cell", "# so far")
     assert edited == kernel_version()

@@ -45,6 +45,7 @@ def states(n, rate=1.0, seed=1):
     return np.column_stack([rng.uniform(-1, 1, (n, 2)), rng.uniform(-rate, rate, (n, 2))])
 
 
+@pytest.mark.slow
 def test_recorded_sections__of_equal_periods_are_those_of_an_ordinary_run():
     """All numbers of cells that settle, and of some that begin by turning over."""
     start = np.vstack([states(12), states(4, rate=40.0)])
@@ -60,6 +61,7 @@ def test_recorded_sections__of_equal_periods_are_those_of_an_ordinary_run():
         np.testing.assert_array_equal(getattr(found, name), getattr(plain, name), err_msg=name)
 
 
+@pytest.mark.slow
 def test_recorded_sections__closes_where_an_ordinary_run_does():
     start, options = states(8), {"n_transient": 400, "n_keep": 4, "rtol": 1e-8, "atol": 1e-8}
     quiet = packed(8, load_preset(q=0.4))
@@ -70,6 +72,7 @@ def test_recorded_sections__closes_where_an_ordinary_run_does():
     np.testing.assert_array_equal(found.orbit_period, plain.orbit_period)
 
 
+@pytest.mark.slow
 def test_recorded_sections__jitter_closes_within_a_tolerance_that_allows_for_it():
     rng = np.random.default_rng(0)
     rising = np.arange(405) / HZ + 1e-5 * rng.standard_normal(405)
@@ -83,6 +86,7 @@ def test_recorded_sections__jitter_closes_within_a_tolerance_that_allows_for_it(
     assert (loose.orbit_period == 1).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("torque", [False, True], ids=["edges", "torque"])
 def test_recorded_sections__same_bits_in_any_chunks(torque):
     rising, falling = uneven_drive(9)
@@ -109,6 +113,7 @@ def test_recorded_sections__same_bits_in_any_chunks(torque):
             np.testing.assert_array_equal(getattr(other, name), getattr(found[0], name), err_msg=name)
 
 
+@pytest.mark.slow
 def test_recorded_sections__of_uneven_periods_against_another_integrator(pendulum_rhs):
     """Periods and duty cycles that differ, the model's own wave written out from Eq. 8."""
     model = load_model("pendulum-free")
@@ -139,6 +144,7 @@ def test_recorded_sections__of_uneven_periods_against_another_integrator(pendulu
     assert found.n_periods[0, 0] == 6
 
 
+@pytest.mark.slow
 def test_recorded_sections__of_a_torque_are_the_exact_response():
     """A linear oscillator, values joined by lines, sections at some of the samples."""
     times = np.linspace(0, 6, 241)
@@ -158,6 +164,7 @@ def test_recorded_sections__of_a_torque_are_the_exact_response():
     np.testing.assert_allclose(found.section[0, 0], exact[ends[1:] + 1], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_recorded_trajectory__of_the_models_own_torque_converges_to_the_ordinary_one():
     """Lines between samples of the drive: the error falls with the square of their distance."""
     from magpend_core import trajectory
@@ -229,6 +236,7 @@ def test_evaluate_recorded__of_edges_is_each_periods_own():
         np.testing.assert_allclose(found[inside], expected, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_evaluate_recorded__of_a_torque_is_the_torque():
     times = np.linspace(0, 2, 21)
     torque = np.random.default_rng(3).normal(size=21)

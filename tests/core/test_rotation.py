@@ -58,6 +58,7 @@ def rotation(text, states, turning, frequency, n_periods=200, orbit_period=None,
     )
 
 
+@pytest.mark.slow
 def test_angle__mean_rate():
     """th' = b - sin(th) turns at the mean rate sqrt(b^2 - 1), and backwards with -b."""
     for sign in (1.0, -1.0):
@@ -77,6 +78,7 @@ def test_weights__better_than_the_plain_mean():
     assert abs(short.rotation[0] - exact) < short.error[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("frequency", [0.02, 0.5, 3.1])
 def test_plane__turns_of_the_trajectory(frequency):
     """Turns about the centre of the circle: w / (2 pi f), clockwise; at .02 Hz there are many in a drive period."""

@@ -35,6 +35,7 @@ def test_sample__of_a_linear_oscillator_is_the_closed_form():
     assert found.status[0] == Status.BOUNDED
 
 
+@pytest.mark.slow
 def test_sample__does_not_depend_on_the_neighbours():
     """A trajectory has the same bits alone, among others and in any number of lanes."""
     states, times = some_states(37), [np.linspace(0, 3, 90), np.array([0.0, 0.1, 2.0])]
@@ -138,6 +139,7 @@ def test_with_parameter_tangent__of_a_linear_oscillator_is_the_closed_form():
     np.testing.assert_array_equal(found.states[0, :, :2], found.states[1, :, :2])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["e1", "mu", "c0", "q", "duty_cycle"])
 def test_with_parameter_tangent__is_that_of_differences(name):
     """Of the pendulum with load-dependent friction and a square wave: central differences, tightly."""

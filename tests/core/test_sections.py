@@ -30,6 +30,7 @@ def test_sections__agree_with_dop853_and_radau(preset, reference, k):
     assert np.max(abs(difference)) < 1e-8
 
 
+@pytest.mark.slow
 def test_sections__settle_on_the_orbits(preset, reference):
     # multipliers of modulus 0.96: 800 periods take 0.01 far below the tolerance
     orbits = reference("orbits")
@@ -42,6 +43,7 @@ def test_sections__settle_on_the_orbits(preset, reference):
     assert (found.turns == 0).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tolerance", [1e-4, 1e-6, 1e-8])
 def test_sections__stop_when_closed_is_within_the_tolerance_of_the_orbit(preset, reference, tolerance):
     orbits = reference("orbits")
@@ -75,6 +77,7 @@ def closed_at(preset, frequency, **options):
     return sections(preset, frequency, starts, **settings)
 
 
+@pytest.mark.slow
 def test_sections__period_2_at_2_48_hz(preset):
     # chaotic transients before some of them last hundreds of periods, and depend on the last bit
     found = closed_at(preset, 2.48, n_transient=3000)
@@ -86,6 +89,7 @@ def test_sections__period_2_at_2_48_hz(preset):
     assert (closed_at(preset, 2.48, max_orbit_period=1).orbit_period == 0).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("frequency", [2.03, 2.40])
 def test_sections__chaos_does_not_close(preset, frequency):
     found = closed_at(preset, frequency)
@@ -96,6 +100,7 @@ def test_sections__chaos_does_not_close(preset, frequency):
     assert np.ptp(found.section[..., 0]) > 0.05
 
 
+@pytest.mark.slow
 def test_sections__stop_when_closed_changes_nothing_where_nothing_closes(preset):
     early, late = closed_at(preset, 2.03), closed_at(preset, 2.03, stop_when_closed=False)
     assert early.section.tobytes() == late.section.tobytes()

@@ -30,6 +30,7 @@ def by_scipy(parameters, frequency, start, times):
     return states
 
 
+@pytest.mark.slow
 def test_trajectory__agrees_with_dop853(preset):
     times = np.sort(np.random.default_rng(0).uniform(0.0, 1.2 / FREQUENCY, 60))
     found = trajectory(preset, FREQUENCY, START, times, rtol=1e-11, atol=1e-11)
@@ -37,6 +38,7 @@ def test_trajectory__agrees_with_dop853(preset):
     assert np.max(abs(found - expected)) < 1e-7
 
 
+@pytest.mark.slow
 def test_trajectory__agrees_with_dop853_for_dipoles(dipoles):
     times = np.linspace(0.0, 0.6 / FREQUENCY, 20)
     found = trajectory(dipoles, FREQUENCY, START, times, rtol=1e-11, atol=1e-11)

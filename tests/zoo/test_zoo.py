@@ -22,6 +22,7 @@ from tests.zoo.running import outcome_of  # noqa: E402
 ANSWERS = {name: answers.load(name) for name in answers.names()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name, answer in ANSWERS.items() if answer.quick])
 def test_zoo__quick(name):
     outcome = outcome_of(name, variants.OWN)
@@ -29,6 +30,7 @@ def test_zoo__quick(name):
     assert not outcome.verdict.wrong, (outcome.verdict.wrong, outcome.found)
 
 
+@pytest.mark.slow
 def test_zoo__systems_have_a_source_and_valid_specifications_that_vary_in_one_thing(tmp_path):
     from pipeline.specification.parsing import load_spec
 

@@ -55,6 +55,7 @@ def test_check_system__finds_nothing_in_what_is_right(duffing, oscillator):
     assert found(oscillator, states=six) == []  # its Jacobian is not used
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", model_names())
 def test_check_system__finds_nothing_in_the_models_that_ship(name):
     model, rng = load_model(name), np.random.default_rng(3)
@@ -328,6 +329,7 @@ def test_check_system__comes_before_compiling(broken, monkeypatch):
         )
 
 
+@pytest.mark.slow
 def test_check_system__is_asked_by_trajectory(monkeypatch):
     asked = []
     module = importlib.import_module("magpend_core.sampling")

@@ -74,6 +74,7 @@ def test_keep__an_entry_is_read_again(cache):
     assert [path.suffix for path in cache.rglob("*") if path.is_file()] == [".nbc"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n", [pytest.param(120 if LONG else 28, id="damages")])
 def test_keep__damaged_entries_are_compiled_again(cache, caplog, n):
     value = called()[0]
@@ -204,6 +205,7 @@ for word in sys.argv[1]:
 """
 
 
+@pytest.mark.slow
 def test_keep__two_processes_that_write_at_once(tmp_path):
     """Each signature has a file of its own, so that none is taken for another."""
     script = tmp_path / "script.py"

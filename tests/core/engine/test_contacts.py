@@ -121,6 +121,7 @@ class ExactBall:
         return phase
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ratio", [1.15, 1.7, 1.9, 2.15])
 @pytest.mark.parametrize("start", [(0.004, 0.1), (0.0012, -0.3)])
 def test_stick__is_that_of_closed_forms(ball, ratio, start):
@@ -131,6 +132,7 @@ def test_stick__is_that_of_closed_forms(ball, ratio, start):
     assert found.section[0] == pytest.approx(exact, rel=0, abs=1e-9)
 
 
+@pytest.mark.slow
 def test_chatter__is_named_where_nothing_sticks():
     loose = {**BALL, "name": "ball-loose", "impacts": [{k: v for k, v in BALL["impacts"][0].items() if k != "stick"}]}
     found = sections(read_model(loose).load("default"), FREQUENCY, np.array([[0.004, 0.1]]), n_transient=0, n_keep=8)
@@ -169,6 +171,7 @@ def test_ball__one_impact_in_n_periods_begins_and_doubles_where_published(ball, 
         assert found.orbit_period.tolist() == [period]
 
 
+@pytest.mark.slow
 def test_load__that_lies_swings_with_its_carrier_and_leaves_where_it_weighs_nothing():
     """At rest on one another both masses are one on the spring, while the load pushes: y'' > -g."""
     model = read_model(LOAD)
@@ -200,6 +203,7 @@ def test_load__that_lies_swings_with_its_carrier_and_leaves_where_it_weighs_noth
     assert found[1, :3] == pytest.approx([*flown, swung], abs=1e-9)
 
 
+@pytest.mark.slow
 def test_derivatives__of_a_chattering_load_are_those_of_differences():
     """Through impacts without end, rest, and the end of rest."""
     model = read_model(LOAD)
@@ -227,6 +231,7 @@ def test_rest__goes_on_from_a_section_as_if_it_had_not_stopped(ball):
     assert whole.section[0, -1] == pytest.approx([0.0, 0.7 * EARTH / OMEGA], abs=1e-15)
 
 
+@pytest.mark.slow
 def test_force_that_jumps__lifts_at_its_edge():
     """A force that is on for half a period lifts a ball at rest at once; it flies on parabolas."""
     lifted = {

@@ -185,6 +185,7 @@ print(functions_digest(*PENDULUM_FITTED.functions))
 """
 
 
+@pytest.mark.slow
 def test_kernel__of_a_system_from_outside_is_kept_and_never_old(run_python, tmp_path):
     folder, seeds = tmp_path / "theirs", iter("1234")
     folder.mkdir()
@@ -228,6 +229,7 @@ assert engines[1] is engines[0]
 """
 
 
+@pytest.mark.slow
 def test_kernel__of_a_text_is_kept_and_its_parameters_values_compile_nothing(run_python):
     # where all tests keep theirs: others need this engine, and may have compiled it
     home = os.environ["MAGPEND_CACHE_DIR"]

@@ -81,6 +81,7 @@ def crossings_of(rhs, start, level, of, direction, time):
 VAN_DER_POL_PERIOD = 6.6632868593231301
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("direction", ["up", "down"])
 def test_section__of_van_der_pol_has_the_published_period(direction):
     found = returns(
@@ -111,6 +112,7 @@ def lorenz(t, y, sigma=10.0, rho=28.0, beta=8.0 / 3.0):
     return sigma * (y[1] - y[0]), y[0] * (rho - y[2]) - y[1], y[0] * y[1] - beta * y[2]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("rhs", "start", "of", "level", "direction"),
     [(rossler, [-3.0, -4.0, 0.1], 0, 0.0, -1), (lorenz, [-3.0, -4.0, 20.0], 2, 27.0, 1)],
@@ -126,6 +128,7 @@ def test_section__of_a_chaotic_flow_is_that_of_another_integrator(rhs, start, of
     assert abs(found.section[0, 0, :, of] - level).max() < 1e-14
 
 
+@pytest.mark.slow
 def test_section__of_an_angle_is_crossed_modulo_a_turn_and_one_way():
     # a rotor that turns over: th passes every level once a turn, backwards never
     torque, d, start, level = 1.6, 0.5, [0.3, 2.0], 2.5
@@ -258,6 +261,7 @@ def test_with_section__refuses(duffing):
         )
 
 
+@pytest.mark.slow
 def test_cubic__root_and_dip_are_those_of_numpy():
     rng = np.random.default_rng(8)
     a, b = rng.uniform(0.0, 1.0, 4000), rng.uniform(-1.0, 1.0, 4000)
@@ -376,6 +380,7 @@ def relay_exactly(amplitude, time):
     return sign * (-quarter * s + 0.5 * s**2), sign * (-quarter + s)
 
 
+@pytest.mark.slow
 def test_switch__of_a_relay_gives_parabolas():
     amplitudes = np.linspace(0.3, 2.0, 21)
     found = run_cells(STICK, RELAY, 1.0, np.c_[amplitudes, 0.0 * amplitudes], n_keep=6, rtol=1e-6)
@@ -453,6 +458,7 @@ class DryFriction:
         return brentq(function, t, t + step, xtol=1e-15, rtol=1e-14)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("force", "mu", "frequency"), [(1.0, 0.6, 0.05), (1.0, 0.3, 0.07), (2.0, 0.4, 0.11)])
 def test_switch__of_dry_friction_sticks_and_slips_as_in_closed_form(force, mu, frequency):
     times = np.arange(1, 13) / frequency
@@ -473,6 +479,7 @@ def test_switch__sticks_for_ever_under_a_weak_force():
     assert found.orbit_period.tolist() == [[1], [1]]
 
 
+@pytest.mark.slow
 def test_switch__that_sticks_is_torn_off_by_an_edge():
     # at rest, pushed to 2 (F - mu) in half a swing, let go and back in another; edges at 5 s and 14 s
     times = np.arange(1, 60) * 0.97
@@ -552,6 +559,7 @@ def ball_exactly(height, g, r, time):
 FLOOR = Crossing("x", 0.0, "down")
 
 
+@pytest.mark.slow
 def test_impact__of_a_bouncing_ball_is_the_closed_form():
     g, r, heights, times = 9.81, 0.9, np.linspace(0.4, 2.0, 17), 0.5 * np.arange(1, 9)
     starts = np.c_[heights, 0.0 * heights]
@@ -653,6 +661,7 @@ class ImpactOscillator:
             t, y, n = hit, np.array([x, -self.r * v]), n + 1
 
 
+@pytest.mark.slow
 def test_impact__oscillator_follows_its_exact_map_and_its_derivative():
     zeta, force, gap, r, frequency, n_periods = 0.05, 1.0, 0.4, 0.8, 0.13, 3
     exact = ImpactOscillator(zeta, force, gap, r, frequency)
@@ -686,6 +695,7 @@ def test_impact__multipliers_of_an_orbit_are_those_of_the_exact_map():
     assert orbit.multipliers[0].prod() == pytest.approx(area, rel=1e-8)
 
 
+@pytest.mark.slow
 def test_switch__derivative_of_a_relay_is_that_of_its_period():
     # from rest at a: after time T the derivative by a follows from the closed form
     a, time, step = 0.7, 3.0, 1e-5
@@ -712,6 +722,7 @@ def test_switch__sliding_forgets_the_velocity():
         assert abs(np.linalg.det(derivatives[i])) < 1e-10
 
 
+@pytest.mark.slow
 def test_lyapunov__exponents_through_impacts_add_up_to_the_loss_of_area():
     zeta, force, gap, r, frequency = 0.05, 1.0, 0.4, 0.8, 0.13
     packed = np.tile([zeta, force, gap, r], (2, 1))
@@ -735,6 +746,7 @@ def test_lyapunov__exponents_through_impacts_add_up_to_the_loss_of_area():
     assert count >= 64
 
 
+@pytest.mark.slow
 def test_lyapunov__through_sticking_has_a_largest_exponent():
     # sticking forgets the velocity: the second exponent is none, the first is that of where it stuck
     force, mu, frequency = 1.0, 0.6, 0.05
@@ -773,6 +785,7 @@ def given(system, *values):
     return SimpleNamespace(model=SimpleNamespace(system=system), pack=lambda: np.array(values, float))
 
 
+@pytest.mark.slow
 def test_rates__take_switches_by_their_signs_and_segments_by_time():
     states = np.array([[0.5, 1.0], [0.5, -2.0], [-0.5, 0.0]])
     found = rates(0.0, states, given(STICK, *dry(1.0, 0.3)), 0.1)

@@ -194,6 +194,7 @@ def _sums(v):
     )
 
 
+@pytest.mark.slow
 def test_rule__sums_and_differences():
     rng = np.random.default_rng(5)
     assert_follows_the_rule(_sums, rng.normal(size=(400, 4)))
@@ -240,6 +241,7 @@ def rates_of(system):
     return inline(scope["rates"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MODELS)
 def test_rule__constants_forcing_and_rates(name):
     model = load_model(name)

@@ -42,6 +42,7 @@ def edit(folder, name, old, new):
     path.write_text(text.replace(old, new), "utf-8")
 
 
+@pytest.mark.slow
 def test_kernel__sees_an_edit_of_a_callee_in_a_folder_named_by_the_digest(run_python, copied, tmp_path):
     # the cached entry point is in pointwise.py, what it calls in the model's system.py
     first = run_python(SCRIPT, package=copied).split()
@@ -73,6 +74,7 @@ def test_source_digest__changes_with_any_source(copied, monkeypatch):
     assert all(re.fullmatch("[0-9a-f]{16}", version) for version in versions)
 
 
+@pytest.mark.slow
 def test_plain_python__gives_the_same_numbers(run_python, preset):
     # the same sources run without the compiler; only fused products round differently
     script = (

@@ -136,6 +136,7 @@ def duffing_exactly(time, frequency, state):
     return solve_ivp(rhs, (0.0, time), [*state, 1, 0, 0, 1], "DOP853", rtol=1e-13, atol=1e-13).y[:, -1]
 
 
+@pytest.mark.slow
 def test_engine__converges_with_order_5(stepper):
     frequency, state, time = 0.5 / np.pi, [0.5, 0.3], 3.0
     exact = duffing_exactly(time, frequency, state)
@@ -212,6 +213,7 @@ def limits(slack, x, rate, passed, remaining, widths, ratios, fades):
     return np.array([layer, behind, ahead]), fades & (abs(away - reach) < 0.01 * reach)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fades", [False, True])
 def test_choose_step__keeps_the_distance_from_layers_and_edges(oscillator, fades):
     system = dataclasses.replace(oscillator, n_edges=2, has_layers=True, layers=_one_layer, layers_fade=fades)
@@ -304,6 +306,7 @@ def oscillate(system, parameters, starts, frequency=1.0, n_points=1, **options):
     return run_branches(packed, np.full((n, n_points), frequency), full, system=system, **settings)
 
 
+@pytest.mark.slow
 def test_run_branches__diverged_cells_and_what_follows_them(oscillator):
     # x'' = 9 x grows by e^3 a period: the first passes the bound of 1000 in its second period, the
     # derivatives of the second their bound of 1e6 in its fifth

@@ -46,6 +46,7 @@ def test_methods__of_order_8_has_scipys_coefficients():
     np.testing.assert_array_equal(EIGHTH.other_error, DOP853.E3)
 
 
+@pytest.mark.slow
 def test_run_branches__of_order_8_agrees_with_another_integrator(pendulum_rhs):
     v = load_model("pendulum-free").load(**SMOOTH).as_dict()
     phase = np.pi / 2.0 - np.pi * v["duty_cycle"]
@@ -94,6 +95,7 @@ def test_run_branches__of_order_8_has_the_same_bits_alone_and_among_others(name)
     np.testing.assert_array_equal(among.n_steps, narrow.n_steps)
 
 
+@pytest.mark.slow
 def test_run_branches__of_order_8_finds_crossings_and_carries_tangents():
     model = load_model("van-der-pol")
     section = Crossing("v", 0.0, "down", longest=50.0)

@@ -54,6 +54,7 @@ def test_closed_period__looks_no_further_than_it_is_told():
     assert closed(np.tile(points, (5, 1)), max_orbit_period=20) == 20
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("modulus", [0.5, 0.9, 0.96, 0.99])
 @pytest.mark.parametrize("angle", [0.0, np.pi, 2.2, 0.3])
 def test_closed_period__a_spiral_is_not_closed_before_it_is_near(modulus, angle):

@@ -59,6 +59,7 @@ def cold(folder):
     return integrated(folder, "driven-pendulum", "duffing", "three-magnets")
 
 
+@pytest.mark.slow
 def test_parts__a_second_system_compiles_its_equations_alone(cold):
     """Other states, other constants, angles or none: what knows no equations is had from the first one."""
     assert len(cold["driven-pendulum"][2].split(",")) > 30
@@ -68,6 +69,7 @@ def test_parts__a_second_system_compiles_its_equations_alone(cold):
     assert not others
 
 
+@pytest.mark.slow
 def test_parts__bits_depend_on_the_system_alone(cold, folder, tmp_path):
     """From nothing after others or alone, without a cache, from the cache, and from one that is damaged.
 
@@ -124,6 +126,7 @@ def expected(n):
     return [sum(range(n * WIDTH, 2 * n * WIDTH, WIDTH)), sum((i + 1) * (i % 2 + 1) for i in range(n))]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n", [1, 2, 3, 7])
 def test_bound_part__is_one_code_with_the_sizes_of_each_system(n):
     part = bound_part(_sum_of_states, sizes(n), False)

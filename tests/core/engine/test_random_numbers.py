@@ -43,6 +43,7 @@ def drawn() -> tuple[np.ndarray, np.ndarray]:
     return plain(normal_pair)(count, low, word(7), tag_word(0, 0), key_words(42))
 
 
+@pytest.mark.slow
 def test_normal_pair__distribution(drawn: tuple[np.ndarray, np.ndarray]) -> None:
     for sample in drawn:
         x = sample.ravel()

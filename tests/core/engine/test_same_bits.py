@@ -59,6 +59,7 @@ def straight():
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n_lanes", [1, 8, 16, 40, 96, 1000])
 def test_engine__same_bits_for_any_number_of_lanes(straight, n_lanes):
     assert_same_bits(straight, run_many(*many(), n_lanes=n_lanes))
@@ -140,6 +141,7 @@ def straight_struck():
     return run_branches(*struck(), system=load_model("impact").system, **settings)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("build", BUILDS)
 def test_engine__same_bits_however_it_is_built(straight, straight_struck, run_python, tmp_path, build):
     settings, package = BUILDS[build], Path(magpend_core.__file__).parent.parent

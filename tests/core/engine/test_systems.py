@@ -144,6 +144,7 @@ def test_system__takes_lists_and_whole_numbers(duffing):
     assert listed.label == duffing.label
 
 
+@pytest.mark.slow
 def test_one_state__section_multiplier_and_exponent_are_the_closed_forms():
     rate, omega = 0.5, 1.0
     packed, frequency = np.array([[rate]] * 2), np.full(2, UNIT_FREQUENCY)
@@ -205,6 +206,7 @@ def _no_memory(settings, n_states):
     return 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n_keep", [0, 4])
 def test_observer__of_ones_own_on_one_state_without_forcing_or_parameters(n_keep):
     codes = {"PENDING": int(Status.PENDING), "BOUNDED": int(Status.BOUNDED), "LEVEL": 0.5}

@@ -169,6 +169,7 @@ def test_share__interruption_does_not_wait_for_the_others():
     assert ended.wait(20)
 
 
+@pytest.mark.slow
 @compiled
 def test_number_of_threads__from_the_variable(run_python):
     script = "from magpend_core.engine.threads import number_of_threads; print(number_of_threads())"

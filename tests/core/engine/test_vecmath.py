@@ -163,6 +163,7 @@ CASES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_vecmath__errors_are_within_the_stated_bound(name):
     # the bounds are those of the module's docstring
@@ -195,6 +196,7 @@ def test_sines__near_their_zeros_lose_only_the_rest_of_pi(name, function, first)
             assert abs(mpmath.mpf(value) - function(mpmath.mpf(argument))) < 3e-27 * argument + 1e-42
 
 
+@pytest.mark.slow
 def test_vecmath__numbers_lanes_and_an_interpreter_have_the_same_bits():
     x = np.concatenate([points((0.0, 1.0), (0.3, 3.0), (0.0, 700.0)), 10.0 ** points((-300.0, 2.8))])
     x = np.concatenate([x, -x])

@@ -45,6 +45,7 @@ def expected_extremes(radius, omega):
     )
 
 
+@pytest.mark.slow
 def test_extremes__of_a_linear_oscillator_are_the_closed_forms():
     found, radius, omega = linear_oscillator(quantities=NAMES)
     assert found.extremes.shape == (3, 1, 2, 5, 3)

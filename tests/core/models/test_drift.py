@@ -96,6 +96,7 @@ def closed_form(n, start_s, duration_s, a, b):
     return linear_response(start_s + duration_s, n / HZ, y, b, 0.0)
 
 
+@pytest.mark.slow
 def test_drifting_sections__keeps_the_order_across_the_corners_of_a_ramp():
     """Of a force's amplitude, by the closed form of the linear oscillator: order 5 with both corners within a step."""
     ramp = Ramp("A", "linear", (("from", 0.5), ("to", 9.0), ("start_s", 7.3), ("duration_s", 1.7)))
@@ -111,6 +112,7 @@ def test_drifting_sections__keeps_the_order_across_the_corners_of_a_ramp():
     assert 4.5 < order < 6.0, (errors, steps)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["A", "k"])
 def test_drifting_sections__against_another_integrator(name):
     """Smooth ramps; linear ones of both are in the closed form above and the table below."""
@@ -126,6 +128,7 @@ def test_drifting_sections__against_another_integrator(name):
     np.testing.assert_allclose(found.section[0, 0], expected, atol=3e-9)
 
 
+@pytest.mark.slow
 def test_drifting_sections__of_two_parameters_and_a_table():
     """Stiffness by lines between samples, damping by a ramp: both at once."""
     times, values = (0.0, 4.0, 9.0, 9.5, 30.0), (1.0, 2.0, 1.5, 3.0, 1.0)
@@ -144,6 +147,7 @@ def test_drifting_sections__of_two_parameters_and_a_table():
     np.testing.assert_allclose(found.section[0, 0], expected, atol=3e-9)
 
 
+@pytest.mark.slow
 def test_drifting_sections__of_a_switched_drive():
     """True jumps of the drive and of friction: corners lie between the edges of a period, and on one of them."""
     ramp = Ramp("A", "linear", (("from", 0.5), ("to", 2.0), ("start_periods", 1.0 + 0.3), ("duration_periods", 2.45)))
@@ -177,6 +181,7 @@ def test_drifting_sections__of_a_switched_drive():
     np.testing.assert_allclose(found.section[0, 0], out, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_drifting_sections__of_the_pendulum():
     """A parameter by which its constants are divided."""
     base, name = load_preset(), "J2"
@@ -195,6 +200,7 @@ def test_drifting_sections__of_the_pendulum():
     np.testing.assert_allclose(found.section[0, 0], expected, atol=2e-7)
 
 
+@pytest.mark.slow
 def test_drifting_sections__of_a_ramp_to_the_same_value_are_those_of_an_ordinary_run():
     ramp = Ramp("A", "linear", (("from", 0.5), ("to", 0.5), ("start_s", 0.0), ("duration_s", 1.0)))
     _, found = drifted(OSCILLATOR, [ramp], [{}], n_transient=300, n_keep=80)
@@ -223,6 +229,7 @@ def test_drifting_sections__close_after_the_drift_alone():
     assert after.status[0, 0] == Status.PERIODIC
 
 
+@pytest.mark.slow
 def test_drifting_sections__same_bits_in_any_company():
     """Other cells, lanes and chunks; corners of some cells lie among the kept sections."""
     ramp = Ramp("A", "linear", RAMP)
@@ -239,6 +246,7 @@ def test_drifting_sections__same_bits_in_any_company():
         np.testing.assert_array_equal(getattr(other, name), getattr(whole, name), err_msg=name)
 
 
+@pytest.mark.slow
 def test_drifting_sections__turns_of_angles_with_corners_among_the_kept_sections():
     """A rotor under a torque that grows: turns are those of its closed form, per cell alone."""
     rotor = load_model(

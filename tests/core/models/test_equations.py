@@ -106,6 +106,7 @@ def lagrangian_accelerations():
     )
 
 
+@pytest.mark.slow
 def test_accelerations__equal_sympys_lagrangian(bare):
     solve, total_energy = lagrangian_accelerations()
     rng = np.random.default_rng(4)
@@ -138,6 +139,7 @@ def test_magnet_torque__sum_with_regularisation(preset):
     assert f.magnet_torque.sum(axis=1) == pytest.approx(expected, rel=1e-12, abs=1e-15)
 
 
+@pytest.mark.slow
 def test_dipole_torques__equal_the_force_between_poles(dipoles):
     # F = mu0 p1 p2/(4 pi r^2) away from the fixed magnet at (0, -h), times the lever of each angle
     m, l1 = dipoles, dipoles["l1"]
@@ -192,6 +194,7 @@ def test_friction__opposes_the_motion_in_the_joints(y, slow):
         assert r2 * (state[3] - state[2]) >= 0.0
 
 
+@pytest.mark.slow
 @given(STATE, st.integers(-3, 3), st.integers(-3, 3), st.floats(0.0, 1.0))
 @settings(max_examples=200, deadline=None)
 def test_accelerations__full_turns_change_nothing(y, k1, k2, t):

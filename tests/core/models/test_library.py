@@ -220,6 +220,7 @@ def _cycles(name, crossing, points, periods, **values):
     )
 
 
+@pytest.mark.slow
 def test_van_der_pol__period_amplitude_and_multiplier(library):
     """At mu = 1 the period is 6.6632868593231 (Amore, arXiv 2111.12198)."""
     for known in library["van-der-pol"]:
@@ -249,6 +250,7 @@ def _half_a_turn(point):
     return found.y_events[0][0]
 
 
+@pytest.mark.slow
 def test_rossler__orbits_of_chaosbook(library):
     """Unstable orbits of 1, 2 and 3 returns at c = 5.7: periods and multipliers."""
     known = library["rossler"]["orbits"]
@@ -278,6 +280,7 @@ def test_rossler__multiplier_is_minus_one_at_the_doublings(library):
         assert found.multipliers[0, 0] == pytest.approx(-1.0, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_lorenz__shortest_orbit(library):
     """The orbit AB of Viswanath (Nonlinearity 16, 2003): 1.5586522107162 s."""
     known = library["lorenz"]["ab"]
@@ -300,6 +303,7 @@ def test_pendulum_text__has_the_built_in_parameters(pendulums):
     }
 
 
+@pytest.mark.slow
 def test_pendulum_text__accelerations_and_quantities(pendulums):
     """Four sweeps of the loads against two Newton steps: 1e-9 of accelerations of up to 1e3 rad/s2."""
     built_in, text = pendulums
@@ -315,6 +319,7 @@ def test_pendulum_text__accelerations_and_quantities(pendulums):
     )
 
 
+@pytest.mark.slow
 def test_pendulum_text__sections_are_those_of_the_built_in_one(pendulums):
     """Twelve periods of regular motion at 2.7 Hz: the same states to 1e-9."""
     states = np.random.default_rng(9).uniform(-0.3, 0.3, (6, 4))
@@ -366,6 +371,7 @@ def _turning_point(start, belt):
     return found.y_events[0][0][0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "tolerance"), [("belt", 5e-3), ("belt-stick", 1e-8)])
 def test_belt__stick_slip_cycle(name, tolerance, library):
     """Period and turning point of the cycle with true sticking; the steep tanh creeps a little."""

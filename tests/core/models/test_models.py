@@ -40,6 +40,7 @@ def test_load_model__reports_an_unknown_name():
         load_model("dufing")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "preset"), CASES)
 def test_jacobian__is_the_derivative_of_the_rates(name, preset):
     parameters = load_model(name).load(preset)
@@ -66,6 +67,7 @@ def test_mirror__maps_rates_on_rates(name):
     np.testing.assert_allclose(there, signs * here, rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("drive", ["", "-sine"])
 def test_pendulum_free__is_the_pendulum_with_magnets_switched_off(drive):
     free = load_model(f"pendulum-free{drive}").load()
@@ -75,6 +77,7 @@ def test_pendulum_free__is_the_pendulum_with_magnets_switched_off(drive):
     assert (torques(0.1, y, free, FREQUENCY).magnet_torque == 0.0).all()
 
 
+@pytest.mark.slow
 def test_pendulum_sine__has_a_sinusoidal_torque():
     parameters = load_model("pendulum-sine").load(q=1.2)
     t = np.linspace(0.0, 1.0, 50)
@@ -82,6 +85,7 @@ def test_pendulum_sine__has_a_sinusoidal_torque():
     np.testing.assert_allclose(drive, 1.2 * np.sin(2 * np.pi * FREQUENCY * t), atol=1e-12)
 
 
+@pytest.mark.slow
 def test_evaluate__energy_changes_by_the_powers(preset):
     model, h = preset.model, 1e-6
     y = states_of(model)

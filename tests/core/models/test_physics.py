@@ -87,6 +87,7 @@ def test_sections__fall_into_the_well_on_either_side():
     assert result.section[:, 0] == pytest.approx(np.array([right, -right]), abs=5e-3)
 
 
+@pytest.mark.slow
 def test_sections__left_and_right_motions_coexist(preset, reference):
     right, left = (np.array(orbit["section"]) for orbit in reference("orbits")[:2])
     rng = np.random.default_rng(0)

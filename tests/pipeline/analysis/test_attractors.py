@@ -45,6 +45,7 @@ def row_of(found, section):
     return int(np.nanmin(distance, axis=-1).argmin())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("orbit", [o for o in ORBITS if o["frequency_hz"] == FREQUENCY])
 def test_identify__reference_orbits_from_random_starts(found, orbit):
     one = found.isel(attractor=row_of(found, orbit["section"]))
@@ -103,6 +104,7 @@ def test_identify__every_cell_where_it_belongs(cube, found):
     assert found["share"].values == pytest.approx(np.bincount(ids) / 64)
 
 
+@pytest.mark.slow
 def test_identify__slow_spirals_stay_whole(starts, found):
     """Cells stopped at 1e-2 to 1e-5 from their orbits: the same two orbits, and no others beside them."""
     result = sections(load_preset(), FREQUENCY, starts, n_transient=180, n_keep=32, rtol=1e-8)
@@ -129,6 +131,7 @@ def same(a, b):
     )
 
 
+@pytest.mark.slow
 def test_identify__order_and_blocks_of_cells_do_not_matter(cube, found):
     order = np.random.default_rng(5).permutation(64)
     shuffled = identify(cube.isel(initial_condition=order), parameters=load_preset(), block_bytes=40_000)
@@ -137,6 +140,7 @@ def test_identify__order_and_blocks_of_cells_do_not_matter(cube, found):
     assert np.array_equal(shuffled["decision"].values, found["decision"].values[order])
 
 
+@pytest.mark.slow
 def test_identify__parameters_from_the_run_and_its_axes(cube, found):
     """An axis replaces the attribute of the same name."""
     ds = cube.expand_dims(q=[load_preset()["q"]]).assign_attrs(attributes_of(load_preset(q=1.0)))

@@ -47,6 +47,7 @@ def orbit_of_cells(found):
     return found["attractor_points"].values[rows, 0], np.where(on_orbit, found["orbit_period"].values[rows], 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("frequency", "periods"),
     [
@@ -68,6 +69,7 @@ def test_identify__loose_closure_gives_the_labels_of_a_strict_run(frequency, per
     assert np.abs(seen - points)[both].max() < 1e-8
 
 
+@pytest.mark.slow
 def test_identify__loose_closure_sees_half_the_period():
     """What the run itself says of these cells is not what they are."""
     ds = run(2.48, 2e-2)
@@ -78,6 +80,7 @@ def test_identify__loose_closure_sees_half_the_period():
     assert {CLOSED, EXTENDED} <= set(found["decision"].values.tolist())
 
 
+@pytest.mark.slow
 def test_identify__loose_closure_in_any_order_and_in_blocks():
     ds = run(2.48, 2e-2)
     order = np.random.default_rng(1).permutation(64)
@@ -89,6 +92,7 @@ def test_identify__loose_closure_in_any_order_and_in_blocks():
         assert np.array_equal(other[name].values, plain[name].values[order])
 
 
+@pytest.mark.slow
 def test_identify__tolerance_follows_the_run():
     ds = run(2.2, 1e-3, n=2)
     assert identify(ds, parameters=load_preset()).attrs["identify_tolerance"] == pytest.approx(1e-2)

@@ -99,6 +99,7 @@ def test_identify__inferred_cells_are_their_orbits():
     assert found["status"].values.tolist() == [1, 1, 7, 7, 7]
 
 
+@pytest.mark.slow
 def test_identify__shuffled_cells_keep_their_ids():
     rng = np.random.default_rng(0)
     cells = [on(B, phase=i, noise=1e-6, rng=rng) for i in range(30)]
@@ -183,6 +184,7 @@ def sweep(seed=0, order=None):
     return xr.concat(points, "frequency"), np.array(names)
 
 
+@pytest.mark.slow
 def test_match__ids_follow_through_gap_crossing_birth_and_death():
     ds, names = sweep()
     named = match(identify(ds, polish=False))
@@ -198,6 +200,7 @@ def test_match__ids_follow_through_gap_crossing_birth_and_death():
     assert np.isnan(named["attractor_points"].values[4, 0]).all()
 
 
+@pytest.mark.slow
 def test_match__options_decide_what_follows():
     found = identify(sweep()[0], polish=False)
     # no look back beyond the gap: a comes back as another
@@ -212,6 +215,7 @@ def test_match__options_decide_what_follows():
         match(found, look_back=0)
 
 
+@pytest.mark.slow
 def test_match__does_not_depend_on_the_order_of_the_cells():
     order = np.random.default_rng(8).permutation(30)
     plain, shuffled = (match(identify(sweep(order=o)[0], polish=False)) for o in (None, order))

@@ -35,6 +35,7 @@ def bench(tmp_path_factory, computed):
     return folder, directory, g, h, derive(directory, "bands", {"posterior": str(folder / "fit")})
 
 
+@pytest.mark.slow
 def test_bands__bifurcations_are_those_of_the_closed_form(bench):
     _, _, g, h, found = bench
     words = str(found["kind"].attrs["flag_meanings"]).split()
@@ -86,6 +87,7 @@ def test_orbit_data__a_branch_that_turns_back_is_cut_there():
     assert (np.diff(sizes[found[1]]) < 0.0).all()
 
 
+@pytest.mark.slow
 def test_bands__are_kept_and_depend_on_the_draws(bench, tmp_path):
     folder, directory, g, h, found = bench
     xr.testing.assert_equal(stored(directory, "bands"), found)
@@ -96,6 +98,7 @@ def test_bands__are_kept_and_depend_on_the_draws(bench, tmp_path):
     np.testing.assert_array_equal(other["bifurcation_value"], some["bifurcation_value"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["branches", "bifurcation"])
 def test_figure__shades_the_bands_and_draws_the_intervals(bench, name):
     folder, directory, g, h, found = bench

@@ -97,6 +97,7 @@ def test_basin_fractions__rule_of_three():
     assert 0.5 < half["unseen_high_if_all"].item() < 0.53
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 def test_basin_fractions__simulated_coverage(method):
     # starts in [-1.04, 2]; basins (-1, 1), (1, 2], [-1.04, -1) on paper
@@ -163,6 +164,7 @@ def test_basin_fractions__inferred_cells_count_and_are_told():
 # --- entropy ---------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_basin_entropy__grebogi_map():
     # Attractors.jl, test/basins/uncertainty_tests.jl: 0.40-0.42 and 0.60-0.61 at this resolution
     ds = basin_entropy(grebogi_map(), 6)
@@ -216,6 +218,7 @@ def test_basin_entropy__unfinished():
     assert basin_entropy(labels, 2, unfinished=())["n_labels"].item() == 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("patch", "block", "low", "high"), [(1, 1, 0.8, 1.25), (4, 4, 0.8, 1.25), (4, 1, 0.1, 0.45)])
 def test_basin_entropy__bootstrap_tells_the_scatter(patch, block, low, high):
     # patches of boxes are mixed or not by a coin: the scatter over many such grids is the true error
@@ -255,6 +258,7 @@ def test_uncertainty_exponent__newton(method, epsilons):
     assert 0.01 < ds["exponent_stderr"].item() < 0.06
 
 
+@pytest.mark.slow
 def test_uncertainty_exponent__grebogi_map():
     # the same file, 251 x 251, boxes of 3 to 15: 0.2-0.3, roughly 0.2 in the paper
     ds = uncertainty_exponent(grebogi_map(251), method="boxes", epsilons=range(3, 16))
@@ -299,6 +303,7 @@ def test_uncertainty_exponent__boxes_that_see_nothing_are_no_part_of_the_fit():
     assert ds["exponent"].item() == pytest.approx(slope)
 
 
+@pytest.mark.slow
 def test_uncertainty_exponent__bootstrap_tells_the_scatter():
     # smooth random boundaries: many discs thrown at the square
     rng = np.random.default_rng(4)

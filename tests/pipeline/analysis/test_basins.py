@@ -139,6 +139,7 @@ def test_derive_basins__refuses_before_it_identifies(made):
     assert not said
 
 
+@pytest.mark.slow
 def test_derive_basins__of_an_incomplete_run(made):
     made.commit(0)
     found = derive(made.info.directory, "basins", {"polish": False, "box": 2})

@@ -87,6 +87,7 @@ def only(branch, kind):
     return [b for b in branch.bifurcations if b.kind == kind]
 
 
+@pytest.mark.slow
 def test_explore__linear_oscillator():
     """The exact orbit and multipliers at every frequency."""
     damping, linear, amplitude = 0.3, 4.0, 1.0
@@ -113,6 +114,7 @@ def resonance():
     return orbits, branch
 
 
+@pytest.mark.slow
 def test_explore__folds_of_duffing(resonance):
     orbits, branch = resonance
     upper, lower = only(branch, "fold")
@@ -125,6 +127,7 @@ def test_explore__folds_of_duffing(resonance):
         assert orbits.values(fold.point.u)[0] == pytest.approx(there, abs=1e-8)
 
 
+@pytest.mark.slow
 def test_explore__starts_on_one_branch(resonance):
     """All coexisting orbits at one frequency lie on the one bent branch, which is followed once."""
     orbits, branch = resonance
@@ -162,6 +165,7 @@ def test_dataset_of__resonance(resonance):
     assert (first["to"], second["from"]) == (upper["frequency_hz"], lower["frequency_hz"])
 
 
+@pytest.mark.slow
 def test_explore__period_doublings(cascade):
     orbits, branches = cascade
     assert [b.family.period for b in branches] == [1, 2, 4]
@@ -181,6 +185,7 @@ def test_explore__period_doublings(cascade):
     assert np.abs(image - branches[1].family.state(point.u)).max() > 1e-3
 
 
+@pytest.mark.slow
 def test_explore__start_on_doubled_orbit(cascade):
     """From the doubled orbit the single one is found as the branch that it ends on."""
     orbits, branches = cascade
@@ -197,6 +202,7 @@ def test_explore__start_on_doubled_orbit(cascade):
     )
 
 
+@pytest.mark.slow
 def test_explore__neimark_sacker():
     """A forced van der Pol oscillator leaves entrainment through a torus."""
     parameters = [0.2, 0.4]
@@ -215,6 +221,7 @@ def test_explore__neimark_sacker():
         assert orbits.values(torus.point.u)[0] == pytest.approx(there, abs=1e-8)
 
 
+@pytest.mark.slow
 def test_explore__symmetry_breaking():
     """The symmetric orbit of a symmetric spring; scipy finds the pitchfork with the half-period map."""
     parameters = [0.1, 0.0, 1.0, 0.3]
@@ -252,6 +259,7 @@ def test_explore__symmetry_breaking():
         assert ends == pytest.approx([2.5, 2.5])  # the symmetric branch ends at 0.1
 
 
+@pytest.mark.slow
 def test_continue_curves__fold_of_duffing(resonance):
     """The fold at another amplitude, against scipy."""
     orbits, branch = resonance
@@ -300,6 +308,7 @@ def test_explore__rotation():
     np.testing.assert_allclose(image - state, [2.0 * np.pi, 0.0], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_orbits_near__chaotic_well():
     """Recurrences of a chaotic trajectory lead to unstable orbits, each a fixed point by scipy too."""
     parameters = [0.3, -1.0, 1.0, 0.5]
@@ -344,6 +353,7 @@ def evaluated(problem, u):
     return value
 
 
+@pytest.mark.slow
 def test_orbit_problem__periods_side_by_side_are_the_whole_orbit():
     """Three periods from a point that is on no orbit: image, monodromy matrix and slope are scipy's."""
     parameters = [0.1, 1.0, 1.0, 0.3]
@@ -378,6 +388,7 @@ def test_orbit_problem__periods_side_by_side_are_the_whole_orbit():
     np.testing.assert_allclose(closed.value.monodromy, monodromy, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_explore__followed_ahead(resonance):
     """The first starts of other attractors are followed beside; the branches are those without this."""
     orbits, branch = resonance
@@ -408,6 +419,7 @@ def test_watch__neutral_saddle():
     assert tell_apart(found, found[0].point) == found[1:]
 
 
+@pytest.mark.slow
 def test_explore__closed_branch():
     """A weakly forced van der Pol oscillator: the entrained orbits and their saddles form a closed curve."""
     parameters = [0.2, 0.1]
@@ -440,6 +452,7 @@ def right_family():
     return parameters, orbits, explore([Start(orbits, np.array(state), 2.2)], scope)
 
 
+@pytest.mark.slow
 def test_explore__right_family(right_family):
     """Where stability ends and comes back: the abrupt end is a subcritical doubling, the halving none."""
     _, orbits, branches = right_family
@@ -452,6 +465,7 @@ def test_explore__right_family(right_family):
     assert double.ends == ("start", "period_halving")
 
 
+@pytest.mark.slow
 def test_explore__brute_force_agrees(right_family):
     """Inside the stable segments, sections of trajectories lie on the branch to 1e-6."""
     parameters, _, branches = right_family

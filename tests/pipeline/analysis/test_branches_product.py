@@ -48,6 +48,7 @@ def directory(computed):
     return computed(SPEC)
 
 
+@pytest.mark.slow
 def test_attractors__ids_through_the_cascade(directory):
     """The orbits of each well have one id, from period 1 to 4; the chaos beyond has another one."""
     ds = derive(directory, "attractors")
@@ -62,6 +63,7 @@ def test_attractors__ids_through_the_cascade(directory):
     assert "first appearance" in text
 
 
+@pytest.mark.slow
 def test_branches__all_periods_or_a_line(directory):
     heard = []
     with reporting(lambda what, done, total, *_: heard.append((what, done, total))):
@@ -87,6 +89,7 @@ def test_branches__none_to_begin_with(directory):
     assert any("outside of amplitude 0.4 to 0.6" in line for line in lines)
 
 
+@pytest.mark.slow
 def test_branches__along_the_frequency_by_either_name(directory):
     """Of a run that does not sweep it."""
     options = {"low": 0.18, "high": 0.2, "max_period": 1, "generations": 0}
@@ -117,6 +120,7 @@ def test_branches__refusals(directory, options, message):
         derive(directory, "branches", options)
 
 
+@pytest.mark.slow
 def test_curves__in_the_plane_of_amplitude_and_damping(directory):
     """Both wells' first doublings: two curves over each other, by the mirror symmetry."""
     plane = {"second": "damping", "second_low": 0.25, "second_high": 0.4, "max_period": 1, **ALONG}
@@ -134,6 +138,7 @@ def test_curves__in_the_plane_of_amplitude_and_damping(directory):
         derive(directory, "curves", {**plane, "second": "amplitude"})
 
 
+@pytest.mark.slow
 def test_branches__from_recurrences_in_chaos(directory):
     """Unstable orbits inside of the chaos, where no closed orbit attracts."""
     options = {"parameter": "amplitude", "low": 0.45, "high": 0.55, "recurrences": 2, "generations": 0}
@@ -183,6 +188,7 @@ def test_branches__an_empty_table_is_refused(directory, main, tmp_path):
     assert not (tmp_path / "found.csv").exists()
 
 
+@pytest.mark.slow
 def test_orbits__at_a_point(directory):
     """All orbits of period 1 by their index, both wells' among them."""
     ds = derive(directory, "orbits", {"at": {"amplitude": 0.25}, "max_period": 1, "starts": 100})

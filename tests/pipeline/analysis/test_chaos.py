@@ -153,6 +153,7 @@ def test_chaos__exponents_after_the_first_are_of_good_cells():
     assert found.attractor_lyapunov.values[0] == pytest.approx(0.3)
 
 
+@pytest.mark.slow
 def test_chaos__transients_and_drift():
     cube = made_up([0.3, 0.3, 0.3])
     cube["lyapunov_blocks"][0, 0, 11:, 0] -= 0.8  # chaos for 11 of 16 blocks, then decay
@@ -204,6 +205,7 @@ def test_chaos__without_exponents():
         chaos(cube, one_set(cube), stride=2, polish=False)
 
 
+@pytest.mark.slow
 def test_chaos__correlation_dimension_of_enough_points():
     cube = on_a_plane()
     found = chaos(cube, attractors_of(cube, [0] * 8 + [1, 1], [BOUNDED_SET] * 2), n_max=4000).isel(frequency=0)
@@ -275,6 +277,7 @@ def run(computed):
     return computed(RUN)
 
 
+@pytest.mark.slow
 def test_analyse_chaos__order_and_chaos(main, run, tmp_path):
     code, out, err = main("analyse", "chaos", run, "--csv", tmp_path / "c.csv")
     assert code == 0, err
@@ -329,6 +332,7 @@ def on_a_plane(n_cells=8, n_keep=500):
     return cube
 
 
+@pytest.mark.slow
 def test_section_dimension__of_each_set_that_stays():
     cube = on_a_plane()
     found = section_dimension(
@@ -360,6 +364,7 @@ def artists(fig, gid):
     return [a for a in fig.findobj(lambda a: getattr(a, "get_gid", lambda: None)() == gid)]
 
 
+@pytest.mark.slow
 def test_plot_dimension__curve_fit_and_slope():
     cube = on_a_plane()
     ds = section_dimension(cube, attractors_of(cube, [0] * 8 + [-1, -1], [BOUNDED_SET]))
@@ -382,6 +387,7 @@ def test_plot_dimension__curve_fit_and_slope():
 # ---- convergence -------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_plot_convergence__lines_bands_and_transients():
     cube = made_up([[0.3, 0.36, -0.2], [0.1, 0.1, 0.1]], (2.0, 4.0)).assign_attrs(lyapunov_n_periods=320)
     cube["lyapunov_blocks"][0, 0, 11:, 0] -= 0.8
@@ -401,6 +407,7 @@ def test_plot_convergence__lines_bands_and_transients():
     assert second.data["exponent_value"].values == pytest.approx([-0.1, -0.04, -0.6])
 
 
+@pytest.mark.slow
 def test_commands__dimension_and_figures(main, run, tmp_path):
     few = ("--at", "frequency=2.4", "--n-sample", "4", "--budget", "0.5")
     code, out, err = main("analyse", "dimension", run, *few, "--csv", tmp_path / "d.csv")

@@ -28,6 +28,7 @@ def circle(n, phase, alpha=GOLDEN, radius=1.0):
     return radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n", [128, 512, 2048])
 def test_mixing__two_trajectories_on_one_chaotic_set(n):
     shares = [mixing(henon(n, i), henon(n, i + 50), PLANE) for i in range(20)]

@@ -96,6 +96,7 @@ def stuart_landau():
     return continue_curves(starts, ((0.05, 1.95), (0.05, 1.5)), max_period=1)
 
 
+@pytest.mark.slow
 def test_stuart_landau__curves(stuart_landau):
     """Folds (1 - rho)(1 - 3 rho) + sigma^2 = 0; the Neimark-Sacker curves spring from R1."""
     assert sorted(c.kind for c in stuart_landau) == ["fold", "neimark_sacker", "neimark_sacker"]
@@ -136,6 +137,7 @@ def test_curves_table__names_the_points(stuart_landau):
     assert any("cusp" in line for line in table.lines)
 
 
+@pytest.mark.slow
 def test_duffing__cusp():
     """x'' + .1 x' + x + x^3 = F cos wt: cusp at w = 1.0901095, F = .0513635."""
     model = load_model("duffing")
@@ -152,6 +154,7 @@ def test_duffing__cusp():
     assert value[1] == pytest.approx(0.0513635, abs=1e-7)
 
 
+@pytest.mark.slow
 def test_generalised_doubling__and_the_folds_that_spring_from_it():
     """u' = u (mu + a u^2 - u^4): the doubling is degenerate at a = 0; folds of twice the period at mu = -a^2/4."""
     bounds = ((-0.5, 0.5), (-1.0, 1.5))
@@ -168,6 +171,7 @@ def test_generalised_doubling__and_the_folds_that_spring_from_it():
     np.testing.assert_allclose(fold.values[:, 0], -(fold.values[:, 1] ** 2) / 4.0, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_chenciner():
     """r' = r (nu + b r^2 - r^4)."""
     bounds = ((-0.5, 0.5), (-1.0, 1.0))
@@ -177,6 +181,7 @@ def test_chenciner():
     np.testing.assert_allclose(value, 0.0, atol=1e-7)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "free", "bifurcations"),
     [
@@ -196,6 +201,7 @@ def test_two_bifurcations_at_once(kind, free, bifurcations):
         np.testing.assert_allclose(value, 0.0, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_continue_curves__counts_what_it_cannot_locate(monkeypatch):
     """A sign change without a located zero is told, not dropped."""
 

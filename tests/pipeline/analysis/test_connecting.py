@@ -179,6 +179,7 @@ def test_match__ids_rest_on_followed_branches(wells):
     assert match(ds, threshold=1e-9, connect=False).sizes["attractor"] == 3
 
 
+@pytest.mark.slow
 def test_match__coexisting_attractors_have_different_ids(wells):
     """The single orbit is listed beside the doubled one: the doubled one is another attractor then."""
     ds = appearances("amplitude", [0.26, 0.28], [wells(1, 0.26)], [wells(1, 0.28), wells(2, 0.28)])
@@ -207,6 +208,7 @@ LEFT = {
 }
 
 
+@pytest.mark.slow
 def test_match__one_sided_motions_through_the_chaotic_band():
     """Period 1 is unstable from 2.372 to 2.499 Hz on the right, from 2.386 to 2.506 on the left."""
     parameters = load_model("pendulum").load()

@@ -35,6 +35,7 @@ def everything():
     return found_of(6)
 
 
+@pytest.mark.slow
 def test_search_orbits__each_is_an_orbit_and_is_found_once(everything):
     def rates(t, z):
         return [z[1], 0.2 * np.cos(t) - 0.15 * z[1] + z[0] - z[0] ** 3]
@@ -67,6 +68,7 @@ def test_search_orbits__the_indices_add_up(everything):
     assert coverage(everything) > 0.95
 
 
+@pytest.mark.slow
 def test_search_orbits__deflation_finds_more(everything):
     plain = found_of(0, n=60)
     more = found_of(6, n=60)

@@ -117,6 +117,7 @@ def test_extend__a_chaotic_attractor_stays():
     assert not found.ran_out
 
 
+@pytest.mark.slow
 def test_extend__two_chaotic_attractors_are_two():
     """Two tents side by side, with a gap that 20 sections do not resolve."""
 
@@ -170,6 +171,7 @@ def test_extend__a_torus_of_a_conservative_map_is_neutral():
     assert [one.stability for one in found.sets] == [NEUTRAL] * 4
 
 
+@pytest.mark.slow
 def test_extend__a_slow_spiral_is_not_settled():
     """Towards a point, by .9999 at each turn: it neither stays nor arrives in the time allowed."""
 
@@ -199,6 +201,7 @@ def test_extend__without_a_budget_nothing_is_said():
     assert {(one.kind, one.stability) for one in found.sets} == {(BOUNDED_SET, NOT_SETTLED)}
 
 
+@pytest.mark.slow
 def test_extend__slopes_are_refined_unless_chaos_is_plain():
     """The baker's map stretches by 2 and shrinks by 3; a rotation does neither."""
 

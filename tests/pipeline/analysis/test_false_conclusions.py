@@ -40,6 +40,8 @@ from pipeline.runs.run import run
 from pipeline.specification.problems import SpecError
 from tests.zoo.variants import write
 
+pytestmark = pytest.mark.slow
+
 CIRCLE = {"on_circle": True}
 
 UNIFORM_ANGLE = {

@@ -226,6 +226,7 @@ def test_kaplan_yorke_dimension__errors_are_carried_over():
 # ---- correlation dimension ---------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_correlation_dimension__henon():
     # 1.21 +- .01 by Grassberger and Procaccia (1983), 1.220 by later work: local slopes wave by .07
     found = correlation_dimension(cube(henon(1, 8000)), geometry=PLANE)
@@ -248,6 +249,7 @@ def test_correlation_dimension__henon():
     assert np.polyfit(x, y, 1)[0] == pytest.approx(found["correlation_dimension"].item(), abs=1e-9)
 
 
+@pytest.mark.slow
 def test_correlation_dimension__circle_torus_and_square():
     ring = correlation_dimension(cube(circle(4000)), geometry=CIRCLE)
     assert ring["correlation_dimension"].item() == pytest.approx(1.0, abs=0.03)
@@ -277,6 +279,7 @@ def test_correlation_dimension__pairs_are_those_of_the_definition():
         assert (np.isnan(y) and share == 0.0) or np.exp(y) == pytest.approx(share, rel=1e-12)
 
 
+@pytest.mark.slow
 def test_correlation_dimension__closed_orbits_points_and_failed_cells():
     section = henon(5, 2000)
     section[0] = np.array([[0.1, 0.2], [0.5, -0.3], [-0.2, 0.0]])[np.arange(2000) % 3]
@@ -295,6 +298,7 @@ def test_correlation_dimension__closed_orbits_points_and_failed_cells():
     assert np.isfinite(few["log_correlation_sum"].values).any()
 
 
+@pytest.mark.slow
 def test_correlation_dimension__pooled_cells_and_sample_bound():
     pooled = correlation_dimension(cube(henon(60, 50)), pool=["initial_condition"], geometry=PLANE)
     assert pooled["correlation_dimension"].item() == pytest.approx(1.21, abs=0.05)
@@ -306,6 +310,7 @@ def test_correlation_dimension__pooled_cells_and_sample_bound():
     assert many["n_points"].item() == 100
 
 
+@pytest.mark.slow
 def test_correlation_dimension__error_is_the_scatter():
     found = correlation_dimension(cube(henon(16, 2000)), geometry=PLANE)
     scatter = found["correlation_dimension"].values.std(ddof=1)
@@ -313,6 +318,7 @@ def test_correlation_dimension__error_is_the_scatter():
     assert 0.5 < stated / scatter < 2.0
 
 
+@pytest.mark.slow
 def test_correlation_dimension__scales_of_the_states_do_not_matter():
     section = henon(1, 1500)
     plain = correlation_dimension(cube(section), geometry=PLANE)

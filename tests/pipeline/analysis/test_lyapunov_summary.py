@@ -73,6 +73,7 @@ def test_summarise__a_cube_without_exponents_is_refused(cube):
         summarise(cube.drop_vars("lyapunov"))
 
 
+@pytest.mark.slow
 def test_spectrum_of_jacobians__henon():
     # a = 1.4, b = 0.3: l1 = 0.419 (0.4192), l1 + l2 = ln 0.3
     n_transient = 50
@@ -114,6 +115,7 @@ def test_spectrum_of_jacobians__mistakes(shape, options, message):
         spectrum_of_jacobians(np.full((16, 2, 2), np.nan))
 
 
+@pytest.mark.slow
 def test_spectrum_of_jacobians__is_the_spectrum_of_the_engine():
     # few periods: chaos separates the two computations
     start, one, frequency = np.array([[0.5, -0.3, 0.0, 0.0]]), load_preset().pack()[None], np.array([2.4])
@@ -133,6 +135,7 @@ def artists(fig, gid):
     return [a for a in fig.findobj(lambda a: getattr(a, "get_gid", lambda: None)() == gid)]
 
 
+@pytest.mark.slow
 def test_plot_lyapunov__points_are_the_largest_exponents_with_their_errors(cube):
     cube["lyapunov"][0, 1, 0] = 0.97
     cube["lyapunov_flag"][1, 1] = 2
@@ -153,6 +156,7 @@ def test_plot_lyapunov__points_are_the_largest_exponents_with_their_errors(cube)
     assert bottom.get_ylabel() == "largest exponent [1/s]"
 
 
+@pytest.mark.slow
 def test_plot_lyapunov__mistakes(cube):
     with pytest.raises(ValueError, match="unknown unit"):
         plot_lyapunov(cube, per="second")
@@ -164,6 +168,7 @@ def test_plot_lyapunov__mistakes(cube):
     assert plot_lyapunov(two, at={"q": 1.5}).data["exponent_value"].sizes == {"frequency": 2, "exponent": 1}
 
 
+@pytest.mark.slow
 def test_plot_lyapunov_map__the_largest_over_the_cells():
     rates = np.array([[[0.5, -0.1], [-0.2, -0.3]], [[0.1, 0.7], [np.nan, np.nan]]])
     cube = exponents_cube(rates, frequency=[1.0, 2.0], q=[1.0, 1.5], initial_condition=[0, 1])

@@ -34,6 +34,7 @@ def image(state, damping, amplitude, n_periods):
     return solve_ivp(rates, span, state, method="DOP853", rtol=1e-13, atol=1e-14).y[:, -1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("side", [1.0, -1.0])
 def test_stable_manifold__leads_to_the_orbit(side):
     """By scipy; an error of the point would grow by 324 per period."""
@@ -54,6 +55,7 @@ def test_stable_manifold__leads_to_the_orbit(side):
         assert np.linalg.norm(expected - EDGE) < 5e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("side", [1.0, -1.0])
 def test_unstable_manifold__maps_to_itself(side):
     """The image of a point lies on the curve, one generation later; chords are as short as asked for."""
@@ -102,6 +104,7 @@ def test_first_tangency__tends_to_that_of_melnikov():
     assert (4.0 * ratios[1] - ratios[0]) / 3.0 == pytest.approx(0.7530181, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_first_tangency__refuses_an_interval_without_one():
     with pytest.raises(ValueError, match=r"are apart at both 0\.05 and 0\.055"):
         first_tangency(lambda g: saddle_of(0.08, g, (-0.5 * g, 0.0)), 0.05, 0.055, (1.0, 1.0), Resolution(0.05, 6.0))

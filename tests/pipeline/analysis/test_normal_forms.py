@@ -74,6 +74,7 @@ def only(branch, kind):
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("a", [-0.7, 0.4])
 def test_neimark_sacker__of_a_radial_flow(a):
     """r' = a r^3 at mu = 0, so that the map over T is r + a T r^3 + ..., and r^2 = 2 |z|^2 with |q| = 1."""
@@ -84,6 +85,7 @@ def test_neimark_sacker__of_a_radial_flow(a):
     assert one.criticality == ("supercritical" if a < 0.0 else "subcritical")
 
 
+@pytest.mark.slow
 def test_neimark_sacker__of_a_flow_seen_at_even_times():
     """The map over T of a flow at its Hopf point: d = T w l1, quadratic terms included (Brusselator)."""
     found = {}
@@ -98,6 +100,7 @@ def test_neimark_sacker__of_a_flow_seen_at_even_times():
     assert torus.coefficient == pytest.approx(PERIOD * 1.2 * hopf.coefficient, rel=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("b", [-1.0, 0.5])
 def test_branch_point__pitchfork(b):
     """x' = b x^3 at mu = 0: the map is x + b T x^3 + ..."""
@@ -106,6 +109,7 @@ def test_branch_point__pitchfork(b):
     assert one.criticality == ("supercritical" if b < 0.0 else "subcritical")
 
 
+@pytest.mark.slow
 def test_branch_point__transcritical():
     """x' = a x^2 at mu = 0: the map is x + a T x^2 + ..."""
     one = only(at_rest(SCALAR, a=0.8, b=-1.0)[0], "transcritical")
@@ -113,6 +117,7 @@ def test_branch_point__transcritical():
     assert one.criticality == ""
 
 
+@pytest.mark.slow
 def test_fold__bends_the_branch_as_its_coefficient_says(settled):
     """On the centre manifold x = x + beta + b x^2: the orbits lie at x^2 = -beta/b, beta = <p, dF/dmu>."""
     parameters, frequency = load_model("duffing").load(damping=0.1, linear=1.0, cubic=1.0, amplitude=0.1), 0.7 / np.pi
@@ -136,6 +141,7 @@ def test_fold__bends_the_branch_as_its_coefficient_says(settled):
         assert one.coefficient_error < 1e-5 * abs(one.coefficient)
 
 
+@pytest.mark.slow
 def test_doubling__orbits_of_twice_the_period_are_as_far_as_its_coefficient_says(cascade):
     """x -> -(1 + beta) x + c x^3: the orbits lie at x^2 = beta/c."""
     singles = [b for b in cascade[1] if b.family.period == 1]

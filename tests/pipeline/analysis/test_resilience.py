@@ -144,6 +144,7 @@ def separates(well_at, well):
     return bool((well_at(1.0 - off) == well).all() and (well_at(1.0 + off) == 1 - well).any())
 
 
+@pytest.mark.slow
 def test_resilience__critical_shock_of_duffing_by_exhaustion(found, exhaustive):
     """No smaller multiple of .004 leads away at any phase; the shock found does, a slightly smaller one does not."""
     for well in (0, 1):
@@ -163,6 +164,7 @@ def test_resilience__critical_shock_of_duffing_by_exhaustion(found, exhaustive):
         assert float(one["shock_safe"]) < size
 
 
+@pytest.mark.slow
 def test_resilience__distances_of_duffing(found):
     """In any direction at the section, and along each state: smaller shocks stay, larger ones leave (DOP853)."""
     turns = np.linspace(0.0, 2.0 * np.pi, 30, endpoint=False)
@@ -182,6 +184,7 @@ def test_resilience__distances_of_duffing(found):
             assert abs(along[k]) >= size
 
 
+@pytest.mark.slow
 def test_resilience__basin_stability_and_table(found, wells):
     shares = found["basin_stability"].values
     fractions = wells.derive("basins")["fraction"].sel(label=[0, 1]).values
@@ -208,6 +211,7 @@ def linear(duffing):
     return duffing(damping=0.2, linear=2.0, cubic=0.0, amplitude=1.0, num=5)
 
 
+@pytest.mark.slow
 def test_resilience__of_a_linear_oscillator(linear):
     """No shock leads away; arrivals follow the matrix exponential (validation.md, 1)."""
     one = linear.derive("resilience", within=7, largest=3.0).isel(attractor=0)
@@ -234,6 +238,7 @@ def test_resilience__of_a_linear_oscillator(linear):
 # ---- magnets -----------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_shocks__magnetic_pendulum_as_published(magnets):
     """Test "Magnetic 2D" of Attractors.jl: .39 to .395 of place, in the Euclidean norm, from a magnet at rest.
 
@@ -251,6 +256,7 @@ def test_shocks__magnetic_pendulum_as_published(magnets):
         assert one.leads_to in {0, 1, 2} - {own}
 
 
+@pytest.mark.slow
 def test_resilience__of_the_magnets(magnets):
     """Bases of three equal magnets: the same sizes by symmetry, and jumps of place that agree with the search above."""
     found = magnets.derive("resilience", states="x,y", timed=0)
@@ -265,6 +271,7 @@ def test_resilience__of_the_magnets(magnets):
 HILLTOP, MULTIPLIERS = (-0.099835710177, 0.007534227463), (324.501702, 0.00120079844)
 
 
+@pytest.mark.slow
 def test_edge__of_a_fractal_boundary(wells):
     """The boundary is fractal: its paths do not settle, and the orbit on the hilltop is one of those on it."""
     found = wells.derive("edge", between=("A", "B"), seed=2)
@@ -284,6 +291,7 @@ def test_edge__of_a_fractal_boundary(wells):
     assert gids == {"edge orbit", "edge set"}
 
 
+@pytest.mark.slow
 def test_edge__of_a_smooth_boundary(duffing):
     """At F = .1 all pairs come to one saddle orbit: a fixed point by DOP853, between the two basins."""
     a_run = duffing(amplitude=0.1)
@@ -310,6 +318,7 @@ def test_edge__of_a_smooth_boundary(duffing):
     assert set(nearest.argmin(axis=1).tolist()) == {0, 1}
 
 
+@pytest.mark.slow
 def test_edge__of_two_magnets(magnets):
     """On the line between two magnets' basins lies a rest: no force by its formula, one unstable eigenvalue."""
     found = magnets.derive("edge", between=("A", "B"), pairs=8)
@@ -352,6 +361,7 @@ def test_resilience__refuses(wells, name, options, message):
         wells.derive(name, **options)
 
 
+@pytest.mark.slow
 def test_edge__says_what_is_not_decided(wells):
     """A path of 16 sections on a fractal boundary has not settled."""
     found = wells.derive("edge", between=("A", "B"), seed=2, returns=16, max_period=0)

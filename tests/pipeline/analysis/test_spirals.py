@@ -35,6 +35,7 @@ def cell(frequency, state):
     return cube_of(found, STATES, frequency=frequency).assign_attrs(rtol=1e-7, atol=1e-7)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("frequency", "state", "period"), SLOW)
 def test_identify__a_slow_spiral_is_its_orbits(frequency, state, period):
     ds = cell(frequency, state)

@@ -65,6 +65,7 @@ def pitchfork(computed):
     return computed(SPEC)
 
 
+@pytest.mark.slow
 def test_attractors__a_repeller_on_the_grid_is_none(pitchfork):
     """+-sqrt(r) with the multiplier exp(-2 r), half of the cells each; 0 with exp(r); all cells at r = 0."""
     rows = attractors_table(derive(pitchfork, "attractors")).rows
@@ -91,6 +92,7 @@ def test_outcomes__cells_on_the_repeller_are_counted_by_name(pitchfork):
     assert sentence(ids) == "13 of 15 cells end on attractors; 2 on an unstable orbit or equilibrium"
 
 
+@pytest.mark.slow
 def test_basins__have_no_basin_of_a_repeller(pitchfork):
     found = derive(pitchfork, "basins")
     assert found["n_unstable"].values.tolist() == [0, 1, 1]
@@ -102,6 +104,7 @@ def test_basins__have_no_basin_of_a_repeller(pitchfork):
     assert at["fraction_if_all"].values.max() == pytest.approx(0.6)
 
 
+@pytest.mark.slow
 def test_derive__more_evidence_holds_everywhere(pitchfork):
     """What is asked with less is answered with the most that is kept, and the rest is stale."""
     without = derive(pitchfork, "attractors", {"extend": False, "n_points": 8})

@@ -84,6 +84,7 @@ def edge_of_stuart_landau(force):
     return float(np.sqrt(-(1.0 - rho) * (1.0 - 3.0 * rho))[0])
 
 
+@pytest.mark.slow
 def test_cube__rotation_numbers(stuart_landau):
     """Locked cells turn once per period exactly; far away the rate is near w0, and it is symmetric about 1."""
     cube = stuart_landau.cube().isel(initial_condition=0)
@@ -98,6 +99,7 @@ def test_cube__rotation_numbers(stuart_landau):
     assert (cube["rotation_error"].values < 1e-3).all()
 
 
+@pytest.mark.slow
 def test_tongue__edges_in_closed_form(stuart_landau):
     """The folds of the 1/1 tongue on the row, and along the whole curve."""
     ds = stuart_landau.derive("tongues", parameter="w0", second="F", second_low=0.1, second_high=0.5, max_denominator=1)
@@ -132,6 +134,7 @@ def section_map(state, frequency, force, periods, mu=1.0):
     return end[:2], end[2:6].reshape(2, 2), end[6] / (2.0 * np.pi)
 
 
+@pytest.mark.slow
 def test_tongues__edges_by_another_integrator(van_der_pol):
     """At the edges the orbit closes after q periods, has turned p times, and has a multiplier 1."""
     ds = van_der_pol.derive(
@@ -205,6 +208,7 @@ def edge_of_step(state, bias, turns, periods):
     return float(found.x[2])
 
 
+@pytest.mark.slow
 def test_tongues__steps_of_the_staircase(computed):
     """The edges of 0/1, 1/3, 1/2 and 1/1 of a damped pendulum, as docs/examples/driven-pendulum.md has them."""
     found = AnalysedRun.of(computed(STAIRCASE))
@@ -243,6 +247,7 @@ def test_cells__only_good_rotation_numbers(van_der_pol):
     assert np.flatnonzero(~known.all(axis=1)).tolist() == [3]
 
 
+@pytest.mark.slow
 def test_figures(van_der_pol):
     """The map has the median over the cells; a line of it is a staircase."""
     cube = van_der_pol.cube()

@@ -19,6 +19,7 @@ from pipeline.specification.parsing import parse_spec
 from pipeline.specification.problems import SpecError
 
 
+@pytest.mark.slow
 def test_help__exit_codes(main):
     for arguments in (["--help"], ["run", "--help"]):
         text = " ".join(re.sub(r"[│╭╰╮╯─]", " ", main(*arguments)[1]).split())
@@ -59,6 +60,7 @@ REFUSED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("line", "sentence"), REFUSED.items())
 def test_bad_input__refused_in_a_sentence(main, write_spec, sweep_text, tmp_path, line, sentence):
     write_spec(sweep_text)
@@ -70,6 +72,7 @@ def test_bad_input__refused_in_a_sentence(main, write_spec, sweep_text, tmp_path
     assert sorted(tmp_path.rglob("*")) == before
 
 
+@pytest.mark.slow
 def test_run__dry_run_creates_nothing(main, write_spec, sweep_text, tmp_path):
     write_spec(sweep_text)
     before = sorted(tmp_path.rglob("*"))
@@ -120,6 +123,7 @@ def test_figure_command__fits_the_products(axes, products, n_keep, command):
     assert figure_command(plan, Path("run")) == command
 
 
+@pytest.mark.slow
 def test_run__plot_of_two_parameters_draws_a_diagram_and_says_what_is_left(main, write_spec, sweep_text):
     write_spec(sweep_text)
     code, out, err = main("run", "spec.toml", "--workers", "0", "--plot")
@@ -131,6 +135,7 @@ def test_run__plot_of_two_parameters_draws_a_diagram_and_says_what_is_left(main,
     ]
 
 
+@pytest.mark.slow
 def test_run__status__verify__plot(main, write_spec, walk_text, tmp_path, monkeypatch):
     write_spec(walk_text + "\n[smoke]\ninitial_conditions.n = 2\n")
     code, out, _ = main("run", "spec.toml", "--smoke", "--workers", "0", "--plot")
@@ -202,6 +207,7 @@ def test_run__failed_task_has_its_own_code(main, write_spec, sweep_text, monkeyp
     assert "No space left on device" in err
 
 
+@pytest.mark.slow
 def test_simulate__series_figure_and_data_with_provenance(main, tmp_path):
     words = ("simulate", "--psi1-deg", "10", "--periods", "2", "--samples", "20", "--out")
     assert main(*words, "a.nc")[1].split() == ["series:", "a.nc", "figure:", "a.png"]
@@ -222,6 +228,7 @@ def test_presets__values_units_and_source(main):
     assert re.search(r"delta .*0\.003265.*m .*calibrated", out)
 
 
+@pytest.mark.slow
 def test_find_spec__shipped_workflows():
     shipped = workflows.shipped_workflows()
     assert "quickstart" in shipped

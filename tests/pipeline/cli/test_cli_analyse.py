@@ -11,6 +11,8 @@ import pytest
 from pipeline.cli.exits import Exit
 from pipeline.runs.derive import derive
 
+pytestmark = pytest.mark.slow
+
 SPIRALS = """
 kind = "sweep"
 axes = { frequency_hz = { values = [2.2, 2.25] } }

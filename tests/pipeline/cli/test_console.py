@@ -85,6 +85,7 @@ def test_progress__first_line_within_seconds_and_without_reports(monkeypatch, ca
     assert "analyse: " in said
 
 
+@pytest.mark.slow
 def test_at_rest__ends_the_lines_of_a_command_that_serves(monkeypatch, capsys):
     monkeypatch.setattr(console, "FIRST_LINE_S", 0.2)
     with progress("explore"):
@@ -120,6 +121,7 @@ def test_reporting__says_when_it_compiles():
     assert heard == ["work", "compiling", "work"]
 
 
+@pytest.mark.slow
 def test_head__ends_with_0(magpend, made, environment):
     """Whoever reads no further is no error."""
     command = f"{sys.executable} -m pipeline.cli.main status {made.info.directory} | head -c 1"
@@ -154,6 +156,7 @@ def test_help__keeps_square_brackets_units_bounds_and_defaults(main):
     assert "--install-completion" in main("--help")[1]
 
 
+@pytest.mark.slow
 def test_completion__completes_names():
     lines = {
         "magpend analyse hy": "hysteresis",

@@ -12,6 +12,7 @@ from pipeline.runs.modelling import TEMPLATE
 from pipeline.specification.parsing import load_spec
 
 
+@pytest.mark.slow
 def test_new__runs_as_it_is(main, tmp_path):
     code, out, _ = main("model", "new", "mine.toml")
     assert (code, out) == (0, "specification: mine.toml\n")

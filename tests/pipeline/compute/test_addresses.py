@@ -94,6 +94,7 @@ def test_ask__wrong_port():
         assert f"tcp://127.0.0.1:{port}: nothing listens there" in refusal(f"127.0.0.1:{port}")
 
 
+@pytest.mark.slow
 def test_ask__web_server(monkeypatch):
     assert addresses.ANSWER_S <= 5
     monkeypatch.setattr(addresses, "ANSWER_S", 0.5)
@@ -101,12 +102,14 @@ def test_ask__web_server(monkeypatch):
         assert "is another kind of server" in refusal(f"tcp://127.0.0.1:{port}")
 
 
+@pytest.mark.slow
 def test_ask__mute(monkeypatch):
     monkeypatch.setattr(addresses, "ANSWER_S", 0.5)
     with mute_server() as port:
         assert "or a scheduler that hangs" in refusal(f"tcp://127.0.0.1:{port}")
 
 
+@pytest.mark.slow
 def test_ask__a_scheduler_and_what_is_beside_it(cluster, monkeypatch):
     ask(read_address(cluster.scheduler_address, "--scheduler"))
     monkeypatch.setattr(addresses, "ANSWER_S", 0.5)

@@ -48,6 +48,7 @@ def silent(line):
 # ---- coming and going ----------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_workers__come_and_go(tmp_path, write_spec, scheduler_file, worker, bytes_of, monkeypatch):
     """None is there at first; the first one is killed in the middle, after another has come."""
     path = write_spec(SPEC)
@@ -77,6 +78,7 @@ def test_workers__come_and_go(tmp_path, write_spec, scheduler_file, worker, byte
     assert bytes_of(tmp_path / "out") == bytes_of(tmp_path / "alone")
 
 
+@pytest.mark.slow
 def test_workers__none(main, write_spec, scheduler_file, monkeypatch):
     monkeypatch.setenv("MAGPEND_WAIT_FOR_WORKERS", "00:00:01")
     code, _, errors = main("run", write_spec(SPEC), "--out", "out", "--scheduler", scheduler_file)
@@ -105,6 +107,7 @@ def refusal(scheduler_file, n_workers, **where):
     return text
 
 
+@pytest.mark.slow
 def test_workers__other_versions(tmp_path, environment, scheduler_file, worker):
     """One has another numba, and one no magpend at all."""
     (tmp_path / "other" / "numba-0.0.1.dist-info").mkdir(parents=True)
@@ -135,6 +138,7 @@ MOUNTS = {
 }
 
 
+@pytest.mark.slow
 def test_workers__other_files(tmp_path, scheduler_file, worker):
     """One sees an empty folder by the same name, one may only read: disks are mounted for them alone."""
     out = tmp_path / "out"
@@ -152,6 +156,7 @@ def test_workers__other_files(tmp_path, scheduler_file, worker):
     assert not list((out / "commits").iterdir())
 
 
+@pytest.mark.slow
 def test_sees(tmp_path, monkeypatch):
     monkeypatch.setattr(probe, "_LATE_S", 0.3)
     place, key = str(tmp_path), "commits/.probe.tmp"

@@ -78,6 +78,7 @@ def test_simulate__says_that_the_left_orbit_is_closed():
     assert ds.attrs["closing"].startswith("closed: the motion repeats after 1 drive period (")
 
 
+@pytest.mark.slow
 def test_simulate__says_that_300_periods_are_too_few_and_that_1000_will_do():
     start = (0.0, math.radians(20.0), 0.0, 0.0)
     early, late = (simulate(2.48, start, n_transient=n, n_periods=4, samples_per_period=20) for n in (300, 1000))

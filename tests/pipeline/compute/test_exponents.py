@@ -41,6 +41,7 @@ def cube(tmp_path_factory):
     return open_run(folder / "run").load()
 
 
+@pytest.mark.slow
 def test_lyapunov__is_what_the_core_gives_from_the_last_section(cube):
     packed = load_preset().pack()
     for frequency in (1.0, 2.2):

@@ -41,6 +41,7 @@ def test_order__circle():
         Order(range(3), lambda i: (i + 1) % 3)
 
 
+@pytest.mark.slow
 def test_order__many_tasks():
     started = time.process_time()
     found = drained(Order(range(100_000), in_steps_of(100)))

@@ -85,6 +85,7 @@ def refined(labels, stride):
     return source, own
 
 
+@pytest.mark.slow
 @given(
     st.integers(1, 3).flatmap(lambda d: st.lists(st.integers(1, 40 // d**2 + 4), min_size=d, max_size=d)),
     st.sampled_from([2, 4, 8, 16]),
@@ -212,6 +213,7 @@ def two_wells(n):
     return integrate
 
 
+@pytest.mark.slow
 def test_infer__duffing_against_the_full_grid():
     n = 96
     integrate, asked = two_wells(n), []
@@ -278,6 +280,7 @@ def refined_run(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_run__refined_against_the_full_grid(refined_run):
     one, full = (open_run(refined_run / name).load() for name in ("refined", "full"))
     inferred = (one.status == Status.INFERRED).values
@@ -290,6 +293,7 @@ def test_run__refined_against_the_full_grid(refined_run):
     assert state(refined_run / "refined").cells["inferred"] == inferred.sum()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("workers", [0, 2])
 def test_kill__refined_run_resumes_to_the_same_bytes(refined_run, start, tmp_path, bytes_of, workers):
     directory = tmp_path / "run"
@@ -302,6 +306,7 @@ def test_kill__refined_run_resumes_to_the_same_bytes(refined_run, start, tmp_pat
     assert bytes_of(directory) == bytes_of(refined_run / "refined")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lengths", [(17,), (5, 4, 4, 5)])
 def test_compute__one_and_four_grid_dims(lengths):
     ranges = [
@@ -335,6 +340,7 @@ def refined_text(shape, stride, extra=""):
     )
 
 
+@pytest.mark.slow
 @settings(deadline=None)
 @given(
     st.lists(st.integers(16, 70), min_size=1, max_size=4),

@@ -50,6 +50,7 @@ def test_simulate__equal_periods_are_the_ordinary_series(even):
     assert found.attrs["frequency_hz"] == pytest.approx(HZ)
 
 
+@pytest.mark.slow
 def test_simulate__goes_over_the_whole_drive(even, torque):
     whole = simulate(None, START, drive=even, samples_per_period=10)
     assert whole.sizes["time"] == 81
@@ -89,6 +90,7 @@ def test_simulate__section_is_that_of_a_run(even):
     np.testing.assert_allclose(found.psi1_dot[1:], expected[:, 2], atol=1e-7)
 
 
+@pytest.mark.slow
 def test_plot_trajectory__marks_the_sections_of_the_recording(even):
     figure = plot_trajectory(simulate(None, START, drive=even, samples_per_period=40))
     texts = [text.get_text() for text in figure.findobj(Text)]

@@ -20,6 +20,7 @@ from pipeline.compute.processes import Processes
 from pipeline.compute.threads import in_threads, writing_results
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("place", ["threads", "processes", "dask"])
 def test_run_tasks__order_failures_and_a_second_try(faulty, tmp_path, scheduler, place):
     task = partial(faulty.raising, str(tmp_path), poison=(5,), unlucky=(2,))
@@ -92,6 +93,7 @@ def test_threads__tasks_that_go_on_after_the_end_write_nothing():
     assert written == []
 
 
+@pytest.mark.slow
 def test_threads__end_waits_for_what_is_being_written():
     begun, written, number = threading.Event(), [], itertools.count()
 
@@ -113,6 +115,7 @@ def test_threads__end_waits_for_what_is_being_written():
 # ---- processes -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_processes__poison_kills_them_and_the_others_finish(faulty, tmp_path):
     task = partial(faulty.deadly, str(tmp_path), poison=(3,), unlucky=(1,))
     found, before = [], set(psutil.Process().children())
@@ -143,6 +146,7 @@ def asleep(faulty, tmp_path):
     thread.join()
 
 
+@pytest.mark.slow
 def test_processes__end_with_the_process_that_started_them(asleep):
     """Its end of the pipe closes with it, however it ended."""
     _, child = asleep
@@ -150,6 +154,7 @@ def test_processes__end_with_the_process_that_started_them(asleep):
     assert child.wait(60) == 0
 
 
+@pytest.mark.slow
 def test_processes__are_not_waited_for(asleep):
     processes, child = asleep
     assert os.getpgid(child.pid) != os.getpgid(0)  # the terminal sends Ctrl-C to this group alone
@@ -159,6 +164,7 @@ def test_processes__are_not_waited_for(asleep):
         processes(1)
 
 
+@pytest.mark.slow
 def test_run_tasks__loads_no_distributed(environment):
     code = (
         "import sys; from pipeline.compute.execute import run_tasks; "

@@ -109,6 +109,7 @@ def assert_same_whatever_the_cut(write_spec, folder, text, cuts=(1, 3, None)):
     return one
 
 
+@pytest.mark.slow
 def test_walk__plain_both_ways(write_spec, tmp_path):
     ds = assert_same_whatever_the_cut(write_spec, tmp_path, duffing())
     assert np.isfinite(ds.section).all()
@@ -117,12 +118,14 @@ def test_walk__plain_both_ways(write_spec, tmp_path):
     assert (ds.section[:, :4].values != ds.section[:, 4:].values).any()
 
 
+@pytest.mark.slow
 def test_walk__along_another_dim(write_spec, tmp_path):
     axes = "frequency_hz = { values = [0.1, 0.2] }\namplitude = { start = 0.2, stop = 0.5, num = 5 }"
     ds = assert_same_whatever_the_cut(write_spec, tmp_path, duffing(axes, "amplitude"), (1, 2, None))
     assert ds.section.dims[:3] == ("frequency", "amplitude", "branch")
 
 
+@pytest.mark.slow
 def test_walk__stops_when_closed(write_spec, tmp_path):
     closing = "stop_when_closed = true\nclosure_tolerance = 1e-2"
     text = duffing(integration=closing).replace("n_transient = 12", "n_transient = 200")
@@ -130,6 +133,7 @@ def test_walk__stops_when_closed(write_spec, tmp_path):
     assert len(np.unique(ds.n_periods)) > 2
 
 
+@pytest.mark.slow
 def test_walk__ends_with_a_cell_that_fails(write_spec, tmp_path):
     # the lower the frequency the more steps to a period: downwards all fail on the way, upwards at once
     limit = "max_steps_per_period = 40"
@@ -152,6 +156,7 @@ def test_walk__ends_with_a_cell_that_fails(write_spec, tmp_path):
     assert (ds.n_steps.values[status == Status.UNREACHED] == 0).all()
 
 
+@pytest.mark.slow
 def test_walk__goes_on_from_where_it_does_not_return(write_spec, tmp_path):
     ds = assert_same_whatever_the_cut(write_spec, tmp_path, VAN_DER_POL, (1, 4, None))
     status, down = ds.status.values, 3
@@ -164,6 +169,7 @@ def test_walk__goes_on_from_where_it_does_not_return(write_spec, tmp_path):
     assert np.isnan(ds.rest_state.values[~left]).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n_committed", [1, 3, 5])
 def test_walk__interrupted_and_resumed(write_spec, tmp_path, bytes_of, monkeypatch, n_committed):
     from pipeline.compute import task

@@ -22,6 +22,7 @@ def one_second(index):
     return 1.0
 
 
+@pytest.mark.slow
 def test_workers__poison_kills_them_and_the_others_finish(faulty, scheduler, tmp_path):
     """A worker that dies takes nothing along; who killed it is found out when it is tried alone."""
     task = partial(faulty.deadly, str(tmp_path), poison=(3,), unlucky=(1,))
@@ -34,6 +35,7 @@ def test_workers__poison_kills_them_and_the_others_finish(faulty, scheduler, tmp
     assert 2 <= faulty.tries(tmp_path)[3] <= 4
 
 
+@pytest.mark.slow
 def test_workers__one_that_dies_with_a_result_that_was_not_fetched_yet(faulty, scheduler, tmp_path, monkeypatch):
     """The task is computed again: nobody takes the scheduler for gone."""
     outcome, states = dispatch._outcome, []
@@ -60,6 +62,7 @@ def test_workers__one_that_dies_with_a_result_that_was_not_fetched_yet(faulty, s
     assert states != ["finished"]
 
 
+@pytest.mark.slow
 def test_workers__one_that_is_stopped(faulty, scheduler, tmp_path):
     """SIGSTOP: it falls silent, the scheduler restarts it, and its task is done by another."""
     task = partial(faulty.hanging, str(tmp_path), number=signal.SIGSTOP, unlucky=(2,))
@@ -68,6 +71,7 @@ def test_workers__one_that_is_stopped(faulty, scheduler, tmp_path):
     assert faulty.tries(tmp_path)[2] == 2
 
 
+@pytest.mark.slow
 def test_workers__tasks_that_hang(faulty, scheduler, tmp_path, monkeypatch):
     """A living worker that is busy for ever: the task is given up there and done elsewhere, or reported."""
     # tasks that do not hang have all the time that a busy machine takes for them
@@ -84,6 +88,7 @@ def test_workers__tasks_that_hang(faulty, scheduler, tmp_path, monkeypatch):
     assert faulty.tries(tmp_path)[2] == 2
 
 
+@pytest.mark.slow
 def test_workers__a_blocked_callback_of_another_client_holds_up_nobody(faulty, scheduler, tmp_path):
     from distributed import Client
 
@@ -96,6 +101,7 @@ def test_workers__a_blocked_callback_of_another_client_holds_up_nobody(faulty, s
             free.set()
 
 
+@pytest.mark.slow
 def test_workers__scheduler_dies(faulty, processes, scheduler_file, worker, tmp_path):
     """A scheduler that is killed: an error in one sentence, soon."""
     (tmp_path / "log").mkdir()

@@ -46,6 +46,7 @@ def reached(state, at, wells):
     return found
 
 
+@pytest.mark.slow
 def test_shocks__part_the_motions(wells):
     found = disturbances(wells, {"amplitude": SMOOTH})
     json.dumps(found, allow_nan=False)
@@ -59,6 +60,7 @@ def test_shocks__part_the_motions(wells):
         assert reached(start + 0.999 * jump, SMOOTH, wells) == shock["attractor"]
 
 
+@pytest.mark.slow
 def test_shocks__between_sections_are_told_apart(wells):
     shocks = [s for at in (SMOOTH, FRACTAL) for s in disturbances(wells, {"amplitude": at})["shocks"]]
     for shock in shocks:
@@ -70,6 +72,7 @@ def test_shocks__between_sections_are_told_apart(wells):
     assert {s["smallest"]["phase"] for s in shocks} == {0.0, 0.5}
 
 
+@pytest.mark.slow
 def test_edges__are_orbits_at_their_own_point(wells):
     found = disturbances(wells, {"amplitude": SMOOTH})
     (edge,) = found["edges"]
@@ -86,6 +89,7 @@ def test_edges__are_orbits_at_their_own_point(wells):
     assert beside["notes"] == [f"edge states are not computed here: {command}"]
 
 
+@pytest.mark.slow
 def test_disturbances__of_other_attractors_are_left_out(wells):
     """Letters of a result whose attractors were told otherwise would name other sets."""
     explored = ExploredRun.of(wells)
@@ -102,6 +106,7 @@ def test_disturbances__refuse_an_index_off_the_axis(wells):
         disturbances(wells, {"amplitude": 2})
 
 
+@pytest.mark.slow
 def test_disturbances__are_answered_and_copied(wells):
     explored, at = ExploredRun.of(wells), {"amplitude": SMOOTH}
     answer = ANSWERS["disturbances"].give(explored, Query({"at.amplitude": str(SMOOTH)}), None)
@@ -113,6 +118,7 @@ def test_disturbances__are_answered_and_copied(wells):
 # ---- pushes and noise ----------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_push__leads_where_the_analysis_says(wells, watcher):
     """The page sends the orbit's state plus the impulse."""
     for at, amplitude in enumerate(AMPLITUDES):
@@ -147,6 +153,7 @@ noise = {{ seed = 7, strengths = {{ v = 0.05 }} }}
 """
 
 
+@pytest.mark.slow
 def test_noisy_start__has_the_bits_of_a_noisy_run(watcher, tmp_path):
     directory = finished(tmp_path, NOISY)
     cell = Run.open(directory).cube().sel(amplitude=0.2, x_0=-0.5, v_0=0.25)
@@ -161,6 +168,7 @@ def test_noisy_start__has_the_bits_of_a_noisy_run(watcher, tmp_path):
     assert np.abs(other - section).max() > 0.05
 
 
+@pytest.mark.slow
 def test_noisy_start__without_noise_is_the_plain_one(watcher):
     weak, plain = noisy(watcher, noise=1e-12, periods=2)[1], sections([-0.5, 0.25], 0.2, 2)[1:]
     np.testing.assert_allclose(weak, plain, atol=1e-4)  # steps of a 256th of a period

@@ -57,6 +57,7 @@ def run(made):
     return Run.open(made.info.directory)
 
 
+@pytest.mark.slow
 def test_export_page__has_the_cubes_numbers(run, tmp_path):
     written = export_page(run, tmp_path / "copy.html", most_orbits=0)
     assert written.size == (tmp_path / "copy.html").stat().st_size
@@ -80,6 +81,7 @@ def test_export_page__has_the_cubes_numbers(run, tmp_path):
     assert "Nothing is computed here" in about["notice"]
 
 
+@pytest.mark.slow
 def test_export_page__leaves_out_what_does_not_fit_and_says_what(run, tmp_path):
     whole = export_page(run, tmp_path / "whole.html", most_orbits=0)
     assert not any("left out" in s or "rounded" in s for s in whole.sentences)
@@ -159,6 +161,7 @@ def test_choose__an_orbit_for_each_attractor_else_the_nearest(run):
     assert (len(none.cells), set(none.orbit)) == (0, {NONE})
 
 
+@pytest.mark.slow
 def test_export_page__an_orbit_that_fails_is_told_where_it_is_asked_for(run, tmp_path, monkeypatch):
     asked = []
 
@@ -174,6 +177,7 @@ def test_export_page__an_orbit_that_fails_is_told_where_it_is_asked_for(run, tmp
     assert {entry["cell"] for entry in attrs.values()} <= set(asked)
 
 
+@pytest.mark.slow
 def test_export_folder__lists_every_object_and_pins_the_list(run, tmp_path):
     written = export_folder(run, tmp_path / "site", most_orbits=0)
     site = tmp_path / "site"
@@ -196,6 +200,7 @@ def _parsed(text):
     return title, re.findall(r'<script[^>]* id="([^"]+)"', text), re.findall(r"<([a-z]\w*)", text)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["page", "folder"])
 def test_export__a_hostile_title_stays_text(run, tmp_path, kind, monkeypatch):
     plain = tmp_path / "plain.html"
@@ -214,6 +219,7 @@ def test_export__a_hostile_title_stays_text(run, tmp_path, kind, monkeypatch):
         assert (scripts, tags) == _parsed(plain.read_text("utf-8"))[1:]
 
 
+@pytest.mark.slow
 def test_export__what_is_there_is_not_overwritten(run, tmp_path):
     page = tmp_path / "copy.html"
     page.write_text("mine")
@@ -238,6 +244,7 @@ def test_export__what_is_there_is_not_overwritten(run, tmp_path):
     assert (site / "thesis.tex").read_text() == "mine"
 
 
+@pytest.mark.slow
 def test_export_folder__that_fails_leaves_what_was_there(run, tmp_path, monkeypatch):
     site = tmp_path / "site"
     export_folder(run, site, most_orbits=0)
@@ -253,6 +260,7 @@ def test_export_folder__that_fails_leaves_what_was_there(run, tmp_path, monkeypa
     assert [p.name for p in tmp_path.iterdir() if p.name.startswith(".")] == []
 
 
+@pytest.mark.slow
 def test_export__command(main, run, tmp_path):
     code, out, err = main("export", run.directory, "--orbits", 0)
     assert code == 0, err

@@ -72,6 +72,7 @@ def start_of(cube, at):
 # ---- starts --------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["whole", "closing"])
 def test_start__has_the_bits_and_the_attractor_of_the_cell(directories, watch, name):
     opened = Run.open(directories[name])
@@ -129,6 +130,7 @@ def test_start__off_the_cube_is_told_by_its_orbit(directories, watch):
     assert ends[0]["label"].startswith("not among the run's: period")
 
 
+@pytest.mark.slow
 def test_start__ends_of_a_flow(directories, watch):
     """At rest or on the cycle, as the analysis says of the cell; what leaves, and what lies beside, says so."""
     cube, attractors = Run.open(directories["flow"]).cube(), derive(directories["flow"], "attractors")
@@ -151,6 +153,7 @@ def test_start__ends_of_a_flow(directories, watch):
     assert end["status"] in ("diverged", "step_limit", "step_underflow")
 
 
+@pytest.mark.slow
 def test_start__is_superseded_and_cancelled(directories, watch):
     watcher = watch(directories["whole"])
     watcher.ask(do="start", parameters={"A": 0.2}, state={"x": 0.3})
@@ -193,6 +196,7 @@ def slice_of(x, v, resolution, **parameters):
     }
 
 
+@pytest.mark.slow
 def test_slice__is_that_of_the_cube_and_computes_no_start_twice(directories, watch, monkeypatch):
     starts = []
 
@@ -280,6 +284,7 @@ def test_follow__is_the_orbit_at_the_value(directories, watch):
     np.testing.assert_allclose(states[0], states[-1], atol=1e-6)  # it closes
 
 
+@pytest.mark.slow
 def test_follow__goes_through_unstable_parts_and_says_where_it_is_lost(directories, watch):
     live = LiveRun(Run.open(directories["whole"]))
     watcher = watch(live)
@@ -298,6 +303,7 @@ def test_follow__goes_through_unstable_parts_and_says_where_it_is_lost(directori
     assert {True} <= set(stable)
 
 
+@pytest.mark.slow
 def test_follow__refuses_with_a_sentence(directories, watch):
     live = LiveRun(Run.open(directories["whole"]))
     watcher, cell = watch(live), closed_cell(live)
@@ -312,6 +318,7 @@ def test_follow__refuses_with_a_sentence(directories, watch):
         assert word in watcher.ask(do="follow", **{"from": origin}, parameter=parameter, value=value)["error"]
 
 
+@pytest.mark.slow
 def test_follow__of_a_flow(directories, watch):
     live = LiveRun(Run.open(directories["flow"]))
     watcher = watch(live)
@@ -350,6 +357,7 @@ def test_zoomed__is_the_region_and_reads_back(directories, tmp_path):
     assert spec.initial_conditions == opened.spec.initial_conditions
 
 
+@pytest.mark.slow
 def test_run__a_region_beside_the_run(directories, watch, monkeypatch):
     watcher = watch(directories["whole"])
     beside = directories["whole"].parent
@@ -407,6 +415,7 @@ HOSTILE = [
 ]
 
 
+@pytest.mark.slow
 def test_receive__answers_what_is_wrong_and_goes_on(directories, watch):
     watcher = watch(directories["whole"])
     for text in HOSTILE:

@@ -42,6 +42,7 @@ def sentence(answer):
 # ---- what is answered
 
 
+@pytest.mark.slow
 def test_api__every_answer_has_the_policy(client):
     """The page, an answer, a refusal and a place that is not there."""
     for path, token in (("/", False), ("/api/view", True), ("/api/view", False), ("/nowhere", True)):
@@ -200,6 +201,7 @@ def test_api__what_integrates_waits_for_what_it_needs(client, monkeypatch):
     assert found == [400] * len(orbits)
 
 
+@pytest.mark.slow
 def test_api__damage_is_said_and_nothing_is_shown(made_run):
     section = made_run / "cube.zarr" / "section"
     for file in section.rglob("*"):
@@ -273,6 +275,7 @@ def test_browser__is_told_a_file_for_this_user_alone(monkeypatch):
 # ---- the command
 
 
+@pytest.mark.slow
 def test_explore__serves_until_it_is_stopped(made_run, start, environment, monkeypatch):
     """It prints the address, answers, changes nothing in the run, and ends with Ctrl-C as other commands."""
     before = {p: (p.stat().st_mtime_ns, p.stat().st_size) for p in made_run.rglob("*")}
@@ -301,6 +304,7 @@ def test_explore__serves_until_it_is_stopped(made_run, start, environment, monke
     assert {p: (p.stat().st_mtime_ns, p.stat().st_size) for p in made_run.rglob("*")} == before
 
 
+@pytest.mark.slow
 def test_explore__takes_a_region_that_it_runs_along(made_run, start):
     """What was begun for a page ends with the server, though it is in a group of its own."""
     process = start("explore", made_run, "--no-browser")

@@ -123,6 +123,7 @@ def ask(notebook, client):
     return both
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "words", "body"), ANSWERED, ids=lambda part: part if isinstance(part, str) else "")
 def test_answers__are_the_same_bytes(ask, name, words, body):
     code, content, filename = ask(name, words, body)
@@ -139,6 +140,7 @@ def test_answers__refuse_in_the_same_sentence(ask, name, words, body, said):
     assert "Traceback" not in sentence
 
 
+@pytest.mark.slow
 def test_answers__are_those_of_the_run(ask, little):
     explored = ExploredRun.of(little)
     assert ask("diagram", DIAGRAM, None)[1] == diagram(explored, "frequency", "x", {})
@@ -180,6 +182,7 @@ async def until(true):
         await asyncio.sleep(0.01)
 
 
+@pytest.mark.slow
 def test_live__is_computed_alike(notebook, client):
     """The first part of the path comes in the same bytes, the end with the same words."""
 
@@ -251,6 +254,7 @@ def test_socket__a_page_that_leaves_cancels_its_jobs(client):
     client.talk(conversation())
 
 
+@pytest.mark.slow
 def test_connection__a_page_that_leaves_cancels_its_jobs(little):
     notebook = Notebook(little)
     notebook.tell("one", open=True)

@@ -95,6 +95,7 @@ def flow(tmp_path_factory):
 # ---- the view
 
 
+@pytest.mark.slow
 def test_describe_view__says_what_stands_in_a_run(sweep):
     explored = ExploredRun.of(sweep)
     found = describe_view(explored, True)
@@ -120,6 +121,7 @@ def test_describe_view__says_what_stands_in_a_run(sweep):
     assert [p["value"] is None for p in found["model"]["parameters"] if p["name"] == "amplitude"] == [True]
 
 
+@pytest.mark.slow
 def test_describe_view__names_commands_that_the_run_can_have(sweep, walk, made_run):
     # of what a run of two parameters is to be followed along, a person has to say
     assert describe_view(ExploredRun.of(sweep), False)["commands"] == {}
@@ -127,6 +129,7 @@ def test_describe_view__names_commands_that_the_run_can_have(sweep, walk, made_r
     assert {"attractors", "basins"} <= describe_view(ExploredRun.of(made_run.directory), False)["commands"].keys()
 
 
+@pytest.mark.slow
 def test_describe_view__reads_what_is_computed_later(walk):
     explored = ExploredRun.of(walk)
     view = describe_view(explored, False)
@@ -156,6 +159,7 @@ def test_plain__labels_have_no_latex():
 # ---- the diagram
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("x", ["frequency", "amplitude"])
 @pytest.mark.parametrize("y", ["v", "energy.max"])
 def test_diagram__has_every_point_of_the_cube(sweep, x, y):
@@ -182,6 +186,7 @@ def test_diagram__has_every_point_of_the_cube(sweep, x, y):
     assert len(arrays["cell"]) == status.size // cube.sizes[other]
 
 
+@pytest.mark.slow
 def test_diagram__colours_are_those_of_the_analyses(sweep):
     explored = ExploredRun.of(sweep)
     arrays, _ = unpack_arrays(diagram(explored, "amplitude", "x", {"frequency": 0}))
@@ -193,6 +198,7 @@ def test_diagram__colours_are_those_of_the_analyses(sweep):
     assert set(expected.tolist()) - {-1} <= named
 
 
+@pytest.mark.slow
 def test_diagram__tells_directions_and_seeds(walk):
     explored = ExploredRun.of(walk)
     arrays, _ = unpack_arrays(diagram(explored, "amplitude", "x", {}))
@@ -202,6 +208,7 @@ def test_diagram__tells_directions_and_seeds(walk):
     np.testing.assert_array_equal(arrays["colour_seed"], cube["seed"].values[branch])
 
 
+@pytest.mark.slow
 def test_diagram__shows_the_last_sections_where_there_are_too_many(sweep, monkeypatch):
     explored = ExploredRun.of(sweep)
     whole, _ = unpack_arrays(diagram(explored, "amplitude", "x", {"frequency": 0}))
@@ -216,6 +223,7 @@ def test_diagram__shows_the_last_sections_where_there_are_too_many(sweep, monkey
         diagram(explored, "amplitude", "x", {"frequency": 0})
 
 
+@pytest.mark.slow
 def test_diagram__of_a_run_in_progress_has_what_is_committed(made_run):
     """Pending cells are there without points; after a commit and a fresh look they have them."""
     explored = ExploredRun.of(made_run.directory)
@@ -252,6 +260,7 @@ def some_cells(explored, n=4):
     return found[:: max(1, len(found) // n)][:n].tolist()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("which", ["sweep", "walk", "flow"])
 def test_orbit__ends_where_the_cube_goes_on(which, request):
     """The first point is the section asked for, and each period ends at the cube's next one."""
@@ -277,6 +286,7 @@ def test_orbit__ends_where_the_cube_goes_on(which, request):
             np.testing.assert_allclose(arrays["section_times"][-1], arrays["time"][-1], rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_orbit__agrees_with_scipy(sweep):
     """The whole path of one period is that of DOP853 on the model's own rates."""
     explored = ExploredRun.of(sweep)
@@ -294,6 +304,7 @@ def test_orbit__agrees_with_scipy(sweep):
     assert np.abs(exact.y.T - arrays["states"]).max() < 1e-6
 
 
+@pytest.mark.slow
 def test_orbit__says_what_the_cube_and_the_analysis_say(sweep):
     explored = ExploredRun.of(sweep)
     found = derive(sweep, "attractors")
@@ -319,6 +330,7 @@ def test_orbit__says_what_the_cube_and_the_analysis_say(sweep):
             assert attrs["evidence"] == "multipliers"
 
 
+@pytest.mark.slow
 def test_orbit__has_multipliers_without_an_analysis(sweep, walk):
     """Polishing the cell's own section gives those that the analysis of attractors gives; first it says they come."""
     explored = ExploredRun.of(sweep)
@@ -386,6 +398,7 @@ def test_recorded__is_looked_at_and_not_followed_on(tmp_path):
 # ---- what lies over and beside
 
 
+@pytest.mark.slow
 def test_curves__are_shares_and_exponents_of_the_analysis(sweep):
     explored = ExploredRun.of(sweep)
     found = derive(sweep, "attractors").isel(frequency=1)
@@ -404,6 +417,7 @@ def test_curves__are_shares_and_exponents_of_the_analysis(sweep):
         assert one["x"] == found["amplitude"].values.tolist()
 
 
+@pytest.mark.slow
 def test_branches__lie_on_the_diagram(walk):
     """Where a branch is stable, points of the cube lie on it; every located point has its branch."""
     explored = ExploredRun.of(walk)
@@ -429,6 +443,7 @@ def test_branches__lie_on_the_diagram(walk):
     assert {p["branch"] for p in found["points"]} <= {b["id"] for b in found["branches"]}
 
 
+@pytest.mark.slow
 def test_attractors__are_those_of_the_point(sweep):
     explored = ExploredRun.of(sweep)
     here = derive(sweep, "attractors").isel(frequency=0, amplitude=2)
@@ -443,6 +458,7 @@ def test_attractors__are_those_of_the_point(sweep):
         np.testing.assert_array_equal(one["section"], points[np.isfinite(points).all(axis=1)])
 
 
+@pytest.mark.slow
 def test_plane__has_the_label_of_every_start(sweep):
     explored = ExploredRun.of(sweep)
     arrays, attrs = unpack_arrays(plane(explored, {"frequency": 1, "amplitude": 0}))
@@ -456,6 +472,7 @@ def test_plane__has_the_label_of_every_start(sweep):
     assert set(np.unique(arrays["label"])) - {-1} <= {c["id"] for c in attrs["labels"]}
 
 
+@pytest.mark.slow
 def test_plane__of_scattered_starts_lists_them(walk):
     explored = ExploredRun.of(walk)
     arrays, attrs = unpack_arrays(plane(explored, {"amplitude": 1}))
@@ -470,6 +487,7 @@ def test_plane__of_scattered_starts_lists_them(walk):
 # ---- tables
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["diagram", "curves", "orbit", "plane", "attractors"])
 def test_table__has_the_same_rows_in_both_formats(sweep, kind, tmp_path):
     explored = ExploredRun.of(sweep)

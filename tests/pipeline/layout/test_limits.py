@@ -80,6 +80,7 @@ def test_run__refuses_what_is_too_large(refuses, sizes, words):
     assert all(word in said for word in words), said
 
 
+@pytest.mark.slow
 def test_make_plan__the_remedies_are_some():
     """The bound of a piece is that of the compressor."""
     from numcodecs import blosc

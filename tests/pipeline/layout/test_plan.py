@@ -32,6 +32,7 @@ ROOT = Path(__file__).parents[3]
 SHAPES = st.lists(st.integers(1, 9), min_size=0, max_size=4)
 
 
+@pytest.mark.slow
 @given(SHAPES, st.integers(1, 40), st.data())
 def test_tasks__every_cell_in_one_task(shape, wanted, data):
     path = data.draw(st.sampled_from([None, *range(len(shape))]))

@@ -154,6 +154,7 @@ def test_draw_figure__nearest_is_said_and_shown():
     assert float(figure.data["frequency"]) == 2.05
 
 
+@pytest.mark.slow
 def test_draw_figure__provenance_beside_and_inside(tmp_path):
     figure = draw_figure(FakeRun(), "bifurcation", options_of("bifurcation", state="psi2", width=85.0))
     path = save_data(figure, save_figure(figure, tmp_path / "a.png"))
@@ -174,6 +175,7 @@ def test_draw_figure__provenance_beside_and_inside(tmp_path):
         assert all(text in written for text in (b"node7", b"d" * 64, b"bifurcation diagram"))
 
 
+@pytest.mark.slow
 def test_files__without_what_is_empty_and_with_fonts_as_outlines(tmp_path):
     """A dim of length 0 is NetCDF's for one that may grow; scipy does not read it back."""
     figure = plot_bifurcation(make_cube())
@@ -188,6 +190,7 @@ def test_files__without_what_is_empty_and_with_fonts_as_outlines(tmp_path):
         assert set(stored.variables) == {"some"}
 
 
+@pytest.mark.slow
 def test_frame__limits_show_and_keep_a_part():
     figure = plot_bifurcation(make_cube(), frame=Frame(xlim=(2.04, 2.11), ylim=(0.105, 0.125)))
     ax = figure.axes[0]

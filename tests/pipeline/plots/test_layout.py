@@ -59,6 +59,7 @@ def is_clear(fig):
         assert 0 <= box.y0 < box.y1 <= fig.bbox.y1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("width", [COLUMN_MM, 120.0, 178.0])
 def test_bifurcation__width_in_millimetres_and_legible_letters(width):
     figure = plot_bifurcation(make_cube(), frame=Frame(width))
@@ -68,6 +69,7 @@ def test_bifurcation__width_in_millimetres_and_legible_letters(width):
     assert len([tick for tick in figure.axes[0].get_xticks() if 2.0 <= tick <= 2.2]) > 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("width", [85.0, 178.0])
 @pytest.mark.parametrize("n", [1, 2, 3])
 def test_gallery__no_label_covers_a_panel_or_another_label(n, width):
@@ -81,6 +83,7 @@ def test_gallery__no_label_covers_a_panel_or_another_label(n, width):
         assert not any(box.padded(-2).overlaps(p.padded(-2)) for p in panels), text.get_text()
 
 
+@pytest.mark.slow
 def test_trajectory__labels_stay_off_the_series():
     """The path of a small motion has ticks of many digits, known only once its scale is."""
     ds = make_trajectory()
@@ -92,6 +95,7 @@ def test_trajectory__labels_stay_off_the_series():
     assert boxes[figure.axes[-1].yaxis.label].x0 > last.get_window_extent().x1
 
 
+@pytest.mark.slow
 def test_legends__fit_into_the_figure_beside_the_axes():
     """Twenty attractors with the longest names."""
     coords = {"frequency": [2.0, 2.1, 2.2]}

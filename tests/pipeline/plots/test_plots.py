@@ -80,6 +80,7 @@ def test_status_codes_are_those_of_the_kernel():
     assert points.ABSENT["not reached"] == (Status.UNREACHED,)
 
 
+@pytest.mark.slow
 def test_plot_bifurcation__each_class_has_its_points_and_colour():
     ds = make_cube()
     fig = plot_bifurcation(ds)
@@ -97,6 +98,7 @@ def test_plot_bifurcation__each_class_has_its_points_and_colour():
     assert not [gid for gid in lines if gid.startswith("absent")]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("state", STATES)
 def test_plot_bifurcation__state_and_degrees(state):
     ds = make_cube()
@@ -112,6 +114,7 @@ def test_plot_bifurcation__state_and_degrees(state):
     assert radians.axes[0].get_xlabel() == "drive frequency [Hz]"
 
 
+@pytest.mark.slow
 def test_plot_bifurcation__side_by_side():
     ds = make_cube()
     fig = plot_bifurcation(ds, layout="side")
@@ -122,6 +125,7 @@ def test_plot_bifurcation__side_by_side():
     assert not {"up", "down"} & set(legend_texts(fig))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("status", [PENDING, DIVERGED, STEP_LIMIT, STEP_UNDERFLOW, UNREACHED])
 def test_plot_bifurcation__absent_cells_are_not_drawn_but_shown(status):
     ds = set_status(make_cube(), 1, 2, status)
@@ -139,6 +143,7 @@ def test_plot_bifurcation__absent_cells_are_not_drawn_but_shown(status):
     assert "blank" not in by_gid(fig)
 
 
+@pytest.mark.slow
 def test_plot_bifurcation__blank_where_no_cell_is_left():
     ds = make_cube()
     for branch in range(4):
@@ -188,6 +193,7 @@ def test_plot_bifurcation__refusals():
     plot_bifurcation(ds.sel(q=1.5))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("chunks", "block_values"), [({"branch": 1}, 50), ({"branch": 3, "frequency": 2}, 1)])
 def test_plot_bifurcation__blocks_do_not_matter(chunks, block_values, monkeypatch):
     ds = set_status(make_cube(), 3, 1, DIVERGED)
@@ -239,6 +245,7 @@ def assert_ink(found, colour):
     np.testing.assert_allclose(1.0 - found, strength * paper, atol=0.01)
 
 
+@pytest.mark.slow
 def test_plot_bifurcation__image_has_the_same_points(monkeypatch):
     monkeypatch.setattr(pixels, "MARKER_LIMIT", 0)
     ds = set_status(make_cube(), 1, 2, PENDING)
@@ -255,6 +262,7 @@ def test_plot_bifurcation__image_has_the_same_points(monkeypatch):
     assert (pixel(fig, 2.1, 0.11) < 1).any()
 
 
+@pytest.mark.slow
 def test_plot_bifurcation__image_shows_up_over_down(monkeypatch):
     monkeypatch.setattr(pixels, "MARKER_LIMIT", 0)
     ds = make_cube().isel(branch=[0, 0], period_index=[0])
@@ -267,6 +275,7 @@ def test_plot_bifurcation__image_shows_up_over_down(monkeypatch):
     np.testing.assert_allclose(pixel(fig, 2.3, -0.15), tint, atol=0.01)
 
 
+@pytest.mark.slow
 def test_plot_bifurcation__fuller_pixels_are_darker_on_one_scale_of_all_panels(monkeypatch):
     monkeypatch.setattr(pixels, "MARKER_LIMIT", 0)
     ds = make_cube(n_keep=40).isel(branch=[1])

@@ -72,6 +72,7 @@ def legend_colours(fig):
     return dict(zip(legend_texts(fig), [to_rgb(p.get_facecolor()) for p in handles], strict=True))
 
 
+@pytest.mark.slow
 def test_plot_basins__each_cell_has_the_colour_of_its_legend(grid):
     fig = plot_basins(grid)
     picture, legend = colours_of(fig), legend_colours(fig)
@@ -105,6 +106,7 @@ def test_plot_basins__the_denominator_of_the_table(grid):
     assert "shares of the 13 of 16 cells that end on attractors or diverge" in caption_of(fig)
 
 
+@pytest.mark.slow
 def test_plot_basins__pixels_of_the_file_lie_where_the_axes_say(grid, tmp_path):
     """The pixel under each cell's centre, found through the axes, has the cell's colour."""
     fig = plot_basins(grid, degrees=True)
@@ -126,6 +128,7 @@ def test_plot_basins__pixels_of_the_file_lie_where_the_axes_say(grid, tmp_path):
     assert plot_basins(wide).axes[0].get_aspect() == "auto"
 
 
+@pytest.mark.slow
 def test_plot_basins__shading_by_time(grid):
     """Slower is darker, in the same hue; cells that took no time or did not close are not shaded."""
     grid["status"][1, :2] = grid["status"][2, 1] = INFERRED  # as the others: no basin of their own
@@ -245,6 +248,7 @@ def band(fig, name):
     return [[round(float(v), 9) for v in (b.x0, b.x1, b.y0, b.y1)] for b in boxes]
 
 
+@pytest.mark.slow
 def test_plot_fractions__bands_are_stacked_and_what_is_not_decided_is_on_top(sweep):
     fig = plot_fractions(sweep)
     assert band(fig, "B") == [[1.95, 2.05, 0, 0.5], [2.05, 2.15, 0, 0.4], [2.15, 2.25, 0, 0.8]]
@@ -273,6 +277,7 @@ def offsets(fig, gid):
     return where[order], np.sqrt(np.broadcast_to(area, len(where))[order])
 
 
+@pytest.mark.slow
 def test_plot_coexisting__points_and_weights(sweep):
     """Points are where the attractors are; the larger the basin fraction per point, the larger."""
     fig = plot_coexisting(sweep, degrees=True)
@@ -290,6 +295,7 @@ def test_plot_coexisting__points_and_weights(sweep):
     np.testing.assert_allclose(halves**2, [least + growth * 0.25, least + growth * 0.25, least + growth * 0.4])
 
 
+@pytest.mark.slow
 def test_plot_coexisting__angles_on_the_circle(sweep):
     sweep["attractor_points"][:] = sweep["attractor_points"] + 2 * np.pi
     np.testing.assert_allclose(offsets(plot_coexisting(sweep), "points:B")[0][:, 1], 0.2)
@@ -310,6 +316,7 @@ def walk():
     return make_attractors(ids, ("frequency", "branch"), coords)
 
 
+@pytest.mark.slow
 def test_plot_coexisting__directions_and_loops(walk):
     fig = plot_coexisting(walk, hysteresis=hysteresis(walk, walk))
     lines = {line.get_gid(): line for line in fig.axes[0].get_lines()}
@@ -356,6 +363,7 @@ def legend_patches(fig):
     return {" ".join(h.get_label().split()): to_rgb(h.get_facecolor()) for h in patches}
 
 
+@pytest.mark.slow
 def test_plot_regimes__each_point_has_its_regime(map_of_two):
     fig = plot_regimes(map_of_two)
     assert regime_names(fig) == [["1", "1 + 2", "2"], ["1", "1", "none"]]
@@ -372,6 +380,7 @@ def test_plot_regimes__each_point_has_its_regime(map_of_two):
     assert fig.data["n_attractors"].transpose("frequency", "q").values.tolist() == [[1, 2, 1], [1, 1, 0]]
 
 
+@pytest.mark.slow
 def test_attractor_figures__say_how_many_cells_are_left_out_and_why(map_of_two, sweep):
     """Which cells a map of regimes does not count, and a diagram or a gallery does not show, stood nowhere."""
     map_of_two["status"][0, 2, 0] = Status.DIVERGED
@@ -437,6 +446,7 @@ def test_plot_regimes__not_periodic_and_one_parameter(map_of_two, sweep):
         plot_regimes(map_of_two, show="period")
 
 
+@pytest.mark.slow
 def test_plot_gallery__orbits_sections_and_paths():
     attractors = make_attractors(range(3), ("initial_condition",))
     drawn = make_portraits(3, turning=(2,))
@@ -461,6 +471,7 @@ def test_plot_gallery__orbits_sections_and_paths():
     assert titles[0] == "A: period 1, left, share 10.0 %"
 
 
+@pytest.mark.slow
 def test_plot_gallery__largest_shares_are_drawn():
     attractors = make_attractors(range(11), ("initial_condition",))
     portraits = make_portraits(11)
@@ -495,6 +506,7 @@ def test_greys__every_cell_without_an_attractor_has_one():
     assert [bool(found[name][len(Status) + k]) for k, name in enumerate(on_sets)] == [True] * 4
 
 
+@pytest.mark.slow
 def test_plot_fractions__intervals(sweep):
     fig = plot_fractions(sweep)
     # Wilson's score interval, by its own equation: |p - k/n| = z sqrt(p (1 - p) / n) at both ends
@@ -524,6 +536,7 @@ def test_plot_fractions__branches_are_no_sample(walk):
     assert "branches each" in caption_of(fig)
 
 
+@pytest.mark.slow
 def test_plot_regimes__shares_and_what_may_be_missing(map_of_two):
     fig = plot_regimes(map_of_two)
     here = fig.data.sel(frequency=2.0, q=1.5)

@@ -46,6 +46,7 @@ def test_plot_section__all_points_with_labels_and_fixed_values():
     np.testing.assert_array_equal(np.sort(line.get_ydata()), np.sort(figure.data["y"]))
 
 
+@pytest.mark.slow
 def test_plot_section__zoom_of_many_points_counts_them_anew():
     ds = make_sections(300, 1000)
     assert ds["section"].sizes["period_index"] * 300 > pixels.MARKER_LIMIT
@@ -60,6 +61,7 @@ def test_plot_section__zoom_of_many_points_counts_them_anew():
     assert np.diff(np.unique(zoom.data["x"])).min() < 0.2 * np.diff(np.unique(whole.data["x"])).min()
 
 
+@pytest.mark.slow
 def test_plot_section__one_parameter_point():
     ds = xr.concat([make_sections(), make_sections(seed=4)], "frequency").assign_coords(frequency=[0.1, 0.2])
     with pytest.raises(ValueError, match=r"one parameter point, .*frequency \(2 values\).*--at frequency=0\.2"):
@@ -80,6 +82,7 @@ def test_plot_section__states_and_degrees():
         plot_section(ds, states=("x", "w"))
 
 
+@pytest.mark.slow
 def test_plot_section__colours_of_attractors():
     ds = make_sections()
     ids = make_attractors([0, 1, 1, -1], ("initial_condition",), attrs=DUFFING, status=np.full(4, BOUNDED, np.int8))
@@ -118,6 +121,7 @@ def make_extremes():
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "word", "column"), [("min", "least", 0), ("mean", "mean", 2)])
 def test_plot_bifurcation__extremes_of_a_quantity(kind, word, column):
     ds = make_extremes()

@@ -25,6 +25,7 @@ def lines(fig):
     return {line.get_gid(): line.get_xydata() for ax in fig.axes for line in ax.get_lines()}
 
 
+@pytest.mark.slow
 def test_plot_trajectory__series_portraits_sections_and_torque():
     ds = make_trajectory()
     found = lines(plot_trajectory(ds))
@@ -38,6 +39,7 @@ def test_plot_trajectory__series_portraits_sections_and_torque():
     assert "torque [N m]" in [ax.get_ylabel() for ax in fig.axes]
 
 
+@pytest.mark.slow
 def test_plot_trajectory__panel_per_unit_and_no_path_without_a_drawing():
     ds = make_trajectory()[["psi1", "psi2"]].rename(psi1="x", psi2="v").assign_attrs(DUFFING)
     ds["energy"] = ("time", np.ones(401), {"units": "J/kg"})
@@ -46,6 +48,7 @@ def test_plot_trajectory__panel_per_unit_and_no_path_without_a_drawing():
     assert "path" not in figure.data
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("width", [85.0, 178.0])
 def test_plot_trajectory__path_of_the_magnet(width):
     ds = make_trajectory().assign_attrs(PENDULUM)
@@ -59,6 +62,7 @@ def test_plot_trajectory__path_of_the_magnet(width):
     assert (right - left) / box.width == pytest.approx((top - bottom) / box.height)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wrapped", [False, True])
 def test_plot_trajectory__rotation_is_drawn_on_the_circle(wrapped):
     ds = make_trajectory()
@@ -80,6 +84,7 @@ def test_plot_trajectory__missing_variables():
         plot_trajectory(make_trajectory().isel(time=[0]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("suffix", "start"), [(".png", b"\x89PNG"), (".pdf", b"%PDF"), (".svg", b"<?xml")])
 def test_save_figure__same_bytes_each_time(tmp_path, suffix, start, monkeypatch):
     salt = matplotlib.rcParams["svg.hashsalt"]

@@ -16,6 +16,7 @@ ALL = [*CELL_PRODUCTS.values(), *ANALYSES.values(), *FIGURES.values()]
 NAMES = [f"{type(p).__name__}-{p.name}" for p in ALL]
 
 
+@pytest.mark.slow
 def test_registry__names_are_the_products_own():
     for registry in (CELL_PRODUCTS, ANALYSES, FIGURES):
         assert {name: product.name for name, product in registry.items()} == {n: n for n in registry}

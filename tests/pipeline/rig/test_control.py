@@ -66,6 +66,7 @@ def compared(computed, rig, targets, tmp_path):
     return orbits, compare(read_branch(tmp_path / "orbits.csv", found.model), branches, sizes)
 
 
+@pytest.mark.slow
 def test_trace__unstable_middle_branch(computed, tmp_path):
     """Without noise all orbits, the unstable ones too, are those of the model; control leaves one cosine."""
     (tmp_path / "rig.toml").write_text(CONTROL)
@@ -81,6 +82,7 @@ def test_trace__unstable_middle_branch(computed, tmp_path):
     assert orbits.residue.max() < 1e-3
 
 
+@pytest.mark.slow
 def test_trace__with_noise(computed, tmp_path):
     """With noise of 2 mm in amplitudes of a metre orbits are right within per cents, and scatter."""
     rig = Controlled(load_model("duffing").load("hardening"), 0.22, "x", "amplitude", noise=2e-3, seed=3)
@@ -91,6 +93,7 @@ def test_trace__with_noise(computed, tmp_path):
     assert np.abs(found["relative_error"].values[near]).max() < 0.03
 
 
+@pytest.mark.slow
 def test_trace__command(computed, tmp_path, command):
     """The command writes the table, and measured branch reads it."""
     (tmp_path / "rig.toml").write_text(CONTROL.replace("num = 9", "num = 4"))

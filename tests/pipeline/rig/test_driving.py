@@ -107,6 +107,7 @@ def test_drive_file__refuses():
         drive_file(recording(holed), "torque")
 
 
+@pytest.mark.slow
 def test_cli__from_a_recording_to_a_simulation_and_a_run(main, tmp_path):
     """A virtual rig: what it measured comes back when its motor's recording drives the model."""
     (tmp_path / "rig.toml").write_text(RIG.replace("STEPS", STEPS), "utf-8")
@@ -145,6 +146,7 @@ def test_cli__refuses_a_model_and_a_file(main, tmp_path):
     assert "none.csv: cannot be read" in err
 
 
+@pytest.mark.slow
 def test_cli__what_the_motor_did_is_closer_than_what_it_was_told(main, tmp_path):
     """Periods that jitter by 1 %: the recorded torque, the edges, the mean frequency, in this order."""
     rng = np.random.default_rng(0)

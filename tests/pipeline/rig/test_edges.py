@@ -94,6 +94,7 @@ def test_find_edges__a_band_outside_the_levels_is_refused(hysteresis):
         find_edges(time, square(time), hysteresis=hysteresis)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("jitter", [2e-3, 1e-4, 0.0])
 def test_frequency__errors_hold_over_many_recordings(jitter):
     """Monte Carlo: over recordings with a known jitter, the z scores have spread 1."""

@@ -101,6 +101,7 @@ def response(frequency):
     return 0.2 / np.hypot(1.0 - w * w, 0.3 * w)
 
 
+@pytest.mark.slow
 def test_amplitudes__of_a_linear_oscillator(linear):
     """A / sqrt((1 - w^2)^2 + (d w)^2) on the whole branch."""
     branches = linear.derive("branches", parameter="frequency_hz")
@@ -109,6 +110,7 @@ def test_amplitudes__of_a_linear_oscillator(linear):
     np.testing.assert_allclose(found[0, :n], response(branches["parameter"].values[0, :n]), rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_compare__with_a_table(linear, tmp_path):
     """Errors in per cent and in scatters of a table of orbits; none is unstable."""
     table = tmp_path / "orbits.csv"
@@ -168,6 +170,7 @@ def test_read_branch__specification(tmp_path, old, new, message):
     assert message in str(raised.value)
 
 
+@pytest.mark.slow
 def test_flutter__errors_of_the_published_parameters(tmp_path, command):
     """15.7 % on the stable cycles and 8.4 % on the unstable ones, as own shooting by DOP853 has them."""
     command(tmp_path, "run", "flutter", "--out", "computed", "--workers", "0")

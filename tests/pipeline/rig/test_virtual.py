@@ -47,6 +47,7 @@ def test_record__ideal_sensors_see_the_engines_states(parameters):
     assert findings_of(ds) == []
 
 
+@pytest.mark.slow
 def test_record__steps_of_the_drive_carry_the_state_on(parameters):
     """Against scipy, step by step: another frequency, another duty cycle, and the drive off."""
     from scipy.integrate import solve_ivp

@@ -138,6 +138,7 @@ def test_spec__has_a_method_for_every_table_and_its_keys():
     assert "Relative tolerance of a step" in magpend.Spec.integration.__doc__
 
 
+@pytest.mark.slow
 def test_spec__reads_and_writes_what_ships():
     for name, path in shipped_workflows().items():
         spec, shipped = magpend.Spec.read(name), load_spec(path)
@@ -164,6 +165,7 @@ def test_spec__names_files_from_where_it_is(tmp_path, monkeypatch):
         spec.parameters(frequency_hz=0.3).save(saved)
 
 
+@pytest.mark.slow
 def test_preview__is_the_dry_run(tmp_path):
     found = built().preview(tmp_path / "run", workers=2)
     assert (found.n_cells, found.dims) == (24, {"A": 3, "k": 2, "x_0": 4})
@@ -174,6 +176,7 @@ def test_preview__is_the_dry_run(tmp_path):
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.slow
 def test_run__of_a_spec_of_a_dict_and_of_equations(tmp_path, bytes_of):
     spec = built()
     (tmp_path / "spec.toml").write_text(TEXT, "utf-8")
@@ -217,6 +220,7 @@ def test_run__of_a_text_goes_on_where_it_was(tmp_path, monkeypatch):
     assert any("nothing to do" in line for line in said)
 
 
+@pytest.mark.slow
 def test_repr__tells_what_it_is_and_what_to_do_next(driven):
     text = repr(driven)
     assert len(text.splitlines()) <= 20
@@ -227,6 +231,7 @@ def test_repr__tells_what_it_is_and_what_to_do_next(driven):
     assert "three forces" in driven._repr_html_()
 
 
+@pytest.mark.slow
 def test_table__has_a_row_per_attractor_and_parameter_point(driven):
     found = magpend.table(magpend.attractors(driven))
     assert len(found) == 3

@@ -79,6 +79,7 @@ def products(made, name="mean"):
     return sorted((made.info.directory / "derived").glob(f"{name}-*.zarr"))
 
 
+@pytest.mark.slow
 def test_derive__returns_what_was_computed_and_keeps_it_as_plain_zarr(whole, compute):
     said = []
     expected = compute(Run.open(whole.info.directory), MeanOptions())
@@ -106,6 +107,7 @@ def test_derive__returns_what_was_computed_and_keeps_it_as_plain_zarr(whole, com
     assert json.loads((path / "mean" / "zarr.json").read_text())["codecs"][-1]["name"] == "crc32c"
 
 
+@pytest.mark.slow
 def test_derive__other_options_cells_and_code_compute_again(made, compute, monkeypatch):
     made.commit(0)
     directory = made.info.directory
@@ -180,6 +182,7 @@ HARM = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("harm", HARM)
 def test_derive__damage_is_said_and_mended(whole, compute, harm):
     said = []
@@ -215,6 +218,7 @@ def _write_often(directory, barrier, n):
         derive(directory, "mean", {"a": i})
 
 
+@pytest.mark.slow
 def test_derive__writers_at_once(whole, compute):
     context = multiprocessing.get_context("spawn")
     barrier = context.Barrier(2)
@@ -230,6 +234,7 @@ def test_derive__writers_at_once(whole, compute):
     assert compute.calls == 0
 
 
+@pytest.mark.slow
 def test_attractors__matching_again_identifies_nothing_again(whole):
     said = []
     found = derive(whole.info.directory, "attractors", {**QUICK}, echo=said.append)
@@ -245,6 +250,7 @@ def test_attractors__matching_again_identifies_nothing_again(whole):
     assert len(products(whole, "attractors")) == 2
 
 
+@pytest.mark.slow
 def test_attractors__what_was_shown_holds_from_then_on(whole):
     """A search with a smaller budget is the one with the largest; what rests on less is stale."""
     directory = whole.info.directory

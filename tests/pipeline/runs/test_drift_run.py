@@ -49,6 +49,7 @@ def critical_rate(y):
     return brentq(lambda rate: passing_time(y, rate) - LENGTH / rate, low, 3.0, xtol=1e-14)
 
 
+@pytest.mark.slow
 def test_run__stores_the_parameter_at_its_sections(moving_fold):
     ds = open_run(moving_fold)
     seconds = np.arange(1, 41)
@@ -64,6 +65,7 @@ def test_run__stores_the_parameter_at_its_sections(moving_fold):
     assert ds["status"].values[0].tolist() == [Status.PERIODIC, Status.PERIODIC]
 
 
+@pytest.mark.slow
 def test_tipping__critical_rates_are_those_of_the_closed_form(moving_fold):
     ds = derive(moving_fold, "tipping", {"settle": 60, "keep": 32})
     assert ds["critical_start"].values.tolist() == [0, 1]
@@ -97,6 +99,7 @@ def test_delay__of_a_synthetic_passage():
     assert left_at(lag, 1e-4)[0] == -1  # never near
 
 
+@pytest.mark.slow
 def test_delay__and_figure_of_a_run(moving_fold):
     ds = derive(moving_fold, "delay", {"distance": 1.2, "static": 0.0})
     assert ds["left"].shape == (4, 2)

@@ -18,6 +18,8 @@ from pipeline.store.errors import RefusedError
 from pipeline.store.run import Run
 from tests.pipeline.factories import duffing, quietly, silent
 
+pytestmark = pytest.mark.slow
+
 BASE = duffing(
     "frequency_hz = { start = 0.10, stop = 0.14, num = 5 }",
     'kind = "grid"\nx = { start = -1.0, stop = 1.0, num = 5 }\nv = 0.1',

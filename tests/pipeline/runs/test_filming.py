@@ -52,6 +52,7 @@ def pendulum(t, y):
     return [y[1], 1.66 * np.cos(2 * np.pi * HZ * t) - 0.2 * y[1] - np.sin(y[0])]
 
 
+@pytest.mark.slow
 def test_animation__frames_are_where_another_integration_says(swinging):
     """DOP853 of the equations as they stand here, and the bob at (sin th, -cos th)."""
     data = swinging.figure.data
@@ -72,6 +73,7 @@ def test_animation__frames_are_where_another_integration_says(swinging):
         np.testing.assert_allclose(np.transpose(machine.lines[0].get_data()), [[0.0, 0.0], bob], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_of_attractors__what_does_not_attract_is_shown_when_asked_for(run, monkeypatch):
     """Else it is said to be there; where nothing attracts, all sets are shown."""
     opened, options = AnalysedRun.of(run), AnimationOptions(at={"frequency": 0.16})
@@ -116,6 +118,7 @@ def test_animation__cells_pass_through_their_sections(run):
         np.testing.assert_allclose(values, cube.section.sel(state=name).values[:4], atol=2e-4)
 
 
+@pytest.mark.slow
 def test_animate__files_open_with_their_frames_and_loop(main, run, tmp_path):
     """GIF and WebP repeat for ever; MP4 where ffmpeg is."""
     words = ["animate", run, "--at", "frequency=0.16", "--attractor", "b", "--seconds", "2", "--fps", "8"]
@@ -151,6 +154,7 @@ def test_animate__files_open_with_their_frames_and_loop(main, run, tmp_path):
         assert code == Exit.REFUSED
 
 
+@pytest.mark.slow
 def test_animate__a_start_with_and_without_a_run(main, run, tmp_path):
     """States come first, or after the directory: neither is taken for the other."""
     small = ["--seconds", "1", "--fps", "4", "--size", "200"]
@@ -193,6 +197,7 @@ REFUSED = [
 ]
 
 
+@pytest.mark.slow
 def test_animate__refuses_in_one_sentence(main, run, tmp_path):
     before = sorted(run.rglob("*"))
     for words, said in REFUSED:

@@ -38,6 +38,7 @@ def test_settings__workers_refuse_line_breaks(kind):
             settings(cluster, Path(f"/logs/a\n{mark}"))
 
 
+@pytest.mark.slow
 def test_prepare__working_directory_and_specification(tmp_path, write_spec, sweep_text, monkeypatch):
     place = tmp_path / "a\n#PBS -l walltime=99:00:00"
     place.mkdir()

@@ -53,6 +53,7 @@ def directory(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return finished(tmp_path_factory.mktemp("noise"), WELL)
 
 
+@pytest.mark.slow
 def test_escapes__mean_first_passage_time_by_quadrature(directory: Path) -> None:
     # a cell that is looked at every T seconds is seen beyond a level as if that were higher by .5826 s sqrt(T):
     # Broadie, Glasserman and Kou, Math. Finance 7 (1997) 325
@@ -81,6 +82,7 @@ def test_escapes__kramers_fit_has_the_barrier(directory: Path) -> None:
     assert passage_time(s, 0.8) == pytest.approx(corrected, rel=0.06)  # what is beyond this order
 
 
+@pytest.mark.slow
 def test_density__of_the_double_well(directory: Path) -> None:
     ds = derive(directory, "density", {"skip": 250, "bandwidth": 0.3}).sel(noise_x=0.7)
     value = ds["value"].values
@@ -110,6 +112,7 @@ SMALL: dict[str, Any] = {
 }
 
 
+@pytest.mark.slow
 def test_extend__gives_the_bytes_of_a_longer_run(tmp_path: Path, bytes_of: Any) -> None:
     short = WELL.replace("[0.45, 0.55, 0.7]", "[0.2]").replace("stop = 199", "stop = 19")
     short = short.replace("n_transient = 0", "n_transient = 2").replace("n_keep = 1000", "n_keep = 5")
@@ -126,6 +129,7 @@ def test_extend__gives_the_bytes_of_a_longer_run(tmp_path: Path, bytes_of: Any) 
     np.testing.assert_array_equal(first[0], whole[0, :20, :, :5])
 
 
+@pytest.mark.slow
 def test_run__tasks_do_not_change_the_numbers(tmp_path: Path) -> None:
     for n in (3, 20):
         quietly(spec(**SMALL, execution={"trajectories_per_task": n}), tmp_path / str(n))
@@ -133,6 +137,7 @@ def test_run__tasks_do_not_change_the_numbers(tmp_path: Path) -> None:
     np.testing.assert_array_equal(few["section"].values, all_["section"].values)
 
 
+@pytest.mark.slow
 def test_derive__refuses_analyses_of_the_other_kind(directory: Path, tmp_path: Path) -> None:
     with pytest.raises(SpecError, match="attractors assumes that the same state goes on in the same way"):
         derive(directory, "attractors")

@@ -54,6 +54,7 @@ def stored(finished_text, tmp_path):
     return shutil.copytree(finished_text, tmp_path / "run")
 
 
+@pytest.mark.slow
 def test_run__text_is_integrated_as_it_is_written(finished_text):
     """Against scipy's DOP853 of the same equations, from another hand."""
     ds = open_run(finished_text)
@@ -114,6 +115,7 @@ def test_open_run__stranger_s_text_is_one_error(stored, tmp_path, main, text):
     assert not (tmp_path / "pwned").exists()
 
 
+@pytest.mark.slow
 def test_open_run__stranger_s_object_is_never_imported(own, stored, tmp_path, main, monkeypatch):
     """The module lies in the current folder and on the path; opening and drawing leave it alone."""
     trace = own.write_module(tmp_path, "trap")

@@ -30,6 +30,7 @@ def probe(axis, values, rate=RATE, **parameters):
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("axis", "values", "lost"),
     [

@@ -63,6 +63,7 @@ def recorded(write_spec, tmp_path):
     return write
 
 
+@pytest.mark.slow
 def test_run__equal_periods_give_the_numbers_of_the_ordinary_run(recorded, write_spec, tmp_path):
     quietly(recorded(RECORDED + EXTREMES, edges()), tmp_path / "recorded")
     quietly(write_spec(ORDINARY + EXTREMES), tmp_path / "ordinary")
@@ -85,6 +86,7 @@ def torque(n=1200):
     return "\n".join(["time_s,drive", *rows]) + "\n"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["edges", "torque"])
 def test_run__same_bytes_in_other_tasks_and_after_a_failure(recorded, tmp_path, monkeypatch, bytes_of, kind):
     text = RECORDED.replace("n_transient = 7", "n_transient = 5")
@@ -128,6 +130,7 @@ def path(once, tmp_path):
     return tmp_path / "spec.toml"
 
 
+@pytest.mark.slow
 def test_run__explains_itself_when_the_file_is_gone(path, tmp_path):
     text = (tmp_path / "drive.csv").read_text("utf-8")
     (tmp_path / "drive.csv").unlink()
@@ -166,6 +169,7 @@ def test_derive__refuses_what_goes_on_beyond_the_recording(once):
         figure(once / "run", "gallery", {"at": {"q": 1.6}})
 
 
+@pytest.mark.slow
 def test_extend__cells_under_the_same_recording(once, recorded, tmp_path, bytes_of, monkeypatch):
     wider = recorded(RECORDED.replace("[0.6, 1.6]", "[0.6, 1.1, 1.6]"))
     quietly(wider, tmp_path / "fresh")

@@ -49,6 +49,7 @@ HALF = MANY.replace("n = 64", "n = 32")  # both ways, as many cells as the sweep
 MANY_WALK = f'kind = "continuation"\n{HALF}\n[continuation]\ndirection = "both"\n{EIGHT}\npoints_per_task = 1'
 
 
+@pytest.mark.slow
 def test_run__walk_is_what_the_kernel_says(write_spec, walk_text, tmp_path):
     run(write_spec(walk_text), tmp_path / "run", workers=0, echo=silent)
     ds = open_run(tmp_path / "run")
@@ -80,6 +81,7 @@ def test_run__sweep_is_what_the_kernel_says(write_spec, sweep_text, tmp_path):
     assert int(cell.n_steps) == expected.n_steps[0, 0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["sweep", "walk", "drift", "noise"])
 def test_run__same_bytes_everywhere(write_spec, sweep_text, walk_text, tmp_path, bytes_of, kind):
     path = write_spec({"sweep": sweep_text, "walk": walk_text, "drift": DRIFT, "noise": NOISE}[kind])
@@ -94,6 +96,7 @@ def test_run__same_bytes_everywhere(write_spec, sweep_text, walk_text, tmp_path,
     assert sum(key.startswith("commits/") for key in found[0]) > 2
 
 
+@pytest.mark.slow
 def test_run__in_another_thread_and_inside_an_event_loop(write_spec, walk_text, tmp_path):
     path, done = write_spec(walk_text), []
 
@@ -110,6 +113,7 @@ def test_run__in_another_thread_and_inside_an_event_loop(write_spec, walk_text, 
     assert done == [True, True]
 
 
+@pytest.mark.slow
 def test_run__numbers_do_not_depend_on_the_tasks(write_spec, sweep_text, tmp_path):
     for n in (24, 7):
         text = sweep_text.replace("trajectories_per_task = 24", f"trajectories_per_task = {n}")
@@ -145,6 +149,7 @@ def test_run__again_does_nothing(write_spec, sweep_text, tmp_path, monkeypatch, 
     assert bytes_of(tmp_path / "run") == before
 
 
+@pytest.mark.slow
 def test_run__failed_task_then_only_the_rest(write_spec, sweep_text, tmp_path, monkeypatch, bytes_of):
     path = write_spec(sweep_text)
     run(path, tmp_path / "whole", workers=0, echo=silent)
@@ -233,6 +238,7 @@ def uninterrupted(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "workers", "seed"), [("sweep", 2, 0), ("walk", 2, 1), ("sweep", 0, 2), ("walk", 0, 3)]
 )
@@ -252,6 +258,7 @@ def test_kill__resumed_run_has_the_same_bytes(uninterrupted, start, tmp_path, by
     assert bytes_of(directory) == bytes_of(uninterrupted / kind)
 
 
+@pytest.mark.slow
 def test_kill__of_processes_over_and_over_loses_nothing(uninterrupted, start, tmp_path, bytes_of):
     """A process dies with every third task that is committed; those that live and new ones do the rest."""
     rng = np.random.default_rng(4)
@@ -272,6 +279,7 @@ def test_kill__of_processes_over_and_over_loses_nothing(uninterrupted, start, tm
     assert bytes_of(directory) == bytes_of(uninterrupted / "sweep")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_signal__stops_cleanly_and_resumes(uninterrupted, start, tmp_path, bytes_of, number, code):
     spec, directory = uninterrupted / "sweep.toml", tmp_path / "run"
@@ -288,6 +296,7 @@ def test_signal__stops_cleanly_and_resumes(uninterrupted, start, tmp_path, bytes
     assert bytes_of(directory) == bytes_of(uninterrupted / "sweep")
 
 
+@pytest.mark.slow
 def test_scheduler__existing_one(write_spec, sweep_text, tmp_path, bytes_of, monkeypatch):
     from distributed import LocalCluster
 
@@ -309,6 +318,7 @@ def test_scheduler__existing_one(write_spec, sweep_text, tmp_path, bytes_of, mon
         assert bytes_of(tmp_path / name) == bytes_of(tmp_path / "alone")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scheduler", ["threads", "processes"])
 def test_run__on_this_machine_listens_nowhere(write_spec, sweep_text, tmp_path, monkeypatch, scheduler):
     def look(self, cells):

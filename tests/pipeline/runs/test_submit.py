@@ -285,6 +285,7 @@ def test_submit__wrong_words(main, write_spec, words, said):
     assert said in errors
 
 
+@pytest.mark.slow
 def test_submit__what_the_batch_system_says(main, tmp_path, write_spec, cluster, command_of):
     """A command that refuses, one that says nothing, and a job that is there already."""
     words = ("submit", write_spec(SMALL), "--cluster", cluster("slurm"), "--out", "out")
@@ -308,6 +309,7 @@ def test_submit__what_the_batch_system_says(main, tmp_path, write_spec, cluster,
     assert main(*words)[0] == 0
 
 
+@pytest.mark.slow
 def test_submit__torque_lists_a_job_that_has_ended(main, tmp_path, write_spec, command_of):
     words = ("submit", write_spec(SMALL), "--cluster", "torque", "--out", "out")
     command_of("qsub", "echo 12.head")

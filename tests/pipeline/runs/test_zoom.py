@@ -63,6 +63,7 @@ def test_to_toml__reads_back(sweep, walk):
         assert max(len(line) for line in tables.splitlines() if not line.startswith("    [")) < 120
 
 
+@pytest.mark.slow
 @given(TITLES, st.floats(0.1, 10.0), st.floats(-1e-300, 1e300))
 def test_to_toml__any_title_and_number(title, frequency, angle):
     data = tomllib.loads(LIST)

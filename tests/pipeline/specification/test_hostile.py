@@ -73,12 +73,14 @@ def refused(main, tmp_path):
     return call
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", ODD)
 def test_run__odd_specifications_are_refused_in_few_words(refused, what):
     text, words = ODD[what]
     assert words in refused(text)
 
 
+@pytest.mark.slow
 def test_load_spec__endless_files_and_arrays(tmp_path):
     path = tmp_path / "spec.toml"
     with open(path, "wb") as file:
@@ -178,6 +180,7 @@ def test_outcome__what_is_mutated_can_be_planned(write_spec):
     assert all(outcome(write_spec(BASE), smoke) for smoke in (False, True))
 
 
+@pytest.mark.slow
 @FUZZ
 @given(mutations())
 @example({"kind": []})
@@ -189,6 +192,7 @@ def test_run__mutated_tables_are_planned_or_refused(refused, tmp_path, data):
     held(refused, tmp_path / "spec.toml", text.encode("utf-8", "surrogatepass"))
 
 
+@pytest.mark.slow
 @FUZZ
 @given(st.data())
 def test_run__mutated_bytes_are_planned_or_refused(refused, tmp_path, data):
@@ -219,6 +223,7 @@ def seconds_of(call):
     return time.process_time() - started
 
 
+@pytest.mark.slow
 def test_range__ten_million_points_take_seconds():
     for axis in (
         {"start": 2.0, "stop": 2.8, "num": 10_000_000},
@@ -227,6 +232,7 @@ def test_range__ten_million_points_take_seconds():
         assert seconds_of(Range(**axis).array) < 60
 
 
+@pytest.mark.slow
 @given(st.floats(-1e6, 1e6), st.floats(1e-6, 1e6), st.integers(2, 40), st.booleans(), st.integers(0, 12))
 def test_range__values_are_the_nearest_floats(start, span, num, by_step, digits):
     from fractions import Fraction

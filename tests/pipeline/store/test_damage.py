@@ -325,6 +325,7 @@ def computed(monkeypatch):
     return blocks
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_damage__is_found_never_read_repaired_and_mended(case, whole, sound, bytes_of, computed):
     damage, place = CASES[case]
@@ -415,6 +416,7 @@ def test_run__mends_by_sizes_alone_if_asked(whole, sound, computed, monkeypatch)
     assert len(computed) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["section", "n_steps"])
 def test_flipped_bit__is_seen_by_readers_that_opened_before_and_by_zarr_alone(whole, name):
     """The record's digest, and the checksum in the chunk, for readers that know no records."""

@@ -134,6 +134,7 @@ def killed_at(place, number):
     return in_a_child(child)
 
 
+@pytest.mark.slow
 def test_kill__at_every_step(finished, place):
     tried = 0
     for number in spread(len(finished.log), KILLS, seed=1):
@@ -145,6 +146,7 @@ def test_kill__at_every_step(finished, place):
     assert tried == len(finished.log) if LONG else tried == KILLS
 
 
+@pytest.mark.slow
 def test_kill__again_and_again(finished, place):
     """Each attempt is killed in its turn: what was committed stays, and in the end nothing is left to do."""
     rng, kills = np.random.default_rng(2), 0
@@ -193,6 +195,7 @@ def fails(main, place, act):
     return text, steps
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("once", [True, False], ids=["one call", "all from there"])
 @pytest.mark.parametrize("code", KINDS, ids=[errno.errorcode[code] for code in KINDS])
 def test_failing__at_every_step(finished, place, main, code, once):
@@ -236,6 +239,7 @@ def assert_told(code, said, why):
     assert why in said
 
 
+@pytest.mark.slow
 def test_no_room__files_may_not_grow(finished, place):
     limit = "import resource, signal\nresource.setrlimit(resource.RLIMIT_FSIZE, (600, 600))"
     code, said = in_a_process(place, limit)
@@ -266,6 +270,7 @@ def small_disk(tmp_path):
         subprocess.run(["umount", "-l", str(place)], check=False)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share", [0.4, 0.7, 0.9])
 @pytest.mark.parametrize("what", ["size", "nr_inodes"])
 def test_no_room__on_a_small_disk(finished, small_disk, main, monkeypatch, what, share):
@@ -345,6 +350,7 @@ KEEPS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("keeps", KEEPS)
 def test_power_cut__at_every_step(finished, place, keeps):
     """No record that counts is there without what it vouches for; and the run goes on to the same bytes."""

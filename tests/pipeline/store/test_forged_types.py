@@ -62,6 +62,7 @@ def look(directory):
     open_run(directory).load()
 
 
+@pytest.mark.slow
 def test_run_file__of_other_types(made):
     made.commit(0)
     path = made.info.directory / "run.json"
@@ -97,6 +98,7 @@ def test_run_file__the_command_names_what_is_wrong(made, main, key, value, named
         assert named in err
 
 
+@pytest.mark.slow
 def test_record__of_other_types(made):
     for index in range(2):
         made.commit(index)
@@ -111,6 +113,7 @@ def test_record__of_other_types(made):
     assert verify_run(made.info.directory).sound
 
 
+@pytest.mark.slow
 def test_pack__of_other_types(made):
     made.commit(0)
     info = made.info
@@ -136,6 +139,7 @@ def unseal_last(line):
     return data
 
 
+@pytest.mark.slow
 def test_product__of_other_types(made):
     place = made.info.directory / "derived/mean-12345678.zarr"
     labels = xr.DataArray(["in", "out", "in"], dims="place")

@@ -64,6 +64,7 @@ def bomb(n_bytes):
 # ---- what files declare ------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_declared__every_file_of_a_sound_run_is_as_planned(sound):
     declared = Declared(plan_of(sound))
     cube = sound / "cube.zarr"
@@ -143,6 +144,7 @@ def test_cube__bombs_are_not_decompressed(hostile, key, check, monkeypatch):
         cube[name].load()
 
 
+@pytest.mark.slow
 def test_open_product__bombs_are_computed_again(hostile):
     product = next((hostile / "derived").glob("attractors-*.zarr"))
     chunk = next(f for f in sorted(product.rglob("c*")) if f.is_file())
@@ -197,6 +199,7 @@ print("SEEN", seen)
 """
 
 
+@pytest.mark.slow
 def test_commands__execute_nothing_of_a_run_directory(hostile, tmp_path):
     """Opening, verifying, analysing and drawing: no import, no pickle, no process, no file outside."""
     for name in ("sitecustomize.py", "numpy.py", "__init__.py", "conftest.py", "duffing.py", "BOOM.py"):

@@ -77,6 +77,7 @@ IN_TABLE = ("run.json", "commits", "cube.zarr")
 """Links from these places to the same content: test_damage."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("place", "kind"),
     [(p, k) for p in PLACES for k in ("same", "dangling") if k == "dangling" or not p.startswith(IN_TABLE)],

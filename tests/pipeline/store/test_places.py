@@ -156,6 +156,7 @@ def fail_at(monkeypatch, name, kind):
     return failed
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="needs /proc to name open files")
 @pytest.mark.parametrize(
     "command",
@@ -261,6 +262,7 @@ def test_sweep__removes_and_names_what_no_record_vouches_for_and_nothing_else(wh
     assert sweep(whole.info, whole.plan, commits_left) == 0
 
 
+@pytest.mark.slow
 def test_rebuild__files_worded_by_another_version(whole):
     """Where the metadata come out otherwise, repair leaves them; a run writes them and their digests anew."""
     directory = whole.info.directory

@@ -118,6 +118,7 @@ def test_create__axes_keep_the_order_of_the_file(tmp_path, write_spec):
 # ---- packs -------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_packs__hold_whole_blocks_and_do_not_change_what_a_run_is(whole):
     alone = Run.open(whole.info.directory)
     digest, cells, first = alone.digest, alone.commits.cells(), dict(alone.commits)
@@ -139,6 +140,7 @@ def test_packs__hold_whole_blocks_and_do_not_change_what_a_run_is(whole):
         assert np.array_equal(ds[name].values[whole.plan.task(3)], values)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", [(4, 3, 2, 1, 0), (2, 0, 3, 1, 4)])
 def test_packs__same_bytes_in_any_order_late_and_twice(packed, bytes_of, order):
     withdraw(packed.info, [f"{i:06d}.json" for i in range(5)])
@@ -151,6 +153,7 @@ def test_packs__same_bytes_in_any_order_late_and_twice(packed, bytes_of, order):
     assert bytes_of(packed.info.directory) == packed.before
 
 
+@pytest.mark.slow
 def test_withdraw__leaves_the_others_of_a_pack(packed, bytes_of):
     withdraw(packed.info, ["000001.json"])
     assert names_in(packed) == PACKED
@@ -163,6 +166,7 @@ def test_withdraw__leaves_the_others_of_a_pack(packed, bytes_of):
     assert bytes_of(packed.info.directory) == packed.before
 
 
+@pytest.mark.slow
 def test_damaged_pack__loses_only_the_damaged_record(packed, bytes_of):
     """Any bit of a record costs that task alone, and of the last line none."""
     path = packed.info.directory / "commits" / PACKED[0]

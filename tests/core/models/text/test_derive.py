@@ -113,6 +113,7 @@ CORNERED = st.recursive(
 )
 
 
+@pytest.mark.slow
 @given(SMOOTH, st.floats(0.1, 2.0), st.floats(-2.0, 2.0))
 def test_rates__are_what_the_text_says(text, x, v):
     model = model_with_value(text)
@@ -125,6 +126,7 @@ def test_rates__are_what_the_text_says(text, x, v):
         assert found[1] == pytest.approx(wanted, rel=1e-9, abs=1e-6) or abs(wanted) > 1e5
 
 
+@pytest.mark.slow
 @given(CORNERED, st.floats(0.11, 2.0), st.floats(-2.0, 2.0))
 def test_rates__are_what_the_text_says_on_each_side_of_its_corners(text, x, v):
     model = model_with_value(text)
@@ -183,6 +185,7 @@ def test_rates__on_either_side_of_a_corner(text):
         assert plain_rates(model, (x, v), t)[1] == pytest.approx(wanted, rel=1e-14, abs=1e-14), (x, v, t)
 
 
+@pytest.mark.slow
 @given(SMOOTH)
 def test_jacobian__is_sympys_derivative(text):
     x, v = 0.83, -0.57
@@ -251,6 +254,7 @@ def exact(name, x, v, a):
     return own[name]() if name in own else getattr(m, name.removeprefix("f_"))(x)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("x", [0.7, 0.013, -0.4, 0.999, 1e-9, 0.4])
 def test_functions__agree_with_mpmath(functions, x):
     """Compiled, to a few units in the last place."""
@@ -317,6 +321,7 @@ MANY = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", MANY)
 def test_derived__takes_seconds_at_most(what):
     """The largest expression of each sort is worked off, or refused."""

@@ -183,6 +183,7 @@ EXPRESSION = st.recursive(
 )
 
 
+@pytest.mark.slow
 @given(EXPRESSION)
 @example("(-x)**2 - (-y)/(w/(-k))")
 def test_written__reads_back_to_the_same_tree(text):
@@ -220,6 +221,7 @@ def test_value_of__is_what_python_computes(text):
     np.testing.assert_allclose(value_of(parse(text), VALUES), wanted, rtol=1e-12)
 
 
+@pytest.mark.slow
 @given(st.text(max_size=60))
 def test_parse__ends_in_a_tree_or_in_one_error(text):
     with contextlib.suppress(GrammarError):

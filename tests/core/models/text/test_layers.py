@@ -44,6 +44,7 @@ def test_pendulum__has_the_edges_and_layers_that_were_declared_by_hand():
             np.testing.assert_allclose(found, wanted, rtol=1e-6, atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("text", "value", "half_width", "jump"),
     [
@@ -90,6 +91,7 @@ def shaken():
     return model_of({"x": "v", "v": "-0.3*atan(k*(v - cos(2*pi*f*t))) - x"}, {"k": 2e3})
 
 
+@pytest.mark.slow
 def test_layers__may_move_with_time(shaken):
     system = shaken.system
     assert (len(shaken.derived.layers), shaken.derived.missed, system.timed_layers) == (1, (), True)
@@ -112,6 +114,7 @@ def test_layers__may_move_with_time(shaken):
     assert with_layer < 0.2 * without
 
 
+@pytest.mark.slow
 def test_layers__that_move_with_time_carry_tangents(shaken):
     extended = with_tangents(shaken.system, 2)
     start = np.array([[0.3, 0.2]])
@@ -164,6 +167,7 @@ def jumping():
     return model_of({"x": text}, {"d": 0.3, "e": 0.6, "s": 0.37, "k": 1.0, "duty": 0.3, **weights})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("duty", [0.3, 0.5, 0.9])
 def test_square__is_followed_exactly(duty, jumping):
     assert model_of({"x": "square(t*f, d) - x"}, {"d": 0.3}).derived.missed == ()
@@ -295,6 +299,7 @@ def rubbing():
     return model
 
 
+@pytest.mark.slow
 def test_switch__whose_surface_jumps_with_time_is_on_the_right_side_of_it(rubbing):
     """A body rubbed by a belt that runs forth and back: v' = mu towards the belt's velocity."""
     start = [[0.0, 0.0, 0.0], [0.0, -0.3, -0.3]]
@@ -357,6 +362,7 @@ def test_impacts__set_what_the_text_sets(cornered):
     np.testing.assert_allclose(found.section[0, 0, 2:], wanted, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_jacobian__beside_a_corner_is_that_of_its_side():
     model = model_of({"x": "v", "v": "-x*abs(x) - v*where(v > 0, 2, 3) - 0.1*sign(v)"})
     found = jacobian(0.0, [[0.5, 0.2], [-0.5, -0.2]], model.load(), 1.0)

@@ -272,6 +272,7 @@ def test_digest__changes_with_the_meaning(path, value):
     assert digest(changed(DUFFING, *path, value=value)) != digest(DUFFING)
 
 
+@pytest.mark.slow
 def test_source__is_the_same_whatever_was_read_before(run_python):
     """No word of a text and no memory of others stands in the generated code."""
     script = (
@@ -368,6 +369,7 @@ def test_read_model__refuses_what_is_no_table_of_a_model(table):
     assert problems_of(table)
 
 
+@pytest.mark.slow
 def test_opening__needs_neither_compiler_nor_algebra(run_python):
     script = (
         "import sys, json\n"

@@ -65,6 +65,7 @@ def test_pieces_of__a_recorded_torque_drives_the_model(forced):
     assert judged.rms["x"] == pytest.approx(NOISE, rel=0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("steps", "sensor", "rate_hz"),
     [

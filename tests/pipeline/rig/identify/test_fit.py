@@ -82,6 +82,7 @@ def brute_jacobian(problem, theta, starts):
     return np.column_stack(columns)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("slopes", ["differences", "variational"])
 def test_evaluate__has_the_cost_and_the_normal_equations_of_all_samples(slopes):
     """The compressed rows stand for all of them: same cost, gradient and normal matrix as by brute force."""
@@ -130,6 +131,7 @@ def test_evaluate__ignores_what_was_not_measured():
     assert found.cost == pytest.approx(0.5 * np.nansum(rows**2), rel=1e-5)
 
 
+@pytest.mark.slow
 def test_fit_local__is_the_optimum_of_brute_force():
     """With noise: a step of Gauss and Newton by scipy's differences of all residuals leads nowhere from there."""
     problem = make_problem(NOISE)
@@ -144,6 +146,7 @@ def test_fit_local__is_the_optimum_of_brute_force():
     assert fit.rms[0] == pytest.approx(NOISE, rel=0.1)
 
 
+@pytest.mark.slow
 def test_fit_local__holds_what_is_fixed():
     problem = make_problem()
     truth = dict(zip(problem.names, truth_of(problem), strict=True))
@@ -167,6 +170,7 @@ def test_fit_starts__finds_each_start_by_itself():
     np.testing.assert_allclose(fit_starts(alone, truth_of(problem), guess[1:2]).starts[0], found[1], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_fit_local__follows_ties_and_priors():
     tied = make_problem(free=("damping", "linear", "amplitude"), tied={"cubic": (0.8 / 3.0, "linear")})
     fit = fit_local(tied, tied.start)
@@ -209,6 +213,7 @@ def long_problem(weight):
     )
 
 
+@pytest.mark.slow
 def test_fit_local__closes_the_gaps_as_their_weight_grows():
     gaps = []
     for weight in (0.01, 1.0, 100.0):
@@ -224,6 +229,7 @@ def test_fit_local__closes_the_gaps_as_their_weight_grows():
     assert gaps[2] < 1e-3
 
 
+@pytest.mark.slow
 def test_cut__reads_starts_off_the_recording():
     problem = make_problem(0.1 * NOISE)
     pieces = cut(problem, 1.5).pieces
@@ -276,6 +282,7 @@ class Shelf:
         self.fits[number] = fit
 
 
+@pytest.mark.slow
 def test_search__ends_at_the_truth_from_guesses_far_off():
     problem, shelf = make_problem(NOISE), Shelf()
     arguments = {"n_starts": 6, "seed": 3, "spread": 0.3, "n_samples": 6}
@@ -299,6 +306,7 @@ def test_sobol__keeps_to_spread_and_bounds():
     np.testing.assert_array_equal(points, sobol(problem, 100, 5, 0.3))
 
 
+@pytest.mark.slow
 def test_refine__under_a_measured_torque():
     """The same motion, its drive given as values at instants."""
     problem = make_problem(free=("damping", "linear", "cubic"))

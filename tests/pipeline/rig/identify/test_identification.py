@@ -93,6 +93,7 @@ def files_of(folder):
     return {p.relative_to(folder).as_posix(): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
+@pytest.mark.slow
 def test_identify__truth_is_within_the_intervals(bench):
     _, result, lines = bench
     # three gaps: a warning or a note each, nothing that makes the numbers wrong
@@ -143,6 +144,7 @@ def test_identify__again_does_nothing(bench):
     assert lines == [f"{folder / 'out'} is complete; nothing to do."]
 
 
+@pytest.mark.slow
 def test_identify__goes_on_to_the_same_bytes(bench, tmp_path):
     """As after a kill: some outcomes are there, one of them torn, and no result."""
     folder, _, _ = bench
@@ -159,6 +161,7 @@ def test_identify__goes_on_to_the_same_bytes(bench, tmp_path):
     assert (out / "outcomes" / "start-0000.npz").stat().st_mtime_ns == kept
 
 
+@pytest.mark.slow
 def test_identify__stopped_by_a_signal_goes_on_to_the_same_bytes(bench, tmp_path, start):
     """A process stopped between two outcomes says so, and the same command continues."""
     folder, _, _ = bench
@@ -254,6 +257,7 @@ def test_identify__bad_input_is_refused_before_anything(bench, tmp_path, old, ne
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_identify__no_convergence_is_no_result(bench, tmp_path, monkeypatch, main):
     from dataclasses import replace
 
@@ -297,6 +301,7 @@ def without_cubic(bench):
     return folder / "linear"
 
 
+@pytest.mark.slow
 def test_compare__goes_by_held_out_pieces(bench, without_cubic, main):
     folder, _, _ = bench
     code, out, _ = main("identify", "compare", without_cubic, folder / "out", "--json")
@@ -358,6 +363,7 @@ def test_judgement__without_a_spread_has_no_correlation():
     assert judged["rms"]["c"] is None
 
 
+@pytest.mark.slow
 def test_identify__outliers_under_a_robust_loss(bench, tmp_path):
     """One sample in forty is off by a hundred times the noise: that leads least squares alone astray."""
     folder, _, _ = bench
@@ -388,6 +394,7 @@ def test_identify__outliers_under_a_robust_loss(bench, tmp_path):
     assert high - low < 0.5 * wide
 
 
+@pytest.mark.slow
 def test_identify__stretches_with_a_price_on_their_gaps(bench, tmp_path):
     """Gaps that cost take freedom from the starts: intervals are those of whole pieces, or nearly."""
     folder, whole, _ = bench

@@ -69,6 +69,7 @@ def expected(theta):
     return np.array(rows)
 
 
+@pytest.mark.slow
 def test_evaluate__residuals_and_slopes_are_those_of_the_closed_form(data, tmp_path):
     problem = built(data, tmp_path).problem
     theta = np.array([1.1, 0.03, 6.1])
@@ -80,6 +81,7 @@ def test_evaluate__residuals_and_slopes_are_those_of_the_closed_form(data, tmp_p
         np.testing.assert_allclose(found.jacobian[:, i], slope, rtol=1e-5, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_fit_local__finds_the_parameters_from_stable_and_unstable_cycles(data, tmp_path):
     problem = built(data, tmp_path).problem
     fit = fit_local(problem, problem.start)
@@ -87,6 +89,7 @@ def test_fit_local__finds_the_parameters_from_stable_and_unstable_cycles(data, t
     np.testing.assert_allclose(fit.theta, list(TRUTH.values()), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_bifurcations__are_data(data, tmp_path):
     g, h = TRUTH["g"], TRUTH["h"]
     fold = h - 1.0 / (4.0 * g)
@@ -111,6 +114,7 @@ def test_bifurcations__are_data(data, tmp_path):
     np.testing.assert_allclose(fit_local(problem, problem.start).theta, [g, h], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_parameter_sd__compares_the_nearest_orbit_beside_a_fold(data, tmp_path):
     # beyond the fold at these parameters there is no orbit; the nearest one is
     sd, g, h, measured = 0.02, 1.6, 0.05, radius(-0.1, 1)
@@ -129,6 +133,7 @@ def test_parameter_sd__compares_the_nearest_orbit_beside_a_fold(data, tmp_path):
     assert found.jacobian[:, 0] @ found.rows == pytest.approx((up.cost - down.cost) / 2e-4, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_parameter_sd__adds_to_the_variance_along_the_branch(data, tmp_path):
     # effective variance: sd_A^2 + (dA/dm sd_m)^2
     sd, g = 0.02, TRUTH["g"]
@@ -143,6 +148,7 @@ def test_parameter_sd__adds_to_the_variance_along_the_branch(data, tmp_path):
         assert own @ own == pytest.approx(by_g**2 / (0.002**2 + (by_m * sd) ** 2), rel=1e-4)
 
 
+@pytest.mark.slow
 def test_lost__an_orbit_beyond_its_fold_is_counted(data, tmp_path):
     problem = built(data, tmp_path).problem
     found = evaluate(problem, np.array([[2.5, 0.05, 6.0]]), problem.starts[None], slopes=False)[0]
@@ -151,6 +157,7 @@ def test_lost__an_orbit_beyond_its_fold_is_counted(data, tmp_path):
     assert found.cost > 1e11
 
 
+@pytest.mark.slow
 def test_identify__judges_orbits_that_were_held_out(data, tmp_path):
     data["orbits"][1]["hold_out"] = ["no -0.02"]
     data["search"] = {"n_starts": 1, "profiles": False}
@@ -196,6 +203,7 @@ def fitted(finished, tmp_path):
     return Path(shutil.copytree(directory, tmp_path / "fitted")), deepcopy(result)
 
 
+@pytest.mark.slow
 def test_posterior__draws_are_those_of_the_covariance(fitted):
     directory, result = fitted
     drawn = draw_posterior(directory, 4000, seed=3)
@@ -208,6 +216,7 @@ def test_posterior__draws_are_those_of_the_covariance(fitted):
     assert not drawn.equals(draw_posterior(directory, 4000, seed=4))
 
 
+@pytest.mark.slow
 def test_posterior__bifurcations_and_branches_of_each_draw_are_those_of_the_closed_form(fitted):
     directory, result = fitted
     _, bifurcations, written = write_posterior(directory, 16, seed=2)
@@ -236,6 +245,7 @@ def test_posterior__bifurcations_and_branches_of_each_draw_are_those_of_the_clos
         assert (known == there)[clear].all()
 
 
+@pytest.mark.slow
 def test_run_posterior__each_draw_is_a_run_and_its_bifurcations_are_those_of_the_closed_form(fitted, tmp_path):
     directory, result = fitted
     path = write_toml(tmp_path / "sweep.toml", SWEEP)
@@ -300,6 +310,7 @@ def test_read_orbits__names_the_problem(data, tmp_path, change, words):
         read_orbits(parse_identification(data, tmp_path))
 
 
+@pytest.mark.slow
 def test_build__an_orbit_that_the_model_does_not_have_at_the_start(data, tmp_path):
     data["identify"]["g"]["start"] = 2.5
     with pytest.raises(SpecError, match=r"'yes -0.1': at the start of the fit the model has no stable orbit"):

@@ -133,6 +133,7 @@ def test_load_identification__a_file_that_is_not_there(tmp_path):
         load_identification(tmp_path / "none.toml")
 
 
+@pytest.mark.slow
 def test_load__slopes_are_one_of_two_kinds(tmp_path):
     """What the fit takes them by goes into the problem; another word is refused by name."""
     from pipeline.rig.identify.build import build, read_all

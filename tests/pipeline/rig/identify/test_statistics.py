@@ -119,6 +119,7 @@ def test_n_effective__of_autoregressive_noise(ringdown, memory, rng):
     assert found == pytest.approx(20 * 3000 * (1 - memory) / (1 + memory), rel=0.15)
 
 
+@pytest.mark.slow
 def test_is_autocorrelated__white_and_not(rng):
     taken = [st.is_autocorrelated([rng.normal(size=(300, 2)) for _ in range(5)]) for _ in range(400)]
     assert sum(taken) <= 10  # 4 of 400 at the level of 1 %; 10 or more in 1 of 100
@@ -149,11 +150,13 @@ def coverage(ringdown, seeds: int, *estimators, **rig) -> tuple[np.ndarray, list
     return inside / seeds, chosen
 
 
+@pytest.mark.slow
 def test_coverage__white_noise_quantised_with_a_dead_band(ringdown):
     (share,), _ = coverage(ringdown, 200, None, noise=0.002, bits=12, dead_band=True)
     assert ((share >= 0.92) & (share <= 0.98)).all(), share
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("n_pieces", "n"), [(16, 120), (2, 1500)])
 def test_coverage__autocorrelated_noise(ringdown, n_pieces, n):
     """Where residuals remember, intervals of independent ones are far too narrow; ours are not."""

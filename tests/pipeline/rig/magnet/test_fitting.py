@@ -109,6 +109,7 @@ def test_fit_jointly__holds_what_is_held(measured):
     assert wrong.quality.rms > 0.005
 
 
+@pytest.mark.slow
 def test_fit_jointly__covers_the_truth_and_scatters_as_its_covariance_says(measured):
     start = fit_laws(fit_curves(measured)).values
     fits = [fit_jointly(with_noise(measured, seed), start) for seed in range(150)]
@@ -164,6 +165,7 @@ def test_errors_by_cluster__are_the_jackknife_of_a_line():
     assert np.isnan(errors_by_cluster(again, one_decides)).all()
 
 
+@pytest.mark.slow
 def test_fit_jointly__errors_by_curve_hold_where_residuals_of_a_curve_are_alike(measured):
     """With a common shift of every curve those from the residuals' variance are too small."""
     start, fits = fit_laws(fit_curves(measured)).values, []

@@ -82,6 +82,7 @@ def test_report__holds_curves_joint_fit_and_dipoles(fitted):
     assert warnings_of(outcome) == []
 
 
+@pytest.mark.slow
 def test_fit_magnet__writes_all_and_says_where(main, rig, tmp_path):
     out = tmp_path / "fit"
     code, result, notes = main("fit-magnet", str(rig.path), "--out", str(out))
@@ -106,6 +107,7 @@ def test_fit_magnet__json_is_the_report_and_the_preset_drives_a_simulation(main,
     assert len(series.read_text().splitlines()) == 402
 
 
+@pytest.mark.slow
 def test_fit_magnet__takes_a_measurement_that_ships_by_name(main, tmp_path):
     code, result, notes = main("fit-magnet", "discs", "--no-figures")
     assert code == 0

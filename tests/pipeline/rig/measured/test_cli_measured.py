@@ -35,6 +35,7 @@ def files(tmp_path_factory, pendulum):
     return folder
 
 
+@pytest.mark.slow
 def test_measured_steps__prints_json(main, files):
     code, out, _ = main("measured", "steps", files / "up.csv", "--mapping", files / "rig.toml", *FEW, "--json")
     rows = json.loads(out)
@@ -44,6 +45,7 @@ def test_measured_steps__prints_json(main, files):
     assert [r["frequency_hz"] for r in rows] == pytest.approx(FREQUENCIES, abs=2e-4)
 
 
+@pytest.mark.slow
 def test_measured_compare__writes_figures_tables_and_numbers(main, files, run_directory, tmp_path):
     words = ("measured", "compare", run_directory, files / "up.csv", "--mapping", files / "rig.toml", *FEW)
     code, out, err = main(*words, "--out", tmp_path / "out")
@@ -63,6 +65,7 @@ def test_measured_compare__writes_figures_tables_and_numbers(main, files, run_di
         assert next(csv.DictReader(file))["before"] == "period 2, right"
 
 
+@pytest.mark.slow
 def test_measured_diagram__alone_and_with_a_run(main, files, run_directory, tmp_path):
     words = ("measured", "diagram", files / "up.csv", "--mapping", files / "rig.toml", *FEW)
     for name, more in (("a.png", ()), ("b.svg", ("--run", run_directory, "--layout", "over", "--degrees"))):
@@ -73,6 +76,7 @@ def test_measured_diagram__alone_and_with_a_run(main, files, run_directory, tmp_
         assert out.startswith(f"figure: {tmp_path / name}")
 
 
+@pytest.mark.slow
 def test_measured_series__prints_how_far_off_it_is(main, files, tmp_path):
     words = ("measured", "series", files / "up.csv", "--mapping", files / "rig.toml", "--out", tmp_path / "s.png")
     code, out, err = main(*words, "--start-s", 100, "--periods", 4)
@@ -81,6 +85,7 @@ def test_measured_series__prints_how_far_off_it_is(main, files, tmp_path):
     assert (tmp_path / "s.png").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "says"),
     [
@@ -101,6 +106,7 @@ def test_measured_steps__bad_input_exits_with_2(main, files, change, says):
     assert "Traceback" not in err
 
 
+@pytest.mark.slow
 def test_measured_diagram__refuses_a_state_and_a_folder_that_are_not_there(main, files, tmp_path):
     words = ("measured", "diagram", files / "up.csv", "--mapping", files / "rig.toml", *FEW)
     code, _, err = main(*words, "--out", tmp_path / "a.png", "--state", "psi3")

@@ -39,6 +39,7 @@ def truth(pendulum, start, frequencies):
     return found.orbit_period[0]
 
 
+@pytest.mark.slow
 def test_measure__a_sweep_is_recovered(measured, swept, pendulum):
     """Frequencies, duty cycle, period and side of each step; sections as they truly were."""
     f = np.concatenate([SWEPT, SWEPT[::-1]])
@@ -60,6 +61,7 @@ def test_measure__a_sweep_is_recovered(measured, swept, pendulum):
         assert np.sqrt(((off / noise) ** 2).mean()) < 1.3, i
 
 
+@pytest.mark.slow
 def test_measure__periods_are_those_of_the_motion_without_noise(measured, swept, pendulum):
     """Where the noise-free walk has closed and the rig is sure; next to a bifurcation neither is."""
     periods, sure = measured["orbit_period"].values, measured["confidence"].values > 0.8
@@ -71,6 +73,7 @@ def test_measure__periods_are_those_of_the_motion_without_noise(measured, swept,
     np.testing.assert_array_equal(periods[known], true[known])
 
 
+@pytest.mark.slow
 def test_compare__the_winner_is_the_attractor_that_the_rig_was_on(compared, run_directory):
     winners = compared["winner"].values
     sides = AnalysedRun.of(run_directory).derive("attractors")["side"]
@@ -89,6 +92,7 @@ def test_compare__the_true_model_is_a_noise_floor_away(compared):
     assert (compared["same_period"].values[settled] == 1).all()
 
 
+@pytest.mark.slow
 def test_compare__window_edges_lie_within_the_step(compared, swept, pendulum):
     """Period 2 ends, going up, where it ends without noise: within a step of the rig's own sweep."""
     assert compared.sizes["edge"] == 2
@@ -105,6 +109,7 @@ def test_compare__window_edges_lie_within_the_step(compared, swept, pendulum):
         assert abs(shift) <= error + 1e-5
 
 
+@pytest.mark.slow
 def test_compare__a_model_that_is_off_is_far_and_its_windows_shift(measured, compared, computed):
     """With 10 % more inertia of a link the doublings lie 30 mHz lower, and distances far above the noise."""
     off = computed(f"{RUN}\n[parameters]\noverrides = {{ J2 = 0.015739 }}\n")
@@ -117,6 +122,7 @@ def test_compare__a_model_that_is_off_is_far_and_its_windows_shift(measured, com
     np.testing.assert_allclose(shifts, 0.03, atol=errors.max())
 
 
+@pytest.mark.slow
 def test_compare__does_not_depend_on_the_order_of_the_recordings(swept, pendulum, run_directory, compared):
     (up, _), (down, _) = swept
     other = compare(measure([down, up], WAY, parameters=pendulum), AnalysedRun.of(run_directory))
@@ -125,6 +131,7 @@ def test_compare__does_not_depend_on_the_order_of_the_recordings(swept, pendulum
         np.testing.assert_array_equal(other[name].values[order], compared[name].values)
 
 
+@pytest.mark.slow
 def test_compare__angles_alone_are_compared_with_angles(swept, run_directory, pendulum):
     """A recording of one link: its angle and the rate of it; no side can be told."""
     part = swept[0][0].drop_vars("psi2")
@@ -135,6 +142,7 @@ def test_compare__angles_alone_are_compared_with_angles(swept, run_directory, pe
     assert (found["distance_in_noise"].values[[0, 4]] < 2.0).all()
 
 
+@pytest.mark.slow
 def test_candidates__orbits_are_interpolated_between_frequencies(run_directory, pendulum):
     """Halfway between two frequencies of the run: against the orbit that the engine settles on there."""
     computed = Computed.of(AnalysedRun.of(run_directory), "pendulum")
@@ -147,6 +155,7 @@ def test_candidates__orbits_are_interpolated_between_frequencies(run_directory, 
     assert off < 0.2 * np.abs(plain.points - exact).max()
 
 
+@pytest.mark.slow
 def test_compare__steps_off_the_runs_axis_have_no_winner(measured, run_directory):
     computed = Computed.of(AnalysedRun.of(run_directory), "pendulum")
     moved = measured.assign_coords(frequency=measured["frequency"] + 0.05)
@@ -155,12 +164,14 @@ def test_compare__steps_off_the_runs_axis_have_no_winner(measured, run_directory
     assert np.isnan(found["distance"].values[3:5]).all()
 
 
+@pytest.mark.slow
 def test_compare__frequencies_that_do_not_overlap_are_refused(measured, run_directory):
     other = measured.assign_coords(frequency=measured["frequency"] + 0.5)
     with pytest.raises(SpecError, match=r"measured from 2\.96 to 3\.04 Hz, computed from 2\.44 to 2\.56 Hz"):
         compare(other, AnalysedRun.of(run_directory))
 
 
+@pytest.mark.slow
 def test_measure__recordings_that_do_not_fit_are_refused(swept):
     (up, _), (down, _) = swept
     with pytest.raises(SpecError, match="their models are duffing, pendulum"):
@@ -173,6 +184,7 @@ def test_measure__recordings_that_do_not_fit_are_refused(swept):
         measure([up.assign(drive=xr.ones_like(up["drive"]))], WAY)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("layout", "simulated"), [("side", 1), ("over", 0)])
 def test_plot_measured__draws_both_on_shared_axes(compared, run_directory, layout, simulated):
     computed = Computed.of(AnalysedRun.of(run_directory), "pendulum")
@@ -188,6 +200,7 @@ def test_plot_measured__draws_both_on_shared_axes(compared, run_directory, layou
     assert {"x_diagram", "y_diagram"} <= set(fig.data.variables)
 
 
+@pytest.mark.slow
 def test_plot_comparison__marks_each_distance_in_its_winners_colour(compared, run_directory):
     computed = Computed.of(AnalysedRun.of(run_directory), "pendulum")
     fig = plot_comparison(compared, computed)

@@ -28,6 +28,7 @@ def test_wasserstein__on_a_line_it_is_that_of_sorted_points(sizes):
     assert wasserstein(a, b, LINE) == pytest.approx(wasserstein_distance(a[:, 0], b[:, 0]) / 2.0, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_wasserstein__unequal_numbers_take_little_memory():
     """97 and 112 points: not 10,864 squared, which is 0.9 GB."""
     rng = np.random.default_rng(3)

@@ -22,6 +22,7 @@ def logistic(r, n, skip=1000):
     return np.array(out[skip:])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("period", [1, 2, 3, 4, 5, 6, 8])
 @pytest.mark.parametrize("seed", range(5))
 def test_find_period__cycles_among_noise(period, seed):
@@ -40,6 +41,7 @@ def test_find_period__the_logistic_map_as_on_paper(r, period):
     assert found.confidence > 0.9
 
 
+@pytest.mark.slow
 def test_find_period__chaos_is_unclosed_for_many_starts():
     wrong = sum(find_period(*noisy(logistic(4.0, 60, 1000 + k), 1e-3)).orbit_period > 0 for k in range(100))
     assert wrong == 0
@@ -74,6 +76,7 @@ def test_find_period__a_split_of_the_size_of_noise_is_not_sure():
     assert found.margin < 1.5
 
 
+@pytest.mark.slow
 def test_find_period__where_it_is_sure_it_is_right():
     """Over splits from none to ten deviations: sure at both ends, unsure between, never sure of the wrong."""
     rng, sure = np.random.default_rng(7), []

@@ -18,6 +18,7 @@ from pipeline.specification.problems import SpecError
 from .conftest import RIGHT, walked
 
 
+@pytest.mark.slow
 def test_measure__a_slow_sweep_is_cut_into_windows(pendulum, record_steps):
     """From 2.46 to 2.56 Hz, 0.2 mHz a period: the right motion's doubling, where it is without noise."""
     frequencies = np.arange(2.46, 2.56, 2e-4)
@@ -40,6 +41,7 @@ def test_measure__a_slow_sweep_is_cut_into_windows(pendulum, record_steps):
     assert edge == pytest.approx(ended, abs=0.008)
 
 
+@pytest.mark.slow
 def test_measure__a_drive_that_truly_jitters_hides_no_period(pendulum, record_steps):
     """Half a millisecond shakes the motion by five times the sections' noise: the same periods."""
     rng, steps = np.random.default_rng(3), []
@@ -57,6 +59,7 @@ def test_measure__a_drive_that_truly_jitters_hides_no_period(pendulum, record_st
     assert (found["confidence"].values > 0.5).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("model", "phase"), [("pendulum", 0.0), ("pendulum-sine", 0.0), ("duffing", 0.25), ("double-pendulum", 0.0)]
 )
@@ -83,6 +86,7 @@ def test_measure__sections_of_another_model_are_where_it_takes_them():
     np.testing.assert_allclose(mean, exact, atol=6e-3)
 
 
+@pytest.mark.slow
 def test_series_of__the_model_follows_the_rig_from_the_same_state(pendulum, swept):
     ds = series_of(swept[0][0], pendulum, start_s=30.0, n_periods=5)
     assert float(ds.attrs["frequency_hz"]) == pytest.approx(2.46, abs=5e-5)
@@ -94,6 +98,7 @@ def test_series_of__the_model_follows_the_rig_from_the_same_state(pendulum, swep
     assert rms["psi1_dot"] < 0.2
 
 
+@pytest.mark.slow
 def test_series_of__another_parameter_is_seen(pendulum, swept):
     """With 10 % more drive the model leaves the rig's motion."""
     off = series_of(swept[0][0], pendulum.replace(q=1.1 * pendulum["q"]), start_s=30.0, n_periods=5)
@@ -108,6 +113,7 @@ def test_series_of__ends_where_the_frequency_changes(pendulum, swept):
     assert ds["time"].values[-1] == pytest.approx(10 / 2.46, abs=0.5 / 2.46)
 
 
+@pytest.mark.slow
 def test_series_of__what_does_not_fit_is_refused(pendulum, swept):
     recording = swept[0][0]
     with pytest.raises(SpecError, match="mapped to the model pendulum, while duffing"):

@@ -53,6 +53,7 @@ def test_recordings_show__lists_the_channels_of_a_file(main, swing):
     assert [row["channel"] for row in json.loads(out)] == ["time", "rig/psi1", "rig/psi2", "rig/drive"]
 
 
+@pytest.mark.slow
 def test_recordings_show__with_a_mapping_says_what_was_found(main, swing, tmp_path):
     code, out, err = main("recordings", "show", swing.name, "--mapping", "swing.toml", "--out", "swing.png")
     assert code == 0, err
@@ -81,6 +82,7 @@ def test_recordings_convert__is_read_with_its_mapping(main, swing):
     assert out == "recording: x.nc\n"
 
 
+@pytest.mark.slow
 def test_recordings_show__real_pendulum(main, tmp_path):
     for name in ("multiarm_free_swings.mat", "multiarm_free_swings.toml"):
         shutil.copy(FOLDER / name, tmp_path)

@@ -24,6 +24,7 @@ def noisy(make, sigma, seed=0, n=20_000, rate_hz=1000.0):
     return recording_of(raw, make.mapping()), (a, b), rates
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sigma", [1e-4, 1e-3, 1e-2])
 def test_smooth__noise_is_that_which_was_added(make, sigma):
     """From the residuals with the polynomials' degrees of freedom, 20000 samples: error 0.5 per cent."""
@@ -42,6 +43,7 @@ def test_smooth__what_is_left_of_the_noise_is_what_it_says(make):
         assert error.std() == pytest.approx(found[name].attrs["noise_smoothed"], rel=0.35)
 
 
+@pytest.mark.slow
 def test_smooth__chosen_window_is_near_the_best(make):
     """The error of angles at the chosen window is at most a fifth above that at the best of all windows."""
     ds, angles, _ = noisy(make, 1e-3, n=6000)
