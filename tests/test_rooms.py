@@ -8,6 +8,8 @@ import re
 from collections.abc import Collection, Iterator
 from pathlib import Path
 
+import pytest
+
 from magpend_core.models import load_model, model_names
 from magpend_core.models.text.views import DEFAULT_PRESET
 
@@ -48,6 +50,7 @@ def name_of(path: Path) -> str:
     return path.relative_to(ROOT).as_posix()
 
 
+@pytest.mark.slow
 def test_pipeline__knows_no_model():
     """Nothing outside a model's own room names its states, its parts or its presets."""
     assert {name_of(path): words for path in PIPELINE if (words := words_of_a_model(path))} == {}
@@ -70,6 +73,7 @@ def test_modules__are_not_too_long():
     assert {n: lines for n, lines in lengths.items() if lines > MAX_MODULE and n not in LONG_MODULES} == {}
 
 
+@pytest.mark.slow
 def test_functions__are_not_too_long():
     """Docstrings do not count: they say what a reader needs."""
     assert {name: n for path in PIPELINE for name, n in lengths_in(path) if n > MAX_FUNCTION} == {}
@@ -91,6 +95,7 @@ def test_tolerances__of_the_analyses_stand_in_one_table():
     assert [name_of(path) for path in others if own.search(path.read_text("utf-8"))] == []
 
 
+@pytest.mark.slow
 def test_imports__make_no_circle():
     """Imports inside functions and for types count too."""
     modules = {module_of(path): path for path in (*PIPELINE, *CORE)}

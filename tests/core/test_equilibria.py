@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from magpend_core.crossing import Crossing
 from magpend_core.equilibria import find_equilibria, newton_steps
@@ -30,6 +31,7 @@ def test_find_equilibria__lorenz():
         assert np.abs(own[:, None] - cubic).min(axis=1).max() < 1e-9
 
 
+@pytest.mark.slow
 def test_find_equilibria__not_finite():
     """A state that is not known stays so, and takes nothing from the others."""
     parameters = flow(VAN_DER_POL).load()
@@ -39,6 +41,7 @@ def test_find_equilibria__not_finite():
     np.testing.assert_allclose(found.states[1], 0.0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_newton_steps__through_a_section():
     """The section changes nothing: the level is one more parameter, of which the rates know nothing."""
     model = flow(VAN_DER_POL)

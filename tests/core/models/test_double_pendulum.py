@@ -12,6 +12,8 @@ from magpend_core.models import load_model
 from magpend_core.pointwise import rates
 from magpend_core.sampling import sample
 
+pytestmark = pytest.mark.slow
+
 MODEL = load_model("double-pendulum")
 VALUES = MODEL.load(T1=1e-3, T2=8e-4, c1=3e-4, c2=1e-4, mu0=0.7, c0=2.0, eps=30.0, k1=0.05, k2=0.03, l2=0.28, q=0.02)
 

@@ -51,6 +51,7 @@ def test_transition__is_where_the_two_bumps_have_equal_shares():
     assert at == pytest.approx(np.mean(peaks), abs=1e-15)
 
 
+@pytest.mark.slow
 def test_dipole_moment__is_that_of_the_model():
     p = load_model("pendulum-dipole").load(pole1=150.0)
     expected = evaluate(["magnet_moment"], 0.0, STATES, p, 2.0)[:, 0]

@@ -44,6 +44,7 @@ def kinds(found):
     return found["kind"].values.tolist()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("value", [0.0, 0.6])
 def test_identify__cycle_beside_equilibrium(value):
     """At mu = -0.1 the origin and the cycle attract, whether the section runs through the origin or not.
@@ -69,6 +70,7 @@ def test_identify__cycle_beside_equilibrium(value):
     assert float(found["lyapunov_max"][rest]) == pytest.approx(-0.1, abs=1e-10)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("frequency_hz", [1.0 / np.pi, 2.0 / np.pi, 0.41])
 def test_identify__strobed_cycle_is_one(frequency_hz):
     """A strobe of the cycle's period, of half of it and of another one: one limit cycle, not one per cell."""

@@ -48,6 +48,7 @@ def two():
     return cube("twin-well-periodic", 6, 400, 16)
 
 
+@pytest.mark.slow
 def test_identify__chaos_without_angles(chaotic, strange):
     """Grouping sets took the largest difference of no rotations."""
     assert strange["kind"].values.tolist() == [CHAOTIC_SET]

@@ -11,6 +11,8 @@ from pipeline.analysis.branches.arclength import Settings
 from pipeline.analysis.branches.problems import Family
 from pipeline.analysis.branches.table import curves_table
 
+pytestmark = pytest.mark.slow
+
 DUFFING = load_model("duffing")
 TWO_PI = 2.0 * np.pi
 

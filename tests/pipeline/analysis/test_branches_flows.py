@@ -22,6 +22,8 @@ from pipeline.analysis.branches import (
 from pipeline.analysis.branches.starting_orbits import family_of
 from tests.core.flows import BAUTIN, PAIR, ROSSLER, flow
 
+pytestmark = pytest.mark.slow
+
 
 def followed(table, of, state, parameter, low, high, *, max_period=1, **values):
     """Branches from a limit cycle near a state."""

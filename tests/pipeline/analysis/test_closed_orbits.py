@@ -11,6 +11,8 @@ from pipeline.analysis.attractors.finding import closed_orbits
 from pipeline.analysis.attractors.finding.closed_orbits import polish
 from pipeline.analysis.sets import Geometry
 
+pytestmark = pytest.mark.slow
+
 DUFFING = load_model("duffing")
 OMEGA = 1.2
 FREQUENCY = OMEGA / (2.0 * np.pi)

@@ -62,6 +62,7 @@ def only(branch, kind):
     return found, branch.family.values(found.point.u)[0]
 
 
+@pytest.mark.slow
 def test_equilibria__folds_of_a_cubic():
     """m = x^3 - 3 x: folds at x = -1 and 1, m = 2 and -2; stable, unstable, stable."""
     model = load_model(tomllib.loads(CUBIC))
@@ -75,6 +76,7 @@ def test_equilibria__folds_of_a_cubic():
     assert branch.ends == ("bound", "bound")
 
 
+@pytest.mark.slow
 def test_equilibria__lorenz():
     """Subcritical Hopf point at sigma (sigma + beta + 3)/(sigma - beta - 1) = 470/19."""
     x = np.sqrt(8.0 / 3.0 * 23.0)
@@ -96,6 +98,7 @@ def test_equilibria__lorenz():
     assert any("hopf" in line and "subcritical" in line and "equilibrium" in line for line in lines)
 
 
+@pytest.mark.slow
 def test_equilibria__pitchfork_of_lorenz():
     """At rho = 1 the branches of both wings cross that of rest, whose stability changes."""
     found, _ = branches_of(load_model("lorenz"), "rho", (0.5, 3.0), [0.0, 0.0, 0.0], 0.7, step=0.02)
@@ -110,6 +113,7 @@ def test_equilibria__pitchfork_of_lorenz():
     assert states[:, 0].max() > 2.0
 
 
+@pytest.mark.slow
 def test_hopf__of_the_brusselator_has_the_amplitude_of_its_cycles():
     """b = 1 + a^2, w = a, supercritical; amplitudes by the coefficient and by scipy."""
     a, table, scales = 1.2, tomllib.loads(BRUSSELATOR), (2.0, 0.5)
@@ -194,6 +198,7 @@ def flutter_matrices():
     return np.linalg.inv(mass), damping, stiffness
 
 
+@pytest.mark.slow
 def test_equilibria__flutter_rig():
     """Hopf point and fold of the cycles as own shooting with DOP853 found them (Lee, Barton and Renson's model)."""
     found, _ = branches_of(load_model("flutter"), "U", (14.0, 20.0), [0.0] * 6, 19.0, Crossing("h", 0.0, "up", 5.0))

@@ -49,6 +49,7 @@ def test_overlap_counts__leaves_out_what_is_not_known():
         overlap_counts(np.zeros(3), np.zeros(4))
 
 
+@pytest.mark.slow
 def test_overlaps__of_basins_whose_boundary_is_known(tmp_path, write_spec):
     """x = -1 and x = 1 attract, and a lies between their basins: of the 40 starts above 0, 10 lie below 0.5."""
     run(write_spec(SPEC), out=tmp_path / "run", workers=0, echo=lambda line: None)

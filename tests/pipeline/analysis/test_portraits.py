@@ -42,6 +42,7 @@ def attractors():
     )
 
 
+@pytest.mark.slow
 def test_portraits__closed_orbits_close(attractors):
     found = portraits(attractors, at={"frequency": 2.2}, parameters=load_preset(), n_periods=3)
     assert found["attractor"].values.tolist() == [0, 1, 2]

@@ -6,6 +6,8 @@ import pytest
 
 from pipeline.cli.exits import Exit
 
+pytestmark = pytest.mark.slow
+
 SPEC = """
 kind = "sweep"
 title = "{title}"

@@ -17,6 +17,7 @@ from pipeline.store.run import Run
 from tests.pipeline.explorer.small_runs import CURVES
 
 
+@pytest.mark.slow
 def test_line__its_own_curves(bent):
     """Of the run that was followed: its curves, and no map."""
     line, _ = bent
@@ -31,6 +32,7 @@ def test_line__its_own_curves(bent):
     assert {point["label"] for point in found["points"]} <= {"CP", "R1", "GPD"}
 
 
+@pytest.mark.slow
 def test_plane__curves_of_another_run(bent):
     """Over the number of attractors, which two folds bound."""
     line, plane = bent
@@ -45,6 +47,7 @@ def test_plane__curves_of_another_run(bent):
     assert explored.refreshed().curves is explored.curves
 
 
+@pytest.mark.slow
 def test_no_curves(bent):
     """A run without curves says how to get them."""
     _, plane = bent
@@ -54,6 +57,7 @@ def test_no_curves(bent):
     assert not describe_view(ExploredRun.of(plane), False)["has"]["curves"]
 
 
+@pytest.mark.slow
 def test_curve_orbit__by_another_integrator(bent):
     """The orbit closes at the values of its point, with a multiplier 1 on a fold."""
     line, _ = bent

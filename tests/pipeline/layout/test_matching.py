@@ -14,6 +14,8 @@ from pipeline.layout.matching import NOWHERE, Finder, apart, way_of
 from pipeline.layout.plan import make_plan
 from pipeline.specification.parsing import Spec, parse_spec
 
+pytestmark = pytest.mark.slow
+
 values = st.lists(st.sampled_from([-1.0, -0.5, -0.0, 0.0, 0.1, 1 / 3, 0.5, 1.0]), min_size=1, max_size=4)
 
 

@@ -17,6 +17,7 @@ from tests.pipeline.plots.made_up import DUFFING, legend_texts, make_attractors,
 CELLS = ("frequency", "initial_condition")
 
 
+@pytest.mark.slow
 def test_attractor_figures__without_angles_and_classifier():
     sweep = make_attractors([[0, 0, 1], [0, 1, 1]], CELLS, {"frequency": [0.1, 0.2]}, attrs=DUFFING)
     for figure in (plot_fractions(sweep), plot_coexisting(sweep)):
@@ -43,6 +44,7 @@ def test_plot_gallery__portraits_that_the_model_names_and_no_path(n):
         plot_gallery(found, portraits, degrees=True)
 
 
+@pytest.mark.slow
 def test_plot_regimes__more_regimes_than_colours_are_a_map_each():
     """Every subset of five attractors: 31 regimes."""
     masks = np.arange(1, 32)

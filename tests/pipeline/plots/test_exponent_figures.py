@@ -41,6 +41,7 @@ def make_cube(n_cells=3, dims=(), sizes=(), exponents=(0.3, -0.4)):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("per", ["s", "period"])
 def test_plot_convergence__per_period_at_one_fixed_frequency(per):
     ds = make_cube()
@@ -50,6 +51,7 @@ def test_plot_convergence__per_period_at_one_fixed_frequency(per):
     assert figure.axes[0].get_title(loc="left") == "$f$ = 0.25\N{NO-BREAK SPACE}Hz"
 
 
+@pytest.mark.slow
 def test_plot_convergence__many_cells_are_bands():
     many = plot_convergence(make_cube(10_000))
     few = plot_convergence(make_cube(MOST_LINES))
@@ -102,6 +104,7 @@ def boxes(axes, gid):
     return (min(map(np.min, xs)), max(map(np.max, xs))) if xs else None
 
 
+@pytest.mark.slow
 def test_plot_lyapunov__shows_where_cells_were_lost_and_why():
     """Cells that diverged were no more than a gap, and were called failed in the panel above."""
     ds = make_cube(2, ("F",), (6,))
@@ -121,6 +124,7 @@ def test_plot_lyapunov__shows_where_cells_were_lost_and_why():
     assert len(plot_lyapunov(make_cube(2, ("F",), (6,))).axes) == 2
 
 
+@pytest.mark.slow
 def test_left_out__figures_of_exponents_say_how_many_cells_and_why():
     ds = make_cube(3, ("F", "delta"), (4, 3))
     assert "left out" not in plot_lyapunov_map(ds).axes[0].get_title(loc="left")

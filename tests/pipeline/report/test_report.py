@@ -17,6 +17,8 @@ from pipeline.runs.derive import derive
 from pipeline.runs.run import run as run_spec
 from pipeline.store.run import Run
 
+pytestmark = pytest.mark.slow
+
 HOSTILE = "<script>alert(1)</script> & friends"
 SWEEP = f"""
 kind = "sweep"
@@ -45,7 +47,7 @@ def folder(tmp_path_factory):
 
 
 def written(command, folder, *words):
-    command(folder, "report", *words)
+    command(folder, "report", *words, "--out", "report.html", "--force")
     return (folder / "report.html").read_text("utf-8")
 
 

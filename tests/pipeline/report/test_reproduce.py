@@ -78,6 +78,7 @@ def study(tmp_path):
     return write
 
 
+@pytest.mark.slow
 def test_reproduce__a_study_of_ones_own(study, main, tmp_path):
     study(STUDY)
     code, out, err = main("reproduce", "mine.toml", "--out", "done", "--workers", "0")
@@ -101,6 +102,7 @@ COUNTED = "       2  not met: Nothing closes"
 NO_TEST = "1 of 2 claims are no test: parameters were calibrated on them. Did not come out: figure 2: Nothing closes."
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("calibrated", "words"), [(False, COUNTED), (True, NO_TEST)])
 def test_reproduce__a_required_claim_is_contradicted(study, main, tmp_path, calibrated, words):
     study(STUDY + FALSE + f"calibrated = {str(calibrated).lower()}\n")

@@ -87,6 +87,7 @@ def test_read_recording__says_its_model_and_writes_it_back(bench):
     assert model_of(again) is model_of(ds)
 
 
+@pytest.mark.slow
 def test_load_rig__text_of_a_file(bench):
     raw, mapping = simulated(load_rig(bench / "rig.toml"))
     assert mapping.system.name == "spring"

@@ -70,6 +70,7 @@ def test_estimate__within_a_factor_of_what_it_takes(monkeypatch):
     assert plan.core_seconds > found.core_seconds
 
 
+@pytest.mark.slow
 def test_writing_seconds__takes_the_time_of_writing_and_leaves_nothing(sweep_text, tmp_path, monkeypatch):
     spec, plan = read(sweep_text)
     written, original = [], commits.write_task
@@ -89,6 +90,7 @@ def test_writing_seconds__takes_the_time_of_writing_and_leaves_nothing(sweep_tex
     assert writing_seconds(spec, plan) == pytest.approx((len(plan.variables) + 1) * estimates.FILE_S)
 
 
+@pytest.mark.slow
 def test_describe_plan__says_what_the_time_rests_on_and_what_is_left(write_spec, sweep_text, tmp_path):
     path = write_spec(sweep_text)
     first, *_, last = describe_plan(path, tmp_path / "run")

@@ -18,6 +18,7 @@ def run(made):
     return Run.open(made.info.directory)
 
 
+@pytest.mark.slow
 def test_place__every_spelling(run):
     for name, value, degrees, expected in (
         ("frequency", 2.5, False, ("frequency", 2.5)),

@@ -13,6 +13,8 @@ from pipeline.store.checksums import seal, unseal
 from pipeline.store.commits import marker_key
 from pipeline.store.files import entry_of
 
+pytestmark = pytest.mark.slow
+
 SPEC = """
 kind = "sweep"
 model = "duffing"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import pytest
 
 from pipeline.layout.vocabulary import DIVERGED
 from pipeline.runs.outcome import outcomes_of, warning
@@ -34,6 +35,7 @@ equations = { x = "v", v = "a*v - x + 0.1*cos(2*pi*f*t)" }
 """
 
 
+@pytest.mark.slow
 def test_run__says_how_its_cells_ended_and_what_to_do_next(main, tmp_path):
     """The amplitude exceeds 1e6 within 43 periods (900 rad) where e^(a t/2) does: for a = 0.3 and above."""
     (tmp_path / "spec.toml").write_text(AMPLIFIED, "utf-8")

@@ -10,11 +10,14 @@ from types import SimpleNamespace
 
 import numpy as np
 import psutil
+import pytest
 
 from pipeline.runs import run as runs
 from pipeline.runs.status import state
 from pipeline.runs.verify import verify_run
 from tests.pipeline.factories import duffing
+
+pytestmark = pytest.mark.slow
 
 N_TASKS = 10_000 if os.environ.get("MAGPEND_LONG") == "1" else 150
 KILOBYTES_PER_TASK = 10 if N_TASKS > 1000 else 40

@@ -27,6 +27,7 @@ def cells_of(spec):
     return compute(spec, cells, tuple(slice(0, n) for n in cells.shape))
 
 
+@pytest.mark.slow
 def test_method__of_order_8_gives_the_same_motion_in_fewer_steps():
     fifth, eighth = (cells_of(spec_of(m, products={"lyapunov": {}})) for m in ("dopri5", "dop853"))
     np.testing.assert_allclose(eighth["section"], fifth["section"], atol=1e-6)

@@ -22,6 +22,7 @@ def _open(folder):
         return xr.open_zarr(folder / "cube.zarr", mask_and_scale=False).load()
 
 
+@pytest.mark.slow
 def test_write_cube__has_the_cubes_numbers_and_pending_cells(made, tmp_path):
     for index in range(made.plan.n_tasks - 1):
         made.commit(index)
@@ -54,6 +55,7 @@ def test_write_cube__lists_the_digest_of_every_file(made, tmp_path):
     assert "section" in group["consolidated_metadata"]["metadata"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("along", "chunk"), [("frequency", (3, 1, 3, 4)), ("q", (1, 2, 3, 4)), (None, (1, 2, 3, 4))])
 def test_write_cube__a_chunk_is_a_state_of_all_starts_at_some_values(made, tmp_path, monkeypatch, along, chunk):
     """12 starts x 3 sections x 8 bytes a column; room for three of them."""

@@ -18,6 +18,8 @@ from pipeline.store.errors import LockedError
 from pipeline.store.local import writer_lock
 from tests.pipeline.factories import duffing, quietly
 
+pytestmark = pytest.mark.slow
+
 SPEC = duffing(
     "frequency_hz = { start = 0.15, stop = 0.25, num = 20 }",
     'kind = "grid"\nx = 0.5\nv = 0.1',

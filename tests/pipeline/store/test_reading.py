@@ -6,6 +6,7 @@ import ast
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from magpend_core import Status
 from magpend_core.models import load_model
@@ -17,6 +18,7 @@ from pipeline.store.view import CommittedStore
 VARIABLES = base_variables(load_model())
 
 
+@pytest.mark.slow
 def test_open_run__explains_itself(made):
     made.commit(0)
     ds = open_run(made.info.directory)
@@ -43,6 +45,7 @@ def test_open_run__explains_itself(made):
     assert ds.section.sel(frequency=2.25, q=1.6, state="psi1").dims == ("psi1_0", "psi2_0", "period_index")
 
 
+@pytest.mark.slow
 def test_open_run__reads_no_chunk_before_it_is_used(made, monkeypatch):
     for index in range(made.plan.n_tasks):
         made.commit(index)

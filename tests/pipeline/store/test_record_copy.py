@@ -106,6 +106,7 @@ def test_group__metadata_that_disagree_are_damage(whole):
     assert verify_run(whole.info.directory).skeleton == [problem.replace("\\", "")]
 
 
+@pytest.mark.slow
 def test_group__of_an_earlier_version_opens_as_before(whole):
     now = open_run(whole.info.directory).load().drop_attrs(deep=False)
     remade(whole, lambda group: group.pop("consolidated_metadata"), described=False)

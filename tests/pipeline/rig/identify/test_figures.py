@@ -71,6 +71,7 @@ def test_residual_views__mean_goes_with_the_rate(ds):
     assert float(views["x_autocorrelation"][0]) == 1.0
 
 
+@pytest.mark.slow
 def test_draw_all__writes_figures_and_their_data(ds, tmp_path):
     files = figures.draw_all(tmp_path, ds, RESULT)
     assert sorted(files) == sorted(
@@ -83,6 +84,7 @@ def test_draw_all__writes_figures_and_their_data(ds, tmp_path):
     assert {p.name: p.read_bytes() for p in tmp_path.iterdir()} == first
 
 
+@pytest.mark.slow
 def test_plot_residuals__says_units_and_what_is_simulated(ds):
     for simulated in (0, 1):
         fig = figures.plot_residuals(ds.assign_attrs(simulated=simulated))

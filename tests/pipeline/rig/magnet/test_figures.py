@@ -24,6 +24,7 @@ def figures(fitted):
     return {name: draw(fitted.outcome, Frame(85.0)) for name, draw in FIGURES.items()}
 
 
+@pytest.mark.slow
 def test_draw_curves__data_are_readings_and_bumps(outcome, figures):
     data = figures["fig6"].data
     assert data.sizes == {"reading": 5 * 42, "curve": 10, "fine": 241}
@@ -60,6 +61,7 @@ def test_draw_comparison__what_is_left_over_is_readings_less_models(outcome, fig
     np.testing.assert_allclose(data["torque"] - data["left_by_dipoles"], computed, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_figures__say_that_readings_are_synthetic_and_their_data_lie_beside_them(outcome, figures, tmp_path):
     for figure in figures.values():
         assert "SYNTHETIC" in " ".join(t.get_text() for t in figure.findobj(lambda a: hasattr(a, "get_text")))

@@ -51,6 +51,7 @@ def check_damaged_files(tmp_path, make, suffix):
     assert set(outcomes) == {"read", "refused"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", [".csv", ".lvm"])
 def test_read_raw__damaged_files_are_read_or_refused(tmp_path, make, suffix):
     check_damaged_files(tmp_path, make, suffix)

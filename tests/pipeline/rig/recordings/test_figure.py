@@ -31,6 +31,7 @@ def broken(make):
     return recording_of(make.raw(make.channels(columns, step_s=np.nan)), mapping)
 
 
+@pytest.mark.slow
 def test_plot_recording__draws_what_was_measured(broken):
     figure = plot_recording(broken)
     assert len(figure.axes) == 2
