@@ -65,7 +65,7 @@ def test_show__text_of_a_specification(main, tmp_path, own):
     assert found["autonomous"] is False
     code, out, _ = main("model", "show", "spec.toml", "--latex")
     assert out.startswith("\\begin{align}\n")
-    assert r"\frac{\mathrm{d}v}{\mathrm{d}t} &= \mathrm{drive} - d \, v - x^{3}" in out
+    assert r"\frac{\mathrm{d}\dot{x}}{\mathrm{d}t} &= \mathrm{drive} - d \, \dot{x} - x^{3}" in out
 
 
 def test_show__file_of_a_model_and_one_that_ships(main, tmp_path, own):
