@@ -146,6 +146,7 @@ def test_extend__opens_the_wider_run(run, tmp_path):
     assert set(run.cube()["section"].values.ravel()) < set(more.cube()["section"].values.ravel())
 
 
+@pytest.mark.slow
 def test_zoom__is_a_specification_that_run_takes(run):
     notes = []
     table = run.zoom({"frequency": (0.2, 0.28)}, num=3, echo=notes.append)
@@ -292,6 +293,7 @@ def test_accessor__knows_model_run_and_cells(run):
         ds.magpend.sel_cell(q=1.0)
 
 
+@pytest.mark.slow
 def test_accessor__refuses_wrong_datasets_in_a_sentence(run):
     cube = run.cube()
     for wrong, message in (

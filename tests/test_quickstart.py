@@ -86,6 +86,7 @@ def test_quickstart__the_docs_show_this_run(directory):
     assert stale < 0.005, "docs/quickstart.png is stale; make it with: magpend run quickstart --plot"
 
 
+@pytest.mark.slow
 def test_quickstart__left_orbit_at_2p2_hz(ds):
     """Some walk lies on the left orbit; what is left of its transient is below 1e-6.
 

@@ -77,6 +77,7 @@ def test_sections__absurd_states_diverge(start):
     assert np.isnan(found.section).all()
 
 
+@pytest.mark.slow
 def test_trajectory__absurd_arguments_end(preset):
     times = np.linspace(0.0, 1.0, 5)
     with pytest.raises(ValueError, match=r"1e\+180 periods .* at most 1e\+07"):

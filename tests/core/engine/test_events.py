@@ -151,6 +151,7 @@ def test_section__of_an_angle_is_crossed_modulo_a_turn_and_one_way():
     assert backwards.status[0, 0] == Status.NO_RETURN
 
 
+@pytest.mark.slow
 def test_section__the_crossing_at_the_start_does_not_count():
     # x = cos t, v = -sin t falls through v = 0 at the start and a period later
     section = Crossing("v", 0.0, "down")
@@ -183,6 +184,7 @@ def test_section__no_return_ends_the_cell_and_the_walk_goes_on():
     assert "section.longest" in Status.NO_RETURN.sentence
 
 
+@pytest.mark.slow
 def test_section__finds_a_pair_of_crossings_within_a_step():
     # the top of a circle of radius 1 reaches beyond the level by 5e-5, for 0.02 s; steps are ten times longer
     for depth in (1e-3, 5e-5, 1e-6):
@@ -392,6 +394,7 @@ def test_switch__of_a_relay_gives_parabolas():
     assert found.n_rejected.sum() < 3 * n_crossings
 
 
+@pytest.mark.slow
 def test_segments__of_a_square_drive_turn_about_two_centres():
     # right of x = 0 the relay pulls by 1/2 to one side: x'' = push - 1/2 - k x
     k, frequency = 1.7, 0.8
@@ -575,6 +578,7 @@ def test_impact__of_a_bouncing_ball_is_the_closed_form():
     assert found.return_time[:, 0, 1:] == pytest.approx(2.0 * speeds[:, :-1] / g, abs=1e-11)
 
 
+@pytest.mark.slow
 def test_section__of_a_flow_with_switches_or_impacts():
     a, g, height = 0.7, 2.0, 0.9
     relay = [0.0, 1.0, 0.0, -1e3, 1.0, 0.0]
@@ -678,6 +682,7 @@ def test_impact__oscillator_follows_its_exact_map_and_its_derivative():
     assert min(counts) >= 3
 
 
+@pytest.mark.slow
 def test_impact__multipliers_of_an_orbit_are_those_of_the_exact_map():
     zeta, force, gap, r, frequency = 0.05, 1.0, 0.4, 0.8, 0.13
     packed = np.array([[zeta, force, gap, r]])
@@ -707,6 +712,7 @@ def test_switch__derivative_of_a_relay_is_that_of_its_period():
     assert np.linalg.det(derivative[0]) == pytest.approx(1.0, abs=1e-10)
 
 
+@pytest.mark.slow
 def test_switch__sliding_forgets_the_velocity():
     # once it has stuck, the section depends on where it stuck alone: one multiplier is 0
     force, mu, frequency = 1.0, 0.6, 0.05

@@ -55,6 +55,7 @@ def test_jacobian__is_the_derivative_of_the_rates(name, preset):
         np.testing.assert_allclose(found[..., j], by_differences, rtol=close, atol=close)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [n for n in model_names() if load_model(n).mirror])
 def test_mirror__maps_rates_on_rates(name):
     model = load_model(name)

@@ -192,6 +192,7 @@ def test_walk__interrupted_and_resumed(write_spec, tmp_path, bytes_of, monkeypat
     assert bytes_of(tmp_path / "run") == bytes_of(tmp_path / "whole")
 
 
+@pytest.mark.slow
 def test_walk__a_task_in_its_middle_is_lost(write_spec, tmp_path, bytes_of):
     path, directory = write_spec(duffing(cut=3)), tmp_path / "run"
     plan = run(path, directory, workers=0, echo=silent).plan

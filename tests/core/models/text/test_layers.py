@@ -177,6 +177,7 @@ def test_square__is_followed_exactly(duty, jumping):
     assert found.n_rejected[0] <= 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("d", "e", "s"), [(0.3, 0.6, 0.37), (0.7, 0.2, -0.9), (0.5, 0.5, 2.6), (0.1, 0.95, 0.0)])
 def test_jumps_in_time__are_followed_in_whatever_order_the_parameters_put_them(d, e, s, jumping):
     alone = model_of({"x": f"{JUMPS} - k*x"}, {"d": 0.3, "e": 0.6, "s": 0.37, "k": 1.0})
@@ -310,6 +311,7 @@ def test_switch__whose_surface_jumps_with_time_is_on_the_right_side_of_it(rubbin
     np.testing.assert_allclose(stuck.section[0, 0, 1:], -1.0, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_sticking__is_exact(rubbing):
     """A mass on a belt, stuck until the spring pulls as hard as friction: x = x0 + belt t, then slipping."""
     alone = model_of({"x": "v", "v": "-x - mu*sign(v - belt)"}, {"mu": 0.4, "belt": 0.1})
@@ -350,6 +352,7 @@ def test_sticking__without_friction_there_is_none(rubbing, mu1, mu2, start, end)
     np.testing.assert_allclose(found.section[0, 0], end, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_impacts__set_what_the_text_sets(cornered):
     """A ball on the floor: the time of flight after each bounce is r times that before."""
     assert len(cornered.derived.impacts) == 1
