@@ -79,6 +79,7 @@ def test_gallery__page_draws_the_study_s_figure(name):
     assert picture.figure in FIGURES
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=[] if name in QUICK else [pytest.mark.long]) for name in FIGURE]
 )

@@ -146,6 +146,7 @@ def test_plot__without_kernel(directory, tmp_path, command, monkeypatch):
     assert plotted.read_bytes() == (directory / "figures" / "bifurcation_psi1.png").read_bytes()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=[pytest.mark.long] if "/" in name else []) for name in shipped_workflows()]
 )
