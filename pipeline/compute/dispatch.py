@@ -243,7 +243,7 @@ async def _outcome(client: Any, future: Any) -> tuple[Any, BaseException | None]
 
 
 def _restarted(client: Any, address: str) -> None:
-    """Restart a dask worker and wait until it is back, in a thread of its own: a suspended worker answers slowly."""
+    """Restart a dask worker in a new thread, and wait there until it is back: a suspended worker answers slowly."""
     with contextlib.suppress(Exception):
         client.restart_workers([address], timeout=ANSWER_S, raise_for_error=False)
 

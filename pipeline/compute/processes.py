@@ -25,7 +25,7 @@ class ProcessError(Exception):
 
 
 class Processes:
-    """Task that each thread runs in a process of its own, which is replaced if it dies.
+    """Task that each thread runs in its own child process; a process that dies is replaced.
 
     A process does not import the main module, so a script needs no ``if __name__ == "__main__"``.
     """

@@ -38,7 +38,7 @@ def seconds_of(time: str) -> int:
 
 
 def refuse_breaks(texts: Iterable[str]) -> None:
-    """Raise `SpecError` for a text with control characters, which would begin a line of its own in a job file."""
+    """Raise `SpecError` for control characters: a line break would add a line to a job file."""
     for text in texts:
         if _CONTROL.search(text):
             raise SpecError(f"{text!r}: has line breaks or control characters, which no job file may have; rename it.")

@@ -65,7 +65,7 @@ class StoredPack(Stored):
 
 
 class StoredIdentity(Stored):
-    """What decides a run's numbers and layout."""
+    """Identity of a run: the entries that decide its numbers and layout."""
 
     refinement: int | None = None
     format: int | float

@@ -309,7 +309,7 @@ def split_rhat(values: Array) -> Array:
 
 
 def figures_of(chain: Chain, names: Sequence[str]) -> xr.Dataset:
-    """Return the convergence figures of a chain over the unknowns of these names, to be stored with its draws."""
+    """Return the convergence figures of a chain, as they are stored with its draws."""
     return xr.Dataset(
         {
             "autocorrelation_time": ("unknown", chain.time, {"units": "1", "long_name": "steps"}),

@@ -409,7 +409,7 @@ class _Extension:
         return not is_sure or any(one.stability == NOT_SETTLED for one in self.sets)
 
     def _joined(self, sets: list[BoundedSet], owns: list[list[Course]], has_stayed: bool) -> Work[list[BoundedSet]]:
-        """Join the tori that are one: the points of each trajectory on it may lie on a curve of its own."""
+        """Join tori that are the same: each trajectory on a torus may fill only one curve of it."""
         k = 0
         while k < len(sets):
             for i in range(k):
