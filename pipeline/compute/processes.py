@@ -24,6 +24,31 @@ class ProcessError(Exception):
     """Raised if a task failed in its process, or if the process died."""
 
 
+class _Process(subprocess.Popen[bytes]):
+    """Child that answers one thread; any thread may end it."""
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self._asked = threading.Lock()
+
+    def ask(self, task: bytes, index: int) -> tuple[dict[str, Any], str]:
+        assert self.stdin
+        assert self.stdout
+        with self._asked:
+            pickle.dump((task, index), self.stdin)
+            self.stdin.flush()
+            result, reason = pickle.load(self.stdout)
+        return result, reason
+
+    def end(self) -> None:
+        self.kill()
+        self.wait()
+        with self._asked:  # closing a pipe takes its buffer from a thread that still reads
+            for pipe in (self.stdin, self.stdout):
+                with contextlib.suppress(OSError):  # a request may not have left the buffer
+                    pipe.close()  # type: ignore[union-attr]
+
+
 class Processes:
     """Task that each thread runs in its own child process; a process that dies is replaced.
 
@@ -33,7 +58,7 @@ class Processes:
     def __init__(self, task: Task) -> None:
         self._task = pickle.dumps(task)
         self._own = threading.local()
-        self._started: list[subprocess.Popen[bytes]] = []
+        self._started: list[_Process] = []
         self._lock = threading.Lock()
         self._is_closed = False
 
@@ -45,28 +70,24 @@ class Processes:
         ProcessError
             If it fails there, or the process dies.
         """
-        process: subprocess.Popen[bytes] = getattr(self._own, "process", None) or self._start()
-        assert process.stdin
-        assert process.stdout
+        process: _Process = getattr(self._own, "process", None) or self._start()
         try:
-            pickle.dump((self._task, index), process.stdin)
-            process.stdin.flush()
-            result, reason = pickle.load(process.stdout)
+            result, reason = process.ask(self._task, index)
         except (OSError, EOFError, pickle.UnpicklingError):
             self._own.process = None
-            _end(process)
+            process.end()
             raise ProcessError("its process died (out of memory, or killed)") from None
         if reason:
             raise ProcessError(reason)
         return dict(result)
 
-    def _start(self) -> subprocess.Popen[bytes]:
+    def _start(self) -> _Process:
         # the same folders, also those that were added since the start of Python
         code = f"import sys; sys.path[:] = {sys.path!r}; from {__name__} import serve; serve()"
         with self._lock:
             if self._is_closed:
                 raise ProcessError("the run has ended")
-            self._own.process = process = subprocess.Popen(
+            self._own.process = process = _Process(
                 [sys.executable, "-c", code],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
@@ -80,15 +101,7 @@ class Processes:
         with self._lock:
             self._is_closed = True
         for process in self._started:
-            _end(process)
-
-
-def _end(process: subprocess.Popen[bytes]) -> None:
-    process.kill()
-    process.wait()
-    for pipe in (process.stdin, process.stdout):
-        with contextlib.suppress(OSError):  # a request may not have left the buffer
-            pipe.close()  # type: ignore[union-attr]
+            process.end()
 
 
 def serve() -> NoReturn:
