@@ -1,5 +1,4 @@
-"""Share the rows of an engine call (branches, cells, trajectories) among threads, and run two computations beside
-each other.
+"""Share the rows of an engine call (branches, cells, trajectories) among threads.
 
 A lane's numbers depend on its own inputs only, so it does not matter which thread integrates which row. Every thread
 calls the same compiled function, with work arrays of its own, on the same input and output arrays. Whenever a lane is
@@ -13,12 +12,11 @@ from __future__ import annotations
 
 import contextlib
 import os
-import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import ContextVar, copy_context
 from functools import cache
-from typing import Any, TypeVar
+from typing import Any
 
 import numba
 import numpy as np
@@ -103,49 +101,6 @@ def share(run: Callable[[np.ndarray, int], None], n_rows: int, n_lanes: int) -> 
                 helper.result()
     finally:
         queue[0] = n_rows  # after an error or an interruption: nothing is left for the others
-
-
-T = TypeVar("T")
-R = TypeVar("R")
-
-
-def in_halves(work: Callable[[Sequence[T], Callable[[], bool]], list[R]], items: Sequence[T]) -> list[R]:
-    """Call `work` for every other item, and in a second thread for the rest. While one integrates, the other can use
-    Python.
-
-    Parameters
-    ----------
-    work
-        Function of some of the items that returns a result for each. Its second argument tells whether the other
-        thread has failed, so that it need not go on.
-    items
-        What to work on; no result may depend on another item. With one thread, `work` gets all of them.
-
-    Raises
-    ------
-    Exception
-        The error of `work` in either thread.
-    """
-    if number_of_threads() < 2 or len(items) < 2:
-        return work(items, lambda: False)
-    has_failed = threading.Event()
-
-    def half(own: Sequence[T]) -> list[R]:
-        try:
-            return work(own, has_failed.is_set)
-        except BaseException:
-            has_failed.set()
-            raise
-
-    other = _pool(number_of_threads()).submit(copy_context().run, half, items[1::2])
-    try:
-        found = half(items[::2])
-        rest = half(items[1::2]) if other.cancel() else other.result()
-    finally:
-        has_failed.set()
-    results: list[Any] = [None] * len(items)
-    results[::2], results[1::2] = found, rest
-    return results
 
 
 @cache

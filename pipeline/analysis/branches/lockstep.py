@@ -7,14 +7,13 @@ more than the cost of one. Each gets the same numbers as if it ran alone.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
 
 from magpend_core.engine.system import System
-from magpend_core.engine.threads import in_halves
 from magpend_core.orbits import section_map
 from pipeline.analysis.branches.problems import Ends, Problem, Rows, Value
 from pipeline.analysis.tolerances import BRANCH_RTOL
@@ -42,34 +41,30 @@ def run_together(computations: Sequence[Steps[T]], what: str = "", rtol: float =
     tolerance of the integrations.
     """
     covered = [0.0] * len(computations)
+    results: dict[int, T] = {}
+    waiting: dict[int, Query] = {}
+    seen: dict[int, tuple[float, float]] = {}
 
-    def run(numbers: Sequence[int], is_over: Callable[[], bool]) -> list[T]:
-        results: dict[int, T] = {}
-        waiting: dict[int, Query] = {}
-        seen: dict[int, tuple[float, float]] = {}
+    def advance(i: int, value: Value | None) -> None:
+        try:
+            waiting[i] = next(computations[i]) if value is None else computations[i].send(value)
+        except StopIteration as stop:
+            results[i], covered[i] = stop.value, 1.0
 
-        def advance(i: int, value: Value | None) -> None:
-            try:
-                waiting[i] = next(computations[i]) if value is None else computations[i].send(value)
-            except StopIteration as stop:
-                results[i], covered[i] = stop.value, 1.0
-
-        for i in numbers:
-            advance(i, None)
-        while waiting and not is_over():
-            queries, waiting = waiting, {}
-            for i, value in zip(queries, _evaluate(list(queries.values()), rtol), strict=True):
-                advance(i, value)
-            for i in waiting:
-                last = float(queries[i].u[-1])
-                low, high = seen.get(i, (last, last))
-                seen[i] = min(low, last), max(high, last)
-                covered[i] = min(seen[i][1] - seen[i][0], 0.9)
-            if what:
-                report(what, round(sum(covered), 1), len(computations))
-        return [results[i] for i in numbers if i in results]
-
-    return in_halves(run, range(len(computations)))
+    for i in range(len(computations)):
+        advance(i, None)
+    while waiting:
+        queries, waiting = waiting, {}
+        for i, value in zip(queries, _evaluate(list(queries.values()), rtol), strict=True):
+            advance(i, value)
+        for i in waiting:
+            last = float(queries[i].u[-1])
+            low, high = seen.get(i, (last, last))
+            seen[i] = min(low, last), max(high, last)
+            covered[i] = min(seen[i][1] - seen[i][0], 0.9)
+        if what:
+            report(what, round(sum(covered), 1), len(computations))
+    return [results[i] for i in range(len(computations))]
 
 
 def run_alone(computation: Steps[T]) -> T:

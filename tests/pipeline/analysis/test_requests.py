@@ -6,7 +6,6 @@ import re
 
 import numpy as np
 
-from magpend_core.engine.threads import using_threads
 from pipeline.analysis.attractors.finding import requests
 from pipeline.analysis.attractors.finding.requests import EXTENDING, Leg, Polish, answer_all
 from pipeline.cli.console import Display
@@ -36,7 +35,7 @@ def test_answer_all__tells_no_time_left_that_is_wrong(monkeypatch):
 
     monkeypatch.setattr(requests, "_legs", legs)
     monkeypatch.setattr(requests, "_polished", lambda asked, points, settings: dict.fromkeys(asked))
-    with using_threads(1), reporting(display):
+    with reporting(display):
         found = answer_all({(i,): point(100 if i >= 15 else 1) for i in range(20)}, {}, None)
     assert found == {(i,): 100 if i >= 15 else 1 for i in range(20)}
     assert any("15 of 20 (75 %)" in line for _, line in lines)

@@ -6,7 +6,7 @@ so that their trajectories fill the engine's lanes together.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar
 
@@ -15,7 +15,6 @@ import xarray as xr
 
 from magpend_core.defaults import ATOL, MOST_STEPS, RTOL
 from magpend_core.engine.system import System
-from magpend_core.engine.threads import in_halves
 from magpend_core.orbits import section_map
 from magpend_core.sections import run_branches
 from pipeline.analysis.attractors.finding.cell_blocks import Guesses
@@ -162,33 +161,27 @@ def answer_all(
     number does not tell the time left.
     """
     results: dict[tuple[int, ...], T] = {}
+    answers: dict[tuple[int, ...], Any] = dict.fromkeys(works)
     what = FINDING
-
-    def answer(indices: Sequence[tuple[int, ...]], is_over: Callable[[], bool]) -> list[T]:
-        nonlocal what
-        answers: dict[tuple[int, ...], Any] = dict.fromkeys(indices)
-        while answers and not is_over():
+    while answers:
+        report(what, len(results), len(works), UNTOLD)
+        asked: dict[tuple[int, ...], Request] = {}
+        for index, value in answers.items():
+            try:
+                asked[index] = works[index].send(value)
+            except StopIteration as stop:
+                results[index] = stop.value
+        legs = {index: request for index, request in asked.items() if isinstance(request, Leg)}
+        guesses = {index: request for index, request in asked.items() if isinstance(request, Polish)}
+        slopes = {index: request for index, request in asked.items() if isinstance(request, Slopes)}
+        if legs and what != EXTENDING:
+            what = EXTENDING
             report(what, len(results), len(works), UNTOLD)
-            asked: dict[tuple[int, ...], Request] = {}
-            for index, value in answers.items():
-                try:
-                    asked[index] = works[index].send(value)
-                except StopIteration as stop:
-                    results[index] = stop.value
-            legs = {index: request for index, request in asked.items() if isinstance(request, Leg)}
-            guesses = {index: request for index, request in asked.items() if isinstance(request, Polish)}
-            slopes = {index: request for index, request in asked.items() if isinstance(request, Slopes)}
-            if legs and what != EXTENDING:
-                what = EXTENDING
-                report(what, len(results), len(works), UNTOLD)
-            answers = _legs(legs, points, settings) if legs else {}
-            answers |= _polished(guesses, points, settings) if guesses else {}
-            answers |= _slopes(slopes, points, settings) if slopes else {}
-        return [results[index] for index in indices if index in results]
-
-    found = in_halves(answer, list(works))
+        answers = _legs(legs, points, settings) if legs else {}
+        answers |= _polished(guesses, points, settings) if guesses else {}
+        answers |= _slopes(slopes, points, settings) if slopes else {}
     report(what, len(results), len(works), UNTOLD)
-    return dict(zip(works, found, strict=True))
+    return {index: results[index] for index in works}
 
 
 def _gathered(
