@@ -42,7 +42,6 @@ def test_write_task__a_bit_flips_while_a_chunk_is_written(made, monkeypatch):
     assert (open_run(made.info.directory).section.isel(frequency=0, q=0) == made.values(0)["section"][0, 0]).all()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("checks", [True, False])
 def test_open_run__a_record_that_vouches_for_a_flipped_bit(made, checks):
     """Records of earlier versions hold the digests of what was read back; the chunk's own checksum is of what was

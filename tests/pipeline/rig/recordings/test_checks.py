@@ -84,6 +84,13 @@ def pot(angle, dead=0.2):
 POT = {"unit": "V", "zero": 2.5, "range": [0.0, 5.0], "dead_band": [0.0, 0.1]}
 
 
+def test_readings__zero_scale_sign_and_offset(make):
+    """The value is sign x scale x (reading - zero) + offset."""
+    volts = 2.5 + 0.1 * np.sin(make.time)
+    ds = make.recorded(volts, unit="V", zero=2.5, scale=3.0, sign=-1, offset=0.01)
+    np.testing.assert_allclose(ds["psi1"], 0.01 - 0.3 * np.sin(make.time), atol=1e-12)
+
+
 def test_dead_band__is_not_measured_and_the_turns_go_on(make):
     t = make.time
     angle = 2.0 * t + np.sin(3.0 * t)  # 8 rad: over the top, again and again
