@@ -78,6 +78,9 @@ SAME_CONNECTED = 1e-5
 SAME_RETURN = 1e-2
 """Distance within which a return is tried as the period of a limit cycle."""
 
+SAME_SECONDS = 1e-6
+"""Largest relative difference between the periods of a limit cycle that is found twice."""
+
 SAME_POINT = 1e-6
 """Distance below which section points of a set count as one."""
 

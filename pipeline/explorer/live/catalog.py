@@ -27,11 +27,12 @@ from pipeline.analysis.attractors.finding.assigning import decide
 from pipeline.analysis.attractors.finding.cell_blocks import Block
 from pipeline.analysis.attractors.finding.closed_orbits import Orbit, number_of, polish, raw_orbit
 from pipeline.analysis.attractors.finding.equilibria import tell_rest
-from pipeline.analysis.attractors.finding.limit_cycles import tell_cycles
+from pipeline.analysis.attractors.finding.known_sets import Cycle
+from pipeline.analysis.attractors.finding.limit_cycles import number_of_cycle, tell_cycles
 from pipeline.analysis.attractors.finding.points import Point
 from pipeline.analysis.attractors.finding.spirals import Recurrence
 from pipeline.analysis.sets import Geometry
-from pipeline.analysis.tolerances import STRICT
+from pipeline.analysis.tolerances import SAME_SECONDS, STRICT
 from pipeline.explorer.data.series import orbit_series
 from pipeline.explorer.live.settling import Place
 from pipeline.layout.vocabulary import ABSENT, APERIODIC, ATTRACTS, EQUILIBRIUM, NOT_SETTLED, PERIODIC_ORBIT, split_dims
@@ -42,9 +43,6 @@ MOST_ENTRIES = 64
 
 SAME_REST = 1e-5
 """Largest scaled distance between an equilibrium of the run and the same one found again."""
-
-SAME_SECONDS = 1e-6
-"""Largest relative difference between the periods of a limit cycle found twice."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -260,7 +258,7 @@ class Catalog:
                 assert point.on_cycle is not None
                 own = point.on_cycle == k
                 last = block.section[own][0, -1:]
-                entry = self._entry_of_seconds(cycle.seconds) or self._new(
+                entry = self._entry_of(cycle, point) or self._new(
                     PERIODIC_ORBIT, 0, last, seconds=cycle.seconds, stability=ATTRACTS
                 )
                 numbers[own] = entry.number
@@ -331,12 +329,16 @@ class Catalog:
                 return entry
         return None
 
-    def _entry_of_seconds(self, seconds: float) -> Entry | None:
-        for entry in self.entries:
-            same = abs(entry.seconds - seconds) <= SAME_SECONDS * seconds
-            if entry.kind == PERIODIC_ORBIT and not entry.period and same:
-                return entry
-        return None
+    def _entry_of(self, cycle: Cycle, point: Point) -> Entry | None:
+        alike = [
+            entry
+            for entry in self.entries
+            if entry.kind == PERIODIC_ORBIT
+            and not entry.period
+            and abs(entry.seconds - cycle.seconds) <= SAME_SECONDS * cycle.seconds
+        ]
+        states, near = [entry.points[0] for entry in alike], [self.tolerance] * len(alike)
+        return [*alike, None][number_of_cycle(cycle, states, near, point, self._geometry)]
 
     def _class_of(self, block: Block, row: int) -> Entry:
         """Return the catalog entry for cells without an attractor that share status, period and motion with a given

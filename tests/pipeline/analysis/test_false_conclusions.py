@@ -7,6 +7,8 @@ import json
 import numpy as np
 import pytest
 import xarray as xr
+from scipy.integrate import solve_ivp
+from scipy.spatial import cKDTree
 
 from magpend_core import run_branches
 from magpend_core.crossing import Crossing
@@ -95,6 +97,20 @@ HELD = {
     "equations": {**oscillators(1.0)["equations"], "s": "0*s"},
 }
 """A parameter written as a state: a limit cycle for each value of it."""
+
+THREE_FATES = {
+    "name": "three_fates",
+    "states": {"x": {}, "y": {}, "z": {}},
+    "parameters": {"s": 0.125},
+    "equations": {"x": "s*(y - x)", "y": "-x*z - y", "z": "x*y + 0.6*z"},
+}
+"""Lorenz with r = 0, b = -.6: two limit cycles, each the mirror image of the other."""
+
+
+def three_fates(_, u):
+    x, y, z = u
+    return [0.125 * (y - x), -x * z - y, x * y + 0.6 * z]
+
 
 PREY = {
     "name": "prey",
@@ -197,6 +213,26 @@ def test_identify__a_steady_rotation_is_a_limit_cycle(table, starts, of, seconds
     if multiplier is not None:
         assert own[1 if strobed else 0] == pytest.approx(multiplier, rel=1e-6)
         assert not strobed or own[0] == 1.0
+
+
+def test_identify__a_curve_has_one_id_at_any_phase():
+    """A cycle of multiplier .64 that cells reach after the run, and its mirror image: scipy goes through all points."""
+    rng = np.random.default_rng(0)
+    starts = np.array([-2.1338, -1.0636, 5.9469]) + rng.uniform(-0.3, 0.3, (12, 3))
+    both = np.concatenate([starts, starts * [-1.0, -1.0, 1.0]])
+    found = found_of(THREE_FATES, rng.permutation(both), frequency_hz=0.5, n_transient=60)
+    assert found["kind"].values.tolist() == [PERIODIC_ORBIT] * 2
+    is_bounded = np.isin(found["status"], (Status.PERIODIC, Status.BOUNDED))  # the others diverge
+    assert found["n_cells"].values.tolist() == [is_bounded.sum() / 2] * 2
+    seconds = found["period_s"].values
+    assert np.ptp(seconds) <= 1e-6
+    for k in range(2):
+        own, other = found["attractor_points"].values[[k, 1 - k]]
+        own, other = own[np.isfinite(own).all(axis=1)][::97], other[np.isfinite(other).all(axis=1)]
+        flow = solve_ivp(three_fates, (0.0, seconds[k]), own[0], rtol=1e-10, atol=1e-10, dense_output=True)
+        curve = cKDTree(flow.sol(np.linspace(0.0, seconds[k], 40_000)).T)
+        assert curve.query(own)[0].max() <= 2e-2
+        assert curve.query(other)[0].max() > 1.0
 
 
 # ---- one state ---------------------------------------------------------------------------------

@@ -18,8 +18,9 @@ from pipeline.analysis.attractors.extension.lifetimes import lifetime_interval
 from pipeline.analysis.attractors.finding import stability
 from pipeline.analysis.attractors.finding.assigning import decide
 from pipeline.analysis.attractors.finding.cell_blocks import Block, marks_of
-from pipeline.analysis.attractors.finding.closed_orbits import Orbit, raw_orbit
+from pipeline.analysis.attractors.finding.closed_orbits import Orbit, distinct, raw_orbit
 from pipeline.analysis.attractors.finding.equilibria import put_at_rest
+from pipeline.analysis.attractors.finding.limit_cycles import number_among
 from pipeline.analysis.attractors.finding.points import Point
 from pipeline.analysis.attractors.finding.probing import is_approaching, probe_equilibrium, probe_orbit
 from pipeline.analysis.attractors.finding.requests import Slopes, Work
@@ -309,6 +310,7 @@ def _describe(
 ) -> Found:
     """Compute the features of all sets that have cells, and renumber the sets in canonical order."""
     resting = len(orbits) + len(sets)
+    _assert_distinct(point, orbits, search.geometry)
     _label_elsewhere(point, resting, labels)
     cells: dict[int, Cells] = {}
     for block in point.blocks():
@@ -334,6 +336,14 @@ def _describe(
         ranked,
         [cells[n].n for n in order],
     )
+
+
+def _assert_distinct(point: Point, orbits: Sequence[Orbit], geometry: Geometry) -> None:
+    """Raise AssertionError if two polished orbits or two limit cycles, which get an id each, are one."""
+    polished = [orbit for orbit in orbits if orbit.is_polished]
+    assert len(distinct(polished, geometry)) == len(polished), "two ids of one orbit"
+    for k, cycle in enumerate(point.cycles):
+        assert number_among(cycle, point.cycles[:k], point, geometry) == k, "two ids of one limit cycle"
 
 
 def _label_elsewhere(point: Point, first: int, labels: _Labels) -> None:

@@ -15,6 +15,7 @@ import numpy as np
 from magpend_core.engine.system import System
 from magpend_core.orbits import PeriodicOrbits, polish_orbits
 from magpend_core.sections import run_branches
+from pipeline.analysis.attractors.finding.known_sets import position_error
 from pipeline.analysis.attractors.finding.stability import by_margin, largest_error
 from pipeline.analysis.sets import Geometry, rounded_points
 from pipeline.analysis.tolerances import (
@@ -102,7 +103,7 @@ class Orbit:
     @property
     def error(self) -> float:
         """Estimated distance from the true orbit, from the residual of Newton's method."""
-        return float(10.0 * self.residual / max(np.abs(1.0 - self.multipliers).min(), 1e-6))
+        return position_error(self.residual, self.multipliers)
 
 
 def scaled_derivative(orbit: Orbit, geometry: Geometry) -> np.ndarray:
@@ -293,5 +294,6 @@ def _coincide(a: Orbit, b: Orbit, geometry: Geometry) -> bool:
     if a.period != b.period:
         return False
     allowed = SAME_ORBIT + a.error + b.error
-    start = int(np.argmin(geometry.distance(b.points, a.points[0])))
-    return bool(geometry.distance(np.roll(b.points, -start, axis=0), a.points).max() <= allowed)
+    # every start within the error: two points of one orbit may be as near to each other
+    starts = np.flatnonzero(geometry.distance(b.points, a.points[0]) <= allowed)
+    return any(geometry.distance(np.roll(b.points, -i, axis=0), a.points).max() <= allowed for i in starts)

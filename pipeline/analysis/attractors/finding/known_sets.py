@@ -112,18 +112,34 @@ class Equilibrium:
 
 @dataclass(frozen=True)
 class Cycle:
-    """A stable limit cycle: its period [s], its multipliers and the residual of Newton's method.
+    """A stable limit cycle of a flow, by one of its states, its period and its multipliers.
 
     Attributes
     ----------
+    state : ndarray, (state,)
+        Polished state at which the cycle crosses a level upwards.
+    crossed : int
+        Index of the state variable that crosses the level there.
     seconds : float
         Period [s].
     multipliers : ndarray of complex, (state,)
-        Floquet multipliers by falling modulus; one is 1, along the flow.
+        Floquet multipliers by falling modulus; the first is 1, along the flow.
     residual : float
         Residual of `polish_orbits`.
     """
 
+    state: np.ndarray
+    crossed: int
     seconds: float
     multipliers: np.ndarray
     residual: float
+
+    @property
+    def error(self) -> float:
+        """Estimated distance of the state from the true cycle, from the residual of Newton's method."""
+        return position_error(self.residual, self.multipliers[1:])
+
+
+def position_error(residual: float, multipliers: np.ndarray) -> float:
+    """Estimate the distance of a polished point from the true orbit, from the residual of Newton's method."""
+    return float(10.0 * residual / max(np.abs(1.0 - multipliers).min(initial=1.0), 1e-6))

@@ -9,7 +9,7 @@ the cycle as a periodic point (`magpend_core.orbits`), and all cells on the cycl
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -21,7 +21,7 @@ from pipeline.analysis.attractors.finding.closed_orbits import orbit_of
 from pipeline.analysis.attractors.finding.known_sets import Cycle
 from pipeline.analysis.attractors.finding.points import Point
 from pipeline.analysis.sets import Geometry, hashes
-from pipeline.analysis.tolerances import CROSSING_RTOL, SAME_RETURN
+from pipeline.analysis.tolerances import BRANCH_RTOL, CROSSING_RTOL, REACH, SAME_ORBIT, SAME_RETURN, SAME_SECONDS
 from pipeline.layout.vocabulary import ATTRACTS
 
 RETURNS = 32
@@ -29,6 +29,9 @@ RETURNS = 32
 
 TRIES = 3
 """Cells without a cycle after which the search at a parameter point ends."""
+
+ROUNDS = 8
+"""Most times that a cell which comes nearer to a cycle is integrated over `RETURNS` crossings."""
 
 
 class _Crossings:
@@ -39,7 +42,7 @@ class _Crossings:
         self._system = with_section(point.integrates, point.integrates.state_names[state], 1)
         self.state = state
 
-    def of(self, states: np.ndarray, level: float) -> np.ndarray:
+    def of(self, states: np.ndarray, level: float, rtol: float = CROSSING_RTOL) -> np.ndarray:
         """Integrate each start state over a fixed number of upward crossings; return (cell, crossing, state), padded
         with NaN.
         """
@@ -50,8 +53,8 @@ class _Crossings:
             states,
             n_transient=0,
             n_keep=RETURNS,
-            rtol=CROSSING_RTOL,
-            atol=CROSSING_RTOL,
+            rtol=rtol,
+            atol=rtol,
             system=self._system,
         )
         return np.asarray(found.section[:, 0])
@@ -72,8 +75,67 @@ class _Crossings:
         if not found.converged[0] or orbit_of(found, 0).stability != ATTRACTS:
             return None
         own = found.multipliers[0][:-1]  # the last one is 0: the direction of the flow
-        cycle = Cycle(float(found.seconds[0]), np.append(1.0 + 0.0j, own), float(found.residual[0]))
+        multipliers = np.append(1.0 + 0.0j, own)
+        cycle = Cycle(found.section[0], self.state, float(found.seconds[0]), multipliers, float(found.residual[0]))
         return cycle, self.of(found.section, level)[0, : int(found.orbit_period[0])]
+
+    def reach(self, states: np.ndarray, where: np.ndarray, tolerance: float, geometry: Geometry) -> np.ndarray:
+        """Return which trajectories reach a cycle, given by its crossings of a level (crossing, state)."""
+        reached, rows, before = np.zeros(len(states), bool), np.arange(len(states)), np.full(len(states), REACH)
+        for _ in range(ROUNDS):
+            # compare last crossings: the first ones may still show the cell's distance from the cycle
+            last = self.of(states[rows], float(where[0, self.state]))[:, -1]
+            away = np.nan_to_num(geometry.distance(last[:, None], where).min(axis=1), nan=np.inf)
+            reached[rows] = away <= tolerance
+            going = (away > tolerance) & (away < before)
+            rows, before = rows[going], away[going]
+            if not len(rows):
+                break
+            states = states.copy()
+            states[rows] = last[going]
+        return reached
+
+
+def number_of_cycle(
+    cycle: Cycle, known: Sequence[np.ndarray], allowed: Sequence[float], point: Point, geometry: Geometry
+) -> int:
+    """Return the index of the first of some states of one period from which the flow leads through a cycle's own state.
+
+    Cycles are compared as curves, whatever the phase of their states.
+
+    Parameters
+    ----------
+    cycle
+        Cycle whose state is looked for.
+    known
+        A state of each known cycle.
+    allowed
+        Scaled distance of each known state from its cycle; the error of `cycle` is added.
+    point
+        Parameter point of all cycles.
+    geometry
+        Geometry of the states.
+
+    Returns
+    -------
+    int
+        The length of `known` if no trajectory leads there.
+    """
+    if not known:
+        return 0
+    seen = _Crossings(point, cycle.crossed, 2.0 * cycle.seconds).of(
+        np.stack(known), float(cycle.state[cycle.crossed]), BRANCH_RTOL
+    )
+    away = np.nan_to_num(geometry.distance(seen, cycle.state), nan=np.inf).min(axis=1)
+    same = away <= SAME_ORBIT + cycle.error + np.asarray(allowed)
+    return int(np.argmax(same)) if same.any() else len(known)
+
+
+def number_among(cycle: Cycle, cycles: Sequence[Cycle], point: Point, geometry: Geometry) -> int:
+    """Return the index of a cycle in a list of cycles, or the length of the list if the cycle is not in it."""
+    alike = [k for k, one in enumerate(cycles) if abs(one.seconds - cycle.seconds) <= SAME_SECONDS * cycle.seconds]
+    states, errors = [cycles[k].state for k in alike], [cycles[k].error for k in alike]
+    return [*alike, len(cycles)][number_of_cycle(cycle, states, errors, point, geometry)]
 
 
 def tell_cycles(points: Iterable[Point], tolerance: float, longest: int, residual: float, geometry: Geometry) -> None:
@@ -115,13 +177,11 @@ def _tell(point: Point, tolerance: float, longest: int, residual: float, geometr
             failures, left = failures + 1, left[1:]
             continue
         cycle, where = found
-        seen = crossings.of(states[left], float(states[left[0]][crossings.state]))
-        # compare last crossings: the first ones may still show the cell's distance from the cycle
-        away = np.stack([geometry.distance(seen[:, -1], x) for x in where]).min(axis=0)
-        own = np.nan_to_num(away, nan=np.inf) <= tolerance
+        own = crossings.reach(states[left], where, tolerance, geometry)
         own[0] = True
-        on_cycle[left[own]] = len(cycles)
-        cycles.append(cycle)
+        number = number_among(cycle, cycles, point, geometry)
+        on_cycle[left[own]] = number
+        cycles += [cycle] if number == len(cycles) else []
         left = left[~own]
     point.cycles, point.on_cycle = cycles, on_cycle
 
