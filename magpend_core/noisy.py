@@ -1,4 +1,6 @@
-"""Compute the section points of many trajectories with white noise, and estimate the error of their steps."""
+"""Compute the section points of many trajectories with white noise, their first passages out of a region, and the error
+of their steps.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +14,7 @@ from magpend_core.engine.entry import N_LANES
 from magpend_core.engine.noise import Noise
 from magpend_core.engine.noisy import NoisyCells, noisy_engine_of
 from magpend_core.engine.observers import FIRST_TURN, RECORD, Settings
+from magpend_core.engine.passage import PASSAGE, PassageSettings, Region
 from magpend_core.engine.random_numbers import MAX_SEED, key_words
 from magpend_core.engine.system import System
 from magpend_core.engine.vecmath import TWO_PI
@@ -129,30 +132,11 @@ def noisy_sections(
     ValueError
         If an argument has the wrong shape or is out of bounds.
     """
-    frequency = check_frequency(frequency_hz, 1)
-    n_cells = len(frequency)
-    packed = check_array("parameters", parameters, 2)
-    initial = check_states(initial_states, 2, system.n_states, "initial_states")
-    if packed.shape != (n_cells, len(system.parameter_names)) or len(initial) != n_cells:
-        raise ValueError(
-            f"parameters has shape {packed.shape} and initial_states {initial.shape}; {n_cells} frequencies and "
-            f"{system.name} ask for {(n_cells, len(system.parameter_names))} and {(n_cells, system.n_states)}."
-        )
-    seed = check_count("seed", seed, 0)
-    if seed > MAX_SEED:
-        raise ValueError(f"seed = {seed} is out of bounds: it must be at most {MAX_SEED}.")
-    steps = np.broadcast_to(np.asarray(steps_per_period, np.int64), (n_cells,)).copy()
-    first = np.broadcast_to(np.asarray(first_period, np.int64), (n_cells,)).copy()
     settings = _settings(n_transient, n_keep)
-    n_periods = settings.n_transient + settings.n_keep
-    if n_cells and not (steps.min() >= 1 and steps.max() <= MOST_STEPS):
-        raise ValueError(f"steps_per_period must be from 1 to {MOST_STEPS}.")
-    if n_cells and int((first + n_periods).max()) * int(steps.max()) >= LARGEST_COUNT:
-        raise ValueError(f"cells of more than {LARGEST_COUNT} steps in all are too long; take fewer.")
-    check_system(system, packed[:, None], frequency[:, None], initial)
-    own = cell_words(packed, frequency, initial) if words is None else np.asarray(words, np.float64)
-    cells = _cells(system, frequency, packed, initial, own, first, steps, settings.n_keep)
-    engine, keys = noisy_engine_of(system, noise, RECORD), key_words(seed)
+    given = parameters, frequency_hz, initial_states, words, first_period, steps_per_period
+    cells = _checked(system, *given, settings.n_transient + settings.n_keep, settings.n_keep)
+    n_cells = len(cells.frequency)
+    engine, keys = noisy_engine_of(system, noise, RECORD), _keys(seed)
     if n_cells:
         engine(cells, check_count("n_lanes", n_lanes, 1), keys, settings, False)
     angles = [i for i, is_angle in enumerate(system.is_angle) if is_angle]
@@ -169,6 +153,116 @@ def noisy_sections(
         n_periods=cells.n_periods.astype(np.int32),
         strong_error=error,
     )
+
+
+@dataclass(frozen=True)
+class Passages:
+    """First passages of noisy trajectories out of a region.
+
+    Attributes
+    ----------
+    steps : ndarray, (cell,)
+        Number of the step, from 1, in which a trajectory leaves; with halved steps a multiple of 1/2. Infinite for
+        one that stays, or diverges in a step that cannot be told.
+    place : ndarray, (cell, n_states)
+        State at the end of that step; NaN for a trajectory that stays.
+    status : ndarray of int8, (cell,)
+        ``BOUNDED`` or ``DIVERGED``, see `Status`.
+    n_periods : ndarray of int32, (cell,)
+        Periods integrated here.
+    """
+
+    steps: np.ndarray
+    place: np.ndarray
+    status: np.ndarray
+    n_periods: np.ndarray
+
+
+def first_passages(
+    parameters: np.ndarray,
+    frequency_hz: np.ndarray,
+    states: np.ndarray,
+    region: Region,
+    *,
+    system: System,
+    noise: Noise,
+    seed: int,
+    steps_per_period: np.ndarray | int,
+    n_periods: int,
+    first_period: np.ndarray | int,
+    words: np.ndarray,
+    halves: bool = False,
+) -> Passages:
+    """Integrate cells as `noisy_sections` does, on the same path of the noise, until they leave a region.
+
+    Passage is tested in every step, also between the step's ends, see `engine.passage`: the mean time to it has an
+    error of the order of the step.
+
+    Parameters
+    ----------
+    parameters, frequency_hz, system, noise, seed, steps_per_period, first_period, words
+        See `noisy_sections`.
+    states
+        Shape (cell, n_states): inside the region, at the end of period `first_period`.
+    region
+        With an entry for each cell.
+    n_periods
+        Most periods of a cell.
+    halves
+        Whether each step is made as two of half its length, on the same path of the noise: what the times change by
+        tells their error.
+    """
+    settings = PassageSettings(check_count("n_periods", n_periods, 1))
+    given = parameters, frequency_hz, states, words, first_period, steps_per_period
+    cells = _checked(system, *given, settings.n_periods, 0)
+    cells = cells._replace(region=Region(*(np.require(part, np.float64, ["C", "W"]) for part in region)))
+    if len(cells.frequency):
+        noisy_engine_of(system, noise, PASSAGE)(cells, N_LANES, _keys(seed), settings, halves)
+    return Passages(
+        steps=cells.measures[:, 0] - cells.first_period * cells.n_steps,
+        place=cells.measures[:, 1:].copy(),
+        status=cells.status.astype(np.int8),
+        n_periods=cells.n_periods.astype(np.int32),
+    )
+
+
+def _keys(seed: int) -> np.ndarray:
+    seed = check_count("seed", seed, 0)
+    if seed > MAX_SEED:
+        raise ValueError(f"seed = {seed} is out of bounds: it must be at most {MAX_SEED}.")
+    return key_words(seed)
+
+
+def _checked(
+    system: System,
+    parameters: np.ndarray,
+    frequency_hz: np.ndarray,
+    states: np.ndarray,
+    words: np.ndarray | None,
+    first_period: np.ndarray | int,
+    steps_per_period: np.ndarray | int,
+    n_periods: int,
+    n_keep: int,
+) -> NoisyCells:
+    """Check the arguments of a computation, and return the engine's arrays."""
+    frequency = check_frequency(frequency_hz, 1)
+    n_cells = len(frequency)
+    packed = check_array("parameters", parameters, 2)
+    initial = check_states(states, 2, system.n_states, "initial_states")
+    if packed.shape != (n_cells, len(system.parameter_names)) or len(initial) != n_cells:
+        raise ValueError(
+            f"parameters has shape {packed.shape} and initial_states {initial.shape}; {n_cells} frequencies and "
+            f"{system.name} ask for {(n_cells, len(system.parameter_names))} and {(n_cells, system.n_states)}."
+        )
+    steps = np.broadcast_to(np.asarray(steps_per_period, np.int64), (n_cells,)).copy()
+    first = np.broadcast_to(np.asarray(first_period, np.int64), (n_cells,)).copy()
+    if n_cells and not (steps.min() >= 1 and steps.max() <= MOST_STEPS):
+        raise ValueError(f"steps_per_period must be from 1 to {MOST_STEPS}.")
+    if n_cells and int((first + n_periods).max()) * int(steps.max()) >= LARGEST_COUNT:
+        raise ValueError(f"cells of more than {LARGEST_COUNT} steps in all are too long; take fewer.")
+    check_system(system, packed[:, None], frequency[:, None], initial)
+    own = cell_words(packed, frequency, initial) if words is None else np.asarray(words, np.float64)
+    return _cells(system, frequency, packed, initial, own, first, steps, n_keep)
 
 
 def _settings(n_transient: int, n_keep: int) -> Settings:
@@ -206,6 +300,7 @@ def _cells(
         before=np.zeros((n, system.n_states)),
         status=np.zeros(n, np.int64),
         n_periods=np.zeros(n, np.int64),
+        region=Region(*(np.zeros((0, 0)) for _ in Region._fields)),
     )
 
 

@@ -32,11 +32,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from magpend_core.engine import lanes
+from magpend_core.engine import lanes, passage
 from magpend_core.engine.jit import bound_part, entry, inline, keeping
 from magpend_core.engine.lanes import ZERO
 from magpend_core.engine.noise import ITO, Noise
 from magpend_core.engine.observers import Observer
+from magpend_core.engine.passage import FIRST_HALF, PASSAGE, SECOND_HALF, WHOLE, watched_step
 from magpend_core.engine.random_numbers import normal_pair, tag_word
 from magpend_core.engine.simd import WIDTH, load, load_rows, store, store_rows, take
 from magpend_core.engine.system import System
@@ -45,7 +46,7 @@ from magpend_core.status import Status
 
 PENDING, DIVERGED = int(Status.PENDING), int(Status.DIVERGED)
 PATH, BRIDGE = 0, 1
-"""Purposes of the random numbers of a step: the path, and its refinement."""
+"""Purposes of the random numbers of a step: the path, and its refinement. `passage.LEAVING` is another."""
 ROOT_TWELFTH = math.sqrt(1.0 / 12.0)
 ROOT_HALF = math.sqrt(0.5)
 
@@ -73,13 +74,23 @@ class NoisyRows(NamedTuple):
     high: int
     fresh: int  # written by `lanes.take_section`, read by nobody
     constants: int
+    centre: int  # of the region, see `passage`; these rows exist with the observer `PASSAGE` alone
+    low_face: int
+    high_face: int
+    weight: int
+    begin: int  # state at the begin of the step
+    place: int  # state at the end of the step in which the path left
+    held_strength: int
+    radius: int
+    passed: int  # steps since the begin of the cell until the path left
     size: int
 
 
-def noisy_rows_of(system: System, noise: Noise) -> NoisyRows:
+def noisy_rows_of(system: System, noise: Noise, observer: Observer) -> NoisyRows:
     """Return the row layout of the work array for a group of SIMD lanes."""
     n, k = system.n_states, len(noise.states)
-    counts = [*[n] * 5, *[k] * 7, *[1] * 7, system.n_constants]
+    watched = [*[n] * 6, k, 1, 1] if observer is PASSAGE else [0] * 9
+    counts = [*[n] * 5, *[k] * 7, *[1] * 7, system.n_constants, *watched]
     offsets = np.concatenate([[0], np.cumsum(counts)]) * WIDTH
     return NoisyRows(*(int(x) for x in offsets))
 
@@ -99,6 +110,7 @@ class NoisyCells(NamedTuple):
     before: Any  # (cell, n_states): state at the begin of the last period
     status: Any  # int64
     n_periods: Any  # int64, integrated here
+    region: Any  # a `passage.Region`; without entries but for the observer `PASSAGE`
 
 
 class NoisyWork(NamedTuple):
@@ -232,11 +244,11 @@ def make_steps(w: Any, base: int, n: int, keys: Any, halves: bool) -> None:
         time = done * h
         if halves:
             split(w, base, keys)
-            step(w, base, time, 0.5 * h, ROOT_HALF * root)
+            watched_step(w, base, time, 0.5 * h, ROOT_HALF * root, keys, FIRST_HALF)
             second_half(w, base)
-            step(w, base, time + 0.5 * h, 0.5 * h, ROOT_HALF * root)
+            watched_step(w, base, time + 0.5 * h, 0.5 * h, ROOT_HALF * root, keys, SECOND_HALF)
         else:
-            step(w, base, time, h, root)
+            watched_step(w, base, time, h, root, keys, WHOLE)
         store(w, base + ROWS.done, done + 1.0)
         store(w, base + ROWS.total, load(w, base + ROWS.total) + 1.0)
 
@@ -263,6 +275,8 @@ def begin_cell(cells: NoisyCells, work: NoisyWork, lane: int, cell: int, scratch
     work.cell[lane] = cell
     work.left[lane] = n
     work.i_period[lane] = 0
+    if PASSES:
+        begin_watch(cells, cell, w, base, column)
     # angles come in as given; from here on they are in (-pi, pi] at every section
     take_section(w, base, column, scratch, work.turns[lane])
     note_state(cells, work, lane)
@@ -282,17 +296,21 @@ def end_period(cells: NoisyCells, work: NoisyWork, lane: int, settings: Any, sec
     work.i_period[lane] += 1
     work.left[lane] = cells.n_steps[cell]
     w[base + ROWS.done + column] = 0.0
-    status = DIVERGED
-    if take_section(w, base, column, section, work.turns[lane]):
-        status = observe(
-            section,
-            work.turns[lane],
-            work.i_period[lane],
-            work.memory[lane],
-            cells.section[cell],
-            cells.measures[cell],
-            settings,
-        )
+    status = PENDING
+    if PASSES:
+        status = note_passage(cells, cell, w, base, column)
+    if status == PENDING:
+        status = DIVERGED
+        if take_section(w, base, column, section, work.turns[lane]):
+            status = observe(
+                section,
+                work.turns[lane],
+                work.i_period[lane],
+                work.memory[lane],
+                cells.section[cell],
+                cells.measures[cell],
+                settings,
+            )
     if status == PENDING:
         note_state(cells, work, lane)
         return False
@@ -367,6 +385,7 @@ _CALLED = (  # callees first
     "second_half",
     "strengths_beside",
     "step",
+    "watched_step",
     "make_steps",
     "begin_cell",
     "end_period",
@@ -397,7 +416,8 @@ def _bindings(system: System, noise: Noise, observer: Observer) -> dict[str, Any
     numbers = range(len(noise.states))
     bindings: dict[str, Any] = {
         **lanes.engine_bindings(system, observer),
-        "ROWS": noisy_rows_of(system, noise),
+        "ROWS": noisy_rows_of(system, noise, observer),
+        "PASSES": observer is PASSAGE,
         "N_SOURCES": len(noise.states),
         "NOISY": np.array(noise.states, np.int64),
         "OWN": np.array(noise.own, np.float64),
@@ -410,6 +430,7 @@ def _bindings(system: System, noise: Noise, observer: Observer) -> dict[str, Any
     }
     for key in _OF_LANES:
         bindings[key] = bound_part(getattr(lanes, key), bindings, key != "move_lane")
+    bindings |= passage.passage_bindings(system, noise, bindings)
     for key in (*_INLINE, *_CALLED):
         bindings[key] = bound_part(globals()[key], bindings, key in _INLINE)
     return bindings
@@ -429,7 +450,7 @@ def noisy_engine_of(system: System, noise: Noise, observer: Observer) -> Callabl
     kept = keeping(*functions, *(() if noise.factors is None else (noise.factors,)))
     compiled = entry(advance, f"{system.label}_{noise.label}_{observer.name}", bindings, kept)
     memory_size = getattr(observer.memory_size, "py_func", observer.memory_size)
-    rows = noisy_rows_of(system, noise)
+    rows = noisy_rows_of(system, noise, observer)
 
     @wraps(compiled)
     def engine(cells: NoisyCells, n_lanes: int, keys: Any, settings: Any, halves: bool) -> None:

@@ -86,8 +86,8 @@ def uniform(a: Any, b: Any) -> Any:
 
 
 @inline
-def normal_pair(count: Any, low: Any, high: Any, tag: Any, keys: Any) -> Any:
-    """Return two independent standard normal numbers.
+def uniform_pair(count: Any, low: Any, high: Any, tag: Any, keys: Any) -> Any:
+    """Return two independent uniform numbers in (0, 1).
 
     Parameters
     ----------
@@ -102,6 +102,13 @@ def normal_pair(count: Any, low: Any, high: Any, tag: Any, keys: Any) -> Any:
     """
     counter = count + COUNT_OFFSET
     a, b, c, d = philox(lower_word(counter), exclusive_or(upper_word(counter), tag), low, high, keys)
-    radius = sqrt(-2.0 * log(uniform(a, b)))
-    sine, cosine = sincos(TWO_PI * uniform(c, d))
+    return uniform(a, b), uniform(c, d)
+
+
+@inline
+def normal_pair(count: Any, low: Any, high: Any, tag: Any, keys: Any) -> Any:
+    """Return two independent standard normal numbers; see `uniform_pair` for the parameters."""
+    first, second = uniform_pair(count, low, high, tag, keys)
+    radius = sqrt(-2.0 * log(first))
+    sine, cosine = sincos(TWO_PI * second)
     return radius * cosine, radius * sine

@@ -1,9 +1,7 @@
-"""Find when noisy cells leave a set, at which rate, where they go, and the stretch of sections before."""
+"""Compute at which rate noisy cells leave a set, where they go, and the stretch of sections before."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,21 +9,17 @@ import xarray as xr
 
 from magpend_core.engine.vecmath import TWO_PI
 from magpend_core.models.model import Model
-from magpend_core.models.text.scene import MIXED
 from magpend_core.sizes import NOISE_PREFIX
-from magpend_core.status import Status
 from pipeline.analysis.intervals import binomial_interval
 from pipeline.analysis.noise.cells import PointCells, cells_at_points, coordinates_of, point_dims
+from pipeline.analysis.noise.exits import Exits, find_exits, labels_of
+from pipeline.analysis.noise.passages import find_passages
 from pipeline.analysis.noise.rates import NO_FIT, KramersFit, constancy, fit_kramers, rate_interval
 from pipeline.analysis.run import Run
-from pipeline.layout.vocabulary import FREQUENCY_DIM, parameters_of
+from pipeline.layout.vocabulary import FREQUENCY_DIM
 from pipeline.products.noise import EscapeOptions
 
-NOT_LEFT = -1
 _IN_AND_OUT = ("inside", "outside")
-
-Labels = Callable[[np.ndarray, Mapping[str, float]], np.ndarray]
-"""From sections (cell, section, state) and the values of a point to codes: 0 or more in a set, below 0 undecided."""
 
 
 def needs_set(run: Run, options: EscapeOptions) -> None:
@@ -52,111 +46,6 @@ def needs_set(run: Run, options: EscapeOptions) -> None:
         )
 
 
-@dataclass(frozen=True)
-class Exits:
-    """Exits of the cells of a parameter point.
-
-    Attributes
-    ----------
-    counted : ndarray of bool, (cell,)
-        Cells that are in a set at the first counted section.
-    begin : ndarray of int, (cell,)
-        Code of the set in which a cell begins.
-    first_out : ndarray of int, (cell,)
-        Number of the first section outside, counted from the first counted one; `NOT_LEFT`.
-    end : ndarray of int, (cell,)
-        Code at that section; `NOT_LEFT` where a cell did not leave, or diverged.
-    at_risk : ndarray of int, (cell,)
-        Intervals between sections at whose begin a cell was in its set.
-    """
-
-    counted: np.ndarray
-    begin: np.ndarray
-    first_out: np.ndarray
-    end: np.ndarray
-    at_risk: np.ndarray
-
-
-def find_exits(codes: np.ndarray, cells: PointCells, skip: int, n_transient: int) -> Exits:
-    """Find the first section at which each cell is in another set than at the first.
-
-    Parameters
-    ----------
-    codes
-        Code of the set at each section, shape (cell, section); negative ones decide nothing.
-    cells
-        The cells; those that diverged leave in the period in which they did.
-    skip, n_transient
-        Sections that are not counted, and periods before the first section.
-    """
-    seen = codes[:, skip:]
-    begin = seen[:, 0]
-    outside = (seen != begin[:, None]) & (seen >= 0)
-    left = outside.any(axis=1)
-    first_out = np.where(left, outside.argmax(axis=1), NOT_LEFT)
-    end = np.where(left, np.take_along_axis(seen, np.maximum(first_out, 0)[:, None], axis=1)[:, 0], NOT_LEFT)
-    counted = begin >= 0
-    gone = cells.status == Status.DIVERGED
-    when = cells.n_periods - n_transient - 1 - skip
-    # a diverged cell has no sections: it was inside as long as it was there
-    first_out = np.where(gone, when, first_out)
-    counted = np.where(gone, when > 0, counted & (cells.status == Status.BOUNDED))
-    begin = np.where(gone, 0, begin)
-    end = np.where(gone, NOT_LEFT, end)
-    has_left = first_out > 0
-    at_risk = np.where(has_left, first_out, seen.shape[1] - 1)
-    return Exits(counted, begin, np.where(has_left, first_out, NOT_LEFT), end, np.where(counted, at_risk, 0))
-
-
-def labels_of(model: Model, options: EscapeOptions, cube: xr.Dataset) -> tuple[Labels, tuple[str, ...]]:
-    """Return the function that tells in which set a section point is, and the names of the sets."""
-    names = model.state_names
-    circle, scales = np.array(model.is_angle), np.array(model.scales)
-    if options.low or options.high:
-        low, high = (
-            np.array([given.get(name, ends) for name in names])
-            for given, ends in ((options.low, -np.inf), (options.high, np.inf))
-        )
-
-        def in_box(section: np.ndarray, values: Mapping[str, float]) -> np.ndarray:
-            inside = ((section >= low) & (section <= high)).all(axis=-1)
-            return np.where(inside, 0, 1)
-
-        return in_box, _IN_AND_OUT
-    if options.radius is not None:
-        fixed = np.array([options.centre.get(name, np.nan) for name in names])
-        radius = options.radius
-
-        def in_ball(section: np.ndarray, values: Mapping[str, float]) -> np.ndarray:
-            first = section[:, options.skip : options.skip + 1]
-            centre = np.where(np.isfinite(fixed), fixed, 0.0) if options.centre else first
-            distance = np.abs(section - centre)
-            distance = np.where(circle, np.minimum(distance % TWO_PI, TWO_PI - distance % TWO_PI), distance) / scales
-            if options.centre:  # states without a centre do not count
-                distance = np.where(np.isfinite(fixed), distance, 0.0)
-            return np.where((distance**2).sum(axis=-1) <= radius**2, 0, 1)
-
-        return in_ball, _IN_AND_OUT
-    classifier = model.classifier
-    assert classifier is not None
-    fixed_values = dict(parameters_of(cube))
-    # one section that meets no condition of a text is between the classes, and no class of its own
-    undecided = [0, *classifier.neutral, *(k for k, word in enumerate(classifier.words) if word == MIXED)]
-
-    def by_motion(section: np.ndarray, values: Mapping[str, float]) -> np.ndarray:
-        one = section.reshape(-1, 1, section.shape[-1])
-        finite = np.isfinite(one).all(axis=(1, 2))
-        codes = np.full(len(one), -1)
-        no_turns = np.zeros((int(finite.sum()), len(model.angles)), np.int64)
-        hz = np.full(int(finite.sum()), values[FREQUENCY_DIM])
-        found = classifier.classify(one[finite], no_turns, hz, {**fixed_values, **values})
-        decided = ~np.isin(found, undecided)
-        codes[finite] = np.where(decided, found, -1)
-        return codes.reshape(section.shape[:-1])
-
-    return by_motion, classifier.words
-
-
 def escapes(run: Run, options: EscapeOptions) -> xr.Dataset:
     """Compute rates of escape, exit places, last stretches and the fit of Kramers' law.
 
@@ -164,23 +53,39 @@ def escapes(run: Run, options: EscapeOptions) -> xr.Dataset:
     -------
     Dataset
         Over the parameter points, and over ``set`` (in which cells begin): ``n_cells``, ``n_left``, ``n_to`` (by
-        the set they go to), ``at_risk`` [periods], ``rate``, ``rate_low``, ``rate_high`` [1/s], ``left_share``
-        with its interval, ``constant_p``, ``exit_mean`` and ``exit_std`` of each state; ``path_mean`` and
-        ``path_std`` by section before leaving; over a strength ``barrier`` and so on, see `rates.KramersFit`.
+        the set they go to), ``at_risk`` [intervals], ``rate``, ``rate_low``, ``rate_high`` and, of a box or a
+        ball, ``rate_halved`` with halved steps [1/s], ``left_share`` with its interval, ``constant_p``,
+        ``exit_mean`` and ``exit_std`` of each state; ``path_mean`` and ``path_std`` by section before leaving; over
+        a strength ``barrier`` and so on, see `rates.KramersFit`. The ``interval`` at whose end exits are seen is a
+        step for a box or a ball, and a period for a class of motion.
     """
     cube, model = run.cube(), run.model
     dims = point_dims(cube)
-    label, words = labels_of(model, options, cube)
+    words = _sets_of(model, options)
     shape = tuple(cube.sizes[d] for d in dims)
     tables = _empty(shape, len(words), options.stretch, model)
     for cells in cells_at_points(cube):
         index = tuple(cells.at[d] for d in dims)
+        if words == _IN_AND_OUT:
+            _fill(tables, (*index, 0), cells, find_passages(run, cells, options), 0, options, model)
+            again = find_passages(run, cells, options, halves=True)
+            tables["rate_halved"][(*index, 0)] = _rate(again, again.counted, options)[0]
+            continue
         values = {FREQUENCY_DIM: _frequency(cube, cells), **cells.values}
-        found = find_exits(label(cells.section, values), cells, options.skip, run.spec.integration.n_transient)
+        codes, n_transient = labels_of(model, cube)(cells.section, values), run.spec.integration.n_transient
+        found = find_exits(codes, cells, options.skip, n_transient, 1.0 / values[FREQUENCY_DIM])
         for k in range(len(words)):
-            _fill(tables, (*index, k), cells, found, k, options, 1.0 / values[FREQUENCY_DIM], model)
+            _fill(tables, (*index, k), cells, found, k, options, model)
     ds = _dataset(tables, cube, dims, words, options, model)
     return _with_kramers(ds, dims, options).assign_attrs({**_attrs(cube), "confidence": options.confidence})
+
+
+def _sets_of(model: Model, options: EscapeOptions) -> tuple[str, ...]:
+    """Return the names of the sets: of a box or a ball its inside and outside, else the classes of motion."""
+    if options.low or options.high or options.radius is not None:
+        return _IN_AND_OUT
+    assert model.classifier is not None
+    return model.classifier.words
 
 
 def _frequency(cube: xr.Dataset, cells: PointCells) -> float:
@@ -194,7 +99,7 @@ def _attrs(cube: xr.Dataset) -> dict[str, Any]:
 
 
 _NUMBERS = ("n_cells", "n_left", "at_risk")
-_REALS = ("rate", "rate_low", "rate_high", "left_share", "left_low", "left_high", "constant_p")
+_REALS = ("rate", "rate_low", "rate_high", "rate_halved", "left_share", "left_low", "left_high", "constant_p")
 
 
 def _empty(shape: tuple[int, ...], n_sets: int, stretch: int, model: Model) -> dict[str, np.ndarray]:
@@ -216,7 +121,6 @@ def _fill(
     found: Exits,
     code: int,
     options: EscapeOptions,
-    period: float,
     model: Model,
 ) -> None:
     """Write the numbers of the cells that begin in one set at one parameter point."""
@@ -224,23 +128,31 @@ def _fill(
     left = own & (found.first_out > 0)
     n, n_left, at_risk = int(own.sum()), int(left.sum()), int(found.at_risk[own].sum())
     tables["n_cells"][at], tables["n_left"][at], tables["at_risk"][at] = n, n_left, at_risk
-    tables["interval"][at] = period
+    tables["interval"][at] = found.interval
     if not n:
         return
-    ends = np.array(n_left), np.array(at_risk), np.array(period)
-    for name, value in zip(_REALS[:3], rate_interval(*ends, options.confidence), strict=True):
+    for name, value in zip(_REALS[:3], _rate(found, own, options), strict=True):
         tables[name][at] = value
     low, high = binomial_interval(n_left, n, confidence=options.confidence, method="clopper-pearson")
     tables["left_share"][at], tables["left_low"][at], tables["left_high"][at] = n_left / n, low, high
-    half = (cells.section.shape[1] - options.skip - 1) // 2
+    half = found.n_intervals // 2
     early = np.minimum(found.at_risk[own], half)
-    n_early = int((found.first_out[left] <= half).sum())
+    n_early = int((found.at_risk[left] <= half).sum())
     tables["constant_p"][at] = constancy(n_early, n_left - n_early, int(early.sum()), at_risk - int(early.sum()))
     to, counts = np.unique(found.end[left], return_counts=True)
     for target, count in zip(to, counts, strict=True):
         if target >= 0:
             tables["n_to"][(*at, target)] = count
+    place = found.place[left][np.isfinite(found.place[left]).all(axis=1)]
+    if len(place):
+        tables["exit_mean"][at], tables["exit_std"][at] = mean_and_spread(place, np.array(model.is_angle))
     _fill_paths(tables, at, cells.section[left], found.first_out[left] + options.skip, options.stretch, model)
+
+
+def _rate(found: Exits, own: np.ndarray, options: EscapeOptions) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the rate of escape of some cells, and its interval [1/s]."""
+    n_left, at_risk = int((own & (found.first_out > 0)).sum()), int(found.at_risk[own].sum())
+    return rate_interval(np.array(n_left), np.array(at_risk), np.array(found.interval), options.confidence)
 
 
 def _fill_paths(
@@ -251,7 +163,7 @@ def _fill_paths(
     stretch: int,
     model: Model,
 ) -> None:
-    """Write mean and spread of the sections before leaving, and of the first one outside."""
+    """Write mean and spread of the sections before leaving, and of the first one after it."""
     circle = np.array(model.is_angle)
     for lag in range(stretch + 1):
         place = first_out - stretch + lag
@@ -262,8 +174,6 @@ def _fill_paths(
         if len(points):
             mean, std = mean_and_spread(points, circle)
             tables["path_mean"][(*at, lag)], tables["path_std"][(*at, lag)] = mean, std
-    tables["exit_mean"][at] = tables["path_mean"][(*at, stretch)]
-    tables["exit_std"][at] = tables["path_std"][(*at, stretch)]
 
 
 def mean_and_spread(points: np.ndarray, circle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -291,7 +201,7 @@ def _dataset(
         "path_n": ("lag",),
     }
     own |= {"path_mean": ("lag", "state"), "path_std": ("lag", "state")}
-    units = {"rate": "1/s", "rate_low": "1/s", "rate_high": "1/s", "interval": "s"}
+    units = {"interval": "s", **{name: "1/s" for name in _REALS if name.startswith("rate")}}
     variables = {
         name: ((*dims, "set", *own.get(name, ())), value, {"units": units.get(name, "1")})
         for name, value in tables.items()

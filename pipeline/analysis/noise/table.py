@@ -16,6 +16,7 @@ _ESCAPE = (
     "rate",
     "rate_low",
     "rate_high",
+    "rate_halved",
     "left_share",
     "left_low",
     "left_high",
@@ -39,7 +40,11 @@ def escapes_table(ds: xr.Dataset) -> Table:
             row |= {f"exit_{s}": float(one["exit_mean"].sel(state=s)) for s in ds["state"].values.tolist()}
             rows.append(row)
     level = f"{100 * ds.attrs['confidence']:g} %"
-    lines = [f"escapes, intervals of {level}", *aligned([_escape_words(ds, row, dims) for row in rows])]
+    looked = "in every step" if np.isfinite(ds["rate_halved"]).any() else "at the sections"
+    lines = [
+        f"escapes, looked for {looked}, intervals of {level}",
+        *aligned([_escape_words(ds, row, dims) for row in rows]),
+    ]
     lines += [line for row in rows if (line := _uneven_line(ds, row, dims))]
     lines += _kramers_lines(ds, dims)
     return Table(rows, lines, "" if any(row["n_cells"] for row in rows) else "no cell begins in the set")
@@ -49,6 +54,7 @@ def _escape_words(ds: xr.Dataset, row: Row, dims: list[str]) -> Words:
     to = ", ".join(f"{n} {key[3:]}" for key, n in row.items() if key.startswith("to_") and n)
     mean = 1.0 / row["rate"] if 0.0 < row["rate"] < np.inf else np.nan
     interval = f"{number(row['rate_low'], '.3g')} to {number(row['rate_high'], '.3g')}"
+    halved = {} if np.isnan(row["rate_halved"]) else {"halved steps": number(row["rate_halved"], ".4g")}
     return {
         **at_point(ds, row, dims),
         "begins": row["begins"],
@@ -57,6 +63,7 @@ def _escape_words(ds: xr.Dataset, row: Row, dims: list[str]) -> Words:
         "to": to or "-",
         "rate [1/s]": number(row["rate"], ".4g"),
         "interval": interval,
+        **halved,
         "mean time [s]": number(mean, ".4g"),
     }
 

@@ -10,7 +10,9 @@ from magpend_core import load_model
 from magpend_core.status import Status
 from pipeline.analysis.noise.cells import PointCells
 from pipeline.analysis.noise.density import effective_number, find_density_peaks, silverman_bandwidth
-from pipeline.analysis.noise.escapes import NOT_LEFT, find_exits, labels_of, mean_and_spread
+from pipeline.analysis.noise.escapes import mean_and_spread
+from pipeline.analysis.noise.exits import NOT_LEFT, find_exits, labels_of
+from pipeline.analysis.noise.passages import region_of
 from pipeline.analysis.noise.rates import NO_FIT, constancy, fit_kramers, rate_interval
 from pipeline.layout.vocabulary import model_attribute
 from pipeline.products.noise import EscapeOptions
@@ -33,7 +35,7 @@ def test_find_exits__on_paper() -> None:
             [-1, 0, 0, 1, 1],  # undecided at the begin: not counted
         ]
     )
-    found = find_exits(codes, cells_of(np.zeros((5, 5, 1))), 0, 0)
+    found = find_exits(codes, cells_of(np.zeros((5, 5, 1))), 0, 0, 1.0)
     assert found.counted.tolist() == [True, True, True, True, False]
     assert found.first_out.tolist()[:4] == [2, NOT_LEFT, 1, 3]
     assert found.end.tolist()[:4] == [1, NOT_LEFT, 0, 1]
@@ -45,7 +47,7 @@ def test_find_exits__skips_sections_and_counts_divergence() -> None:
     status = [int(Status.BOUNDED), int(Status.DIVERGED), int(Status.DIVERGED)]
     # after a transient of 10 periods, one diverged in the fourth counted period, one in the transient
     cells = cells_of(np.full((3, 5, 1), np.nan), status, [15, 15, 7])
-    found = find_exits(codes, cells, 1, 10)
+    found = find_exits(codes, cells, 1, 10, 1.0)
     assert found.counted.tolist() == [True, True, False]
     assert found.first_out.tolist()[:2] == [1, 3]
     assert found.end.tolist()[:2] == [1, NOT_LEFT]
@@ -157,18 +159,24 @@ TABLE = {
 }
 
 
-def test_labels_of__box_ball_and_classes() -> None:
+def test_region_of__box_and_ball() -> None:
+    model = load_model(TABLE)
+    states = np.array([[-1.0, 0.0], [3.1, 0.0], [-3.1, 0.0], [0.0, 3.0]])
+    first = np.tile(states[0], (4, 1))
+
+    def inside(**options: object) -> list[bool]:
+        return region_of(model, EscapeOptions(**options), first).contains(states, model.is_angle).tolist()
+
+    assert inside(low={"th": -2.0}, high={"v": 2.0}) == [True, True, False, False]
+    assert inside(low={"th": -4.0}) == [True] * 4  # the whole circle
+    assert inside(radius=0.2, centre={"th": 3.14}) == [False, True, True, False]  # on the circle, whatever v is
+    assert inside(radius=1.9) == [True, False, False, True]  # about the first section; v counts in units of 2
+
+
+def test_labels_of__classes() -> None:
     model = load_model(TABLE)
     cube = xr.Dataset(attrs={"model": model_attribute(model), "parameters": "a = 1.0"})
     section = np.array([[[-1.0, 0.0], [3.1, 0.0], [-3.1, 0.0], [0.0, 3.0]]])
-
-    def codes(**options: object) -> list[int]:
-        label, _ = labels_of(model, EscapeOptions(**options), cube)
-        return label(section, {"frequency": 1.0})[0].tolist()
-
-    assert codes(low={"th": -2.0}, high={"v": 2.0}) == [0, 0, 1, 1]
-    assert codes(radius=0.2, centre={"th": 3.14}) == [1, 0, 0, 1]  # on the circle, whatever v is
-    assert codes(radius=1.9) == [0, 1, 1, 0]  # about the first section; v counts in units of 2
-    label, words = labels_of(model, EscapeOptions(), cube)
-    found = label(section, {"frequency": 1.0})[0]
-    assert [words[c] if c >= 0 else "-" for c in found] == ["left", "right", "left", "-"]
+    assert model.classifier is not None
+    found = labels_of(model, cube)(section, {"frequency": 1.0})[0]
+    assert [model.classifier.words[c] if c >= 0 else "-" for c in found] == ["left", "right", "left", "-"]
