@@ -108,7 +108,8 @@ variable                          dims                     meaning
 from pipeline.analysis.branches.curves import curves_from
 from pipeline.analysis.branches.curves_dataset import curves_dataset
 from pipeline.analysis.branches.dataset import dataset_of
-from pipeline.analysis.branches.exploring import Scope, Start, explore
+from pipeline.analysis.branches.exploring import Scope, explore
+from pipeline.analysis.branches.known import Start
 from pipeline.analysis.branches.starting_orbits import attracting, orbits_near, recurrent
 from pipeline.analysis.branches.table import table_of, windows_of
 

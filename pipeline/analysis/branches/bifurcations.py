@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
+from itertools import accumulate, groupby, pairwise, product
 from typing import Any
 
 import numpy as np
@@ -18,10 +20,18 @@ HOPF, PITCHFORK, TRANSCRITICAL = "hopf", "pitchfork", "transcritical"
 KINDS = (FOLD, DOUBLING, TORUS, BRANCHING, HOPF, PITCHFORK, TRANSCRITICAL)
 
 CONTRADICTORY = "contradictory"
-"""Criticality of a period doubling whose coefficient and whose doubled branch disagree."""
+"""Criticality of a period doubling or pitchfork whose coefficient and whose other branch disagree."""
 
 WIDTH = 1e-8
 """Width to which a bifurcation is bracketed [arclength]; in its scale, the parameter changes by less."""
+
+CERTAIN = 1e-4
+"""Distance of all multipliers from the unit circle, or of all scaled eigenvalues from the imaginary axis, above which
+their number outside is certain: where two meet, each errs by the root of the error of the matrix."""
+
+SAME_PLACE = 1e-4
+"""Largest scaled distance between two locations of one branch point: there Newton's method is as exact as the root of
+its residual."""
 
 Test = Callable[[Point], float]
 
@@ -47,6 +57,16 @@ def n_unstable(point: Point) -> int:
     if point.value.is_rest:
         return int((np.linalg.eigvals(point.value.monodromy).real > 0.0).sum())
     return int((np.abs(np.linalg.eigvals(point.value.monodromy)) > 1.0).sum())
+
+
+def _margin(point: Point) -> float:
+    """Return the distance of the nearest multiplier from the unit circle, or of an eigenvalue from the imaginary axis,
+    relative to the largest one.
+    """
+    values = np.linalg.eigvals(point.value.monodromy)
+    if point.value.is_rest:
+        return float(np.abs(values.real).min() / max(np.abs(values).max(), np.finfo(float).tiny))
+    return float(np.abs(np.abs(values) - 1.0).min())
 
 
 def _branching_test(point: Point) -> float:
@@ -85,14 +105,14 @@ class Bifurcation:
     bracket : float
         Distance of the parameter values between which the test function changes its sign.
     n_unstable_before, n_unstable_after : int
-        Multipliers outside the unit circle on both sides, in the order of the branch.
+        Multipliers outside the unit circle on both sides, in the order of the branch (see `settle_sides`).
     rises_before : bool
         Whether the parameter rises along the branch before it; at a fold it turns.
     after : int
         Index of the point of the branch after which it comes.
     criticality : str
         ``supercritical``, ``subcritical`` or, if unknown, empty, by the sign of `coefficient`. The branch that
-        leaves a period doubling tells it as well: `CONTRADICTORY` if the two disagree.
+        leaves a period doubling or pitchfork tells it as well: `CONTRADICTORY` if the two disagree.
     coefficient, coefficient_error : float
         Normal form coefficient and its error (see `normal_forms`); NaN if unknown.
     child : Branch or None
@@ -254,6 +274,47 @@ def _between(a: Point, b: Point, share: float) -> np.ndarray:
     return np.asarray(bent + (share - (bent - a.u) @ chord / (chord @ chord)) * chord)
 
 
+def counts_of(points: Sequence[Point], found: Sequence[Bifurcation]) -> list[int]:
+    """Count the unstable multipliers at each point of a branch with some bifurcations.
+
+    Near a bifurcation rounding decides on which side of the circle a multiplier lies. There a point has the number of
+    the nearest point up to the next bifurcation where it is certain.
+    """
+    counts, margins = [n_unstable(point) for point in points], np.array([_margin(point) for point in points])
+    places = sorted({0, len(points), *(one.after + 1 for one in found)})
+    for first, last in pairwise(places):
+        sure = first + np.flatnonzero(margins[first:last] > CERTAIN)
+        for i in first + np.flatnonzero(margins[first:last] <= CERTAIN) if len(sure) else ():
+            counts[i] = counts[sure[np.argmin(np.abs(sure - i))]]
+    return counts
+
+
+def settle_sides(points: Sequence[Point], found: Sequence[Bifurcation]) -> None:
+    """Take from a branch's points what holds on both sides of each bifurcation, in place: the numbers of unstable
+    multipliers, and whether the parameter rises before it.
+
+    Between bifurcations of one step there is no point; there the number follows from how each kind changes it. The
+    tangent at a branch point is any vector of a plane.
+    """
+    counts = counts_of(points, found) if found else []
+    for after, group in groupby(found, lambda one: one.after):
+        ones = list(group)
+        first, last = counts[after], counts[after + 1]
+        changes = [(c, -c, 0) for c in (_CHANGES.get(one.kind, 1) for one in ones)]
+        chains = [list(accumulate(steps, initial=first)) for steps in product(*changes)]
+        *own, _ = min(chains, key=partial(_doubt, last=last, ones=ones))
+        for one, *sides in zip(ones, own, [*own[1:], last], strict=True):
+            one.n_unstable_before, one.n_unstable_after = sides
+            rise = one.point.u[-1] - points[after].u[-1] or points[after + 1].u[-1] - points[after].u[-1]
+            one.rises_before = bool(rise > 0.0)
+
+
+def _doubt(chain: Sequence[int], last: int, ones: Sequence[Bifurcation]) -> tuple[bool, int, int]:
+    """Rank the numbers of unstable multipliers between bifurcations of one step: the least is the most likely."""
+    still = sum(a == b for a, b in pairwise(chain))
+    return chain[-1] != last, still, sum(n != one.n_unstable_after for n, one in zip(chain[1:], ones, strict=True))
+
+
 def tell_apart(located: list[Bifurcation], a: Point) -> list[Bifurcation]:
     """Keep the true bifurcations in the order of the branch. Drop neutral saddles, and folds that are really branch
     points.
@@ -263,7 +324,7 @@ def tell_apart(located: list[Bifurcation], a: Point) -> list[Bifurcation]:
     for one in located:
         if (one.kind == TORUS and not _is_torus(one)) or (one.kind == HOPF and not _is_pair(one)):
             continue
-        if one.kind == FOLD and any(np.abs(one.point.u - u).max() < 1e-5 for u in branching):
+        if one.kind == FOLD and any(np.abs(one.point.u - u).max() < SAME_PLACE for u in branching):
             continue
         kept.append(one)
     return sorted(kept, key=lambda one: float(a.tangent @ (one.point.u - a.u)))

@@ -14,9 +14,9 @@ from pipeline.analysis.branches.bifurcations import (
     HOPF,
     KINDS,
     Bifurcation,
+    counts_of,
     eigenvalues_of,
     multipliers_of,
-    n_unstable,
 )
 from pipeline.analysis.branches.following import ENDS, Branch
 from pipeline.analysis.branches.motion import rotation_of, sides_of
@@ -55,7 +55,7 @@ def dataset_of(
     for i, branch in enumerate(branches):
         for j, point in enumerate(branch.points):
             arrays.put(i, j, branch, point)
-        _settle_origin(arrays.n_unstable[i], branch)
+        arrays.n_unstable[i, : len(branch.points)] = counts_of(branch.points, branch.bifurcations)
     words = model.classifier.words if model is not None and model.classifier is not None else ()
     if parameters is not None and words:
         for i, codes in enumerate(sides_of(branches, parameters)):
@@ -105,13 +105,6 @@ def _side_variables(
     }
 
 
-def _settle_origin(counts: np.ndarray, branch: Branch) -> None:
-    """Copy the number of unstable multipliers at a branch's starting bifurcation from the next point, in place."""
-    for j, point in enumerate(branch.points):
-        if branch.origin is not None and point.u is branch.origin.point.u:
-            counts[j] = counts[j + 1] if j + 1 < len(branch.points) else counts[j - 1]
-
-
 class _Arrays:
     """Arrays of the output variables, with one entry per branch and branch point."""
 
@@ -130,7 +123,6 @@ class _Arrays:
         self.section[i, j, : max(branch.family.period, 1)] = _orbit(branch, point)
         self.multiplier[i, j] = multipliers_of(point)
         self.eigenvalue[i, j] = eigenvalues_of(point)
-        self.n_unstable[i, j] = n_unstable(point)
         self.residual[i, j] = point.residual
         self.period_s[i, j] = point.value.seconds
 

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from pipeline.analysis.branches.arclength import Point, Settings, correct
+from pipeline.analysis.branches.arclength import Point, Settings
 from pipeline.analysis.branches.bifurcations import BRANCHING, DOUBLING, HOPF, Bifurcation
+from pipeline.analysis.branches.crossings import FOLLOWING, cross, settle_crossings
 from pipeline.analysis.branches.cycles import crossings_of, cycle_family, cycles_from
 from pipeline.analysis.branches.following import (
     Branch,
-    crossing_half,
     doubled_start,
     first_point,
     half_branch,
@@ -22,34 +22,16 @@ from pipeline.analysis.branches.following import (
     opposite,
     problem_of,
 )
-from pipeline.analysis.branches.lockstep import Steps, run_together
+from pipeline.analysis.branches.known import Start, fixed, gap, lie_on, same_others
+from pipeline.analysis.branches.lockstep import run_together
 from pipeline.analysis.branches.normal_forms import judge
-from pipeline.analysis.branches.problems import FREQUENCY, Family
-from pipeline.analysis.tolerances import SAME_ON_BRANCH
-
-FOLLOWING = "following branches"
-"""First words of the work's name in progress reports."""
+from pipeline.analysis.branches.problems import Family
 
 AT_HOPF = 0.05
 """Largest scaled distance of the last cycle of a branch from the Hopf point at which it ends."""
 
 CLEAR = 2
 """Points of a branch by which cycles are away from where they touch a section."""
-
-GUESS = 0.05
-"""Largest scaled distance from a branch's chord at which an orbit is tested for lying on the branch."""
-
-
-@dataclass(frozen=True, eq=False)
-class Start:
-    """An orbit from which a branch starts: its family, a section point, the parameter value and the attractor's id (-1:
-    none).
-    """
-
-    family: Family
-    state: np.ndarray
-    value: float
-    attractor: int = -1
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,6 +77,7 @@ def explore(starts: Sequence[Start], scope: Scope) -> list[Branch]:
             break
     _adopt(branches)
     _adopt_cycles(branches)
+    settle_crossings(branches)
     judge([(branch.family, one) for branch in branches for one in branch.bifurcations])
     return branches
 
@@ -114,7 +97,7 @@ def _follow_starts(starts: Sequence[Start], branches: list[Branch], scope: Scope
     for i, start in enumerate(starts):
         if n_compared < len(branches):
             rest = i + np.flatnonzero(~is_known[i:])
-            is_known[rest] = _lie_on([starts[k] for k in rest], branches[n_compared:])
+            is_known[rest] = lie_on([starts[k] for k in rest], branches[n_compared:])
             n_compared = len(branches)
         if is_known[i]:
             continue
@@ -153,59 +136,6 @@ def _both_ways(starts: Sequence[Start], scope: Scope, what: str) -> list[Branch 
     return [None if p is None else next(found) for p in firsts]
 
 
-def _lie_on(starts: Sequence[Start], branches: Sequence[Branch]) -> list[bool]:
-    asked = [(i, guess) for i, s in enumerate(starts) for b in branches for guess in _near(s, b)]
-    settings = Settings()
-    found = run_together([_at_value(starts[i].family, guess, settings) for i, guess in asked])
-    known = [False] * len(starts)
-    for (i, _), point in zip(asked, found, strict=True):
-        if point is not None and _distance(starts[i], point) <= SAME_ON_BRANCH:
-            known[i] = True
-    return known
-
-
-def _at_value(family: Family, guess: np.ndarray, settings: Settings) -> Steps[Point | None]:
-    normal = np.zeros(len(guess))
-    normal[-1] = 1.0
-    found = yield from correct(problem_of(family), guess, normal, settings)
-    return found
-
-
-def _near(start: Start, branch: Branch) -> Iterator[np.ndarray]:
-    """Yield guesses of the orbits on a branch that have a starting orbit's parameter value and lie near it."""
-    family = branch.family
-    if family.period != start.family.period or not _same_others(family, start.family):
-        return
-    values = branch.values
-    for i in np.flatnonzero((values[:-1] - start.value) * (values[1:] - start.value) <= 0.0):
-        width = values[i + 1] - values[i]
-        share = (start.value - values[i]) / width if width else 0.0
-        a, b = branch.points[i], branch.points[i + 1]
-        guess = a.u + share * (b.u - a.u)
-        guess[-1] = start.value / family.scales[0]
-        orbits = [p.value.images for p in (a, b)]
-        if (
-            min(np.abs(family.mismatch(family.unknowns(start.state, [0.0]), x)).max() for o in orbits for x in o)
-            < GUESS
-        ):
-            yield guess
-
-
-def _same_others(a: Family, b: Family) -> bool:
-    return a.free == b.free and np.array_equal(_fixed(a), _fixed(b))
-
-
-def _fixed(family: Family) -> np.ndarray:
-    values = np.append(family.parameters, family.frequency_hz)
-    names = (*family.system.parameter_names, FREQUENCY)
-    return np.array([v for n, v in zip(names, values, strict=True) if n not in family.free])
-
-
-def _distance(start: Start, point: Point) -> float:
-    here = start.family.unknowns(start.state, [0.0])
-    return min(float(np.abs(start.family.mismatch(here, x)).max()) for x in point.value.images)
-
-
 # ---- switching ---------------------------------------------------------------------------------
 
 
@@ -237,19 +167,14 @@ def _doubling_at(branches: Sequence[Branch], branch: Branch, which: int) -> Bifu
     reach = 3.0 * max(float(np.linalg.norm(end.u - inner.u)), 1e-3)
     best, nearest = None, reach
     for other in branches:
-        if 2 * other.family.period != branch.family.period or not _same_others(other.family, branch.family):
+        if 2 * other.family.period != branch.family.period or not same_others(other.family, branch.family):
             continue
         for one in other.bifurcations:
             if one.kind == DOUBLING:
-                away = max(_gap(branch.family, end, one), abs(end.u[-1] - one.point.u[-1]))
+                away = max(gap(branch.family, end.u, one.point), abs(end.u[-1] - one.point.u[-1]))
                 if away < nearest:
                     best, nearest = one, away
     return best
-
-
-def _gap(family: Family, end: Point, one: Bifurcation) -> float:
-    """Return the scaled distance between an orbit and the nearest section point of the orbit at a bifurcation."""
-    return min(float(np.linalg.norm(family.mismatch(end.u, x))) for x in one.point.value.images)
 
 
 def _half_orbit(branch: Branch, which: int) -> Start:
@@ -259,8 +184,7 @@ def _half_orbit(branch: Branch, which: int) -> Start:
 
 def _criticality(at: Bifurcation, child: Branch, end: int) -> str:
     """Decide whether a period doubling is sub- or supercritical, from the side on which the doubled branch lies."""
-    rising = at.point.tangent[-1] > 0.0
-    worse_above = (at.n_unstable_after > at.n_unstable_before) == rising
+    worse_above = (at.n_unstable_after > at.n_unstable_before) == at.rises_before
     inner = child.points[end + 3 if end == 0 else end - 3]
     return "supercritical" if (inner.u[-1] > at.point.u[-1]) == worse_above else "subcritical"
 
@@ -297,43 +221,9 @@ def _switch(branches: list[Branch], scope: Scope, what: str) -> None:
             other = _doubling_at(branches, child, 1)
             if other is not None:
                 other.child, other.criticality = child, _criticality(other, child, -1)
-    _cross([(b, one) for b, one in open_ends if one.kind == BRANCHING], branches, scope)
-
-
-def _cross(points: Sequence[tuple[Branch, Bifurcation]], branches: list[Branch], scope: Scope) -> None:
-    """Follow the second branch through each branch point in both directions."""
-    for parent, one in points:
-        if _is_crossing(parent, one, branches):
-            continue
-        halves = run_together(
-            [
-                crossing_half(parent.family, one, _direction(parent, one), way, scope.low, scope.high, scope.settings)
-                for way in (-1.0, 1.0)
-            ],
-            FOLLOWING,
-        )
-        child = joined(parent.family, *halves)
-        if len(child.points) > 2:
-            child.origin, one.child = one, child
-            branches.append(child)
-
-
-def _direction(branch: Branch, at: Bifurcation) -> np.ndarray:
-    """Return the direction of a branch at a bifurcation: the difference of the points after and before it."""
-    u = np.array([p.u for p in branch.points])
-    i = int(np.argmin(np.linalg.norm(u - at.point.u, axis=1)))
-    return np.asarray(u[min(i + 1, len(u) - 1)] - u[max(i - 1, 0)])
-
-
-def _is_crossing(parent: Branch, one: Bifurcation, branches: Sequence[Branch]) -> bool:
-    """Find a known branch that crosses at a branch point, and link the two. Return whether there is one."""
-    for branch in branches:
-        for other in branch.bifurcations if branch.family.period == parent.family.period else ():
-            same = _gap(branch.family, one.point, other) < 1e-4 and abs(one.point.u[-1] - other.point.u[-1]) < 1e-4
-            if other is not one and other.kind == BRANCHING and same:
-                one.child = other.child = branch
-                return True
-    return False
+    cross(
+        [(b, one) for b, one in open_ends if one.kind == BRANCHING], branches, (scope.low, scope.high), scope.settings
+    )
 
 
 # ---- Hopf points -------------------------------------------------------------------------------
@@ -352,7 +242,7 @@ def _adopt_cycles(branches: Sequence[Branch]) -> None:
 
 def _hopf_at(branches: Sequence[Branch], cycles: Branch, end: Point) -> Bifurcation | None:
     near = [
-        (max(_gap(cycles.family, end, one), abs(end.u[-1] - one.point.u[-1])), one)
+        (max(gap(cycles.family, end.u, one.point), abs(end.u[-1] - one.point.u[-1])), one)
         for other in branches
         if not other.family.period and other.family.free == cycles.family.free
         for one in other.bifurcations
@@ -397,7 +287,7 @@ def _without_known(cycles: Branch, own: Family, branches: list[Branch], scope: S
             starts[first, last] = Start(replace(section, period=period), state, value)
         if section is own:
             _follow_starts(list(starts.values()), branches, scope)
-        for (first, last), is_known in zip(starts, _lie_on(list(starts.values()), branches), strict=True):
+        for (first, last), is_known in zip(starts, lie_on(list(starts.values()), branches), strict=True):
             wanted[first : last + 1] &= not is_known
     return _parts(cycles, wanted)
 
@@ -411,8 +301,8 @@ def _equal_runs(periods: np.ndarray) -> list[tuple[int, int]]:
 def _other_sections(cycles: Branch, own: Family, branches: Sequence[Branch]) -> list[Family]:
     """Return a family of orbits for each Poincare section of the known branches, except the section of `cycles`."""
     families = [own, *(b.family for b in branches if b.family.period and b.family.free == own.free)]
-    by_section = {_fixed(family).tobytes(): family for family in reversed(families)}
-    by_section.pop(_fixed(cycles.family).tobytes(), None)
+    by_section = {fixed(family).tobytes(): family for family in reversed(families)}
+    by_section.pop(fixed(cycles.family).tobytes(), None)
     return list(reversed(by_section.values()))
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from magpend_core.orbits import crossed_state
 from magpend_core.pointwise import rates_packed
 from pipeline.analysis.branches.arclength import Point, Settings, Trace, correct, kernel_of, trace
-from pipeline.analysis.branches.bifurcations import FOLD, Bifurcation, Watch
+from pipeline.analysis.branches.bifurcations import FOLD, Bifurcation, Watch, settle_sides
 from pipeline.analysis.branches.equilibria import EquilibriumProblem, OneParameter
 from pipeline.analysis.branches.lockstep import Query, Steps
 from pipeline.analysis.branches.problems import Family, OrbitProblem
@@ -55,6 +55,9 @@ class Branch:
     bifurcations: list[Bifurcation]
     ends: tuple[str, str]
     origin: Bifurcation | None = None
+
+    def __post_init__(self) -> None:
+        settle_sides(self.points, self.bifurcations)
 
     @property
     def values(self) -> np.ndarray:

@@ -123,6 +123,11 @@ def judge(bifurcations: Sequence[tuple[Family, Bifurcation]]) -> None:
 
 def _judge(one: Bifurcation, case: Case, matrices: np.ndarray) -> None:
     one.coefficient, one.coefficient_error, _ = settled(case.coefficients(FORMS[one.kind], matrices))
+    _judge_sign(one)
+
+
+def _judge_sign(one: Bifurcation) -> None:
+    """Add to the criticality, which the branches may have told, what the sign of the coefficient says."""
     side = _SUPERCRITICAL.get(one.kind)
     if side is not None and abs(one.coefficient) > one.coefficient_error:
         found = "supercritical" if one.coefficient * side > 0.0 else "subcritical"
@@ -132,6 +137,7 @@ def _judge(one: Bifurcation, case: Case, matrices: np.ndarray) -> None:
 def _tell_branch_point(one: Bifurcation, case: Case, matrices: np.ndarray) -> None:
     square, error, _ = settled(case.coefficients(_quadratic, matrices))
     size, _, _ = settled(case.coefficients(_size, matrices))
+    by_arms, one.criticality = one.criticality, ""
     if not np.isfinite(square + size):
         return
     if abs(square) > max(SAME * size, 3.0 * error):
@@ -139,8 +145,8 @@ def _tell_branch_point(one: Bifurcation, case: Case, matrices: np.ndarray) -> No
     elif error <= SAME * size:
         one.kind = PITCHFORK
         one.coefficient, one.coefficient_error, _ = settled(case.coefficients(_cubic, matrices))
-        if abs(one.coefficient) > one.coefficient_error:
-            one.criticality = "supercritical" if one.coefficient < 0.0 else "subcritical"
+        one.criticality = by_arms
+        _judge_sign(one)
 
 
 def _matrices(cases: Sequence[Case]) -> list[np.ndarray]:
@@ -299,5 +305,5 @@ def _hopf(case: Case, bends: Sequence[Bend]) -> float:
 
 FORMS: dict[str, Form] = {FOLD: _quadratic, DOUBLING: _doubling, TORUS: _torus, HOPF: _hopf}
 
-_SUPERCRITICAL = {DOUBLING: 1.0, TORUS: -1.0, HOPF: -1.0}
+_SUPERCRITICAL = {DOUBLING: 1.0, TORUS: -1.0, HOPF: -1.0, PITCHFORK: -1.0}
 """Sign of the coefficient at a supercritical bifurcation."""

@@ -12,7 +12,7 @@ from magpend_core.engine.system import System
 from magpend_core.models.model import Parameters
 from magpend_core.orbits import scaled_distance
 from pipeline.analysis.branches.deflation import search_orbits
-from pipeline.analysis.branches.exploring import Start
+from pipeline.analysis.branches.known import Start
 from pipeline.analysis.branches.problems import FREQUENCY, Family
 from pipeline.analysis.tolerances import RECURRENCE
 from pipeline.layout.vocabulary import BOUNDED, EQUILIBRIUM, PERIODIC_ORBIT, frequency_of, is_start_dim

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,9 @@ from pipeline.analysis.branches.problems import FREQUENCY
 from pipeline.analysis.tabular import Row, Words, aligned, counted, values
 from pipeline.layout.vocabulary import model_of, parameter_name
 from pipeline.products.product import Table
+
+NO_LENGTH = 1e-9
+"""Length of a stable segment, as a share of its branch, that is nothing but rounding."""
 
 
 def branches_table(ds: xr.Dataset) -> Table:
@@ -158,9 +162,13 @@ def windows_of(ds: xr.Dataset) -> list[dict[str, Any]]:
     """Return the stable segments of all branches, with the parameter values and the names of their bounds."""
     found = []
     for i in range(ds.sizes["branch"]):
-        n = int(ds["n_points"][i])
-        for first, last in _stable_runs(ds["n_unstable"].values[i, :n] == 0, _ends_of(ds, i)[0] == "closed"):
-            ends = sorted([_bound(ds, i, first, first - 1, 0), _bound(ds, i, last, last, 1)])
+        n, closed = int(ds["n_points"][i]), _ends_of(ds, i)[0] == "closed"
+        line = ds["parameter"].values[i, :n]
+        runs = _stable_runs(ds["n_unstable"].values[i, :n] == 0, closed)
+        for first, last in [piece for run in runs for piece in _straight(line, *run)]:
+            ends = sorted([_bound(ds, i, first, 0), _bound(ds, i, last, 1)])
+            if not ends[1][0] - ends[0][0] > NO_LENGTH * np.ptp(line):
+                continue
             middle = (first + (last - first) % n // 2) % n
             found.append(
                 {
@@ -175,6 +183,17 @@ def windows_of(ds: xr.Dataset) -> list[dict[str, Any]]:
                 }
             )
     return sorted(found, key=lambda w: (w["period"], w["side"], w["from"]))
+
+
+def _straight(line: np.ndarray, first: int, last: int) -> list[tuple[int, int]]:
+    """Split a series of points where their parameter turns, as where a branch goes on to its mirror image."""
+    n = len(line)
+    path = [(first + k) % n for k in range((last - first) % n + 1)]
+    if last < first < n - 1:
+        path.remove(n - 1)  # the last step of a closed branch repeats the first one
+    steps = np.sign(np.diff(line[path]))
+    turns = [path[k + 1] for k in np.flatnonzero(steps[:-1] * steps[1:] < 0.0)]
+    return list(pairwise([first, *turns, last])) if len(path) > 1 else [(first, last)]
 
 
 def _stable_runs(stable: np.ndarray, closed: bool) -> list[tuple[int, int]]:
@@ -193,23 +212,25 @@ def _ends_of(ds: xr.Dataset, branch: int) -> tuple[str, str]:
     return ends["first_end"], ends["last_end"]
 
 
-def _bound(ds: xr.Dataset, branch: int, point: int, after: int, end: int) -> tuple[float, str]:
-    """Return the parameter value and the name of a bound of a stable segment: a bifurcation, or the end of the
-    branch.
+def _bound(ds: xr.Dataset, branch: int, point: int, end: int) -> tuple[float, str]:
+    """Return the parameter value and the name of the first (0) or last (1) bound of a stable segment: a bifurcation, or
+    the end of the branch.
     """
+    n, value = int(ds["n_points"][branch]), float(ds["parameter"][branch, point])
+    after = point - 1 + end
     here = np.flatnonzero((ds["of_branch"].values == branch) & (ds["after"].values == after))
-    value = float(ds["parameter"][branch, point])
     if len(here):
         return _named(ds, int(here[0 if end else -1]))
-    if point not in (0, int(ds["n_points"][branch]) - 1):
-        return value, "not located"
     origins = np.flatnonzero(ds["to_branch"].values == branch)
-    name = _ends_of(ds, branch)[end]
-    if name in ("start", "period_halving", "equilibrium") and len(origins):
-        nearest = origins[np.argmin(np.abs(ds["value"].values[origins] - value))]
+    nearest = origins[np.argmin(np.abs(ds["value"].values[origins] - value))] if len(origins) else -1
+    name = "not located" if point not in (0, n - 1) else _ends_of(ds, branch)[end]
+    beside = ds["parameter"].values[branch, max(point - 1, 0) : min(point + 2, n)]
+    is_near = nearest >= 0 and abs(float(ds["value"][nearest]) - value) <= np.ptp(beside)
+    if (nearest >= 0 and name in ("start", "period_halving", "equilibrium")) or (name == "not located" and is_near):
         parent = int(ds["orbit_period"][int(ds["of_branch"][nearest])])
         at, kind = _named(ds, int(nearest))
-        return at, f"{kind} of {f'period {parent}' if parent else 'an equilibrium'}"
+        own = parent == int(ds["orbit_period"][branch])
+        return at, kind if own else f"{kind} of {f'period {parent}' if parent else 'an equilibrium'}"
     return value, name
 
 

@@ -14,8 +14,8 @@ from magpend_core.engine.system import System
 from magpend_core.orbits import scaled_distance
 from magpend_core.rotation import CLOSED_TURNS, TurningState, rotation_numbers
 from pipeline.analysis.branches.arclength import Settings, correct, kernel_of
-from pipeline.analysis.branches.exploring import Start
 from pipeline.analysis.branches.following import Branch, problem_of
+from pipeline.analysis.branches.known import Start
 from pipeline.analysis.branches.lockstep import Query, Steps, run_together
 from pipeline.analysis.branches.problems import Family
 

@@ -16,10 +16,10 @@ from magpend_core.models.pendulum.systems import PENDULUM_FITTED
 from magpend_core.orbits import scaled_distance, stroboscopic_map
 from pipeline.analysis.branches import Scope, Start, dataset_of, explore, orbits_near, table_of, windows_of
 from pipeline.analysis.branches.arclength import Point, Settings
-from pipeline.analysis.branches.bifurcations import Bifurcation, multipliers_of, n_unstable, tell_apart
+from pipeline.analysis.branches.bifurcations import Bifurcation, counts_of, multipliers_of, n_unstable, tell_apart
+from pipeline.analysis.branches.crossings import cross
 from pipeline.analysis.branches.curves import continue_curves
-from pipeline.analysis.branches.exploring import _cross
-from pipeline.analysis.branches.following import first_point
+from pipeline.analysis.branches.following import Branch, first_point
 from pipeline.analysis.branches.lockstep import Query, run_alone, run_together
 from pipeline.analysis.branches.problems import Family, OrbitProblem, Value, doubling_test, fold_test, torus_test
 
@@ -245,6 +245,26 @@ def test_explore__symmetry_breaking():
     assert good == 1
     assert orbits.values(u)[0] == pytest.approx(there[2], abs=1e-7)
 
+    # where an arm is followed first, through the point and on to its mirror image, all is the same
+    i = len(broken.points) // 4
+    arm, symmetric = Start(orbits, orbits.state(broken.points[i].u), float(broken.values[i])), branches[0]
+    ends = broken.points[0], broken.points[-1], symmetric.points[-1]
+    at_bound = [Start(orbits, orbits.state(point.u), 2.5) for point in ends]
+    again = explore([arm, *at_bound], Scope(0.1, 2.5, max_period=1))
+    assert len(again) == 2
+    (same,) = [b for branch in again for b in only(branch, "pitchfork")]
+    assert same.child is again[0]
+    assert same.criticality == pitchfork.criticality == "supercritical"
+    assert orbits.values(same.point.u)[0] == pytest.approx(orbits.values(u)[0], abs=1e-8)
+    for found in (branches, again):
+        ds = dataset_of(found, "amplitude", None)
+        assert sorted(row["type"] for row in table_of(ds)) == ["fold", "fold", "pitchfork"]
+        (row,) = [row for row in table_of(ds) if row["type"] == "pitchfork"]
+        assert (row["unstable_below"], row["unstable_above"]) == ("0", "1")
+        windows = [w for w in windows_of(ds) if w["begins"] == "supercritical pitchfork"]
+        assert [w["from"] for w in windows] == pytest.approx([orbits.values(u)[0]] * 2)
+        assert min(w["to"] - w["from"] for w in windows) > 1e-3
+
     far = broken.points[-1] if broken.points[0] is pitchfork.point else broken.points[0]
     half, _ = flow(orbits.state(far.u), orbits.frequency_hz, [*parameters[:3], orbits.values(far.u)[0]], 0.5)
     assert np.abs(half + orbits.state(far.u)).max() > 1e-2
@@ -253,7 +273,7 @@ def test_explore__symmetry_breaking():
     for tangent in (plane[0], plane.sum(axis=0) / np.sqrt(2.0)):
         pitchfork.child = None
         pitchfork.point.tangent[:] = tangent
-        _cross([(branches[0], pitchfork)], branches[:1], Scope(0.1, 2.5, max_period=1))
+        cross([(branches[0], pitchfork)], branches[:1], (0.1, 2.5), Settings())
         assert pitchfork.child is not None
         ends = [orbits.values(pitchfork.child.points[i].u)[0] for i in (0, -1)]
         assert ends == pytest.approx([2.5, 2.5])  # the symmetric branch ends at 0.1
@@ -406,6 +426,12 @@ def test_explore__followed_ahead(resonance):
         np.testing.assert_array_equal(a.u, b.u)
 
 
+def point_of(matrix):
+    """Point of a branch with a monodromy matrix."""
+    value = Value(np.zeros(2), np.zeros((2, 3)), np.zeros((1, 2)), matrix)
+    return Point(np.zeros(3), np.array([0.0, 0.0, 1.0]), value, 0)
+
+
 def test_watch__neutral_saddle():
     """A real pair of product 1 makes the torus test vanish and is dropped; a complex pair is kept."""
     saddle, angle = np.diag([2.0, 0.5]), 1.0
@@ -413,10 +439,22 @@ def test_watch__neutral_saddle():
     found = []
     for matrix in (saddle, torus):
         assert torus_test(matrix) == pytest.approx(0.0)
-        value = Value(np.zeros(2), np.zeros((2, 3)), np.zeros((1, 2)), matrix)
-        point = Point(np.zeros(3), np.array([0.0, 0.0, 1.0]), value, 0)
-        found.append(Bifurcation("neimark_sacker", point, 0.0, 1, 1, True))
+        found.append(Bifurcation("neimark_sacker", point_of(matrix), 0.0, 1, 1, True))
     assert tell_apart(found, found[0].point) == found[1:]
+
+
+def test_branch__counts_are_those_of_its_points():
+    """Rounding decides the counts within a bracket, and at points beside it; the points farther away are certain."""
+    points = [point_of(np.diag([mu, 0.1])) for mu in (0.9, 0.97, 1.0 + 1e-9, 1.03, 1.1)]
+    (one,) = ones = [Bifurcation("branch_point", points[2], 0.0, 0, 0, True, after=2)]
+    branch = Branch(family(1.0, [0.2, 0.4], "frequency", 1.0), points, ones, ("bound", "bound"))
+    assert (one.n_unstable_before, one.n_unstable_after) == (0, 1)
+    assert counts_of(branch.points, ones) == [0, 0, 0, 1, 1]
+    # two in one step, from 0 to 3: the pair that a torus changes and the fold's one
+    points = [point_of(np.diag([mu, nu, xi])) for mu, nu, xi in ((0.9, 0.9, 0.9), (1.1, 1.1, 1.1))]
+    two = [Bifurcation(kind, points[0], 0.0, 3, 3, True, after=0) for kind in ("fold", "neimark_sacker")]
+    Branch(branch.family, points, two, ("bound", "bound"))
+    assert [(one.n_unstable_before, one.n_unstable_after) for one in two] == [(0, 1), (1, 3)]
 
 
 @pytest.mark.slow
