@@ -111,6 +111,14 @@ class Geometry:
         return max(1, int(length / side))
 
 
+def rows_by_number(numbers: np.ndarray) -> dict[int, np.ndarray]:
+    """Return the rows (ascending) that have each number; negative numbers stand for none."""
+    order = np.argsort(numbers, kind="stable")
+    found, begins = np.unique(numbers[order], return_index=True)
+    rows = np.split(order, begins)[1:]
+    return {number: own for number, own in zip(found.tolist(), rows, strict=True) if number >= 0}
+
+
 def hashes(rows: np.ndarray) -> np.ndarray:
     """Hash each row of an array to a uint64. The hash depends on the row's bits alone, so that sorting by it is
     reproducible.

@@ -26,7 +26,7 @@ from pipeline.analysis.attractors.finding.probing import is_approaching, probe_e
 from pipeline.analysis.attractors.finding.requests import Slopes, Work
 from pipeline.analysis.attractors.finding.searching import Search, State, search_orbits
 from pipeline.analysis.attractors.finding.spirals import keys_of
-from pipeline.analysis.sets import Geometry, order_by_points
+from pipeline.analysis.sets import Geometry, order_by_points, rows_by_number
 from pipeline.analysis.sides import UNKNOWN
 from pipeline.analysis.tolerances import PRESERVED_VOLUME, VOLUME_RTOL
 from pipeline.layout.vocabulary import (
@@ -249,8 +249,9 @@ def _label_raw(point: Point, state: State, groups: np.ndarray, labels: _Labels, 
     best: dict[int, tuple[float, int, np.ndarray]] = {}
     for block in point.blocks():
         _representatives(block, left[block.cells], best, search.geometry)
+    rows = rows_by_number(left)
     for i, g in enumerate(sorted(best)):
-        labels.put(left == g, len(state.orbits) + i, CLOSED)
+        labels.put(rows[g], len(state.orbits) + i, CLOSED)
     return [raw_orbit(best[g][2], search.geometry) for g in sorted(best)]
 
 
@@ -316,9 +317,9 @@ def _describe(
     for block in point.blocks():
         own = labels.label[block.cells]
         sides = feature.sides_of(block.section, block.turns, point.frequency, point.parameters)
-        for number in np.unique(own[own >= 0]):
-            found = cells.setdefault(int(number), Cells(search.options.n_points))
-            found.add(block, np.flatnonzero(own == number), sides, search.geometry)
+        for number, rows in rows_by_number(own).items():
+            found = cells.setdefault(number, Cells(search.options.n_points))
+            found.add(block, rows, sides, search.geometry)
     features = {n: _features_of(n, found, orbits, sets, point, search) for n, found in cells.items()}
     numbers = list(features)
     order = [numbers[i] for i in order_by_points([features[n].points for n in numbers], search.geometry)]
