@@ -109,7 +109,7 @@ def test_run__function_returns_the_run_with_methods(run):
     assert magpend.Run.open(run) is run
     assert type(magpend.Run.open(str(run.directory))) is magpend.Run
     assert inspect.signature(magpend.run) == inspect.signature(python.run)
-    assert "run.plot.bifurcation()" in repr(run)
+    assert "run.plot.lyapunov(" in repr(run)
     assert run.status().complete
     assert "20 of 20 cells" in str(run.status())
     assert run.verify().sound

@@ -94,6 +94,7 @@ def load_model(reference: str | Mapping[str, Any] | Model = DEFAULT) -> Model:
 def _of_table(table: Mapping[str, Any]) -> Model:
     """Return the model that a table defines. Tables with the same meaning give the same object."""
     try:
+        table = _with_rates(table)
         # not sorted: the order of the states is the model's
         text = json.dumps(table)
         if imported.KEY in table:
@@ -105,6 +106,12 @@ def _of_table(table: Mapping[str, Any]) -> Model:
         raise ModelError(error.problems) from None
     except (TypeError, ValueError, RecursionError) as error:
         raise ModelError([f"the text of a model is no plain data ({error})."]) from None
+
+
+def _with_rates(table: Mapping[str, Any]) -> Mapping[str, Any]:
+    from magpend_core.models.text.lines import expanded
+
+    return expanded(table)
 
 
 _by_meaning: WeakValueDictionary[str, Model] = WeakValueDictionary()

@@ -130,7 +130,7 @@ def _plot(run: Run) -> None:
         draw(run.name, name, FIGURES[name].options(**options))
     except (SpecError, RefusedError) as error:
         console.result(f"no figure: {error}")
-        console.result(f"the run is complete; draw it with: {figure_command(run.plan, run.name)}")
+        console.result(f"the run is complete; draw it with: {figure_command(run)}")
     else:
         if left_out:
             console.result(left_out)

@@ -6,9 +6,7 @@ from __future__ import annotations
 
 import math
 from enum import IntEnum
-from typing import Any, Self
-
-from pydantic import model_validator
+from typing import Any
 
 from pipeline.products.product import CellProduct, Options, option
 from pipeline.products.variable import Variable, flag_attrs
@@ -30,18 +28,13 @@ class LyapunovOptions(Options):
         200, "Time in which the tangent vectors align.", unit="drive periods or returns", ge=0, le=1_000_000
     )
     n_periods: int = option(
-        400, "Time over which growth is averaged.", unit="drive periods or returns", ge=2, le=100_000_000
+        400,
+        "Time over which growth is averaged, rounded up to blocks of equal length.",
+        unit="drive periods or returns",
+        ge=2,
+        le=100_000_000,
     )
     n_blocks: int = option(16, "Number of blocks of that time, for standard errors.", ge=2, le=1000)
-
-    @model_validator(mode="after")
-    def _whole_blocks(self) -> Self:
-        if self.n_periods % self.n_blocks:
-            nearest = -(-self.n_periods // self.n_blocks) * self.n_blocks
-            raise ValueError(
-                f"n_periods = {self.n_periods} must be a multiple of n_blocks = {self.n_blocks}, such as {nearest}."
-            )
-        return self
 
 
 class LyapunovFlag(IntEnum):
@@ -117,7 +110,8 @@ def _settled(options: LyapunovOptions, model: Any) -> LyapunovOptions:
         raise ValueError(
             f"n_exponents = {options.n_exponents}: must be at most {n}, the number of states of {model.name}."
         )
-    return options.model_copy(update={"n_exponents": options.n_exponents or n})
+    n_periods = -(-options.n_periods // options.n_blocks) * options.n_blocks
+    return options.model_copy(update={"n_exponents": options.n_exponents or n, "n_periods": n_periods})
 
 
 def _numbers(options: LyapunovOptions, model: Any) -> dict[str, Any]:

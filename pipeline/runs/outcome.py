@@ -90,7 +90,7 @@ def summary(run: Run) -> list[str]:
     """Return the text lines that ``magpend run`` prints at its end: cells by status, and suggested commands."""
     found = outcomes_of(run)
     lines = [f"{run.plan.n_cells} cells by status:", *(o.line for o in found)]
-    lines.append(f"plot it with: {figure_command(run.plan, run.name)}")
+    lines.append(f"plot it with: {figure_command(run)}")
     lost = lost_cells(found)
     if lost:
         lines.append(f"what each status means: magpend status {run.name}")

@@ -28,35 +28,54 @@ MANY_SECTIONS = 500
 """Fewest kept sections for which the section of a single parameter point is drawn."""
 
 
-def first_figure(plan: Plan) -> str:
-    """Return the name of the figure that gives the best overview of a run."""
-    n_swept, n_grid = _long(plan)
-    if plan.is_recorded:  # its cells cannot be integrated further, so it has no attractors to draw
-        return "bifurcation" if n_swept else "section"
+def first_figure(run: Run) -> str:
+    """Return the name of the figure that gives the best overview of a run; the run can draw it."""
+    plan = run.plan
+    swept, grid = _long(plan)
+    if run.spec.drift:
+        return "drift"
+    if plan.is_recorded or run.spec.noise is not None:  # their cells cannot be integrated further: no attractors
+        return "bifurcation" if swept else "section"
     if any(v.name == "lyapunov" for v in plan.variables):
-        return "lyapunov" if n_swept else "convergence"
-    if n_swept >= 2:
+        return "lyapunov" if swept else "convergence"
+    if len(swept) >= 2:
         return "regimes"
-    if n_swept == 1:
+    if swept:
         return "bifurcation"
-    if n_grid >= 2:
+    if len(grid) >= 2:
         return "basins"
     if plan.sizes.get("period_index", 0) >= MANY_SECTIONS:
         return "section"
     return "bifurcation" if any(not is_start_dim(d) for d in plan.dims) else "gallery"
 
 
-def figure_command(plan: Plan, directory: str | Path) -> str:
+def figure_command(run: Run) -> str:
     """Return the ``magpend plot`` command that draws the best overview of a run."""
-    name = first_figure(plan)
-    as_map = name == "lyapunov" and _long(plan)[0] >= 2
-    return f"magpend plot {name} {directory}" + (" --map" if as_map else "")
+    name, options = needed(run)
+    points = "".join(f" --at {axis}={value:.10g}" for axis, value in options.get("at", {}).items())
+    return f"magpend plot {name} {run.name}" + (" --map" if "as_map" in options else "") + points
 
 
-def _long(plan: Plan) -> tuple[int, int]:
-    """Count the axes with more than one value: swept parameters, and axes of initial conditions."""
+def needed(run: Run, name: str = "") -> tuple[str, dict[str, Any]]:
+    """Return the name of a figure, by default `first_figure`, and the options without which it cannot show the run: a
+    value in the middle of each axis that it has not.
+    """
+    name = name or first_figure(run)
+    (swept, grid), options = _long(run.plan), dict[str, Any]()
+    as_map = name == "lyapunov" and len(swept) >= 2
+    if as_map:
+        options["as_map"] = True
+    left = [*swept[2 if as_map or name == "regimes" else 1 :], *(grid[2:] if name == "basins" else ())]
+    if left:
+        cube = run.cube()
+        options["at"] = {d: float(cube[d].values[cube.sizes[d] // 2]) for d in left}
+    return name, options
+
+
+def _long(plan: Plan) -> tuple[list[str], list[str]]:
+    """Return the axes with more than one value: swept parameters, and axes of initial conditions."""
     long = [d for d, n in zip(plan.dims, plan.shape, strict=True) if n > 1]
-    return sum(not is_start_dim(d) for d in long), sum(is_grid_dim(d) for d in long)
+    return [d for d in long if not is_start_dim(d)], [d for d in long if is_grid_dim(d)]
 
 
 def shown(run: Run) -> tuple[str, dict[str, Any], str]:
@@ -71,23 +90,18 @@ def shown(run: Run) -> tuple[str, dict[str, Any], str]:
     left_out : str
         Sentence on the parts of the run that are not drawn, with the command that draws them; else empty.
     """
-    plan, cube = run.plan, run.cube()
-    name = first_figure(plan)
-    options: dict[str, Any] = {}
-    sizes = {d: n for d, n in zip(plan.dims, plan.shape, strict=True) if n > 1 and not is_start_dim(d)}
-    swept = list(sizes)
-    as_map = name == "lyapunov" and len(swept) >= 2
-    if name == "regimes":  # a map of regimes would ask for an analysis, which may take long
-        name = "bifurcation"
-    if len(swept) >= 2:
-        options["at"] = {d: float(cube[d].values[sizes[d] // 2]) for d in swept[2 if as_map else 1 :]}
+    name = first_figure(run)
+    # a map of regimes would ask for an analysis, which may take long
+    name, options = needed(run, "bifurcation" if name == "regimes" else name)
+    sizes = dict(zip(run.plan.dims, run.plan.shape, strict=True))
     left = [f"{d} is drawn at {v:.6g}, one of {sizes[d]} values" for d, v in options.get("at", {}).items()]
-    more = f"magpend plot {first_figure(plan)} {run.name}"
-    if as_map:
-        options["as_map"] = True
+    more = figure_command(run)
+    if "as_map" in options:
         left.append("the sections are not in the map")
-        more = f"magpend plot bifurcation {run.name} --at " + " --at ".join(f"{d}=VALUE" for d in swept[1:])
-    elif name == "lyapunov" and cube.sizes.get("exponent", 1) > 1:
+        more = f"magpend plot bifurcation {run.name} --at " + " --at ".join(
+            f"{d}=VALUE" for d in _long(run.plan)[0][1:]
+        )
+    elif name == "lyapunov" and run.cube().sizes.get("exponent", 1) > 1:
         left.append("all exponents but the largest")
         more += " --spectrum"
     return name, options, f"left out: {'; '.join(left)}. See: {more}" if left else ""

@@ -346,7 +346,8 @@ class SpecTables:
         n_transient
             Time in which the tangent vectors align [drive periods or returns]; 0 or more, at most 1e+06; default 200.
         n_periods
-            Time over which growth is averaged [drive periods or returns]; 2 or more, at most 1e+08; default 400.
+            Time over which growth is averaged, rounded up to blocks of equal length [drive periods or returns]; 2 or
+            more, at most 1e+08; default 400.
         n_blocks
             Number of blocks of that time, for standard errors; 2 or more, at most 1000; default 16.
         """

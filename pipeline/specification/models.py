@@ -14,6 +14,7 @@ from magpend_core.models import ModelError, import_model, load_model, model_name
 from magpend_core.models.imported import KEY, is_object_path
 from magpend_core.models.model import Model
 from magpend_core.models.parameters import ParameterError
+from magpend_core.models.text.lines import is_equations
 from pipeline.specification.files import read_toml
 from pipeline.specification.problems import SpecError, shown
 from pipeline.specification.toml import table_lines, toml_value
@@ -55,6 +56,8 @@ def find_model(reference: Any, folder: str | Path | None = ".", at: str = "model
                 '"FILE.toml", a Python object "package.module:NAME", or a table [model] with states, '
                 "parameters and equations."
             )
+        if is_equations(reference):
+            return load_model({"equations": reference})
         if folder is not None and is_object_path(reference):
             return import_model(reference, folder)
         if is_model_file(reference):

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 from pipeline.layout.limits import check_plan
 from pipeline.layout.plan import Plan, make_plan
@@ -23,14 +23,6 @@ if TYPE_CHECKING:
 
     from magpend_core.models.model import Model, Parameters
 
-
-_NEXT = (
-    "next",
-    "  run.cube()                                 the cube, an xarray.Dataset",
-    '  magpend.figure(run, "bifurcation")         a figure; also "basins", "section", "attractors", ...',
-    "  magpend.table(magpend.attractors(run))     what attracts, and what has been shown of it",
-)
-"""Lines that say how to go on from a run in Python."""
 
 MOST_SHOWN = 70
 """Most characters of a list of names in one line."""
@@ -64,8 +56,6 @@ class Run:
     commits: Records
     known: Mapping[str, bytes] = field(default_factory=dict, repr=False, compare=False)
 
-    _next: ClassVar[tuple[str, ...]] = _NEXT
-
     @classmethod
     def open(cls, source: str | Path | Files | Run) -> Run:
         """Open a run directory with its present commit records; return an opened run unchanged.
@@ -94,6 +84,11 @@ class Run:
         plan = make_plan(spec)
         check_plan(plan)
         return cls(info, spec, plan, read_commits(info, plan), known)
+
+    @property
+    def _next(self) -> tuple[str, ...]:
+        """Lines that say how to go on from the run in Python."""
+        return ()
 
     def __repr__(self) -> str:
         facts = (f"  {name:9s} {text}" for name, text in self._facts.items())

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from magpend_core.models.parameters import near_names
+from magpend_core.models.parameters import ParameterError, near_names
 from magpend_core.models.text.grammar import ELSEWHERE, name_problem
 from magpend_core.models.text.reading import KEYS, read_definition
 from magpend_core.models.text.tables import shown
@@ -131,6 +131,23 @@ def read_lines(
     table["equations"] = rates
     found.table = {key: table[key] for key in (*KEYS, *table) if key in table}
     return found
+
+
+def expanded(table: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return the table of a model with its equations read by `read_lines` if they are lines or have primed keys.
+
+    Raises
+    ------
+    ParameterError
+        If the equations are wrong; the message lists all problems.
+    """
+    given = table.get("equations")
+    if not isinstance(given, str) and not (isinstance(given, Mapping) and any("'" in str(key) for key in given)):
+        return table
+    found = read_lines(given, {key: value for key, value in table.items() if key != "equations"})
+    if problems := found.judged():
+        raise ParameterError(problems)
+    return found.table
 
 
 def _entries(equations: str | Mapping[str, Any], found: Lines) -> Iterator[Entry]:

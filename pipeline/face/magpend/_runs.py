@@ -23,13 +23,6 @@ if TYPE_CHECKING:
 
 P = ParamSpec("P")
 
-_NEXT = (
-    "next",
-    "  run.cube()                           the cube, an xarray.Dataset",
-    "  run.plot.bifurcation()               a figure; also basins, section, attractors, ...",
-    '  run.table("attractors")              what attracts, and what has been shown of it',
-)
-
 
 class Run(Analyses):
     """An opened run directory with its analyses as methods and its figures under `plot`.
@@ -54,8 +47,6 @@ class Run(Analyses):
     >>> run.attractors().magpend.table()                                 # doctest: +SKIP
     >>> ax = run.plot.bifurcation(degrees=True)                         # doctest: +SKIP
     """
-
-    _next = _NEXT
 
     @classmethod
     def open(cls, source: str | Path | Files | StoredRun) -> Self:
@@ -88,6 +79,21 @@ class Run(Analyses):
         from magpend._trees import tree_of
 
         return tree_of(self, chunks, check)
+
+    @property
+    def _next(self) -> tuple[str, ...]:
+        from pipeline.runs.preview import needed
+
+        name, options = needed(self)
+        call = f"run.plot.{name}({', '.join(f'{key}={value!r}' for key, value in options.items())})"
+        lines: tuple[str, ...] = (
+            "next",
+            "  run.cube()                           the cube, an xarray.Dataset",
+            f"  {call:36s} a figure; run.plot lists the others",
+        )
+        if self.spec.noise is None and not self.spec.drift and self.spec.recorded is None:
+            lines += ('  run.table("attractors")              what attracts, and what has been shown of it',)
+        return lines
 
     @property
     def plot(self) -> Plots:

@@ -6,10 +6,12 @@ import os
 import re
 from itertools import islice
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import xarray as xr
 
+import magpend
 from pipeline.cli.exits import Exit
 from pipeline.layout.plan import make_plan
 from pipeline.plots import bifurcation
@@ -17,6 +19,7 @@ from pipeline.runs import preview, workflows
 from pipeline.runs.preview import figure_command, first_figure
 from pipeline.specification.parsing import parse_spec
 from pipeline.specification.problems import SpecError
+from pipeline.store.run import Run
 
 
 @pytest.mark.slow
@@ -84,11 +87,12 @@ def test_run__dry_run_creates_nothing(main, write_spec, sweep_text, tmp_path):
     assert sorted(tmp_path.rglob("*")) == before
 
 
-def plan_of(axes, **tables):
-    """Plan of a sweep over so many values of each axis."""
+def sweep_of(axes, **tables):
+    """A sweep over so many values of each axis: its plan and specification."""
     values = {name: {"values": [1.5 + i for i in range(n)]} for name, n in axes.items()}
     parameters = {} if "frequency_hz" in axes else {"frequency_hz": 2.2}
-    return make_plan(parse_spec({"kind": "sweep", "parameters": parameters, "axes": values, **tables}))
+    spec = parse_spec({"kind": "sweep", "parameters": parameters, "axes": values, **tables})
+    return SimpleNamespace(spec=spec, plan=make_plan(spec), name="run")
 
 
 @pytest.mark.parametrize(
@@ -104,7 +108,7 @@ def plan_of(axes, **tables):
 )
 def test_first_figure__fits_the_axes(axes, starts, figure):
     grid = {name: {"start": 0.0, "stop": 1.0, "num": n} for name, n in starts.items()}
-    assert first_figure(plan_of(axes, initial_conditions={"kind": "grid", "psi1": 0.1, **grid})) == figure
+    assert first_figure(sweep_of(axes, initial_conditions={"kind": "grid", "psi1": 0.1, **grid})) == figure
 
 
 @pytest.mark.parametrize(
@@ -119,8 +123,41 @@ def test_first_figure__fits_the_axes(axes, starts, figure):
 )
 def test_figure_command__fits_the_products(axes, products, n_keep, command):
     starts = {"kind": "random", "n": 3, "psi1": [0.0, 1.0]}
-    plan = plan_of(axes, initial_conditions=starts, products=products, integration={"n_keep": n_keep})
-    assert figure_command(plan, Path("run")) == command
+    run = sweep_of(axes, initial_conditions=starts, products=products, integration={"n_keep": n_keep})
+    assert figure_command(run) == command
+
+
+WELL = "x' = v\nv' = x - x**3 - d*v + A*cos(2*pi*f*t)\nd = 0.15\nA = 0.2"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("tables", "hint"),
+    [
+        ({"noise": {"strengths": {"v": 0.05}, "steps_per_period": 64}}, "section run"),
+        ({"drift": {"A": {"from": 0.2, "to": 0.3, "rate_per_period": 0.01}}}, "drift run"),
+        ({"axes": {n: {"values": [0.15, 0.2]} for n in ("A", "d", "frequency_hz")}}, "regimes run --at frequency=0.2"),
+        ({"axes": {"A": {"values": [0.2, 0.3]}}, "initial_conditions": {"kind": "random", "n": 2}}, "bifurcation run"),
+    ],
+    ids=["noise", "drift", "three axes", "one axis"],
+)
+def test_hint_after_a_run__is_a_figure_that_the_run_can_draw(main, tables, hint, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    start = {"kind": "list", "points": [[0.1, 0.0]]}
+    frequency = {} if "frequency_hz" in tables.get("axes", {}) else {"frequency_hz": 0.159}
+    magpend.run(
+        {"kind": "sweep", "model": WELL, "parameters": frequency, "initial_conditions": start}
+        | {"integration": {"n_transient": 10, "n_keep": 4}, **tables},
+        "run",
+        workers=0,
+        echo=lambda _: None,
+    )
+    command = figure_command(Run.open("run"))
+    assert command == f"magpend plot {hint}"
+    code, _, err = main(*command.split()[1:])
+    assert code == 0, err
+    name, _, rest = hint.partition(" run")
+    assert f"run.plot.{name}({'at={' if rest else ')'}" in repr(magpend.Run.open("run"))
 
 
 @pytest.mark.slow

@@ -8,6 +8,9 @@ import tomllib
 import numpy as np
 import pytest
 
+import magpend
+from magpend_core.models import load_model
+from pipeline.products.lyapunov import LYAPUNOV, LyapunovOptions
 from pipeline.specification.parsing import Range, load_spec, parse_spec
 from pipeline.specification.problems import SpecError
 
@@ -158,3 +161,17 @@ def test_spec__degrees_convert_once():
     states = initial_states(parse_spec(tomllib.loads(text)).initial_conditions).at(np.arange(2))
     expected = [[math.pi / 2, -math.pi / 4, 0, 0], [math.pi, 0, 2 * math.pi, -math.pi]]
     assert np.allclose(states, expected, rtol=1e-15)
+
+
+def test_model__as_lines_of_equations():
+    text = "x'' = -d*x' - x + A*cos(2*pi*f*t)\nd = 0.2\nA = 0.1"
+    tables = tomllib.loads(
+        f'kind = "sweep"\nmodel = """\n{text}\n"""\nparameters.frequency_hz = 0.2\n'
+        'initial_conditions = { kind = "list", points = [[0.1, 0.0]] }\nintegration.n_keep = 2\n'
+    )
+    assert parse_spec(tables).model is load_model(magpend.model(text).reference)
+
+
+@pytest.mark.parametrize(("given", "used"), [(150, 160), (160, 160), (3, 16)])
+def test_lyapunov__rounds_up_to_whole_blocks(given, used):
+    assert LYAPUNOV.settle(LyapunovOptions(n_periods=given), load_model("duffing")).n_periods == used

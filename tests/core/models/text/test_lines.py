@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import re
 
 import pytest
 
-from magpend_core.models import load_model
+from magpend_core.models import ModelError, load_model
 from magpend_core.models.text.lines import is_equations, read_lines
 
 TABLE = {
@@ -44,6 +45,18 @@ def test_read_lines__of_a_dict():
     assert by_state.judged() == []
     assert by_state.table == read_lines("x' = v\nv' = -x", {}).table
     assert read_lines({"x''": "-x"}, {}).table == read_lines("x'' = -x", {}).table
+
+
+@pytest.mark.parametrize("equations", ["x'' = -d*x' - x", {"x''": "-d*x' - x"}], ids=["lines", "primed key"])
+def test_load_model__reads_primes_in_a_table(equations):
+    table = {"name": "m", "states": {"x": "m"}, "parameters": {"d": 0.2}, "equations": equations}
+    plain = {"states": {"x": "m", "v": "m/s"}, "equations": {"x": "v", "v": "-d*v - x"}}
+    model = load_model(table)
+    assert [state.unit for state in model.states] == ["m", "m/s"]
+    renamed = json.loads(json.dumps(plain).replace('"v"', '"x_dot"').replace("*v", "*x_dot"))
+    assert model is load_model({**table, **renamed})
+    with pytest.raises(ModelError, match=r"'dd' .*did you mean d"):
+        load_model(json.loads(json.dumps(table).replace("-d*", "-dd*")))
 
 
 def test_read_lines__puts_positions_before_their_rates():
