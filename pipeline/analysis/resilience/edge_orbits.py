@@ -11,8 +11,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pipeline.analysis.attractors.destinations import Destinations
+from pipeline.analysis.attractors.destinations import UNDECIDED, Destinations
 from pipeline.analysis.attractors.finding.closed_orbits import Orbit, distinct, polish
+from pipeline.analysis.attractors.finding.known_sets import Equilibrium
 from pipeline.analysis.branches.deflation import search_orbits
 from pipeline.analysis.sets import nearest_distances
 from pipeline.analysis.tolerances import RECURRENCE
@@ -101,7 +102,24 @@ def is_on_boundary(orbit: Orbit, there: Destinations, between: tuple[int, int]) 
     """Return whether states of both basins lie arbitrarily close to a saddle orbit, along its unstable direction."""
     values, vectors = np.linalg.eig(orbit.derivative)
     direction = vectors[:, int(np.abs(values).argmax())].real
+    labels = _beside(orbit.points[0], direction, there)
+    return set(between) <= set(labels[:, :NEAREST].ravel().tolist())
+
+
+def separates(rest: Equilibrium, there: Destinations, between: tuple[int, int]) -> bool:
+    """Return whether an equilibrium has one unstable direction, and leaving along it leads to one of two attractors on
+    one side, and to the other on the other side.
+    """
+    if (rest.eigenvalues.real > rest.eigenvalue_error).sum() != 1:
+        return False
+    values, vectors = np.linalg.eig(rest.jacobian)
+    direction = vectors[:, int(values.real.argmax())].real * np.asarray(there.geometry.scales)
+    sides = [set(own.tolist()) - {UNDECIDED} for own in _beside(rest.state, direction, there)]
+    return sorted(map(sorted, sides)) == [[number] for number in sorted(between)]
+
+
+def _beside(state: np.ndarray, direction: np.ndarray, there: Destinations) -> np.ndarray:
+    """Return the labels of states beside another along a direction, shape (side, shift)."""
     direction = direction / np.abs(direction / np.asarray(there.geometry.scales)).max()
     shifts = np.concatenate([SHIFTS, -SHIFTS])
-    labels = there.follow(orbit.points[0] + shifts[:, None] * direction).label.reshape(2, -1)
-    return set(between) <= set(labels[:, :NEAREST].ravel().tolist())
+    return np.asarray(there.follow(state + shifts[:, None] * direction).label.reshape(2, -1))

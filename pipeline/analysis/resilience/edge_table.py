@@ -29,6 +29,7 @@ _SENTENCES = {
     "third_attractor": "another basin lies between the two; start closer to their common boundary with a finer grid",
     "undecided": "states between the two end on no known attractor; a larger --budget may decide",
     "lost": "the pair diverged, did not return to the section, or left the boundary; a smaller --farthest may help",
+    "parted": "it parts too far within one section to show where the boundary is; a smaller --closest may help",
     "not_settled": "its path has not come to a set that repeats itself; give more --returns",
 }
 

@@ -14,6 +14,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from magpend_core.models.sectioned import of_flow
+from magpend_core.sampling import sample
 from magpend_core.status import Status
 from pipeline.analysis.attractors.destinations import UNDECIDED, Destinations
 from pipeline.analysis.attractors.extension.clouds import is_stationary
@@ -21,11 +23,12 @@ from pipeline.analysis.attractors.finding.closed_orbits import Orbit, polish
 from pipeline.analysis.attractors.finding.equilibria import equilibria_near
 from pipeline.analysis.attractors.finding.known_sets import Equilibrium
 from pipeline.analysis.attractors.finding.requests import LEG
-from pipeline.analysis.resilience.edge_orbits import n_unstable
+from pipeline.analysis.resilience.edge_orbits import n_unstable, separates
+from pipeline.analysis.tolerances import PORTRAIT_RTOL, RECURRENCE
 from pipeline.products.reporting import report
 
-REASONS = ("none", "third_attractor", "undecided", "lost", "not_settled")
-NONE, THIRD, UNKNOWN, LOST, NOT_SETTLED = range(len(REASONS))
+REASONS = ("none", "third_attractor", "undecided", "lost", "not_settled", "parted")
+NONE, THIRD, UNKNOWN, LOST, NOT_SETTLED, PARTED = range(len(REASONS))
 """Why a pair has no edge state."""
 
 PARTS = 8
@@ -36,6 +39,14 @@ MOST_DIVISIONS = 40
 
 CLOSE = 10.0
 """Distance within which a path recurs, and from its edge state, in units of the pair's largest distance."""
+
+
+WIDEST = 100.0
+"""Distance of a pair after one section, in units of the largest distance, beyond which it no longer shows where the
+boundary is: the segment between its states may cross other parts of it."""
+
+INSTANTS = 1024
+"""Instants between two sections at which it is seen where a trajectory is slow."""
 
 
 @dataclass(frozen=True)
@@ -159,9 +170,13 @@ class Tracking:
         states = found.section[:, 0, -1].reshape(len(pairs), 2, -1)
         last = found.final_state[:, 0].reshape(len(pairs), 2, -1)
         status = found.status[:, 0].reshape(len(pairs), 2)
-        for pair, own, end, codes in zip(pairs, states, last, status, strict=True):
+        for i, (pair, own, end, codes) in enumerate(zip(pairs, states, last, status, strict=True)):
             if np.isin(codes, (Status.PERIODIC, Status.BOUNDED)).all() and (own[0] != own[1]).any():
-                pair.ends = own
+                before, pair.ends = pair.ends[0], own
+                if self._width(pair) > WIDEST * self._limits.farthest:
+                    pair.reason = PARTED
+                    if self._there.point.can_rest and found.return_time is not None:
+                        self._pass(pair, before, float(found.return_time[2 * i, 0, -1]))
                 continue
             pair.reason = LOST
             if self._there.point.can_rest and (codes == Status.NO_RETURN).any():
@@ -249,6 +264,26 @@ class Tracking:
                 pair.found, pair.reason = one, NONE
                 return True
         return False
+
+    def _pass(self, pair: Pair, state: np.ndarray, seconds: float) -> None:
+        """Take the saddle that a parting pair passes between two sections as its edge state, if it is one."""
+        assert self._there.point.parameters is not None
+        parameters = of_flow(self._there.point.parameters)
+        states = sample(
+            parameters.model.system,
+            parameters.pack()[None],
+            state[None],
+            [np.linspace(0.0, seconds, INSTANTS)],
+            rtol=PORTRAIT_RTOL,
+            atol=PORTRAIT_RTOL,
+        ).states[0]
+        speed = self._geometry.distance(states[1:], states[:-1])
+        slow = 1 + np.flatnonzero((speed[1:-1] <= speed[:-2]) & (speed[1:-1] <= speed[2:]))
+        for one in equilibria_near(self._there.point, states[slow], self._geometry) if len(slow) else ():
+            passes = self._geometry.distance(states, one.state).min() <= RECURRENCE
+            if passes and separates(one, self._there, self._between):
+                pair.found, pair.reason = one, NONE
+                return
 
     def _as_set(self, pair: Pair) -> None:
         """Take the later half of a path as section points of a bounded set, if both its halves fill the same points."""

@@ -342,6 +342,42 @@ def test_edge__of_two_magnets(magnets):
     assert (values.real > 0.0).sum() == 1
 
 
+THOMAS = """
+kind = "sweep"
+section = { of = "x", value = 0.0, direction = "up" }
+[initial_conditions]
+kind = "random"
+n = 200
+seed = 1
+x = [-5.0, 5.0]
+y = [-5.0, 5.0]
+z = [-5.0, 5.0]
+[integration]
+rtol = 1e-9
+atol = 1e-9
+n_transient = 200
+n_keep = 32
+[model]
+name = "thomas"
+states = { x = {}, y = {}, z = {} }
+parameters = { b = 0.16 }
+equations = { x = "sin(y) - b*x", y = "sin(z) - b*y", z = "sin(x) - b*z" }
+"""
+
+
+@pytest.mark.slow
+def test_edge__between_sections(computed):
+    """Thomas' cycles: pairs part between two crossings, where they pass the saddles; no other set is an edge."""
+    found = AnalysedRun.of(computed(THOMAS)).derive("edge", between=("A", "B"))
+    assert found.sizes["edge"] >= 1
+    assert (found["kind"] == EQUILIBRIUM).all()
+    for state, real in zip(found["section"].values[:, 0], found["eigenvalue_real"].values, strict=True):
+        assert np.sin(np.roll(state, -1)) - 0.16 * state == pytest.approx(np.zeros(3), abs=1e-9)
+        assert np.linalg.norm(state) == pytest.approx(4.06585, abs=1e-5)
+        matrix = np.diag(np.cos(np.roll(state, -1))) @ np.roll(np.eye(3), 1, axis=1) - 0.16 * np.eye(3)
+        assert np.sort(real) == pytest.approx(np.sort(np.linalg.eigvals(matrix).real), abs=1e-6)
+
+
 # ---- what does not suit ------------------------------------------------------------------------
 
 
