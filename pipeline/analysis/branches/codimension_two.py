@@ -264,18 +264,22 @@ def _cosine(values: np.ndarray) -> float:
 def merged(points: Mapping[int, list[SpecialPoint]]) -> list[SpecialPoint]:
     """Collect the points of codimension two of several curves without duplicates; `points` has those of each curve
     number.
+
+    A Chenciner point at a strong resonance is dropped: the coefficient that vanishes there has no meaning at it.
     """
     found: list[SpecialPoint] = []
+    strong = [one for ones in points.values() for one in ones if one.kind in (R1, R2, R3, R4)]
     for number, ones in points.items():
         for one in ones:
-            if not any(_is_known(one, other) for other in found):
+            is_resonance = one.kind == CHENCINER and any(_is_same_orbit(one, other) for other in strong)
+            if not is_resonance and not any(one.kind == other.kind and _is_same_orbit(one, other) for other in found):
                 found.append(SpecialPoint(one.kind, one.family, one.point, one.bracket, number))
     return found
 
 
-def _is_known(one: SpecialPoint, other: SpecialPoint) -> bool:
+def _is_same_orbit(one: SpecialPoint, other: SpecialPoint) -> bool:
     """Return whether two located points of codimension two are the same orbit at the same parameter values."""
-    if one.kind != other.kind or one.family.period != other.family.period:
+    if one.family.period != other.family.period:
         return False
     if np.abs(one.point.u[-2:] - other.point.u[-2:]).max() > SAME_POINT:
         return False

@@ -181,9 +181,10 @@ def tongues_table(ds: xr.Dataset) -> Table:
     lines = [
         f"{counted(n_found, 'tongue')} with denominators up to {ds.attrs['max_denominator']}; stable orbits along "
         f"{first} at {second} {ds.attrs['row']:g}",
-        *aligned([_words(row) for row in rows]),
+        *aligned([_words(row) for row in rows if not _is_thin(row)]),
     ]
     without = {
+        "narrower than the error of its ends": [row["tongue"] for row in rows if _is_thin(row)],
         "no orbit found": [row["tongue"] for row in rows if not row["branches"]],
         "only unstable orbits found": [row["tongue"] for row in rows if row["branches"] and not row["begins"]],
     }
@@ -206,6 +207,11 @@ def _row(one: xr.Dataset, ds: xr.Dataset) -> TableRow:
         "branches": int(one["n_branches"]),
         "curves": int(is_own.sum()),
     }
+
+
+def _is_thin(row: TableRow) -> bool:
+    """Return whether a tongue is not shown to be wider than the errors of its two ends."""
+    return bool(row["width"] <= 2.0 * row["error"])
 
 
 def _words(row: TableRow) -> Words:

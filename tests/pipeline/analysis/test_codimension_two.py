@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -125,6 +126,15 @@ def test_stuart_landau__points(stuart_landau):
     for one, other in zip(sorted(found), sorted(expected), strict=True):
         assert one[0] == other[0]
         assert one[1:] == pytest.approx(other[1:], abs=1e-7)
+
+
+def test_merged__no_chenciner_point_at_a_resonance(stuart_landau):
+    """The Neimark-Sacker curves end at R1, where the coefficient has no meaning; farther away it has."""
+    (r1, *_) = [one for curve in stuart_landau for one in curve.special if one.kind == "r1"]
+    u = r1.point.u + np.array([0.0, 0.0, 1e-8, 0.0])
+    beside = replace(r1, kind="chenciner", point=replace(r1.point, u=u))
+    away = replace(beside, point=replace(r1.point, u=u + [0.0, 0.0, 1e-3, 0.0]))
+    assert [one.kind for one in codimension_two.merged({0: [beside, r1, away]})] == ["r1", "chenciner"]
 
 
 def test_curves_table__names_the_points(stuart_landau):

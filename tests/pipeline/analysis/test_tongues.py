@@ -103,6 +103,8 @@ def test_cube__rotation_numbers(stuart_landau):
 def test_tongue__edges_in_closed_form(stuart_landau):
     """The folds of the 1/1 tongue on the row, and along the whole curve."""
     ds = stuart_landau.derive("tongues", parameter="w0", second="F", second_low=0.1, second_high=0.5, max_denominator=1)
+    thin = tongues_table(ds.assign(tongue_error=ds["tongue_high"] - ds["tongue_low"]))
+    assert thin.lines[-2:] == ["", "narrower than the error of its ends: 1/1"]
     (row,) = tongues_table(ds).rows
     edge = edge_of_stuart_landau(0.4)
     assert row["tongue"] == "1/1"
