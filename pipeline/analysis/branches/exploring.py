@@ -112,7 +112,7 @@ def _follow_starts(starts: Sequence[Start], branches: list[Branch], scope: Scope
 
 
 def _first_of_each(starts: Sequence[Start], followed: set[int]) -> list[int]:
-    """Return the index of the first starting orbit of each attractor and period of which no orbit has been followed."""
+    """Return, for each attractor and period that is not followed yet, the index of its first starting orbit."""
     kinds = [(start.attractor, start.family.period) for start in starts]
     done = {kinds[i] for i in followed}
     firsts = {kind: i for i, kind in reversed(list(enumerate(kinds))) if kind[0] >= 0 and kind not in done}
@@ -221,9 +221,8 @@ def _switch(branches: list[Branch], scope: Scope, what: str) -> None:
             other = _doubling_at(branches, child, 1)
             if other is not None:
                 other.child, other.criticality = child, _criticality(other, child, -1)
-    cross(
-        [(b, one) for b, one in open_ends if one.kind == BRANCHING], branches, (scope.low, scope.high), scope.settings
-    )
+    crossings = [(b, one) for b, one in open_ends if one.kind == BRANCHING]
+    cross(crossings, branches, (scope.low, scope.high), scope.settings)
 
 
 # ---- Hopf points -------------------------------------------------------------------------------

@@ -48,14 +48,12 @@ def lie_on(starts: Sequence[Start], branches: Sequence[Branch]) -> list[bool]:
         (i, branch.family, guess) for i, s in enumerate(starts) for branch in branches for guess in _near(s, branch)
     ]
     there = run_together([_at_value(family, guess) for _, family, guess in asked])
-    known = [False] * len(starts)
-    open_ones = {i for (i, _, _), point in zip(asked, there, strict=True) if point is not None}
-    order = sorted(open_ones)
-    own = dict(zip(order, run_together([_at_value(starts[i].family, starts[i].unknowns) for i in order]), strict=True))
-    for (i, _, _), point in zip(asked, there, strict=True):
-        if point is not None and _is_same(starts[i], own[i], point):
-            known[i] = True
-    return known
+    candidates = [(i, point) for (i, _, _), point in zip(asked, there, strict=True) if point is not None]
+    near = sorted({i for i, _ in candidates})
+    polished = run_together([_at_value(starts[i].family, starts[i].unknowns) for i in near])
+    own = dict(zip(near, polished, strict=True))
+    known = {i for i, point in candidates if _is_same(starts[i], own[i], point)}
+    return [i in known for i in range(len(starts))]
 
 
 def _is_same(start: Start, polished: Point | None, point: Point) -> bool:

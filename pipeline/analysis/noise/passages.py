@@ -92,7 +92,7 @@ def find_passages(run: Run, cells: PointCells, options: EscapeOptions, *, halves
     )
     parts = steps * (2 if halves else 1)
     left = np.isfinite(found.steps)
-    ends = np.full(len(go), 0, np.int64)
+    ends = np.zeros(len(go), np.int64)
     ends[left] = np.rint(found.steps[left] * (parts // steps)).astype(np.int64)
     ends[~left] = parts * found.n_periods[~left]
     has_left = left | (found.status == Status.DIVERGED)

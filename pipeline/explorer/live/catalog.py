@@ -84,7 +84,7 @@ class Entry:
 
 @dataclass(frozen=True, eq=False)
 class Known:
-    """What a run has stored for one parameter point: attractors and cells, each None if there are none.
+    """The attractors and cells that a run holds at one parameter point; None where it holds none.
 
     Attributes
     ----------

@@ -344,7 +344,9 @@ def _assert_distinct(point: Point, orbits: Sequence[Orbit], geometry: Geometry) 
     polished = [orbit for orbit in orbits if orbit.is_polished]
     assert len(distinct(polished, geometry)) == len(polished), "two ids of one orbit"
     for k, cycle in enumerate(point.cycles):
-        assert number_among(cycle, point.cycles[:k], point, geometry) == k, "two ids of one limit cycle"
+        # from later cycles to this one: the search went from earlier ones
+        later = point.cycles[k + 1 :]
+        assert number_among(cycle, later, point, geometry) == len(later), "two ids of one limit cycle"
 
 
 def _label_elsewhere(point: Point, first: int, labels: _Labels) -> None:
