@@ -79,9 +79,9 @@ def newton_steps(
     rates, jacobians = rates_at(system, states, packed), jacobian_at(system, states, packed)
     good = np.isfinite(rates).all(axis=1) & np.isfinite(jacobians).all(axis=(1, 2))
     steps, vanishes = np.full(states.shape, np.nan), np.zeros(len(states), bool)
-    own, scales = jacobians[good], np.asarray(system.scales)
-    inverse = np.linalg.pinv(own, rcond=1e-14)
-    steps[good] = -np.einsum("nij,nj->ni", inverse, rates[good])
+    own, scales, sizes = jacobians[good], np.asarray(system.scales), np.asarray(system.sizes)
+    inverse = np.linalg.pinv(own * sizes / sizes[:, None], rcond=1e-14)
+    steps[good] = -np.einsum("nij,nj->ni", inverse, rates[good] / sizes) * sizes
     left = np.abs(rates[good] + np.einsum("nij,nj->ni", own, steps[good]))
     if met is None:
         met = np.zeros(states.shape)

@@ -102,23 +102,25 @@ class _Settings(NamedTuple):
 
 
 def _orthonormalise(state: Any, memory: Any, settings: Any) -> None:
-    """Make the tangent vectors orthonormal, and add the logarithms of their former lengths to the observer's memory."""
+    """Make the tangent vectors orthonormal in units of the sizes, and add the logarithms of their former lengths to the
+    observer's memory.
+    """
     n_vectors = N_TANGENTS // N_BASE
     for k in range(n_vectors):
         own = N_BASE * (1 + k)
         before = 0.0
         for i in range(N_BASE):
-            before += state[own + i] * state[own + i]
+            before += (state[own + i] / SIZES[i]) * (state[own + i] / SIZES[i])
         for j in range(k):
             other = N_BASE * (1 + j)
             along = 0.0
             for i in range(N_BASE):
-                along += state[own + i] * state[other + i] / LENGTH**2
+                along += (state[own + i] / SIZES[i]) * (state[other + i] / SIZES[i]) / LENGTH**2
             for i in range(N_BASE):
                 state[own + i] -= along * state[other + i]
         after = 0.0
         for i in range(N_BASE):
-            after += state[own + i] * state[own + i]
+            after += (state[own + i] / SIZES[i]) * (state[own + i] / SIZES[i])
         # a vector can vanish: along the one by which trajectories that begin to slide differed
         length = max(np.sqrt(after) / LENGTH, SHORTEST)
         for i in range(N_BASE):
@@ -252,7 +254,7 @@ def lyapunov_exponents(
             settings,
             parameters=packed[own, None],
             frequency_hz=frequency[own, None],
-            initial_states=_with_vectors(start[own], n_exponents),
+            initial_states=_with_vectors(start[own], n_exponents, system),
             n_keep=n_blocks,
             n_measures=n_exponents + 3,
             rtol=rtol,
@@ -307,8 +309,10 @@ def _settings(n_exponents: int, n_transient: int, n_periods: int, n_blocks: int,
     return _Settings(n_transient, n_blocks, n_periods // n_blocks)
 
 
-def _with_vectors(states: np.ndarray, n_vectors: int) -> np.ndarray:
-    """Append to each state the first unit vectors as tangent vectors, and a 0 for the integral of the divergence."""
+def _with_vectors(states: np.ndarray, n_vectors: int, system: System) -> np.ndarray:
+    """Append to each state the first unit vectors (of the sizes) as tangent vectors, and a 0 for the integral of the
+    divergence.
+    """
     n = states.shape[1]
-    vectors = np.broadcast_to(LENGTH * np.eye(n)[:n_vectors].ravel(), (len(states), n * n_vectors))
+    vectors = np.broadcast_to(LENGTH * np.diag(system.sizes)[:n_vectors].ravel(), (len(states), n * n_vectors))
     return np.concatenate([states, vectors, np.zeros((len(states), 1))], axis=1)

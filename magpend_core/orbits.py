@@ -133,7 +133,8 @@ def section_map(
     periods = np.broadcast_to(n_periods, len(points))
     starts = on_section(points, packed, system)
     is_finite = np.isfinite(starts).all(axis=1)
-    identity = np.broadcast_to(np.eye(n).ravel(), (len(starts), n * n))
+    sizes = np.asarray(system.sizes)
+    identity = np.broadcast_to(np.diag(sizes).ravel(), (len(starts), n * n))
     extended = np.concatenate([np.where(is_finite[:, None], starts, 0.0), identity], axis=1)
     # the longest first, so that the last of them do not run alone
     order = np.argsort(-periods, kind="stable")
@@ -157,7 +158,7 @@ def section_map(
     states = np.where(is_finite[:, None, None], cells.section[back, 0], np.nan)
     images = states[:, :, :n]
     # tangent vector k, the derivative by state k, is a column
-    derivatives = states[rows, periods - 1, n:].reshape(len(starts), n, n).transpose(0, 2, 1)
+    derivatives = states[rows, periods - 1, n:].reshape(len(starts), n, n).transpose(0, 2, 1) / sizes
     crossed = crossed_state(system)
     if crossed is None:
         return Returns(images, derivatives, np.repeat(1.0 / frequency[:, None], most, axis=1))
@@ -359,8 +360,9 @@ def _newton_steps(derivatives: np.ndarray, mismatch: np.ndarray, system: System)
     """Solve (1 - M) step = mismatch for each orbit, in the least-squares sense if singular; too long steps are
     shortened.
     """
-    matrices = np.eye(system.n_states) - derivatives
-    steps = np.einsum("nij,nj->ni", np.linalg.pinv(matrices, rcond=1e-14), mismatch)
+    sizes = np.asarray(system.sizes)
+    matrices = np.eye(system.n_states) - derivatives * sizes / sizes[:, None]
+    steps = np.einsum("nij,nj->ni", np.linalg.pinv(matrices, rcond=1e-14), mismatch / sizes) * sizes
     longest = np.abs(steps / np.asarray(system.scales)).max(axis=1, keepdims=True)
     return np.asarray(steps * np.minimum(1.0, TRUST / np.maximum(longest, 1e-300)))
 

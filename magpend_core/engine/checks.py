@@ -154,15 +154,15 @@ def _declaration(system: System, linearised: bool) -> Iterator[str]:
     n, names = system.n_states, ", ".join(system.state_names)
     if not n:
         yield "state_names is empty; a system has one state at least."
-    for field in ("is_angle", "scales", "escape"):
+    for field in ("is_angle", "scales", "sizes", "escape"):
         values = getattr(system, field)
         if len(values) != n:
             yield f"{field} has {len(values)} entries; it must have one for each of the {n} states ({names})."
-    for field in ("scales", "escape"):
+    for field in ("scales", "sizes", "escape"):
         for name, value in zip(system.state_names, getattr(system, field), strict=False):
-            if not value > 0.0 or (field == "scales" and not np.isfinite(value)):
+            if not value > 0.0 or (field != "escape" and not np.isfinite(value)):
                 yield f"{field}: {value!r} for {name} is out of bounds; it must be greater than 0" + (
-                    " and finite." if field == "scales" else "."
+                    " and finite." if field != "escape" else "."
                 )
     for field in ("state_names", "parameter_names", "quantity_names"):
         own = getattr(system, field)

@@ -157,7 +157,7 @@ _SIZES = frozenset(
 )
 """Free names that are sizes of a system: a part is compiled once for all values above 0 (see `linking`)."""
 
-_ARRAYS = frozenset(("IS_ANGLE", "SCALES", "ESCAPE", "DIRECTIONS", "STARTS", "SAME_VALUE"))
+_ARRAYS = frozenset(("IS_ANGLE", "SCALES", "SIZES", "ESCAPE", "DIRECTIONS", "STARTS", "SAME_VALUE"))
 """Free names that are arrays with an entry per state or event: a part is compiled once for all arrays."""
 
 

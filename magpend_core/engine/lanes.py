@@ -310,7 +310,8 @@ def squared_error(w: Any, base: int, rtol: float, atol: float) -> Any:
         for j in range(2, N_STAGES):
             error = multiply_add(ERROR[j], load(w, row + ROWS.slopes + j * N * WIDTH), error)
         size = maximum(absolute(load(w, row + ROWS.state)), absolute(load(w, row + ROWS.trial)))
-        scaled = error / (atol + rtol * size)
+        floor = atol * SIZES[i]
+        scaled = error / (rtol * size + floor)
         total = multiply_add(scaled, scaled, total)
     h = load(w, base + ROWS.step)
     return (h * h) * total * (1.0 / N_CONTROLLED)
@@ -332,7 +333,8 @@ def squared_error_of_two(w: Any, base: int, rtol: float, atol: float) -> Any:
             error = multiply_add(ERROR[j], slope, error)
             other = multiply_add(OTHER_ERROR[j], slope, other)
         size = maximum(absolute(load(w, row + ROWS.state)), absolute(load(w, row + ROWS.trial)))
-        per = 1.0 / (atol + rtol * size)
+        floor = atol * SIZES[i]
+        per = 1.0 / (rtol * size + floor)
         error, other = error * per, other * per
         total = multiply_add(error, error, total)
         other_total = multiply_add(other, other, other_total)
@@ -901,6 +903,7 @@ def engine_bindings(system: System, observer: Observer, watched: tuple[int, ...]
         "RENEW_BELOW": observer.renew_below,
         "IS_ANGLE": np.array(system.is_angle, np.int64),
         "SCALES": np.array(system.scales),
+        "SIZES": np.array(system.sizes),
         "ESCAPE": np.where(system.is_angle, np.minimum(system.escape, FARTHEST), system.escape),
         "constants": system.constants,
         "edges": system.edges,

@@ -88,6 +88,8 @@ class System:
         their full turns are counted; `rhs` must not change when 2 pi is added.
     scales : tuple of float
         Typical size of each state, the unit in which sections are compared; empty for 1.
+    sizes : tuple of float
+        Unit of each state's absolute tolerance; empty for 1. It is not 1 where the scale was found from the motion.
     escape : tuple of float
         Bound on the absolute value of each state at a section; beyond it a trajectory has diverged. Empty
         for none.
@@ -202,6 +204,7 @@ class System:
     jacobian_entries: tuple[int, ...] | None = None
     is_angle: tuple[bool, ...] = ()
     scales: tuple[float, ...] = ()
+    sizes: tuple[float, ...] = ()
     escape: tuple[float, ...] = ()
     n_edges: int = 0
     edges: Callable[..., Any] = None  # type: ignore[assignment]
@@ -236,6 +239,7 @@ class System:
         absent = {
             "is_angle": (False,) * n,
             "scales": (1.0,) * n,
+            "sizes": (1.0,) * n,
             "escape": (math.inf,) * n,
             "forcing": no_forcing,
             "edges": no_edges,
@@ -249,6 +253,7 @@ class System:
             "quantity_names": str,
             "is_angle": bool,
             "scales": float,
+            "sizes": float,
             "escape": float,
             "slides": bool,
             "impact_directions": int,
@@ -295,6 +300,8 @@ class System:
             )
         if self.n_contacts:
             data += (self.sticks,)  # type: ignore[assignment]
+        if any(size != 1.0 for size in self.sizes):
+            data += (self.sizes,)  # type: ignore[assignment]
         if self.method != "dopri5":
             data += (self.method,)  # type: ignore[assignment]
         if self.n_known is not None or self.jacobian_entries is not None:

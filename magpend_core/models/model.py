@@ -56,6 +56,8 @@ class State:
         Size that counts as 1 when states are compared.
     escape : float
         Beyond this absolute value at a section a trajectory has diverged.
+    size : float
+        Unit of the absolute tolerance; 1 unless it was found from a run's motions.
     rate : str
         Name of the state that is its time derivative, if one is; phase portraits show the pair.
     """
@@ -68,6 +70,7 @@ class State:
     scale: float = 1.0
     escape: float = math.inf
     rate: str = ""
+    size: float = 1.0
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ import numpy as np
 
 from magpend_core.models import load_model
 from magpend_core.models.text.model import TextModel
-from magpend_core.models.text.numeric import value_of
+from magpend_core.models.text.numeric import rates_of
 from pipeline.layout.cells import initial_states, parameter_axes
 from pipeline.specification.parsing import Spec
 from pipeline.specification.problems import SpecError
@@ -49,16 +49,20 @@ def check_starts(spec: Spec) -> None:
     """
     states = initial_states(spec.initial_conditions)
     chosen = np.unique(np.linspace(0, len(states) - 1, min(len(states), MOST_STARTS)).astype(np.int64))
-    axes = parameter_axes(spec)
-    ends = [np.unique([a.values.min(), a.values.max()]).tolist() for a in axes]
-    corners = list(itertools.islice(itertools.product(*ends), MOST_CORNERS))
-    names = [a.parameter for a in axes]
-    fixed = {**spec.values, FREQUENCY: spec.frequency_hz}
-    points = [{**fixed, **dict(zip(names, corner, strict=True))} for corner in corners]
+    points = parameter_points(spec)
     model = load_model(spec.reference)
     check_states(model, states.at(chosen), points)
     if isinstance(model, TextModel) and not model.autonomous and spec.drive is None:
         _check_period(model, states.at(chosen[: len(SHARES)]), points)
+
+
+def parameter_points(spec: Spec) -> list[dict[str, Any]]:
+    """Return the values of the parameters and of the frequency at both ends of every axis, at most `MOST_CORNERS`."""
+    axes = parameter_axes(spec)
+    ends = [np.unique([a.values.min(), a.values.max()]).tolist() for a in axes]
+    corners = itertools.islice(itertools.product(*ends), MOST_CORNERS)
+    fixed = {**spec.values, FREQUENCY: spec.frequency_hz}
+    return [{**fixed, **dict(zip([a.parameter for a in axes], corner, strict=True))} for corner in corners]
 
 
 def _check_period(model: TextModel, states: np.ndarray, points: Sequence[Mapping[str, Any]]) -> None:
@@ -94,10 +98,7 @@ def _rates(model: TextModel, states: np.ndarray, point: Mapping[str, Any], late:
         "t": (SHARES + late) / frequency,
     }
     with np.errstate(all="ignore"):
-        for name in definition.used(definition.equations.values()):
-            if name in definition.define:
-                known[name] = value_of(definition.define[name], known)
-        values = {name: value_of(tree, known) for name, tree in definition.equations.items()}
+        values = rates_of(definition, known)
     return {name: np.nan_to_num(np.broadcast_to(value, SHARES.shape)) for name, value in values.items()}
 
 

@@ -19,6 +19,7 @@ from pipeline.layout.domains import check_starts
 from pipeline.layout.identity import canonical, digest_of
 from pipeline.layout.matching import NOWHERE, Finder, apart, way_of
 from pipeline.layout.plan import Plan, make_plan
+from pipeline.layout.scales import with_sizes
 from pipeline.layout.writing import sync_folder
 from pipeline.runs.preview import time_line
 from pipeline.runs.progress import size
@@ -137,7 +138,7 @@ def _wide(run: Run, spec: str | Path | None, widening: Widening) -> tuple[Spec, 
         raise SpecError("extend: nothing to change; give a wider SPEC, or an option such as --axis NAME=LOW:HIGH:NUM.")
     if spec is not None:
         path = find_spec(spec)
-        parsed = load_spec(path)
+        parsed = with_sizes(load_spec(path), run.spec)
         if not widening:
             return parsed, path.read_text("utf-8")
         wide, origin = widened(parsed, widening), f"specification {path.name}"

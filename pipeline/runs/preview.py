@@ -11,12 +11,14 @@ from typing import Any
 from pipeline.layout.domains import check_starts
 from pipeline.layout.limits import check_space
 from pipeline.layout.plan import Plan, make_plan
+from pipeline.layout.scales import size_remarks
 from pipeline.layout.units import unit_remarks
 from pipeline.layout.vocabulary import is_grid_dim, is_start_dim
 from pipeline.runs.estimate import estimate, wall_seconds, writing_seconds
 from pipeline.runs.noise import check_steps
 from pipeline.runs.progress import duration, size
 from pipeline.runs.run import identity_here
+from pipeline.runs.scaling import in_scales
 from pipeline.runs.workflows import read_given
 from pipeline.specification.parsing import Spec
 from pipeline.store.commits import read_commits
@@ -189,6 +191,7 @@ class Preview:
         dims = ", ".join(f"{d} {n}" for d, n in self.dims.items())
         yield f"{self.spec.kind}: {self.n_cells} cells ({dims or 'one cell'})"
         block = " x ".join(map(str, self.plan.block)) or "1"
+        yield from size_remarks(self.spec)
         yield f"tasks: {self.n_tasks} of {block} cells, {len(self.done)} done"
         yield f"cube: {size(self.n_bytes)} before compression"
         yield f"directory: {self.directory}" + ("" if self.exists else " (not created)")
@@ -219,8 +222,9 @@ def preview(
     """
     parsed, _, default = read_given(spec, smoke=smoke)
     check_starts(parsed)
-    check_steps(parsed)
     files = open_files(out if out is not None else default)
+    parsed = in_scales(parsed, files)
+    check_steps(parsed)
     plan = make_plan(parsed)
     info = check(files, identity_here(parsed, plan))
     done = read_commits(info, plan) if info else {}

@@ -15,10 +15,12 @@ from pipeline.layout.domains import check_starts
 from pipeline.layout.identity import identity_of
 from pipeline.layout.limits import check_plan, check_space
 from pipeline.layout.plan import Plan, make_plan
+from pipeline.layout.scales import size_remarks
 from pipeline.layout.units import unit_remarks
 from pipeline.runs.mending import sound_commits
 from pipeline.runs.noise import check_steps, warn_of_steps
 from pipeline.runs.progress import Progress, duration
+from pipeline.runs.scaling import in_scales
 from pipeline.runs.status import State, state
 from pipeline.runs.stopping import InterruptedRunError, stoppable
 from pipeline.runs.workflows import read_given
@@ -104,9 +106,12 @@ def run(
     where = Where(scheduler, Path(cluster) if cluster is not None else None, dashboard, files.place)
     where.resolved()
     check_starts(parsed)
+    parsed = in_scales(parsed, files)
     check_steps(parsed)
     for remark in (*parsed.model.flow.remarks, *unit_remarks(parsed.model)):
         echo(f"warning: {remark}")
+    for line in size_remarks(parsed):
+        echo(line)
     carry_out(parsed, text, files, workers=workers, where=where, echo=echo)
     warn_of_steps(parsed, files, echo)
     return state(files)

@@ -282,7 +282,8 @@ class SpecTables:
         rtol
             Relative tolerance of a step; 1e-13 or more, below 1; default 1e-08.
         atol
-            Absolute tolerance of a step, in the states' units; above 0, below 1; default 1e-08.
+            Absolute tolerance of a step, in the states' units; or in units of the sizes that the motion gave them;
+            above 0, below 1; default 1e-08.
         method
             Runge-Kutta method: dopri5 of order 5, or dop853 of order 8 for smooth equations; default 'dopri5'.
         n_transient

@@ -21,6 +21,7 @@ from pipeline.runs.choosing import Choice, choose, no_command
 from pipeline.runs.noise import check_steps
 from pipeline.runs.refusals import remedy
 from pipeline.runs.run import identity_here
+from pipeline.runs.scaling import in_scales
 from pipeline.runs.sites import Site, ask_site, no_default
 from pipeline.runs.sizing import Work, complete, measure
 from pipeline.runs.workflows import default_directory, find_spec
@@ -146,6 +147,7 @@ def prepare(
             "digits, and . _ - + , : = @."
         )
     check_starts(parsed)
+    parsed = in_scales(parsed, files)
     check_steps(parsed)
     plan = make_plan(parsed)
     info = check(files, identity_here(parsed, plan))

@@ -147,7 +147,13 @@ class Integration(Table):
     """The table ``[integration]``: tolerances, length of the transient, and section points kept for each trajectory."""
 
     rtol: float = Field(defaults.RTOL, ge=1e-13, lt=1, description="Relative tolerance of a step.")
-    atol: float = Field(defaults.ATOL, gt=0, lt=1, description="Absolute tolerance of a step, in the states' units.")
+    atol: float = Field(
+        defaults.ATOL,
+        gt=0,
+        lt=1,
+        description="Absolute tolerance of a step, in the states' units; or in units of the sizes "
+        "that the motion gave them.",
+    )
     method: Literal["dopri5", "dop853"] = Field(
         "dopri5", description="Runge-Kutta method: dopri5 of order 5, or dop853 of order 8 for smooth equations."
     )

@@ -130,6 +130,7 @@ def duffing(oscillator):
         state_names=("x", "v"),
         is_angle=(False, False),
         scales=(1.0, 1.0),
+        sizes=(1.0, 1.0),
         rhs=_duffing_rhs,
         escape=(1e3, 1e3),
     )

@@ -13,7 +13,10 @@ from collections.abc import Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from multiprocessing import get_context
 
+from magpend_core.models import load_model
+from magpend_core.models.text.model import TextModel
 from tests.zoo import answers, variants
+from tests.zoo.rescaling import UNITS
 from tests.zoo.running import Outcome, outcome_of
 
 WORDS = ("right", "not settled", "kind undecided", "WRONG", "error")
@@ -41,6 +44,8 @@ def main() -> int:
 
 
 def _settings(name: str, asked: str) -> list[str]:
+    if asked in UNITS:
+        return [asked] if isinstance(load_model(variants.load(name)["model"]), TextModel) else []
     every = [word for word, _ in variants.settings(variants.load(name))]
     return every if asked == "all" else [word for word in every if word == asked]
 

@@ -18,6 +18,7 @@ import numpy as np
 from tests.zoo import answers, variants
 from tests.zoo.answers import Answer
 from tests.zoo.judge import Verdict, judge_point, words
+from tests.zoo.rescaling import UNITS, Units, rescaled
 
 
 @dataclass
@@ -46,11 +47,15 @@ def outcome_of(name: str, setting: str, limit: float = 0.0) -> Outcome:
     """Run one setting of a system in a temporary folder; an error or a time above the limit [s] is kept."""
     started = time.perf_counter()
     outcome = Outcome(name, setting)
-    data = dict(variants.settings(variants.load(name)))[setting]
+    data, units = variants.load(name), None
+    if setting in UNITS:
+        data, units = rescaled(data, *UNITS[setting])
+    else:
+        data = dict(variants.settings(data))[setting]
     try:
         with _time_limit(limit), tempfile.TemporaryDirectory(prefix=f"zoo-{name}-") as folder:
             ds, rows = analysed(data, Path(folder))
-            outcome.verdict = judged(answers.load(name), ds, rows)
+            outcome.verdict = judged(answers.load(name), ds, rows, units)
             outcome.found = "; ".join(words(row) for row in rows)
     except Exception as error:
         place = traceback.extract_tb(error.__traceback__)[-1]
@@ -86,22 +91,26 @@ def analysed(data: Mapping[str, Any], folder: Path) -> tuple[Any, list[dict[str,
     return ds, attractors_table(ds).rows
 
 
-def judged(answer: Answer, ds: Any, rows: list[dict[str, Any]]) -> Verdict:
-    """Judge the rows of all parameter points of a run."""
+def judged(answer: Answer, ds: Any, rows: list[dict[str, Any]], units: Units | None = None) -> Verdict:
+    """Judge the rows of all parameter points of a run, whose numbers may have other units."""
     from pipeline.analysis.sets import Geometry
     from pipeline.layout.vocabulary import model_of, split_dims
 
-    geometry = Geometry.of(model_of(ds)).difference
+    model = model_of(ds)
+    units = units or Units(dict.fromkeys(model.state_names, 1.0))
+    lengths = np.array(list(units.states.values()))
+    geometry = Geometry(model.is_angle, tuple(np.array(model.scales) / lengths)).difference
     dims, _ = split_dims(ds["attractor_id"])
     verdict = Verdict()
     for index in np.ndindex(*(ds.sizes[d] for d in dims)):
         one = ds.isel(dict(zip(dims, index, strict=True)))
         where = {d: float(one[d]) for d in dims}
         here = [
-            {**row, "points": one["attractor_points"].sel(attractor=row["attractor_id"]).values}
+            {**units.row(row), "points": one["attractor_points"].sel(attractor=row["attractor_id"]).values / lengths}
             for row in rows
             if all(np.isclose(row[d], v, rtol=1e-12, atol=0.0) for d, v in where.items())
         ]
+        where = {d: v * units.time if d == "frequency" else v for d, v in where.items()}
         n_cells, n_left = _cells(one)
         verdict.add(judge_point(answer, where, here, n_cells=n_cells, n_left=n_left, geometry=geometry))
     return verdict

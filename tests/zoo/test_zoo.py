@@ -17,6 +17,7 @@ if str(ROOT) not in sys.path:  # tests are no package; the zoo's modules are fou
 
 from tests.zoo import answers, variants  # noqa: E402
 from tests.zoo.judge import judge_point  # noqa: E402
+from tests.zoo.rescaling import UNITS  # noqa: E402
 from tests.zoo.running import outcome_of  # noqa: E402
 
 ANSWERS = {name: answers.load(name) for name in answers.names()}
@@ -28,6 +29,16 @@ def test_zoo__quick(name):
     outcome = outcome_of(name, variants.OWN)
     assert not outcome.error, outcome.error
     assert not outcome.verdict.wrong, (outcome.verdict.wrong, outcome.found)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("setting", UNITS)
+@pytest.mark.parametrize("name", ["bautin", "close-pair", "slow-focus", "repeller", "belt-stick"])
+def test_zoo__other_units_change_no_conclusion(name, setting):
+    outcome = outcome_of(name, setting)
+    assert not outcome.error, outcome.error
+    assert not outcome.verdict.wrong, (outcome.verdict.wrong, outcome.found)
+    assert outcome.word == outcome_of(name, variants.OWN).word
 
 
 @pytest.mark.slow

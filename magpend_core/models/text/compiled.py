@@ -45,6 +45,7 @@ def system_of(definition: Definition, derived: Derived, source: Source) -> Syste
         jacobian_entries=source.jacobian_entries,
         is_angle=tuple(s.on_circle for s in states),
         scales=tuple(s.scale for s in states),
+        sizes=tuple(s.size for s in states),
         escape=tuple(s.escape for s in states),
         n_edges=source.n_edges,
         edges=functions.get("edges"),  # type: ignore[arg-type]

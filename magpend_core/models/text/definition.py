@@ -137,7 +137,10 @@ class Definition:
         """
         bounds = [[p.name, p.bound] for p in self.parameters]
         plain = {
-            "states": [[s.name, s.on_circle, repr(s.scale), repr(s.escape)] for s in self.states],
+            "states": [
+                [s.name, s.on_circle, repr(s.scale), repr(s.escape), *([repr(s.size)] if s.size != 1.0 else [])]
+                for s in self.states
+            ],
             "parameters": bounds,
             "define": {name: written(tree) for name, tree in self.define.items()},
             "equations": {name: written(tree) for name, tree in self.equations.items()},

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from magpend_core.models.text.definition import Definition
 from magpend_core.models.text.grammar import Tree
 from magpend_core.models.text.graph import Node, in_order
 
@@ -89,6 +90,15 @@ def value_of(tree: Tree, names: Mapping[str, Any]) -> Any:
     """
     with np.errstate(all="ignore"):
         return _value(tree, names)
+
+
+def rates_of(definition: Definition, names: Mapping[str, Any]) -> dict[str, Any]:
+    """Compute the rates of all states, by name, for given values of the states, the parameters and the time."""
+    known = dict(names)
+    for name in definition.used(definition.equations.values()):
+        if name in definition.define:
+            known[name] = value_of(definition.define[name], known)
+    return {name: value_of(tree, known) for name, tree in definition.equations.items()}
 
 
 def _value(tree: Tree, names: Mapping[str, Any]) -> Any:

@@ -39,7 +39,7 @@ KEYS = (
     "presets",
     "classifier",
 )
-_STATE_KEYS = ("unit", "meaning", "symbol", "on_circle", "scale", "escape")
+_STATE_KEYS = ("unit", "meaning", "symbol", "on_circle", "scale", "size", "escape")
 _PARAMETER_KEYS = ("value", "unit", "meaning", "symbol", "bound")
 _QUANTITY_KEYS = ("value", "unit", "meaning", "symbol")
 # dims, coordinates and keys of runs: a state, a parameter or a quantity of the name would be taken for them
@@ -163,9 +163,10 @@ class _Reading(ViewsReader):
             unit, symbol = self.text(entry, "unit", place, "1"), self.text(entry, "symbol", place)
             meaning = self.text(entry, "meaning", place) or name
             on_circle = self.flag(entry, "on_circle", place)
-            scale = self.positive(entry, "scale", place, 1.0)
-            escape = self.positive(entry, "escape", place, ESCAPE)
-            states.append(State(name, unit, meaning, symbol, on_circle, scale, escape))
+            size = self.positive(entry, "size", place, 1.0)
+            scale = self.positive(entry, "scale", place, size)
+            escape = self.positive(entry, "escape", place, ESCAPE * size)
+            states.append(State(name, unit, meaning, symbol, on_circle, scale, escape, size=size))
         if isinstance(given, Mapping) and not given and not self.problems:
             self.report(self.at("states"), "is empty; a model has one state at least.")
         return tuple(states)

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from pipeline.analysis.attractors.describing.features import Features
+from pipeline.analysis.attractors.describing.labelling import _fill_orbit
 from pipeline.analysis.attractors.finding.closed_orbits import Orbit
 from pipeline.analysis.attractors.finding.stability import by_margin, largest_error
 from pipeline.analysis.attractors.table import attractors_table
 from pipeline.analysis.outcomes import other_cells, outcomes, sentence
-from pipeline.layout.vocabulary import ATTRACTS, NEUTRAL, UNSTABLE
+from pipeline.layout.vocabulary import ATTRACTS, NEUTRAL, PERIODIC_ORBIT, UNSTABLE
 from pipeline.runs.derive import derive, stale
 
 
@@ -115,3 +119,10 @@ def test_derive__more_evidence_holds_everywhere(pitchfork):
     assert any("attractors" in name for name in stale(pitchfork))
     basins = derive(pitchfork, "basins", {"n_points": 8})
     assert basins.attrs["identify_budget"] == 3.0
+
+
+def test_fill_orbit__no_table_says_that_a_saddle_attracts():
+    saddle = replace(orbit(382.0, residual=1e6), approached_within=0.05)
+    assert saddle.is_stable
+    with pytest.raises(AssertionError, match="a multiplier of modulus 382 is said to attract"):
+        _fill_orbit(Features(saddle.points, PERIODIC_ORBIT, 1, np.zeros(0), 0, np.zeros(1), np.zeros(1)), saddle, False)

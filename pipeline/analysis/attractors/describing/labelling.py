@@ -454,6 +454,11 @@ def _of_orbit(cells: Cells, orbit: Orbit, point: Point, search: Search) -> Featu
 def _fill_orbit(found: Features, orbit: Orbit, is_flow: bool) -> None:
     found.multipliers, found.residual, found.is_polished = orbit.multipliers, orbit.residual, True
     found.multiplier_error = orbit.multiplier_error
+    modulus = float(np.abs(orbit.multipliers).max())
+    if orbit.is_stable and modulus > 1.0 + stability.ABOVE:
+        raise AssertionError(
+            f"an orbit with a multiplier of modulus {modulus:g} is said to attract: a fault of magpend."
+        )
     found.evidence = stability.BY_APPROACH if orbit.approached_within else stability.BY_MULTIPLIERS
     exponents = orbit_exponents(orbit.multipliers, orbit.seconds, is_flow)
     found.lyapunov_max = found.lyapunov_low = found.lyapunov_high = float(exponents[0])

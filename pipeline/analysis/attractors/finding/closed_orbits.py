@@ -56,6 +56,8 @@ class Orbit:
         Period [s]; NaN if not polished.
     approached_within : float
         Scaled distance from which trajectories on both sides came nearer; 0 if not tried or not seen.
+    sizes : tuple of float
+        Units of the states in which errors of the monodromy matrix are estimated; empty for 1.
     """
 
     points: np.ndarray
@@ -64,6 +66,7 @@ class Orbit:
     derivative: np.ndarray
     seconds: float = np.nan
     approached_within: float = 0.0
+    sizes: tuple[float, ...] = ()
 
     @property
     def period(self) -> int:
@@ -82,8 +85,10 @@ class Orbit:
         It adds the error of the monodromy matrix and the error of the orbit's place: near a fold the
         multiplier changes with the square root of the residual.
         """
-        of_matrix = MATRIX_ERROR * float(np.abs(self.derivative).max(initial=1.0))
-        return largest_error(self.derivative, of_matrix) + PLACE_ERROR * float(np.sqrt(self.residual))
+        sizes = np.asarray(self.sizes or 1.0)
+        matrix = self.derivative * sizes / sizes[..., None]
+        of_matrix = MATRIX_ERROR * float(np.abs(matrix).max(initial=1.0))
+        return largest_error(matrix, of_matrix) + PLACE_ERROR * float(np.sqrt(self.residual))
 
     @cached_property
     def stability(self) -> int:
@@ -217,7 +222,7 @@ def _polished(
     order.
     """
     found = polish_orbits(packed, frequency, points, period, tolerance=tolerance, system=system)
-    orbits = [orbit_of(found, row) if found.converged[row] else None for row in range(len(points))]
+    orbits = [orbit_of(found, row, system) if found.converged[row] else None for row in range(len(points))]
     least = {row: _rolled(one.points, geometry)[0] for row, one in enumerate(orbits) if one is not None}
     rows = [row for row, point in least.items() if (point != orbits[row].points[0]).any()]  # type: ignore[union-attr]
     if rows:
@@ -226,11 +231,11 @@ def _polished(
             packed[rows], frequency[rows], starts, found.orbit_period[rows], tolerance=tolerance, system=system
         )
         for i, row in enumerate(rows):
-            orbits[row] = orbit_of(again, i) if again.converged[i] else None
+            orbits[row] = orbit_of(again, i, system) if again.converged[i] else None
     return orbits
 
 
-def orbit_of(found: PeriodicOrbits, row: int) -> Orbit:
+def orbit_of(found: PeriodicOrbits, row: int, system: System) -> Orbit:
     """Return a row of orbits that Newton's method found."""
     return Orbit(
         found.points[row, : found.orbit_period[row]],
@@ -238,6 +243,7 @@ def orbit_of(found: PeriodicOrbits, row: int) -> Orbit:
         float(found.residual[row]),
         found.derivative[row],
         float(found.seconds[row]),
+        sizes=system.sizes,
     )
 
 

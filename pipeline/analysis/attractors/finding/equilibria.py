@@ -15,6 +15,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from magpend_core.equilibria import find_equilibria, newton_steps
+from magpend_core.natural import natural_size
 from magpend_core.sections import run_branches
 from magpend_core.status import Status
 from pipeline.analysis.attractors.finding.known_sets import Equilibrium
@@ -30,6 +31,9 @@ MOST = 64
 
 ITERATIONS = 100
 """Most Newton steps: near a degenerate equilibrium convergence is only linear."""
+
+RATES = 30.0
+"""Rates of a flow per rate of its section, roughly: a section is often given some ten times as long as it needs."""
 
 GUESSES, GUESS_BOX = 64, 0.1
 """Most far states from which Newton's method starts, and the side of the boxes with one start each."""
@@ -118,12 +122,13 @@ def equilibria_near(point: Point, states: np.ndarray, geometry: Geometry) -> lis
     number.
     """
     found = find_equilibria(point.integrates, states, point.packed, max_iterations=ITERATIONS)
-    scales = np.asarray(geometry.scales)
+    scales, rate = np.asarray(geometry.scales), natural_size(RATES * point.frequency)
     kept: list[Equilibrium] = []
     for i in np.flatnonzero(found.converged):
         if all(geometry.distance(found.states[i], other.state) > SAME_EQUILIBRIUM for other in kept):
             jacobian = found.jacobians[i] * scales / scales[:, None]
-            kept.append(Equilibrium(found.states[i], found.eigenvalues[i], float(found.residual[i]), jacobian))
+            residual = float(found.residual[i])
+            kept.append(Equilibrium(found.states[i], found.eigenvalues[i], residual, jacobian, rate=rate))
         if len(kept) == MOST:
             break
     if not kept:

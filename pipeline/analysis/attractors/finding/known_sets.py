@@ -29,6 +29,8 @@ class Equilibrium:
         Jacobian in units of the scales [1/s].
     approached_within : float
         Scaled distance from which trajectories on both sides came nearer; 0 if not tried or not seen.
+    rate : float
+        Order of magnitude of the flow's rates [1/s]; the Jacobian of a degenerate equilibrium may vanish.
     """
 
     state: np.ndarray
@@ -36,12 +38,14 @@ class Equilibrium:
     residual: float
     jacobian: np.ndarray
     approached_within: float = 0.0
+    rate: float = 1.0
 
     @cached_property
     def eigenvalue_error(self) -> float:
         """Estimated error of the largest real part of the eigenvalues [1/s]."""
         # the error of the state is its residual, or more if degenerate, and carries over to the Jacobian
-        size = max(RATE_ERROR, 1e-4 * float(np.sqrt(self.residual))) * float(np.abs(self.jacobian).max(initial=1.0))
+        fastest = float(np.abs(self.jacobian).max(initial=self.rate))
+        size = max(RATE_ERROR, 1e-4 * float(np.sqrt(self.residual))) * fastest
         return largest_error(self.jacobian, size, real=True)
 
     @cached_property

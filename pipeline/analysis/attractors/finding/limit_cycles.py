@@ -72,7 +72,7 @@ class _Crossings:
         packed, rate = np.append(self._packed, level)[None], np.array([self._rate])
         found = polish_orbits(packed, rate, path[-1:], np.array([near[0] + 1]), tolerance=residual, system=self._system)
         # one multiplier is 1, along the flow; with a second one the cycle lies in a family, and does not attract
-        if not found.converged[0] or orbit_of(found, 0).stability != ATTRACTS:
+        if not found.converged[0] or orbit_of(found, 0, self._system).stability != ATTRACTS:
             return None
         own = found.multipliers[0][:-1]  # the last one is 0: the direction of the flow
         multipliers = np.append(1.0 + 0.0j, own)

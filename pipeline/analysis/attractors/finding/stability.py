@@ -31,6 +31,9 @@ BY_NOTHING, BY_EIGENVALUES, BY_MULTIPLIERS, BY_APPROACH, BY_STAYING, BY_LEAVING,
 TIMES_LONGEST = 10.0
 """A sample has stayed long enough after this many times the longest transient seen."""
 
+ABOVE = 0.01
+"""Largest excess of a multiplier over 1 that rounding errors leave to an orbit which trajectories approach."""
+
 _TRIALS = 8
 
 
