@@ -20,7 +20,7 @@ from typing import Any
 
 from dask.threaded import get
 
-from pipeline.compute.order import Order, Predecessor, why
+from pipeline.compute.order import Order, Predecessor, TaskFailedError, why
 
 Task = Callable[[int], dict[str, Any]]
 
@@ -91,8 +91,21 @@ def in_threads(
     TaskFailedError
         As soon as so many tasks have failed that the cause cannot lie in single tasks.
     """
-    ended: SimpleQueue[tuple[int, dict[str, Any], str] | None] = SimpleQueue()
-    gate = Gate()
+    ended: SimpleQueue[dict[str, Any] | TaskFailedError | None] = SimpleQueue()
+    gate, books = Gate(), threading.Lock()
+    tried: set[int] = set()
+
+    def note(index: int, reason: str) -> None:
+        """Enter an ended task in the books, in its own thread: no task begins between too many failures and the end."""
+        with books:
+            tried.add(index)
+            if not reason:
+                return order.done(index)
+            try:
+                order.failed(index, reason)
+            except TaskFailedError as given_up:
+                gate.close()
+                ended.put(given_up)
 
     def attempt(index: int, *is_done: bool) -> bool:
         """Run a task whose predecessor is done, and return whether it is done as well."""
@@ -103,7 +116,9 @@ def in_threads(
             result, reason = task(index), ""
         except BaseException as error:
             result, reason = {}, why(error)
-        ended.put((index, result, reason))
+        note(index, reason)
+        if not reason:
+            ended.put(result)
         return not reason
 
     def compute(chosen: Collection[int]) -> None:
@@ -118,19 +133,14 @@ def in_threads(
             finally:
                 ended.put(None)
 
-    tried: set[int] = set()
     chosen: Collection[int] = set(indices)
     try:
         while chosen:
             threading.Thread(target=compute, args=(chosen,), daemon=True).start()
             while (end := ended.get()) is not None:
-                index, result, reason = end
-                tried.add(index)
-                if reason:
-                    order.failed(index, reason)
-                else:
-                    order.done(index)
-                    yield result
+                if isinstance(end, TaskFailedError):
+                    raise end
+                yield end
             chosen = _rest(order, tried)
     finally:
         gate.close()
