@@ -6,6 +6,7 @@ component. Results do not depend on the order of rows, and the work is not quadr
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -117,6 +118,16 @@ def rows_by_number(numbers: np.ndarray) -> dict[int, np.ndarray]:
     found, begins = np.unique(numbers[order], return_index=True)
     rows = np.split(order, begins)[1:]
     return {number: own for number, own in zip(found.tolist(), rows, strict=True) if number >= 0}
+
+
+def looked_up(values: Mapping[int, int], keys: np.ndarray, default: np.ndarray | int) -> np.ndarray:
+    """Return the value of each key of an array in a mapping, and a default for keys that are not in it."""
+    if not values:
+        return np.full(len(keys), default, np.int64) if np.ndim(default) == 0 else np.asarray(default)
+    known = np.array(sorted(values), keys.dtype)
+    found = np.array([values[key] for key in sorted(values)], np.int64)
+    at = np.minimum(np.searchsorted(known, keys), len(known) - 1)
+    return np.where(known[at] == keys, found[at], default)
 
 
 def hashes(rows: np.ndarray) -> np.ndarray:

@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+import sys
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from magpend_core.status import Status
-from pipeline.analysis.attractors.describing.labelling import _preserves_volume
-from pipeline.analysis.attractors.extension.extending import Outcome, extend
+from pipeline.analysis.attractors.describing.labelling import (
+    _label_courses,
+    _Labels,
+    _preserves_volume,
+    _representatives,
+)
+from pipeline.analysis.attractors.extension.extending import Outcome, _Extension, extend
 from pipeline.analysis.attractors.extension.growth import growth_of, on_closed_curves
 from pipeline.analysis.attractors.finding.cell_blocks import Block
 from pipeline.analysis.attractors.finding.closed_orbits import Orbit
@@ -26,6 +34,7 @@ class MapPoint:
     """Cells of a map in place of a parameter point."""
 
     can_rest, is_flow, n_neutral = False, False, 0
+    at_rest = on_cycle = None
 
     def __init__(self, step, slope, starts, seen=N_KEEP):
         self.step, self.slope = step, slope
@@ -277,3 +286,33 @@ def test_on_closed_curves__curves_but_no_arcs_clouds_or_points():
     assert not on_closed_curves(circle * 0.999 ** np.arange(600)[:, None], geometry)
     # a doubled circle of a width that the points resolve
     assert not on_closed_curves(circle * (1.0 + 0.05 * rng.uniform(-1, 1, (600, 1))), geometry)
+
+
+def calls_of(work, n):
+    """Count the calls of functions that a piece of work on `n` cells of one point makes."""
+    geometry = Geometry((False,), (1.0,))
+    settings = Settings(1e-8, 1e-8, 100, 1e-5, 4, 1e-10, N_KEEP, None, "", geometry)
+    point = MapPoint(lambda x: np.mod(3.1 * x, 1.0), None, np.random.default_rng(0).uniform(size=(n, 1)))
+    extension, group = _Extension(point, [], settings, 1.0), np.arange(n) % 3
+    courses = extension.sample(np.arange(n), 24)
+    for course, cell in zip(courses, range(3), strict=False):
+        course.cell, course.end = cell, cell
+    search = SimpleNamespace(settings=settings, geometry=geometry)
+    works = {
+        "sample": lambda: extension.sample(np.arange(n), 24),
+        "label": lambda: _label_courses(point, Outcome([], courses, []), _Labels.of(n), group, search),
+        "represent": lambda: _representatives(next(point.blocks()), group, {}, geometry),
+    }
+    found = []
+    sys.setprofile(lambda frame, event, arg: found.append(event in ("call", "c_call")))
+    try:
+        works[work]()
+    finally:
+        sys.setprofile(None)
+    return sum(found)
+
+
+@pytest.mark.parametrize("work", ["sample", "label", "represent"])
+def test_extend__calls_do_not_grow_with_cells(work):
+    """All of a million cells may be on no known set."""
+    assert calls_of(work, 4000) <= 1.2 * calls_of(work, 500)

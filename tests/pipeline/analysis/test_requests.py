@@ -43,3 +43,15 @@ def test_answer_all__tells_no_time_left_that_is_wrong(monkeypatch):
         left = re.search(r"([\d.]+) s left", line)
         assert left is None or float(left[1]) > 0.5 * (now[0] - at), line
     assert lines[-1][1] == f"{EXTENDING}: 15 of 20 (75 %), {duration(now[0])} so far"
+
+
+def test_answer_all__a_point_moves_while_its_cells_are_extended(monkeypatch):
+    def work():
+        for spent in (0.0, 0.25, 0.5):
+            yield Leg(np.zeros((1, 1)), np.zeros(1), spent)
+
+    told = []
+    monkeypatch.setattr(requests, "_legs", lambda asked, points, settings: dict.fromkeys(asked))
+    with reporting(lambda what, done, total, expected_s=0.0: told.append((done, total))):
+        answer_all({(0,): work(), (1,): work()}, {}, None)
+    assert list(dict.fromkeys(told)) == [(0, 2), (0.5, 2), (1.0, 2), (2, 2)]

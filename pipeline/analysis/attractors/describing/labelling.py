@@ -12,7 +12,8 @@ from pipeline.analysis.attractors.describing import features as feature
 from pipeline.analysis.attractors.describing.features import Cells, Features
 from pipeline.analysis.attractors.extension.bounded_sets import BoundedSet
 from pipeline.analysis.attractors.extension.clouds import members
-from pipeline.analysis.attractors.extension.courses import DIVERGED, rest_number
+from pipeline.analysis.attractors.extension.courses import AT_REST as RESTS
+from pipeline.analysis.attractors.extension.courses import DIVERGED, ON_SET, rest_number
 from pipeline.analysis.attractors.extension.extending import Outcome, extend
 from pipeline.analysis.attractors.extension.lifetimes import lifetime_interval
 from pipeline.analysis.attractors.finding import stability
@@ -26,7 +27,7 @@ from pipeline.analysis.attractors.finding.probing import is_approaching, probe_e
 from pipeline.analysis.attractors.finding.requests import Slopes, Work
 from pipeline.analysis.attractors.finding.searching import Search, State, search_orbits
 from pipeline.analysis.attractors.finding.spirals import keys_of
-from pipeline.analysis.sets import Geometry, order_by_points, rows_by_number
+from pipeline.analysis.sets import Geometry, looked_up, order_by_points, rows_by_number
 from pipeline.analysis.sides import UNKNOWN
 from pipeline.analysis.tolerances import PRESERVED_VOLUME, VOLUME_RTOL
 from pipeline.layout.vocabulary import (
@@ -228,17 +229,15 @@ def _label_courses(point: Point, found: Outcome, labels: _Labels, groups: np.nda
     elsewhere = _is_elsewhere(point)
     for block in point.blocks():
         rows = np.flatnonzero((block.is_closed | block.is_bounded) & (labels.label[block.cells] < 0))
+        cells = rows + block.cells.start
+        rows, cells = rows[~elsewhere[cells]], cells[~elsewhere[cells]]
         keys = keys_of(block.section[rows], search.settings.closure, search.geometry)
-        for cell, key in zip((rows + block.cells.start).tolist(), keys.tolist(), strict=True):
-            end = ends.get(key, by_group.get(int(groups[cell])) if groups[cell] >= 0 else None)
-            if end is None or elsewhere[cell]:
-                continue
-            if end >= 0:
-                labels.put(np.array([cell]), end, EXTENDED)
-            elif end == DIVERGED:
-                labels.decision[cell] = DIVERGES
-            elif (number := rest_number(end)) is not None and point.at_rest is not None:
-                point.at_rest[cell] = number
+        end = looked_up(ends, keys, looked_up(by_group, groups[cells], ON_SET))
+        labels.put(cells[end >= 0], end[end >= 0], EXTENDED)
+        labels.decision[cells[end == DIVERGED]] = DIVERGES
+        if point.at_rest is not None:
+            rests = end <= RESTS
+            point.at_rest[cells[rests]] = RESTS - end[rests]
 
 
 def _label_raw(point: Point, state: State, groups: np.ndarray, labels: _Labels, search: Search) -> list[Orbit]:
@@ -279,9 +278,9 @@ def _label_ends(block: Block, ends: Mapping[int, int], label: np.ndarray, decisi
     place.
     """
     rest = np.flatnonzero(block.is_closed & (label[block.cells] < 0))
-    for row, mark in zip(rest, block.marks[rest], strict=True):
-        if int(mark) in ends:
-            label[row + block.cells.start], decision[row + block.cells.start] = ends[int(mark)], EXTENDED
+    end = looked_up(ends, block.marks[rest], -1)
+    own = rest[end >= 0] + block.cells.start
+    label[own], decision[own] = end[end >= 0], EXTENDED
 
 
 def _representatives(
@@ -291,14 +290,13 @@ def _representatives(
     exactly.
     """
     rows = np.flatnonzero(group >= 0)
-    if not len(rows):
-        return
-    for row, mark in zip(rows, block.marks[rows], strict=True):
-        p = min(int(block.orbit_period[row]), block.section.shape[1])
-        section = block.section[row]
-        back = section[-1 - p] if section.shape[0] > p else section[-1]
-        entry = (float(geometry.distance(section[-1], back)), int(mark), section[-p:])
-        g = int(group[row])
+    last, n = block.section[rows, -1], block.section.shape[1]
+    periods = np.minimum(block.orbit_period[rows], n)
+    back = block.section[rows, np.where(n > periods, n - 1 - periods, n - 1)]
+    away, marks = geometry.distance(last, back), block.marks[rows]
+    order = np.lexsort((marks, away, group[rows]))
+    for i in order[np.unique(group[rows][order], return_index=True)[1]]:
+        g, entry = int(group[rows[i]]), (float(away[i]), int(marks[i]), block.section[rows[i], -periods[i] :])
         if g not in best or entry[:2] < best[g][:2]:
             best[g] = entry
 

@@ -171,11 +171,12 @@ class Cloud:
         away = geometry.tree(half).query(geometry.scaled(rest), p=np.inf)[0] if len(rest) else np.zeros(1)
         return cls(geometry.tree(points), max(float(np.quantile(away, 0.99)), least))
 
-    def distances(self, section: np.ndarray, geometry: Geometry) -> np.ndarray:
+    def distances(self, section: np.ndarray, geometry: Geometry, most: float = np.inf) -> np.ndarray:
         """Return the distance of each section point (..., state) from the set, in units of the spacing of the set's
-        points.
+        points. A distance above `most` may be infinite, which ends the search for it sooner.
         """
-        away = self.tree.query(geometry.scaled(section), p=np.inf)[0]
+        bound = 1.001 * most * self.spacing
+        away = self.tree.query(geometry.scaled(section), p=np.inf, distance_upper_bound=bound)[0]
         return np.asarray(away / self.spacing)
 
 
@@ -183,7 +184,7 @@ def members(section: np.ndarray, clouds: Sequence[Cloud], geometry: Geometry) ->
     """Return the index of the set (in `clouds`) on which each cell's section points lie; -1 for none."""
     if not clouds or not len(section):
         return np.full(len(section), -1, np.int64)
-    away = np.stack([cloud.distances(section, geometry) for cloud in clouds])
+    away = np.stack([cloud.distances(section, geometry, REACHED) for cloud in clouds])
     inside = (away <= REACHED).mean(axis=2)
     middle = np.median(away, axis=2)
     best = np.where(inside >= INSIDE, middle, np.inf).argmin(axis=0)

@@ -158,22 +158,24 @@ class _Extension:
         """Choose at most `n` unassigned cells to integrate further. The choice is reproducible, and takes one cell from
         each box of section points.
         """
-        known = {course.key for course in self.courses}
-        best: dict[int, tuple[int, int, np.ndarray, float]] = {}
+        known = np.array([course.key for course in self.courses], np.uint64)
+        best: dict[int, tuple[int, Course]] = {}
         is_loose = np.zeros(self.point.n_cells, bool)
         is_loose[loose] = True
         for block in self.point.blocks():
             rows = np.flatnonzero(is_loose[block.cells] & (block.is_bounded | block.is_closed))
-            section = block.section[rows]
-            keys, marks = keys_of(section, self.settings.closure, self.geometry), block.marks[rows]
-            for row, key, mark in zip(rows, keys.tolist(), marks.tolist(), strict=True):
-                if key not in known and (key not in best or mark < best[key][0]):
+            keys = keys_of(block.section[rows], self.settings.closure, self.geometry)
+            new = np.flatnonzero(~np.isin(keys, known))
+            rows, keys, marks = rows[new], keys[new], block.marks[rows[new]]
+            # the least hash of each box, and of these the least `n`
+            order = np.argsort(marks, kind="stable")
+            order = order[np.sort(np.unique(keys[order], return_index=True)[1])[:n]]
+            for row, key, mark in zip(rows[order], keys[order].tolist(), marks[order].tolist(), strict=True):
+                if key not in best or mark < best[key][0]:
                     step = 0.0 if block.step is None else float(np.nan_to_num(block.step[row]))
-                    best[key] = mark, int(row) + block.cells.start, block.section[row], step
-            if len(best) > 4 * n:  # keep those of least hash, to bound the memory
-                best = dict(sorted(best.items(), key=lambda item: item[1][0])[: 2 * n])
-        chosen = sorted(best.items(), key=lambda item: item[1][0])[:n]
-        return [Course(cell, key, kept, kept[-1], step) for key, (_, cell, kept, step) in chosen]
+                    kept = block.section[row].copy()
+                    best[key] = mark, Course(int(row) + block.cells.start, key, kept, kept[-1], step)
+        return [course for _, course in sorted(best.values(), key=lambda item: item[0])[:n]]
 
     def left_of(self, loose: np.ndarray) -> np.ndarray:
         """Return the cells of `loose` whose end is still open: not integrated further, and on no set whose stability is
@@ -250,7 +252,8 @@ class _Extension:
             # extend the shortest courses first: those of a later round
             least = min(course.length for course in going)
             going = [course for course in going if course.length == least]
-            leg: Extended = yield Leg(np.array([c.state for c in going]), np.array([c.step for c in going]))
+            states, steps = np.array([c.state for c in going]), np.array([c.step for c in going])
+            leg: Extended = yield Leg(states, steps, self.spent / self.budget)
             self.spent += LEG * len(going)
             yield from self._take(going, leg)
 

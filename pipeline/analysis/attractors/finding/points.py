@@ -20,12 +20,16 @@ from pipeline.analysis.attractors.finding.cell_blocks import Block, marks_of
 from pipeline.analysis.attractors.finding.known_sets import Cycle, Equilibrium
 from pipeline.analysis.sets import Geometry
 from pipeline.layout.vocabulary import FREQUENCY_DIM, frequency_of, model_of, parameters_of, split_dims
+from pipeline.products.reporting import UNTOLD, report
 
 _READ = ("section", "status", "orbit_period", "turns", "rest_state", "return_time", "n_periods", "step_size")
 """Variables that are read from a cube."""
 
 _MARK = "mark"
 """Hashes of the cells' sections beside these variables: many short rows are hashed at the price of a few."""
+
+PASSING = "passing through the cells of a point"
+"""Name of the work while the blocks of a parameter point are read one after another."""
 
 BUDGET = 256 * 2**20
 """Most memory for sections held at once [bytes]."""
@@ -182,7 +186,10 @@ class Point:
         return int(self.cube.sizes["state"])
 
     def blocks(self) -> Iterator[Block]:
-        """Yield all cells in blocks, in the order of their initial conditions (or branches, in a continuation)."""
+        """Yield all cells in blocks, in the order of their initial conditions (or branches, in a continuation).
+
+        Several blocks take time: the number of cells that are done is reported as progress.
+        """
         first = self.start_dims[0] if self.start_dims else None
         length = self.cube.sizes[first] if first else 1
         inner = self.n_cells // max(length, 1)
@@ -194,6 +201,7 @@ class Point:
         for begin in range(0, length, step):
             part = self.cube.isel({first: slice(begin, begin + step)})
             n = min(step, length - begin) * inner
+            report(PASSING, begin * inner, self.n_cells, UNTOLD)
             yield self._known(self._read(part, slice(begin * inner, begin * inner + n), n))
 
     def _known(self, block: Block) -> Block:

@@ -35,11 +35,12 @@ LEG = 64
 class Leg:
     """Request to integrate trajectories over some more sections, from states (n, state) with step sizes (n,).
 
-    With a step size of 0 the engine chooses the step.
+    With a step size of 0 the engine chooses the step. `spent` is the part of the point's budget that is spent.
     """
 
     state: np.ndarray
     step: np.ndarray
+    spent: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -157,8 +158,8 @@ def answer_all(
     """Run the analyses of all parameter points side by side, and answer their requests together. Return the result of
     each point.
 
-    Progress is the number of points that are decided. A point may take a thousand times longer than another, so this
-    number does not tell the time left.
+    Progress is the number of points that are decided, and of a point whose cells are extended the part of its budget
+    that is spent. A point may take a thousand times longer than another, so this number does not tell the time left.
     """
     results: dict[tuple[int, ...], T] = {}
     answers: dict[tuple[int, ...], Any] = dict.fromkeys(works)
@@ -174,9 +175,9 @@ def answer_all(
         legs = {index: request for index, request in asked.items() if isinstance(request, Leg)}
         guesses = {index: request for index, request in asked.items() if isinstance(request, Polish)}
         slopes = {index: request for index, request in asked.items() if isinstance(request, Slopes)}
-        if legs and what != EXTENDING:
-            what = EXTENDING
-            report(what, len(results), len(works), UNTOLD)
+        what = EXTENDING if legs else what
+        spent = sum(leg.spent for leg in legs.values())
+        report(what, round(len(results) + spent, 2), len(works), UNTOLD)
         answers = _legs(legs, points, settings) if legs else {}
         answers |= _polished(guesses, points, settings) if guesses else {}
         answers |= _slopes(slopes, points, settings) if slopes else {}
