@@ -52,7 +52,7 @@ def plot_rates(
     if len(dims) != 1:
         raise ValueError(
             f"rates are drawn over one axis, and {len(dims)} are left ({', '.join(dims) or 'none'}); choose values "
-            "of the others with at, or draw --show paths"
+            "of the others with at, or draw --show=paths"
         )
     along, kramers = dims[0], dims[0] == strength_dim(dims)
     axis = part[along]
