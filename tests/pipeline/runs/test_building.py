@@ -46,6 +46,21 @@ equations = { x = "v", v = "-k*x - 0.2*v + A*cos(2*pi*f*t)" }
 """
 
 
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (lambda s: s.parameters(A=0.4), r"parameters\.A: .* is given by overrides=\{'A': 0\.4\}"),
+        (lambda s: s.parameters(overides={}), r"parameters\.overides: unknown key; did you mean overrides\?"),
+        (lambda s: s.integration(n_transients=4), r"integration\.n_transients: unknown key; did you mean n_transient"),
+        (lambda s: s.axis("A", stap=0.3), r"axis\.stap: unknown key; did you mean st"),
+        (lambda s: s.extremes(quantites=["x"]), r"extremes\.quantites: unknown key; did you mean quantities\?"),
+    ],
+)
+def test_methods__say_what_is_right_for_an_unknown_keyword(wrong, message):
+    with pytest.raises(TypeError, match=message):
+        wrong(magpend.Spec("sweep"))
+
+
 def oscillator():
     return magpend.model(EQUATIONS, name="oscillator", states={"x": "m", "v": "m/s"}, k=1.0, A=0.5)
 
