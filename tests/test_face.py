@@ -340,6 +340,9 @@ def test_accessor__knows_model_run_and_cells(run):
         ds.magpend.sel_cell(frequency=0.225)
     with pytest.raises(ValueError, match="unknown axis 'q'"):
         ds.magpend.sel_cell(q=1.0)
+    for choose in (ds.magpend.sel_cell, lambda **at: magpend.plot_bifurcation(ds, at=at)):
+        with pytest.raises(ValueError, match="unknown axis 'freqency'; did you mean frequency"):
+            choose(freqency=0.2)
 
 
 @pytest.mark.slow

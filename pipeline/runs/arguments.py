@@ -70,7 +70,7 @@ def names_arguments(function: Callable[P, T]) -> Callable[P, T]:
         signature = inspect.signature(function)
         kinds = {name: str(p.annotation) for name, p in signature.parameters.items()}
         name = kwargs.get("name", args[1] if len(args) > 1 and "name" in kinds else "")
-        product = {**FIGURES, **ANALYSES}.get(str(name)) if "name" in kinds else None
+        product: Any = {**FIGURES, **ANALYSES}.get(str(name)) if "name" in kinds else None
         with contextlib.ExitStack() as stack:
             stack.enter_context(arguments_in_errors(kinds))
             if product is not None:

@@ -36,6 +36,8 @@ REFUSED = {
     "run": "Missing argument",
     "run no-such-workflow": "no-such-workflow",
     "run quickstrt": "did you mean quickstart?",
+    "run spce.toml": "spce.toml: no such file; did you mean spec.toml?",
+    "run spce": "spce: no such file; did you mean spec.toml?",
     "run spec.toml --workers nan": "--workers",
     "status .": "no run directory",
     "stauts run": "did you mean status",
