@@ -1,4 +1,4 @@
-"""Define what commands share: arguments, the list of exit codes, the output of tables."""
+"""Define what commands share: arguments, the output of tables."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from pipeline.cli import console
-from pipeline.cli.exits import Exit
 from pipeline.cli.outputs import check_file, check_table
 
 if TYPE_CHECKING:
@@ -20,8 +19,6 @@ UsageError: Any = typer.BadParameter.__base__
 """The error class of the command line for unknown words, from typer's own copy of click."""
 
 CommandError: Any = UsageError.__base__
-
-EXIT_HELP = "Exit codes: " + "; ".join(f"{int(code)} {code.sentence}" for code in Exit) + "."
 
 # str, since Path would turn the two slashes of s3://BUCKET into one
 Directory = Annotated[str, typer.Argument(metavar="DIR", help="Run directory, or s3://BUCKET/PREFIX.")]

@@ -9,7 +9,7 @@ import typer
 from typer.core import TyperGroup
 from typer.main import get_command
 
-from pipeline.cli.common import EXIT_HELP, UsageError
+from pipeline.cli.common import UsageError
 from pipeline.cli.options import Command, speaking
 
 SETTINGS = {"help_option_names": ["-h", "--help"]}
@@ -18,7 +18,7 @@ SETTINGS = {"help_option_names": ["-h", "--help"]}
 def made(name: str, function: Command, help: str) -> Any:
     """Turn a Python function into a command of the command line."""
     app = typer.Typer(add_completion=False, rich_markup_mode=None)
-    app.command(name, help=help, epilog=EXIT_HELP, context_settings=SETTINGS)(speaking(function))
+    app.command(name, help=help, context_settings=SETTINGS)(speaking(function))
     return get_command(app)
 
 
@@ -31,7 +31,7 @@ def add_command(
     app: typer.Typer, function: Command, name: str | None = None, settings: Mapping[str, Any] | None = None
 ) -> None:
     """Add a Python function to a command group, with the options that all commands share."""
-    app.command(name, epilog=EXIT_HELP, context_settings={**SETTINGS, **(settings or {})})(speaking(function))
+    app.command(name, context_settings={**SETTINGS, **(settings or {})})(speaking(function))
 
 
 _MOVED = {"branches": "magpend analyse branches DIR", "analyze": "magpend analyse X DIR"}

@@ -23,11 +23,15 @@ from pipeline.store.run import Run
 
 
 @pytest.mark.slow
-def test_help__exit_codes(main):
-    for arguments in (["--help"], ["run", "--help"]):
-        text = " ".join(re.sub(r"[│╭╰╮╯─]", " ", main(*arguments)[1]).split())
-        for code in Exit:
-            assert f"{int(code)} {code.sentence}" in text
+def test_help__names_the_page_of_exit_codes_once(main):
+    (line,) = [line for line in main("--help")[1].splitlines() if "Exit codes:" in line]
+    page, _, anchor = line.split()[-1].partition("#")
+    text = (Path(__file__).parents[3] / page).read_text("utf-8")
+    assert f"## {anchor.replace('-', ' ').capitalize()}" in text.splitlines()
+    for code in Exit:
+        assert f"| {int(code)} | {code.sentence} |" in text
+    for command in (("run",), ("analyse", "attractors"), ("plot", "basins")):
+        assert "Exit codes:" not in main(*command, "--help")[1]
     for command in ("run", "status", "verify", "analyse", "plot", "simulate", "models", "presets"):
         assert command in main("--help")[1]
 
