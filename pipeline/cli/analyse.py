@@ -23,7 +23,7 @@ def _make(name: str) -> Any:
 
     analysis = ANALYSES[name]
 
-    def command(directory: Directory, options: Any, csv: Csv = None, json: Json = False) -> None:
+    def command(directory: Directory, options: Any, csv: Csv = None, json: Json = None) -> None:
         from pipeline.products.product import function_of
         from pipeline.runs.derive import derive
         from pipeline.specification.problems import SpecError

@@ -6,19 +6,32 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import typer
-from typer.core import TyperGroup
+from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command
 
-from pipeline.cli.common import UsageError
+from pipeline.cli.common import PRINTED, UsageError
 from pipeline.cli.options import Command, speaking
 
 SETTINGS = {"help_option_names": ["-h", "--help"]}
 
 
+class FileCommand(TyperCommand):
+    """A command whose option ``--json`` may be followed by a file: by a word that ends in ``.json``."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> Any:
+        """Give ``--json`` its value: the file, or the standard output."""
+        own = args[: args.index("--")] if "--" in args else args
+        if "--json" in own and any("--json" in parameter.opts for parameter in self.params):
+            at = own.index("--json")
+            has_file = own[at + 1 : at + 2] and own[at + 1].endswith(".json")
+            args = [*args[:at], f"--json={own[at + 1] if has_file else PRINTED}", *args[at + (2 if has_file else 1) :]]
+        return super().parse_args(ctx, args)
+
+
 def made(name: str, function: Command, help: str) -> Any:
     """Turn a Python function into a command of the command line."""
     app = typer.Typer(add_completion=False, rich_markup_mode=None)
-    app.command(name, help=help, context_settings=SETTINGS)(speaking(function))
+    app.command(name, cls=FileCommand, help=help, context_settings=SETTINGS)(speaking(function))
     return get_command(app)
 
 
@@ -31,7 +44,7 @@ def add_command(
     app: typer.Typer, function: Command, name: str | None = None, settings: Mapping[str, Any] | None = None
 ) -> None:
     """Add a Python function to a command group, with the options that all commands share."""
-    app.command(name, context_settings={**SETTINGS, **(settings or {})})(speaking(function))
+    app.command(name, cls=FileCommand, context_settings={**SETTINGS, **(settings or {})})(speaking(function))
 
 
 _MOVED = {"branches": "magpend analyse branches DIR", "analyze": "magpend analyse X DIR"}
