@@ -15,6 +15,8 @@ import magpend
 from pipeline.cli.exits import Exit
 from pipeline.layout.plan import make_plan
 from pipeline.plots import bifurcation
+from pipeline.products.guide import ANALYSIS_GUIDE, FIGURE_GUIDE
+from pipeline.products.registry import ANALYSES, COMMANDS, FIGURES
 from pipeline.runs import preview, workflows
 from pipeline.runs.preview import figure_command, first_figure
 from pipeline.specification.parsing import parse_spec
@@ -34,6 +36,25 @@ def test_help__names_the_page_of_exit_codes_once(main):
         assert "Exit codes:" not in main(*command, "--help")[1]
     for command in ("run", "status", "verify", "analyse", "plot", "simulate", "models", "presets"):
         assert command in main("--help")[1]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("verb", "guide", "names"), [("analyse", ANALYSIS_GUIDE, COMMANDS), ("plot", FIGURE_GUIDE, tuple(FIGURES))]
+)
+def test_help__groups_products_by_what_they_need(main, verb, guide, names):
+    needs = {name: words for group in guide.values() for name, words in group.items()}
+    assert sorted(needs) == sorted(names)
+    assert sum(map(len, guide.values())) == len(names)
+    lines = main(verb, "--help")[1].splitlines()
+    assert [line.rstrip(":") for line in lines if line.rstrip(":") in guide] == list(guide)
+    text = " ".join(" ".join(lines).split())
+    for name, words in needs.items():
+        assert f" {name} " in text
+        assert words in text
+        if verb == "analyse":
+            assert ("noise" in words) == ANALYSES[name].noisy
+            assert ("drift" in words) == ANALYSES[name].for_drift
 
 
 REFUSED = {
