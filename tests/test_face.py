@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import pickle
 import shutil
 import sys
 from pathlib import Path
@@ -23,8 +24,10 @@ from pipeline.plots.targets import GuestFigure
 from pipeline.products.product import Options
 from pipeline.products.registry import ANALYSES, COMMANDS, FIGURES
 from pipeline.runs import python
+from pipeline.runs.arguments import in_python
 from pipeline.runs.workflows import read_given
 from pipeline.specification.problems import SpecError
+from pipeline.store.errors import RefusedError
 
 RESONANCE = {
     "kind": "continuation",
@@ -113,6 +116,52 @@ def test_run__function_returns_the_run_with_methods(run):
     assert run.status().complete
     assert "20 of 20 cells" in str(run.status())
     assert run.verify().sound
+
+
+@pytest.mark.parametrize(
+    ("text", "wanted"),
+    [
+        ("give another --out.", "give another out=."),
+        ("draw a map with --map", "draw a map with as_map=True"),
+        ("such as --at q=1.5, or leave out --map", "such as at={'q': 1.5}, or leave out as_map=True"),
+        ("--closest 0.1 must be less than --farthest 1e-3: a", "closest=0.1 must be less than farthest=1e-3: a"),
+        ("try --between 0 1; or --no-extend", "try between=(0, 1); or extend=False"),
+        ("--posterior runs/a.b: has no file", "posterior='runs/a.b': has no file"),
+        ("--parameter=q or --axis NAME=LOW:HIGH", "parameter='q' or ranges={'NAME': (LOW, HIGH)}"),
+        ("run it again: magpend run SPEC --out runs/a.b --at q=1, or give --out DIR",
+         "run it again: magpend run SPEC --out runs/a.b --at q=1, or give out=DIR"),
+        ("--unknown 3", "--unknown 3"),
+    ],
+)  # fmt: skip
+def test_errors__name_arguments(text, wanted):
+    kinds = dict.fromkeys(("out", "at", "closest", "farthest", "between", "posterior", "parameter", "ranges"), "str")
+    assert in_python(text, {**kinds, "as_map": "bool", "extend": "bool"}, {"map": "as_map"}) == wanted
+
+
+@pytest.mark.slow
+def test_errors__name_arguments_at_every_door(run, tmp_path, command):
+    figure = run.plot.lyapunov
+    for call in (
+        lambda: figure(as_map=True),
+        lambda: run.cube().magpend.plot.lyapunov(as_map=True),
+        lambda: magpend.figure(run, "lyapunov", as_map=True),
+    ):
+        with pytest.raises(SpecError, match="leave out as_map=True"):
+            call()
+    two = run.cube().expand_dims(q=[1.0, 2.0])
+    with pytest.raises(SpecError, match=r"such as at=\{'q': 1\}, or draw a map with as_map=True"):
+        two.magpend.plot.lyapunov()
+    for call in (run.branches, run.table):
+        with pytest.raises(SpecError, match="low= must be less than high="):
+            call(*(["branches"] if call == run.table else []), low=0.2, high=0.1)
+    (tmp_path / "other").write_text("a file")
+    for given in (lambda out: magpend.run(RESONANCE, out), lambda out: magpend.Spec.read(RESONANCE).preview(out)):
+        with pytest.raises(RefusedError, match="give another out=") as caught:
+            given(tmp_path / "other")
+        assert "--" not in str(caught.value)
+    with pytest.raises(SpecError, match=r"axes=\{'NAME': \{'start': LOW, 'stop': HIGH, 'num': NUM\}\}"):
+        run.extend()
+    assert pickle.loads(pickle.dumps(magpend.figure)) is magpend.figure
 
 
 # ---- analyses and tables ------------------------------------------------------------------------
@@ -291,6 +340,9 @@ def test_accessor__knows_model_run_and_cells(run):
         ds.magpend.sel_cell(frequency=0.225)
     with pytest.raises(ValueError, match="unknown axis 'q'"):
         ds.magpend.sel_cell(q=1.0)
+    for choose in (ds.magpend.sel_cell, lambda **at: magpend.plot_bifurcation(ds, at=at)):
+        with pytest.raises(ValueError, match="unknown axis 'freqency'; did you mean frequency"):
+            choose(freqency=0.2)
 
 
 @pytest.mark.slow

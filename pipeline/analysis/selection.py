@@ -9,6 +9,7 @@ import numpy.typing as npt
 import xarray as xr
 
 from pipeline.layout.vocabulary import split_dims
+from pipeline.specification.problems import unknown_name
 
 Floats = npt.NDArray[np.float64]
 
@@ -48,7 +49,7 @@ def choose(ds: xr.Dataset, at: Mapping[str, float] | None, keep: tuple[str, ...]
     for name, value in (at or {}).items():
         allowed = [d for d in dims if d not in keep]
         if name not in allowed:
-            raise ValueError(f"unknown axis {name!r}; values can be chosen of: {', '.join(allowed) or 'none'}")
+            raise ValueError(unknown_name("axis", name, allowed))
         ds = ds.isel({name: place(ds[name], float(value))})
     left = [d for d in ds["attractor_id"].dims if d not in keep]
     long = [str(d) for d in left if ds.sizes[d] > 1]
@@ -119,8 +120,7 @@ def select_points(ds: xr.Dataset, at: Mapping[str, float] | None, *, purpose: st
     dims, _ = split_dims(ds["status"])
     for name, value in (at or {}).items():
         if name not in dims:
-            allowed = ", ".join(dims) or "none"
-            raise ValueError(f"unknown axis {name!r}; values can be chosen of: {allowed}")
+            raise ValueError(unknown_name("axis", name, map(str, dims)))
         index = place(ds[name], float(value))
         ds = ds.isel({name: slice(index, index + 1)})
     long = [d for d in dims if ds.sizes[d] > 1]

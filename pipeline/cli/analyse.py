@@ -18,12 +18,18 @@ def _names() -> list[str]:
     return list(COMMANDS)
 
 
+def _guide() -> Any:
+    from pipeline.products.guide import ANALYSIS_GUIDE
+
+    return ANALYSIS_GUIDE
+
+
 def _make(name: str) -> Any:
     from pipeline.products.registry import ANALYSES
 
     analysis = ANALYSES[name]
 
-    def command(directory: Directory, options: Any, csv: Csv = None, json: Json = False) -> None:
+    def command(directory: Directory, options: Any, csv: Csv = None, json: Json = None) -> None:
         from pipeline.products.product import function_of
         from pipeline.runs.derive import derive
         from pipeline.specification.problems import SpecError
@@ -43,7 +49,7 @@ def _make(name: str) -> Any:
 
 analyse_app = command_group(
     "Find attractors, basins, chaos and branches in a stored cube; results are kept in DIR/derived.",
-    registry_group("analyse", _names, _make),
+    registry_group("analyse", _names, _make, _guide),
 )
 
 

@@ -1,4 +1,4 @@
-"""Define what commands share: arguments, the list of exit codes, the output of tables."""
+"""Define what commands share: arguments, the output of tables."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from pipeline.cli import console
-from pipeline.cli.exits import Exit
-from pipeline.cli.outputs import check_file, check_table
+from pipeline.cli.outputs import check_document, check_file, check_place, check_table
 
 if TYPE_CHECKING:
     from pipeline.products.product import Table
@@ -21,15 +20,31 @@ UsageError: Any = typer.BadParameter.__base__
 
 CommandError: Any = UsageError.__base__
 
-EXIT_HELP = "Exit codes: " + "; ".join(f"{int(code)} {code.sentence}" for code in Exit) + "."
-
 # str, since Path would turn the two slashes of s3://BUCKET into one
 Directory = Annotated[str, typer.Argument(metavar="DIR", help="Run directory, or s3://BUCKET/PREFIX.")]
 Csv = Annotated[
     str | None,
     typer.Option("--csv", metavar="FILE", help="Write the table as CSV; - writes it to the standard output."),
 ]
-Json = Annotated[bool, typer.Option("--json", help="Write the table as JSON to the standard output.")]
+PRINTED = "-"
+"""Value of ``--csv`` and ``--json`` that stands for the standard output."""
+
+
+def _json_target(path: str | None) -> str | None:
+    check_target(path, "--json")
+    return path
+
+
+Json = Annotated[
+    str | None,
+    typer.Option(
+        "--json",
+        metavar="[FILE.json]",
+        callback=_json_target,
+        help="Write the result as JSON to a file, or without one to the standard output and nothing else.",
+    ),
+]
+"""`pipeline.cli.groups.FileCommand` gives it the value `PRINTED` if no file follows."""
 
 
 def read_pairs(option: str, texts: list[str], example: str) -> dict[str, float]:
@@ -50,20 +65,25 @@ def read_pairs(option: str, texts: list[str], example: str) -> dict[str, float]:
 
 def check_csv(path: str | None) -> None:
     """Raise an error if a CSV file cannot be written, before anything is computed."""
-    from pipeline.specification.problems import SpecError
-
-    if path not in (None, "-") and (Path(str(path)).is_dir() or not Path(str(path)).parent.is_dir()):
-        raise SpecError(f"--csv {path}: must be a file in a folder that exists.")
-    if path not in (None, "-"):
+    check_target(path, "--csv")
+    if path not in (None, PRINTED):
         check_file(Path(str(path)), "--csv")
 
 
-def tell(table: Table, csv: str | None, as_json: bool) -> None:
-    """Print a table: its text lines, its rows as JSON with `as_json`, or its rows as CSV if `csv` is ``-``."""
-    if csv == "-" and not as_json:
-        console.result(table.csv().rstrip("\n"))
-    else:
-        tell_data(json_rows(table), table.lines, as_json)
+def check_target(path: str | None, option: str) -> None:
+    """Raise an error if a file to write lies in no folder, or in a run directory."""
+    from pipeline.specification.problems import SpecError
+
+    if path is None or path == PRINTED:
+        return
+    if Path(path).is_dir() or not Path(path).parent.is_dir():
+        raise SpecError(f"{option} {path}: must be a file in a folder that exists.")
+    check_place(Path(path), option)
+
+
+def tell(table: Table, csv: str | None, as_json: str | None) -> None:
+    """Print a table as text, CSV or JSON, and write it to the files that `csv` and `as_json` name."""
+    tell_data(json_rows(table), [table.csv().rstrip("\n")] if csv == PRINTED else table.lines, as_json)
     if csv not in (None, "-"):
         from pipeline.layout.writing import write_atomically
 
@@ -73,12 +93,18 @@ def tell(table: Table, csv: str | None, as_json: bool) -> None:
         console.note(f"table: {csv}")
 
 
-def tell_data(data: Any, lines: Iterable[str], as_json: bool) -> None:
-    """Print a result: as lines, or as JSON with `as_json`."""
-    if as_json:
+def tell_data(data: Any, lines: Iterable[str], as_json: str | None) -> None:
+    """Print a result as lines or as JSON, and write it to the file that `as_json` names."""
+    if as_json == PRINTED:
         console.result(json.dumps(data, indent=1))
-    else:
-        console.result(*lines)
+        return
+    console.result(*lines)
+    if as_json is not None:
+        from pipeline.layout.writing import write_atomically
+
+        check_document(Path(as_json), data)
+        write_atomically(Path(as_json), json.dumps(data, indent=1) + "\n")
+        console.note(f"JSON: {as_json}")
 
 
 def json_rows(table: Table) -> list[dict[str, Any]]:

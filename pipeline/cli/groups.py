@@ -3,22 +3,38 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import typer
-from typer.core import TyperGroup
+from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command
 
-from pipeline.cli.common import EXIT_HELP, UsageError
+from pipeline.cli.common import PRINTED, UsageError
 from pipeline.cli.options import Command, speaking
 
+if TYPE_CHECKING:
+    from pipeline.products.guide import Guide
+
 SETTINGS = {"help_option_names": ["-h", "--help"]}
+
+
+class FileCommand(TyperCommand):
+    """A command whose option ``--json`` may be followed by a file: by a word that ends in ``.json``."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> Any:
+        """Give ``--json`` its value: the file, or the standard output."""
+        own = args[: args.index("--")] if "--" in args else args
+        if "--json" in own and any("--json" in parameter.opts for parameter in self.params):
+            at = own.index("--json")
+            has_file = own[at + 1 : at + 2] and own[at + 1].endswith(".json")
+            args = [*args[:at], f"--json={own[at + 1] if has_file else PRINTED}", *args[at + (2 if has_file else 1) :]]
+        return super().parse_args(ctx, args)
 
 
 def made(name: str, function: Command, help: str) -> Any:
     """Turn a Python function into a command of the command line."""
     app = typer.Typer(add_completion=False, rich_markup_mode=None)
-    app.command(name, help=help, epilog=EXIT_HELP, context_settings=SETTINGS)(speaking(function))
+    app.command(name, cls=FileCommand, help=help, context_settings=SETTINGS)(speaking(function))
     return get_command(app)
 
 
@@ -31,7 +47,7 @@ def add_command(
     app: typer.Typer, function: Command, name: str | None = None, settings: Mapping[str, Any] | None = None
 ) -> None:
     """Add a Python function to a command group, with the options that all commands share."""
-    app.command(name, epilog=EXIT_HELP, context_settings={**SETTINGS, **(settings or {})})(speaking(function))
+    app.command(name, cls=FileCommand, context_settings={**SETTINGS, **(settings or {})})(speaking(function))
 
 
 _MOVED = {"branches": "magpend analyse branches DIR", "analyze": "magpend analyse X DIR"}
@@ -51,8 +67,12 @@ class TopGroup(TyperGroup):
         return super().resolve_command(ctx, args)
 
 
-def registry_group(verb: str, names: Callable[[], list[str]], make: Callable[[str], Any]) -> type[TyperGroup]:
-    """Make a class of command groups, from a function that lists command names and one that creates a command."""
+def registry_group(
+    verb: str, names: Callable[[], list[str]], make: Callable[[str], Any], guide: Callable[[], Guide] = dict
+) -> type[TyperGroup]:
+    """Make a class of command groups, from functions that list command names, create a command, and tell what each
+    command needs.
+    """
 
     class Group(TyperGroup):
         def list_commands(self, ctx: Any) -> list[str]:
@@ -60,6 +80,19 @@ def registry_group(verb: str, names: Callable[[], list[str]], make: Callable[[st
 
         def get_command(self, ctx: Any, cmd_name: str) -> Any:
             return make(cmd_name) if cmd_name in names() else super().get_command(ctx, cmd_name)
+
+        def format_commands(self, ctx: Any, formatter: Any) -> None:
+            """Write the commands in groups, each with the run that it needs."""
+            told = guide()
+            others = [name for name in self.list_commands(ctx) if not any(name in needs for needs in told.values())]
+            for title, needs in {**told, "Others" if told else "Commands": dict.fromkeys(others, "")}.items():
+                if needs:
+                    with formatter.section(title):
+                        formatter.write_dl([(name, self._about(ctx, name, words)) for name, words in needs.items()])
+
+        def _about(self, ctx: Any, name: str, needs: str) -> str:
+            summary = self.get_command(ctx, name).get_short_help_str(200)
+            return f"{summary} Needs {needs}." if needs else summary
 
         def resolve_command(self, ctx: Any, args: list[str]) -> Any:
             """Find a command by name; raise an error with the right word order if the directory was given first."""

@@ -55,7 +55,7 @@ def identify(
     ],
     out: Annotated[Path | None, typer.Option(help="Directory; by default runs/NAME.")] = None,
     no_figures: Annotated[bool, typer.Option("--no-figures", help="Draw no figures.")] = False,
-    as_json: Json = False,
+    as_json: Json = None,
 ) -> None:
     """Identify the parameters that a specification names: magpend identify SPEC --out DIR.
 
@@ -78,7 +78,7 @@ def check(
     like: Annotated[
         int, typer.Option(min=0, help="Index of the fitted recording with the same mapping, drive and zeros.")
     ] = 0,
-    as_json: Json = False,
+    as_json: Json = None,
 ) -> None:
     """Test identified parameters on another recording, or on a table of measured orbits.
 
@@ -121,7 +121,7 @@ def posterior(
         str | None, typer.Option(help="Specification of the identification; --mcmc needs it if recordings were fitted.")
     ] = None,
     no_figures: Annotated[bool, typer.Option("--no-figures", help="Draw no figures.")] = False,
-    as_json: Json = False,
+    as_json: Json = None,
 ) -> None:
     """Draw parameter sets from an identification, and say how sure its diagram of measured orbits is.
 
@@ -152,7 +152,7 @@ def spread(
     attractors: Annotated[
         bool, typer.Option("--attractors", help="Find the attractors of each run, and match them over the draws.")
     ] = False,
-    as_json: Json = False,
+    as_json: Json = None,
     csv: Csv = None,
 ) -> None:
     """List how fractions of cells, attractors and bifurcations are distributed over the runs of a posterior."""
@@ -162,7 +162,7 @@ def spread(
     tell(spreading(folder, branches=branches, attractors=attractors, echo=console.note), csv, as_json)
 
 
-def _check_orbits(directory: Path, table: Path, as_json: bool) -> None:
+def _check_orbits(directory: Path, table: Path, as_json: str | None) -> None:
     from pipeline.rig.identify.check_orbits import check_orbits
     from pipeline.rig.identify.orbit_reports import orbit_lines
 
@@ -177,7 +177,7 @@ def _check_orbits(directory: Path, table: Path, as_json: bool) -> None:
 
 def compare(
     directories: Annotated[list[Path], typer.Argument(metavar="DIR...", help="Finished identifications.")],
-    as_json: Json = False,
+    as_json: Json = None,
     csv: Csv = None,
 ) -> None:
     """Compare identifications by their errors on held-out pieces or orbits; the best one comes first."""

@@ -23,7 +23,7 @@ def fit_magnet(
         Path | None, typer.Option(metavar="DIR", help="Folder of the results; by default named after the header.")
     ] = None,
     no_figures: Annotated[bool, typer.Option("--no-figures", help="Draw no figures.")] = False,
-    json: Json = False,
+    json: Json = None,
 ) -> None:
     """Fit the magnets' torque to measured curves: a report, figures, and a preset for specifications.
 

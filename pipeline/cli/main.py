@@ -16,7 +16,7 @@ import typer
 
 from pipeline.cli.analyse import analyse_app
 from pipeline.cli.animate import animate
-from pipeline.cli.common import EXIT_HELP, CommandError
+from pipeline.cli.common import CommandError
 from pipeline.cli.console import EnoughError, visible
 from pipeline.cli.exits import Exit
 from pipeline.cli.explore import explore
@@ -44,7 +44,7 @@ app = typer.Typer(
     name="magpend",
     cls=TopGroup,
     help="Sweeps, continuations, attractors, basins and bifurcations of periodically forced systems.",
-    epilog=EXIT_HELP,
+    epilog="Exit codes: docs/reference/commands.md#exit-codes",
     no_args_is_help=True,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,

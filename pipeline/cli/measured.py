@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from pipeline.cli import console
-from pipeline.cli.common import Csv, Directory, Json, check_csv, json_rows, read_pairs, tell, tell_data
+from pipeline.cli.common import PRINTED, Csv, Directory, Json, check_csv, json_rows, read_pairs, tell, tell_data
 from pipeline.cli.groups import command_group, made, registry_group
 from pipeline.cli.options import taking
 from pipeline.cli.outputs import check_file, check_place
@@ -88,7 +88,7 @@ def steps(
     preset: Preset = None,
     settings: Set = None,
     csv: Csv = None,
-    as_json: Json = False,
+    as_json: Json = None,
 ) -> None:
     """List the frequency steps of a recorded sweep: frequency, jitter, duty cycle, orbit period and its confidence.
 
@@ -141,7 +141,7 @@ def compare(
     ],
     options: Any,
     csv: Csv = None,
-    as_json: Json = False,
+    as_json: Json = None,
 ) -> None:
     """Compare a measured sweep with the attractors of a run.
 
@@ -170,10 +170,11 @@ def compare(
             compared, computed, out, frame=Frame(options.width), state=options.state, degrees=options.degrees
         )
     steps_of, ends = steps_table(compared), edges_table(compared)
-    if as_json:
+    if as_json is not None:
         tell_data({"steps": json_rows(steps_of), "edges": json_rows(ends)}, (), as_json)
+    if as_json == PRINTED:
         return
-    tell(steps_of, csv, as_json=False)
+    tell(steps_of, csv, None)
     if csv == "-":
         return
     console.result(*ends.lines, *summary_lines(compared))
@@ -225,7 +226,7 @@ def branch(
     model: Annotated[str, typer.Option(help="Model of a CSV table without --over: its name, or a file.")] = "",
     out: Annotated[Path | None, typer.Option(help="Figure, .png, .pdf or .svg.")] = None,
     csv: Csv = None,
-    as_json: Json = False,
+    as_json: Json = None,
 ) -> None:
     """Measure recorded orbits along a parameter, stable and unstable, and compare them with a run's branches.
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json as json_text
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from pipeline.cli import console
+from pipeline.cli.common import Json, tell_data
 from pipeline.cli.exits import Exit
 from pipeline.cli.groups import add_command, command_group
 from pipeline.cli.models import all_of, described
@@ -37,7 +37,7 @@ def show(
         ),
     ],
     latex: Annotated[bool, typer.Option("--latex", help="Print only the equations, in LaTeX.")] = False,
-    json: Annotated[bool, typer.Option("--json", help="Print everything as JSON.")] = False,
+    json: Json = None,
 ) -> None:
     """Show a model's equations as magpend reads them, the detected discontinuities, and checks.
 
@@ -48,7 +48,7 @@ def show(
 
     model, found = examine(name)
     if json:
-        console.result(json_text.dumps(_as_dict(model, found), indent=1))
+        tell_data(_as_dict(model, found), _lines(model, found), json)
     elif latex:
         _latex(model, found)
     else:

@@ -35,7 +35,7 @@ def models(
             autocompletion=completing(names),
         ),
     ] = None,
-    json: Json = False,
+    json: Json = None,
 ) -> None:
     """List the models: their states, parameters, quantities and presets."""
     from magpend_core.models import load_model, model_names

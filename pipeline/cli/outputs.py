@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Collection
 from pathlib import Path
+from typing import Any
 
 _LOOKED_AT = 100_000
 """Bytes at both ends of a file that are searched for magpend's mark."""
@@ -82,6 +84,30 @@ def check_table(path: Path, header: str) -> None:
         first = file.readline(_LOOKED_AT).rstrip(b"\r\n")
     if first and first != header.encode():
         _refuse(path, "--csv")
+
+
+def check_document(path: Path, data: Any) -> None:
+    """Raise SpecError if a JSON file exists with other keys than `data`, since it may be another program's.
+
+    Raises
+    ------
+    SpecError
+        If such a file exists, unless ``--force`` is given.
+    """
+    if not path.is_file() or not path.stat().st_size:
+        return
+    try:
+        found = json.loads(path.read_text("utf-8"))
+    except ValueError:
+        _refuse(path, "--json")
+        return
+    if _keys(found) != _keys(data):
+        _refuse(path, "--json")
+
+
+def _keys(data: Any) -> set[str]:
+    rows = data if isinstance(data, list) else [data]
+    return set(rows[0]) if rows and isinstance(rows[0], dict) else set()
 
 
 def check_log(path: Path) -> None:

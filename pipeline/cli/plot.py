@@ -25,6 +25,12 @@ def _names() -> list[str]:
     return list(FIGURES)
 
 
+def _guide() -> Any:
+    from pipeline.products.guide import FIGURE_GUIDE
+
+    return FIGURE_GUIDE
+
+
 def _make(name: str) -> Any:
     from pipeline.products.registry import FIGURES
 
@@ -37,7 +43,7 @@ def _make(name: str) -> Any:
 
 
 plot_app = command_group(
-    "Draw figures from a stored cube; no cell is computed again.", registry_group("plot", _names, _make)
+    "Draw figures from a stored cube; no cell is computed again.", registry_group("plot", _names, _make, _guide)
 )
 
 

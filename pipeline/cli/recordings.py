@@ -35,7 +35,7 @@ def show(
         float | None, typer.Option(help="Window of the smoothing [s]; by default the data choose.")
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Figure, .png, .pdf or .svg.")] = None,
-    as_json: Json = False,
+    as_json: Json = None,
 ) -> None:
     """Describe a recording; with a mapping file, list the problems found in it and draw it.
 
@@ -184,7 +184,7 @@ def _smoothed(ds: xr.Dataset, wanted: bool, window_s: float | None) -> xr.Datase
     return smooth(ds, window_s=window_s) if wanted or window_s is not None else ds
 
 
-def _tell(ds: xr.Dataset, as_json: bool) -> None:
+def _tell(ds: xr.Dataset, as_json: str | None) -> None:
     from pipeline.rig.recordings.overview import describe_recording
 
     quantities, findings = describe_recording(ds)
@@ -195,7 +195,7 @@ def _tell(ds: xr.Dataset, as_json: bool) -> None:
     tell_data(told, [*quantities.lines, *findings.lines], as_json)
 
 
-def _draw(ds: xr.Dataset, out: Path, as_json: bool) -> None:
+def _draw(ds: xr.Dataset, out: Path, as_json: str | None) -> None:
     from pipeline.plots import save_figure
     from pipeline.rig.recordings.figure import plot_recording
 

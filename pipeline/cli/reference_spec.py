@@ -32,6 +32,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal, Self
 
+from pipeline.runs.arguments import knows_its_keys
+
 if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
@@ -172,7 +174,7 @@ def _method(method: Method) -> str:
     keys += ["**states"] if method.states is not None else []
     path = f'f"{method.path}"' if "{" in method.path else f'"{method.path}"'
     call = _call(f"return self.{'_replaced' if method.replaces else '_updated'}", path, keys)
-    return _signature(method.name, arguments) + _docstring(method.summary, notes) + call
+    return "    @knows_its_keys\n" + _signature(method.name, arguments) + _docstring(method.summary, notes) + call
 
 
 def _signature(name: str, arguments: Sequence[str]) -> str:

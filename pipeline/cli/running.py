@@ -136,7 +136,7 @@ def _plot(run: Run) -> None:
             console.result(left_out)
 
 
-def status(directory: Directory, json: Json = False) -> None:
+def status(directory: Directory, json: Json = None) -> None:
     """Print how much of a run is computed and stored, and how many cells have each status."""
     from pipeline.products.product import Table
     from pipeline.runs.status import describe_state, state

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from pipeline.cli.common import tell_data
+from pipeline.cli.common import Json, tell_data
 from pipeline.cli.outputs import check_file
 from pipeline.cli.running import Spec
 
@@ -38,7 +38,7 @@ def submit(
     smoke: Annotated[
         bool, typer.Option("--smoke", help="Run the specification's small size, which takes seconds.")
     ] = False,
-    json: Annotated[bool, typer.Option("--json", help="Write the explanation as JSON to the standard output.")] = False,
+    json: Json = None,
 ) -> None:
     """Submit a specification as a job of SLURM, PBS, Torque, Grid Engine or LSF, and print commands to watch and cancel
     the job.

@@ -85,7 +85,8 @@ class Where:
         if self.cluster_file is not None:
             raise SpecError(
                 f"--cluster {self.cluster_file}: says what a job of a batch system is, and --scheduler "
-                f"{wanted} asks for none; leave one of them out, or give --scheduler {' or '.join(QUEUES)}."
+                f"{wanted} asks for none; leave one of them out, or give "
+                f"{' or '.join(f'--scheduler={kind}' for kind in QUEUES)}."
             )
         if wanted.lower() in (THREADS, PROCESSES, IN_PROCESS):
             return wanted.lower()

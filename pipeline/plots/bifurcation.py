@@ -255,8 +255,11 @@ def swept_parameters(ds: xr.Dataset) -> list[str]:
     return list(split_dims(ds["status"])[0])
 
 
-def swept_parameter(ds: xr.Dataset) -> str:
-    """Return the one swept parameter of a result cube; raise ValueError if there are several or none."""
+def swept_parameter(ds: xr.Dataset, instead: str = "draw a map of regimes") -> str:
+    """Return the one swept parameter of a result cube; raise ValueError if there are several or none.
+
+    `instead` says what to draw over two parameters.
+    """
     outer = swept_parameters(ds)
     long = [dim for dim in outer if ds.sizes[dim] > 1]
     if len(long) > 1:
@@ -264,7 +267,7 @@ def swept_parameter(ds: xr.Dataset) -> str:
         value = float(np.asarray(ds[first].values)[0])
         raise ValueError(
             f"the cube sweeps {' and '.join(long)}, and a diagram has one axis for them; "
-            f"choose a value first, such as --at {first}={value:g}, or draw a map of regimes"
+            f"choose a value first, such as --at {first}={value:g}, or {instead}"
         )
     if not outer:
         raise ValueError("the cube sweeps no parameter: there is nothing to draw the sections over")

@@ -15,6 +15,7 @@ from pipeline.plots import labels, style
 from pipeline.plots.figure import Run, frame_of, noted, values_of
 from pipeline.products.figures import DensityFigureOptions
 from pipeline.products.noise import DensityOptions
+from pipeline.specification.problems import unknown_name
 
 CMAP = "cividis"
 _GAMMA = 0.5
@@ -49,7 +50,7 @@ def plot_density(
     dims = [str(d) for d in ds["n_peaks"].dims]
     for name, value in (at or {}).items():
         if name not in dims:
-            raise ValueError(f"unknown axis {name!r}; values can be chosen of: {', '.join(dims) or 'none'}")
+            raise ValueError(unknown_name("axis", name, dims))
         ds = ds.isel({name: place(ds[name], value)})
     part = ds.isel({d: 0 for d in dims if d in ds.dims and ds.sizes[d] == 1})
     left = [str(d) for d in part["n_peaks"].dims]

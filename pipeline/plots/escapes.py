@@ -17,6 +17,7 @@ from pipeline.plots import labels, style
 from pipeline.plots.figure import Run, frame_of, noted, values_of
 from pipeline.products.figures import EscapeFigureOptions
 from pipeline.products.noise import EscapeOptions
+from pipeline.specification.problems import unknown_name
 
 COLOURS = (style.BLUE, style.VERMILLION, style.GREEN, style.PURPLE, style.ORANGE, style.SKY)
 MARKERS = ("o", "s", "^", "D", "v", "P")
@@ -52,7 +53,7 @@ def plot_rates(
     if len(dims) != 1:
         raise ValueError(
             f"rates are drawn over one axis, and {len(dims)} are left ({', '.join(dims) or 'none'}); choose values "
-            "of the others with at, or draw --show paths"
+            "of the others with at, or draw --show=paths"
         )
     along, kramers = dims[0], dims[0] == strength_dim(dims)
     axis = part[along]
@@ -137,7 +138,7 @@ def _at(ds: xr.Dataset, at: Mapping[str, float] | None) -> xr.Dataset:
     dims = [str(d) for d in ds["rate"].dims if d != "set"]
     for name, value in (at or {}).items():
         if name not in dims:
-            raise ValueError(f"unknown axis {name!r}; values can be chosen of: {', '.join(dims) or 'none'}")
+            raise ValueError(unknown_name("axis", name, dims))
         ds = ds.isel({name: place(ds[name], value)})
     return ds.isel({d: 0 for d in dims if d in ds.dims and ds.sizes[d] == 1})
 

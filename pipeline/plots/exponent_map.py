@@ -59,8 +59,8 @@ def plot_lyapunov_map(
     swept = [d for d in swept_parameters(part) if part.sizes[d] > 1]
     if len(swept) != 2:
         raise ValueError(
-            f"a map is drawn over two swept parameters, and {len(swept)} are left "
-            f"({', '.join(swept) or 'none'}); choose values of the others with at"
+            f"a map is drawn over two swept parameters, and {len(swept)} are left ({', '.join(swept) or 'none'}); "
+            + ("choose values of the others with --at" if len(swept) > 2 else "leave out --map")
         )
     values = exponent_values(part, per, spectrum=False)
     largest = values["exponent_value"].isel(exponent=0, drop=True)

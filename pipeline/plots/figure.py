@@ -19,6 +19,7 @@ from pipeline.plots.style import DataFigure, Frame
 from pipeline.products.animation import AnimationOptions
 from pipeline.products.product import FigureOptions, Options, function_of
 from pipeline.products.registry import FIGURES
+from pipeline.specification.problems import unknown_name
 
 
 class Run(Protocol):
@@ -115,7 +116,7 @@ def values_of(run: Run, options: FigureOptions | AnimationOptions) -> tuple[dict
     axes = [str(d) for d in cube["status"].dims if d in cube.coords]
     for name in given:
         if name not in axes:
-            raise ValueError(f"unknown axis {name!r}; values can be chosen of: {', '.join(axes) or 'none'}")
+            raise ValueError(unknown_name("axis", name, axes))
     if not options.nearest:
         for name, value in given.items():
             place(cube[name], value)

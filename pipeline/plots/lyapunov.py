@@ -13,13 +13,14 @@ from matplotlib.collections import PolyCollection
 
 from pipeline.analysis.chaos.lyapunov import GOOD, check_exponents
 from pipeline.plots import labels, pixels, style
-from pipeline.plots.bifurcation import Diagram, with_diagram
+from pipeline.plots.bifurcation import Diagram, swept_parameter, with_diagram
 from pipeline.plots.exponent_map import plot_lyapunov_map
 from pipeline.plots.exponents import UNITS, exponent_values, rate_unit
 from pipeline.plots.figure import Run, frame_of, noted, values_of
 from pipeline.plots.missing_cells import absent_handles, draw_absent, shade_blank
 from pipeline.plots.motions import motions_of
 from pipeline.plots.points import Survey
+from pipeline.plots.selection import at_points
 from pipeline.products.figures import LyapunovFigureOptions
 
 EXPONENT_COLOURS = ("#332288", style.ORANGE, style.SKY, "#882255", "#5B3A1E", "#999933", "#44AA99", "#AA4499")
@@ -71,6 +72,7 @@ def plot_lyapunov(
     """
     style.check_choice("unit (per)", per, UNITS)
     check_exponents(ds)
+    swept_parameter(at_points(ds, at), "draw a map with --map")
     diagram = Diagram.of(ds, state=state, degrees=degrees, at=at, frame=replace(frame, ylim=None))
     part = diagram.view.ds
     part = part.squeeze([d for d in part["status"].dims if d != diagram.parameter and part.sizes[d] == 1])

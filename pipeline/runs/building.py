@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 
 from magpend_core.models.presets import is_file
 from pipeline.layout.domains import check_starts
+from pipeline.runs.arguments import names_arguments
 from pipeline.runs.spec_tables import SpecTables
 from pipeline.runs.workflows import find_spec, read_given
 from pipeline.specification.files import check_new_file, merged, read_toml, toml_tables, write_new
@@ -121,6 +122,7 @@ class Spec(SpecTables, Mapping[str, Any]):
         """Return the specification as the text of a TOML file, which makes the same run."""
         return specification_toml(self._tables)
 
+    @names_arguments
     def check(self, *, smoke: bool = False) -> None:
         """Check the specification as `magpend.run` does before it computes.
 
@@ -131,6 +133,7 @@ class Spec(SpecTables, Mapping[str, Any]):
         """
         check_starts(read_given(self, smoke=smoke)[0])
 
+    @names_arguments
     def preview(self, out: str | Path | None = None, *, workers: int | None = None, smoke: bool = False) -> Preview:
         """Describe the run: cells, bytes, time.
 

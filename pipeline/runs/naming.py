@@ -68,7 +68,7 @@ def _swept(run: Run, others: Iterable[str]) -> str:
     if len(swept) > 1:
         raise SpecError(
             f"{run.name} sweeps {', '.join(swept)}; say which of them to follow: "
-            + " or ".join(f"--parameter {name}" for name in swept)
+            + " or ".join(f"--parameter={name}" for name in swept)
             + "."
         )
     if swept or run.model.crossing is None:

@@ -21,6 +21,7 @@ from pipeline.runs.run import identity_here
 from pipeline.runs.scaling import in_scales
 from pipeline.runs.workflows import read_given
 from pipeline.specification.parsing import Spec
+from pipeline.specification.starts import start_remarks
 from pipeline.store.commits import read_commits
 from pipeline.store.places import open_files
 from pipeline.store.run import Run
@@ -191,6 +192,7 @@ class Preview:
         dims = ", ".join(f"{d} {n}" for d, n in self.dims.items())
         yield f"{self.spec.kind}: {self.n_cells} cells ({dims or 'one cell'})"
         block = " x ".join(map(str, self.plan.block)) or "1"
+        yield from start_remarks(self.spec.initial_conditions)
         yield from size_remarks(self.spec)
         yield f"tasks: {self.n_tasks} of {block} cells, {len(self.done)} done"
         yield f"cube: {size(self.n_bytes)} before compression"

@@ -25,6 +25,7 @@ from pipeline.runs.status import State, state
 from pipeline.runs.stopping import InterruptedRunError, stoppable
 from pipeline.runs.workflows import read_given
 from pipeline.specification.parsing import Spec
+from pipeline.specification.starts import start_remarks
 from pipeline.store.checking import damaged_records, name_of
 from pipeline.store.commits import log_timing, sweep
 from pipeline.store.errors import IncompleteError
@@ -110,7 +111,7 @@ def run(
     check_steps(parsed)
     for remark in (*parsed.model.flow.remarks, *unit_remarks(parsed.model)):
         echo(f"warning: {remark}")
-    for line in size_remarks(parsed):
+    for line in (*start_remarks(parsed.initial_conditions), *size_remarks(parsed)):
         echo(line)
     carry_out(parsed, text, files, workers=workers, where=where, echo=echo)
     warn_of_steps(parsed, files, echo)

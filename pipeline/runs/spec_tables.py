@@ -8,6 +8,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal, Self
 
+from pipeline.runs.arguments import knows_its_keys
+
 if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
@@ -25,6 +27,7 @@ class SpecTables:
     def _replaced(self, path: str, keys: Mapping[str, Any]) -> Self:
         raise NotImplementedError
 
+    @knows_its_keys
     def parameters(
         self,
         *,
@@ -45,6 +48,7 @@ class SpecTables:
         """
         return self._updated("parameters", {"preset": preset, "overrides": overrides, "frequency_hz": frequency_hz})
 
+    @knows_its_keys
     def axis(
         self,
         name: str,
@@ -75,6 +79,7 @@ class SpecTables:
             f"axes.{name}", {"start": start, "stop": stop, "num": num, "step": step, "values": values}
         )
 
+    @knows_its_keys
     def start_grid(
         self, *, refine: int | None = None, **states: float | tuple[float, float, int] | Numbers | Mapping[str, Any]
     ) -> Self:
@@ -90,6 +95,7 @@ class SpecTables:
         """
         return self._replaced("initial_conditions", {"kind": "grid", "refine": refine, **states})
 
+    @knows_its_keys
     def start_list(self, points: Rows | None = None, points_deg: Rows | None = None) -> Self:
         """Start from a list of initial states.
 
@@ -102,6 +108,7 @@ class SpecTables:
         """
         return self._replaced("initial_conditions", {"kind": "list", "points": points, "points_deg": points_deg})
 
+    @knows_its_keys
     def start_random(self, *, n: int, seed: int | None = None, **states: float | tuple[float, float]) -> Self:
         """Start from random initial states in a box.
 
@@ -116,6 +123,7 @@ class SpecTables:
         """
         return self._replaced("initial_conditions", {"kind": "random", "n": n, "seed": seed, **states})
 
+    @knows_its_keys
     def section(
         self,
         *,
@@ -139,6 +147,7 @@ class SpecTables:
         """
         return self._replaced("section", {"of": of, "value": value, "direction": direction, "longest": longest})
 
+    @knows_its_keys
     def continuation(self, *, path: str | None = None, direction: Literal["up", "down", "both"] | None = None) -> Self:
         """Choose the axis that branches follow.
 
@@ -151,6 +160,7 @@ class SpecTables:
         """
         return self._updated("continuation", {"path": path, "direction": direction})
 
+    @knows_its_keys
     def drive(self, *, file: str, section_hz: float | None = None) -> Self:
         """Replace the model's drive by a recorded one.
 
@@ -163,6 +173,7 @@ class SpecTables:
         """
         return self._replaced("drive", {"file": file, "section_hz": section_hz})
 
+    @knows_its_keys
     def drift(
         self,
         name: str,
@@ -221,6 +232,7 @@ class SpecTables:
             },
         )
 
+    @knows_its_keys
     def noise(
         self,
         *,
@@ -262,6 +274,7 @@ class SpecTables:
             },
         )
 
+    @knows_its_keys
     def integration(
         self,
         *,
@@ -314,6 +327,7 @@ class SpecTables:
             },
         )
 
+    @knows_its_keys
     def execution(self, *, trajectories_per_task: int | None = None, points_per_task: int | None = None) -> Self:
         """Set the sizes of tasks, which change no number.
 
@@ -328,6 +342,7 @@ class SpecTables:
             "execution", {"trajectories_per_task": trajectories_per_task, "points_per_task": points_per_task}
         )
 
+    @knows_its_keys
     def lyapunov(
         self,
         *,
@@ -357,6 +372,7 @@ class SpecTables:
             {"n_exponents": n_exponents, "n_transient": n_transient, "n_periods": n_periods, "n_blocks": n_blocks},
         )
 
+    @knows_its_keys
     def extremes(self, *, quantities: Sequence[str]) -> Self:
         """Compute a product of every cell.
 
@@ -369,6 +385,7 @@ class SpecTables:
         """
         return self._replaced("products.extremes", {"quantities": quantities})
 
+    @knows_its_keys
     def rotation(
         self,
         *,

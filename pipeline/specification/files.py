@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Mapping, Sequence
+from difflib import get_close_matches
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -63,10 +64,16 @@ def find_file(what: str, name: str | Path, shipped: Mapping[str, Path]) -> Path:
         If neither a file nor a shipped one has the name.
     """
     path = Path(name)
-    if path.exists() or path.suffix:
+    if path.exists():
         return path
     if str(name) in shipped:
         return shipped[str(name)]
+    beside = {file.stem: str(file) for file in sorted(path.parent.glob("*.toml"))}
+    near = [beside[stem] for stem in get_close_matches(path.stem, beside, n=2, cutoff=0.6)]
+    if near and not get_close_matches(str(name), shipped, n=1, cutoff=0.6):
+        raise SpecError(f"{name}: no such file; did you mean {' or '.join(near)}?")
+    if path.suffix:
+        return path
     folders = {known.partition("/")[0] for known in shipped if "/" in known}
     if len(path.parts) > 1 and path.parts[0] not in folders:
         return path

@@ -58,7 +58,7 @@ def unknown_name(what: str, name: str, known: Iterable[str]) -> str:
     """Return the message for an unknown name, with the nearest known names."""
     names = list(known)
     near = difflib.get_close_matches(name, names, n=2, cutoff=0.5)
-    hint = f"did you mean {' or '.join(near)}?" if near else f"known: {', '.join(names)}."
+    hint = f"did you mean {' or '.join(near)}?" if near else f"known: {', '.join(names) or 'none'}."
     return f"unknown {what} {name!r}; {hint}"
 
 

@@ -186,6 +186,18 @@ def starts_model(kind: str, model: Model) -> type[Starts]:
     return made
 
 
+def start_remarks(starts: Starts) -> list[str]:
+    """Return a line that names the states whose start is not given, with the start taken; empty if all are given."""
+    states = starts.system.states
+    if isinstance(starts, ListStarts):
+        left = states[min(map(len, starts.points or starts.points_deg or ())) :]
+    else:
+        given = {state_of_key(key, starts.system) for key, value in starts if value is not None}
+        left = tuple(state for state in states if state.name not in given)
+    taken = ", ".join(f"{state.name} = 0 {state.unit}".rstrip() for state in left)
+    return [f"starts not given, so taken as 0: {taken} (set in initial_conditions)"] if left else []
+
+
 def refine_problems(kind: str, starts: Starts | None, integration: Integration | None, model: Model) -> list[str]:
     """Return the problems of `refine` on a grid of initial conditions: ranges too short, a continuation, too much
     memory.

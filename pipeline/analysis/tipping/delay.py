@@ -88,7 +88,7 @@ def moving_parameter(names: tuple[str, ...], wanted: str) -> str:
     if wanted and wanted not in names:
         raise ValueError(f"{wanted} does not move in this run; moving: {', '.join(names)}.")
     if not wanted and len(names) > 1:
-        raise ValueError(f"several parameters move: choose with --moving {' or '.join(names)}.")
+        raise ValueError(f"several parameters move: choose with {' or '.join(f'--moving={name}' for name in names)}.")
     return wanted or names[0]
 
 

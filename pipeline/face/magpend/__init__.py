@@ -68,12 +68,15 @@ def _analysis(name: str) -> Callable[..., Any]:
     from magpend._analyses import Analyses
     from pipeline.products.product import default_of
     from pipeline.products.registry import ANALYSES
+    from pipeline.runs.arguments import options_in_errors
     from pipeline.runs.derive import derive
 
-    def found(source: Any, *, echo: Any = None, **options: Any) -> Any:
-        return derive(source, name, options, echo=echo)
-
     analysis = ANALYSES[name]
+
+    def found(source: Any, *, echo: Any = None, **options: Any) -> Any:
+        with options_in_errors(analysis.options):
+            return derive(source, name, options, echo=echo)
+
     model = analysis.options
     lines = [f"    {k} = {default_of(model, k)!r}: {info.description}" for k, info in model.model_fields.items()]
     found.__name__ = found.__qualname__ = name
@@ -90,6 +93,19 @@ def _with_source(method: Callable[..., Any]) -> Any:
     _, *options = own.parameters.values()
     source = inspect.Parameter("source", inspect.Parameter.POSITIONAL_OR_KEYWORD, annotation="str | Path | Run")
     return own.replace(parameters=[source, *options])
+
+
+def _naming_arguments(value: Any, home: str) -> Any:
+    """Wrap a function of the pipeline so that its errors name its arguments; return other values unchanged."""
+    from types import FunctionType
+
+    if not isinstance(value, FunctionType) or not home.startswith("pipeline."):
+        return value
+    from pipeline.runs.arguments import names_arguments
+
+    wrapped = names_arguments(value)
+    wrapped.__module__ = "magpend"  # where pickle finds it
+    return wrapped
 
 
 def _analysis_names() -> tuple[str, ...]:
@@ -110,11 +126,11 @@ def __getattr__(name: str) -> Any:
 
         return metadata.version("magpend")
     if name in _HOME_OF:
-        value = getattr(import_module(_HOME_OF[name]), name)
+        value = _naming_arguments(getattr(import_module(_HOME_OF[name]), name), _HOME_OF[name])
     elif not name.startswith("_") and name in _analysis_names():
         value = _analysis(name)
     elif not name.startswith("_") and name in _plot_names():
-        value = getattr(import_module("pipeline.plots"), name)
+        value = _naming_arguments(getattr(import_module("pipeline.plots"), name), "pipeline.plots")
     else:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     globals()[name] = value

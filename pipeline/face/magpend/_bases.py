@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import nullcontext
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -27,9 +28,12 @@ class AnalysingRun(StoredRun):
     """An opened run that computes analyses by name."""
 
     def _analysed(self, name: str, given: Mapping[str, Any]) -> xr.Dataset:
+        from pipeline.products.registry import ANALYSES
+        from pipeline.runs.arguments import options_in_errors
         from pipeline.runs.derive import derive
 
-        return derive(self, name, options_in(given), echo=given["echo"])
+        with options_in_errors(ANALYSES[name].options) if name in ANALYSES else nullcontext():
+            return derive(self, name, options_in(given), echo=given["echo"])
 
 
 class Drawing:
@@ -64,7 +68,10 @@ class Drawing:
         return panels[0] if panels.size == 1 else panels
 
     def _drawn(self, name: str, given: Mapping[str, Any]) -> list[Axes]:
+        from pipeline.products.registry import FIGURES
+        from pipeline.runs.arguments import options_in_errors
         from pipeline.runs.drawing import draw_panels
 
         places = {key: given[key] for key in ("ax", "figure", "echo")}
-        return draw_panels(self._source, name, options_in(given), **places)
+        with options_in_errors(FIGURES[name].options):
+            return draw_panels(self._source, name, options_in(given), **places)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal, ParamSpec, Self, overload
 from magpend._analyses import Analyses, AnalysisName
 from magpend._figures import Plots
 from pipeline.runs import python
+from pipeline.runs.arguments import names_arguments
 from pipeline.store.run import Run as StoredRun
 
 if TYPE_CHECKING:
@@ -124,6 +125,7 @@ class Run(Analyses):
         """
         return python.table(self._analysed(name, {**options, "echo": echo}))
 
+    @names_arguments
     def explore(self, *, curves: str | Path | StoredRun | None = None, height: int = 720) -> Explorer:
         """Show the run on the explorer's interactive page, in a cell of Jupyter, VS Code or marimo.
 
@@ -184,6 +186,7 @@ class Run(Analyses):
 
         return state(self.info.files)
 
+    @names_arguments
     def verify(self, *, repair: bool = False) -> Verification:
         """Compare every stored file with its checksum, and name what is damaged.
 
@@ -206,6 +209,7 @@ class Run(Analyses):
 
         return verify_run(self.name, repair=repair)
 
+    @names_arguments
     def extend(
         self,
         spec: str | Path | None = None,
@@ -254,6 +258,7 @@ class Run(Analyses):
         )  # fmt: skip
         return self.open(self.name if out is None else out)
 
+    @names_arguments
     def zoom(
         self,
         ranges: Mapping[str, tuple[float, float]] | None = None,
@@ -318,7 +323,7 @@ def _opening(function: Callable[P, StoredRun]) -> Callable[P, Run]:
     return opening
 
 
-run = _opening(python.run)
+run = names_arguments(_opening(python.run))
 
 
 @overload

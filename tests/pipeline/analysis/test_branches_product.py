@@ -172,7 +172,7 @@ def test_branches__of_several_axes_say_which(made, interval):
         derive(made.info.directory, "branches", interval)
     (sentence,) = refused.value.problems
     assert "run sweeps frequency_hz, q; say which of them to follow: " in sentence
-    assert "--parameter frequency_hz or --parameter q" in sentence
+    assert "--parameter=frequency_hz or --parameter=q" in sentence
     assert not (made.info.directory / "derived").exists()
 
 

@@ -15,6 +15,8 @@ import magpend
 from pipeline.cli.exits import Exit
 from pipeline.layout.plan import make_plan
 from pipeline.plots import bifurcation
+from pipeline.products.guide import ANALYSIS_GUIDE, FIGURE_GUIDE
+from pipeline.products.registry import ANALYSES, COMMANDS, FIGURES
 from pipeline.runs import preview, workflows
 from pipeline.runs.preview import figure_command, first_figure
 from pipeline.specification.parsing import parse_spec
@@ -23,19 +25,44 @@ from pipeline.store.run import Run
 
 
 @pytest.mark.slow
-def test_help__exit_codes(main):
-    for arguments in (["--help"], ["run", "--help"]):
-        text = " ".join(re.sub(r"[│╭╰╮╯─]", " ", main(*arguments)[1]).split())
-        for code in Exit:
-            assert f"{int(code)} {code.sentence}" in text
+def test_help__names_the_page_of_exit_codes_once(main):
+    (line,) = [line for line in main("--help")[1].splitlines() if "Exit codes:" in line]
+    page, _, anchor = line.split()[-1].partition("#")
+    text = (Path(__file__).parents[3] / page).read_text("utf-8")
+    assert f"## {anchor.replace('-', ' ').capitalize()}" in text.splitlines()
+    for code in Exit:
+        assert f"| {int(code)} | {code.sentence} |" in text
+    for command in (("run",), ("analyse", "attractors"), ("plot", "basins")):
+        assert "Exit codes:" not in main(*command, "--help")[1]
     for command in ("run", "status", "verify", "analyse", "plot", "simulate", "models", "presets"):
         assert command in main("--help")[1]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("verb", "guide", "names"), [("analyse", ANALYSIS_GUIDE, COMMANDS), ("plot", FIGURE_GUIDE, tuple(FIGURES))]
+)
+def test_help__groups_products_by_what_they_need(main, verb, guide, names):
+    needs = {name: words for group in guide.values() for name, words in group.items()}
+    assert sorted(needs) == sorted(names)
+    assert sum(map(len, guide.values())) == len(names)
+    lines = main(verb, "--help")[1].splitlines()
+    assert [line.rstrip(":") for line in lines if line.rstrip(":") in guide] == list(guide)
+    text = " ".join(" ".join(lines).split())
+    for name, words in needs.items():
+        assert f" {name} " in text
+        assert words in text
+        if verb == "analyse":
+            assert ("noise" in words) == ANALYSES[name].noisy
+            assert ("drift" in words) == ANALYSES[name].for_drift
 
 
 REFUSED = {
     "run": "Missing argument",
     "run no-such-workflow": "no-such-workflow",
     "run quickstrt": "did you mean quickstart?",
+    "run spce.toml": "spce.toml: no such file; did you mean spec.toml?",
+    "run spce": "spce: no such file; did you mean spec.toml?",
     "run spec.toml --workers nan": "--workers",
     "status .": "no run directory",
     "stauts run": "did you mean status",

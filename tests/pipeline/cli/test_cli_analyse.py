@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 import re
 
 import numpy as np
@@ -62,6 +63,24 @@ def test_attractors__table_per_point(main, spirals, tmp_path):
 
     code, _, err = main("analyse", "attractors", spirals)
     assert "attractors: taken from" in err
+
+
+def test_json__is_printed_or_goes_to_a_file(main, walk, tmp_path):
+    printed = main("status", "run", "--json")[1]
+    assert json.loads(printed)[0]["complete"]
+    assert main("status", "--json", "run")[1] == printed
+    lines = main("status", "run")[1]
+    for words in (("run", "--json", "found.json"), ("--json=found.json", "run")):
+        assert main("status", *words)[:2] == (0, lines)
+        assert (tmp_path / "found.json").read_text().strip() == printed.strip()
+    (tmp_path / "other.json").write_text('{"mine": 1}')
+    for file in ("other.json", "run/found.json", "none/found.json"):
+        code, _, err = main("status", "run", "--json", file)
+        assert code == Exit.REFUSED
+        assert file in err
+    assert (tmp_path / "other.json").read_text() == '{"mine": 1}'
+    rows = main("analyse", "attractors", "run", "--no-polish", "--csv", "-", "--json", "rows.json")[1]
+    assert len(json.loads((tmp_path / "rows.json").read_text())) == len(rows.splitlines()) - 1
 
 
 def test_hysteresis__loops_and_jumps(main, walk, tmp_path):

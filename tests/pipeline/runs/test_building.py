@@ -10,12 +10,14 @@ import numpy as np
 import pytest
 
 import magpend
+from pipeline.layout.cells import initial_states
 from pipeline.layout.identity import identity_of
 from pipeline.layout.plan import make_plan
 from pipeline.products.registry import CELL_PRODUCTS
 from pipeline.runs.workflows import read_given, shipped_workflows
 from pipeline.specification.parsing import _KEYS, load_spec, parse_spec
 from pipeline.specification.problems import SpecError
+from pipeline.specification.starts import start_remarks
 from tests.pipeline.factories import silent
 
 EQUATIONS = "x' = v\nv' = -k*x - 0.2*v + A*cos(2*pi*f*t)"
@@ -44,6 +46,52 @@ states = { x = "m", v = "m/s" }
 parameters = { k = 1.0, A = 0.5 }
 equations = { x = "v", v = "-k*x - 0.2*v + A*cos(2*pi*f*t)" }
 """
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (lambda s: s.parameters(A=0.4), r"parameters\.A: .* is given by overrides=\{'A': 0\.4\}"),
+        (lambda s: s.parameters(overides={}), r"parameters\.overides: unknown key; did you mean overrides\?"),
+        (lambda s: s.integration(n_transients=4), r"integration\.n_transients: unknown key; did you mean n_transient"),
+        (lambda s: s.axis("A", stap=0.3), r"axis\.stap: unknown key; did you mean st"),
+        (lambda s: s.extremes(quantites=["x"]), r"extremes\.quantites: unknown key; did you mean quantities\?"),
+    ],
+)
+def test_methods__say_what_is_right_for_an_unknown_keyword(wrong, message):
+    with pytest.raises(TypeError, match=message):
+        wrong(magpend.Spec("sweep"))
+
+
+@pytest.mark.parametrize(
+    ("change", "left"),
+    [
+        (lambda s: s.start_grid(x=(-1.0, 1.0, 4)), ["v"]),
+        (lambda s: s.start_grid(x=(-1.0, 1.0, 4), v=0.0), []),
+        (lambda s: s.start_random(n=3, v=(-1.0, 1.0)), ["x"]),
+        (lambda s: s.start_list([[1.0], [2.0]]), ["v"]),
+        (lambda s: s.start_list([[1.0, 0.5]]), []),
+    ],
+)
+def test_starts__that_are_not_given_are_said(change, left):
+    spec = read_given(change(magpend.Spec("sweep", "duffing").parameters(frequency_hz=0.2)))[0]
+    first = initial_states(spec.initial_conditions).at(np.array([0]))[0]
+    units = {s.name: s.unit for s in spec.model.states}
+    assert [line for line in start_remarks(spec.initial_conditions) if line.startswith("starts not given")] == [
+        f"starts not given, so taken as 0: {name} = 0 {units[name]}".rstrip() + " (set in initial_conditions)"
+        for name in left
+    ]
+    assert all(first[spec.model.state_names.index(name)] == 0.0 for name in left)
+
+
+@pytest.mark.slow
+def test_starts__that_are_not_given_are_said_by_run_and_preview(tmp_path):
+    spec = magpend.Spec("sweep", "duffing").parameters(frequency_hz=0.2).start_grid(x=(-1.0, 1.0, 2))
+    spec = spec.axis("amplitude", 0.1, 0.2, 2).integration(n_transient=2, n_keep=2)
+    told = []
+    magpend.run(spec, tmp_path / "run", workers=0, echo=told.append)
+    for lines in (told, repr(spec.preview(tmp_path / "other")).splitlines()):
+        assert sum(line.startswith("starts not given, so taken as 0: v = 0") for line in lines) == 1
 
 
 def oscillator():
