@@ -401,7 +401,7 @@ def points(
 
 def tinted(colour: str, tint: float) -> tuple[float, float, float]:
     """Mix a colour with white; `tint` is the share of white, 0 to 1."""
-    red, green, blue = (float(c) + (1.0 - float(c)) * tint for c in to_rgb(as_hex(colour)))
+    red, green, blue = (float(c) + (1.0 - float(c)) * tint for c in to_rgb(colour))
     return red, green, blue
 
 
