@@ -12,7 +12,7 @@ from typer.core import TyperGroup
 from pipeline.cli import console
 from pipeline.cli.common import Csv, Json, check_csv, json_rows, tell, tell_data
 from pipeline.cli.groups import add_command, command_group
-from pipeline.cli.options import completing
+from pipeline.cli.options import completing, drawing
 
 RUN = "spec"
 """Name of the command that ``magpend identify SPEC`` runs."""
@@ -187,6 +187,6 @@ def compare(
     tell(comparing(directories), csv, as_json)
 
 
-add_command(identify_app, identify, RUN)
-for _command in (check, posterior, spread, compare):
+add_command(identify_app, drawing(identify), RUN)
+for _command in (check, drawing(posterior), spread, compare):
     add_command(identify_app, _command)

@@ -28,6 +28,7 @@ from pipeline.cli.magnet import fit_magnet
 from pipeline.cli.measured import measured_app
 from pipeline.cli.model import model_app
 from pipeline.cli.models import models, presets
+from pipeline.cli.options import drawing
 from pipeline.cli.plot import plot_app
 from pipeline.cli.recordings import recordings_app
 from pipeline.cli.report import report
@@ -69,7 +70,7 @@ def _main(
     pass
 
 
-_ANY_OPTION = (zoom, simulate, animate)
+_ANY_OPTION = ("zoom", "simulate", "animate")
 """Commands whose options include a model's states by name."""
 
 for _command in (
@@ -79,7 +80,7 @@ for _command in (
     verify,
     extend,
     zoom,
-    simulate,
+    drawing(simulate),
     explore,
     export,
     animate,
@@ -87,9 +88,9 @@ for _command in (
     reproduce,
     models,
     presets,
-    fit_magnet,
+    drawing(fit_magnet),
 ):
-    add_command(app, _command, settings=EXTRA if _command in _ANY_OPTION else {})
+    add_command(app, _command, settings=EXTRA if _command.__name__ in _ANY_OPTION else {})
 app.add_typer(analyse_app, name="analyse")
 app.add_typer(plot_app, name="plot")
 app.add_typer(model_app, name="model")

@@ -15,7 +15,7 @@ import typer
 from pipeline.cli import console
 from pipeline.cli.common import PRINTED, Csv, Directory, Json, check_csv, json_rows, read_pairs, tell, tell_data
 from pipeline.cli.groups import command_group, made, registry_group
-from pipeline.cli.options import taking
+from pipeline.cli.options import drawing, taking
 from pipeline.cli.outputs import check_file, check_place
 from pipeline.cli.plot import check_figure_path
 from pipeline.layout.writing import write_atomically
@@ -295,12 +295,15 @@ _COMMANDS: dict[str, tuple[Any, str]] = {
 }
 """Commands, and the names of their options in `pipeline.products.measured`; empty if there are none."""
 
+_DRAWING = ("diagram", "compare", "series", "branch")
+
 
 def _make(name: str) -> Any:
     from pipeline.products import measured
 
     function, options = _COMMANDS[name]
     command = taking(getattr(measured, options), function) if options else function
+    command = drawing(command) if name in _DRAWING else command
     return made(name, command, str(function.__doc__))
 
 

@@ -32,6 +32,13 @@ IMPORT = Annotated[
         metavar="MODULE:NAME", help="Import this Python object, the model of a run; otherwise nothing is imported."
     ),
 ]
+STYLE = Annotated[
+    str | None,
+    typer.Option(metavar="TEXT", help="Style of matplotlib that changes magpend's: its name, or a style file."),
+]
+DPI = Annotated[
+    float | None, typer.Option(min=20.0, max=2400.0, metavar="X", help="Resolution of figures [1/in]; by default 200.")
+]
 _METAVARS = {int: "N", float: "X", str: "TEXT"}
 _VOICES = {"quiet": (QUIET, False), "verbose": (VERBOSE, False), "log": (LOGFILE, None)}
 _IMPORTED = "import_model"
@@ -58,6 +65,21 @@ def speaking(command: Command) -> Command:
         voices.append(_keyword("force", FORCE, False))
     voices.append(_keyword(_IMPORTED, IMPORT, None))
     return _signed(run, command, [*_own(command), *voices])
+
+
+def drawing(command: Command) -> Command:
+    """Wrap a command that draws figures so that it has the options ``--style`` and ``--dpi``."""
+
+    def run(*args: Any, style: str | None, dpi: float | None, **given: Any) -> None:
+        if style is None and dpi is None:
+            command(*args, **given)
+            return
+        from pipeline.plots import looks
+
+        with looks.given(style or "", dpi):
+            command(*args, **given)
+
+    return _signed(run, command, [*_own(command), _keyword("style", STYLE, None), _keyword("dpi", DPI, None)])
 
 
 def taking(model: type[Options], command: Command) -> Command:
@@ -123,10 +145,10 @@ def bounds_of(info: FieldInfo) -> str:
 
 
 def kind_of(info: FieldInfo) -> Any:
-    """Return the type of a field; for an optional field, the type other than ``None``."""
+    """Return the type of a field on the command line: of several types, the first other than ``None``."""
     kind = info.annotation
     if get_origin(kind) in (Union, types.UnionType):
-        (kind,) = [part for part in get_args(kind) if part is not type(None)]
+        kind, *_ = [part for part in get_args(kind) if part is not type(None)]
     return kind
 
 

@@ -10,6 +10,7 @@ import typer
 from pipeline.cli import console
 from pipeline.cli.common import Json, json_rows, tell, tell_data
 from pipeline.cli.groups import add_command, command_group
+from pipeline.cli.options import drawing
 from pipeline.cli.outputs import check_file, check_place
 from pipeline.cli.plot import check_figure_path
 from pipeline.layout.writing import write_atomically
@@ -203,5 +204,5 @@ def _draw(ds: xr.Dataset, out: Path, as_json: str | None) -> None:
     say(f"figure: {save_figure(plot_recording(ds), out)}")
 
 
-for _command in (show, convert, drive, simulate):
+for _command in (drawing(show), convert, drive, simulate):
     add_command(recordings_app, _command)

@@ -93,6 +93,8 @@ def figures() -> str:
         from magpend._bases import Drawing, Panels
 
         if TYPE_CHECKING:
+            from pathlib import Path
+
             from matplotlib.axes import Axes
             from matplotlib.figure import Figure, SubFigure
 

@@ -18,10 +18,10 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from magpend_core.models.model import Model
 from pipeline.layout.vocabulary import model_of
 from pipeline.plots import labels, style
+from pipeline.plots.looks import MM
 from pipeline.plots.movers import Scene, Trail, moving_clock, moving_machine, moving_portrait
 
 SCREEN_DPI = 100
-LOOK = style.Look(10.0, 9.0, 9.0)
 """Letters of films of every size: 12 pixels and more."""
 
 LEAST_LABELLED_IN = 1.0
@@ -78,12 +78,12 @@ class Animation:
     def frames(self) -> Iterator[Pixels]:
         """Draw the frames one after another, and yield them as RGB images (height, width, 3)."""
         canvas: Any = FigureCanvasAgg(self.figure)
-        with style.TEXT_LOCK:
+        with style.LOCK:
             canvas.draw()
         background = canvas.copy_from_bbox(self.figure.bbox)
         substeps = int(self.figure.data.attrs["substeps"])
         for k in range(self.n_frames):
-            with style.TEXT_LOCK:
+            with style.LOCK:
                 canvas.restore_region(background)
                 for mover in self.movers:
                     for artist in mover.at(k * substeps):
@@ -91,6 +91,7 @@ class Animation:
             yield np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
+@style.drawn
 def plot_animation(ds: xr.Dataset, *, degrees: bool = False, portrait: str = "", size: int = 800) -> Animation:
     """Lay out a film that shows one or more motions side by side.
 
@@ -120,10 +121,9 @@ def plot_animation(ds: xr.Dataset, *, degrees: bool = False, portrait: str = "",
     model = model_of(ds)
     pairs = portraits_of(model, portrait, ds.sizes["motion"], degrees)
     plan = _Plan.of(ds.sizes["motion"], len(pairs), model.drawing is not None, size)
-    frame = style.Frame(plan.width / style.MM)
+    frame = style.Frame(plan.width / MM)
     fig = style.new_figure(plan.height, ds, frame, arranged=False, exact=True)
     fig.set_dpi(SCREEN_DPI)
-    fig.look = LOOK
     movers: list[Any] = []
     scene = None if model.drawing is None else Scene.of(ds, model.drawing)
     for k in range(ds.sizes["motion"]):

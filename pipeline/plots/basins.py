@@ -24,6 +24,7 @@ _OTHERS = -1
 _FIRST_GREY = -2
 
 
+@style.drawn
 def plot_basins(
     attractors: xr.Dataset,
     *,
@@ -236,10 +237,8 @@ def _entries(cast: palette.Cast, counts: Mapping[int, int]) -> list[tuple[str, s
 def _draw_scale(fig: style.DataFigure, ax: Axes, scale: LogNorm, periods: str) -> None:
     ramp = LinearSegmentedColormap.from_list("time", [(0.85,) * 3, (0.85 * (1.0 - _DARKEST),) * 3])
     bar = fig.colorbar(ScalarMappable(scale, ramp), ax=ax, orientation="horizontal", shrink=0.6, aspect=24, pad=0.02)
-    bar.outline.set_linewidth(style.LINE_PT)
     bar.ax.set_gid("time")
-    bar.set_label(f"{periods} to converge", fontsize=fig.look.legend, labelpad=2.0)
-    bar.ax.tick_params(labelsize=fig.look.tick, width=style.LINE_PT, length=2.5, pad=1.5)
+    style.style_bar(bar, f"{periods} to converge")
     bar.ax.xaxis.set_major_locator(LogLocator(10.0, (1.0, 2.0, 3.0, 5.0, 7.0), numticks=12))
     bar.ax.xaxis.set_major_formatter(ScalarFormatter())
     bar.ax.xaxis.set_minor_locator(NullLocator())

@@ -29,6 +29,7 @@ LAYOUTS = ("overlay", "side")
 EXTREMES = ("min", "max", "mean")
 
 
+@style.drawn
 def plot_bifurcation(
     ds: xr.Dataset,
     *,

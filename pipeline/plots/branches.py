@@ -39,6 +39,7 @@ _NAME_PT = 7.0
 _LEADER = {"arrowstyle": "-", "linewidth": 0.4, "color": "0.4", "shrinkA": 4.0, "shrinkB": 2.5}
 
 
+@style.drawn
 def plot_branches(
     ds: xr.Dataset,
     cube: xr.Dataset | None = None,
@@ -237,7 +238,6 @@ def _name(ax: Axes, names: list[_Name]) -> None:
                 ha="center",
                 va="center",
                 fontsize=_NAME_PT,
-                fontfamily=style.FONT,
                 zorder=9.0,
                 gid=f"name:{name.text}",
                 arrowprops=_LEADER,

@@ -25,6 +25,7 @@ _UP_PT, _DOWN_PT, _TINT = 1.5, 4.2, 0.55
 _SPAN: dict[str, Any] = {"facecolor": "0.9", "edgecolor": "none", "linewidth": 0.0}
 
 
+@style.drawn
 def plot_coexisting(
     attractors: xr.Dataset,
     *,

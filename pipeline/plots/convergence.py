@@ -39,6 +39,7 @@ _DASHES: dict[Motion, Any] = {
 }
 
 
+@style.drawn
 def plot_convergence(
     ds: xr.Dataset,
     *,
@@ -87,7 +88,7 @@ def plot_convergence(
     final = fig.add_subplot(grid[0, 1], sharey=top)
     for ax in (top, bottom, final):
         style.style_axes(ax)
-        ax.axhline(0.0, color="0.4", linewidth=style.LINE_PT, zorder=1.0)
+        ax.axhline(0.0, color="0.4", linewidth=0.7, zorder=1.0)
     handles = _draw_running(top, final, data)
     for kind, colour in _COLOURS.items():
         _draw_cells(bottom, data, "in_block", kind, colour)

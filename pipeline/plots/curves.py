@@ -17,6 +17,7 @@ from pipeline.products.figures import CurveFigureOptions, RegimeOptions
 _COLOURS = dict(zip(KINDS[:4], (style.BLUE, style.VERMILLION, style.GREEN, style.PURPLE), strict=True))
 
 
+@style.drawn
 def plot_curves(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.DataFigure:
     """Draw bifurcation curves and points of codimension two in the plane of two parameters.
 

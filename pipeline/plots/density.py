@@ -17,11 +17,11 @@ from pipeline.products.figures import DensityFigureOptions
 from pipeline.products.noise import DensityOptions
 from pipeline.specification.problems import unknown_name
 
-CMAP = "cividis"
 _GAMMA = 0.5
 """Exponent of the colour scale: the square root shows what is rare, too."""
 
 
+@style.drawn
 def plot_density(
     ds: xr.Dataset, *, at: Mapping[str, float] | None = None, frame: style.Frame = style.WIDE
 ) -> style.DataFigure:
@@ -72,9 +72,7 @@ def _over(part: xr.Dataset, along: str, frame: style.Frame) -> style.DataFigure:
     shown = part["smoothed"].transpose("value", along).values / measure.factor
     top = float(np.nanmax(shown)) if np.isfinite(shown).any() else 1.0
     norm = PowerNorm(_GAMMA, 0.0, top)
-    ax.pcolormesh(
-        style.edges(x), style.edges(measure.shown(y)), shown, cmap=CMAP, norm=norm, rasterized=True, gid="density"
-    )
+    ax.pcolormesh(style.edges(x), style.edges(measure.shown(y)), shown, norm=norm, rasterized=True, gid="density")
     peaks = measure.shown(part["peak"].transpose(along, "rank").values)
     ax.plot(
         np.broadcast_to(x[:, None], peaks.shape).ravel(), peaks.ravel(), "o", ms=3.2, mfc="white", mec="black", mew=0.6
@@ -87,8 +85,8 @@ def _over(part: xr.Dataset, along: str, frame: style.Frame) -> style.DataFigure:
     style.label_axes(ax, None, measure.label)
     style.label_axes(below, labels.parameter_label(part[along]), "peaks")
     style.limits(ax, frame, style.span(x))
-    bar = fig.colorbar(ScalarMappable(norm, CMAP), ax=ax, pad=0.015, aspect=26)
-    style.style_bar(fig, bar, "density")
+    bar = fig.colorbar(ScalarMappable(norm), ax=ax, pad=0.015, aspect=26)
+    style.style_bar(bar, "density")
     handles = [style.dot("peaks", "black", 4.0, face="white")]
     style.complete(fig, ax, _text(part, [along]), handles)
     return fig

@@ -14,6 +14,7 @@ from pipeline.products.chaos import DimensionOptions
 from pipeline.products.figures import DimensionFigureOptions
 
 
+@style.drawn
 def plot_dimension(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.DataFigure:
     """Draw the correlation sum of an attractor over the radius, with the fitted line and the local slope.
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 import xarray as xr
-from matplotlib import colormaps
+from matplotlib import colormaps, rcParams
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import ListedColormap, Normalize, to_hex
@@ -19,12 +19,13 @@ from pipeline.plots.figure import Run, frame_of, noted, values_of
 from pipeline.plots.selection import at_points
 from pipeline.products.figures import DriftFigureOptions
 
-CMAP, DARKEST, LIGHTEST = "cividis", 0.0, 0.85
+DARKEST, LIGHTEST = 0.0, 0.85
 BELOW = "0.72"
 MOST_DOTS = 200_000
 """Most dots of a vector file that are not pixels."""
 
 
+@style.drawn
 def plot_drift(
     ds: xr.Dataset,
     parameter: str,
@@ -91,7 +92,7 @@ def plot_drift(
         axis = part[swept[0]]
         norm = Normalize(float(axis.min()), float(axis.max()))
         bar = fig.colorbar(ScalarMappable(norm, _ramp()), ax=ax, pad=0.015, aspect=32)
-        style.style_bar(fig, bar, labels.parameter_label(axis))
+        style.style_bar(bar, labels.parameter_label(axis))
     style.complete(fig, ax, labels.caption(part, drop=[at_section(parameter)]), handles)
     return fig
 
@@ -109,7 +110,7 @@ def _points(part: xr.Dataset, parameter: str, measure: labels.Measure) -> tuple[
 
 def _ramp() -> ListedColormap:
     """Return the colours from the least to the largest value, without the lightest, which would be faint on white."""
-    return ListedColormap(colormaps[CMAP](np.linspace(DARKEST, LIGHTEST, 256)))
+    return ListedColormap(colormaps[rcParams["image.cmap"]](np.linspace(DARKEST, LIGHTEST, 256)))
 
 
 def _colours(part: xr.Dataset, swept: list[str]) -> list[str]:

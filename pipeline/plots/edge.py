@@ -24,6 +24,7 @@ _MARKS: dict[str, dict[str, Any]] = {
 """Markers of edge states: white with a black rim, to be seen over every colour of a basin."""
 
 
+@style.drawn
 def plot_edge(
     ds: xr.Dataset,
     basins: style.DataFigure | None = None,

@@ -23,6 +23,7 @@ COLOURS = (style.BLUE, style.VERMILLION, style.GREEN, style.PURPLE, style.ORANGE
 MARKERS = ("o", "s", "^", "D", "v", "P")
 
 
+@style.drawn
 def plot_rates(
     ds: xr.Dataset, *, at: Mapping[str, float] | None = None, frame: style.Frame = style.WIDE
 ) -> style.DataFigure:
@@ -91,6 +92,7 @@ def _draw_points(ax: Axes, x: np.ndarray, one: xr.Dataset, colour: str, marker: 
     ax.plot(x[none], high[none], marker, mfc="white", color=colour, ms=4.5, gid="bound")
 
 
+@style.drawn
 def plot_paths(
     ds: xr.Dataset, *, at: Mapping[str, float] | None = None, frame: style.Frame = style.WIDE
 ) -> style.DataFigure:

@@ -23,6 +23,7 @@ _SHOWN = 0.98
 """Share of the points whose exponents the scale holds, so that a few do not pale all others."""
 
 
+@style.drawn
 def plot_lyapunov_map(
     ds: xr.Dataset, *, per: str = "s", at: Mapping[str, float] | None = None, frame: style.Frame = style.WIDE
 ) -> style.DataFigure:
@@ -94,7 +95,7 @@ def _draw_map(fig: style.DataFigure, ax: Axes, data: xr.Dataset, part: xr.Datase
         style.legend_above(fig, [Patch(facecolor=_NO_EXPONENT, label="no cell has an exponent")])
     bar = fig.colorbar(ScalarMappable(norm, "PuOr_r"), ax=ax, extend=extend, pad=0.015, aspect=32, ticks=MaxNLocator(7))
     text = f"largest exponent [{rate_unit(data)}]\nmaximum over the cells of each point"
-    style.style_bar(fig, bar, text)
+    style.style_bar(bar, text)
 
 
 def _scale(grid: np.ndarray) -> tuple[Normalize, str]:

@@ -99,8 +99,8 @@ def run_provenance(run: Run) -> dict[str, Any]:
 
 
 def frame_of(options: FigureOptions) -> Frame:
-    """Return the width and the axis ranges of a figure from its options."""
-    return Frame(options.width, options.xlim, options.ylim)
+    """Return the width, the axis ranges and the style of a figure from its options."""
+    return Frame(options.width, options.xlim, options.ylim, options.style, options.dpi)
 
 
 def values_of(run: Run, options: FigureOptions | AnimationOptions) -> tuple[dict[str, float], list[str]]:

@@ -8,18 +8,17 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import matplotlib
 import xarray as xr
+from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 from pipeline.layout.writing import write_atomically, write_netcdf
-from pipeline.plots.style import DPI, TEXT_LOCK, DataFigure
+from pipeline.plots.looks import DPI, LOCK, VECTORS
+from pipeline.plots.style import DataFigure
 
 SUFFIXES = (".png", ".pdf", ".svg")
 VECTOR_DPI = 400
 """Resolution of the images inside PDF and SVG files, which get magnified."""
-
-_SETTINGS: dict[str, Any] = {"svg.hashsalt": "magpend", "svg.fonttype": "none", "pdf.fonttype": 42}
 
 
 def save_figure(fig: Figure, path: str | Path) -> Path:
@@ -55,15 +54,12 @@ def save_figure(fig: Figure, path: str | Path) -> Path:
     buffer = io.BytesIO()
     options: dict[str, Any] = {
         "format": suffix[1:],
-        "dpi": DPI if suffix == ".png" else VECTOR_DPI,
+        "dpi": _dpi(fig, suffix),
         "metadata": _metadata(fig.data.attrs if isinstance(fig, DataFigure) else {}, suffix),
-        "facecolor": "white",
+        "facecolor": fig.get_facecolor(),
     }
-    with TEXT_LOCK:
-        if suffix == ".png":
-            fig.savefig(buffer, **options)
-        else:
-            _save_vectors(fig, buffer, options)
+    with LOCK, rc_context(VECTORS):
+        fig.savefig(buffer, **options)
     write_atomically(path, buffer.getvalue())
     return path
 
@@ -88,6 +84,12 @@ def with_provenance(ds: xr.Dataset, provenance: Mapping[str, Any]) -> xr.Dataset
     return ds.assign_attrs({**ds.attrs, **plain})
 
 
+def _dpi(fig: Figure, suffix: str) -> float:
+    if not isinstance(fig, DataFigure):
+        return DPI if suffix == ".png" else VECTOR_DPI
+    return fig.file_dpi if suffix == ".png" else fig.frame.dpi or VECTOR_DPI
+
+
 def _metadata(attrs: Mapping[Any, Any], suffix: str) -> dict[str, Any]:
     title, source = str(attrs.get("title", "")), str(attrs.get("source", "magpend"))
     rest = {k: v for k, v in attrs.items() if isinstance(v, str | int | float) and k not in ("title",)}
@@ -99,18 +101,3 @@ def _metadata(attrs: Mapping[Any, Any], suffix: str) -> dict[str, Any]:
         return {**own, "CreationDate": None}
     own = {"Title": title, "Source": source, "Description": about} if attrs else {}
     return {**own, "Date": None}
-
-
-def _save_vectors(fig: Figure, buffer: io.BytesIO, options: dict[str, Any]) -> None:
-    """Write a figure as PDF or SVG, such that text remains text and equal figures have equal bytes.
-
-    matplotlib reads these options from its shared settings only. The keys are set while the lock is held;
-    all others stay unchanged.
-    """
-    settings: Any = matplotlib.rcParams
-    before = {key: settings[key] for key in _SETTINGS}
-    settings.update(_SETTINGS)
-    try:
-        fig.savefig(buffer, **options)
-    finally:
-        settings.update(before)

@@ -25,6 +25,7 @@ MOST_BARS = 60
 _BAR: dict[str, Any] = {"linewidth": 0.7, "color": "black"}
 
 
+@style.drawn
 def plot_fractions(
     attractors: xr.Dataset, *, at: Mapping[str, float] | None = None, frame: style.Frame = style.WIDE
 ) -> style.DataFigure:

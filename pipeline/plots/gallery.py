@@ -30,6 +30,7 @@ _PATH_IN = 0.14
 """Further room for the tick labels of a path, which are long."""
 
 
+@style.drawn
 def plot_gallery(
     attractors: xr.Dataset, portraits: xr.Dataset, *, degrees: bool = False, frame: style.Frame = style.WIDE
 ) -> style.DataFigure:
@@ -72,7 +73,7 @@ def plot_gallery(
     each = len(model.portraits) + (model.drawing is not None)
     if each * data.sizes["attractor"] == 1:
         frame = replace(frame, width=min(frame.width, LONE_MM))
-    head = style.folded(_told(data, portraits, here), frame.width_in - 0.2, style.look_at(frame).legend)
+    head = style.folded(_told(data, portraits, here), frame.width_in - 0.2, style.sizes().legend)
     layout = _Layout.of(frame, data.sizes["attractor"], each, model.drawing is not None, head.count("\n") + 1)
     titles = [_title(data.isel(attractor=k), cast, layout) for k in range(data.sizes["attractor"])]
     layout = replace(layout, title_lines=1 + max(title.count("\n") for title in titles))
@@ -145,7 +146,7 @@ def _described(attractors: xr.Dataset, portraits: xr.Dataset) -> xr.Dataset:
 def _title(one: xr.Dataset, cast: palette.Cast, layout: _Layout) -> str:
     attracts = int(one["stability"]) == ATTRACTS
     share = f", share {palette.percent(float(one['share']))}" if attracts else ""
-    room, size = layout.each * layout.pitch - layout.left, style.look_at(layout.frame).legend
+    room, size = layout.each * layout.pitch - layout.left, style.sizes().legend
     return style.folded(f"{cast.names[int(one['attractor'])]}{share}", room, size, "   ")
 
 

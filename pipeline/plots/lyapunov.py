@@ -29,6 +29,7 @@ EXPONENT_COLOURS = ("#332288", style.ORANGE, style.SKY, "#882255", "#5B3A1E", "#
 _BAND = 0.25
 
 
+@style.drawn
 def plot_lyapunov(
     ds: xr.Dataset,
     *,
@@ -127,7 +128,7 @@ def _draw_exponents(ax: Axes, data: xr.Dataset, parameter: str, spectrum: bool, 
     value, error = (table[name].transpose(*order).values for name in ("exponent_value", "exponent_stderr"))
     flag = table["lyapunov_flag"].transpose(*order[:2]).values
     motion = table["motion"].transpose(*order[:2]).values if "motion" in table else np.zeros(flag.shape, int)
-    ax.axhline(0.0, color="0.4", linewidth=style.LINE_PT, zorder=1.0)
+    ax.axhline(0.0, color="0.4", linewidth=0.7, zorder=1.0)
     handles: list[Any] = []
     if spectrum:
         for k in range(value.shape[2]):

@@ -20,6 +20,7 @@ _COLOURS = {0: style.VERMILLION, 1: style.BLUE}
 _NAMES = {0: "unstable manifold", 1: "stable manifold"}
 
 
+@style.drawn
 def plot_manifolds(
     ds: xr.Dataset, basins: style.DataFigure | None = None, *, degrees: bool = False, frame: style.Frame = style.WIDE
 ) -> style.DataFigure:

@@ -42,11 +42,12 @@ def motions_of(ds: xr.Dataset) -> Motions:
     """Return the names and colours of a model's classes of motion; a model without a classifier has one class."""
     classifier = model_of(ds).classifier
     if classifier is None:
-        return Motions(("motion",), (PLAIN,), (0,))
+        plain = PLAIN if style.colours() == style.PALETTE else style.colours()[0]
+        return Motions(("motion",), (plain,), (0,))
     own = [c for c in range(1, len(classifier.words)) if c not in classifier.neutral]
     colours = [style.GREY] * len(classifier.words)
     for k, code in enumerate(own):
-        colours[code] = COLOURS[k % len(COLOURS)]
+        colours[code] = style.as_hex(COLOURS[k % len(COLOURS)])
     neutral = [c for c in range(1, len(classifier.words)) if c in classifier.neutral]
     return Motions(classifier.words, tuple(colours), (*own, *neutral))
 

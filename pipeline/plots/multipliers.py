@@ -20,6 +20,7 @@ MOST = 2.0
 """Multipliers beyond this modulus are left out."""
 
 
+@style.drawn
 def plot_multipliers(ds: xr.Dataset, branch: int = 0, *, frame: style.Frame = style.WIDE) -> style.DataFigure:
     """Draw the Floquet multipliers along a branch in the complex plane, with the unit circle.
 
@@ -53,7 +54,7 @@ def plot_multipliers(ds: xr.Dataset, branch: int = 0, *, frame: style.Frame = st
     style.style_axes(ax)
     ax.add_patch(Circle((0.0, 0.0), 1.0, fill=False, edgecolor="0.5", linewidth=0.8))
     shown = np.abs(z) <= MOST
-    points = ax.scatter(z.real[shown], z.imag[shown], c=x[shown], s=6.0, cmap="cividis", linewidths=0.0, zorder=3)
+    points = ax.scatter(z.real[shown], z.imag[shown], c=x[shown], s=6.0, linewidths=0.0, zorder=3)
     here = np.flatnonzero(ds["of_branch"].values == branch)
     handles = _crossings(ax, ds, here)
     for axis in (ax.axhline, ax.axvline):
@@ -67,7 +68,7 @@ def plot_multipliers(ds: xr.Dataset, branch: int = 0, *, frame: style.Frame = st
     fixed = labels.caption(ds, with_start=False)
     style.caption(ax, style.join([title, fixed, f"{missing} beyond |μ| = {MOST:g}" if missing else ""]))
     label = labels.swept_label(str(ds.attrs["parameter"]), str(ds.attrs["parameter_units"]))
-    style.style_bar(fig, fig.colorbar(points, ax=ax, pad=0.015, aspect=32), label)
+    style.style_bar(fig.colorbar(points, ax=ax, pad=0.015, aspect=32), label)
     if frame.compact:
         style.legend_below(fig, handles)
     elif handles:

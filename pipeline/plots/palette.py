@@ -1,10 +1,10 @@
 """Give each attractor a colour, a letter and a name, which are the same in every figure of a run.
 
-The twelve attractors with the most cells have a colour each; the others share one more. They come from Okabe
-& Ito (https://jfly.uni-koeln.de/color/) and five chosen for their distance from them: any two, and any
-of them and the greys of cells without an attractor, differ by 11 or more in CIELAB to normal eyes and to
-those with protanopia, deuteranopia and tritanopia (simulated after Machado et al., IEEE Trans. Vis.
-Comput. Graph. 15, 2009). Letters tell attractors apart where colours do not.
+The attractors with the most cells have the colours of the style; the others share one more. The twelve of magpend's
+style come from Okabe & Ito (https://jfly.uni-koeln.de/color/) and five chosen for their distance from them: any two,
+and any of them and the greys of cells without an attractor, differ by 11 or more in CIELAB to normal eyes and to those
+with protanopia, deuteranopia and tritanopia (simulated after Machado et al., IEEE Trans. Vis. Comput. Graph. 15, 2009).
+Letters tell attractors apart where colours do not.
 """
 
 from __future__ import annotations
@@ -40,20 +40,7 @@ from pipeline.layout.vocabulary import (
 )
 from pipeline.plots import style
 
-COLOURS = (
-    style.BLUE,
-    style.VERMILLION,
-    style.GREEN,
-    style.ORANGE,
-    "#56B4E9",
-    style.PURPLE,
-    "#5B3A1E",
-    "#F0E442",
-    "#332288",
-    "#882255",
-    "#BBDDFF",
-    "#B08D57",
-)
+COLOURS = style.PALETTE
 OTHERS = "#C8E6C0"
 
 GREYS = {
@@ -129,9 +116,9 @@ def cast_of(attractors: xr.Dataset, part: xr.Dataset | None = None) -> Cast:
     attracts = attractors["stability"] == ATTRACTS
     cells = attractors["n_cells"].where(attracts, 0).sum(dims).values
     own = np.flatnonzero(attracts.any(dims).values)
-    ranked = own[np.lexsort((own, -cells[own]))][: len(COLOURS)].tolist()
+    ranked = own[np.lexsort((own, -cells[own]))][: len(style.colours())].tolist()
     colours = {i: _grey_of(attractors["stability"].isel(attractor=i)) for i in range(cells.size)}
-    colours |= dict.fromkeys(own.tolist(), OTHERS) | dict(zip(ranked, COLOURS, strict=False))
+    colours |= dict.fromkeys(own.tolist(), OTHERS) | dict(zip(ranked, style.colours(), strict=False))
     described = attractors if part is None else part
     names = {i: f"{letter(i)}: {describe(described.isel(attractor=i))}" for i in range(cells.size)}
     return Cast(colours, names, tuple(sorted(ranked)))
@@ -239,7 +226,7 @@ def new_panel(
     height
         Minimum height [in] at full width; the figure grows with the legend.
     """
-    look = style.look_at(frame)
+    look = style.sizes()
     room = frame.width_in * (1.0 if frame.compact else 0.33) - 0.35
     lines = [style.folded(_text(e), room, look.legend, "   ") for e in entries]
     line = 1.55 * look.legend / 72.0
@@ -315,6 +302,5 @@ def write_letters(ax: Axes, codes: np.ndarray, attractors: Iterable[int]) -> Non
                 ha="center",
                 va="center",
                 fontsize=size,
-                fontfamily=style.FONT,
                 path_effects=[withStroke(linewidth=2.0, foreground="white")],
             )

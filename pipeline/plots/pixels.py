@@ -156,7 +156,7 @@ Counts = Mapping[tuple[int, int], np.ndarray]
 def _pixels(ax: Axes) -> tuple[int, int]:
     """Return the height and the width of the image that fills the axes [pixels]; it is finer than a saved figure."""
     box, figure = ax.get_window_extent(), ax.figure
-    fine = SUPERSAMPLING * style.DPI / figure.dpi
+    fine = SUPERSAMPLING * style.figure_of(ax).file_dpi / figure.dpi
     return max(1, round(box.height * fine)), max(1, round(box.width * fine))
 
 

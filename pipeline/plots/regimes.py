@@ -41,6 +41,7 @@ _CROSS: dict[str, Any] = {
 }
 
 
+@style.drawn
 def plot_regimes(
     attractors: xr.Dataset,
     *,
@@ -93,7 +94,7 @@ def plot_regimes(
     fixed = labels.caption(part, drop=[x, y])
     lines = line_note(curves) if curves is not None else ""
     text = style.join([titles.get(show, "number of attractors"), lines, fixed, _about(data), left_out(part)])
-    several = show != "number" and np.unique(data["regime"]).size > len(palette.COLOURS)
+    several = show != "number" and np.unique(data["regime"]).size > len(style.colours())
     if curves is not None:
         data = _with_curves(data, curves, x, y)
     if several:
@@ -141,7 +142,7 @@ def _draw_multiples(
     data: xr.Dataset, x: str, y: str, show: str, text: str, frame: style.Frame, cast: palette.Cast
 ) -> style.DataFigure:
     """Draw one panel per attractor or period, shaded by its share of the cells."""
-    most = len(palette.COLOURS)
+    most = len(style.colours())
     total = data["share_of"].sum([x, y]).values
     chosen = np.sort(np.argsort(-total, kind="stable")[:most])
     columns = 2 if frame.compact else 4
@@ -296,12 +297,12 @@ def _label(present: np.ndarray, periods: np.ndarray, show: str) -> str:
 def _looks(data: xr.Dataset, show: str) -> tuple[list[str], list[palette.Entry]]:
     names = [str(v) for v in data["label"].values]
     if show == "number":
-        ramp = matplotlib.colormaps["cividis"]
+        ramp = matplotlib.colormaps[matplotlib.rcParams["image.cmap"]]
         shades = {name: to_hex(ramp(i / max(len(names) - 1, 1))) for i, name in enumerate(names)}
         shades |= {"0": palette.GREYS["pending"]} if "0" in shades else {}
         return list(shades.values()), list(shades.items())
     own = [name for name in names if name != "none"]
-    colours = {**dict(zip(own, palette.COLOURS, strict=False)), "none": palette.GREYS["pending"]}
+    colours = {**dict(zip(own, style.colours(), strict=False)), "none": palette.GREYS["pending"]}
     return [colours[name] for name in names], [
         (name, colours[name]) for name in [*own, *(["none"] if "none" in names else [])]
     ]

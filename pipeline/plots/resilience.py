@@ -22,6 +22,7 @@ from pipeline.products.resilience import ResilienceOptions
 _LOOK: dict[str, Any] = {"linewidth": 0.9, "markersize": 4.0, "capsize": 2.0, "elinewidth": 0.9}
 
 
+@style.drawn
 def plot_resilience(
     ds: xr.Dataset, attractors: xr.Dataset, *, at: Mapping[str, float] | None = None, frame: style.Frame = style.WIDE
 ) -> style.DataFigure:

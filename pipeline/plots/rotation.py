@@ -29,9 +29,10 @@ LEAST_STEP = 0.01
 CLOSE = 1e-6
 """Largest distance of the rotation number of a closed orbit from p/q."""
 
-UNKNOWN, CMAP = "0.8", "cividis"
+UNKNOWN = "0.8"
 
 
+@style.drawn
 def plot_rotation(
     ds: xr.Dataset, *, at: Mapping[str, float] | None = None, frame: style.Frame = style.WIDE
 ) -> style.DataFigure:
@@ -152,9 +153,7 @@ def draw_map(fig: style.DataFigure, ax: Axes, data: xr.Dataset, swept: list[str]
     known = grid[np.isfinite(grid)]
     norm = Normalize(*((known.min(), known.max()) if known.size else (0.0, 1.0)))
     ax.set_facecolor(UNKNOWN)
-    ax.pcolormesh(
-        style.edges(x), style.edges(y), np.ma.masked_invalid(grid), cmap=CMAP, norm=norm, rasterized=True, gid="map"
-    )
+    ax.pcolormesh(style.edges(x), style.edges(y), np.ma.masked_invalid(grid), norm=norm, rasterized=True, gid="map")
     j, i = np.nonzero(locked == 1.0)
     ax.plot(x[i], y[j], ".", color="white", markersize=1.2, gid="locked", rasterized=True)
     style.label_axes(ax, *(labels.parameter_label(data[d]) for d in swept))
@@ -163,8 +162,8 @@ def draw_map(fig: style.DataFigure, ax: Axes, data: xr.Dataset, swept: list[str]
         entries.append(Patch(facecolor=UNKNOWN, label="no rotation number"))
     if entries:
         style.legend_above(fig, entries)
-    bar = fig.colorbar(ScalarMappable(norm, CMAP), ax=ax, pad=0.015, aspect=32, ticks=MaxNLocator(7))
-    style.style_bar(fig, bar, "rotation number\n[turns per drive period]")
+    bar = fig.colorbar(ScalarMappable(norm), ax=ax, pad=0.015, aspect=32, ticks=MaxNLocator(7))
+    style.style_bar(bar, "rotation number\n[turns per drive period]")
 
 
 def draw(run: Run, options: RotationFigureOptions) -> style.DataFigure:

@@ -25,6 +25,7 @@ from pipeline.products.figures import SectionOptions
 _MOST_PT, _LEAST_PT = 1.7, 0.45
 
 
+@style.drawn
 def plot_section(
     ds: xr.Dataset,
     attractors: xr.Dataset | None = None,

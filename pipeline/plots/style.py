@@ -1,17 +1,19 @@
-"""Define the common look of all figures: sizes, fonts, colours, axes, legends and captions.
+"""Define the common form of all figures: frames, axes, legends and captions.
 
-The look is set on each object, never through `matplotlib.rcParams`: these are shared by all threads.
+Fonts, sizes, widths and colours are those of the rcParams; see `pipeline.plots.looks`.
 """
 
 from __future__ import annotations
 
 import difflib
 import math
-import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextvars import ContextVar
-from dataclasses import dataclass
-from typing import Any, Literal
+from dataclasses import dataclass, replace
+from functools import wraps
+from inspect import signature
+from typing import Any, Literal, ParamSpec, TypeVar
+from weakref import WeakSet
 
 import numpy as np
 import xarray as xr
@@ -20,71 +22,59 @@ from matplotlib.collections import PolyCollection
 from matplotlib.colorbar import Colorbar
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from matplotlib.legend import Legend
 from matplotlib.lines import Line2D
-from matplotlib.text import Text
 from matplotlib.ticker import AutoMinorLocator, MaxNLocator
 
-TEXT_LOCK = threading.Lock()
-"""Held while texts are measured or drawn: matplotlib parses mathematics with one parser for all threads."""
+from pipeline.plots.looks import (
+    BLUE,
+    DPI,
+    GREEN,
+    LOCK,
+    LOOK,
+    ORANGE,
+    PALETTE,
+    PURPLE,
+    SKY,
+    VERMILLION,
+    WIDE,
+    WIDE_MM,
+    Frame,
+    Sizes,
+    as_hex,
+    look,
+    restored,
+    sizes,
+)
 
-MM = 1.0 / 25.4
-"""Inches per millimetre."""
+__all__ = [
+    "BLUE", "DPI", "GREEN", "LOCK", "ORANGE", "PALETTE", "PURPLE", "SKY", "VERMILLION", "WIDE", "Frame", "as_hex",
+    "sizes",
+]  # fmt: skip
 
-WIDE_MM, COLUMN_MM = 178.0, 85.0
-"""Widths of two columns and of one of a journal's page."""
+P = ParamSpec("P")
+T = TypeVar("T")
 
-COMPACT_MM = 130.0
-"""Figures narrower than this have smaller letters, and legends below instead of beside."""
+COLUMN_MM = 85.0
+"""Width of a column of a journal's page."""
 
-DPI = 200
-FONT, MATH_FONT = "STIXGeneral", "stix"
-LINE_PT = 0.7
-
-# Okabe & Ito, https://jfly.uni-koeln.de/color/
-BLUE, VERMILLION, GREEN, PURPLE, ORANGE = "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00"
-SKY, GREY = "#56B4E9", "#7F7F7F"
-
-
-@dataclass(frozen=True)
-class Frame:
-    """Width of a figure, and the ranges of its axes.
-
-    Attributes
-    ----------
-    width : float
-        [mm]; 85 is a journal's column.
-    xlim, ylim : tuple of float, optional
-        Range of the axes, in the units on them; by default what is there.
-    """
-
-    width: float = WIDE_MM
-    xlim: tuple[float, float] | None = None
-    ylim: tuple[float, float] | None = None
-
-    @property
-    def compact(self) -> bool:
-        """Whether the figure is too narrow for a legend beside its axes."""
-        return self.width < COMPACT_MM
-
-    @property
-    def width_in(self) -> float:
-        """Return the figure's width [in]."""
-        return self.width * MM
+GREY = "#7F7F7F"
 
 
-WIDE = Frame()
+def drawn(plot: Callable[P, T]) -> Callable[P, T]:
+    """Wrap a function that draws a figure so that it draws with the look of its `frame`."""
+    parameters = signature(plot)
 
+    @wraps(plot)
+    def run(*args: P.args, **kwargs: P.kwargs) -> T:
+        given = parameters.bind(*args, **kwargs)
+        frame: Frame = given.arguments.get("frame", WIDE)
+        with look(frame.style, frame.dpi, frame.width, is_guest()) as found:
+            if "frame" in parameters.parameters:
+                given.arguments["frame"] = replace(frame, width=found.width_mm)
+            return plot(*given.args, **given.kwargs)
 
-@dataclass(frozen=True)
-class Look:
-    """Font sizes [pt] of a figure: axis labels, ticks and legend."""
-
-    label: float
-    tick: float
-    legend: float
-
-
-_LOOKS = {False: Look(10.0, 9.0, 9.0), True: Look(8.0, 7.0, 7.0)}
+    return run
 
 
 class DataFigure(Figure):
@@ -95,15 +85,38 @@ class DataFigure(Figure):
     data : Dataset
         The numbers drawn, after every selection.
     frame : Frame
-    look : Look
+    look : Sizes
     notes : list of str
         Notes for the user who asked for the figure.
+    rc : dict
+        The rcParams with which it is drawn and saved; empty for those of the user.
+    file_dpi : float
+        Resolution of its files.
+    settled : WeakSet
+        Lines that have the widths and colours of the look.
     """
 
     data: xr.Dataset
     frame: Frame
-    look: Look
+    look: Sizes
     notes: list[str]
+    rc: Mapping[str, Any] = {}
+    file_dpi: float
+    settled: WeakSet[Line2D]
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        self.settled = WeakSet()
+        super().__init__(*args, **kwargs)
+
+    def draw(self, renderer: Any) -> None:
+        """Draw the figure with its own rcParams, since fonts are found while texts are drawn."""
+        with restored(self.rc):
+            super().draw(renderer)
+
+    def savefig(self, *args: Any, **kwargs: Any) -> None:
+        """Save the figure with its own rcParams."""
+        with restored(self.rc):
+            super().savefig(*args, **kwargs)
 
     @property
     def panels(self) -> list[Axes]:
@@ -119,7 +132,7 @@ class DataFigure(Figure):
         """Compute the layout, and fix it."""
         engine = self.get_layout_engine()
         if engine is not None:
-            with TEXT_LOCK:
+            with LOCK:
                 engine.execute(self)
             self.set_layout_engine("none")
 
@@ -135,12 +148,15 @@ class Target:
     Attributes
     ----------
     make : callable
-        ``make(figsize=..., layout=...)`` returns the empty figure.
+        ``make(figsize=..., layout=..., dpi=...)`` returns the empty figure; `dpi` may be None.
+    is_guest : bool
+        Whether it lies in axes or a figure of the caller, who sets its look.
     made : DataFigure, optional
         The figure, once it is made.
     """
 
     make: Callable[..., DataFigure]
+    is_guest: bool = False
     made: DataFigure | None = None
 
 
@@ -169,21 +185,18 @@ def new_figure(
     share = 1.0 if exact else min(frame.width / WIDE_MM, 1.0)
     size = (frame.width_in, height * (share + 0.3 * (1.0 - share)))
     layout: Any = "constrained" if arranged else None
-    target = TARGET.get()
+    target, present = TARGET.get(), LOOK.get()
     if target is None:
-        figure = DataFigure(figsize=size, dpi=DPI, facecolor="white", layout=layout)
+        figure = DataFigure(figsize=size, layout=layout)
     else:
-        figure = target.made = target.make(figsize=size, layout=layout)
-    figure.data, figure.frame, figure.look, figure.notes = data, frame, _LOOKS[frame.compact], []
+        figure = target.made = target.make(figsize=size, layout=layout, dpi=frame.dpi or present.asked_dpi)
+    frame = replace(frame, dpi=frame.dpi or present.asked_dpi)
+    figure.data, figure.frame, figure.look, figure.notes = data, frame, sizes(), []
+    figure.rc, figure.file_dpi = present.rc, present.dpi
     engine: Any = figure.get_layout_engine()
     if engine is not None:
         engine.set(w_pad=0.04, h_pad=0.04, hspace=0.02, wspace=0.02)
     return figure
-
-
-def look_at(frame: Frame) -> Look:
-    """Return the font sizes for a figure of a given width."""
-    return _LOOKS[frame.compact]
 
 
 def figure_of(ax: Axes) -> DataFigure:
@@ -194,49 +207,51 @@ def figure_of(ax: Axes) -> DataFigure:
     return figure
 
 
-def look_of(ax: Axes) -> Look:
+def look_of(ax: Axes) -> Sizes:
     """Return the font sizes of the figure that contains the axes."""
     return figure_of(ax).look
 
 
 def finish(figure: DataFigure) -> None:
-    """Set the common font on all texts of a figure, compute its layout, and fix it."""
-    for text in figure.findobj(Text):
-        assert isinstance(text, Text)
-        text.set_fontfamily(FONT)
-        text.set_math_fontfamily(MATH_FONT)
+    """Give new lines the widths and colours of the look, compute the layout of a figure, and fix it."""
+    legends: Any = figure.findobj(Legend)
+    lines = [*(line for ax in figure.axes for line in ax.lines), *(one for own in legends for one in own.get_lines())]
+    for line in lines:
+        if line not in figure.settled:
+            line.set_linewidth(line.get_linewidth() * LOOK.get().line)
+            for kind in ("color", "markerfacecolor", "markeredgecolor"):
+                colour = getattr(line, f"get_{kind}")()
+                if isinstance(colour, str) and colour[:1] == "C":
+                    line.set(**{kind: as_hex(colour)})
+            figure.settled.add(line)
     figure.arrange()
 
 
 def style_axes(ax: Axes, *, inside: bool = True, minor: bool = True) -> None:
-    """Give axes the common style of lines, ticks and fonts.
+    """Place the ticks of axes, unless they are the user's.
 
     Parameters
     ----------
     ax
         The axes.
     inside
-        Ticks inside, on all four sides; else outside, where they do not lie on an image.
+        Ticks as in the style, inside on all four sides; else outside, where they do not lie on an image.
     minor
         Whether to have ticks between the ticks.
     """
-    look = look_of(ax)
-    ax.tick_params(
-        which="both",
-        direction="in" if inside else "out",
-        top=inside,
-        right=inside,
-        width=LINE_PT,
-        labelsize=look.tick,
-        labelfontfamily=FONT,
-    )
-    ax.tick_params(which="major", length=4.0 if look.tick > 8.0 else 3.0)
-    ax.tick_params(which="minor", length=2.2 if look.tick > 8.0 else 1.7)
-    for spine in ax.spines.values():
-        spine.set_linewidth(LINE_PT)
+    if is_guest():
+        return
+    if not inside:
+        ax.tick_params(which="both", direction="out", top=False, right=False)
     if minor:
         ax.xaxis.set_minor_locator(AutoMinorLocator())
         ax.yaxis.set_minor_locator(AutoMinorLocator(2))
+
+
+def is_guest() -> bool:
+    """Whether the figure is drawn into axes or a figure of the user."""
+    target = TARGET.get()
+    return target is not None and target.is_guest
 
 
 def few_ticks(ax: Axes, x: int = 4, y: int = 4) -> None:
@@ -245,28 +260,26 @@ def few_ticks(ax: Axes, x: int = 4, y: int = 4) -> None:
     ax.yaxis.set_major_locator(MaxNLocator(y))
 
 
-def style_bar(figure: DataFigure, bar: Colorbar, text: str) -> None:
-    """Style a colour bar, and set its label."""
-    bar.outline.set_linewidth(LINE_PT)
-    bar.ax.tick_params(labelsize=figure.look.tick, width=LINE_PT, labelfontfamily=FONT)
-    bar.set_label(text, fontsize=figure.look.label)
+def style_bar(bar: Colorbar, text: str) -> None:
+    """Label a colour bar, with its ticks outside of it."""
+    if not is_guest():
+        bar.ax.tick_params(direction="out")
+    bar.set_label(text)
 
 
 def label_axes(ax: Axes, x: str | None = None, y: str | None = None) -> None:
     """Write the labels of the axes."""
-    size = look_of(ax).label
     if x is not None:
-        ax.set_xlabel(x, fontsize=size, labelpad=2.0)
+        ax.set_xlabel(x)
     if y is not None:
-        ax.set_ylabel(y, fontsize=size, labelpad=3.5)
+        ax.set_ylabel(y)
 
 
 def caption(ax: Axes, text: str, share: float = 1.0) -> None:
     """Write a caption above axes, in lines that use at most a share of the figure's width."""
     if text:
-        look = look_of(ax)
         width = share * figure_of(ax).frame.width_in - 0.6
-        ax.set_title(folded(text, width, look.legend), fontsize=look.legend, loc="left", pad=4.0)
+        ax.set_title(folded(text, width, look_of(ax).title), loc="left")
 
 
 def folded(text: str, width: float, size: float, indent: str = "") -> str:
@@ -316,7 +329,7 @@ def legend_inside(ax: Axes, handles: Sequence[Any]) -> None:
     """Place a legend inside axes, in another corner than a legend that is there already."""
     first = ax.get_legend()
     place: Any = "upper right" if first is None else "lower right"
-    ax.legend(handles=list(handles), loc=place, framealpha=0.9, fontsize=look_of(ax).tick)
+    ax.legend(handles=list(handles), loc=place)
     if first is not None:
         ax.add_artist(first)  # axes have one legend of their own
 
@@ -337,6 +350,11 @@ def columns(frame: Frame, texts: Sequence[str], size: float) -> int:
         if sum(widest) + n * 3.1 * size / 72.0 <= width:
             return n
     return 1
+
+
+def colours() -> tuple[str, ...]:
+    """Return the colours of data in the present look, each once."""
+    return LOOK.get().colours
 
 
 def dot(label: str, colour: Any, size: float = 5.0, *, face: Any = None, marker: str = "o") -> Line2D:

@@ -10,12 +10,14 @@ import contextlib
 from collections.abc import Callable, Iterator
 from typing import Any
 
+from matplotlib import rcParams
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.gridspec import GridSpec
 
-from pipeline.plots.style import MM, STRIP, TARGET, TEXT_LOCK, DataFigure, Target
+from pipeline.plots.looks import LOCK, MM
+from pipeline.plots.style import STRIP, TARGET, DataFigure, Target
 
 Host = Axes | Figure | SubFigure
 
@@ -46,7 +48,7 @@ def drawing_into(host: Host | None, make: Callable[..., Any] | None = None) -> I
         Axes for a figure of one panel, or an empty figure or subfigure. None for a figure of its own.
     make
         Function that makes a figure of its own, with the keywords ``FigureClass``, ``figsize``, ``facecolor`` and
-        ``layout``, such as `matplotlib.pyplot.figure`. By default the figure is known to its holder alone.
+        ``layout``, ``dpi``, such as `matplotlib.pyplot.figure`. By default the figure is known to its holder alone.
 
     Raises
     ------
@@ -56,18 +58,20 @@ def drawing_into(host: Host | None, make: Callable[..., Any] | None = None) -> I
     if isinstance(host, Figure | SubFigure) and (host.axes or host.subfigs):
         raise ValueError("figure= has axes already; give an empty Figure or SubFigure, or ax= for one of its axes.")
 
+    screen_dpi = rcParams["figure.dpi"]  # before a look changes it
+
     def guest(**about: Any) -> DataFigure:
         assert host is not None
         return GuestFigure(host, about["figsize"], arranged=about["layout"] is not None)
 
     def own(**about: Any) -> DataFigure:
         assert make is not None
-        figure = make(FigureClass=DataFigure, facecolor="white", **about)
+        figure = make(FigureClass=DataFigure, **{**about, "dpi": about["dpi"] or screen_dpi})
         assert isinstance(figure, DataFigure)
         return figure
 
     chosen = guest if host is not None else own if make is not None else None
-    token = TARGET.set(Target(chosen) if chosen is not None else None)
+    token = TARGET.set(Target(chosen, host is not None) if chosen is not None else None)
     try:
         yield
     finally:
@@ -98,6 +102,7 @@ class GuestFigure(DataFigure):
         self._others: list[Artist] = []
         super().__init__(figsize=figsize)
         self._ax = host if isinstance(host, Axes) else None
+        self.settled.update(host.lines if isinstance(host, Axes) else ())
         self._place: Any = host.figure if isinstance(host, Axes) else host
         root = self._place.get_figure(root=True) if isinstance(self._place, SubFigure) else self._place
         self._root: Figure = root
@@ -157,8 +162,7 @@ class GuestFigure(DataFigure):
     def legend(self, *args: Any, **kwargs: Any) -> Any:
         """Add a legend to the caller's figure, or one column inside the caller's axes."""
         if self._ax is not None:
-            kwargs |= {"loc": "upper right", "ncols": 1, "frameon": True, "framealpha": 0.85, "borderaxespad": 0.5}
-            kwargs.pop("borderpad", None)
+            kwargs = {"handles": kwargs["handles"], "loc": "upper right"}
         made = (self._place if self._ax is None else self._ax).legend(*args, **kwargs)
         self._others.append(made)
         return made
@@ -191,7 +195,7 @@ class GuestFigure(DataFigure):
         """Compute the layout of the caller's figure, which stays free to change."""
         engine = self._root.get_layout_engine()
         if engine is not None and self._arranged:
-            with TEXT_LOCK:
+            with LOCK:
                 engine.execute(self._root)
 
     def _panel(self, ax: Any) -> Any:

@@ -20,6 +20,7 @@ _COLOURS = (style.VERMILLION, style.BLUE, style.GREEN, style.PURPLE, "black")
 """Colours of the edges over a blank plane, by denominator; later denominators share the last."""
 
 
+@style.drawn
 def plot_tongues(
     ds: xr.Dataset, cube: xr.Dataset | None = None, *, frame: style.Frame = style.WIDE
 ) -> style.DataFigure:

@@ -25,6 +25,7 @@ COLOURS = (style.BLUE, style.VERMILLION, style.GREEN, style.PURPLE, style.ORANGE
 """Of the pairs of states that portraits show; a seventh begins again."""
 
 
+@style.drawn
 def plot_trajectory(ds: xr.Dataset, *, degrees: bool = False, frame: style.Frame = style.WIDE) -> style.DataFigure:
     """Draw one trajectory: its time series, its phase portraits, and the path of a point of the model's drawing.
 

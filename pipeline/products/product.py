@@ -10,12 +10,15 @@ from __future__ import annotations
 
 import csv
 import io
+import json
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from pkgutil import resolve_name
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, field_serializer
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
@@ -211,12 +214,24 @@ class FigureOptions(Options):
     width: float = option(178.0, "Width of the figure; 85 is a journal's column", unit="mm", ge=40.0, le=1000.0)
     xlim: tuple[float, float] | None = option(None, "Range of the horizontal axis, in its unit.")
     ylim: tuple[float, float] | None = option(None, "Range of the vertical axis, in its unit.")
+    style: str | Path | list[str | Path | dict[str, Any]] | dict[str, Any] = option(
+        "", "Style of matplotlib that changes magpend's: its name, or a style file."
+    )
+    dpi: float | None = option(
+        None, "Resolution; by default 200, or that of the style", unit="1/in", ge=20.0, le=2400.0
+    )
     out: str = option("", "Figure file; by default in DIR/figures, named by its options.")
     format: Literal["", "png", "pdf", "svg"] = option("", "File format; by default png, or that of --out.")
+
+    @field_serializer("style", when_used="json")
+    def _plain_style(self, style: Any) -> Any:
+        return json.loads(json.dumps(style, default=str))
 
     def label(self) -> str:
         """Return the part of the figure's file name that lists the options with non-default values."""
         given = {name: value for name, value in self.changed().items() if name not in ("out", "format")}
+        if self.style:
+            given["style"] = re.sub(r"[^\w.]+", "-", str(given["style"])).strip("-")
         first = [name for name in _SPEAKS_FOR_ITSELF if name in given]
         order = [*first, *(name for name in given if name not in first)]
         return "".join(f"_{_words(name, given[name])}" for name in order)

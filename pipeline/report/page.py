@@ -229,10 +229,10 @@ def _environment() -> Environment:
 
 def picture_of(figure: Figure, alt: str, caption: str = "", command: str = "") -> Picture:
     """Make a picture block from a matplotlib figure."""
-    from pipeline.plots.style import TEXT_LOCK
+    from pipeline.plots.looks import LOCK
 
     buffer = io.BytesIO()
-    with TEXT_LOCK:
+    with LOCK:
         figure.savefig(buffer, format="png", dpi=_DPI, facecolor="white", metadata={"Software": None})
     width, height = (round(side * _DPI) for side in figure.get_size_inches())
     return Picture(buffer.getvalue(), width, height, plain(alt), caption, command)

@@ -90,6 +90,7 @@ def draw_quantities(parameters: Parameters, names: tuple[str, ...], frequency_hz
     from magpend_core import evaluate
     from pipeline.plots import style
     from pipeline.plots.labels import with_unit
+    from pipeline.plots.looks import look
 
     model = parameters.model
     share = np.linspace(0.0, 1.0, _FINE, endpoint=False)
@@ -101,15 +102,16 @@ def draw_quantities(parameters: Parameters, names: tuple[str, ...], frequency_hz
         coords={"share": ("share", share, {"units": "1", "long_name": "share of the drive's period"})},
         attrs={"title": "quantities over a drive period", "frequency_hz": frequency_hz},
     )
-    drawn = style.new_figure(1.2 + 1.6 * len(names), data)
-    for row, (ax, q) in enumerate(
-        zip(drawn.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0], about, strict=True)
-    ):
-        style.style_axes(ax)
-        ax.plot(share, values[:, row], color=style.BLUE, linewidth=1.2)
-        ax.axhline(0.0, color="0.75", linewidth=style.LINE_PT, zorder=0)
-        style.label_axes(ax, y=with_unit(f"${q.symbol}$" if q.symbol else q.name, q.unit))
-    style.label_axes(ax, x=f"time since {model.section} [drive periods]")
-    ax.set_xlim(0.0, 1.0)
-    style.complete(drawn, drawn.axes[0], f"$f$ = {frequency_hz:.6g} Hz, the model at rest")
+    with look():
+        drawn = style.new_figure(1.2 + 1.6 * len(names), data)
+        for row, (ax, q) in enumerate(
+            zip(drawn.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0], about, strict=True)
+        ):
+            style.style_axes(ax)
+            ax.plot(share, values[:, row], color=style.BLUE, linewidth=1.2)
+            ax.axhline(0.0, color="0.75", linewidth=0.7, zorder=0)
+            style.label_axes(ax, y=with_unit(f"${q.symbol}$" if q.symbol else q.name, q.unit))
+        style.label_axes(ax, x=f"time since {model.section} [drive periods]")
+        ax.set_xlim(0.0, 1.0)
+        style.complete(drawn, drawn.axes[0], f"$f$ = {frequency_hz:.6g} Hz, the model at rest")
     return drawn

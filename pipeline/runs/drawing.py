@@ -98,6 +98,7 @@ def draw_panels(
     from pipeline.plots.targets import PanelsError, drawing_into, width_of
 
     wanted: Any = validated(FIGURES[name].options, options)
+    _check_style(wanted)
     host = ax if ax is not None else figure
     if ax is not None and figure is not None:
         raise SpecError("ax= and figure= are both given; drop one.")
@@ -121,9 +122,17 @@ def draw_panels(
 
 def ready(source: Source, name: str, options: FigureOptions, echo: Echo | None) -> tuple[AnalysedRun, FigureOptions]:
     """Open a run to draw a figure; return it with the figure's completed options."""
+    _check_style(options)
     run = AnalysedRun.of(source, echo)
     settled: Any = prepared(run, FIGURES[name], options)
     return run, settled
+
+
+def _check_style(options: FigureOptions) -> None:
+    if options.style:
+        from pipeline.plots.looks import check_style
+
+        check_style(options.style)
 
 
 def drawn(run: AnalysedRun, name: str, options: FigureOptions) -> DataFigure:

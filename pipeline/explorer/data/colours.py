@@ -109,7 +109,7 @@ def _schemes(run: ExploredRun) -> Iterator[Scheme]:
                 "direction",
                 "direction of the walk",
                 tuple(
-                    Category(_DIRECTIONS.index(d), d, c)
+                    Category(_DIRECTIONS.index(d), d, rgb(c))
                     for d, c in zip(present, (style.BLUE, style.ORANGE), strict=False)
                 ),
                 lambda block: _directions(block["direction"]),
@@ -118,7 +118,7 @@ def _schemes(run: ExploredRun) -> Iterator[Scheme]:
     yield Scheme(
         "status",
         "what became of the cell",
-        tuple(Category(int(s), s.name.lower().replace("_", " "), c) for s, c in _STATUS.items()),
+        tuple(Category(int(s), s.name.lower().replace("_", " "), rgb(c)) for s, c in _STATUS.items()),
         lambda block: block["status"],
     )
 
@@ -173,6 +173,4 @@ def _directions(words: xr.DataArray) -> xr.DataArray:
 
 def rgb(colour: str) -> str:
     """Convert a matplotlib colour to ``#rrggbb``."""
-    from matplotlib.colors import to_hex
-
-    return str(to_hex(colour))
+    return style.as_hex(colour)

@@ -100,7 +100,11 @@ class Legend:
             return self._free[new % len(self._free)]
         motion = self.motion(entry.motion)
         # paler than any attractor's: a class of cells is none
-        return _pale(MOTION_COLOURS[(entry.motion - 1) % len(MOTION_COLOURS)]) if motion else rgb(GREYS["not settled"])
+        return (
+            _pale(rgb(MOTION_COLOURS[(entry.motion - 1) % len(MOTION_COLOURS)]))
+            if motion
+            else rgb(GREYS["not settled"])
+        )
 
 
 def _status_word(status: int) -> str:

@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any, Literal, overload
 from magpend._bases import Drawing, Panels
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure, SubFigure
 
@@ -28,6 +30,8 @@ class Plots(Drawing):
         width: float = 178.0,
         xlim: tuple[float, float] | None = None,
         ylim: tuple[float, float] | None = None,
+        style: str | Path | list[str | Path | Mapping[str, Any]] | Mapping[str, Any] = "",
+        dpi: float | None = None,
         state: str = "",
         quantity: str = "",
         layout: Literal["overlay"] = "overlay",
@@ -47,6 +51,8 @@ class Plots(Drawing):
         width: float = 178.0,
         xlim: tuple[float, float] | None = None,
         ylim: tuple[float, float] | None = None,
+        style: str | Path | list[str | Path | Mapping[str, Any]] | Mapping[str, Any] = "",
+        dpi: float | None = None,
         state: str = "",
         quantity: str = "",
         layout: Literal["side"],
@@ -65,6 +71,8 @@ class Plots(Drawing):
         width: float = 178.0,
         xlim: tuple[float, float] | None = None,
         ylim: tuple[float, float] | None = None,
+        style: str | Path | list[str | Path | Mapping[str, Any]] | Mapping[str, Any] = "",
+        dpi: float | None = None,
         state: str = "",
         quantity: str = "",
         layout: Literal["overlay", "side"] = "overlay",
@@ -89,6 +97,10 @@ class Plots(Drawing):
             Range of the horizontal axis, in its unit.
         ylim
             Range of the vertical axis, in its unit.
+        style
+            Style of matplotlib that changes magpend's: its name, or a style file.
+        dpi
+            Resolution; by default 200, or that of the style [1/in] (20 or more, at most 2400).
         state
             State to draw; by default the model's first.
         quantity
@@ -126,6 +138,8 @@ class Plots(Drawing):
         width: float = 178.0,
         xlim: tuple[float, float] | None = None,
         ylim: tuple[float, float] | None = None,
+        style: str | Path | list[str | Path | Mapping[str, Any]] | Mapping[str, Any] = "",
+        dpi: float | None = None,
         state: str = "",
         tolerance: float = 0.0,
         polish: bool = True,
@@ -164,6 +178,10 @@ class Plots(Drawing):
             Range of the horizontal axis, in its unit.
         ylim
             Range of the vertical axis, in its unit.
+        style
+            Style of matplotlib that changes magpend's: its name, or a style file.
+        dpi
+            Resolution; by default 200, or that of the style [1/in] (20 or more, at most 2400).
         state
             State to draw; by default the model's first.
         tolerance
@@ -225,6 +243,8 @@ class Plots(Drawing):
         width: float = 178.0,
         xlim: tuple[float, float] | None = None,
         ylim: tuple[float, float] | None = None,
+        style: str | Path | list[str | Path | Mapping[str, Any]] | Mapping[str, Any] = "",
+        dpi: float | None = None,
         state: str = "",
         tolerance: float = 0.0,
         polish: bool = True,
@@ -259,6 +279,10 @@ class Plots(Drawing):
             Range of the horizontal axis, in its unit.
         ylim
             Range of the vertical axis, in its unit.
+        style
+            Style of matplotlib that changes magpend's: its name, or a style file.
+        dpi
+            Resolution; by default 200, or that of the style [1/in] (20 or more, at most 2400).
         state
             State to draw; by default the model's first.
         tolerance
@@ -316,6 +340,8 @@ class Plots(Drawing):
         width: float = 178.0,
         xlim: tuple[float, float] | None = None,
         ylim: tuple[float, float] | None = None,
+        style: str | Path | list[str | Path | Mapping[str, Any]] | Mapping[str, Any] = "",
+        dpi: float | None = None,
         tolerance: float = 0.0,
         polish: bool = True,
         residual: float = 1e-10,
@@ -351,6 +377,10 @@ class Plots(Drawing):
             Range of the horizontal axis, in its unit.
         ylim
             Range of the vertical axis, in its unit.
+        style
+            Style of matplotlib that changes magpend's: its name, or a style file.
+        dpi
+            Resolution; by default 200, or that of the style [1/in] (20 or more, at most 2400).
         tolerance
             Largest distance of a closed cell from its orbit, in units of the states' scales; 0 stands for ten times the
             run's closure tolerance, at least 1e-4 (0 or more).
@@ -406,6 +436,8 @@ class Plots(Drawing):
         width: float = 178.0,
         xlim: tuple[float, float] | None = None,
         ylim: tuple[float, float] | None = None,
+        style: str | Path | list[str | Path | Mapping[str, Any]] | Mapping[str, Any] = "",
+        dpi: float | None = None,
         tolerance: float = 0.0,
         polish: bool = True,
         residual: float = 1e-10,
@@ -440,6 +472,10 @@ class Plots(Drawing):
             Range of the horizontal axis, in its unit.
         ylim
             Range of the vertical axis, in its unit.
+        style
+            Style of matplotlib that changes magpend's: its name, or a style file.
+        dpi
+            Resolution; by default 200, or that of the style [1/in] (20 or more, at most 2400).
         tolerance
             Largest distance of a closed cell from its orbit, in units of the states' scales; 0 stands for ten times the
             run's closure tolerance, at least 1e-4 (0 or more).
@@ -497,6 +533,8 @@ class Plots(Drawing):
         width: float = 178.0,
         xlim: tuple[float, float] | None = None,
         ylim: tuple[float, float] | None = None,
+        style: str | Path | list[str | Path | Mapping[str, Any]] | Mapping[str, Any] = "",
+        dpi: float | None = None,
         tolerance: float = 0.0,
         polish: bool = True,
         residual: float = 1e-10,
@@ -530,6 +568,10 @@ class Plots(Drawing):
             Range of the horizontal axis, in its unit.
         ylim
             Range of the vertical axis, in its unit.
+        style
+            Style of matplotlib that changes magpend's: its name, or a style file.
+        dpi
+            Resolution; by default 200, or that of the style [1/in] (20 or more, at most 2400).
         tolerance
             Largest distance of a closed cell from its orbit, in units of the states' scales; 0 stands for ten times the
             run's closure tolerance, at least 1e-4 (0 or more).
@@ -585,6 +627,8 @@ class Plots(Drawing):
         width: float = 178.0,
         xlim: tuple[float, float] | None = None,
         ylim: tuple[float, float] | None = None,
+        style: str | Path | list[str | Path | Mapping[str, Any]] | Mapping[str, Any] = "",
+        dpi: float | None = None,
         tolerance: float = 0.0,
         polish: bool = True,
         residual: float = 1e-10,
@@ -620,6 +664,10 @@ class Plots(Drawing):
             Range of the horizontal axis, in its unit.
         ylim
             Range of the vertical axis, in its unit.
+        style
+            Style of matplotlib that changes magpend's: its name, or a style file.
+        dpi
+            Resolution; by default 200, or that of the style [1/in] (20 or more, at most 2400).
         tolerance
             Largest distance of a closed cell from its orbit, in units of the states' scales; 0 stands for ten times the
             run's closure tolerance, at least 1e-4 (0 or more).
@@ -680,6 +728,8 @@ class Plots(Drawing):
         width: float = 178.0,
         xlim: tuple[float, float] | None = None,
         ylim: tuple[float, float] | None = None,
+        style: str | Path | list[str | Path | Mapping[str, Any]] | Mapping[str, Any] = "",
+        dpi: float | None = None,
         state: str = "",
         spectrum: bool = False,
         as_map: Literal[False] = False,
@@ -699,6 +749,8 @@ class Plots(Drawing):
         width: float = 178.0,
         xlim: tuple[float, float] | None = None,
         ylim: tuple[float, float] | None = None,
+        style: str | Path | list[str | Path | Mapping[str, Any]] | Mapping[str, Any] = "",
+        dpi: float | None = None,
         state: str = "",
         spectrum: bool = False,
         as_map: Literal[True],
@@ -717,6 +769,8 @@ class Plots(Drawing):
         width: float = 178.0,
         xlim: tuple[float, float] | None = None,
         ylim: tuple[float, float] | None = None,
+        style: str | Path | list[str | Path | Mapping[str, Any]] | Mapping[str, Any] = "",
+        dpi: float | None = None,
         state: str = "",
         spectrum: bool = False,
         as_map: bool = False,
@@ -741,6 +795,10 @@ class Plots(Drawing):
             Range of the horizontal axis, in its unit.
         ylim
             Range of the vertical axis, in its unit.
+        style
+            Style of matplotlib that changes magpend's: its name, or a style file.
+        dpi
+            Resolution; by default 200, or that of the style [1/in] (20 or more, at most 2400).
         state
             State to draw; by default the model's first.
         spectrum
@@ -777,6 +835,8 @@ class Plots(Drawing):
         width: float = 178.0,
         xlim: tuple[float, float] | None = None,
         ylim: tuple[float, float] | None = None,
+        style: str | Path | list[str | Path | Mapping[str, Any]] | Mapping[str, Any] = "",
+        dpi: float | None = None,
         exponent: int = 1,
         per: Literal["s", "period"] = "s",
         ax: Axes | None = None,
@@ -799,6 +859,10 @@ class Plots(Drawing):
             Range of the horizontal axis, in its unit.
         ylim
             Range of the vertical axis, in its unit.
+        style
+            Style of matplotlib that changes magpend's: its name, or a style file.
+        dpi
+            Resolution; by default 200, or that of the style [1/in] (20 or more, at most 2400).
         exponent
             Index of the exponent; 1 is the largest (1 or more).
         per
@@ -831,6 +895,8 @@ class Plots(Drawing):
         width: float = 178.0,
         xlim: tuple[float, float] | None = None,
         ylim: tuple[float, float] | None = None,
+        style: str | Path | list[str | Path | Mapping[str, Any]] | Mapping[str, Any] = "",
+        dpi: float | None = None,
         tolerance: float = 0.0,
         polish: bool = True,
         residual: float = 1e-10,
@@ -867,6 +933,10 @@ class Plots(Drawing):
             Range of the horizontal axis, in its unit.
         ylim
             Range of the vertical axis, in its unit.
+        style
+            Style of matplotlib that changes magpend's: its name, or a style file.
+        dpi
+            Resolution; by default 200, or that of the style [1/in] (20 or more, at most 2400).
         tolerance
             Largest distance of a closed cell from its orbit, in units of the states' scales; 0 stands for ten times the
             run's closure tolerance, at least 1e-4 (0 or more).
@@ -928,6 +998,8 @@ class Plots(Drawing):
         width: float = 178.0,
         xlim: tuple[float, float] | None = None,
         ylim: tuple[float, float] | None = None,
+        style: str | Path | list[str | Path | Mapping[str, Any]] | Mapping[str, Any] = "",
+        dpi: float | None = None,
         state: str = "",
         parameter: str = "",
         low: float | None = None,
@@ -958,6 +1030,10 @@ class Plots(Drawing):
             Range of the horizontal axis, in its unit.
         ylim
             Range of the vertical axis, in its unit.
+        style
+            Style of matplotlib that changes magpend's: its name, or a style file.
+        dpi
+            Resolution; by default 200, or that of the style [1/in] (20 or more, at most 2400).
         state
             State to draw; by default the model's first.
         parameter
@@ -1007,6 +1083,8 @@ class Plots(Drawing):
         width: float = 178.0,
         xlim: tuple[float, float] | None = None,
         ylim: tuple[float, float] | None = None,
+        style: str | Path | list[str | Path | Mapping[str, Any]] | Mapping[str, Any] = "",
+        dpi: float | None = None,
         parameter: str = "",
         low: float | None = None,
         high: float | None = None,
@@ -1034,6 +1112,10 @@ class Plots(Drawing):
             Range of the horizontal axis, in its unit.
         ylim
             Range of the vertical axis, in its unit.
+        style
+            Style of matplotlib that changes magpend's: its name, or a style file.
+        dpi
+            Resolution; by default 200, or that of the style [1/in] (20 or more, at most 2400).
         parameter
             Continuation parameter: a parameter, or frequency_hz; by default the swept one.
         low
@@ -1080,6 +1162,8 @@ class Plots(Drawing):
         width: float = 178.0,
         xlim: tuple[float, float] | None = None,
         ylim: tuple[float, float] | None = None,
+        style: str | Path | list[str | Path | Mapping[str, Any]] | Mapping[str, Any] = "",
+        dpi: float | None = None,
         parameter: str = "",
         low: float | None = None,
         high: float | None = None,
@@ -1115,6 +1199,10 @@ class Plots(Drawing):
             Range of the horizontal axis, in its unit.
         ylim
             Range of the vertical axis, in its unit.
+        style
+            Style of matplotlib that changes magpend's: its name, or a style file.
+        dpi
+            Resolution; by default 200, or that of the style [1/in] (20 or more, at most 2400).
         parameter
             Continuation parameter: a parameter, or frequency_hz; by default the swept one.
         low
@@ -1162,6 +1250,8 @@ class Plots(Drawing):
         width: float = 178.0,
         xlim: tuple[float, float] | None = None,
         ylim: tuple[float, float] | None = None,
+        style: str | Path | list[str | Path | Mapping[str, Any]] | Mapping[str, Any] = "",
+        dpi: float | None = None,
         ax: Axes | None = None,
         figure: Figure | SubFigure | None = None,
         echo: Callable[[str], None] | None = None,
@@ -1182,6 +1272,10 @@ class Plots(Drawing):
             Range of the horizontal axis, in its unit.
         ylim
             Range of the vertical axis, in its unit.
+        style
+            Style of matplotlib that changes magpend's: its name, or a style file.
+        dpi
+            Resolution; by default 200, or that of the style [1/in] (20 or more, at most 2400).
         ax
             Axes to draw into; for a figure of one panel.
         figure
@@ -1213,6 +1307,8 @@ class Plots(Drawing):
         width: float = 178.0,
         xlim: tuple[float, float] | None = None,
         ylim: tuple[float, float] | None = None,
+        style: str | Path | list[str | Path | Mapping[str, Any]] | Mapping[str, Any] = "",
+        dpi: float | None = None,
         parameter: str = "",
         low: float | None = None,
         high: float | None = None,
@@ -1247,6 +1343,10 @@ class Plots(Drawing):
             Range of the horizontal axis, in its unit.
         ylim
             Range of the vertical axis, in its unit.
+        style
+            Style of matplotlib that changes magpend's: its name, or a style file.
+        dpi
+            Resolution; by default 200, or that of the style [1/in] (20 or more, at most 2400).
         parameter
             Continuation parameter: a parameter, or frequency_hz; by default the swept one.
         low
@@ -1292,6 +1392,8 @@ class Plots(Drawing):
         width: float = 178.0,
         xlim: tuple[float, float] | None = None,
         ylim: tuple[float, float] | None = None,
+        style: str | Path | list[str | Path | Mapping[str, Any]] | Mapping[str, Any] = "",
+        dpi: float | None = None,
         max_period: int = 1,
         starts: int = 400,
         rounds: int = 6,
@@ -1319,6 +1421,10 @@ class Plots(Drawing):
             Range of the horizontal axis, in its unit.
         ylim
             Range of the vertical axis, in its unit.
+        style
+            Style of matplotlib that changes magpend's: its name, or a style file.
+        dpi
+            Resolution; by default 200, or that of the style [1/in] (20 or more, at most 2400).
         max_period
             Longest orbit period [drive periods or returns] (1 or more).
         starts
@@ -1361,6 +1467,8 @@ class Plots(Drawing):
         width: float = 178.0,
         xlim: tuple[float, float] | None = None,
         ylim: tuple[float, float] | None = None,
+        style: str | Path | list[str | Path | Mapping[str, Any]] | Mapping[str, Any] = "",
+        dpi: float | None = None,
         state: str = "",
         moving: str = "",
         over: str = "",
@@ -1384,6 +1492,10 @@ class Plots(Drawing):
             Range of the horizontal axis, in its unit.
         ylim
             Range of the vertical axis, in its unit.
+        style
+            Style of matplotlib that changes magpend's: its name, or a style file.
+        dpi
+            Resolution; by default 200, or that of the style [1/in] (20 or more, at most 2400).
         state
             State to draw; by default the model's first.
         moving
@@ -1418,6 +1530,8 @@ class Plots(Drawing):
         width: float = 178.0,
         xlim: tuple[float, float] | None = None,
         ylim: tuple[float, float] | None = None,
+        style: str | Path | list[str | Path | Mapping[str, Any]] | Mapping[str, Any] = "",
+        dpi: float | None = None,
         tolerance: float = 0.0,
         polish: bool = True,
         residual: float = 1e-10,
@@ -1465,6 +1579,10 @@ class Plots(Drawing):
             Range of the horizontal axis, in its unit.
         ylim
             Range of the vertical axis, in its unit.
+        style
+            Style of matplotlib that changes magpend's: its name, or a style file.
+        dpi
+            Resolution; by default 200, or that of the style [1/in] (20 or more, at most 2400).
         tolerance
             Largest distance of a closed cell from its orbit, in units of the states' scales; 0 stands for ten times the
             run's closure tolerance, at least 1e-4 (0 or more).
@@ -1545,6 +1663,8 @@ class Plots(Drawing):
         width: float = 178.0,
         xlim: tuple[float, float] | None = None,
         ylim: tuple[float, float] | None = None,
+        style: str | Path | list[str | Path | Mapping[str, Any]] | Mapping[str, Any] = "",
+        dpi: float | None = None,
         tolerance: float = 0.0,
         polish: bool = True,
         residual: float = 1e-10,
@@ -1586,6 +1706,10 @@ class Plots(Drawing):
             Range of the horizontal axis, in its unit.
         ylim
             Range of the vertical axis, in its unit.
+        style
+            Style of matplotlib that changes magpend's: its name, or a style file.
+        dpi
+            Resolution; by default 200, or that of the style [1/in] (20 or more, at most 2400).
         tolerance
             Largest distance of a closed cell from its orbit, in units of the states' scales; 0 stands for ten times the
             run's closure tolerance, at least 1e-4 (0 or more).
@@ -1655,6 +1779,8 @@ class Plots(Drawing):
         width: float = 178.0,
         xlim: tuple[float, float] | None = None,
         ylim: tuple[float, float] | None = None,
+        style: str | Path | list[str | Path | Mapping[str, Any]] | Mapping[str, Any] = "",
+        dpi: float | None = None,
         low: Mapping[str, float] = {},
         high: Mapping[str, float] = {},
         radius: float | None = None,
@@ -1678,6 +1804,8 @@ class Plots(Drawing):
         width: float = 178.0,
         xlim: tuple[float, float] | None = None,
         ylim: tuple[float, float] | None = None,
+        style: str | Path | list[str | Path | Mapping[str, Any]] | Mapping[str, Any] = "",
+        dpi: float | None = None,
         low: Mapping[str, float] = {},
         high: Mapping[str, float] = {},
         radius: float | None = None,
@@ -1700,6 +1828,8 @@ class Plots(Drawing):
         width: float = 178.0,
         xlim: tuple[float, float] | None = None,
         ylim: tuple[float, float] | None = None,
+        style: str | Path | list[str | Path | Mapping[str, Any]] | Mapping[str, Any] = "",
+        dpi: float | None = None,
         low: Mapping[str, float] = {},
         high: Mapping[str, float] = {},
         radius: float | None = None,
@@ -1730,6 +1860,10 @@ class Plots(Drawing):
             Range of the horizontal axis, in its unit.
         ylim
             Range of the vertical axis, in its unit.
+        style
+            Style of matplotlib that changes magpend's: its name, or a style file.
+        dpi
+            Resolution; by default 200, or that of the style [1/in] (20 or more, at most 2400).
         low
             Box: least value of a state, such as x=-0.5; a cell below it has left.
         high
@@ -1774,6 +1908,8 @@ class Plots(Drawing):
         width: float = 178.0,
         xlim: tuple[float, float] | None = None,
         ylim: tuple[float, float] | None = None,
+        style: str | Path | list[str | Path | Mapping[str, Any]] | Mapping[str, Any] = "",
+        dpi: float | None = None,
         state: str = "",
         bins: int = 200,
         bandwidth: float = 1.0,
@@ -1799,6 +1935,10 @@ class Plots(Drawing):
             Range of the horizontal axis, in its unit.
         ylim
             Range of the vertical axis, in its unit.
+        style
+            Style of matplotlib that changes magpend's: its name, or a style file.
+        dpi
+            Resolution; by default 200, or that of the style [1/in] (20 or more, at most 2400).
         state
             State whose density is estimated; by default the model's first.
         bins

@@ -99,6 +99,7 @@ def _milli(ds: xr.Dataset, channel: str) -> tuple[str, float]:
     return MILLI.get(unit, (unit, 1.0))
 
 
+@style.drawn
 def plot_fit(ds: xr.Dataset) -> style.DataFigure:
     """Draw measured and computed values of up to four pieces, with their residuals.
 
@@ -180,6 +181,7 @@ def _share_range(row: list[Axes]) -> None:
         ax.tick_params(labelleft=False)
 
 
+@style.drawn
 def plot_residuals(ds: xr.Dataset) -> style.DataFigure:
     """Draw the residuals of each channel: autocorrelation, rms by piece, residuals against the channel's rate of
     change, and histogram.
@@ -291,6 +293,7 @@ def _draw_histogram(ax: Axes, views: xr.Dataset, channel: str, factor: float) ->
     ax.set_ylim(0.0, None)
 
 
+@style.drawn
 def plot_profiles(attrs: Mapping[Any, Any], result: Mapping[str, Any]) -> style.DataFigure:
     """Draw the profile likelihood of each unknown, with the parabola that its standard error predicts.
 
@@ -371,6 +374,7 @@ def _engineering(size: float) -> tuple[float, int]:
     return 10.0**-exponent, exponent
 
 
+@style.drawn
 def plot_correlations(attrs: Mapping[Any, Any], result: Mapping[str, Any]) -> style.DataFigure:
     """Draw the correlation matrix of the estimates; entries of parameters that the data do not determine stay empty.
 
@@ -411,7 +415,7 @@ def plot_correlations(attrs: Mapping[Any, Any], result: Mapping[str, Any]) -> st
                 j, i, text, ha="center", va="center", fontsize=fig.look.tick - 1.5, color="white" if strong else "black"
             )
     ax.set_title(" ", fontsize=fig.look.legend)
-    style.style_bar(fig, fig.colorbar(image, ax=ax, pad=0.02, aspect=28), "correlation of the estimates")
+    style.style_bar(fig.colorbar(image, ax=ax, pad=0.02, aspect=28), "correlation of the estimates")
     _finish(fig)
     return fig
 

@@ -45,6 +45,7 @@ _MODELS: dict[str, tuple[str, Any, str]] = {"fit": ("black", "-", "o"), "dipoles
 """Colour, dash and marker by model."""
 
 
+@style.drawn
 def draw_curves(outcome: Outcome, frame: style.Frame = style.WIDE) -> style.DataFigure:
     """Draw the measured torque curves of some locked angles, each with its fitted bump (as Fig. 6 of Wojna et al.
     2018).
@@ -75,10 +76,11 @@ def draw_curves(outcome: Outcome, frame: style.Frame = style.WIDE) -> style.Data
         style.dot("left", "0.3", 4.0, face="white"),
         Line2D([], [], color="0.3", linewidth=1.0, label=_BUMP),
     ]
-    ax.axhline(0.0, color="0.75", linewidth=style.LINE_PT, zorder=0)
+    ax.axhline(0.0, color="0.75", linewidth=0.7, zorder=0)
     return _done(figure, ax, outcome, handles)
 
 
+@style.drawn
 def draw_numbers(outcome: Outcome, frame: style.Frame = style.WIDE) -> style.DataFigure:
     """Draw height, position and width of the fitted bumps against the locked angle, with the laws fitted to these
     values (as Fig. 7 of Wojna et al. 2018).
@@ -124,6 +126,7 @@ def draw_numbers(outcome: Outcome, frame: style.Frame = style.WIDE) -> style.Dat
     return _done(figure, grid[0], outcome, handles, short=True)
 
 
+@style.drawn
 def draw_map(outcome: Outcome, frame: style.Frame = style.WIDE) -> style.DataFigure:
     """Draw the fitted torque in the plane of both angles, with the line of zero torque and the readings (as Fig. 8 of
     Wojna et al. 2018).
@@ -148,11 +151,12 @@ def draw_map(outcome: Outcome, frame: style.Frame = style.WIDE) -> style.DataFig
     ax.set_xlim(*np.degrees(angle[[0, -1]]))
     ax.set_ylim(*np.degrees(locked[[0, -1]]))
     bar = figure.colorbar(image, ax=ax, pad=0.02)
-    style.style_bar(figure, bar, f"{_TORQUE}, {_FIT}")
+    style.style_bar(bar, f"{_TORQUE}, {_FIT}")
     handles = [Line2D([], [], color="black", linewidth=1.1, label="transition"), style.dot("readings", "0.25", 2.5)]
     return _done(figure, ax, outcome, handles)
 
 
+@style.drawn
 def draw_comparison(outcome: Outcome, frame: style.Frame = style.WIDE) -> style.DataFigure:
     """Draw the torques of the joint fit and of point dipoles together with the readings, and the residuals of both (as
     Fig. 9 of Wojna et al. 2018).
@@ -180,7 +184,7 @@ def draw_comparison(outcome: Outcome, frame: style.Frame = style.WIDE) -> style.
         upper.set_title(text, fontsize=figure.look.legend)
         for ax in (upper, lower):
             style.style_axes(ax)
-            ax.axhline(0.0, color="0.75", linewidth=style.LINE_PT, zorder=0)
+            ax.axhline(0.0, color="0.75", linewidth=0.7, zorder=0)
         style.label_axes(lower, x=_ANGLE)
     style.label_axes(grid[0, 0], y=_TORQUE)
     style.label_axes(grid[1, 0], y="left over [N m]")

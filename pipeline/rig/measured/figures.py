@@ -27,6 +27,7 @@ _LOOKS = {"up": (1.9, 0.0), "down": (3.8, pixels.TINT), "none": (1.9, 0.0)}
 SIMULATED, UNMET = "simulated rig", "0.72"
 
 
+@style.drawn
 def plot_measured(
     measured: xr.Dataset,
     cube: xr.Dataset | None = None,
@@ -189,6 +190,7 @@ def _handles(measured: xr.Dataset, motions: Motions, diagram: Diagram | None, ov
     return handles
 
 
+@style.drawn
 def plot_comparison(
     compared: xr.Dataset, computed: Computed, *, state: str = "", degrees: bool = False, frame: style.Frame = style.WIDE
 ) -> style.DataFigure:

@@ -18,6 +18,7 @@ RIG, MODEL = "0.15", style.VERMILLION
 SUFFIX = "_computed"
 
 
+@style.drawn
 def plot_series(ds: xr.Dataset, *, degrees: bool = False, frame: style.Frame = style.WIDE) -> style.DataFigure:
     """Draw measured and computed time series from `pipeline.rig.measured.series.series_of`, and their phase portraits.
 

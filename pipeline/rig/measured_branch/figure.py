@@ -31,6 +31,7 @@ _LOOKS = {"stable": (style.VERMILLION, "o"), "unstable": ("white", "o"), "unknow
 """Face colour and marker."""
 
 
+@style.drawn
 def plot_branch(
     measured: xr.Dataset,
     branches: xr.Dataset | None = None,

@@ -41,6 +41,7 @@ LEAST_MARK = 0.003
 """Least width of a mark, relative to the width of the axes."""
 
 
+@style.drawn
 def plot_recording(ds: xr.Dataset, *, frame: style.Frame = style.WIDE) -> style.DataFigure:
     """Draw the measured quantities of a recording over time, and mark the faults found in it.
 

@@ -15,7 +15,7 @@ from pipeline.analysis.selection import place
 from pipeline.plots import Frame, draw_figure, save_data, save_figure
 from pipeline.plots.bifurcation import plot_bifurcation
 from pipeline.plots.motions import motions_of
-from pipeline.plots.style import BLUE, GREY
+from pipeline.plots.style import GREY, PALETTE
 from pipeline.products.product import Options, default_of
 from pipeline.products.registry import FIGURES
 from tests.pipeline.plots.made_up import PENDULUM
@@ -80,6 +80,7 @@ def other_value(model, name):
         "show": "number",
         "colour": "attractor",
         "width": 85.0,
+        "dpi": 300.0,
         "state": "psi2",
         "quantity": "energy.max",
         "against": "psi2",
@@ -209,7 +210,7 @@ def test_frame__limits_show_and_keep_a_part():
 def test_motions__words_have_colours_and_neutral_ones_are_grey():
     found = motions_of(make_cube())
     assert found.words == load_model("pendulum").classifier.words
-    assert found.colours[found.words.index("left")] == BLUE
+    assert found.colours[found.words.index("left")] == PALETTE[0]
     assert {to_hex(found.colours[c]) for c in load_model("pendulum").classifier.neutral} == {GREY.lower()}
     own = [found.colours[c] for c in found.drawn if found.colours[c] != GREY]
     assert len(set(own)) == len(own)

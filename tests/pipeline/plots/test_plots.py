@@ -89,9 +89,9 @@ def test_plot_bifurcation__each_class_has_its_points_and_colour():
     for branch, kind in enumerate(KINDS):
         np.testing.assert_allclose(found[kind], expected(ds, branch))
     lines = by_gid(fig)
-    assert to_rgb(lines["points:up:left"].get_color()) == to_rgb(style.BLUE)
-    assert to_rgb(lines["points:up:right"].get_color()) == to_rgb(style.VERMILLION)
-    assert to_rgb(lines["points:down:rotating"].get_color()) == style.tinted(style.PURPLE, pixels.TINT)
+    assert to_rgb(lines["points:up:left"].get_color()) == to_rgb(style.as_hex(style.BLUE))
+    assert to_rgb(lines["points:up:right"].get_color()) == to_rgb(style.as_hex(style.VERMILLION))
+    assert to_rgb(lines["points:down:rotating"].get_color()) == style.tinted(style.as_hex(style.PURPLE), pixels.TINT)
     assert legend_texts(fig) == ["left", "right", "straddling", "rotating", "up", "down"]
     # a complete cube has no strip of what is absent
     assert len(fig.axes) == 1
@@ -251,7 +251,11 @@ def test_plot_bifurcation__image_has_the_same_points(monkeypatch):
     ds = set_status(make_cube(), 1, 2, PENDING)
     fig = plot_bifurcation(ds, layout="side")
     assert not drawn(fig)
-    for axes, branch, colour in [(0, 0, style.BLUE), (0, 1, style.VERMILLION), (2, 2, style.GREEN)]:
+    for axes, branch, colour in [
+        (0, 0, style.as_hex(style.BLUE)),
+        (0, 1, style.as_hex(style.VERMILLION)),
+        (2, 2, style.as_hex(style.GREEN)),
+    ]:
         for x, y in expected(ds, branch):
             assert_ink(pixel(fig, x, y, axes), colour)
     inked = (image_of(fig)[0] < 255).any(-1)
@@ -269,9 +273,9 @@ def test_plot_bifurcation__image_shows_up_over_down(monkeypatch):
     ds["direction"] = ("branch", ["up", "down"])
     ds["section"][1, 3, :, :2] -= 0.02
     fig = plot_bifurcation(ds)
-    tint = style.tinted(style.BLUE, pixels.TINT)
-    np.testing.assert_allclose(pixel(fig, 2.1, -0.11), to_rgb(style.BLUE), atol=0.01)
-    np.testing.assert_allclose(pixel(fig, 2.3, -0.13), to_rgb(style.BLUE), atol=0.01)
+    tint = style.tinted(style.as_hex(style.BLUE), pixels.TINT)
+    np.testing.assert_allclose(pixel(fig, 2.1, -0.11), to_rgb(style.as_hex(style.BLUE)), atol=0.01)
+    np.testing.assert_allclose(pixel(fig, 2.3, -0.13), to_rgb(style.as_hex(style.BLUE)), atol=0.01)
     np.testing.assert_allclose(pixel(fig, 2.3, -0.15), tint, atol=0.01)
 
 
@@ -283,9 +287,9 @@ def test_plot_bifurcation__fuller_pixels_are_darker_on_one_scale_of_all_panels(m
     ds["section"][:, :, 30:, :2] = 0.1 + 0.05 * (np.arange(10) % 2)[:, None]
     fig = plot_bifurcation(ds)
     full, single = pixel(fig, 2.1, 0.2), pixel(fig, 2.1, 0.15)
-    np.testing.assert_allclose(full, to_rgb(style.VERMILLION), atol=0.01)
+    np.testing.assert_allclose(full, to_rgb(style.as_hex(style.VERMILLION)), atol=0.01)
     assert single[2] > full[2] + 0.1
-    assert_ink(single, style.VERMILLION)
+    assert_ink(single, style.as_hex(style.VERMILLION))
     # forty points on four heights are darker than on twenty, also in another panel
     ds = ds.isel(branch=[0, 0]).assign_coords(direction=("branch", ["up", "down"]))
     for direction, n in enumerate((4, 20)):
