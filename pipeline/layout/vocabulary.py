@@ -44,7 +44,7 @@ STABILITIES = ("absent", "attracts", "unstable", "transient", "not_settled", "ne
 _, ATTRACTS, UNSTABLE, TRANSIENT, NOT_SETTLED, NEUTRAL = range(len(STABILITIES))
 """Values of `stability`; see `pipeline.analysis.attractors.finding.stability`."""
 
-EVIDENCE = ("none", "eigenvalues", "multipliers", "approach", "stayed", "left", "volume")
+EVIDENCE = ("none", "eigenvalues", "multipliers", "approach", "stayed", "left", "volume", "one_side")
 """Values of `evidence`: the grounds for the stability of a set."""
 
 DECISIONS = ("undecided", "closed", "certain", "approaching", "same_set", "extended", "at_rest", "diverges")

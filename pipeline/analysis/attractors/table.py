@@ -190,6 +190,7 @@ _SHOWN_BY = {
     "multipliers": "multipliers",
     "approach": "both sides come nearer",
     "volume": "volume preserved",
+    "one_side": "one side comes nearer, the other leaves",
 }
 
 

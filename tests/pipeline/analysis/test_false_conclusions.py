@@ -21,6 +21,7 @@ from pipeline.analysis.attractors.extension.extending import extend
 from pipeline.analysis.attractors.finding.cell_blocks import Block
 from pipeline.analysis.attractors.finding.closed_orbits import Orbit
 from pipeline.analysis.attractors.finding.requests import LEG, Extended, Leg, Settings, Slopes
+from pipeline.analysis.attractors.finding.stability import BY_ONE_SIDE
 from pipeline.analysis.sets import Geometry
 from pipeline.compute.integrate import rest_states
 from pipeline.layout.vocabulary import (
@@ -33,6 +34,7 @@ from pipeline.layout.vocabulary import (
     PERIODIC_ORBIT,
     TORUS,
     TRANSIENT,
+    UNSTABLE,
     section_attributes,
 )
 from pipeline.products.product import function_of
@@ -126,9 +128,6 @@ PENDULUM = {
     "parameters": {"w": 1.0},
     "equations": {"x": "v", "v": "-w**2*sin(x)"},
 }
-
-QUADRATIC = {"name": "quadratic", "states": {"x": {}}, "parameters": {"e": 0.0}, "equations": {"x": "e + x**2"}}
-"""One state: a half-stable equilibrium at e = 0, and its ghost at e > 0."""
 
 
 def found_of(table, starts, *, crossing=None, frequency_hz=1.0, n_transient=200, n_keep=20, values=(), **options):
@@ -233,19 +232,6 @@ def test_identify__a_curve_has_one_id_at_any_phase():
         curve = cKDTree(flow.sol(np.linspace(0.0, seconds[k], 40_000)).T)
         assert curve.query(own)[0].max() <= 2e-2
         assert curve.query(other)[0].max() > 1.0
-
-
-# ---- one state ---------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("e", [0.0, 1e-9])
-def test_identify__one_state_beside_a_ghost(e):
-    """No direction is left beside the flow's own: nothing is settled, and nothing fails."""
-    found = found_of(QUADRATIC, [[-1.0]], values={"e": e})
-    assert found["kind"].values.tolist() == [BOUNDED_SET]
-    assert found["stability"].values.tolist() == [NOT_SETTLED]
-    assert EQUILIBRIUM not in found["kind"]
 
 
 # ---- a multiplier of 1 is not attraction -------------------------------------------------------
@@ -396,17 +382,21 @@ def test_extend__neighbours_of_one_cell_show_that_a_set_attracts():
 
 CORNERS = {
     "approached for ever": ({"x": {}}, {"x": "-x**2"}, [[1.0]]),
-    "all diverged": ({"x": {"escape": 5.0}}, {"x": "x"}, [[1.0], [0.5]]),
-    "all at rest": ({"x": {}}, {"x": "-x"}, [[0.0], [0.0]]),
+    "all diverged": ({"x": {"escape": 5.0}}, {"x": "a*x + cos(phase)"}, [[4.0], [3.0]]),
+    "all at rest": ({"x": {}, "v": {}}, {"x": "v", "v": "-a*x - v"}, [[0.0, 0.0], [0.0, 0.0]]),
+    "one cell": ({"x": {}}, {"x": "-a*x + cos(phase)"}, [[0.0]]),
+    "no closed cell": ({"x": CIRCLE}, {"x": "a + 0.1*sin(x) + 0.1*cos(phase)"}, [[0.0], [1.0]]),
 }
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("axes", [{}, {"axes": {"a": {"values": [0.5, 1.0]}}}], ids=["point", "sweep"])
 @pytest.mark.parametrize("name", CORNERS)
-def test_derive__every_analysis_of_a_corner_case(name, tmp_path):
+def test_derive__every_analysis_of_a_corner_case(name, axes, tmp_path):
     """One state, one cell, no closed cell, all diverged, all at rest."""
     states, equations, starts = CORNERS[name]
     spec = {
+        **axes,
         "kind": "sweep",
         "model": {"name": "corner", "states": states, "parameters": {"a": 1.0}, "equations": equations},
         "parameters": {"frequency_hz": 1.0},
@@ -424,3 +414,47 @@ def test_derive__every_analysis_of_a_corner_case(name, tmp_path):
             assert function_of(ANALYSES[analysis].table)(found).lines, analysis
             shown.append(analysis)
     assert {"attractors", "basins", "settling", "chaos"} <= set(shown)
+
+
+# ---- ghosts and half-stable points -------------------------------------------------------------
+
+
+def found_at(equations, starts, folder):
+    """Return kind, stability and evidence of each set, and the set of each cell, after 66 s."""
+    spec = {
+        "kind": "sweep",
+        "model": {
+            "name": "point",
+            "states": {name: {"escape": 10.0} for name in equations},
+            "parameters": {"a": 1.0},
+            "equations": equations,
+        },
+        "parameters": {"frequency_hz": 1.0},
+        "initial_conditions": {"kind": "list", "points": starts},
+        "integration": {"n_transient": 50, "n_keep": 16},
+    }
+    run(write(spec, folder), folder / "run", workers=0, echo=lambda _: None)
+    found = derive(folder / "run", "attractors")
+    sets = zip(*(found[name].values.tolist() for name in ("kind", "stability", "evidence")), strict=True)
+    return list(sets), found["attractor_id"].values.tolist()
+
+
+@pytest.mark.parametrize("turned", [1.0, -1.0])
+def test_attractors__half_stable_point(turned, tmp_path):
+    """x' = x**2 beside y' = -y + x/2: 0 is the only equilibrium, approached along its centre manifold from x < 0 and
+    left for x > 0; exactly, x = 1/(1/x0 - t).
+    """
+    rates = {"x": f"{turned}*x**2", "y": "-y + 0.5*x"}
+    starts = [[-turned, 0.5], [-0.2 * turned, -0.5], [0.012 * turned, 0.006 * turned], [turned, 0.0]]
+    sets, ids = found_at(rates, starts, tmp_path)
+    assert sets[0] == (EQUILIBRIUM, UNSTABLE, BY_ONE_SIDE)
+    assert ids[:2] == [0, 0]
+    assert ids[2] != 0
+    assert ids[3] == -1
+
+
+def test_attractors__ghost_of_a_fold(tmp_path):
+    """x' = e + x**2 has no equilibrium and no orbit; from 0 it takes pi/(2 sqrt(e)) = 5e4 s to leave."""
+    sets, ids = found_at({"x": "1e-9 + x**2"}, [[-1.0], [-0.01], [0.0]], tmp_path)
+    assert {(kind, stability) for kind, stability, _ in sets} == {(BOUNDED_SET, NOT_SETTLED)}
+    assert -1 not in ids

@@ -24,7 +24,7 @@ from magpend_core.sampling import Drive, sample
 from magpend_core.trajectory import trajectory
 from pipeline.analysis.attractors.finding.cell_blocks import Block
 from pipeline.analysis.attractors.finding.known_sets import Cycle, Equilibrium
-from pipeline.analysis.attractors.finding.stability import BY_APPROACH, BY_EIGENVALUES, BY_MULTIPLIERS
+from pipeline.analysis.attractors.finding.stability import BY_APPROACH, BY_EIGENVALUES, BY_MULTIPLIERS, BY_ONE_SIDE
 from pipeline.analysis.sets import TWO_PI, Geometry, hashes, mean_distance, rounded_points
 from pipeline.analysis.sides import UNKNOWN
 from pipeline.analysis.tolerances import PORTRAIT_RTOL
@@ -208,6 +208,7 @@ def of_equilibrium(found: Equilibrium, parameters: Parameters | None, n_angles: 
     """Return the features of an equilibrium. Its largest Lyapunov exponent is the largest real part of the
     eigenvalues.
     """
+    by_probes = BY_APPROACH if found.side is None else BY_ONE_SIDE
     x = Features(
         found.state[None],
         EQUILIBRIUM,
@@ -219,7 +220,7 @@ def of_equilibrium(found: Equilibrium, parameters: Parameters | None, n_angles: 
         residual=found.residual,
         is_polished=True,
         stability=found.stability,
-        evidence=BY_APPROACH if found.approached_within else BY_EIGENVALUES,
+        evidence=by_probes if found.approached_within else BY_EIGENVALUES,
         eigenvalues=found.eigenvalues,
     )
     x.lyapunov_max = x.lyapunov_low = x.lyapunov_high = float(found.eigenvalues.real[0])

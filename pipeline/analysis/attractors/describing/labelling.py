@@ -189,9 +189,7 @@ def _probe(point: Point, state: State, labels: _Labels, search: Search) -> Work[
                 labels.put(rows[near] + block.cells.start, i, APPROACHING)
     degenerate = [k for k, one in enumerate(point.equilibria) if one.stability == NEUTRAL]
     for k in degenerate[:MOST_PROBES]:
-        within = yield from probe_equilibrium(point.equilibria[k], search.geometry)
-        if within:
-            point.equilibria[k] = replace(point.equilibria[k], approached_within=within)
+        point.equilibria[k] = yield from probe_equilibrium(point.equilibria[k], search.geometry)
     if any(one.approached_within for one in point.equilibria):
         put_at_rest(point, search.tolerance, search.geometry)
 
@@ -243,6 +241,8 @@ def _label_courses(point: Point, found: Outcome, labels: _Labels, groups: np.nda
 def _label_raw(point: Point, state: State, groups: np.ndarray, labels: _Labels, search: Search) -> list[Orbit]:
     """Label the closed (periodic) cells that are on no refined orbit, and return an unrefined orbit for each group of
     them.
+
+    After a search by Newton's method there may be no orbit: beside the ghost of a fold, cells move too slowly to see.
     """
     left = np.where((labels.label < 0) & (labels.decision != DIVERGES) & ~_is_elsewhere(point), groups, -1)
     best: dict[int, tuple[float, int, np.ndarray]] = {}
@@ -250,7 +250,7 @@ def _label_raw(point: Point, state: State, groups: np.ndarray, labels: _Labels, 
         _representatives(block, left[block.cells], best, search.geometry)
     rows = rows_by_number(left)
     for i, g in enumerate(sorted(best)):
-        labels.put(rows[g], len(state.orbits) + i, CLOSED)
+        labels.put(rows[g], len(state.orbits) + i, SAME_SET if search.options.polish else CLOSED)
     return [raw_orbit(best[g][2], search.geometry) for g in sorted(best)]
 
 
@@ -422,10 +422,11 @@ def _of_set(cells: Cells, one: BoundedSet, point: Point, search: Search) -> Feat
 
 
 def _of_orbit(cells: Cells, orbit: Orbit, point: Point, search: Search) -> Features:
+    is_shown = orbit.is_polished or not search.options.polish
     found = Features(
         orbit.points,
-        PERIODIC_ORBIT,
-        orbit.period,
+        PERIODIC_ORBIT if is_shown else BOUNDED_SET,
+        orbit.period if is_shown else 0,
         cells.mean_rotation,
         UNKNOWN,
         cells.low,

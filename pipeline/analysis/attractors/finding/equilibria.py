@@ -147,15 +147,15 @@ def _settled(point: Point, states: np.ndarray, reach: np.ndarray, geometry: Geom
 
 
 def put_at_rest(point: Point, tolerance: float, geometry: Geometry) -> None:
-    """Mark cells near a degenerate equilibrium as at rest there, if that equilibrium attracts; changes
+    """Mark cells near a degenerate equilibrium as at rest there, if trajectories approach it; changes
     `point.at_rest`.
     """
     states, _ = _ends(point, tolerance)
     assert point.at_rest is not None
     for k, one in enumerate(point.equilibria):
         if one.approached_within:
-            near = geometry.distance(np.nan_to_num(states, nan=np.inf), one.state) <= one.approached_within
-            point.at_rest[near & (point.at_rest < 0)] = k
+            known = np.flatnonzero(np.isfinite(states).all(axis=1) & (point.at_rest < 0))
+            point.at_rest[known[one.draws(states[known], geometry)]] = k
 
 
 def _label_approaching(point: Point, tolerance: float, geometry: Geometry) -> None:

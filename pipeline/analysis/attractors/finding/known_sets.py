@@ -11,7 +11,7 @@ from scipy.linalg import expm, solve_continuous_lyapunov
 from pipeline.analysis.attractors.finding.stability import by_margin, largest_error
 from pipeline.analysis.sets import Geometry
 from pipeline.analysis.tolerances import RATE_ERROR
-from pipeline.layout.vocabulary import ATTRACTS, NEUTRAL
+from pipeline.layout.vocabulary import ATTRACTS, NEUTRAL, UNSTABLE
 
 
 @dataclass(frozen=True)
@@ -28,9 +28,12 @@ class Equilibrium:
     jacobian : ndarray, (state, state)
         Jacobian in units of the scales [1/s].
     approached_within : float
-        Scaled distance from which trajectories on both sides came nearer; 0 if not tried or not seen.
+        Scaled distance from which trajectories came nearer; 0 if not tried or not seen.
     rate : float
         Order of magnitude of the flow's rates [1/s]; the Jacobian of a degenerate equilibrium may vanish.
+    side : ndarray, (state,), or None
+        If trajectories came nearer on one side only and left on the other: the scaled covector that is 1 on the unit
+        vector towards that side.
     """
 
     state: np.ndarray
@@ -39,6 +42,7 @@ class Equilibrium:
     jacobian: np.ndarray
     approached_within: float = 0.0
     rate: float = 1.0
+    side: np.ndarray | None = None
 
     @cached_property
     def eigenvalue_error(self) -> float:
@@ -54,12 +58,21 @@ class Equilibrium:
         nearby trajectories.
         """
         found = by_margin(float(self.eigenvalues.real[0]), 0.0, self.eigenvalue_error)
-        return ATTRACTS if found == NEUTRAL and self.approached_within > 0.0 else found
+        if found != NEUTRAL or not self.approached_within:
+            return found
+        return ATTRACTS if self.side is None else UNSTABLE
 
     @property
     def is_stable(self) -> bool:
         """Whether the equilibrium is shown to attract."""
         return self.stability == ATTRACTS
+
+    def draws(self, states: np.ndarray, geometry: Geometry) -> np.ndarray:
+        """Return whether states (n, state) lie where trajectories came nearer to a degenerate equilibrium."""
+        away = geometry.difference(states, self.state)
+        distance = np.abs(away).max(axis=1, initial=0.0)
+        near = distance <= self.approached_within
+        return np.asarray(near if self.side is None else near & (away @ self.side >= 0.5 * distance))
 
     @cached_property
     def _norm(self) -> tuple[np.ndarray, float] | None:

@@ -3,9 +3,13 @@
 If a multiplier lies on the unit circle within its error, the linear map does not decide stability.
 Trajectories start on both sides along the critical directions. If all come nearer, the orbit attracts, as for
 ``x' = -x**3``, where distances fall as one over the square root of time. In a centre distances do not fall.
+An equilibrium with one critical direction can also be half-stable, as for ``x' = x**2``: trajectories of one side come
+nearer, those of the other leave.
 """
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 
@@ -32,13 +36,34 @@ def probe_orbit(orbit: Orbit, geometry: Geometry) -> Work[float]:
     return (yield from _probe(orbit.points, critical, geometry))
 
 
-def probe_equilibrium(one: Equilibrium, geometry: Geometry) -> Work[float]:
-    """Find the scaled distance from which trajectories on both sides approach an equilibrium; 0 if they do not approach
-    it.
+def probe_equilibrium(one: Equilibrium, geometry: Geometry) -> Work[Equilibrium]:
+    """Return the equilibrium with the scaled distance from which trajectories approach it, on both sides or on one; 0
+    if they do not approach it.
     """
     values, vectors = np.linalg.eig(one.jacobian)
     critical = vectors[:, np.abs(values.real) <= one.eigenvalue_error]
-    return (yield from _probe(one.state[None], critical, geometry))
+    within = yield from _probe(one.state[None], critical, geometry)
+    if within or critical.shape[1] != 1:
+        return replace(one, approached_within=within)
+    return (yield from _probe_sides(one, critical[:, 0].real, geometry))
+
+
+def _probe_sides(one: Equilibrium, direction: np.ndarray, geometry: Geometry) -> Work[Equilibrium]:
+    """Test whether trajectories approach an equilibrium on one side of its only critical direction and leave it on the
+    other.
+    """
+    values, left = np.linalg.eig(one.jacobian.T)
+    across = left[:, np.argmin(np.abs(values))].real
+    direction = direction / np.abs(direction).max()
+    for size in DISTANCES:
+        offset = size * direction * np.asarray(geometry.scales)
+        for side in (1.0, -1.0):
+            near, far = one.state[None] + side * offset, one.state[None] - side * offset
+            if (yield from _falls(near, one.state[None], size, geometry)) and (
+                yield from _leaves(far, one.state, size, geometry)
+            ):
+                return replace(one, approached_within=size, side=side * across / float(across @ direction))
+    return one
 
 
 def _probe(points: np.ndarray, critical: np.ndarray, geometry: Geometry) -> Work[float]:
@@ -71,6 +96,24 @@ def _falls(state: np.ndarray, points: np.ndarray, size: float, geometry: Geometr
             return False
         before = away
     return bool(before.max() <= FALL * size)
+
+
+def _leaves(state: np.ndarray, point: np.ndarray, size: float, geometry: Geometry) -> Work[bool]:
+    """Return whether a trajectory that starts at the distance `size` from an equilibrium comes to twice this
+    distance.
+    """
+    step = np.zeros(len(state))
+    for _ in range(LEGS):
+        leg: Extended = yield Leg(state, step)
+        if (leg.status == Status.DIVERGED).all():
+            return True
+        waits = leg.status == Status.NO_RETURN
+        if not (np.isin(leg.status, (Status.PERIODIC, Status.BOUNDED)) | waits).all():
+            return False
+        state, step = leg.state, np.where(waits, 0.0, leg.step)
+        if (geometry.distance(state, point) > 2.0 * size).all():
+            return True
+    return False
 
 
 def _distance(section: np.ndarray, points: np.ndarray, geometry: Geometry) -> np.ndarray:

@@ -6,7 +6,8 @@ stability       evidence
 attracts        eigenvalues with negative real parts, multipliers inside the unit circle, by more than
                 their error; for a degenerate orbit or equilibrium, trajectories on both sides that come
                 nearer; for any other set, a sample of its cells that stayed long enough
-unstable        an eigenvalue or a multiplier outside, by more than its error
+unstable        an eigenvalue or a multiplier outside, by more than its error; for a half-stable equilibrium,
+                trajectories of one side that leave
 transient       cells of the set left it
 not settled     none: the budget was too short
 neutral         eigenvalues or multipliers on the axis or circle within their error, or a flow that
@@ -25,7 +26,9 @@ import numpy as np
 
 from pipeline.layout.vocabulary import ATTRACTS, EVIDENCE, NEUTRAL, UNSTABLE
 
-BY_NOTHING, BY_EIGENVALUES, BY_MULTIPLIERS, BY_APPROACH, BY_STAYING, BY_LEAVING, BY_VOLUME = range(len(EVIDENCE))
+(BY_NOTHING, BY_EIGENVALUES, BY_MULTIPLIERS, BY_APPROACH, BY_STAYING, BY_LEAVING, BY_VOLUME, BY_ONE_SIDE) = range(
+    len(EVIDENCE)
+)
 """Values of `evidence`."""
 
 TIMES_LONGEST = 10.0
