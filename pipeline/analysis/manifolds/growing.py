@@ -257,6 +257,8 @@ class _Curve:
             change = wrap_angles(before[i] - before[i - 1], saddle.system)
             step = np.linalg.lstsq(matrix, change, rcond=None)[0] / saddle.scales
             ahead = float(np.linalg.norm(step))
+            if not 0.0 < ahead < np.inf:  # two points coincide: the curve cannot be resolved further
+                break
             # the map expands so much that the predictor must follow the curve's bend
             bend = (step / ahead - tangent) / away if away > 0.0 else bend
             guess = found[-1] + (step + 0.5 * ahead * ahead * bend) * saddle.scales
