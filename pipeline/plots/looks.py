@@ -16,11 +16,11 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib
-from cycler import cycler
 from matplotlib import rc_context
 from matplotlib import style as matplotlib_style
 from matplotlib.colors import to_hex
 from matplotlib.font_manager import FontProperties
+from matplotlib.rcsetup import cycler
 
 from pipeline.specification.problems import SpecError
 

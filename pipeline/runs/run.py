@@ -111,7 +111,7 @@ def run(
     check_steps(parsed)
     for remark in (*parsed.model.flow.remarks, *unit_remarks(parsed.model)):
         echo(f"warning: {remark}")
-    for line in (*start_remarks(parsed.initial_conditions), *size_remarks(parsed)):
+    for line in size_remarks(parsed):
         echo(line)
     carry_out(parsed, text, files, workers=workers, where=where, echo=echo)
     warn_of_steps(parsed, files, echo)
@@ -194,6 +194,8 @@ def _complete(
     before = plan.n_cells - sum(plan.cells_in(i) for i in missing)
     check_space(plan, info.files.local, plan.n_cells - before)
     echo(f"{plan.n_cells} cells in {plan.n_tasks} tasks" + (f", {before} cells done before" if before else ""))
+    for line in start_remarks(spec.initial_conditions):
+        echo(line)
     clients.reach(where)
     _compile(spec, echo)
     job = partial(task.run_task, info.files.place, info.digest, origin=origin(spec.model))

@@ -30,6 +30,9 @@ from pipeline.layout.attractor_letters import letter
 from pipeline.layout.vocabulary import ATTRACTS, STABILITIES, split_dims
 from pipeline.products.product import Table
 
+MOST_STATES = 2
+"""Most states of a model whose places are printed; the CSV table has those of all models."""
+
 _NUMBERS = ("lyapunov_max", "lyapunov_low", "lyapunov_high", "mean_lifetime", "lifetime_low", "lifetime_high")
 
 
@@ -115,6 +118,11 @@ def _columns(ds: xr.Dataset, dims: Sequence[str]) -> dict[str, np.ndarray]:
         found["eigenvalue_real"] = array_of("eigenvalue_real")[..., 0].astype(object)
         found["eigenvalue_imag"] = np.abs(array_of("eigenvalue_imag")[..., 0]).astype(object)
     add("mirror_partner", "mirror_distance", "n_cells", "match_basis")
+    first = ds["attractor_points"].isel(point=0)
+    for part, array in (("section", first), ("min", ds["state_min"]), ("max", ds["state_max"])):
+        for name in ds["state"].values:
+            one = array.sel(state=name).transpose(*dims, "attractor")
+            found[f"{part}_{name}"] = one.values.astype(object)
     return found
 
 
@@ -174,9 +182,20 @@ def _attractor_words(row: Row, n_points: int) -> Words:
         "mirror": _known(row["mirror_partner"]) if "mirror_partner" in row else None,
         "letter": letter(row["attractor_id"]),
         "id by": plain(row["match_basis"]) if n_points > 1 and "match_basis" in row else None,
+        **_place(row),
         "decided": ", ".join(decided),
         "shown by": _shown_by(row),
     }
+
+
+def _place(row: Row) -> Words:
+    """Return the section point and, where it moves, the range of a set in each state, if the states are few."""
+    states = [name.removeprefix("section_") for name in row if name.startswith("section_")]
+    words = {}
+    for x in states if len(states) <= MOST_STATES else ():
+        point, low, high = (number(row[f"{part}_{x}"], ".4g") for part in ("section", "min", "max"))
+        words[x] = point if low == high else f"{point} ({low} to {high})"
+    return words
 
 
 def _kind(row: Row) -> str:

@@ -72,7 +72,8 @@ def pitchfork(computed):
 @pytest.mark.slow
 def test_attractors__a_repeller_on_the_grid_is_none(pitchfork):
     """+-sqrt(r) with the multiplier exp(-2 r), half of the cells each; 0 with exp(r); all cells at r = 0."""
-    rows = attractors_table(derive(pitchfork, "attractors")).rows
+    table = attractors_table(derive(pitchfork, "attractors"))
+    rows = table.rows
     told = {(row["r"], row["stability"], row["n_cells"], round(row["multiplier_modulus"], 4)) for row in rows}
     assert told == {
         (0.0, "attracts", 5, 1.0),
@@ -85,6 +86,14 @@ def test_attractors__a_repeller_on_the_grid_is_none(pitchfork):
     fractions = [row["fraction"] for row in rows if row["r"] > 0.0 and row["stability"] == "attracts"]
     assert fractions == [0.5] * 4
     assert all(np.isnan(row["fraction"]) for row in rows if row["stability"] == "unstable")
+    sweep = 1.0 / np.hypot(1.0, 2.0 * np.pi)  # amplitude of y' = -y + cos(2 pi t)
+    for row in rows[-3:]:
+        root = 0.0 if row["stability"] == "unstable" else np.copysign(np.sqrt(3.0), row["section_x"])
+        assert [row[f"{part}_x"] for part in ("section", "min", "max")] == pytest.approx([root] * 3, abs=1e-8)
+        assert [row["section_y"], row["min_y"], row["max_y"]] == pytest.approx([sweep**2, -sweep, sweep], abs=2e-3)
+    text = "\n".join(table.lines)
+    assert "  1.732  " in text
+    assert "  0.0247 (-0.1572 to 0.1572)  " in text
 
 
 def test_outcomes__cells_on_the_repeller_are_counted_by_name(pitchfork):

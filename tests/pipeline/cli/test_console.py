@@ -35,16 +35,16 @@ def _configured():
 
 
 def test_tell__lines_for_people_and_rows_for_programs(capsys, tmp_path):
-    tell(TABLE, None, False)
+    tell(TABLE, None, None)
     assert capsys.readouterr().out == "two lines\nfor people\n"
-    tell(TABLE, "-", False)
+    tell(TABLE, "-", None)
     assert list(csv.DictReader(io.StringIO(capsys.readouterr().out))) == [
         {"x": "1.5", "name": "a"},
         {"x": "", "name": "b"},
     ]
-    tell(TABLE, None, True)
+    tell(TABLE, None, "-")
     assert json.loads(capsys.readouterr().out) == [{"x": 1.5, "name": "a"}, {"x": None, "name": "b"}]
-    tell(TABLE, str(tmp_path / "a.csv"), False)
+    tell(TABLE, str(tmp_path / "a.csv"), None)
     captured = capsys.readouterr()
     assert captured.out == "two lines\nfor people\n"
     assert "table:" in captured.err
