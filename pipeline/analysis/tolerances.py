@@ -106,6 +106,9 @@ MATRIX_ERROR = 1e-9
 RATE_ERROR = 1e-9
 """Relative error of a Jacobian's entries at a polished equilibrium."""
 
+ROUNDING = 1e-15
+"""Relative error of a rate by rounding, near an equilibrium."""
+
 PLACE_ERROR = 30.0
 """Error of a multiplier near a fold per root of the residual: twice the root of the map's curvature."""
 

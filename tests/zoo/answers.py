@@ -2,7 +2,8 @@
 
 Keys of a file: `source` (where the answer comes from), `quick` (whether the suite has the system), sets
 as tables ``[[set]]``, `also` (stabilities besides those of the sets that rows may have), `share_error`, and
-`sample` (arguments of `independent.shares`).
+`sample` (arguments of `independent.shares`), `sizes` and `time` (units of the states and of time [s] in which
+`independent` computes).
 
 Keys of a set:
 

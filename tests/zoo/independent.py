@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 import sys
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -74,6 +74,8 @@ class Field:
         Expressions of `t` and the states, by sympy.
     symbols : list
         Of the states.
+    sizes, time : tuple of float and float
+        Units of the states and of time [s] in which all is computed.
     """
 
     names: tuple[str, ...]
@@ -81,10 +83,18 @@ class Field:
     period: float
     rates: list[Any]
     symbols: list[Any]
+    sizes: tuple[float, ...]
+    time: float = 1.0
 
     @classmethod
-    def of(cls, spec: Mapping[str, Any], where: Mapping[str, float] | None = None) -> Field:
-        """Field of a specification at a parameter point."""
+    def of(
+        cls,
+        spec: Mapping[str, Any],
+        where: Mapping[str, float] | None = None,
+        sizes: Sequence[float] = (),
+        time: float = 1.0,
+    ) -> Field:
+        """Field of a specification at a parameter point, in units of its own."""
         model, given = model_of(spec), spec.get("parameters", {})
         values = {k: v["value"] if isinstance(v, dict) else v for k, v in model.get("parameters", {}).items()}
         values |= model.get("presets", {}).get(given.get("preset", ""), {})
@@ -101,8 +111,12 @@ class Field:
             rates = [r.subs(parts) for r in rates]
         circle = tuple(bool(dict(s or {}).get("on_circle")) for s in model["states"].values())
         forced = any(r.has(t) for r in rates) or frequency
-        period = 1.0 / frequency if forced else math.nan
-        return cls(names, circle, period, [sp.N(r, 17) for r in rates], [known[n] for n in names])
+        period = 1.0 / (frequency * time) if forced else math.nan
+        symbols, sizes = [known[n] for n in names], tuple(sizes) or (1.0,) * len(names)
+        if time != 1.0 or any(size != 1.0 for size in sizes):
+            units = {t: time * t} | {s: size * s for s, size in zip(symbols, sizes, strict=True)}
+            rates = [r.subs(units, simultaneous=True) * time / size for r, size in zip(rates, sizes, strict=True)]
+        return cls(names, circle, period, [sp.N(r, 17) for r in rates], symbols, sizes, time)
 
     @cached_property
     def jacobian(self) -> list[Any]:
@@ -315,30 +329,32 @@ def crossings(field: Field, y: np.ndarray, seconds: float, section: Mapping[str,
     i, sign = field.names.index(section["of"]), -1.0 if section.get("direction") == "down" else 1.0
     times = np.linspace(0.37 * seconds, 1.37 * seconds, 20_001)  # not from the section itself
     run = solve_ivp(field.at, (0.0, times[-1]), y, method="DOP853", rtol=1e-10, atol=1e-12, t_eval=times).y[i]
-    side = np.sin(0.5 * (run - section["value"])) if field.circle[i] else run - section["value"]
+    value = section["value"] / field.sizes[i]
+    side = np.sin(0.5 * (run - value)) if field.circle[i] else run - value
     side, slope = sign * side, sign * np.diff(run)
     return int(np.count_nonzero((side[:-1] * side[1:] <= 0) & (side[:-1] != 0) & (slope > 0)))
 
 
 def numbers(field: Field, known: Mapping[str, Any], section: Mapping[str, Any] | None) -> dict[str, Any]:
     """Compute what can be computed of one set of an answer, from its point `at`."""
-    at, kind = np.array(known["at"], float), known["kind"]
+    sizes, time = np.array(field.sizes), field.time
+    at, kind = np.array(known["at"], float) / sizes, known["kind"]
     if kind == "equilibrium":
         at, values = equilibrium(field, at)
-        return {"at": at, "eigenvalue": [float(values[0].real), float(abs(values[0].imag))]}
-    if kind == "periodic_orbit" and section is None:
+        return {"at": at * sizes, "eigenvalue": [float(values[0].real / time), float(abs(values[0].imag) / time)]}
+    if kind == "periodic_orbit" and "seconds" not in known:
         at, values = orbit(field, at, known["period"])
-        return {"at": at, "multiplier": float(np.abs(values).max())}
+        return {"at": at * sizes, "multiplier": float(np.abs(values).max())}
     if kind == "periodic_orbit":
-        at, seconds, values = cycle(field, at, known["seconds"])
-        period = crossings(field, at, seconds, section or {})
-        return {"at": at, "seconds": seconds, "period": period, "multiplier": float(np.abs(values).max())}
+        at, seconds, values = cycle(field, at, known["seconds"] / time)
+        found = {"at": at * sizes, "seconds": seconds * time, "multiplier": float(np.abs(values).max(initial=0.0))}
+        return found | ({"period": crossings(field, at, seconds, section)} if section else {})
     n = int(known.get("n_periods", 4000))
     rates, errors = exponents(
         field, at, n, int(known.get("n_steps", 200)), min(len(at), 2), float(known.get("unit", 1.0))
     )
     first = int(np.argmax(rates))
-    return {"lyapunov": float(rates[first]), "error": float(errors[first]), "all": rates}
+    return {"lyapunov": float(rates[first] / time), "error": float(errors[first] / time), "all": rates / time}
 
 
 def box(spec: Mapping[str, Any], field: Field) -> np.ndarray:
@@ -351,17 +367,17 @@ def box(spec: Mapping[str, Any], field: Field) -> np.ndarray:
             half = 0.5 * (side["stop"] - side["start"]) / (side["num"] - 1)
             side = [side["start"] - half, side["stop"] + half]
         sides.append(side if isinstance(side, list) else [side, side])
-    return np.array(sides).T
+    return np.array(sides).T / field.sizes
 
 
 def cloud(field: Field, known: Mapping[str, Any], n: int = 4000) -> np.ndarray:
     """Points of a set: all phases of a flow's, those at phase 0 of a forced one's."""
-    y = np.array([known["at"]], float)
+    y = np.array([known["at"]], float) / field.sizes
     if known["kind"] == "equilibrium":
         return y
     if np.isfinite(field.period):
         return strobed(field.f, y, field.period, 400, 0 if known["kind"] == "periodic_orbit" else 200, n)[0]
-    step = known["seconds"] / n if known["kind"] == "periodic_orbit" else 0.05
+    step = known["seconds"] / field.time / n if known["kind"] == "periodic_orbit" else 0.05
     return strobed(field.f, y, step, 4, 0 if known["kind"] == "periodic_orbit" else 2000, 8 * n)[0]
 
 
@@ -411,7 +427,8 @@ def recompute(name: str) -> None:
         points.setdefault(str(known.get("where", {})), []).append(known)
     for sets in points.values():
         where = sets[0].get("where", {})
-        field = Field.of(spec, {"frequency_hz" if k == "frequency" else k: v for k, v in where.items()})
+        values = {"frequency_hz" if k == "frequency" else k: v for k, v in where.items()}
+        field = Field.of(spec, values, answer.get("sizes", ()), answer.get("time", 1.0))
         print(f"{name} {where or ''}")
         # Newton's method has no unique step at a multiplier of 1
         sets = [s for s in sets if "at" in s and s.get("multiplier") != 1.0]

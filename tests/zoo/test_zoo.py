@@ -45,7 +45,7 @@ def test_zoo__other_units_change_no_conclusion(name, setting):
 def test_zoo__systems_have_a_source_and_valid_specifications_that_vary_in_one_thing(tmp_path):
     from pipeline.specification.parsing import load_spec
 
-    assert len(ANSWERS) >= 75
+    assert len(ANSWERS) >= 114
     for name, answer in ANSWERS.items():
         assert answer.source, name
         assert answer.sets, name

@@ -109,7 +109,10 @@ def _columns(ds: xr.Dataset, dims: Sequence[str]) -> dict[str, np.ndarray]:
         parts = np.moveaxis(array_of("rotation").astype(object), -1, 0)
         found |= {f"rotation_{n}": part for n, part in zip(names, parts, strict=True)}
     size = np.hypot(array_of("multiplier_real"), array_of("multiplier_imag"))
-    largest = np.where(np.isfinite(size).any(axis=-1), size[..., 0], np.nan)
+    # of a limit cycle sampled at equal times the first is 1, along the flow, as a section omits it
+    first = (found["orbit_period"] == 0).astype(int)[..., None]
+    size = np.take_along_axis(np.pad(size, [(0, 0)] * (size.ndim - 1) + [(0, 1)], constant_values=np.nan), first, -1)
+    largest = size[..., 0]
     found["multiplier_modulus"] = largest.astype(object)
     add("multiplier_error", *_NUMBERS, "n_sampled", "n_left", "closes_above", "dimension")
     confidence = float(ds.attrs.get("identify_lifetime_confidence", 0.95))

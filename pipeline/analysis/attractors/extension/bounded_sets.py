@@ -20,6 +20,9 @@ from pipeline.layout.vocabulary import ATTRACTS, BOUNDED_SET, NEUTRAL, NOT_SETTL
 SLOPES = (1024, 4096)
 """Most derivatives of the section map for the exponents of a set: at first, and if the first are too few."""
 
+MOST_ASKED = 4
+"""Most trajectories of a set whose neighbours show whether it is a torus or a family."""
+
 MOST_SHAPED = 1024
 """Most section points that the test for a torus uses."""
 
@@ -106,14 +109,19 @@ def describe(
             break
     verdict, evidence = _verdict(left, growth, has_stayed)
     dimension = _dimension(growth, kind, point)
-    in_phase = None
+    in_phase, is_doubtful = None, growth is not None and growth.may_preserve_volume
     if verdict == ATTRACTS and _is_in_family(pooled, dimension, point, settings):
-        in_phase = yield from differs_in_phase(own[0], point, settings.geometry)
+        # neighbours of one phase may come nearer for a while
+        for course in own[:MOST_ASKED]:
+            in_phase = yield from differs_in_phase(course, point, settings.geometry)
+            if in_phase is not None:
+                break
+        is_doubtful |= in_phase is None
     if in_phase:
         kind = TORUS
     elif in_phase is not None:
         kind, verdict, evidence = BOUNDED_SET, NEUTRAL, stability.BY_MULTIPLIERS
-    elif verdict == ATTRACTS and not all(is_stationary(x, settings.geometry, settings.closure) for x in paths):
+    elif verdict == ATTRACTS and (is_doubtful or not _are_stationary(paths, settings)):
         verdict, evidence = NOT_SETTLED, stability.BY_NOTHING
     return BoundedSet(
         np.array([c.cell for c in own], np.int64),
@@ -131,6 +139,10 @@ def describe(
         _closes_above(own, growth, settings),
         dimension if kind == TORUS else 0,
     )
+
+
+def _are_stationary(paths: Sequence[np.ndarray], settings: Settings) -> bool:
+    return all(is_stationary(path, settings.geometry, settings.closure) for path in paths)
 
 
 def _dimension(growth: Growth | None, kind: int, point: Point) -> int:

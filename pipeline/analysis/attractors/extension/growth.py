@@ -109,11 +109,16 @@ class Growth:
         return bool(abs(self.weighted) <= ZERO and self.weighted_error <= 3.0 * ZERO)
 
     @property
+    def may_preserve_volume(self) -> bool:
+        """Whether no change of volumes is seen beyond doubt, so that the set need not attract."""
+        return bool(abs(self.volume) <= N_SIGMA * self.volume_error)
+
+    @property
     def preserves_volume(self) -> bool:
         """Whether the section map preserves phase volume: the mean logarithm of the volume's change is 0 within its
         error.
         """
-        near = abs(self.volume) <= N_SIGMA * self.volume_error and self.volume_error <= LOST_ERROR
+        near = self.may_preserve_volume and self.volume_error <= LOST_ERROR
         return bool(near or abs(self.volume) <= LOST)
 
 

@@ -32,8 +32,8 @@ ALIKE = 0.2
 LEGS = 8
 """Legs after which neighbours have approached the family: exponents that are not 0 are below -`GROWN` over them."""
 
-SAMPLES = 8192
-"""States along each trajectory whose range is compared."""
+SAMPLES, STRETCHES = 8192, (1, 4, 16)
+"""States along each trajectory whose range is compared, per leg, and the legs until it is known."""
 
 LINKS, HALVINGS, TOGETHER = 16, 6, 0.1
 """States on a segment, how often its widest gap is divided, and the share of the segment's length that remains."""
@@ -41,7 +41,7 @@ LINKS, HALVINGS, TOGETHER = 16, 6, 0.1
 
 def differs_in_phase(course: Course, point: Point, geometry: Geometry) -> Work[bool | None]:
     """Return whether the neighbours of a trajectory that keep their distance run through the same ranges of states;
-    None if all come nearer or one fails.
+    None if all come nearer, one fails, or a range is not known.
     """
     assert point.parameters is not None
     aside = ASIDE * np.diag(geometry.scales)
@@ -58,15 +58,27 @@ def differs_in_phase(course: Course, point: Point, geometry: Geometry) -> Work[b
     kept = np.flatnonzero(np.abs(away).max(axis=1) >= KEPT * ASIDE)
     if not len(kept):
         return None
-    times = np.linspace(0.0, seconds, SAMPLES)
     flow_of, rate = of_flow(point.parameters), LEG / seconds
-    paths = [
-        trajectory(flow_of, rate, states[i], times, rtol=PORTRAIT_RTOL, atol=PORTRAIT_RTOL) for i in [0, *(kept + 1)]
-    ]
-    ranges = np.array([[path.min(axis=0), path.max(axis=0)] for path in paths]) / np.asarray(geometry.scales)
-    turns = np.asarray(geometry.is_angle) & (np.ptp(paths[0], axis=0) >= TWO_PI)
-    change = np.abs(ranges[1:] - ranges[0])[..., ~turns].max(initial=0.0)
-    return bool(change <= ALIKE * ASIDE)
+    for n in STRETCHES:
+        times = np.linspace(0.0, n * seconds, n * SAMPLES)
+        paths = [
+            trajectory(flow_of, rate, states[i], times, rtol=PORTRAIT_RTOL, atol=PORTRAIT_RTOL)
+            for i in [0, *(kept + 1)]
+        ]
+        turns = np.asarray(geometry.is_angle) & (np.ptp(paths[0], axis=0) >= TWO_PI)
+        first, *others = (_ranges(path, geometry)[:, ~turns] for path in paths)
+        if max(np.abs(other - first).max(initial=0.0) for other in others) <= ALIKE * ASIDE:
+            return True
+        # a range that still grows shows no difference
+        early, late = (_ranges(half, geometry)[:, ~turns] for half in np.array_split(paths[0], 2))
+        if np.abs(late - early).max(initial=0.0) <= 0.5 * ALIKE * ASIDE:
+            return False
+    return None
+
+
+def _ranges(path: np.ndarray, geometry: Geometry) -> np.ndarray:
+    """Return the least and the largest value of each state along a trajectory, in units of the scales."""
+    return np.stack([path.min(axis=0), path.max(axis=0)]) / np.asarray(geometry.scales)
 
 
 def is_one_torus(a: Course, b: Course, geometry: Geometry) -> Work[bool]:

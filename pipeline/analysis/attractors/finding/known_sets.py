@@ -10,7 +10,7 @@ from scipy.linalg import expm, solve_continuous_lyapunov
 
 from pipeline.analysis.attractors.finding.stability import by_margin, largest_error
 from pipeline.analysis.sets import Geometry
-from pipeline.analysis.tolerances import RATE_ERROR
+from pipeline.analysis.tolerances import RATE_ERROR, ROUNDING
 from pipeline.layout.vocabulary import ATTRACTS, NEUTRAL, UNSTABLE
 
 
@@ -50,7 +50,9 @@ class Equilibrium:
         # the error of the state is its residual, or more if degenerate, and carries over to the Jacobian
         fastest = float(np.abs(self.jacobian).max(initial=self.rate))
         size = max(RATE_ERROR, 1e-4 * float(np.sqrt(self.residual))) * fastest
-        return largest_error(self.jacobian, size, real=True)
+        # rounding moves a nearly degenerate equilibrium, and its eigenvalues with it
+        moved = ROUNDING * fastest**2 / max(float(np.abs(self.eigenvalues).min()), 1e-300)
+        return largest_error(self.jacobian, size, real=True) + moved
 
     @cached_property
     def stability(self) -> int:
