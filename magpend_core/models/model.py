@@ -227,6 +227,11 @@ class Model:
         return ()
 
     @property
+    def angle_remarks(self) -> tuple[str, ...]:
+        """Return those of the remarks that name states that are angles but not declared as such."""
+        return ()
+
+    @property
     def crossing(self) -> Crossing | None:
         """Return the model's Poincare section at a level of a state; None if the section is stroboscopic."""
         return None

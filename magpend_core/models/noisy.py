@@ -58,6 +58,11 @@ class NoisyModel(Model):
         """Return the warnings about the model's text, the strengths included."""
         return self.expressed.remarks
 
+    @property
+    def angle_remarks(self) -> tuple[str, ...]:
+        """Return the remarks on undeclared angles of the model without noise."""
+        return self.whole.angle_remarks
+
     @cached_property
     def noise(self) -> Noise:
         """Return the noise as the engine takes it; imports the compiler."""

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from magpend_core.models.model import Model, ModelError
+from magpend_core.models.text.circles import angle_remark, undeclared_angles
 from magpend_core.models.text.definition import Definition
 from magpend_core.models.text.derive import Derived, derive
 from magpend_core.models.text.generate import Source, source_of
@@ -63,8 +64,13 @@ class TextModel(Model):
 
     @cached_property
     def remarks(self) -> tuple[str, ...]:
-        """Warnings about parameters and definitions that no expression uses."""
-        return tuple(self.definition.remarks())
+        """Warnings about parameters and definitions that no expression uses, and about undeclared angles."""
+        return (*self.definition.remarks(), *self.angle_remarks)
+
+    @cached_property
+    def angle_remarks(self) -> tuple[str, ...]:
+        """Warnings about states that are angles but not declared as such."""
+        return tuple(map(angle_remark, undeclared_angles(self.definition)))
 
     @cached_property
     def derived(self) -> Derived:

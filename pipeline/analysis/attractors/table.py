@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 
 from pipeline.analysis.basins.numbers import basin_fractions
-from pipeline.analysis.outcomes import outcomes, sentence
+from pipeline.analysis.outcomes import other_cells, outcomes, sentence
 from pipeline.analysis.tabular import (
     FEW_POINTS,
     FRACTION,
@@ -27,11 +27,14 @@ from pipeline.analysis.tabular import (
     words_of,
 )
 from pipeline.layout.attractor_letters import letter
-from pipeline.layout.vocabulary import ATTRACTS, STABILITIES, split_dims
+from pipeline.layout.vocabulary import ATTRACTS, STABILITIES, model_of, split_dims
 from pipeline.products.product import Table
 
 MOST_STATES = 2
 """Most states of a model whose places are printed; the CSV table has those of all models."""
+
+RUN_AWAY = {"diverged", "not settled"}
+"""What is said of cells one of whose states grows without bound, as an angle does that is not declared."""
 
 _NUMBERS = ("lyapunov_max", "lyapunov_low", "lyapunov_high", "mean_lifetime", "lifetime_low", "lifetime_high")
 
@@ -161,6 +164,8 @@ def _remarks(ds: xr.Dataset, rows: Sequence[Row]) -> list[str]:
             f"the extension reached its budget before all sets were classified at {counted(n, 'parameter point')}: "
             f"--budget {2.0 * float(ds.attrs.get('identify_budget', 1.0)):g} allows twice as much"
         )
+    if RUN_AWAY & set(other_cells(ds)):
+        lines += model_of(ds).flow.angle_remarks
     return lines
 
 

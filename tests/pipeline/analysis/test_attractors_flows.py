@@ -10,8 +10,10 @@ import pytest
 from magpend_core.crossing import Crossing
 from magpend_core.models.sectioned import sectioned
 from pipeline.analysis.attractors.attractors import identify
+from pipeline.analysis.attractors.table import attractors_table
 from pipeline.compute.integrate import rest_states
 from pipeline.layout.vocabulary import ATTRACTS, BOUNDED_SET, EQUILIBRIUM, PERIODIC_ORBIT, section_attributes
+from pipeline.runs.derive import derive
 from tests.core.flows import BAUTIN, HOPF, flow
 
 from .cubes import attributes_of, cube_of, integrated
@@ -91,3 +93,22 @@ def test_identify__order_of_cells():
     one, other = identify(ds), identify(ds.isel(initial_condition=order))
     np.testing.assert_array_equal(one["attractor_id"].values[order], other["attractor_id"].values)
     np.testing.assert_allclose(one["period_s"], other["period_s"], rtol=1e-9)
+
+
+@pytest.mark.slow
+def test_attractors_table__names_the_angle_by_which_cells_ran_away(computed):
+    spec = """
+    kind = "sweep"
+    [model]
+    name = "turning"
+    states = { th = { escape = 1e3 }, w = "rad/s" }
+    parameters = { torque = 1.5 }
+    equations = { th = "w", w = "torque - 0.2*w - sin(th)" }
+    [parameters]
+    frequency_hz = 1.0
+    [initial_conditions]
+    kind = "list"
+    points = [[0.0, 0.0]]
+    """
+    lines = attractors_table(derive(computed(spec), "attractors")).lines
+    assert sum("th = { on_circle = true }" in line for line in lines) == 1

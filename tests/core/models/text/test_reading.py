@@ -410,5 +410,41 @@ def test_remarks__name_parameters_and_definitions_that_nothing_uses():
     assert read_model(used).remarks == ()
 
 
+def turning(rates, more=(), **states):
+    """A pendulum-like model by its rates; a state is declared by its table, if it is given one."""
+    own = {name: states.get(name, {}) for name in rates}
+    parameters = {"torque": 1.5, "k": 1.0, "zero": 0.0}
+    return read_model({"name": "turning", "states": own, "parameters": parameters, "equations": rates, **dict(more)})
+
+
+DROPPED = {"of": "th", "direction": "up", "set": {"w": "-w"}}
+KICKED = {"of": "w - 9", "direction": "up", "set": {"w": "cos(th)", "th": "th + 1"}}
+
+
+@pytest.mark.parametrize(
+    ("model", "angles"),
+    [
+        (turning({"th": "w", "w": "torque - w - k*sin(th)"}), ["th"]),
+        (turning({"th": "w", "w": "torque - w - k*sin(th)"}, th={"on_circle": True}), []),
+        (turning({"th": "w", "w": "torque - w - 1e6*sin(th)*cos(2*pi*phase)"}), ["th"]),
+        (turning({"a": "sin(b - a)", "b": "k - sin(b - a)"}), ["a", "b"]),
+        (turning({"x": "sin(2*x)"}), ["x"]),
+        (turning({"x": "-x"}), []),
+        (turning({"x": "sin(x) - zero*x"}), []),
+        (turning({"x": "sin(x/k)"}), []),
+        (turning({"x": "sin(x) - 1e-6*x"}), []),
+        (turning({"x": "-sign(x)", "y": "where(x < 0.01 and x > 0, 1, -1)"}), []),
+        (turning({"x": "-x", "clock": "1", "work": "x**2"}), []),
+        (turning({"th": "w", "w": "-sin(th)"}, {"impacts": [DROPPED]}), []),
+        (turning({"th": "w", "w": "-sin(th)"}, {"impacts": [KICKED]}), ["th"]),
+    ],
+)
+def test_remarks__name_angles_that_are_not_declared(model, angles):
+    said = [line for line in model.remarks if "nothing uses it" not in line]
+    assert said == list(model.angle_remarks)
+    assert [line.split(":")[0] for line in said] == [f"model.states.{name}" for name in angles]
+    assert all(f"{name} = {{ on_circle = true }}" in line for name, line in zip(angles, said, strict=True))
+
+
 def test_remarks__models_that_ship_have_none():
     assert {name: load_model(name).remarks for name in model_names() if load_model(name).remarks} == {}
