@@ -57,8 +57,8 @@ Dims ``branch``, ``point`` (in the order along a branch), ``phase`` (section poi
 of time), ``state``, ``multiplier`` (by falling modulus), ``bifurcation``, and the model's dim of angles.
 Beyond a branch's own points and phases values are NaN, counts -1. ``side`` is there if the model has words
 for motions; parameters with other values than the run's own are variables of their name. Attributes
-``parameter``, ``parameter_units``, ``model``, and ``left_out``: a line for each attractor that was not
-followed.
+``parameter``, ``parameter_units``, ``model``, ``left_out``: a line for each attractor that was not followed, and
+``stuck``: a line for each end that is stuck, with what was met there.
 
 ================================= ======================== ===================================================
 variable                          dims                     meaning

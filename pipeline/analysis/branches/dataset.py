@@ -21,6 +21,7 @@ from pipeline.analysis.branches.bifurcations import (
 from pipeline.analysis.branches.following import ENDS, Branch
 from pipeline.analysis.branches.motion import rotation_of, sides_of
 from pipeline.analysis.branches.problems import FREQUENCY
+from pipeline.analysis.branches.stuck import stuck_ends
 from pipeline.analysis.branches.units import parameter_units, state_units
 from pipeline.layout.attributes import code_flags
 from pipeline.layout.period_names import period_of, periods_of
@@ -75,7 +76,10 @@ def dataset_of(
             model=model_attribute(model), **section_attributes(model.crossing)
         )
     return result.assign_attrs(
-        parameter=parameter, parameter_units=parameter_units(parameter, model), left_out="\n".join(left_out)
+        parameter=parameter,
+        parameter_units=parameter_units(parameter, model),
+        left_out="\n".join(left_out),
+        stuck="\n".join(stuck_ends(branches)),
     )
 
 

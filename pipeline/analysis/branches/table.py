@@ -35,7 +35,8 @@ def branches_table(ds: xr.Dataset) -> Table:
         lines = ["no branch: no closed orbit to begin with", *_left_out(ds)]
         return Table(rows, lines, _why_none(ds))
     head = f"{ds.sizes['bifurcation']} bifurcations on {ds.sizes['branch']} branches"
-    return Table(rows, [head, "", *aligned([_words(ds, row) for row in rows], ""), "", *_windows(ds), *_left_out(ds)])
+    lines = [head, "", *aligned([_words(ds, row) for row in rows], ""), "", *_windows(ds)]
+    return Table(rows, [*lines, *_listed(ds, "stuck"), *_left_out(ds)])
 
 
 def _why_none(ds: xr.Dataset) -> str:
@@ -154,8 +155,13 @@ def _windows(ds: xr.Dataset) -> list[str]:
 
 
 def _left_out(ds: xr.Dataset) -> list[str]:
-    lines = str(ds.attrs.get("left_out", "")).splitlines()
-    return ["", "left out", *(f"  {line}" for line in lines)] if lines else []
+    return _listed(ds, "left_out")
+
+
+def _listed(ds: xr.Dataset, name: str) -> list[str]:
+    """Return the lines of an attribute under its name."""
+    lines = str(ds.attrs.get(name, "")).splitlines()
+    return ["", name.replace("_", " "), *(f"  {line}" for line in lines)] if lines else []
 
 
 def windows_of(ds: xr.Dataset) -> list[dict[str, Any]]:

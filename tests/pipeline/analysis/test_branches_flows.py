@@ -20,14 +20,16 @@ from pipeline.analysis.branches import (
     windows_of,
 )
 from pipeline.analysis.branches.starting_orbits import family_of
+from pipeline.analysis.branches.stuck import grows_without_bound
+from pipeline.analysis.branches.table import branches_table
 from tests.core.flows import BAUTIN, PAIR, ROSSLER, flow
 
 pytestmark = pytest.mark.slow
 
 
-def followed(table, of, state, parameter, low, high, *, max_period=1, **values):
+def followed(table, of, state, parameter, low, high, *, max_period=1, level=0.0, **values):
     """Branches from a limit cycle near a state."""
-    parameters = sectioned(flow(table), Crossing(of, longest=50.0)).load(**values)
+    parameters = sectioned(flow(table), Crossing(of, level, longest=50.0)).load(**values)
     model = parameters.model
     family = family_of(model.system, 1, model.crossing.frequency_hz, parameters.pack(), parameter, high - low)
     start = Start(family, np.array(state, float), parameters[parameter])
@@ -67,6 +69,52 @@ def test_explore__torus():
     critical = complex(row["multiplier_real"], row["multiplier_imag"])
     assert critical == pytest.approx(np.exp(0.7j * np.pi), abs=1e-8)
     assert (row["unstable_below"], row["unstable_above"]) == ("0", "2")
+
+
+HOMOCLINIC = {
+    "name": "homoclinic",
+    "states": {"x": {"escape": 10.0}, "y": {"escape": 10.0}},
+    "parameters": {"alpha": 0.05},
+    "equations": {"x": "-x + 2*y + x**2", "y": "(2 - alpha)*x - y - 3*x**2 + 1.5*x*y"},
+}
+"""Sandstede (1997): at alpha = 0 an orbit leaves the saddle 0, whose eigenvalues are 1 and -3, and comes
+back: y**2 = x**2 - x**3 is invariant."""
+
+
+def test_explore__towards_a_homoclinic_orbit():
+    """The period is -ln(alpha) over the smaller eigenvalue, 1, and a constant. The end names the saddle."""
+    ds = followed(HOMOCLINIC, "x", [0.5, 0.345], "alpha", -0.1, 0.1, level=0.5, alpha=0.05)
+    alpha, seconds = ds["parameter"].values[0], ds["period_s"].values[0]
+    near = alpha < 1e-3
+    assert alpha[near].min() < 1e-6
+    assert ds["section"].values[0, np.nanargmin(alpha), 0, 1] ** 2 == pytest.approx(0.5**2 - 0.5**3, abs=1e-6)
+    slope, _ = np.polyfit(-np.log(alpha[near]), seconds[near], 1)
+    assert slope == pytest.approx(1.0, abs=0.01)
+    (line,) = str(ds.attrs["stuck"]).splitlines()
+    assert "the period grows faster and faster" in line
+    own = np.linalg.eigvals([[-1.0, 2.0], [2.0, -1.0]])
+    assert f"a saddle at x 0, y 0 with eigenvalues {own.max():.5g}, {own.min():.5g} [1/s]" in line
+    assert line.endswith("this suggests a homoclinic bifurcation")
+    assert f"  {line}" in branches_table(ds).lines
+
+
+@pytest.mark.parametrize("ratio", [0.3, 0.6, 0.8])
+@pytest.mark.parametrize(
+    ("period", "grows"),
+    [
+        (lambda d: 5.0 - np.log(d), True),  # homoclinic
+        (lambda d: d**-0.5, True),  # saddle-node on the cycle
+        (lambda d: 5.0 - d**0.5, False),  # a touch
+        (lambda d: 5.0 - d**0.25, False),
+        (lambda d: 5.0 - d, False),
+        (lambda d: 5.0 + np.log(d), False),
+    ],
+)
+def test_grows_without_bound__by_the_law_of_the_period(period, grows, ratio):
+    away = 0.1 * ratio ** np.arange(int(np.log(1e-7) / np.log(ratio)))
+    unknowns = np.stack([1.0 + 0.3 * away, away], axis=1)
+    assert grows_without_bound(unknowns, period(away)) == grows
+    assert not grows_without_bound(unknowns[:2], period(away)[:2])
 
 
 def shot(c, guess):
