@@ -14,7 +14,7 @@ from magpend_core.models.model import Model
 from magpend_core.sampling import Drive
 from pipeline.rig.edges import Edges, find_edges
 from pipeline.rig.identify.measured_orbits import MeasuredTable, first_orbits
-from pipeline.rig.identify.problem import ZERO, Free, Piece, Problem
+from pipeline.rig.identify.problem import PHASE, ZERO, Free, Piece, Problem, steady_drive
 from pipeline.rig.identify.settings import apply_settings
 from pipeline.rig.identify.specification import IdentificationSpec, RecordingTable
 from pipeline.rig.recordings import findings_of, load_mapping, read_recording, smooth, summary
@@ -99,6 +99,11 @@ def build(spec: IdentificationSpec, recordings: Sequence[xr.Dataset], tables: Se
     problems: list[str] = []
     channels = channels_of(spec.model, spec.fit.channels, recordings, problems) if recordings else ()
     problems += drive_problems(spec.model, spec.recordings, recordings, "recordings")
+    if spec.fit.slopes == "variational" and any(t.drive == "known" and t.phase is None for t in spec.recordings):
+        problems.append(
+            'fit.slopes = "variational": gives no slopes by the phase of a known drive; use "differences", or give '
+            "phase."
+        )
     if problems:
         raise SpecError(problems)
     smoothed = [smooth(ds) for ds in recordings]
@@ -110,7 +115,7 @@ def build(spec: IdentificationSpec, recordings: Sequence[xr.Dataset], tables: Se
         except SpecError as error:
             problems += [f"recordings[{i}]: {p}" for p in error.problems]
             continue
-        problems += _hold_out_problems(i, table, len(own))
+        problems += _hold_out_problems(i, table, own)
         held += [p for p in own if p.number in table.hold_out]
         kept += _rechained([p for p in own if p.number not in table.hold_out], len(kept))
     if problems:
@@ -122,7 +127,7 @@ def build(spec: IdentificationSpec, recordings: Sequence[xr.Dataset], tables: Se
     problem = Problem(
         model=spec.model,
         fixed=spec.values,
-        free=free_of(spec, channels, len(recordings)),
+        free=free_of(spec, channels),
         channels=channels,
         pieces=tuple(kept),
         tied=spec.tied,
@@ -175,7 +180,9 @@ def drive_problems(
     problems = []
     for i, (table, ds) in enumerate(zip(tables, recordings, strict=True)):
         path = f"{where}[{i}].drive = {table.drive!r}"
-        if table.drive != "none" and DRIVE not in ds:
+        if table.drive == "known":
+            problems += _clock_problems(model, table, ds, f"{where}[{i}]")
+        elif table.drive != "none" and DRIVE not in ds:
             problems.append(f'{path}: the mapping names no drive channel; add [drive] there, or set drive = "none".')
         elif table.drive == "recorded" and ds[DRIVE].attrs.get("kind") == "signal":
             problems.append(
@@ -183,14 +190,15 @@ def drive_problems(
                 '(kind = "torque").'
             )
     kinds = {table.drive for table in tables}
-    if {"edges", "recorded"} <= kinds:
+    by_model = sorted(kinds & {"edges", "known"})
+    if by_model and "recorded" in kinds:
         problems.append(
-            f'{where}: drive = "edges" cannot stand beside "recorded" in one identification; take '
+            f'{where}: drive = "{by_model[0]}" cannot stand beside "recorded" in one identification; take '
             "one of them for all driven recordings."
         )
-    if "edges" in kinds:
+    if by_model:
         problems += [
-            f'{where}[{i}]: beside drive = "edges" of others, say what switches its drive off: parameters = '
+            f'{where}[{i}]: beside drive = "{by_model[0]}" of others, say what switches its drive off: parameters = '
             "{ NAME = 0.0 } with the name of the drive's amplitude."
             for i, table in enumerate(tables)
             if table.drive == "none" and not table.parameters
@@ -200,16 +208,38 @@ def drive_problems(
     return problems
 
 
-def _hold_out_problems(i: int, table: RecordingTable, n: int) -> list[str]:
+def _clock_problems(model: Model, table: RecordingTable, ds: xr.Dataset, where: str) -> list[str]:
+    """Return problems with a drive of known frequency."""
+    if model.autonomous:
+        return [f'{where}.drive = "known": {model.name} has no drive; use drive = "none".']
+    assert table.frequency_hz is not None
+    rate = 1.0 / float(np.median(np.diff(ds["time"].values)))
+    if table.frequency_hz < 0.5 * rate:
+        return []
+    return [
+        f"{where}.frequency_hz = {table.frequency_hz:g}: must be below {0.5 * rate:g} Hz, half of the recording's "
+        "sampling rate; give it in Hz (not in rad/s), or correct the times of the mapping."
+    ]
+
+
+def _hold_out_problems(i: int, table: RecordingTable, own: Sequence[Piece]) -> list[str]:
+    n = len(own)
     wrong = [k for k in table.hold_out if k >= n]
     if not wrong:
-        return []
+        if table.drive != "known" or table.phase is not None or any(p.number not in table.hold_out for p in own):
+            return []
+        return [
+            f"recordings[{i}].phase: missing; all pieces are held out, so it cannot be fitted: give it (0 to 1 drive "
+            "periods), or leave a piece to be fitted."
+        ]
     return [f"recordings[{i}].hold_out: there are pieces 0 to {n - 1}, and no {', '.join(map(str, wrong))}."]
 
 
-def free_of(spec: IdentificationSpec, channels: Sequence[str], n_recordings: int) -> tuple[Free, ...]:
-    """Return the unknowns of the fit: parameters in the order of the specification, then zero offsets of sensors."""
-    found = []
+def free_of(spec: IdentificationSpec, channels: Sequence[str]) -> tuple[Free, ...]:
+    """Return the unknowns of the fit: parameters in the order of the specification, then zero offsets of sensors, then
+    phases of drives.
+    """
+    found, n_recordings = [], len(spec.recordings)
     for u in spec.unknowns:
         p = spec.model.parameter(u.name)
         mean, sd = (u.prior.mean, u.prior.sd) if u.prior is not None else (math.nan, math.nan)
@@ -221,6 +251,10 @@ def free_of(spec: IdentificationSpec, channels: Sequence[str], n_recordings: int
             suffix = f".{i}" if n_recordings > 1 else ""
             meaning = f"zero offset of {name}" + (f" in recording {i}" if suffix else "")
             found.append(Free(f"{ZERO}.{name}{suffix}", 0.0, -bound, bound, state.unit, meaning))
+    for i, table in enumerate(spec.recordings):
+        if table.drive == "known" and table.phase is None:
+            meaning = f"phase of the drive at time 0 of recording {i}, in drive periods"
+            found.append(Free(f"{PHASE}.{i}", 0.0, unit="1", meaning=meaning, typical=1.0))
     return tuple(found)
 
 
@@ -303,6 +337,8 @@ def pieces_of(
                 start,
                 pieces_drive,
                 len(found) - 1 if stretch.continues and found and whole else -1,
+                float(time[0]),
+                table.frequency_hz or 0.0,
             )
         )
     if problems:
@@ -365,16 +401,22 @@ def _start(model: Model, own: xr.Dataset) -> np.ndarray:
 
 @dataclass(frozen=True)
 class _Driven:
-    """Drive of a recording, with the times that it covers [s]."""
+    """Drive of a recording, with the times that it covers [s]; or its frequency and its phase at time 0, if they are
+    known.
+    """
 
     drive: Drive | None
     begin_s: float
     end_s: float
+    known: tuple[float, float] | None = None
 
     def window(self, begin: float, end: float) -> Drive:
         """Return the drive between two times of the recording [s]. If no drive was recorded, return a drive of zero
         torque.
         """
+        if self.known is not None:
+            frequency, phase = self.known
+            return steady_drive(frequency, phase + frequency * begin, end - begin)
         if self.drive is None:
             # no torque here, while other recordings have one
             return Drive.from_torque(np.array([0.0, end - begin]), np.zeros(2))
@@ -386,6 +428,9 @@ def _drive_of(table: RecordingTable, ds: xr.Dataset) -> _Driven | None:
     time = ds["time"].values
     if table.drive == "none":
         return None
+    if table.frequency_hz is not None:
+        # an unknown phase is fitted on top of 0
+        return _Driven(None, float(time[0]), float(time[-1]), (table.frequency_hz, table.phase or 0.0))
     level = ds[DRIVE].values
     if table.drive == "recorded":
         known = np.isfinite(level)

@@ -61,9 +61,14 @@ def check(directory: str | Path, recording: str | Path, *, like: int = 0) -> dic
             "file": str(recording),
             "mapping": "",
             "drive": tables[like]["drive"],
-            "parameters": tables[like].get("parameters", {}),
+            **{key: tables[like][key] for key in ("parameters", "frequency_hz", "phase") if key in tables[like]},
         }
     )
+    if table.drive == "known" and table.phase is None:
+        raise SpecError(
+            f"like = {like}: the phase of its drive was fitted, and that of {recording} is not known; add {recording} "
+            "to [[recordings]] of the specification with some of its pieces in hold_out, and identify again."
+        )
     ds = read_recording(recording, parse_mapping(info.mappings[like], f"mapping of recording {like}"))
     model = load_model(result["model"])
     channels = tuple(result["channels"])

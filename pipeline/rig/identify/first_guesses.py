@@ -16,6 +16,9 @@ Array = NDArray[np.float64]
 
 MAX_ITERATIONS = 40
 FIRST_DAMPING, LESS, MORE, MOST_DAMPING = 1e-3, 0.1, 10.0, 1e12
+N_PHASES = 12
+"""Number of phases of a known drive from which the best one is chosen."""
+
 SETTLED = 1e-10
 """Relative decrease of a piece's cost, predicted by its slopes, below which its start is found."""
 
@@ -101,6 +104,23 @@ def fit_many_starts(problem: Problem, thetas: Array, starts: Array) -> ManyStart
                     found[i, k], blocks[i][k] = start, block
     costs = np.array([[_cost(block) for block in row] for row in blocks]).reshape(moving.shape)
     return ManyStarts(found, ~moving, costs)
+
+
+def choose_phases(problem: Problem, theta: Array) -> Array:
+    """Return the unknowns with the phase of each recording's known drive moved to the best of phases all round the
+    circle, with initial states fitted for each.
+    """
+    if not problem.phases:
+        return theta
+    shifts = np.arange(N_PHASES) / N_PHASES
+    thetas = np.tile(theta, (N_PHASES, 1))
+    thetas[:, list(problem.phases.values())] += shifts[:, None]
+    costs = fit_many_starts(problem, thetas, np.tile(problem.starts, (N_PHASES, 1, 1))).costs
+    found = np.array(theta)
+    for recording, i in problem.phases.items():
+        own = [p.recording == recording for p in problem.pieces]
+        found[i] += shifts[int(np.argmin(costs[:, own].sum(axis=1)))]
+    return found
 
 
 def block_rows(problem: Problem) -> list[slice]:

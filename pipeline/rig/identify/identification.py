@@ -19,6 +19,7 @@ from pipeline.rig.identify import directory as store
 from pipeline.rig.identify import identifiability, reports
 from pipeline.rig.identify.build import Built, build, read_all
 from pipeline.rig.identify.directory import Outcomes, Source
+from pipeline.rig.identify.drive_frequency import estimate_frequencies
 from pipeline.rig.identify.judging import judge, judge_fit
 from pipeline.rig.identify.linearise import linearise, loss_scale_of
 from pipeline.rig.identify.local import Fit, fit_local
@@ -224,7 +225,7 @@ def find(spec: IdentificationSpec, built: Built, outcomes: Outcomes, echo: Echo)
     directions = identifiability.directions_of(linear.information - np.diag(linear.prior), scale, covariance.inflation)
     held = None
     if built.held_out:
-        held, fit = judge(problem, problem.values(best.theta), reports.zeros_of(problem, best), built.held_out)
+        held, fit = judge(problem, problem.values(best.theta), reports.beside_of(problem, best), built.held_out)
         require_starts(fit, "held-out pieces")
     at_bound = _at_bound(problem, best, scale)
     judged = [judge_orbits(table, problem.values(best.theta)) for table in built.tables]
@@ -239,6 +240,7 @@ def find(spec: IdentificationSpec, built: Built, outcomes: Outcomes, echo: Echo)
         dict(zip(problem.channels, n_effective(linear.residuals), strict=True)),
         at_bound,
         judged,
+        frequencies=estimate_frequencies(problem, best, scale),
     )
     profiles = _profiles(found, linear, scale, outcomes) if table.profiles else {}
     return replace(found, profiles=profiles, warnings=_warnings(found, profiles))
@@ -257,7 +259,7 @@ def _sizes(problem: Problem, best: Fit) -> np.ndarray:
     if problem.pieces:
         measured = np.concatenate([p.measured for p in problem.pieces])
         spread = dict(zip(problem.channels, np.nanstd(measured, axis=0), strict=True))
-    sensed = [spread[f.name.split(".")[1]] if f.name.startswith(f"{ZERO}.") else np.nan for f in problem.free]
+    sensed = [spread[f.name.split(".")[1]] if f.name.startswith(f"{ZERO}.") else f.typical for f in problem.free]
     return identifiability.sizes_of(best.theta, problem.start, problem.lower, problem.upper, np.array(sensed))
 
 
@@ -273,6 +275,7 @@ def _warnings(found: reports.Finding, profiles: Mapping[str, Profile]) -> list[s
     problem = found.problem
     sd = np.array([f.prior_sd for f in problem.free])
     lines = identifiability.warnings_of(problem.names, found.directions, found.covariance, sd, found.at_bound)
+    lines += [w for f in found.frequencies if (w := f.warning)]
     lines += [
         f"the profile of {name} passes a better fit than the best; raise search.n_starts."
         for name, p in profiles.items()

@@ -199,13 +199,21 @@ def _integrate(
     columns = list(problem.columns) if problem.continuity is None else list(range(n))
     if system is not None:
         columns += [n + c for c in columns]
-    drives = [p.drive if system is None else _thrice(p.drive) for p in problem.pieces]
+    own = problem.system if system is None else system
+    flat = parameters.reshape(-1, parameters.shape[-1])
+    packed, turns = np.split(flat, [len(own.parameter_names)], axis=1)
+    # members that differ in the phase of a known drive have drives of their own
+    pieces, which = list(problem.pieces), np.zeros(len(flat), np.int64)
+    if turns.shape[1]:
+        different, which = np.unique(turns, axis=0, return_inverse=True)
+        pieces = [p.turned(*turn.reshape(-1, 2)[p.recording]) for turn in different for p in problem.pieces]
+    drives = [p.drive if system is None else _thrice(p.drive) for p in pieces]
     found = sample(
-        problem.system if system is None else system,
-        np.repeat(parameters.reshape(-1, parameters.shape[-1]), n_pieces, axis=0),
+        own,
+        np.repeat(packed, n_pieces, axis=0),
         starts.reshape(-1, starts.shape[-1]),
-        [_grid(problem, k) for k in range(n_pieces)],
-        piece=np.tile(np.arange(n_pieces), shape[0] * shape[1]),
+        [_grid(problem, k) for k in range(n_pieces)] * (len(pieces) // n_pieces),
+        piece=(which.reshape(-1, 1) * n_pieces + np.arange(n_pieces)).ravel(),
         drives=drives if any(d is not None for d in drives) else None,
         columns=columns,
         rtol=tolerance,

@@ -20,21 +20,39 @@ from pipeline.analysis.branches.carrying import OrbitData, Solution
 ZERO = "zero"
 """Prefix of the names of sensors' zeros: ``zero.CHANNEL`` or ``zero.CHANNEL.RECORDING``."""
 
+PHASE, DETUNING = "phase", "detuning"
+"""Prefixes of the names of a known drive's unknowns: ``phase.RECORDING`` at the recording's time 0 [drive periods], and
+``detuning.RECORDING``, its frequency less the stated one [Hz]."""
+
+
+def steady_drive(
+    frequency_hz: float, phase: float, length_s: float, names: tuple[str, ...] = (), values: np.ndarray | None = None
+) -> Drive:
+    """Return a drive of one frequency for twice a length, from a phase [drive periods] on; `values` hold throughout."""
+    period = 1.0 / frequency_hz
+    n = math.ceil(2.0 * length_s * frequency_hz) + 1
+    row = np.zeros(0) if values is None else values
+    start = min(phase % 1.0 * period, math.nextafter(period, 0.0))
+    return Drive(np.full(n, period), names, np.tile(row, (n, 1)), start)
+
 
 @dataclass(frozen=True)
 class Free:
-    """Unknown of the fit: a parameter of the model or the zero offset of a sensor.
+    """Unknown of the fit: a parameter of the model, the zero offset of a sensor, or the phase of a known drive.
 
     Attributes
     ----------
     name : str
-        Name of the parameter; ``zero.CHANNEL`` for all recordings, ``zero.CHANNEL.RECORDING`` for one.
+        Name of the parameter; ``zero.CHANNEL`` for all recordings, ``zero.CHANNEL.RECORDING`` for one;
+        ``phase.RECORDING``.
     start, lower, upper : float
         First guess and bounds [SI].
     unit, meaning : str
         Unit, and description in words.
     prior_mean, prior_sd : float
         Mean and standard deviation of an independent measurement; NaN for none.
+    typical : float
+        Typical size, for an unknown whose start and bounds do not tell it; NaN: they do.
     """
 
     name: str
@@ -45,10 +63,13 @@ class Free:
     meaning: str = ""
     prior_mean: float = math.nan
     prior_sd: float = math.nan
+    typical: float = math.nan
 
     @property
     def size(self) -> float:
         """Typical size of the unknown. Steps of finite differences and of the search are fractions of this size."""
+        if math.isfinite(self.typical):
+            return self.typical
         width = self.upper - self.lower
         least = 1e-2 * width if math.isfinite(width) else 0.0
         return max(abs(self.start), least) or 1.0
@@ -77,6 +98,10 @@ class Piece:
         Drive of the piece; None for none.
     follows : int
         Index in the problem of the stretch that this one continues; -1 for none.
+    begin_s : float
+        Time of the stretch's start by the recording's clock [s].
+    known_hz : float
+        Frequency of a drive that was not measured; 0 for any other [Hz].
     """
 
     recording: int
@@ -86,6 +111,19 @@ class Piece:
     start: np.ndarray
     drive: Drive | None = None
     follows: int = -1
+    begin_s: float = 0.0
+    known_hz: float = 0.0
+
+    def turned(self, phase: float, detuning_hz: float) -> Piece:
+        """Return the piece with its known drive moved forward by a phase [drive periods] at the recording's time 0, and
+        with another frequency.
+        """
+        if self.drive is None or not self.known_hz or (phase == 0.0 and detuning_hz == 0.0):
+            return self
+        begun = self.drive.start_s * self.known_hz + phase + detuning_hz * self.begin_s
+        values = self.drive.values[0] if self.drive.names else None
+        drive = steady_drive(self.known_hz + detuning_hz, begun, float(self.time[-1]), self.drive.names, values)
+        return replace(self, drive=drive)
 
 
 @dataclass(frozen=True)
@@ -182,19 +220,39 @@ class Problem:
 
     @cached_property
     def moving(self) -> tuple[int, ...]:
-        """Indices of the unknowns on which the trajectories depend."""
-        return tuple(i for i, f in enumerate(self.free) if not f.name.startswith(f"{ZERO}."))
+        """Indices of the unknowns that are parameters of the model."""
+        return tuple(i for i, f in enumerate(self.free) if "." not in f.name)
 
     @property
     def sloped(self) -> tuple[int, ...]:
-        """Indices of the unknowns by which the trajectories' slopes are computed: `moving`, or none if `held`."""
-        return () if self.held else self.moving
+        """Indices of the unknowns by which the trajectories' slopes are computed: all but zeros, or none if `held`."""
+        return () if self.held else tuple(i for i, f in enumerate(self.free) if not f.name.startswith(f"{ZERO}."))
+
+    @cached_property
+    def phases(self) -> dict[int, int]:
+        """By recording whose drive has an unknown phase, the index of that unknown."""
+        return {int(f.name.split(".")[1]): i for i, f in enumerate(self.free) if f.name.startswith(f"{PHASE}.")}
+
+    @cached_property
+    def turns(self) -> np.ndarray:
+        """Derivatives of each known drive's phase and detuning by the unknowns, shape (recording, 2, n_free)."""
+        found = np.zeros((self._n_recordings, 2, len(self.free)))
+        for i, f in enumerate(self.free):
+            word, *rest = f.name.split(".")
+            if word in (PHASE, DETUNING) and rest:
+                found[int(rest[0]), int(word == DETUNING), i] = 1.0
+        return found
+
+    @property
+    def _n_recordings(self) -> int:
+        """Number of recordings that have a piece, or an unknown of their own."""
+        named = [int(last) for f in self.free if (last := f.name.rpartition(".")[2]).isdigit()]
+        return 1 + max([*named, *(p.recording for p in self.pieces)], default=0)
 
     @cached_property
     def zeros(self) -> np.ndarray:
         """Derivatives of each channel's offset by the unknowns (0 or 1), shape (recording, n_channels, n_free)."""
-        n = 1 + max((p.recording for p in self.pieces), default=0)
-        found = np.zeros((n, len(self.channels), len(self.free)))
+        found = np.zeros((self._n_recordings, len(self.channels), len(self.free)))
         for i, f in enumerate(self.free):
             word, *rest = f.name.split(".")
             if word == ZERO:
@@ -225,7 +283,10 @@ class Problem:
         return found
 
     def pack(self, thetas: np.ndarray) -> np.ndarray:
-        """Return the model's packed parameters for each row of unknowns of the fit, shape (n, n_parameters)."""
+        """Return the model's packed parameters for each row of unknowns of the fit, shape (n, n_parameters).
+
+        With unknowns of known drives, phase and detuning of each recording follow.
+        """
         names = list(self.fixed.names)
         packed = np.tile(self.fixed.pack(), (len(thetas), 1))
         for i in self.moving:
@@ -233,7 +294,8 @@ class Problem:
         for name, (factor, other) in self.tied.items():
             packed[:, names.index(name)] = factor * packed[:, names.index(other)]
         more = len(self.system.parameter_names) - len(names)
-        return np.hstack([packed, np.zeros((len(thetas), more))])
+        turns = self.turns.reshape(-1, len(self.free)) if self.turns.any() else np.zeros((0, len(self.free)))
+        return np.hstack([packed, np.zeros((len(thetas), more)), thetas @ turns.T])
 
     def with_orbits(self, known: Sequence[Solution]) -> Problem:
         """Return a copy of the least-squares problem with new computed orbits to start Newton's method, one `Solution`
@@ -245,12 +307,15 @@ class Problem:
     def without(self, fixed: Mapping[str, float]) -> Problem:
         """Return the least-squares problem with some unknowns fixed at given values.
 
-        A sensor's zero that is held is subtracted from the measured values.
+        A sensor's zero that is held is subtracted from the measured values; a phase moves the drives.
         """
-        held = {name: value for name, value in fixed.items() if not name.startswith(f"{ZERO}.")}
+        held = {name: value for name, value in fixed.items() if "." not in name}
         kept = tuple(f for f in self.free if f.name not in fixed)
         offset = np.array([fixed.get(f.name, 0.0) for f in self.free]) * [
             f.name not in held and f.name in fixed for f in self.free
         ]
-        pieces = tuple(replace(p, measured=p.measured - self.zeros[p.recording] @ offset) for p in self.pieces)
+        pieces = tuple(
+            replace(p, measured=p.measured - self.zeros[p.recording] @ offset).turned(*self.turns[p.recording] @ offset)
+            for p in self.pieces
+        )
         return replace(self, fixed=self.fixed.replace(**held), free=kept, pieces=pieces)

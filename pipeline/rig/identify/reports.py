@@ -14,11 +14,12 @@ from magpend_core.models.preset_writing import write_preset
 from pipeline.layout.vocabulary import model_attribute
 from pipeline.layout.writing import json_value
 from pipeline.rig.identify.directory import Source
+from pipeline.rig.identify.drive_frequency import DriveFrequency
 from pipeline.rig.identify.identifiability import Direction
 from pipeline.rig.identify.judging import Judgement
 from pipeline.rig.identify.local import Fit
 from pipeline.rig.identify.orbit_reports import orbit_lines, orbits_result
-from pipeline.rig.identify.problem import ZERO, Problem
+from pipeline.rig.identify.problem import PHASE, ZERO, Problem
 from pipeline.rig.identify.profiles import Profile
 from pipeline.rig.identify.specification import IdentificationSpec
 from pipeline.rig.identify.statistics import Covariance
@@ -44,6 +45,8 @@ class Finding:
         For each unknown, the bound at which its estimate lies: ``lower``, ``upper`` or an empty text.
     orbits : list of Dataset
         Judged orbits and bifurcations, one dataset per table.
+    frequencies : list of DriveFrequency
+        Estimates of the stated frequencies of known drives.
     """
 
     problem: Problem
@@ -58,6 +61,7 @@ class Finding:
     orbits: Sequence[xr.Dataset] = ()
     profiles: Mapping[str, Profile] = field(default_factory=dict)
     warnings: Sequence[str] = ()
+    frequencies: Sequence[DriveFrequency] = ()
 
     @property
     def values(self) -> dict[str, float]:
@@ -67,7 +71,7 @@ class Finding:
     @property
     def zeros(self) -> dict[str, float]:
         """Fitted zero offsets of the sensors, by name of the unknown."""
-        return zeros_of(self.problem, self.best)
+        return beside_of(self.problem, self.best, ZERO)
 
     @property
     def n_same(self) -> int:
@@ -79,10 +83,13 @@ class Finding:
         return fit.converged and fit.cost <= (1 + SAME) * self.best.cost
 
 
-def zeros_of(problem: Problem, fit: Fit) -> dict[str, float]:
-    """Return the fitted zero offsets of the sensors, by name of the unknown."""
+def beside_of(problem: Problem, fit: Fit, *words: str) -> dict[str, float]:
+    """Return the fitted unknowns that are no parameters of the model, by name: zero offsets of the sensors and phases
+    of known drives, or those whose names begin with one of the given words.
+    """
+    prefixes = tuple(f"{word}." for word in words or (ZERO, PHASE))
     named = zip(problem.names, fit.theta, strict=True)
-    return {name: float(value) for name, value in named if name.startswith(f"{ZERO}.")}
+    return {name: float(value) for name, value in named if name.startswith(prefixes)}
 
 
 def result_of(
@@ -107,6 +114,7 @@ def result_of(
         **found.fitted.as_dict(),
         "held_out": None if found.held_out is None else found.held_out.as_dict(),
         "orbits": orbits_result(found.orbits),
+        "drive_frequencies": [f.as_dict() for f in found.frequencies],
         **_sureness(found),
         "starts": [
             {
@@ -262,6 +270,11 @@ def lines_of(result: Mapping[str, Any]) -> list[str]:
     if result["held_out"] is not None:
         lines += [f"held out: {line}" for line in judgement_lines(result["held_out"], result["units"])]
     lines += orbit_lines(result["orbits"])
+    lines += [
+        f"drive of recording {f['recording']}: {f['frequency_hz']:.8g} Hz stated, {f['estimate_hz']:.8g} Hz estimated "
+        f"(standard error {f['error_hz']:.2g} Hz): {f['verdict']}"
+        for f in result["drive_frequencies"]
+    ]
     same = sum(s["best"] for s in result["starts"])
     lines.append(f"{same} of {len(result['starts'])} starts reached this optimum")
     lines.append(f"intervals: {result['covariance']['why']}")

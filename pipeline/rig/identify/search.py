@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.products.reporting import report
-from pipeline.rig.identify.first_guesses import fit_starts
+from pipeline.rig.identify.first_guesses import choose_phases, fit_starts
 from pipeline.rig.identify.local import Echo, Fit, fit_local
 from pipeline.rig.identify.objective import evaluate
 from pipeline.rig.identify.problem import Piece, Problem
@@ -92,6 +92,8 @@ def search(
     """
     import_extra("cma", "rig", "identify")  # now, and not when the first starts have failed
     stages = _stages(problem)
+    first = choose_phases(stages[-1], problem.start)
+    problem = replace(problem, free=tuple(replace(f, start=float(x)) for f, x in zip(problem.free, first, strict=True)))
     guesses = guess(problem, n_starts, seed, spread, method, n_samples, stages[0])
     fits = [_kept(problem, stages, k, theta, len(guesses), keep, tell) for k, theta in enumerate(guesses)]
     if method == "sobol" and not any(fit.converged for fit in fits):
@@ -198,15 +200,21 @@ def refine(problem: Problem, theta: Array, *, stages: Sequence[Problem] | None =
     # measured orbits are known at the guess itself, and may be lost where the stages end
     candidates = [np.clip(theta, problem.lower, problem.upper)] if problem.orbits else []
     for stage in _stages(problem) if stages is None else stages:
+        theta = choose_phases(stage, theta)
         fit = fit_local(stage, theta, max_evaluations=STAGE_EVALUATIONS, tolerance=STAGE_TOLERANCE)
         if np.isfinite(fit.cost):
             theta = fit.theta
             candidates.append(theta)
     candidates = candidates or [np.clip(theta, problem.lower, problem.upper)]
+    if problem.phases:
+        candidates += [choose_phases(problem, one) for one in candidates]
     starts = [fit_starts(problem, one, problem.starts).starts for one in candidates]
     found = evaluate(problem, np.array(candidates), np.array(starts), slopes=False)
     best = int(np.argmin([np.inf if e.failed else e.cost for e in found]))
-    return fit_local(problem, candidates[best], starts=starts[best], echo=echo)
+    fit = fit_local(problem, candidates[best], starts=starts[best], echo=echo)
+    whole = np.array(fit.theta)
+    whole[list(problem.phases.values())] %= 1.0
+    return replace(fit, theta=whole)
 
 
 def _stages(problem: Problem) -> list[Problem]:
@@ -265,7 +273,10 @@ def _stretches(problem: Problem, piece: Piece, length_s: float) -> list[Piece]:
             begin = drive.start_s + piece.time[a]
             drive = drive.window(begin, drive.start_s + piece.time[b - 1])
         time = piece.time[a:b:step] - piece.time[a]
-        found.append(replace(piece, time=time, measured=piece.measured[a:b:step], start=start, drive=drive, follows=-1))
+        measured, begin_s = piece.measured[a:b:step], piece.begin_s + float(piece.time[a])
+        found.append(
+            replace(piece, time=time, measured=measured, start=start, drive=drive, follows=-1, begin_s=begin_s)
+        )
     return found
 
 

@@ -41,10 +41,17 @@ class RecordingTable(Table):
 
     file: str = Field(description="Recording, relative to the specification")
     mapping: str = Field(description="Mapping file of the recording, relative to the specification")
-    drive: Literal["none", "recorded", "edges"] = Field(
+    drive: Literal["none", "recorded", "edges", "known"] = Field(
         "none",
         description="`none`: the drive was off; `recorded`: the torque was measured; `edges`: the times of "
-        "switching were measured, the model gives shape and amplitude",
+        "switching were measured, the model gives shape and amplitude; `known`: it was not measured, its frequency is "
+        "known, the model gives shape and amplitude",
+    )
+    frequency_hz: Annotated[float, Field(gt=0)] | None = Field(
+        None, description="Frequency of the drive in this recording [Hz], for `known`"
+    )
+    phase: Annotated[float, Field(ge=0, lt=1)] | None = Field(
+        None, description="Phase of a `known` drive at the recording's time 0 [drive periods]; by default fitted"
     )
     parameters: dict[str, float] = Field(
         default_factory=dict,
@@ -304,9 +311,22 @@ def _recordings(data: Mapping[str, Any], folder: Path, problems: list[str]) -> t
                 f"recordings[{i}].window_s = {list(one.window_s)}: is empty; give [start, end] with the "
                 "start below the end [s]."
             )
+        problems += _known_drive_problems(one, f"recordings[{i}]")
         if len(set(one.hold_out)) < len(one.hold_out):
             problems.append(f"recordings[{i}].hold_out: names a piece twice; name each once.")
     return tuple(found)
+
+
+def _known_drive_problems(table: RecordingTable, where: str) -> list[str]:
+    if table.drive == "known":
+        missing = f'{where}.frequency_hz: missing; drive = "known" asks for the frequency of the drive [Hz], above 0.'
+        return [missing] if table.frequency_hz is None else []
+    return [
+        f'{where}.{key} = {value:g}: belongs to drive = "known" alone, and here drive = "{table.drive}"; change one '
+        "of the two."
+        for key, value in (("frequency_hz", table.frequency_hz), ("phase", table.phase))
+        if value is not None
+    ]
 
 
 def _orbits(data: Mapping[str, Any], folder: Path, problems: list[str]) -> tuple[OrbitsTable, ...]:
