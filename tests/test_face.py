@@ -132,6 +132,7 @@ def test_run__function_returns_the_run_with_methods(run):
         ("run it again: magpend run SPEC --out runs/a.b --at q=1, or give --out DIR",
          "run it again: magpend run SPEC --out runs/a.b --at q=1, or give out=DIR"),
         ("--unknown 3", "--unknown 3"),
+        ("--between Z: is no set", "between=Z: is no set"),
     ],
 )  # fmt: skip
 def test_errors__name_arguments(text, wanted):
@@ -150,6 +151,14 @@ def test_errors__name_arguments_at_every_door(run, tmp_path, command):
         with pytest.raises(SpecError, match="leave out as_map=True"):
             call()
     two = run.cube().expand_dims(q=[1.0, 2.0])
+    for draw, other in (
+        (lambda: magpend.plot_lyapunov(two), "plot_lyapunov_map"),
+        (lambda: magpend.plot_lyapunov_map(run.cube()), "plot_lyapunov"),
+    ):
+        with pytest.raises(ValueError, match=rf"draw a \w+ with {other}$"):
+            draw()
+    with pytest.raises(SpecError, match=r"^dashboard=True: .* or give scheduler= an address"):
+        magpend.run(RESONANCE, tmp_path / "none", dashboard=True)
     with pytest.raises(SpecError, match=r"such as at=\{'q': 1\}, or draw a map with as_map=True"):
         two.magpend.plot.lyapunov()
     for call in (run.branches, run.table):

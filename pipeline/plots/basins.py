@@ -218,7 +218,7 @@ def _finished(counts: Mapping[int, int]) -> int:
 
 def _entries(cast: palette.Cast, counts: Mapping[int, int]) -> list[tuple[str, str]]:
     finished = _finished(counts)
-    own = sorted((i for i in counts if i >= 0), key=lambda i: (-counts[i], i))
+    own = [i for i in cast.order if i in counts]
     entries = [(f"{cast.names[i]}, {palette.percent(counts[i] / finished)}", cast.colours[i]) for i in own]
     if _OTHERS in counts:
         n = len(cast.names) - len(cast.main)

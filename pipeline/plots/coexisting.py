@@ -184,7 +184,7 @@ def _draw_directions(ax: Axes, one: xr.Dataset, parameter: str, cast: palette.Ca
 
 def _entries(data: xr.Dataset, cast: palette.Cast, both: bool, loops: bool) -> list[palette.Entry]:
     total = data["share"].values.sum(axis=0)
-    ranked = sorted((i for i in cast.main if total[i] > 0), key=lambda i: (-total[i], i))
+    ranked = [i for i in cast.order if i in cast.main and total[i] > 0]
     met = {int(code) for code in np.unique(data["stability"].values)}
     entries: list[palette.Entry] = [(cast.names[i], cast.colours[i]) for i in ranked]
     rest = sum(total[i] > 0 for i in cast.names if i not in cast.main)

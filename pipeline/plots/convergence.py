@@ -27,9 +27,9 @@ QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 
 _COLOURS = {
     Motion.REGULAR: style.BLUE,
-    Motion.UNDECIDED: style.GREY,
     Motion.CHAOTIC: style.VERMILLION,
     Motion.HYPERCHAOTIC: style.PURPLE,
+    Motion.UNDECIDED: style.GREY,
 }
 _DASHES: dict[Motion, Any] = {
     Motion.REGULAR: "-",

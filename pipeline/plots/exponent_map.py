@@ -57,12 +57,7 @@ def plot_lyapunov_map(
     style.check_choice("unit (per)", per, UNITS)
     check_exponents(ds)
     part = at_points(ds, at)
-    swept = [d for d in swept_parameters(part) if part.sizes[d] > 1]
-    if len(swept) != 2:
-        raise ValueError(
-            f"a map is drawn over two swept parameters, and {len(swept)} are left ({', '.join(swept) or 'none'}); "
-            + ("choose values of the others with --at" if len(swept) > 2 else "leave out --map")
-        )
+    swept = swept_pair(part, "draw a diagram with plot_lyapunov")
     values = exponent_values(part, per, spectrum=False)
     largest = values["exponent_value"].isel(exponent=0, drop=True)
     cells = [d for d in largest.dims if d not in swept]
@@ -81,6 +76,20 @@ def plot_lyapunov_map(
     style.limits(ax, frame, *(style.span(part[d].values) for d in swept))
     style.finish(fig)
     return fig
+
+
+def swept_pair(part: xr.Dataset, instead: str) -> list[str]:
+    """Return the names of the two swept parameters of a result cube; raise ValueError if there are not two.
+
+    `instead` says what to do if there are fewer.
+    """
+    swept = [d for d in swept_parameters(part) if part.sizes[d] > 1]
+    if len(swept) != 2:
+        raise ValueError(
+            f"a map is drawn over two swept parameters, and {len(swept)} are left ({', '.join(swept) or 'none'}); "
+            + ("choose values of the others with --at" if len(swept) > 2 else instead)
+        )
+    return swept
 
 
 def _draw_map(fig: style.DataFigure, ax: Axes, data: xr.Dataset, part: xr.Dataset, swept: list[str]) -> None:

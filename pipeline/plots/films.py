@@ -31,7 +31,7 @@ def film_problems(path: Path, fps: float) -> list[str]:
     if path.is_dir():
         problems.append(f"{path}: is a folder; name a file in it.")
     if suffix == ".gif" and fps > MOST_GIF_FPS:
-        problems.append(f"--fps {fps:g}: a GIF has at most {MOST_GIF_FPS:g} frames a second; lower it, or write .webp.")
+        problems.append(f"{fps:g} frames a second: a GIF has at most {MOST_GIF_FPS:g}; take fewer, or write .webp.")
     if suffix == ".webp" and not features.check("webp"):
         problems.append(f"{path}: this Pillow was built without WebP; write .gif, or install another Pillow.")
     if suffix == ".mp4" and shutil.which("ffmpeg") is None:

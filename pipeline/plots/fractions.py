@@ -44,7 +44,8 @@ def plot_fractions(
     -------
     DataFigure
         Bands are stacked, the largest at the bottom; cells without an attractor are grey, at
-        the top. Each parameter value is a column, because nothing is known between two values. Its
+        the top. The legend lists periods in rising order.
+        Each parameter value is a column, because nothing is known between two values. Its
         `data` hold ``fraction`` and the number of cells, ``n_cells``; of a sweep also ``low`` and ``high``,
         the 95 % Wilson interval of each fraction, as if the starts were drawn independently. The widest
         interval is written above. Thin bars, `MOST_BARS` at most, show the interval of the summed bands below
@@ -62,7 +63,9 @@ def plot_fractions(
     cast = palette.cast_of(attractors, part)
     data = _fractions(part, parameter, cast)
     bands = _bands(data, cast)
-    entries: list[palette.Entry] = [(band.name, band.colour) for band in reversed(bands)]
+    place = {number: k for k, number in enumerate(cast.order)}
+    listed = sorted(bands, key=lambda band: place.get(band.attractor, len(place)))
+    entries: list[palette.Entry] = [(band.name, band.colour) for band in listed]
     if bars := "low" in data and 0 < data.sizes[parameter] * (len(bands) - 1) <= MOST_BARS:
         entries.append(Line2D([], [], label="95 % interval of an edge", **_BAR))
     fig, ax = palette.new_panel(data, entries, frame)

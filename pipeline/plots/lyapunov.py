@@ -14,7 +14,7 @@ from matplotlib.collections import PolyCollection
 from pipeline.analysis.chaos.lyapunov import GOOD, check_exponents
 from pipeline.plots import labels, pixels, style
 from pipeline.plots.bifurcation import Diagram, swept_parameter, with_diagram
-from pipeline.plots.exponent_map import plot_lyapunov_map
+from pipeline.plots.exponent_map import plot_lyapunov_map, swept_pair
 from pipeline.plots.exponents import UNITS, exponent_values, rate_unit
 from pipeline.plots.figure import Run, frame_of, noted, values_of
 from pipeline.plots.missing_cells import absent_handles, draw_absent, shade_blank
@@ -73,7 +73,7 @@ def plot_lyapunov(
     """
     style.check_choice("unit (per)", per, UNITS)
     check_exponents(ds)
-    swept_parameter(at_points(ds, at), "draw a map with --map")
+    swept_parameter(at_points(ds, at), "draw a map with plot_lyapunov_map")
     diagram = Diagram.of(ds, state=state, degrees=degrees, at=at, frame=replace(frame, ylim=None))
     part = diagram.view.ds
     part = part.squeeze([d for d in part["status"].dims if d != diagram.parameter and part.sizes[d] == 1])
@@ -194,8 +194,11 @@ def draw(run: Run, options: LyapunovFigureOptions) -> style.DataFigure:
     """Draw the figure ``lyapunov`` of a run: over one parameter, or as colours in the plane of two."""
     cube = run.cube()
     at, notes = values_of(run, options)
+    check_exponents(cube)
     if options.as_map:
+        swept_pair(at_points(cube, at), "leave out --map")
         return noted(plot_lyapunov_map(cube, per=options.per, at=at, frame=frame_of(options)), notes)
+    swept_parameter(at_points(cube, at), "draw a map with --map")
     figure = plot_lyapunov(
         cube,
         spectrum=options.spectrum,

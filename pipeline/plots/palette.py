@@ -70,6 +70,9 @@ SETS = {
 GREY_OF = {code: GREYS[name] for name, code in SETS.items()}
 """Grey of a set that does not attract, by its stability."""
 
+_KINDS = (PERIODIC_ORBIT, TORUS, CHAOTIC_SET, BOUNDED_SET, EQUILIBRIUM)
+"""Kinds of sets in the order of legends."""
+
 _FAILED = ("step limit", "step underflow", "unreached")
 
 
@@ -94,11 +97,14 @@ class Cast:
         Name by id, such as ``A: period 1, left``.
     main : tuple of int
         Ids with a colour of their own: attractors.
+    order : tuple of int
+        All ids as legends list them: by rising period, then tori, chaotic sets and others.
     """
 
     colours: dict[int, str]
     names: dict[int, str]
     main: tuple[int, ...]
+    order: tuple[int, ...]
 
 
 def cast_of(attractors: xr.Dataset, part: xr.Dataset | None = None) -> Cast:
@@ -121,13 +127,22 @@ def cast_of(attractors: xr.Dataset, part: xr.Dataset | None = None) -> Cast:
     colours |= dict.fromkeys(own.tolist(), OTHERS) | dict(zip(ranked, style.colours(), strict=False))
     described = attractors if part is None else part
     names = {i: f"{letter(i)}: {describe(described.isel(attractor=i))}" for i in range(cells.size)}
-    return Cast(colours, names, tuple(sorted(ranked)))
+    order = sorted(names, key=lambda i: _rank(described.isel(attractor=i)))
+    return Cast(colours, names, tuple(sorted(ranked)), tuple(order))
 
 
 def _grey_of(stability: xr.DataArray) -> str:
     """Return the grey for a set that attracts nowhere, by its most frequent stability."""
     codes = stability.values[np.isin(stability.values, list(GREY_OF))]
     return GREY_OF[int(np.bincount(codes).argmax())] if codes.size else OTHERS
+
+
+def _rank(one: xr.Dataset) -> tuple[int, int]:
+    """Return the place of a set in a legend: that of its first kind, and its least period."""
+    kinds, periods = (one[name].values.ravel() for name in ("kind", "orbit_period"))
+    if (periods > 0).any():
+        return 0, int(periods[periods > 0].min())
+    return min((_KINDS.index(k) for k in kinds.tolist() if k in _KINDS), default=len(_KINDS)), 0
 
 
 def describe(one: xr.Dataset) -> str:
@@ -166,13 +181,8 @@ def _periods(periods: np.ndarray, kinds: np.ndarray, is_flow: bool) -> str:
     if closed:
         listed = ", ".join(map(str, closed)) if len(closed) < 4 else f"{closed[0]} to {closed[-1]}"
         parts.append(f"period {listed}")
-    for kind, text in (
-        (PERIODIC_ORBIT, "limit cycle" if is_flow else "not periodic"),
-        (TORUS, "quasi-periodic"),
-        (CHAOTIC_SET, "chaotic"),
-        (BOUNDED_SET, "not periodic"),
-        (EQUILIBRIUM, "at rest"),
-    ):
+    words = ("limit cycle" if is_flow else "not periodic", "quasi-periodic", "chaotic", "not periodic", "at rest")
+    for kind, text in zip(_KINDS, words, strict=True):
         if ((periods == 0) & (kinds == kind)).any() and text not in parts:
             parts.append(text)
     return " or ".join(parts)

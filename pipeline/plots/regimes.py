@@ -303,9 +303,13 @@ def _looks(data: xr.Dataset, show: str) -> tuple[list[str], list[palette.Entry]]
         return list(shades.values()), list(shades.items())
     own = [name for name in names if name != "none"]
     colours = {**dict(zip(own, style.colours(), strict=False)), "none": palette.GREYS["pending"]}
-    return [colours[name] for name in names], [
-        (name, colours[name]) for name in [*own, *(["none"] if "none" in names else [])]
-    ]
+    return [colours[name] for name in names], [(name, colours[name]) for name in sorted(names, key=_rank)]
+
+
+def _rank(name: str) -> tuple[bool, list[tuple[float, str]]]:
+    """Return the place of a regime in the legend: by rising periods, or by letters; what has no attractor last."""
+    members = name.split(" + ")
+    return name == "none", [(float(m) if m.isdigit() else math.inf, f"{len(m)}{m}") for m in members]
 
 
 def draw(run: Run, options: RegimeOptions) -> style.DataFigure:

@@ -55,7 +55,8 @@ def plot_resilience(
     part, along = _selected(ds, at or {})
     cast = palette.cast_of(attractors)
     shown = [i for i in range(part.sizes["attractor"]) if (part["stability"].isel(attractor=i) == ATTRACTS).any()]
-    handles = [Line2D([], [], color=cast.colours[i], marker="o", markersize=4.0, label=cast.names[i]) for i in shown]
+    listed = [i for i in cast.order if i in shown]
+    handles = [Line2D([], [], color=cast.colours[i], marker="o", markersize=4.0, label=cast.names[i]) for i in listed]
     data = part[[str(n) for n, v in part.data_vars.items() if v.dtype.kind != "O"]].assign_attrs(title="resilience")
     fig = style.new_figure(6.4, data, frame)
     panels = fig.subplots(3, 1, sharex=True)

@@ -157,7 +157,7 @@ def _by_attractor(view: View, part: xr.Dataset, attractors: xr.Dataset) -> View:
     motions = Motions(
         (*greys, *(cast.names[i] for i in ids)),
         (*palette.GREYS.values(), *(cast.colours[i] for i in ids)),
-        (*(i + len(greys) for i in ids), *range(len(greys))),
+        (*(i + len(greys) for i in cast.order), *range(len(greys))),
     )
     codes = outcomes(chosen).transpose(*split_dims(chosen["status"])[1]).astype(np.int32) + len(greys)
     for name, which in palette.other_cells(chosen).items():

@@ -22,7 +22,7 @@ Kinds = Mapping[str, str]
 _COMMAND = r"magpend [a-z]+ (?:[^;,()\n.]|\.(?=\S))*"
 _PAIR = r"\w[\w.]*=(?:\.\.\.|[^\s;,()]*[^\s;,():.])"
 _NUMBERS = r"[-+]?\d[\d.]*(?:e[-+]?\d+)?(?<!\.)(?: [-+]?\d[\d.]*(?:e[-+]?\d+)?(?<!\.))*"
-_VALUE = rf"=\S*[\w'\")\]]| (?:{_PAIR}|{_NUMBERS}|[A-Z][A-Z_:]*(?![a-z])|\S+(?=: ))"
+_VALUE = rf"=\S*[\w'\")\]]| (?:{_PAIR}|{_NUMBERS}|[A-Z](?:[A-Z_:]*[A-Z_])?(?![A-Za-z])|\S+(?=: ))"
 _WORD = re.compile(rf"{_COMMAND}|--(?P<flag>[a-z][a-z0-9-]*[a-z0-9])(?P<value>{_VALUE})?(?P<colon>:)?")
 _OTHER_NAMES = {"axis": ("axes", "ranges"), "set": ("overrides",)}
 """Arguments of functions whose option has another name."""
@@ -81,14 +81,17 @@ def names_arguments(function: Callable[P, T]) -> Callable[P, T]:
 
 
 def knows_its_keys(method: Callable[P, T]) -> Callable[P, T]:
-    """Wrap a method of `Spec` so that an unknown keyword raises a TypeError that says what is right."""
+    """Wrap a method of `Spec`, or its constructor, so that an unknown keyword raises a TypeError that says what is
+    right.
+    """
+    path = method.__qualname__.removesuffix(".__init__").rpartition(".")[2]
 
     @wraps(method)
     def called(*args: P.args, **kwargs: P.kwargs) -> T:
         parameters = inspect.signature(method).parameters
         if not any(p.kind is p.VAR_KEYWORD for p in parameters.values()):
             keys = list(parameters)[1:]
-            unknown = [_unknown(method.__name__, key, value, keys) for key, value in kwargs.items() if key not in keys]
+            unknown = [_unknown(path, key, value, keys) for key, value in kwargs.items() if key not in keys]
             if unknown:
                 raise TypeError("\n".join(unknown))
         return method(*args, **kwargs)
@@ -96,11 +99,11 @@ def knows_its_keys(method: Callable[P, T]) -> Callable[P, T]:
     return called
 
 
-def _unknown(method: str, key: str, value: Any, keys: list[str]) -> str:
+def _unknown(path: str, key: str, value: Any, keys: list[str]) -> str:
     hint = (
         f" A parameter of the model is given by overrides={{{key!r}: {shown(value)}}}." if "overrides" in keys else ""
     )
-    return unknown_key(f"{method}.{key}", key, keys) + hint
+    return unknown_key(f"{path}.{key}", key, keys) + hint
 
 
 def in_python(text: str, kinds: Kinds, flags: Mapping[str, str]) -> str:

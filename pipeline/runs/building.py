@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 
 from magpend_core.models.presets import is_file
 from pipeline.layout.domains import check_starts
-from pipeline.runs.arguments import names_arguments
+from pipeline.runs.arguments import knows_its_keys, names_arguments
 from pipeline.runs.spec_tables import SpecTables
 from pipeline.runs.workflows import find_spec, read_given
 from pipeline.specification.files import check_new_file, merged, read_toml, toml_tables, write_new
@@ -54,6 +54,7 @@ class Spec(SpecTables, Mapping[str, Any]):
     {'A': {'start': 0.5, 'stop': 1.0, 'num': 3}}
     """
 
+    @knows_its_keys
     def __init__(
         self,
         kind: Literal["sweep", "continuation"] | str,

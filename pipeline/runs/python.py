@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from pipeline.products.product import function_of
 from pipeline.products.registry import ANALYSES
 from pipeline.runs import notebook
+from pipeline.runs.arguments import names_arguments
 from pipeline.runs.run import run as complete
 from pipeline.runs.stopping import InterruptedRunError, interrupt
 from pipeline.runs.workflows import read_given
@@ -66,7 +67,7 @@ def run(
         _, _, out = read_given(spec, smoke=smoke)
     try:
         with notebook.progress():
-            complete(spec, out, smoke=smoke, echo=echo, **options)
+            names_arguments(complete)(spec, out, smoke=smoke, echo=echo, **options)
     except InterruptedRunError:
         raise interrupt(f"Stopped. The finished cells stay in {out}; the same call goes on from there.") from None
     return Run.open(out)

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import pipeline.explorer
+from pipeline.layout.vocabulary import EVIDENCE
 
 pytestmark = pytest.mark.slow  # needs node
 
@@ -42,6 +43,12 @@ def test_stability_of__what_was_shown_and_by_what():
     ]
     orbits = json.dumps([{"attrs": attrs, "stable": stable} for attrs, stable, _ in cases])
     assert evaluated("facts.js", f"{orbits}.map((o) => m.stabilityOf(o))") == [said for *_, said in cases]
+
+
+def test_stability_of__has_a_text_for_each_evidence():
+    orbits = json.dumps([{"attrs": {"stability": "it", "evidence": word}} for word in EVIDENCE])
+    said = evaluated("facts.js", f"{orbits}.map((o) => m.stabilityOf(o))")
+    assert [text == "it" for text in said] == [word == "none" for word in EVIDENCE]
 
 
 def test_colour_of__a_set_that_does_not_attract_has_none():

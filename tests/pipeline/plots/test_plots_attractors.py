@@ -25,7 +25,7 @@ from pipeline.analysis.branches.table import curves_table
 from pipeline.analysis.outcomes import outcomes
 from pipeline.layout import vocabulary
 from pipeline.layout.attractor_letters import letter
-from pipeline.layout.vocabulary import ATTRACTS, PERIODIC_ORBIT
+from pipeline.layout.vocabulary import ATTRACTS, BOUNDED_SET, CHAOTIC_SET, PERIODIC_ORBIT, TORUS
 from pipeline.plots import (
     palette,
     plot_basins,
@@ -256,7 +256,7 @@ def test_plot_fractions__bands_are_stacked_and_what_is_not_decided_is_on_top(swe
     assert band(fig, "not settled") == [[2.15, 2.25, 0.8, 1.0]]
     assert band(fig, "diverged") == [[2.05, 2.15, 0.8, 0.9]]
     assert band(fig, "pending") == [[2.05, 2.15, 0.9, 1.0]]
-    names = ["pending", "diverged", "not settled", "A: period 1, left", "B: period 1, left", "95 % interval of an edge"]
+    names = ["A: period 1, left", "B: period 1, left", "not settled", "diverged", "pending", "95 % interval of an edge"]
     assert legend_texts(fig) == names
     assert to_rgb(by_gid(fig)["band:A"].get_facecolor()[0]) == legend_patches(fig)["A: period 1, left"]
     assert fig.axes[0].get_xlabel() == "drive frequency [Hz]"
@@ -265,7 +265,7 @@ def test_plot_fractions__bands_are_stacked_and_what_is_not_decided_is_on_top(swe
     # more attractors than colours
     fig = plot_fractions(make_attractors([range(15)] * 2, ("q", "initial_condition"), {"q": [1.0, 1.1]}))
     assert len(legend_patches(fig)) == 13
-    assert legend_texts(fig)[0] == "3 others"
+    assert legend_texts(fig)[-2:] == ["3 others", "95 % interval of an edge"]
     assert band(fig, "3 others") == [[0.95, 1.15, 0.8, 1.0]]
 
 
@@ -350,6 +350,30 @@ def map_of_two():
     return ds
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("plot", [plot_fractions, plot_coexisting, plot_basins, plot_regimes])
+def test_legends__list_rising_periods_then_tori_chaos_and_others(plot):
+    kinds, periods = [BOUNDED_SET, CHAOTIC_SET, TORUS, *[PERIODIC_ORBIT] * 3], [0, 0, 0, 12, 2, 1]
+    dims, coords = ("q", "initial_condition"), {"q": [1.0]}
+    if plot == plot_basins:
+        dims, coords = ("psi1_0", "psi2_0"), {"psi1_0": [0.0, 1.0, 2.0], "psi2_0": np.arange(7.0)}
+    ids = np.repeat(range(6), [6, 1, 5, 2, 4, 3])
+    if plot == plot_regimes:  # a point for each cell
+        ds = make_attractors(ids.reshape(3, 7, 1), ("p", *dims), {"p": [1.0, 2.0, 3.0], "q": np.arange(7.0)})
+    else:
+        ds = make_attractors(ids.reshape(3, 7) if plot == plot_basins else ids[None], dims, coords)
+    here = ds["kind"] > 0
+    ds["kind"] = xr.where(here, xr.DataArray(kinds, dims="attractor"), 0).transpose(*here.dims)
+    ds["orbit_period"] = xr.where(here, xr.DataArray(periods, dims="attractor"), 0).transpose(*here.dims)
+    texts = legend_texts(plot(ds))
+    if plot == plot_regimes:
+        assert texts == ["1", "2", "12", "not periodic"]
+        assert legend_texts(plot(ds, show="attractors")) == list("ABCDEF")
+        return
+    words = [" ".join(text.partition(": ")[2].partition(",")[0].split()) for text in texts[:6]]
+    assert words == ["period 1", "period 2", "period 12", "quasi-periodic", "chaotic", "not periodic"]
+
+
 def regime_names(fig):
     """Name of each point of the map, (frequency, second parameter), through colour and legend."""
     (mesh,) = [c for c in fig.axes[0].collections if c.get_gid() == "regimes"]
@@ -367,7 +391,7 @@ def legend_patches(fig):
 def test_plot_regimes__each_point_has_its_regime(map_of_two):
     fig = plot_regimes(map_of_two)
     assert regime_names(fig) == [["1", "1 + 2", "2"], ["1", "1", "none"]]
-    # the most frequent first, then by name; what has no attractor last
+    # by rising periods; what has no attractor last
     assert legend_texts(fig)[:4] == ["1", "1 + 2", "2", "none"]
     assert fig.axes[0].get_xlabel() == "drive frequency [Hz]"
     assert fig.axes[0].get_ylabel() == "amplitude [N m]"

@@ -55,6 +55,7 @@ equations = { x = "v", v = "-k*x - 0.2*v + A*cos(2*pi*f*t)" }
         (lambda s: s.parameters(overides={}), r"parameters\.overides: unknown key; did you mean overrides\?"),
         (lambda s: s.integration(n_transients=4), r"integration\.n_transients: unknown key; did you mean n_transient"),
         (lambda s: s.axis("A", stap=0.3), r"axis\.stap: unknown key; did you mean st"),
+        (lambda s: type(s)("sweep", intergation={}), r"^Spec\.intergation: unknown key; did you mean integration or"),
         (lambda s: s.extremes(quantites=["x"]), r"extremes\.quantites: unknown key; did you mean quantities\?"),
     ],
 )

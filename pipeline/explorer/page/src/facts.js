@@ -23,6 +23,7 @@ const EVIDENCE = {
   eigenvalues: "shown by its eigenvalues", multipliers: "shown by its multipliers",
   approach: "trajectories on both sides come nearer", stayed: "all extended cells stayed",
   left: "extended cells left it", volume: "the flow preserves volume",
+  one_side: "trajectories of one side come nearer, those of the other leave",
 };
 
 /** Whether a set attracts and what shows it; of an orbit that the analysis does not know what its multipliers say. */
