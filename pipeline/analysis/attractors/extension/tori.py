@@ -78,7 +78,7 @@ def differs_in_phase(course: Course, point: Point, geometry: Geometry) -> Work[b
 
 def _ranges(path: np.ndarray, geometry: Geometry) -> np.ndarray:
     """Return the least and the largest value of each state along a trajectory, in units of the scales."""
-    return np.stack([path.min(axis=0), path.max(axis=0)]) / np.asarray(geometry.scales)
+    return np.asarray(np.stack([path.min(axis=0), path.max(axis=0)]) / np.asarray(geometry.scales))
 
 
 def is_one_torus(a: Course, b: Course, geometry: Geometry) -> Work[bool]:
