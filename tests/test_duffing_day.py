@@ -13,15 +13,19 @@ import re
 import numpy as np
 import pytest
 import xarray as xr
+from matplotlib import pyplot as plt
+from matplotlib.colors import to_hex
+from matplotlib.text import Text
 
 import magpend
+from pipeline.products.guide import FIGURE_GUIDE
 from pipeline.products.registry import COMMANDS, FIGURES
 
 SWEEP = """
 kind = "sweep"
 title = "Duffing, a plane of two parameters"
 model = "duffing"
-parameters = { preset = "twin-well" }
+parameters = { preset = "twin-well", overrides.cubic = 1.0 }
 axes = { frequency_hz = { values = [0.155, 0.159154943] }, amplitude = { values = [0.15, 0.3] } }
 initial_conditions.kind = "grid"
 initial_conditions.x = { start = -1.5, stop = 1.5, num = 5 }
@@ -37,7 +41,7 @@ WALK = """
 kind = "continuation"
 title = "Duffing, its bent resonance"
 model = "duffing"
-parameters = { preset = "hardening" }
+parameters = { preset = "hardening", overrides.damping = 0.1 }
 axes = { frequency_hz = { start = 0.16, stop = 0.30, num = 15 } }
 continuation = { direction = "both" }
 initial_conditions = { kind = "random", n = 2, seed = 1, x = [-1.0, 1.0], v = [-1.0, 1.0] }
@@ -48,7 +52,7 @@ RAMP = """
 kind = "sweep"
 title = "Duffing, its drive grows while it moves"
 model = "duffing"
-parameters = { preset = "twin-well", frequency_hz = 0.159154943 }
+parameters = { preset = "twin-well", frequency_hz = 0.159154943, overrides.cubic = 1.0 }
 drift.amplitude = { from = 0.15, to = 0.25, start_periods = 4 }
 axes = { amplitude_rate_per_period = { values = [0.005, 0.02] } }
 initial_conditions = { kind = "list", points = [[-0.8, 0.0], [1.2, 0.0]] }
@@ -59,7 +63,7 @@ NOISY = """
 kind = "sweep"
 title = "Duffing, driven by noise as well"
 model = "duffing"
-parameters = { preset = "twin-well", frequency_hz = 0.159154943 }
+parameters = { preset = "twin-well", frequency_hz = 0.159154943, overrides.cubic = 1.0 }
 noise = { strengths = { v = 0.1 }, seed = 1, steps_per_period = 128 }
 axes = { noise_v = { values = [0.1, 0.15, 0.2] }, realization = { start = 0, stop = 19, step = 1 } }
 initial_conditions = { kind = "list", points = [[-0.8, 0.0]] }
@@ -213,7 +217,8 @@ def test_plot(drawn, day, words):
     name, directory = words.split()[:2]
     with xr.open_dataset(day / data, engine="scipy") as stored:
         assert stored.attrs["figure"] == name
-        again = magpend.figure(magpend.Run.open(day / directory), name, json.loads(stored.attrs["options"])).data
+        figure = magpend.figure(magpend.Run.open(day / directory), name, json.loads(stored.attrs["options"]))
+        again = figure.data
         assert set(stored.variables) == {key for key, v in again.variables.items() if v.size}
         for key in stored.variables:
             wanted = again[key].values
@@ -221,6 +226,95 @@ def test_plot(drawn, day, words):
                 np.testing.assert_array_equal(stored[key], wanted, err_msg=key)
             else:
                 assert stored[key].astype(str).values.tolist() == wanted.astype(str).tolist(), key
+
+        texts = " ".join(" ".join(text.get_text() for text in figure.findobj(Text)).split())
+        assert ("damping = " if directory == "walk" else "cubic = 1") in texts
+        assert all(f"= {float(value):.6g}" in texts for value in re.findall(r"--at \w+=(\S+)", words))
+
+
+MINE = {
+    "font.size": 17.0,
+    "axes.labelsize": 21.0,
+    "axes.linewidth": 3.0,
+    "axes.edgecolor": "#ff0000",
+    "lines.linewidth": 4.0,
+    **{f"{axis}tick.{key}": v for axis in "xy" for key, v in (("direction", "inout"), ("labelsize", 19.0))},
+}
+
+
+ONE_PANEL = [
+    words
+    for words in PICTURES
+    if FIGURES[words.split()[0]].panels != "several" and "side" not in words and "density" not in words
+]
+"""A density over an axis has a second panel."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("words", ONE_PANEL)
+def test_plot__leaves_the_rc_params_of_given_axes(drawn, day, words):
+    (_, data), (name, directory) = drawn(words), words.split()[:2]
+    with xr.open_dataset(day / data, engine="scipy") as stored:
+        options = json.loads(stored.attrs["options"])
+    options.pop("width", None)
+    run = magpend.Run.open(day / directory)
+    own = magpend.figure(run, name, options)
+    with plt.rc_context(MINE):
+        figure, ax = plt.subplots()
+        (before,) = ax.plot([], [], "C3")
+        assert getattr(run.plot, name)(ax=ax, **options) is ax
+    figure.canvas.draw()
+    assert {label.get_size() for label in (ax.xaxis.label, ax.yaxis.label)} == {21.0}
+    for tick in (*ax.xaxis.get_major_ticks(), *ax.yaxis.get_major_ticks()):
+        assert (tick.get_tickdir(), tick.label1.get_size()) == ("inout", 19.0)
+        assert tick.label1.get_fontfamily() == plt.rcParams["font.family"]
+    assert {spine.get_linewidth() for spine in ax.spines.values()} == {3.0}
+    assert {to_hex(spine.get_edgecolor()) for spine in ax.spines.values()} == {"#ff0000"}
+    assert not ax.xaxis.get_minor_ticks()
+    assert (before.get_linewidth(), to_hex(before.get_color())) == (4.0, "#d62728")
+    mine, drawn = ([line for line in axes.lines if line.get_linestyle() != "None"] for axes in (ax, own.axes[0]))
+    assert [line.get_linewidth() for line in mine[1:]] == pytest.approx([4.0 * line.get_linewidth() for line in drawn])
+    assert [to_hex(line.get_color()) for line in mine[1:]] == [to_hex(line.get_color()) for line in drawn]
+
+
+UNFIT = {
+    "one parameter point": ("sweep", "walk"),
+    "one swept parameter": (f"sweep {POINT}", "sweep"),
+    "two swept parameters": ("walk", f"sweep {LINE}"),
+    "a sweep": ("walk", "walk --at frequency=0.2"),
+    "starts on a grid": ("walk", "walk --at frequency=0.2"),
+    "the product rotation": ("walk",),
+    "the product lyapunov": ("walk", "walk --at frequency=0.2"),
+    "a run with [drift]": ("walk", "sweep", "noisy"),
+    "a run with [noise]": ("walk", "sweep", "ramp"),
+}
+"""Runs that lack what a figure needs, by the words of the guide; a figure with no words takes any steady run."""
+
+REQUIRED = {"second": "damping", "second_low": 0.2, "second_high": 0.3, "between": ("A", "B"), "high": {"x": 0.5}}
+"""Values of the options that figures require, of those that have them."""
+
+TAKES = {"resilience": {f"sweep {POINT}"}, "rotation": {"sweep", f"sweep {LINE}"}, "tongues": {f"sweep {POINT}"}}
+"""Runs that a figure takes by another part of its words: at most one parameter, or two; tongues choose a row."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", FIGURES)
+def test_plot__refuses_runs_that_lack_what_the_guide_says(runs, day, name):
+    """What the guide says suffices, too: see the runs of `PICTURES`, and below the plane of two parameters."""
+    (needs,) = [group[name] for group in FIGURE_GUIDE.values() if name in group]
+    fields = FIGURES[name].options.model_fields
+    required = {key: value for key, value in REQUIRED.items() if key in fields}
+    unfit = [run for words, some in UNFIT.items() if words in needs for run in some]
+    refused = set(unfit or ["ramp", "noisy"]) - TAKES.get(name, set())
+    if needs and "sweep" not in refused:
+        runs("status", "sweep")
+        magpend.figure(magpend.Run.open(day / "sweep"), name, required)
+    for words in refused:
+        directory, *at = words.split(" --at ")
+        runs("status", directory)
+        chosen = {key: float(value) for key, _, value in (one.partition("=") for one in at)}
+        with pytest.raises(magpend.SpecError):
+            magpend.figure(magpend.Run.open(day / directory), name, {**required, "at": chosen})
 
 
 def test_figures__have_names_of_their_own(drawn):

@@ -13,7 +13,6 @@ import pandas as pd
 import pytest
 import xarray as xr
 from matplotlib import pyplot as plt
-from matplotlib.colors import to_hex
 from matplotlib.legend import Legend
 
 import magpend
@@ -247,45 +246,6 @@ def test_plot__draws_into_the_given_axes_alone(run, name, options):
     assert left.get_xlim() == own.axes[0].get_xlim()
     assert plt.get_fignums() == before  # `magpend.figure` is its holder's alone
     figure.canvas.draw()
-
-
-MINE = {
-    "font.size": 17.0,
-    "axes.labelsize": 21.0,
-    "axes.linewidth": 3.0,
-    "axes.edgecolor": "#ff0000",
-    "lines.linewidth": 4.0,
-    **{f"{axis}tick.{key}": v for axis in "xy" for key, v in (("direction", "inout"), ("labelsize", 19.0))},
-}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", [name for name, figure in FIGURES.items() if figure.panels != "several"])
-def test_plot__leaves_the_rc_params_of_given_axes(run, name):
-    options = AT if name in ("section", "basins", "multipliers") else {}
-    given = {
-        key: {"second": "damping"}.get(key) for key, i in FIGURES[name].options.model_fields.items() if i.is_required()
-    }
-    try:
-        own = magpend.figure(run, name, {**options, **given})
-    except SpecError as error:
-        pytest.skip(f"the run has none: {error}")
-    with plt.rc_context(MINE):
-        figure, ax = plt.subplots()
-        (before,) = ax.plot([], [], "C3")
-        assert getattr(run.plot, name)(ax=ax, **options, **given) is ax
-    figure.canvas.draw()
-    assert {label.get_size() for label in (ax.xaxis.label, ax.yaxis.label)} == {21.0}
-    for tick in (*ax.xaxis.get_major_ticks(), *ax.yaxis.get_major_ticks()):
-        assert (tick.get_tickdir(), tick.label1.get_size()) == ("inout", 19.0)
-        assert tick.label1.get_fontfamily() == plt.rcParams["font.family"]
-    assert {spine.get_linewidth() for spine in ax.spines.values()} == {3.0}
-    assert {to_hex(spine.get_edgecolor()) for spine in ax.spines.values()} == {"#ff0000"}
-    assert not ax.xaxis.get_minor_ticks()
-    assert (before.get_linewidth(), to_hex(before.get_color())) == (4.0, "#d62728")
-    mine, drawn = ([line for line in axes.lines if line.get_linestyle() != "None"] for axes in (ax, own.axes[0]))
-    assert [line.get_linewidth() for line in mine[1:]] == pytest.approx([4.0 * line.get_linewidth() for line in drawn])
-    assert [to_hex(line.get_color()) for line in mine[1:]] == [to_hex(line.get_color()) for line in drawn]
 
 
 @pytest.mark.slow

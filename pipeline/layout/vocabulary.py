@@ -127,6 +127,9 @@ def model_of(ds: xr.Dataset) -> Model:
     return sectioned(model, Crossing(str(of), value, ds.attrs[f"{_SECTION}direction"], longest))
 
 
+OVERRIDES = "overrides"
+"""Attribute with a line ``name = value`` for each parameter that a specification sets itself."""
+
 DRIFT = "drift"
 """Attribute that describes the motion of a model's parameters, as JSON."""
 
@@ -162,7 +165,7 @@ def told_by(attrs: Mapping[Any, Any]) -> dict[str, Any]:
     return {
         str(key): value
         for key, value in attrs.items()
-        if key in ("model", "parameters", DRIFT, _NOISE) or str(key).startswith(_SECTION)
+        if key in ("model", "parameters", OVERRIDES, DRIFT, _NOISE) or str(key).startswith(_SECTION)
     }
 
 
@@ -183,6 +186,21 @@ def frequency_of(model: Model | None, values: Mapping[str, Any]) -> float:
     return float(values.get(FREQUENCY_DIM, math.nan))
 
 
+def overrides_attribute(overrides: Mapping[str, float]) -> dict[str, str]:
+    """Return the dataset attribute that lists a specification's overrides; `overrides_of` reads it."""
+    return {OVERRIDES: "\n".join(f"{name} = {value!r}" for name, value in overrides.items())} if overrides else {}
+
+
+def overrides_of(ds: xr.Dataset) -> dict[str, float]:
+    """Return the values that a run's specification sets in place of its preset's, by parameter."""
+    return _values(ds, OVERRIDES)
+
+
+def _values(ds: xr.Dataset, attribute: str) -> dict[str, float]:
+    lines = str(ds.attrs.get(attribute, "")).splitlines()
+    return {name.strip(): float(value) for name, _, value in (line.partition("=") for line in lines)}
+
+
 def parameters_of(ds: xr.Dataset) -> Parameters:
     """Read a run's parameters from the dataset attribute ``parameters``, which has a line ``name = value`` for each
     parameter.
@@ -192,8 +210,7 @@ def parameters_of(ds: xr.Dataset) -> Parameters:
     ValueError
         If the attribute is missing, or its names are not the model's parameters.
     """
-    lines = str(ds.attrs.get("parameters", "")).splitlines()
-    values = {name.strip(): float(value) for name, _, value in (line.partition("=") for line in lines)}
+    values = _values(ds, "parameters")
     if not values:
         raise ValueError("The dataset has no attribute 'parameters'; it tells what was integrated.")
     return Parameters(model_of(ds), values)

@@ -56,6 +56,7 @@ def plot_edge(
         fig = style.new_figure(4.6, stored, frame)
         style.style_axes(fig.add_subplot())
         style.label_axes(fig.axes[0], *(measure.label for measure in measures))
+        style.caption(fig.axes[0], labels.caption(ds, with_start=False))
     else:
         fig.data = with_diagram(stored, fig.data)
     ax = fig.axes[0]

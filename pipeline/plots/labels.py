@@ -17,7 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import Formatter, FuncFormatter, MultipleLocator
 
 from pipeline.layout.units import shown_unit
-from pipeline.layout.vocabulary import model_of
+from pipeline.layout.vocabulary import axis_name, model_of, overrides_of
 from pipeline.plots.style import check_choice, join
 
 if TYPE_CHECKING:
@@ -203,7 +203,8 @@ def swept_label(name: str, units: str) -> str:
 
 
 def caption(ds: xr.Dataset, *, drop: Iterable[str] = (), with_start: bool = True) -> str:
-    """Return a caption with the fixed values of a figure: the parameters, then the initial state.
+    """Return a caption with the fixed values of a figure: the axes' values, the parameters that the specification sets
+    in place of its preset's, then the initial state.
 
     Parameters
     ----------
@@ -214,7 +215,8 @@ def caption(ds: xr.Dataset, *, drop: Iterable[str] = (), with_start: bool = True
     with_start
         Whether to name initial states.
     """
-    axes, states = set(drop), set(model_of(ds).state_names)
+    along = (axis_name(str(ds.attrs.get(f"{role}parameter", ""))) for role in ("", "first_", "second_"))
+    axes, states = {*drop, *along}, set(model_of(ds).state_names)
     parameters: list[str] = []
     starts: list[str] = []
     for key in sorted(map(str, ds.coords)):
@@ -223,6 +225,9 @@ def caption(ds: xr.Dataset, *, drop: Iterable[str] = (), with_start: bool = True
         if coordinate.size != 1 or coordinate.dtype.kind != "f" or key in axes:
             continue
         (starts if is_start else parameters).append(_value(ds, coordinate, is_start))
+    for name, value in overrides_of(ds).items():
+        if name not in axes and name not in ds.coords:
+            parameters.append(_assignment(name, value, model_of(ds).parameter(name).unit))
     crossing = model_of(ds).crossing
     section = [] if crossing is None else [f"section {crossing.sentence}"]
     return join([*parameters, *section, *(starts if with_start else [])])

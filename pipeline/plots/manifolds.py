@@ -10,8 +10,9 @@ from matplotlib.lines import Line2D
 from pipeline.layout.vocabulary import is_start_dim
 from pipeline.plots import labels, style
 from pipeline.plots.basins import plot_basins
-from pipeline.plots.bifurcation import with_diagram
+from pipeline.plots.bifurcation import fixed_of, with_diagram
 from pipeline.plots.figure import Run, attractors_of, frame_of, noted, values_of
+from pipeline.plots.selection import at_points
 from pipeline.products.attractors import AttractorOptions
 from pipeline.products.figures import ManifoldFigureOptions
 from pipeline.products.manifolds import ManifoldOptions
@@ -44,6 +45,7 @@ def plot_manifolds(
         fig = style.new_figure(4.6, ds.assign_attrs(title="manifolds"), frame)
         style.style_axes(fig.add_subplot())
         style.label_axes(fig.axes[0], *(measure.label for measure in measures))
+        style.caption(fig.axes[0], labels.caption(ds, with_start=False))
     else:
         fig.data = with_diagram(ds.assign_attrs(title="manifolds over basins"), fig.data)
     ax = fig.axes[0]
@@ -79,6 +81,7 @@ def draw(run: Run, options: ManifoldFigureOptions) -> style.DataFigure:
     """Draw the figure ``manifolds`` of a run, over the basins if the run's initial states form a grid in two states."""
     at, notes = values_of(run, options)
     found = run.derive("manifolds", **options.part(ManifoldOptions))
+    found = found.assign_coords(fixed_of(at_points(run.cube(), at).squeeze()))
     frame, below = frame_of(options), None
     starts = [str(d) for d in run.cube()["status"].dims if is_start_dim(str(d))]
     if len(starts) == 2:

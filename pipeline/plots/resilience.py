@@ -15,7 +15,9 @@ from pipeline.layout.attractor_letters import letter
 from pipeline.layout.period_names import periods_of
 from pipeline.layout.vocabulary import ATTRACTS, model_of
 from pipeline.plots import labels, palette, style
+from pipeline.plots.bifurcation import swept_parameters
 from pipeline.plots.figure import Run, attractors_of, frame_of, noted, values_of
+from pipeline.plots.selection import at_points
 from pipeline.products.figures import ResilienceFigureOptions
 from pipeline.products.resilience import ResilienceOptions
 
@@ -83,13 +85,18 @@ def _selected(ds: xr.Dataset, at: Mapping[str, float]) -> tuple[xr.Dataset, str]
         if name in dims and ds.sizes[name] > 1:
             ds = ds.isel({name: place(ds[name], value)})
     left = [d for d in dims if d in ds.dims and ds.sizes[d] > 1]
+    _check_axes(ds, left)
+    return ds.squeeze([d for d in dims if d in ds.dims and d not in left]), left[0] if left else ""
+
+
+def _check_axes(ds: xr.Dataset, left: list[str]) -> None:
+    """Raise ValueError if more than one swept parameter is left."""
     if len(left) > 1:
         value = float(ds[left[-1]].values[0])
         raise ValueError(
             f"resilience is drawn over one swept parameter, and {', '.join(left)} are left; choose values of the "
             f"others, such as {left[-1]}={value:g}"
         )
-    return ds.squeeze([d for d in dims if d in ds.dims and d not in left]), left[0] if left else ""
 
 
 def _values(one: xr.Dataset, name: str) -> np.ndarray:
@@ -155,6 +162,8 @@ def _dress(panels: Any, part: xr.Dataset, along: str, letters: list[str]) -> Non
 def draw(run: Run, options: ResilienceFigureOptions) -> style.DataFigure:
     """Draw the figure ``resilience`` of a run."""
     at, notes = values_of(run, options)
+    cube = at_points(run.cube(), at)
+    _check_axes(cube, [name for name in swept_parameters(cube) if cube.sizes[name] > 1])
     found = run.derive("resilience", **{**options.part(ResilienceOptions), "at": at})
     figure = plot_resilience(found, attractors_of(run, options), at=at, frame=frame_of(options))
     return noted(figure, notes)

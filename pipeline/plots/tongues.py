@@ -9,10 +9,11 @@ from matplotlib.patheffects import withStroke
 
 from pipeline.layout.units import shown_unit
 from pipeline.plots import labels, style
-from pipeline.plots.bifurcation import swept_parameters
+from pipeline.plots.bifurcation import fixed_of, swept_parameters
 from pipeline.plots.curve_lines import take_room
 from pipeline.plots.figure import Run, frame_of
 from pipeline.plots.rotation import draw_map, rotation_data
+from pipeline.plots.selection import at_points
 from pipeline.products.figures import TongueFigureOptions
 from pipeline.products.tongues import TongueOptions
 
@@ -69,6 +70,7 @@ def plot_tongues(
             [
                 f"{n_found} of {ds.sizes['tongue']} tongues with denominators up to {ds.attrs['max_denominator']}",
                 f"searched at {second} = {ds.attrs['row']:g}",
+                labels.caption(ds, with_start=False),
             ]
         ),
     )
@@ -140,5 +142,7 @@ def draw(run: Run, options: TongueFigureOptions) -> style.DataFigure:
     found = run.derive("tongues", **options.part(TongueOptions))
     plane = {str(found.attrs[f"{role}_parameter"]) for role in ("first", "second")}
     cube = run.cube()
+    fixed = fixed_of(at_points(cube, options.at).squeeze())
+    found = found.assign_coords({name: value for name, value in fixed.items() if name not in plane})
     swept = [d for d in swept_parameters(cube) if cube.sizes[d] > 1]
     return plot_tongues(found, cube if set(swept) == plane else None, frame=frame_of(options))

@@ -28,6 +28,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.layout.conventions import conventional
+from pipeline.layout.vocabulary import overrides_attribute
 from pipeline.products.attractors import IdentifyOptions
 from pipeline.products.product import Analysis, Options, function_of
 from pipeline.products.registry import ANALYSES
@@ -125,13 +126,13 @@ def derive(
     _refuse_unsteady(run, analysis)
     _refuse_noise(run, analysis)
     wanted = prepared(run, analysis, wanted)
-    key = _key(run, analysis, wanted)
+    key, told = _key(run, analysis, wanted), overrides_attribute(run.spec.parameters.overrides)
     place = run.info.files.below(DERIVED).below(f"{name}-{key['derived_key'][:8]}.zarr")
     try:
         ds = open_product(place)
         if all(ds.attrs.get(part) == value for part, value in key.items()):
             run.echo(f"{name}: taken from {place.name}")
-            return _placed(ds, place)
+            return _placed(ds.assign_attrs(told), place)
     except FileNotFoundError:
         pass
     except DamagedError as error:
@@ -139,7 +140,7 @@ def derive(
     if place.local is not None and (problem := unwritable(place.local.parent)):
         run.echo(f"{problem}: the result of {name} is shown but not kept")
     with notebook.progress():
-        return _kept(run, place, _compute(run, analysis, wanted).assign_attrs(key))
+        return _kept(run, place, _compute(run, analysis, wanted).assign_attrs({**key, **told}))
 
 
 def stored(source: Source, name: str) -> xr.Dataset | None:

@@ -12,7 +12,13 @@ from pipeline.layout.attributes import netcdf_safe
 from pipeline.layout.cells import DIRECTION_CODES
 from pipeline.layout.conventions import conventional
 from pipeline.layout.plan import Plan
-from pipeline.layout.vocabulary import drift_attributes, model_attribute, noise_attributes, section_attributes
+from pipeline.layout.vocabulary import (
+    drift_attributes,
+    model_attribute,
+    noise_attributes,
+    overrides_attribute,
+    section_attributes,
+)
 from pipeline.specification.parsing import Spec
 from pipeline.store.declared import METADATA, consolidated_metadata
 from pipeline.store.parallel_reads import quick_reading
@@ -71,6 +77,7 @@ def _attributes(run: OpenedRun) -> dict[str, Any]:
         "spec": info.spec_text,
         "digest": info.digest,
         "parameters": "\n".join(f"{k} = {v!r}" for k, v in info.identity["parameter_values"].items()),
+        **overrides_attribute(run.spec.parameters.overrides),
         **section_attributes(run.model.crossing),
         **drift_attributes(run.model),
         **noise_attributes(run.model.disturbance),

@@ -13,6 +13,7 @@ from pipeline.analysis.branches.codimension_two import POINT_KINDS, merged
 from pipeline.analysis.branches.curves import CURVE_ENDS, Curve
 from pipeline.analysis.branches.units import parameter_units, state_units
 from pipeline.layout.attributes import code_flags
+from pipeline.layout.vocabulary import model_attribute, section_attributes
 
 
 def curves_dataset(curves: Sequence[Curve], first: str, second: str, model: Model | None = None) -> xr.Dataset:
@@ -49,6 +50,7 @@ def curves_dataset(curves: Sequence[Curve], first: str, second: str, model: Mode
     def numbers(values: list[int]) -> np.ndarray:
         return np.array(values, np.int32)
 
+    told = {} if model is None else {"model": model_attribute(model), **section_attributes(model.crossing)}
     return xr.Dataset(
         {
             "first": (dims, values[..., 0], {"units": parameter_units(first, model), "long_name": first}),
@@ -69,7 +71,7 @@ def curves_dataset(curves: Sequence[Curve], first: str, second: str, model: Mode
             **_special_points(curves, first, second, model, len(names)),
         },
         coords={"state": list(names)},
-        attrs={"first_parameter": first, "second_parameter": second},
+        attrs={"first_parameter": first, "second_parameter": second, **told},
     )
 
 
