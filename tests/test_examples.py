@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from magpend_core.models import LIBRARY, load_model
+from pipeline.analysis.ragged import dense
 from pipeline.layout.vocabulary import EQUILIBRIUM
 from pipeline.runs.derive import AnalysedRun
 from pipeline.runs.workflows import shipped_workflows
@@ -125,7 +126,7 @@ def test_shares__of_all_attractors(analysed, size, name, expected, full, bounded
 @pytest.mark.slow
 def test_belt__where_rest_and_stick_slip_are_found(analysed, size):
     """Rest from the Hopf point on, stick-slip until the unstable cycle meets it, shares in between."""
-    attractors = analysed("belt").derive("attractors")
+    attractors = dense(analysed("belt").derive("attractors"), points=True)
     reference = REFERENCE["belt"]
     share = attractors.share
     rests = attractors.attractor.values[(attractors["kind"] == EQUILIBRIUM).any("belt")]

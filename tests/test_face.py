@@ -187,7 +187,7 @@ def test_attractors__options_reach_the_command_and_the_method_alike(run, command
     assert found.identical(magpend.attractors(run, connect=False, threshold=0.01))
     pd.testing.assert_frame_equal(found.magpend.table(), table)
     # such a threshold tears the branches apart, so that it makes a difference
-    assert found.sizes["attractor"] > run.attractors().sizes["attractor"]
+    assert found.attrs["n_ids"] > run.attractors().attrs["n_ids"]
     with pytest.raises(SpecError, match="threshold = -1"):
         run.attractors(threshold=-1.0)
     with pytest.raises(SpecError, match="unknown analysis 'atractors'"):

@@ -12,6 +12,7 @@ import numpy as np
 import xarray as xr
 
 from pipeline.analysis.intervals import binomial_interval
+from pipeline.analysis.ragged import is_ragged, rows_at
 from pipeline.layout import vocabulary
 from pipeline.layout.vocabulary import ATTRACTS, NEUTRAL, NOT_SETTLED, TRANSIENT, UNSTABLE, split_dims
 from pipeline.layout.vocabulary import DIVERGES as DIVERGED_LATER
@@ -52,11 +53,20 @@ def outcomes(ids: xr.Dataset) -> xr.DataArray:
 
 def stability_of_cells(ids: xr.Dataset) -> np.ndarray:
     """Return the stability code of the set on which each cell ends (0: none), with the parameter dims first."""
-    dims, _ = split_dims(ids["attractor_id"])
-    cells, stability = _cells(ids, "attractor_id"), ids["stability"].transpose(*dims, "attractor").values
+    cells = _cells(ids, "attractor_id")
+    if not is_ragged(ids):
+        stability = ids["stability"].transpose(*split_dims(ids["attractor_id"])[0], "attractor").values
+        ended = np.concatenate([stability, np.zeros((*stability.shape[:-1], 1), stability.dtype)], axis=-1)
+        flat = np.take_along_axis(ended, cells.reshape(*stability.shape[:-1], -1) % ended.shape[-1], axis=-1)
+        return np.asarray(flat.reshape(cells.shape))
+    number, stability = ids["attractor"].values, ids["stability"].values
+    table = np.zeros(int(number.max(initial=-1)) + 2, np.int8)  # by id; the last entry is of cells without one
     found = np.zeros(cells.shape, np.int8)
-    for index in np.ndindex(*stability.shape[:-1]):
-        found[index] = np.append(stability[index], 0)[cells[index]]
+    for index, own in rows_at(ids).items():
+        here = slice(own.start, own.stop)
+        table[number[here]] = stability[here]
+        found[index] = table[cells[index]]
+        table[number[here]] = 0
     return found
 
 

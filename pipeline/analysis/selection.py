@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
+from pipeline.analysis.ragged import isel
 from pipeline.layout.vocabulary import split_dims
 from pipeline.specification.problems import unknown_name
 
@@ -50,7 +51,7 @@ def choose(ds: xr.Dataset, at: Mapping[str, float] | None, keep: tuple[str, ...]
         allowed = [d for d in dims if d not in keep]
         if name not in allowed:
             raise ValueError(unknown_name("axis", name, allowed))
-        ds = ds.isel({name: place(ds[name], float(value))})
+        ds = isel(ds, {name: place(ds[name], float(value))})
     left = [d for d in ds["attractor_id"].dims if d not in keep]
     long = [str(d) for d in left if ds.sizes[d] > 1]
     if long:
@@ -59,7 +60,7 @@ def choose(ds: xr.Dataset, at: Mapping[str, float] | None, keep: tuple[str, ...]
         raise ValueError(
             f"{purpose}, and the dataset also has {axes}: choose a value of each, such as {long[0]}={one:.6g}"
         )
-    return ds.isel(dict.fromkeys(left, 0))
+    return isel(ds, dict.fromkeys(left, 0))
 
 
 def place(axis: xr.DataArray, value: float) -> int:
@@ -122,7 +123,7 @@ def select_points(ds: xr.Dataset, at: Mapping[str, float] | None, *, purpose: st
         if name not in dims:
             raise ValueError(unknown_name("axis", name, map(str, dims)))
         index = place(ds[name], float(value))
-        ds = ds.isel({name: slice(index, index + 1)})
+        ds = isel(ds, {name: slice(index, index + 1)})
     long = [d for d in dims if ds.sizes[d] > 1]
     if purpose and long:
         axes = ", ".join(f"{d} ({ds.sizes[d]} values)" for d in long)

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from pipeline.analysis.ragged import SET, dims_of, index_of_rows, is_ragged
 from pipeline.layout.units import shown_unit
 from pipeline.products.product import padded
 
@@ -58,11 +59,18 @@ def points_of(ds: xr.Dataset, dims: Sequence[str]) -> Iterator[tuple[dict[str, i
         yield at, where_of(ds, at)
 
 
-def sets_of(ds: xr.Dataset, there: xr.DataArray, dims: Sequence[str]) -> Iterator[tuple[Row, xr.Dataset]]:
-    """Yield the attractors and other sets that a mask selects, each as its parameter values and its variables."""
-    for *index, i in np.argwhere(there.transpose(*dims, "attractor").values).tolist():
-        at = dict(zip(dims, index, strict=True))
-        yield where_of(ds, at), ds.isel({**at, "attractor": i})
+def sets_of(ds: xr.Dataset, there: np.ndarray | None = None) -> Iterator[tuple[Row, xr.Dataset]]:
+    """Yield the rows of a result, or those that a mask selects, each as its parameter values and its variables."""
+    if not is_ragged(ds):
+        dims = [str(d) for d in ds["kind"].dims if d != "attractor"]
+        for *index, i in np.argwhere(ds["kind"].transpose(*dims, "attractor").values > 0).tolist():
+            at = dict(zip(dims, index, strict=True))
+            yield where_of(ds, at), ds.isel({**at, "attractor": i})
+        return
+    places = index_of_rows(ds)
+    for row in range(ds.sizes[SET]) if there is None else np.flatnonzero(there).tolist():
+        at = {d: int(i[row]) for d, i in zip(dims_of(ds), places, strict=True)}
+        yield where_of(ds, at), ds.isel({**at, SET: row})
 
 
 def point_table(ds: xr.Dataset, where: Row, rows: Sequence[Row], words: Callable[[Row], Words]) -> list[str]:

@@ -12,6 +12,7 @@ from matplotlib.colors import LinearSegmentedColormap, LogNorm, to_rgb
 from matplotlib.ticker import LogLocator, NullLocator, ScalarFormatter
 
 from pipeline.analysis.outcomes import outcomes
+from pipeline.analysis.ragged import dense
 from pipeline.analysis.selection import choose, start_dims
 from pipeline.layout.period_names import periods_of
 from pipeline.layout.vocabulary import INFERRED, PERIODIC_ORBIT, grid_dim, model_of
@@ -64,7 +65,7 @@ def plot_basins(
         without a value in `at`.
     """
     axes = _axes(attractors, at)
-    part = choose(attractors, at, axes, f"an image of basins has the axes {' and '.join(axes)}")
+    part = dense(choose(attractors, at, axes, f"an image of basins has the axes {' and '.join(axes)}"))
     data = part[["attractor_id", "status"]].transpose(*reversed(axes))
     data["outcome"] = outcomes(part).transpose(*reversed(axes)).assign_attrs(units="1", long_name="outcome")
     if n_periods is not None:

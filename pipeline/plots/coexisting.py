@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Patch
 
 from pipeline.analysis.outcomes import left_out
+from pipeline.analysis.ragged import dense
 from pipeline.analysis.selection import choose, start_dims
 from pipeline.layout.attractor_letters import letter
 from pipeline.layout.vocabulary import ATTRACTS, STABILITIES
@@ -70,7 +71,7 @@ def plot_coexisting(
     measure = labels.state_measure(attractors, state, degrees)
     parameter = swept_parameter(attractors, at, "attractors")
     keep = (parameter, *start_dims(attractors))
-    part = choose(attractors, at, keep, f"attractors are drawn over {parameter}")
+    part = dense(choose(attractors, at, keep, f"attractors are drawn over {parameter}"), points=True)
     cast = palette.cast_of(attractors, part)
     data = _points(part, parameter, measure)
     loops = _loops(hysteresis, part, parameter) if hysteresis is not None else []

@@ -13,6 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
 from pipeline.analysis.outcomes import left_out
+from pipeline.analysis.ragged import dense
 from pipeline.layout.attractor_letters import letter
 from pipeline.layout.period_names import once
 from pipeline.layout.vocabulary import ATTRACTS, model_of, parameters_of, told_by
@@ -139,6 +140,7 @@ class _Layout:
 
 
 def _described(attractors: xr.Dataset, portraits: xr.Dataset) -> xr.Dataset:
+    attractors = dense(attractors)
     at = {d: float(portraits[d]) for d in attractors["kind"].dims if d in portraits.coords and d != "attractor"}
     return attractors.sel(at)
 

@@ -21,6 +21,7 @@ from matplotlib.patheffects import withStroke
 from scipy.ndimage import distance_transform_edt
 
 from pipeline.analysis import outcomes
+from pipeline.analysis.ragged import dense
 from pipeline.layout.attractor_letters import letter
 from pipeline.layout.period_names import period_of
 from pipeline.layout.vocabulary import (
@@ -118,6 +119,7 @@ def cast_of(attractors: xr.Dataset, part: xr.Dataset | None = None) -> Cast:
     part
         Part of the dataset that the names describe; by default all of it.
     """
+    attractors = dense(attractors)
     dims = [d for d in attractors["n_cells"].dims if d != "attractor"]
     attracts = attractors["stability"] == ATTRACTS
     cells = attractors["n_cells"].where(attracts, 0).sum(dims).values
@@ -125,7 +127,7 @@ def cast_of(attractors: xr.Dataset, part: xr.Dataset | None = None) -> Cast:
     ranked = own[np.lexsort((own, -cells[own]))][: len(style.colours())].tolist()
     colours = {i: _grey_of(attractors["stability"].isel(attractor=i)) for i in range(cells.size)}
     colours |= dict.fromkeys(own.tolist(), OTHERS) | dict(zip(ranked, style.colours(), strict=False))
-    described = attractors if part is None else part
+    described = attractors if part is None else dense(part)
     names = {i: f"{letter(i)}: {describe(described.isel(attractor=i))}" for i in range(cells.size)}
     order = sorted(names, key=lambda i: _rank(described.isel(attractor=i)))
     return Cast(colours, names, tuple(sorted(ranked)), tuple(order))

@@ -16,6 +16,7 @@ from matplotlib.lines import Line2D
 
 from pipeline.analysis.basins.numbers import basin_fractions
 from pipeline.analysis.outcomes import left_out, outcomes, share_interval
+from pipeline.analysis.ragged import dense
 from pipeline.analysis.selection import choose, parameter_dims, start_dims
 from pipeline.layout.attractor_letters import letter
 from pipeline.layout.vocabulary import ATTRACTS, parameter_name
@@ -88,7 +89,7 @@ def plot_regimes(
     style.check_choice("show", show, KINDS)
     x, y = _axes(attractors, at)
     keep = (x, y, *start_dims(attractors))
-    part = choose(attractors, at, keep, f"a map of regimes has the axes {x} and {y}")
+    part = dense(choose(attractors, at, keep, f"a map of regimes has the axes {x} and {y}"))
     data = _regimes(part, x, y, show)
     titles = {"periods": "periods of the coexisting attractors", "attractors": "coexisting attractors"}
     fixed = labels.caption(part, drop=[x, y])

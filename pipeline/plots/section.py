@@ -11,6 +11,7 @@ import xarray as xr
 
 from magpend_core.models.model import Model
 from pipeline.analysis.outcomes import outcomes
+from pipeline.analysis.ragged import dense
 from pipeline.layout.period_names import section_name
 from pipeline.layout.vocabulary import model_of, split_dims
 from pipeline.plots import labels, palette, pixels, style
@@ -149,7 +150,7 @@ def _handles(view: View, found: set[int]) -> list[Any]:
 
 def _by_attractor(view: View, part: xr.Dataset, attractors: xr.Dataset) -> View:
     """Colour each point by the attractor of its cell, or by the grey for the reason why the cell has none."""
-    chosen = attractors
+    attractors = chosen = dense(attractors)
     for dim in split_dims(attractors["attractor_id"])[0]:
         chosen = chosen.sel({dim: float(part[dim])})
     cast = palette.cast_of(attractors, chosen)

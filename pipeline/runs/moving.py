@@ -48,6 +48,7 @@ def of_attractors(
     SpecError
         If the run does not have the point, or an attractor does not exist there.
     """
+    from pipeline.analysis.ragged import dense
     from pipeline.analysis.selection import choose
     from pipeline.analysis.selection import start_dims as dims_of_starts
     from pipeline.plots import palette
@@ -56,7 +57,9 @@ def of_attractors(
     with refused(run.name):
         at, notes = values_of(run, options)
         found = attractors_of(run, options)
-        part = choose(found, at, tuple(dims_of_starts(found)), "an animation shows one parameter point")
+        part = dense(
+            choose(found, at, tuple(dims_of_starts(found)), "an animation shows one parameter point"), points=True
+        )
     here = part.isel(attractor=np.flatnonzero(part["kind"].values > 0))
     numbers, more = _chosen(run.name, here, letters)
     cast = palette.cast_of(found, part)

@@ -14,8 +14,9 @@ Schema
 ------
 `identify` and `match` return a Dataset of the same form. Dims: the *parameter dims* of the cube
 (``frequency`` and others, in the order of the cube; none if nothing is swept), its *start dims*
-(``initial_condition``, the grid's ``<state>_0``, or ``branch``), and ``attractor``, ``destination``,
-``point``, ``state``, ``multiplier``, and the dim of the model's angles. Coordinates are those of the cube.
+(``initial_condition``, the grid's ``<state>_0``, or ``branch``), and ``set`` (a row for each set at each
+parameter point, in the order of the points), ``sample``, ``transition``, ``state``, ``multiplier``, and the
+dim of the model's angles. Coordinates are those of the cube, and ``attractor`` (set), the id. `ragged` reads rows.
 
 ======================== ===================================== ============ ==================================
 variable                 dims                                  dtype, fill  meaning
@@ -25,64 +26,64 @@ variable                 dims                                  dtype, fill  mean
 ``status``               parameter dims, start dims            int8         as in the cube
 ``ran_out``              parameter dims                        int8, 0      1 if the budget of the extension
                                                                             ended before all was decided
-``kind``                 parameter dims, attractor             int8, 0      `vocabulary.KINDS`
-``stability``            parameter dims, attractor             int8, 0      `vocabulary.STABILITIES`
-``evidence``             parameter dims, attractor             int8, 0      evidence for the stability:
+``kind``                 set                                   int8, 0      `vocabulary.KINDS`
+``stability``            set                                   int8, 0      `vocabulary.STABILITIES`
+``evidence``             set                                   int8, 0      evidence for the stability:
                                                                             `vocabulary.EVIDENCE`
-``orbit_period``         parameter dims, attractor             int32, 0     drive periods; 0 if not periodic
-``n_cells``              parameter dims, attractor             int64, 0     cells
-``share``                parameter dims, attractor             float64, 0   of the cells of the point that end
+``orbit_period``         set                                   int32, 0     drive periods; 0 if not periodic
+``n_cells``              set                                   int64, 0     cells
+``share``                set                                   float64, 0   of the cells of the point that end
                                                                             on attractors or diverge; 0 of a
                                                                             set that does not attract
-``attractor_points``     parameter dims, attractor, point,     float64, NaN section points, below
-                         state
-``rotation``             parameter dims, attractor, angle      float64, NaN mean turns per drive period
-``side``                 parameter dims, attractor             int8, 0      codes of the model's classifier
-``state_min``,           parameter dims, attractor, state      float64, NaN range, below
+``n_sets``               parameter dims                        int32        rows of the point
+``attractor_points``     sample, state                         float64      section points, row after row
+``n_points``             set                                   int32        section points of the row
+``rotation``             set, angle                            float64, NaN mean turns per drive period
+``side``                 set                                   int8, 0      codes of the model's classifier
+``state_min``,           set, state                            float64, NaN range, below
 ``state_max``
-``energy_min``,          parameter dims, attractor             float64, NaN range of the model's energy, below
+``energy_min``,          set                                   float64, NaN range of the model's energy, below
 ``energy_max``
-``mirror_partner``       parameter dims, attractor             int32, -1    set that is its image
-``mirror_distance``      parameter dims, attractor             float64, NaN nearest set to the image
-``multiplier_real``,     parameter dims, attractor, multiplier float64, NaN Floquet multipliers over the
+``mirror_partner``       set                                   int32, -1    set that is its image
+``mirror_distance``      set                                   float64, NaN nearest set to the image
+``multiplier_real``,     set, multiplier                        float64, NaN Floquet multipliers over the
 ``multiplier_imag``                                                         orbit's period, by falling modulus
-``multiplier_error``     parameter dims, attractor             float64, NaN error of the largest modulus
-``residual``             parameter dims, attractor             float64, NaN certificate of Newton's method
-``is_polished``          parameter dims, attractor             int8, 0      1 if Newton's method converged
-``lyapunov_max``,        parameter dims, attractor             float64, NaN largest exponent [1/s], and its
+``multiplier_error``     set                                   float64, NaN error of the largest modulus
+``residual``             set                                   float64, NaN certificate of Newton's method
+``is_polished``          set                                   int8, 0      1 if Newton's method converged
+``lyapunov_max``,        set                                   float64, NaN largest exponent [1/s], and its
 ``lyapunov_low``,                                                           interval of 3 standard errors
 ``lyapunov_high``
-``period_s``             parameter dims, attractor             float64, NaN period of a polished orbit [s]
-``eigenvalue_real``,     parameter dims, attractor, multiplier float64, NaN of an equilibrium [1/s], by
+``period_s``             set                                   float64, NaN period of a polished orbit [s]
+``eigenvalue_real``,     set, multiplier                        float64, NaN of an equilibrium [1/s], by
 ``eigenvalue_imag``                                                         falling real part
-``n_sampled``            parameter dims, attractor             int64, 0     its cells that were extended, and
+``n_sampled``            set                                   int64, 0     its cells that were extended, and
                                                                             neighbours of them
-``n_left``               parameter dims, attractor             int64, 0     extended cells that left it
-``n_leaving``            parameter dims, attractor             int64, 0     extended cells near their end
+``n_left``               set                                   int64, 0     extended cells that left it
+``n_leaving``            set                                   int64, 0     extended cells near their end
                                                                             from the start
-``n_to``                 parameter dims, attractor,            int64, 0     cells that left, by the id of the
-                         destination                                        set that they ended on
-``time_at_risk``         parameter dims, attractor             float64, NaN sum over cells [drive periods]
-``mean_lifetime``,       parameter dims, attractor             float64, NaN lifetime and its interval, or its
+``n_to``, ``from_set``,  transition                            int64        cells that left, the row that they
+``to``                                                                      left, the id of the set of their end
+``time_at_risk``         set                                   float64, NaN sum over cells [drive periods]
+``mean_lifetime``,       set                                   float64, NaN lifetime and its interval, or its
 ``lifetime_low``,                                                           lower bound and infinity [drive
 ``lifetime_high``                                                           periods]; see `lifetimes`
-``dimension``            parameter dims, attractor             int8, 0      of a torus; 0 of any other set
-``closes_above``         parameter dims, attractor             int32, 0     period that cells seem to close
+``dimension``            set                                   int8, 0      of a torus; 0 of any other set
+``closes_above``         set                                   int32, 0     period that cells seem to close
                                                                             with, above the longest looked for
 ======================== ===================================== ============ ==================================
 
-`attractor_points` holds an orbit's points in the order of time, or a sample of any other set; the rest of the
-row is NaN. A model without angles, classifier, energy or symmetry lacks the variables that need it. For a
-polished orbit, ranges cover the full period; angles are unwrapped from the first point, and an angle that
-rotates has the range -pi to pi. For all other sets, state ranges cover the kept sections, and energy ranges
-the stored points.
+`attractor_points` holds an orbit's points in the order of time, or a sample of any other set. A model
+without angles, classifier, energy or symmetry lacks the variables that need it. For a polished orbit, ranges
+cover the full period; angles are unwrapped from the first point, and an angle that rotates has the range -pi
+to pi. For all other sets, state ranges cover the kept sections, and energy ranges the stored points.
 
 Distances are in units of the states' scales (1 rad, 10 rad/s for the pendulum), angles on their circle;
 states are in the units of the coordinate ``state_units``.
 From `identify` an id numbers the sets of one parameter point (attribute ``matched`` 0), in
-lexicographic order of the least section point; from `match` it follows a set (``matched`` 1), and
-where that set is absent its row holds the fill values. `match` adds ``match_basis`` (int8, parameter
-dims, attractor): the evidence for the id there. `matching` defines an id.
+lexicographic order of the least section point; from `match` it follows a set (``matched`` 1), and a point
+where that set is absent has no row of it. `match` adds ``match_basis`` (int8, set): the evidence for the id
+there. The attribute ``n_ids`` is the number of ids. `matching` defines an id.
 
 Each row lists a *set* on which cells end. Only a set with the stability ``attracts`` is an attractor; see
 `stability` for the criteria. `decision` is 0 undecided (no id), 1 closed on the orbit, 2 certain to end on
@@ -101,14 +102,14 @@ undecided. A loose closure alone never makes an attractor, and periods are those
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import xarray as xr
 
 from magpend_core.engine.system import System
-from magpend_core.models.model import Parameters
+from magpend_core.models.model import Model, Parameters
 from pipeline.analysis.attractors.describing.features import ENERGY, Features
 from pipeline.analysis.attractors.describing.labelling import Found, analyse
 from pipeline.analysis.attractors.finding.equilibria import tell_rest
@@ -118,6 +119,7 @@ from pipeline.analysis.attractors.finding.requests import Settings, answer_all
 from pipeline.analysis.attractors.finding.searching import Search
 from pipeline.analysis.attractors.matching.matching import match
 from pipeline.analysis.chaos.lyapunov import on_attractor, pooled_mean
+from pipeline.analysis.ragged import N_IDS, N_POINTS, ROW_SIZE, SAMPLE, SET, TRANSITION, index_of_rows
 from pipeline.analysis.sides import flags_of
 from pipeline.analysis.tolerances import CLOSURE
 from pipeline.layout.vocabulary import (
@@ -218,59 +220,108 @@ def _dataset(ds: xr.Dataset, found: Mapping[tuple[int, ...], Found], search: Sea
     """Build the Dataset that `identify` returns; the docstring of this module lists its variables."""
     dims, start_dims = split_dims(ds["status"])
     shape = tuple(ds.sizes[d] for d in dims)
-    table = _filled(ds, dims, shape, found, search)
-    result = xr.Dataset(table.variables())
-    result["ran_out"] = (
-        dims,
-        np.zeros(shape, np.int8),
-        {"units": "1", "long_name": "whether the extension's budget ended"},
-    )
+    result = xr.Dataset(_rows(ds, [found[at] for at in np.ndindex(*shape)], search))
     cell_dims = (*dims, *start_dims)
     cell_shape = (*shape, *(ds.sizes[d] for d in start_dims))
+    n_sets, ran_out = np.zeros(shape, np.int32), np.zeros(shape, np.int8)
     ids, decisions = np.empty(cell_shape, np.int32), np.empty(cell_shape, np.int8)
     for index, one in found.items():
         ids[index] = one.label.reshape(cell_shape[len(dims) :])
         decisions[index] = one.decision.reshape(cell_shape[len(dims) :])
-        result["ran_out"].values[index] = one.ran_out
+        n_sets[index], ran_out[index] = len(one.features), one.ran_out
+    result[ROW_SIZE] = (dims, n_sets, {"units": "1", "long_name": "number of sets", "sample_dimension": SET})
+    result["ran_out"] = (dims, ran_out, {"units": "1", "long_name": "whether the extension's budget ended"})
     result["attractor_id"] = (cell_dims, ids, {"units": "1", "long_name": "attractor of the cell, -1 none"})
     how = {"units": "1", "long_name": "how the cell was decided", **_flags(" ".join(DECISIONS))}
     result["decision"] = (cell_dims, decisions, how)
     about = {"units": "1", "long_name": "what became of the cell", **ds["status"].attrs}
     result["status"] = (cell_dims, ds["status"].transpose(*cell_dims).values, about)
-    own = {*cell_dims, "state", table.angle_dim}
-    number = ("attractor", np.arange(table.n, dtype=np.int32), {"units": "1", "long_name": "attractor"})
+    own = {*cell_dims, "state", *result["rotation"].dims} if "rotation" in result else {*cell_dims, "state"}
     result = result.assign_coords({k: v for k, v in ds.coords.items() if set(v.dims) <= own})
+    number = (SET, np.concatenate([np.arange(n, dtype=np.int32) for n in n_sets.ravel()]), _ID)
     plain = {**search.options.plain(), "tolerance": search.tolerance}
     settings = {f"identify_{k}": int(v) if isinstance(v, bool) else v for k, v in plain.items()}
     kept = {k: v for k, v in ds.attrs.items() if k != "title"}
-    return result.assign_coords(attractor=number).assign_attrs({**kept, **settings, "matched": 0})
+    return result.assign_coords(attractor=number).assign_attrs(
+        {**kept, **settings, "matched": 0, N_IDS: int(n_sets.max(initial=0))}
+    )
 
 
-def _filled(
-    ds: xr.Dataset,
-    dims: tuple[str, ...],
-    shape: tuple[int, ...],
-    found: Mapping[tuple[int, ...], Found],
-    search: Search,
-) -> _Table:
-    n = max((len(f.features) for f in found.values()), default=0)
-    longest = max((len(x.points) for f in found.values() for x in f.features), default=0)
-    n_states = ds.sizes["state"]
-    sizes = {
-        "point": max(search.options.n_points, longest),
-        "state": n_states,
-        "multiplier": n_states,
-        "angle": search.dynamics.n_angles,
-        "destination": n,
+_ID = {"units": "1", "long_name": "attractor"}
+
+
+def _rows(ds: xr.Dataset, found: Sequence[Found], search: Search) -> dict[str, Any]:
+    """Return the variables of the rows as (dims, values, attributes), from which xarray builds a Dataset."""
+    features = [x for one in found for x in one.features]
+    model, n_states = search.dynamics.model, ds.sizes["state"]
+    sizes = {"state": n_states, "multiplier": n_states, "angle": search.dynamics.n_angles}
+    angle_dim = model.angle_dim if model is not None else "angle"
+    variables: dict[str, Any] = {}
+    for name in _names(search.dynamics):
+        own, dtype, fill, units, text = _TABLE[name]
+        values = np.full((len(features), *(sizes[d] for d in own)), fill, dtype)
+        for row, x in enumerate(features):
+            known = _value(x, name)
+            if known is not None:
+                values[row] = known
+        dims = (SET, *(angle_dim if d == "angle" else d for d in own))
+        variables[name] = (dims, values, {"units": units, "long_name": text, **_words_of(name, model)})
+    variables["n_cells"][1][:] = [n for one in found for n in one.counts]
+    n_diverged = (ds["status"] == DIVERGED).transpose(*split_dims(ds["status"])[0], ...).values
+    n_diverged = n_diverged.reshape(len(found), -1).sum(axis=1)
+    variables["share"][1][:] = [x for one, n in zip(found, n_diverged, strict=True) for x in _shares(one, int(n))]
+    variables[N_POINTS][1][:] = [len(x.points) for x in features]
+    variables[N_POINTS][2]["sample_dimension"] = SAMPLE
+    points = np.concatenate([np.zeros((0, n_states)), *(x.points for x in features)])
+    about = {"units": _BY_STATE, "long_name": "section points"}
+    return {**variables, "attractor_points": ((SAMPLE, "state"), points, about), **_transitions(features)}
+
+
+def _value(x: Features, name: str) -> Any:
+    """Return a feature of a set by the name of its variable; None if it is not known or is not of the set alone."""
+    if name in _COUNTED:
+        return None
+    stem, _, part = name.rpartition("_")
+    if part in ("real", "imag"):
+        known = x.multipliers if stem == "multiplier" else x.eigenvalues
+        return None if known is None else getattr(known, part)
+    return getattr(x, name)
+
+
+def _shares(one: Found, n_diverged: int) -> np.ndarray:
+    """Return the fraction of trajectories on each attractor, among those that end on one or diverge."""
+    counts = np.array(one.counts, np.int64)
+    attracts = np.array([x.stability == ATTRACTS for x in one.features], bool)
+    total = int(counts[attracts].sum()) + n_diverged + int((one.decision == DIVERGES).sum())
+    return np.where(attracts, counts / max(total, 1), 0.0)
+
+
+def _transitions(features: Sequence[Features]) -> dict[str, Any]:
+    """Return the counts of cells that left one set and ended on another, one row for each pair of sets."""
+    rows = [
+        (row, to, int(n))
+        for row, x in enumerate(features)
+        for to, n in enumerate(() if x.n_to is None else x.n_to)
+        if n
+    ]
+    table = np.array(rows, np.int64).reshape(-1, 3)
+    names = {"from_set": "row of the set that was left", "to": "set of the end", "n_to": "cells that left"}
+    return {
+        name: (TRANSITION, table[:, k], {"units": "1", "long_name": text})
+        for k, (name, text) in enumerate(names.items())
     }
-    table = _Table(dims, shape, n, sizes, search.dynamics)
-    starts = [d for d in ds["status"].dims if d not in dims]
-    table.n_diverged = (ds["status"] == DIVERGED).sum(starts).transpose(*dims).values
-    for index, one in found.items():
-        for i, x in enumerate(one.features):
-            table.fill((*index, i), x, one.counts[i])
-        table.share(index, one)
-    return table
+
+
+def _words_of(name: str, model: Model | None) -> dict[str, Any]:
+    """Return further attributes of a variable: the meanings of its codes, or the unit of the energy."""
+    known = {"kind": KINDS, "stability": STABILITIES, "evidence": EVIDENCE}
+    if name in known:
+        return _flags(" ".join(known[name]))
+    if name == "side" and model is not None and model.classifier is not None:
+        return flags_of(model.classifier)
+    if name.startswith("energy_") and model is not None:
+        return {"units": model.quantity(ENERGY).unit}
+    return {}
 
 
 def _with_exponents(result: xr.Dataset, ds: xr.Dataset) -> xr.Dataset:
@@ -281,17 +332,18 @@ def _with_exponents(result: xr.Dataset, ds: xr.Dataset) -> xr.Dataset:
     first = ds[["lyapunov", "lyapunov_stderr"]].isel(exponent=0, drop=True).transpose(*dims)
     rate, error = first["lyapunov"].values, first["lyapunov_stderr"].values
     counts = on_attractor(ds, n_sigma=signs.n_sigma, least=signs.least).transpose(*dims).values
-    ids, kind = result["attractor_id"].values, result["kind"].values
-    for index in np.argwhere(np.isin(kind, APERIODIC)):
-        point, i = tuple(index[:-1]), index[-1]
-        which = (ids[point] == i) & counts[point]
+    ids, kind, number = result["attractor_id"].values, result["kind"].values, result["attractor"].values
+    points = np.array(index_of_rows(result), np.int64).reshape(result[ROW_SIZE].ndim, -1).T
+    for row in np.flatnonzero(np.isin(kind, APERIODIC)).tolist():
+        point = tuple(points[row].tolist())
+        which = (ids[point] == number[row]) & counts[point]
         if which.any():
             # sum in rising order, so that the last bit does not depend on the order of the cells
             order = np.argsort(rate[point][which], kind="stable")
             own, errors = rate[point][which][order], error[point][which][order]
             _, stderr, _ = pooled_mean(own[None], errors[None], np.ones((1, own.size), bool))
             for end, sign in (("max", 0.0), ("low", -signs.n_sigma), ("high", signs.n_sigma)):
-                result[f"lyapunov_{end}"].values[tuple(index)] = own.mean() + sign * stderr[0]
+                result[f"lyapunov_{end}"].values[row] = own.mean() + sign * stderr[0]
     return result
 
 
@@ -304,7 +356,7 @@ _TABLE: dict[str, tuple[tuple[str, ...], str, float, str, str]] = {
     "orbit_period": ((), "int32", 0, "1", "period in drive periods, 0 if bounded or absent"),
     "n_cells": ((), "int64", 0, "1", "cells on the attractor"),
     "share": ((), "float64", 0.0, "1", "share of all cells of the parameter point"),
-    "attractor_points": (("point", "state"), "float64", np.nan, _BY_STATE, "section points"),
+    N_POINTS: ((), "int32", 0, "1", "stored section points"),
     "rotation": (("angle",), "float64", np.nan, "1", "mean rotation, turns per drive period"),
     "side": ((), "int8", 0, "1", "what the model calls the motion"),
     "state_min": (("state",), "float64", np.nan, _BY_STATE, "least value of the state"),
@@ -327,7 +379,6 @@ _TABLE: dict[str, tuple[tuple[str, ...], str, float, str, str]] = {
     "n_sampled": ((), "int64", 0, "1", "cells of the set, and neighbours, that were extended"),
     "n_left": ((), "int64", 0, "1", "extended cells that left the set"),
     "n_leaving": ((), "int64", 0, "1", "extended cells that were near their end from the start"),
-    "n_to": (("destination",), "int64", 0, "1", "extended cells that left, by where they ended"),
     "time_at_risk": ((), "float64", np.nan, "1", "time on the set in all, drive periods"),
     "mean_lifetime": ((), "float64", np.nan, "1", "mean lifetime in drive periods"),
     "lifetime_low": ((), "float64", np.nan, "1", "lower end of the interval, drive periods"),
@@ -338,17 +389,8 @@ _TABLE: dict[str, tuple[tuple[str, ...], str, float, str, str]] = {
 """Own dims, dtype, fill, units and long name of the variables per attractor."""
 
 
-_ELSEWHERE = (
-    "n_cells",
-    "share",
-    "attractor_points",
-    "multiplier_real",
-    "multiplier_imag",
-    "eigenvalue_real",
-    "eigenvalue_imag",
-    "n_to",
-)
-"""Variables that are not copied from an attribute of `Features`."""
+_COUNTED = ("n_cells", "share", N_POINTS)
+"""Variables that are not an attribute of `Features`."""
 
 
 def _names(dynamics: Dynamics) -> list[str]:
@@ -362,64 +404,3 @@ def _names(dynamics: Dynamics) -> list[str]:
         "eigenvalue_": model is None or not model.autonomous,
     }
     return [name for name in _TABLE if not any(name.startswith(k) and out for k, out in left_out.items())]
-
-
-class _Table:
-    """Arrays of the output variables of `identify`, with one entry per parameter point and attractor."""
-
-    def __init__(
-        self, dims: tuple[str, ...], shape: tuple[int, ...], n: int, sizes: Mapping[str, int], dynamics: Dynamics
-    ) -> None:
-        self._dims, self.n, self._dynamics = (*dims, "attractor"), n, dynamics
-        self.n_diverged = np.zeros(shape, np.int64)
-        self.angle_dim = dynamics.model.angle_dim if dynamics.model is not None else "angle"
-        self.arrays = {}
-        for name in _names(dynamics):
-            own, dtype, fill, _, _ = _TABLE[name]
-            self.arrays[name] = np.full((*shape, n, *(sizes[d] for d in own)), fill, dtype)
-
-    def fill(self, at: tuple[int, ...], x: Features, n_cells: int) -> None:
-        """Write the features of one attractor (or other set on which trajectories end) into the output arrays."""
-        arrays = self.arrays
-        arrays["n_cells"][at] = n_cells
-        if x.n_to is not None:
-            arrays["n_to"][at][: len(x.n_to)] = x.n_to
-        arrays["attractor_points"][at][: len(x.points)] = x.points
-        if x.multipliers is not None:
-            arrays["multiplier_real"][at] = x.multipliers.real
-            arrays["multiplier_imag"][at] = x.multipliers.imag
-        if x.eigenvalues is not None and "eigenvalue_real" in arrays:
-            arrays["eigenvalue_real"][at] = x.eigenvalues.real
-            arrays["eigenvalue_imag"][at] = x.eigenvalues.imag
-        for name in arrays.keys() - set(_ELSEWHERE):
-            arrays[name][at] = getattr(x, name)
-
-    def share(self, index: tuple[int, ...], one: Found) -> None:
-        """Write the fraction of trajectories that end on each attractor, among those that reach an attractor or
-        diverge.
-        """
-        counts = np.array(one.counts, np.int64)
-        attracts = np.array([x.stability == ATTRACTS for x in one.features], bool)
-        total = int(counts[attracts].sum()) + self.n_diverged[index] + int((one.decision == DIVERGES).sum())
-        if total:
-            self.arrays["share"][index][: len(counts)] = np.where(attracts, counts / total, 0.0)
-
-    def variables(self) -> dict[str, Any]:
-        """Return the output arrays as (dims, values, attributes), from which xarray builds a Dataset."""
-        more: dict[str, dict[str, Any]] = {
-            "kind": _flags(" ".join(KINDS)),
-            "stability": _flags(" ".join(STABILITIES)),
-            "evidence": _flags(" ".join(EVIDENCE)),
-        }
-        model = self._dynamics.model
-        if "side" in self.arrays and model is not None and model.classifier is not None:
-            more["side"] = flags_of(model.classifier)
-        if "energy_min" in self.arrays and model is not None:
-            of_energy = {"units": model.quantity(ENERGY).unit}
-            more |= {"energy_min": of_energy, "energy_max": of_energy}
-        found = {}
-        for name, values in self.arrays.items():
-            own = tuple(self.angle_dim if d == "angle" else d for d in _TABLE[name][0])
-            units, text = _TABLE[name][3:]
-            found[name] = ((*self._dims, *own), values, {"units": units, "long_name": text, **more.get(name, {})})
-        return found

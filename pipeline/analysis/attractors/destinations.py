@@ -29,6 +29,7 @@ from pipeline.analysis.attractors.finding.points import Dynamics, Point
 from pipeline.analysis.attractors.finding.requests import LEG, Settings, answer_all
 from pipeline.analysis.attractors.finding.spirals import keys_of
 from pipeline.analysis.outcomes import DIVERGED
+from pipeline.analysis.ragged import dense
 from pipeline.analysis.sets import Geometry
 from pipeline.analysis.tolerances import CLOSURE
 from pipeline.layout.vocabulary import APERIODIC, ATTRACTS, EQUILIBRIUM, PERIODIC_ORBIT, START
@@ -350,6 +351,7 @@ def destinations_at(
         longest=options.max_orbit_period,
         residual=options.residual,
     )
+    attractors = dense(attractors, points=True)
     dims = [str(d) for d in attractors["kind"].dims if d != "attractor"]
     for index, point in points.items():
         here = attractors.isel(dict(zip(dims, index, strict=True)))

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
 import xarray as xr
 
+from pipeline.analysis.ragged import dims_of
 from pipeline.analysis.tabular import Row, Words, aligned, at_point, number, plain, sets_of, values
 from pipeline.layout.period_names import periods_of
 from pipeline.layout.vocabulary import APERIODIC, model_of
@@ -16,20 +18,30 @@ def settling_table(ds: xr.Dataset) -> Table:
     """Return the table of non-periodic sets. It counts the trajectories that stayed on or left each set when integrated
     further.
     """
-    dims = [str(d) for d in ds["kind"].dims if d != "attractor"]
-    found = sets_of(ds, ds["kind"].isin(APERIODIC), dims)
-    rows = [{**where, "attractor_id": int(one["attractor"]), **_row(one)} for where, one in found]
+    dims, ends = dims_of(ds), _ends(ds)
+    is_open = np.isin(ds["kind"].values, APERIODIC)
+    found = zip(np.flatnonzero(is_open).tolist(), sets_of(ds, is_open), strict=True)
+    rows = [
+        {**where, "attractor_id": int(one["attractor"]), **_row(one), "to": ", ".join(ends.get(row, ()))}
+        for row, (where, one) in found
+    ]
     if not rows:
         return Table(rows, ["sets that do not close: none, so there is nothing to extend"])
     head = f"sets that do not close: {len(rows)}; lifetimes are in {periods_of(model_of(ds))}"
     return Table(rows, [head, *aligned([_words(ds, row, dims) for row in rows])])
 
 
+def _ends(ds: xr.Dataset) -> dict[int, list[str]]:
+    """Return for each row that cells left the ids of the sets on which they ended, with the number of cells."""
+    found: dict[int, list[str]] = {}
+    for row, to, count in zip(*(ds[name].values.tolist() for name in ("from_set", "to", "n_to")), strict=True):
+        found.setdefault(row, []).append(f"{to} ({count})")
+    return found
+
+
 def _row(one: xr.Dataset) -> Row:
     counts = ("n_cells", "n_sampled", "n_left", "n_leaving")
-    to = [f"{name} ({count})" for name, count in enumerate(one["n_to"].values.tolist()) if count]
-    row = values(one, "kind", "stability", *counts, "mean_lifetime", "lifetime_low", "lifetime_high")
-    return row | {"to": ", ".join(to)}
+    return values(one, "kind", "stability", *counts, "mean_lifetime", "lifetime_low", "lifetime_high")
 
 
 def _words(ds: xr.Dataset, row: Row, dims: Sequence[str]) -> Words:

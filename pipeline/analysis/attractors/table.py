@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
@@ -9,6 +10,7 @@ import xarray as xr
 
 from pipeline.analysis.basins.numbers import basin_fractions
 from pipeline.analysis.outcomes import other_cells, outcomes, sentence
+from pipeline.analysis.ragged import N_IDS, N_POINTS, SAMPLE, SET, rows_at
 from pipeline.analysis.tabular import (
     FEW_POINTS,
     FRACTION,
@@ -33,6 +35,9 @@ from pipeline.products.product import Table
 MOST_STATES = 2
 """Most states of a model whose places are printed; the CSV table has those of all models."""
 
+MOST_ROWS = 30
+"""Most rows that are printed: of ids, or of the sets of a parameter point."""
+
 RUN_AWAY = {"diverged", "not settled"}
 """What is said of cells one of whose states grows without bound, as an angle does that is not declared."""
 
@@ -46,17 +51,37 @@ def attractors_table(ds: xr.Dataset) -> Table:
     rows = _rows(ds)
     dims, _ = split_dims(ds["attractor_id"])
     n_points = int(np.prod([ds.sizes[d] for d in dims]))
-    attracts = (ds["stability"] == ATTRACTS).any(dims)
-    n, others = int(attracts.sum()), int((~attracts).sum())
+    attracting = np.unique(ds["attractor"].values[ds["stability"].values == ATTRACTS])
+    n, others = attracting.size, int(ds.attrs[N_IDS]) - attracting.size
     lines = [f"{counted(n, 'attractor')} at {counted(n_points, 'parameter point')}"]
     if others:
         lines[0] += f", and {counted(others, 'other set')} on which cells end"
     if n_points > FEW_POINTS:
-        lines += summary(ds, rows, dims, _id_summary, "attractor_id")
+        shown, more = _largest(rows)
+        lines += [*summary(ds, shown, dims, _id_summary, "attractor_id"), *more]
     else:
         for _, where in points_of(ds, dims):
-            lines += point_table(ds, where, rows, lambda row: _attractor_words(row, n_points))
+            shown, more = _largest([row for row in rows if all(row[k] == v for k, v in where.items())])
+            lines += [*point_table(ds, where, shown, lambda row: _attractor_words(row, n_points)), *more]
     return Table(rows, [*lines, sentence(ds), *_remarks(ds, rows)])
+
+
+def _largest(rows: Sequence[Row]) -> tuple[list[Row], list[str]]:
+    """Return the rows of the `MOST_ROWS` ids with the largest shares of a parameter point, and a line on the others."""
+    sizes: dict[int, tuple[float, int]] = {}
+    for row in rows:
+        share = row.get("fraction", np.nan)
+        size = (share if np.isfinite(share) else 0.0, row["n_cells"])
+        sizes[row["attractor_id"]] = max(size, sizes.get(row["attractor_id"], (0.0, 0)))
+    kept = set(sorted(sizes, key=lambda i: sizes[i], reverse=True)[:MOST_ROWS])
+    shown = [row for row in rows if row["attractor_id"] in kept]
+    kinds = {row["attractor_id"]: row for row in reversed(rows) if row["attractor_id"] not in kept}
+    if not kinds:
+        return shown, []
+    period = {i: f" of period {row['orbit_period']}" if row["orbit_period"] else "" for i, row in kinds.items()}
+    counts = Counter(f"{_kind(row)}{period[i]}" for i, row in kinds.items())
+    told = ", ".join(f"{n} {name}" for name, n in counts.most_common())
+    return shown, [f"  {len(kinds)} more with smaller shares: {told}; all rows are in --csv and --json"]
 
 
 def _rows(ds: xr.Dataset) -> list[Row]:
@@ -69,33 +94,31 @@ def _rows(ds: xr.Dataset) -> list[Row]:
     words = words_of(ds["decision"])
     fractions = None
     if start_dims and start_dims != ("branch",):
-        fractions = basin_fractions(outcomes(ds), dims=start_dims, ids=ds["attractor"].values.tolist())
-    rows, columns = [], _columns(ds, dims)
+        fractions = basin_fractions(outcomes(ds), dims=start_dims, ids=np.unique(ds["attractor"].values).tolist())
+    columns, number = _columns(ds), ds["attractor"].values.tolist()
     ids, decided = (ds[n].transpose(*dims, *start_dims).values for n in ("attractor_id", "decision"))
-    kind = ds["kind"].transpose(*dims, "attractor").values
-    for at, where in points_of(ds, dims):
-        index = tuple(at.values())
-        cells = ids[index].ravel()
-        decisions = np.zeros((len(words), ds.sizes["attractor"]), np.int64)
-        np.add.at(decisions, (decided[index].ravel()[cells >= 0], cells[cells >= 0]), 1)
-        for i in np.flatnonzero(kind[index] > 0).tolist():
-            row = {**where, **{name: column[(*index, i)] for name, column in columns.items()}}
+    rows = []
+    for (index, own), (at, where) in zip(rows_at(ds).items(), points_of(ds, dims), strict=True):
+        cells, how = ids[index].ravel(), decided[index].ravel()
+        for i in own:
+            row = {**where, **{name: column[i] for name, column in columns.items()}}
             if fractions is not None:
-                own = fractions.isel(at).sel(label=i)
+                one = fractions.isel(at).sel(label=number[i])
                 counts = row["stability"] == STABILITIES[ATTRACTS]
-                row |= {n: float(own[n]) if counts else np.nan for n in FRACTION}
-            rows.append(row | {f"by_{name}": int(decisions[k, i]) for k, name in enumerate(words) if k})
+                row |= {n: float(one[n]) if counts else np.nan for n in FRACTION}
+            decisions = np.bincount(how[cells == number[i]], minlength=len(words))
+            rows.append(row | {f"by_{name}": int(decisions[k]) for k, name in enumerate(words) if k})
     return rows
 
 
-def _columns(ds: xr.Dataset, dims: Sequence[str]) -> dict[str, np.ndarray]:
-    """Return the table's columns, Python objects of shape (*parameter dims, attractor), without the quantities that the
-    model lacks.
+def _columns(ds: xr.Dataset) -> dict[str, np.ndarray]:
+    """Return the table's columns, one Python object for each row of a set, without the quantities that the model
+    lacks.
     """
     found: dict[str, np.ndarray] = {}
 
     def array_of(name: str) -> np.ndarray:
-        return np.asarray(ds[name].transpose(*dims, "attractor", ...).values)
+        return np.asarray(ds[name].transpose(SET, ...).values)
 
     def add(*names: str) -> None:
         for name in names:
@@ -104,7 +127,7 @@ def _columns(ds: xr.Dataset, dims: Sequence[str]) -> dict[str, np.ndarray]:
                 array = np.array(words_of(ds[name]), object)[array_of(name)] if labelled else array_of(name)
                 found[name] = array.astype(object)
 
-    found["attractor_id"] = np.broadcast_to(ds["attractor"].values.astype(object), array_of("kind").shape)
+    found["attractor_id"] = ds["attractor"].values.astype(object)
     add("kind", "stability", "evidence", "orbit_period", "period_s", "side")
     if "rotation" in ds:
         dim = str(ds["rotation"].dims[-1])
@@ -124,10 +147,11 @@ def _columns(ds: xr.Dataset, dims: Sequence[str]) -> dict[str, np.ndarray]:
         found["eigenvalue_real"] = array_of("eigenvalue_real")[..., 0].astype(object)
         found["eigenvalue_imag"] = np.abs(array_of("eigenvalue_imag")[..., 0]).astype(object)
     add("mirror_partner", "mirror_distance", "n_cells", "match_basis")
-    first = ds["attractor_points"].isel(point=0)
+    begins = np.cumsum(ds[N_POINTS].values) - ds[N_POINTS].values
+    first = ds["attractor_points"].isel({SAMPLE: (SET, begins)})
     for part, array in (("section", first), ("min", ds["state_min"]), ("max", ds["state_max"])):
         for name in ds["state"].values:
-            one = array.sel(state=name).transpose(*dims, "attractor")
+            one = array.sel(state=name)
             found[f"{part}_{name}"] = one.values.astype(object)
     return found
 

@@ -15,6 +15,7 @@ from pipeline.analysis.basins.boundaries import basin_entropy, uncertainty_expon
 from pipeline.analysis.basins.numbers import basin_fractions
 from pipeline.analysis.basins.wada import wada_merge_test
 from pipeline.analysis.outcomes import other_cells, outcomes
+from pipeline.analysis.ragged import dense
 from pipeline.layout import vocabulary
 from pipeline.layout.vocabulary import ATTRACTS, split_dims
 from pipeline.products.basins import BasinOptions
@@ -60,6 +61,7 @@ def basins(ds: xr.Dataset, ids: xr.Dataset, options: BasinOptions | None = None,
     """
     options = options or BasinOptions(**changes)
     check_starts(ds)
+    ids = dense(ids)
     dims, start_dims = split_dims(ids["attractor_id"])
     cells = ids[["attractor_id", "decision", "status", "stability", "ran_out"]]
     result = cells.assign(n_periods=ds["n_periods"].transpose(*dims, *start_dims).load())

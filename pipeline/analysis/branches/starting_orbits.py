@@ -14,6 +14,8 @@ from magpend_core.orbits import scaled_distance
 from pipeline.analysis.branches.deflation import search_orbits
 from pipeline.analysis.branches.known import Start
 from pipeline.analysis.branches.problems import FREQUENCY, Family
+from pipeline.analysis.ragged import points_of_rows
+from pipeline.analysis.tabular import sets_of
 from pipeline.analysis.tolerances import RECURRENCE
 from pipeline.layout.vocabulary import BOUNDED, EQUILIBRIUM, PERIODIC_ORBIT, frequency_of, is_start_dim
 
@@ -48,17 +50,14 @@ def listed(attractors: xr.Dataset, parameters: Parameters, parameter: str, scale
     scale
         Change of the parameter that counts as 1.
     """
-    for point in _points(attractors):
-        frequency, packed = parameters_at(point, parameters)
-        where = {d: float(point[d]) for d in _dims(attractors)}
-        for i in np.flatnonzero(point["kind"].values > 0):
-            one = point.isel(attractor=int(i))
-            kind, period, start = int(one["kind"]), int(one["orbit_period"]), None
-            if int(one["is_polished"]) and (period >= 1 or kind == EQUILIBRIUM):
-                family = family_of(parameters.model.system, period, frequency, packed, parameter, scale)
-                state = np.asarray(one["attractor_points"].values[0])
-                start = Start(family, state, value_of(family, frequency, packed), int(i))
-            yield Listed(int(i), where, period, start, kind == EQUILIBRIUM, kind == PERIODIC_ORBIT and not period)
+    for (where, one), points in zip(sets_of(attractors), points_of_rows(attractors), strict=True):
+        frequency, packed = parameters_at(one, parameters)
+        number, kind, period = (int(one[name]) for name in ("attractor", "kind", "orbit_period"))
+        start = None
+        if int(one["is_polished"]) and (period >= 1 or kind == EQUILIBRIUM):
+            family = family_of(parameters.model.system, period, frequency, packed, parameter, scale)
+            start = Start(family, points[0], value_of(family, frequency, packed), number)
+        yield Listed(number, where, period, start, kind == EQUILIBRIUM, kind == PERIODIC_ORBIT and not period)
 
 
 def attracting(

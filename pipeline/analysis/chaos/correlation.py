@@ -10,6 +10,7 @@ import xarray as xr
 from pipeline.analysis.chaos.dimensions import correlation_dimension
 from pipeline.analysis.chaos.per_attractor import pooled
 from pipeline.analysis.chaos.section_samples import geometry_of
+from pipeline.analysis.ragged import dense
 from pipeline.analysis.selection import select_points
 from pipeline.layout.attributes import code_flags
 from pipeline.layout.vocabulary import APERIODIC, ATTRACTS, split_dims
@@ -56,7 +57,7 @@ def section_dimension(
     options = options or DimensionOptions(**changes)
     part = select_points(ds, options.at)
     dims, starts = split_dims(part["status"])
-    found = attractors.sel({d: part[d].values for d in dims})
+    found = dense(attractors).sel({d: part[d].values for d in dims})
     present = (found["kind"] > 0).any([d for d in found["kind"].dims if d != "attractor"])
     found = found.isel(attractor=np.flatnonzero(present.values))
     section = part[["section", "status"]].load().assign_attrs(ds.attrs)

@@ -51,6 +51,7 @@ from magpend_core.multipliers import orbit_exponents
 from pipeline.analysis.chaos.dimensions import correlation_dimension, kaplan_yorke_dimension
 from pipeline.analysis.chaos.lyapunov import GOOD, UNRESOLVED, pooled_mean
 from pipeline.analysis.chaos.section_samples import Floats, geometry_of
+from pipeline.analysis.ragged import dense
 from pipeline.layout.attributes import code_flags
 from pipeline.layout.vocabulary import (
     APERIODIC,
@@ -154,7 +155,7 @@ def chaos_per_attractor(ds: xr.Dataset, cells: xr.Dataset, attractors: xr.Datase
         "lyapunov_high",
     ]
     copied += [name for name in ("eigenvalue_real", "eigenvalue_imag") if name in attractors]
-    own = attractors[copied].transpose(*dims, "attractor", ...)
+    own = dense(attractors)[copied].transpose(*dims, "attractor", ...)
     shape, n_states = own["kind"].shape, ds.sizes["state"]
     arrays = {
         name: np.full((*shape, *((n_states,) if rank else ())), fill, dtype)

@@ -44,7 +44,7 @@ _TEST = ("median_zero_one", "least_zero_one", "largest_zero_one")
 def chaos_table(ds: xr.Dataset) -> Table:
     """Return the table of exponents, multipliers, dimensions and the 0-1 test, per attractor and parameter point."""
     dims, _ = split_dims(ds["motion"])
-    rows = [{**where, **_row(one)} for where, one in sets_of(ds, ds["kind"] > 0, dims)]
+    rows = [{**where, **_row(one)} for where, one in sets_of(ds)]
     n_points = int(np.prod([ds.sizes[d] for d in dims]))
     lines = [f"{ds['motion'].size} cells at {counted(n_points, 'parameter point')}"]
     if n_points > FEW_POINTS:
@@ -176,7 +176,7 @@ def dimension_table(ds: xr.Dataset) -> Table:
     """
     dims = [str(d) for d in ds["reason"].dims if d != "attractor"]
     names = ("kind", "reason", "n_cells", "n_sampled", "n_left", "n_points", "lifetime_low", *_CURVE)
-    found = sets_of(ds, ds["kind"] > 0, dims)
+    found = sets_of(ds)
     rows = [{**where, "attractor_id": int(one["attractor"]), **values(one, *names)} for where, one in found]
     lines = ["correlation dimension of the sections of attractors that do not close"]
     open_rows = [row for row in rows if row["kind"] in _OPEN]

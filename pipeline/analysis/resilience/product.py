@@ -39,6 +39,7 @@ from pipeline.analysis.basins.basins import check_starts
 from pipeline.analysis.basins.numbers import basin_fractions
 from pipeline.analysis.intervals import binomial_interval
 from pipeline.analysis.outcomes import outcomes
+from pipeline.analysis.ragged import dense
 from pipeline.analysis.resilience.base_states import Asked, Bases, Shocked, answer, bases_of
 from pipeline.analysis.resilience.shocks import Found, Settings, ShockSearch, Trials
 from pipeline.analysis.run import Run
@@ -82,7 +83,7 @@ def _chosen(run: Run, options: ResilienceOptions) -> list[str]:
 def resilience(run: Run, options: ResilienceOptions) -> xr.Dataset:
     """Measure the response of the attractors at each parameter point to shocks."""
     whole = run.derive("attractors", **options.part(AttractorOptions))
-    cube, attractors = select_points(run.cube(), options.at), select_points(whole, options.at)
+    cube, attractors = select_points(run.cube(), options.at), dense(select_points(whole, options.at), points=True)
     dims, starts = split_dims(attractors["attractor_id"])
     result = _Result(run, options, attractors)
     labels = outcomes(attractors).transpose(*dims, *starts).values

@@ -14,6 +14,7 @@ from magpend_core.models.drift.ramps import motions_of
 from magpend_core.models.model import Parameters
 from pipeline.analysis.attractors.attractors import identify
 from pipeline.analysis.outcomes import DIVERGED, outcomes
+from pipeline.analysis.ragged import dense
 from pipeline.analysis.run import Run
 from pipeline.layout.vocabulary import FREQUENCY_DIM, START, model_attribute, parameters_of
 from pipeline.products.tipping import TippingOptions
@@ -132,7 +133,7 @@ def endings(
         ids, settled = None, np.zeros((0, states.shape[1]))
         if len(going):
             cube = _going_on(run, final, states[going], options)
-            ids = identify(cube, parameters=final.parameters)
+            ids = dense(identify(cube, parameters=final.parameters), points=True)
             settled = cube["section"].values[:, -1]
             outcome[np.searchsorted(cells, going)] = outcomes(ids).values
         yield Group(final, cells, ids, going, settled, outcome)

@@ -8,6 +8,7 @@ import xarray as xr
 from pipeline.analysis.basins.basins import check_starts
 from pipeline.analysis.intervals import binomial_interval
 from pipeline.analysis.outcomes import outcomes
+from pipeline.analysis.ragged import dense
 from pipeline.analysis.run import Run
 from pipeline.analysis.selection import choose, place
 from pipeline.analysis.tabular import Row, aligned, with_interval
@@ -68,7 +69,7 @@ def overlaps(run: Run, options: OverlapOptions) -> xr.Dataset:
     The definition is that of Kaszas, Feudel and Tel (Sci. Rep. 9, 8654, 2019): the overlap of two basins over the
     first one, with uniform weight on the starts of the run.
     """
-    found = run.derive("attractors", **options.part(AttractorOptions))
+    found = dense(run.derive("attractors", **options.part(AttractorOptions)))
     axis = axis_name(options.parameter)
     labels = outcomes(found)
     whole = found.assign(outcome=labels)

@@ -84,6 +84,53 @@ class DatasetAccessor:
 
         return table(self._ds)
 
+    def sets(self) -> xr.Dataset:
+        """Return the sets of a result of `magpend.attractors`, one row for each set at each parameter point.
+
+        Returns
+        -------
+        Dataset
+            Variables on the dim ``set``, with ``attractor_id`` and the swept parameters as coordinates along it. The
+            section points of the first row are the first ``n_points`` of ``attractor_points`` on the dim ``sample``,
+            those of the next row follow (a contiguous ragged array of the CF conventions).
+
+        Raises
+        ------
+        ValueError
+            If the Dataset is no result of `magpend.attractors`.
+
+        Examples
+        --------
+        >>> run.attractors().magpend.sets().share.groupby("attractor_id").max()            # doctest: +SKIP
+        """
+        from pipeline.analysis.ragged import sets
+
+        return sets(self._rows("sets"))
+
+    def dense(self) -> xr.Dataset:
+        """Return a result of `magpend.attractors` with its sets on the swept parameters and the dim ``attractor``.
+
+        It has room for each attractor at each parameter point, so that it is large where there are many of both.
+
+        Returns
+        -------
+        Dataset
+            ``attractor`` runs over the ids. Where a point lacks a set, ``kind`` is 0, counts and shares are 0, and
+            other numbers NaN. Section points are on the dim ``point``.
+
+        Raises
+        ------
+        ValueError
+            If the Dataset is no result of `magpend.attractors`.
+
+        Examples
+        --------
+        >>> run.attractors().magpend.dense().share.plot()                                  # doctest: +SKIP
+        """
+        from pipeline.analysis.ragged import dense
+
+        return dense(self._rows("dense"), points=True)
+
     def run(self) -> Run:
         """Open the run from whose directory the Dataset was read.
 
@@ -159,6 +206,14 @@ class DatasetAccessor:
                 "ds.magpend: the Dataset has no attribute 'model', so it is no cube of magpend.open_run and no result "
                 "of an analysis. Arithmetic drops attributes unless xarray.set_options(keep_attrs=True)."
             )
+        return self._ds
+
+    def _rows(self, name: str) -> xr.Dataset:
+        from pipeline.analysis.ragged import is_ragged
+
+        if not is_ragged(self._known()):
+            what = self._ds.attrs.get("derived_product", "a cube")
+            raise ValueError(f"ds.magpend.{name}: needs a result of magpend.attractors, and this is {what}.")
         return self._ds
 
     def _cube(self, name: str) -> xr.Dataset:

@@ -9,6 +9,7 @@ import numpy as np
 import xarray as xr
 
 from pipeline.analysis.attractors.matching.across import match_across
+from pipeline.analysis.ragged import dense
 from pipeline.analysis.tabular import FEW_POINTS, points_of, words_of
 from pipeline.layout.vocabulary import model_of, parameter_name
 
@@ -37,6 +38,7 @@ def attractor_rows(runs: Sequence[xr.Dataset], row: Row) -> tuple[Rows, Rows]:
         printed.
     """
     ids = match_across(runs)
+    runs = [dense(run, points=True) for run in runs]
     n = 1 + max((int(own.max(initial=-1)) for own in ids), default=-1)
     all_rows: Rows = []
     printed: Rows = []

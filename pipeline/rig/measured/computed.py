@@ -13,6 +13,7 @@ import xarray as xr
 
 from magpend_core.models import load_model
 from magpend_core.models.model import Model, Parameters
+from pipeline.analysis.ragged import dense
 from pipeline.analysis.selection import choose, select_points, start_dims
 from pipeline.analysis.sets import Geometry
 from pipeline.layout.vocabulary import ABSENT, APERIODIC, FREQUENCY_DIM, PERIODIC_ORBIT, UNSTABLE, split_dims
@@ -95,7 +96,9 @@ class Computed:
         with refused(run.name):
             found = run.derive("attractors")
             keep = (FREQUENCY_DIM, *start_dims(found))
-            found = choose(found, at, keep, "measured sweeps are compared at one value of the other axes")
+            found = dense(
+                choose(found, at, keep, "measured sweeps are compared at one value of the other axes"), points=True
+            )
         found = found.isel({FREQUENCY_DIM: np.argsort(found[FREQUENCY_DIM].values)})
         return cls(found, cube, parameters, run.info.title, run.digest)
 

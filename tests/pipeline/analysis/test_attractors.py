@@ -11,8 +11,8 @@ import pytest
 from magpend_core import load_preset, sections
 from magpend_core.models import load_model
 from magpend_core.models.pendulum.sides import Side
-from pipeline.analysis.attractors.attractors import identify, match
 from pipeline.layout.vocabulary import ATTRACTS, EXTENDED, PERIODIC_ORBIT
+from tests.pipeline.analysis.dense_sets import identify, match
 
 from .cubes import STATES, attributes_of, cube_of, integrated
 

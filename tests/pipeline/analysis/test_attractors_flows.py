@@ -9,12 +9,12 @@ import pytest
 
 from magpend_core.crossing import Crossing
 from magpend_core.models.sectioned import sectioned
-from pipeline.analysis.attractors.attractors import identify
 from pipeline.analysis.attractors.table import attractors_table
 from pipeline.compute.integrate import rest_states
 from pipeline.layout.vocabulary import ATTRACTS, BOUNDED_SET, EQUILIBRIUM, PERIODIC_ORBIT, section_attributes
 from pipeline.runs.derive import derive
 from tests.core.flows import BAUTIN, HOPF, flow
+from tests.pipeline.analysis.dense_sets import identify
 
 from .cubes import attributes_of, cube_of, integrated
 

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from magpend_core import load_preset, sections
-from pipeline.analysis.attractors.attractors import identify
 from pipeline.analysis.attractors.finding.assigning import decide
 from pipeline.analysis.attractors.finding.cell_blocks import Block
 from pipeline.analysis.attractors.finding.closed_orbits import Orbit
 from pipeline.analysis.sets import Geometry
 from pipeline.layout.vocabulary import ATTRACTS, CLOSED, EXTENDED, PERIODIC_ORBIT, UNDECIDED
+from tests.pipeline.analysis.dense_sets import identify
 
 from .cubes import STATES, cube_of
 

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from magpend_core import load_model, sections
-from pipeline.analysis.attractors.attractors import identify, match
 from pipeline.analysis.attractors.describing.portraits import portraits
 from pipeline.analysis.attractors.settling_table import settling_table
 from pipeline.analysis.attractors.table import attractors_table
 from pipeline.analysis.basins.basins import basins
 from pipeline.analysis.chaos.chaos import chaos
 from pipeline.layout.vocabulary import ATTRACTS, CHAOTIC_SET
+from tests.pipeline.analysis.dense_sets import identify, match, rows_of
 
 from .cubes import attributes_of, cube_of
 
@@ -57,7 +57,7 @@ def test_identify__chaos_without_angles(chaotic, strange):
     assert strange["mirror_partner"].values.tolist() == [0]
     assert {"rotation", "side"}.isdisjoint(strange.data_vars)
     assert strange["energy_min"].attrs["units"] == "J/kg"
-    text = "\n".join(attractors_table(match(strange)).lines)
+    text = "\n".join(attractors_table(rows_of(match(strange))).lines)
     assert "rotation" not in text
     assert "side" not in text
 
@@ -84,7 +84,7 @@ def test_identify__a_strange_attractor_stays(strange):
     assert strange["lifetime_low"].item() >= 3000.0
     # 0.158 per unit time (ChaosTools.jl, issue 301)
     assert strange["lyapunov_low"].item() < 0.158 < strange["lyapunov_high"].item()
-    table = settling_table(strange.expand_dims("frequency"))
+    table = settling_table(rows_of(strange.expand_dims("frequency")))
     assert "chaotic set  attracts" in table.lines[2]
 
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from pipeline.analysis.attractors.attractors import identify, match
 from pipeline.analysis.attractors.finding.points import PASSING
 from pipeline.analysis.attractors.matching.hysteresis import hysteresis
 from pipeline.layout.vocabulary import ATTRACTS, BOUNDED_SET, NOT_SETTLED, PERIODIC_ORBIT
 from pipeline.products.reporting import reporting
+from tests.pipeline.analysis.dense_sets import identify, match
 
 STATES = ["psi1", "psi2", "psi1_dot", "psi2_dot"]
 K = 64

@@ -9,6 +9,7 @@ from pipeline.analysis.attractors.table import attractors_table
 from pipeline.analysis.branches.bifurcations import KINDS
 from pipeline.analysis.branches.orbit_search import orbits_table
 from pipeline.analysis.branches.table import branches_table, curves_table
+from pipeline.analysis.ragged import dense
 from pipeline.cli.exits import Exit
 from pipeline.layout.vocabulary import ABSENT, CHAOTIC_SET
 from pipeline.products.branches import BranchOptions
@@ -16,6 +17,7 @@ from pipeline.products.registry import ANALYSES, FIGURES
 from pipeline.products.reporting import reporting
 from pipeline.runs.derive import AnalysedRun, derive, prepared
 from pipeline.specification.problems import SpecError
+from tests.pipeline.analysis.dense_sets import rows_of
 
 SPEC = """
 kind = "sweep"
@@ -51,14 +53,14 @@ def directory(computed):
 @pytest.mark.slow
 def test_attractors__ids_through_the_cascade(directory):
     """The orbits of each well have one id, from period 1 to 4; the chaos beyond has another one."""
-    ds = derive(directory, "attractors")
+    ds = dense(derive(directory, "attractors"), points=True)
     periods = ds["orbit_period"].values.T.tolist()
     assert sorted(periods)[1:] == [[1, 2, 0, 0], [1, 2, 4, 0]]
     basis = ds["match_basis"].values
     words = ds["match_basis"].attrs["flag_meanings"].split()
     assert {words[b] for b in basis[1:3, :2].ravel()} == {"doubling", "absent"}
     assert ds["kind"].values[3].tolist() == [ABSENT, ABSENT, CHAOTIC_SET]
-    text = "\n".join(attractors_table(ds).lines)
+    text = "\n".join(attractors_table(rows_of(ds)).lines)
     assert "id by" in text
     assert "first appearance" in text
 

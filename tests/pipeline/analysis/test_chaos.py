@@ -10,12 +10,12 @@ import pytest
 import xarray as xr
 
 from pipeline import open_run
-from pipeline.analysis.attractors.attractors import identify
 from pipeline.analysis.chaos.chaos import chaos, chaotic_cells
 from pipeline.analysis.chaos.correlation import section_dimension
 from pipeline.analysis.chaos.lyapunov import Motion, pooled_mean
 from pipeline.analysis.chaos.per_attractor import Nature
 from pipeline.analysis.chaos.table import chaos_table, dimension_table
+from pipeline.analysis.ragged import dense
 from pipeline.cli.exits import Exit
 from pipeline.layout.vocabulary import (
     ABSENT,
@@ -30,6 +30,7 @@ from pipeline.layout.vocabulary import (
 )
 from pipeline.plots import plot_convergence, plot_dimension
 from pipeline.runs.derive import derive
+from tests.pipeline.analysis.dense_sets import identify
 
 from .cubes import exponents_cube
 
@@ -287,7 +288,7 @@ def test_analyse_chaos__order_and_chaos(main, run, tmp_path):
     with (tmp_path / "c.csv").open() as file:
         rows = list(csv.DictReader(file))
     closed = [row for row in rows if row["nature"] == "regular"]
-    found = derive(run, "attractors")
+    found = dense(derive(run, "attractors"), points=True)
     for row in closed:  # the logarithm of the largest multiplier, and close to what was measured
         one = found.sel(frequency=float(row["frequency"]), attractor=int(row["attractor_id"]))
         assert float(row["lyapunov_1"]) == pytest.approx(float(one["lyapunov_max"]), rel=1e-12)

@@ -10,12 +10,13 @@ from magpend_core import trajectory
 from magpend_core.models import load_model
 from magpend_core.orbits import polish_orbits
 from magpend_core.sections import run_branches
-from pipeline.analysis.attractors.matching.matching import BASES, match
+from pipeline.analysis.attractors.matching.matching import BASES
 from pipeline.analysis.branches import connecting, lockstep
 from pipeline.analysis.branches.arclength import Settings
 from pipeline.analysis.branches.connecting import Found, Link, connect, grouped
 from pipeline.analysis.branches.problems import Family
 from pipeline.layout.vocabulary import PERIODIC_ORBIT
+from tests.pipeline.analysis.dense_sets import match
 
 DUFFING = load_model("duffing")
 FREQUENCY = 1.2 / (2.0 * np.pi)

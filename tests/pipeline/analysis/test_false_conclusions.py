@@ -16,12 +16,12 @@ from magpend_core.equilibria import find_equilibria
 from magpend_core.models import load_model
 from magpend_core.models.sectioned import sectioned
 from magpend_core.status import Status
-from pipeline.analysis.attractors.attractors import identify
 from pipeline.analysis.attractors.extension.extending import extend
 from pipeline.analysis.attractors.finding.cell_blocks import Block
 from pipeline.analysis.attractors.finding.closed_orbits import Orbit
 from pipeline.analysis.attractors.finding.requests import LEG, Extended, Leg, Settings, Slopes
 from pipeline.analysis.attractors.finding.stability import BY_ONE_SIDE
+from pipeline.analysis.ragged import dense
 from pipeline.analysis.sets import Geometry
 from pipeline.compute.integrate import rest_states
 from pipeline.layout.vocabulary import (
@@ -42,6 +42,7 @@ from pipeline.products.registry import ANALYSES
 from pipeline.runs.derive import derive
 from pipeline.runs.run import run
 from pipeline.specification.problems import SpecError
+from tests.pipeline.analysis.dense_sets import identify
 from tests.zoo.variants import write
 
 pytestmark = pytest.mark.slow
@@ -434,7 +435,7 @@ def found_at(equations, starts, folder):
         "integration": {"n_transient": 50, "n_keep": 16},
     }
     run(write(spec, folder), folder / "run", workers=0, echo=lambda _: None)
-    found = derive(folder / "run", "attractors")
+    found = dense(derive(folder / "run", "attractors"), points=True)
     sets = zip(*(found[name].values.tolist() for name in ("kind", "stability", "evidence")), strict=True)
     return list(sets), found["attractor_id"].values.tolist()
 

@@ -7,10 +7,16 @@ import pytest
 import xarray as xr
 
 from magpend_core.models import load_model
-from pipeline.analysis.attractors.matching.across import match_across
+from pipeline.analysis.attractors.matching import across
 from pipeline.layout.vocabulary import model_attribute
+from tests.pipeline.analysis.dense_sets import rows_of
 
 PERIODIC = 2
+
+
+def match_across(runs, **options):
+    """Common ids of the attractors of runs, whose sets are on the dim ``attractor``."""
+    return across.match_across([rows_of(run) for run in runs], **options)
 
 
 def run_of(*sets):

@@ -6,9 +6,9 @@ from scipy.integrate import solve_ivp
 
 from magpend_core import load_model, run_branches
 from magpend_core.engine.vecmath import TWO_PI
-from pipeline.analysis.attractors.attractors import identify
 from pipeline.analysis.basins.numbers import basin_fractions
 from pipeline.layout.vocabulary import ABSENT, PERIODIC_ORBIT
+from tests.pipeline.analysis.dense_sets import identify
 
 from . import torque_pendulum as bench
 from .cubes import cube_of, integrated

@@ -11,6 +11,7 @@ from scipy.linalg import expm
 
 from pipeline.analysis.attractors.destinations import ELSEWHERE, UNDECIDED, destinations_at
 from pipeline.analysis.attractors.finding.points import BUDGET, Dynamics, slabs
+from pipeline.analysis.ragged import dense
 from pipeline.analysis.resilience.base_states import Asked, Bases, Shocked, answer
 from pipeline.analysis.resilience.edge_table import edge_table
 from pipeline.analysis.resilience.shocks import Settings, ShockSearch
@@ -90,7 +91,7 @@ def at_point(a_run):
     """The only parameter point of a run, as ends of trajectories."""
     cube, options = a_run.cube(), AttractorOptions()
     (points,) = slabs(cube, Dynamics.of(cube), BUDGET)
-    ((_, there),) = destinations_at(cube, a_run.derive("attractors"), points, options)
+    ((_, there),) = destinations_at(cube, dense(a_run.derive("attractors"), points=True), points, options)
     return there
 
 
@@ -197,7 +198,7 @@ def test_resilience__basin_stability_and_table(found, wells):
     assert table.rows[0]["shock_v"] == pytest.approx(float(found["shock"].isel(attractor=0, state=1)))
     json.dumps([dict(row) for row in table.rows])
     assert f"{float(found['shock_high'][0]):.5g}" in "\n".join(table.lines)
-    figure = plot_resilience(found, wells.derive("attractors"))
+    figure = plot_resilience(found, dense(wells.derive("attractors"), points=True))
     assert [ax.get_ylabel() for ax in figure.axes] == ["basin stability", "smallest shock", "arrival [drive periods]"]
     assert float(figure.data["shock_high"].isel(attractor=0)) == float(found["shock_high"].isel(attractor=0))
 
@@ -310,7 +311,7 @@ def test_edge__of_a_smooth_boundary(duffing):
     values, vectors = np.linalg.eig(np.column_stack(columns))
     assert np.sort(found["multiplier_real"].values[0]) == pytest.approx(np.sort(values), rel=1e-5)
     across = vectors[:, np.argmax(np.abs(values))].real
-    stored = a_run.derive("attractors")["attractor_points"].values
+    stored = dense(a_run.derive("attractors"), points=True)["attractor_points"].values
     points = stored[:, 0][[found.attrs["between"]]].reshape(2, 2)
     ends = flow(point + np.array([[1e-3], [-1e-3]]) * across, 0.0, 60 * 2.0 * np.pi, 0.1)
     nearest = np.abs(ends[:, None] - points).max(axis=-1)

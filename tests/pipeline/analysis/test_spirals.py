@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from magpend_core import load_preset, sections
-from pipeline.analysis.attractors.attractors import identify
 from pipeline.analysis.attractors.finding.closed_orbits import Orbit
 from pipeline.analysis.attractors.finding.requests import LEG
 from pipeline.analysis.attractors.finding.spirals import Recurrence, leap, near_closed
 from pipeline.analysis.sets import Geometry
 from pipeline.layout.vocabulary import ATTRACTS, BOUNDED_SET, NOT_SETTLED, PERIODIC_ORBIT
+from tests.pipeline.analysis.dense_sets import identify
 
 from .cubes import STATES, cube_of
 

@@ -13,6 +13,7 @@ from pipeline.analysis.attractors.finding.closed_orbits import Orbit
 from pipeline.analysis.attractors.finding.stability import by_margin, largest_error
 from pipeline.analysis.attractors.table import attractors_table
 from pipeline.analysis.outcomes import other_cells, outcomes, sentence
+from pipeline.analysis.ragged import dense
 from pipeline.layout.vocabulary import ATTRACTS, NEUTRAL, PERIODIC_ORBIT, UNSTABLE
 from pipeline.runs.derive import derive, stale
 
@@ -97,7 +98,7 @@ def test_attractors__a_repeller_on_the_grid_is_none(pitchfork):
 
 
 def test_outcomes__cells_on_the_repeller_are_counted_by_name(pitchfork):
-    ids = derive(pitchfork, "attractors")
+    ids = dense(derive(pitchfork, "attractors"), points=True)
     assert (outcomes(ids) == -1).sum() == 2
     assert {name: int(which.sum()) for name, which in other_cells(ids).items()} == {
         "on an unstable orbit or equilibrium": 2
@@ -120,10 +121,10 @@ def test_basins__have_no_basin_of_a_repeller(pitchfork):
 @pytest.mark.slow
 def test_derive__more_evidence_holds_everywhere(pitchfork):
     """What is asked with less is answered with the most that is kept, and the rest is stale."""
-    without = derive(pitchfork, "attractors", {"extend": False, "n_points": 8})
+    without = dense(derive(pitchfork, "attractors", {"extend": False, "n_points": 8}), points=True)
     assert without.attrs["identify_extend"] == 0
-    more = derive(pitchfork, "attractors", {"budget": 3.0, "n_points": 8})
-    again = derive(pitchfork, "attractors", {"extend": False, "n_points": 8})
+    more = dense(derive(pitchfork, "attractors", {"budget": 3.0, "n_points": 8}), points=True)
+    again = dense(derive(pitchfork, "attractors", {"extend": False, "n_points": 8}), points=True)
     assert again.attrs["derived_key"] == more.attrs["derived_key"]
     assert any("attractors" in name for name in stale(pitchfork))
     basins = derive(pitchfork, "basins", {"n_points": 8})

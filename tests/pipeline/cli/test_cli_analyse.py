@@ -9,6 +9,7 @@ import re
 import numpy as np
 import pytest
 
+from pipeline.analysis.ragged import dense
 from pipeline.cli.exits import Exit
 from pipeline.runs.derive import derive
 
@@ -44,7 +45,7 @@ def test_attractors__table_per_point(main, spirals, tmp_path):
     assert left.endswith("multipliers")
     assert lines[at + 1].endswith("shown by")
     assert lines[-1] == "all 32 cells end on attractors"
-    ds = derive(spirals, "attractors")
+    ds = dense(derive(spirals, "attractors"), points=True)
     assert f"stored: {ds.encoding['source']}" in err
     with (tmp_path / "a.csv").open() as file:
         rows = list(csv.DictReader(file))

@@ -10,6 +10,7 @@ import pytest
 
 from magpend_core.models import load_model
 from magpend_core.orbits import polish_orbits
+from pipeline.analysis.ragged import dense
 from pipeline.explorer.data.colours import rgb
 from pipeline.explorer.live import slices
 from pipeline.explorer.live.catalog import Entry
@@ -133,7 +134,8 @@ def test_start__off_the_cube_is_told_by_its_orbit(directories, watch):
 @pytest.mark.slow
 def test_start__ends_of_a_flow(directories, watch):
     """At rest or on the cycle, as the analysis says of the cell; what leaves, and what lies beside, says so."""
-    cube, attractors = Run.open(directories["flow"]).cube(), derive(directories["flow"], "attractors")
+    cube = Run.open(directories["flow"]).cube()
+    attractors = dense(derive(directories["flow"], "attractors"))
     watcher, kinds = watch(directories["flow"]), set()
     for mu in (0, 1):
         for at in ((1, 1), (0, 0), (2, 2), (1, 2)):
@@ -206,7 +208,7 @@ def test_slice__is_that_of_the_cube_and_computes_no_start_twice(directories, wat
 
     monkeypatch.setattr(slices, "settle_cells", counted)
     opened = Run.open(directories["whole"])
-    attractors = derive(directories["whole"], "attractors")
+    attractors = dense(derive(directories["whole"], "attractors"), points=True)
     cube = opened.cube()
     watcher = watch(opened)
     # its 16 columns are the run's own: centres of cells of 0.125; four of its rows are

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from pipeline.analysis.ragged import dense
 from pipeline.explorer.data.arrays import unpack_arrays
 from pipeline.explorer.data.explored import ExploredRun, ExplorerError
 from pipeline.explorer.data.parameter_plane import curve_orbit, parameter_plane
@@ -37,7 +38,7 @@ def test_plane__curves_of_another_run(bent):
     """Over the number of attractors, which two folds bound."""
     line, plane = bent
     explored = replace(ExploredRun.of(plane), curves=Run.open(line))
-    found, attractors = parameter_plane(explored), derive(plane, "attractors")
+    found, attractors = parameter_plane(explored), dense(derive(plane, "attractors"))
     assert len(found["curves"]) >= 1
     number = np.array(found["map"]["number"]).reshape(len(found["map"]["y"]), len(found["map"]["x"]))
     expected = (attractors["kind"] > 0).sum("attractor").transpose("amplitude", "frequency").values

@@ -13,6 +13,7 @@ from scipy.integrate import solve_ivp
 
 from magpend_core import rates
 from magpend_core.models import load_model, model_names
+from pipeline.analysis.ragged import dense
 from pipeline.explorer.data import diagram as diagrams
 from pipeline.explorer.data import tables
 from pipeline.explorer.data.arrays import unpack_arrays
@@ -307,7 +308,7 @@ def test_orbit__agrees_with_scipy(sweep):
 @pytest.mark.slow
 def test_orbit__says_what_the_cube_and_the_analysis_say(sweep):
     explored = ExploredRun.of(sweep)
-    found = derive(sweep, "attractors")
+    found = dense(derive(sweep, "attractors"), points=True)
     for number in some_cells(explored, 6):
         _, attrs = unpack_arrays(orbit(explored, number, 0))
         index = explored.cell(number)
@@ -334,7 +335,7 @@ def test_orbit__says_what_the_cube_and_the_analysis_say(sweep):
 def test_orbit__has_multipliers_without_an_analysis(sweep, walk):
     """Polishing the cell's own section gives those that the analysis of attractors gives; first it says they come."""
     explored = ExploredRun.of(sweep)
-    found = derive(sweep, "attractors")
+    found = dense(derive(sweep, "attractors"), points=True)
     compared = 0
     for number in some_cells(explored, 6):
         cell, index = cell_of(explored, number), explored.cell(number)
@@ -401,7 +402,7 @@ def test_recorded__is_looked_at_and_not_followed_on(tmp_path):
 @pytest.mark.slow
 def test_curves__are_shares_and_exponents_of_the_analysis(sweep):
     explored = ExploredRun.of(sweep)
-    found = derive(sweep, "attractors").isel(frequency=1)
+    found = dense(derive(sweep, "attractors"), points=True).isel(frequency=1)
     listed = curves(explored, "amplitude", {"frequency": 1})["curves"]
     json.dumps(listed, allow_nan=False)
     shares = {c["attractor"]: c for c in listed if c["group"] == "fractions"}
@@ -446,7 +447,7 @@ def test_branches__lie_on_the_diagram(walk):
 @pytest.mark.slow
 def test_attractors__are_those_of_the_point(sweep):
     explored = ExploredRun.of(sweep)
-    here = derive(sweep, "attractors").isel(frequency=0, amplitude=2)
+    here = dense(derive(sweep, "attractors"), points=True).isel(frequency=0, amplitude=2)
     found = attractors(explored, {"frequency": 0, "amplitude": 2})["attractors"]
     json.dumps(found, allow_nan=False)
     assert {a["id"] for a in found} == set(np.flatnonzero(here["kind"].values > 0).tolist())

@@ -11,6 +11,7 @@ import shutil
 import pytest
 
 from pipeline.analysis.outcomes import sentence
+from pipeline.analysis.ragged import dense
 from pipeline.layout.vocabulary import ATTRACTS
 from pipeline.report.stored import stored_options
 from pipeline.runs.derive import derive
@@ -78,7 +79,7 @@ def test_report__of_a_sweep(folder, command):
     assert "&lt;script&gt;alert(1)&lt;/script&gt; &amp; friends" in html
     run = Run.open(folder / "run")
     assert run.digest in html
-    found = derive(run, "attractors")
+    found = dense(derive(run, "attractors"), points=True)
     rows = re.findall(r"<tr><td>([A-Z])</td>(.*?)</tr>", html)
     assert [row[0] for row in rows] == [chr(65 + int(i)) for i in found["attractor"].values]
     ids = found["attractor_id"].values.reshape(2, 6)
@@ -102,7 +103,7 @@ def test_report__sets_that_do_not_attract_have_no_share(command, tmp_path):
     """Without extension it is not shown that the chaotic set of the larger amplitude attracts."""
     (tmp_path / "spec.toml").write_text(CHAOTIC)
     run_spec(tmp_path / "spec.toml", tmp_path / "run", workers=0, echo=lambda _: None)
-    found = derive(tmp_path / "run", "attractors", {"extend": False})
+    found = dense(derive(tmp_path / "run", "attractors", {"extend": False}), points=True)
     attract = (found["stability"] == ATTRACTS).any("amplitude").values
     assert 0 < attract.sum() < attract.size
     html = written(command, tmp_path, "run", "--only-stored")

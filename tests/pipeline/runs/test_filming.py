@@ -11,6 +11,7 @@ from PIL import Image
 from scipy.integrate import solve_ivp
 
 import magpend
+from pipeline.analysis.ragged import dense
 from pipeline.cli.exits import Exit
 from pipeline.layout.vocabulary import TRANSIENT
 from pipeline.plots import palette
@@ -77,7 +78,7 @@ def test_animation__frames_are_where_another_integration_says(swinging):
 def test_of_attractors__what_does_not_attract_is_shown_when_asked_for(run, monkeypatch):
     """Else it is said to be there; where nothing attracts, all sets are shown."""
     opened, options = AnalysedRun.of(run), AnimationOptions(at={"frequency": 0.16})
-    found = opened.derive("attractors").copy(deep=True)
+    found = dense(opened.derive("attractors"), points=True).copy(deep=True)
     monkeypatch.setattr("pipeline.plots.figure.attractors_of", lambda run, options: found)
     found["stability"][:, 1] = TRANSIENT
     found["share"][:, 1] = 0.0

@@ -10,8 +10,10 @@ from pipeline import open_run
 from pipeline.analysis.attractors.table import attractors_table
 from pipeline.analysis.branches.table import branches_table
 from pipeline.analysis.chaos.table import chaos_table
+from pipeline.analysis.ragged import dense
 from pipeline.layout.vocabulary import model_of, parameters_of
 from pipeline.runs.derive import derive
+from tests.pipeline.analysis.dense_sets import rows_of
 from tests.pipeline.factories import finished
 
 SPEC = """
@@ -80,8 +82,8 @@ def test_run__cube(directory):
 
 @pytest.mark.slow
 def test_derive__attractors_chaos_and_branches(directory):
-    attractors = derive(directory, "attractors")
-    table = attractors_table(attractors)
+    attractors = dense(derive(directory, "attractors"), points=True)
+    table = attractors_table(rows_of(attractors))
     rests = [row for row in table.rows if row["kind"] == "equilibrium"]
     cycles = [row for row in table.rows if row["kind"] == "periodic_orbit"]
     assert {row["mu"] for row in rests} == {-0.2, -0.1}

@@ -12,6 +12,7 @@ from magpend_core.models.model import Parameters
 from magpend_core.models.sectioned import of_flow
 from magpend_core.sections import run_branches
 from magpend_core.trajectory import trajectory
+from pipeline.analysis.ragged import dense
 from pipeline.analysis.selection import choose, start_dims
 from pipeline.analysis.tolerances import PORTRAIT_RTOL
 from pipeline.layout.vocabulary import APERIODIC, EQUILIBRIUM, PERIODIC_ORBIT, frequency_of, parameters_of, told_by
@@ -62,7 +63,9 @@ def portraits(
     """
     if n_samples < 1 or n_periods < 1:
         raise ValueError(f"n_samples = {n_samples} and n_periods = {n_periods}: each must be 1 or more.")
-    part = choose(attractors, at, tuple(start_dims(attractors)), "portraits are those of one parameter point")
+    part = dense(
+        choose(attractors, at, tuple(start_dims(attractors)), "portraits are those of one parameter point"), points=True
+    )
     here = part.isel(attractor=np.flatnonzero(part["kind"].values > 0))
     values = {str(k): float(v) for k, v in here.coords.items() if not v.ndim and v.dtype.kind == "f"}
     base = parameters_of(attractors) if parameters is None else parameters

@@ -9,7 +9,8 @@ import xarray as xr
 from scipy.optimize import linear_sum_assignment
 
 from pipeline.analysis.attractors.matching.connections import Connections
-from pipeline.analysis.attractors.matching.matching import Rule, Seen, geometry_of, neutral_sides, seen_at
+from pipeline.analysis.attractors.matching.matching import Rule, Seen, geometry_of, neutral_sides, seen_in
+from pipeline.analysis.ragged import N_IDS, rows_at
 
 Appearances = Mapping[tuple[int, ...], Seen]
 """Appearances of one attractor by the index of the parameter point."""
@@ -41,7 +42,7 @@ def match_across(runs: Sequence[xr.Dataset], *, threshold: float = 0.3) -> list[
     for run in runs:
         own = _attracting(run)
         rule = Rule(threshold, geometry_of(run), neutral_sides(run), Connections.none(0))
-        ids = np.full(run.sizes["attractor"], -1, np.int64)
+        ids = np.full(int(run.attrs[N_IDS]), -1, np.int64)
         cost = np.array([[_distance(rule, old, new) for old in known] for new in own.values()])
         cost = cost.reshape(len(own), len(known))
         rows = list(own)
@@ -58,14 +59,14 @@ def match_across(runs: Sequence[xr.Dataset], *, threshold: float = 0.3) -> list[
 
 def _attracting(run: xr.Dataset) -> dict[int, Appearances]:
     """Return the appearances of each set of a run that attracts cells, by its index."""
-    dims = [str(d) for d in run["kind"].dims if d != "attractor"]
-    kinds = run["kind"].transpose(*dims, "attractor").values
-    shares = run["share"].transpose(*dims, "attractor").values
+    share, number = run["share"].values, run["attractor"].values
+    seen = seen_in(run)
     found: dict[int, dict[tuple[int, ...], Seen]] = {}
-    for *index, row in np.argwhere((kinds > 0) & (shares > 0.0)).tolist():
-        place = tuple(index)
-        found.setdefault(row, {})[place] = seen_at(run, 0, (place, row))
-    return {row: found[row] for row in sorted(found)}
+    for place, rows in rows_at(run).items():
+        for row in rows:
+            if share[row] > 0.0:
+                found.setdefault(int(number[row]), {})[place] = seen[row]
+    return {number: found[number] for number in sorted(found)}
 
 
 def _distance(rule: Rule, first: Appearances, second: Appearances) -> float:

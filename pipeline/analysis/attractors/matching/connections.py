@@ -11,10 +11,8 @@ import xarray as xr
 from magpend_core.engine.system import System
 from pipeline.analysis.branches.connecting import OPEN, Found, Link, connect, grouped
 from pipeline.analysis.branches.problems import FREQUENCY, Family
+from pipeline.analysis.ragged import dims_of
 from pipeline.layout.vocabulary import PERIODIC_ORBIT
-
-Place = tuple[tuple[int, ...], int]
-"""A parameter point's index, and the row of an attractor there."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,21 +60,18 @@ class Connections:
         return self.outcomes.get((axis, way, number)) == OPEN
 
 
-def followable(attractors: xr.Dataset, at: Place) -> bool:
-    """Return whether an attractor is a closed orbit on which Newton's method converged, so that its branch can be
-    followed.
-    """
-    index, row = at
-    if "is_polished" not in attractors:
-        return False
-    one = (*index, row)
-    return bool(attractors["kind"].values[one] == PERIODIC_ORBIT and attractors["is_polished"].values[one])
+def followable(attractors: xr.Dataset) -> np.ndarray:
+    """Return which rows are orbits on which Newton's method converged, whose branches can be followed."""
+    closed = attractors["kind"].values == PERIODIC_ORBIT
+    return np.asarray(
+        closed & (attractors["is_polished"].values > 0) if "is_polished" in attractors else closed & False
+    )
 
 
 def connections(
     attractors: xr.Dataset,
-    places: Sequence[Place],
-    dims: Sequence[str],
+    where: Sequence[tuple[int, ...]],
+    points: Sequence[np.ndarray],
     packed: np.ndarray,
     frequency: float,
     system: System,
@@ -87,10 +82,8 @@ def connections(
     ----------
     attractors
         From `identify`.
-    places
-        The appearances.
-    dims
-        Parameter dims.
+    where, points
+        Parameter point and section points of each row.
     packed
         Packed parameters; the axes replace the values of the same name.
     frequency
@@ -98,8 +91,9 @@ def connections(
     system
         System of the run.
     """
-    orbits = {n: _orbit(attractors, place) for n, place in enumerate(places) if followable(attractors, place)}
-    followed = np.zeros(len(places), bool)
+    dims, periods = dims_of(attractors), attractors["orbit_period"].values
+    orbits = {n: points[n][: periods[n]] for n in np.flatnonzero(followable(attractors)).tolist()}
+    followed = np.zeros(len(where), bool)
     lines: list[list[Found]] = []
     axes: list[int] = []
     for axis, dim in enumerate(dims):
@@ -107,12 +101,12 @@ def connections(
         if dim not in (FREQUENCY, *system.parameter_names) or len(values) < 2 or not (np.diff(values) > 0).all():
             continue
         own: dict[tuple[int, ...], list[Found]] = {}
-        for n, points in orbits.items():
-            index = places[n][0]
+        for n, orbit in orbits.items():
+            index = where[n]
             at = {d: float(attractors[d].values[i]) for d, i in zip(dims, index, strict=True)}
-            family = _family(system, len(points), packed, frequency, at, dim, float(np.ptp(values)))
+            family = _family(system, len(orbit), packed, frequency, at, dim, float(np.ptp(values)))
             rest = (*index[:axis], *index[axis + 1 :])
-            own.setdefault(rest, []).append(Found(n, index[axis], family, points, at[dim]))
+            own.setdefault(rest, []).append(Found(n, index[axis], family, orbit, at[dim]))
             followed[n] = True
         lines += own.values()
         axes += [axis] * len(own)
@@ -122,16 +116,9 @@ def connections(
         links += found.links
         for way, ends in ((1, found.up), (-1, found.down)):
             outcomes.update({(axis, way, n): outcome for n, outcome in ends.items()})
-    where = [index for index, _ in places]
     group, used = grouped(where, links)
     branch, _ = grouped(where, [link for link in used if not link.n_doublings])
     return Connections(group, branch, followed, outcomes)
-
-
-def _orbit(attractors: xr.Dataset, place: Place) -> np.ndarray:
-    index, row = place
-    period = int(attractors["orbit_period"].values[(*index, row)])
-    return np.asarray(attractors["attractor_points"].values[(*index, row)][:period])
 
 
 def _family(

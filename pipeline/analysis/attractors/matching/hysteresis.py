@@ -12,6 +12,7 @@ import numpy as np
 import xarray as xr
 
 from pipeline.analysis.outcomes import outcomes
+from pipeline.analysis.ragged import dense
 
 
 def hysteresis(ds: xr.Dataset, ids: xr.Dataset) -> xr.Dataset:
@@ -50,6 +51,7 @@ def hysteresis(ds: xr.Dataset, ids: xr.Dataset) -> xr.Dataset:
         If the cube has no branches in both directions.
     """
     check_directions(ds)
+    ids = dense(ids)
     # ignore sets that do not attract and cells that diverge
     cells = outcomes(ids).clip(min=-1)
     dims = [str(d) for d in cells.dims if d != "branch"]

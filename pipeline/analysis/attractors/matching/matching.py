@@ -30,12 +30,11 @@ from scipy.optimize import linear_sum_assignment
 
 from magpend_core.engine.system import System
 from magpend_core.models.model import Parameters
-from pipeline.analysis.attractors.matching.connections import Connections, Place, connections, followable
+from pipeline.analysis.attractors.matching.connections import Connections, connections, followable
+from pipeline.analysis.ragged import N_IDS, SET, dims_of, points_of_rows, rows_at, take
 from pipeline.analysis.sets import Geometry, mean_distance, order_by_points
 from pipeline.layout.vocabulary import frequency_of, model_of, parameters_of
 from pipeline.products.reporting import track
-
-_PER_ATTRACTOR = "attractor"
 
 BASES = ("absent", "first_appearance", "branch", "doubling", "distance")
 """Meanings of `match_basis`."""
@@ -127,7 +126,7 @@ def match(
     Returns
     -------
     Dataset
-        `attractors` with the dim `attractor` over the ids, and the variable `match_basis`.
+        `attractors` with ids, the rows of each point in their order, and the variable `match_basis`.
 
     Raises
     ------
@@ -138,44 +137,39 @@ def match(
         raise ValueError(f"threshold = {threshold!r} is out of bounds: it must be greater than 0.")
     if look_back < 1:
         raise ValueError(f"look_back = {look_back!r} is out of bounds: it must be 1 or more.")
-    dims = tuple(str(d) for d in attractors["kind"].dims if d != _PER_ATTRACTOR)
-    shape = tuple(attractors.sizes[d] for d in dims)
-    kinds = attractors["kind"].transpose(*dims, _PER_ATTRACTOR).values
-    places = [(index, int(row)) for index in np.ndindex(*shape) for row in np.flatnonzero(kinds[index] > 0)]
-    links = Connections.none(len(places))
+    appearances, rows = seen_in(attractors), rows_at(attractors)
+    where = [index for index, own in rows.items() for _ in own]
+    links = Connections.none(len(where))
     if connect:
-        links = _connections(attractors, places, dims, parameters, system)
+        links = _connections(attractors, where, appearances, parameters, system)
     rule = Rule(threshold, geometry_of(attractors, system), neutral_sides(attractors), links)
-    ids = _Ids(shape, attractors.sizes[_PER_ATTRACTOR], places, rule)
+    ids = _Ids(where, rule)
     seen: dict[tuple[int, ...], dict[int, Seen]] = {}
-    numbers: dict[tuple[int, ...], list[int]] = {}
-    for n, (index, _) in enumerate(places):
-        numbers.setdefault(index, []).append(n)
-    for index in track(list(np.ndindex(*shape)), "matching attractors"):
-        here = [seen_at(attractors, n, places[n]) for n in numbers.get(index, [])]
-        seen[index] = ids.at(here, _known(seen, index, look_back))
+    for index in track(list(rows), "matching attractors"):
+        seen[index] = ids.at([appearances[row] for row in rows[index]], _known(seen, index, look_back))
     attrs = {
         **attractors.attrs,
         "matched": 1,
+        N_IDS: len(ids.taken),
         "match_threshold": threshold,
         "match_look_back": look_back,
         "match_connect": int(connect),
     }
     flags = {"flag_values": np.arange(len(BASES), dtype=np.int8), "flag_meanings": " ".join(BASES)}
     about = {"units": "1", "long_name": "what the id rests on", **flags}
-    rows = attractors.assign(match_basis=((*dims, _PER_ATTRACTOR), ids.basis, about))
-    return _renumbered(rows, ids.ids, len(ids.taken), dims).assign_attrs(attrs)
+    return _renumbered(attractors.assign(match_basis=(SET, ids.basis, about)), ids.ids).assign_attrs(attrs)
 
 
 def _connections(
     attractors: xr.Dataset,
-    places: Sequence[Place],
-    dims: Sequence[str],
+    where: Sequence[tuple[int, ...]],
+    appearances: Sequence[Seen],
     parameters: Parameters | np.ndarray | None,
     system: System | None,
 ) -> Connections:
-    if not dims or sum(followable(attractors, place) for place in places) < 2:
-        return Connections.none(len(places))
+    dims = dims_of(attractors)
+    if not dims or sum(followable(attractors)) < 2:
+        return Connections.none(len(where))
     base = parameters_of(attractors) if parameters is None else parameters
     if isinstance(base, Parameters):
         system, packed = system or base.model.system, base.pack()
@@ -184,7 +178,7 @@ def _connections(
     assert system is not None
     model = base.model if isinstance(base, Parameters) else None
     fixed = frequency_of(model, {str(k): v for k, v in attractors.coords.items() if not v.ndim})
-    return connections(attractors, places, dims, packed, fixed, system)
+    return connections(attractors, where, [one.points for one in appearances], packed, fixed, system)
 
 
 def geometry_of(attractors: xr.Dataset, system: System | None = None) -> Geometry:
@@ -202,19 +196,19 @@ def neutral_sides(attractors: xr.Dataset) -> frozenset[int]:
 class _Ids:
     """Ids given to attractors so far; the parameter points are visited one by one.
 
-    `ids` and `basis` (one axis per parameter, then row) have each appearance's id and the basis for it, -1 and 0 where
-    there is none. `taken` has the parameter points at which each id is, or will be, used.
+    `ids` and `basis` (row) have each appearance's id and the basis for it. `taken` has the parameter points at which
+    each id is, or will be, used.
     """
 
-    def __init__(self, shape: tuple[int, ...], n_rows: int, places: Sequence[Place], rule: Rule) -> None:
-        self.ids = np.full((*shape, n_rows), -1, np.int64)
-        self.basis = np.zeros(self.ids.shape, np.int8)
+    def __init__(self, where: Sequence[tuple[int, ...]], rule: Rule) -> None:
+        self.ids = np.full(len(where), -1, np.int64)
+        self.basis = np.zeros(len(where), np.int8)
         self.taken: list[set[tuple[int, ...]]] = []
-        self._places, self._rule = places, rule
+        self._rule = rule
         self._group = [int(g) for g in rule.known.group]
         self._branch = [int(b) for b in rule.known.branch]
         self._where: dict[int, set[tuple[int, ...]]] = {}
-        for group, (index, _) in zip(self._group, places, strict=True):
+        for group, index in zip(self._group, where, strict=True):
             self._where.setdefault(group, set()).add(index)
         self._by_group: dict[int, int] = {}
         self._met: set[int] = set()
@@ -247,21 +241,20 @@ class _Ids:
         self.taken[identity] |= self._where[group]
 
     def _settle(self, one: Seen, basis: int) -> None:
-        index, row = self._places[one.number]
-        self.ids[(*index, row)] = self._by_group[self._group[one.number]]
-        self.basis[(*index, row)] = basis
+        self.ids[one.number] = self._by_group[self._group[one.number]]
+        self.basis[one.number] = basis
 
 
-def seen_at(attractors: xr.Dataset, number: int, place: Place) -> Seen:
-    """Return the attractor of one row at one parameter point."""
-    index, row = place
-    at = (*index, row)
-    points = attractors["attractor_points"].values[at]
-    points = points[np.isfinite(points).all(axis=-1)]
-    side = int(attractors["side"].values[at]) if "side" in attractors else 0
-    rotation = attractors["rotation"].values[at] if "rotation" in attractors else np.zeros(0)
-    kind, period = (int(attractors[name].values[at]) for name in ("kind", "orbit_period"))
-    return Seen(number, kind, period, side, points, rotation)
+def seen_in(attractors: xr.Dataset) -> list[Seen]:
+    """Return the sets of all rows."""
+    n = attractors.sizes[SET]
+    side = attractors["side"].values if "side" in attractors else np.zeros(n, np.int64)
+    rotation = attractors["rotation"].values if "rotation" in attractors else np.zeros((n, 0))
+    kind, period = attractors["kind"].values, attractors["orbit_period"].values
+    return [
+        Seen(i, int(kind[i]), int(period[i]), int(side[i]), points, rotation[i])
+        for i, points in enumerate(points_of_rows(attractors))
+    ]
 
 
 def _known(
@@ -302,63 +295,26 @@ def _assign(
     return given
 
 
-def _renumbered(attractors: xr.Dataset, ids: np.ndarray, n_ids: int, dims: tuple[str, ...]) -> xr.Dataset:
-    """Reorder the dataset's attractors by id, and replace the indices of attractors in its cells by ids."""
-    present = np.nonzero(ids >= 0)
-    target = (*present[:-1], ids[present])
-    variables: dict[str, Any] = {}
-    for name, variable in attractors.data_vars.items():
-        if _PER_ATTRACTOR not in variable.dims:
-            continue
-        ordered = variable.transpose(*dims, _PER_ATTRACTOR, ...)
-        values = ordered.values
-        moved = np.full(
-            (*values.shape[: len(dims)], n_ids, *values.shape[len(dims) + 1 :]), _fill(str(name), values.dtype)
-        )
-        moved = moved.astype(values.dtype)
-        if name == "n_to":
-            values = _destinations(values, ids, n_ids)
-            moved = np.zeros((*moved.shape[:-1], n_ids), values.dtype)
-        moved[target] = _partners(values, ids)[present] if name == "mirror_partner" else values[present]
-        variables[str(name)] = (ordered.dims, moved, variable.attrs)
-    cells = attractors["attractor_id"]
-    coord = (_PER_ATTRACTOR, np.arange(n_ids, dtype=np.int32), {"units": "1", "long_name": "attractor"})
-    rest = attractors.drop_vars([*variables, _PER_ATTRACTOR], errors="ignore")
-    result = rest.assign(variables).assign_coords(attractor=coord)
-    result["attractor_id"] = cells.copy(data=_cell_ids(cells, ids, dims))
-    return result
-
-
-def _fill(name: str, dtype: np.dtype[Any]) -> float:
-    if name == "mirror_partner":
-        return -1
-    return 0 if dtype.kind in "iu" or name == "share" else np.nan
-
-
-def _lookup(ids: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    table = np.append(ids, -1)
-    return np.asarray(table[rows])
-
-
-def _destinations(values: np.ndarray, ids: np.ndarray, n_ids: int) -> np.ndarray:
-    """Replace indices by ids in the counts that say on which set the cells of a transient set ended."""
-    moved = np.zeros((*values.shape[:-1], n_ids), values.dtype)
-    for *index, row in np.argwhere(ids >= 0).tolist():
-        point = tuple(index)
-        moved[point][:, ids[point][row]] = values[point][:, row]
-    return moved
-
-
-def _partners(values: np.ndarray, ids: np.ndarray) -> np.ndarray:
-    moved = np.empty_like(values)
-    for index in np.ndindex(*values.shape[:-1]):
-        moved[index] = _lookup(ids[index], values[index])
-    return moved
-
-
-def _cell_ids(cells: xr.DataArray, ids: np.ndarray, dims: tuple[str, ...]) -> np.ndarray:
-    values = cells.transpose(*dims, ...).values
-    moved = np.empty_like(values)
-    for index in np.ndindex(*ids.shape[:-1]):
-        moved[index] = _lookup(ids[index], values[index])
-    return np.asarray(cells.transpose(*dims, ...).copy(data=moved).transpose(*cells.dims).values)
+def _renumbered(attractors: xr.Dataset, ids: np.ndarray) -> xr.Dataset:
+    """Order the rows of each parameter point by their ids, and replace numbers of sets by ids everywhere."""
+    dims = dims_of(attractors)
+    cells = attractors["attractor_id"].transpose(*dims, ...)
+    rows = rows_at(attractors)
+    changed, order, ends = cells.values.copy(), [], attractors["to"].values.copy()
+    partners = attractors["mirror_partner"].values.copy() if "mirror_partner" in attractors else np.zeros(0, np.int64)
+    left_at, old = attractors["from_set"].values, attractors["attractor"].values
+    for index, own in rows.items():
+        table = np.full(old.max(initial=-1) + 2, -1)  # by old id; the last entry is of cells without one
+        table[old[own.start : own.stop]] = ids[own.start : own.stop]
+        changed[index] = table[changed[index]]
+        if partners.size:
+            partners[own.start : own.stop] = table[partners[own.start : own.stop]]
+        here = slice(*np.searchsorted(left_at, [own.start, own.stop]))
+        ends[here] = table[ends[here]]
+        order += [own.start + int(i) for i in np.argsort(ids[own.start : own.stop])]
+    found = attractors.assign_coords(attractor=(SET, ids.astype(np.int32), attractors["attractor"].attrs))
+    found["attractor_id"] = cells.copy(data=changed).transpose(*attractors["attractor_id"].dims)
+    found["to"] = attractors["to"].copy(data=ends)
+    if partners.size:
+        found["mirror_partner"] = attractors["mirror_partner"].copy(data=partners)
+    return take(found, np.array(order, np.int64))

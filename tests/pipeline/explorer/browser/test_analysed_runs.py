@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pipeline.analysis.ragged import dense
 from pipeline.explorer.data.disturbances import disturbances
 from pipeline.explorer.data.parameter_plane import parameter_plane
 from pipeline.runs.derive import stored
@@ -35,7 +36,7 @@ def pressed(page: Any, name: str) -> None:
 
 
 def test_push__is_dragged_and_tried_and_shaken(visit: Callable[..., Any], address: str, wells: Path) -> None:
-    found = stored(Run.open(wells), "attractors")
+    found = dense(stored(Run.open(wells), "attractors"), points=True)
     assert found is not None
     ids = found["attractor_id"].transpose("amplitude", "x_0", "v_0").values.ravel()
     opened = drawn(visit(address, **QUIET))

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from pipeline.analysis.ragged import dense
 from pipeline.layout.attractor_letters import letter
 from pipeline.runs.derive import stored
 from pipeline.store.run import Run, open_run
@@ -31,7 +32,7 @@ def cube(looked_at: Path) -> xr.Dataset:
 @pytest.fixture(scope="module")
 def owners(looked_at: Path, cube: xr.Dataset) -> np.ndarray:
     """Attractor of each cell, in C order."""
-    found = stored(Run.open(looked_at), "attractors")
+    found = dense(stored(Run.open(looked_at), "attractors"), points=True)
     assert found is not None
     return found["attractor_id"].transpose(*cube["status"].dims).values.ravel()
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from pipeline.analysis.ragged import dense
 from pipeline.products.measured import SweepOptions
 from pipeline.rig.measured.compare import compare, compare_with
 from pipeline.rig.measured.computed import Computed
@@ -76,7 +77,7 @@ def test_measure__periods_are_those_of_the_motion_without_noise(measured, swept,
 @pytest.mark.slow
 def test_compare__the_winner_is_the_attractor_that_the_rig_was_on(compared, run_directory):
     winners = compared["winner"].values
-    sides = AnalysedRun.of(run_directory).derive("attractors")["side"]
+    sides = dense(AnalysedRun.of(run_directory).derive("attractors"), points=True)["side"]
     for step, winner in enumerate(winners):
         of_winner = sides.sel(attractor=winner).values
         assert set(of_winner[of_winner > 0]) == {RIGHT if step < 5 else LEFT}

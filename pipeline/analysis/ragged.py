@@ -1,0 +1,161 @@
+"""Rows of sets: one for each set on which cells end at each parameter point, in the order of the points.
+
+A result keeps them as contiguous ragged arrays (CF conventions, section 9.3.3): ``n_sets`` (parameter dims) is the
+number of rows of each point along the dim ``set``, and ``n_points`` (set) is the number of section points of each row
+along the dim ``sample``. The coordinate ``attractor`` (set) holds ids. So memory grows with the number of rows alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+SET, SAMPLE, TRANSITION = "set", "sample", "transition"
+"""Dims of the rows, of their section points, and of the counts of cells that left one set for another."""
+
+ROW_SIZE, N_POINTS, N_IDS = "n_sets", "n_points", "n_ids"
+"""Numbers of rows of each parameter point, of section points of each row, and (an attribute) of ids."""
+
+
+def is_ragged(ds: xr.Dataset) -> bool:
+    """Return whether a dataset has rows of sets."""
+    return ROW_SIZE in ds
+
+
+def dims_of(ds: xr.Dataset) -> tuple[str, ...]:
+    """Return the parameter dims of a result with rows."""
+    return tuple(str(d) for d in ds[ROW_SIZE].dims)
+
+
+def point_of_rows(ds: xr.Dataset) -> np.ndarray:
+    """Return for each row the number of its parameter point, in C order of the parameter dims."""
+    sizes = ds[ROW_SIZE].values.ravel()
+    return np.repeat(np.arange(sizes.size), sizes)
+
+
+def index_of_rows(ds: xr.Dataset) -> tuple[np.ndarray, ...]:
+    """Return for each row its index along each parameter dim."""
+    return tuple(np.unravel_index(point_of_rows(ds), ds[ROW_SIZE].shape)) if ds[ROW_SIZE].ndim else ()
+
+
+def rows_at(ds: xr.Dataset) -> dict[tuple[int, ...], range]:
+    """Return the rows of each parameter point."""
+    ends = np.cumsum(ds[ROW_SIZE].values.ravel())
+    begins = np.concatenate([[0], ends[:-1]])
+    places = np.ndindex(*ds[ROW_SIZE].shape)
+    return {at: range(int(a), int(b)) for at, a, b in zip(places, begins, ends, strict=True)}
+
+
+def points_of_rows(ds: xr.Dataset) -> list[np.ndarray]:
+    """Return the section points of each row, (point, state)."""
+    points = ds["attractor_points"].transpose(SAMPLE, "state").values
+    return np.split(points, np.cumsum(ds[N_POINTS].values)[:-1]) if ds.sizes[SET] else []
+
+
+def isel(ds: xr.Dataset, at: Mapping[Any, Any]) -> xr.Dataset:
+    """Select along dims by position, as `xarray.Dataset.isel`, together with the rows of the points that are left.
+
+    Parameters
+    ----------
+    ds
+        Dataset, with rows or without. Slices and arrays of positions must rise.
+    at
+        Position, slice or array of positions by dim; the dim of the rows is not among them.
+    """
+    here = {k: v for k, v in at.items() if k in ds[ROW_SIZE].dims} if is_ragged(ds) else {}
+    if not here:
+        return ds.isel(at)
+    numbers = xr.DataArray(np.arange(ds[ROW_SIZE].size).reshape(ds[ROW_SIZE].shape), dims=ds[ROW_SIZE].dims)
+    left = np.zeros(numbers.size, bool)
+    left[numbers.isel(here).values.ravel()] = True
+    return take(ds.isel(at), np.flatnonzero(left[point_of_rows(ds)]))
+
+
+def take(ds: xr.Dataset, rows: np.ndarray) -> xr.Dataset:
+    """Return a dataset with some of its rows, in their order."""
+    chosen = {SET: rows}
+    sizes = ds[N_POINTS].values if N_POINTS in ds and SAMPLE in ds.dims else None
+    if sizes is not None:
+        begins = np.cumsum(sizes) - sizes
+        parts = [np.arange(begins[i], begins[i] + sizes[i]) for i in rows.tolist()]
+        chosen[SAMPLE] = np.concatenate(parts) if parts else np.zeros(0, np.int64)
+    if TRANSITION in ds.dims:
+        new = np.full(ds.sizes[SET], -1, np.int64)
+        new[rows] = np.arange(len(rows))
+        origin = new[ds["from_set"].values]
+        chosen[TRANSITION] = np.flatnonzero(origin >= 0)
+        ds = ds.assign(from_set=ds["from_set"].copy(data=origin))
+    return ds.isel(chosen)
+
+
+def dense(ds: xr.Dataset, *, points: bool = False) -> xr.Dataset:
+    """Return a result with its rows on the parameter dims and the dim ``attractor``, over all ids of the run.
+
+    It is as large as the parameter points times the ids: for figures, and for single parameter points.
+
+    Parameters
+    ----------
+    ds
+        Result; one without rows is returned as it is.
+    points
+        Whether to keep the section points, on the dim ``point``.
+
+    Returns
+    -------
+    Dataset
+        Where a point lacks a set, numbers are NaN, counts, codes and shares 0, and ``mirror_partner`` -1.
+    """
+    if not is_ragged(ds):
+        return ds
+    dims, ids, at = dims_of(ds), int(ds.attrs[N_IDS]), (*index_of_rows(ds), ds["attractor"].values)
+    found: dict[str, Any] = {}
+    for name, variable in ds.data_vars.items():
+        if SET in variable.dims and name != N_POINTS:
+            own = variable.transpose(SET, ...)
+            found[str(name)] = (own.dims[1:], own.values, variable.attrs)
+    if points:
+        found["attractor_points"] = (("point", "state"), _padded(ds), ds["attractor_points"].attrs)
+    result = ds.drop_dims([SET, SAMPLE, TRANSITION], errors="ignore").drop_vars(ROW_SIZE)
+    for name, (own_dims, values, attrs) in found.items():
+        table = np.full((*ds[ROW_SIZE].shape, ids, *values.shape[1:]), _fill(name, values.dtype), values.dtype)
+        table[at] = values
+        result[name] = ((*dims, "attractor", *own_dims), table, attrs)
+    return result.assign_coords(attractor=("attractor", np.arange(ids, dtype=np.int32), ds["attractor"].attrs))
+
+
+def _fill(name: str, dtype: np.dtype[Any]) -> float:
+    if name == "mirror_partner":
+        return -1
+    return 0 if dtype.kind in "iu" or name == "share" else np.nan
+
+
+def _padded(ds: xr.Dataset) -> np.ndarray:
+    rows = points_of_rows(ds)
+    table = np.full((len(rows), max(map(len, rows), default=0), ds.sizes["state"]), np.nan)
+    for one, points in zip(table, rows, strict=True):
+        one[: len(points)] = points
+    return table
+
+
+def sets(ds: xr.Dataset) -> xr.Dataset:
+    """Return the rows of a result as a dataset of their own: dim ``set``, with ``attractor_id`` and the values of the
+    swept parameters as coordinates along it.
+
+    Examples
+    --------
+    ``sets(found)["share"].groupby("attractor_id").sum()``; ``sets(found).drop_dims("sample").to_dataframe()``
+    """
+    index = index_of_rows(ds)
+    own = [str(k) for k, v in ds.variables.items() if v.dims and set(v.dims).isdisjoint(_cell_dims(ds))]
+    rows = ds[own].drop_vars("attractor")
+    axes = {d: (SET, ds[d].values[i], ds[d].attrs) for d, i in zip(dims_of(ds), index, strict=True) if d in ds.coords}
+    scalars = {k: v for k, v in ds.coords.items() if not v.ndim}
+    number = (SET, ds["attractor"].values, ds["attractor"].attrs)
+    return rows.assign_coords({**scalars, **axes, "attractor_id": number}).assign_attrs(ds.attrs)
+
+
+def _cell_dims(ds: xr.Dataset) -> set[Any]:
+    return {*ds[ROW_SIZE].dims, *(ds["attractor_id"].dims if "attractor_id" in ds else ())}
