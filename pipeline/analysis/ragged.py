@@ -94,7 +94,8 @@ def take(ds: xr.Dataset, rows: np.ndarray) -> xr.Dataset:
 def dense(ds: xr.Dataset, *, points: bool = False) -> xr.Dataset:
     """Return a result with its rows on the parameter dims and the dim ``attractor``, over all ids of the run.
 
-    It is as large as the parameter points times the ids: for figures, and for single parameter points.
+    It is as large as the number of parameter points times the number of ids. Figures use it, and analyses of single
+    parameter points.
 
     Parameters
     ----------
@@ -116,7 +117,7 @@ def dense(ds: xr.Dataset, *, points: bool = False) -> xr.Dataset:
         if SET in variable.dims and name != N_POINTS:
             own = variable.transpose(SET, ...)
             found[str(name)] = (own.dims[1:], own.values, variable.attrs)
-    if points:
+    if points and "attractor_points" in ds:
         found["attractor_points"] = (("point", "state"), _padded(ds), ds["attractor_points"].attrs)
     result = ds.drop_dims([SET, SAMPLE, TRANSITION], errors="ignore").drop_vars(ROW_SIZE)
     for name, (own_dims, values, attrs) in found.items():

@@ -210,7 +210,6 @@ def parameters_of(ds: xr.Dataset) -> Parameters:
     ValueError
         If the attribute is missing, or its names are not the model's parameters.
     """
-    values = _values(ds, "parameters")
-    if not values:
+    if "parameters" not in ds.attrs:
         raise ValueError("The dataset has no attribute 'parameters'; it tells what was integrated.")
-    return Parameters(model_of(ds), values)
+    return Parameters(model_of(ds), _values(ds, "parameters"))

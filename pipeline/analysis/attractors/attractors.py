@@ -46,7 +46,7 @@ variable                 dims                                  dtype, fill  mean
 ``energy_max``
 ``mirror_partner``       set                                   int32, -1    set that is its image
 ``mirror_distance``      set                                   float64, NaN nearest set to the image
-``multiplier_real``,     set, multiplier                        float64, NaN Floquet multipliers over the
+``multiplier_real``,     set, multiplier                       float64, NaN Floquet multipliers over the
 ``multiplier_imag``                                                         orbit's period, by falling modulus
 ``multiplier_error``     set                                   float64, NaN error of the largest modulus
 ``residual``             set                                   float64, NaN certificate of Newton's method
@@ -55,7 +55,7 @@ variable                 dims                                  dtype, fill  mean
 ``lyapunov_low``,                                                           interval of 3 standard errors
 ``lyapunov_high``
 ``period_s``             set                                   float64, NaN period of a polished orbit [s]
-``eigenvalue_real``,     set, multiplier                        float64, NaN of an equilibrium [1/s], by
+``eigenvalue_real``,     set, multiplier                       float64, NaN of an equilibrium [1/s], by
 ``eigenvalue_imag``                                                         falling real part
 ``n_sampled``            set                                   int64, 0     its cells that were extended, and
                                                                             neighbours of them

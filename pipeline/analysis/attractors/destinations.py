@@ -301,7 +301,7 @@ class Destinations:
 
 
 class _Flights:
-    """Trajectories under way: their last states, and the sections of those that go on."""
+    """Trajectories that are being integrated, with their last states and sections."""
 
     def __init__(self, states: np.ndarray, period: float, whole: bool) -> None:
         self.start, self.period, self.whole = np.array(states, np.float64), period, whole

@@ -67,7 +67,7 @@ def attractors_table(ds: xr.Dataset) -> Table:
 
 
 def _largest(rows: Sequence[Row]) -> tuple[list[Row], list[str]]:
-    """Return the rows of the `MOST_ROWS` ids with the largest shares of a parameter point, and a line on the others."""
+    """Return the rows of the `MOST_ROWS` ids with the largest shares or the most cells, and a line on the others."""
     sizes: dict[int, tuple[float, int]] = {}
     for row in rows:
         share = row.get("fraction", np.nan)
@@ -81,7 +81,7 @@ def _largest(rows: Sequence[Row]) -> tuple[list[Row], list[str]]:
     period = {i: f" of period {row['orbit_period']}" if row["orbit_period"] else "" for i, row in kinds.items()}
     counts = Counter(f"{_kind(row)}{period[i]}" for i, row in kinds.items())
     told = ", ".join(f"{n} {name}" for name, n in counts.most_common())
-    return shown, [f"  {len(kinds)} more with smaller shares: {told}; all rows are in --csv and --json"]
+    return shown, [f"  and {len(kinds)} smaller ones: {told}; all are in --csv and --json"]
 
 
 def _rows(ds: xr.Dataset) -> list[Row]:

@@ -230,7 +230,7 @@ class Problem:
 
     @cached_property
     def phases(self) -> dict[int, int]:
-        """By recording whose drive has an unknown phase, the index of that unknown."""
+        """Index of the unknown phase of a drive, for each recording that has one."""
         return {int(f.name.split(".")[1]): i for i, f in enumerate(self.free) if f.name.startswith(f"{PHASE}.")}
 
     @cached_property

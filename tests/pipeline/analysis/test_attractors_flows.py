@@ -112,3 +112,32 @@ def test_attractors_table__names_the_angle_by_which_cells_ran_away(computed):
     """
     lines = attractors_table(derive(computed(spec), "attractors")).lines
     assert sum("th = { on_circle = true }" in line for line in lines) == 1
+
+
+@pytest.mark.slow
+def test_attractors_table__prints_the_largest_and_counts_the_others(computed):
+    """x' = sin x rests at odd multiples of pi; 35 of them have one start each, the last has ten."""
+    rests = [(2 * k + 1) * np.pi for k in range(35)]
+    starts = [*(x + 0.5 for x in rests), *(rests[-1] - 0.1 * k for k in range(1, 10))]
+    spec = f"""
+    kind = "sweep"
+    [model]
+    name = "staircase"
+    states = {{ x = {{ escape = 1e3 }} }}
+    equations = {{ x = "sin(x)" }}
+    [parameters]
+    frequency_hz = 1.0
+    [initial_conditions]
+    kind = "list"
+    points = {[[x] for x in starts]}
+    [integration]
+    n_transient = 60
+    n_keep = 16
+    """
+    table = attractors_table(derive(computed(spec), "attractors"))
+    assert sorted(row["section_x"] for row in table.rows) == pytest.approx(rests, abs=1e-8)
+    printed = [line for line in table.lines if "equilibrium  attracts" in line]
+    assert len(printed) == 30
+    assert sum("0.2273" in line for line in printed) == 1  # ten of 44 cells, though its id is the last
+    (others,) = [line for line in table.lines if "smaller ones" in line]
+    assert others.strip() == "and 5 smaller ones: 5 equilibrium; all are in --csv and --json"

@@ -95,3 +95,8 @@ def test_sets__are_rows_for_xarray_and_pandas(found):
     assert found.magpend.sets().identical(rows)
     with pytest.raises(ValueError, match=r"needs a result of magpend\.attractors"):
         dense(found).magpend.sets()
+
+
+def test_dense__of_a_result_without_section_points(found):
+    """The analysis of what settles keeps some variables only."""
+    assert "attractor_points" not in dense(found.drop_vars(["attractor_points", "n_points"]), points=True)

@@ -17,7 +17,7 @@ from pipeline.layout.vocabulary import PERIODIC_ORBIT
 
 @dataclass(frozen=True, eq=False)
 class Connections:
-    """Record of which attractors at different parameter points lie on one branch, found by following their orbits.
+    """Which attractors of different parameter points lie on one branch, found by following their orbits.
 
     Attributes
     ----------
