@@ -75,7 +75,7 @@ def defaults_of(method, aside: set[str]) -> dict[str, object]:
 @pytest.mark.parametrize("name", COMMANDS)
 def test_run__has_each_analysis_with_the_defaults_of_its_options(name):
     method = getattr(magpend.Run, name)
-    assert defaults_of(method, {"echo"}) == declared(ANALYSES[name].options)
+    assert defaults_of(method, {"echo", "workers", "scheduler"}) == declared(ANALYSES[name].options)
     lines = {line.strip() for line in (inspect.getdoc(method) or "").splitlines()}
     assert set(ANALYSES[name].options.model_fields) <= lines
     names, own = (list(inspect.signature(one).parameters)[1:] for one in (getattr(magpend, name), method))

@@ -7,7 +7,7 @@ along the dim ``sample``. The coordinate ``attractor`` (set) holds ids. So memor
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -89,6 +89,43 @@ def take(ds: xr.Dataset, rows: np.ndarray) -> xr.Dataset:
         chosen[TRANSITION] = np.flatnonzero(origin >= 0)
         ds = ds.assign(from_set=ds["from_set"].copy(data=origin))
     return ds.isel(chosen)
+
+
+def joined(parts: Sequence[xr.Dataset], blocks: Sequence[Mapping[str, slice]], sizes: Mapping[str, int]) -> xr.Dataset:
+    """Join the results of blocks of parameter points to the result of all points.
+
+    Parameters
+    ----------
+    parts
+        Result of each block. What is neither on the parameter dims nor on rows is taken from the first.
+    blocks
+        Slice of each parameter dim, by block, in the C order of the points.
+    sizes
+        Size of each parameter dim.
+    """
+    first = parts[0]
+    n_rows = np.cumsum([0, *(part.sizes.get(SET, 0) for part in parts)])
+    variables: dict[str, Any] = {}
+    for name, variable in first.variables.items():
+        own = [part.variables[name] for part in parts]
+        dims = set(map(str, variable.dims))
+        if name == "from_set":
+            own = [one.copy(data=one.values + n) for one, n in zip(own, n_rows[:-1], strict=True)]
+        if dims & {SET, SAMPLE, TRANSITION}:
+            values = np.concatenate([one.values for one in own])
+            variables[str(name)] = xr.Variable(variable.dims, values, variable.attrs)
+        elif dims & sizes.keys():
+            whole = np.empty([sizes.get(str(d), n) for d, n in variable.sizes.items()], variable.dtype)
+            for one, block in zip(own, blocks, strict=True):
+                whole[tuple(block.get(str(d), slice(None)) for d in variable.dims)] = one.values
+            variables[str(name)] = xr.Variable(variable.dims, whole, variable.attrs)
+        else:
+            variables[str(name)] = variable
+    coords = {name: variables.pop(str(name)) for name in first.coords}
+    attrs = dict(first.attrs)
+    if N_IDS in attrs:
+        attrs[N_IDS] = max(int(part.attrs[N_IDS]) for part in parts)
+    return xr.Dataset(variables, coords, attrs)
 
 
 def dense(ds: xr.Dataset, *, points: bool = False) -> xr.Dataset:

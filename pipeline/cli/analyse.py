@@ -7,9 +7,20 @@ from typing import Annotated, Any
 import typer
 
 from pipeline.cli import console
-from pipeline.cli.common import Csv, Directory, Json, check_csv, tell
+from pipeline.cli.analysing import show
+from pipeline.cli.common import Csv, Directory, Json, check_csv
 from pipeline.cli.groups import add_command, command_group, made, registry_group
 from pipeline.cli.options import taking
+from pipeline.cli.running import ClusterFile, Workers
+
+Scheduler = Annotated[
+    str | None,
+    typer.Option(
+        metavar="WHERE",
+        help="Where blocks of parameter points are analysed, as for magpend run. Default: $DASK_SCHEDULER_ADDRESS, or "
+        "processes.",
+    ),
+]
 
 
 def _names() -> list[str]:
@@ -29,19 +40,19 @@ def _make(name: str) -> Any:
 
     analysis = ANALYSES[name]
 
-    def command(directory: Directory, options: Any, csv: Csv = None, json: Json = None) -> None:
-        from pipeline.products.product import function_of
-        from pipeline.runs.derive import derive
-        from pipeline.specification.problems import SpecError
+    def command(
+        directory: Directory,
+        options: Any,
+        workers: Workers = None,
+        scheduler: Scheduler = None,
+        cluster: ClusterFile = None,
+        csv: Csv = None,
+        json: Json = None,
+    ) -> None:
+        from pipeline.compute.clients import Where
 
         check_csv(csv)
-        ds = derive(directory, name, options, echo=console.note)
-        table = function_of(analysis.table)(ds)
-        if table.nothing:
-            raise SpecError(f"{directory}: {table.nothing}")
-        tell(table, csv, json)
-        if "source" in ds.encoding:
-            console.note(f"stored: {ds.encoding['source']}")
+        show(directory, name, options, workers, Where(scheduler, cluster), csv, json)
 
     command.__name__ = name
     return made(name, taking(analysis.options, command), analysis.help)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pipeline.cli import console
+from pipeline.cli.analysing import show
 from pipeline.cli.common import Directory, Json, tell
 from pipeline.cli.exits import Exit
 from pipeline.cli.options import completing
@@ -70,6 +71,9 @@ def run(
     plot: Annotated[
         bool, typer.Option("--plot", help="Draw the finished run: a diagram, its exponents, or a map.")
     ] = False,
+    analyse: Annotated[
+        str, typer.Option(metavar="NAMES", help="Analyse the finished run, such as attractors,basins.")
+    ] = "",
     posterior: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Run once for each draw of the posterior of an identification.")
     ] = None,
@@ -81,10 +85,13 @@ def run(
     the end it counts the cells by status. Cells that diverged or failed are results, and the exit code is 0;
     above 1 % a warning reports them.
     """
+    from pipeline.compute.clients import Where
     from pipeline.runs import outcome, preview
     from pipeline.runs import run as runs
+    from pipeline.runs.derive import analyses_in
     from pipeline.store.run import Run
 
+    analyses = analyses_in(analyse)
     if posterior is not None:
         _run_posterior(spec, posterior, n_draws, out, smoke=smoke, workers=workers)
         return
@@ -106,6 +113,9 @@ def run(
     console.result(*outcome.summary(done))
     if text := outcome.warning(done):
         console.LOG.warning(text)
+    where = Where(scheduler, cluster, dashboard)
+    for name in analyses:
+        show(done.name, name, {}, workers, where)
     if plot:
         _plot(done)
 

@@ -23,6 +23,10 @@ FACE = Path(__file__).parents[1] / "face" / "magpend"
 WIDTH = 120
 
 _ECHO = ("echo", "Callable[[str], None] | None = None", "Function that prints a line about each computation.")
+_PLACES = (
+    ("workers", "int | None = None", "Number of processes or threads that share the parameter points."),
+    ("scheduler", "str | None = None", "Where they run, as for `magpend.run`."),
+)
 _AX = ("ax", "Axes | None = None", "Axes to draw into; for a figure of one panel.")
 _FIGURE = (
     "figure",
@@ -68,7 +72,7 @@ def analyses() -> str:
 
 
 def _analysis(name: str) -> str:
-    parameters = [*_parameters(ANALYSES[name].options), _ECHO]
+    parameters = _of_analysis(name)
     text = _docstring(
         ANALYSES[name].help,
         parameters,
@@ -79,6 +83,10 @@ def _analysis(name: str) -> str:
         ANALYSES[name].options,
     )
     return f'\n{_def(name, parameters, "xr.Dataset")}\n{text}\n        return self._analysed("{name}", locals())\n'
+
+
+def _of_analysis(name: str) -> list[Parameter]:
+    return [*_parameters(ANALYSES[name].options), *_PLACES, _ECHO]
 
 
 def figures() -> str:
@@ -160,10 +168,7 @@ def stub() -> str:
     lines += [_import(home, names) for home, names in sorted(homes.items())]
     lines += ["", "__version__: str", ""]
     for name in COMMANDS:
-        lines.append(
-            _def(name, [*_parameters(ANALYSES[name].options), _ECHO], "xr.Dataset", "source: str | Path | Run", "")
-            + " ..."
-        )
+        lines.append(_def(name, _of_analysis(name), "xr.Dataset", "source: str | Path | Run", "") + " ...")
     return "\n".join(lines) + "\n"
 
 

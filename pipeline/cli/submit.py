@@ -38,6 +38,9 @@ def submit(
     smoke: Annotated[
         bool, typer.Option("--smoke", help="Run the specification's small size, which takes seconds.")
     ] = False,
+    analyse: Annotated[
+        str, typer.Option(metavar="NAMES", help="Analyse the finished run in the same job, such as attractors,basins.")
+    ] = "",
     json: Json = None,
 ) -> None:
     """Submit a specification as a job of SLURM, PBS, Torque, Grid Engine or LSF, and print commands to watch and cancel
@@ -54,7 +57,7 @@ def submit(
         raise SpecError("--dry-run and --write FILE: give one of them; --dry-run creates nothing.")
     if write is not None:
         check_file(write, "--write")
-    prepared = sending.prepare(spec, out, cluster, job or [], smoke=smoke)
+    prepared = sending.prepare(spec, out, cluster, job or [], smoke=smoke, analyse=analyse)
     if dry_run:
         tell_data(explaining.as_data(prepared), explaining.explain(prepared), json)
     elif prepared.complete:

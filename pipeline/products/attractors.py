@@ -64,6 +64,7 @@ IDENTIFIED = Analysis(
     "Find the attractors of each parameter point on its own.",
     IdentifyOptions,
     compute=f"{_ROOM}:identified",
+    by_point=True,
 )
 
 ATTRACTORS = Analysis(

@@ -41,6 +41,7 @@ CHAOS = Analysis(
     needs=f"{_ROOM}:needs_chaos",
     builds_on=("attractors",),
     figure="lyapunov",
+    by_point=True,
 )
 
 DIMENSION = Analysis(

@@ -189,6 +189,9 @@ class Analysis:
         Options that do not change the result.
     for_drift : bool
         Whether it takes runs whose parameters move; the others assume that parameters are constant.
+    by_point : bool
+        Whether each parameter point is analysed on its own, so that `compute` may be given blocks of points, whose
+        results `pipeline.analysis.ragged.joined` joins.
     """
 
     name: str
@@ -203,6 +206,7 @@ class Analysis:
     ignores: tuple[str, ...] = ()
     for_drift: bool = False
     noisy: bool = False
+    by_point: bool = False
 
 
 class FigureOptions(Options):

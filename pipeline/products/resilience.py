@@ -63,6 +63,7 @@ RESILIENCE = Analysis(
     settle="pipeline.analysis.resilience.product:settle_resilience",
     builds_on=("attractors",),
     figure="resilience",
+    by_point=True,
 )
 
 EDGE = Analysis(

@@ -23,15 +23,16 @@ import hashlib
 import json
 import time
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pipeline.compute.clients import Where
 from pipeline.layout.conventions import conventional
 from pipeline.layout.vocabulary import overrides_attribute
 from pipeline.products.attractors import IdentifyOptions
 from pipeline.products.product import Analysis, Options, function_of
-from pipeline.products.registry import ANALYSES
+from pipeline.products.registry import ANALYSES, COMMANDS
 from pipeline.runs import notebook
 from pipeline.runs.naming import named
 from pipeline.runs.versions import code_version
@@ -40,6 +41,7 @@ from pipeline.store.errors import DamagedError
 from pipeline.store.files import DERIVED, Files
 from pipeline.store.local import unwritable
 from pipeline.store.products import (
+    blocks_in,
     leftover_products,
     open_product,
     products_in,
@@ -70,17 +72,23 @@ class AnalysedRun(Run):
     ----------
     echo : callable
         Function that prints a line.
+    workers : int, optional
+        Number of threads or processes for blocks of parameter points, see `pipeline.compute.execute.run_tasks`.
+    where : Where
+        Place of that computation.
     """
 
     echo: Echo = _silent
+    workers: int | None = None
+    where: Where = field(default_factory=Where)
 
     @classmethod
-    def of(cls, source: Source, echo: Echo | None = None) -> AnalysedRun:
+    def of(cls, source: Source, echo: Echo | None = None, **places: Any) -> AnalysedRun:
         """Open a run directory for analyses, or convert a run that is open already."""
         run = Run.open(source)
-        if isinstance(run, AnalysedRun) and echo is None:
+        if isinstance(run, AnalysedRun) and echo is None and not places:
             return run
-        return cls(**{f.name: getattr(run, f.name) for f in fields(Run)}, echo=echo or _silent)
+        return cls(**{f.name: getattr(run, f.name) for f in fields(Run)}, echo=echo or _silent, **places)
 
     def derive(self, name: str, **options: Any) -> xr.Dataset:
         """Return the result of an analysis of this run, computed now or read if it is stored."""
@@ -88,7 +96,13 @@ class AnalysedRun(Run):
 
 
 def derive(
-    source: Source, name: str, options: Mapping[str, Any] | Options | None = None, *, echo: Echo | None = None
+    source: Source,
+    name: str,
+    options: Mapping[str, Any] | Options | None = None,
+    *,
+    echo: Echo | None = None,
+    workers: int | None = None,
+    scheduler: Where | str | None = None,
 ) -> xr.Dataset:
     """Return the result of an analysis of a run. It is read if it is stored, or else computed and stored.
 
@@ -102,6 +116,8 @@ def derive(
         Options that differ from the defaults.
     echo
         Function that prints a line about each computation and its reason.
+    workers, scheduler
+        Where blocks of parameter points are computed, see `pipeline.compute.execute.run_tasks`.
 
     Returns
     -------
@@ -122,11 +138,15 @@ def derive(
         raise SpecError(unknown_name("analysis", name, ANALYSES))
     analysis = ANALYSES[name]
     wanted = options if isinstance(options, Options) else validated(analysis.options, options or {})
-    run = AnalysedRun.of(source, echo)
+    places: dict[str, Any] = {"workers": workers} if workers is not None else {}
+    if scheduler is not None:
+        places["where"] = Where.of(scheduler)
+        places["where"].resolved()
+    run = AnalysedRun.of(source, echo, **places)
     _refuse_unsteady(run, analysis)
     _refuse_noise(run, analysis)
     wanted = prepared(run, analysis, wanted)
-    key, told = _key(run, analysis, wanted), overrides_attribute(run.spec.parameters.overrides)
+    key, told = key_of(run, analysis, wanted), overrides_attribute(run.spec.parameters.overrides)
     place = run.info.files.below(DERIVED).below(f"{name}-{key['derived_key'][:8]}.zarr")
     try:
         ds = open_product(place)
@@ -137,10 +157,28 @@ def derive(
         pass
     except DamagedError as error:
         run.echo(f"{name}: damaged ({error}); computing it again")
-    if place.local is not None and (problem := unwritable(place.local.parent)):
+    problem = unwritable(place.local.parent) if place.local is not None else ""
+    if problem:
         run.echo(f"{problem}: the result of {name} is shown but not kept")
     with notebook.progress():
-        return _kept(run, place, _compute(run, analysis, wanted).assign_attrs({**key, **told}))
+        computed = _compute(run, analysis, wanted, None if problem else place)
+        return _kept(run, place, computed.assign_attrs({**key, **told}))
+
+
+def analyses_in(text: str) -> list[str]:
+    """Return the analyses that a list names, such as ``attractors,basins``.
+
+    Raises
+    ------
+    SpecError
+        If one is unknown, or cannot be computed with its defaults.
+    """
+    names = [name.strip() for name in text.split(",") if name.strip()]
+    for name in names:
+        if name not in COMMANDS:
+            raise SpecError(f"--analyse: {unknown_name('analysis', name, COMMANDS)}")
+        validated(ANALYSES[name].options, {})
+    return names
 
 
 def stored(source: Source, name: str) -> xr.Dataset | None:
@@ -333,7 +371,8 @@ def refused(directory: str | Path) -> Iterator[None]:
         raise SpecError(f"{directory}: {error}") from None
 
 
-def _key(run: Run, analysis: Analysis, options: Options) -> dict[str, str]:
+def key_of(run: Run, analysis: Analysis, options: Options) -> dict[str, str]:
+    """Return the attributes of a result that hold everything which decides its numbers."""
     plain = {name: value for name, value in options.plain().items() if name not in analysis.ignores}
     parts = {
         "derived_product": analysis.name,
@@ -344,21 +383,30 @@ def _key(run: Run, analysis: Analysis, options: Options) -> dict[str, str]:
     return {**parts, "derived_key": hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()}
 
 
-def _compute(run: AnalysedRun, analysis: Analysis, options: Options) -> xr.Dataset:
+def _compute(run: AnalysedRun, analysis: Analysis, options: Options, place: Files | None) -> xr.Dataset:
+    """Compute a result, in blocks if they can be kept beside its place."""
+    from pipeline.runs.blocks import in_blocks
+
     started = time.perf_counter()
     with refused(run.name):
-        result: xr.Dataset = function_of(analysis.compute)(run, options)
+        if analysis.by_point and place is not None and not getattr(options, "at", None):
+            result = in_blocks(run, analysis, options, place)
+        else:
+            result = function_of(analysis.compute)(run, options)
     run.echo(f"{analysis.name}: computed in {time.perf_counter() - started:.1f} s")
     return result
 
 
 def _kept(run: AnalysedRun, place: Files, result: xr.Dataset) -> xr.Dataset:
+    from pipeline.runs.blocks import remove_blocks
+
     try:
         write_product(place, result)
     except OSError as error:
         kept = place.name.rpartition("/")[2]
         run.echo(f"{kept}: not kept ({error}); the result is shown all the same")
         return conventional(result)
+    remove_blocks(place)
     return _placed(open_product(place), place)
 
 
@@ -373,7 +421,7 @@ def stale(source: Source) -> list[str]:
 
     Outdated results belong to an earlier cube or an earlier version of the code. A leftover was begun by a
     process that was killed. Leftovers younger than an hour may belong to a running process and are not
-    listed.
+    listed. Blocks of results that are not complete are listed.
     """
     return [place.name for place in _stale(Run.open(source))]
 
@@ -392,7 +440,7 @@ def _stale(run: Run) -> list[Files]:
             return True
 
     products = [place for place in products_in(folder) if is_stale(place)]
-    return products + leftover_products(folder, older_than=_LEFTOVER_SECONDS)
+    return products + blocks_in(folder) + leftover_products(folder, older_than=_LEFTOVER_SECONDS)
 
 
 def prune(source: Source) -> list[str]:

@@ -18,6 +18,7 @@ from pipeline.layout.plan import make_plan
 from pipeline.layout.writing import write_atomically
 from pipeline.runs.batch import WORDS, coordinator_script, is_whole
 from pipeline.runs.choosing import Choice, choose, no_command
+from pipeline.runs.derive import analyses_in
 from pipeline.runs.noise import check_steps
 from pipeline.runs.refusals import remedy
 from pipeline.runs.run import identity_here
@@ -115,6 +116,7 @@ def prepare(
     changes: Sequence[str] = (),
     *,
     smoke: bool = False,
+    analyse: str = "",
 ) -> Submission:
     """Make the batch script for a run, without creating files or sending anything.
 
@@ -126,6 +128,8 @@ def prepare(
         See `run.run`.
     cluster, changes
         See `choosing.choose`.
+    analyse
+        Analyses of the finished run, see `derive.analyses_in`.
 
     Raises
     ------
@@ -137,7 +141,9 @@ def prepare(
     """
     path = find_spec(spec)
     parsed = load_spec(path, smoke=smoke)
-    retry = shlex.join([str(spec), *(["--out", str(out)] if out else []), *(["--smoke"] if smoke else [])])
+    analyses_in(analyse)
+    more = [*(["--smoke"] if smoke else []), *(["--analyse", analyse] if analyse else [])]
+    retry = shlex.join([str(spec), *(["--out", str(out)] if out else []), *more])
     choice = choose(cluster, changes, retry)
     files = open_files(out if out is not None else default_directory(path, smoke))
     folder = jobs_folder(files.place)
@@ -160,7 +166,7 @@ def prepare(
     described = cluster_of(table)
     file = choice.file or folder / TABLE
     name = f"magpend-{re.sub(r'[^A-Za-z0-9_.-]', '-', folder.stem)}"
-    command = _command(described, file, path, files.place, smoke)
+    command = _command(described, file, path, files.place, more)
     return Submission(
         name=files.name,
         title=parsed.title,
@@ -177,22 +183,12 @@ def prepare(
     )
 
 
-def _command(cluster: Cluster, file: Path, spec: Path, place: str, smoke: bool) -> list[str]:
+def _command(cluster: Cluster, file: Path, spec: Path, place: str, more: Sequence[str]) -> list[str]:
     where = ["--scheduler", "threads", "--workers", str(cluster.cores)]
     if not is_whole(cluster):
         where = ["--scheduler", cluster.kind, "--cluster", str(file.absolute())]
     python = cluster.python or sys.executable
-    return [
-        python,
-        "-m",
-        "pipeline.cli.main",
-        "run",
-        str(spec.absolute()),
-        "--out",
-        place,
-        *where,
-        *(["--smoke"] if smoke else []),
-    ]
+    return [python, "-m", "pipeline.cli.main", "run", str(spec.absolute()), "--out", place, *where, *more]
 
 
 def write(submission: Submission, file: Path) -> None:

@@ -36,6 +36,9 @@ if TYPE_CHECKING:
 SEAL = "content_sha256"
 """Attribute of a product: a digest of its other attributes and of all files but ``zarr.json``."""
 
+BLOCKS = ".blocks"
+"""End of the name of a folder with blocks of an unfinished product."""
+
 _WORDS = "words"
 _MOST_TRIES = 20
 """Times that a product in the way is removed before the new product is given up."""
@@ -70,7 +73,7 @@ def write_product(place: Place, ds: xr.Dataset) -> None:
     temporary = temporary_beside(path)
     try:
         with writing(path):
-            path.parent.mkdir(exist_ok=True)
+            path.parent.mkdir(parents=True, exist_ok=True)
             data, attrs = _contents(ds)
             for key, content in data.items():
                 (temporary / key).parent.mkdir(parents=True, exist_ok=True)
@@ -238,6 +241,13 @@ def products_in(files: Files) -> list[Files]:
     except (FileNotFoundError, NotADirectoryError):
         return []
     return [files.below(name) for name in names if name.endswith(".zarr") and not name.startswith(".")]
+
+
+def blocks_in(files: Files) -> list[Files]:
+    """Return the folders with blocks of unfinished products in a folder."""
+    with contextlib.suppress(FileNotFoundError, NotADirectoryError):
+        return [files.below(name) for name in files.names() if name.endswith(BLOCKS)]
+    return []
 
 
 def _own(attrs: Mapping[Any, Any]) -> dict[str, Any]:

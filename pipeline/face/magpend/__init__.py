@@ -73,9 +73,9 @@ def _analysis(name: str) -> Callable[..., Any]:
 
     analysis = ANALYSES[name]
 
-    def found(source: Any, *, echo: Any = None, **options: Any) -> Any:
+    def found(source: Any, *, echo: Any = None, workers: Any = None, scheduler: Any = None, **options: Any) -> Any:
         with options_in_errors(analysis.options):
-            return derive(source, name, options, echo=echo)
+            return derive(source, name, options, echo=echo, workers=workers, scheduler=scheduler)
 
     model = analysis.options
     lines = [f"    {k} = {default_of(model, k)!r}: {info.description}" for k, info in model.model_fields.items()]

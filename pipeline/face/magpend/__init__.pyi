@@ -103,6 +103,8 @@ def attractors(
     threshold: float = 0.3,
     look_back: int = 3,
     connect: bool = True,
+    workers: int | None = None,
+    scheduler: str | None = None,
     echo: Callable[[str], None] | None = None,
 ) -> xr.Dataset: ...
 def basins(
@@ -130,6 +132,8 @@ def basins(
     metric: Literal["taxicab", "chessboard"] = "taxicab",
     resamples: int = 200,
     seed: int = 0,
+    workers: int | None = None,
+    scheduler: str | None = None,
     echo: Callable[[str], None] | None = None,
 ) -> xr.Dataset: ...
 def hysteresis(
@@ -148,6 +152,8 @@ def hysteresis(
     threshold: float = 0.3,
     look_back: int = 3,
     connect: bool = True,
+    workers: int | None = None,
+    scheduler: str | None = None,
     echo: Callable[[str], None] | None = None,
 ) -> xr.Dataset: ...
 def settling(
@@ -166,6 +172,8 @@ def settling(
     threshold: float = 0.3,
     look_back: int = 3,
     connect: bool = True,
+    workers: int | None = None,
+    scheduler: str | None = None,
     echo: Callable[[str], None] | None = None,
 ) -> xr.Dataset: ...
 def chaos(
@@ -190,6 +198,8 @@ def chaos(
     stride: int = 1,
     seed: int = 0,
     n_max: int = 2000,
+    workers: int | None = None,
+    scheduler: str | None = None,
     echo: Callable[[str], None] | None = None,
 ) -> xr.Dataset: ...
 def dimension(
@@ -212,6 +222,8 @@ def dimension(
     theiler: int = 1,
     n_max: int = 10000,
     floor: float = 1e-06,
+    workers: int | None = None,
+    scheduler: str | None = None,
     echo: Callable[[str], None] | None = None,
 ) -> xr.Dataset: ...
 def branches(
@@ -223,6 +235,8 @@ def branches(
     max_period: int = 0,
     generations: int = 3,
     recurrences: int = 0,
+    workers: int | None = None,
+    scheduler: str | None = None,
     echo: Callable[[str], None] | None = None,
 ) -> xr.Dataset: ...
 def bands(
@@ -237,6 +251,8 @@ def bands(
     recurrences: int = 0,
     draws: int = 0,
     digest: str = "",
+    workers: int | None = None,
+    scheduler: str | None = None,
     echo: Callable[[str], None] | None = None,
 ) -> xr.Dataset: ...
 def curves(
@@ -252,6 +268,8 @@ def curves(
     generations: int = 3,
     recurrences: int = 0,
     curve_period: int = 0,
+    workers: int | None = None,
+    scheduler: str | None = None,
     echo: Callable[[str], None] | None = None,
 ) -> xr.Dataset: ...
 def orbits(
@@ -262,6 +280,8 @@ def orbits(
     starts: int = 400,
     rounds: int = 6,
     seed: int = 0,
+    workers: int | None = None,
+    scheduler: str | None = None,
     echo: Callable[[str], None] | None = None,
 ) -> xr.Dataset: ...
 def tongues(
@@ -279,6 +299,8 @@ def tongues(
     curve_period: int = 0,
     max_denominator: int = 5,
     at: Mapping[str, float] = {},
+    workers: int | None = None,
+    scheduler: str | None = None,
     echo: Callable[[str], None] | None = None,
 ) -> xr.Dataset: ...
 def manifolds(
@@ -292,6 +314,8 @@ def manifolds(
     length: float = 20.0,
     chord: float = 0.02,
     most: int = 20000,
+    workers: int | None = None,
+    scheduler: str | None = None,
     echo: Callable[[str], None] | None = None,
 ) -> xr.Dataset: ...
 def tangency(
@@ -307,6 +331,8 @@ def tangency(
     seed: int = 0,
     length: float = 6.0,
     chord: float = 0.01,
+    workers: int | None = None,
+    scheduler: str | None = None,
     echo: Callable[[str], None] | None = None,
 ) -> xr.Dataset: ...
 def tipping(
@@ -317,6 +343,8 @@ def tipping(
     keep: int = 64,
     width: float = 1e-06,
     brackets: int = 64,
+    workers: int | None = None,
+    scheduler: str | None = None,
     echo: Callable[[str], None] | None = None,
 ) -> xr.Dataset: ...
 def delay(
@@ -326,6 +354,8 @@ def delay(
     period: int = 1,
     distance: float = 0.01,
     static: float | None = None,
+    workers: int | None = None,
+    scheduler: str | None = None,
     echo: Callable[[str], None] | None = None,
 ) -> xr.Dataset: ...
 def overlaps(
@@ -349,6 +379,8 @@ def overlaps(
     parameter: str = "",
     at: Mapping[str, float] = {},
     confidence: float = 0.95,
+    workers: int | None = None,
+    scheduler: str | None = None,
     echo: Callable[[str], None] | None = None,
 ) -> xr.Dataset: ...
 def resilience(
@@ -380,6 +412,8 @@ def resilience(
     interval: Literal["wilson", "clopper-pearson"] = "wilson",
     confidence: float = 0.95,
     seed: int = 0,
+    workers: int | None = None,
+    scheduler: str | None = None,
     echo: Callable[[str], None] | None = None,
 ) -> xr.Dataset: ...
 def edge(
@@ -406,6 +440,8 @@ def edge(
     max_period: int = 1,
     returns: int = 200,
     seed: int = 0,
+    workers: int | None = None,
+    scheduler: str | None = None,
     echo: Callable[[str], None] | None = None,
 ) -> xr.Dataset: ...
 def escapes(
@@ -418,6 +454,8 @@ def escapes(
     skip: int = 0,
     stretch: int = 20,
     confidence: float = 0.95,
+    workers: int | None = None,
+    scheduler: str | None = None,
     echo: Callable[[str], None] | None = None,
 ) -> xr.Dataset: ...
 def density(
@@ -428,5 +466,7 @@ def density(
     bandwidth: float = 1.0,
     prominence: float = 0.05,
     skip: int = 0,
+    workers: int | None = None,
+    scheduler: str | None = None,
     echo: Callable[[str], None] | None = None,
 ) -> xr.Dataset: ...

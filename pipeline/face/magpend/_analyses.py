@@ -57,6 +57,8 @@ class Analyses(AnalysingRun):
         threshold: float = 0.3,
         look_back: int = 3,
         connect: bool = True,
+        workers: int | None = None,
+        scheduler: str | None = None,
         echo: Callable[[str], None] | None = None,
     ) -> xr.Dataset:
         """Find the attractors at every parameter point, show that they attract, and follow them along the axes.
@@ -93,6 +95,10 @@ class Analyses(AnalysingRun):
             Matching: steps over which an id is remembered (1 or more).
         connect
             Matching: follow closed orbits along the axes by integration; otherwise match by distance.
+        workers
+            Number of processes or threads that share the parameter points.
+        scheduler
+            Where they run, as for `magpend.run`.
         echo
             Function that prints a line about each computation.
 
@@ -133,6 +139,8 @@ class Analyses(AnalysingRun):
         metric: Literal["taxicab", "chessboard"] = "taxicab",
         resamples: int = 200,
         seed: int = 0,
+        workers: int | None = None,
+        scheduler: str | None = None,
         echo: Callable[[str], None] | None = None,
     ) -> xr.Dataset:
         """Measure the basins of a sweep: fractions with intervals, entropy, uncertainty exponent, Wada test.
@@ -186,6 +194,10 @@ class Analyses(AnalysingRun):
             Samples of each bootstrap (2 or more).
         seed
             Seed of the bootstraps (0 or more).
+        workers
+            Number of processes or threads that share the parameter points.
+        scheduler
+            Where they run, as for `magpend.run`.
         echo
             Function that prints a line about each computation.
 
@@ -217,6 +229,8 @@ class Analyses(AnalysingRun):
         threshold: float = 0.3,
         look_back: int = 3,
         connect: bool = True,
+        workers: int | None = None,
+        scheduler: str | None = None,
         echo: Callable[[str], None] | None = None,
     ) -> xr.Dataset:
         """List where a continuation follows different attractors upwards and downwards, and where it jumps.
@@ -250,6 +264,10 @@ class Analyses(AnalysingRun):
             Matching: steps over which an id is remembered (1 or more).
         connect
             Matching: follow closed orbits along the axes by integration; otherwise match by distance.
+        workers
+            Number of processes or threads that share the parameter points.
+        scheduler
+            Where they run, as for `magpend.run`.
         echo
             Function that prints a line about each computation.
 
@@ -281,6 +299,8 @@ class Analyses(AnalysingRun):
         threshold: float = 0.3,
         look_back: int = 3,
         connect: bool = True,
+        workers: int | None = None,
+        scheduler: str | None = None,
         echo: Callable[[str], None] | None = None,
     ) -> xr.Dataset:
         """List each set that does not close: whether its cells stay or leave, and where they go.
@@ -317,6 +337,10 @@ class Analyses(AnalysingRun):
             Matching: steps over which an id is remembered (1 or more).
         connect
             Matching: follow closed orbits along the axes by integration; otherwise match by distance.
+        workers
+            Number of processes or threads that share the parameter points.
+        scheduler
+            Where they run, as for `magpend.run`.
         echo
             Function that prints a line about each computation.
 
@@ -354,6 +378,8 @@ class Analyses(AnalysingRun):
         stride: int = 1,
         seed: int = 0,
         n_max: int = 2000,
+        workers: int | None = None,
+        scheduler: str | None = None,
         echo: Callable[[str], None] | None = None,
     ) -> xr.Dataset:
         """Tell regular from chaotic attractors: exponents, multipliers, dimensions, 0-1 test.
@@ -402,6 +428,10 @@ class Analyses(AnalysingRun):
             0-1 test: seed of the frequencies (0 or more).
         n_max
             Most section points for the correlation dimension; 0 computes none (0 or more).
+        workers
+            Number of processes or threads that share the parameter points.
+        scheduler
+            Where they run, as for `magpend.run`.
         echo
             Function that prints a line about each computation.
 
@@ -437,6 +467,8 @@ class Analyses(AnalysingRun):
         theiler: int = 1,
         n_max: int = 10000,
         floor: float = 1e-06,
+        workers: int | None = None,
+        scheduler: str | None = None,
         echo: Callable[[str], None] | None = None,
     ) -> xr.Dataset:
         """Measure the correlation dimension of each set that attracts and does not close.
@@ -481,6 +513,10 @@ class Analyses(AnalysingRun):
             Most section points of an attractor (100 or more).
         floor
             Smallest resolved distance, in units of the states' scales (above 0).
+        workers
+            Number of processes or threads that share the parameter points.
+        scheduler
+            Where they run, as for `magpend.run`.
         echo
             Function that prints a line about each computation.
 
@@ -505,6 +541,8 @@ class Analyses(AnalysingRun):
         max_period: int = 0,
         generations: int = 3,
         recurrences: int = 0,
+        workers: int | None = None,
+        scheduler: str | None = None,
         echo: Callable[[str], None] | None = None,
     ) -> xr.Dataset:
         """Follow periodic orbits and equilibria along a parameter, stable or not; locate and name their bifurcations.
@@ -527,6 +565,10 @@ class Analyses(AnalysingRun):
             Number of generations of bifurcating branches that are followed (0 or more).
         recurrences
             Also start from orbits up to this period, near close recurrences of bounded cells (0 or more).
+        workers
+            Number of processes or threads that share the parameter points.
+        scheduler
+            Where they run, as for `magpend.run`.
         echo
             Function that prints a line about each computation.
 
@@ -554,6 +596,8 @@ class Analyses(AnalysingRun):
         recurrences: int = 0,
         draws: int = 0,
         digest: str = "",
+        workers: int | None = None,
+        scheduler: str | None = None,
         echo: Callable[[str], None] | None = None,
     ) -> xr.Dataset:
         """Carry draws of identified parameters through the branches: 95 % intervals of bifurcations, bands about
@@ -583,6 +627,10 @@ class Analyses(AnalysingRun):
             Number of draws that are carried; 0 takes all (0 or more).
         digest
             Digest of the file of draws; found by itself.
+        workers
+            Number of processes or threads that share the parameter points.
+        scheduler
+            Where they run, as for `magpend.run`.
         echo
             Function that prints a line about each computation.
 
@@ -611,6 +659,8 @@ class Analyses(AnalysingRun):
         generations: int = 3,
         recurrences: int = 0,
         curve_period: int = 0,
+        workers: int | None = None,
+        scheduler: str | None = None,
         echo: Callable[[str], None] | None = None,
     ) -> xr.Dataset:
         """Continue folds, period doublings and Neimark-Sacker points in the plane of two parameters.
@@ -640,6 +690,10 @@ class Analyses(AnalysingRun):
             Also start from orbits up to this period, near close recurrences of bounded cells (0 or more).
         curve_period
             Longest orbit period; 0 takes all periods of the branches [drive periods or returns] (0 or more).
+        workers
+            Number of processes or threads that share the parameter points.
+        scheduler
+            Where they run, as for `magpend.run`.
         echo
             Function that prints a line about each computation.
 
@@ -663,6 +717,8 @@ class Analyses(AnalysingRun):
         starts: int = 400,
         rounds: int = 6,
         seed: int = 0,
+        workers: int | None = None,
+        scheduler: str | None = None,
         echo: Callable[[str], None] | None = None,
     ) -> xr.Dataset:
         """Search all periodic orbits up to a period at a parameter point, stable or not, from many starts.
@@ -682,6 +738,10 @@ class Analyses(AnalysingRun):
             Most rounds in which known orbits are deflated (0 or more).
         seed
             Seed of the random starts (0 or more).
+        workers
+            Number of processes or threads that share the parameter points.
+        scheduler
+            Where they run, as for `magpend.run`.
         echo
             Function that prints a line about each computation.
 
@@ -712,6 +772,8 @@ class Analyses(AnalysingRun):
         curve_period: int = 0,
         max_denominator: int = 5,
         at: Mapping[str, float] = {},
+        workers: int | None = None,
+        scheduler: str | None = None,
         echo: Callable[[str], None] | None = None,
     ) -> xr.Dataset:
         """Find the Arnold tongues p/q of a plane: where motions lock to the drive, p turns in q drive periods.
@@ -746,6 +808,10 @@ class Analyses(AnalysingRun):
             Largest q of the tongues p/q (1 or more, at most 64).
         at
             Value of a further axis of the run: the row on which tongues are searched.
+        workers
+            Number of processes or threads that share the parameter points.
+        scheduler
+            Where they run, as for `magpend.run`.
         echo
             Function that prints a line about each computation.
 
@@ -772,6 +838,8 @@ class Analyses(AnalysingRun):
         length: float = 20.0,
         chord: float = 0.02,
         most: int = 20000,
+        workers: int | None = None,
+        scheduler: str | None = None,
         echo: Callable[[str], None] | None = None,
     ) -> xr.Dataset:
         """Grow the stable and unstable manifolds of the saddle orbits at a parameter point, as curves.
@@ -797,6 +865,10 @@ class Analyses(AnalysingRun):
             Longest chord, in units of the states' scales (above 0).
         most
             Most points of each side (10 or more).
+        workers
+            Number of processes or threads that share the parameter points.
+        scheduler
+            Where they run, as for `magpend.run`.
         echo
             Function that prints a line about each computation.
 
@@ -825,6 +897,8 @@ class Analyses(AnalysingRun):
         seed: int = 0,
         length: float = 6.0,
         chord: float = 0.01,
+        workers: int | None = None,
+        scheduler: str | None = None,
         echo: Callable[[str], None] | None = None,
     ) -> xr.Dataset:
         """Locate the first homoclinic tangencies of the saddle orbits along a parameter, to 1e-8.
@@ -853,6 +927,10 @@ class Analyses(AnalysingRun):
             Length of each side, in units of the states' scales (above 0).
         chord
             Longest chord, in units of the states' scales (above 0).
+        workers
+            Number of processes or threads that share the parameter points.
+        scheduler
+            Where they run, as for `magpend.run`.
         echo
             Function that prints a line about each computation.
 
@@ -876,6 +954,8 @@ class Analyses(AnalysingRun):
         keep: int = 64,
         width: float = 1e-06,
         brackets: int = 64,
+        workers: int | None = None,
+        scheduler: str | None = None,
         echo: Callable[[str], None] | None = None,
     ) -> xr.Dataset:
         """Find which attractor each trajectory reaches after its parameters have moved, and the critical rates.
@@ -896,6 +976,10 @@ class Analyses(AnalysingRun):
             Width of a critical value's interval, as a part of the axis' range (above 0, below 1).
         brackets
             Most critical values that are bisected (0 or more).
+        workers
+            Number of processes or threads that share the parameter points.
+        scheduler
+            Where they run, as for `magpend.run`.
         echo
             Function that prints a line about each computation.
 
@@ -918,6 +1002,8 @@ class Analyses(AnalysingRun):
         period: int = 1,
         distance: float = 0.01,
         static: float | None = None,
+        workers: int | None = None,
+        scheduler: str | None = None,
         echo: Callable[[str], None] | None = None,
     ) -> xr.Dataset:
         """Find the value of a moving parameter at which trajectories leave a periodic orbit, such as a delayed
@@ -936,6 +1022,10 @@ class Analyses(AnalysingRun):
             Largest distance between sections one period of the orbit apart, in units of the states' scales (above 0).
         static
             Value of the bifurcation at a parameter that does not move [SI].
+        workers
+            Number of processes or threads that share the parameter points.
+        scheduler
+            Where they run, as for `magpend.run`.
         echo
             Function that prints a line about each computation.
 
@@ -972,6 +1062,8 @@ class Analyses(AnalysingRun):
         parameter: str = "",
         at: Mapping[str, float] = {},
         confidence: float = 0.95,
+        workers: int | None = None,
+        scheduler: str | None = None,
         echo: Callable[[str], None] | None = None,
     ) -> xr.Dataset:
         """Compute tipping probabilities between two parameter values from the overlaps of their basins.
@@ -1018,6 +1110,10 @@ class Analyses(AnalysingRun):
             Value of another axis of the run.
         confidence
             Level of the intervals (above 0, below 1).
+        workers
+            Number of processes or threads that share the parameter points.
+        scheduler
+            Where they run, as for `magpend.run`.
         echo
             Function that prints a line about each computation.
 
@@ -1062,6 +1158,8 @@ class Analyses(AnalysingRun):
         interval: Literal["wilson", "clopper-pearson"] = "wilson",
         confidence: float = 0.95,
         seed: int = 0,
+        workers: int | None = None,
+        scheduler: str | None = None,
         echo: Callable[[str], None] | None = None,
     ) -> xr.Dataset:
         """Measure how attractors respond to shocks: critical shocks, distances to the boundary, arrival times.
@@ -1125,6 +1223,10 @@ class Analyses(AnalysingRun):
             Level of the intervals (above 0, below 1).
         seed
             Seed of directions, random shocks and timed initial states (0 or more).
+        workers
+            Number of processes or threads that share the parameter points.
+        scheduler
+            Where they run, as for `magpend.run`.
         echo
             Function that prints a line about each computation.
 
@@ -1164,6 +1266,8 @@ class Analyses(AnalysingRun):
         max_period: int = 1,
         returns: int = 200,
         seed: int = 0,
+        workers: int | None = None,
+        scheduler: str | None = None,
         echo: Callable[[str], None] | None = None,
     ) -> xr.Dataset:
         """Track the edge states between two attractors: the saddle sets on the boundary of their basins.
@@ -1217,6 +1321,10 @@ class Analyses(AnalysingRun):
             Most drive periods or returns for which a pair is tracked (16 or more).
         seed
             Seed that chooses the pairs (0 or more).
+        workers
+            Number of processes or threads that share the parameter points.
+        scheduler
+            Where they run, as for `magpend.run`.
         echo
             Function that prints a line about each computation.
 
@@ -1242,6 +1350,8 @@ class Analyses(AnalysingRun):
         skip: int = 0,
         stretch: int = 20,
         confidence: float = 0.95,
+        workers: int | None = None,
+        scheduler: str | None = None,
         echo: Callable[[str], None] | None = None,
     ) -> xr.Dataset:
         """Measure how cells with noise leave a set: rates with intervals, where they go, and their last stretch.
@@ -1265,6 +1375,10 @@ class Analyses(AnalysingRun):
             Sections before leaving of which mean and spread are kept (1 or more, at most 1000).
         confidence
             Level of all intervals (above 0, below 1).
+        workers
+            Number of processes or threads that share the parameter points.
+        scheduler
+            Where they run, as for `magpend.run`.
         echo
             Function that prints a line about each computation.
 
@@ -1288,6 +1402,8 @@ class Analyses(AnalysingRun):
         bandwidth: float = 1.0,
         prominence: float = 0.05,
         skip: int = 0,
+        workers: int | None = None,
+        scheduler: str | None = None,
         echo: Callable[[str], None] | None = None,
     ) -> xr.Dataset:
         """Estimate the density of the section points of a run with noise: histogram, moments, number of peaks.
@@ -1306,6 +1422,10 @@ class Analyses(AnalysingRun):
             Least height of a peak above the higher of its valleys, as a share of the highest peak (above 0, below 1).
         skip
             Sections at the begin of the record that are not counted (0 or more).
+        workers
+            Number of processes or threads that share the parameter points.
+        scheduler
+            Where they run, as for `magpend.run`.
         echo
             Function that prints a line about each computation.
 

@@ -20,7 +20,7 @@ Panels = np.ndarray[tuple[int], np.dtype[np.object_]]
 
 def options_in(given: Mapping[str, Any]) -> dict[str, Any]:
     """Return the options among the local names of a generated method."""
-    aside = ("self", "echo", "ax", "figure")
+    aside = ("self", "echo", "workers", "scheduler", "ax", "figure")
     return {name: dict(v) if isinstance(v, Mapping) else v for name, v in given.items() if name not in aside}
 
 
@@ -33,7 +33,8 @@ class AnalysingRun(StoredRun):
         from pipeline.runs.derive import derive
 
         with options_in_errors(ANALYSES[name].options) if name in ANALYSES else nullcontext():
-            return derive(self, name, options_in(given), echo=given["echo"])
+            places = {key: given[key] for key in ("echo", "workers", "scheduler") if key in given}
+            return derive(self, name, options_in(given), **places)
 
 
 class Drawing:

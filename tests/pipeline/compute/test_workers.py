@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import shutil
 import signal
 import threading
 import time
@@ -16,6 +17,9 @@ from pipeline.compute.addresses import SchedulerError
 from pipeline.compute.execute import run_tasks
 from pipeline.compute.limits import Limits
 from pipeline.compute.order import TaskFailedError
+from pipeline.runs import blocks
+from pipeline.runs.derive import AnalysedRun, derive
+from tests.pipeline.runs.test_blocks import MAP as BLOCKS
 
 
 def one_second(index):
@@ -122,3 +126,19 @@ def test_limits__learn_from_what_finished():
     assert found.limit_s(2, 1) == 1000
     assert Limits(lambda i: 0.1).limit_s(0, 1) == limits.LEAST_S
     assert Limits(None).limit_s(0, 1) == float("inf")
+
+
+@pytest.mark.slow
+def test_workers__analyse_blocks_of_a_run_to_the_same_bytes(computed, scheduler, tmp_path, monkeypatch):
+    whole = shutil.copytree(computed(BLOCKS), tmp_path / "whole")
+    derive(whole, "attractors", workers=0)
+    monkeypatch.setattr(blocks, "FEWEST_CELLS", 24)
+    run = shutil.copytree(computed(BLOCKS), tmp_path / "run")
+    assert len(blocks.blocks_of(AnalysedRun.of(run))) == 4
+    derive(run, "attractors", scheduler=scheduler())
+    for name in ("identified", "attractors"):
+        own, other = (
+            {p.relative_to(place): p.read_bytes() for p in place.rglob("*") if p.is_file()}
+            for place in (next((one / "derived").glob(f"{name}-*.zarr")) for one in (run, whole))
+        )
+        assert own == other

@@ -1,0 +1,180 @@
+"""Analyses in blocks of parameter points: the same bytes whatever the blocks and workers, stopped or not."""
+
+from __future__ import annotations
+
+import shutil
+
+import pytest
+import xarray as xr
+
+from pipeline.compute import execute
+from pipeline.runs import blocks
+from pipeline.runs.derive import AnalysedRun, analyses_in, derive, prune
+from pipeline.runs.stopping import InterruptedRunError
+from pipeline.specification.problems import SpecError
+
+MAP = """
+kind = "sweep"
+model = "duffing"
+[parameters]
+preset = "twin-well-periodic"
+[axes]
+frequency_hz = { start = 0.12, stop = 0.2, num = 4 }
+amplitude = { start = 0.1, stop = 0.5, num = 3 }
+[initial_conditions]
+kind = "random"
+n = 8
+seed = 1
+x = [-1.5, 1.5]
+v = [-1.0, 1.0]
+[integration]
+n_transient = 200
+n_keep = 32
+"""
+EACH_POINT, A_ROW = (8, 8), (24, 24)
+"""Fewest and most cells of a block, for blocks of one point and of one row."""
+
+
+@pytest.fixture
+def copy(computed, tmp_path):
+    """Copies of the run, without results."""
+
+    def make(name: str) -> AnalysedRun:
+        shutil.copytree(computed(MAP), tmp_path / name, ignore=shutil.ignore_patterns("derived"))
+        return AnalysedRun.of(tmp_path / name)
+
+    return make
+
+
+@pytest.fixture
+def sizes(monkeypatch):
+    """Set the fewest and most cells of a block."""
+
+    def put(fewest, most):
+        monkeypatch.setattr(blocks, "FEWEST_CELLS", fewest)
+        monkeypatch.setattr(blocks, "MOST_CELLS", most)
+
+    return put
+
+
+def files_of(run, name):
+    """Return all files of a stored result."""
+    (folder,) = (run.directory / "derived").glob(f"{name}-*.zarr")
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.fixture
+def whole(copy):
+    """The run analysed at once, which stays below the size of a block."""
+    run = copy("whole")
+    assert len(blocks.blocks_of(run)) == 1
+    derive(run, "attractors")
+    return run
+
+
+def test_blocks_of__cover_each_point_once_in_order(copy, sizes):
+    run = copy("run")
+    for fewest, most in ((8, 8), (16, 16), (24, 24), (48, 48), (96, 96)):
+        sizes(fewest, most)
+        found = [
+            (i, j)
+            for block in blocks.blocks_of(run)
+            for i in range(*block["frequency"].indices(4))
+            for j in range(*block["amplitude"].indices(3))
+        ]
+        assert found == [(i, j) for i in range(4) for j in range(3)]
+        most_cells = max(
+            len(range(*b["frequency"].indices(4))) * len(range(*b["amplitude"].indices(3))) * 8
+            for b in blocks.blocks_of(run)
+        )
+        assert most_cells <= most
+
+
+@pytest.mark.slow
+def test_in_blocks__same_bytes_for_all_blocks_and_workers(copy, sizes, whole):
+    ways = {"threads": 2, "none": None}
+    for bounds in (EACH_POINT, A_ROW):
+        sizes(*bounds)
+        for where, workers in ways.items():
+            run = copy(f"{where}{bounds[1]}")
+            derive(run, "attractors", workers=workers, scheduler=where)
+            for name in ("identified", "attractors"):
+                assert files_of(run, name) == files_of(whole, name)
+            assert not list((run.directory / "derived").glob("*.blocks"))
+
+
+@pytest.mark.slow
+def test_in_blocks__processes_compute_the_same_by_default(copy, sizes, whole, monkeypatch):
+    run, places = copy("run"), []
+    sizes(*A_ROW)
+    real = execute.run_tasks
+    monkeypatch.setattr(
+        execute, "run_tasks", lambda *a, **options: (places.append(options["scheduler"]), real(*a, **options))[1]
+    )
+    derive(run, "identified", workers=2)
+    assert [place.resolved() for place in places] == ["processes"]
+    assert files_of(run, "identified") == files_of(whole, "identified")
+
+
+@pytest.mark.slow
+def test_in_blocks__other_analyses_of_points(copy, sizes):
+    one, other = copy("one"), copy("other")
+    first = {name: derive(one, name, workers=0) for name in ("chaos", "resilience")}
+    sizes(*A_ROW)
+    for name, ds in first.items():
+        xr.testing.assert_identical(derive(other, name, scheduler="none"), ds)
+
+
+def test_in_blocks__stopped_goes_on_to_the_same_bytes(copy, sizes, whole, monkeypatch):
+    run, computed, real = copy("run"), [], blocks.compute_block
+    sizes(*A_ROW)
+
+    def stops(*args, **options):
+        if len(computed) == 2:
+            raise KeyboardInterrupt
+        computed.append(args[-1])
+        return real(*args, **options)
+
+    monkeypatch.setattr(blocks, "compute_block", stops)
+    with pytest.raises(InterruptedRunError, match="the same command continues"):
+        derive(run, "identified", scheduler="none")
+    (folder,) = (run.directory / "derived").glob("identified-*.blocks")
+    assert sorted(path.name for path in folder.iterdir()) == ["000000.zarr", "000001.zarr"]
+
+    def goes_on(*args, **options):
+        computed.append(args[-1])
+        return real(*args, **options)
+
+    monkeypatch.setattr(blocks, "compute_block", goes_on)
+    (folder / "000001.zarr" / "zarr.json").write_text("{}")  # damaged since
+    lines: list[str] = []
+    derive(run, "identified", scheduler="none", echo=lines.append)
+    assert computed == [0, 1, 1, 2, 3]
+    assert "identified: 1 of 4 blocks done before" in lines
+    assert files_of(run, "identified") == files_of(whole, "identified")
+    assert not folder.exists()
+
+
+def test_prune__removes_blocks_that_were_left(copy, sizes, monkeypatch):
+    run = copy("run")
+    (run.directory / "derived" / "identified-00000000.blocks" / "000000.zarr").mkdir(parents=True)
+    assert [path.rpartition("/")[2] for path in prune(run)] == ["identified-00000000.blocks"]
+    assert not list((run.directory / "derived").iterdir())
+
+
+def test_analyses_in__names_unknown_ones_and_missing_options():
+    assert analyses_in(" attractors, basins") == ["attractors", "basins"]
+    with pytest.raises(SpecError, match="--analyse: unknown analysis 'basin'; did you mean basins"):
+        analyses_in("basin")
+    with pytest.raises(SpecError, match="between: missing"):
+        analyses_in("edge")
+
+
+def test_run__analyse(main, write_spec):
+    code, out, err = main("run", write_spec(MAP), "--out", "run", "--workers", 1, "--analyse", "attractors,basins")
+    assert code == 0, err
+    assert "end on attractors" in out
+    assert "boundaries: the starts are no grid" in out
+    code, _, err = main("run", write_spec(MAP), "--out", "other", "--analyse", "attractor")
+    assert code == 2
+    assert "unknown analysis 'attractor'" in err
