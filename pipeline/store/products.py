@@ -243,6 +243,11 @@ def products_in(files: Files) -> list[Files]:
     return [files.below(name) for name in names if name.endswith(".zarr") and not name.startswith(".")]
 
 
+def blocks_beside(place: Files) -> Files:
+    """Return the folder with blocks of a product while it is not finished."""
+    return open_files(place.place.removesuffix(".zarr") + BLOCKS)
+
+
 def blocks_in(files: Files) -> list[Files]:
     """Return the folders with blocks of unfinished products in a folder."""
     with contextlib.suppress(FileNotFoundError, NotADirectoryError):
