@@ -9,35 +9,40 @@ from __future__ import annotations
 import contextlib
 import itertools
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from functools import lru_cache, partial
+from typing import Any
 
 import numpy as np
 import xarray as xr
 
+from magpend_core.engine.threads import using_threads
+from magpend_core.models import import_model
+from magpend_core.models.imported import origin
 from magpend_core.models.model import Model
-from pipeline.analysis.ragged import isel
+from pipeline.analysis.ragged import isel, joined
 from pipeline.analysis.run import Run
 from pipeline.compute import clients, execute
 from pipeline.compute.clients import Where
-from pipeline.compute.threads import Task
+from pipeline.compute.threads import writing_results
 from pipeline.layout.vocabulary import split_dims
+from pipeline.products.product import Analysis, Options, function_of
+from pipeline.products.registry import ANALYSES
 from pipeline.products.reporting import report
 from pipeline.runs.stopping import stoppable
+from pipeline.runs.versions import key_of
 from pipeline.specification.parsing import Spec
-from pipeline.store.errors import DamagedError
-from pipeline.store.files import Files
-from pipeline.store.products import open_product, read_product_attrs
-from pipeline.store.run import Run as StoredRun
-
-if TYPE_CHECKING:
-    from pipeline.runs.derive import AnalysedRun
+from pipeline.store.errors import DamagedError, RefusedError
+from pipeline.store.files import DERIVED, Files
+from pipeline.store.products import blocks_beside, open_product, read_product_attrs, write_product
 
 WANTED, FEWEST_CELLS, MOST_CELLS = 64, 1024, 16_384
 """Number of blocks that is aimed at, and the fewest and most cells of a block of several points."""
 
 Block = Mapping[str, slice]
+PlacedRun = Any
+"""Run with the place of its computation: `pipeline.runs.derive.AnalysedRun`."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +80,7 @@ class Part:
         return isel(self.known[key], self.block)
 
 
-def blocks_of(run: StoredRun) -> list[Block]:
+def blocks_of(run: PlacedRun) -> list[Block]:
     """Divide the parameter points of a run into blocks, in the C order of the points; align them with the tasks."""
     cells = run.cube()["status"]
     dims, starts = split_dims(cells)
@@ -92,25 +97,17 @@ def blocks_of(run: StoredRun) -> list[Block]:
     return [dict(zip(dims, own, strict=True)) for own in itertools.product(*slices)]
 
 
-def compute_missing(
-    task: Task, n: int, folder: Files, key: Mapping[str, str], name: str, run: AnalysedRun
-) -> list[xr.Dataset]:
-    """Compute the blocks of an analysis that are not stored, and return all.
+def in_blocks(run: PlacedRun, analysis: Analysis, options: Options, place: Files) -> xr.Dataset:
+    """Compute an analysis in blocks, or those that are left of them.
 
     Parameters
     ----------
-    task
-        Function that computes and stores the block with a given number; importable in other processes.
-    n
-        Number of blocks.
-    folder
-        Where blocks are stored.
-    key
-        Attributes of a sound block.
-    name
-        Name of the analysis.
     run
-        The run, with workers, scheduler and echo.
+        The run, with the workers and the scheduler.
+    analysis, options
+        Analysis with `by_point`, and its complete options.
+    place
+        Place of the whole result, beside which its blocks lie.
 
     Raises
     ------
@@ -119,19 +116,33 @@ def compute_missing(
     InterruptedRunError
         After Ctrl-C, SIGTERM or SIGHUP. Blocks that have ended stay.
     """
+    blocks = blocks_of(run)
+    n = len(blocks)
+    if n == 1:
+        result: xr.Dataset = function_of(analysis.compute)(run, options)
+        return result
+    for other in analysis.builds_on:  # once, before workers ask for it
+        run.derive(other, **options.part(ANALYSES[other].options))
     where = replace(_in_processes(run.where or Where()), place=run.info.files.place)
     clients.reach(where)
-    missing = [k for k in range(n) if not _is_there(folder.below(name_of(k)), key)]
-    done, what = n - len(missing), f"{name}, blocks of parameter points"
+    key, folder = key_of(run.digest, analysis, options), blocks_beside(place)
+    task = partial(
+        compute_block, type(run).of, run.info.files.place, run.digest, options, key, blocks, origin=origin(run.model)
+    )
+    missing = [k for k in range(n) if not _is_there(folder.below(_name(k)), key)]
+    done, what = n - len(missing), f"{analysis.name}, blocks of parameter points"
     if done:
-        run.echo(f"{name}: {done} of {n} blocks done before")
+        run.echo(f"{analysis.name}: {done} of {n} blocks done before")
     with stoppable(run.name):
         results = execute.run_tasks(task, missing, workers=run.workers, scheduler=where, echo=run.echo)
         with contextlib.closing(results):
             report(what, done, n)
             for k, _ in enumerate(results, done + 1):
                 report(what, k, n)
-    return [open_product(folder.below(name_of(k))) for k in range(n)]
+    cells = run.cube()["status"]
+    sizes = {d: cells.sizes[d] for d in split_dims(cells)[0]}
+    whole = joined([open_product(folder.below(_name(k))) for k in range(n)], blocks, sizes)
+    return whole.drop_attrs(deep=False).assign_attrs({k: v for k, v in whole.attrs.items() if k not in key})
 
 
 def _in_processes(where: Where) -> Where:
@@ -140,8 +151,42 @@ def _in_processes(where: Where) -> Where:
     return where if is_chosen else replace(where, scheduler=clients.PROCESSES)
 
 
-def name_of(index: int) -> str:
-    """Return the name of a block."""
+def compute_block(
+    opened: Callable[[str], PlacedRun],
+    directory: str,
+    digest: str,
+    options: Options,
+    key: Mapping[str, str],
+    blocks: Sequence[Block],
+    index: int,
+    *,
+    origin: tuple[str, str] | None = None,
+) -> dict[str, Any]:
+    """Compute and store one block of parameter points; a task of `pipeline.compute.execute.run_tasks`."""
+    if origin is not None:
+        import_model(*origin)
+    run, known = _opened(opened, directory, digest)
+    analysis = ANALYSES[key["derived_product"]]
+    if key_of(run.digest, analysis, options) != key:
+        raise RefusedError(
+            f"{directory}: this worker's magpend would not compute the same {analysis.name}; install the same version "
+            "everywhere."
+        )
+    with using_threads(1):
+        result: xr.Dataset = function_of(analysis.compute)(Part(run, blocks[index], known), options)
+    place = run.info.files.below(DERIVED).below(f"{analysis.name}-{key['derived_key'][:8]}.zarr")
+    with writing_results():
+        write_product(blocks_beside(place).below(_name(index)), result.assign_attrs(key))
+    return {"block": index}
+
+
+@lru_cache(maxsize=4)
+def _opened(opened: Callable[[str], PlacedRun], directory: str, digest: str) -> tuple[PlacedRun, dict[str, xr.Dataset]]:
+    """Open a run once per process for each state of its cells; return it with the results that it has derived."""
+    return opened(directory), {}
+
+
+def _name(index: int) -> str:
     return f"{index:06d}.zarr"
 
 

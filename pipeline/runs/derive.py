@@ -19,28 +19,25 @@ To add an analysis see `pipeline.products.product`.
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import json
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, fields
-from functools import lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.layout.conventions import conventional
-from pipeline.layout.vocabulary import overrides_attribute, split_dims
+from pipeline.layout.vocabulary import overrides_attribute
 from pipeline.products.attractors import IdentifyOptions
 from pipeline.products.product import Analysis, Options, function_of
 from pipeline.products.registry import ANALYSES, COMMANDS
 from pipeline.runs import notebook
 from pipeline.runs.naming import named
-from pipeline.runs.versions import code_version
+from pipeline.runs.versions import code_version, key_of
 from pipeline.specification.problems import SpecError, unknown_name, validated
-from pipeline.store.errors import DamagedError, RefusedError
+from pipeline.store.errors import DamagedError
 from pipeline.store.files import DERIVED, Files
 from pipeline.store.local import unwritable
-from pipeline.store.places import open_files
 from pipeline.store.products import (
     blocks_beside,
     blocks_in,
@@ -57,7 +54,6 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from pipeline.compute.clients import Where
-    from pipeline.runs.blocks import Block
 
 Echo = Callable[[str], None]
 Source = str | Path | Run
@@ -153,7 +149,7 @@ def derive(
     _refuse_unsteady(run, analysis)
     _refuse_noise(run, analysis)
     wanted = prepared(run, analysis, wanted)
-    key, told = key_of(run, analysis, wanted), overrides_attribute(run.spec.parameters.overrides)
+    key, told = key_of(run.digest, analysis, wanted), overrides_attribute(run.spec.parameters.overrides)
     place = run.info.files.below(DERIVED).below(f"{name}-{key['derived_key'][:8]}.zarr")
     try:
         ds = open_product(place)
@@ -378,100 +374,18 @@ def refused(directory: str | Path) -> Iterator[None]:
         raise SpecError(f"{directory}: {error}") from None
 
 
-def key_of(run: Run, analysis: Analysis, options: Options) -> dict[str, str]:
-    """Return the attributes of a result that hold everything which decides its numbers."""
-    plain = {name: value for name, value in options.plain().items() if name not in analysis.ignores}
-    parts = {
-        "derived_product": analysis.name,
-        "derived_options": json.dumps(plain, sort_keys=True),
-        "cube_digest": run.digest,
-        "analysis_version": code_version(analysis.name),
-    }
-    return {**parts, "derived_key": hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()}
-
-
 def _compute(run: AnalysedRun, analysis: Analysis, options: Options, place: Files | None) -> xr.Dataset:
     """Compute a result, in blocks if they can be kept beside its place."""
+    from pipeline.runs.blocks import in_blocks
+
     started = time.perf_counter()
     with refused(run.name):
         if analysis.by_point and place is not None and not getattr(options, "at", None):
-            result = _in_blocks(run, analysis, options, place)
+            result = in_blocks(run, analysis, options, place)
         else:
             result = function_of(analysis.compute)(run, options)
     run.echo(f"{analysis.name}: computed in {time.perf_counter() - started:.1f} s")
     return result
-
-
-def _in_blocks(run: AnalysedRun, analysis: Analysis, options: Options, place: Files) -> xr.Dataset:
-    """Compute an analysis of parameter points in blocks, or those that are left of them."""
-    from magpend_core.models.imported import origin
-    from pipeline.analysis.ragged import joined
-    from pipeline.runs.blocks import blocks_of, compute_missing
-
-    blocks = blocks_of(run)
-    if len(blocks) == 1:
-        result: xr.Dataset = function_of(analysis.compute)(run, options)
-        return result
-    for other in analysis.builds_on:  # once, before workers ask for it
-        run.derive(other, **options.part(ANALYSES[other].options))
-    key, folder = key_of(run, analysis, options), blocks_beside(place)
-    task = partial(
-        compute_block,
-        run.info.files.place,
-        run.digest,
-        analysis.name,
-        options.model_dump_json(),
-        key,
-        folder.place,
-        blocks,
-        origin=origin(run.model),
-    )
-    parts = compute_missing(task, len(blocks), folder, key, analysis.name, run)
-    cells = run.cube()["status"]
-    whole = joined(parts, blocks, {d: cells.sizes[d] for d in split_dims(cells)[0]})
-    attrs = {name: value for name, value in whole.attrs.items() if name not in key}
-    return whole.drop_attrs(deep=False).assign_attrs(attrs)
-
-
-def compute_block(
-    directory: str,
-    digest: str,
-    name: str,
-    options: str,
-    key: Mapping[str, str],
-    folder: str,
-    blocks: Sequence[Block],
-    index: int,
-    *,
-    origin: tuple[str, str] | None = None,
-) -> dict[str, Any]:
-    """Compute and store one block of parameter points; a task of `pipeline.compute.execute.run_tasks`."""
-    from magpend_core.engine.threads import using_threads
-    from magpend_core.models import import_model
-    from pipeline.compute.threads import writing_results
-    from pipeline.runs.blocks import Part, name_of
-
-    if origin is not None:
-        import_model(*origin)
-    run, known = _opened(directory, digest)
-    analysis = ANALYSES[name]
-    asked = analysis.options.model_validate_json(options)
-    if key_of(run, analysis, asked) != key:
-        raise RefusedError(
-            f"{directory}: this worker's magpend would not compute the same {name}; install the same version "
-            "everywhere."
-        )
-    with refused(directory), using_threads(1):
-        result: xr.Dataset = function_of(analysis.compute)(Part(run, blocks[index], known), asked)
-    with writing_results():
-        write_product(open_files(folder).below(name_of(index)), result.assign_attrs(key))
-    return {"block": index}
-
-
-@lru_cache(maxsize=4)
-def _opened(directory: str, digest: str) -> tuple[AnalysedRun, dict[str, xr.Dataset]]:
-    """Open a run once per process for each state of its cells; return it with the results that it has derived."""
-    return AnalysedRun.of(directory), {}
 
 
 def _kept(run: AnalysedRun, place: Files, result: xr.Dataset) -> xr.Dataset:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import ast
 import hashlib
+import json
 from functools import cache
 from pathlib import Path
 
 from magpend_core.source_digests import meaning_digest
+from pipeline.products.product import Analysis, Options
 from pipeline.products.registry import ANALYSES
 
 _ROOT = Path(__file__).parents[2]
@@ -70,3 +72,15 @@ def _file(module: str) -> Path:
         if file.is_file():
             return file
     raise FileNotFoundError(path)
+
+
+def key_of(digest: str, analysis: Analysis, options: Options) -> dict[str, str]:
+    """Return the attributes of a result that hold everything which decides its numbers, given the cells' digest."""
+    plain = {name: value for name, value in options.plain().items() if name not in analysis.ignores}
+    parts = {
+        "derived_product": analysis.name,
+        "derived_options": json.dumps(plain, sort_keys=True),
+        "cube_digest": digest,
+        "analysis_version": code_version(analysis.name),
+    }
+    return {**parts, "derived_key": hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()}

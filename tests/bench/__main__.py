@@ -15,6 +15,7 @@ FOLDER = Path(__file__).parent
 SMALL = ["--trajectories", "16", "--periods", "2", "--rounds", "1"]
 SCIPY = ["--scipy-trajectories", "1", "--scipy-periods", "1"]
 TINY = {
+    "analysis_scaling": ["--cells", "200"],
     "basins": ["--size", "4", "--bands", "2", "--transient", "300", *SCIPY],
     "costs": SMALL,
     "coverage": ["--rigs", "1", "--draws", "10"],

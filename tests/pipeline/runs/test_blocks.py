@@ -9,7 +9,6 @@ import xarray as xr
 
 from pipeline.compute import execute
 from pipeline.runs import blocks
-from pipeline.runs import derive as deriving
 from pipeline.runs.derive import AnalysedRun, analyses_in, derive, prune
 from pipeline.runs.stopping import InterruptedRunError
 from pipeline.specification.problems import SpecError
@@ -127,7 +126,7 @@ def test_in_blocks__other_analyses_of_points(copy, sizes):
 
 
 def test_in_blocks__stopped_goes_on_to_the_same_bytes(copy, sizes, whole, monkeypatch):
-    run, computed, real = copy("run"), [], deriving.compute_block
+    run, computed, real = copy("run"), [], blocks.compute_block
     sizes(*A_ROW)
 
     def stops(*args, **options):
@@ -136,7 +135,7 @@ def test_in_blocks__stopped_goes_on_to_the_same_bytes(copy, sizes, whole, monkey
         computed.append(args[-1])
         return real(*args, **options)
 
-    monkeypatch.setattr(deriving, "compute_block", stops)
+    monkeypatch.setattr(blocks, "compute_block", stops)
     with pytest.raises(InterruptedRunError, match="the same command continues"):
         derive(run, "identified", scheduler="none")
     (folder,) = (run.directory / "derived").glob("identified-*.blocks")
@@ -146,7 +145,7 @@ def test_in_blocks__stopped_goes_on_to_the_same_bytes(copy, sizes, whole, monkey
         computed.append(args[-1])
         return real(*args, **options)
 
-    monkeypatch.setattr(deriving, "compute_block", goes_on)
+    monkeypatch.setattr(blocks, "compute_block", goes_on)
     (folder / "000001.zarr" / "zarr.json").write_text("{}")  # damaged since
     lines: list[str] = []
     derive(run, "identified", scheduler="none", echo=lines.append)

@@ -35,7 +35,8 @@ def register(patch, compute):
     patch.setattr(deriving, "ANALYSES", {**ANALYSES, "mean": mean})
     real, version = deriving.function_of, deriving.code_version
     patch.setattr(deriving, "function_of", lambda name: compute if name == "tests:mean" else real(name))
-    patch.setattr(deriving, "code_version", lambda name: "test" if name == "mean" else version(name))
+    for module in (deriving, versions):
+        patch.setattr(module, "code_version", lambda name: "test" if name == "mean" else version(name))
     return compute
 
 
@@ -122,7 +123,7 @@ def test_derive__other_options_cells_and_code_compute_again(made, compute, monke
     withdraw(made.info, ["000001.json"])
     xr.testing.assert_identical(derive(directory, "mean", {"a": 1}), before)
     assert compute.calls == 3
-    monkeypatch.setattr(deriving, "code_version", lambda name: "another")
+    monkeypatch.setattr(versions, "code_version", lambda name: "another")
     derive(directory, "mean", {"a": 1})
     assert compute.calls == 4
 
