@@ -7,7 +7,7 @@ along the dim ``sample``. The coordinate ``attractor`` (set) holds ids. So memor
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -128,7 +128,7 @@ def joined(parts: Sequence[xr.Dataset], blocks: Sequence[Mapping[str, slice]], s
     return xr.Dataset(variables, coords, attrs)
 
 
-def dense(ds: xr.Dataset, *, points: bool = False) -> xr.Dataset:
+def dense(ds: xr.Dataset, names: Collection[str] = (), *, points: bool = False) -> xr.Dataset:
     """Return a result with its rows on the parameter dims and the dim ``attractor``, over all ids of the run.
 
     It is as large as the number of parameter points times the number of ids. Figures use it, and analyses of single
@@ -138,6 +138,8 @@ def dense(ds: xr.Dataset, *, points: bool = False) -> xr.Dataset:
     ----------
     ds
         Result; one without rows is returned as it is.
+    names
+        Variables of sets to keep; all if none is named.
     points
         Whether to keep the section points, on the dim ``point``.
 
@@ -151,7 +153,7 @@ def dense(ds: xr.Dataset, *, points: bool = False) -> xr.Dataset:
     dims, ids, at = dims_of(ds), int(ds.attrs[N_IDS]), (*index_of_rows(ds), ds["attractor"].values)
     found: dict[str, Any] = {}
     for name, variable in ds.data_vars.items():
-        if SET in variable.dims and name != N_POINTS:
+        if SET in variable.dims and name != N_POINTS and (name in names or not names):
             own = variable.transpose(SET, ...)
             found[str(name)] = (own.dims[1:], own.values, variable.attrs)
     if points and "attractor_points" in ds:

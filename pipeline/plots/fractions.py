@@ -13,7 +13,6 @@ from matplotlib.lines import Line2D
 
 from pipeline.analysis.intervals import binomial_interval
 from pipeline.analysis.outcomes import outcomes
-from pipeline.analysis.ragged import dense
 from pipeline.analysis.selection import choose, parameter_dims, start_dims
 from pipeline.layout.attractor_letters import letter
 from pipeline.plots import labels, palette, style
@@ -60,7 +59,7 @@ def plot_fractions(
     """
     parameter = swept_parameter(attractors, at, "fractions")
     keep = (parameter, *start_dims(attractors))
-    part = dense(choose(attractors, at, keep, f"fractions are drawn over {parameter}"))
+    part = choose(attractors, at, keep, f"fractions are drawn over {parameter}")
     cast = palette.cast_of(attractors, part)
     data = _fractions(part, parameter, cast)
     bands = _bands(data, cast)

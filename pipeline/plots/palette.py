@@ -21,7 +21,8 @@ from matplotlib.patheffects import withStroke
 from scipy.ndimage import distance_transform_edt
 
 from pipeline.analysis import outcomes
-from pipeline.analysis.ragged import dense
+from pipeline.analysis.ragged import N_IDS, SET, is_ragged
+from pipeline.analysis.sets import rows_by_number
 from pipeline.layout.attractor_letters import letter
 from pipeline.layout.period_names import period_of
 from pipeline.layout.vocabulary import (
@@ -119,18 +120,30 @@ def cast_of(attractors: xr.Dataset, part: xr.Dataset | None = None) -> Cast:
     part
         Part of the dataset that the names describe; by default all of it.
     """
-    attractors = dense(attractors)
-    dims = [d for d in attractors["n_cells"].dims if d != "attractor"]
-    attracts = attractors["stability"] == ATTRACTS
-    cells = attractors["n_cells"].where(attracts, 0).sum(dims).values
-    own = np.flatnonzero(attracts.any(dims).values)
+    sets = _sets(attractors)
+    attracts = [one["stability"].values == ATTRACTS for one in sets]
+    cells = np.array([int(one["n_cells"].values[own].sum()) for one, own in zip(sets, attracts, strict=True)])
+    own = np.flatnonzero([one.any() for one in attracts])
     ranked = own[np.lexsort((own, -cells[own]))][: len(style.colours())].tolist()
-    colours = {i: _grey_of(attractors["stability"].isel(attractor=i)) for i in range(cells.size)}
+    colours = {i: _grey_of(one["stability"]) for i, one in enumerate(sets)}
     colours |= dict.fromkeys(own.tolist(), OTHERS) | dict(zip(ranked, style.colours(), strict=False))
-    described = attractors if part is None else dense(part)
-    names = {i: f"{letter(i)}: {describe(described.isel(attractor=i))}" for i in range(cells.size)}
-    order = sorted(names, key=lambda i: _rank(described.isel(attractor=i)))
+    described = sets if part is None else _sets(part)
+    names = {i: f"{letter(i)}: {describe(one)}" for i, one in enumerate(described)}
+    order = sorted(names, key=lambda i: _rank(described[i]))
     return Cast(colours, names, tuple(sorted(ranked)), tuple(order))
+
+
+_TOLD = ("n_cells", "stability", "kind", "orbit_period", "side", "rotation", "period_s")
+"""Variables of a set by which it is named and coloured."""
+
+
+def _sets(attractors: xr.Dataset) -> list[xr.Dataset]:
+    """Return what is told of each set of a run, by its id, at the parameter points where it is."""
+    told = attractors[[name for name in _TOLD if name in attractors]]
+    if not is_ragged(attractors):
+        return [told.isel(attractor=i) for i in range(told.sizes["attractor"])]
+    rows = rows_by_number(attractors["attractor"].values)
+    return [told.isel({SET: rows.get(i, [])}) for i in range(int(attractors.attrs[N_IDS]))]
 
 
 def _grey_of(stability: xr.DataArray) -> str:

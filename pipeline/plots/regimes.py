@@ -14,7 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap, ListedColormap, to_hex, to_rgb
 from matplotlib.lines import Line2D
 
-from pipeline.analysis.basins.numbers import basin_fractions
+from pipeline.analysis.basins.numbers import unseen_bound
 from pipeline.analysis.outcomes import left_out, outcomes, share_interval
 from pipeline.analysis.ragged import dense
 from pipeline.analysis.selection import choose, parameter_dims, start_dims
@@ -89,7 +89,8 @@ def plot_regimes(
     style.check_choice("show", show, KINDS)
     x, y = _axes(attractors, at)
     keep = (x, y, *start_dims(attractors))
-    part = dense(choose(attractors, at, keep, f"a map of regimes has the axes {x} and {y}"))
+    chosen = choose(attractors, at, keep, f"a map of regimes has the axes {x} and {y}")
+    part = dense(chosen, ("stability", "orbit_period", "share", "n_cells"))
     data = _regimes(part, x, y, show)
     titles = {"periods": "periods of the coexisting attractors", "attractors": "coexisting attractors"}
     fixed = labels.caption(part, drop=[x, y])
@@ -99,7 +100,7 @@ def plot_regimes(
     if curves is not None:
         data = _with_curves(data, curves, x, y)
     if several:
-        fig = _draw_multiples(data, x, y, show, text, frame, palette.cast_of(attractors, part))
+        fig = _draw_multiples(data, x, y, show, text, frame, palette.cast_of(attractors, chosen))
     else:
         fig = _draw_one(data, x, y, show, text, frame)
     if curves is not None:
@@ -266,13 +267,17 @@ def _numbers(part: xr.Dataset, x: str, y: str) -> dict[str, Any]:
     }
     if "branch" in start_dims(part):
         return numbers
-    fractions = basin_fractions(outcomes(part), dims=start_dims(part), ids=part["attractor"].values.tolist())
+    known = (outcomes(part) != -1).sum(start_dims(part)).transpose(y, x)
+    unseen = unseen_bound(known.values)
     low, high = share_interval(part["n_cells"].transpose(*dims).values, share)
-    unseen = fractions["unseen_high"].transpose(y, x).values
     return numbers | {
         "low": (dims, low, {"units": "1", "long_name": "95 % interval of the share, low end"}),
         "high": (dims, high, {"units": "1", "long_name": "95 % interval of the share, high end"}),
-        "unseen_high": ((y, x), unseen, {"units": "1", "long_name": "95 % bound on a basin not seen"}),
+        "unseen_high": (
+            (y, x),
+            unseen_bound(known.values),
+            {"units": "1", "long_name": "95 % bound on a basin not seen"},
+        ),
     }
 
 

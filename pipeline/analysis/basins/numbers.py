@@ -101,13 +101,18 @@ def basin_fractions(
         n_cells=(kept, n_cells),
         n_unfinished=(kept, n_unfinished),
         fraction_unfinished=(kept, n_unfinished / n_cells),
-        unseen_high=(kept, _upper_bound(np.zeros_like(n_cells), n_cells - n_unfinished, confidence)),
+        unseen_high=(kept, unseen_bound(n_cells - n_unfinished, confidence)),
         unseen_high_if_all=(kept, _upper_bound(n_unfinished, n_cells, confidence)),
     )
     if inferred is not None:
         ds["n_inferred"] = ((*kept, "label"), _count_inferred(grid, np.asarray(inferred), shape))
     ds["fraction"].attrs = {"long_name": "basin fraction among the finished cells", "units": "1"}
     return ds.assign_attrs(_provenance(unfinished, confidence, method))
+
+
+def unseen_bound(n: npt.NDArray[np.int64], confidence: float = 0.95) -> npt.NDArray[np.float64]:
+    """Return the one-sided bound on the basin fraction of an attractor that none of `n` cells ends on."""
+    return _upper_bound(np.zeros_like(n), n, confidence)
 
 
 def _kept_dims(
