@@ -273,11 +273,7 @@ def _numbers(part: xr.Dataset, x: str, y: str) -> dict[str, Any]:
     return numbers | {
         "low": (dims, low, {"units": "1", "long_name": "95 % interval of the share, low end"}),
         "high": (dims, high, {"units": "1", "long_name": "95 % interval of the share, high end"}),
-        "unseen_high": (
-            (y, x),
-            unseen_bound(known.values),
-            {"units": "1", "long_name": "95 % bound on a basin not seen"},
-        ),
+        "unseen_high": ((y, x), unseen, {"units": "1", "long_name": "95 % bound on a basin not seen"}),
     }
 
 

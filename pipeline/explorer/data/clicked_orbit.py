@@ -12,6 +12,7 @@ import xarray as xr
 from magpend_core.models.model import Parameters
 from magpend_core.status import Status
 from pipeline.analysis.outcomes import share_interval
+from pipeline.analysis.ragged import dense, isel
 from pipeline.explorer.data.arrays import pack_arrays
 from pipeline.explorer.data.colours import schemes
 from pipeline.explorer.data.explored import ExploredRun, ExplorerError
@@ -273,7 +274,7 @@ def _attractor(run: ExploredRun, cell: Cell) -> dict[str, Any]:
     number = int(found["attractor_id"].isel(cell.index))
     if number < 0:
         return nothing
-    here = found.isel({**_parameter_index(run, cell), "attractor": number})
+    here = dense(isel(found, _parameter_index(run, cell))).isel(attractor=number)
     told = {**nothing, "attractor": number, "share": finite(here["share"]), **shown(here)}
     if BRANCH not in run.start_dims:  # branches of a continuation are no sample of initial states
         low, high = share_interval(np.array([int(here["n_cells"])]), np.array([float(here["share"])]))

@@ -10,6 +10,7 @@ import numpy as np
 
 from magpend_core.status import Status
 from pipeline.analysis.outcomes import outcomes
+from pipeline.analysis.ragged import N_IDS
 from pipeline.layout.vocabulary import BRANCH, split_dims
 from pipeline.plots import palette, style
 from pipeline.plots.motions import motion_codes, motions_of
@@ -157,7 +158,7 @@ def _ends(found: xr.Dataset) -> tuple[xr.DataArray, tuple[Category, ...]]:
     table, others = codes.transpose(*dims, *starts), []
     for name, which in palette.other_cells(found).items():
         if name in palette.SETS:
-            number = found.sizes["attractor"] + list(palette.GREYS).index(name)
+            number = int(found.attrs[N_IDS]) + list(palette.GREYS).index(name)
             table = table.where(~which, number)
             others.append(Category(number, name, rgb(palette.GREYS[name])))
     return table, tuple(others)

@@ -98,7 +98,7 @@ class ExploredRun(Run):
         with self._lock:
             key = f"derived {name}"
             if key not in self._opened:
-                self._opened[key] = None if self.spec.unsteady else _read(self, name)
+                self._opened[key] = None if self.spec.unsteady else stored(self, name)
             found: xr.Dataset | None = self._opened[key]
             return found
 
@@ -244,11 +244,3 @@ class ExploredRun(Run):
     def inputs(self, index: Mapping[str, int]) -> Inputs:
         """Return the inputs of a cell's integration: packed parameters, frequency and initial state."""
         return CellMap(self.spec).inputs(tuple(slice(index[d], index[d] + 1) for d in self.plan.dims))
-
-
-def _read(run: ExploredRun, name: str) -> xr.Dataset | None:
-    """Return a stored result with its sets on the dim ``attractor``; None if there is none."""
-    from pipeline.analysis.ragged import dense
-
-    found = stored(run, name)
-    return None if found is None else dense(found, points=True)

@@ -15,6 +15,7 @@ import xarray as xr
 from pipeline.analysis.branches.bifurcations import KINDS
 from pipeline.analysis.branches.dataset import CRITICALITIES
 from pipeline.analysis.outcomes import share_interval
+from pipeline.analysis.ragged import dense, isel
 from pipeline.explorer.data.clicked_orbit import finite, shown
 from pipeline.explorer.data.colours import rgb
 from pipeline.explorer.data.explored import ExploredRun
@@ -106,7 +107,7 @@ def _attractor_curves(run: ExploredRun, x: str, place: Mapping[str, int]) -> Ite
     if found is None:
         return
     cast = palette.cast_of(found)
-    part = found[["share", "n_cells", "lyapunov_max", "kind", "stability"]].isel(place)
+    part = dense(isel(found, place), ("share", "n_cells", "lyapunov_max", "kind", "stability"))
     walked = BRANCH in run.start_dims
     for number in range(part.sizes["attractor"]):
         one = part.isel(attractor=number)
@@ -278,7 +279,7 @@ def attractors(run: Run, at: Mapping[str, int]) -> dict[str, Any]:
     if found is None:
         return {"attractors": [], "note": "not computed: magpend analyse attractors DIR"}
     cast = palette.cast_of(found)
-    here = found.isel(place)
+    here = dense(isel(found, place), points=True)
     present = np.flatnonzero(here["kind"].values > 0).tolist()
     listed = [_attractor(explored, here.isel(attractor=i), i, cast) for i in present]
     return {"attractors": sorted(listed, key=lambda a: -(a["share"] or 0.0)), "note": None}

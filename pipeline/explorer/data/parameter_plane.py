@@ -12,6 +12,7 @@ from matplotlib.colors import to_hex
 from magpend_core.models.model import Parameters
 from magpend_core.orbits import section_map
 from pipeline.analysis.branches.bifurcations import KINDS
+from pipeline.analysis.ragged import ROW_SIZE, point_of_rows
 from pipeline.explorer.data.arrays import pack_arrays
 from pipeline.explorer.data.clicked_orbit import TOLERANCE, finite
 from pipeline.explorer.data.explored import ExploredRun, ExplorerError
@@ -92,8 +93,10 @@ def _map(run: ExploredRun, names: list[str]) -> dict[str, Any] | None:
     swept = [d for d in map(str, split_dims(attractors["attractor_id"])[0]) if attractors.sizes[d] > 1]
     if sorted(swept) != sorted(names):
         return None
-    attracting = (attractors["kind"] > 0) & (attractors["stability"] == ATTRACTS)
-    number = attracting.sum("attractor").squeeze().transpose(names[1], names[0]).sortby(names)
+    own = point_of_rows(attractors)[attractors["stability"].values == ATTRACTS]
+    sets = attractors[ROW_SIZE]
+    count = sets.copy(data=np.bincount(own, minlength=sets.size).reshape(sets.shape))
+    number = count.squeeze().transpose(names[1], names[0]).sortby(names)
     most = int(number.max())
     shades = colormaps["cividis"](np.linspace(0.25, 1.0, max(most, 1)))
     colours = [to_hex("0.8"), *map(to_hex, shades)]
