@@ -41,6 +41,24 @@ def index_of_rows(ds: xr.Dataset) -> tuple[np.ndarray, ...]:
     return tuple(np.unravel_index(point_of_rows(ds), ds[ROW_SIZE].shape)) if ds[ROW_SIZE].ndim else ()
 
 
+def places_of_rows(ds: xr.Dataset, dims: Sequence[str]) -> list[np.ndarray]:
+    """Return the value of each parameter dim at each row; its index where it has no coordinate."""
+    index = dict(zip(dims_of(ds), index_of_rows(ds), strict=True))
+    return [ds[d].values[index[d]] if d in ds.coords else index[d] for d in dims]
+
+
+def row_of_cells(ds: xr.Dataset) -> np.ndarray:
+    """Return for each cell the row of its set, -1 for none, on the parameter dims and then the start dims."""
+    dims = dims_of(ds)
+    starts = [d for d in ds["attractor_id"].dims if d not in dims]
+    ids = ds["attractor_id"].transpose(*dims, *starts).values
+    width = int(ds.attrs[N_IDS]) + 1  # the last place of each point is of cells without a set
+    table = np.full((ds[ROW_SIZE].size, width), -1, np.int64)
+    table[point_of_rows(ds), ds["attractor"].values] = np.arange(ds.sizes[SET])
+    points = np.arange(ds[ROW_SIZE].size).reshape(*ds[ROW_SIZE].shape, *(1 for _ in starts))
+    return np.asarray(table[points, ids])
+
+
 def rows_at(ds: xr.Dataset) -> dict[tuple[int, ...], range]:
     """Return the rows of each parameter point."""
     ends = np.cumsum(ds[ROW_SIZE].values.ravel())

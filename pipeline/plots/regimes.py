@@ -16,8 +16,9 @@ from matplotlib.lines import Line2D
 
 from pipeline.analysis.basins.numbers import unseen_bound
 from pipeline.analysis.outcomes import left_out, outcomes, share_interval
-from pipeline.analysis.ragged import dense
+from pipeline.analysis.ragged import N_IDS, SET, dense, dims_of, index_of_rows
 from pipeline.analysis.selection import choose, parameter_dims, start_dims
+from pipeline.analysis.sets import rows_by_number
 from pipeline.layout.attractor_letters import letter
 from pipeline.layout.vocabulary import ATTRACTS, parameter_name
 from pipeline.plots import labels, palette, style
@@ -89,8 +90,7 @@ def plot_regimes(
     style.check_choice("show", show, KINDS)
     x, y = _axes(attractors, at)
     keep = (x, y, *start_dims(attractors))
-    chosen = choose(attractors, at, keep, f"a map of regimes has the axes {x} and {y}")
-    part = dense(chosen, ("stability", "orbit_period", "share", "n_cells"))
+    part = choose(attractors, at, keep, f"a map of regimes has the axes {x} and {y}")
     data = _regimes(part, x, y, show)
     titles = {"periods": "periods of the coexisting attractors", "attractors": "coexisting attractors"}
     fixed = labels.caption(part, drop=[x, y])
@@ -100,7 +100,7 @@ def plot_regimes(
     if curves is not None:
         data = _with_curves(data, curves, x, y)
     if several:
-        fig = _draw_multiples(data, x, y, show, text, frame, palette.cast_of(attractors, chosen))
+        fig = _draw_multiples(data, x, y, show, text, frame, palette.cast_of(attractors, part))
     else:
         fig = _draw_one(data, x, y, show, text, frame)
     if curves is not None:
@@ -215,66 +215,68 @@ def _axes(attractors: xr.Dataset, at: Mapping[str, float] | None) -> tuple[str, 
 
 def _regimes(part: xr.Dataset, x: str, y: str, show: str) -> xr.Dataset:
     """Return the regime of each parameter point as a number; the most frequent regime has number 0."""
-    present = part["stability"].transpose(y, x, "attractor").values == ATTRACTS
-    periods = part["orbit_period"].transpose(y, x, "attractor").values
-    values = np.empty(present.shape[:2], object)
-    for index in np.ndindex(values.shape):
-        values[index] = _label(np.flatnonzero(present[index]), periods[index], show)
-    counts = Counter(values.ravel().tolist())
+    shape = (part.sizes[y], part.sizes[x])
+    rows = np.flatnonzero(part["stability"].values == ATTRACTS)
+    index = dict(zip(dims_of(part), index_of_rows(part), strict=True))
+    point = np.ravel_multi_index((index[y][rows], index[x][rows]), shape)
+    periods, ids = part["orbit_period"].values[rows], part["attractor"].values[rows]
+    own = rows_by_number(point)
+    nothing = np.zeros(0, np.int64)
+    values = [_label(np.sort(ids[k]), periods[k], show) for k in (own.get(i, nothing) for i in range(math.prod(shape)))]
+    counts = Counter(values)
     names = sorted(counts, key=lambda name: (-counts[name], name))
     if show == "number":
         names.sort(key=int)
     without = (outcomes(part) < 0).mean(start_dims(part)).transpose(y, x)
     number = {name: i for i, name in enumerate(names)}
-    regime = np.array([number[label] for label in values.ravel()], np.int32).reshape(values.shape)
+    regime = np.array([number[label] for label in values], np.int32).reshape(shape)
+    n_attractors = np.bincount(point, minlength=math.prod(shape)).astype(np.int32).reshape(shape)
     attrs = {"units": "1", "long_name": "regime, an index of label"}
     data = xr.Dataset(
         {
             "regime": ((y, x), regime, attrs),
-            "n_attractors": ((y, x), present.sum(axis=-1).astype(np.int32), {"units": "1"}),
+            "n_attractors": ((y, x), n_attractors, {"units": "1"}),
             "share_without": ((y, x), without.values, {"units": "1", "long_name": "share without attractor"}),
             **_numbers(part, x, y),
         },
         coords={x: part[x], y: part[y], "label": ("label", names)},
         attrs={"title": "regimes", "show": show},
     )
-    return data if show == "number" else data.merge(_members(present, periods, data["share"].values, x, y, show))
-
-
-def _members(present: np.ndarray, periods: np.ndarray, share: np.ndarray, x: str, y: str, show: str) -> xr.Dataset:
-    """Return the share of the cells on each attractor or, in a map of periods, on all attractors of each period."""
-    if show == "attractors":
-        kinds = np.broadcast_to(np.arange(present.shape[-1]), present.shape)
-        names = {i: letter(i) for i in range(present.shape[-1])}
-    else:
-        kinds = periods
-        found = sorted({int(p) for p in periods[present]} - {0})
-        names = {p: str(p) for p in found} | ({0: _NEITHER} if (periods[present] == 0).any() else {})
-    tables = [np.where(present & (kinds == k), share, 0.0).sum(axis=-1) for k in names]
-    stacked = np.stack(tables, axis=-1) if tables else np.zeros((*present.shape[:2], 0))
-    attrs = {"units": "1", "long_name": "share of all cells on attractors of this kind"}
-    return xr.Dataset(
-        {"share_of": ((y, x, "member"), stacked, attrs)}, coords={"member": ("member", list(names.values()))}
+    if show == "number":
+        return data
+    kinds, names_of = (ids, letter) if show == "attractors" else (periods, _period_name)
+    met = (
+        range(int(part.attrs[N_IDS]))
+        if show == "attractors"
+        else sorted(set(periods.tolist()), key=lambda p: p or math.inf)
     )
+    share = part["share"].values[rows]
+    tables = [np.bincount(point[kinds == k], share[kinds == k], math.prod(shape)).reshape(shape) for k in met]
+    stacked = np.stack(tables, axis=-1) if tables else np.zeros((*shape, 0))
+    attrs = {"units": "1", "long_name": "share of all cells on attractors of this kind"}
+    members = [names_of(k) for k in met]
+    return data.assign(share_of=((y, x, "member"), stacked, attrs)).assign_coords(member=("member", members))
+
+
+def _period_name(period: int) -> str:
+    return str(period) if period else _NEITHER
 
 
 def _numbers(part: xr.Dataset, x: str, y: str) -> dict[str, Any]:
     """Return the basin fractions with their 95 % intervals, and a bound on the size of a basin that was missed."""
-    dims = (y, x, "attractor")
-    share = part["share"].transpose(*dims).values
-    numbers: dict[str, Any] = {
-        "share": (dims, share, {"units": "1", "long_name": "share of the cells with an outcome"})
-    }
-    if "branch" in start_dims(part):
-        return numbers
-    known = (outcomes(part) != -1).sum(start_dims(part)).transpose(y, x)
-    unseen = unseen_bound(known.values)
-    low, high = share_interval(part["n_cells"].transpose(*dims).values, share)
-    return numbers | {
-        "low": (dims, low, {"units": "1", "long_name": "95 % interval of the share, low end"}),
-        "high": (dims, high, {"units": "1", "long_name": "95 % interval of the share, high end"}),
-        "unseen_high": ((y, x), unseen, {"units": "1", "long_name": "95 % bound on a basin not seen"}),
-    }
+    about = {"units": "1", "long_name": "share of the cells with an outcome"}
+    rows = part.assign(share=part["share"].assign_attrs(about))
+    names, unseen = ["share"], {}
+    if "branch" not in start_dims(part):
+        interval = share_interval(part["n_cells"].values, part["share"].values)
+        for name, values in zip(("low", "high"), interval, strict=True):
+            rows[name] = (SET, values, {"units": "1", "long_name": f"95 % interval of the share, {name} end"})
+        names += ["low", "high"]
+        known = (outcomes(part) != -1).sum(start_dims(part)).transpose(y, x)
+        attrs = {"units": "1", "long_name": "95 % bound on a basin not seen"}
+        unseen["unseen_high"] = ((y, x), unseen_bound(known.values), attrs)
+    found = dense(rows, names)
+    return {name: found[name].transpose(y, x, "attractor").variable for name in names} | unseen
 
 
 def _about(data: xr.Dataset) -> str:
@@ -284,16 +286,15 @@ def _about(data: xr.Dataset) -> str:
     return f"basins below {palette.percent(bound)} may be missing" if np.isfinite(bound) else ""
 
 
-def _label(present: np.ndarray, periods: np.ndarray, show: str) -> str:
+def _label(ids: np.ndarray, periods: np.ndarray, show: str) -> str:
+    """Return the regime of a parameter point, from its attractors and their periods."""
     if show == "number":
-        return str(present.size)
-    if not present.size:
+        return str(ids.size)
+    if not ids.size:
         return "none"
     if show == "attractors":
-        return " + ".join(letter(int(i)) for i in present)
-    found = sorted({int(p) for p in periods[present]} - {0})
-    words = [str(p) for p in found] + ([_NEITHER] if (periods[present] == 0).any() else [])
-    return " + ".join(words)
+        return " + ".join(letter(int(i)) for i in ids)
+    return " + ".join(_period_name(p) for p in sorted(set(periods.tolist()), key=lambda p: p or math.inf))
 
 
 def _looks(data: xr.Dataset, show: str) -> tuple[list[str], list[palette.Entry]]:

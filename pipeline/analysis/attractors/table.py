@@ -8,9 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 import xarray as xr
 
-from pipeline.analysis.basins.numbers import basin_fractions
-from pipeline.analysis.outcomes import other_cells, outcomes, sentence
-from pipeline.analysis.ragged import N_IDS, N_POINTS, SAMPLE, SET, rows_at
+from pipeline.analysis.outcomes import other_cells, sentence, share_interval
+from pipeline.analysis.ragged import N_IDS, N_POINTS, SAMPLE, SET, places_of_rows, row_of_cells
 from pipeline.analysis.tabular import (
     FEW_POINTS,
     FRACTION,
@@ -91,24 +90,18 @@ def _rows(ds: xr.Dataset) -> list[Row]:
     does not attract. A continuation has no fractions: its branches are no sample of initial conditions.
     """
     dims, start_dims = split_dims(ds["attractor_id"])
-    words = words_of(ds["decision"])
-    fractions = None
+    columns = dict(zip(dims, (axis.astype(object) for axis in places_of_rows(ds, dims)), strict=True)) | _columns(ds)
     if start_dims and start_dims != ("branch",):
-        fractions = basin_fractions(outcomes(ds), dims=start_dims, ids=np.unique(ds["attractor"].values).tolist())
-    columns, number = _columns(ds), ds["attractor"].values.tolist()
-    ids, decided = (ds[n].transpose(*dims, *start_dims).values for n in ("attractor_id", "decision"))
-    rows = []
-    for (index, own), (at, where) in zip(rows_at(ds).items(), points_of(ds, dims), strict=True):
-        cells, how = ids[index].ravel(), decided[index].ravel()
-        for i in own:
-            row = {**where, **{name: column[i] for name, column in columns.items()}}
-            if fractions is not None:
-                one = fractions.isel(at).sel(label=number[i])
-                counts = row["stability"] == STABILITIES[ATTRACTS]
-                row |= {n: float(one[n]) if counts else np.nan for n in FRACTION}
-            decisions = np.bincount(how[cells == number[i]], minlength=len(words))
-            rows.append(row | {f"by_{name}": int(decisions[k]) for k, name in enumerate(words) if k})
-    return rows
+        attracts, share = ds["stability"].values == ATTRACTS, ds["share"].values
+        shares = (np.where(attracts, share, np.nan), *share_interval(ds["n_cells"].values, share))
+        columns |= {name: values.astype(object) for name, values in zip(FRACTION, shares, strict=True)}
+    words = words_of(ds["decision"])
+    decided = np.zeros((ds.sizes[SET], len(words)), np.int64)
+    cells = row_of_cells(ds)
+    how = ds["decision"].transpose(*dims, *start_dims).values
+    np.add.at(decided, (cells[cells >= 0], how[cells >= 0]), 1)
+    columns |= {f"by_{name}": decided[:, k].astype(object) for k, name in enumerate(words) if k}
+    return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 
 
 def _columns(ds: xr.Dataset) -> dict[str, np.ndarray]:

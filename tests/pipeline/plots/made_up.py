@@ -8,7 +8,9 @@ import xarray as xr
 from magpend_core.models import load_model
 from magpend_core.models.pendulum.sides import Side
 from magpend_core.status import Status
+from pipeline import plots
 from pipeline.layout.vocabulary import ATTRACTS, PERIODIC_ORBIT
+from tests.pipeline.analysis.dense_sets import rows_of
 
 VALUES = load_model("pendulum").load().as_dict()
 STATES = ["psi1", "psi2", "psi1_dot", "psi2_dot"]
@@ -90,3 +92,8 @@ def caption_of(fig):
 def by_gid(fig, axes=None):
     """All artists of some axes that have an identifier, the last of each."""
     return {a.get_gid(): a for ax in (fig.axes if axes is None else axes) for a in ax.findobj() if a.get_gid()}
+
+
+def plot_regimes(ds, **options):
+    """Draw the map of a result whose sets are on the dim ``attractor``."""
+    return plots.plot_regimes(rows_of(ds), **options)

@@ -10,9 +10,9 @@ import pytest
 
 import pipeline.plots
 from pipeline.layout.attractor_letters import letter
-from pipeline.plots import Frame, plot_basins, plot_coexisting, plot_fractions, plot_gallery, plot_regimes
+from pipeline.plots import Frame, plot_basins, plot_coexisting, plot_fractions, plot_gallery
 from pipeline.plots.labels import with_unit
-from tests.pipeline.plots.made_up import DUFFING, legend_texts, make_attractors, make_portraits
+from tests.pipeline.plots.made_up import DUFFING, legend_texts, make_attractors, make_portraits, plot_regimes
 
 CELLS = ("frequency", "initial_condition")
 

@@ -26,17 +26,16 @@ from pipeline.analysis.outcomes import outcomes
 from pipeline.layout import vocabulary
 from pipeline.layout.attractor_letters import letter
 from pipeline.layout.vocabulary import ATTRACTS, BOUNDED_SET, CHAOTIC_SET, PERIODIC_ORBIT, TORUS
-from pipeline.plots import (
-    palette,
-    plot_basins,
-    plot_coexisting,
-    plot_curves,
-    plot_fractions,
-    plot_gallery,
+from pipeline.plots import palette, plot_basins, plot_coexisting, plot_curves, plot_fractions, plot_gallery, save_figure
+from tests.pipeline.plots.made_up import (
+    VALUES,
+    by_gid,
+    caption_of,
+    legend_texts,
+    make_attractors,
+    make_portraits,
     plot_regimes,
-    save_figure,
 )
-from tests.pipeline.plots.made_up import VALUES, by_gid, caption_of, legend_texts, make_attractors, make_portraits
 
 PENDING, PERIODIC, BOUNDED, DIVERGED = Status.PENDING, Status.PERIODIC, Status.BOUNDED, Status.DIVERGED
 STEP_LIMIT, INFERRED = Status.STEP_LIMIT, Status.INFERRED
