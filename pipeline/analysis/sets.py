@@ -16,6 +16,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from magpend_core import neighbours
+
 if TYPE_CHECKING:
     from magpend_core.engine.system import System
     from magpend_core.models.model import Model
@@ -82,7 +84,8 @@ class Geometry:
     def tree(self, points: np.ndarray) -> cKDTree:
         """Build a nearest-neighbour search tree of states (query it with `scaled` states and ``p=inf``)."""
         # sliding midpoints: trees are asked a few times each, and a balanced one costs more than it saves
-        return cKDTree(self.scaled(points), boxsize=self.circumference, balanced_tree=False, compact_nodes=False)
+        boxsize = self.circumference if any(self.is_angle) else None
+        return cKDTree(self.scaled(points), boxsize=boxsize, balanced_tree=False, compact_nodes=False)
 
     def boxes(self, points: np.ndarray, side: float) -> np.ndarray:
         """Return the integer coordinates of the box that holds each state; boxes have the side `side` in scaled
@@ -161,7 +164,7 @@ def groups(n: int, pairs: np.ndarray) -> np.ndarray:
 
 def nearest_distances(a: np.ndarray, b: np.ndarray, geometry: Geometry) -> np.ndarray:
     """Return the distance of each state of `a` from the nearest state of `b`."""
-    return np.asarray(geometry.tree(b).query(geometry.scaled(a), p=np.inf)[0])
+    return neighbours.nearest_distances(geometry.scaled(b), geometry.scaled(a), geometry.circumference)
 
 
 def mean_distance(a: np.ndarray, b: np.ndarray, geometry: Geometry) -> float:

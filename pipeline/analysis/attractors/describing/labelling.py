@@ -269,7 +269,7 @@ def _label_sets(
     for block in point.blocks():
         free = (labels.label[block.cells] < 0) & (labels.decision[block.cells] != DIVERGES)
         rows = np.flatnonzero(block.is_bounded & free & ~elsewhere[block.cells])
-        own = members(block.section[rows], clouds, search.geometry)
+        own = members(block.section[rows], clouds)
         labels.put(rows[own >= 0] + block.cells.start, first + own[own >= 0], SAME_SET)
 
 

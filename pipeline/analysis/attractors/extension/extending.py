@@ -195,7 +195,7 @@ class _Extension:
         cells, numbers = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
         for block in self.point.blocks() if final else ():
             rows = np.flatnonzero(is_loose[block.cells] & (block.is_bounded | block.is_closed))
-            own = members(block.section[rows], clouds, self.geometry)
+            own = members(block.section[rows], clouds)
             cells.append(rows[own >= 0] + block.cells.start)
             numbers.append(np.array(final, np.int64)[own[own >= 0]])
         return np.concatenate(cells), np.concatenate(numbers)
