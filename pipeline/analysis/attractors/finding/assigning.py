@@ -90,6 +90,8 @@ def decide(
     """
     label = np.full(len(block.status), -1, np.int64)
     decision = np.zeros(len(block.status), np.int8)
+    if not orbits:
+        return label, decision
     stable = [i for i, orbit in enumerate(orbits) if orbit.is_stable]
     unstable = [i for i in range(len(orbits)) if i not in stable]
     within = tolerance if tolerance <= STRICT else LOOSE_SHARE * tolerance

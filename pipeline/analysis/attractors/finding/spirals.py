@@ -90,13 +90,12 @@ def _recurring(section: np.ndarray, max_period: int, geometry: Geometry) -> tupl
     farthest, last = np.full((n, longest + 1), np.inf), np.full((n, longest + 1), np.inf)
     if longest:
         last[:, 1:] = geometry.distance(section[:, -1:], section[:, -2 : -2 - longest : -1])
-    for p in range(1, longest + 1):
-        # if the last section is not near, the farthest is not
-        rows = np.flatnonzero(last[:, p] <= NEAR)
-        if len(rows):
-            half = max((k - p) // 2, 1)
-            lag = geometry.distance(section[rows, k - half :], section[rows, k - half - p : k - p])
-            farthest[rows, p] = lag.max(axis=1)
+    # if the last section is not near, the farthest is not
+    is_near = last <= NEAR
+    for p in np.flatnonzero(is_near.any(axis=0)).tolist():
+        rows, half = np.flatnonzero(is_near[:, p]), max((k - p) // 2, 1)
+        lag = geometry.distance(section[rows, k - half :], section[rows, k - half - p : k - p])
+        farthest[rows, p] = lag.max(axis=1)
     near = farthest <= np.minimum(NEAR, SAME_LAG * farthest.min(axis=1))[:, None]
     period = near.argmax(axis=1)  # 0 where none is near
     return period, last[np.arange(n), period]
@@ -137,6 +136,8 @@ def near_closed(
     chaos that merely passes an orbit; others up to the period `CHEAP`, unless `closing_only`. `marks` are the
     hashes of the cells' sections, if they are known.
     """
+    if not len(section):
+        return Guesses.none(section.shape[2])
     found = Recurrence.of(section, max_period, geometry)
     closes = _closes_in(section, found, geometry)
     worth = (found.period > 0) & (closes if closing_only else closes | (found.period <= CHEAP))
