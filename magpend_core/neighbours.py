@@ -50,9 +50,17 @@ def n_nearer(
     return float(_n_nearer(_sorted(own, axis), _sorted(other, axis), asked, axis, circumference, least, enough))
 
 
-def _widest(points: np.ndarray) -> int:
+@kernel
+def _widest(points: Any) -> int:
     """Return the state in which points differ most: sorted by it, few of them lie near another."""
-    return int(np.argmax(points.max(axis=0) - points.min(axis=0)))
+    axis, widest = 0, -1.0
+    for k in range(points.shape[1]):
+        low, high = np.inf, -np.inf
+        for i in range(len(points)):
+            low, high = min(low, points[i, k]), max(high, points[i, k])
+        if high - low > widest:
+            axis, widest = k, high - low
+    return axis
 
 
 def _sorted(points: np.ndarray, axis: int) -> np.ndarray:

@@ -73,14 +73,14 @@ def mixing(a: np.ndarray, b: np.ndarray, geometry: Geometry, least: float = 0.0,
     n = min(len(a), len(b), MOST_POINTS) // 2
     if n < 2:
         return float("nan")
-    a, b = thinned(a, 2 * n), thinned(b, 2 * n)
+    a, b = (geometry.scaled(thinned(points, 2 * n)) for points in (a, b))
     return min(_crossing(a, b, n, geometry, least, enough), _crossing(b, a, n, geometry, least, enough))
 
 
 def _crossing(own: np.ndarray, other: np.ndarray, n: int, geometry: Geometry, least: float, enough: float) -> float:
     # take points from the whole duration of the other sample
-    early, there, later = (geometry.scaled(points) for points in (own[:n], thinned(other, n), own[n : 2 * n]))
-    return n_nearer(early, there, later, geometry.circumference, least, enough * n) / n
+    points = own[:n], thinned(other, n), own[n : 2 * n]
+    return n_nearer(*points, geometry.circumference, least, enough * n) / n
 
 
 def is_stationary(path: np.ndarray, geometry: Geometry, least: float = 0.0) -> bool:

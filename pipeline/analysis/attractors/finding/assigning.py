@@ -17,6 +17,10 @@ from pipeline.analysis.tolerances import LOOSE_SHARE, REACH, STRICT
 from pipeline.layout.vocabulary import APPROACHING, CERTAIN, CLOSED, UNDECIDED
 
 
+MOST_PAIRS = 2**18
+"""Most distances between cells and points of orbits that are held at once."""
+
+
 @dataclass(frozen=True)
 class _Metric:
     """Norm of scaled states in which the linearised return map of an orbit contracts: ``|x| = sqrt(x' S x)``."""
@@ -117,9 +121,13 @@ def _nearest(
         return
     owner = np.repeat(np.arange(len(orbits)), [o.period for o in orbits])
     phase = np.concatenate([np.arange(o.period) for o in orbits])
-    tree = geometry.tree(np.concatenate([o.points for o in orbits]))
-    _, near = tree.query(geometry.scaled(section[cells, -1]), p=np.inf, distance_upper_bound=REACH)
-    for i in np.unique(near[near < len(owner)]):
+    points = np.concatenate([o.points for o in orbits])
+    near = np.full(len(cells), -1)
+    for rows in np.array_split(np.arange(len(cells)), -(-len(cells) * len(points) // MOST_PAIRS)):
+        away = geometry.distance(section[cells[rows], None, -1], points)
+        nearest = away.argmin(axis=1)
+        near[rows] = np.where(away[np.arange(len(rows)), nearest] < REACH, nearest, -1)
+    for i in np.unique(near[near >= 0]).tolist():
         yield cells[near == i], int(owner[i]), int(phase[i])
 
 
