@@ -130,6 +130,8 @@ def group(samples: Sequence[np.ndarray], geometry: Geometry, least: float = 0.0)
 
 def _pooled(samples: Sequence[np.ndarray]) -> np.ndarray:
     each = max(4, MOST_POINTS // len(samples))
+    if len({len(sample) for sample in samples}) == 1:
+        return thinned(np.stack(samples, axis=1), each).reshape(-1, samples[0].shape[1])
     parts = [thinned(sample, each) for sample in samples]
     n = min(len(part) for part in parts)
     return np.stack([part[:n] for part in parts], axis=1).reshape(-1, parts[0].shape[1])
