@@ -164,6 +164,8 @@ def hashes(rows: np.ndarray) -> np.ndarray:
 def groups(n: int, pairs: np.ndarray) -> np.ndarray:
     """Return the number of the connected component of each node, in a graph of `n` nodes with edges (m, 2)."""
     edges = np.asarray(pairs, np.int64).reshape(-1, 2)
+    if not len(edges):
+        return np.arange(n)
     graph = coo_array((np.ones(len(edges), np.int8), (edges[:, 0], edges[:, 1])), shape=(n, n))
     return np.asarray(connected_components(graph, directed=False)[1], np.int64)
 

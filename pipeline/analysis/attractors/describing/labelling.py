@@ -265,6 +265,8 @@ def _label_raw(point: Point, state: State, groups: np.ndarray, labels: _Labels, 
     After a search by Newton's method there may be no orbit: beside the ghost of a fold, cells move too slowly to see.
     """
     left = np.where((labels.label < 0) & (labels.decision != DIVERGES) & ~_is_elsewhere(point), groups, -1)
+    if left.max(initial=-1) < 0:
+        return []
     best: dict[int, tuple[float, int, np.ndarray]] = {}
     for block in point.blocks():
         _representatives(block, left[block.cells], best, search.geometry)

@@ -115,7 +115,7 @@ def extend(
     work = _Extension(point, list(orbits), settings, budget)
     loose = np.flatnonzero(label < 0)
     for _ in range(ROUNDS):
-        chosen = work.sample(loose, n_sample)
+        chosen = work.sample(loose, n_sample) if len(loose) else []
         if not chosen:
             break
         work.courses += chosen
@@ -274,7 +274,7 @@ class _Extension:
         """Record the newly integrated section points of each trajectory. Finish the trajectories that reached an orbit
         or an equilibrium.
         """
-        computed = np.isin(leg.status, (Status.PERIODIC, Status.BOUNDED))
+        computed = (leg.status == Status.PERIODIC) | (leg.status == Status.BOUNDED)
         for course, state, step, section, ok in zip(going, leg.state, leg.step, leg.section, computed, strict=True):
             course.state, course.step = state, float(step)
             if ok:

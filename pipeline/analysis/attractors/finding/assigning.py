@@ -97,7 +97,7 @@ def decide(
     if not orbits:
         return label, decision
     stable = [i for i, orbit in enumerate(orbits) if orbit.is_stable]
-    unstable = [i for i in range(len(orbits)) if i not in stable]
+    unstable = [i for i, orbit in enumerate(orbits) if not orbit.is_stable]
     within = tolerance if tolerance <= STRICT else LOOSE_SHARE * tolerance
     for numbers in [stable] if tolerance > STRICT else [stable, unstable]:
         closed = np.flatnonzero(block.is_closed & (decision == UNDECIDED))
