@@ -108,6 +108,8 @@ def _nearest(points: Any, state: Any, axis: int, circumference: Any, within: flo
             away = 0.0
             for k in range(len(circumference)):
                 away = max(away, _difference(points[i, k], state[k], circumference[k]))
+                if away > bound:
+                    break
             if away <= bound:
                 best = bound = away
                 if best < ends_below:

@@ -16,7 +16,6 @@ from pipeline.analysis.sets import Geometry
 from pipeline.analysis.tolerances import LOOSE_SHARE, REACH, STRICT
 from pipeline.layout.vocabulary import APPROACHING, CERTAIN, CLOSED, UNDECIDED
 
-
 MOST_PAIRS = 2**18
 """Most distances between cells and points of orbits that are held at once."""
 
@@ -99,12 +98,15 @@ def decide(
     stable = [i for i, orbit in enumerate(orbits) if orbit.is_stable]
     unstable = [i for i, orbit in enumerate(orbits) if not orbit.is_stable]
     within = tolerance if tolerance <= STRICT else LOOSE_SHARE * tolerance
-    for numbers in [stable] if tolerance > STRICT else [stable, unstable]:
+    both = [stable] if tolerance > STRICT else [stable, unstable]
+    for numbers in both if block.is_closed.any() else []:
         closed = np.flatnonzero(block.is_closed & (decision == UNDECIDED))
         for cells, which, phase in _nearest(block.section, closed, [orbits[i] for i in numbers], geometry):
             number = numbers[which]
             own = cells[_on_orbit(block.section[cells], orbits[number], phase, within, geometry)]
             label[own], decision[own] = number, CLOSED
+    if not stable:
+        return label, decision
     rest = np.flatnonzero((block.is_closed | block.is_bounded) & (decision == UNDECIDED))
     for cells, which, phase in _nearest(block.section, rest, [orbits[i] for i in stable], geometry):
         code = _approach(block.section[cells], orbits[stable[which]], phase, tolerance, geometry)

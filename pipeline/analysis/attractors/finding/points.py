@@ -240,11 +240,11 @@ class Point:
 
 def _arrays(part: xr.Dataset, dims: tuple[str, ...], start_dims: tuple[str, ...]) -> dict[str, np.ndarray]:
     """Return the variables of some cells as arrays of shape (*dims, cell, ...), sections as float64."""
-    found = {}
+    found, n = {}, math.prod(part.sizes[d] for d in start_dims)
     for name, variable in part.data_vars.items():
         own = [d for d in ("period_index", "state") if d in variable.dims]
         values = variable.transpose(*dims, *start_dims, ..., *own).values
-        values = values.reshape(*values.shape[: len(dims)], -1, *values.shape[len(dims) + len(start_dims) :])
+        values = values.reshape(*values.shape[: len(dims)], n, *values.shape[len(dims) + len(start_dims) :])
         found[str(name)] = values.astype(np.float64, copy=False) if name == "section" else values
     return found
 
