@@ -276,6 +276,7 @@ class Destinations:
             self.point,
             cube=cube,
             at={},
+            arrays={},
             start_dims=(START,),
             block_cells=n,
             at_rest=None,

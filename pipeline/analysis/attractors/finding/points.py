@@ -135,6 +135,8 @@ class Point:
         Whether sections are crossings of a flow.
     can_rest : bool
         Whether equilibria are searched.
+    arrays : dict
+        Variables of all cells, shapes (cell, ...), if they fit the memory; else they are read from the cube.
     """
 
     cube: xr.Dataset
@@ -153,6 +155,7 @@ class Point:
     n_periods: int = 0
     is_flow: bool = False
     can_rest: bool = False
+    arrays: Mapping[str, np.ndarray] = field(default_factory=dict)
     _whole: Block | None = None
 
     @property
@@ -218,11 +221,10 @@ class Point:
 
     def _read(self, rows: slice, cells: slice) -> Block:
         """Read the cells of some values of the first start dim."""
-        part = self.cube.isel({**self.at, **dict.fromkeys(self.start_dims[:1], rows)})
-        return self.block_of(_arrays(part, (), self.start_dims), cells)
-
-    def block_of(self, arrays: Mapping[str, np.ndarray], cells: slice) -> Block:
-        """Return a block of cells from the arrays of its variables, shapes (cell, ...)."""
+        arrays = {name: array[cells] for name, array in self.arrays.items()}
+        if not arrays:
+            part = self.cube.isel({**self.at, **dict.fromkeys(self.start_dims[:1], rows)})
+            arrays = _arrays(part, (), self.start_dims)
         n, n_keep = arrays["section"].shape[:2]
         turns, seconds = arrays.get("turns"), arrays.get("return_time")
         return Block(
@@ -277,9 +279,7 @@ def slabs(ds: xr.Dataset, dynamics: Dynamics, budget: int) -> Iterator[dict[tupl
             at = dict(zip(dims, local, strict=True))
             point = points[index] = _point(slab, at, start_dims, values, dynamics, block_cells)
             point.n_periods = point.n_cells * ds.sizes["period_index"] if n_periods is None else int(n_periods[local])
-            if arrays:
-                own = {name: array[local] for name, array in arrays.items()}
-                point._whole = point.block_of(own, slice(0, point.n_cells))
+            point.arrays = {name: array[local] for name, array in arrays.items()}
         yield points
 
 
