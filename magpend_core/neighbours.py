@@ -23,8 +23,9 @@ def nearest_distances(points: np.ndarray, asked: np.ndarray, circumference: np.n
     circumference
         Length of the circle of each state, 0 for states that are no angles; shape (state,).
     """
-    axis = _widest(points)
-    found = np.empty(len(asked))
+    # another order in memory would be compiled anew
+    points, asked = np.ascontiguousarray(points), np.ascontiguousarray(asked)
+    axis, found = _widest(points), np.empty(len(asked))
     _nearest_distances(_sorted(points, axis), asked, axis, circumference, found)
     return found
 
@@ -46,6 +47,7 @@ def n_nearer(
     enough
         The count ends once it has reached this.
     """
+    own, other, asked = (np.ascontiguousarray(points) for points in (own, other, asked))
     axis = _widest(own)
     return float(_n_nearer(_sorted(own, axis), _sorted(other, axis), asked, axis, circumference, least, enough))
 
